@@ -495,7 +495,7 @@ mod tests {
                 "{}",
                 viewer.n_pictures()
             );
-            let Some(pending) = hub.next_request() else {
+            let Some(pending) = hub.pictures().next_request() else {
                 std::thread::sleep(Duration::from_millis(1));
                 continue;
             };
@@ -525,7 +525,7 @@ mod tests {
         let mut shown = Vec::new();
         while shown.len() < 3 {
             assert!(started.elapsed() < Duration::from_secs(60), "{shown:?}");
-            shown.append(&mut hub.take_shown_pictures());
+            shown.append(&mut hub.pictures().take_shown());
             std::thread::sleep(Duration::from_millis(1));
         }
         assert!(

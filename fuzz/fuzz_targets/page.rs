@@ -1,4 +1,4 @@
 //! Fuzz target for the messages of viewers: versions, requests and subscriptions.
 #![no_main]
 
-libfuzzer_sys::fuzz_target!(|session: &str| viz::check_session(session));
+libfuzzer_sys::fuzz_target!(|messages: &str| viz::check_messages(messages));

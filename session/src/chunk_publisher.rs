@@ -64,13 +64,13 @@ impl ChunkPublisher {
         let began = Instant::now();
         self.finish();
         let name = kind.name();
-        let Some(period) = self.hub.chunk_period(name) else {
+        let Some(period) = self.hub.model_chunks().period(name) else {
             // No client draws this model. The next one gets it at once.
             self.models.remove(name);
             return began.elapsed();
         };
         // After a failure, the changes since the last version are lost, so all chunks are due.
-        let only_changed = self.hub.has_model_chunks(name) && !self.failed.contains(name);
+        let only_changed = self.hub.model_chunks().contains(name) && !self.failed.contains(name);
         let step = method.progress().step;
         let is_due = match self.models.get(name) {
             Some(published) if only_changed => {
@@ -126,7 +126,7 @@ impl ChunkPublisher {
         match thread.join() {
             Ok(Ok(chunks)) => {
                 self.failed.remove(name);
-                self.hub.set_model_chunks(name, chunks);
+                self.hub.model_chunks().set(name, chunks);
             }
             Ok(Err(error)) => self.fail(name, &error.to_string()),
             Err(_) => self.fail(name, "encoding panicked"),

@@ -78,7 +78,9 @@ impl ModelViewer {
 
     /// Rotates the models so that they are upright in the page's world, which is z up.
     pub fn with_model_from_page(self, model_from_page: Transform) -> Self {
-        self.hub.set_world_from_model(model_from_page.inverse());
+        self.hub
+            .model_chunks()
+            .set_world_from_model(model_from_page.inverse());
         Self {
             model_from_page,
             ..self
@@ -89,8 +91,8 @@ impl ModelViewer {
     pub fn serve(&mut self, stop: &Stop) {
         while !stop.signaled() {
             self.apply_edits();
-            if self.hub.wait_for_request(POLL_PERIOD)
-                && let Some(pending) = self.hub.next_request()
+            if self.hub.pictures().wait_for_request(POLL_PERIOD)
+                && let Some(pending) = self.hub.pictures().next_request()
             {
                 self.answer(pending);
             }
@@ -149,11 +151,16 @@ impl ModelViewer {
             });
             self.report_edit(&request, erased.map(Some));
         }
-        for request in self.hub.take_edits() {
+        for request in self.hub.operator_requests().take_edits() {
             let edited = self.edit(&request);
             self.report_edit(&request, edited);
         }
-        if self.hub.take_controls().contains(&Control::Save) {
+        if self
+            .hub
+            .operator_requests()
+            .take_controls()
+            .contains(&Control::Save)
+        {
             let saved = self.models.iter_mut().zip(&mut self.saved);
             let notes: Vec<String> = saved
                 .map(|(model, saved)| model.save_edits(saved))

@@ -1,7 +1,7 @@
 //! Edits of a model that operators request.
 
+use crate::client::protocol::{EditKind, EditMessage};
 use crate::pictures::view_request::{InvalidRequest, checked_box};
-use crate::session::protocol::{EditKind, EditMessage};
 use model_files::Aabb;
 
 /// What an operator wants to change.

@@ -9,38 +9,43 @@
 //! let hub = Hub::new();
 //! hub.set_status(Status { state: "training".to_owned(), seconds: 1.5, ..Status::default() });
 //! assert_eq!(hub.n_clients(), 0);
-//! assert!(hub.next_request().is_none(), "nobody requests a picture yet");
+//! assert!(hub.pictures().next_request().is_none(), "nobody requests a picture yet");
 //! ```
 
+mod client;
 mod clock;
+mod demands;
 mod edit;
 mod error;
 #[cfg(feature = "foxglove")]
 mod foxglove_server;
 mod hub;
+mod operator_requests;
 mod pictures;
 mod pose;
 mod server;
-mod session;
 mod topics;
 
+pub use client::protocol::{BASE_PROTOCOL_VERSION, Control, PROTOCOL_VERSION};
 pub use edit::{EditAction, EditRequest};
 pub use error::Error;
 #[cfg(feature = "foxglove")]
 pub use foxglove_server::FoxgloveServer;
-pub use hub::{Hub, PendingRender};
+pub use hub::Hub;
 pub use keyframe::{LiveImage, LivePixels, RangeScan, RobotState};
+pub use operator_requests::OperatorRequests;
+pub use pictures::picture_requests::{PendingRender, PictureRequests};
 pub use pictures::picture_times::{NewestKeyframe, ShownPicture, TrainedKeyframes};
 pub use server::access::{Role, Token, Tokens};
 pub use server::certificate::Certificate;
 pub use server::{Server, ServerConfig, Sharing};
-pub use session::protocol::{BASE_PROTOCOL_VERSION, Control, PROTOCOL_VERSION};
+pub use topics::model_chunks::PublishedChunks;
 pub use topics::observation_map::{ObservationMap, ObservedCell};
 pub use topics::robot::{MeshFormat, RobotDescription, RobotMesh};
 pub use topics::updates::{Guidance, KeyframePose, ModelStatus, RunResult, SceneHint, Status};
 
 /// Handles the messages of a client, one per line, and panics if a result is inconsistent.
 #[cfg(fuzzing)]
-pub fn check_session(session: &str) {
-    session::message_checks::check_session(session);
+pub fn check_messages(messages: &str) {
+    client::message_checks::check_messages(messages);
 }

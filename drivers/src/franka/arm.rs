@@ -3,8 +3,8 @@
 #[cfg(any(test, fuzzing))]
 pub(crate) mod fuzz;
 
+use super::connection::{Connection, error_text, fault};
 use super::motion_loop::{MotionLoop, StampedState};
-use super::session::{Session, error_text, fault};
 use super::state::{MAX_STATE_BYTES, NumberedState, decode, pose};
 use super::{N_JOINTS, StateStatistics, realtime};
 use crate::udp::sequence::{SequencePosition, SequenceTracker};
@@ -82,7 +82,7 @@ impl FrankaArm {
     /// moves the arm.
     pub(super) fn open_with(
         config: &ArmConfig,
-        motion_loop: impl FnOnce(&Arc<Session>, &RobotState) -> Result<Option<MotionLoop>, String>,
+        motion_loop: impl FnOnce(&Arc<Connection>, &RobotState) -> Result<Option<MotionLoop>, String>,
     ) -> Result<Self, Error> {
         let address = &config.address;
         let n = config.joint_names.len();
@@ -92,13 +92,14 @@ impl FrankaArm {
                 format!("the rig file names {n} joints, but the arm has {N_JOINTS}"),
             ));
         }
-        let session = Arc::new(Session::open(address)?);
-        let version = session.version;
-        let first = first_state(address, &session)?;
+        let connection = Arc::new(Connection::open(address)?);
+        let version = connection.version;
+        let first = first_state(address, &connection)?;
         // A wrong robot description would give every image a wrong pose, and the error would look
         // like a bad calibration. So it is detected before anything is read or moved.
         check_kinematics(config, &first).map_err(|reason| fault(address, reason))?;
-        let motion_loop = motion_loop(&session, &first).map_err(|reason| fault(address, reason))?;
+        let motion_loop =
+            motion_loop(&connection, &first).map_err(|reason| fault(address, reason))?;
         let mut reader = StateReader::new(address.clone(), version, motion_loop);
         reader.log_mode(&first);
         let shared = Arc::new(Shared::default());
@@ -107,7 +108,7 @@ impl FrankaArm {
         let name = "franka".to_owned();
         let thread = std::thread::Builder::new()
             .name(name)
-            .spawn(move || reader.run(&session, &reading));
+            .spawn(move || reader.run(&connection, &reading));
         let thread = thread.map_err(|source| Error::Thread {
             device: device.clone(),
             source,
@@ -174,8 +175,8 @@ impl Drop for FrankaArm {
 }
 
 /// Waits for the first state of a controller that has accepted the connection.
-fn first_state(address: &str, session: &Session) -> Result<RobotState, Error> {
-    let Session { network, version } = session;
+fn first_state(address: &str, connection: &Connection) -> Result<RobotState, Error> {
+    let Connection { network, version } = connection;
     let deadline = clock::now() + MAX_SILENCE;
     let mut buffer = [0; MAX_STATE_BYTES];
     loop {
@@ -285,9 +286,9 @@ impl StateReader {
         }
     }
 
-    fn run(mut self, session: &Session, shared: &Shared) {
+    fn run(mut self, connection: &Connection, shared: &Shared) {
         realtime::request_realtime(&format!("arm at {}", self.address));
-        if let Err(reason) = self.read(session, shared) {
+        if let Err(reason) = self.read(connection, shared) {
             // The caller of a motion learns that it has ended even if nobody reads joint states.
             if let Some(motion_loop) = &mut self.motion_loop {
                 motion_loop.handle_disconnect(&reason);
@@ -301,8 +302,8 @@ impl StateReader {
     }
 
     /// Receives states until asked to stop. Returns the reason if no more states can be received.
-    fn read(&mut self, session: &Session, shared: &Shared) -> Result<(), String> {
-        let network = &session.network;
+    fn read(&mut self, connection: &Connection, shared: &Shared) -> Result<(), String> {
+        let network = &connection.network;
         let mut buffer = [0; MAX_STATE_BYTES];
         // States that were queued in the meantime arrive all at once, so they are useless for
         // estimating the robot's clock.

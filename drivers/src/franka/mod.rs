@@ -1,8 +1,9 @@
 //! Franka arms (Panda, FR3) over FCI, the interface of their controllers: read at 1 kHz, and moved
 //! by joint positions.
 //!
-//! * `session` connects, and `state` decodes. `arm` reads on its own thread and commands nothing.
-//!   `realtime` requests real-time scheduling for it, and `statistics` measures delays and losses.
+//! * `connection` connects, and `state` decodes. `arm` reads on its own thread and commands
+//!   nothing. `realtime` requests real-time scheduling for it, and `statistics` measures delays and
+//!   losses.
 //! * `movable` is an arm that may be moved. Commands pass through `mailbox` to `motion_loop`, which
 //!   runs on the reading thread. `reference` tracks the robot's commanded joint positions, `limits`
 //!   has the motion limits, and `request` encodes requests. `recent_cycles` keeps the last cycles
@@ -17,6 +18,7 @@
 //! libfranka 0.21.2 (FCI 10, FR3) and 0.9.2 (FCI 5, Panda).
 
 mod arm;
+mod connection;
 #[cfg(feature = "emulation")]
 pub mod emulated;
 mod limits;
@@ -29,7 +31,6 @@ mod realtime;
 mod recent_cycles;
 mod reference;
 mod request;
-mod session;
 mod state;
 mod statistics;
 #[cfg(test)]

@@ -1,12 +1,12 @@
 //! The part of an arm's thread that moves the arm: for each state that arrives, it sends the joint
 //! positions for the next millisecond.
 
+use super::connection::{Connection, error_text};
 use super::limits::RobotLimits;
 use super::mailbox::{MotionCommand, MotionMailbox};
 use super::recent_cycles::RecentCycles;
 use super::reference::{CommandFate, N_SUCCESS_WINDOW, Reference, ReferenceTracker};
 use super::request::{self, MotionResponse};
-use super::session::{Session, error_text};
 use super::state::NumberedState;
 use crate::clock;
 use crate::motion::{Motion, MotionLimits, TrajectoryGenerator};
@@ -32,7 +32,7 @@ const MAX_STATES_UNTIL_RESPONSE: u32 = 100;
 #[derive(Debug)]
 pub(super) struct MotionLoop {
     device: String,
-    session: Arc<Session>,
+    connection: Arc<Connection>,
     mailbox: Arc<MotionMailbox>,
     robot: RobotLimits,
     limits: Vec<MotionLimits>,
@@ -87,14 +87,14 @@ struct ActiveMotion {
 impl MotionLoop {
     pub(super) fn new(
         device: String,
-        session: Arc<Session>,
+        connection: Arc<Connection>,
         mailbox: Arc<MotionMailbox>,
         robot: RobotLimits,
         limits: Vec<MotionLimits>,
     ) -> Self {
         Self {
             device,
-            session,
+            connection,
             mailbox,
             robot,
             limits,
@@ -173,7 +173,7 @@ impl MotionLoop {
         // The answer to the request and the states come over different connections, so states from
         // before the motion may still arrive.
         if numbered.state.robot_mode != RobotMode::Move {
-            return match request::outcome(&self.session, id) {
+            return match request::outcome(&self.connection, id) {
                 Ok(None) if n_waited < MAX_STATES_UNTIL_START => MotionState::Beginning {
                     id,
                     n_waited: n_waited + 1,
@@ -327,7 +327,7 @@ impl MotionLoop {
         stamped: &StampedState<'_>,
         position_rad: [f64; super::N_JOINTS],
     ) {
-        let Session { network, version } = &*self.session;
+        let Connection { network, version } = &*self.connection;
         let datagram = request::command(*version, active.number, &position_rad, active.is_ending);
         match network.udp.send(stamped.from, &datagram) {
             Ok(()) => {
@@ -361,7 +361,7 @@ impl MotionLoop {
     fn halt(&self, id: u32, reason: String) -> MotionState {
         // Ceasing to send would also stop the robot, after 20 ms and with a reflex that a person
         // must clear.
-        let reason = match request::halt(&self.session) {
+        let reason = match request::halt(&self.connection) {
             Ok(()) => reason,
             Err(why) => format!("{reason}; {why}"),
         };
@@ -383,7 +383,7 @@ impl MotionLoop {
         reason: Option<String>,
         summary: String,
     ) -> MotionState {
-        let reason = match request::outcome(&self.session, id) {
+        let reason = match request::outcome(&self.connection, id) {
             Ok(None) if n_waited < MAX_STATES_UNTIL_RESPONSE => {
                 return MotionState::Ending {
                     id,

@@ -1,11 +1,11 @@
 //! A movable arm. A motion starts with the first target and ends one second after the arm has come
 //! to rest.
 
+use super::connection::Connection;
 use super::limits::{RobotLimits, clamp_to_range};
 use super::mailbox::{MailboxState, MotionCommand, MotionMailbox};
 use super::motion_loop::MotionLoop;
 use super::request::{self, ContactConfig};
-use super::session::Session;
 use super::{ArmConfig, FrankaArm, MotionStatistics, StateStatistics};
 use crate::motion::{
     JointTarget, Motion, MotionConfig, MotionLimits, MotionLock, MovableArm, OnLoss,
@@ -35,7 +35,7 @@ const SETTLE_TIMEOUT: Duration = Duration::from_secs(2);
 pub struct MovableFrankaArm {
     address: String,
     arm: FrankaArm,
-    session: Arc<Session>,
+    connection: Arc<Connection>,
     mailbox: Arc<MotionMailbox>,
     contact: ContactConfig,
     limits: Vec<MotionLimits>,
@@ -90,19 +90,19 @@ impl MovableFrankaArm {
         // The limits depend on the robot, which is known only after the connection. The closure
         // stores what this value needs of them.
         let connected = OnceLock::new();
-        let arm = FrankaArm::open_with(config, |session, first| {
+        let arm = FrankaArm::open_with(config, |connection, first| {
             // A Panda serves no description, so its limits are built in.
-            let robot = match session.version {
+            let robot = match connection.version {
                 FciVersion::V5 => RobotLimits::panda(),
-                FciVersion::V10 => RobotLimits::of_description(&request::description(session)?)?,
+                FciVersion::V10 => RobotLimits::of_description(&request::description(connection)?)?,
             };
             let limits = robot.allowed(&motion.limits)?;
             let device = format!("arm at {}", config.address);
             // The closure is called once.
-            let _ = connected.set((Arc::clone(session), limits.clone()));
+            let _ = connected.set((Arc::clone(connection), limits.clone()));
             let mut motion_loop = MotionLoop::new(
                 device,
-                Arc::clone(session),
+                Arc::clone(connection),
                 Arc::clone(&mailbox),
                 robot,
                 limits,
@@ -111,13 +111,13 @@ impl MovableFrankaArm {
             motion_loop.take_mode(first);
             Ok(Some(motion_loop))
         })?;
-        let (session, limits) = connected
+        let (connection, limits) = connected
             .into_inner()
-            .expect("an arm that is open has a session");
+            .expect("an arm that is open has a connection");
         Ok(Self {
             address,
             arm,
-            session,
+            connection,
             mailbox,
             contact: contact.clone(),
             limits,
@@ -168,10 +168,10 @@ impl MovableFrankaArm {
         // Settings are sent with the first motion, so that a program that only opens the arm
         // changes nothing.
         if !self.is_set {
-            request::set(&self.session, &self.contact).map_err(|why| self.fault(why))?;
+            request::set(&self.connection, &self.contact).map_err(|why| self.fault(why))?;
             self.is_set = true;
         }
-        let id = request::start_motion(&self.session);
+        let id = request::start_motion(&self.connection);
         let id = id.map_err(|why| self.fault(format!("it refused to start a motion: {why}")))?;
         self.mailbox.update(|mailbox_state| {
             mailbox_state.started_motion = Some(id);
@@ -256,7 +256,7 @@ impl MovableArm for MovableFrankaArm {
         match (motion, mode) {
             (Motion::Stopped { reason }, _) if is_lost => return Err(self.fault(reason)),
             (Motion::Stopped { .. }, RobotMode::Reflex) => {
-                request::recover(&self.session).map_err(|why| self.fault(why))?;
+                request::recover(&self.connection).map_err(|why| self.fault(why))?;
             }
             // There is no reflex to clear. The robot either became ready in the meantime, or needs
             // a person.

@@ -1,7 +1,7 @@
 //! Requests to a controller over TCP and motion commands over UDP, in both versions of FCI.
 
 use super::N_JOINTS;
-use super::session::{Session, answer, error_text};
+use super::connection::{Connection, answer, error_text};
 use franka::wire::robot::{v5, v10};
 use franka::wire::{HeaderLayout, f64s_to_wire, message_payload};
 use franka::{FciVersion, FrankaError, RobotMode};
@@ -53,9 +53,9 @@ pub(super) enum MotionResponse {
 }
 
 /// The URDF that an FCI 10 robot serves.
-pub(super) fn description(session: &Session) -> Result<String, String> {
+pub(super) fn description(connection: &Connection) -> Result<String, String> {
     let payload = ask(
-        session,
+        connection,
         v10::Command::GetRobotModel.to_u32(),
         &[],
         MAX_ANSWER,
@@ -71,7 +71,7 @@ pub(super) fn description(session: &Session) -> Result<String, String> {
 }
 
 /// Sets the collision thresholds and the stiffness, and checks each answer.
-pub(super) fn set(session: &Session, contact: &ContactConfig) -> Result<(), String> {
+pub(super) fn set(connection: &Connection, contact: &ContactConfig) -> Result<(), String> {
     let [x, y, z] = contact.force_n;
     let [about_x, about_y, about_z] = contact.moment_nm;
     let torque = &contact.torque_nm;
@@ -81,12 +81,12 @@ pub(super) fn set(session: &Session, contact: &ContactConfig) -> Result<(), Stri
         torque, torque, torque, torque, force, force, force, force,
     );
     let command = command_number(
-        session,
+        connection,
         v5::Command::SetCollisionBehavior,
         v10::Command::SetCollisionBehavior,
     );
     apply(
-        session,
+        connection,
         "it rejected the collision thresholds",
         command,
         collision.as_bytes(),
@@ -95,12 +95,12 @@ pub(super) fn set(session: &Session, contact: &ContactConfig) -> Result<(), Stri
         return Ok(());
     };
     let command = command_number(
-        session,
+        connection,
         v5::Command::SetJointImpedance,
         v10::Command::SetJointImpedance,
     );
     apply(
-        session,
+        connection,
         "it rejected the joint stiffness",
         command,
         v10::SetJointImpedanceRequest::new(stiffness).as_bytes(),
@@ -108,17 +108,22 @@ pub(super) fn set(session: &Session, contact: &ContactConfig) -> Result<(), Stri
 }
 
 /// The number of a command in the robot's FCI version. The versions number them differently.
-fn command_number(session: &Session, v5: v5::Command, v10: v10::Command) -> u32 {
-    match session.version {
+fn command_number(connection: &Connection, v5: v5::Command, v10: v10::Command) -> u32 {
+    match connection.version {
         FciVersion::V5 => v5.to_u32(),
         FciVersion::V10 => v10.to_u32(),
     }
 }
 
 /// Changes a setting, and checks the answer. `problem` starts the error message.
-fn apply(session: &Session, problem: &str, number: u32, payload: &[u8]) -> Result<(), String> {
-    let answer = ask(session, number, payload, MAX_ANSWER)?;
-    match (session.version, first(&answer)?) {
+fn apply(
+    connection: &Connection,
+    problem: &str,
+    number: u32,
+    payload: &[u8],
+) -> Result<(), String> {
+    let answer = ask(connection, number, payload, MAX_ANSWER)?;
+    match (connection.version, first(&answer)?) {
         (_, 0) => Ok(()),
         (FciVersion::V5, status) => Err(format!(
             "{problem}: {}",
@@ -133,11 +138,11 @@ fn apply(session: &Session, problem: &str, number: u32, payload: &[u8]) -> Resul
 
 /// Requests a joint position motion under the robot's joint impedance controller. Returns its ID
 /// once the robot has accepted it.
-pub(super) fn start_motion(session: &Session) -> Result<u32, String> {
+pub(super) fn start_motion(connection: &Connection) -> Result<u32, String> {
     let (translation, rotation, elbow) = ANY_DEVIATION;
     let deviation = || v10::Deviation::new(translation, rotation, elbow);
     let impedance_mode = v10::MoveControllerMode::JointImpedance;
-    let request = match session.version {
+    let request = match connection.version {
         FciVersion::V5 => {
             let mode = v5::MoveMotionGeneratorMode::JointPosition;
             v5::MoveRequest::new(impedance_mode, mode, deviation(), deviation())
@@ -153,8 +158,8 @@ pub(super) fn start_motion(session: &Session) -> Result<u32, String> {
     };
     // The number of this command and of `StopMove` is the same in both versions. A motion has two
     // answers with one ID: this one, and another when it ends.
-    let id = send(session, v10::Command::Move.to_u32(), &request)?;
-    match decode_response(session.version, &wait(session, id, MAX_ANSWER)?) {
+    let id = send(connection, v10::Command::Move.to_u32(), &request)?;
+    match decode_response(connection.version, &wait(connection, id, MAX_ANSWER)?) {
         MotionResponse::Started => Ok(id),
         MotionResponse::Finished => Err("it ended the motion before it started".to_owned()),
         MotionResponse::Rejected(why) => Err(why),
@@ -162,34 +167,34 @@ pub(super) fn start_motion(session: &Session) -> Result<u32, String> {
 }
 
 /// Ends a motion at once: the robot brakes.
-pub(super) fn halt(session: &Session) -> Result<(), String> {
-    send(session, v10::Command::StopMove.to_u32(), &[]).map(drop)
+pub(super) fn halt(connection: &Connection) -> Result<(), String> {
+    send(connection, v10::Command::StopMove.to_u32(), &[]).map(drop)
 }
 
 /// Result of a motion, if the robot has reported it.
-pub(super) fn outcome(session: &Session, id: u32) -> Result<Option<MotionResponse>, String> {
-    let message = session
+pub(super) fn outcome(connection: &Connection, id: u32) -> Result<Option<MotionResponse>, String> {
+    let message = connection
         .network
         .tcp
         .try_receive_response(id)
         .map_err(|error| error_text(&error))?;
     Ok(message.map(|message| {
         decode_response(
-            session.version,
+            connection.version,
             message_payload(HeaderLayout::Robot, &message),
         )
     }))
 }
 
 /// Clears a reflex.
-pub(super) fn recover(session: &Session) -> Result<(), String> {
+pub(super) fn recover(connection: &Connection) -> Result<(), String> {
     let number = command_number(
-        session,
+        connection,
         v5::Command::AutomaticErrorRecovery,
         v10::Command::AutomaticErrorRecovery,
     );
-    let answer = ask(session, number, &[], MAX_RECOVERY)?;
-    let why = match (session.version, first(&answer)?) {
+    let answer = ask(connection, number, &[], MAX_RECOVERY)?;
+    let why = match (connection.version, first(&answer)?) {
         (_, 0) => return Ok(()),
         (FciVersion::V5, status) => status_text(v5::AutomaticErrorRecoveryStatus::from_u8(status)),
         (FciVersion::V10, status) => {
@@ -278,17 +283,17 @@ fn decode_response(version: FciVersion, payload: &[u8]) -> MotionResponse {
 }
 
 fn ask(
-    session: &Session,
+    connection: &Connection,
     command: u32,
     payload: &[u8],
     timeout: Duration,
 ) -> Result<Vec<u8>, String> {
-    let id = send(session, command, payload)?;
-    wait(session, id, timeout)
+    let id = send(connection, command, payload)?;
+    wait(connection, id, timeout)
 }
 
-fn send(session: &Session, command: u32, payload: &[u8]) -> Result<u32, String> {
-    session
+fn send(connection: &Connection, command: u32, payload: &[u8]) -> Result<u32, String> {
+    connection
         .network
         .tcp
         .send_request(command, payload)
@@ -296,9 +301,9 @@ fn send(session: &Session, command: u32, payload: &[u8]) -> Result<u32, String> 
 }
 
 /// Waits for the payload of the answer.
-fn wait(session: &Session, id: u32, timeout: Duration) -> Result<Vec<u8>, String> {
-    let response =
-        answer(&session.network, id, timeout).map_err(|error: FrankaError| error_text(&error))?;
+fn wait(connection: &Connection, id: u32, timeout: Duration) -> Result<Vec<u8>, String> {
+    let response = answer(&connection.network, id, timeout)
+        .map_err(|error: FrankaError| error_text(&error))?;
     let message = response.ok_or_else(|| format!("it did not answer within {timeout:?}"))?;
     Ok(message_payload(HeaderLayout::Robot, &message).to_vec())
 }

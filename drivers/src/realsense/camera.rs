@@ -1,8 +1,8 @@
 //! A RealSense camera that reconnects after an outage.
 
 use super::find;
+use super::image_stream::{ImageStream, Next};
 use super::sdk::Context;
-use super::session::{Next, Session};
 use super::{Calibration, Config, Pace, Problem};
 use crate::reconnecting::{CameraCounts, Failure, ReconnectPolicy, Reconnecting, ReopenableCamera};
 use crate::{Camera, Error, Image};
@@ -55,13 +55,13 @@ impl RealsenseCamera {
             n_resets: 0,
             n_earlier_resets: 0,
         };
-        let session = device
+        let stream = device
             .open()
             .map_err(|failure| failure.into_error(|problem| device.error(problem)))?;
-        log::info!("camera {:?}: {}", device.config.name, session.describe());
-        let calibration = session.calibration().clone();
+        log::info!("camera {:?}: {}", device.config.name, stream.describe());
+        let calibration = stream.calibration().clone();
         Ok(Self {
-            camera: Reconnecting::new(device, session, policy),
+            camera: Reconnecting::new(device, stream, policy),
             calibration,
         })
     }
@@ -93,25 +93,25 @@ impl RealsenseDevice {
 }
 
 impl ReopenableCamera for RealsenseDevice {
-    type Stream = Session;
+    type Stream = ImageStream;
     type Problem = Problem;
 
-    fn open(&mut self) -> Result<Session, Failure<Problem>> {
-        Ok(Session::start(&self.config)?)
+    fn open(&mut self) -> Result<ImageStream, Failure<Problem>> {
+        Ok(ImageStream::start(&self.config)?)
     }
 
-    fn describe(&self, session: &Session) -> Option<String> {
-        Some(session.describe().to_owned())
+    fn describe(&self, stream: &ImageStream) -> Option<String> {
+        Some(stream.describe().to_owned())
     }
 
     fn next_image(
         &mut self,
-        session: &mut Session,
+        stream: &mut ImageStream,
         deadline: Instant,
     ) -> Result<Option<Image>, Failure<Problem>> {
         let camera = || self.config.name.clone();
         let is_file = self.config.file.is_some();
-        match session.next(deadline) {
+        match stream.next(deadline) {
             Ok(Next::Image(image)) => {
                 self.n_earlier_resets += std::mem::take(&mut self.n_resets);
                 return Ok(Some(image));
@@ -128,7 +128,7 @@ impl ReopenableCamera for RealsenseDevice {
             Err(problem) if is_file => return Err(Failure::Final(self.error(problem))),
             Err(problem) => return Err(problem.into()),
         }
-        let waited = session.time_since_image();
+        let waited = stream.time_since_image();
         if !is_file
             && waited
                 > MAX_SILENCE.max(Duration::from_secs_f64(

@@ -4,8 +4,8 @@
 //! cargo feature `realsense`. `sdk.rs` wraps the part of the library that `realsense-rust` lacks;
 //! `find.rs` lists cameras; `lens.rs` and `stamps.rs` convert lens parameters and time stamps;
 //! `options.rs` applies settings; `streams.rs` selects and opens streams; `filters.rs` filters
-//! depth; `session.rs` converts frames to images; `camera.rs` handles disconnections. `emulated/`
-//! writes the files of an emulated camera (cargo feature `emulation`).
+//! depth; `image_stream.rs` converts frames to images; `camera.rs` handles disconnections.
+//! `emulated/` writes the files of an emulated camera (cargo feature `emulation`).
 
 mod config;
 mod problem;
@@ -19,13 +19,13 @@ mod filters;
 #[cfg(feature = "realsense")]
 mod find;
 #[cfg(feature = "realsense")]
+mod image_stream;
+#[cfg(feature = "realsense")]
 mod lens;
 #[cfg(feature = "realsense")]
 mod options;
 #[cfg(feature = "realsense")]
 mod sdk;
-#[cfg(feature = "realsense")]
-mod session;
 #[cfg(feature = "realsense")]
 mod stamps;
 #[cfg(feature = "realsense")]

@@ -25,7 +25,7 @@ impl Live {
             return Ok(());
         }
         if self.requests.is_paused && self.pace != Pace::RealTime {
-            self.hub.wait_for_request(IDLE); // The next keyframe is due at a later step.
+            self.hub.pictures().wait_for_request(IDLE); // The next keyframe is due at a later step.
             return Ok(());
         }
         self.apply_alignments()?;
@@ -117,7 +117,8 @@ impl Live {
             if let Some(item) = self.feed.next(timeout) {
                 return Some(item);
             }
-            let is_requested = self.budget.may_render() && self.hub.wait_for_request(POLL_PERIOD);
+            let is_requested =
+                self.budget.may_render() && self.hub.pictures().wait_for_request(POLL_PERIOD);
             self.budget.add_training(before.elapsed()); // Training was idle, so drawing does not delay it.
             if started.elapsed() >= IDLE || is_requested {
                 return None;

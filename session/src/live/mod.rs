@@ -259,7 +259,7 @@ impl Live {
         if self.is_finished() || self.requests.is_paused {
             // Nothing is trained. Waits for a request, so that the loop does not use a whole
             // processor.
-            self.hub.wait_for_request(IDLE);
+            self.hub.pictures().wait_for_request(IDLE);
             return Ok(());
         }
         if self.is_render_pending() {
@@ -293,7 +293,7 @@ impl Live {
         let hub = &self.hub;
         let budget = self.budget;
         time_slices::train_next(&mut self.sessions, max_steps, || {
-            budget.may_render() && hub.wait_for_request(Duration::ZERO)
+            budget.may_render() && hub.pictures().wait_for_request(Duration::ZERO)
         })?;
         self.budget.add_training(before.elapsed());
         // Steps before this slice are complete, because at most one submit is in flight.

@@ -24,7 +24,7 @@ struct QueuedRender {
 impl Live {
     /// Whether a picture is requested and may be drawn now.
     pub(super) fn is_render_pending(&self) -> bool {
-        self.budget.may_render() && self.hub.wait_for_request(Duration::ZERO)
+        self.budget.may_render() && self.hub.pictures().wait_for_request(Duration::ZERO)
     }
 
     /// Draws requested pictures as long as training keeps its share of the time.
@@ -106,7 +106,7 @@ impl Live {
     /// Starts to draw the next requested picture. Requests that cannot be drawn are answered.
     fn queue_picture(&mut self) -> Option<QueuedRender> {
         loop {
-            let mut pending = self.hub.next_request()?;
+            let mut pending = self.hub.pictures().next_request()?;
             if self.keyframes.is_empty() {
                 pending.fail("no keyframe yet");
                 continue;
@@ -153,7 +153,7 @@ impl Live {
 
     /// Records which pictures of the first model clients have shown.
     pub(super) fn record_shown_pictures(&mut self) {
-        for picture in self.hub.take_shown_pictures() {
+        for picture in self.hub.pictures().take_shown() {
             // The ledger has one time per keyframe. With several models, it would otherwise mix
             // models that receive different shares of the time.
             if session_for_method(&self.sessions, picture.method.as_deref()) == Some(0) {

@@ -38,7 +38,7 @@ impl Live {
         if self.is_scoring() {
             return;
         }
-        for control in self.hub.take_controls() {
+        for control in self.hub.operator_requests().take_controls() {
             match control {
                 Control::Pause => self.requests.is_paused = true,
                 Control::Resume => self.requests.is_paused = false,
@@ -64,7 +64,7 @@ impl Live {
     /// Erases the floaters that were found, and applies the edits that operators have requested.
     pub(super) fn apply_edits(&mut self) {
         self.erase_found(false);
-        for request in self.hub.take_edits() {
+        for request in self.hub.operator_requests().take_edits() {
             let edited = match session_for_method(&self.sessions, request.method()) {
                 Some(session_ix) => {
                     self.sessions[session_ix].edit(&mut self.requests.editor, &request)

@@ -375,7 +375,7 @@ impl WorkDuringScoring<'_> {
                 hub.set_state(&format!("scoring, {n_scored} of {n_all} images"));
             }
         }
-        if let Some(pending) = self.hub.and_then(Hub::next_request) {
+        if let Some(pending) = self.hub.and_then(|hub| hub.pictures().next_request()) {
             let scored_method = self.reporter.kind().name();
             let other = pending
                 .method()

@@ -19,8 +19,8 @@ const LOG_STEP: f64 = 0.004;
 const ESCAPE: u8 = 255;
 /// Largest symbol of a difference between a count and its prediction.
 const MAX_SYMBOL: u16 = 254;
-/// Level for [`Effort::Small`]. Level 6 takes four times as long and saves 7 %.
-const LEVEL: u32 = 3;
+/// Deflate level for [`Effort::Small`]. Level 6 takes four times as long and saves 7 %.
+const DEFLATE_LEVEL: u32 = 3;
 
 /// How much time is spent on compression.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -94,7 +94,7 @@ pub(crate) fn compress(depth: &PackedDepth, effort: Effort) -> std::io::Result<C
             // About the size of the stream for depth of splats, so that the buffer rarely grows.
             let mut encoder = ZlibEncoder::new(
                 Vec::with_capacity(symbols.len() / 4),
-                Compression::new(LEVEL),
+                Compression::new(DEFLATE_LEVEL),
             );
             encoder.write_all(&symbols)?;
             encoder.finish()?

@@ -3,6 +3,7 @@
 pub(crate) mod compact_depth;
 pub(crate) mod jpeg;
 pub(crate) mod picture;
+pub(crate) mod picture_requests;
 pub(crate) mod picture_times;
 pub(crate) mod queue;
 pub(crate) mod view_request;

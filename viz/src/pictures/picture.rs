@@ -1,15 +1,15 @@
 //! Packs pictures and live images into binary messages.
 
+use crate::client::protocol::DepthFormat;
+use crate::client::server_message::{
+    BinaryHeader, ColorPart, DepthPart, LiveHeader, NewestKeyframeMessage, PictureHeader, frame,
+};
 use crate::clock::ServerClock;
 use crate::pictures::compact_depth::{Effort, compress};
 use crate::pictures::jpeg::{Chroma, JpegError, Layout, Pixels, downscale, encode, n_threads};
 use crate::pictures::picture_times::TrainedKeyframes;
 use crate::pictures::queue::{DrawnPicture, RenderJob};
 use crate::pictures::view_request::ViewRequest;
-use crate::session::protocol::DepthFormat;
-use crate::session::server_message::{
-    BinaryHeader, ColorPart, DepthPart, LiveHeader, NewestKeyframeMessage, PictureHeader, frame,
-};
 use keyframe::{LiveImage, LivePixels};
 use std::borrow::Cow;
 use std::time::Instant;

@@ -1,11 +1,11 @@
 //! Render requests by client and view: the newest request of each view, stage by stage. Clients
 //! take turns, and so do the views of a client.
 
+use crate::client::protocol::DepthFormat;
+use crate::client::server_message::PictureHeader;
 use crate::pictures::picture_times::{TrainedKeyframes, UnreportedPictures};
 use crate::pictures::view_request::ViewRequest;
 use crate::server::access::Role;
-use crate::session::protocol::DepthFormat;
-use crate::session::server_message::PictureHeader;
 use std::collections::{BTreeMap, VecDeque};
 use std::ops::Bound;
 use std::sync::Arc;
@@ -136,7 +136,7 @@ impl Queue {
     ///
     /// Only the last stage is kept if it is expected to be fast.
     pub(crate) fn view_request(&mut self, client: u64, mut view_request: ViewRequest) -> bool {
-        // The session is about to end, so an error would reach nobody.
+        // The client is about to leave, so an error would reach nobody.
         let Some(waiting) = self.clients.get_mut(&client) else {
             return true;
         };
@@ -216,7 +216,7 @@ impl Queue {
         }
     }
 
-    /// Puts a result into a client's outbox and wakes the client's session. Drops the reason of a
+    /// Puts a result into a client's outbox and wakes the client's writer. Drops the reason of a
     /// failed edit if the outbox is full; the number of the other results is limited by
     /// [`MAX_UNSENT`].
     pub(crate) fn push_outgoing(&mut self, client: u64, outgoing: Outgoing) {
@@ -355,9 +355,9 @@ fn n_px_of_last_stage(view_request: &ViewRequest) -> f64 {
 #[cfg(test)]
 mod tests {
     use super::{CLIENT_BYTES, MAX_OUTBOX, Outgoing, Queue, SHARED_BYTES};
+    use crate::client::protocol::{DepthFormat, RenderMessage};
     use crate::pictures::view_request::ViewRequest;
     use crate::server::access::Role;
-    use crate::session::protocol::{DepthFormat, RenderMessage};
 
     fn view_request(id: u64) -> ViewRequest {
         let message: RenderMessage = serde_json::from_value(serde_json::json!({

@@ -1,7 +1,7 @@
 //! A validated render request of a client, and its stages.
 
+use crate::client::protocol::{BoxMessage, DepthFormat, Output, ProjectionMessage, RenderMessage};
 use crate::pose::from_row_major;
-use crate::session::protocol::{BoxMessage, DepthFormat, Output, ProjectionMessage, RenderMessage};
 use kinematics::Transform;
 use model_files::Aabb;
 use std::sync::Arc;
@@ -67,7 +67,7 @@ pub(crate) enum InvalidRequest {
         got: String,
         known: Vec<&'static str>,
     },
-    #[error("rate_hz is {got}, expected 0 to {max}", max = crate::session::protocol::MAX_RATE_HZ)]
+    #[error("rate_hz is {got}, expected 0 to {max}", max = crate::client::protocol::MAX_RATE_HZ)]
     Rate { got: f64 },
     #[error("camera and size_px apply only to the topic live_images")]
     NotImages,
@@ -301,7 +301,7 @@ fn checked_background(color: [f32; 3]) -> Result<[f32; 3], InvalidRequest> {
 #[cfg(test)]
 mod tests {
     use super::{InvalidRequest, ViewRequest};
-    use crate::session::protocol::RenderMessage;
+    use crate::client::protocol::RenderMessage;
     use serde_json::{Value, json};
     use trainer::Projection;
 

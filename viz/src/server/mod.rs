@@ -4,21 +4,23 @@ pub(crate) mod access;
 pub(crate) mod admission;
 pub(crate) mod certificate;
 pub(crate) mod client_log;
+mod guarded_stream;
 mod page;
 pub(crate) mod server_context;
 mod tls;
 
+use crate::client::protocol::MAX_MESSAGE_BYTES;
 use crate::clock::ServerClock;
 use crate::server::access::{Access, Role, Tokens};
-use crate::server::admission::{Admission, Connection, GuardedStream, Limits};
+use crate::server::admission::{Admission, Connection, Limits};
 use crate::server::certificate::Certificate;
 use crate::server::client_log::ClientLog;
+use crate::server::guarded_stream::GuardedStream;
 use crate::server::page::{FILES, has_version};
 use crate::server::server_context::ServerContext;
-use crate::session::protocol::MAX_MESSAGE_BYTES;
 use crate::topics::robot::RobotDescription;
 use crate::topics::{self, Publisher};
-use crate::{Error, Hub, Status, session};
+use crate::{Error, Hub, Status, client};
 use axum::extract::{Extension, Path, Request, State, WebSocketUpgrade};
 use axum::http::{HeaderMap, HeaderName, HeaderValue, StatusCode, header};
 use axum::middleware::{Next, from_fn, from_fn_with_state};
@@ -47,8 +49,6 @@ const GOODBYE_TIMEOUT: Duration = Duration::from_millis(500);
 const HEADER_TIMEOUT: Duration = Duration::from_secs(3);
 /// Maximum size of a request including its headers, bytes.
 const MAX_REQUEST_BYTES: usize = 32 * 1024;
-/// Period of checking connections for timeouts.
-const SWEEP_PERIOD: Duration = Duration::from_millis(250);
 /// Pause after a failed accept, so that a permanent failure does not keep a processor busy.
 const ACCEPT_PAUSE: Duration = Duration::from_millis(50);
 /// Size of the kernel's send buffer per connection, bytes; Linux doubles it. For slow clients, data
@@ -131,7 +131,7 @@ impl Server {
         let (listener, address) = listen(listen_address)?;
         let scheme = if tls.is_some() { "https" } else { "http" };
         let (stop, stopped) = watch::channel(false);
-        // One thread: sessions mostly wait, and everything that computes runs on threads for
+        // One thread: clients mostly wait, and everything that computes runs on threads for
         // blocking tasks.
         let runtime = tokio::runtime::Builder::new_current_thread()
             .enable_all()
@@ -227,10 +227,9 @@ async fn serve(
     }));
     tokio::select! {
         () = accept(&listener, &admission, tls.as_ref(), &app) => {}
-        () = sweep(&admission) => {}
         _ = stopped.changed() => {}
     }
-    // No new connections while the sessions say goodbye.
+    // No new connections while the clients receive the goodbye.
     drop(listener);
     let all_disconnected = async {
         while hub.n_clients() > 0 {
@@ -273,13 +272,11 @@ async fn accept(
                 if let Err(error) = stream.set_nodelay(true) {
                     log::debug!("cannot disable Nagle's algorithm: {error}");
                 }
-                let (stream, has_evicted) = admission.admit(stream);
+                let stream = GuardedStream::new(stream, Arc::clone(admission));
                 tokio::spawn(serve_connection(stream, tls.cloned(), app.clone()));
-                if has_evicted {
-                    // Lets the task of the closed connection release its descriptor before the next
-                    // accept.
-                    tokio::task::yield_now().await;
-                }
+                // Lets the task of a connection that was replaced release its descriptor before the
+                // next accept.
+                tokio::task::yield_now().await;
             }
             // The peer has already disconnected.
             Err(error)
@@ -302,16 +299,20 @@ async fn accept(
     }
 }
 
-/// Enforces the time limits of connections. Never returns.
-async fn sweep(admission: &Admission) {
-    loop {
-        tokio::time::sleep(SWEEP_PERIOD).await;
-        // One timer for all connections, instead of one for each read and write.
-        admission.sweep();
+/// Serves a connection until either side closes it.
+async fn serve_connection(
+    stream: GuardedStream,
+    tls: Option<TlsAcceptor>,
+    app: TowerToHyperService<Router>,
+) {
+    let connection = Arc::clone(stream.connection());
+    tokio::select! {
+        () = serve_stream(stream, tls, app) => {}
+        () = connection.closed() => {}
     }
 }
 
-async fn serve_connection(
+async fn serve_stream(
     stream: GuardedStream,
     tls: Option<TlsAcceptor>,
     app: TowerToHyperService<Router>,
@@ -331,7 +332,7 @@ where
     S: AsyncRead + AsyncWrite + Send + Unpin + 'static,
 {
     let service = hyper::service::service_fn(|request: hyper::Request<hyper::body::Incoming>| {
-        connection.requested();
+        connection.record_request();
         let mut request = request.map(Body::new);
         // The handler of the WebSocket needs it, to count the client.
         request.extensions_mut().insert(Arc::clone(&connection));
@@ -420,7 +421,7 @@ async fn robot_mesh(
         )
             .into_response();
     };
-    // Meshes can have many megabytes. Hashing them on this thread would delay all sessions.
+    // Meshes can have many megabytes. Hashing them on this thread would delay all clients.
     let hashed = Arc::clone(&bytes);
     let etag = match tokio::task::spawn_blocking(move || etag(&hashed)).await {
         Ok(etag) => etag,
@@ -471,9 +472,7 @@ async fn connect(
     upgrade
         .max_message_size(MAX_MESSAGE_BYTES)
         .max_frame_size(MAX_MESSAGE_BYTES)
-        .on_upgrade(move |socket| {
-            session::serve(socket, connection, role, app_state.server_context)
-        })
+        .on_upgrade(move |socket| client::serve(socket, connection, role, app_state.server_context))
 }
 
 /// Adds headers that keep other web sites from embedding or reading the responses.

@@ -1,4 +1,4 @@
-//! What all sessions of a server share.
+//! What all clients of a server share.
 
 use crate::Hub;
 use crate::clock::ServerClock;
@@ -7,7 +7,7 @@ use crate::topics::{Publisher, Topic};
 use std::sync::Arc;
 use tokio::sync::watch;
 
-/// Shared by all sessions.
+/// Shared by the tasks of all clients.
 #[derive(Clone)]
 pub(crate) struct ServerContext {
     /// Takes requests and returns pictures.

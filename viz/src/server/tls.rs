@@ -1,6 +1,6 @@
 //! TLS handshakes of shared servers.
 
-use crate::server::admission::GuardedStream;
+use crate::server::guarded_stream::GuardedStream;
 use std::io;
 use std::time::Duration;
 use tokio::io::AsyncWriteExt;
@@ -49,8 +49,8 @@ async fn handshake(
         ));
     }
     acceptor
-        .accept_with(stream, |session| {
-            session.set_buffer_limit(Some(BUFFER_BYTES))
+        .accept_with(stream, |connection| {
+            connection.set_buffer_limit(Some(BUFFER_BYTES))
         })
         .await
 }

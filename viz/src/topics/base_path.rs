@@ -1,8 +1,8 @@
 //! The path of a moving base, for viewers.
 
+use crate::client::server_message::ServerMessage;
 use crate::clock::ServerClock;
-use crate::session::server_message::ServerMessage;
-use crate::topics::items::ItemTopic;
+use crate::topics::shared_topic::SharedTopic;
 use crate::topics::{DefaultRate, Priority};
 use axum::extract::ws::Message;
 use nalgebra::Vector3;
@@ -22,7 +22,7 @@ const POSITION_PERIOD: Duration = Duration::from_millis(100);
 #[derive(Default)]
 pub(crate) struct BasePathTopic;
 
-impl ItemTopic for BasePathTopic {
+impl SharedTopic for BasePathTopic {
     const NAME: &'static str = "base_path";
     const DEFAULT: DefaultRate = DefaultRate::Off;
     const PRIORITY: Priority = Priority::Short;

@@ -2,9 +2,9 @@
 //! full, then the chunks that have changed most, within a budget. While the client's copy is
 //! incomplete, chunks in its view come first.
 
+use crate::client::server_message::{BinaryHeader, ChunkHeader, ServerMessage, frame};
 use crate::pictures::viewpoint::Viewpoint;
 use crate::pose::row_major;
-use crate::session::server_message::{BinaryHeader, ChunkHeader, ServerMessage, frame};
 use crate::topics::chunk_list::{ChunkList, VersionedChunk};
 use crate::topics::subscriptions::ChunkSubscription;
 use axum::extract::ws::Message;

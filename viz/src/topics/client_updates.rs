@@ -34,7 +34,7 @@ struct ClientNeeds<'a> {
 
 /// What to do next.
 #[derive(Debug, PartialEq)]
-pub(crate) enum Next {
+pub(crate) enum NextUpdate {
     /// Sends this message, which is short.
     Short(Message),
     /// Sends this message, which may be long.
@@ -49,9 +49,9 @@ impl ClientUpdates {
     /// The feeds of a client that has received nothing.
     pub(crate) fn new(topics: &[Arc<dyn Topic>]) -> Self {
         // `start_all` has started the topics in the order of the table.
-        let feeds = TOPICS.iter().zip(topics).map(|(row, topic)| NamedFeed {
-            name: row.name,
-            priority: row.priority,
+        let feeds = TOPICS.iter().zip(topics).map(|(entry, topic)| NamedFeed {
+            name: entry.name,
+            priority: entry.priority,
             feed: Arc::clone(topic).feed(),
         });
         Self::of_feeds(feeds.collect())
@@ -74,14 +74,14 @@ impl ClientUpdates {
         has_keyframe_changes: bool,
         now: Instant,
         allows_long: bool,
-    ) -> Next {
+    ) -> NextUpdate {
         let mut timer = Timer::new(now);
         let client = ClientNeeds {
             subscriptions,
             has_keyframe_changes,
         };
         if let Some(message) = self.next_of(Priority::Short, client, &mut timer) {
-            return Next::Short(message);
+            return NextUpdate::Short(message);
         }
         if allows_long {
             // On a slow link, a new image waits whenever the last one has been sent. With a fixed
@@ -94,15 +94,17 @@ impl ClientUpdates {
             for priority in in_turn {
                 if let Some(message) = self.next_of(priority, client, &mut timer) {
                     self.was_live = priority == Priority::Live;
-                    return Next::Long(message);
+                    return NextUpdate::Long(message);
                 }
             }
             if let Some(message) = self.next_of(Priority::Background, client, &mut timer) {
-                return Next::Long(message);
+                return NextUpdate::Long(message);
             }
         }
-        // If long messages are not allowed now, the session asks again when they are.
-        timer.earliest().map_or(Next::Wait, Next::WaitUntil)
+        // If long messages are not allowed now, the writer asks again when they are.
+        timer
+            .earliest()
+            .map_or(NextUpdate::Wait, NextUpdate::WaitUntil)
     }
 
     /// The next message of the topics with a priority, in the order of the table.
@@ -135,20 +137,20 @@ impl ClientUpdates {
 
 #[cfg(test)]
 mod tests {
-    use super::{ClientUpdates, NamedFeed, Next};
+    use super::{ClientUpdates, NamedFeed, NextUpdate};
     use crate::Hub;
-    use crate::session::protocol::SubscribeMessage;
-    use crate::topics::items::Items;
+    use crate::client::protocol::SubscribeMessage;
     use crate::topics::keyframe_log::KeyframeLog;
     use crate::topics::keyframe_points::PointTopic;
     use crate::topics::keyframes::{KeyframeTopic, SharedLog};
     use crate::topics::live_images::LiveImageTopic;
-    use crate::topics::robot_state::Description;
-    use crate::topics::scene::Scene;
-    use crate::topics::status::RunStatus;
+    use crate::topics::robot_state::RobotDescriptionTopic;
+    use crate::topics::scene::SceneTopic;
+    use crate::topics::shared_topic::LatestMessages;
+    use crate::topics::status::StatusTopic;
     use crate::topics::subscriptions::Subscriptions;
     use crate::topics::updates::KeyframePose;
-    use crate::topics::{Item, TOPICS, Topic};
+    use crate::topics::{EncodedMessage, TOPICS, Topic};
     use axum::extract::ws::Message;
     use kinematics::{Stamp, Transform};
     use serde_json::{Value, json};
@@ -158,8 +160,8 @@ mod tests {
 
     const DEFAULT_PX: [u32; 2] = [640, u32::MAX];
 
-    fn item(number: u64) -> Item {
-        Item {
+    fn item(number: u64) -> EncodedMessage {
+        EncodedMessage {
             number,
             message: Message::text(number.to_string()),
         }
@@ -168,9 +170,9 @@ mod tests {
     /// Topics whose messages the tests set without encoding.
     struct Latest {
         hub: Hub,
-        scene: Arc<Items<Scene>>,
-        status: Arc<Items<RunStatus>>,
-        robot: Arc<Items<Description>>,
+        scene: Arc<LatestMessages<SceneTopic>>,
+        status: Arc<LatestMessages<StatusTopic>>,
+        robot: Arc<LatestMessages<RobotDescriptionTopic>>,
         images: Arc<LiveImageTopic>,
         keyframes: Arc<KeyframeTopic>,
         points: Arc<PointTopic>,
@@ -180,9 +182,9 @@ mod tests {
         fn new() -> Self {
             let hub = Hub::new();
             Self {
-                scene: Arc::new(Items::new(&hub)),
-                status: Arc::new(Items::new(&hub)),
-                robot: Arc::new(Items::new(&hub)),
+                scene: Arc::new(LatestMessages::new(&hub)),
+                status: Arc::new(LatestMessages::new(&hub)),
+                robot: Arc::new(LatestMessages::new(&hub)),
                 images: Arc::new(LiveImageTopic::new(&hub)),
                 keyframes: Arc::new(KeyframeTopic::new(&hub)),
                 points: Arc::new(PointTopic::new(&hub)),
@@ -201,13 +203,13 @@ mod tests {
                 ("keyframe_points", self.points.clone()),
             ];
             let feeds = topics.into_iter().map(|(name, topic)| {
-                let row = TOPICS
+                let entry = TOPICS
                     .iter()
-                    .find(|row| row.name == name)
+                    .find(|entry| entry.name == name)
                     .expect("a topic of the table");
                 NamedFeed {
-                    name: row.name,
-                    priority: row.priority,
+                    name: entry.name,
+                    priority: entry.priority,
                     feed: topic.feed(),
                 }
             });
@@ -241,10 +243,10 @@ mod tests {
                 .updates
                 .next(&self.subscriptions, false, self.now, allows_long)
             {
-                Next::Short(message) | Next::Long(message) => {
+                NextUpdate::Short(message) | NextUpdate::Long(message) => {
                     Some(message.into_text().expect("text").to_string())
                 }
-                Next::WaitUntil(_) | Next::Wait => None,
+                NextUpdate::WaitUntil(_) | NextUpdate::Wait => None,
             }
         }
     }
@@ -317,11 +319,14 @@ mod tests {
         let now = client.now;
         assert_eq!(
             client.updates.next(&client.subscriptions, false, now, true),
-            Next::Wait
+            NextUpdate::Wait
         );
         latest.status.set("", item(2));
         let next = client.updates.next(&client.subscriptions, false, now, true);
-        assert_eq!(next, Next::WaitUntil(now + Duration::from_millis(190)));
+        assert_eq!(
+            next,
+            NextUpdate::WaitUntil(now + Duration::from_millis(190))
+        );
     }
 
     #[test]
@@ -390,7 +395,7 @@ mod tests {
                 .send_replace(Some(Arc::new(self.log.clone())));
         }
 
-        fn next(&mut self) -> Next {
+        fn next(&mut self) -> NextUpdate {
             let Client {
                 updates,
                 subscriptions,
@@ -402,7 +407,7 @@ mod tests {
         /// Receives what is sent within a time. Like the page, drops points without a keyframe.
         fn receive(&mut self, millis: u64) {
             for _ in 0..millis / 10 {
-                while let Next::Short(message) | Next::Long(message) = self.next() {
+                while let NextUpdate::Short(message) | NextUpdate::Long(message) = self.next() {
                     self.apply(&message.into_text().expect("text"));
                 }
                 self.client.now += Duration::from_millis(10);
@@ -503,8 +508,8 @@ mod tests {
                 .images
                 .set("left", DEFAULT_PX, item(1 + n_images));
             match viewer.next() {
-                Next::Long(message) if message == item(1 + n_images).message => n_images += 1,
-                Next::Long(message) => viewer.apply(&message.into_text().expect("text")),
+                NextUpdate::Long(message) if message == item(1 + n_images).message => n_images += 1,
+                NextUpdate::Long(message) => viewer.apply(&message.into_text().expect("text")),
                 other => panic!("{other:?} instead of a message"),
             }
             assert!(

@@ -1,7 +1,7 @@
 //! The keyframe list with the order of its changes, so that clients receive only what has changed.
 
-use crate::session::protocol::MAX_CHANGED_KEYFRAMES;
-use crate::session::server_message::{NumberedKeyframe, ServerMessage};
+use crate::client::protocol::MAX_CHANGED_KEYFRAMES;
+use crate::client::server_message::{NumberedKeyframe, ServerMessage};
 use crate::topics::updates::KeyframePose;
 use std::collections::{BTreeMap, VecDeque};
 use std::sync::Arc;
@@ -50,7 +50,7 @@ pub(crate) struct ListPosition {
 
 /// The next message for a client.
 #[derive(Clone, Debug)]
-pub(crate) struct Changes {
+pub(crate) struct KeyframeListUpdate {
     /// The message.
     pub(crate) json: String,
     /// What the client has after the message.
@@ -151,7 +151,7 @@ impl KeyframeLog {
 
     /// The next message for a client at this position; `None` if it is up to date. A message from
     /// version 0 replaces the client's list.
-    pub(crate) fn next_changes(&self, position: ListPosition) -> Option<Changes> {
+    pub(crate) fn next_changes(&self, position: ListPosition) -> Option<KeyframeListUpdate> {
         // A list does not contain keyframes that were removed before it was started, so it needs
         // only later removals.
         // A version above that of the log would be a mistake, and a complete list corrects it.
@@ -211,7 +211,7 @@ impl KeyframeLog {
             removed,
         }
         .to_json();
-        Some(Changes {
+        Some(KeyframeListUpdate {
             json,
             position: ListPosition {
                 version,
@@ -233,8 +233,8 @@ fn has_changed(before: &KeyframePose, after: &KeyframePose) -> bool {
 
 #[cfg(test)]
 mod tests {
-    use super::{Changes, KeyframeLog, ListPosition, MAX_REMOVALS};
-    use crate::session::protocol::MAX_CHANGED_KEYFRAMES;
+    use super::{KeyframeListUpdate, KeyframeLog, ListPosition, MAX_REMOVALS};
+    use crate::client::protocol::MAX_CHANGED_KEYFRAMES;
     use crate::topics::updates::KeyframePose;
     use kinematics::random::Random;
     use kinematics::{Stamp, Transform};
@@ -273,7 +273,7 @@ mod tests {
 
         /// Applies the next message. Returns false if there is none.
         fn receive_one(&mut self, log: &KeyframeLog) -> bool {
-            let Some(Changes {
+            let Some(KeyframeListUpdate {
                 json,
                 position,
                 is_new_list,

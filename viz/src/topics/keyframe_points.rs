@@ -1,11 +1,11 @@
 //! The depth of a keyframe as colored points, for viewers.
 
 use crate::Hub;
-use crate::session::server_message::{BinaryHeader, PointsHeader, frame};
+use crate::client::server_message::{BinaryHeader, PointsHeader, frame};
 use crate::topics::keyframes::SharedLog;
 use crate::topics::positions::pack_positions;
 use crate::topics::{
-    ClientState, DefaultRate, EncodeContext, Feed, Priority, Publisher, Row, Timer, Topic,
+    ClientState, DefaultRate, EncodeContext, Feed, Priority, Publisher, Timer, Topic, TopicEntry,
     receiver, take_if_changed,
 };
 use axum::extract::ws::Message;
@@ -31,7 +31,7 @@ const MAX_EDGE_FRAC: f64 = 0.05;
 const NAME: &str = "keyframe_points";
 
 /// The topic in the table.
-pub(crate) const ROW: Row = Row {
+pub(crate) const ENTRY: TopicEntry = TopicEntry {
     name: NAME,
     default: DefaultRate::Off,
     priority: Priority::Keyframes,

@@ -2,12 +2,12 @@
 //! not know changes.
 
 use crate::Hub;
-use crate::session::server_message::{KeyframeMessage, ServerMessage};
-use crate::topics::keyframe_log::{Changes, KeyframeLog, ListPosition};
+use crate::client::server_message::{KeyframeMessage, ServerMessage};
+use crate::topics::keyframe_log::{KeyframeListUpdate, KeyframeLog, ListPosition};
 use crate::topics::updates::KeyframePose;
 use crate::topics::{
-    ClientState, DefaultRate, EncodeContext, Feed, Item, Priority, Publisher, Row, Sent, Throttle,
-    Timer, Topic, receiver, take_if_changed,
+    ClientState, DefaultRate, EncodeContext, EncodedMessage, Feed, LastSent, Priority, Publisher,
+    Throttle, Timer, Topic, TopicEntry, receiver, take_if_changed,
 };
 use axum::extract::ws::Message;
 use parking_lot::Mutex;
@@ -26,7 +26,7 @@ const LOG_PERIOD: Duration = Duration::from_millis(200);
 const LIST_PERIOD: Duration = Duration::from_millis(950);
 
 /// The topic in the table.
-pub(crate) const ROW: Row = Row {
+pub(crate) const ENTRY: TopicEntry = TopicEntry {
     name: NAME,
     default: DefaultRate::Period(Duration::from_secs(1)),
     priority: Priority::Keyframes,
@@ -58,7 +58,7 @@ struct State {
 /// The complete list, if a client needs it.
 #[derive(Default)]
 struct List {
-    item: Option<Item>,
+    item: Option<EncodedMessage>,
     is_running: bool,
 }
 
@@ -81,7 +81,7 @@ impl KeyframeTopic {
 
     /// Sets the complete list without encoding.
     #[cfg(test)]
-    pub(crate) fn set_list(&self, item: Item) {
+    pub(crate) fn set_list(&self, item: EncodedMessage) {
         self.list.lock().item = Some(item);
     }
 }
@@ -116,7 +116,7 @@ impl Topic for KeyframeTopic {
                 publisher: context.publisher.clone(),
             };
             let keyframes = state.source.borrow().clone();
-            // While a long list was encoded on this thread, no session could send anything.
+            // While a long list was encoded on this thread, no client could receive anything.
             tokio::task::spawn_blocking(move || task.run(&keyframes));
         }
     }
@@ -136,7 +136,7 @@ impl Topic for KeyframeTopic {
         Box::new(KeyframeFeed {
             topic: self,
             n_subscriptions: 0,
-            list: Sent::default(),
+            list: LastSent::default(),
             changes_at: None,
         })
     }
@@ -153,7 +153,7 @@ impl ListTask {
         let keyframes = keyframes.iter().map(KeyframeMessage::from).collect();
         let message = ServerMessage::Keyframes { keyframes }.to_message();
         self.publisher
-            .publish(|number| self.list.lock().item = Some(Item { number, message }));
+            .publish(|number| self.list.lock().item = Some(EncodedMessage { number, message }));
     }
 }
 
@@ -168,7 +168,7 @@ struct KeyframeFeed {
     topic: Arc<KeyframeTopic>,
     /// Number of the subscription that the list belongs to.
     n_subscriptions: u64,
-    list: Sent,
+    list: LastSent,
     /// When the client's list was last up to date.
     changes_at: Option<Instant>,
 }
@@ -180,7 +180,7 @@ impl Feed for KeyframeFeed {
             // A new subscription begins with the complete list. This is how a client whose list is
             // inconsistent, for example after an error in the page, gets a new one.
             self.n_subscriptions = n_subscriptions;
-            self.list = Sent::default();
+            self.list = LastSent::default();
             self.changes_at = None;
             client.keyframes.position = ListPosition::default();
         }
@@ -203,7 +203,7 @@ impl KeyframeFeed {
         if !timer.is_due(self.list.at, period) {
             return None;
         }
-        self.list = Sent {
+        self.list = LastSent {
             number: item.number,
             at: Some(timer.now),
         };
@@ -223,7 +223,7 @@ impl KeyframeFeed {
         if !timer.is_due(self.changes_at, period) {
             return None;
         }
-        let Changes {
+        let KeyframeListUpdate {
             json,
             position,
             is_new_list,

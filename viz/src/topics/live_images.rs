@@ -1,14 +1,14 @@
 //! The current images of the cameras, in the sizes that clients request.
 
 use crate::Hub;
+use crate::client::server_message::ServerMessage;
 use crate::clock::ServerClock;
-use crate::hub::Demand;
+use crate::demands::Demand;
 use crate::pictures::picture::pack_live_image;
-use crate::session::server_message::ServerMessage;
 use crate::topics::subscriptions::{LIVE_IMAGES, Subscriptions, fitted};
 use crate::topics::{
-    ClientState, DefaultRate, EncodeContext, Feed, Item, Priority, Publisher, Row, Sent, Timer,
-    Topic, receiver,
+    ClientState, DefaultRate, EncodeContext, EncodedMessage, Feed, LastSent, Priority, Publisher,
+    Timer, Topic, TopicEntry, receiver,
 };
 use axum::extract::ws::Message;
 use keyframe::LiveImage;
@@ -30,7 +30,7 @@ const MAX_IMAGE_ENCODINGS: usize = 4;
 const DEFAULT_PERIOD: Duration = Duration::from_millis(190);
 
 /// The topic in the table.
-pub(crate) const ROW: Row = Row {
+pub(crate) const ENTRY: TopicEntry = TopicEntry {
     name: LIVE_IMAGES,
     default: DefaultRate::Period(DEFAULT_PERIOD),
     priority: Priority::Live,
@@ -56,7 +56,7 @@ pub(crate) struct LiveImageTopic {
 #[derive(Default)]
 struct EncodedImages {
     encodings: BTreeMap<ImageKey, ImageEncoding>,
-    items: BTreeMap<ImageKey, Item>,
+    messages: BTreeMap<ImageKey, EncodedMessage>,
 }
 
 /// The image of a camera that is being encoded or was encoded last.
@@ -77,10 +77,10 @@ impl LiveImageTopic {
 
     /// Sets an image without encoding.
     #[cfg(test)]
-    pub(crate) fn set(&self, camera: &str, max_px: [u32; 2], item: Item) {
+    pub(crate) fn set(&self, camera: &str, max_px: [u32; 2], item: EncodedMessage) {
         self.images
             .lock()
-            .items
+            .messages
             .insert((camera.into(), max_px), item);
     }
 }
@@ -91,11 +91,14 @@ impl Topic for LiveImageTopic {
         let live_images = source.borrow();
         let wanted = wanted_images(context.settled(), live_images.keys());
         let mut images = self.images.lock();
-        let EncodedImages { encodings, items } = &mut *images;
+        let EncodedImages {
+            encodings,
+            messages,
+        } = &mut *images;
         // Forget sizes that no client requests any longer, such as that of a window before it was
         // resized. A running task still needs its entry, which says that it runs.
         encodings.retain(|key, encoding| encoding.is_running || wanted.contains_key(key));
-        items.retain(|key, _| wanted.contains_key(key));
+        messages.retain(|key, _| wanted.contains_key(key));
         for (key, image) in images_to_encode(wanted, encodings, &live_images, context.now) {
             let encoding = ImageEncoding {
                 image: Arc::clone(&image),
@@ -119,7 +122,7 @@ impl Topic for LiveImageTopic {
         let mut images = self.images.lock();
         // Running tasks may still publish their image. It is removed in the next check.
         images.encodings.retain(|_, encoding| encoding.is_running);
-        images.items.clear();
+        images.messages.clear();
     }
 
     fn feed(self: Arc<Self>) -> Box<dyn Feed> {
@@ -144,8 +147,8 @@ impl EncodingTask {
         self.publisher.publish(|number| {
             self.images
                 .lock()
-                .items
-                .insert(self.key.clone(), Item { number, message });
+                .messages
+                .insert(self.key.clone(), EncodedMessage { number, message });
         });
     }
 }
@@ -234,25 +237,28 @@ fn images_to_encode(
 /// What a client has received.
 struct ImageFeed {
     images: Arc<Mutex<EncodedImages>>,
-    sent: BTreeMap<Arc<str>, Sent>,
+    sent: BTreeMap<Arc<str>, LastSent>,
 }
 
 impl Feed for ImageFeed {
     /// The image of the camera whose last image was sent longest ago.
     fn next(&mut self, client: &mut ClientState<'_>, timer: &mut Timer) -> Option<Message> {
         let images = self.images.lock();
-        let waiting = images.items.iter().filter_map(|((camera, max_px), item)| {
-            let subscription = client.subscriptions.images_of(camera);
-            let sent = self.sent.get(camera).copied().unwrap_or_default();
-            // Images of other sizes are for other clients.
-            let is_wanted = *max_px == subscription.max_px && item.number > sent.number;
-            let is_next = is_wanted && timer.is_due(sent.at, subscription.period?);
-            is_next.then_some((sent.number, camera, item))
-        });
+        let waiting = images
+            .messages
+            .iter()
+            .filter_map(|((camera, max_px), item)| {
+                let subscription = client.subscriptions.images_of(camera);
+                let sent = self.sent.get(camera).copied().unwrap_or_default();
+                // Images of other sizes are for other clients.
+                let is_wanted = *max_px == subscription.max_px && item.number > sent.number;
+                let is_next = is_wanted && timer.is_due(sent.at, subscription.period?);
+                is_next.then_some((sent.number, camera, item))
+            });
         let (_, camera, item) = waiting.min_by_key(|(number, ..)| *number)?;
         self.sent.insert(
             Arc::clone(camera),
-            Sent {
+            LastSent {
                 number: item.number,
                 at: Some(timer.now),
             },
@@ -286,7 +292,10 @@ impl Hub {
 
     /// Whether a client shows the images of any camera.
     pub fn needs_live_images(&self) -> bool {
-        self.is_observed() || self.has_subscription(Subscriptions::has_live_images)
+        self.is_observed()
+            || self
+                .demands()
+                .has_subscription(Subscriptions::has_live_images)
     }
 }
 

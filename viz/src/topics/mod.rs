@@ -4,15 +4,14 @@
 //! clients. [`Feed`] decides what one client receives next. What the halves share is known to the
 //! topic alone.
 //!
-//! To add a topic, write a module and a row of [`TOPICS`]. If all clients receive the same
-//! messages, implement [`ItemTopic`](items::ItemTopic), which needs a name, a period and a function
-//! that encodes. `docs/reference/protocol.md` lists the topics.
+//! To add a topic, write a module and an entry of [`TOPICS`]. If all clients receive the same
+//! messages, implement [`SharedTopic`](shared_topic::SharedTopic), which needs a name, a period and
+//! a function that encodes. `docs/reference/protocol.md` lists the topics.
 
 mod base_path;
 pub(crate) mod chunk_list;
 mod chunk_sender;
 pub(crate) mod client_updates;
-pub(crate) mod items;
 mod keyframe_log;
 mod keyframe_points;
 pub(crate) mod keyframes;
@@ -24,6 +23,7 @@ pub(crate) mod range_scan;
 pub(crate) mod robot;
 pub(crate) mod robot_state;
 mod scene;
+pub(crate) mod shared_topic;
 mod status;
 pub(crate) mod subscriptions;
 #[cfg(test)]
@@ -32,7 +32,7 @@ pub(crate) mod updates;
 
 use crate::Hub;
 use crate::clock::ServerClock;
-use crate::hub::Demand;
+use crate::demands::Demand;
 use crate::pictures::viewpoint::Viewpoint;
 use crate::topics::keyframe_log::ListPosition;
 use crate::topics::subscriptions::Subscriptions;
@@ -43,23 +43,23 @@ use std::time::{Duration, Instant};
 use tokio::sync::watch;
 
 /// All topics. Within a priority, a client receives them in this order.
-pub(crate) const TOPICS: &[Row] = &[
-    items::row::<scene::Scene>(),
-    items::row::<status::RunStatus>(),
-    items::row::<base_path::BasePathTopic>(),
-    items::row::<robot_state::Description>(),
-    live_images::ROW,
-    items::row::<range_scan::RangeScanTopic>(),
-    keyframes::ROW,
-    keyframe_points::ROW,
-    items::row::<observation_map::Observations>(),
-    model_chunks::ROW,
+pub(crate) const TOPICS: &[TopicEntry] = &[
+    shared_topic::entry::<scene::SceneTopic>(),
+    shared_topic::entry::<status::StatusTopic>(),
+    shared_topic::entry::<base_path::BasePathTopic>(),
+    shared_topic::entry::<robot_state::RobotDescriptionTopic>(),
+    live_images::ENTRY,
+    shared_topic::entry::<range_scan::RangeScanTopic>(),
+    keyframes::ENTRY,
+    keyframe_points::ENTRY,
+    shared_topic::entry::<observation_map::ObservationTopic>(),
+    model_chunks::ENTRY,
     #[cfg(test)]
-    items::row::<test_topic::Weather>(),
+    shared_topic::entry::<test_topic::Weather>(),
 ];
 
-/// A topic in the table.
-pub(crate) struct Row {
+/// A topic in the list of all topics.
+pub(crate) struct TopicEntry {
     /// Name in `subscribe`.
     pub(crate) name: &'static str,
     /// What a client receives before it subscribes.
@@ -95,8 +95,8 @@ pub(crate) enum Priority {
     Background,
 }
 
-/// The half of a topic that encodes new data once for all clients. It works outside the sessions,
-/// on the server's thread.
+/// The half of a topic that encodes new data once for all clients. It works outside the tasks of
+/// clients, on the server's thread.
 pub(crate) trait Topic: Send + Sync {
     /// Encodes what is new and due, if a client receives it. Work that takes more than a
     /// millisecond belongs on a thread for blocking tasks.
@@ -166,7 +166,7 @@ pub(crate) struct KeyframeProgress {
     pub(crate) n_lists: u64,
 }
 
-/// Numbers new messages, and wakes up the sessions.
+/// Numbers new messages, and wakes up the writers.
 #[derive(Clone, Debug, Default)]
 pub(crate) struct Publisher {
     n_messages: Arc<AtomicU64>,
@@ -174,13 +174,13 @@ pub(crate) struct Publisher {
 }
 
 impl Publisher {
-    /// Calls `store` with the number of a new message, and then wakes up the sessions. Later
+    /// Calls `store` with the number of a new message, and then wakes up the writers. Later
     /// messages have larger numbers.
     pub(crate) fn publish(&self, store: impl FnOnce(u64)) {
         // Only the order of the numbers matters. The locks of the topics order the messages. Number
         // 0 is left for clients that have received nothing.
         store(1 + self.n_messages.fetch_add(1, Ordering::Relaxed));
-        // After storing: a session that is woken up earlier would find nothing, and then sleep
+        // After storing: a writer that is woken up earlier would find nothing, and then sleep
         // until the next message.
         self.changed.send_replace(());
     }
@@ -193,14 +193,14 @@ impl Publisher {
 
 /// An encoded message; clones share the bytes.
 #[derive(Clone, Debug)]
-pub(crate) struct Item {
+pub(crate) struct EncodedMessage {
     pub(crate) number: u64,
     pub(crate) message: Message,
 }
 
 /// Number of the last message of a kind that a client has received, and when it was sent.
 #[derive(Clone, Copy, Debug, Default)]
-pub(crate) struct Sent {
+pub(crate) struct LastSent {
     pub(crate) number: u64,
     pub(crate) at: Option<Instant>,
 }
@@ -227,7 +227,7 @@ impl Timer {
             .and_then(|at| at.checked_add(period))
             .unwrap_or(self.now);
         if due > self.now {
-            // There is something to send. Without this time, the session would sleep until
+            // There is something to send. Without this time, the writer would sleep until
             // something else changes.
             self.wait_until(due);
         }
@@ -236,7 +236,7 @@ impl Timer {
 
     /// Records that a message is due at this time.
     pub(crate) fn wait_until(&mut self, due: Instant) {
-        // All feeds of a client share the timer, and its session sleeps only once.
+        // All feeds of a client share the timer, and its writer sleeps only once.
         self.earliest = Some(self.earliest.map_or(due, |earliest| earliest.min(due)));
     }
 
@@ -282,18 +282,18 @@ const CHECK_PERIOD: Duration = Duration::from_millis(20);
 /// use the hub: the files would import each other in a cycle.
 impl Default for Subscriptions {
     fn default() -> Self {
-        Self::new(TOPICS.iter().filter_map(|row| match row.default {
+        Self::new(TOPICS.iter().filter_map(|entry| match entry.default {
             // Nobody can subscribe to these topics, so their names must be unknown.
             DefaultRate::Always => None,
-            DefaultRate::Period(period) => Some((row.name, Some(period))),
-            DefaultRate::Off => Some((row.name, None)),
+            DefaultRate::Period(period) => Some((entry.name, Some(period))),
+            DefaultRate::Off => Some((entry.name, None)),
         }))
     }
 }
 
 /// Starts all topics for the data of a hub.
 pub(crate) fn start_all(hub: &Hub) -> Arc<[Arc<dyn Topic>]> {
-    TOPICS.iter().map(|row| (row.start)(hub)).collect()
+    TOPICS.iter().map(|entry| (entry.start)(hub)).collect()
 }
 
 /// Encodes new data while clients are connected. Runs until the server stops.
@@ -313,7 +313,7 @@ pub(crate) async fn encode_all(
             topics.iter().for_each(|topic| topic.clear());
             continue;
         }
-        let demands = hub.demands();
+        let demands = hub.demands().all();
         // One time for all topics, so that their periods end in the same check.
         let now = Instant::now();
         let context = EncodeContext {

@@ -5,7 +5,7 @@ use crate::topics::chunk_list::ChunkList;
 use crate::topics::chunk_sender::{ChunkSender, NextChunk};
 use crate::topics::subscriptions::MODEL_CHUNKS;
 use crate::topics::{
-    ClientState, DefaultRate, EncodeContext, Feed, Priority, Row, Timer, Topic, receiver,
+    ClientState, DefaultRate, EncodeContext, Feed, Priority, Timer, Topic, TopicEntry, receiver,
     take_if_changed,
 };
 use axum::extract::ws::Message;
@@ -18,7 +18,7 @@ use tokio::sync::watch;
 use trainer::ModelChunks;
 
 /// The topic in the table.
-pub(crate) const ROW: Row = Row {
+pub(crate) const ENTRY: TopicEntry = TopicEntry {
     name: MODEL_CHUNKS,
     default: DefaultRate::Off,
     priority: Priority::Background,
@@ -43,13 +43,13 @@ struct ChunkTopic {
 impl Topic for ChunkTopic {
     fn encode(&self, context: &EncodeContext<'_>) {
         if take_if_changed(&mut self.lists.lock()).is_some() {
-            // There is no message to store: this only wakes up the sessions, whose feeds compare
+            // There is no message to store: this only wakes up the writers, whose feeds compare
             // versions.
             context.publisher.publish(|_| ());
         }
     }
 
-    // Without clients, the hub has no chunks: see `drop_unused_chunks`.
+    // Without clients, the hub has no chunks: see `drop_unused`.
     fn clear(&self) {}
 
     fn feed(self: Arc<Self>) -> Box<dyn Feed> {
@@ -88,10 +88,23 @@ impl Feed for ChunkFeed {
 }
 
 impl Hub {
-    /// The minimum time between two calls of [`Self::set_model_chunks`] for a model; `None` if no
-    /// client draws it.
-    pub fn chunk_period(&self, method: &str) -> Option<Duration> {
-        self.min_over_subscriptions(|subscriptions| {
+    /// The chunks of models.
+    pub fn model_chunks(&self) -> PublishedChunks<'_> {
+        PublishedChunks { hub: self }
+    }
+}
+
+/// The chunks of models in a hub, for clients that draw models themselves.
+#[derive(Clone, Copy, Debug)]
+pub struct PublishedChunks<'a> {
+    hub: &'a Hub,
+}
+
+impl PublishedChunks<'_> {
+    /// The minimum time between two calls of [`Self::set`] for a model; `None` if no client draws
+    /// it.
+    pub fn period(&self, method: &str) -> Option<Duration> {
+        self.hub.demands().min_period(|subscriptions| {
             let chunks = subscriptions
                 .model_chunks
                 .as_ref()
@@ -101,20 +114,27 @@ impl Hub {
     }
 
     /// Whether clients have the chunks of this model, so that only changed chunks are needed.
-    pub fn has_model_chunks(&self, method: &str) -> bool {
-        self.latest::<ModelLists>().borrow().contains_key(method)
+    pub fn contains(&self, method: &str) -> bool {
+        self.hub
+            .latest::<ModelLists>()
+            .borrow()
+            .contains_key(method)
     }
 
     /// Sets the chunks of a model, or those that have changed. They are kept only while a client
     /// draws the model.
-    pub fn set_model_chunks(&self, method: &str, chunks: ModelChunks) {
+    pub fn set(&self, method: &str, chunks: ModelChunks) {
         // The client may have left while the chunks were encoded on another thread. Nobody would
         // free them.
-        if self.chunk_period(method).is_none() {
+        if self.period(method).is_none() {
             return;
         }
-        let world_from_model = self.latest::<WorldFromModel>().borrow().unwrap_or_default();
-        self.latest::<ModelLists>().send_modify(|lists| {
+        let world_from_model = self
+            .hub
+            .latest::<WorldFromModel>()
+            .borrow()
+            .unwrap_or_default();
+        self.hub.latest::<ModelLists>().send_modify(|lists| {
             // Feeds may be reading the present list, so the new one is a copy. Copies share the
             // chunks.
             let mut list = lists
@@ -123,7 +143,7 @@ impl Hub {
                 .unwrap_or_default();
             list.world_from_model = world_from_model;
             // Changes of chunks that were dropped in the meantime are discarded. The run sends all
-            // chunks when it sees that none are there (`has_model_chunks`).
+            // chunks when it sees that none are there (`contains`).
             if list.apply(chunks) {
                 lists.insert(method.into(), Arc::new(list));
             }
@@ -133,17 +153,18 @@ impl Hub {
     /// Sets the pose of models in the world of the clients, for chunks; by default, the two frames
     /// are the same.
     pub fn set_world_from_model(&self, world_from_model: Transform) {
-        self.latest::<WorldFromModel>()
+        self.hub
+            .latest::<WorldFromModel>()
             .send_replace(Some(world_from_model));
     }
 
     /// Frees the chunks of models that no client draws any longer.
-    pub(crate) fn drop_unused_chunks(&self) {
-        self.latest::<ModelLists>().send_if_modified(|lists| {
-            // Called whenever a subscription changes. Sessions must wake up only if a list was
+    pub(crate) fn drop_unused(&self) {
+        self.hub.latest::<ModelLists>().send_if_modified(|lists| {
+            // Called whenever a subscription changes. Writers must wake up only if a list was
             // removed.
             let n_before = lists.len();
-            lists.retain(|method, _| self.chunk_period(method).is_some());
+            lists.retain(|method, _| self.period(method).is_some());
             lists.len() < n_before
         });
     }

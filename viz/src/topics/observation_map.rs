@@ -1,9 +1,9 @@
 //! When and how precisely each part of the scene was observed, for viewers.
 
 use crate::Hub;
+use crate::client::server_message::{BinaryHeader, ObservationsHeader, frame};
 use crate::clock::ServerClock;
-use crate::session::server_message::{BinaryHeader, ObservationsHeader, frame};
-use crate::topics::items::ItemTopic;
+use crate::topics::shared_topic::SharedTopic;
 use crate::topics::{DefaultRate, Priority};
 use axum::extract::ws::Message;
 use flate2::Compression;
@@ -24,7 +24,7 @@ const MIN_SIGMA_M: f64 = 1e-5;
 /// m.
 const LOG_STEP: f64 = 0.055;
 /// Neighboring cells have similar codes, so higher levels gain little.
-const LEVEL: u32 = 3;
+const DEFLATE_LEVEL: u32 = 3;
 
 /// A grid over the scene. Cells without an entry in [`Self::observed`] were not observed.
 #[derive(Clone, Debug, Default, PartialEq)]
@@ -57,9 +57,9 @@ pub struct ObservedCell {
 
 /// The topic.
 #[derive(Default)]
-pub(crate) struct Observations;
+pub(crate) struct ObservationTopic;
 
-impl ItemTopic for Observations {
+impl SharedTopic for ObservationTopic {
     const NAME: &'static str = "observations";
     const DEFAULT: DefaultRate = DefaultRate::Off;
     const PRIORITY: Priority = Priority::Background;
@@ -79,7 +79,7 @@ impl ItemTopic for Observations {
 impl Hub {
     /// Whether a client shows when and how precisely the scene was observed.
     pub fn needs_observations(&self) -> bool {
-        self.is_wanted(Observations::NAME)
+        self.demands().has_topic(ObservationTopic::NAME)
     }
 
     /// Sets the map of observations. Compresses it, which takes some milliseconds.
@@ -119,7 +119,7 @@ impl PackedObservations {
             ages[cell.ix] = code(cell.age_secs, MIN_AGE_SECS);
             sigmas[cell.ix] = code(cell.sigma_m, MIN_SIGMA_M);
         }
-        let mut encoder = ZlibEncoder::new(Vec::new(), Compression::new(LEVEL));
+        let mut encoder = ZlibEncoder::new(Vec::new(), Compression::new(DEFLATE_LEVEL));
         encoder.write_all(&codes)?;
         Ok(Self {
             min_m: map.min_m,

@@ -1,10 +1,10 @@
 //! Scans of range scanners, for viewers.
 
 use crate::Hub;
+use crate::client::server_message::{BinaryHeader, RangeScanHeader, frame};
 use crate::clock::ServerClock;
-use crate::session::server_message::{BinaryHeader, RangeScanHeader, frame};
-use crate::topics::items::ItemTopic;
 use crate::topics::positions::pack_positions;
+use crate::topics::shared_topic::SharedTopic;
 use crate::topics::{DefaultRate, Priority};
 use axum::extract::ws::Message;
 use keyframe::RangeScan;
@@ -26,7 +26,7 @@ pub(crate) struct RangeScanTopic {
     encoded: RangeScans,
 }
 
-impl ItemTopic for RangeScanTopic {
+impl SharedTopic for RangeScanTopic {
     const NAME: &'static str = "range_scans";
     const DEFAULT: DefaultRate = DefaultRate::Off;
     const PRIORITY: Priority = Priority::Live;

@@ -1,22 +1,22 @@
 //! The topic of the robot: its description, which clients receive once, and its state.
 
 use crate::Hub;
+use crate::client::server_message::ServerMessage;
 use crate::clock::ServerClock;
-use crate::session::server_message::ServerMessage;
 use crate::topics::base_path::BasePath;
-use crate::topics::items::ItemTopic;
 use crate::topics::robot::{RobotDescription, RobotMessage};
+use crate::topics::shared_topic::SharedTopic;
 use crate::topics::{DefaultRate, Priority};
 use axum::extract::ws::Message;
 use keyframe::RobotState;
 use std::sync::Arc;
 
-/// The robot's description, which clients need before its states. Sessions send the states
+/// The robot's description, which clients need before its states. Writers send the states
 /// themselves, as soon as they arrive.
 #[derive(Default)]
-pub(crate) struct Description;
+pub(crate) struct RobotDescriptionTopic;
 
-impl ItemTopic for Description {
+impl SharedTopic for RobotDescriptionTopic {
     const NAME: &'static str = "robot_state";
     const DEFAULT: DefaultRate = DefaultRate::Off;
     const PRIORITY: Priority = Priority::Short;
@@ -55,6 +55,6 @@ impl Hub {
         // The path is recorded even if no client is connected, so that later clients get all of it.
         self.is_observed()
             || self.latest::<BasePath>().borrow().is_due()
-            || self.is_wanted(Description::NAME)
+            || self.demands().has_topic(RobotDescriptionTopic::NAME)
     }
 }

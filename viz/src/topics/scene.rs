@@ -1,9 +1,9 @@
 //! Scene extent and initial view.
 
 use crate::Hub;
+use crate::client::server_message::ServerMessage;
 use crate::clock::ServerClock;
-use crate::session::server_message::ServerMessage;
-use crate::topics::items::ItemTopic;
+use crate::topics::shared_topic::SharedTopic;
 use crate::topics::updates::SceneHint;
 use crate::topics::{DefaultRate, Priority};
 use axum::extract::ws::Message;
@@ -11,9 +11,9 @@ use std::sync::Arc;
 
 /// The topic. Every client receives it, because it cannot choose a view without it.
 #[derive(Default)]
-pub(crate) struct Scene;
+pub(crate) struct SceneTopic;
 
-impl ItemTopic for Scene {
+impl SharedTopic for SceneTopic {
     const NAME: &'static str = "scene";
     const DEFAULT: DefaultRate = DefaultRate::Always;
     const PRIORITY: Priority = Priority::Short;

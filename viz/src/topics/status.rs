@@ -1,9 +1,9 @@
 //! Status of the run.
 
 use crate::Hub;
+use crate::client::server_message::ServerMessage;
 use crate::clock::ServerClock;
-use crate::session::server_message::ServerMessage;
-use crate::topics::items::ItemTopic;
+use crate::topics::shared_topic::SharedTopic;
 use crate::topics::updates::{RunResult, Status};
 use crate::topics::{DefaultRate, Priority};
 use axum::extract::ws::Message;
@@ -12,9 +12,9 @@ use std::time::Duration;
 
 /// The topic.
 #[derive(Default)]
-pub(crate) struct RunStatus;
+pub(crate) struct StatusTopic;
 
-impl ItemTopic for RunStatus {
+impl SharedTopic for StatusTopic {
     const NAME: &'static str = "status";
     // Slightly shorter than the documented 200 ms, as for live images.
     const DEFAULT: DefaultRate = DefaultRate::Period(Duration::from_millis(190));

@@ -1,7 +1,7 @@
 //! How often and at which size a client receives each kind of data.
 
+use crate::client::protocol::{MAX_RATE_HZ, SubscribeMessage};
 use crate::pictures::view_request::InvalidRequest;
-use crate::session::protocol::{MAX_RATE_HZ, SubscribeMessage};
 use std::collections::BTreeMap;
 use std::sync::Arc;
 use std::time::Duration;
@@ -264,7 +264,7 @@ pub(crate) fn fitted(size_px: [u32; 2], max_px: [u32; 2]) -> [u32; 2] {
 #[cfg(test)]
 mod tests {
     use super::{MAX_CAMERAS, Subscriptions, fitted};
-    use crate::session::protocol::SubscribeMessage;
+    use crate::client::protocol::SubscribeMessage;
     use serde_json::{Value, json};
     use std::time::Duration;
 

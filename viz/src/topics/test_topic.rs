@@ -1,9 +1,9 @@
-//! A topic that exists only in tests: what a new topic needs is in this file and in one row of the
-//! table.
+//! A topic that exists only in tests: what a new topic needs is in this file and in one entry of
+//! the list of topics.
 
 use crate::Hub;
 use crate::clock::ServerClock;
-use crate::topics::items::ItemTopic;
+use crate::topics::shared_topic::SharedTopic;
 use crate::topics::{DefaultRate, Priority};
 use axum::extract::ws::Message;
 use std::sync::Arc;
@@ -12,7 +12,7 @@ use std::sync::Arc;
 #[derive(Default)]
 pub(crate) struct Weather;
 
-impl ItemTopic for Weather {
+impl SharedTopic for Weather {
     const NAME: &'static str = "weather";
     const DEFAULT: DefaultRate = DefaultRate::Off;
     const PRIORITY: Priority = Priority::Background;

@@ -186,8 +186,8 @@ fn viewer_connects_despite_idle_sockets() {
     let mut message = render_message(1, [64, 48]);
     message["stages"] = json!([1.0]);
     other.send_json(&message);
-    assert!(hub.wait_for_request(TIMEOUT));
-    let pending = hub.next_request().expect("a request is pending");
+    assert!(hub.pictures().wait_for_request(TIMEOUT));
+    let pending = hub.pictures().next_request().expect("a request is pending");
     let picture = Picture {
         size_px: [64, 48],
         rgba_srgb: vec![9; 64 * 48 * 4],
@@ -199,7 +199,7 @@ fn viewer_connects_despite_idle_sockets() {
 }
 
 #[test]
-fn client_slots_are_released_after_any_session_end() {
+fn client_slots_are_released_after_any_disconnection() {
     let (hub, server) = start();
     for _ in 0..3 {
         let clients: Vec<_> = (0..32).map(|_| Client::connect(server.address())).collect();
@@ -274,8 +274,8 @@ fn requests_are_read_while_a_picture_waits_for_the_client() {
     message["outputs"] = json!(["depth"]);
     message["depth_format"] = json!("f32");
     client.send_json(&message);
-    assert!(hub.wait_for_request(TIMEOUT));
-    let pending = hub.next_request().expect("a request is pending");
+    assert!(hub.pictures().wait_for_request(TIMEOUT));
+    let pending = hub.pictures().next_request().expect("a request is pending");
     let n_px = (SIZE_PX[0] * SIZE_PX[1]) as usize;
     // Almost 16 MiB, more than the sockets hold.
     pending.deliver(Picture {
@@ -289,10 +289,10 @@ fn requests_are_read_while_a_picture_waits_for_the_client() {
     client.send_json(&message);
     // The picture waits until this client reads.
     assert!(
-        hub.wait_for_request(TIMEOUT),
+        hub.pictures().wait_for_request(TIMEOUT),
         "the request is not read while the picture waits"
     );
-    drop(hub.next_request());
+    drop(hub.pictures().next_request());
     assert_eq!(client.binary_of("picture").0["id"], json!(1));
 }
 

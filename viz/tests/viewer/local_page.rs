@@ -265,10 +265,10 @@ fn local_drawing_equals_the_pictures_of_the_server() {
 
     browser.evaluate("document.querySelector('[data-method=tsdf]').click()");
     wait_for(&mut browser, "the other model", |_| {
-        hub.chunk_period("tsdf").is_some()
+        hub.model_chunks().period("tsdf").is_some()
     });
     assert!(
-        hub.chunk_period("splat").is_none() && !hub.has_model_chunks("splat"),
+        hub.model_chunks().period("splat").is_none() && !hub.model_chunks().contains("splat"),
         "its memory is free"
     );
     check_local(&mut browser, &thread, &mut reference_tsdf, ("tsdf", MIN_DB));

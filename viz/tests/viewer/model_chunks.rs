@@ -129,11 +129,11 @@ fn a_client_receives_both_kinds_of_models_in_full() {
         );
         assert_eq!(replica.n_coarse > 0, method == "splat");
     }
-    assert!(hub.has_model_chunks("tsdf") && !hub.has_model_chunks("splat"));
+    assert!(hub.model_chunks().contains("tsdf") && !hub.model_chunks().contains("splat"));
     client.send_json(&json!({"type": "subscribe", "topic": "model_chunks", "rate_hz": 0}));
     client.settle();
     assert!(
-        !hub.has_model_chunks("tsdf") && hub.chunk_period("tsdf").is_none(),
+        !hub.model_chunks().contains("tsdf") && hub.model_chunks().period("tsdf").is_none(),
         "the memory is free"
     );
     drop(thread.finish());
@@ -202,7 +202,7 @@ fn changes_arrive_and_the_copy_equals_the_model() {
     client.settle();
     let mut replica = Replica::default();
     let mut model = tsdf_model(2);
-    hub.set_model_chunks(
+    hub.model_chunks().set(
         "tsdf",
         model
             .queue_chunks(true, &Arc::default())
@@ -228,7 +228,7 @@ fn changes_arrive_and_the_copy_equals_the_model() {
                 .finish()
                 .expect("encoded");
             assert!(!changes.is_complete);
-            hub.set_model_chunks("tsdf", changes);
+            hub.model_chunks().set("tsdf", changes);
         }
         all_chunks(&mut model)
     });

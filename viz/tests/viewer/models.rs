@@ -147,8 +147,8 @@ fn serve(
     stop: &AtomicBool,
 ) -> Models {
     while !stop.load(Ordering::Relaxed) {
-        hub.wait_for_request(Duration::from_millis(20));
-        if let Some(pending) = hub.next_request() {
+        hub.pictures().wait_for_request(Duration::from_millis(20));
+        if let Some(pending) = hub.pictures().next_request() {
             let is_panorama = pending.request.projection == Projection::Equirectangular;
             let has_color = pending
                 .packing()
@@ -174,14 +174,14 @@ fn serve(
             }
         }
         for (name, model) in &mut models {
-            if hub.chunk_period(name).is_some() && !hub.has_model_chunks(name) {
+            if hub.model_chunks().period(name).is_some() && !hub.model_chunks().contains(name) {
                 let chunks = model
                     .queue_chunks(false, &Arc::default())
                     .expect("queued")
                     .expect("not empty")
                     .finish()
                     .expect("encoded");
-                hub.set_model_chunks(name, chunks);
+                hub.model_chunks().set(name, chunks);
             }
         }
     }

@@ -25,8 +25,11 @@ fn start() -> (Hub, Server) {
 }
 
 fn next(hub: &Hub) -> PendingRender {
-    assert!(hub.wait_for_request(TIMEOUT), "no request arrived");
-    hub.next_request().expect("a request is pending")
+    assert!(
+        hub.pictures().wait_for_request(TIMEOUT),
+        "no request arrived"
+    );
+    hub.pictures().next_request().expect("a request is pending")
 }
 
 fn render_message(id: u64, view: &str) -> Value {
@@ -167,7 +170,7 @@ fn views_are_independent_and_take_turns() {
         [("inset".to_owned(), Some(2)), ("main".to_owned(), Some(3))],
         "the newest of each view"
     );
-    assert!(hub.next_request().is_none());
+    assert!(hub.pictures().next_request().is_none());
     // Errors name the view, too.
     client.send_json(&render_message(4, "inset"));
     next(&hub).fail("the GPU is lost");
@@ -178,7 +181,7 @@ fn views_are_independent_and_take_turns() {
     }
     let error = client.text_of("error");
     assert_eq!(error["id"], json!(18), "eight views are pending: {error}");
-    while hub.wait_for_request(Duration::ZERO) {
+    while hub.pictures().wait_for_request(Duration::ZERO) {
         draw_next(&hub);
         client.binary_of("picture");
     }

@@ -41,8 +41,10 @@ impl Model {
                 model,
                 ..Status::default()
             });
-            self.hub.wait_for_request(Duration::from_millis(20));
-            if let Some(pending) = self.hub.next_request() {
+            self.hub
+                .pictures()
+                .wait_for_request(Duration::from_millis(20));
+            if let Some(pending) = self.hub.pictures().next_request() {
                 let keyframes = *self.keyframes.lock().expect("no panic");
                 let picture = analytic_scene::draw(&pending.request);
                 pending.of_keyframes(keyframes).deliver(picture);
@@ -170,7 +172,7 @@ fn time_from_the_camera_to_the_screen_is_shown_and_reported() {
             "camera to model: {details}"
         );
 
-        check_reports(&hub.take_shown_pictures(), total);
+        check_reports(&hub.pictures().take_shown(), total);
         model.is_over.store(true, Ordering::Relaxed);
     });
     std::fs::remove_dir_all(&profile).expect("the browser has left its profile");

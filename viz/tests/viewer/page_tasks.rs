@@ -85,8 +85,8 @@ fn publish(hub: &Hub, is_over: &AtomicBool) {
 fn deliver(hub: &Hub, is_over: &AtomicBool) {
     let mut drawn: BTreeMap<[u32; 2], Picture> = BTreeMap::new();
     while !is_over.load(Ordering::Relaxed) {
-        hub.wait_for_request(Duration::from_millis(50));
-        if let Some(pending) = hub.next_request() {
+        hub.pictures().wait_for_request(Duration::from_millis(50));
+        if let Some(pending) = hub.pictures().next_request() {
             let picture = drawn
                 .entry(pending.request.size_px)
                 .or_insert_with(|| analytic_scene::draw(&pending.request));

@@ -43,8 +43,11 @@ fn render_message(id: u64) -> Value {
 }
 
 fn next(hub: &Hub) -> PendingRender {
-    assert!(hub.wait_for_request(TIMEOUT), "no request arrived");
-    hub.next_request().expect("a request is pending")
+    assert!(
+        hub.pictures().wait_for_request(TIMEOUT),
+        "no request arrived"
+    );
+    hub.pictures().next_request().expect("a request is pending")
 }
 
 /// Renders and delivers every pending stage.
@@ -184,7 +187,10 @@ fn stages_stream_and_show_the_scene() {
         check_against_scene(&request_of_stage(&message, &header), &picture, depth);
     }
     assert_eq!(sizes, [json!([16, 12]), json!([80, 60]), json!([160, 120])]);
-    assert!(hub.next_request().is_none(), "all stages are drawn");
+    assert!(
+        hub.pictures().next_request().is_none(),
+        "all stages are drawn"
+    );
 }
 
 /// The server stores a quaternion, so a matrix returns with rounding errors.
@@ -300,7 +306,7 @@ fn newer_request_replaces_unstarted_stages() {
             (Some(3), Some(2))
         ]
     );
-    assert!(hub.next_request().is_none());
+    assert!(hub.pictures().next_request().is_none());
 }
 
 #[test]
@@ -322,7 +328,7 @@ fn clients_alternate_and_disconnected_ones_are_skipped() {
     assert_eq!(second.binary_of("picture").0["stage"], json!(1));
     assert_eq!(second.binary_of("picture").0["stage"], json!(2));
     assert!(
-        hub.next_request().is_none(),
+        hub.pictures().next_request().is_none(),
         "the remaining stages of the disconnected client are dropped"
     );
 }
@@ -387,8 +393,11 @@ fn actions_of_operators_reach_the_run_once() {
             .expect("text")
             .contains("explode")
     );
-    assert_eq!(hub.take_controls(), [Control::Pause, Control::Save]);
-    assert_eq!(hub.take_controls(), []);
+    assert_eq!(
+        hub.operator_requests().take_controls(),
+        [Control::Pause, Control::Save]
+    );
+    assert_eq!(hub.operator_requests().take_controls(), []);
 }
 
 #[test]
@@ -424,7 +433,7 @@ fn edits_of_operators_reach_the_run_in_order() {
             "{message}: {error}"
         );
     }
-    let edits = hub.take_edits();
+    let edits = hub.operator_requests().take_edits();
     let box_of = |world_from_box| Aabb {
         world_from_box,
         min_m: [-1.0, 0.0, 0.0],
@@ -468,7 +477,7 @@ fn edits_of_operators_reach_the_run_in_order() {
                 .contains("64 edits"),
         "{refused}"
     );
-    assert_eq!(hub.take_edits().len(), 64);
+    assert_eq!(hub.operator_requests().take_edits().len(), 64);
 }
 
 #[test]
@@ -639,7 +648,7 @@ fn one_of_each() -> Vec<Value> {
         &json!({"type": "subscribe", "topic": "model_chunks", "rate_hz": 1, "method": "tsdf"}),
     );
     client.settle();
-    hub.set_model_chunks(
+    hub.model_chunks().set(
         "tsdf",
         ModelChunks {
             is_complete: true,
@@ -648,7 +657,7 @@ fn one_of_each() -> Vec<Value> {
         },
     );
     messages.extend([(); 2].map(|()| client.binary_of("model_chunk").0));
-    hub.set_model_chunks(
+    hub.model_chunks().set(
         "tsdf",
         ModelChunks {
             is_complete: true,

@@ -17,8 +17,8 @@ impl RequestThread {
         let stopped = Arc::clone(&stop);
         let thread = std::thread::spawn(move || {
             while !stopped.load(Ordering::Relaxed) {
-                hub.wait_for_request(Duration::from_millis(50));
-                if let Some(pending) = hub.next_request() {
+                hub.pictures().wait_for_request(Duration::from_millis(50));
+                if let Some(pending) = hub.pictures().next_request() {
                     answer(pending);
                 }
             }

@@ -258,7 +258,7 @@ fn only_operators_change_the_run() {
             .is_some_and(|text| text.contains("requires the role operator")),
         "{refusal}"
     );
-    assert_eq!(shared.hub.take_controls(), []);
+    assert_eq!(shared.hub.operator_requests().take_controls(), []);
     viewer.send(&json!({"type": "edit", "action": "undo", "id": 4}));
     let refusal = viewer.text_of("error");
     assert!(
@@ -267,15 +267,18 @@ fn only_operators_change_the_run() {
                 .as_str()
                 .is_some_and(|text| text.contains("role operator"))
     );
-    assert_eq!(shared.hub.take_edits(), []);
+    assert_eq!(shared.hub.operator_requests().take_edits(), []);
 
     let mut operator = shared.client(&shared.operator);
     assert_eq!(operator.text_of("hello")["role"], json!("operator"));
     operator.send(&json!({"type": "control", "action": "pause"}));
     operator.send(&json!({"type": "edit", "action": "undo"}));
     assert!(operator.is_answered(), "the messages before were read");
-    assert_eq!(shared.hub.take_edits().len(), 1);
-    assert_eq!(shared.hub.take_controls(), [Control::Pause]);
+    assert_eq!(shared.hub.operator_requests().take_edits().len(), 1);
+    assert_eq!(
+        shared.hub.operator_requests().take_controls(),
+        [Control::Pause]
+    );
     assert!(
         viewer.is_answered(),
         "a refused message does not end the connection"
@@ -471,8 +474,11 @@ fn replies_do_not_wait_for_pictures_with_tls() {
         scope.spawn(|| {
             let picture = noise();
             while !is_over.load(Ordering::Relaxed) {
-                shared.hub.wait_for_request(Duration::from_millis(50));
-                if let Some(pending) = shared.hub.next_request() {
+                shared
+                    .hub
+                    .pictures()
+                    .wait_for_request(Duration::from_millis(50));
+                if let Some(pending) = shared.hub.pictures().next_request() {
                     pending.deliver(picture.clone());
                 }
             }

@@ -151,7 +151,7 @@ fn page_uses_its_token_and_shows_its_role() {
     ] {
         browser.click("pause");
         wait_for(&mut browser, "the action", |_| {
-            hub.take_controls() == [action]
+            hub.operator_requests().take_controls() == [action]
         });
         hub.set_state(state); // As the run does.
         wait_for(&mut browser, "the state", |browser| {
@@ -177,7 +177,7 @@ fn press(browser: &mut Browser, key: &str) {
 fn wait_for_edits(browser: &mut Browser, hub: &Hub) -> Vec<EditRequest> {
     let mut edits = Vec::new();
     wait_for(browser, "an edit", |_| {
-        edits = hub.take_edits();
+        edits = hub.operator_requests().take_edits();
         !edits.is_empty()
     });
     edits
@@ -192,7 +192,7 @@ fn edit_model(browser: &mut Browser, hub: &Hub) {
     press(browser, "w");
     browser.click("toggle-edit");
     assert_eq!(
-        hub.take_edits(),
+        hub.operator_requests().take_edits(),
         [],
         "keys have no effect while the panel is closed"
     );

@@ -18,8 +18,11 @@ fn draw(hub: &Hub, client: &mut Client, id: u64, trained_on: Option<TrainedKeyfr
         "world_from_camera": [1, 0, 0, 0.0, 0, 0, 1, -2.0, 0, -1, 0, 0.5, 0, 0, 0, 1],
         "projection": {"kind": "pinhole", "vertical_fov_rad": 0.9},
     }));
-    assert!(hub.wait_for_request(TIMEOUT), "no request arrived");
-    let pending = hub.next_request().expect("a request is pending");
+    assert!(
+        hub.pictures().wait_for_request(TIMEOUT),
+        "no request arrived"
+    );
+    let pending = hub.pictures().next_request().expect("a request is pending");
     let picture = analytic_scene::draw(&pending.request);
     match trained_on {
         Some(trained_on) => pending.of_keyframes(trained_on).deliver(picture),
@@ -137,7 +140,7 @@ fn shown_pictures_reach_the_run() {
         client.send_json(&shown(id, millis));
     }
     client.settle();
-    let pictures = hub.take_shown_pictures();
+    let pictures = hub.pictures().take_shown();
     assert_eq!(
         pictures.len(),
         2,
@@ -156,7 +159,7 @@ fn shown_pictures_reach_the_run() {
         pictures[1].shown_at, pictures[1].sent_at,
         "not before it was sent"
     );
-    assert_eq!(hub.take_shown_pictures(), [], "taken");
+    assert_eq!(hub.pictures().take_shown(), [], "taken");
 
     client.send_json(&shown(1, -1.0));
     let refusal = client.text_of("error");

@@ -276,7 +276,7 @@ fn cases() -> [Case; 8] {
 /// Changes one field at a time.
 #[test]
 fn every_documented_field_is_used_and_other_values_are_refused() {
-    let page = include_str!("../../../docs/reference/files.md");
+    let page = include_str!("../../../../docs/reference/files.md");
     let section = page
         .split("### `edits.json`")
         .nth(1)

@@ -1,9 +1,9 @@
 //! The messages from the server, as in `docs/reference/protocol.md`.
 
+use crate::client::protocol::{DepthFormat, ProjectionMessage};
 use crate::clock::ServerClock;
 use crate::pose::row_major;
 use crate::server::access::Role;
-use crate::session::protocol::{DepthFormat, ProjectionMessage};
 use crate::topics::robot::{RobotMessage, RobotStateMessage};
 use crate::topics::updates::{KeyframePose, SceneHint, Status};
 use axum::extract::ws::Message;

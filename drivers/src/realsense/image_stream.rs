@@ -26,9 +26,9 @@ const MAX_STARTUP: Duration = Duration::from_secs(2);
 /// Exposure times of depth are in microseconds.
 const DEPTH_SECS_PER_COUNT: f64 = 1e-6;
 
-/// A streaming device.
+/// The images of a streaming device.
 #[derive(Debug)]
-pub(super) struct Session {
+pub(super) struct ImageStream {
     camera: Arc<str>,
     stamps: Stamps,
     filters: Filters,
@@ -68,7 +68,7 @@ pub(super) enum Next {
     End,
 }
 
-impl Session {
+impl ImageStream {
     /// Opens the device of a configuration, applies the settings and starts the streams.
     pub(super) fn start(config: &Config) -> Result<Self, Problem> {
         let context = Context::new()?;
@@ -275,7 +275,7 @@ fn warn_of_device(camera: &str, found: &FoundCamera) {
     }
 }
 
-impl Drop for Session {
+impl Drop for ImageStream {
     /// Stops the streams while draining the queue. Otherwise they would deadlock: stopping waits
     /// for the thread that reads the file, and that thread waits for space in the queue.
     fn drop(&mut self) {

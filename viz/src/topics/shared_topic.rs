@@ -4,8 +4,8 @@
 use crate::Hub;
 use crate::clock::ServerClock;
 use crate::topics::{
-    ClientState, DefaultRate, EncodeContext, Feed, Item, Priority, Row, Sent, Throttle, Timer,
-    Topic, receiver, take_if_changed,
+    ClientState, DefaultRate, EncodeContext, EncodedMessage, Feed, LastSent, Priority, Throttle,
+    Timer, Topic, TopicEntry, receiver, take_if_changed,
 };
 use axum::extract::ws::Message;
 use parking_lot::Mutex;
@@ -15,7 +15,7 @@ use std::time::Duration;
 use tokio::sync::watch;
 
 /// A topic of which all clients receive the same messages.
-pub(crate) trait ItemTopic: Default + Send + 'static {
+pub(crate) trait SharedTopic: Default + Send + 'static {
     /// Name in `subscribe`.
     const NAME: &'static str;
     /// What a client receives before it subscribes.
@@ -32,29 +32,29 @@ pub(crate) trait ItemTopic: Default + Send + 'static {
     fn encode(&mut self, source: &Self::Source, clock: ServerClock) -> Vec<(Arc<str>, Message)>;
 }
 
-/// The row of a topic.
-pub(crate) const fn row<T: ItemTopic>() -> Row {
-    Row {
+/// The entry of a topic.
+pub(crate) const fn entry<T: SharedTopic>() -> TopicEntry {
+    TopicEntry {
         name: T::NAME,
         default: T::DEFAULT,
         priority: T::PRIORITY,
-        start: |hub| Arc::new(Items::<T>::new(hub)),
+        start: |hub| Arc::new(LatestMessages::<T>::new(hub)),
     }
 }
 
 /// The latest messages of a topic.
-pub(crate) struct Items<T: ItemTopic> {
+pub(crate) struct LatestMessages<T: SharedTopic> {
     state: Mutex<State<T>>,
 }
 
-struct State<T: ItemTopic> {
+struct State<T: SharedTopic> {
     topic: T,
     source: watch::Receiver<T::Source>,
     encoded: Throttle,
-    items: BTreeMap<Arc<str>, Item>,
+    messages: BTreeMap<Arc<str>, EncodedMessage>,
 }
 
-impl<T: ItemTopic> Items<T> {
+impl<T: SharedTopic> LatestMessages<T> {
     /// A topic for the data of a hub.
     pub(crate) fn new(hub: &Hub) -> Self {
         Self {
@@ -62,19 +62,19 @@ impl<T: ItemTopic> Items<T> {
                 topic: T::default(),
                 source: receiver(hub),
                 encoded: Throttle::new(T::PERIOD),
-                items: BTreeMap::new(),
+                messages: BTreeMap::new(),
             }),
         }
     }
 
     /// Sets a message without encoding.
     #[cfg(test)]
-    pub(crate) fn set(&self, key: &str, item: Item) {
-        self.state.lock().items.insert(key.into(), item);
+    pub(crate) fn set(&self, key: &str, item: EncodedMessage) {
+        self.state.lock().messages.insert(key.into(), item);
     }
 }
 
-impl<T: ItemTopic> Topic for Items<T> {
+impl<T: SharedTopic> Topic for LatestMessages<T> {
     fn encode(&self, context: &EncodeContext<'_>) {
         // Without a client, the data stays marked as changed, so that it is encoded as soon as a
         // client subscribes.
@@ -86,7 +86,7 @@ impl<T: ItemTopic> Topic for Items<T> {
             topic,
             source,
             encoded,
-            items,
+            messages,
         } = &mut *state;
         // Before looking at the data: what has changed must stay marked until the period is over.
         if !encoded.is_due(context.now) {
@@ -101,7 +101,7 @@ impl<T: ItemTopic> Topic for Items<T> {
         for (key, message) in topic.encode(&source, context.clock) {
             context
                 .publisher
-                .publish(|number| _ = items.insert(key, Item { number, message }));
+                .publish(|number| _ = messages.insert(key, EncodedMessage { number, message }));
         }
     }
 
@@ -111,33 +111,33 @@ impl<T: ItemTopic> Topic for Items<T> {
         state.topic = T::default();
         state.source.mark_changed();
         state.encoded.reset();
-        state.items.clear();
+        state.messages.clear();
     }
 
     fn feed(self: Arc<Self>) -> Box<dyn Feed> {
-        Box::new(ItemFeed {
-            items: self,
+        Box::new(LatestMessageFeed {
+            messages: self,
             sent: BTreeMap::new(),
         })
     }
 }
 
 /// What a client has received of a topic.
-struct ItemFeed<T: ItemTopic> {
-    items: Arc<Items<T>>,
-    sent: BTreeMap<Arc<str>, Sent>,
+struct LatestMessageFeed<T: SharedTopic> {
+    messages: Arc<LatestMessages<T>>,
+    sent: BTreeMap<Arc<str>, LastSent>,
 }
 
-impl<T: ItemTopic> Feed for ItemFeed<T> {
+impl<T: SharedTopic> Feed for LatestMessageFeed<T> {
     /// The message with the key whose last message was sent longest ago.
     fn next(&mut self, client: &mut ClientState<'_>, timer: &mut Timer) -> Option<Message> {
         let period = match T::DEFAULT {
             DefaultRate::Always => Duration::ZERO,
             _ => client.subscriptions.period(T::NAME)?,
         };
-        // Sessions and the encoder run on the same thread, so this lock is usually free.
-        let state = self.items.state.lock();
-        let waiting = state.items.iter().filter_map(|(key, item)| {
+        // Writers and the encoder run on the same thread, so this lock is usually free.
+        let state = self.messages.state.lock();
+        let waiting = state.messages.iter().filter_map(|(key, item)| {
             let sent = self.sent.get(key).copied().unwrap_or_default();
             // The timer is asked only about new messages: it remembers when those are due that
             // are not.
@@ -147,7 +147,7 @@ impl<T: ItemTopic> Feed for ItemFeed<T> {
         let (_, key, item) = waiting.min_by_key(|(number, ..)| *number)?;
         self.sent.insert(
             Arc::clone(key),
-            Sent {
+            LastSent {
                 number: item.number,
                 at: Some(timer.now),
             },

@@ -1,6 +1,6 @@
 //! Agrees with a client on a protocol version and on capabilities.
 
-use crate::session::protocol::{BASE_PROTOCOL_VERSION, ClientHello, PROTOCOL_VERSION};
+use crate::client::protocol::{BASE_PROTOCOL_VERSION, ClientHello, PROTOCOL_VERSION};
 
 /// Names of the capabilities of this server.
 pub(crate) const CAPABILITIES: [&str; 15] = [
@@ -105,7 +105,7 @@ pub(crate) fn negotiate(hello: &ClientHello) -> Result<Agreement, String> {
 #[cfg(test)]
 mod tests {
     use super::{Negotiated, negotiate};
-    use crate::session::protocol::{BASE_PROTOCOL_VERSION, ClientHello, PROTOCOL_VERSION};
+    use crate::client::protocol::{BASE_PROTOCOL_VERSION, ClientHello, PROTOCOL_VERSION};
     use serde_json::{Value, json};
 
     fn hello(message: Value) -> ClientHello {

@@ -20,7 +20,7 @@ const ONE_CLIENT_HINT: &str = "FCI accepts one client at a time: stop the other 
 
 /// An open connection. Dropping it closes the connection.
 #[derive(Debug)]
-pub(super) struct Session {
+pub(super) struct Connection {
     pub(super) network: Network,
     pub(super) version: FciVersion,
 }
@@ -31,7 +31,7 @@ enum ConnectResponse {
     OtherVersion(u16),
 }
 
-impl Session {
+impl Connection {
     /// Connects with FCI 10, or with FCI 5 if the controller uses that version.
     pub(super) fn open(address: &str) -> Result<Self, Error> {
         let connect = |version: FciVersion| {

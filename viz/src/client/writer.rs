@@ -4,23 +4,24 @@
 //! most one part. The parts and the kernel's buffer are so small that their transfer takes less
 //! than 100 ms. Everything else waits here, where newer data replaces older data.
 
-use crate::hub::Demand;
+use crate::client::link_rate::LinkRate;
+use crate::client::negotiation::{Agreement, CAPABILITIES, Negotiated};
+use crate::client::protocol::{BASE_PROTOCOL_VERSION, PROTOCOL_VERSION};
+use crate::client::server_message::{BinaryHeader, PartHeader, ServerMessage, frame};
+use crate::demands::Demand;
 use crate::pictures::compact_depth::Effort;
 use crate::pictures::picture::{PackError, PackedPicture, pack_picture};
+use crate::pictures::picture_requests::PictureRequests;
 use crate::pictures::picture_times::SentPicture;
 use crate::pictures::queue::{DrawnPicture, Outgoing};
 use crate::pictures::view_request::{DEFAULT_STAGES, MAX_SIZE_PX};
 use crate::server::access::Role;
 use crate::server::admission::Connection;
 use crate::server::server_context::ServerContext;
-use crate::session::link_rate::LinkRate;
-use crate::session::negotiation::{Agreement, CAPABILITIES, Negotiated};
-use crate::session::protocol::{BASE_PROTOCOL_VERSION, PROTOCOL_VERSION};
-use crate::session::server_message::{BinaryHeader, PartHeader, ServerMessage, frame};
-use crate::topics::client_updates::{ClientUpdates, Next};
-use crate::topics::items::ItemTopic;
+use crate::topics::client_updates::{ClientUpdates, NextUpdate};
 use crate::topics::robot::RobotStateMessage;
-use crate::topics::robot_state::Description;
+use crate::topics::robot_state::RobotDescriptionTopic;
+use crate::topics::shared_topic::SharedTopic;
 use axum::body::Bytes;
 use axum::extract::ws::{Message, WebSocket};
 use futures_util::SinkExt;
@@ -55,10 +56,10 @@ pub(crate) enum Reply {
     Goodbye { reason: String },
 }
 
-/// Control flow of a session: continue or end.
-pub(crate) type SessionFlow = ControlFlow<()>;
+/// Whether to serve the client further: continue or end.
+pub(crate) type ClientFlow = ControlFlow<()>;
 
-/// The sending half of a session.
+/// Sends to one client.
 pub(crate) struct Writer<'a> {
     pub(crate) sink: SplitSink<WebSocket, Message>,
     pub(crate) server_context: &'a ServerContext,
@@ -120,7 +121,7 @@ impl Writer<'_> {
         wake: &Notify,
         mut replies: mpsc::Receiver<Reply>,
         mut demand: watch::Receiver<Demand>,
-    ) -> SessionFlow {
+    ) -> ClientFlow {
         let mut stopped = self.server_context.stopped.clone();
         let mut published = self.server_context.publisher.changed();
         let mut robot_state = self
@@ -151,7 +152,7 @@ impl Writer<'_> {
             // advance, they would be outdated when it is their turn.
             if encoding.is_none()
                 && is_heard
-                && let Some(outgoing) = self.server_context.hub.collect(self.client)
+                && let Some(outgoing) = self.pictures().collect(self.client)
             {
                 encoding = self.begin(outgoing).await?;
                 if encoding.is_none() {
@@ -181,22 +182,22 @@ impl Writer<'_> {
                 published.mark_unchanged();
                 let has_changes = self.negotiated.has_keyframe_changes;
                 match updates.next(&subscriptions, has_changes, Instant::now(), allows_long) {
-                    Next::Short(message) => waiting_update = Some((message, false)),
-                    Next::Long(message) => waiting_update = Some((message, true)),
-                    Next::WaitUntil(time) => {
+                    NextUpdate::Short(message) => waiting_update = Some((message, false)),
+                    NextUpdate::Long(message) => waiting_update = Some((message, true)),
+                    NextUpdate::WaitUntil(time) => {
                         update_due = Some(update_due.map_or(time, |due| due.min(time)))
                     }
-                    Next::Wait => {}
+                    NextUpdate::Wait => {}
                 }
             }
             let is_waiting_long = waiting_update.as_ref().map(|(_, is_long)| *is_long);
             // States need the description of the robot, and a waiting short message may be a new
             // one.
-            let state_period = subscriptions.period(Description::NAME);
+            let state_period = subscriptions.period(RobotDescriptionTopic::NAME);
             let state_due = state_period
                 .filter(|_| {
                     is_heard
-                        && updates.has_sent(Description::NAME)
+                        && updates.has_sent(RobotDescriptionTopic::NAME)
                         && is_waiting_long != Some(false)
                 })
                 .map(|period| {
@@ -238,7 +239,7 @@ impl Writer<'_> {
                         let is_complete = current.n_sent == current.bytes.len();
                         // The run may now render the next picture for this client.
                         if current.is_picture && (is_complete || sent.is_break()) {
-                            self.server_context.hub.release(self.client);
+                            self.pictures().release(self.client);
                         }
                         sent?;
                         transfers.current = (!is_complete).then_some(current);
@@ -266,7 +267,7 @@ impl Writer<'_> {
                         Err(error) => error.to_string(),
                     };
                     let sent = self.send_error(Some(id), &view, &reason).await;
-                    self.server_context.hub.release(self.client);
+                    self.pictures().release(self.client);
                     sent?;
                 }
                 // The branches below only begin the next round.
@@ -276,6 +277,10 @@ impl Writer<'_> {
                 () = sleep_until(update_due) => {}
             }
         }
+    }
+
+    fn pictures(&self) -> &PictureRequests {
+        self.server_context.hub.pictures()
     }
 
     /// Begins to encode a picture, or sends the reason why there is none.
@@ -288,7 +293,7 @@ impl Writer<'_> {
             Outgoing::Failed { id, view, reason } => {
                 let sent = self.send_error(Some(id), &view, &reason).await;
                 // Even if the connection is broken: the place of the picture must become free.
-                self.server_context.hub.release(self.client);
+                self.pictures().release(self.client);
                 sent?;
                 ControlFlow::Continue(None)
             }
@@ -316,12 +321,12 @@ impl Writer<'_> {
                 n_keyframes: trained_on.n,
                 sent_at,
             };
-            self.server_context.hub.picture_sent(self.client, picture);
+            self.pictures().record_sent(self.client, picture);
         }
         message
     }
 
-    async fn send_hello(&mut self) -> SessionFlow {
+    async fn send_hello(&mut self) -> ClientFlow {
         let hello = ServerMessage::Hello {
             protocol: BASE_PROTOCOL_VERSION,
             protocols: [BASE_PROTOCOL_VERSION, PROTOCOL_VERSION],
@@ -336,7 +341,7 @@ impl Writer<'_> {
         self.send_message(&hello).await
     }
 
-    async fn reply(&mut self, reply: Reply) -> SessionFlow {
+    async fn reply(&mut self, reply: Reply) -> ClientFlow {
         match reply {
             Reply::Welcome(Agreement {
                 protocol,
@@ -364,7 +369,7 @@ impl Writer<'_> {
     }
 
     /// Sends the next part, or the whole message if the client cannot join parts.
-    async fn send_part(&mut self, transfer: &mut Transfer) -> SessionFlow {
+    async fn send_part(&mut self, transfer: &mut Transfer) -> ClientFlow {
         let n_bytes = transfer.bytes.len();
         let n_part = if self.negotiated.has_parts {
             self.link.part_bytes()
@@ -402,7 +407,7 @@ impl Writer<'_> {
     }
 
     /// Sends the last status, which contains the result of the run, then a goodbye.
-    async fn send_goodbye_when_stopped(&mut self) -> SessionFlow {
+    async fn send_goodbye_when_stopped(&mut self) -> ClientFlow {
         let latest = self.server_context.hub.status();
         if let Some(status) = latest {
             self.send_message(&ServerMessage::Status(&status)).await?;
@@ -410,25 +415,25 @@ impl Writer<'_> {
         self.send_goodbye("the server has stopped").await
     }
 
-    async fn send_error(&mut self, id: Option<u64>, view: &str, message: &str) -> SessionFlow {
+    async fn send_error(&mut self, id: Option<u64>, view: &str, message: &str) -> ClientFlow {
         let view = (!view.is_empty()).then_some(view);
         self.send_message(&ServerMessage::Error { id, view, message })
             .await
     }
 
-    async fn send_goodbye(&mut self, reason: &str) -> SessionFlow {
+    async fn send_goodbye(&mut self, reason: &str) -> ClientFlow {
         self.send_message(&ServerMessage::Goodbye { reason })
             .await?;
         self.send(Message::Close(None)).await?;
-        // The session ends. The reader waits until the client has received the goodbye.
+        // The writer ends. The reader waits until the client has received the goodbye.
         ControlFlow::Break(())
     }
 
-    async fn send_message(&mut self, message: &ServerMessage<'_>) -> SessionFlow {
+    async fn send_message(&mut self, message: &ServerMessage<'_>) -> ClientFlow {
         self.send(message.to_message()).await
     }
 
-    async fn send(&mut self, message: Message) -> SessionFlow {
+    async fn send(&mut self, message: Message) -> ClientFlow {
         match self.sink.send(message).await {
             Ok(()) => ControlFlow::Continue(()),
             Err(error) => {
@@ -440,7 +445,7 @@ impl Writer<'_> {
     }
 }
 
-/// Encodes a picture on another thread: it takes milliseconds, in which no session could send.
+/// Encodes a picture on another thread: it takes milliseconds, in which no writer could send.
 fn encode(drawn: Box<DrawnPicture>, effort: Option<Effort>) -> EncodingTask {
     let view_request = &drawn.job.view_request;
     let id = view_request.id;

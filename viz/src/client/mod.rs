@@ -1,5 +1,5 @@
-//! The session of one client, from hello to goodbye: a reader and a writer that never wait for each
-//! other.
+//! Serves one connected client, from hello to goodbye: a reader and a writer that never wait for
+//! each other.
 
 pub(crate) mod link_rate;
 #[cfg(any(test, fuzzing))]
@@ -10,9 +10,17 @@ pub(crate) mod server_message;
 mod writer;
 
 use crate::Hub;
+use crate::client::link_rate::LinkRate;
+use crate::client::negotiation::{Negotiated, negotiate};
+use crate::client::protocol::{
+    ClientHello, ClientMessage, ControlMessage, EditMessage, RenderMessage, ShownMessage,
+    SubscribeMessage,
+};
+use crate::client::writer::{Reply, Writer};
 use crate::clock::ServerClock;
+use crate::demands::Demand;
 use crate::edit::EditRequest;
-use crate::hub::{Demand, MAX_WAITING_EDITS};
+use crate::operator_requests::MAX_WAITING_EDITS;
 use crate::pictures::queue::MAX_VIEWS;
 use crate::pictures::view_request::{InvalidRequest, ViewRequest};
 use crate::pictures::viewpoint::Viewpoint;
@@ -20,13 +28,6 @@ use crate::server::access::Role;
 use crate::server::admission::Connection;
 use crate::server::client_log::ClientLog;
 use crate::server::server_context::ServerContext;
-use crate::session::link_rate::LinkRate;
-use crate::session::negotiation::{Negotiated, negotiate};
-use crate::session::protocol::{
-    ClientHello, ClientMessage, ControlMessage, EditMessage, RenderMessage, ShownMessage,
-    SubscribeMessage,
-};
-use crate::session::writer::{Reply, Writer};
 use axum::extract::ws::{Message, WebSocket};
 use futures_util::StreamExt;
 use futures_util::stream::SplitStream;
@@ -97,13 +98,14 @@ pub(crate) async fn serve(
             // If the time is over, the client does not get a reply to its last messages.
             let _ = tokio::time::timeout(LINGER, reading).await;
         }
+        () = connection.closed() => {}
     }
     // Before the log entry, so that the client is gone when somebody reads it.
     drop(client_guard);
     log.line(format_args!("client {client} disconnected"));
 }
 
-/// Removes a client from the hub when its session ends, for whatever reason.
+/// Removes a client from the hub when it is no longer served, for whatever reason.
 struct ClientGuard<'a> {
     hub: &'a Hub,
     client: u64,
@@ -153,7 +155,7 @@ impl Reader<'_> {
                 }),
             };
             // Even an invalid message shows that the client is alive.
-            self.connection.last_message();
+            self.connection.record_message();
             let Some(reply) = reply else { continue };
             let is_last = matches!(reply, Reply::Goodbye { .. });
             // The writer may not have had time to send the replies to a burst of messages.
@@ -173,8 +175,8 @@ impl Reader<'_> {
         }
     }
 
-    /// Reads until the client disconnects, and ignores what it sends: the writer ends the session,
-    /// or has ended it.
+    /// Reads until the client disconnects, and ignores what it sends: the writer disconnects it,
+    /// or has done so.
     async fn discard(&mut self) {
         while let Some(Ok(message)) = self.stream.next().await {
             if matches!(message, Message::Close(_)) {
@@ -197,7 +199,7 @@ impl Reader<'_> {
             ClientMessage::Control(ControlMessage { action }) => {
                 self.log
                     .line(format_args!("client {}: {action:?}", self.client));
-                self.hub.control(action);
+                self.hub.operator_requests().control(action);
             }
             ClientMessage::Shown(message) => self.shown(&message)?,
             ClientMessage::Edit(message) => self.edit(&message)?,
@@ -227,12 +229,12 @@ impl Reader<'_> {
     fn render(&self, message: &RenderMessage) -> Result<(), InvalidRequest> {
         let view_request = ViewRequest::check(message)?;
         if let Some(viewpoint) = Viewpoint::of(&view_request) {
-            // Only the writer of this session needs it, so the hub is not informed: views change
+            // Only the writer of this client needs it, so the hub is not informed: views change
             // many times per second.
             self.demand
                 .send_modify(|demand| demand.viewpoint = Some(viewpoint));
         }
-        if !self.hub.view_request(self.client, view_request) {
+        if !self.hub.pictures().request(self.client, view_request) {
             return Err(InvalidRequest::Views { max: MAX_VIEWS });
         }
         Ok(())
@@ -249,7 +251,9 @@ impl Reader<'_> {
             .instant(*shown_millis)
             .ok_or(InvalidRequest::ShownTime { got: *shown_millis })?;
         let view = view.as_deref().unwrap_or_default();
-        self.hub.picture_shown(self.client, *id, view, shown_at);
+        self.hub
+            .pictures()
+            .record_shown(self.client, *id, view, shown_at);
         Ok(())
     }
 
@@ -261,7 +265,7 @@ impl Reader<'_> {
             self.client,
             request.action()
         ));
-        if !self.hub.edit(request) {
+        if !self.hub.operator_requests().edit(request) {
             return Err(InvalidRequest::Edits {
                 max: MAX_WAITING_EDITS,
             });
@@ -277,7 +281,7 @@ impl Reader<'_> {
         Ok(())
     }
 
-    /// Changes what the client receives, for the writer of this session and for the hub.
+    /// Changes what the client receives, for its writer and for the hub.
     fn change_demand(&self, change: impl FnOnce(&mut Demand)) {
         self.demand.send_modify(change);
         self.hub

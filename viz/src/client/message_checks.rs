@@ -1,23 +1,23 @@
 //! Checks the messages of viewers: every accepted request must be safe to render, and every
 //! accepted subscription must keep its limits. The fuzz target `page` calls it.
 
-use crate::clock::ServerClock;
-use crate::edit::{EditAction, EditRequest};
-use crate::pictures::view_request::{MAX_SIZE_PX, ViewRequest};
-use crate::session::negotiation::{CAPABILITIES, negotiate};
-use crate::session::protocol::{
+use crate::client::negotiation::{CAPABILITIES, negotiate};
+use crate::client::protocol::{
     BASE_PROTOCOL_VERSION, ClientHello, ClientMessage, EditMessage, MAX_RATE_HZ, PROTOCOL_VERSION,
     RenderMessage, ShownMessage, SubscribeMessage,
 };
+use crate::clock::ServerClock;
+use crate::edit::{EditAction, EditRequest};
+use crate::pictures::view_request::{MAX_SIZE_PX, ViewRequest};
 use crate::topics::TOPICS;
 use crate::topics::subscriptions::{Subscriptions, fitted};
 use model_files::Aabb;
 use trainer::{Projection, RenderRequest};
 
-/// Handles the messages of a session, one per line, and panics if a result is inconsistent.
-pub(crate) fn check_session(session: &str) {
+/// Handles the messages of a client, one per line, and panics if a result is inconsistent.
+pub(crate) fn check_messages(messages: &str) {
     let mut subscriptions = Subscriptions::default();
-    for text in session.lines() {
+    for text in messages.lines() {
         match serde_json::from_str(text) {
             Ok(ClientMessage::Hello(hello)) => check_hello(&hello),
             Ok(ClientMessage::Render(message)) => check_render(&message),
@@ -123,7 +123,7 @@ fn check_subscription(subscriptions: &mut Subscriptions, message: SubscribeMessa
     let chunks = subscriptions.model_chunks.as_ref();
     let of_topics = TOPICS
         .iter()
-        .filter_map(|row| subscriptions.period(row.name));
+        .filter_map(|entry| subscriptions.period(entry.name));
     let mut periods = of_topics
         .chain(images.period)
         .chain(chunks.map(|chunks| chunks.period));
@@ -142,7 +142,7 @@ fn check_subscription(subscriptions: &mut Subscriptions, message: SubscribeMessa
 
 #[cfg(test)]
 mod tests {
-    use super::check_session;
+    use super::check_messages;
     use kinematics::random::Random;
     use std::path::Path;
 
@@ -154,7 +154,7 @@ mod tests {
         let mut n_seeds = 0;
         for entry in std::fs::read_dir(folder).expect("the seeds") {
             let seed = std::fs::read_to_string(entry.expect("a file").path()).expect("text");
-            check_session(&seed);
+            check_messages(&seed);
             for _ in 0..2000 {
                 let mut bytes = seed.clone().into_bytes();
                 for _ in 0..=random.below(3) {
@@ -173,7 +173,7 @@ mod tests {
                         break;
                     }
                 }
-                check_session(&String::from_utf8_lossy(&bytes));
+                check_messages(&String::from_utf8_lossy(&bytes));
             }
             n_seeds += 1;
         }

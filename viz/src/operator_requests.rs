@@ -1,0 +1,48 @@
+//! What operators have requested of the run: actions and edits.
+
+use crate::client::protocol::Control;
+use crate::edit::EditRequest;
+use parking_lot::Mutex;
+
+/// Maximum number of edits that wait to be applied. It is also the maximum number of edits of a
+/// model.
+pub(crate) const MAX_WAITING_EDITS: usize = 64;
+
+/// Requests of operators that the run has not taken yet.
+#[derive(Debug, Default)]
+pub struct OperatorRequests {
+    /// Actions without repetitions.
+    controls: Mutex<Vec<Control>>,
+    edits: Mutex<Vec<EditRequest>>,
+}
+
+impl OperatorRequests {
+    /// The actions that operators have requested since the last call, in order.
+    pub fn take_controls(&self) -> Vec<Control> {
+        std::mem::take(&mut *self.controls.lock())
+    }
+
+    /// The edits that operators have requested since the last call, in order.
+    pub fn take_edits(&self) -> Vec<EditRequest> {
+        std::mem::take(&mut *self.edits.lock())
+    }
+
+    /// Requests an action of the run.
+    pub(crate) fn control(&self, action: Control) {
+        let mut controls = self.controls.lock();
+        // Repeated clicks count once, and as the last action: after pause, resume and pause, the
+        // run must pause.
+        controls.retain(|earlier| *earlier != action);
+        controls.push(action);
+    }
+
+    /// Requests an edit. Returns false if too many edits are waiting.
+    pub(crate) fn edit(&self, request: EditRequest) -> bool {
+        let mut edits = self.edits.lock();
+        let has_room = edits.len() < MAX_WAITING_EDITS;
+        if has_room {
+            edits.push(request);
+        }
+        has_room
+    }
+}

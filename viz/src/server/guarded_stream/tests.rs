@@ -1,0 +1,129 @@
+use super::GuardedStream;
+use crate::server::admission::{Admission, Limits};
+use std::io::ErrorKind;
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+use tokio::io::{AsyncReadExt, AsyncWriteExt};
+use tokio::net::TcpStream;
+
+const LIMITS: Limits = Limits {
+    connections: 4,
+    clients: 2,
+};
+/// Shorter than that of a server.
+const WRITE_TIMEOUT: Duration = Duration::from_millis(200);
+/// No test waits longer.
+const TIMEOUT: Duration = Duration::from_secs(30);
+
+/// An admission and a listening port that creates both ends of connections.
+struct Port {
+    admission: Arc<Admission>,
+    listener: std::net::TcpListener,
+}
+
+impl Port {
+    fn open() -> Self {
+        let listener = std::net::TcpListener::bind("127.0.0.1:0").expect("a free port exists");
+        Self {
+            admission: Admission::new(LIMITS),
+            listener,
+        }
+    }
+
+    /// Both ends of a new connection.
+    fn connect(&self) -> (GuardedStream, TcpStream) {
+        let address = self.listener.local_addr().expect("bound");
+        let peer = std::net::TcpStream::connect(address).expect("it listens");
+        let (stream, _) = self.listener.accept().expect("a peer waits");
+        for stream in [&peer, &stream] {
+            stream.set_nonblocking(true).expect("a socket");
+        }
+        let stream = TcpStream::from_std(stream).expect("a runtime");
+        (
+            GuardedStream::new(stream, Arc::clone(&self.admission)),
+            TcpStream::from_std(peer).expect("a runtime"),
+        )
+    }
+}
+
+fn run(test: impl Future<Output = ()>) {
+    let runtime = tokio::runtime::Builder::new_current_thread()
+        .enable_all()
+        .build();
+    runtime.expect("a runtime").block_on(test);
+}
+
+#[test]
+fn downloads_are_not_idle() {
+    run(async {
+        let port = Port::open();
+        let (mut downloading, mut peer) = port.connect();
+        let (idle, _b) = port.connect();
+        downloading.connection().record_request();
+        idle.connection().record_request();
+        downloading
+            .write_all(b"the next bytes of a mesh")
+            .await
+            .expect("the peer reads");
+        assert_eq!(peer.read_u8().await.expect("a byte"), b't');
+        port.admission.evict();
+        assert!(
+            idle.connection().is_closed() && !downloading.connection().is_closed(),
+            "the connection in use stays"
+        );
+    });
+}
+
+#[test]
+fn dropped_streams_make_room() {
+    run(async {
+        let port = Port::open();
+        let (kept, _a) = port.connect();
+        for _ in 0..2 * LIMITS.connections {
+            drop(port.connect());
+        }
+        assert!(!kept.connection().is_closed());
+    });
+}
+
+#[test]
+fn peers_that_do_not_read_time_out() {
+    run(async {
+        let port = Port::open();
+        let (mut stuck, _a) = port.connect();
+        stuck.write_timeout = WRITE_TIMEOUT;
+        let began = Instant::now();
+        let filling = async {
+            loop {
+                if let Err(error) = stuck.write_all(&[0; 65536]).await {
+                    break error.kind();
+                }
+            }
+        };
+        let error = tokio::time::timeout(TIMEOUT, filling).await;
+        assert_eq!(error, Ok(ErrorKind::TimedOut), "the peer never reads");
+        assert!(began.elapsed() >= WRITE_TIMEOUT);
+        assert!(stuck.connection().is_closed());
+    });
+}
+
+#[test]
+fn slow_peers_do_not_time_out() {
+    run(async {
+        let port = Port::open();
+        let (mut stream, mut peer) = port.connect();
+        stream.write_timeout = 4 * WRITE_TIMEOUT;
+        // More than the kernel holds, for longer than one write may be blocked.
+        let n_bytes = 64 << 20;
+        let reading = async {
+            let mut bytes = vec![0; n_bytes / 16];
+            for _ in 0..16 {
+                tokio::time::sleep(WRITE_TIMEOUT / 2).await;
+                peer.read_exact(&mut bytes).await.expect("sent");
+            }
+        };
+        let bytes = vec![0; n_bytes];
+        let (sent, ()) = tokio::join!(stream.write_all(&bytes), reading);
+        assert!(sent.is_ok(), "each pause is shorter than the limit");
+    });
+}
