@@ -9,7 +9,7 @@ use kinematics::Transform;
 use std::path::PathBuf;
 use std::sync::Arc;
 use std::time::Duration;
-use trainer::{Aabb, Edits, Method, ModelKind, RenderRequest, Rendered};
+use trainer::{Aabb, AlignedModel, Edits, Method, ModelKind, RenderRequest, Rendered};
 use viz::{
     Control, EditAction, EditRequest, Hub, KeyframePose, ModelStatus, PendingRender, Status,
 };
@@ -23,7 +23,7 @@ pub struct ServedModel {
     /// The method.
     pub kind: ModelKind,
     /// The model.
-    pub method: Box<dyn Method>,
+    pub method: AlignedModel,
     /// Erased space, in the model's world.
     pub edits: Arc<Edits>,
     /// Folder or file of the saved model. Only folders can hold edits.
@@ -115,7 +115,11 @@ impl ModelViewer {
         }
         let ServedModel { method, edits, .. } = &mut self.models[0];
         let model_from_page = &self.model_from_page;
-        let render = |request: &RenderRequest| method.render(&in_model(request, model_from_page));
+        let render = |request: &RenderRequest| {
+            method
+                .model_mut()
+                .render(&in_model(request, model_from_page))
+        };
         // The step has no effect, because the model does not change.
         let model = ModelState {
             step: 1,
@@ -134,7 +138,8 @@ impl ModelViewer {
             ..
         } in &mut self.models
         {
-            self.chunk_publisher.publish(*kind, method.as_mut(), edits);
+            self.chunk_publisher
+                .publish(*kind, method.model_mut(), edits);
         }
     }
 
@@ -172,7 +177,7 @@ impl ModelViewer {
             action => action,
         };
         self.editor
-            .apply(request, &action, &mut model.edits, model.method.as_mut())
+            .apply(request, &action, &mut model.edits, model.method.model_mut())
     }
 
     /// Publishes the result of an edit, or sends the reason why it was not possible.
@@ -233,7 +238,7 @@ impl ModelViewer {
             Ok(model) => model,
             Err(reason) => return pending.fail(&reason),
         };
-        answer_with(pending, request, model.method.as_mut(), &model.edits);
+        answer_with(pending, request, model.method.model_mut(), &model.edits);
     }
 }
 
@@ -271,10 +276,11 @@ impl ServedModel {
         if !self.path.is_dir() {
             return format!("edits cannot be saved: {path} is not a model folder");
         }
+        let model = self.method.model_mut();
         let written = self
             .edits
             .write(&self.path)
-            .and_then(|()| self.method.write_for_others(&self.path, &self.edits));
+            .and_then(|()| model.write_for_others(&self.path, &self.edits));
         match written {
             Ok(()) => {
                 *saved = Arc::clone(&self.edits);

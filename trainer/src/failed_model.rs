@@ -2,8 +2,8 @@
 
 use crate::checkpoint::PendingCheckpoint;
 use crate::gpu::PassTiming;
-use crate::{Error, Method, Picture, Progress, RenderRequest};
-use calibration::{Alignment, CalibratedCamera, TrialReport};
+use crate::{CorrectedKeyframe, Error, Method, Picture, Progress, RenderRequest};
+use calibration::{Alignment, TrialReport};
 use keyframe::Keyframe;
 use kinematics::Stamp;
 use std::path::Path;
@@ -49,16 +49,12 @@ impl Method for FailedModel {
         Err(Error::DeviceLost)
     }
 
-    fn calibrated_camera(&mut self, _: &Keyframe) -> Result<CalibratedCamera, Error> {
+    fn recalibrate(&mut self, _: &[CorrectedKeyframe], _: &Alignment) -> Result<(), Error> {
         Err(Error::DeviceLost)
     }
 
     fn profile_step(&mut self) -> Result<Vec<PassTiming>, Error> {
         Err(Error::DeviceLost)
-    }
-
-    fn alignment(&self) -> Option<&Alignment> {
-        None
     }
 
     fn progress(&self) -> Progress {

@@ -13,6 +13,7 @@ mod aabb;
 mod aligned;
 mod bounds;
 pub mod checkpoint;
+mod corrected_keyframe;
 pub mod edits;
 mod error;
 pub mod eval;
@@ -50,8 +51,9 @@ pub mod tsdf;
 mod view;
 
 pub use aabb::Aabb;
-pub use aligned::{Aligned, CorrectedKeyframe, Recalibrate, ResumedModel};
+pub use aligned::{AlignedModel, ResumedModel};
 pub use bounds::Bounds;
+pub use corrected_keyframe::CorrectedKeyframe;
 pub use edits::Edits;
 pub use error::Error;
 pub use failed_model::FailedModel;

@@ -6,8 +6,8 @@ use crate::edits::{Edits, PendingFloaters};
 use crate::gpu::PassTiming;
 use crate::initial_points::InitialPoints;
 use crate::model_chunks::PendingChunks;
-use crate::{Error, Packing, Picture, QueuedPicture, RenderRequest, Rendered};
-use calibration::{Alignment, CalibratedCamera, CameraCorrection, TrialReport};
+use crate::{CorrectedKeyframe, Error, Packing, Picture, QueuedPicture, RenderRequest, Rendered};
+use calibration::{Alignment, CameraCorrection, TrialReport};
 use keyframe::Keyframe;
 use kinematics::Stamp;
 use std::collections::BTreeMap;
@@ -45,7 +45,8 @@ pub(crate) fn submit_millis(watched: bool) -> f64 {
 
 /// A scene model that trains on keyframes.
 ///
-/// Several models can share one device; each is owned by one thread.
+/// Several models can share one device; each is owned by one thread. The alignment of cameras is
+/// added by [`AlignedModel`](crate::AlignedModel).
 pub trait Method {
     /// Adds a keyframe. Test keyframes are used for evaluation only. The method checks the parts of
     /// the keyframe that it uses ([`Keyframe::check`]).
@@ -151,25 +152,23 @@ pub trait Method {
         Ok(None)
     }
     /// Corrections of cameras that were optimized with the scene, by name. They follow those of
-    /// [`Method::alignment`]. Waits for queued work.
+    /// alignment. Waits for queued work.
     fn camera_corrections(&mut self) -> Result<BTreeMap<String, CameraCorrection>, Error> {
         Ok(BTreeMap::new())
     }
-    /// The camera of a keyframe with the model's per-camera corrections, but without its per-image
-    /// corrections.
-    fn calibrated_camera(&mut self, keyframe: &Keyframe) -> Result<CalibratedCamera, Error>;
+    /// Replaces all keyframes pushed so far. The model moves along with its keyframes, or forgets
+    /// all training if it cannot be moved.
+    ///
+    /// * `keyframes`: in the order of their arrival, without test keyframes.
+    /// * `alignment`: the source of the new corrections.
+    fn recalibrate(
+        &mut self,
+        keyframes: &[CorrectedKeyframe],
+        alignment: &Alignment,
+    ) -> Result<(), Error>;
     /// Takes one step with timestamps around every pass; returns an empty list if the adapter does
     /// not support them.
     fn profile_step(&mut self) -> Result<Vec<PassTiming>, Error>;
-    /// Result of keyframe alignment; `None` until it is done, or if it was not requested or not
-    /// possible.
-    fn alignment(&self) -> Option<&Alignment>;
-    /// In a live run, applies the result of an alignment in the background if it is ready, or waits
-    /// for it if `wait`. Returns whether a result was applied, which depends on timing unless
-    /// `wait` is set.
-    fn poll_alignment(&mut self, _wait: bool) -> Result<bool, Error> {
-        Ok(false)
-    }
     /// Number of steps that must remain for a search for the model size that is pending or running:
     /// the rest of the search, and as many steps after it as the whole search takes. 0 if there is
     /// no search.

@@ -14,9 +14,8 @@ use std::sync::Arc;
 /// Creates an untrained model.
 pub type StartModel = fn(Arc<Gpu>, &ModelOptions) -> Result<Box<dyn Method>, Error>;
 /// Restores a model from a checkpoint. The keyframes must include those that the model was trained
-/// on, except those that placeholders stand for (see [`Aligned::resume`](crate::Aligned::resume)).
-pub type ResumeModel =
-    fn(Arc<Gpu>, &Checkpoint, &[Arc<Keyframe>], &[Arc<Keyframe>]) -> Result<ResumedModel, Error>;
+/// on.
+pub type ResumeModel = fn(Arc<Gpu>, &Checkpoint, &[Arc<Keyframe>]) -> Result<ResumedModel, Error>;
 /// Loads a saved model from a folder or a single file.
 pub type LoadModel = fn(Arc<Gpu>, &Path) -> Result<Box<dyn Method>, Error>;
 
@@ -58,6 +57,11 @@ pub struct MethodEntry {
     pub resume: ResumeModel,
     /// Loads a saved model from its folder, or from a single file.
     pub load: LoadModel,
+}
+
+/// A resumed model of one method as a model of any method.
+pub(crate) fn boxed<M: Method + 'static>((model, untrained): ResumedModel<M>) -> ResumedModel {
+    (Box::new(model), untrained)
 }
 
 /// A type of file that holds a complete model.

@@ -13,16 +13,17 @@ pub trait MethodOptions: Serialize + DeserializeOwned + Default {
 }
 
 /// When the cameras of keyframes are aligned.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum AlignTiming {
     /// Once, with the keyframes that are known at the first step. The result is applied a fixed
     /// number of steps later, or before the first step if no keyframe has depth.
+    #[default]
     Once,
     /// Repeatedly as keyframes arrive. Results are applied a fixed number of steps later.
     Lockstep,
     /// Repeatedly as keyframes arrive. Results are applied by
-    /// [`Method::poll_alignment`](crate::Method::poll_alignment), so that training never waits for
+    /// [`poll_alignment`](crate::AlignedModel::poll_alignment), so that training never waits for
     /// them.
     RealTime,
 }

@@ -1,13 +1,13 @@
 //! Checks that scoring image by image gives the same result as scoring all images at once.
 
 use super::*;
-use calibration::{CalibratedCamera, TrialReport};
+use calibration::TrialReport;
 use keyframe::Split;
 use kinematics::Transform;
 use std::path::Path;
-use trainer::Error;
 use trainer::checkpoint::PendingCheckpoint;
 use trainer::gpu::{GpuOptions, PassTiming};
+use trainer::{CorrectedKeyframe, Error, Method};
 
 const SIZE_PX: [u32; 2] = [4, 2];
 const N_TESTS: u8 = 5;
@@ -65,16 +65,12 @@ impl Method for Gray {
         })
     }
 
-    fn calibrated_camera(&mut self, keyframe: &Keyframe) -> Result<CalibratedCamera, Error> {
-        Ok(CalibratedCamera::of(keyframe))
+    fn recalibrate(&mut self, _: &[CorrectedKeyframe], _: &Alignment) -> Result<(), Error> {
+        Ok(())
     }
 
     fn profile_step(&mut self) -> Result<Vec<PassTiming>, Error> {
         Ok(Vec::new())
-    }
-
-    fn alignment(&self) -> Option<&Alignment> {
-        None
     }
 
     fn n_steps_for_size_search(&self) -> u64 {
@@ -140,7 +136,10 @@ fn session_with_evaluation_due(stop: &Stop) -> (Session, std::rc::Rc<std::cell::
     let gpu = Gpu::open(&GpuOptions::default()).expect("an adapter");
     let mut session = Session::new(
         gpu,
-        (ModelKind::default(), Box::new(method)),
+        (
+            ModelKind::default(),
+            AlignedModel::unaligned(Box::new(method)),
+        ),
         evaluators,
         Limits::default(),
         Box::new(()),
@@ -198,7 +197,7 @@ fn stepwise_scoring_equals_scoring_at_once() {
 #[test]
 fn scoring_in_parallel_equals_scoring_one_by_one() {
     let tests: Vec<Arc<Keyframe>> = (0..50).map(test_keyframe).collect();
-    let mut method = Gray::default();
+    let mut method = AlignedModel::unaligned(Box::new(Gray::default()));
     let mut reported = Vec::new();
     let evaluator = Evaluator::psnr_only();
     let at_once = evaluator
@@ -260,7 +259,10 @@ fn size_search_ends_before_the_time_limit() {
         let gpu = Gpu::open(&GpuOptions::default()).expect("an adapter");
         let mut session = Session::new(
             gpu,
-            (ModelKind::default(), Box::new(method)),
+            (
+                ModelKind::default(),
+                AlignedModel::unaligned(Box::new(method)),
+            ),
             evaluators,
             limits,
             Box::new(()),

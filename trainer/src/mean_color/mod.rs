@@ -6,14 +6,12 @@
 use crate::checkpoint::{Checkpoint, PendingCheckpoint};
 use crate::gpu::PassTiming;
 use crate::keyframe_signature::{self, KeyframeSignature};
-use crate::method_entry::MethodEntry;
+use crate::method_entry::{MethodEntry, boxed};
 use crate::model_metadata::METADATA_FILE;
 use crate::model_options::{MethodOptions, ModelOptions, default_options};
-use crate::{
-    Aligned, CorrectedKeyframe, Error, Method, Picture, Progress, Recalibrate, RenderRequest,
-};
+use crate::{CorrectedKeyframe, Error, Method, Picture, Progress, RenderRequest};
 use calibration::Alignment;
-use calibration::{CalibratedCamera, ParamSet, TrialReport};
+use calibration::{ParamSet, TrialReport};
 use keyframe::{Keyframe, Split};
 use kinematics::Stamp;
 use serde::{Deserialize, Serialize};
@@ -35,17 +33,9 @@ pub(crate) static ENTRY: MethodEntry = MethodEntry {
     exports: &[],
     default_options: default_options::<MeanColorOptions>,
     check_options: |options| options.typed::<MeanColorOptions>().map(drop),
-    start: |gpu, options| {
-        Ok(Aligned::if_requested(
-            MeanColor::new(options.typed()?),
-            &options.common,
-            &gpu,
-        ))
-    },
-    resume: |_, checkpoint, keyframes, placeholders| {
-        Aligned::resume(checkpoint, keyframes, placeholders, MeanColor::resume)
-    },
-    load: |_, folder| Ok(Box::new(Aligned::load(MeanColor::load(folder)?, folder)?)),
+    start: |_, options| Ok(Box::new(MeanColor::new(options.typed()?))),
+    resume: |_, checkpoint, keyframes| MeanColor::resume(checkpoint, keyframes).map(boxed),
+    load: |_, folder| Ok(Box::new(MeanColor::load(folder)?)),
 };
 
 /// File of the saved color, in the format of a checkpoint.
@@ -160,16 +150,6 @@ fn channel_sum(pixels: &[[u8; 4]], channel: usize) -> f64 {
     pixels.iter().map(|pixel| f64::from(pixel[channel])).sum()
 }
 
-impl Recalibrate for MeanColor {
-    fn recalibrate(&mut self, keyframes: &[CorrectedKeyframe], _: &Alignment) -> Result<(), Error> {
-        // The mean does not depend on poses. It restarts anyway, as an example for models that do.
-        *self = Self::new(self.options.clone());
-        keyframes
-            .iter()
-            .try_for_each(|keyframe| self.push(keyframe.after.clone()))
-    }
-}
-
 impl Method for MeanColor {
     fn push(&mut self, keyframe: Arc<Keyframe>) -> Result<(), Error> {
         if keyframe.split != Split::Test {
@@ -239,17 +219,17 @@ impl Method for MeanColor {
         })
     }
 
-    fn calibrated_camera(&mut self, keyframe: &Keyframe) -> Result<CalibratedCamera, Error> {
-        Ok(CalibratedCamera::of(keyframe))
+    fn recalibrate(&mut self, keyframes: &[CorrectedKeyframe], _: &Alignment) -> Result<(), Error> {
+        // The mean does not depend on poses. It restarts anyway, as an example for models that do.
+        *self = Self::new(self.options.clone());
+        keyframes
+            .iter()
+            .try_for_each(|keyframe| self.push(keyframe.after.clone()))
     }
 
     fn profile_step(&mut self) -> Result<Vec<PassTiming>, Error> {
         self.step(1)?;
         Ok(Vec::new())
-    }
-
-    fn alignment(&self) -> Option<&Alignment> {
-        None
     }
 
     fn progress(&self) -> Progress {

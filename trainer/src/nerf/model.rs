@@ -9,20 +9,19 @@ use super::field_trainer::{Compiled, FieldTrainer, STEPS_PER_SUBMIT};
 use super::options::{NerfBudget, NerfOptions};
 use super::rays::{self, RayImage, RaySampling};
 use super::sizes::Sizes;
-use crate::aligned::replacement;
 use crate::checkpoint::PendingCheckpoint;
+use crate::corrected_keyframe::replacement;
 use crate::gpu::{Gpu, PassTiming};
 use crate::model_options::ModelOptions;
 use crate::packing::{Format, Output};
 use crate::submits::Submits;
 use crate::view::Camera;
 use crate::{
-    Bounds, CorrectedKeyframe, Error, Method, Packing, Picture, Progress, Recalibrate,
-    RenderRequest, Rendered,
+    Bounds, CorrectedKeyframe, Error, Method, Packing, Picture, Progress, RenderRequest, Rendered,
 };
 use calibration::Alignment;
 use calibration::TrialReport;
-use calibration::{CalibratedCamera, CameraCorrection, EMBEDDING_DIM, ParamSet};
+use calibration::{CameraCorrection, EMBEDDING_DIM, ParamSet};
 use images::Trials;
 use keyframe::{Keyframe, Split};
 use kinematics::Stamp;
@@ -330,31 +329,6 @@ impl NerfModel {
     }
 }
 
-impl Recalibrate for NerfModel {
-    /// Continues with the corrected images. Pose corrections of single images start again at zero.
-    fn recalibrate(&mut self, keyframes: &[CorrectedKeyframe], _: &Alignment) -> Result<(), Error> {
-        // The halves of a trial must be trained on the same images, so a running trial starts
-        // again.
-        self.finish_in_flight()?;
-        self.undo_trial()?;
-        let corrected = replacement(keyframes);
-        for image in self.images.iter_mut().chain(&mut self.validation_images) {
-            let mut keyframe = image.keyframe.clone();
-            corrected(&mut keyframe);
-            *image = RayImage::new(keyframe);
-        }
-        self.is_extent_stale = true;
-        self.corrections = None;
-        if let Some((_, field_trainer)) = &mut self.field {
-            field_trainer.reset_image_params_except(
-                &self.gpu,
-                self.learned_params - ParamSet::IMAGE_POSES,
-            )?;
-        }
-        self.hint_images(0..self.n_hinted)
-    }
-}
-
 impl Method for NerfModel {
     fn depth_stride(&self) -> u32 {
         if self.gpu.is_software() {
@@ -484,13 +458,27 @@ impl Method for NerfModel {
         Ok(self.current_corrections()?.clone())
     }
 
-    fn calibrated_camera(&mut self, keyframe: &Keyframe) -> Result<CalibratedCamera, Error> {
-        let corrections = self.current_corrections()?;
-        let correction = corrections.get(keyframe.camera.as_ref());
-        Ok(correction.map_or_else(
-            || CalibratedCamera::of(keyframe),
-            |correction| correction.apply(keyframe),
-        ))
+    /// Continues with the corrected images. Pose corrections of single images start again at zero.
+    fn recalibrate(&mut self, keyframes: &[CorrectedKeyframe], _: &Alignment) -> Result<(), Error> {
+        // The halves of a trial must be trained on the same images, so a running trial starts
+        // again.
+        self.finish_in_flight()?;
+        self.undo_trial()?;
+        let corrected = replacement(keyframes);
+        for image in self.images.iter_mut().chain(&mut self.validation_images) {
+            let mut keyframe = image.keyframe.clone();
+            corrected(&mut keyframe);
+            *image = RayImage::new(keyframe);
+        }
+        self.is_extent_stale = true;
+        self.corrections = None;
+        if let Some((_, field_trainer)) = &mut self.field {
+            field_trainer.reset_image_params_except(
+                &self.gpu,
+                self.learned_params - ParamSet::IMAGE_POSES,
+            )?;
+        }
+        self.hint_images(0..self.n_hinted)
     }
 
     fn profile_step(&mut self) -> Result<Vec<PassTiming>, Error> {
@@ -503,10 +491,6 @@ impl Method for NerfModel {
             return Err(no_field());
         };
         field_trainer.submit_timed(&self.gpu)
-    }
-
-    fn alignment(&self) -> Option<&Alignment> {
-        None
     }
 
     fn progress(&self) -> Progress {

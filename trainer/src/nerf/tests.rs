@@ -14,8 +14,7 @@ use crate::gpu::testing::test_gpu;
 use crate::model_options::{CommonOptions, ModelOptions};
 use crate::test_scenes as scenes;
 use crate::{
-    Aabb, CorrectedKeyframe, Error, Method, ModelKind, Picture, Projection, Recalibrate,
-    RenderRequest,
+    Aabb, CorrectedKeyframe, Error, Method, ModelKind, Picture, Projection, RenderRequest,
 };
 use calibration::{Alignment, CameraCorrection, CameraRefinement, ParamSet, rigid_transform};
 use keyframe::{DepthMap, Keyframe, Split};
@@ -407,7 +406,7 @@ fn drifting_poses_are_corrected() {
             .zip(&true_keyframes)
             .map(|(given, true_keyframes)| {
                 position_error_m(
-                    &model.calibrated_camera(given).unwrap().world_from_camera,
+                    &scenes::calibrated_camera(model, given).world_from_camera,
                     true_keyframes,
                 )
             });
@@ -446,8 +445,8 @@ fn drifting_poses_are_corrected() {
     model.save(folder.path()).unwrap();
     let mut loaded = NerfModel::load(gpu(), folder.path()).unwrap();
     assert_eq!(
-        loaded.calibrated_camera(&drifted_keyframes[3]).unwrap(),
-        model.calibrated_camera(&drifted_keyframes[3]).unwrap()
+        scenes::calibrated_camera(&mut loaded, &drifted_keyframes[3]),
+        scenes::calibrated_camera(&mut model, &drifted_keyframes[3])
     );
 
     let mut with_removed = NerfModel::resume(gpu(), &checkpoint, &drifted_keyframes)

@@ -43,10 +43,10 @@ use crate::model_metadata::{METADATA_FILE, read_metadata};
 use crate::model_options::{MethodOptions, ModelOptions};
 use crate::packing::{Format, Output};
 use crate::{
-    Bounds, Error, InitialPoints, Method, Packing, Picture, Progress, Projection, QueuedPicture,
-    RenderRequest, Rendered,
+    Bounds, CorrectedKeyframe, Error, InitialPoints, Method, Packing, Picture, Progress,
+    Projection, QueuedPicture, RenderRequest, Rendered,
 };
-use calibration::{Alignment, CalibratedCamera, CameraCorrection, Trial, TrialReport};
+use calibration::{Alignment, CameraCorrection, Trial, TrialReport};
 use keyframe::{Keyframe, Split};
 use kinematics::Stamp;
 use lazy_pipelines::LazyPipelines;
@@ -490,17 +490,12 @@ impl Method for SplatTrainer {
         cameras.corrections(&self.recorder.gpu, set, params, self.seeding.scene.size_m)
     }
 
-    fn calibrated_camera(&mut self, keyframe: &Keyframe) -> Result<CalibratedCamera, Error> {
-        let corrections = self.camera_corrections()?;
-        let correction = corrections.get(keyframe.camera.as_ref());
-        Ok(correction.map_or_else(
-            || CalibratedCamera::of(keyframe),
-            |correction| correction.apply(keyframe),
-        ))
-    }
-
-    fn alignment(&self) -> Option<&Alignment> {
-        None
+    fn recalibrate(
+        &mut self,
+        keyframes: &[CorrectedKeyframe],
+        alignment: &Alignment,
+    ) -> Result<(), Error> {
+        self.move_with_keyframes(keyframes, alignment)
     }
 
     fn n_steps_for_size_search(&self) -> u64 {

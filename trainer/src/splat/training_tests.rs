@@ -8,6 +8,7 @@ use crate::eval::{PixelPair, psnr};
 use crate::gpu::testing::test_gpu;
 use crate::gpu::{Gpu, f32s_of};
 use crate::model_options::{CommonOptions, ModelOptions};
+use crate::test_scenes::calibrated_camera;
 use crate::view::Camera;
 use crate::{Aabb, InitialPoints, Method, Packing, Projection, RenderRequest, Rendered};
 use calibration::{CameraRefinement, ParamSet};
@@ -588,10 +589,7 @@ fn wrong_lens_is_corrected_by_trial() {
     let miscalibrated: Vec<_> = miscalibrated.collect();
     let mut trainer = trainer_with_lens_trial(&miscalibrated, gpu, 2000);
     train(&mut trainer, 900);
-    let found_focal_px = trainer
-        .calibrated_camera(&miscalibrated[0])
-        .unwrap()
-        .focal_px;
+    let found_focal_px = calibrated_camera(&mut trainer, &miscalibrated[0]).focal_px;
     assert!(
         trainer.trials()[0].kept,
         "{:?}, focal length {found_focal_px:?}",

@@ -27,11 +27,9 @@ use crate::model_options::ModelOptions;
 use crate::packing::{Format, Reader};
 use crate::view::ErasedSpace;
 use crate::{
-    CorrectedKeyframe, Error, Method, Packing, Picture, Progress, Recalibrate, RenderRequest,
-    Rendered,
+    CorrectedKeyframe, Error, Method, Packing, Picture, Progress, RenderRequest, Rendered,
 };
 use calibration::Alignment;
-use calibration::CalibratedCamera;
 use calibration::TrialReport;
 use field_store::{FieldStore, INITIAL_CAPACITY};
 use frustum::ViewFrustum;
@@ -330,19 +328,6 @@ impl TsdfModel {
     }
 }
 
-impl Recalibrate for TsdfModel {
-    /// Fuses all keyframes again: the contribution of each one to the sums is unknown.
-    fn recalibrate(&mut self, keyframes: &[CorrectedKeyframe], _: &Alignment) -> Result<(), Error> {
-        self.finish_in_flight()?;
-        let is_watched = self.fusion.submits.is_watched();
-        *self = Self::new(self.gpu.clone(), self.options.clone())?;
-        self.set_watched(is_watched);
-        keyframes
-            .iter()
-            .try_for_each(|keyframe| self.push(keyframe.after.clone()))
-    }
-}
-
 impl Method for TsdfModel {
     fn push(&mut self, keyframe: Arc<Keyframe>) -> Result<(), Error> {
         // A keyframe without depth contains no surface, so this is not an error: in a rig, only
@@ -498,8 +483,15 @@ impl Method for TsdfModel {
         self.fusion.submits.set_watched(watched);
     }
 
-    fn calibrated_camera(&mut self, keyframe: &Keyframe) -> Result<CalibratedCamera, Error> {
-        Ok(CalibratedCamera::of(keyframe))
+    /// Fuses all keyframes again: the contribution of each one to the sums is unknown.
+    fn recalibrate(&mut self, keyframes: &[CorrectedKeyframe], _: &Alignment) -> Result<(), Error> {
+        self.finish_in_flight()?;
+        let is_watched = self.fusion.submits.is_watched();
+        *self = Self::new(self.gpu.clone(), self.options.clone())?;
+        self.set_watched(is_watched);
+        keyframes
+            .iter()
+            .try_for_each(|keyframe| self.push(keyframe.after.clone()))
     }
 
     fn profile_step(&mut self) -> Result<Vec<PassTiming>, Error> {
@@ -517,10 +509,6 @@ impl Method for TsdfModel {
             .counters(&self.gpu)?;
         self.apply_counters(&counters)?;
         Ok(timings)
-    }
-
-    fn alignment(&self) -> Option<&Alignment> {
-        None
     }
 
     fn progress(&self) -> Progress {

@@ -7,11 +7,11 @@
 //! corrections are a few degrees at most.
 
 use super::SplatTrainer;
-use crate::aligned::replacement;
+use crate::corrected_keyframe::replacement;
 use crate::gpu::{Gpu, f32s_of};
 use crate::splat::buffers::SplatBuffers;
 use crate::splat::camera_params::CameraParams;
-use crate::{CorrectedKeyframe, Error, Method, Recalibrate};
+use crate::{CorrectedKeyframe, Error, Method};
 use calibration::{Alignment, CameraCorrection, ParamSet};
 use keyframe::{DepthMap, Keyframe};
 use kinematics::{Intrinsics, Lens, Transform};
@@ -37,8 +37,9 @@ const WITHOUT_DEPTH: f64 = 1e-4;
 /// Parameters of single images, which stay enabled. Shared parameters are part of the alignment.
 const IMAGE_PARAMS: ParamSet = ParamSet::IMAGE_POSES.union(ParamSet::IMAGE_GAINS);
 
-impl Recalibrate for SplatTrainer {
-    fn recalibrate(
+impl SplatTrainer {
+    /// Moves the splats with their keyframes; see [`Method::recalibrate`].
+    pub(super) fn move_with_keyframes(
         &mut self,
         keyframes: &[CorrectedKeyframe],
         alignment: &Alignment,

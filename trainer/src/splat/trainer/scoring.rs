@@ -333,6 +333,7 @@ mod tests {
     use crate::gpu::Gpu;
     use crate::gpu::testing::test_gpu;
     use crate::splat::training_tests::{n_keyframes, options, request, train};
+    use crate::test_scenes::calibrated_camera;
     use calibration::{CameraRefinement, ParamSet};
     use keyframe::Split;
 
@@ -481,7 +482,7 @@ mod tests {
             trainer.trials()
         );
         let gains = |trainer: &mut SplatTrainer, ix: usize| {
-            trainer.calibrated_camera(&stepped[ix]).unwrap().gains[1]
+            calibrated_camera(trainer, &stepped[ix]).gains[1]
         };
         // Only images near the exposure step show parts of the scene that were captured with both
         // exposures.
@@ -523,7 +524,7 @@ mod tests {
         );
         train(&mut trainer, 100);
         let gains = |trainer: &mut SplatTrainer, ix: usize| {
-            trainer.calibrated_camera(&stepped[ix]).unwrap().gains[1]
+            calibrated_camera(trainer, &stepped[ix]).gains[1]
         };
         let ratio = gains(&mut trainer, 17) / gains(&mut trainer, 19);
         assert!((1.4..2.6).contains(&ratio), "{ratio}");
