@@ -60,7 +60,7 @@ pub trait Method {
     fn set_initial_points(&mut self, _points: &Arc<InitialPoints>) -> bool {
         false
     }
-    /// Queues up to `n` optimizer updates, but at most 20 ms of GPU work (4 ms while watched,
+    /// Queues up to `n` optimizer updates, but at most 20 ms of GPU work (2 ms while watched,
     /// [`Method::set_watched`]). Returns the number of queued updates. At most one submit runs and
     /// one is queued.
     ///
