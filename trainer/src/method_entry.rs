@@ -7,7 +7,6 @@ use crate::model_options::ModelOptions;
 use crate::{Error, Method, ResumedModel};
 use calibration::ParamSet;
 use keyframe::Keyframe;
-use serde_json::Value;
 use std::path::Path;
 use std::sync::Arc;
 
@@ -45,8 +44,8 @@ pub struct MethodEntry {
     pub learnable: ParamSet,
     /// Export formats, the preferred one first.
     pub exports: &'static [Export],
-    /// Default options of the method, as JSON.
-    pub default_options: fn() -> Value,
+    /// Default options of a model.
+    pub default_options: fn() -> ModelOptions,
     /// Fails if options are invalid.
     pub check_options: fn(&ModelOptions) -> Result<(), Error>,
     /// Creates an untrained model.

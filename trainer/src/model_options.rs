@@ -118,18 +118,14 @@ impl<S: MethodOptions> ModelOptions<S> {
     pub fn to_json(&self) -> ModelOptions {
         ModelOptions {
             common: self.common.clone(),
-            specific: json(&self.specific),
+            specific: serde_json::to_value(&self.specific).expect("options are plain data"),
         }
     }
 }
 
-/// Default options of a method, as JSON.
-pub(crate) fn default_options<S: MethodOptions>() -> Value {
-    json(&S::default())
-}
-
-fn json(options: &impl MethodOptions) -> Value {
-    serde_json::to_value(options).expect("options are plain data")
+/// Default options of a model of the method with the options `S`, as JSON.
+pub(crate) fn default_options<S: MethodOptions>() -> ModelOptions {
+    ModelOptions::<S>::default().to_json()
 }
 
 #[cfg(test)]

@@ -59,17 +59,15 @@ impl ModelSpec {
         common: CommonOptions,
         settings: &[(&str, Value)],
     ) -> Result<Self, Error> {
-        let mut specific = (kind.entry().default_options)();
+        let mut options = (kind.entry().default_options)();
+        options.common = common;
         for (name, value) in settings {
             // `get_mut` does not insert: an option that this method lacks stays absent.
-            if let Some(option) = specific.get_mut(name) {
+            if let Some(option) = options.specific.get_mut(name) {
                 *option = value.clone();
             }
         }
-        let model_spec = Self {
-            kind,
-            options: ModelOptions { common, specific },
-        };
+        let model_spec = Self { kind, options };
         model_spec.check()?;
         Ok(model_spec)
     }
