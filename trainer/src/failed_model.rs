@@ -3,7 +3,7 @@
 use crate::checkpoint::PendingCheckpoint;
 use crate::gpu::PassTiming;
 use crate::{CorrectedKeyframe, Error, Method, Picture, Progress, RenderRequest};
-use calibration::{Alignment, TrialReport};
+use calibration::Alignment;
 use keyframe::Keyframe;
 use kinematics::Stamp;
 use std::path::Path;
@@ -31,8 +31,6 @@ impl Method for FailedModel {
         true
     }
 
-    fn set_watched(&mut self, _: bool) {}
-
     fn n_total_steps(&mut self) -> Result<u64, Error> {
         Err(Error::DeviceLost)
     }
@@ -59,10 +57,6 @@ impl Method for FailedModel {
 
     fn progress(&self) -> Progress {
         Progress::default()
-    }
-
-    fn report(&self) -> Vec<TrialReport> {
-        Vec::new()
     }
 
     fn save(&mut self, _: &Path) -> Result<(), Error> {

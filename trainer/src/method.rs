@@ -74,14 +74,18 @@ pub trait Method {
     /// rejected trials. Unlike [`Progress::step`], it never decreases.
     fn n_total_steps(&mut self) -> Result<u64, Error>;
     /// Initializes the model from the keyframes added so far, so that it can be rendered without
-    /// training.
-    fn seed(&mut self) -> Result<(), Error>;
+    /// training. Does nothing if the model can be rendered only after training.
+    fn seed(&mut self) -> Result<(), Error> {
+        Ok(())
+    }
     /// Waits until all training kernels are compiled. Without this call, the first [`Method::step`]
     /// waits.
-    fn prepare(&mut self) -> Result<(), Error>;
+    fn prepare(&mut self) -> Result<(), Error> {
+        Ok(())
+    }
     /// Sets whether pictures are requested during training. If so, submits are shorter; the trained
     /// parameters are bit-identical either way.
-    fn set_watched(&mut self, watched: bool);
+    fn set_watched(&mut self, _watched: bool) {}
     /// Renders a picture. If the model is empty, first initializes it as [`Method::seed`] does.
     fn render(&mut self, request: &RenderRequest) -> Result<Picture, Error>;
     /// Renders a picture as [`Method::render`] does and packs it on the GPU, if the model and the
@@ -188,7 +192,9 @@ pub trait Method {
     /// Progress of training.
     fn progress(&self) -> Progress;
     /// Reports of the trials, in the order in which they ran.
-    fn report(&self) -> Vec<TrialReport>;
+    fn report(&self) -> Vec<TrialReport> {
+        Vec::new()
+    }
     /// Writes the model into an existing folder. The files do not depend on the number of planned
     /// steps.
     fn save(&mut self, folder: &Path) -> Result<(), Error>;

@@ -1,7 +1,6 @@
 //! Checks that scoring image by image gives the same result as scoring all images at once.
 
 use super::*;
-use calibration::TrialReport;
 use keyframe::Split;
 use kinematics::Transform;
 use std::path::Path;
@@ -44,16 +43,6 @@ impl Method for Gray {
         Ok(self.level.into())
     }
 
-    fn seed(&mut self) -> Result<(), Error> {
-        Ok(())
-    }
-
-    fn prepare(&mut self) -> Result<(), Error> {
-        Ok(())
-    }
-
-    fn set_watched(&mut self, _watched: bool) {}
-
     fn render(&mut self, request: &RenderRequest) -> Result<Picture, Error> {
         self.n_drawn.set(self.n_drawn.get() + 1);
         assert!(!request.depth, "PSNR needs no depth");
@@ -86,10 +75,6 @@ impl Method for Gray {
             step: self.level.into(),
             ..Progress::default()
         }
-    }
-
-    fn report(&self) -> Vec<TrialReport> {
-        Vec::new()
     }
 
     fn save(&mut self, _folder: &Path) -> Result<(), Error> {

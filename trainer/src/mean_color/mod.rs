@@ -10,8 +10,7 @@ use crate::method_entry::{MethodEntry, boxed};
 use crate::model_metadata::METADATA_FILE;
 use crate::model_options::{MethodOptions, ModelOptions, default_options};
 use crate::{CorrectedKeyframe, Error, Method, Picture, Progress, RenderRequest};
-use calibration::Alignment;
-use calibration::{ParamSet, TrialReport};
+use calibration::{Alignment, ParamSet};
 use keyframe::{Keyframe, Split};
 use kinematics::Stamp;
 use serde::{Deserialize, Serialize};
@@ -190,16 +189,6 @@ impl Method for MeanColor {
         Ok(self.step)
     }
 
-    fn seed(&mut self) -> Result<(), Error> {
-        Ok(())
-    }
-
-    fn prepare(&mut self) -> Result<(), Error> {
-        Ok(())
-    }
-
-    fn set_watched(&mut self, _watched: bool) {}
-
     fn render(&mut self, request: &RenderRequest) -> Result<Picture, Error> {
         let n_pixels = request.size_px.iter().map(|side| *side as usize).product();
         #[expect(
@@ -238,10 +227,6 @@ impl Method for MeanColor {
             primitives: 1,
             ..Progress::default()
         }
-    }
-
-    fn report(&self) -> Vec<TrialReport> {
-        Vec::new()
     }
 
     fn save(&mut self, folder: &Path) -> Result<(), Error> {

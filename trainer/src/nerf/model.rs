@@ -412,11 +412,6 @@ impl Method for NerfModel {
         Ok(self.step + self.n_discarded_steps)
     }
 
-    /// Does nothing: a field can be rendered only after training.
-    fn seed(&mut self) -> Result<(), Error> {
-        Ok(())
-    }
-
     fn prepare(&mut self) -> Result<(), Error> {
         self.compiled().map(drop)
     }

@@ -30,7 +30,6 @@ use crate::{
     CorrectedKeyframe, Error, Method, Packing, Picture, Progress, RenderRequest, Rendered,
 };
 use calibration::Alignment;
-use calibration::TrialReport;
 use field_store::{FieldStore, INITIAL_CAPACITY};
 use frustum::ViewFrustum;
 use fusion::Fusion;
@@ -422,10 +421,6 @@ impl Method for TsdfModel {
         self.fuse_one()
     }
 
-    fn prepare(&mut self) -> Result<(), Error> {
-        Ok(())
-    }
-
     fn render(&mut self, request: &RenderRequest) -> Result<Picture, Error> {
         self.finish_in_flight()?;
         self.fuse_one()?;
@@ -521,10 +516,6 @@ impl Method for TsdfModel {
                 .map_or(0, |store| store.buffers.bytes(store.n_resident.into())),
             step_millis: self.fusion.submits.step_millis(),
         }
-    }
-
-    fn report(&self) -> Vec<TrialReport> {
-        Vec::new()
     }
 
     fn save(&mut self, folder: &Path) -> Result<(), Error> {
