@@ -6,13 +6,13 @@ mod images;
 use super::carve;
 use super::extent::Extent;
 use super::field_trainer::{Compiled, FieldTrainer, STEPS_PER_SUBMIT};
-use super::options::{NerfBudget, NerfOptions};
+use super::options::NerfOptions;
 use super::rays::{self, RayImage, RaySampling};
 use super::sizes::Sizes;
 use crate::checkpoint::PendingCheckpoint;
 use crate::corrected_keyframe::replacement;
 use crate::gpu::{Gpu, PassTiming};
-use crate::model_options::ModelOptions;
+use crate::model_options::{CommonOptions, ModelOptions};
 use crate::packing::{Format, Output};
 use crate::submits::Submits;
 use crate::view::Camera;
@@ -118,17 +118,6 @@ impl NerfModel {
             .unwrap_or(&self.loaded_corrections))
     }
 
-    fn nerf_budget(&self) -> NerfBudget {
-        self.options
-            .specific
-            .nerf_budget
-            .unwrap_or(if self.gpu.is_software() {
-                NerfBudget::SMALL
-            } else {
-                NerfBudget::FULL
-            })
-    }
-
     /// Creates a field if there is none or if the scene has outgrown it, and refines its cells when
     /// due. Returns whether there are images to train on.
     fn begin(&mut self) -> Result<bool, Error> {
@@ -148,32 +137,34 @@ impl NerfModel {
         Ok(true)
     }
 
-    /// Extent and sizes of a field for the current images.
-    fn sizes(&self) -> Result<(Extent, Sizes), Error> {
-        let keyframes = || self.images.iter().map(|image| &*image.keyframe);
-        let extent = Extent::of(keyframes());
-        let sizes = Sizes::choose(
-            &self.options,
-            self.nerf_budget(),
-            self.gpu.max_binding_bytes(),
-            keyframes(),
-            &extent,
-        )?;
-        Ok((extent, sizes))
-    }
-
     /// Returns the kernels, compiling them on first use.
     fn compiled(&mut self) -> Result<Arc<Compiled>, Error> {
         if let Some(compiled) = &self.compiled {
             return Ok(compiled.clone());
         }
-        let compiled = Arc::new(Compiled::new(&self.gpu, &self.nerf_budget())?);
+        let nerf_budget = self
+            .options
+            .specific
+            .budget_or_default(self.gpu.is_software());
+        let compiled = Arc::new(Compiled::new(&self.gpu, &nerf_budget)?);
         self.compiled = Some(compiled.clone());
         Ok(compiled)
     }
 
+    /// Creates a field for the extent of the current images, if there is none or if they have
+    /// outgrown it.
     fn fit_extent(&mut self) -> Result<(), Error> {
-        let (extent, sizes) = self.sizes()?;
+        let keyframes = || self.images.iter().map(|image| &*image.keyframe);
+        let extent = Extent::of(keyframes());
+        let sizes = Sizes::choose(
+            &self.options,
+            self.options
+                .specific
+                .budget_or_default(self.gpu.is_software()),
+            self.gpu.max_binding_bytes(),
+            keyframes(),
+            &extent,
+        )?;
         if self
             .field
             .as_ref()
@@ -232,20 +223,18 @@ impl NerfModel {
             .as_ref()
             .is_some_and(|(_, field_trainer)| field_trainer.sizes.can_refine);
         if is_refinement_due {
-            self.refinement_step().saturating_sub(self.step).max(1)
+            refinement_step(&self.options.common)
+                .saturating_sub(self.step)
+                .max(1)
         } else {
             u64::MAX
         }
     }
 
-    fn refinement_step(&self) -> u64 {
-        (self.options.common.n_planned_steps / REFINE_DIVISOR).max(1)
-    }
-
     /// Refines the cells when due. Coarse cells need fewer updates at first; fine cells later
     /// separate empty space better.
     fn refine_cells_when_due(&mut self) -> Result<(), Error> {
-        let is_refinement_due = self.step >= self.refinement_step();
+        let is_refinement_due = self.step >= refinement_step(&self.options.common);
         if !is_refinement_due
             || !self
                 .field
@@ -383,7 +372,9 @@ impl Method for NerfModel {
         // Validation images may have become training images. Use them from the next step on.
         self.begin()?;
         // A submit ends where the host has to change the field.
-        let max_steps = self.steps_to_finer_cells().min(self.steps_to_trial());
+        let max_steps = self
+            .steps_to_finer_cells()
+            .min(self.trials.steps_left(self.step, &self.options.common));
         let n_steps = n.min(self.steps_per_submit()).min(max_steps);
         let since = Instant::now();
         for slot_ix in 0..n_steps {
@@ -420,7 +411,8 @@ impl Method for NerfModel {
         // Rendering must not create a field: the times of pictures would then determine its initial
         // keyframes.
         self.finish_in_flight()?;
-        let embedding = self.embedding_of(request.appearance_of.as_ref())?;
+        let corrections = self.current_corrections()?;
+        let embedding = images::embedding_of(corrections, request.appearance_of.as_ref());
         Rendered::picture(request, |camera, output| {
             self.draw(request, camera, embedding, output)
         })
@@ -432,7 +424,8 @@ impl Method for NerfModel {
         packing: Packing,
     ) -> Result<Rendered, Error> {
         self.finish_in_flight()?;
-        let embedding = self.embedding_of(request.appearance_of.as_ref())?;
+        let corrections = self.current_corrections()?;
+        let embedding = images::embedding_of(corrections, request.appearance_of.as_ref());
         Rendered::of(request, Format::Packed(packing), |camera, output| {
             self.draw(request, camera, embedding, output)
         })
@@ -509,6 +502,11 @@ impl Method for NerfModel {
     fn checkpoint(&mut self) -> Result<PendingCheckpoint, Error> {
         self.take_checkpoint()
     }
+}
+
+/// Step at which the cells are refined.
+fn refinement_step(common: &CommonOptions) -> u64 {
+    (common.n_planned_steps / REFINE_DIVISOR).max(1)
 }
 
 /// The error if a step is taken before the field is created.
