@@ -70,7 +70,7 @@ impl SplatTrainer {
         let corrections = self.learned_corrections()?;
         let neighbors: Vec<Vec<usize>> = validation
             .iter()
-            .map(|(keyframe, _)| self.neighbors(keyframe))
+            .map(|(keyframe, _)| self.views.neighbors(keyframe))
             .collect();
         // The gains of a validation keyframe itself would be fitted to the image that they are
         // scored on. Those of its neighbors predict them only if exposure really changes.
@@ -186,29 +186,6 @@ impl SplatTrainer {
             .cameras
             .initialize_gains(&self.recorder.gpu, &keyframe, log_gains);
         Ok(())
-    }
-
-    /// The last view before and the first view after a keyframe, from the same camera.
-    fn neighbors(&self, keyframe: &Keyframe) -> Vec<usize> {
-        // Other cameras have their own exposure. Views are in the order of arrival, which may
-        // differ from that of the stamps.
-        let before = self
-            .views_of_camera(&keyframe.camera)
-            .filter(|(_, other)| other.stamp <= keyframe.stamp)
-            .max_by_key(|(_, other)| other.stamp);
-        let after = self
-            .views_of_camera(&keyframe.camera)
-            .filter(|(_, other)| other.stamp > keyframe.stamp)
-            .min_by_key(|(_, other)| other.stamp);
-        before.into_iter().chain(after).map(|(ix, _)| ix).collect()
-    }
-
-    /// The views of a camera, with their indices.
-    fn views_of_camera(&self, camera: &str) -> impl Iterator<Item = (usize, &Arc<Keyframe>)> {
-        self.views
-            .keyframes()
-            .enumerate()
-            .filter(move |(_, keyframe)| keyframe.camera.as_ref() == camera)
     }
 
     /// Computes the gains of those views that `known` does not contain yet.
