@@ -3,9 +3,9 @@
 //! Alignment runs in parallel with training, once or repeatedly as keyframes arrive. Its result is
 //! applied a fixed number of steps after it began, so that a seed gives one result; in real time,
 //! it is applied when the caller asks for it ([`AlignedModel::poll_alignment`]), so that training
-//! never waits. Alignment from features, without depth, takes only seconds, so it precedes the first
-//! step if it runs once. A result that changes the corrections replaces the keyframes; the model
-//! moves along with them or restarts, see [`Method::recalibrate`].
+//! never waits. Alignment from features, without depth, takes only seconds, so it precedes the
+//! first step if it runs once. A result that changes the corrections replaces the keyframes; the
+//! model moves along with them or restarts, see [`Method::recalibrate`].
 
 use crate::checkpoint::{Checkpoint, PendingCheckpoint};
 use crate::corrected_keyframe::{CorrectedKeyframe, id_of};
