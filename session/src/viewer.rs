@@ -114,12 +114,9 @@ impl ModelViewer {
             return;
         }
         let ServedModel { method, edits, .. } = &mut self.models[0];
+        let method = method.model_mut();
         let model_from_page = &self.model_from_page;
-        let render = |request: &RenderRequest| {
-            method
-                .model_mut()
-                .render(&in_model(request, model_from_page))
-        };
+        let render = |request: &RenderRequest| method.render(&in_model(request, model_from_page));
         // The step has no effect, because the model does not change.
         let model = ModelState {
             step: 1,
