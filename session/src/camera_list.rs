@@ -9,7 +9,7 @@ use kinematics::{Stamp, Transform};
 use serde::{Deserialize, Serialize};
 use std::path::Path;
 use std::sync::Arc;
-use trainer::Method;
+use trainer::AlignedModel;
 use viz::KeyframePose;
 
 /// Name of the file in the run folder.
@@ -40,7 +40,7 @@ struct File {
 }
 
 /// The cameras of keyframes with the model's corrections applied.
-pub(crate) fn of_model(method: &mut dyn Method, keyframes: &[Arc<Keyframe>]) -> Vec<PosedCamera> {
+pub(crate) fn of_model(method: &mut AlignedModel, keyframes: &[Arc<Keyframe>]) -> Vec<PosedCamera> {
     let mut cameras = Vec::new();
     for keyframe in keyframes {
         // The list is an aid for viewers. An error, such as a lost GPU, must not prevent it.

@@ -12,7 +12,7 @@ use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
-use trainer::{Method, ModelKind, PendingCheckpoint};
+use trainer::{AlignedModel, ModelKind, PendingCheckpoint};
 
 /// Default time between two checkpoints: the training time that a killed process loses at most.
 /// Each checkpoint writes the whole state, so shorter periods write more to the disk.
@@ -131,7 +131,7 @@ struct WriterThread {
 /// A model in training, and the other contents of its checkpoint.
 pub struct Snapshot<'a> {
     /// The model.
-    pub method: &'a mut dyn Method,
+    pub method: &'a mut AlignedModel,
     /// All keyframes in the store, including test keyframes.
     pub keyframes: &'a [Arc<Keyframe>],
     /// Erased space.

@@ -10,7 +10,7 @@ use serde::Serialize;
 use sha2::{Digest, Sha256};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
-use trainer::{Method, Picture};
+use trainer::{AlignedModel, Picture};
 
 /// A saved model from which depth is rendered.
 #[derive(Clone, Debug)]
@@ -71,7 +71,7 @@ impl DepthSource {
             .collect();
         let n_all = Some(lacking.len());
         for (ix, keyframe) in lacking.iter_mut().enumerate() {
-            let filled = fill(model.as_mut(), keyframe)?;
+            let filled = fill(&mut model, keyframe)?;
             n_images += usize::from(filled.n_rendered > 0);
             totals = Filled {
                 n_missing: totals.n_missing + filled.n_missing,
@@ -140,7 +140,7 @@ struct Filled {
 
 /// Renders the missing depth of one keyframe at the resolution of its depth image, or of its color
 /// image if it has no depth.
-fn fill(model: &mut dyn Method, keyframe: &mut Arc<Keyframe>) -> crate::Result<Filled> {
+fn fill(model: &mut AlignedModel, keyframe: &mut Arc<Keyframe>) -> crate::Result<Filled> {
     // An image without depth gets an empty depth map with the lens and pose of its color image.
     let mut request_keyframe = keyframe.as_ref().clone();
     let depth = request_keyframe.depth.get_or_insert_with(|| DepthMap {

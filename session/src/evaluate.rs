@@ -15,7 +15,7 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::Duration;
 use trainer::eval::{Lpips, PixelPair, depth_rmse_m, psnr, ssim, surface_error};
-use trainer::{Method, Picture, Projection, RenderRequest};
+use trainer::{AlignedModel, Picture, Projection, RenderRequest};
 
 /// Environment variable with the path of the LPIPS weights, used if the flag is not given.
 const LPIPS_WEIGHTS: &str = "FIELDRIG_LPIPS_WEIGHTS";
@@ -154,7 +154,7 @@ impl Evaluator {
     /// Scores one test keyframe.
     pub fn score(
         &self,
-        method: &mut dyn Method,
+        method: &mut AlignedModel,
         keyframe: &Keyframe,
     ) -> crate::Result<ImageScores> {
         // Scoring on the GPU needs no read-back of the picture. Other scores need the pixels.
@@ -182,7 +182,7 @@ impl Evaluator {
     /// Scores one test keyframe. Errors name the keyframe.
     pub fn score_named(
         &self,
-        method: &mut dyn Method,
+        method: &mut AlignedModel,
         keyframe: &Keyframe,
     ) -> crate::Result<ImageScores> {
         self.score(method, keyframe)
@@ -196,9 +196,9 @@ impl Evaluator {
     ///   due.
     pub fn score_all<'a>(
         &self,
-        method: &mut dyn Method,
+        method: &mut AlignedModel,
         tests: impl Iterator<Item = &'a Arc<Keyframe>>,
-        mut meanwhile: impl FnMut(&mut dyn Method, usize),
+        mut meanwhile: impl FnMut(&mut AlignedModel, usize),
     ) -> crate::Result<Vec<ImageScores>> {
         // Two pictures per thread: one that is scored, and one that waits for it. More would only
         // use more memory.
@@ -255,7 +255,7 @@ impl Evaluator {
     /// Renders the pictures from which the scores of a keyframe are computed.
     fn draw<'a>(
         &self,
-        method: &mut dyn Method,
+        method: &mut AlignedModel,
         keyframe: &'a Keyframe,
     ) -> crate::Result<Drawn<'a>> {
         let mut depth = None;
@@ -438,13 +438,13 @@ fn mean(values: impl Iterator<Item = Option<f64>>) -> Option<f64> {
 /// Renders a model at the pose of a keyframe, with the model's background and the keyframe's
 /// rolling shutter and color gains.
 pub fn draw(
-    method: &mut dyn Method,
+    method: &mut AlignedModel,
     keyframe: &Keyframe,
     depth: bool,
 ) -> Result<Picture, trainer::Error> {
     let lens = method.calibrated_camera(keyframe)?;
-    let background_srgb = method.background_srgb();
-    let mut picture = method.render(&RenderRequest {
+    let background_srgb = method.model().background_srgb();
+    let mut picture = method.model_mut().render(&RenderRequest {
         depth,
         background_srgb,
         ..request(keyframe, &lens)
@@ -464,15 +464,15 @@ pub fn draw(
 /// Computes the PSNR of [`draw`]'s picture on the GPU, bit-identical to the PSNR of the picture on
 /// the host. `None` if the method does not support this, or if gains are applied after rendering.
 fn psnr_on_gpu(
-    method: &mut dyn Method,
+    method: &mut AlignedModel,
     keyframe: &Keyframe,
 ) -> Result<Option<f64>, trainer::Error> {
     let lens = method.calibrated_camera(keyframe)?;
     if lens.gains != [1.0; 3] {
         return Ok(None);
     }
-    let background_srgb = method.background_srgb();
-    method.psnr(
+    let background_srgb = method.model().background_srgb();
+    method.model_mut().psnr(
         &RenderRequest {
             background_srgb,
             ..request(keyframe, &lens)
@@ -484,7 +484,7 @@ fn psnr_on_gpu(
 /// Renders a model at the pose of a keyframe's depth image. Size and intrinsics come from `depth`,
 /// which may be a subsampled depth map. `None` for a keyframe without depth.
 pub fn render_depth(
-    method: &mut dyn Method,
+    method: &mut AlignedModel,
     keyframe: &Keyframe,
     depth: &DepthMap,
 ) -> Result<Option<Picture>, trainer::Error> {
@@ -493,7 +493,7 @@ pub fn render_depth(
         return Ok(None);
     };
     // Rendered from the depth camera: between two viewpoints, near objects hide different parts.
-    let drawn = method.render(&RenderRequest {
+    let drawn = method.model_mut().render(&RenderRequest {
         world_from_camera: lens.world_from_camera * color_from_depth,
         size_px: depth.size_px,
         projection: Projection::Pinhole {
@@ -538,13 +538,13 @@ fn request(keyframe: &Keyframe, lens: &CalibratedCamera) -> RenderRequest {
 
 /// Renders depth at the size at which the method can be compared with the measured depth.
 fn draw_depth<'a>(
-    method: &mut dyn Method,
+    method: &mut AlignedModel,
     keyframe: &'a Keyframe,
 ) -> crate::Result<Option<(Picture, Cow<'a, DepthMap>)>> {
     let Some(full) = &keyframe.depth else {
         return Ok(None);
     };
-    let stride = method.depth_stride();
+    let stride = method.model().depth_stride();
     let depth = if stride > 1 {
         Cow::Owned(full.subsampled(stride))
     } else {
@@ -555,7 +555,7 @@ fn draw_depth<'a>(
 
 /// Renders at the true pose, for the comparison with the noise-free image, which has no rolling
 /// shutter.
-fn draw_at_truth(method: &mut dyn Method, keyframe: &Keyframe) -> crate::Result<Option<Picture>> {
+fn draw_at_truth(method: &mut AlignedModel, keyframe: &Keyframe) -> crate::Result<Option<Picture>> {
     let Some(truth) = &keyframe.truth else {
         return Ok(None);
     };
@@ -563,8 +563,8 @@ fn draw_at_truth(method: &mut dyn Method, keyframe: &Keyframe) -> crate::Result<
         world_from_camera: truth.world_from_camera,
         ..method.calibrated_camera(keyframe)?
     };
-    let background_srgb = method.background_srgb();
-    Ok(Some(method.render(&RenderRequest {
+    let background_srgb = method.model().background_srgb();
+    Ok(Some(method.model_mut().render(&RenderRequest {
         shutter: None,
         background_srgb,
         ..request(keyframe, &lens)

@@ -55,7 +55,7 @@ pub fn load(gpu: Arc<Gpu>, model: &Path) -> crate::Result<LoadedModel> {
 /// * `path`: path of the model.
 #[must_use]
 pub fn note_if_empty(path: &Path, model: &LoadedModel) -> Option<String> {
-    let is_empty = model.method.progress().primitives == 0;
+    let is_empty = model.method.model().progress().primitives == 0;
     is_empty.then(|| empty_note(path, model.kind))
 }
 

@@ -12,7 +12,7 @@ use std::ffi::OsStr;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::{Duration, SystemTime, UNIX_EPOCH};
-use trainer::{Method, ModelKind};
+use trainer::{AlignedModel, ModelKind};
 
 /// File extension of recordings.
 const RECORDING_EXTENSION: &str = "mcap";
@@ -377,7 +377,7 @@ fn partial_model(folder: &Path) -> PathBuf {
 
 /// Saves a model and its edits in a temporary subfolder and moves its files into place once it is
 /// complete.
-pub fn save_model(method: &mut dyn Method, edits: &Edits, folder: &Path) -> crate::Result<()> {
+pub fn save_model(method: &mut AlignedModel, edits: &Edits, folder: &Path) -> crate::Result<()> {
     let partial_folder = partial_model(folder);
     // Left over if an earlier run was killed while saving. No other run saves now, because this one
     // has locked the folder.
@@ -387,7 +387,7 @@ pub fn save_model(method: &mut dyn Method, edits: &Edits, folder: &Path) -> crat
         if edits.is_empty() {
             Ok(())
         } else {
-            method.write_for_others(&partial_folder, edits)
+            method.model_mut().write_for_others(&partial_folder, edits)
         }
     });
     if let Err(error) = saved {

@@ -38,7 +38,7 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 use trainer::floaters::Floaters;
 use trainer::{
-    FailedModel, Method, ModelKind, Packing, Picture, Progress, QueuedPicture, RenderRequest,
+    AlignedModel, FailedModel, ModelKind, Packing, Picture, Progress, QueuedPicture, RenderRequest,
     Rendered,
 };
 use training_time::TrainingTime;
@@ -58,7 +58,7 @@ const MAX_LIVE_STEP_MILLIS: f64 = 300.0;
 
 /// A model in training.
 pub struct Session {
-    method: Box<dyn Method>,
+    method: AlignedModel,
     gpu: Arc<Gpu>,
     /// Points from which a new model without depth starts.
     initial_points: Option<Arc<InitialPoints>>,
@@ -80,7 +80,7 @@ impl Session {
     /// A session with a new model. Its clock does not run until [`Self::start_clock`].
     pub fn new(
         gpu: Arc<Gpu>,
-        (kind, method): (ModelKind, Box<dyn Method>),
+        (kind, method): (ModelKind, AlignedModel),
         evaluators: Evaluators,
         limits: Limits,
         observer: Box<dyn Observer>,
@@ -123,7 +123,7 @@ impl Session {
         } = self;
         initial_points
             .as_ref()
-            .is_none_or(|points| method.set_initial_points(points))
+            .is_none_or(|points| method.model_mut().set_initial_points(points))
     }
 
     /// Enables checkpoints.
@@ -237,7 +237,7 @@ impl Session {
         // store, and this one must be among them.
         self.hold(keyframe);
         self.method.push(keyframe.clone())?;
-        self.persistence.log_push(self.method.as_mut(), keyframe)
+        self.persistence.log_push(&mut self.method, keyframe)
     }
 
     /// Adds a keyframe without pushing it to the model, such as one that a resumed model was
@@ -260,32 +260,33 @@ impl Session {
         self.scoreboard.remove(camera, stamp);
         self.method.remove(camera, stamp)?;
         self.persistence
-            .log_removal(self.method.as_mut(), camera, stamp)
+            .log_removal(&mut self.method, camera, stamp)
     }
 
     /// Creates splats for the keyframes so far.
     pub fn seed(&mut self) -> crate::Result<()> {
         self.persistence.log_render();
-        Ok(self.method.seed()?)
+        Ok(self.method.model_mut().seed()?)
     }
 
     /// Draws a picture.
     pub fn render(&mut self, request: &RenderRequest) -> Result<Picture, trainer::Error> {
         self.persistence.log_render();
-        self.method.render(request)
+        self.method.model_mut().render(request)
     }
 
-    /// Starts to render a picture, packed if `packing` is given; see [`Method::queue_packed`].
+    /// Starts to render a picture, packed if `packing` is given; see
+    /// [`trainer::Method::queue_packed`].
     pub fn queue_picture(
         &mut self,
         request: &RenderRequest,
         packing: Option<Packing>,
     ) -> Result<QueuedPicture, trainer::Error> {
         self.persistence.log_render();
+        let model = self.method.model_mut();
         match packing {
-            Some(packing) => self.method.queue_packed(request, packing),
-            None => self
-                .method
+            Some(packing) => model.queue_packed(request, packing),
+            None => model
                 .render(request)
                 .map(|picture| QueuedPicture::ready(picture.into())),
         }
@@ -298,18 +299,19 @@ impl Session {
         request: &RenderRequest,
         packing: Option<Packing>,
     ) -> Result<Rendered, trainer::Error> {
+        let model = self.method.model_mut();
         match (queued.finish(&self.gpu)?, packing) {
             (Some(rendered), _) => Ok(rendered),
             // A buffer was too small for the queued picture. Rendering it again, with waiting,
             // grows the buffer.
-            (None, Some(packing)) => self.method.render_packed(request, packing),
-            (None, None) => self.method.render(request).map(Rendered::Picture),
+            (None, Some(packing)) => model.render_packed(request, packing),
+            (None, None) => model.render(request).map(Rendered::Picture),
         }
     }
 
     /// Publishes the chunks of the model if they are due. Returns the time spent.
     pub(crate) fn publish_chunks(&mut self, publisher: &mut ChunkPublisher) -> Duration {
-        publisher.publish(self.kind(), self.method.as_mut(), &self.edits)
+        publisher.publish(self.kind(), self.method.model_mut(), &self.edits)
     }
 
     /// Erased space, for pictures that viewers request.
@@ -327,7 +329,7 @@ impl Session {
             request,
             request.action(),
             &mut self.edits,
-            self.method.as_mut(),
+            self.method.model_mut(),
         )
     }
 
@@ -394,7 +396,7 @@ impl Session {
 
     /// Pauses or continues the growth of the model.
     pub(crate) fn pause_growth(&mut self, is_paused: bool) -> crate::Result<()> {
-        if self.method.pause_growth(is_paused)? {
+        if self.method.model_mut().pause_growth(is_paused)? {
             let Progress {
                 primitives,
                 step_millis,
@@ -405,7 +407,7 @@ impl Session {
                 "growth {change} at {primitives} splats: a step takes {step_millis:.0} ms, limit {MAX_LIVE_STEP_MILLIS} ms"
             );
             self.persistence
-                .log_growth_pause(self.method.as_mut(), is_paused)?;
+                .log_growth_pause(&mut self.method, is_paused)?;
         }
         Ok(())
     }
@@ -416,7 +418,7 @@ impl Session {
         let is_applied = self.method.poll_alignment(wait)?;
         if is_applied {
             self.refresh_corrections()?;
-            self.persistence.log_alignment(self.method.as_mut())?;
+            self.persistence.log_alignment(&mut self.method)?;
         }
         Ok(is_applied)
     }
@@ -434,14 +436,14 @@ impl Session {
     /// Reads the corrections that are optimized with the scene, for [`Self::camera_of`]. Waits for
     /// queued work.
     pub fn refresh_corrections(&mut self) -> crate::Result<()> {
-        self.learned = self.method.camera_corrections()?;
+        self.learned = self.camera_corrections()?;
         Ok(())
     }
 
     /// Corrections of cameras that were optimized with the scene; they follow those of
     /// [`Self::alignment`].
     pub fn camera_corrections(&mut self) -> crate::Result<BTreeMap<String, CameraCorrection>> {
-        Ok(self.method.camera_corrections()?)
+        Ok(self.method.model_mut().camera_corrections()?)
     }
 
     /// Trains for one time slice on a shared device, at most `max_steps` steps. Queued work is
@@ -536,7 +538,7 @@ impl Session {
 
     /// Drops the model on a failed device; [`Self::restart_on`] makes a new one.
     pub fn drop_model(&mut self) {
-        self.method = Box::new(FailedModel);
+        self.method = AlignedModel::unaligned(Box::new(FailedModel));
     }
 
     /// Restores the model on another device from the newest checkpoint or else from scratch.
@@ -564,7 +566,7 @@ impl Session {
         self.persistence.check_folders_when_due();
         let seconds = self.secs();
         self.persistence.write_checkpoint_when_due(Snapshot {
-            method: self.method.as_mut(),
+            method: &mut self.method,
             keyframes: &self.keyframes,
             edits: &self.edits,
             seconds,
@@ -630,13 +632,13 @@ impl Session {
     /// Runs work that does not count as training time.
     fn without_clock<T>(
         &mut self,
-        work: impl FnOnce(&Scoreboard, &mut dyn Method) -> crate::Result<T>,
+        work: impl FnOnce(&Scoreboard, &mut AlignedModel) -> crate::Result<T>,
     ) -> crate::Result<T> {
         // Steps that are still queued are training time, so they are completed first.
         self.gpu.wait()?;
         self.persistence.log_render();
         let before = Instant::now();
-        let done = work(&self.scoreboard, self.method.as_mut())?;
+        let done = work(&self.scoreboard, &mut self.method)?;
         // Work that `work` has queued is completed before its time is taken.
         self.gpu.wait()?;
         self.time.exclude(before.elapsed());
@@ -645,7 +647,7 @@ impl Session {
 
     /// Sets whether pictures are requested during training. If so, submits are shorter.
     pub fn set_watched(&mut self, watched: bool) {
-        self.method.set_watched(watched);
+        self.method.model_mut().set_watched(watched);
     }
 
     /// Scores the test keyframe with the oldest score, for the PSNR curve between scheduled
@@ -655,7 +657,7 @@ impl Session {
             return Ok(());
         };
         self.persistence.log_render();
-        let scores = Evaluator::psnr_only().score(self.method.as_mut(), &oldest)?;
+        let scores = Evaluator::psnr_only().score(&mut self.method, &oldest)?;
         self.scoreboard.record(&[scores], self.secs());
         Ok(())
     }
@@ -682,7 +684,7 @@ impl Session {
 
     /// The training progress.
     pub fn progress(&self) -> Progress {
-        self.method.progress()
+        self.method.model().progress()
     }
 }
 

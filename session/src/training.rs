@@ -46,7 +46,7 @@ pub fn train(
     let kind = plan.model_spec.kind;
     let mut method = plan.model_spec.start(gpu.clone())?;
     // Compiling kernels takes seconds and is not training.
-    method.prepare()?;
+    method.model_mut().prepare()?;
     let session = Session::new(
         gpu,
         (kind, method),

@@ -10,7 +10,7 @@ use model_files::{Aabb, Edits};
 use std::path::PathBuf;
 use std::sync::Arc;
 use std::time::Duration;
-use trainer::{Method, ModelKind, RenderRequest, Rendered};
+use trainer::{AlignedModel, Method, ModelKind, RenderRequest, Rendered};
 use viz::{
     Control, EditAction, EditRequest, Hub, KeyframePose, ModelStatus, PendingRender, Status,
 };
@@ -24,7 +24,7 @@ pub struct ServedModel {
     /// The method.
     pub kind: ModelKind,
     /// The model.
-    pub method: Box<dyn Method>,
+    pub method: AlignedModel,
     /// Erased space, in the model's world.
     pub edits: Arc<Edits>,
     /// Folder or file of the saved model. Only folders can hold edits.
@@ -117,6 +117,7 @@ impl ModelViewer {
             return;
         }
         let ServedModel { method, edits, .. } = &mut self.models[0];
+        let method = method.model_mut();
         let model_from_page = &self.model_from_page;
         let render = |request: &RenderRequest| method.render(&in_model(request, model_from_page));
         // The step has no effect, because the model does not change.
@@ -137,7 +138,8 @@ impl ModelViewer {
             ..
         } in &mut self.models
         {
-            self.chunk_publisher.publish(*kind, method.as_mut(), edits);
+            self.chunk_publisher
+                .publish(*kind, method.model_mut(), edits);
         }
     }
 
@@ -180,7 +182,7 @@ impl ModelViewer {
             action => action,
         };
         self.editor
-            .apply(request, &action, &mut model.edits, model.method.as_mut())
+            .apply(request, &action, &mut model.edits, model.method.model_mut())
     }
 
     /// Publishes the result of an edit, or sends the reason why it was not possible.
@@ -241,7 +243,7 @@ impl ModelViewer {
             Ok(model) => model,
             Err(reason) => return pending.fail(&reason),
         };
-        answer_with(pending, request, model.method.as_mut(), &model.edits);
+        answer_with(pending, request, model.method.model_mut(), &model.edits);
     }
 }
 
@@ -279,11 +281,12 @@ impl ServedModel {
         if !self.path.is_dir() {
             return format!("edits cannot be saved: {path} is not a model folder");
         }
+        let model = self.method.model_mut();
         let written = self
             .edits
             .write(&self.path)
             .map_err(trainer::Error::from)
-            .and_then(|()| self.method.write_for_others(&self.path, &self.edits));
+            .and_then(|()| model.write_for_others(&self.path, &self.edits));
         match written {
             Ok(()) => {
                 *saved = Arc::clone(&self.edits);

@@ -88,7 +88,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
         "{bar:30} {elapsed} scored {pos} of {len} images",
         args.json,
     );
-    let images = evaluator.score_all(model.as_mut(), tests.iter(), |_, n_scored| {
+    let images = evaluator.score_all(&mut model, tests.iter(), |_, n_scored| {
         scored.set_position(n_scored as u64)
     })?;
     scored.finish_and_clear();

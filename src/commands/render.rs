@@ -160,7 +160,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     for (ix, request) in requests.iter().enumerate() {
         // The request is timed alone: encoding and writing files are not part of drawing.
         let since = Instant::now();
-        let picture = model.render(&RenderRequest {
+        let picture = model.model_mut().render(&RenderRequest {
             edits: Arc::clone(&edits),
             ..request.clone()
         })?;

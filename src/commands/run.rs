@@ -430,7 +430,7 @@ pub(super) fn start(
     // Compile kernels before the first image, so that keyframes do not wait.
     models
         .iter_mut()
-        .try_for_each(|model| model.method.prepare())?;
+        .try_for_each(|model| model.method.model_mut().prepare())?;
     // Only now the devices, because their data is used from the first sample on.
     let device_notes = Notes::default();
     let Opened {

@@ -257,7 +257,7 @@ fn train(args: &Args, created: &mut CreatedFolders) -> anyhow::Result<Exit> {
         .then(|| models[0].method.n_total_steps())
         .transpose()?;
     // Like the limit, `step` excludes steps of rejected trials and steps before a restart.
-    let step = models[0].method.progress().step;
+    let step = models[0].method.model().progress().step;
     if let (Some(steps), Some(subject)) = (given_steps, &subject)
         && steps < step
     {
@@ -273,7 +273,7 @@ fn train(args: &Args, created: &mut CreatedFolders) -> anyhow::Result<Exit> {
     // Kernels are compiled now, so that the training time does not include it.
     models
         .iter_mut()
-        .try_for_each(|model| model.method.prepare())?;
+        .try_for_each(|model| model.method.model_mut().prepare())?;
     let kinds: Vec<ModelKind> = models.iter().map(|model| model.model_spec.kind).collect();
     // Folders are created only when nothing else can be refused.
     let folders = created.make_each(args.out(), &kinds, data.rig.as_ref())?;
@@ -621,7 +621,7 @@ impl Args {
     /// Logs in which ways the resumed run differs from an uninterrupted one.
     fn resumed(&self, resumed: Resumed) -> Resumed {
         let planned = resumed.model_spec.options.common.n_planned_steps;
-        let step = resumed.method.progress().step;
+        let step = resumed.method.model().progress().step;
         log::info!("continuing from step {step} of {planned} planned steps");
         if self.steps.is_some_and(|steps| steps > planned) {
             log::warn!(

@@ -183,7 +183,7 @@ fn in_page(cameras: Vec<KeyframePose>, model_from_page: &Transform) -> Vec<Keyfr
 /// Bounds of the first model that has any.
 fn bounds(models: &mut [LoadedModel]) -> anyhow::Result<Option<Bounds>> {
     for model in models {
-        if let Some(bounds) = model.method.bounds()? {
+        if let Some(bounds) = model.method.model_mut().bounds()? {
             return Ok(Some(bounds));
         }
     }
@@ -223,7 +223,7 @@ fn report(model: &Path) -> Value {
 fn model_status(path: &Path, model: &LoadedModel) -> ModelStatus {
     ModelStatus {
         edits: model.edits.len(),
-        ..trained_status(path, model.kind, &model.method.progress())
+        ..trained_status(path, model.kind, &model.method.model().progress())
     }
 }
 

@@ -1,24 +1,21 @@
-//! A scene model whose cameras are aligned while it trains.
+//! A scene model, and the alignment of its cameras while it trains.
 //!
 //! Alignment runs in parallel with training, once or repeatedly as keyframes arrive. Its result is
 //! applied a fixed number of steps after it began, so that a seed gives one result; in real time,
-//! it is applied when the caller asks for it ([`Method::poll_alignment`]), so that training never
-//! waits. Alignment from features, without depth, takes only seconds, so it precedes the first step
-//! if it runs once. A result that changes the corrections replaces the keyframes; the model moves
-//! along with them or restarts, see [`Recalibrate`].
+//! it is applied when the caller asks for it ([`AlignedModel::poll_alignment`]), so that training
+//! never waits. Alignment from features, without depth, takes only seconds, so it precedes the
+//! first step if it runs once. A result that changes the corrections replaces the keyframes; the
+//! model moves along with them or restarts, see [`Method::recalibrate`].
 
+use crate::corrected_keyframe::{CorrectedKeyframe, id_of};
 use crate::floaters::PendingFloaters;
-use crate::model_chunks::PendingChunks;
 use crate::model_metadata::{METADATA_FILE, read_metadata};
 use crate::model_options::{AlignTiming, CommonOptions};
 use crate::pending::PendingCheckpoint;
-use crate::{
-    Bounds, Error, Method, Packing, Picture, Progress, QueuedPicture, RenderRequest, Rendered,
-};
-use calibration::TrialReport;
+use crate::{Error, Method};
 use calibration::{
-    Alignment, AlignmentTask, CalibratedCamera, CameraCorrection, CameraRefinement,
-    MOVEMENT_WINDOW, MovementTask, alignment_step,
+    Alignment, AlignmentTask, CalibratedCamera, CameraRefinement, MOVEMENT_WINDOW, MovementTask,
+    alignment_step,
 };
 use gpu::{Gpu, PassTiming};
 use keyframe::{Keyframe, Split};
@@ -26,7 +23,7 @@ use kinematics::Stamp;
 use model_files::checkpoint::Checkpoint;
 use model_files::{Edits, InitialPoints};
 use serde::{Deserialize, Serialize};
-use std::collections::{BTreeMap, HashMap};
+use std::collections::BTreeMap;
 use std::path::Path;
 use std::sync::Arc;
 
@@ -45,55 +42,28 @@ const FIRST_LIVE_ALIGNMENT: usize = 25;
 /// cameras sooner, but needs more CPU time and restarts more models.
 const LIVE_ALIGNMENT_GROWTH: f64 = std::f64::consts::SQRT_2;
 
-/// A keyframe with its corrections before and after an alignment.
-#[derive(Clone, Debug)]
-pub struct CorrectedKeyframe {
-    /// As it was pushed.
-    pub before: Arc<Keyframe>,
-    /// With the new corrections.
-    pub after: Arc<Keyframe>,
-}
-
-/// Replaces a keyframe with its version after the corrections.
-pub(crate) fn replacement(keyframes: &[CorrectedKeyframe]) -> impl Fn(&mut Arc<Keyframe>) {
-    let after: HashMap<_, _> = keyframes
-        .iter()
-        .map(|keyframe| (id_of(&keyframe.before), &keyframe.after))
-        .collect();
-    move |keyframe| {
-        if let Some(after) = after.get(&id_of(keyframe)).copied() {
-            *keyframe = Arc::clone(after);
-        }
-    }
-}
-
-/// A model whose cameras can be corrected during training.
-pub trait Recalibrate: Method {
-    /// Replaces all keyframes pushed so far. The model moves along with its keyframes, or forgets
-    /// all training if it cannot be moved.
-    ///
-    /// * `keyframes`: in the order of their arrival, without test keyframes.
-    /// * `alignment`: the source of the new corrections.
-    fn recalibrate(
-        &mut self,
-        keyframes: &[CorrectedKeyframe],
-        alignment: &Alignment,
-    ) -> Result<(), Error>;
-}
-
 /// A resumed model, and the keyframes that it was not trained on.
-pub type ResumedModel = (Box<dyn Method>, Vec<Arc<Keyframe>>);
+pub type ResumedModel<M = Box<dyn Method>> = (M, Vec<Arc<Keyframe>>);
 
-/// A model with alignment of its keyframes' cameras.
-#[derive(Debug)]
-pub struct Aligned<M> {
-    model: M,
-    choice: CameraRefinement,
+/// A scene model, and the alignment of its keyframes' cameras if that is requested.
+///
+/// This type has the functions in which alignment takes part. Everything else is done by the model
+/// ([`Self::model_mut`]).
+pub struct AlignedModel {
+    model: Box<dyn Method>,
     alignment_task: AlignmentTask,
     /// The uncorrected keyframes in order of arrival, kept until alignment is done.
     original_keyframes: Vec<Arc<Keyframe>>,
-    /// Number of original keyframes when alignment began; `None` before that.
-    n_begun: Option<usize>,
+    /// Detection of movements; it has begun if `state.n_references` is given.
+    movement_task: Option<MovementTask>,
+    state: AlignedState,
+}
+
+/// The alignment state in a checkpoint.
+#[derive(Clone, Debug, Default, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+struct AlignedState {
+    choice: CameraRefinement,
     /// Number of steps from the start of alignment until its result is applied.
     alignment_steps: u64,
     /// Step at which the result of the running alignment is due.
@@ -104,91 +74,51 @@ pub struct Aligned<M> {
     /// Steps of the model before its last restart.
     n_steps_before_restart: u64,
     /// Whether movements of cameras are detected after the first alignment of a live run.
-    detects_movements: bool,
-    /// Stamp of the first keyframe, which may have been evicted since.
-    first_stamp: Option<Stamp>,
-    /// Detection of movements, and the number of original keyframes that are its references.
-    movements: Option<(MovementTask, usize)>,
-}
-
-/// The alignment state in a checkpoint.
-#[derive(Debug, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-struct AlignedState {
-    choice: CameraRefinement,
-    is_aligned: bool,
-    alignment: Option<Alignment>,
-    alignment_steps: u64,
-    due_step: Option<u64>,
-    timing: AlignTiming,
-    begins_at: usize,
-    n_steps_before_restart: u64,
     #[serde(default)]
     detects_movements: bool,
-    /// Stamp of the first keyframe, nanoseconds.
+    /// Stamp of the first keyframe, which may have been evicted since, nanoseconds.
     first_nanos: Option<i64>,
-    /// Number of reference keyframes of movement detection; `None` before it begins.
+    /// Number of original keyframes that are references of movement detection; `None` before it
+    /// begins.
     n_references: Option<usize>,
-    /// Camera and stamp of the keyframes, until alignment is done.
-    keyframes: Vec<(String, i64)>,
+    /// Number of original keyframes when alignment began; `None` before that.
     n_begun: Option<usize>,
+    /// Whether the alignment task is done. Only in checkpoints, like the next two fields.
+    is_aligned: bool,
+    /// Result of the alignment task.
+    alignment: Option<Alignment>,
+    /// Camera and stamp of the original keyframes.
+    keyframes: Vec<(String, i64)>,
 }
 
-fn id_of(keyframe: &Keyframe) -> (&str, i64) {
-    (&keyframe.camera, keyframe.stamp.0)
-}
-
-impl<M: Recalibrate + 'static> Aligned<M> {
-    /// A model whose keyframes are aligned as specified by `choice`; the result is applied early in
-    /// `n_planned_steps`.
-    pub fn new(
-        model: M,
-        choice: CameraRefinement,
-        is_software: bool,
-        n_planned_steps: u64,
-    ) -> Self {
+impl AlignedModel {
+    /// An untrained model, with the alignment that the options request. If it runs once, its result
+    /// is applied early in the planned steps.
+    pub fn new(model: Box<dyn Method>, common: &CommonOptions, is_software: bool) -> Self {
+        let is_live = common.align_timing != AlignTiming::Once;
         Self {
             model,
-            alignment_task: AlignmentTask::new(&choice),
-            choice,
+            alignment_task: AlignmentTask::new(&common.align),
             original_keyframes: Vec::new(),
-            n_begun: None,
-            alignment_steps: alignment_step(is_software, n_planned_steps),
-            due_step: None,
-            timing: AlignTiming::Once,
-            begins_at: 0,
-            n_steps_before_restart: 0,
-            detects_movements: false,
-            first_stamp: None,
-            movements: None,
+            movement_task: None,
+            state: AlignedState {
+                choice: common.align.clone(),
+                alignment_steps: alignment_step(is_software, common.n_planned_steps),
+                timing: common.align_timing,
+                begins_at: if is_live { FIRST_LIVE_ALIGNMENT } else { 0 },
+                detects_movements: common.detects_movements && is_live,
+                ..AlignedState::default()
+            },
         }
     }
 
-    /// Wraps the model with alignment if the options request it.
-    pub fn if_requested(model: M, common: &CommonOptions, gpu: &Gpu) -> Box<dyn Method> {
-        if common.align == CameraRefinement::default() {
-            return Box::new(model);
-        }
-        let begins_at = if common.align_timing == AlignTiming::Once {
-            0
-        } else {
-            FIRST_LIVE_ALIGNMENT
-        };
-        Box::new(Self {
-            timing: common.align_timing,
-            begins_at,
-            detects_movements: common.detects_movements && common.align_timing != AlignTiming::Once,
-            ..Self::new(
-                model,
-                common.align.clone(),
-                gpu.is_software(),
-                common.n_planned_steps,
-            )
-        })
+    /// A model without alignment.
+    pub fn unaligned(model: Box<dyn Method>) -> Self {
+        Self::new(model, &CommonOptions::default(), false)
     }
 
     /// A saved model, with the alignment stored in its folder.
-    pub fn load(model: M, folder: &Path) -> Result<Self, Error> {
+    pub fn load(model: Box<dyn Method>, folder: &Path) -> Result<Self, Error> {
         if !folder.join(METADATA_FILE).exists() {
             log::warn!(
                 "{} has no {METADATA_FILE}: the corrections of the cameras and the background of the model are unknown",
@@ -204,10 +134,9 @@ impl<M: Recalibrate + 'static> Aligned<M> {
                 unknown.join(", ")
             );
         }
-        let alignment_task = AlignmentTask::done(metadata.alignment);
         Ok(Self {
-            alignment_task,
-            ..Self::new(model, CameraRefinement::default(), false, 0)
+            alignment_task: AlignmentTask::done(metadata.alignment),
+            ..Self::unaligned(model)
         })
     }
 
@@ -220,8 +149,8 @@ impl<M: Recalibrate + 'static> Aligned<M> {
         checkpoint: &Checkpoint,
         keyframes: &[Arc<Keyframe>],
         placeholders: &[Arc<Keyframe>],
-        resume: impl FnOnce(&Checkpoint, &[Arc<Keyframe>]) -> Result<(M, Vec<Arc<Keyframe>>), Error>,
-    ) -> Result<ResumedModel, Error> {
+        resume: impl FnOnce(&Checkpoint, &[Arc<Keyframe>]) -> Result<ResumedModel, Error>,
+    ) -> Result<ResumedModel<Self>, Error> {
         // The model does not know the state of the alignment, so it is taken out first. A
         // checkpoint without it was written by a model that is not aligned.
         let mut own_checkpoint = checkpoint.clone();
@@ -231,27 +160,14 @@ impl<M: Recalibrate + 'static> Aligned<M> {
             .and_then(|state| state.remove(STATE_KEY))
         else {
             let (model, untrained) = resume(checkpoint, &[keyframes, placeholders].concat())?;
-            return Ok((Box::new(model), untrained));
+            return Ok((Self::unaligned(model), untrained));
         };
-        let AlignedState {
-            choice,
-            is_aligned,
-            alignment,
-            alignment_steps,
-            due_step,
-            timing,
-            begins_at,
-            n_steps_before_restart,
-            detects_movements,
-            first_nanos,
-            n_references,
-            keyframes: ids,
-            n_begun,
-        } = serde_json::from_value(state).map_err(invalid_state)?;
+        let mut state: AlignedState = serde_json::from_value(state).map_err(invalid_state)?;
+        let ids = std::mem::take(&mut state.keyframes);
         // Checkpoints do not contain a running alignment. It starts again from the same keyframes,
         // and its result is due at the same step, so the resumed run gives the same model.
-        let mut alignment_task = AlignmentTask::done(alignment);
-        if !is_aligned {
+        let mut alignment_task = AlignmentTask::done(state.alignment.take());
+        if !state.is_aligned {
             alignment_task.request_again();
         }
 
@@ -276,7 +192,8 @@ impl<M: Recalibrate + 'static> Aligned<M> {
                 .filter(|keyframe: &Arc<Keyframe>| !keyframe.rgba_srgb.is_empty())
         };
         let n_with_pixels = |n: usize| ids.iter().take(n).filter_map(with_pixels).count();
-        let [n_begun, n_references] = [n_begun, n_references].map(|n| n.map(n_with_pixels));
+        state.n_begun = state.n_begun.map(n_with_pixels);
+        state.n_references = state.n_references.map(n_with_pixels);
         let original_keyframes: Vec<_> = ids.iter().filter_map(with_pixels).collect();
 
         // Uncorrected, because `push` corrects them.
@@ -286,205 +203,30 @@ impl<M: Recalibrate + 'static> Aligned<M> {
             .collect();
         let mut aligned = Self {
             model,
-            choice,
             alignment_task,
             original_keyframes,
-            n_begun,
-            alignment_steps,
-            due_step,
-            timing,
-            begins_at,
-            n_steps_before_restart,
-            detects_movements,
-            first_stamp: first_nanos.map(Stamp),
-            movements: None,
+            movement_task: None,
+            state,
         };
-        if let Some(n_references) = n_references {
+        if let Some(n_references) = aligned.state.n_references {
             aligned.detect_movements(n_references);
         }
-        Ok((Box::new(aligned), untrained))
+        Ok((aligned, untrained))
     }
 
-    /// Starts alignment if it is requested and there are enough keyframes.
-    fn begin_alignment(&mut self) {
-        let n_keyframes = self.original_keyframes.len();
-        // If a checkpoint was written while alignment ran, the resumed run must start it even if
-        // keyframes were removed since.
-        let has_enough = self.n_begun.is_some() || n_keyframes >= self.begins_at;
-        if !self.alignment_task.is_requested() || !has_enough {
-            return;
-        }
-        // A resumed alignment must not use keyframes that arrived after it began.
-        let n_begun = *self.n_begun.get_or_insert(n_keyframes);
-        // The due step of a single alignment counts from the start of training, because all its
-        // keyframes are pushed before the first step.
-        let from = if self.timing == AlignTiming::Once {
-            0
-        } else {
-            self.model.progress().step
-        };
-        // In real time, no step is due: the caller polls for the result.
-        if self.timing != AlignTiming::RealTime {
-            self.due_step.get_or_insert(from + self.alignment_steps);
-        }
-        self.alignment_task
-            .begin(&self.original_keyframes[..n_begun], &self.choice);
+    /// The model, for everything in which alignment takes no part.
+    pub fn model(&self) -> &dyn Method {
+        self.model.as_ref()
     }
 
-    /// Applies the result of alignment at a fixed step, or when the model is idle.
-    fn finish_alignment_when_due(&mut self) -> Result<(), Error> {
-        let step = self.model.progress().step;
-        // An idle model may never reach the due step: a distance field has no steps left once it
-        // has fused all keyframes. Its result is applied at once.
-        let is_idle = step > 0 && self.model.is_idle() && self.is_awaited();
-        let is_due = is_idle || self.due_step.is_some_and(|due_step| step >= due_step);
-        if self.alignment_task.is_done() || !is_due {
-            return Ok(());
-        }
-        self.begin_alignment(); // A model that was resumed at this step has not started it.
-        self.finish_alignment()
+    /// The model, for everything in which alignment takes no part. It must be trained, and get its
+    /// keyframes, through [`Self::step`] and [`Self::push`] only.
+    pub fn model_mut(&mut self) -> &mut dyn Method {
+        self.model.as_mut()
     }
 
-    /// Waits for the result of alignment and applies it.
-    fn finish_alignment(&mut self) -> Result<(), Error> {
-        // `finish` replaces the result, but the model holds keyframes with the previous one.
-        let previous = AlignmentTask::done(self.alignment_task.result().cloned());
-        let is_changed = self.alignment_task.finish(&self.original_keyframes)?;
-        let n_begun = self.n_begun.take();
-        self.due_step = None;
-        // Live runs request the next alignment at once. It begins when enough keyframes have
-        // arrived.
-        if self.timing != AlignTiming::Once {
-            self.begins_at = next_live_alignment(self.original_keyframes.len());
-            self.alignment_task.request_again();
-        }
-        if is_changed {
-            self.recalibrate(&previous)?;
-        }
-        if self.detects_movements && self.alignment_task.result().is_some() {
-            match (&self.movements, n_begun) {
-                // The first alignment is trusted: movements are measured relative to the keyframes
-                // that it used.
-                (None, Some(n_begun)) => self.detect_movements(n_begun),
-                (Some((_, n_references)), _) if is_changed => {
-                    // The latest keyframes are tested again with the new corrections.
-                    let n_older =
-                        first_recent(&self.original_keyframes, MOVEMENT_WINDOW).max(*n_references);
-                    self.detect_movements(n_older);
-                }
-                _ => {}
-            }
-        }
-        // Nothing reads the originals after a single alignment, and they hold all pixels.
-        if self.timing == AlignTiming::Once {
-            self.original_keyframes.clear();
-        }
-        Ok(())
-    }
-
-    /// Replaces the keyframes with their newly corrected versions.
-    fn recalibrate(&mut self, previous: &AlignmentTask) -> Result<(), Error> {
-        let Some(alignment) = self.alignment_task.result() else {
-            return Ok(());
-        };
-        let keyframes: Vec<_> = self
-            .original_keyframes
-            .iter()
-            .map(|original| CorrectedKeyframe {
-                before: previous.corrected(original),
-                after: alignment.corrected(original),
-            })
-            .collect();
-        // A model that cannot move with its keyframes starts again from step 0. Its earlier steps
-        // stay part of the total, which limits and schedules of the session count.
-        let n_steps = self.model.n_total_steps()?;
-        self.model.recalibrate(&keyframes, alignment)?;
-        let n_forgotten = n_steps.wrapping_sub(self.model.n_total_steps()?);
-        if n_forgotten > 0 {
-            log::info!("training restarted with corrected cameras");
-        }
-        self.n_steps_before_restart += n_forgotten;
-        Ok(())
-    }
-
-    /// Detects movements from now on: the first `n_references` keyframes are references, later ones
-    /// are tested.
-    fn detect_movements(&mut self, n_references: usize) {
-        let corrected = |keyframe: &Arc<Keyframe>| self.alignment_task.corrected(keyframe);
-        let (references, later) = self.original_keyframes.split_at(n_references);
-        let mut task = MovementTask::new(references.iter().map(corrected).collect());
-        later
-            .iter()
-            .map(corrected)
-            .for_each(|keyframe| task.push(keyframe));
-        self.movements = Some((task, n_references));
-    }
-
-    /// Applies a movement if one was found. With `wait`, tests all keyframes first. Returns whether
-    /// a movement was applied. During an alignment, no keyframes are tested.
-    fn poll_movement(&mut self, wait: bool) -> Result<bool, Error> {
-        // A running alignment may change the corrections with which the task's keyframes were
-        // corrected. Detection starts again after it.
-        let (Some((task, _)), None) = (&mut self.movements, self.n_begun) else {
-            return Ok(false);
-        };
-        let Some(movement) = task.poll(wait)? else {
-            return Ok(false);
-        };
-        // Reports give the time since the first keyframe of the run.
-        let first = self.first_stamp.unwrap_or(Stamp(movement.since_nanos));
-        let previous = AlignmentTask::done(self.alignment_task.result().cloned());
-        self.alignment_task.add_movement(movement, first);
-        if let Some(movement) = self
-            .alignment_task
-            .result()
-            .and_then(|alignment| alignment.movements.last())
-        {
-            log::warn!("{movement}");
-        }
-        self.recalibrate(&previous)?;
-        // The next alignment begins now: it uses the images since the movement, too.
-        let n_keyframes = self.original_keyframes.len();
-        self.begins_at = n_keyframes;
-        // All keyframes are corrected now, so all of them can be references for the next movement.
-        self.detect_movements(n_keyframes);
-        Ok(true)
-    }
-
-    /// Whether the model must wait for an alignment before its result is final.
-    fn is_awaited(&self) -> bool {
-        match self.timing {
-            AlignTiming::Once => !self.alignment_task.is_done(),
-            AlignTiming::Lockstep => self.n_begun.is_some(),
-            AlignTiming::RealTime => false,
-        }
-    }
-
-    /// Whether alignment must end before the first step.
-    fn precedes_training(&self) -> bool {
-        // Alignment from features takes seconds, and wrong cameras would cost the model more.
-        // Registration with depth takes longer and runs beside training.
-        self.timing == AlignTiming::Once
-            && self.model.progress().step == 0
-            && self.alignment_task.is_requested()
-            && self
-                .original_keyframes
-                .iter()
-                .all(|keyframe| keyframe.depth.is_none())
-    }
-
-    /// Steps until the result of alignment is due.
-    fn steps_to_alignment(&self) -> u64 {
-        let step = self.model.progress().step;
-        match self.due_step {
-            Some(due_step) if !self.alignment_task.is_done() => due_step.saturating_sub(step),
-            _ => u64::MAX,
-        }
-    }
-}
-
-impl<M: Recalibrate + 'static> Method for Aligned<M> {
-    fn push(&mut self, keyframe: Arc<Keyframe>) -> Result<(), Error> {
+    /// Adds a keyframe; see [`Method::push`]. It may begin or end an alignment.
+    pub fn push(&mut self, keyframe: Arc<Keyframe>) -> Result<(), Error> {
         // Test keyframes must not influence the cameras. A single alignment that is done needs no
         // more keyframes. In live runs, the task is always requested again.
         let is_used =
@@ -497,22 +239,23 @@ impl<M: Recalibrate + 'static> Method for Aligned<M> {
                 .any(|known| id_of(known) == id_of(&keyframe));
         // In lockstep, the test of the previous keyframe must end before this one is corrected:
         // otherwise its correction would depend on the speed of the test.
-        if is_new && self.timing == AlignTiming::Lockstep {
+        if is_new && self.state.timing == AlignTiming::Lockstep {
             self.poll_movement(true)?;
         }
         let corrected = self.alignment_task.corrected(&keyframe);
         self.model.push(corrected.clone())?;
         if is_new {
-            self.first_stamp.get_or_insert(keyframe.stamp);
+            self.state.first_nanos.get_or_insert(keyframe.stamp.0);
             self.original_keyframes.push(keyframe);
-            if let Some((task, _)) = &mut self.movements {
+            if let Some(task) = &mut self.movement_task {
                 task.push(corrected);
             }
         }
         Ok(())
     }
 
-    fn remove(&mut self, camera: &str, stamp: Stamp) -> Result<(), Error> {
+    /// Removes a keyframe; see [`Method::remove`].
+    pub fn remove(&mut self, camera: &str, stamp: Stamp) -> Result<(), Error> {
         if let Some(ix) = self
             .original_keyframes
             .iter()
@@ -520,21 +263,16 @@ impl<M: Recalibrate + 'static> Method for Aligned<M> {
         {
             self.original_keyframes.remove(ix);
             // Both numbers count a prefix of the list, which just became shorter.
-            self.n_begun = self
-                .n_begun
-                .map(|n_begun| n_begun - usize::from(ix < n_begun));
-            if let Some((_, n_references)) = &mut self.movements {
-                *n_references -= usize::from(ix < *n_references);
+            for n in [&mut self.state.n_begun, &mut self.state.n_references] {
+                *n = n.map(|n| n - usize::from(ix < n));
             }
         }
         self.model.remove(camera, stamp)
     }
 
-    fn set_initial_points(&mut self, points: &Arc<InitialPoints>) -> bool {
-        self.model.set_initial_points(points)
-    }
-
-    fn step(&mut self, n: u64) -> Result<u64, Error> {
+    /// Queues up to `n` optimizer updates; see [`Method::step`]. Begins an alignment, or applies
+    /// its result, when that is due.
+    pub fn step(&mut self, n: u64) -> Result<u64, Error> {
         if self.precedes_training() {
             self.begin_alignment();
             self.finish_alignment()?;
@@ -545,25 +283,29 @@ impl<M: Recalibrate + 'static> Method for Aligned<M> {
         if n_steps > 0 {
             // After the first step, which itself needs much CPU time.
             self.begin_alignment();
-            if let (Some((task, _)), None) = (&mut self.movements, self.n_begun) {
+            if let (Some(task), None) = (&mut self.movement_task, self.state.n_begun) {
                 task.begin();
             }
         }
         Ok(n_steps)
     }
 
-    fn is_idle(&self) -> bool {
+    /// Whether further steps have no effect until a keyframe arrives.
+    pub fn is_idle(&self) -> bool {
         // While alignment is awaited, the caller must go on calling `step`, which applies the
         // result. Before the first step, there is nothing to train on, so waiting would not end.
         self.model.is_idle() && (!self.is_awaited() || self.model.progress().step == 0)
     }
 
-    fn poll_alignment(&mut self, wait: bool) -> Result<bool, Error> {
-        if self.timing != AlignTiming::RealTime {
+    /// In a live run, applies the result of an alignment in the background if it is ready, or waits
+    /// for it if `wait`. Returns whether a result was applied, which depends on timing unless
+    /// `wait` is set.
+    pub fn poll_alignment(&mut self, wait: bool) -> Result<bool, Error> {
+        if self.state.timing != AlignTiming::RealTime {
             return Ok(false);
         }
         // No alignment is running, so a movement may be found instead.
-        if self.n_begun.is_none() {
+        if self.state.n_begun.is_none() {
             return self.poll_movement(wait);
         }
         let is_ready = wait || self.alignment_task.has_result();
@@ -574,106 +316,30 @@ impl<M: Recalibrate + 'static> Method for Aligned<M> {
         Ok(is_ready)
     }
 
-    fn n_total_steps(&mut self) -> Result<u64, Error> {
-        Ok(self.n_steps_before_restart + self.model.n_total_steps()?)
+    /// Waits for queued updates and returns the total number of updates, including those before a
+    /// restart and those of rejected trials. Unlike [`Progress::step`](crate::Progress::step), it
+    /// never decreases.
+    pub fn n_total_steps(&mut self) -> Result<u64, Error> {
+        Ok(self.state.n_steps_before_restart + self.model.n_total_steps()?)
     }
 
-    fn seed(&mut self) -> Result<(), Error> {
-        self.model.seed()
-    }
-
-    fn prepare(&mut self) -> Result<(), Error> {
-        self.model.prepare()
-    }
-
-    fn render(&mut self, request: &RenderRequest) -> Result<Picture, Error> {
-        self.model.render(request)
-    }
-
-    fn render_packed(
-        &mut self,
-        request: &RenderRequest,
-        packing: Packing,
-    ) -> Result<Rendered, Error> {
-        self.model.render_packed(request, packing)
-    }
-
-    fn queue_packed(
-        &mut self,
-        request: &RenderRequest,
-        packing: Packing,
-    ) -> Result<QueuedPicture, Error> {
-        self.model.queue_packed(request, packing)
-    }
-
-    fn queue_chunks(
-        &mut self,
-        only_changed: bool,
-        edits: &Arc<Edits>,
-    ) -> Result<Option<PendingChunks>, Error> {
-        self.model.queue_chunks(only_changed, edits)
-    }
-
-    fn find_floaters(&mut self, edits: &Arc<Edits>) -> Result<PendingFloaters, Error> {
-        self.model.find_floaters(edits)
-    }
-
-    fn write_for_others(&mut self, folder: &Path, edits: &Edits) -> Result<(), Error> {
-        self.model.write_for_others(folder, edits)
-    }
-
-    fn set_watched(&mut self, watched: bool) {
-        self.model.set_watched(watched);
-    }
-
-    fn psnr(&mut self, request: &RenderRequest, keyframe: &Keyframe) -> Result<Option<f64>, Error> {
-        self.model.psnr(request, keyframe)
-    }
-
-    fn background_srgb(&self) -> [f32; 3] {
-        self.model.background_srgb()
-    }
-
-    fn depth_stride(&self) -> u32 {
-        self.model.depth_stride()
-    }
-
-    fn bounds(&mut self) -> Result<Option<Bounds>, Error> {
-        self.model.bounds()
-    }
-
-    fn camera_corrections(&mut self) -> Result<BTreeMap<String, CameraCorrection>, Error> {
-        self.model.camera_corrections()
-    }
-
-    fn calibrated_camera(&mut self, keyframe: &Keyframe) -> Result<CalibratedCamera, Error> {
+    /// The camera of a keyframe with the corrections of alignment, followed by those that the model
+    /// learned for the camera, but without those for single images.
+    pub fn calibrated_camera(&mut self, keyframe: &Keyframe) -> Result<CalibratedCamera, Error> {
         let learned = self.model.camera_corrections()?;
         Ok(self
             .alignment_task
             .calibrated_camera(keyframe, learned.get(&*keyframe.camera)))
     }
 
-    fn profile_step(&mut self) -> Result<Vec<PassTiming>, Error> {
-        self.model.profile_step()
-    }
-
-    fn alignment(&self) -> Option<&Alignment> {
+    /// Result of keyframe alignment; `None` until it is done, or if it was not requested or not
+    /// possible.
+    pub fn alignment(&self) -> Option<&Alignment> {
         self.alignment_task.result()
     }
 
-    fn pause_growth(&mut self, is_paused: bool) -> Result<bool, Error> {
-        self.model.pause_growth(is_paused)
-    }
-
-    fn progress(&self) -> Progress {
-        self.model.progress()
-    }
-
-    fn report(&self) -> Vec<TrialReport> {
-        self.model.report()
-    }
-
-    fn save(&mut self, folder: &Path) -> Result<(), Error> {
+    /// Writes the model and its alignment into an existing folder; see [`Method::save`].
+    pub fn save(&mut self, folder: &Path) -> Result<(), Error> {
         // The model writes its own metadata; the alignment is added to the same file afterwards.
         self.model.save(folder)?;
         let Some(alignment) = self.alignment_task.result() else {
@@ -701,28 +367,21 @@ impl<M: Recalibrate + 'static> Method for Aligned<M> {
         })
     }
 
-    fn checkpoint(&mut self) -> Result<PendingCheckpoint, Error> {
+    /// Takes a checkpoint of the model and its alignment; see [`Method::checkpoint`].
+    pub fn checkpoint(&mut self) -> Result<PendingCheckpoint, Error> {
+        // Without alignment, the checkpoint is that of the model.
+        if self.state.choice == CameraRefinement::default() && self.alignment().is_none() {
+            return self.model.checkpoint();
+        }
         let state = AlignedState {
-            choice: self.choice.clone(),
             is_aligned: self.alignment_task.is_done(),
             alignment: self.alignment_task.result().cloned(),
-            alignment_steps: self.alignment_steps,
-            due_step: self.due_step,
-            timing: self.timing,
-            begins_at: self.begins_at,
-            n_steps_before_restart: self.n_steps_before_restart,
-            detects_movements: self.detects_movements,
-            first_nanos: self.first_stamp.map(|stamp| stamp.0),
-            n_references: self
-                .movements
-                .as_ref()
-                .map(|(_, n_references)| *n_references),
             keyframes: self
                 .original_keyframes
                 .iter()
                 .map(|keyframe| (keyframe.camera.to_string(), keyframe.stamp.0))
                 .collect(),
-            n_begun: self.n_begun,
+            ..self.state.clone()
         };
         // The state of the alignment is captured now, with the state of the model. Only reading the
         // GPU buffers is deferred.
@@ -735,6 +394,186 @@ impl<M: Recalibrate + 'static> Method for Aligned<M> {
             }
             Ok(checkpoint)
         }))
+    }
+
+    /// Starts alignment if it is requested and there are enough keyframes.
+    fn begin_alignment(&mut self) {
+        let n_keyframes = self.original_keyframes.len();
+        // If a checkpoint was written while alignment ran, the resumed run must start it even if
+        // keyframes were removed since.
+        let has_enough = self.state.n_begun.is_some() || n_keyframes >= self.state.begins_at;
+        if !self.alignment_task.is_requested() || !has_enough {
+            return;
+        }
+        // A resumed alignment must not use keyframes that arrived after it began.
+        let n_begun = *self.state.n_begun.get_or_insert(n_keyframes);
+        // The due step of a single alignment counts from the start of training, because all its
+        // keyframes are pushed before the first step.
+        let from = if self.state.timing == AlignTiming::Once {
+            0
+        } else {
+            self.model.progress().step
+        };
+        // In real time, no step is due: the caller polls for the result.
+        if self.state.timing != AlignTiming::RealTime {
+            self.state
+                .due_step
+                .get_or_insert(from + self.state.alignment_steps);
+        }
+        self.alignment_task
+            .begin(&self.original_keyframes[..n_begun], &self.state.choice);
+    }
+
+    /// Applies the result of alignment at a fixed step, or when the model is idle.
+    fn finish_alignment_when_due(&mut self) -> Result<(), Error> {
+        let step = self.model.progress().step;
+        // An idle model may never reach the due step: a distance field has no steps left once it
+        // has fused all keyframes. Its result is applied at once.
+        let is_idle = step > 0 && self.model.is_idle() && self.is_awaited();
+        let is_due = is_idle || self.state.due_step.is_some_and(|due_step| step >= due_step);
+        if self.alignment_task.is_done() || !is_due {
+            return Ok(());
+        }
+        self.begin_alignment(); // A model that was resumed at this step has not started it.
+        self.finish_alignment()
+    }
+
+    /// Waits for the result of alignment and applies it.
+    fn finish_alignment(&mut self) -> Result<(), Error> {
+        // `finish` replaces the result, but the model holds keyframes with the previous one.
+        let previous = AlignmentTask::done(self.alignment_task.result().cloned());
+        let is_changed = self.alignment_task.finish(&self.original_keyframes)?;
+        let n_begun = self.state.n_begun.take();
+        self.state.due_step = None;
+        // Live runs request the next alignment at once. It begins when enough keyframes have
+        // arrived.
+        if self.state.timing != AlignTiming::Once {
+            self.state.begins_at = next_live_alignment(self.original_keyframes.len());
+            self.alignment_task.request_again();
+        }
+        if is_changed {
+            self.recalibrate(&previous)?;
+        }
+        if self.state.detects_movements && self.alignment_task.result().is_some() {
+            match (self.state.n_references, n_begun) {
+                // The first alignment is trusted: movements are measured relative to the keyframes
+                // that it used.
+                (None, Some(n_begun)) => self.detect_movements(n_begun),
+                (Some(n_references), _) if is_changed => {
+                    // The latest keyframes are tested again with the new corrections.
+                    let n_older =
+                        first_recent(&self.original_keyframes, MOVEMENT_WINDOW).max(n_references);
+                    self.detect_movements(n_older);
+                }
+                _ => {}
+            }
+        }
+        // Nothing reads the originals after a single alignment, and they hold all pixels.
+        if self.state.timing == AlignTiming::Once {
+            self.original_keyframes.clear();
+        }
+        Ok(())
+    }
+
+    /// Replaces the keyframes with their newly corrected versions.
+    fn recalibrate(&mut self, previous: &AlignmentTask) -> Result<(), Error> {
+        let Some(alignment) = self.alignment_task.result() else {
+            return Ok(());
+        };
+        let keyframes: Vec<_> = self
+            .original_keyframes
+            .iter()
+            .map(|original| CorrectedKeyframe {
+                before: previous.corrected(original),
+                after: alignment.corrected(original),
+            })
+            .collect();
+        // A model that cannot move with its keyframes starts again from step 0. Its earlier steps
+        // stay part of the total, which limits and schedules of the session count.
+        let n_steps = self.model.n_total_steps()?;
+        self.model.recalibrate(&keyframes, alignment)?;
+        let n_forgotten = n_steps.wrapping_sub(self.model.n_total_steps()?);
+        if n_forgotten > 0 {
+            log::info!("training restarted with corrected cameras");
+        }
+        self.state.n_steps_before_restart += n_forgotten;
+        Ok(())
+    }
+
+    /// Detects movements from now on: the first `n_references` keyframes are references, later ones
+    /// are tested.
+    fn detect_movements(&mut self, n_references: usize) {
+        let corrected = |keyframe: &Arc<Keyframe>| self.alignment_task.corrected(keyframe);
+        let (references, later) = self.original_keyframes.split_at(n_references);
+        let mut task = MovementTask::new(references.iter().map(corrected).collect());
+        later
+            .iter()
+            .map(corrected)
+            .for_each(|keyframe| task.push(keyframe));
+        self.movement_task = Some(task);
+        self.state.n_references = Some(n_references);
+    }
+
+    /// Applies a movement if one was found. With `wait`, tests all keyframes first. Returns whether
+    /// a movement was applied. During an alignment, no keyframes are tested.
+    fn poll_movement(&mut self, wait: bool) -> Result<bool, Error> {
+        // A running alignment may change the corrections with which the task's keyframes were
+        // corrected. Detection starts again after it.
+        let (Some(task), None) = (&mut self.movement_task, self.state.n_begun) else {
+            return Ok(false);
+        };
+        let Some(movement) = task.poll(wait)? else {
+            return Ok(false);
+        };
+        // Reports give the time since the first keyframe of the run.
+        let first = Stamp(self.state.first_nanos.unwrap_or(movement.since_nanos));
+        let previous = AlignmentTask::done(self.alignment_task.result().cloned());
+        self.alignment_task.add_movement(movement, first);
+        if let Some(movement) = self
+            .alignment_task
+            .result()
+            .and_then(|alignment| alignment.movements.last())
+        {
+            log::warn!("{movement}");
+        }
+        self.recalibrate(&previous)?;
+        // The next alignment begins now: it uses the images since the movement, too.
+        let n_keyframes = self.original_keyframes.len();
+        self.state.begins_at = n_keyframes;
+        // All keyframes are corrected now, so all of them can be references for the next movement.
+        self.detect_movements(n_keyframes);
+        Ok(true)
+    }
+
+    /// Whether the model must wait for an alignment before its result is final.
+    fn is_awaited(&self) -> bool {
+        match self.state.timing {
+            AlignTiming::Once => !self.alignment_task.is_done(),
+            AlignTiming::Lockstep => self.state.n_begun.is_some(),
+            AlignTiming::RealTime => false,
+        }
+    }
+
+    /// Whether alignment must end before the first step.
+    fn precedes_training(&self) -> bool {
+        // Alignment from features takes seconds, and wrong cameras would cost the model more.
+        // Registration with depth takes longer and runs beside training.
+        self.state.timing == AlignTiming::Once
+            && self.model.progress().step == 0
+            && self.alignment_task.is_requested()
+            && self
+                .original_keyframes
+                .iter()
+                .all(|keyframe| keyframe.depth.is_none())
+    }
+
+    /// Steps until the result of alignment is due.
+    fn steps_to_alignment(&self) -> u64 {
+        let step = self.model.progress().step;
+        match self.state.due_step {
+            Some(due_step) if !self.alignment_task.is_done() => due_step.saturating_sub(step),
+            _ => u64::MAX,
+        }
     }
 }
 
@@ -774,13 +613,16 @@ fn next_live_alignment(n: usize) -> usize {
 mod tests {
     use super::*;
     use crate::mean_color::MeanColor;
+    use crate::method_entry::boxed;
     use crate::model_options::ModelOptions;
     use crate::nerf::{NerfBudget, NerfModel, NerfOptions};
+    use crate::registry::ModelKind;
     use crate::splat::SplatTrainer;
     use crate::test_scenes as scenes;
     use crate::tsdf::TsdfModel;
     use calibration::ParamSet;
     use calibration::scenes::{Miscalibration, capture, remaining, wrong_extrinsics};
+    use gpu::Gpu;
     use gpu::testing::test_gpu;
     use kinematics::Transform;
     use nalgebra::Vector3;
@@ -813,10 +655,25 @@ mod tests {
         NerfModel::new(gpu.clone(), options).unwrap()
     }
 
-    type Resume<M> =
-        fn(Arc<Gpu>, &Checkpoint, &[Arc<Keyframe>]) -> Result<(M, Vec<Arc<Keyframe>>), Error>;
+    /// A model that is aligned once, at [`ALIGNMENT_STEP`].
+    fn aligned(model: impl Method + 'static, align: CameraRefinement) -> AlignedModel {
+        let common = CommonOptions {
+            align,
+            n_planned_steps: 4 * ALIGNMENT_STEP,
+            ..CommonOptions::default()
+        };
+        AlignedModel::new(Box::new(model), &common, true)
+    }
 
-    fn train(model: &mut dyn Method, n_steps: u64) {
+    fn mean_color() -> MeanColor {
+        MeanColor::new(ModelOptions::default())
+    }
+
+    fn step_of(model: &AlignedModel) -> u64 {
+        model.model().progress().step
+    }
+
+    fn train(model: &mut AlignedModel, n_steps: u64) {
         for _ in 0..n_steps {
             model.step(1).unwrap();
         }
@@ -827,36 +684,18 @@ mod tests {
         /// Steps after the first one that follows the correction.
         const RESTARTED: u64 = 1;
         let gpu = test_gpu();
-        check_correction(
-            &gpu,
-            tsdf(&gpu),
-            RESTARTED,
-            TsdfModel::resume,
-            TsdfModel::load,
-        );
-        check_correction(
-            &gpu,
-            nerf(&gpu),
-            ALIGNMENT_STEP + 1,
-            NerfModel::resume,
-            NerfModel::load,
-        );
-        check_correction(
-            &gpu,
-            MeanColor::new(ModelOptions::default()),
-            RESTARTED,
-            |_, checkpoint, keyframes| MeanColor::resume(checkpoint, keyframes),
-            |_, folder| MeanColor::load(folder),
-        );
+        check_correction(&gpu, "tsdf", tsdf(&gpu), RESTARTED);
+        check_correction(&gpu, "nerf", nerf(&gpu), ALIGNMENT_STEP + 1);
+        check_correction(&gpu, "mean-color", mean_color(), RESTARTED);
     }
 
-    fn check_correction<M: Recalibrate + 'static>(
+    fn check_correction(
         gpu: &Arc<Gpu>,
-        model: M,
+        method: &str,
+        model: impl Method + 'static,
         n_steps_after_correction: u64,
-        resume: Resume<M>,
-        load: fn(Arc<Gpu>, &Path) -> Result<M, Error>,
     ) {
+        let entry = ModelKind::from_name(method).unwrap().entry();
         let miscalibration = Miscalibration {
             extrinsics: wrong_extrinsics(),
             ..Miscalibration::none()
@@ -866,26 +705,19 @@ mod tests {
             .iter()
             .find(|keyframe| keyframe.split == Split::Test)
             .unwrap();
-        let mut uninterrupted = Aligned::new(
-            model,
-            CameraRefinement::Always(ParamSet::EXTRINSICS),
-            true,
-            4 * ALIGNMENT_STEP,
-        );
+        let mut uninterrupted = aligned(model, CameraRefinement::Always(ParamSet::EXTRINSICS));
         keyframes
             .iter()
             .for_each(|keyframe| uninterrupted.push(keyframe.clone()).unwrap());
         train(&mut uninterrupted, ALIGNMENT_STEP - 2);
         let early = uninterrupted.checkpoint().unwrap().finish().unwrap();
         train(&mut uninterrupted, 2);
-        assert!(
-            uninterrupted.alignment().is_none() && uninterrupted.progress().step == ALIGNMENT_STEP
-        );
+        assert!(uninterrupted.alignment().is_none() && step_of(&uninterrupted) == ALIGNMENT_STEP);
         let due = uninterrupted.checkpoint().unwrap().finish().unwrap();
         train(&mut uninterrupted, 1);
         assert_eq!(
             (
-                uninterrupted.progress().step,
+                step_of(&uninterrupted),
                 uninterrupted.n_total_steps().unwrap()
             ),
             (n_steps_after_correction, ALIGNMENT_STEP + 1)
@@ -900,8 +732,8 @@ mod tests {
         train(&mut uninterrupted, 2);
 
         let resumed = |checkpoint: &Checkpoint| {
-            Aligned::resume(checkpoint, &keyframes, &[], |own_checkpoint, keyframes| {
-                resume(gpu.clone(), own_checkpoint, keyframes)
+            AlignedModel::resume(checkpoint, &keyframes, &[], |own_checkpoint, keyframes| {
+                (entry.resume)(gpu.clone(), own_checkpoint, keyframes)
             })
             .unwrap()
         };
@@ -915,23 +747,22 @@ mod tests {
         untrained
             .into_iter()
             .for_each(|keyframe| interrupted.push(keyframe).unwrap());
-        train(&mut *interrupted, 3);
+        train(&mut interrupted, 3);
         let (mut interrupted, untrained) =
             resumed(&interrupted.checkpoint().unwrap().finish().unwrap());
         untrained
             .into_iter()
             .for_each(|keyframe| interrupted.push(keyframe).unwrap());
-        train(&mut *interrupted, 2);
-        let [uninterrupted_end, interrupted_end] =
-            [&mut uninterrupted as &mut dyn Method, &mut *interrupted]
-                .map(|model| model.checkpoint().unwrap().finish().unwrap());
+        train(&mut interrupted, 2);
+        let [uninterrupted_end, interrupted_end] = [&mut uninterrupted, &mut interrupted]
+            .map(|model| model.checkpoint().unwrap().finish().unwrap());
         assert_eq!(uninterrupted_end, interrupted_end);
 
         let (mut interrupted, untrained) = resumed(&due);
         untrained
             .into_iter()
             .for_each(|keyframe| interrupted.push(keyframe).unwrap());
-        train(&mut *interrupted, 3);
+        train(&mut interrupted, 3);
         assert_eq!(
             interrupted.checkpoint().unwrap().finish().unwrap(),
             uninterrupted_end,
@@ -940,8 +771,10 @@ mod tests {
 
         let folder = tempfile::tempdir().unwrap();
         uninterrupted.save(folder.path()).unwrap();
-        let loaded =
-            || Aligned::load(load(gpu.clone(), folder.path()).unwrap(), folder.path()).unwrap();
+        let loaded = || {
+            let model = (entry.load)(gpu.clone(), folder.path()).unwrap();
+            AlignedModel::load(model, folder.path()).unwrap()
+        };
         assert_eq!(
             loaded().calibrated_camera(test).unwrap(),
             correction.apply(test)
@@ -965,20 +798,13 @@ mod tests {
         let n_first = 2 * keyframes.len() / 3;
         for timing in [AlignTiming::Lockstep, AlignTiming::RealTime] {
             let choice = CameraRefinement::Always(ParamSet::EXTRINSICS);
-            let mut model = Aligned {
-                timing,
-                begins_at: n_first,
-                ..Aligned::new(
-                    MeanColor::new(ModelOptions::default()),
-                    choice,
-                    true,
-                    4 * ALIGNMENT_STEP,
-                )
-            };
+            let mut model = aligned(mean_color(), choice);
+            model.state.timing = timing;
+            model.state.begins_at = n_first;
             let correction =
-                |model: &dyn Method| model.alignment().unwrap().corrections["wrist"].clone();
+                |model: &AlignedModel| model.alignment().unwrap().corrections["wrist"].clone();
             let remaining_after =
-                |model: &dyn Method| remaining(&correction(model), &miscalibration.extrinsics);
+                |model: &AlignedModel| remaining(&correction(model), &miscalibration.extrinsics);
             let is_real_time = timing == AlignTiming::RealTime;
             keyframes[..n_first - 1]
                 .iter()
@@ -997,19 +823,19 @@ mod tests {
             );
             assert_eq!(model.poll_alignment(true).unwrap(), is_real_time);
             assert!(
-                model.progress().step < ALIGNMENT_STEP,
+                step_of(&model) < ALIGNMENT_STEP,
                 "the model must have restarted"
             );
             let (degrees, mm) = remaining_after(&model);
             assert!(degrees < 0.1 && mm < 1.0, "{degrees} degrees, {mm} mm");
-            let step = model.progress().step;
+            let step = step_of(&model);
             keyframes[n_first..]
                 .iter()
                 .for_each(|keyframe| model.push(keyframe.clone()).unwrap());
             let before = correction(&model);
             train(&mut model, ALIGNMENT_STEP + 2);
             assert_eq!(model.poll_alignment(true).unwrap(), is_real_time);
-            let has_restarted = model.progress().step < step + ALIGNMENT_STEP + 2;
+            let has_restarted = step_of(&model) < step + ALIGNMENT_STEP + 2;
             assert_eq!(
                 has_restarted,
                 correction(&model) != before,
@@ -1018,29 +844,20 @@ mod tests {
             let (degrees, mm) = remaining_after(&model);
             assert!(degrees < 0.05 && mm < 0.5, "{degrees} degrees, {mm} mm");
             train(&mut model, 3 * ALIGNMENT_STEP);
-            assert!(
-                model.progress().step > 2 * ALIGNMENT_STEP,
-                "no further alignment"
-            );
+            assert!(step_of(&model) > 2 * ALIGNMENT_STEP, "no further alignment");
             assert!(!model.poll_alignment(true).unwrap());
         }
     }
 
     /// A model without steps before its first alignment with `n` keyframes, which detects
     /// movements.
-    fn detecting(timing: AlignTiming, n: usize) -> Aligned<MeanColor> {
+    fn detecting(timing: AlignTiming, n: usize) -> AlignedModel {
         let choice = CameraRefinement::Always(ParamSet::EXTRINSICS);
-        Aligned {
-            timing,
-            begins_at: n,
-            detects_movements: true,
-            ..Aligned::new(
-                MeanColor::new(ModelOptions::default()),
-                choice,
-                true,
-                4 * ALIGNMENT_STEP,
-            )
-        }
+        let mut model = aligned(mean_color(), choice);
+        model.state.timing = timing;
+        model.state.begins_at = n;
+        model.state.detects_movements = true;
+        model
     }
 
     #[test]
@@ -1063,7 +880,7 @@ mod tests {
         let [before, after, right] =
             [error, motion.inverse() * error, Transform::identity()].map(scan);
         let keyframes = [&before[..MOVED_AT], &after[MOVED_AT..]].concat();
-        let train_on = |model: &mut dyn Method, keyframes: &[Arc<Keyframe>]| {
+        let train_on = |model: &mut AlignedModel, keyframes: &[Arc<Keyframe>]| {
             for keyframe in keyframes {
                 model.push(keyframe.clone()).unwrap();
                 train(model, 2);
@@ -1110,14 +927,15 @@ mod tests {
         let n_before = MOVED_AT + 2;
         train_on(&mut uninterrupted, &keyframes[N_FIRST..n_before]);
         let checkpoint = uninterrupted.checkpoint().unwrap().finish().unwrap();
-        let resume =
-            |own: &Checkpoint, keyframes: &[Arc<Keyframe>]| MeanColor::resume(own, keyframes);
+        let resume = |own: &Checkpoint, keyframes: &[Arc<Keyframe>]| {
+            MeanColor::resume(own, keyframes).map(boxed)
+        };
         let (mut resumed, untrained) =
-            Aligned::resume(&checkpoint, &keyframes[..n_before], &[], resume).unwrap();
+            AlignedModel::resume(&checkpoint, &keyframes[..n_before], &[], resume).unwrap();
         untrained
             .into_iter()
             .for_each(|keyframe| resumed.push(keyframe).unwrap());
-        let ends = [&mut uninterrupted as &mut dyn Method, &mut *resumed].map(|model| {
+        let ends = [&mut uninterrupted, &mut resumed].map(|model| {
             train_on(model, &keyframes[n_before..]);
             model.checkpoint().unwrap().finish().unwrap()
         });
@@ -1133,11 +951,11 @@ mod tests {
                 ..restored[ix].as_ref().clone()
             });
         }
-        let (mut recovered, _) = Aligned::resume(&checkpoint, &restored, &[], resume).unwrap();
+        let (mut recovered, _) = AlignedModel::resume(&checkpoint, &restored, &[], resume).unwrap();
         evicted
             .iter()
             .for_each(|ix| recovered.remove("wrist", keyframes[*ix].stamp).unwrap());
-        train_on(&mut *recovered, &keyframes[n_before..]);
+        train_on(&mut recovered, &keyframes[n_before..]);
         assert_eq!(recovered.alignment().unwrap().movements.len(), 1);
     }
 
@@ -1157,7 +975,7 @@ mod tests {
         let choice = CameraRefinement::Try(vec![ParamSet::EXTRINSICS]);
         let gpu = test_gpu();
         let splats = SplatTrainer::new(gpu, ModelOptions::default()).unwrap();
-        let mut model = Aligned::new(splats, choice, true, 4 * ALIGNMENT_STEP);
+        let mut model = aligned(splats, choice);
         keyframes
             .iter()
             .for_each(|keyframe| model.push(keyframe.clone()).unwrap());
@@ -1166,7 +984,7 @@ mod tests {
         let correction = model.alignment().unwrap().corrections["wrist"].clone();
         let (degrees, mm) = remaining(&correction, &miscalibration.extrinsics);
         assert!(degrees < 0.15 && mm < 4.0, "{degrees} degrees, {mm} mm");
-        assert_eq!(model.progress().step, 1, "no step was discarded");
+        assert_eq!(step_of(&model), 1, "no step was discarded");
         let test = keyframes
             .iter()
             .find(|keyframe| keyframe.split == Split::Test)
@@ -1182,21 +1000,16 @@ mod tests {
         let gpu = test_gpu();
         check_training_continues(tsdf(&gpu));
         check_training_continues(nerf(&gpu));
-        check_training_continues(MeanColor::new(ModelOptions::default()));
+        check_training_continues(mean_color());
     }
 
-    fn check_training_continues<M: Recalibrate + 'static>(model: M) {
-        let mut model = Aligned::new(
-            model,
-            CameraRefinement::Always(ParamSet::EXTRINSICS),
-            true,
-            4 * ALIGNMENT_STEP,
-        );
+    fn check_training_continues(model: impl Method + 'static) {
+        let mut model = aligned(model, CameraRefinement::Always(ParamSet::EXTRINSICS));
         assert!(model.is_idle());
         for keyframe in scenes::ring(&[scenes::floor()], nalgebra::Point3::origin(), 2) {
             model.push(keyframe).unwrap();
         }
-        while !model.is_idle() && model.progress().step < ALIGNMENT_STEP + 2 {
+        while !model.is_idle() && step_of(&model) < ALIGNMENT_STEP + 2 {
             model.step(1).unwrap();
         }
         assert!(
@@ -1204,6 +1017,6 @@ mod tests {
                 .alignment()
                 .is_none_or(|alignment| !alignment.has_corrections())
         );
-        assert!(model.progress().step > 0);
+        assert!(step_of(&model) > 0);
     }
 }

@@ -1,8 +1,8 @@
 //! Placeholder for a model whose GPU failed.
 
 use crate::pending::PendingCheckpoint;
-use crate::{Error, Method, Picture, Progress, RenderRequest};
-use calibration::{Alignment, CalibratedCamera, TrialReport};
+use crate::{CorrectedKeyframe, Error, Method, Picture, Progress, RenderRequest};
+use calibration::Alignment;
 use gpu::PassTiming;
 use keyframe::Keyframe;
 use kinematics::Stamp;
@@ -31,8 +31,6 @@ impl Method for FailedModel {
         true
     }
 
-    fn set_watched(&mut self, _: bool) {}
-
     fn n_total_steps(&mut self) -> Result<u64, Error> {
         Err(device_lost())
     }
@@ -49,7 +47,7 @@ impl Method for FailedModel {
         Err(device_lost())
     }
 
-    fn calibrated_camera(&mut self, _: &Keyframe) -> Result<CalibratedCamera, Error> {
+    fn recalibrate(&mut self, _: &[CorrectedKeyframe], _: &Alignment) -> Result<(), Error> {
         Err(device_lost())
     }
 
@@ -57,16 +55,8 @@ impl Method for FailedModel {
         Err(device_lost())
     }
 
-    fn alignment(&self) -> Option<&Alignment> {
-        None
-    }
-
     fn progress(&self) -> Progress {
         Progress::default()
-    }
-
-    fn report(&self) -> Vec<TrialReport> {
-        Vec::new()
     }
 
     fn save(&mut self, _: &Path) -> Result<(), Error> {

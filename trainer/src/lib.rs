@@ -11,6 +11,7 @@
 
 mod aligned;
 mod bounds;
+mod corrected_keyframe;
 mod error;
 pub mod eval;
 mod failed_model;
@@ -42,8 +43,9 @@ mod test_scenes;
 pub mod tsdf;
 mod view;
 
-pub use aligned::{Aligned, CorrectedKeyframe, Recalibrate, ResumedModel};
+pub use aligned::{AlignedModel, ResumedModel};
 pub use bounds::Bounds;
+pub use corrected_keyframe::CorrectedKeyframe;
 pub use error::Error;
 pub use failed_model::FailedModel;
 pub use method::{Method, Progress};

@@ -4,8 +4,8 @@ use crate::bounds::Bounds;
 use crate::floaters::PendingFloaters;
 use crate::model_chunks::PendingChunks;
 use crate::pending::PendingCheckpoint;
-use crate::{Error, Packing, Picture, QueuedPicture, RenderRequest, Rendered};
-use calibration::{Alignment, CalibratedCamera, CameraCorrection, TrialReport};
+use crate::{CorrectedKeyframe, Error, Packing, Picture, QueuedPicture, RenderRequest, Rendered};
+use calibration::{Alignment, CameraCorrection, TrialReport};
 use gpu::PassTiming;
 use keyframe::Keyframe;
 use kinematics::Stamp;
@@ -29,7 +29,8 @@ pub struct Progress {
 
 /// A scene model that trains on keyframes.
 ///
-/// Several models can share one device; each is owned by one thread.
+/// Several models can share one device; each is owned by one thread. The alignment of cameras is
+/// added by [`AlignedModel`](crate::AlignedModel).
 pub trait Method {
     /// Adds a keyframe. Test keyframes are used for evaluation only. The method checks the parts of
     /// the keyframe that it uses ([`Keyframe::check`]).
@@ -43,7 +44,7 @@ pub trait Method {
     fn set_initial_points(&mut self, _points: &Arc<InitialPoints>) -> bool {
         false
     }
-    /// Queues up to `n` optimizer updates, but at most 20 ms of GPU work (4 ms while watched,
+    /// Queues up to `n` optimizer updates, but at most 20 ms of GPU work (2 ms while watched,
     /// [`Method::set_watched`]). Returns the number of queued updates. At most one submit runs and
     /// one is queued.
     ///
@@ -57,14 +58,18 @@ pub trait Method {
     /// rejected trials. Unlike [`Progress::step`], it never decreases.
     fn n_total_steps(&mut self) -> Result<u64, Error>;
     /// Initializes the model from the keyframes added so far, so that it can be rendered without
-    /// training.
-    fn seed(&mut self) -> Result<(), Error>;
+    /// training. Does nothing if the model can be rendered only after training.
+    fn seed(&mut self) -> Result<(), Error> {
+        Ok(())
+    }
     /// Waits until all training kernels are compiled. Without this call, the first [`Method::step`]
     /// waits.
-    fn prepare(&mut self) -> Result<(), Error>;
+    fn prepare(&mut self) -> Result<(), Error> {
+        Ok(())
+    }
     /// Sets whether pictures are requested during training. If so, submits are shorter; the trained
     /// parameters are bit-identical either way.
-    fn set_watched(&mut self, watched: bool);
+    fn set_watched(&mut self, _watched: bool) {}
     /// Renders a picture. If the model is empty, first initializes it as [`Method::seed`] does.
     fn render(&mut self, request: &RenderRequest) -> Result<Picture, Error>;
     /// Renders a picture as [`Method::render`] does and packs it on the GPU, if the model and the
@@ -135,25 +140,23 @@ pub trait Method {
         Ok(None)
     }
     /// Corrections of cameras that were optimized with the scene, by name. They follow those of
-    /// [`Method::alignment`]. Waits for queued work.
+    /// alignment. Waits for queued work.
     fn camera_corrections(&mut self) -> Result<BTreeMap<String, CameraCorrection>, Error> {
         Ok(BTreeMap::new())
     }
-    /// The camera of a keyframe with the model's per-camera corrections, but without its per-image
-    /// corrections.
-    fn calibrated_camera(&mut self, keyframe: &Keyframe) -> Result<CalibratedCamera, Error>;
+    /// Replaces all keyframes pushed so far. The model moves along with its keyframes, or forgets
+    /// all training if it cannot be moved.
+    ///
+    /// * `keyframes`: in the order of their arrival, without test keyframes.
+    /// * `alignment`: the source of the new corrections.
+    fn recalibrate(
+        &mut self,
+        keyframes: &[CorrectedKeyframe],
+        alignment: &Alignment,
+    ) -> Result<(), Error>;
     /// Takes one step with timestamps around every pass; returns an empty list if the adapter does
     /// not support them.
     fn profile_step(&mut self) -> Result<Vec<PassTiming>, Error>;
-    /// Result of keyframe alignment; `None` until it is done, or if it was not requested or not
-    /// possible.
-    fn alignment(&self) -> Option<&Alignment>;
-    /// In a live run, applies the result of an alignment in the background if it is ready, or waits
-    /// for it if `wait`. Returns whether a result was applied, which depends on timing unless
-    /// `wait` is set.
-    fn poll_alignment(&mut self, _wait: bool) -> Result<bool, Error> {
-        Ok(false)
-    }
     /// Pauses or continues the growth of the model. Returns false if this changes nothing, or is
     /// not possible now.
     fn pause_growth(&mut self, _is_paused: bool) -> Result<bool, Error> {
@@ -162,7 +165,9 @@ pub trait Method {
     /// Progress of training.
     fn progress(&self) -> Progress;
     /// Reports of the trials, in the order in which they ran.
-    fn report(&self) -> Vec<TrialReport>;
+    fn report(&self) -> Vec<TrialReport> {
+        Vec::new()
+    }
     /// Writes the model into an existing folder. The files do not depend on the number of planned
     /// steps.
     fn save(&mut self, folder: &Path) -> Result<(), Error>;

@@ -7,16 +7,14 @@ use calibration::ParamSet;
 use gpu::Gpu;
 use keyframe::Keyframe;
 use model_files::checkpoint::Checkpoint;
-use serde_json::Value;
 use std::path::Path;
 use std::sync::Arc;
 
 /// Creates an untrained model.
 pub type StartModel = fn(Arc<Gpu>, &ModelOptions) -> Result<Box<dyn Method>, Error>;
 /// Restores a model from a checkpoint. The keyframes must include those that the model was trained
-/// on, except those that placeholders stand for (see [`Aligned::resume`](crate::Aligned::resume)).
-pub type ResumeModel =
-    fn(Arc<Gpu>, &Checkpoint, &[Arc<Keyframe>], &[Arc<Keyframe>]) -> Result<ResumedModel, Error>;
+/// on.
+pub type ResumeModel = fn(Arc<Gpu>, &Checkpoint, &[Arc<Keyframe>]) -> Result<ResumedModel, Error>;
 /// Loads a saved model from a folder or a single file.
 pub type LoadModel = fn(Arc<Gpu>, &Path) -> Result<Box<dyn Method>, Error>;
 
@@ -46,8 +44,8 @@ pub struct MethodEntry {
     pub learnable: ParamSet,
     /// Export formats, the preferred one first.
     pub exports: &'static [Export],
-    /// Default options of the method, as JSON.
-    pub default_options: fn() -> Value,
+    /// Default options of a model.
+    pub default_options: fn() -> ModelOptions,
     /// Fails if options are invalid.
     pub check_options: fn(&ModelOptions) -> Result<(), Error>,
     /// Creates an untrained model.
@@ -58,6 +56,11 @@ pub struct MethodEntry {
     pub resume: ResumeModel,
     /// Loads a saved model from its folder, or from a single file.
     pub load: LoadModel,
+}
+
+/// A resumed model of one method as a model of any method.
+pub(crate) fn boxed<M: Method + 'static>((model, untrained): ResumedModel<M>) -> ResumedModel {
+    (Box::new(model), untrained)
 }
 
 /// A type of file that holds a complete model.

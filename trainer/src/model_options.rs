@@ -13,16 +13,17 @@ pub trait MethodOptions: Serialize + DeserializeOwned + Default {
 }
 
 /// When the cameras of keyframes are aligned.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum AlignTiming {
     /// Once, with the keyframes that are known at the first step. The result is applied a fixed
     /// number of steps later, or before the first step if no keyframe has depth.
+    #[default]
     Once,
     /// Repeatedly as keyframes arrive. Results are applied a fixed number of steps later.
     Lockstep,
     /// Repeatedly as keyframes arrive. Results are applied by
-    /// [`Method::poll_alignment`](crate::Method::poll_alignment), so that training never waits for
+    /// [`poll_alignment`](crate::AlignedModel::poll_alignment), so that training never waits for
     /// them.
     RealTime,
 }
@@ -117,18 +118,14 @@ impl<S: MethodOptions> ModelOptions<S> {
     pub fn to_json(&self) -> ModelOptions {
         ModelOptions {
             common: self.common.clone(),
-            specific: json(&self.specific),
+            specific: serde_json::to_value(&self.specific).expect("options are plain data"),
         }
     }
 }
 
-/// Default options of a method, as JSON.
-pub(crate) fn default_options<S: MethodOptions>() -> Value {
-    json(&S::default())
-}
-
-fn json(options: &impl MethodOptions) -> Value {
-    serde_json::to_value(options).expect("options are plain data")
+/// Default options of a model of the method with the options `S`, as JSON.
+pub(crate) fn default_options<S: MethodOptions>() -> ModelOptions {
+    ModelOptions::<S>::default().to_json()
 }
 
 #[cfg(test)]

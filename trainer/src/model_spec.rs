@@ -2,7 +2,7 @@
 
 use crate::model_options::{CommonOptions, MethodOptions, ModelOptions};
 use crate::registry::ModelKind;
-use crate::{Error, Method};
+use crate::{AlignedModel, Error};
 use gpu::Gpu;
 use keyframe::Keyframe;
 use kinematics::Stamp;
@@ -27,7 +27,7 @@ pub struct Resumed {
     /// Method and options of the original training.
     pub model_spec: ModelSpec,
     /// The model.
-    pub method: Box<dyn Method>,
+    pub method: AlignedModel,
     /// Keyframes that the model was not trained on: test keyframes and new ones.
     pub untrained: Vec<Arc<Keyframe>>,
     /// Erased space.
@@ -42,7 +42,7 @@ pub struct LoadedModel {
     /// The method.
     pub kind: ModelKind,
     /// The model.
-    pub method: Box<dyn Method>,
+    pub method: AlignedModel,
     /// Erased space.
     pub edits: Edits,
 }
@@ -60,17 +60,15 @@ impl ModelSpec {
         common: CommonOptions,
         settings: &[(&str, Value)],
     ) -> Result<Self, Error> {
-        let mut specific = (kind.entry().default_options)();
+        let mut options = (kind.entry().default_options)();
+        options.common = common;
         for (name, value) in settings {
             // `get_mut` does not insert: an option that this method lacks stays absent.
-            if let Some(option) = specific.get_mut(name) {
+            if let Some(option) = options.specific.get_mut(name) {
                 *option = value.clone();
             }
         }
-        let model_spec = Self {
-            kind,
-            options: ModelOptions { common, specific },
-        };
+        let model_spec = Self { kind, options };
         model_spec.check()?;
         Ok(model_spec)
     }
@@ -108,8 +106,10 @@ impl ModelSpec {
     /// # Errors
     ///
     /// Fails if the options are invalid, or on an error of the GPU.
-    pub fn start(&self, gpu: Arc<Gpu>) -> Result<Box<dyn Method>, Error> {
-        (self.kind.entry().start)(gpu, &self.options)
+    pub fn start(&self, gpu: Arc<Gpu>) -> Result<AlignedModel, Error> {
+        let is_software = gpu.is_software();
+        let model = (self.kind.entry().start)(gpu, &self.options)?;
+        Ok(AlignedModel::new(model, &self.options.common, is_software))
     }
 }
 
@@ -171,7 +171,10 @@ fn resume_with(
     let options = ModelOptions::deserialize(options).map_err(|error| Error::CheckpointState {
         reason: format!("options: {error}"),
     })?;
-    let (method, untrained) = (kind.entry().resume)(gpu, checkpoint, keyframes, placeholders)?;
+    let (method, untrained) =
+        AlignedModel::resume(checkpoint, keyframes, placeholders, |own, keyframes| {
+            (kind.entry().resume)(gpu, own, keyframes)
+        })?;
     Ok(Resumed {
         model_spec: ModelSpec { kind, options },
         method,
@@ -189,10 +192,17 @@ pub fn load(gpu: Arc<Gpu>, model: &Path) -> Result<LoadedModel, Error> {
     let kind = ModelKind::of_saved(model)?.ok_or_else(|| Error::UnknownModel {
         path: model.to_owned(),
     })?;
+    let edits = Edits::read(model)?;
+    let method = (kind.entry().load)(gpu, model)?;
     Ok(LoadedModel {
         kind,
-        edits: Edits::read(model)?,
-        method: (kind.entry().load)(gpu, model)?,
+        edits,
+        // Only the folder of a saved model has an alignment.
+        method: if model.is_dir() {
+            AlignedModel::load(method, model)?
+        } else {
+            AlignedModel::unaligned(method)
+        },
     })
 }
 

@@ -37,7 +37,7 @@ impl ModelKind {
 
     /// Whether the method has an option of this name.
     pub fn has_option(self, name: &str) -> bool {
-        (self.0.default_options)().get(name).is_some()
+        (self.0.default_options)().specific.get(name).is_some()
     }
 
     /// The method of a saved model. `None` if it cannot be determined. For a folder, it is read

@@ -2,7 +2,9 @@
 
 use crate::model_options::ModelOptions;
 use crate::tsdf::TsdfOptions;
-use crate::{Projection, RenderRequest};
+use crate::{Method, Projection, RenderRequest};
+use calibration::CalibratedCamera;
+use keyframe::Keyframe;
 pub(crate) use keyframe::scenes::*;
 use kinematics::Transform;
 use std::sync::Arc;
@@ -13,6 +15,15 @@ pub(crate) fn options() -> ModelOptions<TsdfOptions> {
         noise_per_m2: Some(1e-4),
         ..TsdfOptions::default()
     })
+}
+
+/// The camera of a keyframe with the corrections that the model learned.
+pub(crate) fn calibrated_camera(model: &mut dyn Method, keyframe: &Keyframe) -> CalibratedCamera {
+    let corrections = model.camera_corrections().unwrap();
+    corrections.get(&*keyframe.camera).map_or_else(
+        || CalibratedCamera::of(keyframe),
+        |correction| correction.apply(keyframe),
+    )
 }
 
 pub(crate) fn request(world_from_camera: Transform) -> RenderRequest {

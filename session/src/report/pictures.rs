@@ -8,7 +8,7 @@ use kinematics::f32s_of;
 use kinematics::quantile::trimmed_range;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
-use trainer::{Method, Picture};
+use trainer::{AlignedModel, Picture};
 
 /// Maximum number of test images shown. Each one is rendered again for the page, and adds to its
 /// size.
@@ -66,7 +66,7 @@ pub(crate) struct Scored<'a> {
 /// Renders an evenly spread selection of test images, including the best and the worst, in the
 /// order of `scored`.
 pub(crate) fn compare(
-    method: &mut dyn Method,
+    method: &mut AlignedModel,
     scored: &[Scored<'_>],
 ) -> crate::Result<Vec<Comparison>> {
     let started = Instant::now();
@@ -122,7 +122,7 @@ fn selected(psnr: &[f64]) -> Vec<usize> {
 }
 
 impl Comparison {
-    fn of(method: &mut dyn Method, scored: &Scored<'_>) -> crate::Result<Self> {
+    fn of(method: &mut AlignedModel, scored: &Scored<'_>) -> crate::Result<Self> {
         let keyframe = scored.keyframe;
         let rendered = evaluate::draw(method, keyframe, true)?;
         let [size_px, small_px] =

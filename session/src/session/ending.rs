@@ -11,7 +11,7 @@ use model_files::Edits;
 use serde::Serialize;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
-use trainer::{Method, ModelKind};
+use trainer::{AlignedModel, ModelKind};
 use viz::Hub;
 
 /// A trained model that has been saved and scored and is still in GPU memory.
@@ -19,7 +19,7 @@ pub struct FinishedModel {
     /// The method.
     pub kind: ModelKind,
     /// The model.
-    pub method: Box<dyn Method>,
+    pub method: AlignedModel,
     /// Erased space.
     pub edits: Arc<Edits>,
     /// Folder of the saved model.
@@ -203,8 +203,8 @@ impl Session {
     /// Saves the model, in a temporary folder if `out` cannot be written. `seconds`: training time.
     fn save(&mut self, out: &Path, seconds: f64) -> crate::Result<Saved> {
         self.persistence.check_folders();
-        self.persistence.end_decisions(self.method.as_mut())?;
-        let progress = self.method.progress();
+        self.persistence.end_decisions(&mut self.method)?;
+        let progress = self.progress();
         if progress.step > 0 && progress.primitives == 0 {
             log::warn!("the model is empty: no observation could be used");
         }
@@ -214,13 +214,13 @@ impl Session {
         let is_live = self.persistence.keeps_keyframes();
         let is_finished = self.is_over() || (self.is_idle() && !is_live);
         let checkpoint = self.persistence.take_last_checkpoint(Snapshot {
-            method: self.method.as_mut(),
+            method: &mut self.method,
             keyframes: &self.keyframes,
             edits: &self.edits,
             seconds,
             is_finished,
         });
-        let saved = run_folder::save_model(self.method.as_mut(), &self.edits, out)
+        let saved = run_folder::save_model(&mut self.method, &self.edits, out)
             .and_then(|()| run_folder::checkpoint_sha256(out));
         // The checkpoint is written after the model: if the disk has no space for both, the model
         // is the more important one.
@@ -240,7 +240,7 @@ impl Session {
 
     /// Saves the model in a temporary folder, because its run folder could not be written.
     fn save_elsewhere(&mut self, out: &Path, save_error: crate::Error) -> crate::Result<Saved> {
-        match save_in_fallback_folder(self.method.as_mut(), &self.edits) {
+        match save_in_fallback_folder(&mut self.method, &self.edits) {
             Ok((folder, sha256)) => {
                 let context = format!(
                     "cannot save the model in {}; it was saved in {}",
@@ -268,7 +268,7 @@ impl Session {
     /// Writes the list of camera poses with the model's corrections. Without this list, a viewer
     /// starts with an outside view of the model.
     fn write_cameras(&mut self, out: &Path) {
-        let cameras = camera_list::of_model(self.method.as_mut(), &self.keyframes);
+        let cameras = camera_list::of_model(&mut self.method, &self.keyframes);
         if let Err(error) = camera_list::write(out, &cameras) {
             log::warn!("{} was not written: {error:#}", camera_list::FILE);
         }
@@ -284,21 +284,21 @@ impl Session {
         hub: Option<&Hub>,
     ) -> crate::Result<FinishedModel> {
         let outcome = self.score_at_end(seconds, hub)?;
-        let method = self.method.as_mut();
+        let method = &mut self.method;
         // Rendered before profiling, because profiling trains the model further.
         let comparisons =
             self.reporter
                 .compare(method, self.scoreboard.tests(), &outcome.per_image);
-        let passes = self.reporter.profile(method)?;
+        let passes = self.reporter.profile(method.model_mut())?;
         self.reporter.report_end(ScoredModel {
             out,
             checkpoint_sha256,
             outcome: &outcome,
             comparisons,
             passes,
-            cameras: method.camera_corrections()?,
+            cameras: method.model_mut().camera_corrections()?,
             alignment: method.alignment(),
-            trials: method.report(),
+            trials: method.model().report(),
             adapter: self.gpu.describe(),
             details,
         })?;
@@ -326,10 +326,10 @@ impl Session {
         };
         let per_image = self
             .scoreboard
-            .score_all(self.method.as_mut(), |method, n_scored| {
+            .score_all(&mut self.method, |method, n_scored| {
                 work.advance(method, n_scored);
             })?;
-        let progress = self.method.progress();
+        let progress = self.progress();
         Ok(TrainingOutcome {
             seconds,
             steps: progress.step,
@@ -344,7 +344,7 @@ impl Session {
 
 /// Saves a model in a new temporary folder. Returns the folder and the checksum of the model.
 fn save_in_fallback_folder(
-    method: &mut dyn Method,
+    method: &mut AlignedModel,
     edits: &Edits,
 ) -> crate::Result<(PathBuf, String)> {
     let folder = run_folder::make_fallback_folder()?;
@@ -366,7 +366,7 @@ struct WorkDuringScoring<'a> {
 
 impl WorkDuringScoring<'_> {
     /// Reports that `n_scored` images are scored, and draws at most one picture.
-    fn advance(&mut self, method: &mut dyn Method, n_scored: usize) {
+    fn advance(&mut self, method: &mut AlignedModel, n_scored: usize) {
         // Called often, also without progress, so that viewers do not wait for the next score.
         if self.n_reported.replace(n_scored) != Some(n_scored) {
             let n_all = self.n_all;
@@ -388,7 +388,7 @@ impl WorkDuringScoring<'_> {
                         "cannot render {other} while {scored_method} is scored; try again later"
                     ));
                 }
-                None => viewer::answer(pending, method, self.edits),
+                None => viewer::answer(pending, method.model_mut(), self.edits),
             }
         }
     }

@@ -11,7 +11,7 @@ use kinematics::Stamp;
 use model_files::checkpoint::Checkpoint;
 use std::path::Path;
 use std::sync::Arc;
-use trainer::{Method, Resumed};
+use trainer::{AlignedModel, Resumed};
 
 /// Checkpoints, decision log and recovery data of a session.
 #[derive(Default)]
@@ -60,7 +60,7 @@ impl Persistence {
     /// Logs that a keyframe was pushed to the model.
     pub(super) fn log_push(
         &mut self,
-        method: &mut dyn Method,
+        method: &mut AlignedModel,
         keyframe: &Arc<Keyframe>,
     ) -> crate::Result<()> {
         if let Some(decisions) = &mut self.decisions {
@@ -72,7 +72,7 @@ impl Persistence {
     /// Logs that a keyframe was removed from the model.
     pub(super) fn log_removal(
         &mut self,
-        method: &mut dyn Method,
+        method: &mut AlignedModel,
         camera: &str,
         stamp: Stamp,
     ) -> crate::Result<()> {
@@ -83,7 +83,7 @@ impl Persistence {
     }
 
     /// Logs that the result of an alignment was applied.
-    pub(super) fn log_alignment(&mut self, method: &mut dyn Method) -> crate::Result<()> {
+    pub(super) fn log_alignment(&mut self, method: &mut AlignedModel) -> crate::Result<()> {
         if let Some(decisions) = &mut self.decisions {
             decisions.aligned(method.n_total_steps()?);
         }
@@ -93,7 +93,7 @@ impl Persistence {
     /// Logs that growth was paused or continued.
     pub(super) fn log_growth_pause(
         &mut self,
-        method: &mut dyn Method,
+        method: &mut AlignedModel,
         is_paused: bool,
     ) -> crate::Result<()> {
         if let Some(decisions) = &mut self.decisions {
@@ -118,7 +118,7 @@ impl Persistence {
     }
 
     /// Ends the decision log. Write errors are logged.
-    pub(super) fn end_decisions(&mut self, method: &mut dyn Method) -> crate::Result<()> {
+    pub(super) fn end_decisions(&mut self, method: &mut AlignedModel) -> crate::Result<()> {
         if let Some(decisions) = self.decisions.take()
             && let Err(error) = decisions.end(method.n_total_steps()?)
         {
@@ -244,7 +244,7 @@ impl Persistence {
         &mut self,
         gpu: &Arc<Gpu>,
         keyframes: &[Arc<Keyframe>],
-    ) -> crate::Result<Box<dyn Method>> {
+    ) -> crate::Result<AlignedModel> {
         let Some(recovery) = &self.recovery else {
             keyframe::bail!("this run cannot continue on another device")
         };
@@ -260,7 +260,7 @@ impl Persistence {
             None => (recovery.model_spec.start(gpu.clone())?, held.clone()),
         };
         // Kernels are compiled here, so that this time does not count as training time.
-        method.prepare()?;
+        method.model_mut().prepare()?;
         // Evictions since the checkpoint are repeated. Keyframes that the model was not trained on
         // are not in its store.
         for keyframe in self

@@ -15,7 +15,7 @@ use serde::Serialize;
 use std::collections::BTreeMap;
 use std::path::Path;
 use std::sync::Arc;
-use trainer::{Method, ModelKind, Progress};
+use trainer::{AlignedModel, Method, ModelKind, Progress};
 
 /// The content of `report.json`.
 #[derive(Debug, Serialize)]
@@ -168,7 +168,7 @@ impl Reporter {
     /// order.
     pub(super) fn compare<'a>(
         &self,
-        method: &mut dyn Method,
+        method: &mut AlignedModel,
         tests: impl Iterator<Item = &'a Arc<Keyframe>>,
         scores: &[ImageScores],
     ) -> crate::Result<Vec<report::Comparison>> {

@@ -8,7 +8,7 @@ use kinematics::Stamp;
 use std::collections::{BTreeMap, VecDeque};
 use std::sync::Arc;
 use std::time::Duration;
-use trainer::Method;
+use trainer::AlignedModel;
 
 /// Maximum time of one scheduled evaluation, during which nothing is trained. In a long run, the
 /// allowed fraction of the training time would permit evaluations of many minutes.
@@ -159,7 +159,7 @@ impl Scoreboard {
     /// Scores a test keyframe for a scheduled evaluation.
     pub(super) fn score(
         &self,
-        method: &mut dyn Method,
+        method: &mut AlignedModel,
         keyframe: &Keyframe,
     ) -> crate::Result<ImageScores> {
         self.evaluators
@@ -175,8 +175,8 @@ impl Scoreboard {
     /// Scores all test keyframes at the end of training; see [`Evaluator::score_all`].
     pub(super) fn score_all(
         &self,
-        method: &mut dyn Method,
-        meanwhile: impl FnMut(&mut dyn Method, usize),
+        method: &mut AlignedModel,
+        meanwhile: impl FnMut(&mut AlignedModel, usize),
     ) -> crate::Result<Vec<ImageScores>> {
         self.evaluators
             .at_end

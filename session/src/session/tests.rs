@@ -1,12 +1,11 @@
 //! Checks that scoring image by image gives the same result as scoring all images at once.
 
 use super::*;
-use calibration::{CalibratedCamera, TrialReport};
 use gpu::{GpuOptions, PassTiming};
 use keyframe::Split;
 use kinematics::Transform;
 use std::path::Path;
-use trainer::{Error, PendingCheckpoint};
+use trainer::{CorrectedKeyframe, Error, Method, PendingCheckpoint};
 
 const SIZE_PX: [u32; 2] = [4, 2];
 const N_TESTS: u8 = 5;
@@ -41,16 +40,6 @@ impl Method for Gray {
         Ok(self.level.into())
     }
 
-    fn seed(&mut self) -> Result<(), Error> {
-        Ok(())
-    }
-
-    fn prepare(&mut self) -> Result<(), Error> {
-        Ok(())
-    }
-
-    fn set_watched(&mut self, _watched: bool) {}
-
     fn render(&mut self, request: &RenderRequest) -> Result<Picture, Error> {
         self.n_drawn.set(self.n_drawn.get() + 1);
         assert!(!request.depth, "PSNR needs no depth");
@@ -62,16 +51,12 @@ impl Method for Gray {
         })
     }
 
-    fn calibrated_camera(&mut self, keyframe: &Keyframe) -> Result<CalibratedCamera, Error> {
-        Ok(CalibratedCamera::of(keyframe))
+    fn recalibrate(&mut self, _: &[CorrectedKeyframe], _: &Alignment) -> Result<(), Error> {
+        Ok(())
     }
 
     fn profile_step(&mut self) -> Result<Vec<PassTiming>, Error> {
         Ok(Vec::new())
-    }
-
-    fn alignment(&self) -> Option<&Alignment> {
-        None
     }
 
     fn progress(&self) -> Progress {
@@ -79,10 +64,6 @@ impl Method for Gray {
             step: self.level.into(),
             ..Progress::default()
         }
-    }
-
-    fn report(&self) -> Vec<TrialReport> {
-        Vec::new()
     }
 
     fn save(&mut self, _folder: &Path) -> Result<(), Error> {
@@ -129,7 +110,10 @@ fn session_with_evaluation_due(stop: &Stop) -> (Session, std::rc::Rc<std::cell::
     let gpu = Gpu::open(&GpuOptions::default()).expect("an adapter");
     let mut session = Session::new(
         gpu,
-        (ModelKind::default(), Box::new(method)),
+        (
+            ModelKind::default(),
+            AlignedModel::unaligned(Box::new(method)),
+        ),
         evaluators,
         Limits::default(),
         Box::new(()),
@@ -187,7 +171,7 @@ fn stepwise_scoring_equals_scoring_at_once() {
 #[test]
 fn scoring_in_parallel_equals_scoring_one_by_one() {
     let tests: Vec<Arc<Keyframe>> = (0..50).map(test_keyframe).collect();
-    let mut method = Gray::default();
+    let mut method = AlignedModel::unaligned(Box::new(Gray::default()));
     let mut reported = Vec::new();
     let evaluator = Evaluator::psnr_only();
     let at_once = evaluator

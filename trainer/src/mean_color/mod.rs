@@ -4,15 +4,12 @@
 //! example of a method.
 
 use crate::keyframe_signature::{self, KeyframeSignature};
-use crate::method_entry::MethodEntry;
+use crate::method_entry::{MethodEntry, boxed};
 use crate::model_metadata::METADATA_FILE;
 use crate::model_options::{MethodOptions, ModelOptions, default_options};
 use crate::pending::PendingCheckpoint;
-use crate::{
-    Aligned, CorrectedKeyframe, Error, Method, Picture, Progress, Recalibrate, RenderRequest,
-};
-use calibration::Alignment;
-use calibration::{CalibratedCamera, ParamSet, TrialReport};
+use crate::{CorrectedKeyframe, Error, Method, Picture, Progress, RenderRequest};
+use calibration::{Alignment, ParamSet};
 use gpu::PassTiming;
 use keyframe::{Keyframe, Split};
 use kinematics::Stamp;
@@ -36,17 +33,9 @@ pub(crate) static ENTRY: MethodEntry = MethodEntry {
     exports: &[],
     default_options: default_options::<MeanColorOptions>,
     check_options: |options| options.typed::<MeanColorOptions>().map(drop),
-    start: |gpu, options| {
-        Ok(Aligned::if_requested(
-            MeanColor::new(options.typed()?),
-            &options.common,
-            &gpu,
-        ))
-    },
-    resume: |_, checkpoint, keyframes, placeholders| {
-        Aligned::resume(checkpoint, keyframes, placeholders, MeanColor::resume)
-    },
-    load: |_, folder| Ok(Box::new(Aligned::load(MeanColor::load(folder)?, folder)?)),
+    start: |_, options| Ok(Box::new(MeanColor::new(options.typed()?))),
+    resume: |_, checkpoint, keyframes| MeanColor::resume(checkpoint, keyframes).map(boxed),
+    load: |_, folder| Ok(Box::new(MeanColor::load(folder)?)),
 };
 
 /// File of the saved color, in the format of a checkpoint.
@@ -161,16 +150,6 @@ fn channel_sum(pixels: &[[u8; 4]], channel: usize) -> f64 {
     pixels.iter().map(|pixel| f64::from(pixel[channel])).sum()
 }
 
-impl Recalibrate for MeanColor {
-    fn recalibrate(&mut self, keyframes: &[CorrectedKeyframe], _: &Alignment) -> Result<(), Error> {
-        // The mean does not depend on poses. It restarts anyway, as an example for models that do.
-        *self = Self::new(self.options.clone());
-        keyframes
-            .iter()
-            .try_for_each(|keyframe| self.push(keyframe.after.clone()))
-    }
-}
-
 impl Method for MeanColor {
     fn push(&mut self, keyframe: Arc<Keyframe>) -> Result<(), Error> {
         if keyframe.split != Split::Test {
@@ -211,16 +190,6 @@ impl Method for MeanColor {
         Ok(self.step)
     }
 
-    fn seed(&mut self) -> Result<(), Error> {
-        Ok(())
-    }
-
-    fn prepare(&mut self) -> Result<(), Error> {
-        Ok(())
-    }
-
-    fn set_watched(&mut self, _watched: bool) {}
-
     fn render(&mut self, request: &RenderRequest) -> Result<Picture, Error> {
         let n_pixels = request.size_px.iter().map(|side| *side as usize).product();
         #[expect(
@@ -240,17 +209,17 @@ impl Method for MeanColor {
         })
     }
 
-    fn calibrated_camera(&mut self, keyframe: &Keyframe) -> Result<CalibratedCamera, Error> {
-        Ok(CalibratedCamera::of(keyframe))
+    fn recalibrate(&mut self, keyframes: &[CorrectedKeyframe], _: &Alignment) -> Result<(), Error> {
+        // The mean does not depend on poses. It restarts anyway, as an example for models that do.
+        *self = Self::new(self.options.clone());
+        keyframes
+            .iter()
+            .try_for_each(|keyframe| self.push(keyframe.after.clone()))
     }
 
     fn profile_step(&mut self) -> Result<Vec<PassTiming>, Error> {
         self.step(1)?;
         Ok(Vec::new())
-    }
-
-    fn alignment(&self) -> Option<&Alignment> {
-        None
     }
 
     fn progress(&self) -> Progress {
@@ -259,10 +228,6 @@ impl Method for MeanColor {
             primitives: 1,
             ..Progress::default()
         }
-    }
-
-    fn report(&self) -> Vec<TrialReport> {
-        Vec::new()
     }
 
     fn save(&mut self, folder: &Path) -> Result<(), Error> {

@@ -2,7 +2,7 @@
 
 use super::*;
 use crate::test_scenes as scenes;
-use crate::{CommonOptions, ModelKind, ModelSpec, Projection, Resumed, load, resume};
+use crate::{AlignedModel, CommonOptions, ModelKind, ModelSpec, Projection, Resumed, load, resume};
 use gpu::testing::test_gpu;
 use kinematics::Transform;
 use std::sync::Arc;
@@ -28,7 +28,7 @@ fn gray(stamp: i64, level: u8) -> Arc<Keyframe> {
     })
 }
 
-fn rendered(model: &mut dyn Method) -> Vec<u8> {
+fn rendered(model: &mut AlignedModel) -> Vec<u8> {
     let request = RenderRequest {
         world_from_camera: Transform::identity(),
         size_px: SIZE_PX,
@@ -42,7 +42,7 @@ fn rendered(model: &mut dyn Method) -> Vec<u8> {
         appearance_of: None,
         depth: false,
     };
-    model.render(&request).unwrap().rgba_srgb
+    model.model_mut().render(&request).unwrap().rgba_srgb
 }
 
 #[test]
@@ -59,12 +59,12 @@ fn registered_method_trains_saves_loads_and_resumes() {
     assert_eq!(model.step(3).unwrap(), 3);
     let checkpoint = model.checkpoint().unwrap().finish().unwrap();
     assert_eq!(model.step(60).unwrap(), 60);
-    let level = rendered(&mut *model)[0];
+    let level = rendered(&mut model)[0];
     assert!(
         (130..150).contains(&level),
         "the mean of 100 and 180: {level}"
     );
-    assert_eq!(rendered(&mut *model), [level, level, level, 255].repeat(6));
+    assert_eq!(rendered(&mut model), [level, level, level, 255].repeat(6));
 
     let later = gray(3, 50);
     let all = [keyframes.as_slice(), &[later]].concat();
@@ -88,7 +88,7 @@ fn registered_method_trains_saves_loads_and_resumes() {
         }
         let mut loaded = load(gpu.clone(), folder.path()).unwrap();
         assert_eq!(loaded.kind, kind());
-        assert_eq!(rendered(&mut *loaded.method), rendered(&mut *model));
+        assert_eq!(rendered(&mut loaded.method), rendered(&mut model));
     }
     std::fs::write(folder.path().join(METADATA_FILE), "{").unwrap();
     assert!(matches!(

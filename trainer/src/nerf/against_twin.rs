@@ -14,8 +14,8 @@ use super::reference::ray as reference;
 use super::reference::scene::{EMBEDDING_DIM, Ray, WEIGHTS, field, gradient, ray, samples};
 use crate::mismatches::Mismatches;
 use crate::optim::reference::{Adam, Moments};
-use gpu::{Buffer, Gpu, GpuOptions, Passes};
 use gpu::testing::test_gpu_with;
+use gpu::{Buffer, Gpu, GpuOptions, Passes};
 use kinematics::{f32_of, f32s_of};
 use model_files::contraction::contract;
 

@@ -6,21 +6,20 @@ mod images;
 use super::carve;
 use super::extent::Extent;
 use super::field_trainer::{Compiled, FieldTrainer, STEPS_PER_SUBMIT};
-use super::options::{NerfBudget, NerfOptions};
+use super::options::NerfOptions;
 use super::rays::{self, RayImage, RaySampling};
 use super::sizes::Sizes;
-use crate::aligned::replacement;
-use crate::model_options::ModelOptions;
+use crate::corrected_keyframe::replacement;
+use crate::model_options::{CommonOptions, ModelOptions};
 use crate::packing::{Format, Output};
 use crate::pending::PendingCheckpoint;
 use crate::view::Camera;
 use crate::{
-    Bounds, CorrectedKeyframe, Error, Method, Packing, Picture, Progress, Recalibrate,
-    RenderRequest, Rendered,
+    Bounds, CorrectedKeyframe, Error, Method, Packing, Picture, Progress, RenderRequest, Rendered,
 };
 use calibration::Alignment;
 use calibration::TrialReport;
-use calibration::{CalibratedCamera, CameraCorrection, EMBEDDING_DIM, ParamSet};
+use calibration::{CameraCorrection, EMBEDDING_DIM, ParamSet};
 use gpu::{Gpu, PassTiming, Submits};
 use images::Trials;
 use keyframe::{Keyframe, Split};
@@ -118,17 +117,6 @@ impl NerfModel {
             .unwrap_or(&self.loaded_corrections))
     }
 
-    fn nerf_budget(&self) -> NerfBudget {
-        self.options
-            .specific
-            .nerf_budget
-            .unwrap_or(if self.gpu.is_software() {
-                NerfBudget::SMALL
-            } else {
-                NerfBudget::FULL
-            })
-    }
-
     /// Creates a field if there is none or if the scene has outgrown it, and refines its cells when
     /// due. Returns whether there are images to train on.
     fn begin(&mut self) -> Result<bool, Error> {
@@ -148,32 +136,34 @@ impl NerfModel {
         Ok(true)
     }
 
-    /// Extent and sizes of a field for the current images.
-    fn sizes(&self) -> Result<(Extent, Sizes), Error> {
-        let keyframes = || self.images.iter().map(|image| &*image.keyframe);
-        let extent = Extent::of(keyframes());
-        let sizes = Sizes::choose(
-            &self.options,
-            self.nerf_budget(),
-            self.gpu.max_binding_bytes(),
-            keyframes(),
-            &extent,
-        )?;
-        Ok((extent, sizes))
-    }
-
     /// Returns the kernels, compiling them on first use.
     fn compiled(&mut self) -> Result<Arc<Compiled>, Error> {
         if let Some(compiled) = &self.compiled {
             return Ok(compiled.clone());
         }
-        let compiled = Arc::new(Compiled::new(&self.gpu, &self.nerf_budget())?);
+        let nerf_budget = self
+            .options
+            .specific
+            .budget_or_default(self.gpu.is_software());
+        let compiled = Arc::new(Compiled::new(&self.gpu, &nerf_budget)?);
         self.compiled = Some(compiled.clone());
         Ok(compiled)
     }
 
+    /// Creates a field for the extent of the current images, if there is none or if they have
+    /// outgrown it.
     fn fit_extent(&mut self) -> Result<(), Error> {
-        let (extent, sizes) = self.sizes()?;
+        let keyframes = || self.images.iter().map(|image| &*image.keyframe);
+        let extent = Extent::of(keyframes());
+        let sizes = Sizes::choose(
+            &self.options,
+            self.options
+                .specific
+                .budget_or_default(self.gpu.is_software()),
+            self.gpu.max_binding_bytes(),
+            keyframes(),
+            &extent,
+        )?;
         if self
             .field
             .as_ref()
@@ -232,20 +222,18 @@ impl NerfModel {
             .as_ref()
             .is_some_and(|(_, field_trainer)| field_trainer.sizes.can_refine);
         if is_refinement_due {
-            self.refinement_step().saturating_sub(self.step).max(1)
+            refinement_step(&self.options.common)
+                .saturating_sub(self.step)
+                .max(1)
         } else {
             u64::MAX
         }
     }
 
-    fn refinement_step(&self) -> u64 {
-        (self.options.common.n_planned_steps / REFINE_DIVISOR).max(1)
-    }
-
     /// Refines the cells when due. Coarse cells need fewer updates at first; fine cells later
     /// separate empty space better.
     fn refine_cells_when_due(&mut self) -> Result<(), Error> {
-        let is_refinement_due = self.step >= self.refinement_step();
+        let is_refinement_due = self.step >= refinement_step(&self.options.common);
         if !is_refinement_due
             || !self
                 .field
@@ -330,31 +318,6 @@ impl NerfModel {
     }
 }
 
-impl Recalibrate for NerfModel {
-    /// Continues with the corrected images. Pose corrections of single images start again at zero.
-    fn recalibrate(&mut self, keyframes: &[CorrectedKeyframe], _: &Alignment) -> Result<(), Error> {
-        // The halves of a trial must be trained on the same images, so a running trial starts
-        // again.
-        self.finish_in_flight()?;
-        self.undo_trial()?;
-        let corrected = replacement(keyframes);
-        for image in self.images.iter_mut().chain(&mut self.validation_images) {
-            let mut keyframe = image.keyframe.clone();
-            corrected(&mut keyframe);
-            *image = RayImage::new(keyframe);
-        }
-        self.is_extent_stale = true;
-        self.corrections = None;
-        if let Some((_, field_trainer)) = &mut self.field {
-            field_trainer.reset_image_params_except(
-                &self.gpu,
-                self.learned_params - ParamSet::IMAGE_POSES,
-            )?;
-        }
-        self.hint_images(0..self.n_hinted)
-    }
-}
-
 impl Method for NerfModel {
     fn depth_stride(&self) -> u32 {
         if self.gpu.is_software() {
@@ -409,7 +372,9 @@ impl Method for NerfModel {
         // Validation images may have become training images. Use them from the next step on.
         self.begin()?;
         // A submit ends where the host has to change the field.
-        let max_steps = self.steps_to_finer_cells().min(self.steps_to_trial());
+        let max_steps = self
+            .steps_to_finer_cells()
+            .min(self.trials.steps_left(self.step, &self.options.common));
         let n_steps = n.min(self.steps_per_submit()).min(max_steps);
         let since = Instant::now();
         for slot_ix in 0..n_steps {
@@ -438,11 +403,6 @@ impl Method for NerfModel {
         Ok(self.step + self.n_discarded_steps)
     }
 
-    /// Does nothing: a field can be rendered only after training.
-    fn seed(&mut self) -> Result<(), Error> {
-        Ok(())
-    }
-
     fn prepare(&mut self) -> Result<(), Error> {
         self.compiled().map(drop)
     }
@@ -451,7 +411,8 @@ impl Method for NerfModel {
         // Rendering must not create a field: the times of pictures would then determine its initial
         // keyframes.
         self.finish_in_flight()?;
-        let embedding = self.embedding_of(request.appearance_of.as_ref())?;
+        let corrections = self.current_corrections()?;
+        let embedding = images::embedding_of(corrections, request.appearance_of.as_ref());
         Rendered::picture(request, |camera, output| {
             self.draw(request, camera, embedding, output)
         })
@@ -463,7 +424,8 @@ impl Method for NerfModel {
         packing: Packing,
     ) -> Result<Rendered, Error> {
         self.finish_in_flight()?;
-        let embedding = self.embedding_of(request.appearance_of.as_ref())?;
+        let corrections = self.current_corrections()?;
+        let embedding = images::embedding_of(corrections, request.appearance_of.as_ref());
         Rendered::of(request, Format::Packed(packing), |camera, output| {
             self.draw(request, camera, embedding, output)
         })
@@ -484,13 +446,27 @@ impl Method for NerfModel {
         Ok(self.current_corrections()?.clone())
     }
 
-    fn calibrated_camera(&mut self, keyframe: &Keyframe) -> Result<CalibratedCamera, Error> {
-        let corrections = self.current_corrections()?;
-        let correction = corrections.get(keyframe.camera.as_ref());
-        Ok(correction.map_or_else(
-            || CalibratedCamera::of(keyframe),
-            |correction| correction.apply(keyframe),
-        ))
+    /// Continues with the corrected images. Pose corrections of single images start again at zero.
+    fn recalibrate(&mut self, keyframes: &[CorrectedKeyframe], _: &Alignment) -> Result<(), Error> {
+        // The halves of a trial must be trained on the same images, so a running trial starts
+        // again.
+        self.finish_in_flight()?;
+        self.undo_trial()?;
+        let corrected = replacement(keyframes);
+        for image in self.images.iter_mut().chain(&mut self.validation_images) {
+            let mut keyframe = image.keyframe.clone();
+            corrected(&mut keyframe);
+            *image = RayImage::new(keyframe);
+        }
+        self.is_extent_stale = true;
+        self.corrections = None;
+        if let Some((_, field_trainer)) = &mut self.field {
+            field_trainer.reset_image_params_except(
+                &self.gpu,
+                self.learned_params - ParamSet::IMAGE_POSES,
+            )?;
+        }
+        self.hint_images(0..self.n_hinted)
     }
 
     fn profile_step(&mut self) -> Result<Vec<PassTiming>, Error> {
@@ -503,10 +479,6 @@ impl Method for NerfModel {
             return Err(no_field());
         };
         field_trainer.submit_timed(&self.gpu)
-    }
-
-    fn alignment(&self) -> Option<&Alignment> {
-        None
     }
 
     fn progress(&self) -> Progress {
@@ -530,6 +502,11 @@ impl Method for NerfModel {
     fn checkpoint(&mut self) -> Result<PendingCheckpoint, Error> {
         self.take_checkpoint()
     }
+}
+
+/// Step at which the cells are refined.
+fn refinement_step(common: &CommonOptions) -> u64 {
+    (common.n_planned_steps / REFINE_DIVISOR).max(1)
 }
 
 /// The error if a step is taken before the field is created.

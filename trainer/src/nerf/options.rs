@@ -87,6 +87,17 @@ impl NerfBudget {
     }
 }
 
+impl NerfOptions {
+    /// The sizes in use: the given ones, or the default of the adapter.
+    pub(crate) fn budget_or_default(&self, is_software: bool) -> NerfBudget {
+        self.nerf_budget.unwrap_or(if is_software {
+            NerfBudget::SMALL
+        } else {
+            NerfBudget::FULL
+        })
+    }
+}
+
 impl MethodOptions for NerfOptions {
     const METHOD: &'static str = "nerf";
 }

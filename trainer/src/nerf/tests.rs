@@ -10,9 +10,7 @@ use super::{NerfModel, params};
 use crate::eval::{self, PixelPair};
 use crate::model_options::{CommonOptions, ModelOptions};
 use crate::test_scenes as scenes;
-use crate::{
-    CorrectedKeyframe, Error, Method, ModelKind, Picture, Projection, Recalibrate, RenderRequest,
-};
+use crate::{CorrectedKeyframe, Error, Method, ModelKind, Picture, Projection, RenderRequest};
 use calibration::{Alignment, CameraCorrection, CameraRefinement, ParamSet, rigid_transform};
 use gpu::Gpu;
 use gpu::testing::test_gpu;
@@ -407,7 +405,7 @@ fn drifting_poses_are_corrected() {
             .zip(&true_keyframes)
             .map(|(given, true_keyframes)| {
                 position_error_m(
-                    &model.calibrated_camera(given).unwrap().world_from_camera,
+                    &scenes::calibrated_camera(model, given).world_from_camera,
                     true_keyframes,
                 )
             });
@@ -446,8 +444,8 @@ fn drifting_poses_are_corrected() {
     model.save(folder.path()).unwrap();
     let mut loaded = NerfModel::load(gpu(), folder.path()).unwrap();
     assert_eq!(
-        loaded.calibrated_camera(&drifted_keyframes[3]).unwrap(),
-        model.calibrated_camera(&drifted_keyframes[3]).unwrap()
+        scenes::calibrated_camera(&mut loaded, &drifted_keyframes[3]),
+        scenes::calibrated_camera(&mut model, &drifted_keyframes[3])
     );
 
     let mut with_removed = NerfModel::resume(gpu(), &checkpoint, &drifted_keyframes)

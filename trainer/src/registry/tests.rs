@@ -68,6 +68,7 @@ fn untrained_model_of_every_method_is_resumed_saved_and_recognized() {
             load(gpu.clone(), folder.path())
                 .unwrap()
                 .method
+                .model_mut()
                 .bounds()
                 .unwrap(),
             None
@@ -78,6 +79,7 @@ fn untrained_model_of_every_method_is_resumed_saved_and_recognized() {
             load(gpu.clone(), folder.path())
                 .unwrap()
                 .method
+                .model_mut()
                 .bounds()
                 .unwrap(),
             None
@@ -98,14 +100,14 @@ fn removed_keyframe_is_not_needed_to_resume() {
         keyframes
             .iter()
             .for_each(|keyframe| model.push(keyframe.clone()).unwrap());
-        while model.progress().step < 2 {
+        while model.model().progress().step < 2 {
             model.step(1).unwrap();
         }
-        let n_steps = model.progress().step;
+        let n_steps = model.model().progress().step;
         model
             .remove(&keyframes[0].camera, keyframes[0].stamp)
             .unwrap();
-        assert_eq!(model.progress().step, n_steps, "{kind:?}");
+        assert_eq!(model.model().progress().step, n_steps, "{kind:?}");
         let checkpoint = model.checkpoint().unwrap().finish().unwrap();
         let resumed = resume(gpu.clone(), &checkpoint, &keyframes[1..]);
         assert!(resumed.is_ok(), "{kind:?}: {:?}", resumed.err());
@@ -125,7 +127,7 @@ fn every_method_resumes_without_missing_keyframes() {
         keyframes
             .iter()
             .for_each(|keyframe| model.push(keyframe.clone()).unwrap());
-        while model.progress().step < 2 {
+        while model.model().progress().step < 2 {
             model.step(1).unwrap();
         }
         let checkpoint = model.checkpoint().unwrap().finish().unwrap();
@@ -140,12 +142,12 @@ fn every_method_resumes_without_missing_keyframes() {
             resume_without_missing(gpu.clone(), &checkpoint, &left).unwrap();
         let expected = [1, 2].map(|ix| (keyframes[ix].camera.clone(), keyframes[ix].stamp));
         assert_eq!(missing, expected, "{kind:?}");
-        let n_before = resumed.method.progress().step;
+        let n_before = resumed.method.model().progress().step;
         for _ in 0..4 {
             resumed.method.step(1).unwrap();
         }
         assert!(
-            resumed.method.progress().step > n_before || resumed.method.is_idle(),
+            resumed.method.model().progress().step > n_before || resumed.method.is_idle(),
             "{kind:?}"
         );
         // A checkpoint of the resumed model does not need them.

@@ -2,7 +2,8 @@
 //! checkpoint is bit-exact.
 
 use super::{SplatOptions, SplatTrainer};
-use crate::{Aligned, CommonOptions, Method, ModelOptions};
+use crate::method_entry::boxed;
+use crate::{AlignedModel, CommonOptions, ModelOptions};
 use calibration::scenes::{Miscalibration, capture, remaining, wrong_extrinsics};
 use calibration::{CameraRefinement, ParamSet};
 use gpu::Gpu;
@@ -13,8 +14,9 @@ use std::sync::Arc;
 
 const N_PLANNED_STEPS: u64 = 120;
 
-fn new_model(gpu: &Arc<Gpu>, keyframes: &[Arc<Keyframe>]) -> Aligned<SplatTrainer> {
+fn new_model(gpu: &Arc<Gpu>, keyframes: &[Arc<Keyframe>]) -> AlignedModel {
     let common = CommonOptions {
+        align: CameraRefinement::Try(vec![ParamSet::EXTRINSICS]),
         cameras: CameraRefinement::Try(vec![ParamSet::IMAGE_POSES]),
         n_planned_steps: N_PLANNED_STEPS,
         ..CommonOptions::default()
@@ -25,17 +27,17 @@ fn new_model(gpu: &Arc<Gpu>, keyframes: &[Arc<Keyframe>]) -> Aligned<SplatTraine
         sh_degree: 0,
         ..SplatOptions::default()
     };
-    let align = CameraRefinement::Try(vec![ParamSet::EXTRINSICS]);
-    let trainer = SplatTrainer::new(gpu.clone(), ModelOptions { common, specific }).unwrap();
-    let mut model = Aligned::new(trainer, align, true, N_PLANNED_STEPS);
+    let options = ModelOptions { common, specific };
+    let trainer = SplatTrainer::new(gpu.clone(), options.clone()).unwrap();
+    let mut model = AlignedModel::new(Box::new(trainer), &options.common, true);
     for keyframe in keyframes {
         model.push(keyframe.clone()).unwrap();
     }
     model
 }
 
-fn train_to(model: &mut dyn Method, step: u64) {
-    while model.progress().step != step {
+fn train_to(model: &mut AlignedModel, step: u64) {
+    while model.model().progress().step != step {
         model.step(1).unwrap();
     }
 }
@@ -54,7 +56,7 @@ fn wrong_extrinsics_are_corrected_and_resuming_is_exact() {
     assert!(uninterrupted.alignment().is_none());
     uninterrupted.step(1).unwrap();
     assert_eq!(
-        uninterrupted.progress().step,
+        uninterrupted.model().progress().step,
         ALIGNMENT_STEP + 1,
         "training continues"
     );
@@ -75,21 +77,22 @@ fn wrong_extrinsics_are_corrected_and_resuming_is_exact() {
     // order of arrival.
     let mut stored = keyframes.clone();
     stored.reverse();
-    let mut interrupted: Box<dyn Method> = Box::new(new_model(&gpu, &keyframes));
-    train_to(&mut *interrupted, 10);
+    let mut interrupted = new_model(&gpu, &keyframes);
+    train_to(&mut interrupted, 10);
     for end in [ALIGNMENT_STEP + 1, ALIGNMENT_STEP + 7, ALIGNMENT_STEP + 10] {
         let checkpoint = interrupted.checkpoint().unwrap().finish().unwrap();
         let untrained;
-        (interrupted, untrained) = Aligned::resume(&checkpoint, &stored, &[], |own, keyframes| {
-            SplatTrainer::resume(gpu.clone(), own, keyframes)
-        })
-        .unwrap();
+        (interrupted, untrained) =
+            AlignedModel::resume(&checkpoint, &stored, &[], |own, keyframes| {
+                SplatTrainer::resume(gpu.clone(), own, keyframes).map(boxed)
+            })
+            .unwrap();
         for keyframe in untrained.into_iter().rev() {
             interrupted.push(keyframe).unwrap();
         }
-        train_to(&mut *interrupted, end);
+        train_to(&mut interrupted, end);
     }
-    let [one, other] = [&mut uninterrupted as &mut dyn Method, &mut *interrupted]
+    let [one, other] = [&mut uninterrupted, &mut interrupted]
         .map(|model| model.checkpoint().unwrap().finish().unwrap());
     assert_eq!(one.state, other.state);
     assert!(one.arrays == other.arrays, "arrays differ");
@@ -101,7 +104,7 @@ fn wrong_extrinsics_are_corrected_and_resuming_is_exact() {
     let arrays = ply::read(&folder.path().join("splats.ply")).unwrap();
     let trainer = SplatTrainer::from_arrays(gpu, ModelOptions::default(), &arrays).unwrap();
     let trainer = trainer.with_saved_metadata(folder.path()).unwrap();
-    let mut loaded = Aligned::load(trainer, folder.path()).unwrap();
+    let mut loaded = AlignedModel::load(Box::new(trainer), folder.path()).unwrap();
     assert_eq!(
         loaded.calibrated_camera(test).unwrap(),
         correction.apply(test)

@@ -3,8 +3,8 @@
 use super::kernels::DrawPipelines;
 use super::params::{Capacity, Model, TILE_PX, status};
 use crate::Error;
-use gpu::{Buffer, Gpu, Passes, PendingRead};
 use gpu::sort::SortBuffers;
+use gpu::{Buffer, Gpu, Passes, PendingRead};
 use model_files::splat::arrays::SplatArrays;
 
 /// Splats per block, consecutive in depth. This constant and the next two are those of

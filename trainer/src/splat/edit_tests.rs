@@ -11,8 +11,8 @@ use kinematics::random::Random;
 use kinematics::{Transform, f32_of};
 use model_files::Aabb;
 use model_files::edits::{Edit, Edits};
-use model_files::splat::{file, ply};
 use model_files::splat::arrays::SplatArrays;
+use model_files::splat::{file, ply};
 use nalgebra::Vector3;
 use std::sync::Arc;
 

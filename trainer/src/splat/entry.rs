@@ -1,12 +1,13 @@
 //! Registers splats as a method.
 
 use super::{SplatOptions, SplatTrainer};
-use crate::method_entry::{Export, ExportRequest, ExportWriter, Exported, MethodEntry, SingleFile};
-use crate::model_options::{MethodOptions, ModelOptions, default_options};
-use crate::{Aligned, Error, Method, ResumedModel};
+use crate::method_entry::{
+    Export, ExportRequest, ExportWriter, Exported, MethodEntry, SingleFile, boxed,
+};
+use crate::model_options::{MethodOptions, default_options};
+use crate::{Error, Method};
 use calibration::ParamSet;
 use gpu::Gpu;
-use keyframe::Keyframe;
 use model_files::Edits;
 use model_files::checkpoint::Checkpoint;
 use model_files::splat::file::{self, EXTENSIONS, Format, IN_FOLDER, UNSUPPORTED};
@@ -49,29 +50,12 @@ pub(crate) static ENTRY: MethodEntry = MethodEntry {
     ],
     default_options: default_options::<SplatOptions>,
     check_options: |options| options.typed::<SplatOptions>().map(drop),
-    start,
-    resume,
+    start: |gpu, options| Ok(Box::new(SplatTrainer::new(gpu, options.typed()?)?)),
+    resume: |gpu, checkpoint, keyframes| {
+        SplatTrainer::resume(gpu, checkpoint, keyframes).map(boxed)
+    },
     load,
 };
-
-fn start(gpu: Arc<Gpu>, options: &ModelOptions) -> Result<Box<dyn Method>, Error> {
-    let model = SplatTrainer::new(gpu.clone(), options.typed()?)?;
-    Ok(Aligned::if_requested(model, &options.common, &gpu))
-}
-
-fn resume(
-    gpu: Arc<Gpu>,
-    checkpoint: &Checkpoint,
-    keyframes: &[Arc<Keyframe>],
-    placeholders: &[Arc<Keyframe>],
-) -> Result<ResumedModel, Error> {
-    Aligned::resume(
-        checkpoint,
-        keyframes,
-        placeholders,
-        |own_checkpoint, keyframes| SplatTrainer::resume(gpu, own_checkpoint, keyframes),
-    )
-}
 
 fn load(gpu: Arc<Gpu>, model: &Path) -> Result<Box<dyn Method>, Error> {
     let splats = file::read(model)?;
@@ -82,12 +66,12 @@ fn load(gpu: Arc<Gpu>, model: &Path) -> Result<Box<dyn Method>, Error> {
         ..SplatOptions::default()
     };
     let trainer = SplatTrainer::from_arrays(gpu, options.into(), &splats)?;
-    // Only the folder of a saved model has camera corrections and an alignment.
-    if model.is_dir() {
-        let trainer = trainer.with_saved_metadata(model)?;
-        return Ok(Box::new(Aligned::load(trainer, model)?));
-    }
-    Ok(Box::new(trainer))
+    // Only the folder of a saved model has camera corrections.
+    Ok(Box::new(if model.is_dir() {
+        trainer.with_saved_metadata(model)?
+    } else {
+        trainer
+    }))
 }
 
 fn write_ply(request: &ExportRequest<'_>) -> Result<Exported, Error> {

@@ -28,18 +28,18 @@ use super::params::Camera;
 use super::params::status;
 use super::schedule::Schedule;
 use super::seed;
-use crate::floaters::PendingFloaters;
 use super::trials::{SplatTrials, ValidationImage};
+use crate::floaters::PendingFloaters;
 use crate::model_chunks::PendingChunks;
 use crate::model_metadata::{METADATA_FILE, read_metadata};
 use crate::model_options::{MethodOptions, ModelOptions};
 use crate::packing::{Format, Output};
 use crate::pending::PendingCheckpoint;
 use crate::{
-    Bounds, Error, Method, Packing, Picture, Progress, Projection, QueuedPicture, RenderRequest,
-    Rendered,
+    Bounds, CorrectedKeyframe, Error, Method, Packing, Picture, Progress, Projection,
+    QueuedPicture, RenderRequest, Rendered,
 };
-use calibration::{Alignment, CalibratedCamera, CameraCorrection, Trial, TrialReport};
+use calibration::{Alignment, CameraCorrection, Trial, TrialReport};
 use gpu::{Gpu, PassTiming};
 use keyframe::{Keyframe, Split};
 use kinematics::Stamp;
@@ -483,17 +483,12 @@ impl Method for SplatTrainer {
         cameras.corrections(&self.recorder.gpu, set, params, self.seeding.scene.size_m)
     }
 
-    fn calibrated_camera(&mut self, keyframe: &Keyframe) -> Result<CalibratedCamera, Error> {
-        let corrections = self.camera_corrections()?;
-        let correction = corrections.get(keyframe.camera.as_ref());
-        Ok(correction.map_or_else(
-            || CalibratedCamera::of(keyframe),
-            |correction| correction.apply(keyframe),
-        ))
-    }
-
-    fn alignment(&self) -> Option<&Alignment> {
-        None
+    fn recalibrate(
+        &mut self,
+        keyframes: &[CorrectedKeyframe],
+        alignment: &Alignment,
+    ) -> Result<(), Error> {
+        self.move_with_keyframes(keyframes, alignment)
     }
 
     fn pause_growth(&mut self, is_paused: bool) -> Result<bool, Error> {

@@ -4,6 +4,7 @@
 use super::{SplatOptions, SplatTrainer};
 use crate::eval::{PixelPair, psnr};
 use crate::model_options::{CommonOptions, ModelOptions};
+use crate::test_scenes::calibrated_camera;
 use crate::view::Camera;
 use crate::{Method, Packing, Projection, RenderRequest, Rendered};
 use calibration::{CameraRefinement, ParamSet};
@@ -11,9 +12,9 @@ use gpu::Gpu;
 use gpu::testing::test_gpu;
 use keyframe::{DepthMap, Keyframe, Split};
 use kinematics::{Stamp, Transform, f32s_of};
-use model_files::{Aabb, InitialPoints};
 use model_files::splat::arrays::SplatArrays;
 use model_files::splat::cloud::synthetic_cloud;
+use model_files::{Aabb, InitialPoints};
 use nalgebra::{Point3, Vector3};
 use std::sync::Arc;
 
@@ -576,10 +577,7 @@ fn wrong_lens_is_corrected_by_trial() {
     let miscalibrated: Vec<_> = miscalibrated.collect();
     let mut trainer = trainer_with_lens_trial(&miscalibrated, gpu, 2000);
     train(&mut trainer, 900);
-    let found_focal_px = trainer
-        .calibrated_camera(&miscalibrated[0])
-        .unwrap()
-        .focal_px;
+    let found_focal_px = calibrated_camera(&mut trainer, &miscalibrated[0]).focal_px;
     assert!(
         trainer.trials()[0].kept,
         "{:?}, focal length {found_focal_px:?}",

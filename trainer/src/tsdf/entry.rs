@@ -2,12 +2,11 @@
 
 use super::files::{BLOCKS_FILE, MESH_GLB, MESH_PLY};
 use super::{TsdfModel, TsdfOptions};
-use crate::method_entry::{Export, ExportRequest, ExportWriter, Exported, MethodEntry};
-use crate::model_options::{MethodOptions, ModelOptions, default_options};
-use crate::{Aligned, Error, Method, ResumedModel};
+use crate::Error;
+use crate::method_entry::{Export, ExportRequest, ExportWriter, Exported, MethodEntry, boxed};
+use crate::model_options::{MethodOptions, default_options};
 use calibration::ParamSet;
 use gpu::Gpu;
-use keyframe::Keyframe;
 use model_files::Edits;
 use model_files::checkpoint::Checkpoint;
 use model_files::mesh::{Mesh, write_glb, write_ply};
@@ -42,36 +41,10 @@ pub(crate) static ENTRY: MethodEntry = MethodEntry {
     ],
     default_options: default_options::<TsdfOptions>,
     check_options: |options| options.typed::<TsdfOptions>().map(drop),
-    start,
-    resume,
-    load,
+    start: |gpu, options| Ok(Box::new(TsdfModel::new(gpu, options.typed()?)?)),
+    resume: |gpu, checkpoint, keyframes| TsdfModel::resume(gpu, checkpoint, keyframes).map(boxed),
+    load: |gpu, folder| Ok(Box::new(TsdfModel::load(gpu, folder)?)),
 };
-
-fn start(gpu: Arc<Gpu>, options: &ModelOptions) -> Result<Box<dyn Method>, Error> {
-    let model = TsdfModel::new(gpu.clone(), options.typed()?)?;
-    Ok(Aligned::if_requested(model, &options.common, &gpu))
-}
-
-fn resume(
-    gpu: Arc<Gpu>,
-    checkpoint: &Checkpoint,
-    keyframes: &[Arc<Keyframe>],
-    placeholders: &[Arc<Keyframe>],
-) -> Result<ResumedModel, Error> {
-    Aligned::resume(
-        checkpoint,
-        keyframes,
-        placeholders,
-        |own_checkpoint, keyframes| TsdfModel::resume(gpu, own_checkpoint, keyframes),
-    )
-}
-
-fn load(gpu: Arc<Gpu>, folder: &Path) -> Result<Box<dyn Method>, Error> {
-    Ok(Box::new(Aligned::load(
-        TsdfModel::load(gpu, folder)?,
-        folder,
-    )?))
-}
 
 /// Extracts the mesh from the voxels and writes it.
 fn export(

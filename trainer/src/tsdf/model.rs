@@ -26,12 +26,9 @@ use crate::packing::{Format, Reader};
 use crate::pending::PendingCheckpoint;
 use crate::view::ErasedSpace;
 use crate::{
-    CorrectedKeyframe, Error, Method, Packing, Picture, Progress, Recalibrate, RenderRequest,
-    Rendered,
+    CorrectedKeyframe, Error, Method, Packing, Picture, Progress, RenderRequest, Rendered,
 };
 use calibration::Alignment;
-use calibration::CalibratedCamera;
-use calibration::TrialReport;
 use field_store::{FieldStore, INITIAL_CAPACITY};
 use frustum::ViewFrustum;
 use fusion::Fusion;
@@ -332,19 +329,6 @@ impl TsdfModel {
     }
 }
 
-impl Recalibrate for TsdfModel {
-    /// Fuses all keyframes again: the contribution of each one to the sums is unknown.
-    fn recalibrate(&mut self, keyframes: &[CorrectedKeyframe], _: &Alignment) -> Result<(), Error> {
-        self.finish_in_flight()?;
-        let is_watched = self.fusion.submits.is_watched();
-        *self = Self::new(self.gpu.clone(), self.options.clone())?;
-        self.set_watched(is_watched);
-        keyframes
-            .iter()
-            .try_for_each(|keyframe| self.push(keyframe.after.clone()))
-    }
-}
-
 impl Method for TsdfModel {
     fn push(&mut self, keyframe: Arc<Keyframe>) -> Result<(), Error> {
         // A keyframe without depth contains no surface, so this is not an error: in a rig, only
@@ -439,10 +423,6 @@ impl Method for TsdfModel {
         self.fuse_one()
     }
 
-    fn prepare(&mut self) -> Result<(), Error> {
-        Ok(())
-    }
-
     fn render(&mut self, request: &RenderRequest) -> Result<Picture, Error> {
         self.finish_in_flight()?;
         self.fuse_one()?;
@@ -500,8 +480,15 @@ impl Method for TsdfModel {
         self.fusion.submits.set_watched(watched);
     }
 
-    fn calibrated_camera(&mut self, keyframe: &Keyframe) -> Result<CalibratedCamera, Error> {
-        Ok(CalibratedCamera::of(keyframe))
+    /// Fuses all keyframes again: the contribution of each one to the sums is unknown.
+    fn recalibrate(&mut self, keyframes: &[CorrectedKeyframe], _: &Alignment) -> Result<(), Error> {
+        self.finish_in_flight()?;
+        let is_watched = self.fusion.submits.is_watched();
+        *self = Self::new(self.gpu.clone(), self.options.clone())?;
+        self.set_watched(is_watched);
+        keyframes
+            .iter()
+            .try_for_each(|keyframe| self.push(keyframe.after.clone()))
     }
 
     fn profile_step(&mut self) -> Result<Vec<PassTiming>, Error> {
@@ -521,10 +508,6 @@ impl Method for TsdfModel {
         Ok(timings)
     }
 
-    fn alignment(&self) -> Option<&Alignment> {
-        None
-    }
-
     fn progress(&self) -> Progress {
         Progress {
             step: self.queue.step(),
@@ -535,10 +518,6 @@ impl Method for TsdfModel {
                 .map_or(0, |store| store.buffers.bytes(store.n_resident.into())),
             step_millis: self.fusion.submits.step_millis(),
         }
-    }
-
-    fn report(&self) -> Vec<TrialReport> {
-        Vec::new()
     }
 
     fn save(&mut self, folder: &Path) -> Result<(), Error> {

@@ -3,8 +3,8 @@
 use crate::Error;
 use gpu::{Buffer, Gpu, Passes};
 use kinematics::{f32_of, f32s_of};
-use model_files::{Aabb, Edits};
 use model_files::edits::{CellGrid, CellSet, Edit};
+use model_files::{Aabb, Edits};
 use nalgebra::{Matrix4, Vector3};
 use std::sync::Arc;
 

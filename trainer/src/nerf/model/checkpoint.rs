@@ -138,10 +138,10 @@ impl NerfModel {
     fn state(&self) -> Result<NerfState, Error> {
         Ok(NerfState {
             // The sizes in use, because another adapter would choose others.
-            options: self
-                .options
-                .clone()
-                .with(|options| options.specific.nerf_budget = Some(self.nerf_budget())),
+            options: self.options.clone().with(|options| {
+                let nerf_budget = options.specific.budget_or_default(self.gpu.is_software());
+                options.specific.nerf_budget = Some(nerf_budget);
+            }),
             step: self.step,
             images: self
                 .images

@@ -10,6 +10,7 @@
 
 use super::NerfModel;
 use crate::Error;
+use crate::model_options::CommonOptions;
 use crate::nerf::extent::Extent;
 use crate::nerf::field_trainer::RayColor;
 use crate::nerf::params::{EMBEDDING, IMAGE_PARAM_STRIDE};
@@ -105,6 +106,24 @@ impl Trials {
     pub(super) fn before(&self) -> Option<&FieldSnapshot> {
         self.running.as_ref().map(|trial| &trial.before)
     }
+
+    /// The step at which a trial starts or changes its phase.
+    fn next_step(&self, common: &CommonOptions) -> Option<u64> {
+        let share = |of: u64| (common.n_planned_steps / of).max(1);
+        // Both halves begin at the same step, because the field is restored in between. The end of
+        // a half is therefore measured from there.
+        let at = match self.before() {
+            None => share(TRIAL_START_DIVISOR),
+            Some(before) => before.step + share(TRIAL_LENGTH_DIVISOR),
+        };
+        (!self.are_finished()).then_some(at)
+    }
+
+    /// Steps from `step` until a trial starts or changes its phase.
+    pub(super) fn steps_left(&self, step: u64, common: &CommonOptions) -> u64 {
+        self.next_step(common)
+            .map_or(u64::MAX, |at| at.saturating_sub(step).max(1))
+    }
 }
 
 impl NerfModel {
@@ -117,27 +136,13 @@ impl NerfModel {
         }
     }
 
-    /// The step at which a trial starts or changes its phase.
-    fn next_trial_step(&self) -> Option<u64> {
-        let share = |of: u64| (self.options.common.n_planned_steps / of).max(1);
-        // Both halves begin at the same step, because the field is restored in between. The end of
-        // a half is therefore measured from there.
-        let at = match self.trials.before() {
-            None => share(TRIAL_START_DIVISOR),
-            Some(before) => before.step + share(TRIAL_LENGTH_DIVISOR),
-        };
-        (!self.trials.are_finished()).then_some(at)
-    }
-
-    /// Steps until a trial starts or changes its phase.
-    pub(super) fn steps_to_trial(&self) -> u64 {
-        self.next_trial_step()
-            .map_or(u64::MAX, |at| at.saturating_sub(self.step).max(1))
-    }
-
     /// When due, starts a trial, switches it to the baseline, or concludes it.
     pub(super) fn advance_trials_when_due(&mut self) -> Result<(), Error> {
-        while self.next_trial_step().is_some_and(|at| self.step >= at) {
+        while self
+            .trials
+            .next_step(&self.options.common)
+            .is_some_and(|at| self.step >= at)
+        {
             self.finish_in_flight()?;
             self.advance_trial()?;
         }
@@ -398,26 +403,25 @@ impl NerfModel {
         }
         Ok(())
     }
+}
 
-    /// Appearance embedding for a camera and stamp, interpolated between the images before and
-    /// after it. Falls back to the mean of all embeddings.
-    pub(super) fn embedding_of(
-        &mut self,
-        image: Option<&(Arc<str>, Stamp)>,
-    ) -> Result<[f64; EMBEDDING_DIM], Error> {
-        let corrections = self.current_corrections()?;
-        let embedding_of_image = image.and_then(|(camera, stamp)| {
-            interpolate(
-                &corrections.get(camera.as_ref())?.appearance_embeddings,
-                *stamp,
-            )
-        });
-        let all = || all_embeddings(corrections);
-        let n = all().count().max(1) as f64;
-        Ok(embedding_of_image.unwrap_or_else(|| {
-            std::array::from_fn(|ix| all().map(|embedding| embedding[ix]).sum::<f64>() / n)
-        }))
-    }
+/// Appearance embedding for a camera and stamp, interpolated between the images before and after
+/// it. Falls back to the mean of all embeddings.
+pub(super) fn embedding_of(
+    corrections: &BTreeMap<String, CameraCorrection>,
+    image: Option<&(Arc<str>, Stamp)>,
+) -> [f64; EMBEDDING_DIM] {
+    let embedding_of_image = image.and_then(|(camera, stamp)| {
+        interpolate(
+            &corrections.get(camera.as_ref())?.appearance_embeddings,
+            *stamp,
+        )
+    });
+    let all = || all_embeddings(corrections);
+    let n = all().count().max(1) as f64;
+    embedding_of_image.unwrap_or_else(|| {
+        std::array::from_fn(|ix| all().map(|embedding| embedding[ix]).sum::<f64>() / n)
+    })
 }
 
 /// Appearance embedding of an image, interpolated between those of its camera; neutral if the

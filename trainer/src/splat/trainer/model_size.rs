@@ -31,7 +31,7 @@ impl SplatTrainer {
         for view_ix in &sampled_views {
             self.reserve_view(self.views.size_px((*view_ix, 0)))?;
         }
-        self.set_unit_errors();
+        self.optimizer.set_unit_errors(&mut self.recorder);
         self.optimizer.set_n_splats(&self.recorder.gpu, n_splats);
         // Dropped splats would contribute nothing.
         self.optimizer.write_drop_frac(&self.recorder.gpu, 0.0);
@@ -45,19 +45,6 @@ impl SplatTrainer {
         }
         self.recorder.passes.clear_bindings();
         Ok(self.recorder.gpu.read(&contributions, n_splats as usize)?)
-    }
-
-    /// Sets the error of every pixel to one and its other gradients to zero. Then, a splat's error
-    /// sum equals the sum of its blending weights.
-    fn set_unit_errors(&mut self) {
-        if let Some(image_buffers) = &self.optimizer.image_buffers {
-            self.recorder.gpu.write(
-                &image_buffers.pixel_totals,
-                0,
-                bytemuck::cast_slice(&[0.0f32, 1.0].repeat(image_buffers.n_pixels as usize)),
-            );
-            self.recorder.passes.clear(&image_buffers.upstream);
-        }
     }
 
     /// Adds the blending weights of each splat in a view to `contributions`.

@@ -114,6 +114,19 @@ impl Optimizer {
             .ok_or_else(|| Error::internal("no image buffers are reserved for a step"))
     }
 
+    /// Sets the error of every pixel to one and its other gradients to zero. Then, a splat's error
+    /// sum equals the sum of its blending weights.
+    pub(super) fn set_unit_errors(&self, recorder: &mut Recorder) {
+        if let Some(image_buffers) = &self.image_buffers {
+            recorder.gpu.write(
+                &image_buffers.pixel_totals,
+                0,
+                bytemuck::cast_slice(&[0.0f32, 1.0].repeat(image_buffers.n_pixels as usize)),
+            );
+            recorder.passes.clear(&image_buffers.upstream);
+        }
+    }
+
     /// Allocates the buffers for training up to `capacity` splats on images of this size.
     pub(super) fn reserve_view(
         &mut self,

@@ -7,10 +7,10 @@
 //! corrections are a few degrees at most.
 
 use super::SplatTrainer;
-use crate::aligned::replacement;
+use crate::corrected_keyframe::replacement;
 use crate::splat::buffers::SplatBuffers;
 use crate::splat::camera_params::CameraParams;
-use crate::{CorrectedKeyframe, Error, Method, Recalibrate};
+use crate::{CorrectedKeyframe, Error, Method};
 use calibration::{Alignment, CameraCorrection, ParamSet};
 use gpu::Gpu;
 use keyframe::{DepthMap, Keyframe};
@@ -37,8 +37,9 @@ const WITHOUT_DEPTH: f64 = 1e-4;
 /// Parameters of single images, which stay enabled. Shared parameters are part of the alignment.
 const IMAGE_PARAMS: ParamSet = ParamSet::IMAGE_POSES.union(ParamSet::IMAGE_GAINS);
 
-impl Recalibrate for SplatTrainer {
-    fn recalibrate(
+impl SplatTrainer {
+    /// Moves the splats with their keyframes; see [`Method::recalibrate`].
+    pub(super) fn move_with_keyframes(
         &mut self,
         keyframes: &[CorrectedKeyframe],
         alignment: &Alignment,

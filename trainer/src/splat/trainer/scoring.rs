@@ -70,7 +70,7 @@ impl SplatTrainer {
         let corrections = self.learned_corrections()?;
         let neighbors: Vec<Vec<usize>> = validation
             .iter()
-            .map(|(keyframe, _)| self.neighbors(keyframe))
+            .map(|(keyframe, _)| self.views.neighbors(keyframe))
             .collect();
         // The gains of a validation keyframe itself would be fitted to the image that they are
         // scored on. Those of its neighbors predict them only if exposure really changes.
@@ -186,29 +186,6 @@ impl SplatTrainer {
             .cameras
             .initialize_gains(&self.recorder.gpu, &keyframe, log_gains);
         Ok(())
-    }
-
-    /// The last view before and the first view after a keyframe, from the same camera.
-    fn neighbors(&self, keyframe: &Keyframe) -> Vec<usize> {
-        // Other cameras have their own exposure. Views are in the order of arrival, which may
-        // differ from that of the stamps.
-        let before = self
-            .views_of_camera(&keyframe.camera)
-            .filter(|(_, other)| other.stamp <= keyframe.stamp)
-            .max_by_key(|(_, other)| other.stamp);
-        let after = self
-            .views_of_camera(&keyframe.camera)
-            .filter(|(_, other)| other.stamp > keyframe.stamp)
-            .min_by_key(|(_, other)| other.stamp);
-        before.into_iter().chain(after).map(|(ix, _)| ix).collect()
-    }
-
-    /// The views of a camera, with their indices.
-    fn views_of_camera(&self, camera: &str) -> impl Iterator<Item = (usize, &Arc<Keyframe>)> {
-        self.views
-            .keyframes()
-            .enumerate()
-            .filter(move |(_, keyframe)| keyframe.camera.as_ref() == camera)
     }
 
     /// Computes the gains of those views that `known` does not contain yet.
@@ -331,6 +308,7 @@ mod tests {
     use crate::Method;
     use crate::eval::{PixelPair, psnr};
     use crate::splat::training_tests::{n_keyframes, options, request, train};
+    use crate::test_scenes::calibrated_camera;
     use calibration::{CameraRefinement, ParamSet};
     use gpu::Gpu;
     use gpu::testing::test_gpu;
@@ -481,7 +459,7 @@ mod tests {
             trainer.trials()
         );
         let gains = |trainer: &mut SplatTrainer, ix: usize| {
-            trainer.calibrated_camera(&stepped[ix]).unwrap().gains[1]
+            calibrated_camera(trainer, &stepped[ix]).gains[1]
         };
         // Only images near the exposure step show parts of the scene that were captured with both
         // exposures.
@@ -523,7 +501,7 @@ mod tests {
         );
         train(&mut trainer, 100);
         let gains = |trainer: &mut SplatTrainer, ix: usize| {
-            trainer.calibrated_camera(&stepped[ix]).unwrap().gains[1]
+            calibrated_camera(trainer, &stepped[ix]).gains[1]
         };
         let ratio = gains(&mut trainer, 17) / gains(&mut trainer, 19);
         assert!((1.4..2.6).contains(&ratio), "{ratio}");

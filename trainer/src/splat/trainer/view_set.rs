@@ -99,6 +99,20 @@ impl ViewSet {
         [0, 1, 2].map(|color| f32_of(mean(color)))
     }
 
+    /// Indices of the last view before and the first view after a keyframe, from the same camera.
+    pub(super) fn neighbors(&self, keyframe: &Keyframe) -> Vec<usize> {
+        // Other cameras have their own exposure. Views are in the order of arrival, which may
+        // differ from that of the stamps.
+        let (before, after): (Vec<_>, Vec<_>) = self
+            .keyframes()
+            .enumerate()
+            .filter(|(_, other)| other.camera == keyframe.camera)
+            .partition(|(_, other)| other.stamp <= keyframe.stamp);
+        let last = before.iter().max_by_key(|(_, other)| other.stamp);
+        let next = after.iter().min_by_key(|(_, other)| other.stamp);
+        last.into_iter().chain(next).map(|(ix, _)| *ix).collect()
+    }
+
     pub(super) fn retain(&mut self, is_kept: impl Fn(&Arc<Keyframe>) -> bool) {
         self.views.retain(|view| is_kept(&view.keyframe));
     }
