@@ -322,12 +322,14 @@ pub(crate) fn bar(length: Option<u64>, template: &'static str, hidden: bool) -> 
 }
 
 /// The crates that log progress.
-const WORKSPACE_CRATES: [&str; 9] = [
+const WORKSPACE_CRATES: [&str; 11] = [
     "fieldrig",
     "bench",
+    "calibrate",
     "calibration",
     "capture",
     "drivers",
+    "report",
     "session",
     "sim",
     "trainer",

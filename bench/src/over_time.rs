@@ -6,9 +6,9 @@ use crate::memory;
 use crate::statistics::theil_sen;
 use crate::viewer::{ReceivedPicture, Viewer};
 use kinematics::quantile::median;
+use report::chart::{Line, Point};
 use serde::Serialize;
 use session::Live;
-use session::chart::{Line, Point};
 use std::time::{Duration, Instant};
 use trainer::gpu::Gpu;
 

@@ -12,16 +12,18 @@ use syn::visit::Visit;
 use syn::{Attribute, Item, UseTree};
 
 /// Source folders of the crates, relative to the workspace.
-const ROOTS: [&str; 12] = [
+const ROOTS: [&str; 14] = [
     "kinematics/src",
     "keyframe/src",
     "calibration/src",
+    "calibration/procedures/src",
     "drivers/src",
     "sim/src",
     "capture/src",
     "trainer/src",
     "viz/src",
     "session/src",
+    "session/report/src",
     "targets/src",
     "bench/src",
     "src",
