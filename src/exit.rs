@@ -65,10 +65,10 @@ pub(crate) fn of(error: &anyhow::Error) -> Exit {
 
 /// The class of an error of this program or its libraries.
 fn class_of(error: &(dyn std::error::Error + 'static)) -> Option<ErrorClass> {
-    if error.is::<BadArgument>() || error.is::<ConfigError>() {
+    if error.is::<BadArgument>() || error.is::<calibrate::BadInput>() || error.is::<ConfigError>() {
         return Some(ErrorClass::BadInput);
     }
-    if error.is::<InsufficientData>() {
+    if error.is::<InsufficientData>() || error.is::<calibrate::InsufficientData>() {
         return Some(ErrorClass::InsufficientData);
     }
     // The budget is an argument, so another one is a remedy.

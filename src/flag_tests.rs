@@ -12,16 +12,9 @@ use syn::{Attribute, Item, LitStr, Macro, Meta};
 /// accept a flag in a message, unless the message names a command that accepts it.
 const PRINTED_BY: [(&str, &[&str]); 24] = [
     ("bench/src", &["bench"]),
+    ("calibration/procedures/src", &["calibrate"]),
     ("calibration/src/hand_eye", &["calibrate hand-eye"]),
     ("keyframe/src/error.rs", &["train", "eval", "bench"]),
-    (
-        "session/src/calibration_report",
-        &[
-            "calibrate intrinsics",
-            "calibrate hand-eye",
-            "calibrate scene",
-        ],
-    ),
     ("session/src/camera_path.rs", &["render"]),
     ("session/src/checkpoints.rs", &["run", "train"]),
     (
@@ -242,7 +235,9 @@ fn source_files(root: &Path) -> Vec<PathBuf> {
         .flatten()
         .map(|entry| entry.path().join("src"));
     let mut folders: Vec<PathBuf> = crates
-        .chain([root.join("src")])
+        .chain(
+            ["src", "calibration/procedures/src", "session/report/src"].map(|src| root.join(src)),
+        )
         .filter(|folder| folder.is_dir())
         .collect();
     let mut files = Vec::new();

@@ -322,13 +322,15 @@ pub(crate) fn bar(length: Option<u64>, template: &'static str, hidden: bool) -> 
 }
 
 /// The crates that log progress.
-const WORKSPACE_CRATES: [&str; 10] = [
+const WORKSPACE_CRATES: [&str; 12] = [
     "fieldrig",
     "bench",
+    "calibrate",
     "calibration",
     "capture",
     "drivers",
     "gpu",
+    "report",
     "session",
     "sim",
     "trainer",

@@ -2,11 +2,12 @@
 
 use crate::Result;
 use keyframe::failed;
+use report::Table;
+use report::chart::drawing::escaped;
+use report::chart::{Chart, raster};
 use serde_json::Value;
 use session::Context;
-use session::chart::drawing::escaped;
-use session::chart::{Chart, raster};
-use session::{Table, run_folder};
+use session::run_folder;
 use std::path::{Path, PathBuf};
 
 /// Results of a bench so far.

@@ -8,8 +8,9 @@ use crate::viewer::Viewer;
 use gpu::Gpu;
 use keyframe::counted;
 use kinematics::quantile::{Rank, quantile};
-use session::chart::{Axis, Chart, Line, Marker, Point, Scale};
-use session::{Live, Table};
+use report::Table;
+use report::chart::{Axis, Chart, Line, Marker, Point, Scale};
+use session::Live;
 use std::collections::BTreeMap;
 use std::sync::Arc;
 

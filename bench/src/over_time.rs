@@ -7,9 +7,9 @@ use crate::statistics::theil_sen;
 use crate::viewer::{ReceivedPicture, Viewer};
 use gpu::Gpu;
 use kinematics::quantile::median;
+use report::chart::{Line, Point};
 use serde::Serialize;
 use session::Live;
-use session::chart::{Line, Point};
 use std::time::{Duration, Instant};
 
 /// Time between two samples.

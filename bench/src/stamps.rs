@@ -6,10 +6,10 @@ use crate::{Error, Result};
 use kinematics::quantile::{Rank, median, quantile};
 use kinematics::random::Random;
 use kinematics::{ClockMap, JointHistory, JointState, Stamp};
+use report::Table;
+use report::chart::{Axis, Chart, Line, Point, Scale};
 use serde::Serialize;
 use session::Context;
-use session::Table;
-use session::chart::{Axis, Chart, Line, Point, Scale};
 use std::path::PathBuf;
 use std::time::Duration;
 

@@ -64,4 +64,4 @@ pub use robot_motion::{RobotMotion, RobotReading};
 pub use stamp_clock::StampClock;
 pub use stations::{StationReport, Stations};
 pub use stop::Stop;
-pub use supervised_arm::{MotionEnd, SupervisedArm};
+pub use supervised_arm::{HOLDING, MotionEnd, SupervisedArm};

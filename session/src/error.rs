@@ -163,7 +163,7 @@ impl StdError for Error {
 }
 
 impl_from!(
-    Error: Capture(capture::Error), Capture(capture::ConfigError), Trainer(trainer::Error), Trainer(gpu::Error), Trainer(model_files::Error), Keyframe(keyframe::Error), Driver(drivers::Error), Kinematics(kinematics::Error), Io(std::io::Error), Other(image::ImageError), Other(resvg::usvg::Error), Other(serde_json::Error),
+    Error: Capture(capture::Error), Capture(capture::ConfigError), Trainer(trainer::Error), Trainer(gpu::Error), Trainer(model_files::Error), Keyframe(keyframe::Error), Driver(drivers::Error), Kinematics(kinematics::Error), Io(std::io::Error), Other(image::ImageError), Other(anyhow::Error), Other(serde_json::Error),
 );
 define_context!(Error);
 

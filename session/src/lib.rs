@@ -21,10 +21,8 @@
 //! # Ok::<(), session::Error>(())
 //! ```
 
-pub mod calibration_report;
 pub mod camera_list;
 pub mod camera_path;
-pub mod chart;
 pub mod checkpoints;
 mod chunk_publisher;
 mod clock;
@@ -38,7 +36,6 @@ mod error;
 pub mod evaluate;
 pub mod evaluation_schedule;
 mod gpu_loss;
-mod inline_picture;
 mod kept_folder;
 mod latency;
 mod ledger;
@@ -60,7 +57,6 @@ mod scene_calibration;
 pub mod scene_hint;
 mod session;
 mod stored_keyframes;
-mod table;
 mod time_slices;
 mod training;
 mod training_options;
@@ -92,7 +88,6 @@ pub use session::{
     EndingSession, Evaluators, FinishedModel, Limits, Session, TrainingOutcome, finish,
 };
 pub use stored_keyframes::StoredKeyframes;
-pub use table::Table;
 pub use training::{TrainingPlan, check_before_data, drive, limits, model_specs, train};
 pub use training_options::{AvailableData, REALIGN, Refine, RefineSettings, TrainingOptions};
 pub use viewer::{ModelViewer, ServedModel};

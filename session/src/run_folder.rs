@@ -464,7 +464,7 @@ fn name_from_time(since_epoch: Duration) -> String {
 }
 
 /// Date and time of day in UTC, for readers.
-pub(crate) fn utc_now() -> String {
+pub fn utc_now() -> String {
     #[expect(clippy::disallowed_methods, reason = "only shown; no time is measured")]
     let secs = SystemTime::now()
         .duration_since(UNIX_EPOCH)

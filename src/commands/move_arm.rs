@@ -3,8 +3,8 @@
 use crate::exit::{BadArgument, Exit};
 use crate::{print, signals};
 use anyhow::bail;
-use capture::config::{ArmMotion, Rig};
-use capture::{Stop, SupervisedArm, open};
+use capture::config::Rig;
+use capture::{HOLDING, Stop, SupervisedArm, open};
 use drivers::clock;
 use drivers::motion::{JointTarget, OnLoss};
 use indicatif::ProgressBar;
@@ -14,9 +14,6 @@ use std::path::PathBuf;
 
 /// A target may exceed the joint range by this much, rad or m.
 const TOLERANCE_RAD: f64 = 1e-4;
-
-/// What to do while an arm is held that its motors would release.
-pub(super) const HOLDING: &str = "holding the arm; support it before you press Ctrl-C, because the motors then no longer hold it";
 
 /// Flags of `move`.
 #[derive(Debug, clap::Args)]
@@ -82,7 +79,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     )?;
     signals::stop_when_output_closes(&stop)?;
     let rig = Rig::load(&args.rig_file, &[])?;
-    let motion = motion_of(&rig)?;
+    let motion = open::motion_of(&rig)?;
     check(args, &rig)?;
     let mut arm = SupervisedArm::new(open::movable_arm(&rig)?, &rig);
     let bar = print::bar(None, "{spinner} {elapsed} {msg}", args.json);
@@ -132,16 +129,6 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     Ok(Exit::Done)
 }
 
-/// How the arm of a rig may be moved.
-pub(super) fn motion_of(rig: &Rig) -> Result<&ArmMotion, BadArgument> {
-    rig.arm.motion.as_ref().ok_or_else(|| {
-        BadArgument(
-            "the rig file has no table [arm.motion], so its arm is only read: see docs/guide/moving-arms.md".to_owned(),
-        )
-    })
-}
-
-/// Checks the arguments against the rig file, before any device is opened.
 fn check(args: &Args, rig: &Rig) -> Result<(), BadArgument> {
     let joints = &rig.arm.joints;
     if let Some(to) = args.to.as_ref().filter(|to| to.len() != joints.len()) {

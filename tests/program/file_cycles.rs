@@ -12,11 +12,12 @@ use syn::visit::Visit;
 use syn::{Attribute, Item, UseTree};
 
 /// Source folders of the crates, relative to the workspace.
-const ROOTS: [&str; 13] = [
+const ROOTS: [&str; 15] = [
     "kinematics/src",
     "keyframe/src",
     "calibration/src",
     "trainer/model-files/src",
+    "calibration/procedures/src",
     "drivers/src",
     "sim/src",
     "capture/src",
@@ -24,6 +25,7 @@ const ROOTS: [&str; 13] = [
     "trainer/src",
     "viz/src",
     "session/src",
+    "session/report/src",
     "targets/src",
     "bench/src",
     "src",

@@ -15,7 +15,7 @@ mod tags;
 pub use movable::{Movable, movable};
 #[cfg(target_os = "linux")]
 pub use real::franka_chain;
-pub use real::{check_motion, movable_arm, udp_arm_address};
+pub use real::{check_motion, motion_of, movable_arm, udp_arm_address};
 
 use crate::config::{ArmDriver, BaseDriver, CameraDriver, Override, Parent, Rig, ScannerDriver};
 use crate::error::{Context, Error};

@@ -88,16 +88,25 @@ pub(super) fn open(rig: &mut Rig) -> crate::Result<(Devices, Vec<DatagramMonitor
 /// If the rig file has no table `[arm.motion]`, the driver cannot move arms or does not support the
 /// settings, or the arm cannot be reached.
 pub fn movable_arm(rig: &Rig) -> crate::Result<Box<dyn MovableArm>> {
-    let Some(motion) = &rig.arm.motion else {
-        bail!(
-            "the rig file has no table [arm.motion], so its arm is only read; see docs/guide/moving-arms.md"
-        );
-    };
+    let motion = motion_of(rig)?;
     match rig.arm.driver {
         ArmDriver::Can => movable_can_arm(rig, motion),
         ArmDriver::Franka => movable_franka_arm(rig, motion),
         _ => bail!("{READ_ONLY}"),
     }
+}
+
+/// How the arm of a rig may be moved.
+///
+/// # Errors
+///
+/// If the rig file does not say so.
+pub fn motion_of(rig: &Rig) -> crate::Result<&ArmMotion> {
+    rig.arm.motion.as_ref().ok_or_else(|| {
+        crate::Error::BadInput(
+            "the rig file has no table [arm.motion], so its arm is only read: see docs/guide/moving-arms.md".to_owned(),
+        )
+    })
 }
 
 /// Checks the motion settings as far as possible without the arm.

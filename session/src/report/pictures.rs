@@ -1,11 +1,11 @@
 //! Test images next to the model's renders, small enough to embed in a page.
 
 use crate::evaluate;
-use crate::inline_picture::{data_uri, fit_size};
 use capture::downscale;
 use keyframe::Keyframe;
 use kinematics::f32s_of;
 use kinematics::quantile::trimmed_range;
+use report::inline_picture::{data_uri, fit_size};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 use trainer::{AlignedModel, Picture};

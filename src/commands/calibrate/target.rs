@@ -4,6 +4,7 @@ use super::target_argument;
 use crate::exit::BadArgument;
 use crate::print;
 use anyhow::Context;
+use calibrate::symmetry_warning;
 use std::path::PathBuf;
 use targets::{Paper, TargetSpec};
 
@@ -13,18 +14,6 @@ const DEFAULT_TARGET: &str = "charuco:5x7:34mm:26mm:5X5_100";
 const TARGET_HELP: &str = "Target to draw: chessboard:9x6:25mm (inner corners, square), charuco:5x7:34mm:26mm:5X5_100 \
      (squares, square, marker, dictionary), aprilgrid:6x6:20mm:0.3 (tags, tag, gap relative to the tag), \
      puzzleboard:12x9:20mm (squares, square) or tag:36h11:5:100mm (family, id, side)";
-
-/// A warning if the pose of a target is ambiguous.
-pub(super) fn symmetry_warning(target: &TargetSpec) -> Option<String> {
-    let turn = match target.symmetry().len() {
-        0 | 1 => return None,
-        2 => "half a turn",
-        _ => "a quarter turn",
-    };
-    Some(format!(
-        "{target} looks the same after {turn}, so a single image does not show how it is rotated; for hand-eye calibration, use a target whose orientation is unique, such as a chessboard with an even and an odd number of inner corners (9x6) or a ChArUco board"
-    ))
-}
 
 /// Flags of `calibrate target`.
 #[derive(Debug, clap::Args)]

@@ -1,7 +1,7 @@
 //! Compares what samples files may contain with docs/reference/samples.md.
 
 use super::{FILE_KEYS, SAMPLE_KEYS, SamplesFile};
-use crate::commands::calibrate::lens::{LensFile, param_names};
+use crate::lens::{LensFile, param_names};
 use serde_json::{Value, json};
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::Path;

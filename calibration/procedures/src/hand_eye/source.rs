@@ -1,8 +1,9 @@
 //! Samples of `fieldrig calibrate hand-eye` from a file, a recording or devices.
 
-use super::super::scan::Scan;
 use super::samples_file::{Samples, SamplesFile};
-use crate::exit::InsufficientData;
+use crate::error::InsufficientData;
+use crate::host::Host;
+use crate::scan::Scan;
 use calibration::hand_eye::Setup;
 use kinematics::{Chain, Intrinsics, Transform};
 use nalgebra::DMatrix;
@@ -84,11 +85,9 @@ impl Source {
     }
 
     /// Detects the target in all images of a file; a scan has done so.
-    ///
-    /// * `is_hidden`: no progress bar.
-    pub(super) fn samples(&mut self, is_hidden: bool) -> anyhow::Result<Samples> {
+    pub(super) fn samples(&mut self, host: &dyn Host) -> anyhow::Result<Samples> {
         match self {
-            Self::File(file) => file.detect(is_hidden),
+            Self::File(file) => file.detect(host),
             Self::Scan { scan, target } => {
                 let (used, unused) = scan.samples(None);
                 let size_px = Some(scan.intrinsics().size_px);

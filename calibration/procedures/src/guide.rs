@@ -1,66 +1,62 @@
 //! Guidance while devices are read: what the images cover so far, and what to do next.
 
-use super::images::{self, DetectedImage};
-use super::page::GuidancePage;
+use crate::host::CameraView;
+use crate::images::{self, DetectedImage};
 use calibration::hand_eye::{HandEyeAdvice, HandEyeGuidance, Setup};
 use calibration::{BoardView, IntrinsicsAdvice, IntrinsicsGuidance};
 use capture::CalibrationImage;
 use capture::config::{Camera, Parent};
 use drivers::Sample;
-use indicatif::ProgressBar;
 use kinematics::Transform;
 use targets::TargetSpec;
 
 /// What images are taken for.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(super) enum Purpose {
+pub(crate) enum Purpose {
     /// The lens: corners in all parts of the image, and tilts.
     Lens,
     /// The pose of the camera on the robot: rotations.
     HandEye,
 }
 
-/// Detects the target in each image as it arrives, and shows what to do next: on the page and in a
-/// progress bar, or as lines if stderr is not a terminal.
-pub(super) struct Guide<'a> {
+/// Detects the target in each image as it arrives, and shows what to do next.
+pub(crate) struct Guide<'a> {
     target: &'a TargetSpec,
     camera: &'a Camera,
     purpose: Purpose,
-    bar: ProgressBar,
-    page: GuidancePage,
+    shown: Box<dyn CameraView>,
     views: Vec<BoardView>,
     base_from_flange: Vec<Transform>,
     detected: Vec<DetectedImage>,
 }
 
 impl<'a> Guide<'a> {
-    pub(super) fn new(
+    pub(crate) fn new(
         target: &'a TargetSpec,
         camera: &'a Camera,
         purpose: Purpose,
-        bar: ProgressBar,
-        page: GuidancePage,
+        shown: Box<dyn CameraView>,
     ) -> Self {
-        let guide = Self {
+        let mut guide = Self {
             target,
             camera,
             purpose,
-            bar,
-            page,
+            shown,
             views: Vec::new(),
             base_from_flange: Vec::new(),
             detected: Vec::new(),
         };
         // The first advice appears before any image, so that it describes how to begin.
-        guide.show(&guide.advice());
+        let advice = guide.advice();
+        guide.shown.advise(&advice);
         guide
     }
 
     /// Shows a sample if it is an image of the camera, and detects the target in the images that
     /// are new.
-    pub(super) fn update(&mut self, sample: &Sample, images: &[CalibrationImage]) {
+    pub(crate) fn update(&mut self, sample: &Sample, images: &[CalibrationImage]) {
         if let Sample::Image(image) = sample {
-            self.page.show_live(image);
+            self.shown.show_live(image);
         }
         self.detect(images);
     }
@@ -71,7 +67,7 @@ impl<'a> Guide<'a> {
             let detected = images::detect_in_image(image, self.target);
             let view = detected.board.as_ref().ok().map(|board| &board.view);
             // Images without the target are shown, too: they often show why it was not found.
-            self.page.show_searched(image.size_px, &image.gray, view);
+            self.shown.show_searched(image.size_px, &image.gray, view);
             let text = match &detected.board {
                 Ok(board) => {
                     // A copy, because the detection itself is kept for the estimate.
@@ -83,16 +79,16 @@ impl<'a> Guide<'a> {
                 // The reason replaces the advice, while the target can still be moved.
                 Err(reason) => format!("{}: {reason}", detected.name),
             };
-            self.show(&text);
+            self.shown.advise(&text);
             self.detected.push(detected);
         }
     }
 
     /// The target in each of all images.
-    pub(super) fn finish(mut self, images: &[CalibrationImage]) -> Vec<DetectedImage> {
+    pub(crate) fn finish(mut self, images: &[CalibrationImage]) -> Vec<DetectedImage> {
         // Images that arrived after the last update.
         self.detect(images);
-        self.page.finish();
+        self.shown.finish();
         self.detected
     }
 
@@ -140,16 +136,6 @@ impl<'a> Guide<'a> {
             format!("{so_far}; {advice}: press Ctrl-C to calibrate")
         } else {
             format!("{so_far}; next: {advice}")
-        }
-    }
-
-    fn show(&self, text: &str) {
-        self.page.guide(text);
-        // A hidden bar swallows messages, for example if stderr is a file.
-        if self.bar.is_hidden() {
-            log::info!("{text}");
-        } else {
-            self.bar.set_message(text.to_owned());
         }
     }
 }

@@ -1,24 +1,27 @@
 //! Intrinsics as JSON.
 
-use super::json_object::JsonObject;
-use crate::exit::BadArgument;
+use crate::error::BadInput;
+use crate::json_object::JsonObject;
 use kinematics::{Intrinsics, Lens};
 use nalgebra::DMatrix;
 use serde::Serialize;
 
 /// Intrinsics in JSON files, as `calibrate intrinsics` prints them. Pixel centers are at +0.5.
 #[derive(Clone, Debug, Serialize)]
-pub(super) struct LensFile {
+pub struct LensFile {
     /// `pinhole`, `brown_conrady` (five or eight coefficients) or `kannala_brandt`, as in rig
     /// files; by default, pinhole without distortion coefficients, and `brown_conrady` with them.
     #[serde(skip_serializing_if = "Option::is_none")]
-    pub(super) model: Option<String>,
+    model: Option<String>,
     #[serde(skip_serializing_if = "Option::is_none")]
-    pub(super) size_px: Option<[u32; 2]>,
-    pub(super) focal_px: [f64; 2],
-    pub(super) principal_px: [f64; 2],
+    /// Width and height of the images.
+    pub size_px: Option<[u32; 2]>,
+    /// Focal lengths.
+    pub focal_px: [f64; 2],
+    /// Principal point.
+    pub principal_px: [f64; 2],
     /// Coefficients in OpenCV's order.
-    pub(super) distortion: Vec<f64>,
+    pub distortion: Vec<f64>,
     /// Covariance of all these parameters, row by row; empty if it is unknown.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     covariance: Vec<f64>,
@@ -34,7 +37,7 @@ const KANNALA_BRANDT: &str = "kannala_brandt";
 impl LensFile {
     /// Keys of a file with intrinsics, including those that `calibrate intrinsics --json` prints
     /// and that are not needed.
-    pub(super) const KEYS: [&'static str; 17] = [
+    pub(crate) const KEYS: [&'static str; 17] = [
         "focal_px",
         "principal_px",
         "distortion",
@@ -54,7 +57,7 @@ impl LensFile {
         "next_view",
     ];
 
-    pub(super) fn read(object: &JsonObject<'_>) -> Result<Self, BadArgument> {
+    pub(crate) fn read(object: &JsonObject<'_>) -> Result<Self, BadInput> {
         let size_px = match object.array::<2>("size_px")? {
             Some([width, height]) => Some([side(object, width)?, side(object, height)?]),
             None => None,
@@ -81,7 +84,8 @@ impl LensFile {
         })
     }
 
-    pub(super) fn of(intrinsics: &Intrinsics) -> Self {
+    /// The intrinsics without their uncertainty.
+    pub fn of(intrinsics: &Intrinsics) -> Self {
         let (model, distortion) = match &intrinsics.lens {
             Lens::Pinhole => (PINHOLE, Vec::new()),
             Lens::BrownConrady(k) => (BROWN_CONRADY, k.to_vec()),
@@ -99,7 +103,9 @@ impl LensFile {
         }
     }
 
-    pub(super) fn with_covariance(self, covariance: &DMatrix<f64>) -> Self {
+    /// The intrinsics with the covariance of their parameters.
+    #[must_use]
+    pub fn with_covariance(self, covariance: &DMatrix<f64>) -> Self {
         // Symmetric, so the order of rows and columns does not matter.
         Self {
             covariance: covariance.as_slice().to_vec(),
@@ -109,23 +115,23 @@ impl LensFile {
 
     /// Covariance of [`Intrinsics::params`]. If only standard deviations are given, the parameters
     /// count as independent, and parameters without a standard deviation count as exact.
-    pub(super) fn covariance(
+    pub(crate) fn covariance(
         &self,
         intrinsics: &Intrinsics,
-    ) -> Result<Option<DMatrix<f64>>, BadArgument> {
+    ) -> Result<Option<DMatrix<f64>>, BadInput> {
         let n = intrinsics.params().len();
         let name = |ix: usize| param_names(self.model.as_deref())[ix];
         // A standard deviation of a coefficient that the lens lacks is probably that of another
         // lens.
         if let Some((ix, _)) = self.sigmas.iter().find(|(ix, _)| *ix >= n) {
             let params = param_names(self.model.as_deref())[..n].join(", ");
-            return Err(BadArgument(format!(
+            return Err(BadInput(format!(
                 "intrinsics.sigma.{}: the lens has only {params}",
                 name(*ix)
             )));
         }
         let given = covariance_of(&self.covariance, intrinsics)
-            .map_err(|error| BadArgument(format!("intrinsics.covariance: {error}")))?;
+            .map_err(|error| BadInput(format!("intrinsics.covariance: {error}")))?;
         let Some(given) = given else {
             let mut independent = DMatrix::zeros(n, n);
             for (ix, sigma) in &self.sigmas {
@@ -141,7 +147,7 @@ impl LensFile {
         for (ix, sigma) in &self.sigmas {
             let of_covariance = given[(*ix, *ix)].max(0.0).sqrt();
             if (sigma - of_covariance).abs() > MAX_DIFFERENCE * sigma.max(of_covariance) {
-                return Err(BadArgument(format!(
+                return Err(BadInput(format!(
                     "intrinsics.sigma.{} is {sigma}, but intrinsics.covariance means {of_covariance}; remove the wrong one",
                     name(*ix)
                 )));
@@ -151,11 +157,11 @@ impl LensFile {
     }
 
     /// The intrinsics for images of the given size.
-    pub(super) fn intrinsics(&self, size_px: [u32; 2]) -> Result<Intrinsics, BadArgument> {
+    pub(crate) fn intrinsics(&self, size_px: [u32; 2]) -> Result<Intrinsics, BadInput> {
         let [width, height] = size_px;
         // Intrinsics are not scaled to another resolution, because cameras often crop instead.
         if let Some(own) = self.size_px.filter(|own| *own != size_px) {
-            return Err(BadArgument(format!(
+            return Err(BadInput(format!(
                 "the intrinsics are for images of {}x{} pixels, but the images have {width}x{height}; calibrate this resolution",
                 own[0], own[1]
             )));
@@ -165,7 +171,7 @@ impl LensFile {
         if (0..2).any(|axis| {
             !CENTRAL_FRAC.contains(&(self.principal_px[axis] / f64::from(size_px[axis])))
         }) {
-            return Err(BadArgument(format!(
+            return Err(BadInput(format!(
                 "principal_px {:?} is far from the center of images of {width}x{height} pixels; the intrinsics are probably for another resolution",
                 self.principal_px
             )));
@@ -179,11 +185,11 @@ impl LensFile {
         };
         intrinsics
             .validate()
-            .map_err(|error| BadArgument(format!("intrinsics: {error}")))?;
+            .map_err(|error| BadInput(format!("intrinsics: {error}")))?;
         Ok(intrinsics)
     }
 
-    fn lens(&self) -> Result<Lens, BadArgument> {
+    fn lens(&self) -> Result<Lens, BadInput> {
         let k = &self.distortion;
         let default = if k.is_empty() { PINHOLE } else { BROWN_CONRADY };
         let model = self.model.as_deref().unwrap_or(default);
@@ -196,18 +202,19 @@ impl LensFile {
             BROWN_CONRADY => Err(too_many(8)),
             KANNALA_BRANDT if k.len() <= 4 => Ok(Lens::KannalaBrandt(padded(k))),
             KANNALA_BRANDT => Err(too_many(4)),
-            other => Err(BadArgument(format!(
+            other => Err(BadInput(format!(
                 "intrinsics: unknown model {other:?}, expected {PINHOLE}, {BROWN_CONRADY} or {KANNALA_BRANDT}"
             ))),
         }
     }
 
-    pub(super) fn model_name(&self) -> &str {
+    /// Name of the lens model, as in rig files.
+    pub fn model_name(&self) -> &str {
         self.model.as_deref().unwrap_or(PINHOLE)
     }
 
     /// The value of `intrinsics` in a rig file.
-    pub(super) fn to_toml(&self) -> String {
+    pub fn to_toml(&self) -> String {
         let distortion = if self.distortion.is_empty() {
             String::new()
         } else {
@@ -228,7 +235,7 @@ impl LensFile {
     clippy::cast_sign_loss,
     reason = "a whole number in the range"
 )]
-fn side(object: &JsonObject<'_>, value: f64) -> Result<u32, BadArgument> {
+fn side(object: &JsonObject<'_>, value: f64) -> Result<u32, BadInput> {
     let is_side = value.fract() == 0.0 && (1.0..=f64::from(u32::MAX)).contains(&value);
     is_side
         .then_some(value as u32)
@@ -236,8 +243,8 @@ fn side(object: &JsonObject<'_>, value: f64) -> Result<u32, BadArgument> {
 }
 
 /// The error for `n` coefficients of a model that has at most `max`.
-fn too_many(n: usize, model: &str, max: usize) -> BadArgument {
-    BadArgument(format!(
+fn too_many(n: usize, model: &str, max: usize) -> BadInput {
+    BadInput(format!(
         "intrinsics: {n} distortion coefficients; {model} has at most {max}"
     ))
 }
@@ -258,7 +265,7 @@ const KANNALA_BRANDT_NAMES: [&str; 4] = ["k1", "k2", "k3", "k4"];
 
 /// Names of the parameters of a lens model, in the order of [`Intrinsics::params`]. A lens may have
 /// only the first ones.
-pub(super) fn param_names(model: Option<&str>) -> Vec<&'static str> {
+pub(crate) fn param_names(model: Option<&str>) -> Vec<&'static str> {
     let coefficients: &[&str] = if model == Some(KANNALA_BRANDT) {
         &KANNALA_BRANDT_NAMES
     } else {
@@ -268,7 +275,7 @@ pub(super) fn param_names(model: Option<&str>) -> Vec<&'static str> {
 }
 
 /// Standard deviations with the indices of their parameters.
-fn sigmas(sigma: &JsonObject<'_>, model: Option<&str>) -> Result<Vec<(usize, f64)>, BadArgument> {
+fn sigmas(sigma: &JsonObject<'_>, model: Option<&str>) -> Result<Vec<(usize, f64)>, BadInput> {
     let names = param_names(model).into_iter().enumerate();
     let given = names.filter_map(|(ix, name)| sigma.get(name).map(|value| (ix, name, value)));
     given
@@ -282,7 +289,7 @@ fn sigmas(sigma: &JsonObject<'_>, model: Option<&str>) -> Result<Vec<(usize, f64
 }
 
 /// The matrix of a list. `None` if it is empty.
-pub(super) fn covariance_of(
+pub(crate) fn covariance_of(
     list: &[f64],
     intrinsics: &Intrinsics,
 ) -> Result<Option<DMatrix<f64>>, String> {

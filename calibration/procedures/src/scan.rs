@@ -1,24 +1,25 @@
 //! Images of a target from a recording or from the devices of a rig, as input of `calibrate
 //! intrinsics` and `calibrate hand-eye`.
 
-use super::guide::{Guide, Purpose};
-use super::images::{self, DetectedImage, OtherSize};
-use super::lens::covariance_of;
-use super::outputs::{InputKind, RigFlags, RigOutput};
-use super::page::GuidancePage;
-use crate::exit::{BadArgument, InsufficientData};
-use crate::{print, signals};
+use crate::error::{BadInput, InsufficientData};
+use crate::guide::{Guide, Purpose};
+use crate::host::{Activity, Host};
+use crate::images::{self, DetectedImage, OtherSize};
+use crate::lens::covariance_of;
+use crate::outputs::{InputKind, RigOptions, RigOutput};
 use calibration::BoardView;
 use calibration::hand_eye::{
     BoardObservation, FlangeMotion, HandEyeSample, Setup, corners_at_mid_exposure,
 };
 use capture::config::{ArmDriver, Camera, Override, Parent, Rig};
 use capture::open::{self, Devices, Opened};
-use capture::{ArmDuringImage, CalibrationImage, CalibrationImages, calibration_images};
+use capture::{
+    ArmDuringImage, CalibrationImage, CalibrationImages, StampClock, calibration_images,
+};
 use kinematics::{Chain, Intrinsics, Stamp, Transform};
 use nalgebra::DMatrix;
-use session::calibration_report::{Photo, Photos, Unused};
-use session::corrected_rig;
+use report::calibration_report::{Photo, Photos, Unused};
+use session::{ReadProgress, corrected_rig};
 use std::ops::ControlFlow;
 use std::path::Path;
 use targets::TargetSpec;
@@ -32,7 +33,7 @@ const DEFAULT_SECS: f64 = 30.0;
 const MAX_SHIFT_PX: f64 = 3.0;
 
 /// Images of one camera in which a target was searched.
-pub(super) struct Scan {
+pub(crate) struct Scan {
     rig: Rig,
     camera: Camera,
     setup: Setup,
@@ -43,31 +44,31 @@ pub(super) struct Scan {
     /// The images, if they were requested.
     photos: Photos,
     /// Why there are no images.
-    pub(super) no_images: Option<String>,
+    pub(crate) no_images: Option<String>,
     /// Damage of the recording.
-    pub(super) warnings: Vec<String>,
+    pub(crate) warnings: Vec<String>,
 }
 
 /// What to do while images are read.
-#[derive(Clone, Copy, Debug)]
-pub(super) struct ScanOptions {
+#[derive(Clone, Copy)]
+pub(crate) struct ScanOptions<'a> {
+    /// Receives the progress and may request a stop.
+    pub(crate) host: &'a dyn Host,
     /// Keeps the images for a report.
-    pub(super) keeps_photos: bool,
-    /// No progress bars.
-    pub(super) is_hidden: bool,
+    pub(crate) keeps_photos: bool,
     /// What is calibrated. Hand-eye calibration needs an arm.
-    pub(super) purpose: Purpose,
+    pub(crate) purpose: Purpose,
 }
 
-impl RigFlags {
+impl RigOptions {
     /// Reads a recording, or the devices of a rig. `None` if the input is neither.
     ///
     /// * `output`: gets the calibration that devices report.
-    pub(super) fn read(
+    pub(crate) fn read(
         &self,
         input: &Path,
         target: Option<&TargetSpec>,
-        options: ScanOptions,
+        options: ScanOptions<'_>,
         output: Option<&mut RigOutput>,
     ) -> anyhow::Result<Option<Scan>> {
         self.check(input)?;
@@ -79,7 +80,7 @@ impl RigFlags {
         session::expect(input)?;
         let Some(target) = target else {
             let example = "for example --target charuco:5x7:34mm:26mm:5X5_100";
-            return Err(BadArgument(format!(
+            return Err(BadInput(format!(
                 "{}: --target is required with a recording or rig file, {example}",
                 input.display()
             ))
@@ -99,7 +100,7 @@ impl RigFlags {
         // The rig as opened: cameras may have reported calibration that the file lacks.
         let rig = opened.rig.clone();
         if options.purpose == Purpose::HandEye && rig.arm.driver == ArmDriver::None {
-            return Err(BadArgument(format!(
+            return Err(BadInput(format!(
                 "{}: the rig has no arm, which hand-eye calibration needs; without an arm, use `fieldrig calibrate intrinsics`",
                 input.display()
             ))
@@ -128,7 +129,7 @@ impl RigFlags {
             .then(|| no_images(input, &rig, &camera, &found));
         // From devices, the target was detected while they were read.
         let detected = detected.unwrap_or_else(|| {
-            images::detect_each(&found.images, options.is_hidden, |image| {
+            images::detect_each(&found.images, options.host, |image| {
                 images::detect_in_image(image, target)
             })
         });
@@ -164,24 +165,17 @@ impl RigFlags {
         opened: Opened,
         camera: &Camera,
         target: &TargetSpec,
-        options: ScanOptions,
+        options: ScanOptions<'_>,
     ) -> anyhow::Result<(CalibrationImages, Option<Vec<DetectedImage>>)> {
-        let stop = signals::stop_on_signals_logging(
-            "calibrating with the images so far; Ctrl-C again exits at once",
-        )?;
+        let host = options.host;
+        let activity = Activity::ReadImages;
+        let stop = host.stop_requests(activity)?;
         // Only recordings have stamps that are unrelated to this computer's clock.
-        let is_live = !matches!(opened.stamp_clock, capture::StampClock::Unrelated);
-        let template = if is_live {
-            "{spinner} {msg}"
-        } else {
-            "{spinner} {pos} images"
-        };
-        let bar = print::bar(None, template, options.is_hidden);
-        let page = is_live
-            .then(|| GuidancePage::start(&self.page, camera))
+        let is_live = !matches!(opened.stamp_clock, StampClock::Unrelated);
+        let view = is_live
+            .then(|| host.open_view(camera, activity))
             .transpose()?;
-        let mut guide =
-            page.map(|page| Guide::new(target, camera, options.purpose, bar.clone(), page));
+        let mut guide = view.map(|view| Guide::new(target, camera, options.purpose, view));
         // A recording has an end.
         let limit_secs = if is_live {
             self.seconds.unwrap_or(DEFAULT_SECS)
@@ -190,9 +184,13 @@ impl RigFlags {
         };
         let mut first: Option<Stamp> = None;
         let found = calibration_images(opened, &camera.name, MAX_SHIFT_PX, |sample, images| {
-            bar.set_position(images.len() as u64);
-            if let Some(guide) = &mut guide {
-                guide.update(sample, images);
+            match &mut guide {
+                Some(guide) => guide.update(sample, images),
+                None => host.on_progress(ReadProgress {
+                    noun: "images",
+                    n_done: images.len(),
+                    n_all: None,
+                }),
             }
             // Counted by stamps, because a simulation does not run in real time.
             let since_first = sample
@@ -204,8 +202,7 @@ impl RigFlags {
                 ControlFlow::Continue(())
             }
         });
-        bar.finish_and_clear();
-        // The bar is removed before an error is shown.
+        host.on_progress_end();
         let found = found?;
         let detected = guide.map(|guide| guide.finish(&found.images));
         Ok((found, detected))
@@ -239,7 +236,7 @@ impl Scan {
         camera: Camera,
         found: CalibrationImages,
         detected: Vec<DetectedImage>,
-        options: ScanOptions,
+        options: ScanOptions<'_>,
     ) -> anyhow::Result<Self> {
         let mut photos = Photos::new();
         let mut images = Vec::new();
@@ -262,7 +259,7 @@ impl Scan {
     }
 
     /// Images in which the target was searched, with the state of the arm.
-    pub(super) fn new(
+    pub(crate) fn new(
         rig: Rig,
         camera: Camera,
         images: Vec<(DetectedImage, Option<ArmDuringImage>)>,
@@ -298,20 +295,20 @@ impl Scan {
         })
     }
 
-    pub(super) fn setup(&self) -> Setup {
+    pub(crate) fn setup(&self) -> Setup {
         self.setup
     }
 
-    pub(super) fn chain(&self) -> Option<&Chain> {
+    pub(crate) fn chain(&self) -> Option<&Chain> {
         self.chain.as_ref()
     }
 
-    pub(super) fn intrinsics(&self) -> &Intrinsics {
+    pub(crate) fn intrinsics(&self) -> &Intrinsics {
         &self.camera.intrinsics
     }
 
     /// Covariance of the intrinsics, if the rig file contains it.
-    pub(super) fn intrinsics_covariance(&self) -> Result<Option<DMatrix<f64>>, BadArgument> {
+    pub(crate) fn intrinsics_covariance(&self) -> Result<Option<DMatrix<f64>>, BadInput> {
         let Camera {
             name,
             intrinsics,
@@ -319,25 +316,25 @@ impl Scan {
             ..
         } = &self.camera;
         covariance_of(intrinsics_covariance, intrinsics)
-            .map_err(|error| BadArgument(format!("camera.{name}.intrinsics_covariance: {error}")))
+            .map_err(|error| BadInput(format!("camera.{name}.intrinsics_covariance: {error}")))
     }
 
     /// The size of a board that the images show instead of that of the target.
-    pub(super) fn other_size(&self, target: &TargetSpec) -> Option<OtherSize> {
+    pub(crate) fn other_size(&self, target: &TargetSpec) -> Option<OtherSize> {
         images::other_size(self.images.iter().map(|(image, _)| image), target)
     }
 
-    pub(super) fn n_images(&self) -> usize {
+    pub(crate) fn n_images(&self) -> usize {
         self.images.len()
     }
 
     /// Takes the images, if they were requested.
-    pub(super) fn take_photos(&mut self) -> Photos {
+    pub(crate) fn take_photos(&mut self) -> Photos {
         std::mem::take(&mut self.photos)
     }
 
     /// An error if no image can be used.
-    pub(super) fn check(&self) -> Result<(), InsufficientData> {
+    pub(crate) fn check(&self) -> Result<(), InsufficientData> {
         self.no_images
             .clone()
             .map_or(Ok(()), |reason| Err(InsufficientData(reason)))
@@ -345,20 +342,20 @@ impl Scan {
 
     /// `parent_from_camera` of the rig file for an estimated pose, which is relative to the flange
     /// or base.
-    pub(super) fn rig_pose(&self, parent_from_camera: &Transform) -> Transform {
+    pub(crate) fn rig_pose(&self, parent_from_camera: &Transform) -> Transform {
         corrected_rig::parent_from_camera(&self.rig.base, self.camera.parent, parent_from_camera)
     }
 
     /// Whether the rows of an image are exposed one after another, so that the corrections of
     /// corners depend on the pose of the camera.
-    pub(super) fn is_rolling_shutter(&self) -> bool {
+    pub(crate) fn is_rolling_shutter(&self) -> bool {
         self.camera
             .readout_micros
             .is_some_and(|micros| micros > 0.0)
     }
 
     /// The images, with corners corrected for a rolling shutter.
-    pub(super) fn detected(&mut self) -> Vec<DetectedImage> {
+    pub(crate) fn detected(&mut self) -> Vec<DetectedImage> {
         // Moved out, because the correction needs the rest of `self`.
         let images = std::mem::take(&mut self.images);
         images
@@ -374,7 +371,7 @@ impl Scan {
 
     /// Samples for hand-eye calibration, and the images without target with the reasons.
     /// `parent_from_camera`: pose of the camera, if it is known better than in the rig file.
-    pub(super) fn samples(
+    pub(crate) fn samples(
         &self,
         parent_from_camera: Option<&Transform>,
     ) -> (Vec<HandEyeSample>, Vec<Unused>) {

@@ -1,28 +1,28 @@
 //! Report of a calibration from a static scene.
 
-use super::Heading;
-use super::page::{self, Page};
-use crate::SceneCalibration;
 use calibration::{Estimate, PoseEstimate, PoseSigmas, ScalarEstimate, Trial};
 use capture::config::Rig;
 use kinematics::Transform;
+use report::calibration_report::page::{self, Page};
+use report::calibration_report::{Heading, with_sigma};
+use session::SceneCalibration;
 
 /// Contents of the report.
 #[derive(Clone, Debug)]
-pub struct SceneReport<'a> {
+pub(crate) struct SceneReport<'a> {
     /// Input, verdict and warnings.
-    pub heading: &'a Heading,
+    pub(crate) heading: &'a Heading,
     /// The rig before the calibration, if there is one.
-    pub rig: Option<&'a Rig>,
+    pub(crate) rig: Option<&'a Rig>,
     /// Names of the cameras and the number of images of each.
-    pub n_images: &'a [(String, usize)],
+    pub(crate) n_images: &'a [(String, usize)],
     /// The result; `None` if the data are not sufficient.
-    pub calibration: Option<&'a SceneCalibration>,
+    pub(crate) calibration: Option<&'a SceneCalibration>,
 }
 
 impl SceneReport<'_> {
     /// The page.
-    pub fn html(&self) -> String {
+    pub(crate) fn html(&self) -> String {
         let verdict = self.calibration.map_or(String::new(), verdict);
         let mut page = Page::new(
             "Calibration from a static scene",
@@ -367,7 +367,7 @@ fn scalar(
     unit: &str,
     digits: usize,
 ) -> Vec<String> {
-    let value = super::with_sigma(factor * estimate.value, factor * estimate.sigma, digits);
+    let value = with_sigma(factor * estimate.value, factor * estimate.sigma, digits);
     vec![
         format!("{what} of {}", estimate.camera),
         format!("{value} {unit}"),
@@ -426,6 +426,8 @@ mod tests {
         };
         let heading = Heading {
             input: "a.mcap".to_owned(),
+            utc: "2026-11-23 17:00 UTC".to_owned(),
+            command: "fieldrig calibrate scene a.mcap".to_owned(),
             refused: None,
             warnings: vec!["side is kept".to_owned()],
         };

@@ -1,15 +1,14 @@
 //! Reads JSON objects, with errors that name the file and the field.
 
-use super::transform_of;
-use crate::exit::BadArgument;
-use kinematics::Transform;
+use crate::error::BadInput;
+use kinematics::{Transform, transform};
 use serde::de::{Deserialize, Deserializer, Error as _, MapAccess, SeqAccess, Visitor};
 use serde_json::{Map, Value};
 use std::fmt::Formatter;
 
 /// Parses JSON. A key that occurs twice in one object is an error: otherwise, only its last value
 /// would be used.
-pub(super) fn parse(text: &str) -> serde_json::Result<Value> {
+pub(crate) fn parse(text: &str) -> serde_json::Result<Value> {
     serde_json::from_str(text).map(|Unique(value)| value)
 }
 
@@ -81,7 +80,7 @@ impl<'de> Visitor<'de> for UniqueVisitor {
 
 /// An object in a JSON file.
 #[derive(Clone, Debug)]
-pub(super) struct JsonObject<'a> {
+pub(crate) struct JsonObject<'a> {
     file: &'a str,
     /// Where the object is in the file, such as `samples[3]`; empty for the whole file.
     path: String,
@@ -90,19 +89,19 @@ pub(super) struct JsonObject<'a> {
 
 impl<'a> JsonObject<'a> {
     /// Rejects other values, and keys other than `known`.
-    pub(super) fn new(
+    pub(crate) fn new(
         file: &'a str,
         path: String,
         value: &'a Value,
         known: &[&str],
-    ) -> Result<Self, BadArgument> {
+    ) -> Result<Self, BadInput> {
         let place = if path.is_empty() {
             file.to_owned()
         } else {
             format!("{file}: {path}")
         };
         let Some(map) = value.as_object() else {
-            return Err(BadArgument(format!(
+            return Err(BadInput(format!(
                 "{place}: {}, expected an object",
                 kind_of(value)
             )));
@@ -113,7 +112,7 @@ impl<'a> JsonObject<'a> {
                 Some(key) => format!("did you mean {key:?}?"),
                 None => format!("the keys are {}", known.join(", ")),
             };
-            return Err(BadArgument(format!(
+            return Err(BadInput(format!(
                 "{place}: unknown key {unknown:?}; {hint}"
             )));
         }
@@ -121,8 +120,8 @@ impl<'a> JsonObject<'a> {
     }
 
     /// An error about a field.
-    pub(super) fn invalid(&self, key: &str, why: impl std::fmt::Display) -> BadArgument {
-        BadArgument(format!("{}: {}: {why}", self.file, self.path_of(key)))
+    pub(crate) fn invalid(&self, key: &str, why: impl std::fmt::Display) -> BadInput {
+        BadInput(format!("{}: {}: {why}", self.file, self.path_of(key)))
     }
 
     fn path_of(&self, key: &str) -> String {
@@ -134,15 +133,15 @@ impl<'a> JsonObject<'a> {
     }
 
     /// The value of a field. `null` counts as missing.
-    pub(super) fn get(&self, key: &str) -> Option<&'a Value> {
+    pub(crate) fn get(&self, key: &str) -> Option<&'a Value> {
         self.map.get(key).filter(|value| !value.is_null())
     }
 
-    pub(super) fn required<T>(&self, key: &str, value: Option<T>) -> Result<T, BadArgument> {
+    pub(crate) fn required<T>(&self, key: &str, value: Option<T>) -> Result<T, BadInput> {
         value.ok_or_else(|| self.invalid(key, "missing"))
     }
 
-    pub(super) fn text(&self, key: &str) -> Result<Option<&'a str>, BadArgument> {
+    pub(crate) fn text(&self, key: &str) -> Result<Option<&'a str>, BadInput> {
         self.get(key)
             .map(|value| {
                 value.as_str().ok_or_else(|| {
@@ -152,7 +151,7 @@ impl<'a> JsonObject<'a> {
             .transpose()
     }
 
-    pub(super) fn numbers(&self, key: &str) -> Result<Option<Vec<f64>>, BadArgument> {
+    pub(crate) fn numbers(&self, key: &str) -> Result<Option<Vec<f64>>, BadInput> {
         let Some(value) = self.get(key) else {
             return Ok(None);
         };
@@ -168,7 +167,7 @@ impl<'a> JsonObject<'a> {
             .ok_or_else(|| self.invalid(key, "expected an array of numbers"))
     }
 
-    pub(super) fn array<const N: usize>(&self, key: &str) -> Result<Option<[f64; N]>, BadArgument> {
+    pub(crate) fn array<const N: usize>(&self, key: &str) -> Result<Option<[f64; N]>, BadInput> {
         let Some(numbers) = self.numbers(key)? else {
             return Ok(None);
         };
@@ -180,13 +179,13 @@ impl<'a> JsonObject<'a> {
             .map_err(|_| self.invalid(key, format!("{n} numbers, expected {N}")))
     }
 
-    pub(super) fn transform(&self, key: &str) -> Result<Option<Transform>, BadArgument> {
+    pub(crate) fn transform(&self, key: &str) -> Result<Option<Transform>, BadInput> {
         self.get(key)
             .map(|value| transform_of(value).map_err(|why| self.invalid(key, why)))
             .transpose()
     }
 
-    pub(super) fn list(&self, key: &str) -> Result<&'a [Value], BadArgument> {
+    pub(crate) fn list(&self, key: &str) -> Result<&'a [Value], BadInput> {
         let value = self.required(key, self.get(key))?;
         let list = value
             .as_array()
@@ -195,20 +194,40 @@ impl<'a> JsonObject<'a> {
     }
 
     /// The object in a field.
-    pub(super) fn object(&self, key: &str, known: &[&str]) -> Result<Option<Self>, BadArgument> {
+    pub(crate) fn object(&self, key: &str, known: &[&str]) -> Result<Option<Self>, BadInput> {
         self.get(key)
             .map(|value| Self::new(self.file, self.path_of(key), value, known))
             .transpose()
     }
 
     /// The objects in a list.
-    pub(super) fn objects(&self, key: &str, known: &[&str]) -> Result<Vec<Self>, BadArgument> {
+    pub(crate) fn objects(&self, key: &str, known: &[&str]) -> Result<Vec<Self>, BadInput> {
         let path = self.path_of(key);
         let object = |(ix, value): (usize, &'a Value)| {
             Self::new(self.file, format!("{path}[{ix}]"), value, known)
         };
         self.list(key)?.iter().enumerate().map(object).collect()
     }
+}
+
+/// The transform of a matrix in JSON: four lists of four numbers, or one list of 16, row by row.
+fn transform_of(value: &Value) -> Result<Transform, String> {
+    let rows = value.as_array().map_or(0, Vec::len);
+    let row_of = |row: &Value| row.as_array().filter(|row| row.len() == 4).cloned();
+    let given = value.as_array().cloned().unwrap_or_default();
+    // Four rows of four, or else the numbers themselves. Other shapes fail at the conversion below.
+    let flat = match given.iter().map(row_of).collect::<Option<Vec<_>>>() {
+        Some(rows) => rows.concat(),
+        None => given,
+    };
+    let numbers: Option<Vec<f64>> = flat.iter().map(Value::as_f64).collect();
+    let numbers: Option<[f64; 16]> = numbers.and_then(|numbers| numbers.try_into().ok());
+    // One to three rows are likely a forgotten last row, which is worth a hint.
+    let numbers = numbers.ok_or_else(|| match rows {
+        1..=3 => format!("must be a matrix of 4 x 4 numbers, row by row; found {rows} rows"),
+        _ => "must be a matrix of 4 x 4 numbers, row by row".to_owned(),
+    })?;
+    transform::from_rows(&numbers).map_err(|error| error.to_string())
 }
 
 fn kind_of(value: &Value) -> &'static str {
@@ -227,7 +246,7 @@ mod tests {
     use super::*;
     use serde_json::json;
 
-    fn error<T>(result: Result<T, BadArgument>) -> String {
+    fn error<T>(result: Result<T, BadInput>) -> String {
         result.err().expect("an error").to_string()
     }
 

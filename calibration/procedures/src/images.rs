@@ -1,35 +1,37 @@
 //! Reads image files, and detects a target in images.
 
-use crate::exit::BadArgument;
-use crate::print;
+use crate::error::BadInput;
+use crate::host::Host;
 use calibration::{BoardPoint, BoardView};
 use capture::CalibrationImage;
 use image::ImageReader;
 use rayon::prelude::*;
-use session::calibration_report::{Photo, Photos, Unused};
+use report::calibration_report::{Photo, Photos, Unused};
+use session::ReadProgress;
 use std::io::BufReader;
 use std::path::{Path, PathBuf};
+use std::sync::atomic::{AtomicUsize, Ordering};
 use targets::{Counts, Detection, GrayImage, TargetSpec};
 
 /// The target in one image.
 #[derive(Debug)]
-pub(super) struct DetectedImage {
+pub(crate) struct DetectedImage {
     /// Name of the file, or time in the recording.
-    pub(super) name: String,
+    pub(crate) name: String,
     /// The target, or the reason why it was not found.
-    pub(super) board: Result<Board, NoBoard>,
+    pub(crate) board: Result<Board, NoBoard>,
 }
 
 /// The target in an image of known size.
 #[derive(Debug)]
-pub(super) struct Board {
-    pub(super) size_px: [u32; 2],
-    pub(super) view: BoardView,
+pub(crate) struct Board {
+    pub(crate) size_px: [u32; 2],
+    pub(crate) view: BoardView,
 }
 
 /// Why an image has no target.
 #[derive(Debug, thiserror::Error)]
-pub(super) enum NoBoard {
+pub(crate) enum NoBoard {
     /// The file is not an image, or damaged.
     #[error("cannot read the image: {0}")]
     Unreadable(String),
@@ -40,7 +42,7 @@ pub(super) enum NoBoard {
 
 impl NoBoard {
     /// The image with this reason, for reports and messages.
-    pub(super) fn unused(&self, name: String) -> Unused {
+    pub(crate) fn unused(&self, name: String) -> Unused {
         Unused {
             name,
             reason: self.to_string(),
@@ -51,19 +53,19 @@ impl NoBoard {
 
 /// An image file and the name that messages use for it.
 #[derive(Clone, Debug)]
-pub(super) struct ImageFile {
-    pub(super) name: String,
-    pub(super) path: PathBuf,
+pub(crate) struct ImageFile {
+    pub(crate) name: String,
+    pub(crate) path: PathBuf,
 }
 
 /// Extensions of the image files in a folder that are read.
 const EXTENSIONS: [&str; 3] = ["jpg", "jpeg", "png"];
 
 /// The image files in a folder, in order of their names.
-pub(super) fn files(folder: &Path) -> Result<Vec<ImageFile>, BadArgument> {
+pub(crate) fn files(folder: &Path) -> Result<Vec<ImageFile>, BadInput> {
     // A single image is a likely mistake. Without this check, the error would be about a folder.
     if folder.is_file() {
-        return Err(BadArgument(format!(
+        return Err(BadInput(format!(
             "{} is a file, expected a folder of images",
             folder.display()
         )));
@@ -84,7 +86,7 @@ pub(super) fn files(folder: &Path) -> Result<Vec<ImageFile>, BadArgument> {
     // The order of a folder differs between file systems, and reports list images in this order.
     files.sort_by(|a, b| a.path.cmp(&b.path));
     if files.is_empty() {
-        return Err(BadArgument(format!(
+        return Err(BadInput(format!(
             "{}: no .jpg, .jpeg or .png image",
             folder.display()
         )));
@@ -92,8 +94,8 @@ pub(super) fn files(folder: &Path) -> Result<Vec<ImageFile>, BadArgument> {
     Ok(files)
 }
 
-fn unreadable_folder(folder: &Path, error: &std::io::Error) -> BadArgument {
-    BadArgument(format!(
+fn unreadable_folder(folder: &Path, error: &std::io::Error) -> BadInput {
+    BadInput(format!(
         "cannot read the folder {}: {error}",
         folder.display()
     ))
@@ -111,16 +113,14 @@ fn is_image(path: &Path) -> bool {
 /// Detects a target in image files, on all processors; the results are in the order of the files.
 /// Images that cannot be read are named in a warning.
 ///
-/// * `is_hidden`: no progress bar.
-///
 /// # Errors
 /// If no image can be read.
-pub(super) fn detect(
+pub(crate) fn detect(
     files: &[ImageFile],
     target: &TargetSpec,
-    is_hidden: bool,
-) -> Result<Vec<DetectedImage>, BadArgument> {
-    let detected = detect_each(files, is_hidden, |ImageFile { name, path }| DetectedImage {
+    host: &dyn Host,
+) -> Result<Vec<DetectedImage>, BadInput> {
+    let detected = detect_each(files, host, |ImageFile { name, path }| DetectedImage {
         name: name.clone(),
         board: detect_in_file(path, name, target),
     });
@@ -129,29 +129,33 @@ pub(super) fn detect(
 }
 
 /// Calls a function for each image, on all processors; the results are in the order of the images.
-///
-/// * `is_hidden`: no progress bar.
-pub(super) fn detect_each<T: Sync>(
+pub(crate) fn detect_each<T: Sync>(
     images: &[T],
-    is_hidden: bool,
+    host: &dyn Host,
     detect: impl Fn(&T) -> DetectedImage + Sync,
 ) -> Vec<DetectedImage> {
-    let bar = print::bar(
-        Some(images.len() as u64),
-        "{bar:30} {pos} of {len} images",
-        is_hidden,
-    );
+    let n_done = AtomicUsize::new(0);
+    host.on_progress(searched(0, images.len()));
     let detected = images.par_iter().map(|image| {
         let detected = detect(image);
-        bar.inc(1);
+        let n_done = 1 + n_done.fetch_add(1, Ordering::Relaxed);
+        host.on_progress(searched(n_done, images.len()));
         detected
     });
     let detected = detected.collect();
-    bar.finish_and_clear();
+    host.on_progress_end();
     detected
 }
 
-fn check_readable(images: &[DetectedImage]) -> Result<(), BadArgument> {
+fn searched(n_done: usize, n_all: usize) -> ReadProgress {
+    ReadProgress {
+        noun: "images",
+        n_done,
+        n_all: Some(n_all),
+    }
+}
+
+fn check_readable(images: &[DetectedImage]) -> Result<(), BadInput> {
     let unreadable: Vec<(&str, &NoBoard)> = images
         .iter()
         .filter_map(|image| Some((image.name.as_str(), image.board.as_ref().err()?)))
@@ -162,7 +166,7 @@ fn check_readable(images: &[DetectedImage]) -> Result<(), BadArgument> {
     };
     // A few damaged files must not end a calibration of many images.
     if unreadable.len() == images.len() {
-        return Err(BadArgument(format!(
+        return Err(BadInput(format!(
             "none of {} images can be read; {first}: {reason}",
             images.len()
         )));
@@ -179,15 +183,15 @@ fn check_readable(images: &[DetectedImage]) -> Result<(), BadArgument> {
 
 /// A chessboard of another size than that of the target.
 #[derive(Clone, Debug, PartialEq)]
-pub(super) struct OtherSize {
+pub(crate) struct OtherSize {
     /// What the images show, and what to do.
-    pub(super) text: String,
+    pub(crate) text: String,
     /// Whether more images show the other size than the given one.
-    pub(super) prevails: bool,
+    pub(crate) prevails: bool,
 }
 
 /// The size of a board that several images show instead of that of the target.
-pub(super) fn other_size<'a>(
+pub(crate) fn other_size<'a>(
     images: impl Iterator<Item = &'a DetectedImage>,
     target: &TargetSpec,
 ) -> Option<OtherSize> {
@@ -257,7 +261,7 @@ fn detect_in_file(path: &Path, name: &str, target: &TargetSpec) -> Result<Board,
 }
 
 /// Detects a target in an image of a device or recording.
-pub(super) fn detect_in_image(image: &CalibrationImage, target: &TargetSpec) -> DetectedImage {
+pub(crate) fn detect_in_image(image: &CalibrationImage, target: &TargetSpec) -> DetectedImage {
     let name = format!("image at {:.3} s", image.secs);
     let gray = GrayImage {
         size_px: image.size_px,
@@ -268,7 +272,7 @@ pub(super) fn detect_in_image(image: &CalibrationImage, target: &TargetSpec) -> 
 }
 
 /// Detects a target in an image. `name` is used in messages.
-pub(super) fn detect_in_gray(
+pub(crate) fn detect_in_gray(
     image: GrayImage<'_>,
     name: &str,
     target: &TargetSpec,
@@ -292,7 +296,7 @@ fn view(name: &str, detection: &Detection) -> BoardView {
 }
 
 /// The files of images, for a report.
-pub(super) fn photos(files: &[ImageFile]) -> Photos {
+pub(crate) fn photos(files: &[ImageFile]) -> Photos {
     files
         .iter()
         .map(|file| (file.name.clone(), Photo::File(file.path.clone())))
@@ -300,7 +304,7 @@ pub(super) fn photos(files: &[ImageFile]) -> Photos {
 }
 
 /// The images without the target, for a report.
-pub(super) fn unused(images: &[DetectedImage]) -> Vec<Unused> {
+pub(crate) fn unused(images: &[DetectedImage]) -> Vec<Unused> {
     let reason =
         |image: &DetectedImage| Some(image.board.as_ref().err()?.unused(image.name.clone()));
     images.iter().filter_map(reason).collect()

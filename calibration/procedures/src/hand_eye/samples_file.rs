@@ -1,15 +1,16 @@
 //! The samples file of `fieldrig calibrate hand-eye`, and the target in its images.
 
-use super::super::images::{self, DetectedImage, ImageFile, OtherSize};
-use super::super::json_object::{self, JsonObject};
-use super::super::lens::LensFile;
-use super::super::{outputs, target_argument};
-use crate::exit::{BadArgument, InsufficientData};
+use crate::error::{BadInput, InsufficientData};
+use crate::host::Host;
+use crate::images::{self, DetectedImage, ImageFile, OtherSize};
+use crate::json_object::{self, JsonObject};
+use crate::lens::LensFile;
+use crate::outputs;
 use calibration::hand_eye::{BoardObservation, HandEyeSample, Setup};
 use capture::camera_info;
 use kinematics::{Intrinsics, Transform};
 use nalgebra::DMatrix;
-use session::calibration_report::{Photos, Unused};
+use report::calibration_report::{Photos, Unused};
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use targets::TargetSpec;
@@ -53,18 +54,18 @@ const FILE_KEYS: [&str; 4] = ["intrinsics", "target", "setup", "samples"];
 const SAMPLE_KEYS: [&str; 4] = ["base_from_flange", "camera_from_board", "image", "joints"];
 
 impl SamplesFile {
-    pub(super) fn read(path: &Path) -> Result<Self, BadArgument> {
+    pub(super) fn read(path: &Path) -> Result<Self, BadInput> {
         let name = path.display().to_string();
         let text = outputs::read_text(path)?;
         let mut value = json_object::parse(&text)
             // Such files often come from other programs, so the error says what to change.
-            .map_err(|error| BadArgument(format!("{name}: {error}{}", not_json_hint(&text))))?;
+            .map_err(|error| BadInput(format!("{name}: {error}{}", not_json_hint(&text))))?;
         // Paths in the file are relative to it, so that its folder can be moved.
         let folder = path.parent().unwrap_or(Path::new(""));
         // The intrinsics may be written in several formats, or be in a file of their own. They are
         // converted in place, so that the code below reads one format.
         if let Some(intrinsics) = value.get_mut("intrinsics") {
-            let invalid = |why: String| BadArgument(format!("{name}: intrinsics: {why}"));
+            let invalid = |why: String| BadInput(format!("{name}: intrinsics: {why}"));
             let mut source = String::new();
             if let Some(file) = intrinsics.as_str() {
                 let file = folder.join(file);
@@ -82,7 +83,10 @@ impl SamplesFile {
         // Unknown keys are errors, because a misspelled one would be ignored silently.
         let file = JsonObject::new(&name, String::new(), &value, &FILE_KEYS)?;
         let intrinsics = file.object("intrinsics", &LensFile::KEYS)?;
-        let target = file.text("target")?.map(target_argument).transpose();
+        let target = file
+            .text("target")?
+            .map(str::parse::<TargetSpec>)
+            .transpose();
         let setup = match file.text("setup")? {
             None | Some("eye-in-hand") => Setup::EyeInHand,
             Some("eye-to-hand") => Setup::EyeToHand,
@@ -130,8 +134,8 @@ impl SamplesFile {
     }
 
     /// The given intrinsics, for images of this size.
-    pub(super) fn intrinsics(&self, size_px: [u32; 2]) -> Result<Option<Intrinsics>, BadArgument> {
-        let of_file = |error: BadArgument| BadArgument(format!("{}: {error}", self.path.display()));
+    pub(super) fn intrinsics(&self, size_px: [u32; 2]) -> Result<Option<Intrinsics>, BadInput> {
+        let of_file = |error: BadInput| BadInput(format!("{}: {error}", self.path.display()));
         self.intrinsics
             .as_ref()
             .map(|lens| lens.intrinsics(size_px).map_err(of_file))
@@ -142,8 +146,8 @@ impl SamplesFile {
     pub(super) fn intrinsics_covariance(
         &self,
         intrinsics: &Intrinsics,
-    ) -> Result<Option<DMatrix<f64>>, BadArgument> {
-        let of_file = |error: BadArgument| BadArgument(format!("{}: {error}", self.path.display()));
+    ) -> Result<Option<DMatrix<f64>>, BadInput> {
+        let of_file = |error: BadInput| BadInput(format!("{}: {error}", self.path.display()));
         Ok(match &self.intrinsics {
             Some(lens) => lens.covariance(intrinsics).map_err(of_file)?,
             None => None,
@@ -182,9 +186,7 @@ impl SamplesFile {
     }
 
     /// Detects the target in all images.
-    ///
-    /// * `is_hidden`: no progress bar.
-    pub(super) fn detect(&self, is_hidden: bool) -> anyhow::Result<Samples> {
+    pub(super) fn detect(&self, host: &dyn Host) -> anyhow::Result<Samples> {
         let image = |entry: &Entry| match &entry.board {
             EntryBoard::Image(file) => Some(file.clone()),
             EntryBoard::Pose(_) => None,
@@ -192,7 +194,7 @@ impl SamplesFile {
         let files: Vec<ImageFile> = self.entries.iter().filter_map(image).collect();
         let detected = match &self.target {
             // Without images there is nothing to detect, and the target is optional.
-            Some(target) if !files.is_empty() => images::detect(&files, target, is_hidden)?,
+            Some(target) if !files.is_empty() => images::detect(&files, target, host)?,
             _ => Vec::new(),
         };
         let mut samples = Samples {
@@ -285,7 +287,7 @@ impl Samples {
 }
 
 /// Rejects an image with two robot poses. Identical samples are allowed.
-fn check_images(samples: &[JsonObject<'_>], entries: &[Entry]) -> Result<(), BadArgument> {
+fn check_images(samples: &[JsonObject<'_>], entries: &[Entry]) -> Result<(), BadInput> {
     let mut first_use: BTreeMap<&Path, usize> = BTreeMap::new();
     for (ix, entry) in entries.iter().enumerate() {
         let EntryBoard::Image(image) = &entry.board else {
@@ -305,7 +307,7 @@ fn check_images(samples: &[JsonObject<'_>], entries: &[Entry]) -> Result<(), Bad
 }
 
 /// A pose in a sample.
-fn pose(sample: &JsonObject<'_>, key: &str) -> Result<Option<Transform>, BadArgument> {
+fn pose(sample: &JsonObject<'_>, key: &str) -> Result<Option<Transform>, BadInput> {
     /// Positions beyond this are assumed to be mistakes.
     const MAX_POSITION_M: f64 = 1e4;
     let pose = sample.transform(key)?;
@@ -321,7 +323,7 @@ fn pose(sample: &JsonObject<'_>, key: &str) -> Result<Option<Transform>, BadArgu
 }
 
 impl Entry {
-    fn read(sample: &JsonObject<'_>, folder: &Path) -> Result<Self, BadArgument> {
+    fn read(sample: &JsonObject<'_>, folder: &Path) -> Result<Self, BadInput> {
         let base_from_flange =
             sample.required("base_from_flange", pose(sample, "base_from_flange")?)?;
         let board = match (pose(sample, "camera_from_board")?, sample.text("image")?) {

@@ -1,13 +1,11 @@
 //! `fieldrig calibrate hand-eye --move`: the arm itself moves to poses that show the target.
 
-use super::super::images::{self, DetectedImage};
-use super::super::outputs::{self, InputKind, RigFlags, RigOutput};
-use super::super::page::GuidancePage;
-use super::super::scan::Scan;
 use super::{next_pose_options, with_distortion};
-use crate::commands::move_arm;
-use crate::exit::{BadArgument, Exit, InsufficientData};
-use crate::signals;
+use crate::error::{BadInput, InsufficientData};
+use crate::host::{Activity, CameraView, Host};
+use crate::images::{self, DetectedImage};
+use crate::outputs::{self, InputKind, RigOptions, RigOutput};
+use crate::scan::Scan;
 use calibration::BoardView;
 use calibration::hand_eye::{
     ArmPlan, ArmPlanOptions, ArmStep, BoardObservation, FirstView, HandEyeInput, HandEyeOptions,
@@ -15,10 +13,10 @@ use calibration::hand_eye::{
 };
 use capture::config::{ArmDriver, Camera, Parent, Rig};
 use capture::open::{self, Devices};
-use capture::{ArmCapture, ArmDuringImage, CalibrationImage, Stop};
+use capture::{ArmCapture, ArmDuringImage, CalibrationImage, HOLDING, Stop};
 use drivers::motion::OnLoss;
 use kinematics::{Chain, Transform};
-use session::calibration_report::{Photo, Photos};
+use report::calibration_report::{Photo, Photos};
 use std::path::Path;
 use targets::{GrayImage, TargetSpec};
 
@@ -33,33 +31,22 @@ const DEFAULT_DISTANCE_M: f64 = 0.3;
 /// at a distance of half a meter.
 const GOAL_DEG: f64 = 0.05;
 
-/// Flags for moving the arm.
-#[derive(Debug, clap::Args)]
-pub(super) struct MoveFlags {
-    /// With a rig file: move the arm to poses that show the target, until the result is accurate.
-    /// The target must be visible at the start; the arm returns there at the end. It does not avoid
-    /// obstacles, and does not check for collisions of the arm with itself, its base or cables
-    #[arg(long = "move")]
-    pub(super) is_requested: bool,
-    /// With --move: confirm the motion: nobody is within reach of the arm, and a hand is on the
-    /// emergency stop. Not needed with --sim
-    #[arg(long, requires = "is_requested")]
-    enable_motion: bool,
-    /// With --move: maximum number of poses
-    #[arg(long, value_name = "N", default_value_t = 20, requires = "is_requested", value_parser = clap::value_parser!(u16).range(10..=200))]
-    max_poses: u16,
-    /// With --move: end when the standard deviations of the position are this small, millimeters
-    #[arg(long, value_name = "MM", default_value_t = 0.2, requires = "is_requested", value_parser = super::super::super::number_in_range(1e-3..=100.0))]
-    goal_mm: f64,
-    /// With --move: maximum distance of the flange from its position at the start, millimeters;
-    /// tool, camera, target and elbow can reach farther. Default: 300; with a camera on the flange,
-    /// at most half its distance to the target
-    #[arg(long, value_name = "MM", requires = "is_requested", value_parser = super::super::super::number_in_range(10.0..=5000.0))]
-    max_distance_mm: Option<f64>,
+/// How an arm moves to calibrate its camera.
+#[derive(Clone, Debug)]
+pub struct MotionOptions {
+    /// Whether the user has confirmed that the arm may move. A simulated arm needs no confirmation.
+    pub is_confirmed: bool,
+    /// Maximum number of poses.
+    pub max_poses: u16,
+    /// The standard deviations of the position at which the motion ends, millimeters.
+    pub goal_mm: f64,
+    /// Maximum distance of the flange from its position at the start, millimeters. `None`: 300;
+    /// with a camera on the flange, at most half its distance to the target.
+    pub max_distance_mm: Option<f64>,
 }
 
 /// An arm after it has moved.
-pub(super) struct MovedArm {
+pub struct MovedArm {
     capture: ArmCapture,
     stop: Stop,
     /// Whether the motors hold the arm after this program has ended.
@@ -71,7 +58,10 @@ pub(super) struct MovedArm {
 impl MovedArm {
     /// Holds an arm whose motors would release it, until Ctrl-C. Returns the result of the
     /// calibration, or why the motion was not completed.
-    pub(super) fn finish(mut self, result: anyhow::Result<Exit>) -> anyhow::Result<Exit> {
+    ///
+    /// # Errors
+    /// If the calibration or the motion failed, or if the arm has stopped because of a fault.
+    pub fn finish<T>(mut self, result: anyhow::Result<T>) -> anyhow::Result<T> {
         let failure = self.failure.take();
         // The arm is held before anything is returned, because the motors of some arms release it
         // when this program ends.
@@ -107,7 +97,7 @@ impl MovedArm {
         }
         // The next Ctrl-C ends the hold in order, even if an earlier one has stopped the motion.
         self.stop.rearm("ending; the motors no longer hold the arm");
-        log::info!("{}", move_arm::HOLDING);
+        log::info!("{HOLDING}");
         Ok(self.capture.hold(&self.stop)?)
     }
 }
@@ -116,12 +106,13 @@ impl MovedArm {
 pub(super) struct Request<'a> {
     pub(super) input: &'a Path,
     pub(super) target: &'a TargetSpec,
-    pub(super) rig: &'a RigFlags,
+    pub(super) rig: &'a RigOptions,
     pub(super) options: HandEyeOptions,
+    pub(super) host: &'a dyn Host,
     pub(super) keeps_photos: bool,
 }
 
-impl MoveFlags {
+impl MotionOptions {
     /// Moves the arm and takes images. `output` gets the calibration that devices report.
     pub(super) fn run(
         &self,
@@ -133,13 +124,13 @@ impl MoveFlags {
         // Everything that needs no device is checked before the arm is enabled.
         flags.check(request.input)?;
         if InputKind::of(request.input) != InputKind::Rig {
-            return Err(BadArgument(format!(
+            return Err(BadInput(format!(
                 "--move needs a rig file (.toml) as input; {input} is not one"
             ))
             .into());
         }
         if flags.seconds.is_some() {
-            return Err(BadArgument(
+            return Err(BadInput(
                 "--seconds cannot be combined with --move; limit the number of poses with --max-poses".to_owned(),
             )
             .into());
@@ -148,33 +139,29 @@ impl MoveFlags {
         let given_camera = flags.camera_of(&given)?.clone();
         let camera = &given_camera.name;
         if given.arm.driver == ArmDriver::None {
-            return Err(BadArgument(format!("--move: {input}: the rig has no arm")).into());
+            return Err(BadInput(format!("--move: {input}: the rig has no arm")).into());
         }
         let is_simulated = flags.sim || given.arm.driver == ArmDriver::Sim;
         if !is_simulated {
-            move_arm::motion_of(&given)?;
+            open::motion_of(&given)?;
             open::check_motion(&given)?;
-            if !self.enable_motion {
-                return Err(BadArgument(
+            if !self.is_confirmed {
+                return Err(BadInput(
                     "--move moves the arm: add --enable-motion to confirm that nobody is within reach of the arm and that a hand is on the emergency stop"
                         .to_owned(),
                 )
                 .into());
             }
         }
-        let stop = signals::stop_on_signals_logging(
-            "bringing the arm to rest, then calibrating; Ctrl-C again applies on_loss at once",
-        )?;
-        if !is_simulated {
-            signals::stop_when_output_closes(&stop)?;
-        }
+        let activity = Activity::MoveArm { is_simulated };
+        let stop = request.host.stop_requests(activity)?;
         let devices = if flags.sim {
             Devices::Sim
         } else {
             Devices::Real
         };
         // Before the arm: without its page, the planned motion is not shown.
-        let page = GuidancePage::start(&flags.page, &given_camera)?;
+        let view = request.host.open_view(&given_camera, activity)?;
         let mut capture = ArmCapture::new(open::movable(&given, devices, camera)?)?;
         let rig = resolved(&given, capture.rig());
         if let Some(output) = output.filter(|_| !is_simulated) {
@@ -192,19 +179,19 @@ impl MoveFlags {
             camera: &camera,
             base_or_flange_from_camera,
             request,
-            page,
+            view,
             found: Vec::new(),
             photos: Photos::new(),
         };
         let failure = self.take_images(&mut capture, &mut images, &stop).err();
         let Images {
-            page,
+            mut view,
             found,
             photos,
             ..
         } = images;
-        page.finish();
-        drop(page);
+        view.finish();
+        drop(view);
         // A simulated arm has nothing to fall.
         let holds_on_exit = is_simulated
             || given
@@ -317,8 +304,7 @@ impl MoveFlags {
                 }
             };
             let motion = format!("moving to pose {}: {purpose}", images.found.len() + 1);
-            log::info!("{motion}");
-            images.page.guide(&motion);
+            images.view.advise(&motion);
             // After Ctrl-C, the arm stays where it came to rest, because nobody expects another
             // motion.
             if !capture.move_to(&joints, stop)? {
@@ -337,8 +323,7 @@ impl MoveFlags {
                 }
             }
         }
-        log::info!("returning to the start");
-        images.page.guide("returning to the start");
+        images.view.advise("returning to the start");
         capture.move_to(&start, stop)?;
         Ok(())
     }
@@ -381,7 +366,7 @@ struct Images<'a> {
     camera: &'a Camera,
     base_or_flange_from_camera: Transform,
     request: &'a Request<'a>,
-    page: GuidancePage,
+    view: Box<dyn CameraView>,
     found: Vec<(DetectedImage, Option<ArmDuringImage>)>,
     photos: Photos,
 }
@@ -402,7 +387,7 @@ impl Images<'_> {
             &name,
             self.request.target,
         );
-        let view = match &board {
+        let found = match &board {
             Ok(board) => {
                 log::info!("pose {n}: {} corners", board.view.points.len());
                 Ok(board.view.clone())
@@ -414,7 +399,7 @@ impl Images<'_> {
                 "the target is not visible: {reason}"
             ))),
         };
-        self.page
+        self.view
             .show_searched(size_px, &gray, board.as_ref().ok().map(|board| &board.view));
         if self.request.keeps_photos {
             self.photos.insert(
@@ -426,7 +411,7 @@ impl Images<'_> {
             );
         }
         self.found.push((DetectedImage { name, board }, arm));
-        view
+        found
     }
 
     fn setup(&self) -> Setup {

@@ -1,11 +1,11 @@
 //! Pictures that are small enough to embed in a page.
 
-use crate::error::Context;
+use anyhow::Context;
 use image::ExtendedColorType;
 use image::codecs::jpeg::JpegEncoder;
 
 /// The largest size with the same aspect ratio and sides of at most `max_side_px`.
-pub(crate) fn fit_size(size_px: [u32; 2], max_side_px: u32) -> [u32; 2] {
+pub fn fit_size(size_px: [u32; 2], max_side_px: u32) -> [u32; 2] {
     let max_side = size_px[0].max(size_px[1]).max(1);
     if max_side <= max_side_px {
         return size_px;
@@ -21,11 +21,12 @@ pub(crate) fn fit_size(size_px: [u32; 2], max_side_px: u32) -> [u32; 2] {
 }
 
 /// A JPEG as a data URI for `<img>`.
-pub(crate) fn data_uri(
-    rgb: &[u8],
-    [width, height]: [u32; 2],
-    quality: u8,
-) -> crate::Result<String> {
+///
+/// * `rgb`: three bytes per pixel, row by row.
+///
+/// # Errors
+/// If the picture cannot be encoded.
+pub fn data_uri(rgb: &[u8], [width, height]: [u32; 2], quality: u8) -> anyhow::Result<String> {
     let mut bytes = Vec::new();
     let mut encoder = JpegEncoder::new_with_quality(&mut bytes, quality);
     encoder

@@ -2,17 +2,18 @@
 
 use super::Heading;
 use crate::chart::drawing::escaped;
-use crate::{Table, next_commands, run_folder};
+use crate::{STYLE, Table};
 
 /// A key figure: name, value, unit.
-pub(super) type Figure = (&'static str, String, &'static str);
+pub type Figure = (&'static str, String, &'static str);
 
 /// The beginning of the line below the title. It marks a file as a report.
 pub(super) const SUBTITLE: &str = "<p class=\"sub\">fieldrig ";
 
 /// A page with its sections.
-pub(super) struct Page {
+pub struct Page {
     title: String,
+    command: String,
     html: String,
 }
 
@@ -20,10 +21,10 @@ impl Page {
     /// Begins a page.
     ///
     /// * `verdict`: what the result is based on, if there is one.
-    pub(super) fn new(title: &str, heading: &Heading, verdict: &str, figures: &[Figure]) -> Self {
+    pub fn new(title: &str, heading: &Heading, verdict: &str, figures: &[Figure]) -> Self {
         let subtitle = [
             env!("CARGO_PKG_VERSION").to_owned(),
-            run_folder::utc_now(),
+            heading.utc.clone(),
             heading.input.clone(),
         ];
         let (class, head, text) = match &heading.refused {
@@ -44,6 +45,7 @@ impl Page {
         }
         Self {
             title: title.to_owned(),
+            command: heading.command.clone(),
             html,
         }
     }
@@ -52,7 +54,7 @@ impl Page {
     ///
     /// * `legend`: what the section shows, as text.
     /// * `content`: HTML.
-    pub(super) fn section(&mut self, title: &str, legend: &str, content: &str) {
+    pub fn section(&mut self, title: &str, legend: &str, content: &str) {
         if content.is_empty() {
             return;
         }
@@ -68,7 +70,7 @@ impl Page {
     }
 
     /// Adds a table. Without rows, adds nothing.
-    pub(super) fn table(&mut self, title: &str, head: &[&str], rows: Vec<Vec<String>>) {
+    pub fn table(&mut self, title: &str, head: &[&str], rows: Vec<Vec<String>>) {
         if !rows.is_empty() {
             let head = head.iter().map(|name| (*name).to_owned()).collect();
             self.html.push_str(
@@ -83,15 +85,15 @@ impl Page {
     }
 
     /// The complete page, with the command line at the end.
-    pub(super) fn finish(self) -> String {
-        let command = escaped(&next_commands::this_command());
+    pub fn finish(self) -> String {
+        let command = escaped(&self.command);
         format!(
             "<!doctype html>\n<html lang=\"en\"><head><meta charset=\"utf-8\">\n\
              <meta name=\"viewport\" content=\"width=device-width, initial-scale=1\">\n\
              <title>{}</title>\n<style>\n{}{}</style></head>\n<body><main>\n{}\
              <h2>Command</h2>\n<p class=\"card command\"><code>{command}</code></p>\n</main></body></html>\n",
             escaped(&self.title),
-            include_str!("../report/style.css"),
+            STYLE,
             include_str!("style.css"),
             self.html
         )
@@ -126,14 +128,14 @@ fn list(sentences: &[String]) -> String {
 }
 
 /// A short text in a box; nothing if there is none.
-pub(super) fn note(text: Option<&str>) -> String {
+pub fn note(text: Option<&str>) -> String {
     text.map_or(String::new(), |text| {
         format!("<p class=\"card note\">{}</p>", escaped(text))
     })
 }
 
 /// A code line to copy.
-pub(super) fn code(text: Option<&str>) -> String {
+pub fn code(text: Option<&str>) -> String {
     text.map_or(String::new(), |text| {
         format!(
             "<p class=\"card command\"><code>{}</code></p>",
@@ -143,12 +145,12 @@ pub(super) fn code(text: Option<&str>) -> String {
 }
 
 /// A chart in a box.
-pub(super) fn chart(chart: &crate::chart::Chart) -> String {
+pub fn chart(chart: &crate::chart::Chart) -> String {
     format!("<div class=\"chart card\">{}</div>\n", chart.draw().svg())
 }
 
 /// A picture with a caption.
-pub(super) fn figure(caption: &str, content: &str) -> String {
+pub fn figure(caption: &str, content: &str) -> String {
     format!(
         "<figure class=\"card\">{content}<figcaption>{}</figcaption></figure>\n",
         escaped(caption)
@@ -156,7 +158,7 @@ pub(super) fn figure(caption: &str, content: &str) -> String {
 }
 
 /// Pictures next to each other.
-pub(super) fn gallery(figures: &[String]) -> String {
+pub fn gallery(figures: &[String]) -> String {
     if figures.is_empty() {
         String::new()
     } else {

@@ -54,7 +54,9 @@ impl Table {
 }
 
 /// A row of an HTML table.
-pub(crate) fn html_row(cells: &[String], tag: &str) -> String {
+///
+/// * `tag`: tag of its cells, `td` or `th`.
+pub fn html_row(cells: &[String], tag: &str) -> String {
     let cells: String = cells
         .iter()
         .map(|cell| format!("<{tag}>{}</{tag}>", escaped(cell)))

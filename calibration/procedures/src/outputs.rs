@@ -1,44 +1,38 @@
-//! Files that `calibrate` writes: a rig file with the result, and a report.
+//! Files that calibrations write: a rig file with the result, and a report.
 
-use crate::exit::{self, BadArgument, Exit};
-use crate::page_args::PageArgs;
+use crate::error::{BadInput, is_refusal};
+use anyhow::Context;
 use calibration::hand_eye::{JointOffset, Setup};
 use capture::config::{Camera, Parent, Rig};
 use keyframe::listed;
 use kinematics::{Intrinsics, Transform};
 use nalgebra::DMatrix;
-use session::calibration_report::{self, Heading};
-use session::{Data, DataOptions, corrected_rig};
+use report::calibration_report::{Heading, is_report};
+use session::{Data, DataOptions, corrected_rig, run_folder};
 use std::path::{Path, PathBuf};
 
-/// Flags of commands that calibrate one camera, from files, a recording or the devices of a rig.
-#[derive(Debug, clap::Args)]
-pub(super) struct RigFlags {
+/// How the images of one camera are read, and where its calibration is written.
+#[derive(Clone, Debug, Default)]
+pub struct RigOptions {
     /// The camera to calibrate, with a recording or rig file as input; the camera in the rig file,
-    /// with --write-rig [default: the only one]
-    #[arg(long, value_name = "NAME")]
-    pub(super) camera: Option<String>,
-    /// With a recording: read it with this rig file instead of the one stored in it. With image
-    /// files: the rig file to write the result into
-    #[arg(long, value_name = "RIG.toml")]
-    pub(super) rig: Option<PathBuf>,
-    /// Write the rig file with the result. An existing file is kept with the extension .old
-    #[arg(long, value_name = "FILE")]
-    write_rig: Option<PathBuf>,
-    /// With a rig file: simulate all devices
-    #[arg(long)]
-    pub(super) sim: bool,
-    /// With a rig file: read the devices for S seconds [default: 30]
-    #[arg(long, value_name = "S", value_parser = super::super::number_in_range(1.0..=3600.0))]
-    pub(super) seconds: Option<f64>,
-    /// With a rig file: the page with the camera images and what to do next.
-    #[command(flatten)]
-    pub(super) page: PageArgs,
+    /// with `write_rig`. `None`: the only one.
+    pub camera: Option<String>,
+    /// With a recording: the rig file to read it with, instead of the one stored in it. With image
+    /// files: the rig file to write the result into.
+    pub rig: Option<PathBuf>,
+    /// The rig file to write, with the result.
+    pub write_rig: Option<PathBuf>,
+    /// Whether all devices are simulated; only with a rig file as input.
+    pub sim: bool,
+    /// Time for which devices are read, seconds; only with a rig file as input.
+    pub seconds: Option<f64>,
+    /// Whether the page was configured, which only devices need.
+    pub has_page_flags: bool,
 }
 
 /// What a command calibrates from.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(super) enum InputKind {
+pub(crate) enum InputKind {
     /// A folder of images, or a file with samples.
     Files,
     Recording,
@@ -47,10 +41,10 @@ pub(super) enum InputKind {
 }
 
 impl InputKind {
-    pub(super) fn of(input: &Path) -> Self {
+    pub(crate) fn of(input: &Path) -> Self {
         if is_rig_file(input) {
             Self::Rig
-        } else if session::run_folder::is_recording(input) {
+        } else if run_folder::is_recording(input) {
             Self::Recording
         } else {
             Self::Files
@@ -59,18 +53,17 @@ impl InputKind {
 }
 
 /// Whether a path is that of a rig file.
-pub(super) fn is_rig_file(path: &Path) -> bool {
+pub(crate) fn is_rig_file(path: &Path) -> bool {
     path.extension()
         .is_some_and(|extension| extension == "toml")
 }
 
-impl RigFlags {
+impl RigOptions {
     /// Rejects flags that do not apply to the input.
-    pub(super) fn check(&self, input: &Path) -> Result<(), BadArgument> {
-        self.page.check()?;
+    pub(crate) fn check(&self, input: &Path) -> Result<(), BadInput> {
         let kind = InputKind::of(input);
         let problem = if kind != InputKind::Rig
-            && (self.sim || self.seconds.is_some() || self.page.is_given())
+            && (self.sim || self.seconds.is_some() || self.has_page_flags)
         {
             "--sim, --seconds and the flags of the page (--listen, --share) need a rig file (.toml) as input".to_owned()
         } else if kind == InputKind::Rig && self.rig.is_some() {
@@ -90,19 +83,19 @@ impl RigFlags {
         } else {
             return Ok(());
         };
-        Err(BadArgument(problem))
+        Err(BadInput(problem))
     }
 
     /// Reads the rig file to write the result into: the input, that of a recording, or `--rig`.
     /// `None` without `--write-rig`.
-    pub(super) fn open(&self, input: &Path) -> anyhow::Result<Option<RigOutput>> {
+    pub(crate) fn open(&self, input: &Path) -> anyhow::Result<Option<RigOutput>> {
         self.check(input)?;
         let Some(file) = &self.write_rig else {
             return Ok(None);
         };
         // All commands recognize rig files by this extension.
         if !is_rig_file(file) {
-            return Err(BadArgument(format!(
+            return Err(BadInput(format!(
                 "--write-rig {}: must have the extension .toml",
                 file.display()
             ))
@@ -133,14 +126,14 @@ impl RigFlags {
     }
 
     /// The camera with the given name, or the only one.
-    pub(super) fn camera_of<'a>(&self, rig: &'a Rig) -> anyhow::Result<&'a Camera> {
+    pub(crate) fn camera_of<'a>(&self, rig: &'a Rig) -> anyhow::Result<&'a Camera> {
         match (&self.camera, &rig.cameras[..]) {
             (Some(name), _) => Ok(corrected_rig::camera(rig, name)?),
             (None, [only]) => Ok(only),
             (None, cameras) => {
                 let names: Vec<&str> = cameras.iter().map(|camera| &*camera.name).collect();
                 let names = listed(&names, "or");
-                Err(BadArgument(format!(
+                Err(BadInput(format!(
                     "the rig has several cameras; choose one with --camera: {names}"
                 ))
                 .into())
@@ -151,7 +144,7 @@ impl RigFlags {
 
 /// A rig file to write.
 #[derive(Debug)]
-pub(super) struct RigOutput {
+pub(crate) struct RigOutput {
     rig: Rig,
     camera: String,
     file: PathBuf,
@@ -159,12 +152,12 @@ pub(super) struct RigOutput {
 
 impl RigOutput {
     /// Uses the rig with the calibration that the devices report.
-    pub(super) fn set_rig(&mut self, rig: &Rig) {
+    pub(crate) fn set_rig(&mut self, rig: &Rig) {
         self.rig = rig.clone();
     }
 
     /// Adds offsets to those in the rig file.
-    pub(super) fn add_joint_offsets(&mut self, offsets: &[JointOffset]) {
+    pub(crate) fn add_joint_offsets(&mut self, offsets: &[JointOffset]) {
         let arm = &mut self.rig.arm;
         // The rig file may have no offsets, or fewer than joints.
         arm.joint_offsets.resize(arm.joints.len(), 0.0);
@@ -178,14 +171,14 @@ impl RigOutput {
     }
 
     /// Rejects images of another size than those of the camera.
-    pub(super) fn expect_size(&self, size_px: [u32; 2]) -> anyhow::Result<()> {
+    pub(crate) fn expect_size(&self, size_px: [u32; 2]) -> anyhow::Result<()> {
         Ok(corrected_rig::expect_size(
             corrected_rig::camera(&self.rig, &self.camera)?,
             size_px,
         )?)
     }
 
-    pub(super) fn set_intrinsics(
+    pub(crate) fn set_intrinsics(
         &mut self,
         intrinsics: &Intrinsics,
         covariance: Option<&DMatrix<f64>>,
@@ -194,7 +187,7 @@ impl RigOutput {
         Ok(())
     }
 
-    pub(super) fn set_extrinsics(
+    pub(crate) fn set_extrinsics(
         &mut self,
         setup: Setup,
         parent_from_camera: &Transform,
@@ -206,7 +199,7 @@ impl RigOutput {
     }
 
     /// Rejects a setup in which the camera is attached to another frame than in the rig file.
-    pub(super) fn expect_setup(&self, setup: Setup) -> anyhow::Result<()> {
+    pub(crate) fn expect_setup(&self, setup: Setup) -> anyhow::Result<()> {
         // The result is dropped: only the error counts.
         corrected_rig::with_extrinsics(
             &self.rig,
@@ -218,7 +211,7 @@ impl RigOutput {
     }
 
     /// Warns if a pose was estimated with other intrinsics than those of the rig file.
-    pub(super) fn warn_if_intrinsics_differ(&self, used: &Intrinsics) -> anyhow::Result<()> {
+    pub(crate) fn warn_if_intrinsics_differ(&self, used: &Intrinsics) -> anyhow::Result<()> {
         const MAX_PX: f64 = 0.01;
         let given = &corrected_rig::camera(&self.rig, &self.camera)?.intrinsics;
         let pairs = given.params().into_iter().zip(used.params());
@@ -235,7 +228,7 @@ impl RigOutput {
         Ok(())
     }
 
-    pub(super) fn write(&self) -> anyhow::Result<()> {
+    pub(crate) fn write(&self) -> anyhow::Result<()> {
         corrected_rig::write(&self.rig, &self.file)?;
         log::info!("rig file written to {}", self.file.display());
         Ok(())
@@ -249,41 +242,99 @@ fn parent_of(setup: Setup) -> Parent {
     }
 }
 
-/// The flag of commands that write a report.
-#[derive(Debug, clap::Args)]
-pub(super) struct ReportFlag {
-    /// Write a report with the result, its uncertainty and the errors of all samples as an HTML
-    /// page; also if the calibration is refused
-    #[arg(long, value_name = "FILE.html")]
-    report: Option<PathBuf>,
+/// A report to write: an HTML page with the result, its uncertainty and the errors of all samples;
+/// also if the calibration is refused.
+#[derive(Clone, Debug)]
+pub struct ReportOptions {
+    /// The file, with the extension `.html`. Another report is replaced.
+    pub file: PathBuf,
+    /// The command line, which is shown at the end.
+    pub command: String,
 }
 
-impl ReportFlag {
-    /// The file to write, if any.
-    pub(super) fn open(&self) -> anyhow::Result<Option<&Path>> {
-        let Some(file) = self.report.as_deref() else {
-            return Ok(None);
+impl ReportOptions {
+    /// Checks that a report can be written to the file.
+    pub(crate) fn check(&self) -> Result<(), BadInput> {
+        let file = &self.file;
+        let folder = file
+            .parent()
+            .filter(|folder| !folder.as_os_str().is_empty())
+            .unwrap_or(Path::new("."));
+        let is_page = file
+            .extension()
+            .is_some_and(|extension| extension.eq_ignore_ascii_case("html"));
+        if !folder.is_dir() || file.is_dir() || !is_page {
+            return Err(BadInput(format!(
+                "--report {}: must be a file with the extension .html in an existing folder",
+                file.display()
+            )));
+        }
+        // Reports are replaced, so that a command can be repeated. A mistyped name must not replace
+        // another page.
+        if is_other_file(file) {
+            return Err(BadInput(format!(
+                "--report {}: the file exists and is not a report of fieldrig; choose another name",
+                file.display()
+            )));
+        }
+        Ok(())
+    }
+
+    /// Writes the page atomically and logs its path.
+    pub(crate) fn write(&self, html: &str) -> anyhow::Result<()> {
+        files::write(&self.file, html)
+            .with_context(|| format!("cannot write {}", self.file.display()))?;
+        log::info!("report written to {}", self.file.display());
+        Ok(())
+    }
+
+    /// The heading of the report on a result. `None` for errors that are not a refusal: they have
+    /// no report.
+    pub(crate) fn heading<T>(
+        &self,
+        input: &Path,
+        result: &anyhow::Result<T>,
+        warnings: Vec<String>,
+    ) -> Option<Heading> {
+        let refused = match result {
+            Ok(_) => None,
+            // A refusal is a result, too: the report shows what is missing.
+            Err(error) if is_refusal(error) => {
+                let text = format!("{error:#}");
+                Some(
+                    // The heading already says that the calibration was refused.
+                    text.strip_prefix("calibration refused: ")
+                        .map_or(text.clone(), str::to_owned),
+                )
+            }
+            Err(_) => return None,
         };
-        calibration_report::check_target_file(file)?;
-        Ok(Some(file))
+        Some(Heading {
+            input: input.display().to_string(),
+            utc: run_folder::utc_now(),
+            command: self.command.clone(),
+            refused,
+            warnings,
+        })
     }
 }
 
-/// Writes a report and logs its path.
-pub(super) fn write_report(file: &Path, html: &str) -> anyhow::Result<()> {
-    calibration_report::write(file, html)?;
-    log::info!("report written to {}", file.display());
-    Ok(())
+/// Whether a file exists that is neither empty nor a report.
+fn is_other_file(file: &Path) -> bool {
+    match files::read(file, files::Budget::TEXT) {
+        Ok(bytes) => !bytes.is_empty() && !is_report(&String::from_utf8_lossy(&bytes)),
+        Err(_) => false,
+    }
 }
 
 /// Writes the report, if one is requested, on a result or on the reason why there is none. Returns
 /// the result, and whether the report was written: the result is printed even if it was not.
-pub(super) fn reported<T>(
+pub(crate) fn reported<T>(
     result: anyhow::Result<T>,
-    report: Option<&Path>,
-    write: impl FnOnce(&Path, &anyhow::Result<T>) -> anyhow::Result<()>,
+    report: Option<&ReportOptions>,
+    write: impl FnOnce(&ReportOptions, &anyhow::Result<T>) -> anyhow::Result<()>,
 ) -> anyhow::Result<(T, anyhow::Result<()>)> {
-    let written = report.map_or(Ok(()), |path| write(path, &result));
+    let written = report.map_or(Ok(()), |report| write(report, &result));
     match result {
         Ok(result) => Ok((result, written)),
         Err(error) => {
@@ -294,41 +345,14 @@ pub(super) fn reported<T>(
 }
 
 /// Logs why a report was not written, if another error is returned.
-pub(super) fn log_failure(written: anyhow::Result<()>) {
+pub(crate) fn log_failure(written: anyhow::Result<()>) {
     if let Err(error) = written {
         log::error!("{error:#}");
     }
 }
 
-/// The heading of the report on a result. `None` for errors that are not a refusal: they have no
-/// report.
-pub(super) fn heading<T>(
-    input: &Path,
-    result: &anyhow::Result<T>,
-    warnings: Vec<String>,
-) -> Option<Heading> {
-    let refused = match result {
-        Ok(_) => None,
-        // A refusal is a result, too: the report shows what is missing.
-        Err(error) if exit::of(error) == Exit::InsufficientData => {
-            let text = format!("{error:#}");
-            Some(
-                // The heading already says that the calibration was refused.
-                text.strip_prefix("calibration refused: ")
-                    .map_or(text.clone(), str::to_owned),
-            )
-        }
-        Err(_) => return None,
-    };
-    Some(Heading {
-        input: input.display().to_string(),
-        refused,
-        warnings,
-    })
-}
-
 /// The contents of a text file; a missing or unreadable file is a bad argument.
-pub(super) fn read_text(path: &Path) -> Result<String, BadArgument> {
+pub(crate) fn read_text(path: &Path) -> Result<String, BadInput> {
     files::read_text(path)
-        .map_err(|error| BadArgument(format!("cannot read {}: {error}", path.display())))
+        .map_err(|error| BadInput(format!("cannot read {}: {error}", path.display())))
 }
