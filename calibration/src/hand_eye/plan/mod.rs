@@ -1,9 +1,11 @@
 //! Where an arm moves to calibrate its camera: first small rotations about the target, then poses
 //! by information gain, until the result is accurate.
 
-use super::next_poses::{NextPoseOptions, suggest_next_poses};
-use super::planar_pose;
-use super::reach::Reach;
+mod next_poses;
+
+pub use next_poses::{NextPose, NextPoseOptions, Reach, suggest_next_poses};
+
+use super::samples::board_poses;
 use super::{HandEyeCalibration, HandEyeInput, HandEyeOptions, Setup};
 use crate::{BoardView, Error};
 use kinematics::{Intrinsics, Transform};
@@ -64,14 +66,9 @@ impl FirstView<'_> {
     /// Distance of a point of the board from the camera, meters. `None` if the view does not
     /// determine it.
     pub fn distance_m(&self, point_in_board: &Vector3<f64>) -> Option<f64> {
-        let pose = planar_pose::board_poses(self.view, self.intrinsics)
-            .into_iter()
-            .next()?;
-        Some(
-            (pose.camera_from_board * Point3::from(*point_in_board))
-                .coords
-                .norm(),
-        )
+        let poses = board_poses(self.view, self.intrinsics);
+        let in_camera = poses.first()?.camera_from_board * Point3::from(*point_in_board);
+        Some(in_camera.coords.norm())
     }
 }
 
@@ -250,7 +247,7 @@ fn first_poses(
         Vector3::from_fn(|row, _| if row == axis { sign } else { 0.0 })
     };
     let mut poses = VecDeque::new();
-    if let Some(board) = planar_pose::board_poses(first.view, first.intrinsics).first() {
+    if let Some(board) = board_poses(first.view, first.intrinsics).first() {
         let base_from_camera = match first.setup {
             Setup::EyeInHand => start * first.parent_from_camera,
             Setup::EyeToHand => *first.parent_from_camera,
@@ -283,13 +280,13 @@ fn first_poses(
 
 #[cfg(test)]
 mod tests {
-    use super::super::scene::{self, N_COLUMNS, N_ROWS, SQUARE_M};
+    use super::super::tests::{self as scene, N_COLUMNS, N_ROWS, SQUARE_M};
     use super::super::{BoardObservation, HandEyeSample, calibrate_hand_eye};
     use super::*;
     use kinematics::Chain;
     use kinematics::random::Random;
 
-    const PANDA: &str = include_str!("../../../rigs/robots/panda.urdf");
+    const PANDA: &str = include_str!("../../../../rigs/robots/panda.urdf");
     const START: [f64; 7] = [0.0, -0.3, 0.0, -2.2, 0.0, 2.2, 0.8];
 
     /// Runs a plan with simulated corners. Returns the samples, the end, and whether each

@@ -1,14 +1,103 @@
-//! Names common mistakes in the input: wrong units, inverted transforms, mirrored boards, lists
-//! that are off by one.
+//! Whether the samples and the result can be trusted: names common mistakes in the input (wrong
+//! units, inverted transforms, mirrored boards, lists that are off by one), contradictions, and
+//! directions that are not observable.
 
-use super::closed_form::{self, ClosedForm};
-use super::consensus::{self, Consensus};
+mod rotations;
+
+pub(crate) use rotations::axis_name;
+pub use rotations::{HandEyeAdvice, HandEyeGuidance, RECOMMENDED_POSES, RotationExcitation};
+
 use super::geometry;
-use super::refine::Refined;
-use super::refusal::Refusal;
-use super::samples::{self, Sample};
-use super::{BoardObservation, HandEyeInput, HandEyeSample, Setup};
+use super::report::HandEyeCalibration;
+use super::samples::{self, Sample, Sorted, used};
+use super::solve::{self, ClosedForm, Consensus, Refined, consensus};
+use super::{BoardObservation, HandEyeInput, HandEyeSample, MIN_SAMPLES, Refusal, Setup};
+use crate::Error;
+use crate::least_squares::sigma_of;
 use kinematics::Transform;
+use nalgebra::{DMatrix, SymmetricEigen, Vector3};
+
+/// Finds an initial solution, and names mistakes in the samples.
+///
+/// # Errors
+/// [`Error::Refused`] if the samples contain a known mistake, do not determine the result, or
+/// disagree.
+pub(crate) fn find_consensus(
+    input: &HandEyeInput<'_>,
+    sorted: &Sorted,
+) -> Result<Consensus, Error> {
+    let samples = &sorted.usable;
+    // Units first: all other checks compare meters.
+    if let Err(refusal) = check_magnitudes(&input.samples) {
+        let mistake = scale_mistake(samples, consensus(samples).as_ref());
+        return Err(mistake
+            .map_or(refusal, |(why, remedy)| Refusal::new(why, remedy))
+            .into());
+    }
+    // Rotations about one axis do not determine the result, however good the images are.
+    let given = input.samples.iter().map(|sample| sample.base_from_flange);
+    rotations::check_rotations(&given.collect::<Vec<_>>())?;
+    // Samples without a board and repeated ones are reported, but not used: a repetition would
+    // count as an independent measurement.
+    if samples.len() < MIN_SAMPLES {
+        let kind = if sorted.repeated.is_empty() {
+            ""
+        } else {
+            "different "
+        };
+        let what = [
+            "has a usable view of the board",
+            "have a usable view of the board",
+        ];
+        return Err(samples::too_few(samples.len(), kind, what).into());
+    }
+    // Known mistakes are named before anything is estimated: outlier rejection would only report
+    // that the samples disagree.
+    let found = consensus(samples);
+    if let Some(refusal) = explain(input, samples, found.as_ref()) {
+        return Err(refusal.into());
+    }
+    found.ok_or_else(|| {
+        Refusal::new(
+            NO_SOLUTION,
+            "check that each robot pose belongs to its image, and rotate the flange more between the poses",
+        )
+        .into()
+    })
+}
+
+/// Checks that the samples that were used determine the result.
+///
+/// # Errors
+/// [`Error::Refused`] with the likely cause of a result that is too uncertain.
+pub(crate) fn check_result(
+    input: &HandEyeInput<'_>,
+    refined: &Refined,
+    calibration: &HandEyeCalibration,
+) -> Result<(), Error> {
+    // Without the outliers, the remaining rotations may no longer suffice.
+    let poses =
+        used(&refined.samples).map(|sample| input.samples[sample.sample_ix].base_from_flange);
+    rotations::check_rotations(&poses.collect::<Vec<_>>())?;
+    let Err(refusal) = check_uncertainty(input, refined) else {
+        return Ok(());
+    };
+    // An uncertain result has a cause. Contradicting intrinsics are the most specific one, then
+    // contradicting poses, then too little motion, which the refusal names.
+    let Some(doubt) = refined.intrinsics_doubt.as_deref() else {
+        let contradiction = contradiction(refined, calibration.scatter.mm);
+        let uncertain = || refusal.with_warnings(&calibration.warnings, None);
+        return Err(contradiction.unwrap_or_else(uncertain).into());
+    };
+    let refusal = refusal.with_warnings(&calibration.warnings, Some(doubt));
+    Err(Refusal {
+        motion: format!("{doubt}; otherwise, {}", refusal.motion),
+        ..refusal
+    }
+    .into())
+}
+
+const NO_SOLUTION: &str = "no hand-eye transform explains three of the samples";
 
 /// Positions of a robot or distances of a board in meters do not exceed this; in millimeters they
 /// do, from 2 cm on.
@@ -22,7 +111,7 @@ const MUCH_BETTER: f64 = 5.0;
 ///
 /// # Errors
 /// If most of them are too large.
-pub(super) fn check_magnitudes(samples: &[HandEyeSample]) -> Result<(), Refusal> {
+fn check_magnitudes(samples: &[HandEyeSample]) -> Result<(), Refusal> {
     let robot: Vec<f64> = samples
         .iter()
         .map(|sample| sample.base_from_flange.translation.vector.norm())
@@ -58,23 +147,13 @@ const GOOD_FRAC: f64 = 0.02;
 
 /// The mistake that explains why the samples disagree. `None` if they agree or no known mistake
 /// explains it.
-pub(super) fn explain(
+fn explain(
     input: &HandEyeInput<'_>,
     samples: &[Sample],
-    consensus: Option<&Consensus>,
+    found: Option<&Consensus>,
 ) -> Option<Refusal> {
-    let distances: Vec<f64> = samples
-        .iter()
-        .map(|sample| {
-            sample.candidates[0]
-                .camera_from_board
-                .translation
-                .vector
-                .norm()
-        })
-        .collect();
-    let distance_m = kinematics::quantile::median(&distances)?;
-    let found_m = consensus.map_or(f64::INFINITY, Consensus::median_m);
+    let distance_m = geometry::median_distance_m(samples.iter().map(likely_board))?;
+    let found_m = found.map_or(f64::INFINITY, Consensus::median_m);
     let residual = if found_m.is_finite() {
         format!(
             "the samples disagree by {:.0} mm (median, board at {:.0} mm)",
@@ -82,26 +161,18 @@ pub(super) fn explain(
             1e3 * distance_m
         )
     } else {
-        "no hand-eye transform explains three of the samples".to_owned()
+        NO_SOLUTION.to_owned()
     };
-    let has_poses = samples.iter().all(|sample| {
-        sample
-            .candidates
-            .iter()
-            .all(|candidate| candidate.corners.is_none())
-    });
     // A shift is tested first: with shifted lists, all other tests would compare wrong pairs.
     if let Some(refusal) = shift_mistake(input, samples, found_m, distance_m) {
         return Some(refusal);
     }
     // Wrong units are tested even if the samples agree roughly: a scale near 1, such as that of a
     // board of another size, leaves small errors only.
-    if let Some(scale) = scale_mistake(samples, consensus) {
-        return Some(Refusal::new(
-            format!("{residual}, and {}", scale.0),
-            scale.1,
-        ));
+    if let Some((why, remedy)) = scale_mistake(samples, found) {
+        return Some(Refusal::new(format!("{residual}, and {why}"), remedy));
     }
+    let has_poses = !has_images(samples);
     if found_m <= GOOD_FRAC * distance_m {
         let is_tested = input.options.board_is_seen && has_poses;
         return is_tested.then(|| behind_mistake(samples)).flatten();
@@ -109,10 +180,22 @@ pub(super) fn explain(
     inversion_mistake(input, samples, has_poses, [found_m, distance_m], &residual)
 }
 
+/// The most likely pose of the board.
+fn likely_board(sample: &Sample) -> &Transform {
+    &sample.candidates[0].camera_from_board
+}
+
+/// Whether the board poses follow from corners. An input has either corners or poses.
+fn has_images(samples: &[Sample]) -> bool {
+    samples
+        .iter()
+        .any(|sample| sample.candidates[0].corners.is_some())
+}
+
 /// Explanation of samples that agree on a board behind the camera: other camera axes, or both poses
 /// of each sample inverted, so that they agree on the inverse of another transform.
 fn behind_mistake(samples: &[Sample]) -> Option<Refusal> {
-    let is_behind = |sample: &&Sample| sample.candidates[0].camera_from_board.translation.z <= 0.0;
+    let is_behind = |sample: &&Sample| likely_board(sample).translation.z <= 0.0;
     let n_behind = samples.iter().filter(is_behind).count();
     // Most, not all: a few samples may be wrong in another way.
     (5 * n_behind > 4 * samples.len()).then(|| {
@@ -147,7 +230,7 @@ fn inversion_mistake(
             ..sample.clone()
         })
         .collect();
-    let variant_m = consensus::find(&variant)?.median_m();
+    let variant_m = consensus(&variant)?.median_m();
     if variant_m * MUCH_BETTER > found_m.min(distance_m) || variant_m > 2.0 * GOOD_FRAC * distance_m
     {
         return None;
@@ -164,11 +247,8 @@ fn inversion_mistake(
     let board = "camera_from_board is inverted: the given matrices are board_from_camera";
     // Only boards in front of the camera are visible. Poses from corners are not inverted: this
     // program computed them.
-    let is_in_front = |sample: &Sample| sample.candidates[0].camera_from_board.translation.z > 0.0;
-    let inverse_is_in_front = |sample: &Sample| {
-        let pose = sample.candidates[0].camera_from_board;
-        pose.inverse().translation.z > 0.0
-    };
+    let is_in_front = |sample: &Sample| likely_board(sample).translation.z > 0.0;
+    let inverse_is_in_front = |sample: &Sample| likely_board(sample).inverse().translation.z > 0.0;
     let may_be_robot = !has_poses || samples.iter().all(is_in_front);
     let may_be_board = has_poses && samples.iter().all(inverse_is_in_front);
     Some(if !may_be_robot {
@@ -183,24 +263,13 @@ fn inversion_mistake(
     })
 }
 
-/// Positions of the robot or the board that are in another unit than the others.
-pub(super) fn unit_mistake(input: &HandEyeInput<'_>) -> Option<Refusal> {
-    let samples = samples::samples(input, input.intrinsics.as_ref()).usable;
-    let (why, remedy) = scale_mistake(&samples, consensus::find(&samples).as_ref())?;
-    Some(Refusal::new(why, remedy))
-}
-
 /// Samples that contradict each other, which more samples do not change. `scatter_mm` is the
 /// scatter of the board.
-pub(super) fn contradiction(refined: &Refined, scatter_mm: f64) -> Option<Refusal> {
+fn contradiction(refined: &Refined, scatter_mm: f64) -> Option<Refusal> {
     /// Scatter of the board relative to its distance. Detections and robots are far more accurate.
     const MAX_FRAC: f64 = 0.05;
-    let distances: Vec<f64> = refined
-        .measurements()
-        .iter()
-        .map(|found| found.camera_from_board.translation.vector.norm())
-        .collect();
-    let distance_m = kinematics::quantile::median(&distances)?;
+    let boards = used(&refined.samples).map(|sample| &sample.chosen().camera_from_board);
+    let distance_m = geometry::median_distance_m(boards)?;
     (scatter_mm > 1e3 * MAX_FRAC * distance_m).then(|| {
         Refusal::new(
             format!(
@@ -242,13 +311,11 @@ fn shift_mistake(
     } else {
         "not at all".to_owned()
     };
-    let has_images = samples.iter().any(|sample| {
-        sample
-            .candidates
-            .iter()
-            .any(|candidate| candidate.corners.is_some())
-    });
-    let board = if has_images { "image" } else { "board pose" };
+    let board = if has_images(samples) {
+        "image"
+    } else {
+        "board pose"
+    };
     Some(Refusal::new(
         format!(
             "the robot poses and {board}s are off by one: the samples agree {before} (median), but within {:.1} mm if each {board} is paired with the robot pose of the {other} sample",
@@ -281,26 +348,24 @@ fn shifted_median_m(input: &HandEyeInput<'_>, samples: &[Sample], shift: isize) 
     if shifted.len() + 1 < MIN_SHIFTED_SAMPLES {
         return f64::INFINITY;
     }
-    consensus::find(&shifted).map_or(f64::INFINITY, |found| found.median_m())
+    consensus(&shifted).map_or(f64::INFINITY, |found| found.median_m())
 }
 
 /// Explanation by different units of the robot's and the board's translations, and the remedy.
-fn scale_mistake(samples: &[Sample], consensus: Option<&Consensus>) -> Option<(String, String)> {
+fn scale_mistake(samples: &[Sample], found: Option<&Consensus>) -> Option<(String, String)> {
     /// A scale closer to 1 or to 0 may be noise.
     const MIN_SIGMAS: f64 = 5.0;
     /// Smaller changes are errors of the robot or of the print.
     const MIN_CHANGE: f64 = 0.02;
     /// Factor by which the scale must improve the agreement.
     const BETTER: f64 = 3.0;
-    let choice = consensus.map_or_else(|| vec![0; samples.len()], |found| found.choice.clone());
-    let pairs: Vec<(Transform, Transform)> = samples
-        .iter()
-        .zip(&choice)
-        .map(|(sample, choice)| (sample.a, sample.candidates[*choice].camera_from_board))
-        .collect();
-    let motions = closed_form::motions(&pairs);
+    let pairs = samples.iter().enumerate().map(|(ix, sample)| {
+        let choice = found.map_or(0, |found| found.choice[ix]);
+        (sample.a, sample.candidates[choice].camera_from_board)
+    });
+    let motions = solve::motions(&pairs.collect::<Vec<_>>());
     let rotation = ClosedForm::ParkMartin.solve(&motions)?.rotation;
-    let (scale, sigma) = closed_form::relative_scale(&motions, rotation)?;
+    let (scale, sigma) = solve::relative_scale(&motions, rotation)?;
     // Unrelated motions have a scale near 0.
     if scale.is_nan()
         || scale.abs() <= MIN_SIGMAS * sigma
@@ -313,8 +378,8 @@ fn scale_mistake(samples: &[Sample], consensus: Option<&Consensus>) -> Option<(S
     for candidate in scaled.iter_mut().flat_map(|sample| &mut sample.candidates) {
         candidate.camera_from_board.translation.vector *= scale;
     }
-    let explained_m = consensus::find(&scaled)?.median_m() / scale.abs().max(1.0);
-    if explained_m * BETTER > consensus.map_or(f64::INFINITY, Consensus::median_m) {
+    let explained_m = consensus(&scaled)?.median_m() / scale.abs().max(1.0);
+    if explained_m * BETTER > found.map_or(f64::INFINITY, Consensus::median_m) {
         return None;
     }
     Some(explain_scale(scale, sigma))
@@ -365,21 +430,57 @@ fn wrong_unit(body: &str, other: &str, unit: &str, per_m: f64) -> String {
     )
 }
 
-/// Names of the samples whose board is seen from the other side than in most samples: its corners
-/// are mirrored.
-pub(super) fn mirrored<'a>(
-    samples: &'a [HandEyeSample],
-    poses: &[(usize, Transform)],
-) -> Vec<&'a str> {
-    // The board's z axis points away from a viewer of the printed side.
-    let is_front = |pose: &Transform| {
-        (pose.rotation * nalgebra::Vector3::z()).dot(&pose.translation.vector) > 0.0
+/// Checks the predicted uncertainty of position and rotation along every direction.
+///
+/// # Errors
+/// Names the direction that is determined worst.
+fn check_uncertainty(input: &HandEyeInput<'_>, refined: &Refined) -> Result<(), Refusal> {
+    let [max_sigma_m, max_sigma_rad] = [input.options.max_sigma_m, input.options.max_sigma_rad];
+    let (sigma_rad, rotation_axis) = worst_direction(&refined.covariance, 0);
+    let (sigma_m, direction) = worst_direction(&refined.covariance, 3);
+    // Written so that NaN is refused.
+    if sigma_m <= max_sigma_m && sigma_rad <= max_sigma_rad {
+        return Ok(());
+    }
+    let (in_camera, what) = if sigma_m > max_sigma_m {
+        let what = format!(
+            "the position is uncertain by {:.1} mm (at most {:.1} mm) along",
+            1e3 * sigma_m,
+            1e3 * max_sigma_m
+        );
+        (direction, what)
+    } else {
+        let what = format!(
+            "the rotation is uncertain by {:.2} degrees (at most {:.2} degrees) around",
+            sigma_rad.to_degrees(),
+            max_sigma_rad.to_degrees()
+        );
+        (rotation_axis, what)
     };
-    let n_front = poses.iter().filter(|(_, pose)| is_front(pose)).count();
-    let majority = 2 * n_front >= poses.len();
-    poses
-        .iter()
-        .filter(|(_, pose)| is_front(pose) != majority)
-        .map(|(ix, _)| samples[*ix].name.as_str())
-        .collect()
+    // People move the flange, so its axes are named if the camera is on it.
+    let is_on_flange = input.setup == Setup::EyeInHand;
+    let (axis, body) = if is_on_flange {
+        (refined.solution.x.rotation * in_camera, "flange")
+    } else {
+        (in_camera, "camera")
+    };
+    Err(Refusal {
+        why: format!("{what} {}", axis_name(&axis, body)),
+        axis: is_on_flange.then(|| axis.into()),
+        motion: format!(
+            "add poses that rotate {}",
+            rotations::rotations_across(&axis, body)
+        ),
+    })
+}
+
+/// Largest standard deviation in any direction of three parameters, starting with parameter
+/// `first`, and this direction.
+fn worst_direction(covariance: &DMatrix<f64>, first: usize) -> (f64, Vector3<f64>) {
+    let eigen = SymmetricEigen::new(covariance.fixed_view::<3, 3>(first, first).into_owned());
+    let ix = eigen.eigenvalues.imax();
+    (
+        sigma_of(eigen.eigenvalues[ix]),
+        eigen.eigenvectors.column(ix).into_owned(),
+    )
 }

@@ -5,8 +5,9 @@
 //! 2014, "Infinitesimal plane-based pose estimation", section 4.3). Both are refined by minimizing
 //! the reprojection error.
 
-use super::closed_form::nearest_rotation;
-use crate::intrinsics::board_pose::moved;
+use super::super::geometry::nearest_rotation;
+use super::CornerStatistics;
+use crate::intrinsics::board_pose::{NormalEquations, moved, residual};
 use crate::intrinsics::homography;
 use crate::least_squares::{self, BlockSums, Loss};
 use crate::{BoardPoint, BoardView};
@@ -14,12 +15,11 @@ use kinematics::random::Random;
 use kinematics::{Intrinsics, Transform};
 use nalgebra::{
     DVector, Matrix2, Matrix2x3, Matrix3, Matrix6, Rotation3, UnitQuaternion, Vector2, Vector3,
-    Vector6,
 };
 
 /// Minimum number of corners for a pose: a homography has eight parameters, and a corner two
 /// coordinates.
-pub(super) const MIN_CORNERS: usize = 4;
+const MIN_CORNERS: usize = 4;
 
 /// Threshold of the robust loss, pixels. Corners of sharp images are accurate to a tenth of a
 /// pixel.
@@ -27,47 +27,25 @@ const LOSS_THRESHOLD_PX: f64 = 1.0;
 
 /// A pose of the board and its quality.
 #[derive(Clone, Debug)]
-pub(super) struct BoardPose {
-    pub(super) camera_from_board: Transform,
-    /// Information about a small rotation (in camera axes) and translation of the board for corners
-    /// with an error of one pixel: see [`moved`].
-    pub(super) information: Matrix6<f64>,
-    /// Sum of the squared residuals of the inliers, square pixels.
-    pub(super) squares_px2: f64,
-    /// Per corner: whether its residual fits those of the others.
-    pub(super) is_inlier: Vec<bool>,
-}
-
-impl BoardPose {
-    pub(super) fn n_inliers(&self) -> usize {
-        self.is_inlier
-            .iter()
-            .filter(|is_inlier| **is_inlier)
-            .count()
-    }
+pub(crate) struct BoardPose {
+    pub(crate) camera_from_board: Transform,
+    pub(crate) corners: CornerStatistics,
 }
 
 /// The poses that explain the corners, best first: one or two. Empty if the corners do not
 /// determine a pose. Corners beyond the range of the lens model are outliers.
-pub(super) fn board_poses(view: &BoardView, intrinsics: &Intrinsics) -> Vec<BoardPose> {
+pub(crate) fn board_poses(view: &BoardView, intrinsics: &Intrinsics) -> Vec<BoardPose> {
     // Corners without a ray cannot be used, but keep their place in the list of inliers.
     let ray = |point: &BoardPoint| intrinsics.unproject(point.pixel).map(|ray| ray.xy());
     let rays: Vec<Option<Vector2<f64>>> = view.points.iter().map(ray).collect();
-    let seen = view
-        .points
-        .iter()
-        .zip(&rays)
-        .filter(|(_, ray)| ray.is_some())
-        .map(|(point, _)| *point);
-    let seen: Vec<BoardPoint> = seen.collect();
-    let mut poses = poses_in_range(
-        &seen,
-        &rays.iter().flatten().copied().collect::<Vec<_>>(),
-        intrinsics,
-    );
+    let seen = view.points.iter().zip(&rays);
+    let (points, seen_rays): (Vec<BoardPoint>, Vec<Vector2<f64>>) = seen
+        .filter_map(|(point, ray)| Some((*point, (*ray)?)))
+        .unzip();
+    let mut poses = poses_in_range(&points, &seen_rays, intrinsics);
     for pose in &mut poses {
-        let mut of_seen = std::mem::take(&mut pose.is_inlier).into_iter();
-        pose.is_inlier = rays
+        let mut of_seen = std::mem::take(&mut pose.corners.is_inlier).into_iter();
+        pose.corners.is_inlier = rays
             .iter()
             .map(|ray| ray.is_some() && of_seen.next().unwrap_or(false))
             .collect();
@@ -84,20 +62,19 @@ fn poses_in_range(
     let Some(plane) = Plane::new(points) else {
         return Vec::new();
     };
-    // All corners first: without outliers, this is the best result, and the fastest.
     let corners = Corners {
-        plane: &plane,
         points,
-        rays,
+        plane_from_board: plane.plane_from_board,
+        pairs: plane.points.into_iter().zip(rays.iter().copied()).collect(),
         intrinsics,
     };
+    // All corners first: without outliers, this is the best result, and the fastest.
+    let n_inliers = |poses: &[BoardPose]| poses.first().map_or(0, |best| best.corners.n_inliers());
     let mut poses = corners.poses(&vec![true; points.len()]);
-    let has_outliers = poses
-        .first()
-        .is_none_or(|best| best.n_inliers() < points.len());
-    if has_outliers && let Some(consensus) = consensus_corners(&plane.points, rays, intrinsics) {
+    if n_inliers(&poses) < points.len()
+        && let Some(consensus) = corners.consensus()
+    {
         let robust = corners.poses(&consensus);
-        let n_inliers = |poses: &[BoardPose]| poses.first().map_or(0, BoardPose::n_inliers);
         if n_inliers(&robust) >= n_inliers(&poses) {
             poses = robust;
         }
@@ -111,30 +88,69 @@ fn poses_in_range(
 
 /// Corners of one board, on the board and in the camera.
 struct Corners<'a> {
-    plane: &'a Plane,
     points: &'a [BoardPoint],
-    rays: &'a [Vector2<f64>],
+    plane_from_board: Transform,
+    /// Positions in the plane of the board, and on the plane `z = 1` of the camera.
+    pairs: Vec<(Vector2<f64>, Vector2<f64>)>,
     intrinsics: &'a Intrinsics,
 }
 
 impl Corners<'_> {
     /// The poses that minimize the reprojection error of the selected corners, best first.
     fn poses(&self, is_used: &[bool]) -> Vec<BoardPose> {
-        let plane_points = &self.plane.points;
-        let Some(homography) = homography(plane_points, self.rays, is_used) else {
+        let selected = self.pairs.iter().zip(is_used);
+        let pairs: Vec<(Vector2<f64>, Vector2<f64>)> = selected
+            .filter(|(_, is_used)| **is_used)
+            .map(|(pair, _)| *pair)
+            .collect();
+        let Some(homography) = homography(&pairs) else {
             return Vec::new();
         };
         let mut poses: Vec<BoardPose> = initial_rotations(&homography)
             .into_iter()
             .filter_map(|rotation| {
-                let camera_from_plane =
-                    with_translation(rotation, plane_points, self.rays, is_used)?;
-                let camera_from_board = camera_from_plane * self.plane.plane_from_board;
+                let camera_from_plane = with_translation(rotation, &pairs)?;
+                let camera_from_board = camera_from_plane * self.plane_from_board;
                 refine(camera_from_board, self.points, self.intrinsics, is_used)
             })
             .collect();
-        poses.sort_by(|a, b| a.squares_px2.total_cmp(&b.squares_px2));
+        poses.sort_by(|a, b| a.corners.squares_px2.total_cmp(&b.corners.squares_px2));
         poses
+    }
+
+    /// The largest set of corners found that agrees with a homography of four of them (Fischler and
+    /// Bolles 1981). `None` if it has fewer than half of the corners.
+    fn consensus(&self) -> Option<Vec<bool>> {
+        // Finds four good corners with 99.99 % probability if half of them are wrong:
+        // (1 - 0.5^4)^150 = 6e-5.
+        const TRIALS: usize = 150;
+        // A homography of four noisy corners is inaccurate far from them.
+        const ALLOWED_PX: f64 = 3.0;
+        let n = self.pairs.len();
+        // Rays are in units of the focal length.
+        let allowed = ALLOWED_PX / self.intrinsics.focal_px[0];
+        let mut random = Random::new(1);
+        let mut order: Vec<usize> = (0..n).collect();
+        let mut best: Vec<bool> = Vec::new();
+        let count = |set: &[bool]| set.iter().filter(|is_in| **is_in).count();
+        for _ in 0..TRIALS {
+            random.shuffle(&mut order);
+            let mut picked = order[..MIN_CORNERS].to_vec();
+            picked.sort_unstable();
+            let picked: Vec<_> = picked.into_iter().map(|ix| self.pairs[ix]).collect();
+            let Some(matrix) = homography(&picked) else {
+                continue;
+            };
+            let agrees = |(point, ray): &(Vector2<f64>, Vector2<f64>)| {
+                let image = matrix * point.push(1.0);
+                image.z > 0.0 && (image.xy() / image.z - ray).norm() < allowed
+            };
+            let set: Vec<bool> = self.pairs.iter().map(agrees).collect();
+            if count(&set) > count(&best) {
+                best = set;
+            }
+        }
+        (count(&best) >= MIN_CORNERS.max(n.div_ceil(2))).then_some(best)
     }
 }
 
@@ -197,24 +213,11 @@ impl Plane {
 
 /// Homography from the plane to the plane `z = 1` of the camera, scaled such that the last element
 /// is 1. `None` if it is not determined.
-fn homography(
-    points: &[Vector2<f64>],
-    rays: &[Vector2<f64>],
-    is_used: &[bool],
-) -> Option<Matrix3<f64>> {
-    let used: Vec<(Vector2<f64>, Vector2<f64>)> = points
-        .iter()
-        .zip(rays)
-        .zip(is_used)
-        .filter(|(_, used)| **used)
-        .map(|((p, r), _)| (*p, *r))
-        .collect();
-    let matrix = homography::homography(&used)?;
+fn homography(pairs: &[(Vector2<f64>, Vector2<f64>)]) -> Option<Matrix3<f64>> {
+    let matrix = homography::homography(pairs)?;
     let scaled = matrix / matrix[(2, 2)];
-    scaled
-        .iter()
-        .all(|value| value.is_finite())
-        .then_some(scaled)
+    let is_finite = scaled.iter().all(|value| value.is_finite());
+    is_finite.then_some(scaled)
 }
 
 /// Both rotations that the homography allows at the origin of the plane.
@@ -264,19 +267,12 @@ fn initial_rotations(homography: &Matrix3<f64>) -> Vec<UnitQuaternion<f64>> {
 /// behind the camera.
 fn with_translation(
     rotation: UnitQuaternion<f64>,
-    points: &[Vector2<f64>],
-    rays: &[Vector2<f64>],
-    is_used: &[bool],
+    pairs: &[(Vector2<f64>, Vector2<f64>)],
 ) -> Option<Transform> {
     // The rotated point plus the translation must be parallel to the ray: two linear equations.
     let mut normal = Matrix3::zeros();
     let mut right = Vector3::zeros();
-    for ((point, ray), _) in points
-        .iter()
-        .zip(rays)
-        .zip(is_used)
-        .filter(|(_, used)| **used)
-    {
+    for (point, ray) in pairs {
         let rotated = rotation * point.push(0.0);
         let rows = Matrix2x3::new(1.0, 0.0, -ray.x, 0.0, 1.0, -ray.y);
         normal += rows.transpose() * rows;
@@ -310,7 +306,7 @@ impl least_squares::Problem for Reprojection<'_> {
 
     fn evaluate(&self, pose: &Transform, _block_ix: usize, sums: &mut BlockSums) -> Option<()> {
         for point in &self.points {
-            let (residual, rows) = residual(pose, point, self.intrinsics)?;
+            let (residual, rows) = residual(self.intrinsics, point, pose)?;
             sums.add(residual, [rows[0].as_slice(), rows[1].as_slice()]);
         }
         Some(())
@@ -319,29 +315,6 @@ impl least_squares::Problem for Reprojection<'_> {
     fn moved(&self, pose: &Transform, shared: &DVector<f64>, _local: &[DVector<f64>]) -> Transform {
         moved(pose, &shared.fixed_rows::<6>(0).into_owned())
     }
-}
-
-/// Reprojection error in pixels and its derivatives with respect to the step of [`moved`], one
-/// array per component.
-fn residual(
-    pose: &Transform,
-    point: &BoardPoint,
-    intrinsics: &Intrinsics,
-) -> Option<([f64; 2], [[f64; 6]; 2])> {
-    let rotated = pose.rotation * point.point_in_board;
-    let (pixel, by_point) =
-        intrinsics.project_with_jacobian(&(rotated + pose.translation.vector))?;
-    let by_rotation = -by_point * rotated.cross_matrix();
-    let rows = [0_usize, 1].map(|axis| {
-        std::array::from_fn(|ix| {
-            if ix < 3 {
-                by_rotation[(axis, ix)]
-            } else {
-                by_point[(axis, ix - 3)]
-            }
-        })
-    });
-    Some(([pixel[0] - point.pixel[0], pixel[1] - point.pixel[1]], rows))
 }
 
 /// Minimizes the reprojection error of the selected corners, and evaluates all corners at the
@@ -377,34 +350,27 @@ fn refine(
     let errors: Vec<f64> = points
         .iter()
         .map(|point| {
-            residual(&pose, point, intrinsics)
+            residual(intrinsics, point, &pose)
                 .map_or(f64::INFINITY, |(error, _)| error[0].hypot(error[1]))
         })
         .collect();
     let limit = inlier_limit(&errors);
     let is_inlier: Vec<bool> = errors.iter().map(|error| *error <= limit).collect();
-    let mut information = Matrix6::zeros();
-    let mut squares_px2 = 0.0;
-    for ((point, error), _) in points
-        .iter()
-        .zip(&errors)
-        .zip(&is_inlier)
+    let inliers = points.iter().zip(&errors).zip(&is_inlier);
+    let (inliers, inlier_errors): (Vec<BoardPoint>, Vec<f64>) = inliers
         .filter(|(_, is_inlier)| **is_inlier)
-    {
-        let (_, rows) = residual(&pose, point, intrinsics)?;
-        for row in rows {
-            let row = Vector6::from(row);
-            information += row * row.transpose();
-        }
-        squares_px2 += error * error;
-    }
+        .map(|((point, error), _)| (*point, *error))
+        .unzip();
+    let information = NormalEquations::new(intrinsics, &inliers, &pose)?.matrix;
     // Inliers that do not determine the pose give no covariance.
     information.cholesky()?;
     Some(BoardPose {
         camera_from_board: pose,
-        information,
-        squares_px2,
-        is_inlier,
+        corners: CornerStatistics {
+            unit_covariance: information.try_inverse()?,
+            squares_px2: inlier_errors.iter().map(|error| error * error).sum(),
+            is_inlier,
+        },
     })
 }
 
@@ -412,23 +378,17 @@ fn refine(
 /// corners with an error of one pixel. For a board that faces the camera, a pose near the true one
 /// describes the corners better than the best one, because small tilts change the corners only in
 /// second order.
-pub(super) fn stepped(
+pub(crate) fn stepped(
     predicted: &Transform,
     points: &[BoardPoint],
     intrinsics: &Intrinsics,
 ) -> Option<(Transform, Matrix6<f64>)> {
-    let mut information = Matrix6::zeros();
-    let mut gradient = Vector6::zeros();
-    for point in points {
-        let (error, rows) = residual(predicted, point, intrinsics)?;
-        for (value, row) in error.into_iter().zip(rows) {
-            let row = Vector6::from(row);
-            information += row * row.transpose();
-            gradient += row * value;
-        }
-    }
-    let covariance = information.try_inverse()?;
-    Some((moved(predicted, &-(covariance * gradient)), covariance))
+    let equations = NormalEquations::new(intrinsics, points, predicted)?;
+    let covariance = equations.matrix.try_inverse()?;
+    Some((
+        moved(predicted, &-(covariance * equations.gradient)),
+        covariance,
+    ))
 }
 
 /// Largest residual that fits the others.
@@ -443,50 +403,15 @@ fn inlier_limit(errors: &[f64]) -> f64 {
     (DEVIATIONS * median / MEDIAN_OF_NORM).max(MIN_PX)
 }
 
-/// The largest set of corners found that agrees with a homography of four of them (Fischler and
-/// Bolles 1981). `None` if it has fewer than half of the corners.
-fn consensus_corners(
-    points: &[Vector2<f64>],
-    rays: &[Vector2<f64>],
-    intrinsics: &Intrinsics,
-) -> Option<Vec<bool>> {
-    // Finds four good corners with 99.99 % probability if half of them are wrong:
-    // (1 - 0.5^4)^150 = 6e-5.
-    const TRIALS: usize = 150;
-    // A homography of four noisy corners is inaccurate far from them.
-    const ALLOWED_PX: f64 = 3.0;
-    let n = points.len();
-    // Rays are in units of the focal length.
-    let allowed = ALLOWED_PX / intrinsics.focal_px[0];
-    let mut random = Random::new(1);
-    let mut order: Vec<usize> = (0..n).collect();
-    let mut best: Vec<bool> = Vec::new();
-    let count = |set: &[bool]| set.iter().filter(|is_in| **is_in).count();
-    for _ in 0..TRIALS {
-        random.shuffle(&mut order);
-        let mut is_used = vec![false; n];
-        order[..MIN_CORNERS]
-            .iter()
-            .for_each(|&ix| is_used[ix] = true);
-        let Some(matrix) = homography(points, rays, &is_used) else {
-            continue;
-        };
-        let agrees = |(point, ray): (&Vector2<f64>, &Vector2<f64>)| {
-            let image = matrix * point.push(1.0);
-            image.z > 0.0 && (image.xy() / image.z - ray).norm() < allowed
-        };
-        let set: Vec<bool> = points.iter().zip(rays).map(agrees).collect();
-        if count(&set) > count(&best) {
-            best = set;
-        }
-    }
-    (count(&best) >= MIN_CORNERS.max(n.div_ceil(2))).then_some(best)
-}
-
 #[cfg(test)]
 mod tests {
-    use super::super::scene;
+    use super::super::super::tests as scene;
     use super::*;
+
+    /// Distance between the positions of a found and a true pose, meters.
+    fn off_m(found: &BoardPose, truth: &Transform) -> f64 {
+        (found.camera_from_board.translation.vector - truth.translation.vector).norm()
+    }
 
     #[test]
     fn only_the_corner_beyond_the_lens_model_is_dropped() {
@@ -516,13 +441,11 @@ mod tests {
         view.points[7].pixel = [1e4, -2e4];
         assert!(intrinsics.unproject(view.points[7].pixel).is_none());
         let found = &board_poses(&view, &intrinsics)[0];
+        assert!(off_m(found, &pose) < 1e-8);
         assert!(
-            (found.camera_from_board.translation.vector - pose.translation.vector).norm() < 1e-8
-        );
-        assert!(
-            !found.is_inlier[7] && found.n_inliers() == view.points.len() - 1,
+            !found.corners.is_inlier[7] && found.corners.n_inliers() == view.points.len() - 1,
             "{:?}",
-            found.is_inlier
+            found.corners.is_inlier
         );
     }
 
@@ -533,10 +456,7 @@ mod tests {
             let pose = Transform::new(Vector3::new(-0.05, 0.02, 0.6), rotation.into());
             let view = scene::view(&pose, 0.0, &mut Random::new(1));
             let found = &board_poses(&view, &intrinsics)[0];
-            assert!(
-                (found.camera_from_board.translation.vector - pose.translation.vector).norm()
-                    < 1e-8
-            );
+            assert!(off_m(found, &pose) < 1e-8);
             assert!(found.camera_from_board.rotation.angle_to(&pose.rotation) < 1e-7);
         }
     }
@@ -548,17 +468,10 @@ mod tests {
         let view = scene::view(&pose, 0.1, &mut Random::new(2));
         let found = board_poses(&view, &intrinsics);
         assert_eq!(found.len(), 2);
-        let closest = found
-            .iter()
-            .map(|found| found.camera_from_board.rotation.angle_to(&pose.rotation));
-        assert!(closest.fold(f64::INFINITY, f64::min) < 0.1);
-        assert!(
-            found[0]
-                .camera_from_board
-                .rotation
-                .angle_to(&found[1].camera_from_board.rotation)
-                > 0.2
-        );
+        let [first, second] = [0, 1].map(|ix| found[ix].camera_from_board.rotation);
+        let off_rad = [first, second].map(|rotation| rotation.angle_to(&pose.rotation));
+        assert!(off_rad[0].min(off_rad[1]) < 0.1);
+        assert!(first.angle_to(&second) > 0.2);
     }
 
     #[test]
@@ -571,11 +484,10 @@ mod tests {
             point.pixel = [random.uniform(0.0, 1280.0), random.uniform(0.0, 720.0)];
         }
         let found = &board_poses(&view, &intrinsics)[0];
-        assert!(
-            (found.camera_from_board.translation.vector - pose.translation.vector).norm() < 1e-3
-        );
+        assert!(off_m(found, &pose) < 1e-3);
         assert!(
             found
+                .corners
                 .is_inlier
                 .iter()
                 .step_by(3)

@@ -5,13 +5,17 @@
 //! 1988, section 8.2, with square roots, which keep the variances positive and increase the
 //! likelihood monotonically.
 
-use super::Setup;
-use super::geometry::{self, Matrix6x12, N_PARAMS, Solution};
-use super::samples::Sample;
+use super::super::Setup;
+use super::super::geometry::{self, Matrix6x12, N_PARAMS, Solution};
+use super::super::samples::{Sample, used};
 use crate::Error;
-use crate::least_squares::{self, BlockSums};
+use crate::least_squares::{self, BlockSums, Loss};
 use kinematics::Transform;
 use nalgebra::{DMatrix, DVector, Matrix6, SMatrix, Vector6};
+
+/// Norm of six whitened residuals, beyond which their loss is linear: 95 % of the samples without a
+/// mistake are below.
+const LOSS_THRESHOLD: f64 = 3.55;
 
 /// Standard deviations of the measurement errors.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -73,37 +77,60 @@ impl HandEyeNoise {
 
 /// One sample with the chosen board pose.
 #[derive(Clone, Debug)]
-pub(super) struct Measurement {
+pub(crate) struct Measurement {
     /// See [`Sample`].
-    pub(super) stop_ix: usize,
+    stop_ix: usize,
     /// One divided by the number of measurements of the stop. The error of the robot pose is common
     /// to them, so that a stop counts once.
-    pub(super) weight: f64,
-    pub(super) a: Transform,
-    pub(super) camera_from_board: Transform,
+    weight: f64,
+    pub(crate) a: Transform,
+    pub(crate) camera_from_board: Transform,
     /// Covariance of the pose for corners with an error of one pixel; `None` for given poses.
-    pub(super) unit_covariance: Option<Matrix6<f64>>,
+    pub(crate) unit_covariance: Option<Matrix6<f64>>,
 }
 
-/// The chosen candidate of each sample, with weights for all of them.
-pub(super) fn measurements(samples: &[Sample], choice: &[usize]) -> Vec<Measurement> {
-    let mut measurements = Vec::with_capacity(samples.len());
-    for (sample, choice) in samples.iter().zip(choice) {
-        let candidate = &sample.candidates[*choice];
-        let corners = candidate.corners.as_ref();
-        measurements.push(Measurement {
-            stop_ix: sample.stop_ix,
+impl Measurement {
+    /// A measurement that is alone at its stop.
+    pub(crate) fn new(
+        a: Transform,
+        camera_from_board: Transform,
+        unit_covariance: Option<Matrix6<f64>>,
+    ) -> Self {
+        Self {
+            stop_ix: usize::MAX,
             weight: 1.0,
-            a: sample.a,
-            camera_from_board: candidate.camera_from_board,
-            unit_covariance: corners.map(|corners| corners.unit_covariance),
-        });
+            a,
+            camera_from_board,
+            unit_covariance,
+        }
     }
-    with_weights(measurements)
+
+    pub(super) fn of(sample: &Sample) -> Self {
+        let chosen = sample.chosen();
+        let corners = chosen.corners.as_ref();
+        let unit_covariance = corners.map(|corners| corners.unit_covariance);
+        Self {
+            stop_ix: sample.stop_ix,
+            ..Self::new(sample.a, chosen.camera_from_board, unit_covariance)
+        }
+    }
+
+    /// Residual of a solution, and its derivatives with respect to the parameters of
+    /// [`Solution::moved`].
+    fn linearized(&self, solution: &Solution) -> (Vector6<f64>, Matrix6x12) {
+        let predicted = solution.camera_from_board(&self.a);
+        let residual = geometry::residual(&predicted, &self.camera_from_board);
+        (residual, geometry::residual_jacobian(&predicted, &residual))
+    }
+}
+
+/// The used samples, weighted such that each stop counts once.
+pub(crate) fn measurements(samples: &[Sample]) -> Vec<Measurement> {
+    with_weights(used(samples).map(Measurement::of).collect())
 }
 
 /// Weighs measurements such that each stop counts once.
-pub(super) fn with_weights(mut measurements: Vec<Measurement>) -> Vec<Measurement> {
+fn with_weights(mut measurements: Vec<Measurement>) -> Vec<Measurement> {
     let mut n_of_stop = std::collections::BTreeMap::<usize, usize>::new();
     for measurement in &measurements {
         *n_of_stop.entry(measurement.stop_ix).or_default() += 1;
@@ -119,6 +146,8 @@ pub(super) fn with_weights(mut measurements: Vec<Measurement>) -> Vec<Measuremen
 pub(super) struct PoseFit {
     pub(super) solution: Solution,
     pub(super) noise: HandEyeNoise,
+    /// Noise that determines the weights.
+    pub(super) weighting: HandEyeNoise,
     /// Covariance of the parameters of [`Solution::moved`].
     pub(super) covariance: DMatrix<f64>,
     /// Effective degrees of freedom of the covariance (Satterthwaite 1946).
@@ -127,6 +156,9 @@ pub(super) struct PoseFit {
 
 /// Fits a solution to the measurements.
 ///
+/// * `knows_noise`: keeps the weights of the given noise. Otherwise, they follow from the estimated
+///   noise.
+///
 /// # Errors
 /// If fewer than three measurements are given.
 pub(super) fn fit(
@@ -134,80 +166,99 @@ pub(super) fn fit(
     measurements: &[Measurement],
     initial: Solution,
     noise: HandEyeNoise,
-) -> Result<PoseFit, Error> {
-    fit_with(setup, measurements, initial, noise, 60)
-}
-
-/// Fits a solution with the given noise.
-///
-/// # Errors
-/// If fewer than three measurements are given.
-pub(super) fn fit_with_known_noise(
-    setup: Setup,
-    measurements: &[Measurement],
-    initial: Solution,
-    noise: HandEyeNoise,
-) -> Result<PoseFit, Error> {
-    fit_with(setup, measurements, initial, noise, 1)
-}
-
-fn fit_with(
-    setup: Setup,
-    measurements: &[Measurement],
-    initial: Solution,
-    noise: HandEyeNoise,
-    max_rounds: usize,
+    knows_noise: bool,
 ) -> Result<PoseFit, Error> {
     // Relative change of the information about the parameters. It is far below the uncertainty of
     // variances that are estimated from tens of samples.
     const CONVERGED: f64 = 1e-3;
-    let mut solution = initial;
-    let mut noise = noise;
+    let max_rounds = if knows_noise { 1 } else { 60 };
     let options = least_squares::Options {
-        loss: geometry::SAMPLE_LOSS,
+        loss: Loss::Huber {
+            threshold: LOSS_THRESHOLD,
+        },
         max_steps: 30,
         ..least_squares::Options::default()
     };
     // The weights depend on the variances, and those on the residuals of the solution: both are
     // estimated in turns.
-    let mut last: Option<(least_squares::Fit<Solution>, f64)> = None;
-    for _ in 0..max_rounds {
+    let mut solution = initial;
+    let mut noise = noise;
+    let mut before: Option<DVector<f64>> = None;
+    let mut n_rounds = 0;
+    loop {
+        n_rounds += 1;
         let problem = Whitened::new(setup, measurements, &solution, &noise);
         let fit = least_squares::minimize(&problem, solution, &options)?;
         solution = fit.state;
         let update = update_variances(setup, measurements, &solution, &noise, &fit.information);
         noise = update.noise;
         let diagonal = fit.information.diagonal();
-        let is_settled = last.as_ref().is_some_and(|(before, _)| {
-            let before = before.information.diagonal();
-            diagonal
-                .iter()
-                .zip(&before)
-                .all(|(now, before)| (now / before - 1.0).abs() < CONVERGED)
+        let is_settled = before.as_ref().is_some_and(|before| {
+            let mut changes = diagonal.iter().zip(before);
+            changes.all(|(now, before)| (now / before - 1.0).abs() < CONVERGED)
         });
-        last = Some((fit, update.n_free));
-        if is_settled {
-            break;
+        if is_settled || n_rounds == max_rounds {
+            // The whitened residuals have unit variance by construction.
+            let covariance = fit.information.try_inverse().unwrap_or(fit.covariance);
+            return Ok(PoseFit {
+                solution,
+                noise,
+                weighting: noise,
+                covariance,
+                n_free: update.n_free,
+            });
         }
+        before = Some(diagonal);
     }
-    let Some((fit, n_free)) = last else {
-        return Err(Error::TooFewResiduals {
-            n_residuals: 0,
-            n_params: N_PARAMS,
-        });
+}
+
+/// Largest number of fits of a cross-validation. With more measurements, several are left out at a
+/// time, because the time would grow with the square of their number. Leaving out one of 60 changes
+/// a solution very little already.
+pub const MAX_FOLDS: usize = 60;
+
+/// For each measurement, the solution of the others: stops are left out one by one, or with many
+/// stops in [`MAX_FOLDS`] interleaved folds.
+///
+/// * `knows_noise`: keeps the given noise, which is faster than estimating it without the
+///   measurement.
+pub(crate) fn held_out_solutions(
+    setup: Setup,
+    measurements: &[Measurement],
+    solution: Solution,
+    noise: HandEyeNoise,
+    knows_noise: bool,
+) -> Vec<Option<Solution>> {
+    // Measurements at one stop share the error of the robot pose, so they are left out together.
+    let mut stops: Vec<usize> = measurements
+        .iter()
+        .map(|measurement| measurement.stop_ix)
+        .collect();
+    stops.sort_unstable();
+    stops.dedup();
+    let n_folds = stops.len().min(MAX_FOLDS);
+    let fold_of = |measurement: &Measurement| {
+        stops.partition_point(|stop| *stop < measurement.stop_ix) % n_folds
     };
-    // The whitened residuals have unit variance by construction.
-    let covariance = fit
-        .information
-        .clone()
-        .try_inverse()
-        .unwrap_or_else(|| fit.covariance.clone());
-    Ok(PoseFit {
-        solution,
-        noise,
-        covariance,
-        n_free,
-    })
+    let n_left_out = stops.len().div_ceil(n_folds.max(1));
+    // The others must be at three stops at least.
+    let is_possible = stops.len() >= n_left_out + 3;
+    let folds: Vec<Option<Solution>> = (0..n_folds)
+        .map(|fold| {
+            is_possible.then_some(())?;
+            let others: Vec<Measurement> = measurements
+                .iter()
+                .filter(|other| fold_of(other) != fold)
+                .cloned()
+                .collect();
+            let held_out = fit(setup, &others, solution, noise, knows_noise);
+            Some(held_out.ok()?.solution)
+        })
+        .collect();
+    measurements
+        .iter()
+        .map(|measurement| folds[fold_of(measurement)])
+        .collect()
 }
 
 /// Covariance of the parameters of a fit whose weights follow from `weighting`, if the true noise
@@ -222,9 +273,7 @@ pub(super) fn sandwich_covariance(
     let mut information = SMatrix::<f64, 12, 12>::zeros();
     let mut scatter = SMatrix::<f64, 12, 12>::zeros();
     for measurement in measurements {
-        let predicted = solution.camera_from_board(&measurement.a);
-        let residual = geometry::residual(&predicted, &measurement.camera_from_board);
-        let jacobian = geometry::residual_jacobian(&predicted, &residual);
+        let (_, jacobian) = measurement.linearized(solution);
         let weighted = covariance(setup, measurement, solution, weighting)
             .cholesky()?
             .inverse()
@@ -249,10 +298,8 @@ pub(super) fn initial_noise(
     solution: &Solution,
     corner_px: Option<f64>,
 ) -> HandEyeNoise {
-    let residuals: Vec<Vector6<f64>> = measurements
-        .iter()
-        .map(|m| geometry::residual(&solution.camera_from_board(&m.a), &m.camera_from_board))
-        .collect();
+    let residuals = measurements.iter().map(|m| m.linearized(solution).0);
+    let residuals: Vec<Vector6<f64>> = residuals.collect();
     HandEyeNoise {
         corner_px,
         residual_px: corner_px,
@@ -317,7 +364,7 @@ fn total(parts: &[Matrix6<f64>], variances: &[f64]) -> Matrix6<f64> {
 }
 
 /// Covariance of the residual of a measurement.
-pub(super) fn covariance(
+pub(crate) fn covariance(
     setup: Setup,
     measurement: &Measurement,
     solution: &Solution,
@@ -418,10 +465,12 @@ impl least_squares::Problem for Whitened<'_> {
 
     fn evaluate(&self, solution: &Solution, block_ix: usize, sums: &mut BlockSums) -> Option<()> {
         let measurement = &self.measurements[block_ix];
-        let predicted = solution.camera_from_board(&measurement.a);
-        let residual = geometry::residual(&predicted, &measurement.camera_from_board);
-        let jacobian = geometry::residual_jacobian(&predicted, &residual);
-        geometry::add_whitened(sums, &self.whitening[block_ix], &residual, &jacobian);
+        let (residual, jacobian) = measurement.linearized(solution);
+        let whitening = &self.whitening[block_ix];
+        // Matrices are stored by columns, so the rows are contiguous in the transpose.
+        let rows = (whitening * jacobian).transpose();
+        let row = |ix: usize| &rows.as_slice()[N_PARAMS * ix..N_PARAMS * (ix + 1)];
+        sums.add((whitening * residual).into(), [0, 1, 2, 3, 4, 5].map(row));
         Some(())
     }
 
@@ -474,9 +523,7 @@ fn update_variances(
         else {
             continue;
         };
-        let predicted = solution.camera_from_board(&measurement.a);
-        let residual = geometry::residual(&predicted, &measurement.camera_from_board);
-        let jacobian: Matrix6x12 = geometry::residual_jacobian(&predicted, &residual);
+        let (residual, jacobian) = measurement.linearized(solution);
         let weighted = weight * residual;
         let robust = robust_weight(residual.dot(&weighted));
         let projected = &inverse * (jacobian.transpose() * weight);
@@ -496,24 +543,20 @@ fn update_variances(
         }
     }
     // A part of the residuals' information is spent on the parameters.
-    let n_scalars = 6.0
-        * measurements
-            .iter()
-            .map(|measurement| measurement.weight)
-            .sum::<f64>();
+    let n_scalars = 6.0 * measurements.iter().map(|m| m.weight).sum::<f64>();
     fisher *= ((n_scalars - N_PARAMS as f64) / n_scalars).max(0.05);
     // Limited, because the first steps may be far off, and a variance of zero would stay zero.
-    let updated: Vec<f64> = (0..n_variances)
-        .map(|k| {
-            let factor: f64 = f64::sqrt(squares[k] / expected[k]);
-            variances[k]
-                * if factor.is_finite() {
-                    factor.clamp(0.2, 5.0)
-                } else {
-                    1.0
-                }
-        })
-        .collect();
+    let updated = (0..n_variances).map(|k| {
+        let factor: f64 = f64::sqrt(squares[k] / expected[k]);
+        let is_valid = factor.is_finite();
+        variances[k]
+            * if is_valid {
+                factor.clamp(0.2, 5.0)
+            } else {
+                1.0
+            }
+    });
+    let updated: Vec<f64> = updated.collect();
     // Satterthwaite 1946: a variance with `n` degrees of freedom has a relative variance of `2 /
     // n`.
     let relative_variance = fisher.try_inverse().map_or(f64::INFINITY, |covariance| {
@@ -530,11 +573,10 @@ fn update_variances(
     }
 }
 
-/// Weight of [`geometry::SAMPLE_LOSS`], divided by its mean for normal residuals.
+/// Weight of six whitened residuals, divided by its mean for normal residuals.
 fn robust_weight(squared_norm: f64) -> f64 {
-    const THRESHOLD: f64 = 3.55;
     // The mean of the weighted square relative to six. Without it, variances of normal residuals
     // would be 1 % too small.
     const MEAN: f64 = 0.99;
-    (THRESHOLD / squared_norm.sqrt()).min(1.0) / MEAN
+    (LOSS_THRESHOLD / squared_norm.sqrt()).min(1.0) / MEAN
 }

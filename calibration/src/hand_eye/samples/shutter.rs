@@ -1,6 +1,6 @@
 //! Corrects detected corners for the motion during the readout of a rolling shutter.
 
-use super::Setup;
+use super::super::Setup;
 use crate::{BoardPoint, board_pose};
 use kinematics::{Intrinsics, Transform};
 use nalgebra::Point3;
@@ -74,7 +74,7 @@ impl FlangeMotion<'_> {
 
 #[cfg(test)]
 mod tests {
-    use super::super::scene::{self, Scene};
+    use super::super::super::tests::{self as scene, Scene};
     use super::*;
     use kinematics::{Twist, transform};
     use nalgebra::Vector3;

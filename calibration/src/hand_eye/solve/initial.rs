@@ -1,13 +1,271 @@
-//! Closed-form solutions of `a x = x b`: Park and Martin 1994, Daniilidis 1999, Tsai and Lenz 1989.
+//! Initial solution that most samples agree with, and the board pose of each sample that fits it
+//! best.
 //!
+//! Least trimmed squares over closed-form solutions of three samples (Rousseeuw 1984; concentration
+//! steps of Rousseeuw and Van Driessen 1999). It resolves the two-fold ambiguity of planar boards
+//! and boards with rotational symmetry, and tolerates wrong samples up to almost one half.
+//!
+//! The closed forms solve `a x = x b`: Park and Martin 1994, Daniilidis 1999, Tsai and Lenz 1989.
 //! `a` is the motion of the flange between two samples, `b` the motion of the camera, and `x` is
 //! `flange_from_camera`.
 
+use super::super::geometry::{self, Solution, nearest_rotation};
+use super::super::samples::{Sample, used};
 use kinematics::Transform;
+use kinematics::random::Random;
 use nalgebra::{
-    DMatrix, DVector, Matrix3, Quaternion, Rotation3, SMatrix, SVector, SymmetricEigen,
-    Translation3, UnitQuaternion, Vector3,
+    DMatrix, DVector, Matrix3, Quaternion, SMatrix, SVector, SymmetricEigen, Translation3,
+    UnitQuaternion, Vector3,
 };
+
+/// An initial solution.
+#[derive(Clone, Debug)]
+pub(crate) struct Consensus {
+    pub(crate) solution: Solution,
+    /// Candidate of each sample.
+    pub(crate) choice: Vec<usize>,
+    /// Distance of each sample: see [`Metric`].
+    distances_m: Vec<f64>,
+}
+
+impl Consensus {
+    /// Median distance of the samples, meters.
+    pub(crate) fn median_m(&self) -> f64 {
+        kinematics::quantile::median(&self.distances_m).unwrap_or(f64::INFINITY)
+    }
+
+    /// Chooses the candidates, and excludes the samples that disagree with the solution.
+    pub(super) fn apply_to(&self, samples: &mut [Sample]) {
+        /// With two fifths of wrong samples, the median is the 83 % quantile of the good ones.
+        const MEDIANS: f64 = 4.0;
+        const ROUNDING_M: f64 = 1e-9;
+        let limit = MEDIANS * self.median_m() + ROUNDING_M;
+        for (ix, sample) in samples.iter_mut().enumerate() {
+            sample.choice = self.choice[ix];
+            sample.is_used = self.distances_m[ix] <= limit;
+        }
+    }
+}
+
+/// Number of samples whose agreement decides: `(n + p + 1) / 2` for solutions of `p = 3` samples,
+/// which tolerates the most wrong samples (Rousseeuw 1984).
+fn n_deciding(n: usize) -> usize {
+    (n + 4).div_ceil(2).min(n)
+}
+
+/// Distance between poses: translation, and rotation times the typical distance of the board,
+/// meters.
+#[derive(Clone, Copy, Debug)]
+struct Metric {
+    lever_m: f64,
+}
+
+impl Metric {
+    fn of(samples: &[Sample]) -> Self {
+        // A rotation error moves the board in the image as much as a translation of the angle times
+        // the distance.
+        let likely = samples
+            .iter()
+            .map(|sample| &sample.candidates[0].camera_from_board);
+        Self {
+            lever_m: geometry::median_distance_m(likely).unwrap_or(1.0).max(1e-3),
+        }
+    }
+
+    fn distance_m(self, predicted: &Transform, measured: &Transform) -> f64 {
+        let residual = geometry::residual(predicted, measured);
+        let rotation = residual.fixed_rows::<3>(0).norm() * self.lever_m;
+        rotation.hypot(residual.fixed_rows::<3>(3).norm())
+    }
+}
+
+/// The best solution found. `None` if no three samples determine one.
+pub(crate) fn consensus(samples: &[Sample]) -> Option<Consensus> {
+    /// Three good samples with the right choice among four poses each are drawn with 99 %
+    /// probability if two fifths of the samples are wrong.
+    const TRIALS: usize = 1500;
+    /// Without a choice, this number suffices.
+    const TRIALS_WITHOUT_CHOICE: usize = 200;
+    let metric = Metric::of(samples);
+    // A fixed seed, so that the same samples give the same result.
+    let mut random = Random::new(1);
+    let mut best: Option<(f64, Solution)> = None;
+    let has_choice = samples.iter().any(|sample| sample.candidates.len() > 1);
+    let n_trials = if has_choice {
+        TRIALS
+    } else {
+        TRIALS_WITHOUT_CHOICE
+    };
+    for trial in 0..n_trials {
+        let Some(picked) = pick(samples, trial, &mut random) else {
+            continue;
+        };
+        let Some(solution) = solve(&picked, ClosedForm::ParkMartin) else {
+            continue;
+        };
+        let score = trimmed_squares(&distances(samples, &solution, metric).1);
+        if best.as_ref().is_none_or(|(least, _)| score < *least) {
+            best = Some((score, solution));
+        }
+    }
+    // Concentration steps: solutions of half of the samples are more accurate than those of three.
+    // Each step decreases the sum of squares until the set of samples no longer changes.
+    let (mut least, mut solution) = best?;
+    for _ in 0..10 {
+        let Some(next) = concentrate(samples, &solution, metric) else {
+            break;
+        };
+        let score = trimmed_squares(&distances(samples, &next, metric).1);
+        if score.is_nan() || score >= least {
+            break;
+        }
+        (least, solution) = (score, next);
+    }
+    let (choice, distances_m) = distances(samples, &solution, metric);
+    Some(Consensus {
+        solution,
+        choice,
+        distances_m,
+    })
+}
+
+/// Three samples with one candidate each; `None` if the rotation angles of their motions disagree.
+fn pick(
+    samples: &[Sample],
+    trial: usize,
+    random: &mut Random,
+) -> Option<[(Transform, Transform); 3]> {
+    // Flange and camera rotate by the same angle, so different angles show a wrong sample or
+    // candidate without solving. The limit is far above the errors of good samples.
+    const MAX_DIFFERENCE_RAD: f64 = 0.2;
+    let n = samples.len();
+    (n >= 3).then_some(())?;
+    let first = random.below(n);
+    let second = (first + 1 + random.below(n - 1)) % n;
+    let third = loop {
+        let ix = random.below(n);
+        if ix != first && ix != second {
+            break ix;
+        }
+    };
+    let picked = [first, second, third].map(|ix| {
+        let sample = &samples[ix];
+        let n_candidates = sample.candidates.len();
+        // The first trials use the best poses only.
+        let candidate_ix = if trial < 100 {
+            0
+        } else {
+            random.below(n_candidates)
+        };
+        (sample.a, sample.candidates[candidate_ix].camera_from_board)
+    });
+    let agrees = motions(&picked).iter().all(|motion| {
+        (motion.a.rotation.angle() - motion.b.rotation.angle()).abs() < MAX_DIFFERENCE_RAD
+    });
+    agrees.then_some(picked)
+}
+
+/// Closed-form solution of samples.
+fn solve(pairs: &[(Transform, Transform)], solver: ClosedForm) -> Option<Solution> {
+    let x = solver.solve(&motions(pairs))?;
+    let boards: Vec<Transform> = pairs
+        .iter()
+        .map(|(a, camera_from_board)| a * x * camera_from_board)
+        .collect();
+    let y = geometry::mean(&boards)?;
+    Some(Solution { x, y })
+}
+
+/// The closed-form solution of the used samples with the smallest leave-one-out scatter. `None` if
+/// there is none.
+pub(super) fn best_closed_form(samples: &[Sample]) -> Option<Solution> {
+    let pairs: Vec<(Transform, Transform)> = used(samples)
+        .map(|sample| (sample.a, sample.chosen().camera_from_board))
+        .collect();
+    ClosedForm::ALL
+        .into_iter()
+        .filter_map(|solver| Some((leave_one_out_mm(&pairs, solver)?, solve(&pairs, solver)?)))
+        .min_by(|a, b| a.0.total_cmp(&b.0))
+        .map(|(_, solution)| solution)
+}
+
+/// Scatter of the positions of the board, each from a closed form without this pair, millimeters.
+fn leave_one_out_mm(pairs: &[(Transform, Transform)], solver: ClosedForm) -> Option<f64> {
+    /// Enough to rank three solvers; each one solves for all pairs of the others.
+    const MAX_FOLDS: usize = 20;
+    let stride = pairs.len().div_ceil(MAX_FOLDS).max(1);
+    let boards: Option<Vec<Transform>> = (0..pairs.len())
+        .step_by(stride)
+        .map(|left_out| {
+            let mut others = pairs.to_vec();
+            let (a, camera_from_board) = others.remove(left_out);
+            Some(solve(&others, solver)?.board(&a, &camera_from_board))
+        })
+        .collect();
+    Some(geometry::scatter(&boards?)?.mm)
+}
+
+/// For each sample the candidate that fits best, and its distance in meters.
+fn distances(samples: &[Sample], solution: &Solution, metric: Metric) -> (Vec<usize>, Vec<f64>) {
+    samples
+        .iter()
+        .map(|sample| nearest(sample, solution, metric))
+        .unzip()
+}
+
+/// The candidate of a sample that fits best, and its distance in meters.
+fn nearest(sample: &Sample, solution: &Solution, metric: Metric) -> (usize, f64) {
+    let predicted = solution.camera_from_board(&sample.a);
+    sample
+        .candidates
+        .iter()
+        .map(|candidate| metric.distance_m(&predicted, &candidate.camera_from_board))
+        .enumerate()
+        .min_by(|a, b| a.1.total_cmp(&b.1))
+        .unwrap_or((0, f64::INFINITY))
+}
+
+/// Chooses the candidate of each sample that fits a solution best. Returns whether a choice has
+/// changed.
+pub(super) fn choose(samples: &mut [Sample], solution: &Solution) -> bool {
+    let metric = Metric::of(samples);
+    let mut has_changed = false;
+    for sample in samples {
+        let (choice, _) = nearest(sample, solution, metric);
+        has_changed |= choice != sample.choice;
+        sample.choice = choice;
+    }
+    has_changed
+}
+
+/// Sum of the squares of the smallest distances. The others may be arbitrarily wrong.
+fn trimmed_squares(distances_m: &[f64]) -> f64 {
+    let mut sorted = distances_m.to_vec();
+    sorted.sort_unstable_by(f64::total_cmp);
+    sorted
+        .iter()
+        .take(n_deciding(sorted.len()))
+        .map(|distance| distance * distance)
+        .sum()
+}
+
+/// Solution of the samples with the smallest distances.
+fn concentrate(samples: &[Sample], solution: &Solution, metric: Metric) -> Option<Solution> {
+    let (choice, distances_m) = distances(samples, solution, metric);
+    let mut order: Vec<usize> = (0..samples.len()).collect();
+    order.sort_by(|&i, &j| distances_m[i].total_cmp(&distances_m[j]));
+    let pairs: Vec<_> = order
+        .into_iter()
+        .take(n_deciding(samples.len()))
+        .map(|ix| {
+            (
+                samples[ix].a,
+                samples[ix].candidates[choice[ix]].camera_from_board,
+            )
+        })
+        .collect();
+    solve(&pairs, ClosedForm::ParkMartin)
+}
 
 /// Motions with a smaller rotation, in radians, have no usable rotation axis: the errors of their
 /// rotations may be as large.
@@ -41,7 +299,7 @@ impl ClosedForm {
     }
 
     /// Solves `a x = x b` for all motions. `None` if the rotation axes of the motions are parallel.
-    pub(super) fn solve(self, motions: &[Motion]) -> Option<Transform> {
+    pub(crate) fn solve(self, motions: &[Motion]) -> Option<Transform> {
         let x = match self {
             Self::ParkMartin => with_translation(motions, park_martin_rotation(motions)?),
             Self::TsaiLenz => with_translation(motions, tsai_lenz_rotation(motions)?),
@@ -53,16 +311,16 @@ impl ClosedForm {
 
 /// A pair of corresponding motions.
 #[derive(Clone, Copy, Debug)]
-pub(super) struct Motion {
-    pub(super) a: Transform,
-    pub(super) b: Transform,
+pub(crate) struct Motion {
+    a: Transform,
+    b: Transform,
 }
 
 /// Motions between all pairs of samples, or between evenly distributed pairs if there are many.
 ///
 /// * `pairs`: `a` and `camera_from_board` of each sample, where `a x camera_from_board` is
 ///   constant.
-pub(super) fn motions(pairs: &[(Transform, Transform)]) -> Vec<Motion> {
+pub(crate) fn motions(pairs: &[(Transform, Transform)]) -> Vec<Motion> {
     let n = pairs.len();
     // Numbers of pairs grow with the square of the number of samples.
     let stride = (n * n.saturating_sub(1) / 2).div_ceil(MAX_MOTIONS).max(1);
@@ -86,28 +344,6 @@ fn park_martin_rotation(motions: &[Motion]) -> Option<UnitQuaternion<f64>> {
     nearest_rotation(&correlation)
 }
 
-/// The rotation `r` that maximizes the trace of `r' correlation` (Kabsch 1976). `None` if it is not
-/// unique.
-pub(crate) fn nearest_rotation(correlation: &Matrix3<f64>) -> Option<UnitQuaternion<f64>> {
-    // Of the second to the first singular value; parallel axes have 0.
-    const MIN_RATIO: f64 = 1e-9;
-    if !correlation.iter().all(|value| value.is_finite()) {
-        return None;
-    }
-    let svd = correlation.svd(true, true);
-    if svd.singular_values[1] <= MIN_RATIO * svd.singular_values[0] {
-        return None;
-    }
-    let u = svd.u?;
-    let v_t = svd.v_t?;
-    // If the product of the two orthogonal matrices is a reflection, the direction with the
-    // smallest singular value is flipped, which costs the least.
-    let mirror = Matrix3::from_diagonal(&Vector3::new(1.0, 1.0, (u * v_t).determinant().signum()));
-    Some(UnitQuaternion::from_rotation_matrix(
-        &Rotation3::from_matrix_unchecked(u * mirror * v_t),
-    ))
-}
-
 fn tsai_lenz_rotation(motions: &[Motion]) -> Option<UnitQuaternion<f64>> {
     let mut normal = Matrix3::zeros();
     let mut right = Vector3::zeros();
@@ -119,7 +355,7 @@ fn tsai_lenz_rotation(motions: &[Motion]) -> Option<UnitQuaternion<f64>> {
         normal += skew.transpose() * skew;
         right += skew.transpose() * (p_b - p_a);
     }
-    let tangent = solve(&normal, &right)?;
+    let tangent = solve_normal(&normal, &right)?;
     // The vector is the axis times the tangent of half the angle.
     let half_cosine = 1.0 / (1.0 + tangent.norm_squared()).sqrt();
     Some(UnitQuaternion::from_quaternion(Quaternion::from_parts(
@@ -140,7 +376,7 @@ fn positive(rotation: UnitQuaternion<f64>) -> Quaternion<f64> {
     if q.scalar() < 0.0 { -q } else { q }
 }
 
-fn solve(normal: &Matrix3<f64>, right: &Vector3<f64>) -> Option<Vector3<f64>> {
+fn solve_normal(normal: &Matrix3<f64>, right: &Vector3<f64>) -> Option<Vector3<f64>> {
     // Of eigenvalues, which are squares of singular values.
     const MIN_RATIO: f64 = 1e-12;
     let eigen = SymmetricEigen::new(*normal);
@@ -159,7 +395,7 @@ fn with_translation(motions: &[Motion], rotation: UnitQuaternion<f64>) -> Option
             * (rotation * motion.b.translation.vector - motion.a.translation.vector);
     }
     Some(Transform::from_parts(
-        Translation3::from(solve(&normal, &right)?),
+        Translation3::from(solve_normal(&normal, &right)?),
         rotation,
     ))
 }
@@ -167,7 +403,7 @@ fn with_translation(motions: &[Motion], rotation: UnitQuaternion<f64>) -> Option
 /// Scale of the translations of `b` relative to those of `a`, estimated together with the
 /// translation, and its standard deviation. 1 if both have the same unit; 1000 if only those of `a`
 /// are in millimeters.
-pub(super) fn relative_scale(
+pub(crate) fn relative_scale(
     motions: &[Motion],
     rotation: UnitQuaternion<f64>,
 ) -> Option<(f64, f64)> {
@@ -211,20 +447,11 @@ fn daniilidis(motions: &[Motion]) -> Option<Transform> {
         let (a, a_dual) = dual_quaternion(&motion.a);
         let (b, b_dual) = dual_quaternion(&motion.b);
         let mut rows = SMatrix::<f64, 6, 8>::zeros();
-        for (row, column, difference, sum) in [
-            (0, 0, a.imag() - b.imag(), a.imag() + b.imag()),
-            (
-                3,
-                0,
-                a_dual.imag() - b_dual.imag(),
-                a_dual.imag() + b_dual.imag(),
-            ),
-            (3, 4, a.imag() - b.imag(), a.imag() + b.imag()),
-        ] {
+        for (row, column, p, q) in [(0, 0, a, b), (3, 0, a_dual, b_dual), (3, 4, a, b)] {
             rows.fixed_view_mut::<3, 1>(row, column)
-                .copy_from(&difference);
+                .copy_from(&(p.imag() - q.imag()));
             rows.fixed_view_mut::<3, 3>(row, column + 1)
-                .copy_from(&sum.cross_matrix());
+                .copy_from(&(p.imag() + q.imag()).cross_matrix());
         }
         normal += rows.transpose() * rows;
     }
@@ -255,12 +482,8 @@ fn daniilidis(motions: &[Motion]) -> Option<Transform> {
 
 /// The quaternion in four elements of a vector.
 fn quaternion_at(vector: &SVector<f64, 8>, first: usize) -> Quaternion<f64> {
-    Quaternion::new(
-        vector[first],
-        vector[first + 1],
-        vector[first + 2],
-        vector[first + 3],
-    )
+    let [w, i, j, k] = [0, 1, 2, 3].map(|ix| vector[first + ix]);
+    Quaternion::new(w, i, j, k)
 }
 
 /// Dot product of quaternions as vectors of four numbers.
@@ -306,7 +529,6 @@ fn dual_quaternion(motion: &Transform) -> (Quaternion<f64>, Quaternion<f64>) {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use kinematics::random::Random;
 
     fn pose(random: &mut Random, angle_rad: f64) -> Transform {
         let mut vector = || Vector3::new(random.normal(), random.normal(), random.normal());
