@@ -2,7 +2,7 @@
 
 use crate::print;
 use capture::ConfigError;
-use keyframe::ErrorClass;
+use messages::ErrorClass;
 use std::io::ErrorKind;
 use std::process::ExitCode;
 

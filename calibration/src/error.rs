@@ -1,7 +1,7 @@
 //! Errors of calibration.
 
 use crate::hand_eye::Refusal;
-use keyframe::ErrorClass;
+use messages::ErrorClass;
 
 /// An error of calibration.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]

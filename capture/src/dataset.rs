@@ -4,8 +4,9 @@ use crate::error::Context;
 use crate::{downscale, memory};
 use drivers::dataset::{Dataset, DatasetImage, DepthImage, ListedSplit};
 use keyframe::ensure;
-use keyframe::{DepthMap, Holdout, Keyframe, Split, counted};
+use keyframe::{DepthMap, Holdout, Keyframe, Split};
 use kinematics::{Intrinsics, Undistortion};
+use messages::counted;
 use rayon::prelude::*;
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::sync::{Arc, OnceLock};
@@ -252,7 +253,7 @@ fn split_of(listed: ListedSplit) -> Split {
 /// The first messages in one line, and the number of the others.
 fn first_of(errors: &[String]) -> String {
     const MAX_SHOWN: usize = 3;
-    kinematics::shortened(errors, MAX_SHOWN, "; ")
+    messages::shortened(errors, MAX_SHOWN, "; ")
 }
 
 /// Undistortion maps of one lens; empty for a lens without distortion.

@@ -1,6 +1,6 @@
 //! Errors of keyframes.
 
-use crate::ErrorClass;
+use messages::ErrorClass;
 use std::path::PathBuf;
 
 /// An error of a keyframe or of a selection of keyframes.

@@ -3,7 +3,8 @@
 use crate::Error;
 use crate::error::Context;
 use keyframe::ensure;
-use kinematics::{Transform, shortened, transform};
+use kinematics::{Transform, transform};
+use messages::shortened;
 use serde::Deserialize;
 use serde_json::Value;
 use std::collections::{BTreeMap, BTreeSet};

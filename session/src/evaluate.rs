@@ -5,7 +5,8 @@
 
 use crate::error::Context;
 use calibration::CalibratedCamera;
-use keyframe::{DepthMap, Keyframe, counted};
+use keyframe::{DepthMap, Keyframe};
+use messages::counted;
 use serde::Serialize;
 use std::borrow::Cow;
 use std::collections::BTreeMap;

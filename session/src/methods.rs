@@ -4,7 +4,7 @@ use crate::Error;
 use crate::run_folder::{expect_model, expect_one_model};
 use capture::Rig;
 use capture::config::Train;
-use keyframe::listed;
+use messages::listed;
 use serde_json::Value;
 use std::path::Path;
 use std::sync::Arc;

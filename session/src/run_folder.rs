@@ -3,8 +3,9 @@
 use crate::Error;
 use crate::error::Context;
 use capture::config::Rig;
-use keyframe::{Keyframe, listed};
+use keyframe::Keyframe;
 use keyframe::{bail, ensure};
+use messages::listed;
 use serde::Serialize;
 use sha2::{Digest, Sha256};
 use std::ffi::OsStr;

@@ -5,8 +5,9 @@ use crate::training_options::{Refine, TrainingOptions};
 use crate::{Data, Error};
 use calibration::{Alignment, CameraRefinement, ExtrinsicsCovariance, ParamSet, PoseSigmas};
 use capture::config::{Parent, Rig};
-use keyframe::{Keyframe, Split, counted};
+use keyframe::{Keyframe, Split};
 use kinematics::Transform;
+use messages::counted;
 use std::collections::BTreeMap;
 use std::sync::Arc;
 

@@ -5,7 +5,7 @@ use crate::Error;
 use crate::methods::{COUNT, MAX_SPLATS, describe};
 use calibration::{CameraRefinement, ParamSet, candidates};
 use capture::Override;
-use keyframe::listed;
+use messages::listed;
 use trainer::ModelKind;
 use trainer::splat::CountPolicy;
 

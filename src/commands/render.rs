@@ -4,7 +4,7 @@ use crate::exit::{BadArgument, Exit};
 use crate::open_gpu::open_gpu;
 use crate::{print, signals};
 use anyhow::Context;
-use keyframe::counted;
+use messages::counted;
 use serde::Serialize;
 use session::camera_path::{CameraPath, PathCamera};
 use session::evaluate::{covered_frac, warn_if_hardly_covered};

@@ -19,8 +19,9 @@ use capture::{
     StationReport, Stations, Stop,
 };
 use drivers::Source;
-use keyframe::{Keyframe, Split, counted};
+use keyframe::{Keyframe, Split};
 use kinematics::Stamp;
+use messages::counted;
 use serde::Serialize;
 use session::methods::{self, COUNT};
 use session::next_commands::{DataSource, quoted};

@@ -300,7 +300,7 @@ impl fmt::Display for Ids {
             return write!(f, "{} to {}", self.0[0], self.0[self.0.len() - 1]);
         }
         const SHOWN: usize = 8;
-        f.write_str(&kinematics::shortened(&self.0, SHOWN, ", "))
+        f.write_str(&messages::shortened(&self.0, SHOWN, ", "))
     }
 }
 

@@ -5,15 +5,19 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::process::Command;
 
 /// Every crate, and the workspace crates that it may depend on.
-const ALLOWED: [(&str, &[&str]); 16] = [
+const ALLOWED: [(&str, &[&str]); 17] = [
     ("background", &[]),
     ("files", &[]),
     ("kinematics", &[]),
-    ("keyframe", &["files", "kinematics"]),
-    ("calibration", &["background", "keyframe", "kinematics"]),
-    ("drivers", &["files", "kinematics"]),
+    ("messages", &[]),
+    ("keyframe", &["files", "kinematics", "messages"]),
+    (
+        "calibration",
+        &["background", "keyframe", "kinematics", "messages"],
+    ),
+    ("drivers", &["files", "kinematics", "messages"]),
     ("sim", &["drivers", "kinematics", "targets"]),
-    ("targets", &["kinematics"]),
+    ("targets", &["kinematics", "messages"]),
     ("test-features", &[]),
     ("test-support", &[]),
     (
@@ -25,6 +29,7 @@ const ALLOWED: [(&str, &[&str]); 16] = [
             "files",
             "keyframe",
             "kinematics",
+            "messages",
             "sim",
         ],
     ),
@@ -36,9 +41,13 @@ const ALLOWED: [(&str, &[&str]); 16] = [
             "files",
             "keyframe",
             "kinematics",
+            "messages",
         ],
     ),
-    ("viz", &["files", "keyframe", "kinematics", "trainer"]),
+    (
+        "viz",
+        &["files", "keyframe", "kinematics", "messages", "trainer"],
+    ),
     (
         "session",
         &[
@@ -49,6 +58,7 @@ const ALLOWED: [(&str, &[&str]); 16] = [
             "files",
             "keyframe",
             "kinematics",
+            "messages",
             "trainer",
             "viz",
         ],
@@ -61,6 +71,7 @@ const ALLOWED: [(&str, &[&str]); 16] = [
             "files",
             "keyframe",
             "kinematics",
+            "messages",
             "session",
             "trainer",
         ],
@@ -76,6 +87,7 @@ const ALLOWED: [(&str, &[&str]); 16] = [
             "files",
             "keyframe",
             "kinematics",
+            "messages",
             "session",
             "sim",
             "targets",

@@ -218,7 +218,7 @@ fn no_images(input: &Path, rig: &Rig, camera: &Camera, found: &CalibrationImages
     match (found.n_read, found.n_fast) {
         (0, _) => {
             let names: Vec<&str> = rig.cameras.iter().map(|camera| &*camera.name).collect();
-            let names = keyframe::listed(&names, "and");
+            let names = messages::listed(&names, "and");
             format!(
                 "{input}: no image of camera {name:?}; the cameras of the rig are {names}: choose one with --camera"
             )

@@ -8,8 +8,8 @@ use crate::{print, signals};
 use calibration::{CameraCorrection, Estimate, PoseSigmas, Trial, rigid_transform};
 use capture::config::{Override, Rig};
 use capture::open::{self, Devices};
-use keyframe::listed;
 use kinematics::Stamp;
+use messages::listed;
 use serde::Serialize;
 use session::calibration_report::SceneReport;
 use session::{
