@@ -4,8 +4,9 @@ use crate::findings::{BenchResult, Findings};
 use crate::runs::{Host, Job, NamedData, Run, Runs, RunsOptions};
 use crate::statistics::sample_std;
 use crate::variant::Variant;
-use crate::{Error, Result};
+use anyhow::Result;
 use kinematics::quantile::median;
+use messages::BadInput;
 use serde::Serialize;
 use session::Table;
 use std::collections::HashSet;
@@ -126,15 +127,14 @@ pub fn run(options: &AblationOptions, host: &Host<'_>) -> Result<BenchResult> {
         .collect();
     if changes.is_empty() {
         let names: Vec<&str> = VARIANTS.iter().map(|change| change.name).collect();
-        return Err(Error::BadInput(format!(
+        return Err(BadInput(format!(
             "--only: no variant matches; variants: {}",
             names.join(", ")
-        )));
+        ))
+        .into());
     }
     if options.runs.training.count.is_some() {
-        return Err(Error::BadInput(
-            "--count: this bench sets it; remove the flag".into(),
-        ));
+        return Err(BadInput("--count: this bench sets it; remove the flag".into()).into());
     }
     runs.expect((changes.len() as u64 + 1) * options.seeds);
     let mut baseline: Vec<Run> = Vec::new();

@@ -1,9 +1,8 @@
 //! Measures the training speed of a neural field.
 
 use crate::kernels::profile;
-use crate::{Error, Result};
+use anyhow::{Context, Result};
 use serde::Serialize;
-use session::Context;
 use session::OpenGpu;
 use trainer::nerf::bench::time_steps;
 
@@ -56,11 +55,11 @@ pub struct FieldRow {
 /// # Errors
 ///
 /// If the GPU cannot be opened or its memory is insufficient.
-pub fn measure<E: From<Error>>(
+pub fn measure(
     options: &FieldOptions,
     open_gpu: OpenGpu,
-    mut on_row: impl FnMut(&FieldRow) -> Result<(), E>,
-) -> Result<(), E> {
+    mut on_row: impl FnMut(&FieldRow) -> Result<()>,
+) -> Result<()> {
     let is_software = open_gpu()?.is_software();
     let default_samples: &[u32] = if is_software {
         &DEFAULT_SAMPLES_ON_CPU

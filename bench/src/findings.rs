@@ -1,9 +1,7 @@
 //! Writes the results of a bench: JSON with every number, charts as SVG and PNG, and an HTML page.
 
-use crate::Result;
-use keyframe::failed;
+use anyhow::{Context, Result, anyhow};
 use serde_json::Value;
-use session::Context;
 use session::chart::drawing::escaped;
 use session::chart::{Chart, raster};
 use session::{Table, run_folder};
@@ -41,7 +39,7 @@ impl BenchResult {
         latest: Option<(Findings, PathBuf)>,
         data_losses: Vec<String>,
     ) -> Result<Self> {
-        let (findings, page) = latest.ok_or_else(|| failed!("there is nothing to train"))?;
+        let (findings, page) = latest.ok_or_else(|| anyhow!("there is nothing to train"))?;
         Ok(Self {
             findings,
             page,

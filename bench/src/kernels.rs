@@ -1,8 +1,7 @@
 //! Measures the speed of the splat kernels.
 
-use crate::{Error, Result};
+use anyhow::{Context, Result};
 use serde::Serialize;
-use session::Context;
 use session::OpenGpu;
 use std::path::PathBuf;
 use std::time::Duration;
@@ -87,11 +86,11 @@ pub struct KernelsRow {
 /// # Errors
 ///
 /// If the file of the cloud is invalid, the GPU cannot be opened, or its memory is insufficient.
-pub fn measure<E: From<Error>>(
+pub fn measure(
     options: &KernelsOptions,
     open_gpu: OpenGpu,
-    mut on_row: impl FnMut(&KernelsRow) -> Result<(), E>,
-) -> Result<(), E> {
+    mut on_row: impl FnMut(&KernelsRow) -> Result<()>,
+) -> Result<()> {
     let given = options
         .cloud
         .as_deref()

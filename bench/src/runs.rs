@@ -1,12 +1,11 @@
 //! The runs of a bench. Each run is trained once and saved to a file, so that a bench restarted in
 //! the same folder does not repeat it.
 
-use crate::{Error, Result};
+use anyhow::{Context, Result, anyhow, ensure};
 use capture::Stop;
 use keyframe::{Keyframe, Split};
-use keyframe::{ensure, failed};
+use messages::{BadInput, InsufficientData};
 use serde::{Deserialize, Serialize};
-use session::Context;
 use session::methods::MAX_SPLATS;
 use session::run_folder::{self, CreatedFolders};
 use session::{
@@ -242,11 +241,12 @@ impl NamedData {
     pub(crate) fn single_model_spec(&self) -> Result<&ModelSpec> {
         match &self.model_specs[..] {
             [one] => Ok(one),
-            _ => Err(Error::BadInput(format!(
+            _ => Err(BadInput(format!(
                 "{}: this bench needs a single method, but the methods are {}",
                 self.name,
                 self.methods()
-            ))),
+            ))
+            .into()),
         }
     }
 
@@ -261,12 +261,13 @@ impl NamedData {
             _ => None,
         };
         options.ok_or_else(|| {
-            Error::BadInput(format!(
+            BadInput(format!(
                 "{}: this bench needs the method {}, but the method is {}",
                 self.name,
                 SplatOptions::METHOD,
                 self.methods()
             ))
+            .into()
         })
     }
 
@@ -343,10 +344,7 @@ impl<'a> Runs<'a> {
         drop(on_progress);
         if data.of_split(Split::Test).is_empty() {
             let reason = "there are no test images, so nothing can be scored; see --holdout";
-            return Err(Error::InsufficientData(format!(
-                "{}: {reason}",
-                path.display()
-            )));
+            return Err(InsufficientData(format!("{}: {reason}", path.display())).into());
         }
         let model_specs = session::model_specs(training, &data, None, self.gpu.is_software())?;
         let initial_points = data.initial_points();
@@ -371,11 +369,12 @@ impl<'a> Runs<'a> {
             // A run with other settings must not appear among these results.
             let cached = read(&path)?;
             if let Some(difference) = difference(&cached.settings, &settings)? {
-                return Err(Error::BadInput(format!(
+                return Err(BadInput(format!(
                     "--out {}: the saved run {} differs in {difference}; choose another folder",
                     self.out.display(),
                     job.name
-                )));
+                ))
+                .into());
             }
             self.report(&cached, true);
             return Ok(cached);
@@ -524,7 +523,7 @@ fn difference(cached: &RunSettings, requested: &RunSettings) -> Result<Option<St
     let requested = fields(requested)?;
     let requested = requested
         .as_object()
-        .ok_or_else(|| failed!("settings are an object"))?;
+        .ok_or_else(|| anyhow!("settings are an object"))?;
     Ok(requested
         .iter()
         .find(|(key, value)| cached[key.as_str()] != **value)

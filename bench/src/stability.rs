@@ -5,10 +5,10 @@ use crate::findings::{BenchResult, Findings};
 use crate::runs::{Disturbed, Host, Job, NamedData, Run, Runs, RunsOptions};
 use crate::statistics::{Interpolation, break_point, extent};
 use crate::variant::Variant;
-use crate::{Error, Result};
-use keyframe::ensure;
+use anyhow::{Result, ensure};
 use keyframe::{Keyframe, Split};
 use kinematics::quantile::median;
+use messages::BadInput;
 use serde::Serialize;
 use session::chart::{Axis, Chart, Line, Marker, Point, Scale, compact_number};
 use session::{Limits, Table};
@@ -257,9 +257,10 @@ impl StabilityOptions {
     fn check(&self) -> Result<()> {
         let selected = &self.disturbances;
         if !self.levels.is_empty() && selected.len() != 1 {
-            return Err(Error::BadInput(
+            return Err(BadInput(
                 "--levels: needs a single disturbance in --disturb, because units differ".into(),
-            ));
+            )
+            .into());
         }
         let min_level = if *selected == [Disturbance::Keyframes] {
             1.0
@@ -271,17 +272,16 @@ impl StabilityOptions {
             .iter()
             .find(|level| !level.is_finite() || **level < min_level)
         {
-            return Err(Error::BadInput(format!(
+            return Err(BadInput(format!(
                 "--levels {level}: must be a number of at least {min_level}"
-            )));
+            ))
+            .into());
         }
         if self
             .rate_hz
             .is_some_and(|rate| !rate.is_finite() || rate <= 0.0)
         {
-            return Err(Error::BadInput(
-                "--rate-hz: must be a number above 0".into(),
-            ));
+            return Err(BadInput("--rate-hz: must be a number above 0".into()).into());
         }
         Ok(())
     }
@@ -299,7 +299,7 @@ impl StabilityOptions {
                 let message = format!("clock-offset: {}: {reason}", data.path.display());
                 if selected.contains(&Disturbance::ClockOffset) {
                     if !self.can_skip_clock_offset {
-                        return Err(Error::BadInput(message));
+                        return Err(BadInput(message).into());
                     }
                     log::warn!("skipped: {message}");
                 }

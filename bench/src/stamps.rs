@@ -2,12 +2,12 @@
 //! with jitter.
 
 use crate::findings::{BenchResult, Findings};
-use crate::{Error, Result};
+use anyhow::{Context, Result};
 use kinematics::quantile::{Rank, median, quantile};
 use kinematics::random::Random;
 use kinematics::{ClockMap, JointHistory, JointState, Stamp};
+use messages::BadInput;
 use serde::Serialize;
-use session::Context;
 use session::Table;
 use session::chart::{Axis, Chart, Line, Point, Scale};
 use std::path::PathBuf;
@@ -143,11 +143,12 @@ fn check(options: &StampsOptions) -> Result<()> {
         .into_iter()
         .find(|(_, number, allowed)| !allowed.contains(number))
     {
-        Some((flag, number, allowed)) => Err(Error::BadInput(format!(
+        Some((flag, number, allowed)) => Err(BadInput(format!(
             "{flag}: {number} is outside {} to {}",
             allowed.start(),
             allowed.end()
-        ))),
+        ))
+        .into()),
         None => Ok(()),
     }
 }

@@ -31,7 +31,6 @@
 //! # Ok::<(), keyframe::Error>(())
 //! ```
 
-mod context;
 mod error;
 mod fingerprint;
 mod holdout;
@@ -43,7 +42,6 @@ mod range_points;
 pub mod scenes;
 mod shutter;
 
-pub use context::write_chain;
 pub use error::Error;
 pub use fingerprint::fingerprint;
 pub use holdout::Holdout;

@@ -1,10 +1,8 @@
 //! Viewpoints for rendering: a single pose, or a camera path exported by nerfstudio's viewer.
 
-use crate::Error;
-use crate::error::Context;
-use keyframe::ensure;
+use anyhow::{Context, ensure};
 use kinematics::{Transform, transform};
-use messages::shortened;
+use messages::{BadInput, shortened};
 use serde::Deserialize;
 use serde_json::Value;
 use std::collections::{BTreeMap, BTreeSet};
@@ -76,7 +74,7 @@ struct PathFileCamera {
 }
 
 impl PathFile {
-    fn size_px(&self) -> crate::Result<Option<[u32; 2]>> {
+    fn size_px(&self) -> anyhow::Result<Option<[u32; 2]>> {
         let width = whole_side("render_width", self.render_width)?;
         let height = whole_side("render_height", self.render_height)?;
         ensure!(
@@ -112,7 +110,7 @@ impl PathFile {
 }
 
 /// A width or height as a whole number of pixels; `None` if it is not given.
-fn whole_side(name: &str, side_px: Option<f64>) -> crate::Result<Option<u32>> {
+fn whole_side(name: &str, side_px: Option<f64>) -> anyhow::Result<Option<u32>> {
     let Some(side_px) = side_px else {
         return Ok(None);
     };
@@ -131,7 +129,7 @@ fn whole_side(name: &str, side_px: Option<f64>) -> crate::Result<Option<u32>> {
 impl CameraPath {
     /// Reads a nerfstudio camera path and converts its cameras to the axes of
     /// [`kinematics::camera`].
-    pub fn load(path: &Path) -> crate::Result<Self> {
+    pub fn load(path: &Path) -> anyhow::Result<Self> {
         let text =
             files::read_text(path).with_context(|| format!("cannot read {}", path.display()))?;
         Self::parse(&text).with_context(|| format!("the nerfstudio camera path {}", path.display()))
@@ -139,9 +137,9 @@ impl CameraPath {
 
     /// A path with one viewpoint, from the 16 numbers of `world_from_camera`, row major, with the
     /// axes of [`kinematics::camera`].
-    pub fn of_pose(numbers: &[f64]) -> Result<Self, Error> {
+    pub fn of_pose(numbers: &[f64]) -> anyhow::Result<Self> {
         let world_from_camera =
-            rigid(numbers).map_err(|error| Error::BadInput(format!("--pose: {error}")))?;
+            rigid(numbers).map_err(|error| BadInput(format!("--pose: {error}")))?;
         let cameras = vec![PathCamera {
             world_from_camera,
             fov_y_rad: None,
@@ -154,7 +152,7 @@ impl CameraPath {
         })
     }
 
-    fn parse(text: &str) -> crate::Result<Self> {
+    fn parse(text: &str) -> anyhow::Result<Self> {
         let file: PathFile = serde_json::from_str(text)?;
         ensure!(!file.camera_path.is_empty(), "it contains no cameras");
         let camera_type = file.camera_type.as_deref().unwrap_or(PERSPECTIVE);
@@ -183,13 +181,13 @@ impl CameraPath {
 }
 
 /// Converts a row-major 4x4 matrix, whose numbers may be rounded, to a rigid transform.
-pub fn rigid(numbers: &[f64]) -> crate::Result<Transform> {
+pub fn rigid(numbers: &[f64]) -> anyhow::Result<Transform> {
     let rows: &[f64; 16] = numbers
         .try_into()
         .ok()
         .with_context(|| format!("a pose has 16 numbers, got {}", numbers.len()))?;
     let (pose, _) =
-        transform::from_rounded_rows(rows).map_err(|error| Error::BadInput(error.to_string()))?;
+        transform::from_rounded_rows(rows).map_err(|error| BadInput(error.to_string()))?;
     Ok(pose)
 }
 

@@ -1,19 +1,18 @@
 //! Input of `train` and `eval`: a dataset folder or a recording, as keyframes in host memory.
 
-use crate::Error;
 use crate::depth_from::{DepthSource, RenderedDepth};
 use crate::methods::methods_of;
 use crate::read_progress::{OnReadProgress, ReadProgress};
 use crate::run_folder::{hex, is_recording};
 use crate::training_options::{AvailableData, MIN_IMAGES_PER_CAMERA};
+use anyhow::ensure;
 use capture::config::{Override, Rig};
 use capture::open::{self, Opened};
 use capture::{Join, JoinEvent, SampleUse, StationReport, Stations, dataset};
 use drivers::Sample;
-use keyframe::ensure;
 use keyframe::{Holdout, Keyframe, KeyframeList, Split};
 use kinematics::Stamp;
-use messages::counted;
+use messages::{BadInput, InsufficientData, counted};
 use sha2::{Digest, Sha256};
 use std::collections::{BTreeMap, HashSet};
 use std::path::{Path, PathBuf};
@@ -40,7 +39,7 @@ pub struct DataOptions {
 
 impl DataOptions {
     /// The test images selected by `--holdout`, if it is given.
-    pub fn holdout(&self) -> Result<Option<Holdout>, Error> {
+    pub fn holdout(&self) -> anyhow::Result<Option<Holdout>> {
         Ok(self
             .holdout
             .as_deref()
@@ -82,15 +81,16 @@ impl DataOptions {
         &self,
         subject: &str,
         before: &BTreeMap<String, String>,
-    ) -> Result<Self, Error> {
+    ) -> anyhow::Result<Self> {
         let now = self.flags();
         for (name, value) in before {
             // A path with other contents is detected later, when keyframes are compared.
             let is_other = |now: &String| now != value && is_number(now) && is_number(value);
             if let Some(now) = now.get(name).filter(|now| is_other(now)) {
-                return Err(Error::BadInput(format!(
+                return Err(BadInput(format!(
                     "--{name} {now}: {subject} was trained with --{name} {value}"
-                )));
+                ))
+                .into());
             }
         }
         let unset_flag = |name: &str| before.get(name).filter(|_| !now.contains_key(name));
@@ -102,7 +102,7 @@ impl DataOptions {
         let scale = unset_flag("scale").map(|scale| scale.parse());
         let scale = scale
             .transpose()
-            .map_err(|_| Error::BadInput(format!("{subject}: the scale is not a number")))?;
+            .map_err(|_| BadInput(format!("{subject}: the scale is not a number")))?;
         let restored = Self {
             holdout: self.holdout.clone().or(image_flag("holdout").cloned()),
             keyframes: self
@@ -200,7 +200,7 @@ impl Data {
         purpose: Purpose,
         overrides: &[Override],
         progress: OnReadProgress<'_>,
-    ) -> crate::Result<Self> {
+    ) -> anyhow::Result<Self> {
         let list = args
             .keyframes
             .as_deref()
@@ -231,7 +231,7 @@ impl Data {
         scale: f64,
         overrides: &[Override],
         progress: OnReadProgress<'_>,
-    ) -> crate::Result<Self> {
+    ) -> anyhow::Result<Self> {
         let selection = DataSelection {
             list: Some(list),
             holdout: None,
@@ -248,7 +248,7 @@ impl Data {
         purpose: Purpose,
         overrides: &[Override],
         progress: OnReadProgress<'_>,
-    ) -> crate::Result<Self> {
+    ) -> anyhow::Result<Self> {
         let DataSelection {
             list,
             holdout,
@@ -267,10 +267,11 @@ impl Data {
                 .transpose()?;
             Self::from_recording(path, rig, list, overrides, progress)?
         } else if let Some(rig) = rig {
-            return Err(Error::BadInput(format!(
+            return Err(BadInput(format!(
                 "--rig {}: only recordings take a rig file",
                 rig.display()
-            )));
+            ))
+            .into());
         } else {
             Self::from_folder(path, holdout.as_ref(), scale.unwrap_or(1.0), list, progress)?
         };
@@ -288,24 +289,25 @@ impl Data {
     }
 
     /// Returns an error if there is no image for this purpose.
-    fn check_split(&self, path: &Path, purpose: Purpose) -> Result<(), Error> {
+    fn check_split(&self, path: &Path, purpose: Purpose) -> anyhow::Result<()> {
         let (required_split, message) = match purpose {
             Purpose::Training => (Split::Train, "no training image"),
             Purpose::Scoring => (Split::Test, "no test image"),
         };
         if self.of_split(required_split).is_empty() {
             let n_images = counted(self.keyframes.len() as u64, "image");
-            return Err(Error::InsufficientData(format!(
+            return Err(InsufficientData(format!(
                 "{}: {message} among {n_images}",
                 path.display()
-            )));
+            ))
+            .into());
         }
         Ok(())
     }
 
     /// Returns an error if all pixels of all images are masked, and logs a warning if those of some
     /// images are.
-    fn check_masks(&self, path: &Path) -> Result<(), Error> {
+    fn check_masks(&self, path: &Path) -> anyhow::Result<()> {
         let n_masked = self
             .keyframes
             .iter()
@@ -313,11 +315,11 @@ impl Data {
             .count();
         // The usual cause is an inverted mask. Training would succeed with an empty model.
         if n_masked == self.keyframes.len() {
-            return Err(Error::InsufficientData(format!(
+            return Err(InsufficientData(format!(
                 "{}: no pixel of any image can be used: masks, transparency or lens parameters exclude all of them (black in \
                  a mask means \"do not use\")",
                 path.display()
-            )));
+            )).into());
         }
         if n_masked > 0 {
             let n_images = counted(n_masked as u64, "image");
@@ -330,7 +332,7 @@ impl Data {
     }
 
     /// The rig of a recording, before flags override its keys.
-    pub fn rig_as_given(path: &Path, args: &DataOptions) -> crate::Result<Rig> {
+    pub fn rig_as_given(path: &Path, args: &DataOptions) -> anyhow::Result<Rig> {
         let rig = args
             .rig
             .as_deref()
@@ -341,7 +343,7 @@ impl Data {
 
     /// The methods to train if no flag names any: those in the rig file of a recording, or else the
     /// default method.
-    pub fn default_methods(path: &Path, args: &DataOptions) -> crate::Result<Vec<ModelKind>> {
+    pub fn default_methods(path: &Path, args: &DataOptions) -> anyhow::Result<Vec<ModelKind>> {
         expect(path)?;
         if is_recording(path) {
             methods_of(&Self::rig_as_given(path, args)?)
@@ -411,7 +413,7 @@ impl Data {
             log::warn!("{shown}: these points are not used, because images have depth");
             return None;
         }
-        match ply::read_points(path).map_err(Error::from) {
+        match ply::read_points(path).map_err(anyhow::Error::from) {
             Ok((points, notes)) => {
                 for note in notes {
                     log::warn!("{shown}: {note}");
@@ -433,7 +435,7 @@ impl Data {
         gpu: Arc<Gpu>,
         source: &DepthSource,
         progress: OnReadProgress<'_>,
-    ) -> crate::Result<()> {
+    ) -> anyhow::Result<()> {
         let started = Instant::now();
         self.rendered_depth = Some(source.draw(gpu, &mut self.keyframes, progress)?);
         self.preparation_time += started.elapsed();
@@ -446,7 +448,7 @@ impl Data {
         scale: f64,
         list: Option<KeyframeList>,
         progress: OnReadProgress<'_>,
-    ) -> crate::Result<Self> {
+    ) -> anyhow::Result<Self> {
         let folder = drivers::dataset::read(path)?;
         let n_all = Some(folder.images.len());
         let on_image = |n_done: usize| report(progress, "images", n_done, n_all);
@@ -477,7 +479,7 @@ impl Data {
         list: Option<KeyframeList>,
         overrides: Vec<Override>,
         progress: OnReadProgress<'_>,
-    ) -> crate::Result<Self> {
+    ) -> anyhow::Result<Self> {
         Self::from_source(
             open::recording(path, rig, &overrides)?,
             list,
@@ -492,7 +494,7 @@ impl Data {
         opened: Opened,
         is_end: impl FnMut(&Sample) -> bool,
         progress: OnReadProgress<'_>,
-    ) -> crate::Result<Self> {
+    ) -> anyhow::Result<Self> {
         let mut data = Self::from_source(opened, None, is_end, progress)?;
         data.realign();
         Ok(data)
@@ -503,7 +505,7 @@ impl Data {
         list: Option<KeyframeList>,
         mut is_end: impl FnMut(&Sample) -> bool,
         progress: OnReadProgress<'_>,
-    ) -> crate::Result<Self> {
+    ) -> anyhow::Result<Self> {
         let Opened {
             rig,
             mut source,
@@ -554,7 +556,7 @@ impl Data {
     }
 
     /// Reassigns the splits, separately for each camera.
-    fn assign_splits(&mut self, holdout: &Holdout) -> crate::Result<()> {
+    fn assign_splits(&mut self, holdout: &Holdout) -> anyhow::Result<()> {
         let mut by_camera: BTreeMap<Arc<str>, Vec<usize>> = BTreeMap::new();
         for (ix, keyframe) in self.keyframes.iter().enumerate() {
             by_camera
@@ -573,7 +575,7 @@ impl Data {
     }
 
     /// Keeps only the listed keyframes, with the splits in the list.
-    fn take_only(&mut self, list: &KeyframeList) -> Result<(), Error> {
+    fn take_only(&mut self, list: &KeyframeList) -> anyhow::Result<()> {
         let images: Vec<(&str, Stamp)> = self
             .keyframes
             .iter()
@@ -636,7 +638,7 @@ pub fn points_sha256(points: &InitialPoints) -> String {
 }
 
 /// Returns an error if the path does not exist.
-pub fn expect(path: &Path) -> crate::Result<()> {
+pub fn expect(path: &Path) -> anyhow::Result<()> {
     ensure!(path.exists(), "{} does not exist", path.display());
     Ok(())
 }

@@ -1,11 +1,11 @@
 //! `--depth-from`: renders depth for images without depth from a saved model.
 
-use crate::error::Context;
 use crate::evaluate::{self, CHECK_SAME_SCENE, MIN_ALPHA, MIN_COVERED_FRAC};
 use crate::read_progress::{OnReadProgress, ReadProgress};
-use crate::{Error, methods, run_folder};
+use crate::{methods, run_folder};
+use anyhow::Context;
 use keyframe::{DepthMap, Keyframe, Split};
-use messages::counted;
+use messages::{BadInput, InsufficientData, counted};
 use serde::Serialize;
 use sha2::{Digest, Sha256};
 use std::path::{Path, PathBuf};
@@ -35,8 +35,8 @@ pub struct RenderedDepth {
 
 impl DepthSource {
     /// The model in a folder, or in a single file of splats.
-    pub fn find(model: &Path) -> crate::Result<Self> {
-        let invalid = |error: crate::Error| Error::BadInput(format!("--depth-from: {error:#}"));
+    pub fn find(model: &Path) -> anyhow::Result<Self> {
+        let invalid = |error: anyhow::Error| BadInput(format!("--depth-from: {error:#}"));
         run_folder::expect_model(model).map_err(invalid)?;
         let sha256 = if model.is_file() {
             let bytes = files::read(model, files::Budget::PLAIN)
@@ -58,7 +58,7 @@ impl DepthSource {
         gpu: Arc<Gpu>,
         keyframes: &mut [Arc<Keyframe>],
         progress: OnReadProgress<'_>,
-    ) -> crate::Result<RenderedDepth> {
+    ) -> anyhow::Result<RenderedDepth> {
         let model_name = self.model.display();
         let mut model = methods::load(gpu, &self.model)
             .with_context(|| format!("--depth-from {model_name}"))?
@@ -87,9 +87,10 @@ impl DepthSource {
         // The usual cause is a model of another scene, or in another world frame.
         if totals.n_missing > 0 && totals.n_rendered == 0 {
             let message = "the model is not visible in any image that lacks depth";
-            return Err(Error::InsufficientData(format!(
+            return Err(InsufficientData(format!(
                 "--depth-from {model_name}: {message}; {CHECK_SAME_SCENE}"
-            )));
+            ))
+            .into());
         }
         let rendered_frac = totals.n_rendered as f64 / totals.n_missing.max(1) as f64;
         let images = counted(n_images as u64, "image");
@@ -116,19 +117,19 @@ impl DepthSource {
 /// Returns an error unless the depth models used `before` and given `now` have the same SHA-256.
 ///
 /// `subject`: name of the earlier result in messages.
-pub fn check_same(subject: &str, before: Option<&str>, now: Option<&str>) -> Result<(), Error> {
+pub fn check_same(subject: &str, before: Option<&str>, now: Option<&str>) -> anyhow::Result<()> {
     match (before, now) {
         (before, now) if before == now => Ok(()),
-        (None, _) => Err(Error::BadInput(format!(
+        (None, _) => Err(BadInput(format!(
             "{subject} was made without --depth-from: remove the flag"
-        ))),
-        (Some(before), None) => Err(Error::BadInput(format!(
+        )).into()),
+        (Some(before), None) => Err(BadInput(format!(
             "{subject} used depth rendered from the model with the SHA-256 {before}: give that model with --depth-from"
-        ))),
-        (Some(before), Some(now)) => Err(Error::BadInput(format!(
+        )).into()),
+        (Some(before), Some(now)) => Err(BadInput(format!(
             "{subject} used depth rendered from the model with the SHA-256 {before}, but the model given with \
              --depth-from has {now}"
-        ))),
+        )).into()),
     }
 }
 
@@ -141,7 +142,7 @@ struct Filled {
 
 /// Renders the missing depth of one keyframe at the resolution of its depth image, or of its color
 /// image if it has no depth.
-fn fill(model: &mut dyn Method, keyframe: &mut Arc<Keyframe>) -> crate::Result<Filled> {
+fn fill(model: &mut dyn Method, keyframe: &mut Arc<Keyframe>) -> anyhow::Result<Filled> {
     // An image without depth gets an empty depth map with the lens and pose of its color image.
     let mut request_keyframe = keyframe.as_ref().clone();
     let depth = request_keyframe.depth.get_or_insert_with(|| DepthMap {

@@ -1,6 +1,6 @@
 //! Pictures that are small enough to embed in a page.
 
-use crate::error::Context;
+use anyhow::Context;
 use image::ExtendedColorType;
 use image::codecs::jpeg::JpegEncoder;
 
@@ -25,7 +25,7 @@ pub(crate) fn data_uri(
     rgb: &[u8],
     [width, height]: [u32; 2],
     quality: u8,
-) -> crate::Result<String> {
+) -> anyhow::Result<String> {
     let mut bytes = Vec::new();
     let mut encoder = JpegEncoder::new_with_quality(&mut bytes, quality);
     encoder

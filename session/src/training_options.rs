@@ -1,11 +1,10 @@
 //! Options shared by all commands that train. They override the keys of the same name in a rig
 //! file.
 
-use crate::Error;
 use crate::methods::{COUNT, MAX_SPLATS, describe};
 use calibration::{CameraRefinement, ParamSet, candidates};
 use capture::Override;
-use messages::listed;
+use messages::{BadInput, listed};
 use trainer::ModelKind;
 use trainer::splat::CountPolicy;
 
@@ -125,7 +124,7 @@ impl TrainingOptions {
     }
 
     /// Rejects flags for options that none of the methods has.
-    pub fn check_for(&self, kinds: &[ModelKind]) -> Result<(), Error> {
+    pub fn check_for(&self, kinds: &[ModelKind]) -> anyhow::Result<()> {
         let flags = [
             (self.max_splats.is_some(), "--max-splats", MAX_SPLATS),
             (self.count.is_some(), "--count", COUNT),
@@ -140,18 +139,19 @@ impl TrainingOptions {
                     .iter()
                     .filter(|kind| kind.has_option(option))
                     .map(|kind| kind.name());
-                Err(Error::BadInput(format!(
+                Err(BadInput(format!(
                     "{flag}: needs the method {}, but the method is {}",
                     listed(&having.collect::<Vec<_>>(), "or"),
                     describe(kinds)
-                )))
+                ))
+                .into())
             }
             None => Ok(()),
         }
     }
 
     /// Rejects flags that are invalid for any data, before the data is read.
-    pub fn check_before_data(&self, kinds: &[ModelKind], joints: bool) -> Result<(), Error> {
+    pub fn check_before_data(&self, kinds: &[ModelKind], joints: bool) -> anyhow::Result<()> {
         let all_available = AvailableData {
             joints,
             drifts: true,
@@ -170,7 +170,7 @@ impl TrainingOptions {
         &self,
         kinds: &[ModelKind],
         available: AvailableData,
-    ) -> Result<(), Error> {
+    ) -> anyhow::Result<()> {
         let is_other = |param: &Refine| matches!(param, Refine::Auto | Refine::None | Refine::Base);
         let is_known = |param: &Refine| {
             is_other(param) || available.can_align(*param) || can_learn(kinds, *param)
@@ -188,12 +188,13 @@ impl TrainingOptions {
         } else {
             " without measured depth"
         };
-        Err(Error::BadInput(format!(
+        Err(BadInput(format!(
             "--refine {}: the method {} cannot estimate this{without}; it supports {}",
             unknown.name(),
             describe(kinds),
             known.join(", ")
-        )))
+        ))
+        .into())
     }
 
     /// Which calibration parameters to estimate; `default_value` applies if the flag is not given.
@@ -201,7 +202,7 @@ impl TrainingOptions {
         &self,
         available: AvailableData,
         default_value: Refine,
-    ) -> Result<RefineSettings, Error> {
+    ) -> anyhow::Result<RefineSettings> {
         let requested = if self.refine.is_empty() {
             std::slice::from_ref(&default_value)
         } else {
@@ -209,9 +210,10 @@ impl TrainingOptions {
         };
         let has = |param| requested.contains(&param);
         if (has(Refine::Auto) || has(Refine::None)) && requested.len() > 1 {
-            return Err(Error::BadInput(
+            return Err(BadInput(
                 "--refine: auto and none cannot be combined with other values".into(),
-            ));
+            )
+            .into());
         }
         if has(Refine::Auto) {
             return Ok(available.auto_settings());
@@ -227,15 +229,10 @@ impl TrainingOptions {
             && let Some(param) = needs_depth.into_iter().find(|param| has(*param))
         {
             let message = "needs depth images measured by a camera";
-            return Err(Error::BadInput(format!(
-                "--refine {}: {message}",
-                param.name()
-            )));
+            return Err(BadInput(format!("--refine {}: {message}", param.name())).into());
         }
         if has(Refine::Joints) && !available.joints {
-            return Err(Error::BadInput(
-                "--refine joints: needs a recording of an arm".into(),
-            ));
+            return Err(BadInput("--refine joints: needs a recording of an arm".into()).into());
         }
         let set = param_set(requested);
         // Without measured depth, features of images give a first estimate, and training with the
@@ -269,7 +266,7 @@ impl TrainingOptions {
         &self,
         available: AvailableData,
         software: bool,
-    ) -> Result<RefineSettings, Error> {
+    ) -> anyhow::Result<RefineSettings> {
         if !self.refine.is_empty() || software {
             return self.refining(available, Refine::None);
         }

@@ -34,7 +34,7 @@ fn folder_of(n: usize, lens: &Value) -> tempfile::TempDir {
     folder
 }
 
-fn load_at(folder: &Path, scale_frac: f64) -> crate::Result<LoadedDataset> {
+fn load_at(folder: &Path, scale_frac: f64) -> anyhow::Result<LoadedDataset> {
     load(&drivers::dataset::read(folder)?, None, scale_frac, &|_| ())
 }
 

@@ -18,7 +18,8 @@ pub use photo::{Photo, Photos};
 pub use scene::SceneReport;
 pub use time_offset::TimeOffsetReport;
 
-use crate::{Error, run_folder};
+use crate::run_folder;
+use messages::BadInput;
 use std::path::Path;
 
 /// Heading of every report.
@@ -46,8 +47,8 @@ pub struct Unused {
 /// Checks that a report can be written to this path.
 ///
 /// # Errors
-/// [`Error::BadInput`] if it cannot.
-pub fn check_target_file(file: &Path) -> Result<(), Error> {
+/// [`BadInput`] if it cannot.
+pub fn check_target_file(file: &Path) -> anyhow::Result<()> {
     let folder = file
         .parent()
         .filter(|folder| !folder.as_os_str().is_empty())
@@ -56,18 +57,20 @@ pub fn check_target_file(file: &Path) -> Result<(), Error> {
         .extension()
         .is_some_and(|extension| extension.eq_ignore_ascii_case("html"));
     if !folder.is_dir() || file.is_dir() || !is_page {
-        return Err(Error::BadInput(format!(
+        return Err(BadInput(format!(
             "--report {}: must be a file with the extension .html in an existing folder",
             file.display()
-        )));
+        ))
+        .into());
     }
     // Reports are replaced, so that a command can be repeated. A mistyped name must not replace
     // another page.
     if is_other_file(file) {
-        return Err(Error::BadInput(format!(
+        return Err(BadInput(format!(
             "--report {}: the file exists and is not a report of fieldrig; choose another name",
             file.display()
-        )));
+        ))
+        .into());
     }
     Ok(())
 }
@@ -84,7 +87,7 @@ fn is_other_file(file: &Path) -> bool {
 ///
 /// # Errors
 /// If the file cannot be written.
-pub fn write(file: &Path, html: &str) -> crate::Result<()> {
+pub fn write(file: &Path, html: &str) -> anyhow::Result<()> {
     run_folder::write_atomic(file, html)
 }
 

@@ -2,8 +2,8 @@
 
 use super::image_map::{ImageMap, ImagePart};
 use super::page;
-use crate::error::Context;
 use crate::inline_picture::{data_uri, fit_size};
+use anyhow::Context;
 use calibration::PointFit;
 use image::DynamicImage;
 use image::imageops::FilterType;
@@ -60,7 +60,7 @@ pub(super) fn with_corners(
 }
 
 /// A small copy of the part of an image around the corners, as a data URI, and the part.
-fn embedded(photo: &Photo, points: &[PointFit]) -> crate::Result<(String, ImagePart)> {
+fn embedded(photo: &Photo, points: &[PointFit]) -> anyhow::Result<(String, ImagePart)> {
     let picture = match photo {
         Photo::File(file) => read(file)?,
         Photo::Gray {
@@ -88,7 +88,7 @@ fn embedded(photo: &Photo, points: &[PointFit]) -> crate::Result<(String, ImageP
     Ok((data_uri(&small.into_rgb8(), small_px, QUALITY)?, part))
 }
 
-fn read(file: &Path) -> crate::Result<DynamicImage> {
+fn read(file: &Path) -> anyhow::Result<DynamicImage> {
     let in_file = || format!("cannot read {}", file.display());
     let opened = std::io::BufReader::new(files::open(file).with_context(in_file)?);
     let reader = image::ImageReader::new(opened)

@@ -1,7 +1,7 @@
 //! Rasterizes a drawing to PNG. The font is built into the program, so no system fonts are needed.
 
 use super::drawing::{Drawing, TextSize};
-use crate::error::Context;
+use anyhow::Context;
 use image::{ExtendedColorType, ImageEncoder, codecs::png::PngEncoder};
 use resvg::tiny_skia::{Color, Pixmap, Transform};
 use resvg::usvg::{Options, Tree, fontdb};
@@ -29,7 +29,7 @@ pub fn text_width(text: &str, size: TextSize) -> f64 {
 }
 
 /// The drawing as the bytes of a PNG file.
-pub fn png(drawing: &Drawing) -> crate::Result<Vec<u8>> {
+pub fn png(drawing: &Drawing) -> anyhow::Result<Vec<u8>> {
     let options = Options {
         fontdb: Arc::clone(&FONTS),
         ..Options::default()

@@ -3,6 +3,7 @@
 
 use crate::checkpoints::{self, CheckpointWrite, Checkpoints, Snapshot};
 use crate::decisions::DecisionLog;
+use crate::error::is_gpu_error;
 use crate::kept_folder::KeptFolder;
 use crate::recovery::Recovery;
 use keyframe::{DepthMap, Keyframe};
@@ -62,7 +63,7 @@ impl Persistence {
         &mut self,
         method: &mut dyn Method,
         keyframe: &Arc<Keyframe>,
-    ) -> crate::Result<()> {
+    ) -> anyhow::Result<()> {
         if let Some(decisions) = &mut self.decisions {
             decisions.pushed(method.n_total_steps()?, keyframe);
         }
@@ -75,7 +76,7 @@ impl Persistence {
         method: &mut dyn Method,
         camera: &str,
         stamp: Stamp,
-    ) -> crate::Result<()> {
+    ) -> anyhow::Result<()> {
         if let Some(decisions) = &mut self.decisions {
             decisions.removed(method.n_total_steps()?, camera, stamp);
         }
@@ -83,7 +84,7 @@ impl Persistence {
     }
 
     /// Logs that the result of an alignment was applied.
-    pub(super) fn log_alignment(&mut self, method: &mut dyn Method) -> crate::Result<()> {
+    pub(super) fn log_alignment(&mut self, method: &mut dyn Method) -> anyhow::Result<()> {
         if let Some(decisions) = &mut self.decisions {
             decisions.aligned(method.n_total_steps()?);
         }
@@ -91,7 +92,7 @@ impl Persistence {
     }
 
     /// Logs that a search for the model size was ended.
-    pub(super) fn log_size_search_end(&mut self, method: &mut dyn Method) -> crate::Result<()> {
+    pub(super) fn log_size_search_end(&mut self, method: &mut dyn Method) -> anyhow::Result<()> {
         if let Some(decisions) = &mut self.decisions {
             decisions.size_search_ended(method.n_total_steps()?);
         }
@@ -103,7 +104,7 @@ impl Persistence {
         &mut self,
         method: &mut dyn Method,
         is_paused: bool,
-    ) -> crate::Result<()> {
+    ) -> anyhow::Result<()> {
         if let Some(decisions) = &mut self.decisions {
             decisions.growth_paused(method.n_total_steps()?, is_paused);
         }
@@ -126,7 +127,7 @@ impl Persistence {
     }
 
     /// Ends the decision log. Write errors are logged.
-    pub(super) fn end_decisions(&mut self, method: &mut dyn Method) -> crate::Result<()> {
+    pub(super) fn end_decisions(&mut self, method: &mut dyn Method) -> anyhow::Result<()> {
         if let Some(decisions) = self.decisions.take()
             && let Err(error) = decisions.end(method.n_total_steps()?)
         {
@@ -155,7 +156,7 @@ impl Persistence {
     pub(super) fn write_checkpoint_when_due(
         &mut self,
         snapshot: Snapshot<'_>,
-    ) -> crate::Result<()> {
+    ) -> anyhow::Result<()> {
         let Some(checkpoints) = &mut self.checkpoints else {
             return Ok(());
         };
@@ -212,7 +213,7 @@ impl Persistence {
     }
 
     /// Waits until no checkpoint is being written.
-    pub(super) fn wait(&mut self) -> crate::Result<()> {
+    pub(super) fn wait(&mut self) -> anyhow::Result<()> {
         self.checkpoints.as_mut().map_or(Ok(()), Checkpoints::wait)
     }
 
@@ -252,9 +253,9 @@ impl Persistence {
         &mut self,
         gpu: &Arc<Gpu>,
         keyframes: &[Arc<Keyframe>],
-    ) -> crate::Result<Box<dyn Method>> {
+    ) -> anyhow::Result<Box<dyn Method>> {
         let Some(recovery) = &self.recovery else {
-            keyframe::bail!("this run cannot continue on another device")
+            anyhow::bail!("this run cannot continue on another device")
         };
         let checkpoint = newest_checkpoint(self.checkpoints.as_mut(), recovery.resumed.as_deref());
         // A checkpoint requires all keyframes that its model was trained on, including those that
@@ -317,9 +318,9 @@ impl Persistence {
 fn newest_checkpoint(
     checkpoints: Option<&mut Checkpoints>,
     resumed_folder: Option<&Path>,
-) -> Option<crate::Result<Checkpoint>> {
+) -> Option<anyhow::Result<Checkpoint>> {
     match (checkpoints.and_then(Checkpoints::newest), resumed_folder) {
-        (Some(path), _) => Some(Checkpoint::read(path).map_err(crate::Error::from)),
+        (Some(path), _) => Some(Checkpoint::read(path).map_err(anyhow::Error::from)),
         (None, Some(folder)) => Some(checkpoints::read(folder)),
         (None, None) => None,
     }
@@ -334,9 +335,9 @@ fn contains(keyframes: &[Arc<Keyframe>], keyframe: &Arc<Keyframe>) -> bool {
 /// if the GPU failed.
 fn resume(
     gpu: &Arc<Gpu>,
-    checkpoint: crate::Result<Checkpoint>,
+    checkpoint: anyhow::Result<Checkpoint>,
     keyframes: &[Arc<Keyframe>],
-) -> crate::Result<Option<Resumed>> {
+) -> anyhow::Result<Option<Resumed>> {
     // Keyframes that were missing at the start of this run are still missing.
     let resume = |checkpoint| {
         Ok(trainer::resume_without_missing(
@@ -348,7 +349,7 @@ fn resume(
     match checkpoint.and_then(resume) {
         Ok((resumed, _)) => Ok(Some(resumed)),
         // The new device has failed, too: the caller tries again.
-        Err(error) if error.is_gpu_error() => Err(error),
+        Err(error) if is_gpu_error(&error) => Err(error),
         // The checkpoint is unusable, for example damaged. Starting again loses training time;
         // an error would lose the run.
         Err(error) => {

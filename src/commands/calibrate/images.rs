@@ -1,10 +1,10 @@
 //! Reads image files, and detects a target in images.
 
-use crate::exit::BadArgument;
 use crate::print;
 use calibration::{BoardPoint, BoardView};
 use capture::CalibrationImage;
 use image::ImageReader;
+use messages::BadInput;
 use rayon::prelude::*;
 use session::calibration_report::{Photo, Photos, Unused};
 use std::io::BufReader;
@@ -60,10 +60,10 @@ pub(super) struct ImageFile {
 const EXTENSIONS: [&str; 3] = ["jpg", "jpeg", "png"];
 
 /// The image files in a folder, in order of their names.
-pub(super) fn files(folder: &Path) -> Result<Vec<ImageFile>, BadArgument> {
+pub(super) fn files(folder: &Path) -> Result<Vec<ImageFile>, BadInput> {
     // A single image is a likely mistake. Without this check, the error would be about a folder.
     if folder.is_file() {
-        return Err(BadArgument(format!(
+        return Err(BadInput(format!(
             "{} is a file, expected a folder of images",
             folder.display()
         )));
@@ -84,7 +84,7 @@ pub(super) fn files(folder: &Path) -> Result<Vec<ImageFile>, BadArgument> {
     // The order of a folder differs between file systems, and reports list images in this order.
     files.sort_by(|a, b| a.path.cmp(&b.path));
     if files.is_empty() {
-        return Err(BadArgument(format!(
+        return Err(BadInput(format!(
             "{}: no .jpg, .jpeg or .png image",
             folder.display()
         )));
@@ -92,8 +92,8 @@ pub(super) fn files(folder: &Path) -> Result<Vec<ImageFile>, BadArgument> {
     Ok(files)
 }
 
-fn unreadable_folder(folder: &Path, error: &std::io::Error) -> BadArgument {
-    BadArgument(format!(
+fn unreadable_folder(folder: &Path, error: &std::io::Error) -> BadInput {
+    BadInput(format!(
         "cannot read the folder {}: {error}",
         folder.display()
     ))
@@ -119,7 +119,7 @@ pub(super) fn detect(
     files: &[ImageFile],
     target: &TargetSpec,
     is_hidden: bool,
-) -> Result<Vec<DetectedImage>, BadArgument> {
+) -> Result<Vec<DetectedImage>, BadInput> {
     let detected = detect_each(files, is_hidden, |ImageFile { name, path }| DetectedImage {
         name: name.clone(),
         board: detect_in_file(path, name, target),
@@ -151,7 +151,7 @@ pub(super) fn detect_each<T: Sync>(
     detected
 }
 
-fn check_readable(images: &[DetectedImage]) -> Result<(), BadArgument> {
+fn check_readable(images: &[DetectedImage]) -> Result<(), BadInput> {
     let unreadable: Vec<(&str, &NoBoard)> = images
         .iter()
         .filter_map(|image| Some((image.name.as_str(), image.board.as_ref().err()?)))
@@ -162,7 +162,7 @@ fn check_readable(images: &[DetectedImage]) -> Result<(), BadArgument> {
     };
     // A few damaged files must not end a calibration of many images.
     if unreadable.len() == images.len() {
-        return Err(BadArgument(format!(
+        return Err(BadInput(format!(
             "none of {} images can be read; {first}: {reason}",
             images.len()
         )));

@@ -6,12 +6,13 @@ use super::lens::LensFile;
 use super::outputs::{self, ReportFlag, RigFlags, RigOutput};
 use super::scan::ScanOptions;
 use super::target_argument;
-use crate::exit::{Exit, InsufficientData};
+use crate::exit::Exit;
 use crate::print;
 use calibration::{
     BoardView, ImageGrid, IntrinsicsCalibration, IntrinsicsInput, LensModel, LensTrial,
     calibrate_intrinsics,
 };
+use messages::InsufficientData;
 use serde::Serialize;
 use session::calibration_report::{IntrinsicsReport, Photos, Unused};
 use std::collections::BTreeMap;

@@ -1,8 +1,8 @@
 //! Reads JSON objects, with errors that name the file and the field.
 
 use super::transform_of;
-use crate::exit::BadArgument;
 use kinematics::Transform;
+use messages::BadInput;
 use serde::de::{Deserialize, Deserializer, Error as _, MapAccess, SeqAccess, Visitor};
 use serde_json::{Map, Value};
 use std::fmt::Formatter;
@@ -95,14 +95,14 @@ impl<'a> JsonObject<'a> {
         path: String,
         value: &'a Value,
         known: &[&str],
-    ) -> Result<Self, BadArgument> {
+    ) -> Result<Self, BadInput> {
         let place = if path.is_empty() {
             file.to_owned()
         } else {
             format!("{file}: {path}")
         };
         let Some(map) = value.as_object() else {
-            return Err(BadArgument(format!(
+            return Err(BadInput(format!(
                 "{place}: {}, expected an object",
                 kind_of(value)
             )));
@@ -113,7 +113,7 @@ impl<'a> JsonObject<'a> {
                 Some(key) => format!("did you mean {key:?}?"),
                 None => format!("the keys are {}", known.join(", ")),
             };
-            return Err(BadArgument(format!(
+            return Err(BadInput(format!(
                 "{place}: unknown key {unknown:?}; {hint}"
             )));
         }
@@ -121,8 +121,8 @@ impl<'a> JsonObject<'a> {
     }
 
     /// An error about a field.
-    pub(super) fn invalid(&self, key: &str, why: impl std::fmt::Display) -> BadArgument {
-        BadArgument(format!("{}: {}: {why}", self.file, self.path_of(key)))
+    pub(super) fn invalid(&self, key: &str, why: impl std::fmt::Display) -> BadInput {
+        BadInput(format!("{}: {}: {why}", self.file, self.path_of(key)))
     }
 
     fn path_of(&self, key: &str) -> String {
@@ -138,11 +138,11 @@ impl<'a> JsonObject<'a> {
         self.map.get(key).filter(|value| !value.is_null())
     }
 
-    pub(super) fn required<T>(&self, key: &str, value: Option<T>) -> Result<T, BadArgument> {
+    pub(super) fn required<T>(&self, key: &str, value: Option<T>) -> Result<T, BadInput> {
         value.ok_or_else(|| self.invalid(key, "missing"))
     }
 
-    pub(super) fn text(&self, key: &str) -> Result<Option<&'a str>, BadArgument> {
+    pub(super) fn text(&self, key: &str) -> Result<Option<&'a str>, BadInput> {
         self.get(key)
             .map(|value| {
                 value.as_str().ok_or_else(|| {
@@ -152,7 +152,7 @@ impl<'a> JsonObject<'a> {
             .transpose()
     }
 
-    pub(super) fn numbers(&self, key: &str) -> Result<Option<Vec<f64>>, BadArgument> {
+    pub(super) fn numbers(&self, key: &str) -> Result<Option<Vec<f64>>, BadInput> {
         let Some(value) = self.get(key) else {
             return Ok(None);
         };
@@ -168,7 +168,7 @@ impl<'a> JsonObject<'a> {
             .ok_or_else(|| self.invalid(key, "expected an array of numbers"))
     }
 
-    pub(super) fn array<const N: usize>(&self, key: &str) -> Result<Option<[f64; N]>, BadArgument> {
+    pub(super) fn array<const N: usize>(&self, key: &str) -> Result<Option<[f64; N]>, BadInput> {
         let Some(numbers) = self.numbers(key)? else {
             return Ok(None);
         };
@@ -180,13 +180,13 @@ impl<'a> JsonObject<'a> {
             .map_err(|_| self.invalid(key, format!("{n} numbers, expected {N}")))
     }
 
-    pub(super) fn transform(&self, key: &str) -> Result<Option<Transform>, BadArgument> {
+    pub(super) fn transform(&self, key: &str) -> Result<Option<Transform>, BadInput> {
         self.get(key)
             .map(|value| transform_of(value).map_err(|why| self.invalid(key, why)))
             .transpose()
     }
 
-    pub(super) fn list(&self, key: &str) -> Result<&'a [Value], BadArgument> {
+    pub(super) fn list(&self, key: &str) -> Result<&'a [Value], BadInput> {
         let value = self.required(key, self.get(key))?;
         let list = value
             .as_array()
@@ -195,14 +195,14 @@ impl<'a> JsonObject<'a> {
     }
 
     /// The object in a field.
-    pub(super) fn object(&self, key: &str, known: &[&str]) -> Result<Option<Self>, BadArgument> {
+    pub(super) fn object(&self, key: &str, known: &[&str]) -> Result<Option<Self>, BadInput> {
         self.get(key)
             .map(|value| Self::new(self.file, self.path_of(key), value, known))
             .transpose()
     }
 
     /// The objects in a list.
-    pub(super) fn objects(&self, key: &str, known: &[&str]) -> Result<Vec<Self>, BadArgument> {
+    pub(super) fn objects(&self, key: &str, known: &[&str]) -> Result<Vec<Self>, BadInput> {
         let path = self.path_of(key);
         let object = |(ix, value): (usize, &'a Value)| {
             Self::new(self.file, format!("{path}[{ix}]"), value, known)
@@ -227,7 +227,7 @@ mod tests {
     use super::*;
     use serde_json::json;
 
-    fn error<T>(result: Result<T, BadArgument>) -> String {
+    fn error<T>(result: Result<T, BadInput>) -> String {
         result.err().expect("an error").to_string()
     }
 

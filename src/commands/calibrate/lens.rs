@@ -1,8 +1,8 @@
 //! Intrinsics as JSON.
 
 use super::json_object::JsonObject;
-use crate::exit::BadArgument;
 use kinematics::{Intrinsics, Lens};
+use messages::BadInput;
 use nalgebra::DMatrix;
 use serde::Serialize;
 
@@ -54,7 +54,7 @@ impl LensFile {
         "next_view",
     ];
 
-    pub(super) fn read(object: &JsonObject<'_>) -> Result<Self, BadArgument> {
+    pub(super) fn read(object: &JsonObject<'_>) -> Result<Self, BadInput> {
         let size_px = match object.array::<2>("size_px")? {
             Some([width, height]) => Some([side(object, width)?, side(object, height)?]),
             None => None,
@@ -112,20 +112,20 @@ impl LensFile {
     pub(super) fn covariance(
         &self,
         intrinsics: &Intrinsics,
-    ) -> Result<Option<DMatrix<f64>>, BadArgument> {
+    ) -> Result<Option<DMatrix<f64>>, BadInput> {
         let n = intrinsics.params().len();
         let name = |ix: usize| param_names(self.model.as_deref())[ix];
         // A standard deviation of a coefficient that the lens lacks is probably that of another
         // lens.
         if let Some((ix, _)) = self.sigmas.iter().find(|(ix, _)| *ix >= n) {
             let params = param_names(self.model.as_deref())[..n].join(", ");
-            return Err(BadArgument(format!(
+            return Err(BadInput(format!(
                 "intrinsics.sigma.{}: the lens has only {params}",
                 name(*ix)
             )));
         }
         let given = covariance_of(&self.covariance, intrinsics)
-            .map_err(|error| BadArgument(format!("intrinsics.covariance: {error}")))?;
+            .map_err(|error| BadInput(format!("intrinsics.covariance: {error}")))?;
         let Some(given) = given else {
             let mut independent = DMatrix::zeros(n, n);
             for (ix, sigma) in &self.sigmas {
@@ -141,7 +141,7 @@ impl LensFile {
         for (ix, sigma) in &self.sigmas {
             let of_covariance = given[(*ix, *ix)].max(0.0).sqrt();
             if (sigma - of_covariance).abs() > MAX_DIFFERENCE * sigma.max(of_covariance) {
-                return Err(BadArgument(format!(
+                return Err(BadInput(format!(
                     "intrinsics.sigma.{} is {sigma}, but intrinsics.covariance means {of_covariance}; remove the wrong one",
                     name(*ix)
                 )));
@@ -151,11 +151,11 @@ impl LensFile {
     }
 
     /// The intrinsics for images of the given size.
-    pub(super) fn intrinsics(&self, size_px: [u32; 2]) -> Result<Intrinsics, BadArgument> {
+    pub(super) fn intrinsics(&self, size_px: [u32; 2]) -> Result<Intrinsics, BadInput> {
         let [width, height] = size_px;
         // Intrinsics are not scaled to another resolution, because cameras often crop instead.
         if let Some(own) = self.size_px.filter(|own| *own != size_px) {
-            return Err(BadArgument(format!(
+            return Err(BadInput(format!(
                 "the intrinsics are for images of {}x{} pixels, but the images have {width}x{height}; calibrate this resolution",
                 own[0], own[1]
             )));
@@ -165,7 +165,7 @@ impl LensFile {
         if (0..2).any(|axis| {
             !CENTRAL_FRAC.contains(&(self.principal_px[axis] / f64::from(size_px[axis])))
         }) {
-            return Err(BadArgument(format!(
+            return Err(BadInput(format!(
                 "principal_px {:?} is far from the center of images of {width}x{height} pixels; the intrinsics are probably for another resolution",
                 self.principal_px
             )));
@@ -179,11 +179,11 @@ impl LensFile {
         };
         intrinsics
             .validate()
-            .map_err(|error| BadArgument(format!("intrinsics: {error}")))?;
+            .map_err(|error| BadInput(format!("intrinsics: {error}")))?;
         Ok(intrinsics)
     }
 
-    fn lens(&self) -> Result<Lens, BadArgument> {
+    fn lens(&self) -> Result<Lens, BadInput> {
         let k = &self.distortion;
         let default = if k.is_empty() { PINHOLE } else { BROWN_CONRADY };
         let model = self.model.as_deref().unwrap_or(default);
@@ -196,7 +196,7 @@ impl LensFile {
             BROWN_CONRADY => Err(too_many(8)),
             KANNALA_BRANDT if k.len() <= 4 => Ok(Lens::KannalaBrandt(padded(k))),
             KANNALA_BRANDT => Err(too_many(4)),
-            other => Err(BadArgument(format!(
+            other => Err(BadInput(format!(
                 "intrinsics: unknown model {other:?}, expected {PINHOLE}, {BROWN_CONRADY} or {KANNALA_BRANDT}"
             ))),
         }
@@ -228,7 +228,7 @@ impl LensFile {
     clippy::cast_sign_loss,
     reason = "a whole number in the range"
 )]
-fn side(object: &JsonObject<'_>, value: f64) -> Result<u32, BadArgument> {
+fn side(object: &JsonObject<'_>, value: f64) -> Result<u32, BadInput> {
     let is_side = value.fract() == 0.0 && (1.0..=f64::from(u32::MAX)).contains(&value);
     is_side
         .then_some(value as u32)
@@ -236,8 +236,8 @@ fn side(object: &JsonObject<'_>, value: f64) -> Result<u32, BadArgument> {
 }
 
 /// The error for `n` coefficients of a model that has at most `max`.
-fn too_many(n: usize, model: &str, max: usize) -> BadArgument {
-    BadArgument(format!(
+fn too_many(n: usize, model: &str, max: usize) -> BadInput {
+    BadInput(format!(
         "intrinsics: {n} distortion coefficients; {model} has at most {max}"
     ))
 }
@@ -268,7 +268,7 @@ pub(super) fn param_names(model: Option<&str>) -> Vec<&'static str> {
 }
 
 /// Standard deviations with the indices of their parameters.
-fn sigmas(sigma: &JsonObject<'_>, model: Option<&str>) -> Result<Vec<(usize, f64)>, BadArgument> {
+fn sigmas(sigma: &JsonObject<'_>, model: Option<&str>) -> Result<Vec<(usize, f64)>, BadInput> {
     let names = param_names(model).into_iter().enumerate();
     let given = names.filter_map(|(ix, name)| sigma.get(name).map(|value| (ix, name, value)));
     given

@@ -1,11 +1,11 @@
 //! Files that `calibrate` writes: a rig file with the result, and a report.
 
-use crate::exit::{self, BadArgument, Exit};
+use crate::exit::{self, Exit};
 use crate::page_args::PageArgs;
 use calibration::hand_eye::{JointOffset, Setup};
 use capture::config::{Camera, Parent, Rig};
 use kinematics::{Intrinsics, Transform};
-use messages::listed;
+use messages::{BadInput, listed};
 use nalgebra::DMatrix;
 use session::calibration_report::{self, Heading};
 use session::{Data, DataOptions, corrected_rig};
@@ -66,7 +66,7 @@ pub(super) fn is_rig_file(path: &Path) -> bool {
 
 impl RigFlags {
     /// Rejects flags that do not apply to the input.
-    pub(super) fn check(&self, input: &Path) -> Result<(), BadArgument> {
+    pub(super) fn check(&self, input: &Path) -> Result<(), BadInput> {
         self.page.check()?;
         let kind = InputKind::of(input);
         let problem = if kind != InputKind::Rig
@@ -90,7 +90,7 @@ impl RigFlags {
         } else {
             return Ok(());
         };
-        Err(BadArgument(problem))
+        Err(BadInput(problem))
     }
 
     /// Reads the rig file to write the result into: the input, that of a recording, or `--rig`.
@@ -102,7 +102,7 @@ impl RigFlags {
         };
         // All commands recognize rig files by this extension.
         if !is_rig_file(file) {
-            return Err(BadArgument(format!(
+            return Err(BadInput(format!(
                 "--write-rig {}: must have the extension .toml",
                 file.display()
             ))
@@ -135,12 +135,12 @@ impl RigFlags {
     /// The camera with the given name, or the only one.
     pub(super) fn camera_of<'a>(&self, rig: &'a Rig) -> anyhow::Result<&'a Camera> {
         match (&self.camera, &rig.cameras[..]) {
-            (Some(name), _) => Ok(corrected_rig::camera(rig, name)?),
+            (Some(name), _) => corrected_rig::camera(rig, name),
             (None, [only]) => Ok(only),
             (None, cameras) => {
                 let names: Vec<&str> = cameras.iter().map(|camera| &*camera.name).collect();
                 let names = listed(&names, "or");
-                Err(BadArgument(format!(
+                Err(BadInput(format!(
                     "the rig has several cameras; choose one with --camera: {names}"
                 ))
                 .into())
@@ -179,10 +179,7 @@ impl RigOutput {
 
     /// Rejects images of another size than those of the camera.
     pub(super) fn expect_size(&self, size_px: [u32; 2]) -> anyhow::Result<()> {
-        Ok(corrected_rig::expect_size(
-            corrected_rig::camera(&self.rig, &self.camera)?,
-            size_px,
-        )?)
+        corrected_rig::expect_size(corrected_rig::camera(&self.rig, &self.camera)?, size_px)
     }
 
     pub(super) fn set_intrinsics(
@@ -328,7 +325,7 @@ pub(super) fn heading<T>(
 }
 
 /// The contents of a text file; a missing or unreadable file is a bad argument.
-pub(super) fn read_text(path: &Path) -> Result<String, BadArgument> {
+pub(super) fn read_text(path: &Path) -> Result<String, BadInput> {
     files::read_text(path)
-        .map_err(|error| BadArgument(format!("cannot read {}: {error}", path.display())))
+        .map_err(|error| BadInput(format!("cannot read {}: {error}", path.display())))
 }

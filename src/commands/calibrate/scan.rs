@@ -6,7 +6,6 @@ use super::images::{self, DetectedImage, OtherSize};
 use super::lens::covariance_of;
 use super::outputs::{InputKind, RigFlags, RigOutput};
 use super::page::GuidancePage;
-use crate::exit::{BadArgument, InsufficientData};
 use crate::{print, signals};
 use calibration::BoardView;
 use calibration::hand_eye::{
@@ -16,6 +15,7 @@ use capture::config::{ArmDriver, Camera, Override, Parent, Rig};
 use capture::open::{self, Devices, Opened};
 use capture::{ArmDuringImage, CalibrationImage, CalibrationImages, calibration_images};
 use kinematics::{Chain, Intrinsics, Stamp, Transform};
+use messages::{BadInput, InsufficientData};
 use nalgebra::DMatrix;
 use session::calibration_report::{Photo, Photos, Unused};
 use session::corrected_rig;
@@ -79,7 +79,7 @@ impl RigFlags {
         session::expect(input)?;
         let Some(target) = target else {
             let example = "for example --target charuco:5x7:34mm:26mm:5X5_100";
-            return Err(BadArgument(format!(
+            return Err(BadInput(format!(
                 "{}: --target is required with a recording or rig file, {example}",
                 input.display()
             ))
@@ -99,7 +99,7 @@ impl RigFlags {
         // The rig as opened: cameras may have reported calibration that the file lacks.
         let rig = opened.rig.clone();
         if options.purpose == Purpose::HandEye && rig.arm.driver == ArmDriver::None {
-            return Err(BadArgument(format!(
+            return Err(BadInput(format!(
                 "{}: the rig has no arm, which hand-eye calibration needs; without an arm, use `fieldrig calibrate intrinsics`",
                 input.display()
             ))
@@ -148,14 +148,14 @@ impl RigFlags {
             Vec::new()
         };
         let rig = Rig::load(rig_file, &overrides)?;
-        Ok(open::rig(
+        open::rig(
             rig,
             if self.sim {
                 Devices::Sim
             } else {
                 Devices::Real
             },
-        )?)
+        )
     }
 
     /// Reads images. From devices, the target is detected at once, to tell what to do next.
@@ -311,7 +311,7 @@ impl Scan {
     }
 
     /// Covariance of the intrinsics, if the rig file contains it.
-    pub(super) fn intrinsics_covariance(&self) -> Result<Option<DMatrix<f64>>, BadArgument> {
+    pub(super) fn intrinsics_covariance(&self) -> Result<Option<DMatrix<f64>>, BadInput> {
         let Camera {
             name,
             intrinsics,
@@ -319,7 +319,7 @@ impl Scan {
             ..
         } = &self.camera;
         covariance_of(intrinsics_covariance, intrinsics)
-            .map_err(|error| BadArgument(format!("camera.{name}.intrinsics_covariance: {error}")))
+            .map_err(|error| BadInput(format!("camera.{name}.intrinsics_covariance: {error}")))
     }
 
     /// The size of a board that the images show instead of that of the target.

@@ -3,13 +3,13 @@
 use super::outputs::{self, ReportFlag, is_rig_file};
 use super::{matrix_of, print_matrix};
 use crate::console::ReadBar;
-use crate::exit::{self, BadArgument, Exit, InsufficientData};
+use crate::exit::{self, Exit};
 use crate::{print, signals};
 use calibration::{CameraCorrection, Estimate, PoseSigmas, Trial, rigid_transform};
 use capture::config::{Override, Rig};
 use capture::open::{self, Devices};
 use kinematics::Stamp;
-use messages::listed;
+use messages::{BadInput, InsufficientData, listed};
 use serde::Serialize;
 use session::calibration_report::SceneReport;
 use session::{
@@ -110,9 +110,7 @@ struct PrintedRelative {
 pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     // `auto` chooses the parameters itself, so a list contradicts it.
     if args.params.len() > 1 && args.params.contains(&Refine::Auto) {
-        return Err(
-            BadArgument("--params: auto cannot be combined with other values".into()).into(),
-        );
+        return Err(BadInput("--params: auto cannot be combined with other values".into()).into());
     }
     // Checked first, so that a wrong path does not cost a calibration.
     let report = args.report.open()?;
@@ -121,7 +119,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     if let Some(file) = &args.write_rig {
         let Some(rig) = &given else {
             let input = args.input.display();
-            return Err(BadArgument(format!(
+            return Err(BadInput(format!(
                 "--write-rig {}: {input} contains no rig file",
                 file.display()
             ))
@@ -136,7 +134,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     } else {
         data.rig.clone()
     };
-    let result = calibrate_scene(&data, &args.params, rig.as_ref()).map_err(anyhow::Error::from);
+    let result = calibrate_scene(&data, &args.params, rig.as_ref());
     let (calibration, written) = outputs::reported(result, report, |path, result| {
         args.write_report(path, &data, rig.as_ref(), result)
     })?;
@@ -253,40 +251,38 @@ impl Args {
     /// The rig file, without settings that apply only to this command; `None` for a folder.
     fn rig_as_given(&self) -> anyhow::Result<Option<Rig>> {
         if !self.input.exists() {
-            return Err(BadArgument(format!("{} does not exist", self.input.display())).into());
+            return Err(BadInput(format!("{} does not exist", self.input.display())).into());
         }
         if is_rig_file(&self.input) {
             return Ok(Some(Rig::load(&self.input, &[])?));
         }
         // Dataset folders have no rig file.
         let is_recording = session::run_folder::is_recording(&self.input);
-        Ok(is_recording
+        is_recording
             .then(|| Data::rig_as_given(&self.input, &self.options()))
-            .transpose()?)
+            .transpose()
     }
 
     fn data(&self) -> anyhow::Result<Data> {
         let bar = ReadBar::new(self.json);
         if !is_rig_file(&self.input) {
             if self.sim || self.seconds.is_some() {
-                return Err(BadArgument(
+                return Err(BadInput(
                     "--sim and --seconds need a rig file (.toml) as input".into(),
                 )
                 .into());
             }
-            return Ok(Data::load(
+            return Data::load(
                 &self.input,
                 &self.options(),
                 Purpose::Training,
                 &[],
                 &|read| bar.show(read),
-            )?);
+            );
         }
         // Both flags are about data that were recorded before.
         if self.keyframes.is_some() || self.rig.is_some() {
-            return Err(
-                BadArgument("--keyframes and --rig need a recording as input".into()).into(),
-            );
+            return Err(BadInput("--keyframes and --rig need a recording as input".into()).into());
         }
         let stop = signals::stop_on_signals_logging(
             "calibrating with the images so far; Ctrl-C again exits at once",

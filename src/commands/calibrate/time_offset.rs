@@ -2,13 +2,14 @@
 
 use super::outputs::{self, ReportFlag};
 use super::{matrix_of, print_matrix};
-use crate::exit::{self, BadArgument, Exit, InsufficientData};
+use crate::exit::{self, Exit};
 use crate::print;
 use calibration::hand_eye::Refusal;
 use calibration::time_offset::{
     MotionProfile, PoseSample, TimeOffset, TimeOffsetOptions, estimate_time_offset, motion_profile,
 };
 use kinematics::Transform;
+use messages::{BadInput, InsufficientData};
 use nalgebra::{Quaternion, Translation3, UnitQuaternion};
 use serde::Serialize;
 use session::calibration_report::TimeOffsetReport;
@@ -191,7 +192,7 @@ fn read(path: &Path) -> anyhow::Result<Vec<PoseSample>> {
         }
         let place = || format!("{}, line {}", path.display(), ix + 1);
         let [secs, x, y, z, qx, qy, qz, qw] = <[f64; 8]>::try_from(numbers).map_err(|numbers| {
-            BadArgument(format!(
+            BadInput(format!(
                 "{}: {} numbers, expected 8: t,x,y,z,qx,qy,qz,qw",
                 place(),
                 numbers.len()
@@ -200,13 +201,13 @@ fn read(path: &Path) -> anyhow::Result<Vec<PoseSample>> {
         const MAX_NORM_ERROR: f64 = 0.01;
         let quaternion = Quaternion::new(qw, qx, qy, qz);
         if ![secs, x, y, z].iter().all(|value| value.is_finite()) {
-            return Err(BadArgument(format!("{}: t, x, y and z must be finite", place())).into());
+            return Err(BadInput(format!("{}: t, x, y and z must be finite", place())).into());
         }
         let norm = quaternion.norm();
         // Normalized afterwards. A larger deviation shows another order of the columns.
         let is_unit = (norm - 1.0).abs() < MAX_NORM_ERROR; // False for NaN.
         if !is_unit {
-            return Err(BadArgument(format!(
+            return Err(BadInput(format!(
                 "{}: |qx,qy,qz,qw| is {norm:.3}, expected 1",
                 place()
             ))
@@ -219,7 +220,7 @@ fn read(path: &Path) -> anyhow::Result<Vec<PoseSample>> {
         samples.push(PoseSample { secs, pose });
     }
     if samples.is_empty() {
-        return Err(BadArgument(format!("{}: no row t,x,y,z,qx,qy,qz,qw", path.display())).into());
+        return Err(BadInput(format!("{}: no row t,x,y,z,qx,qy,qz,qw", path.display())).into());
     }
     Ok(samples)
 }

@@ -11,7 +11,7 @@ use super::outputs::{self, ReportFlag, RigFlags, RigOutput};
 use super::scan::ScanOptions;
 use super::target::symmetry_warning;
 use super::target_argument;
-use crate::exit::{self, BadArgument, Exit, InsufficientData};
+use crate::exit::{self, Exit};
 use crate::print;
 use anyhow::Context;
 use calibration::hand_eye::{
@@ -20,6 +20,7 @@ use calibration::hand_eye::{
 };
 use kinematics::urdf::Robot;
 use kinematics::{Chain, Intrinsics, Lens, Transform};
+use messages::{BadInput, InsufficientData};
 use moved::{MoveFlags, MovedArm, Request};
 use nalgebra::Vector3;
 use printed::{Printed, PrintedPose, PrintedSample};
@@ -265,7 +266,7 @@ impl Args {
         keeps_photos: bool,
         output: Option<&mut RigOutput>,
     ) -> anyhow::Result<(Source, Option<MovedArm>)> {
-        let has = |what: &str, flag: &str| BadArgument(format!("{flag}: {what}; remove the flag"));
+        let has = |what: &str, flag: &str| BadInput(format!("{flag}: {what}; remove the flag"));
         let (scan, arm) = if self.motion.is_requested {
             let (scan, arm) = self.motion.run(&self.request(keeps_photos)?, output)?;
             (Some(scan), Some(arm))
@@ -294,7 +295,7 @@ impl Args {
             }
             (_, None) if self.with_joints && self.urdf.is_none() => {
                 let why = "--with-joints: with samples in JSON, --urdf and --tip are needed, too";
-                return Err(BadArgument(why.to_owned()).into());
+                return Err(BadInput(why.to_owned()).into());
             }
             (_, None) => {
                 let file = SamplesFile::read(&self.input)?;
@@ -312,11 +313,11 @@ impl Args {
     fn request(&self, keeps_photos: bool) -> anyhow::Result<Request<'_>> {
         let Some(target) = &self.target else {
             let why = "--target is required with --move, for example --target charuco:5x7:34mm:26mm:5X5_100";
-            return Err(BadArgument(why.to_owned()).into());
+            return Err(BadInput(why.to_owned()).into());
         };
         if self.urdf.is_some() {
             let why = "--urdf: the rig file names the robot description; remove the flag";
-            return Err(BadArgument(why.to_owned()).into());
+            return Err(BadInput(why.to_owned()).into());
         }
         Ok(Request {
             input: &self.input,

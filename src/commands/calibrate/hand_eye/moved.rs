@@ -6,7 +6,7 @@ use super::super::page::GuidancePage;
 use super::super::scan::Scan;
 use super::{next_pose_options, with_distortion};
 use crate::commands::move_arm;
-use crate::exit::{BadArgument, Exit, InsufficientData};
+use crate::exit::Exit;
 use crate::signals;
 use calibration::BoardView;
 use calibration::hand_eye::{
@@ -18,6 +18,7 @@ use capture::open::{self, Devices};
 use capture::{ArmCapture, ArmDuringImage, CalibrationImage, Stop};
 use drivers::motion::OnLoss;
 use kinematics::{Chain, Transform};
+use messages::{BadInput, InsufficientData};
 use session::calibration_report::{Photo, Photos};
 use std::path::Path;
 use targets::{GrayImage, TargetSpec};
@@ -108,7 +109,7 @@ impl MovedArm {
         // The next Ctrl-C ends the hold in order, even if an earlier one has stopped the motion.
         self.stop.rearm("ending; the motors no longer hold the arm");
         log::info!("{}", move_arm::HOLDING);
-        Ok(self.capture.hold(&self.stop)?)
+        self.capture.hold(&self.stop)
     }
 }
 
@@ -133,13 +134,13 @@ impl MoveFlags {
         // Everything that needs no device is checked before the arm is enabled.
         flags.check(request.input)?;
         if InputKind::of(request.input) != InputKind::Rig {
-            return Err(BadArgument(format!(
+            return Err(BadInput(format!(
                 "--move needs a rig file (.toml) as input; {input} is not one"
             ))
             .into());
         }
         if flags.seconds.is_some() {
-            return Err(BadArgument(
+            return Err(BadInput(
                 "--seconds cannot be combined with --move; limit the number of poses with --max-poses".to_owned(),
             )
             .into());
@@ -148,14 +149,14 @@ impl MoveFlags {
         let given_camera = flags.camera_of(&given)?.clone();
         let camera = &given_camera.name;
         if given.arm.driver == ArmDriver::None {
-            return Err(BadArgument(format!("--move: {input}: the rig has no arm")).into());
+            return Err(BadInput(format!("--move: {input}: the rig has no arm")).into());
         }
         let is_simulated = flags.sim || given.arm.driver == ArmDriver::Sim;
         if !is_simulated {
             move_arm::motion_of(&given)?;
             open::check_motion(&given)?;
             if !self.enable_motion {
-                return Err(BadArgument(
+                return Err(BadInput(
                     "--move moves the arm: add --enable-motion to confirm that nobody is within reach of the arm and that a hand is on the emergency stop"
                         .to_owned(),
                 )

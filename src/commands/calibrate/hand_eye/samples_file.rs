@@ -4,10 +4,10 @@ use super::super::images::{self, DetectedImage, ImageFile, OtherSize};
 use super::super::json_object::{self, JsonObject};
 use super::super::lens::LensFile;
 use super::super::{outputs, target_argument};
-use crate::exit::{BadArgument, InsufficientData};
 use calibration::hand_eye::{BoardObservation, HandEyeSample, Setup};
 use capture::camera_info;
 use kinematics::{Intrinsics, Transform};
+use messages::{BadInput, InsufficientData};
 use nalgebra::DMatrix;
 use session::calibration_report::{Photos, Unused};
 use std::collections::BTreeMap;
@@ -53,18 +53,18 @@ const FILE_KEYS: [&str; 4] = ["intrinsics", "target", "setup", "samples"];
 const SAMPLE_KEYS: [&str; 4] = ["base_from_flange", "camera_from_board", "image", "joints"];
 
 impl SamplesFile {
-    pub(super) fn read(path: &Path) -> Result<Self, BadArgument> {
+    pub(super) fn read(path: &Path) -> Result<Self, BadInput> {
         let name = path.display().to_string();
         let text = outputs::read_text(path)?;
         let mut value = json_object::parse(&text)
             // Such files often come from other programs, so the error says what to change.
-            .map_err(|error| BadArgument(format!("{name}: {error}{}", not_json_hint(&text))))?;
+            .map_err(|error| BadInput(format!("{name}: {error}{}", not_json_hint(&text))))?;
         // Paths in the file are relative to it, so that its folder can be moved.
         let folder = path.parent().unwrap_or(Path::new(""));
         // The intrinsics may be written in several formats, or be in a file of their own. They are
         // converted in place, so that the code below reads one format.
         if let Some(intrinsics) = value.get_mut("intrinsics") {
-            let invalid = |why: String| BadArgument(format!("{name}: intrinsics: {why}"));
+            let invalid = |why: String| BadInput(format!("{name}: intrinsics: {why}"));
             let mut source = String::new();
             if let Some(file) = intrinsics.as_str() {
                 let file = folder.join(file);
@@ -130,8 +130,8 @@ impl SamplesFile {
     }
 
     /// The given intrinsics, for images of this size.
-    pub(super) fn intrinsics(&self, size_px: [u32; 2]) -> Result<Option<Intrinsics>, BadArgument> {
-        let of_file = |error: BadArgument| BadArgument(format!("{}: {error}", self.path.display()));
+    pub(super) fn intrinsics(&self, size_px: [u32; 2]) -> Result<Option<Intrinsics>, BadInput> {
+        let of_file = |error: BadInput| BadInput(format!("{}: {error}", self.path.display()));
         self.intrinsics
             .as_ref()
             .map(|lens| lens.intrinsics(size_px).map_err(of_file))
@@ -142,8 +142,8 @@ impl SamplesFile {
     pub(super) fn intrinsics_covariance(
         &self,
         intrinsics: &Intrinsics,
-    ) -> Result<Option<DMatrix<f64>>, BadArgument> {
-        let of_file = |error: BadArgument| BadArgument(format!("{}: {error}", self.path.display()));
+    ) -> Result<Option<DMatrix<f64>>, BadInput> {
+        let of_file = |error: BadInput| BadInput(format!("{}: {error}", self.path.display()));
         Ok(match &self.intrinsics {
             Some(lens) => lens.covariance(intrinsics).map_err(of_file)?,
             None => None,
@@ -285,7 +285,7 @@ impl Samples {
 }
 
 /// Rejects an image with two robot poses. Identical samples are allowed.
-fn check_images(samples: &[JsonObject<'_>], entries: &[Entry]) -> Result<(), BadArgument> {
+fn check_images(samples: &[JsonObject<'_>], entries: &[Entry]) -> Result<(), BadInput> {
     let mut first_use: BTreeMap<&Path, usize> = BTreeMap::new();
     for (ix, entry) in entries.iter().enumerate() {
         let EntryBoard::Image(image) = &entry.board else {
@@ -305,7 +305,7 @@ fn check_images(samples: &[JsonObject<'_>], entries: &[Entry]) -> Result<(), Bad
 }
 
 /// A pose in a sample.
-fn pose(sample: &JsonObject<'_>, key: &str) -> Result<Option<Transform>, BadArgument> {
+fn pose(sample: &JsonObject<'_>, key: &str) -> Result<Option<Transform>, BadInput> {
     /// Positions beyond this are assumed to be mistakes.
     const MAX_POSITION_M: f64 = 1e4;
     let pose = sample.transform(key)?;
@@ -321,7 +321,7 @@ fn pose(sample: &JsonObject<'_>, key: &str) -> Result<Option<Transform>, BadArgu
 }
 
 impl Entry {
-    fn read(sample: &JsonObject<'_>, folder: &Path) -> Result<Self, BadArgument> {
+    fn read(sample: &JsonObject<'_>, folder: &Path) -> Result<Self, BadInput> {
         let base_from_flange =
             sample.required("base_from_flange", pose(sample, "base_from_flange")?)?;
         let board = match (pose(sample, "camera_from_board")?, sample.text("image")?) {

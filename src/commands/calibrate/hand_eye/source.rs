@@ -2,9 +2,9 @@
 
 use super::super::scan::Scan;
 use super::samples_file::{Samples, SamplesFile};
-use crate::exit::InsufficientData;
 use calibration::hand_eye::Setup;
 use kinematics::{Chain, Intrinsics, Transform};
+use messages::InsufficientData;
 use nalgebra::DMatrix;
 use targets::TargetSpec;
 
