@@ -6,7 +6,7 @@ use crate::statistics::sample_std;
 use crate::variant::Variant;
 use anyhow::Result;
 use kinematics::quantile::median;
-use messages::BadInput;
+use messages::{BadInput, Setting};
 use serde::Serialize;
 use session::Table;
 use std::collections::HashSet;
@@ -128,13 +128,15 @@ pub fn run(options: &AblationOptions, host: &Host<'_>) -> Result<BenchResult> {
     if changes.is_empty() {
         let names: Vec<&str> = VARIANTS.iter().map(|change| change.name).collect();
         return Err(BadInput(format!(
-            "--only: no variant matches; variants: {}",
+            "{}: no variant matches; variants: {}",
+            Setting::Only,
             names.join(", ")
         ))
         .into());
     }
     if options.runs.training.count.is_some() {
-        return Err(BadInput("--count: this bench sets it; remove the flag".into()).into());
+        let message = format!("{}: this bench sets it; remove the flag", Setting::Count);
+        return Err(BadInput(message).into());
     }
     runs.expect((changes.len() as u64 + 1) * options.seeds);
     let mut baseline: Vec<Run> = Vec::new();

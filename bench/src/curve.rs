@@ -6,7 +6,7 @@ use crate::runs::{Host, Job, NamedData, Run, Runs, RunsOptions};
 use crate::statistics::{extent, sample_std, secs_to};
 use anyhow::Result;
 use kinematics::quantile::median;
-use messages::BadInput;
+use messages::{BadInput, Setting};
 use serde::Serialize;
 use session::chart::{Axis, Chart, Line, Point, Scale, compact_number};
 use session::{Table, evaluation_schedule};
@@ -103,7 +103,7 @@ struct TimeToQuality {
 pub fn run(options: &CurveOptions, host: &Host<'_>) -> Result<BenchResult> {
     let limits = session::limits(Some(options.seconds), None, DEFAULT_SECONDS)?;
     if options.seconds == 0.0 {
-        return Err(BadInput("--seconds: must be above 0".into()).into());
+        return Err(BadInput(format!("{}: must be above 0", Setting::Seconds)).into());
     }
     let peers = options
         .peers

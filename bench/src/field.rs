@@ -2,6 +2,7 @@
 
 use crate::kernels::profile;
 use anyhow::{Context, Result};
+use messages::Setting;
 use serde::Serialize;
 use session::OpenGpu;
 use trainer::nerf::bench::time_steps;
@@ -85,7 +86,7 @@ pub fn measure(
         // Every ray has the same number of samples.
         let n_samples = (n_samples / options.n_rays).max(1) * options.n_rays;
         let figures = time_steps(&gpu, options.n_rays, n_samples, n_repeats as usize)
-            .with_context(|| format!("{n_samples} samples: try fewer --samples"))?;
+            .with_context(|| format!("{n_samples} samples: try fewer {}", Setting::Samples))?;
         on_row(&FieldRow {
             rays: figures.n_rays,
             samples: figures.n_samples,

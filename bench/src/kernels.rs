@@ -1,6 +1,7 @@
 //! Measures the speed of the splat kernels.
 
 use anyhow::{Context, Result};
+use messages::Setting;
 use serde::Serialize;
 use session::OpenGpu;
 use std::path::PathBuf;
@@ -169,7 +170,11 @@ pub fn measure(
             };
             let figures = time_kernels(&gpu, cloud, setup, repeats).with_context(|| {
                 let [width, height] = size_px;
-                format!("{width}x{height} pixels and {n_splats} splats: try fewer --splats or a smaller --size")
+                format!(
+                    "{width}x{height} pixels and {n_splats} splats: try fewer {} or a smaller {}",
+                    Setting::Splats,
+                    Setting::Size
+                )
             })?;
             let passes = profile(&figures.passes, options.profile);
             on_row(&KernelsRow {

@@ -1,7 +1,7 @@
 //! Reads curves measured with other trainers: JSON with `rows` of `seconds` and `psnr`.
 
 use anyhow::Result;
-use messages::BadInput;
+use messages::{BadInput, Setting};
 use serde::Deserialize;
 use std::path::Path;
 
@@ -36,7 +36,8 @@ impl Peer {
     ///
     /// If the file is unreadable or has another format.
     pub(crate) fn load(path: &Path) -> Result<Self> {
-        let invalid = |reason: &str| BadInput(format!("--peer {}: {reason}", path.display()));
+        let invalid =
+            |reason: &str| BadInput(format!("{} {}: {reason}", Setting::Peer, path.display()));
         let text = files::read_text(path)
             .map_err(|error| invalid(&format!("cannot be read ({error})")))?;
         let file: File = serde_json::from_str(&text).map_err(|error| {

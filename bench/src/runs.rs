@@ -4,7 +4,7 @@
 use anyhow::{Context, Result, anyhow, ensure};
 use capture::Stop;
 use keyframe::{Keyframe, Split};
-use messages::{BadInput, InsufficientData};
+use messages::{BadInput, InsufficientData, Setting};
 use serde::{Deserialize, Serialize};
 use session::methods::MAX_SPLATS;
 use session::run_folder::{self, CreatedFolders};
@@ -343,8 +343,12 @@ impl<'a> Runs<'a> {
         // Ends the progress bar before the next message.
         drop(on_progress);
         if data.of_split(Split::Test).is_empty() {
-            let reason = "there are no test images, so nothing can be scored; see --holdout";
-            return Err(InsufficientData(format!("{}: {reason}", path.display())).into());
+            return Err(InsufficientData(format!(
+                "{}: there are no test images, so nothing can be scored; see {}",
+                path.display(),
+                Setting::Holdout
+            ))
+            .into());
         }
         let model_specs = session::model_specs(training, &data, None, self.gpu.is_software())?;
         let initial_points = data.initial_points();
@@ -370,7 +374,8 @@ impl<'a> Runs<'a> {
             let cached = read(&path)?;
             if let Some(difference) = difference(&cached.settings, &settings)? {
                 return Err(BadInput(format!(
-                    "--out {}: the saved run {} differs in {difference}; choose another folder",
+                    "{} {}: the saved run {} differs in {difference}; choose another folder",
+                    Setting::Out,
                     self.out.display(),
                     job.name
                 ))
@@ -443,7 +448,8 @@ impl<'a> Runs<'a> {
         // An interrupted run is not saved, because it would count as a complete one.
         ensure!(
             session.is_over() || !self.host.stop.requested(),
-            "stopped early; to continue the bench, run the same command with --out {}",
+            "stopped early; to continue the bench, run the same command with {} {}",
+            Setting::Out,
             self.out.display()
         );
         session.score_without_saving()

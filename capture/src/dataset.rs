@@ -5,7 +5,7 @@ use anyhow::{Context, ensure};
 use drivers::dataset::{Dataset, DatasetImage, DepthImage, ListedSplit};
 use keyframe::{DepthMap, Holdout, Keyframe, Split};
 use kinematics::{Intrinsics, Undistortion};
-use messages::{BadInput, counted};
+use messages::{BadInput, Setting, counted};
 use rayon::prelude::*;
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::sync::{Arc, OnceLock};
@@ -227,7 +227,8 @@ fn check_memory(dataset: &Dataset, scale_frac: f64, available_bytes: u64) -> any
     let remedy = match (100.0 * fitting).floor() / 100.0 {
         scale if scale >= downscale::MIN_SCALE => {
             format!(
-                "scale them to {scale} or less (--scale of `fieldrig train`, `eval` and `bench`)"
+                "scale them to {scale} or less ({} of `fieldrig train`, `eval` and `bench`)",
+                Setting::Scale
             )
         }
         _ => "use fewer photos".to_owned(),

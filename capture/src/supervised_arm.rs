@@ -6,6 +6,7 @@ use anyhow::{Context, bail};
 use drivers::motion::{JointTarget, Motion};
 use drivers::{Error, MovableArm, clock};
 use kinematics::JointState;
+use messages::Setting;
 use std::time::Duration;
 
 /// Duration of one wait for a joint state. It bounds the time until a request to stop is noticed.
@@ -74,7 +75,8 @@ impl SupervisedArm {
         // fault may report nothing any more.
         if let Motion::Stopped { reason } = self.arm.motion() {
             bail!(
-                "the arm stopped: {reason}. Inspect it, then recover it with `fieldrig move --recover`"
+                "the arm stopped: {reason}. Inspect it, then recover it with `fieldrig move {}`",
+                Setting::Recover
             );
         }
         match state {

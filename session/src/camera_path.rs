@@ -2,7 +2,7 @@
 
 use anyhow::{Context, ensure};
 use kinematics::{Transform, transform};
-use messages::{BadInput, shortened};
+use messages::{BadInput, Setting, shortened};
 use serde::Deserialize;
 use serde_json::Value;
 use std::collections::{BTreeMap, BTreeSet};
@@ -101,9 +101,9 @@ impl PathFile {
         let quoted: Vec<String> = unknown.iter().map(|key| format!("{key:?}")).collect();
         let named = shortened(&quoted, MAX_NAMED, ", ");
         let advice = if unknown.contains("crop") {
-            "; for \"crop\", use --crop"
+            format!("; for \"crop\", use {}", Setting::Crop)
         } else {
-            ""
+            String::new()
         };
         vec![format!("unknown keys are not used: {named}{advice}")]
     }
@@ -139,7 +139,7 @@ impl CameraPath {
     /// axes of [`kinematics::camera`].
     pub fn of_pose(numbers: &[f64]) -> anyhow::Result<Self> {
         let world_from_camera =
-            rigid(numbers).map_err(|error| BadInput(format!("--pose: {error}")))?;
+            rigid(numbers).map_err(|error| BadInput(format!("{}: {error}", Setting::Pose)))?;
         let cameras = vec![PathCamera {
             world_from_camera,
             fov_y_rad: None,
@@ -260,7 +260,7 @@ mod tests {
         for (key, note) in [
             (
                 "crop",
-                "unknown keys are not used: \"crop\"; for \"crop\", use --crop",
+                "unknown keys are not used: \"crop\"; for \"crop\", use crop",
             ),
             ("smooth", "unknown keys are not used: \"smooth\""),
         ] {

@@ -5,7 +5,7 @@ use crate::stored_keyframes::StoredKeyframes;
 use anyhow::Context;
 use background::Task;
 use keyframe::Keyframe;
-use messages::BadInput;
+use messages::{BadInput, Setting};
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -88,9 +88,11 @@ pub fn check_limit_not_passed(
 ) -> anyhow::Result<()> {
     match seconds.filter(|seconds| *seconds <= checkpoint.seconds) {
         Some(seconds) => Err(BadInput(format!(
-            "--seconds {seconds}: {subject} has already been trained for {:.1} s, which counts; give a larger limit",
+            "{} {seconds}: {subject} has already been trained for {:.1} s, which counts; give a larger limit",
+            Setting::Seconds,
             checkpoint.seconds
-        )).into()),
+        ))
+        .into()),
         None => Ok(()),
     }
 }

@@ -4,7 +4,7 @@ use anyhow::Context;
 use calibration::{Alignment, CameraCorrection, Estimate};
 use capture::config::{Base, Camera, Parent, Rig, TimeOffset};
 use kinematics::{Chain, Intrinsics, Stamp, Transform};
-use messages::{BadInput, listed};
+use messages::{BadInput, Setting, listed};
 use nalgebra::{DMatrix, Translation3, UnitQuaternion, Vector3};
 use std::collections::BTreeMap;
 use std::fs::File;
@@ -89,7 +89,8 @@ pub fn camera<'a>(rig: &'a Rig, name: &str) -> anyhow::Result<&'a Camera> {
         .ok_or_else(|| {
             let names: Vec<&str> = rig.cameras.iter().map(|camera| &*camera.name).collect();
             BadInput(format!(
-                "--camera {name}: the rig file has no such camera; it has {}",
+                "{} {name}: the rig file has no such camera; it has {}",
+                Setting::Camera,
                 listed(&names, "and")
             ))
             .into()
@@ -147,10 +148,12 @@ pub fn with_extrinsics(
     let is_converted = (parent, given) == (Parent::Base, Parent::World) && !rig.has_moving_base();
     if given != parent && !is_converted {
         return Err(BadInput(format!(
-            "--camera {name}: its parent in the rig file is {}, but the calibrated pose is relative to the {}; change parent, or the setup of the calibration",
+            "{} {name}: its parent in the rig file is {}, but the calibrated pose is relative to the {}; change parent, or the setup of the calibration",
+            Setting::Camera,
             name_of(given),
             name_of(parent)
-        )).into());
+        ))
+        .into());
     }
     let mut rig = rig.clone();
     let camera = rig.cameras.iter_mut().find(|camera| *camera.name == *name);
@@ -177,9 +180,11 @@ pub fn expect_size(camera: &Camera, [width, height]: [u32; 2]) -> anyhow::Result
         return Ok(());
     }
     Err(BadInput(format!(
-        "--camera {}: its images have {rig_width}x{rig_height} pixels in the rig file, but the calibrated images have {width}x{height}; calibrate this resolution, or change size_px",
+        "{} {}: its images have {rig_width}x{rig_height} pixels in the rig file, but the calibrated images have {width}x{height}; calibrate this resolution, or change size_px",
+        Setting::Camera,
         camera.name
-    )).into())
+    ))
+    .into())
 }
 
 fn name_of(parent: Parent) -> &'static str {
@@ -198,17 +203,20 @@ pub fn check_target_file(rig: &Rig, file: &Path) -> anyhow::Result<()> {
         .unwrap_or(Path::new("."));
     if !folder.is_dir() || file.is_dir() {
         return Err(BadInput(format!(
-            "--write-rig {}: must be a file in an existing folder",
+            "{} {}: must be a file in an existing folder",
+            Setting::WriteRig,
             file.display()
         ))
         .into());
     }
     match other_robot(rig, file) {
         Some(urdf) => Err(BadInput(format!(
-            "--write-rig {}: {} is the URDF of another robot; write the rig file to a separate folder",
+            "{} {}: {} is the URDF of another robot; write the rig file to a separate folder",
+            Setting::WriteRig,
             file.display(),
             urdf.display()
-        )).into()),
+        ))
+        .into()),
         None => Ok(()),
     }
 }

@@ -1,6 +1,7 @@
 //! Input of `train` and `eval`: a dataset folder or a recording, as keyframes in host memory.
 
 use crate::depth_from::{DepthSource, RenderedDepth};
+use crate::holdout::parse_holdout;
 use crate::methods::methods_of;
 use crate::read_progress::{OnReadProgress, ReadProgress};
 use crate::run_folder::{hex, is_recording};
@@ -12,7 +13,7 @@ use capture::{Join, JoinEvent, SampleUse, StationReport, Stations, dataset};
 use drivers::Sample;
 use keyframe::{Holdout, Keyframe, KeyframeList, Split};
 use kinematics::Stamp;
-use messages::{BadInput, InsufficientData, counted};
+use messages::{BadInput, InsufficientData, Setting, counted};
 use sha2::{Digest, Sha256};
 use std::collections::{BTreeMap, HashSet};
 use std::path::{Path, PathBuf};
@@ -37,14 +38,18 @@ pub struct DataOptions {
     pub scale: Option<f64>,
 }
 
+/// The options in the order of [`DataOptions::flags`], with their names in checkpoints.
+const SETTINGS: [(&str, Setting); 4] = [
+    ("holdout", Setting::Holdout),
+    ("keyframes", Setting::Keyframes),
+    ("rig", Setting::Rig),
+    ("scale", Setting::Scale),
+];
+
 impl DataOptions {
-    /// The test images selected by `--holdout`, if it is given.
+    /// The selected test images, if any are selected.
     pub fn holdout(&self) -> anyhow::Result<Option<Holdout>> {
-        Ok(self
-            .holdout
-            .as_deref()
-            .map(Holdout::from_argument)
-            .transpose()?)
+        Ok(self.holdout.as_deref().map(parse_holdout).transpose()?)
     }
 
     /// Names and values of the given flags that affect keyframes. Paths of files are absolute.
@@ -66,10 +71,10 @@ impl DataOptions {
         let rig = self
             .rig
             .as_ref()
-            .map(|file| ["--rig".to_owned(), file.display().to_string()]);
+            .map(|file| [Setting::Rig.to_string(), file.display().to_string()]);
         let scale = self
             .scale
-            .map(|scale| ["--scale".to_owned(), scale.to_string()]);
+            .map(|scale| [Setting::Scale.to_string(), scale.to_string()]);
         rig.into_iter().chain(scale).flatten().collect()
     }
 
@@ -83,12 +88,15 @@ impl DataOptions {
         before: &BTreeMap<String, String>,
     ) -> anyhow::Result<Self> {
         let now = self.flags();
-        for (name, value) in before {
+        for (name, setting) in SETTINGS {
             // A path with other contents is detected later, when keyframes are compared.
-            let is_other = |now: &String| now != value && is_number(now) && is_number(value);
-            if let Some(now) = now.get(name).filter(|now| is_other(now)) {
+            let is_other =
+                |now: &str, value: &str| now != value && is_number(now) && is_number(value);
+            if let (Some(now), Some(value)) = (now.get(name), before.get(name))
+                && is_other(now, value)
+            {
                 return Err(BadInput(format!(
-                    "--{name} {now}: {subject} was trained with --{name} {value}"
+                    "{setting} {now}: {subject} was trained with {setting} {value}"
                 ))
                 .into());
             }
@@ -112,11 +120,11 @@ impl DataOptions {
             rig: self.rig.clone().or(unset_flag("rig").map(PathBuf::from)),
             scale: self.scale.or(scale),
         };
-        let restored_flags: Vec<String> = restored
-            .flags()
+        let all = restored.flags();
+        let restored_flags: Vec<String> = SETTINGS
             .iter()
             .filter(|(name, _)| !now.contains_key(*name))
-            .map(|(name, value)| format!("--{name} {value}"))
+            .filter_map(|(name, setting)| Some(format!("{setting} {}", all.get(*name)?)))
             .collect();
         if !restored_flags.is_empty() {
             log::info!(
@@ -268,7 +276,8 @@ impl Data {
             Self::from_recording(path, rig, list, overrides, progress)?
         } else if let Some(rig) = rig {
             return Err(BadInput(format!(
-                "--rig {}: only recordings take a rig file",
+                "{} {}: only recordings take a rig file",
+                Setting::Rig,
                 rig.display()
             ))
             .into());
@@ -696,7 +705,7 @@ mod tests {
         .to_string();
         assert_eq!(
             other,
-            "--scale 0.5: the checkpoint was trained with --scale 0.25"
+            "scale 0.5: the checkpoint was trained with scale 0.25"
         );
         assert!(
             again(&DataOptions {

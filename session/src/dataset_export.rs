@@ -305,7 +305,7 @@ mod tests {
     fn read_back(out: &Path) -> Vec<Arc<Keyframe>> {
         let dataset = drivers::dataset::read(out).unwrap();
         assert!(dataset.notes.is_empty(), "{:?}", dataset.notes);
-        let holdout = Holdout::from_argument(out.join(TEST_LIST).to_str().unwrap()).unwrap();
+        let holdout = Holdout::from_list(&out.join(TEST_LIST)).unwrap();
         dataset::load(&dataset, Some(&holdout), 1.0, &|_| ())
             .unwrap()
             .keyframes

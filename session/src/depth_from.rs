@@ -5,7 +5,7 @@ use crate::read_progress::{OnReadProgress, ReadProgress};
 use crate::{methods, run_folder};
 use anyhow::Context;
 use keyframe::{DepthMap, Keyframe, Split};
-use messages::{BadInput, InsufficientData, counted};
+use messages::{BadInput, InsufficientData, Setting, counted};
 use serde::Serialize;
 use sha2::{Digest, Sha256};
 use std::path::{Path, PathBuf};
@@ -36,7 +36,7 @@ pub struct RenderedDepth {
 impl DepthSource {
     /// The model in a folder, or in a single file of splats.
     pub fn find(model: &Path) -> anyhow::Result<Self> {
-        let invalid = |error: anyhow::Error| BadInput(format!("--depth-from: {error:#}"));
+        let invalid = |error: anyhow::Error| BadInput(format!("{}: {error:#}", Setting::DepthFrom));
         run_folder::expect_model(model).map_err(invalid)?;
         let sha256 = if model.is_file() {
             let bytes = files::read(model, files::Budget::PLAIN)
@@ -61,7 +61,7 @@ impl DepthSource {
     ) -> anyhow::Result<RenderedDepth> {
         let model_name = self.model.display();
         let mut model = methods::load(gpu, &self.model)
-            .with_context(|| format!("--depth-from {model_name}"))?
+            .with_context(|| format!("{} {model_name}", Setting::DepthFrom))?
             .method;
         let mut totals = Filled::default();
         let mut n_images = 0;
@@ -88,7 +88,8 @@ impl DepthSource {
         if totals.n_missing > 0 && totals.n_rendered == 0 {
             let message = "the model is not visible in any image that lacks depth";
             return Err(InsufficientData(format!(
-                "--depth-from {model_name}: {message}; {CHECK_SAME_SCENE}"
+                "{} {model_name}: {message}; {CHECK_SAME_SCENE}",
+                Setting::DepthFrom
             ))
             .into());
         }
@@ -100,7 +101,10 @@ impl DepthSource {
         );
         match (totals.n_missing, rendered_frac) {
             (0, _) => {
-                log::warn!("--depth-from {model_name} has no effect: no training image lacks depth")
+                log::warn!(
+                    "{} {model_name} has no effect: no training image lacks depth",
+                    Setting::DepthFrom
+                );
             }
             (_, frac) if frac < MIN_COVERED_FRAC => log::warn!("{message}; {CHECK_SAME_SCENE}"),
             _ => log::info!("{message}"),
@@ -118,19 +122,19 @@ impl DepthSource {
 ///
 /// `subject`: name of the earlier result in messages.
 pub fn check_same(subject: &str, before: Option<&str>, now: Option<&str>) -> anyhow::Result<()> {
-    match (before, now) {
-        (before, now) if before == now => Ok(()),
-        (None, _) => Err(BadInput(format!(
-            "{subject} was made without --depth-from: remove the flag"
-        )).into()),
-        (Some(before), None) => Err(BadInput(format!(
-            "{subject} used depth rendered from the model with the SHA-256 {before}: give that model with --depth-from"
-        )).into()),
-        (Some(before), Some(now)) => Err(BadInput(format!(
+    let setting = Setting::DepthFrom;
+    let message = match (before, now) {
+        (before, now) if before == now => return Ok(()),
+        (None, _) => format!("{subject} was made without {setting}: remove the flag"),
+        (Some(before), None) => format!(
+            "{subject} used depth rendered from the model with the SHA-256 {before}: give that model with {setting}"
+        ),
+        (Some(before), Some(now)) => format!(
             "{subject} used depth rendered from the model with the SHA-256 {before}, but the model given with \
-             --depth-from has {now}"
-        )).into()),
-    }
+             {setting} has {now}"
+        ),
+    };
+    Err(BadInput(message).into())
 }
 
 /// Pixel counts of one or several keyframes.

@@ -38,6 +38,7 @@ mod error;
 pub mod evaluate;
 pub mod evaluation_schedule;
 mod gpu_loss;
+mod holdout;
 mod inline_picture;
 mod kept_folder;
 mod latency;

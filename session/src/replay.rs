@@ -10,7 +10,7 @@ use capture::Stop;
 use capture::config::Override;
 use keyframe::{Keyframe, KeyframeList};
 use kinematics::Stamp;
-use messages::{BadInput, InsufficientData};
+use messages::{BadInput, InsufficientData, Setting};
 use std::collections::HashMap;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -163,11 +163,14 @@ impl Replay {
         let name = self.name();
         match (self.decisions.settings.from_step, from_step) {
             (log, here) if log == here => Ok(()),
-            (None, _) => {
-                Err(BadInput(format!("{name} starts at the first step: remove --resume")).into())
-            }
+            (None, _) => Err(BadInput(format!(
+                "{name} starts at the first step: remove {}",
+                Setting::Resume
+            ))
+            .into()),
             (Some(log), None) => Err(BadInput(format!(
-                "{name} continues from step {log}: give the folder of that checkpoint with --resume"
+                "{name} continues from step {log}: give the folder of that checkpoint with {}",
+                Setting::Resume
             ))
             .into()),
             (Some(log), Some(here)) => Err(BadInput(format!(

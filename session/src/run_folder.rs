@@ -3,7 +3,7 @@
 use anyhow::{Context, bail, ensure};
 use capture::config::Rig;
 use keyframe::Keyframe;
-use messages::{BadInput, listed};
+use messages::{BadInput, Setting, listed};
 use serde::Serialize;
 use sha2::{Digest, Sha256};
 use std::ffi::OsStr;
@@ -40,7 +40,8 @@ pub fn check_no_model(folder: &Path) -> anyhow::Result<()> {
     });
     match files.find(|file| folder.join(file).exists()) {
         Some(file) => Err(BadInput(format!(
-            "--out {}: the folder already contains a model ({}); give another folder",
+            "{} {}: the folder already contains a model ({}); give another folder",
+            Setting::Out,
             folder.display(),
             file.display()
         ))
@@ -59,10 +60,13 @@ pub fn check_no_unfinished_run(out: &Path) -> anyhow::Result<()> {
         .find(|folder| folder.join(CHECKPOINT).exists())
     {
         Some(folder) => Err(BadInput(format!(
-            "--out {}: {} contains an interrupted run: continue it with --resume, or give another folder",
+            "{} {}: {} contains an interrupted run: continue it with {}, or give another folder",
+            Setting::Out,
             out.display(),
-            folder.display()
-        )).into()),
+            folder.display(),
+            Setting::Resume
+        ))
+        .into()),
         None => Ok(()),
     }
 }
@@ -74,7 +78,8 @@ pub fn check_not_data_folder(out: &Path, data: &Path) -> anyhow::Result<()> {
     let canonical = |path: &Path| path.canonicalize().ok();
     match (canonical(out), canonical(data)) {
         (Some(folder), Some(data)) if folder == data => Err(BadInput(format!(
-            "--out {}: this is the folder of the data; give another folder",
+            "{} {}: this is the folder of the data; give another folder",
+            Setting::Out,
             out.display()
         ))
         .into()),
@@ -115,9 +120,12 @@ pub fn expect_model(model: &Path) -> anyhow::Result<()> {
         }
         let has_checkpoint = model.join(CHECKPOINT).exists();
         let hint = if has_checkpoint {
-            " but has a checkpoint: train --resume continues from it"
+            format!(
+                " but has a checkpoint: train {} continues from it",
+                Setting::Resume
+            )
         } else {
-            ""
+            String::new()
         };
         bail!("{shown} contains no model{hint}");
     }
@@ -289,7 +297,8 @@ fn make(requested: Option<&Path>) -> anyhow::Result<PathBuf> {
         // `report.json` and the next commands contain the name, and JSON is UTF-8.
         if folder.to_str().is_none() {
             return Err(BadInput(format!(
-                "--out {}: the name must be valid UTF-8",
+                "{} {}: the name must be valid UTF-8",
+                Setting::Out,
                 folder.display()
             ))
             .into());
@@ -342,8 +351,9 @@ fn make_in(parent: &Path, prefix: &str) -> anyhow::Result<PathBuf> {
         }
     }
     bail!(
-        "{} and 98 numbered variants already exist: give a folder with --out",
-        parent.join(name).display()
+        "{} and 98 numbered variants already exist: give a folder with {}",
+        parent.join(name).display(),
+        Setting::Out
     )
 }
 
@@ -363,7 +373,8 @@ pub(crate) fn lock(folder: &Path) -> anyhow::Result<()> {
         Some(file) => std::mem::forget(file), // The system releases the lock when the process ends.
         None => {
             let message = format!(
-                "--out {}: another run uses this folder; give another one",
+                "{} {}: another run uses this folder; give another one",
+                Setting::Out,
                 folder.display()
             );
             return Err(BadInput(message).into());
@@ -662,7 +673,7 @@ mod tests {
             std::fs::write(at(name), b"x").expect("file");
             assert!(message(name).contains("give its folder"), "{name}");
             if name == CHECKPOINT {
-                assert!(message("").contains("--resume"));
+                assert!(message("").contains("train resume"));
             }
         }
         std::fs::write(at("splats.ply"), b"x").expect("file");

@@ -7,7 +7,7 @@ use calibration::{Alignment, CameraRefinement, ExtrinsicsCovariance, ParamSet, P
 use capture::config::{Parent, Rig};
 use keyframe::{Keyframe, Split};
 use kinematics::Transform;
-use messages::{BadInput, InsufficientData, counted};
+use messages::{InsufficientData, Setting, counted};
 use std::collections::BTreeMap;
 use std::sync::Arc;
 
@@ -110,14 +110,9 @@ pub fn calibrate_scene(
         refine: params.to_vec(),
         ..TrainingOptions::default()
     };
-    // The same rules as for training, whose messages name the flag of that command.
-    let choice = match options.refining(data.available(), Refine::Auto) {
-        Ok(settings) => without_image_poses(settings.align),
-        Err(error) => {
-            let BadInput(reason) = error.downcast()?;
-            return Err(BadInput(reason.replace("--refine", "--params")).into());
-        }
-    };
+    // The same rules as for training.
+    let settings = options.estimating(Setting::Params, data.available(), Refine::Auto)?;
+    let choice = without_image_poses(settings.align);
     // Nothing is scored here, so test images would be wasted.
     let keyframes: Vec<_> = data.keyframes.iter().map(for_calibration).collect();
     let Some(alignment) = calibration::align(&keyframes, &choice) else {

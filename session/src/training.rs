@@ -10,7 +10,7 @@ use crate::{run_folder, time_slices};
 use capture::Stop;
 use capture::config::DEFAULT_SEED;
 use keyframe::Keyframe;
-use messages::{BadInput, InsufficientData, listed};
+use messages::{BadInput, InsufficientData, Setting, listed};
 use std::path::Path;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
@@ -95,8 +95,9 @@ pub fn drive(
                 .collect();
             return Err(InsufficientData(format!(
                 "the method {} needs depth, but no training image has depth: \
-                 use `fieldrig train --depth-from` to render depth from another model of the scene, or use the method {}",
+                 use `fieldrig train {}` to render depth from another model of the scene, or use the method {}",
                 session.kind().name(),
+                Setting::DepthFrom,
                 listed(&others, "or")
             )).into());
         }
@@ -206,7 +207,8 @@ pub fn limits(
     default_secs: f64,
 ) -> anyhow::Result<Limits> {
     if seconds.is_some_and(|seconds| seconds.is_nan() || seconds < 0.0) {
-        return Err(BadInput("--seconds: must be a number of at least 0".into()).into());
+        let message = format!("{}: must be a number of at least 0", Setting::Seconds);
+        return Err(BadInput(message).into());
     }
     Ok(Limits {
         seconds: seconds.or(steps.is_none().then_some(default_secs)),

@@ -4,7 +4,7 @@
 use crate::methods::{COUNT, MAX_SPLATS, describe};
 use calibration::{CameraRefinement, ParamSet, candidates};
 use capture::Override;
-use messages::{BadInput, listed};
+use messages::{BadInput, Setting, listed};
 use trainer::ModelKind;
 use trainer::splat::CountPolicy;
 
@@ -125,22 +125,22 @@ impl TrainingOptions {
 
     /// Rejects flags for options that none of the methods has.
     pub fn check_for(&self, kinds: &[ModelKind]) -> anyhow::Result<()> {
-        let flags = [
-            (self.max_splats.is_some(), "--max-splats", MAX_SPLATS),
-            (self.count.is_some(), "--count", COUNT),
+        let settings = [
+            (self.max_splats.is_some(), Setting::MaxSplats, MAX_SPLATS),
+            (self.count.is_some(), Setting::Count, COUNT),
         ];
         let is_unused = |option: &str| !kinds.iter().any(|kind| kind.has_option(option));
-        match flags
+        match settings
             .into_iter()
             .find(|(is_given, _, option)| *is_given && is_unused(option))
         {
-            Some((_, flag, option)) => {
+            Some((_, setting, option)) => {
                 let having = ModelKind::ALL
                     .iter()
                     .filter(|kind| kind.has_option(option))
                     .map(|kind| kind.name());
                 Err(BadInput(format!(
-                    "{flag}: needs the method {}, but the method is {}",
+                    "{setting}: needs the method {}, but the method is {}",
                     listed(&having.collect::<Vec<_>>(), "or"),
                     describe(kinds)
                 ))
@@ -189,7 +189,8 @@ impl TrainingOptions {
             " without measured depth"
         };
         Err(BadInput(format!(
-            "--refine {}: the method {} cannot estimate this{without}; it supports {}",
+            "{} {}: the method {} cannot estimate this{without}; it supports {}",
+            Setting::Refine,
             unknown.name(),
             describe(kinds),
             known.join(", ")
@@ -203,6 +204,16 @@ impl TrainingOptions {
         available: AvailableData,
         default_value: Refine,
     ) -> anyhow::Result<RefineSettings> {
+        self.estimating(Setting::Refine, available, default_value)
+    }
+
+    /// As [`Self::refining`]; `setting` is the one that the user gave.
+    pub(crate) fn estimating(
+        &self,
+        setting: Setting,
+        available: AvailableData,
+        default_value: Refine,
+    ) -> anyhow::Result<RefineSettings> {
         let requested = if self.refine.is_empty() {
             std::slice::from_ref(&default_value)
         } else {
@@ -210,10 +221,8 @@ impl TrainingOptions {
         };
         let has = |param| requested.contains(&param);
         if (has(Refine::Auto) || has(Refine::None)) && requested.len() > 1 {
-            return Err(BadInput(
-                "--refine: auto and none cannot be combined with other values".into(),
-            )
-            .into());
+            let message = format!("{setting}: auto and none cannot be combined with other values");
+            return Err(BadInput(message).into());
         }
         if has(Refine::Auto) {
             return Ok(available.auto_settings());
@@ -229,10 +238,11 @@ impl TrainingOptions {
             && let Some(param) = needs_depth.into_iter().find(|param| has(*param))
         {
             let message = "needs depth images measured by a camera";
-            return Err(BadInput(format!("--refine {}: {message}", param.name())).into());
+            return Err(BadInput(format!("{setting} {}: {message}", param.name())).into());
         }
         if has(Refine::Joints) && !available.joints {
-            return Err(BadInput("--refine joints: needs a recording of an arm".into()).into());
+            let message = format!("{setting} joints: needs a recording of an arm");
+            return Err(BadInput(message).into());
         }
         let set = param_set(requested);
         // Without measured depth, features of images give a first estimate, and training with the
@@ -515,7 +525,7 @@ mod tests {
             .unwrap_err()
             .to_string();
         assert!(
-            message.contains("--max-splats") && message.contains("tsdf and nerf"),
+            message.contains("max_splats") && message.contains("tsdf and nerf"),
             "{message}"
         );
         let message = options
@@ -524,7 +534,7 @@ mod tests {
             .to_string();
         assert!(
             message.starts_with(
-                "--refine image-gains: the method tsdf cannot estimate this; it supports auto, none, base, extrinsics,"
+                "refine image-gains: the method tsdf cannot estimate this; it supports auto, none, base, extrinsics,"
             ),
             "{message}"
         );

@@ -6,6 +6,7 @@ use super::propagation::propagated;
 use super::selection::{Free, Selection, corner_fit};
 use crate::least_squares::Fit;
 use kinematics::Intrinsics;
+use messages::Setting;
 use nalgebra::{DMatrix, DVector};
 
 /// The corners contradict the given intrinsics.
@@ -52,10 +53,11 @@ impl IntrinsicsDoubt {
         }
         let change = fixed.state.solution.x.inverse() * free.state.solution.x;
         let warning = format!(
-            "the corners contradict the given intrinsics: with free intrinsics, {}, and the camera moves by {:.1} mm and {:.2} degrees, which is included in the uncertainty; calibrate the intrinsics with calibrate intrinsics, or estimate them together with the pose (--with-intrinsics)",
+            "the corners contradict the given intrinsics: with free intrinsics, {}, and the camera moves by {:.1} mm and {:.2} degrees, which is included in the uncertainty; calibrate the intrinsics with calibrate intrinsics, or estimate them together with the pose ({})",
             change_of_intrinsics(intrinsics, &free.state.intrinsics),
             1e3 * change.translation.vector.norm(),
-            change.rotation.angle().to_degrees()
+            change.rotation.angle().to_degrees(),
+            Setting::WithIntrinsics
         );
         Some(Self {
             free: free.state.solution,

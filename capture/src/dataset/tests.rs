@@ -209,7 +209,7 @@ fn photos_that_exceed_the_memory_are_refused_with_a_scale() {
     };
     let text = message(n_bytes / 4);
     assert!(
-        text.contains("10 photos take") && text.contains("scale them to 0.5 or less (--scale of"),
+        text.contains("10 photos take") && text.contains("scale them to 0.5 or less (scale of"),
         "{text}"
     );
     assert!(message(10).ends_with("use fewer photos"));

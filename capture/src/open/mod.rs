@@ -25,12 +25,18 @@ use drivers::recording::{RIG_FILE, Recorder, Recording, RecordingMetadata, URDF_
 use drivers::udp::DatagramMonitor;
 use drivers::{Live, Playback, Repeating, Sample, Source};
 use kinematics::Chain;
+use messages::Setting;
 use std::path::Path;
 use std::sync::{Arc, OnceLock};
 use tags::TagBaseSource;
 
 /// Hint in error messages about devices that cannot be opened.
-const SIM_HINT: &str = "`fieldrig run --sim` replaces every device by its simulated twin";
+fn sim_hint() -> String {
+    format!(
+        "`fieldrig run {}` replaces every device by its simulated twin",
+        Setting::Sim
+    )
+}
 
 /// The port of a Franka controller.
 pub const FCI_PORT: u16 = 1337;
@@ -132,13 +138,13 @@ pub(crate) fn rig_with_monitors(
     // The settings are checked before any device is opened, so that an error of the rig file does
     // not start cameras.
     if let Some(device) = unsupported_device(&rig) {
-        bail!("{device} cannot be opened by this version; {SIM_HINT}");
+        bail!("{device} cannot be opened by this version; {}", sim_hint());
     }
     check_arm(&rig)?;
     if devices == Devices::Sim {
         check_intrinsics(&rig)?;
     }
-    let opened = real::open(&mut rig).map_err(|error| anyhow!("{error:#}; {SIM_HINT}"));
+    let opened = real::open(&mut rig).map_err(|error| anyhow!("{error:#}; {}", sim_hint()));
     let (real, monitors) = opened?;
     let (source, stamp_clock): (Box<dyn Source>, _) = if is_any_simulated(&rig) {
         simulate(&rig, real)?
@@ -283,7 +289,8 @@ fn stored_rig(path: &Path, recording: &Recording, overrides: &[Override]) -> any
 fn stored_text<'a>(path: &Path, recording: &'a Recording, name: &str) -> anyhow::Result<&'a str> {
     let bytes = recording.attachment(name).with_context(|| {
         format!(
-            "the recording {path:?} contains no {name}, which fieldrig stores in it; if another program removed it, give the rig file with --rig to `fieldrig train`, `eval`, `export` or `calibrate`"
+            "the recording {path:?} contains no {name}, which fieldrig stores in it; if another program removed it, give the rig file with {} to `fieldrig train`, `eval`, `export` or `calibrate`",
+            Setting::Rig
         )
     })?;
     std::str::from_utf8(bytes)
@@ -422,7 +429,7 @@ mod tests {
                 .expect("no such driver")
         );
         assert!(
-            message.contains("rgbd") && message.contains("--sim"),
+            message.contains("rgbd") && message.contains("run sim`"),
             "{message}"
         );
     }
@@ -449,7 +456,7 @@ mod tests {
         let message = error_of(&on_base);
         assert!(
             message.contains("no V4L2 camera named \"no such serial\"")
-                && message.contains("--sim"),
+                && message.contains("run sim`"),
             "{message}"
         );
         let without_scale = [&on_base[..3], &on_base[5..]].concat();
@@ -501,7 +508,7 @@ mod tests {
             "--features realsense"
         };
         assert!(
-            message.contains(expected) && message.contains("--sim"),
+            message.contains(expected) && message.contains("run sim`"),
             "{message}"
         );
     }

@@ -1,4 +1,4 @@
-//! Parts of messages that all crates share: classes of errors, counts and lists.
+//! Parts of messages that all crates share: classes of errors, counts and lists, names of settings.
 //!
 //! ```
 //! use messages::{BadInput, ErrorClass, counted, listed};
@@ -11,8 +11,10 @@
 
 mod counted;
 mod error_class;
+mod setting;
 mod shortened;
 
 pub use counted::{counted, listed};
 pub use error_class::{BadInput, ErrorClass, InsufficientData};
+pub use setting::Setting;
 pub use shortened::shortened;

@@ -19,7 +19,7 @@ pub use scene::SceneReport;
 pub use time_offset::TimeOffsetReport;
 
 use crate::run_folder;
-use messages::BadInput;
+use messages::{BadInput, Setting};
 use std::path::Path;
 
 /// Heading of every report.
@@ -58,7 +58,8 @@ pub fn check_target_file(file: &Path) -> anyhow::Result<()> {
         .is_some_and(|extension| extension.eq_ignore_ascii_case("html"));
     if !folder.is_dir() || file.is_dir() || !is_page {
         return Err(BadInput(format!(
-            "--report {}: must be a file with the extension .html in an existing folder",
+            "{} {}: must be a file with the extension .html in an existing folder",
+            Setting::Report,
             file.display()
         ))
         .into());
@@ -67,7 +68,8 @@ pub fn check_target_file(file: &Path) -> anyhow::Result<()> {
     // another page.
     if is_other_file(file) {
         return Err(BadInput(format!(
-            "--report {}: the file exists and is not a report of fieldrig; choose another name",
+            "{} {}: the file exists and is not a report of fieldrig; choose another name",
+            Setting::Report,
             file.display()
         ))
         .into());

@@ -8,6 +8,7 @@ use crate::kept_folder::KeptFolder;
 use crate::recovery::Recovery;
 use keyframe::{DepthMap, Keyframe};
 use kinematics::Stamp;
+use messages::Setting;
 use std::path::Path;
 use std::sync::Arc;
 use trainer::checkpoint::Checkpoint;
@@ -233,7 +234,10 @@ impl Persistence {
     pub(super) fn describe_unsaved(&mut self) -> String {
         match self.describe_recoverable() {
             Some(left) if self.has_checkpoint() => {
-                format!("{left}; use --out to save the model in another folder")
+                format!(
+                    "{left}; use {} to save the model in another folder",
+                    Setting::Out
+                )
             }
             Some(left) => left,
             None => "there is no checkpoint either".to_owned(),

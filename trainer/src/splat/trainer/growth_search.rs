@@ -19,6 +19,7 @@ use crate::splat::views::Level;
 use crate::view::depth_in_color_view;
 use crate::{Error, Method};
 use calibration::{CameraCorrection, Candidate, MIN_VALIDATION_IMAGES};
+use messages::Setting;
 use std::collections::{BTreeMap, VecDeque};
 use std::sync::Arc;
 
@@ -83,7 +84,8 @@ impl SplatTrainer {
         match advanced {
             Err(error) if error.is_out_of_memory() => {
                 log::warn!(
-                    "cross-validation stopped, so the number of splats is limited only by --max-splats: {error}"
+                    "cross-validation stopped, so the number of splats is limited only by {}: {error}",
+                    Setting::MaxSplats
                 );
                 self.abort_growth_search()?;
                 self.growth_search = GrowthSearch::Off;

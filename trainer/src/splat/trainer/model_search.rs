@@ -7,6 +7,7 @@ use crate::splat::snapshot::Snapshot;
 use crate::splat::trials::{Due, SecondHalf, TrialContext, TrialEnd};
 use calibration::Candidate;
 use keyframe::Keyframe;
+use messages::Setting;
 use std::sync::Arc;
 
 impl SplatTrainer {
@@ -155,7 +156,8 @@ impl SplatTrainer {
     pub(super) fn cancel_trial(&mut self) -> Result<(), Error> {
         if self.growth_search.running().is_some() {
             log::warn!(
-                "training stopped while the number of splats was tested; more time or --count to-cap gives a better model"
+                "training stopped while the number of splats was tested; more time or {} to-cap gives a better model",
+                Setting::Count
             );
         }
         self.abort_growth_search()?;
