@@ -328,7 +328,8 @@ impl Data {
                 "{}: no pixel of any image can be used: masks, transparency or lens parameters exclude all of them (black in \
                  a mask means \"do not use\")",
                 path.display()
-            )).into());
+            ))
+            .into());
         }
         if n_masked > 0 {
             let n_images = counted(n_masked as u64, "image");

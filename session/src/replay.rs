@@ -122,7 +122,8 @@ impl Replay {
                 return Err(InsufficientData(format!(
                     "image {stamp} of camera {camera:?} differs in pixels, depth, intrinsics or pose between {shown} \
                      and {name}"
-                )).into());
+                ))
+                .into());
             }
         }
         Ok(())
@@ -146,14 +147,16 @@ impl Replay {
             (log, here) if log == here => Ok(()),
             (None, _) => Err(InsufficientData(format!(
                 "{name} starts without points: remove ply_file_path from transforms.json"
-            )).into()),
+            ))
+            .into()),
             (Some(log), here) => Err(InsufficientData(format!(
                 "{name} starts from points with the SHA-256 {log}, but the data {}: restore the file of ply_file_path",
                 here.map_or_else(
                     || "has no points".to_owned(),
                     |here| format!("has points with {here}")
                 )
-            )).into()),
+            ))
+            .into()),
         }
     }
 

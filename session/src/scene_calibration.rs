@@ -124,7 +124,8 @@ pub fn calibrate_scene(
         };
         return Err(InsufficientData(format!(
             "the cameras cannot be calibrated from {n_images}: too few of them show the same surfaces{needed}. Move the camera around the scene, and turn it about all of its axes"
-        )).into());
+        ))
+        .into());
     };
     let mut refused: BTreeMap<String, Vec<String>> = BTreeMap::new();
     for direction in &alignment.unobservable {

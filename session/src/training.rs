@@ -99,7 +99,8 @@ pub fn drive(
                 session.kind().name(),
                 Setting::DepthFrom,
                 listed(&others, "or")
-            )).into());
+            ))
+            .into());
         }
     }
     let is_done = |session: &Session| session.is_over() || session.is_idle();
