@@ -1,8 +1,8 @@
 //! Opens the devices of a rig that are not simulated.
 
+#[cfg(target_os = "linux")]
 use crate::config::Depth;
 use crate::config::{ArmDriver, ArmMotion, BaseDriver, Camera, CameraDriver, Rig, ScannerDriver};
-#[cfg(target_os = "linux")]
 use anyhow::{Context, bail};
 #[cfg(target_os = "linux")]
 use drivers::can::odrive::Endpoints;
