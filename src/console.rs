@@ -2,7 +2,7 @@
 
 use crate::print;
 use indicatif::ProgressBar;
-use keyframe::counted;
+use messages::counted;
 use parking_lot::Mutex;
 use serde::Serialize;
 use session::next_commands::{self, SavedModel};

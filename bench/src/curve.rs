@@ -4,8 +4,9 @@ use crate::findings::{BenchResult, Findings};
 use crate::peer::Peer;
 use crate::runs::{Host, Job, NamedData, Run, Runs, RunsOptions};
 use crate::statistics::{extent, sample_std, secs_to};
-use crate::{Error, Result};
+use anyhow::Result;
 use kinematics::quantile::median;
+use messages::{BadInput, Setting};
 use report::Table;
 use report::chart::{Axis, Chart, Line, Point, Scale, compact_number};
 use serde::Serialize;
@@ -103,7 +104,7 @@ struct TimeToQuality {
 pub fn run(options: &CurveOptions, host: &Host<'_>) -> Result<BenchResult> {
     let limits = session::limits(Some(options.seconds), None, DEFAULT_SECONDS)?;
     if options.seconds == 0.0 {
-        return Err(Error::BadInput("--seconds: must be above 0".into()));
+        return Err(BadInput(format!("{}: must be above 0", Setting::Seconds)).into());
     }
     let peers = options
         .peers

@@ -1,13 +1,13 @@
 //! Memory use of a long run by component, and its growth rate once the keyframe store is full.
 
-use crate::Result;
 use crate::findings::Findings;
 use crate::growth::{Excluded, Growth, Sample, resident_bytes};
 use crate::statistics::extent;
 use crate::viewer::Viewer;
+use anyhow::Result;
 use gpu::Gpu;
-use keyframe::counted;
 use kinematics::quantile::{Rank, quantile};
+use messages::counted;
 use report::Table;
 use report::chart::{Axis, Chart, Line, Marker, Point, Scale};
 use session::Live;

@@ -1,6 +1,6 @@
 //! Errors of calibration.
 
-use keyframe::ErrorClass;
+use messages::ErrorClass;
 
 /// An error of calibration.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]

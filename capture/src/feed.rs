@@ -1,12 +1,12 @@
 //! The input side of a run: a thread reads the source, records and joins the samples, and corrects
 //! base poses at stations. Keyframes are delivered through a bounded queue.
 
-use crate::error::{Context, Error};
 use crate::join::{Change, Join, JoinEvent, PosedImage};
 use crate::robot_motion::RobotMotion;
 use crate::stamp_clock::StampClock;
 use crate::stations::Stations;
 use crate::stop::Stop;
+use anyhow::{Context, anyhow};
 use drivers::recording::Recorder;
 use drivers::{PixelFormat, Sample, Source};
 use keyframe::{LiveImage, LivePixels, RangePoints, RangeScan, RobotState};
@@ -102,7 +102,7 @@ pub struct InputResult {
     /// Error that ended the input early.
     pub input_error: Option<drivers::Error>,
     /// Error that ended the recording early.
-    pub recording_error: Option<crate::Error>,
+    pub recording_error: Option<anyhow::Error>,
 }
 
 /// The running input.
@@ -124,7 +124,7 @@ impl Feed {
         input: Input,
         observer: Box<dyn InputObserver>,
         stop: Stop,
-    ) -> crate::Result<Self> {
+    ) -> anyhow::Result<Self> {
         let (sender, changes) = sync_channel(MAX_WAITING);
         let shared = Arc::new(Shared::default());
         let pump = Pump {
@@ -189,12 +189,12 @@ impl Feed {
     /// # Errors
     ///
     /// If the thread panicked, which is a bug.
-    pub fn finish(self) -> crate::Result<InputResult> {
+    pub fn finish(self) -> anyhow::Result<InputResult> {
         // Wakes an input thread that is waiting to send.
         drop(self.changes);
         self.thread
             .join()
-            .map_err(|_| Error::Failed("the input thread panicked: this is a bug".into()))
+            .map_err(|_| anyhow!("the input thread panicked: this is a bug"))
     }
 }
 
@@ -275,14 +275,14 @@ impl Pump {
 
     /// Records a sample. If the recording fails, for example because the disk is full, it ends, and
     /// the run continues.
-    fn record(&mut self, sample: &Sample, recording_error: &mut Option<Error>) {
+    fn record(&mut self, sample: &Sample, recording_error: &mut Option<anyhow::Error>) {
         if recording_error.is_some() {
             return;
         }
         if let Some(recorder) = &mut self.input.recorder
             && let Err(error) = recorder.write(sample)
         {
-            let error = Error::from(error);
+            let error = anyhow::Error::from(error);
             log::error!("the recording ends here, the run continues: {error:#}");
             *recording_error = Some(error);
         }

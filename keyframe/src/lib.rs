@@ -31,10 +31,7 @@
 //! # Ok::<(), keyframe::Error>(())
 //! ```
 
-mod context;
-mod counted;
 mod error;
-mod error_class;
 mod fingerprint;
 mod holdout;
 mod keyframe;
@@ -45,10 +42,7 @@ mod range_points;
 pub mod scenes;
 mod shutter;
 
-pub use context::write_chain;
-pub use counted::{counted, listed};
 pub use error::Error;
-pub use error_class::ErrorClass;
 pub use fingerprint::fingerprint;
 pub use holdout::Holdout;
 pub use keyframe::{BaseState, DepthMap, Keyframe, Split, Truth};

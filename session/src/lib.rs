@@ -18,7 +18,7 @@
 //! // Every 10th image is a test image.
 //! let options = DataOptions { holdout: Some("10".into()), ..DataOptions::default() };
 //! assert!(options.holdout()?.is_some());
-//! # Ok::<(), session::Error>(())
+//! # Ok::<(), anyhow::Error>(())
 //! ```
 
 pub mod camera_list;
@@ -36,6 +36,7 @@ mod error;
 pub mod evaluate;
 pub mod evaluation_schedule;
 mod gpu_loss;
+mod holdout;
 mod kept_folder;
 mod latency;
 mod ledger;
@@ -68,7 +69,7 @@ pub use clock::Clock;
 pub use data::{Data, DataOptions, Purpose, expect, points_sha256};
 pub use dataset_export::{Written, write_nerfstudio};
 pub use decisions::{DecisionLog, RunDescription, Settings};
-pub use error::{Context, Error, Result};
+pub use error::{class, is_gpu_error, is_gpu_unrecoverable};
 pub use evaluate::Evaluator;
 pub use gpu_loss::lose_gpu_at_step;
 pub use kept_folder::KeptFolder;

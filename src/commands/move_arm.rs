@@ -1,6 +1,6 @@
 //! `fieldrig move`: moves an arm to given joint positions, within its limits, under supervision.
 
-use crate::exit::{BadArgument, Exit};
+use crate::exit::Exit;
 use crate::{print, signals};
 use anyhow::bail;
 use capture::config::Rig;
@@ -9,6 +9,7 @@ use drivers::clock;
 use drivers::motion::{JointTarget, OnLoss};
 use indicatif::ProgressBar;
 use kinematics::{JointState, Stamp};
+use messages::BadInput;
 use serde::Serialize;
 use std::path::PathBuf;
 
@@ -129,12 +130,12 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     Ok(Exit::Done)
 }
 
-fn check(args: &Args, rig: &Rig) -> Result<(), BadArgument> {
+fn check(args: &Args, rig: &Rig) -> Result<(), BadInput> {
     let joints = &rig.arm.joints;
     if let Some(to) = args.to.as_ref().filter(|to| to.len() != joints.len()) {
         let n = to.len();
         let names = joints.join(", ");
-        return Err(BadArgument(format!(
+        return Err(BadInput(format!(
             "--to has {n} positions, the arm has {} joints: {names}",
             joints.len()
         )));
@@ -144,7 +145,7 @@ fn check(args: &Args, rig: &Rig) -> Result<(), BadArgument> {
         .iter()
         .find(|joint| args.by.iter().filter(|(by, _)| by == *joint).count() > 1)
     {
-        return Err(BadArgument(format!("--by: joint {joint:?} is given twice")));
+        return Err(BadInput(format!("--by: joint {joint:?} is given twice")));
     }
     if let Some((joint, _)) = args.by.iter().find(|(joint, _)| !joints.contains(joint)) {
         let available = if joints.is_empty() {
@@ -152,7 +153,7 @@ fn check(args: &Args, rig: &Rig) -> Result<(), BadArgument> {
         } else {
             joints.join(", ")
         };
-        return Err(BadArgument(format!(
+        return Err(BadInput(format!(
             "--by: unknown joint {joint:?}; joints of the arm: {available}"
         )));
     }
@@ -175,7 +176,7 @@ fn check_range(rig: &Rig, requested: &JointTarget, now: &JointState) -> anyhow::
         if (requested - now).abs() > TOLERANCE_RAD
             && !(lower - TOLERANCE_RAD..=upper + TOLERANCE_RAD).contains(&requested)
         {
-            return Err(BadArgument(format!(
+            return Err(BadInput(format!(
                 "joint {joint:?}: target {requested:.4} is outside its range of {lower:.4} to {upper:.4}; the joint is at {now:.4}, and nothing was moved"
             ))
             .into());

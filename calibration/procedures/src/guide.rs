@@ -123,7 +123,7 @@ impl<'a> Guide<'a> {
                 let [x, y, z] = guidance.span_deg;
                 let so_far = format!(
                     "{} with the target, rotated by {x:.0}, {y:.0} and {z:.0} degrees about the {body}'s x, y and z axes",
-                    keyframe::counted(guidance.n_poses as u64, "pose")
+                    messages::counted(guidance.n_poses as u64, "pose")
                 );
                 (
                     so_far,

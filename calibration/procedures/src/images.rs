@@ -5,6 +5,7 @@ use crate::host::Host;
 use calibration::{BoardPoint, BoardView};
 use capture::CalibrationImage;
 use image::ImageReader;
+use messages::BadInput;
 use rayon::prelude::*;
 use report::calibration_report::{Photo, Photos, Unused};
 use session::ReadProgress;

@@ -2,6 +2,7 @@
 
 use crate::error::BadInput;
 use kinematics::{Transform, transform};
+use messages::BadInput;
 use serde::de::{Deserialize, Deserializer, Error as _, MapAccess, SeqAccess, Visitor};
 use serde_json::{Map, Value};
 use std::fmt::Formatter;

@@ -3,6 +3,7 @@
 use crate::error::BadInput;
 use crate::json_object::JsonObject;
 use kinematics::{Intrinsics, Lens};
+use messages::BadInput;
 use nalgebra::DMatrix;
 use serde::Serialize;
 

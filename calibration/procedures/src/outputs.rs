@@ -1,11 +1,11 @@
 //! Files that calibrations write: a rig file with the result, and a report.
 
-use crate::error::{BadInput, is_refusal};
 use anyhow::Context;
+use crate::error::{BadInput, is_refusal};
 use calibration::hand_eye::{JointOffset, Setup};
 use capture::config::{Camera, Parent, Rig};
-use keyframe::listed;
 use kinematics::{Intrinsics, Transform};
+use messages::{BadInput, listed};
 use nalgebra::DMatrix;
 use report::calibration_report::{Heading, is_report};
 use session::{Data, DataOptions, corrected_rig, run_folder};
@@ -128,7 +128,7 @@ impl RigOptions {
     /// The camera with the given name, or the only one.
     pub(crate) fn camera_of<'a>(&self, rig: &'a Rig) -> anyhow::Result<&'a Camera> {
         match (&self.camera, &rig.cameras[..]) {
-            (Some(name), _) => Ok(corrected_rig::camera(rig, name)?),
+            (Some(name), _) => corrected_rig::camera(rig, name),
             (None, [only]) => Ok(only),
             (None, cameras) => {
                 let names: Vec<&str> = cameras.iter().map(|camera| &*camera.name).collect();
@@ -172,10 +172,7 @@ impl RigOutput {
 
     /// Rejects images of another size than those of the camera.
     pub(crate) fn expect_size(&self, size_px: [u32; 2]) -> anyhow::Result<()> {
-        Ok(corrected_rig::expect_size(
-            corrected_rig::camera(&self.rig, &self.camera)?,
-            size_px,
-        )?)
+        corrected_rig::expect_size(corrected_rig::camera(&self.rig, &self.camera)?, size_px)
     }
 
     pub(crate) fn set_intrinsics(

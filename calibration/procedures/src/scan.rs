@@ -17,6 +17,7 @@ use capture::{
     ArmDuringImage, CalibrationImage, CalibrationImages, StampClock, calibration_images,
 };
 use kinematics::{Chain, Intrinsics, Stamp, Transform};
+use messages::{BadInput, InsufficientData};
 use nalgebra::DMatrix;
 use report::calibration_report::{Photo, Photos, Unused};
 use session::{ReadProgress, corrected_rig};
@@ -149,14 +150,14 @@ impl RigOptions {
             Vec::new()
         };
         let rig = Rig::load(rig_file, &overrides)?;
-        Ok(open::rig(
+        open::rig(
             rig,
             if self.sim {
                 Devices::Sim
             } else {
                 Devices::Real
             },
-        )?)
+        )
     }
 
     /// Reads images. From devices, the target is detected at once, to tell what to do next.
@@ -215,7 +216,7 @@ fn no_images(input: &Path, rig: &Rig, camera: &Camera, found: &CalibrationImages
     match (found.n_read, found.n_fast) {
         (0, _) => {
             let names: Vec<&str> = rig.cameras.iter().map(|camera| &*camera.name).collect();
-            let names = keyframe::listed(&names, "and");
+            let names = messages::listed(&names, "and");
             format!(
                 "{input}: no image of camera {name:?}; the cameras of the rig are {names}: choose one with --camera"
             )

@@ -2,7 +2,7 @@
 
 use super::station_detector::StationDetector;
 use crate::config::{self, BaseDriver, Parent, Rig};
-use crate::error::Context;
+use anyhow::Context;
 use drivers::BasePose;
 use keyframe::BaseState;
 use kinematics::urdf::JointLimits;
@@ -112,7 +112,7 @@ impl CameraPose {
 
 impl Motion {
     /// The motion of the robot of a rig, without readings.
-    pub(crate) fn new(rig: &Rig) -> crate::Result<Self> {
+    pub(crate) fn new(rig: &Rig) -> anyhow::Result<Self> {
         let chain = Chain::from_urdf(&rig.arm.urdf_text, &rig.arm.base_link, &rig.arm.flange_link)
             .context("the arm's URDF")?;
         let order = chain.order_in(&rig.arm.joints).context("arm.joints")?;

@@ -20,7 +20,7 @@ const POLL_PERIOD: Duration = Duration::from_millis(2);
 impl Live {
     /// Pushes new keyframes to the models: all waiting keyframes in real time, or the keyframe that
     /// is due in lockstep. Does nothing during an evaluation.
-    pub(super) fn take_keyframes(&mut self) -> crate::Result<()> {
+    pub(super) fn take_keyframes(&mut self) -> anyhow::Result<()> {
         if self.is_scoring() {
             return Ok(());
         }
@@ -55,7 +55,7 @@ impl Live {
     }
 
     /// Takes all keyframes that wait in the queue. Waits for one if there is nothing to train.
-    fn take_waiting_keyframes(&mut self) -> crate::Result<()> {
+    fn take_waiting_keyframes(&mut self) -> anyhow::Result<()> {
         if !self.is_training() || self.is_idle() || self.requests.is_paused {
             let first = self.wait_for_change();
             first.map_or(Ok(()), |item| self.apply(item))?;
@@ -67,7 +67,7 @@ impl Live {
     }
 
     /// Takes keyframes as long as one is due at the current steps of the models.
-    fn take_due_keyframes(&mut self, steps_per_keyframe: u64) -> crate::Result<()> {
+    fn take_due_keyframes(&mut self, steps_per_keyframe: u64) -> anyhow::Result<()> {
         while !self.feed.ended() && self.is_keyframe_due() {
             let Some(item) = self.wait_for_change() else {
                 break;
@@ -86,7 +86,7 @@ impl Live {
     }
 
     /// Applies the results of alignments that are ready.
-    fn apply_alignments(&mut self) -> crate::Result<()> {
+    fn apply_alignments(&mut self) -> anyhow::Result<()> {
         let mut is_applied = false;
         for session in &mut self.sessions {
             is_applied |= session.poll_alignment(false)?;
@@ -135,7 +135,7 @@ impl Live {
         self.sessions.iter().zip(&self.next_keyframe_at).all(is_due)
     }
 
-    fn apply(&mut self, FeedItem { change, times }: FeedItem) -> crate::Result<()> {
+    fn apply(&mut self, FeedItem { change, times }: FeedItem) -> anyhow::Result<()> {
         match change {
             Change::Accepted(keyframe) => self.add_keyframe(keyframe, times),
             Change::Evicted { camera, stamp } => self.remove_keyframe(&camera, stamp),
@@ -147,7 +147,7 @@ impl Live {
         &mut self,
         keyframe: Arc<Keyframe>,
         times: Option<InputTimes>,
-    ) -> crate::Result<()> {
+    ) -> anyhow::Result<()> {
         let keyframe = match &mut self.keyframe_change {
             Some(change) => change(keyframe),
             None => keyframe,
@@ -187,7 +187,7 @@ impl Live {
     }
 
     /// Removes an evicted keyframe from the models.
-    fn remove_keyframe(&mut self, camera: &Arc<str>, stamp: Stamp) -> crate::Result<()> {
+    fn remove_keyframe(&mut self, camera: &Arc<str>, stamp: Stamp) -> anyhow::Result<()> {
         self.n_evicted += 1;
         self.keyframes
             .retain(|keyframe| keyframe.camera != *camera || keyframe.stamp != stamp);

@@ -196,7 +196,7 @@ impl Live {
     }
 
     /// Runs one cycle: takes keyframes, trains, draws and publishes. Reopens the GPU if it fails.
-    pub fn advance(&mut self) -> crate::Result<()> {
+    pub fn advance(&mut self) -> anyhow::Result<()> {
         self.warn_without_keyframes();
         // Requests of operators come first, so that the pictures and the status of this cycle
         // already show their effect.
@@ -215,7 +215,7 @@ impl Live {
     }
 
     /// Waits for queued work. Reopens the GPU if it failed, and returns whether it did.
-    pub fn wait(&mut self) -> crate::Result<bool> {
+    pub fn wait(&mut self) -> anyhow::Result<bool> {
         match self.sessions.iter().try_for_each(Session::wait) {
             Ok(()) => Ok(false),
             Err(error) => self
@@ -232,7 +232,7 @@ impl Live {
 
     /// Trains for one slice once there are enough keyframes. During an evaluation, scores one test
     /// image instead. Does not train if a requested picture may be drawn now.
-    fn step(&mut self) -> crate::Result<()> {
+    fn step(&mut self) -> anyhow::Result<()> {
         // Checked even if no steps are made: callbacks may report a lost device at any time, and an
         // idle run must recover, too.
         self.sessions.iter().try_for_each(Session::check_gpu)?;
@@ -269,7 +269,7 @@ impl Live {
     }
 
     /// Trains the next model for one slice.
-    fn train_slice(&mut self) -> crate::Result<()> {
+    fn train_slice(&mut self) -> anyhow::Result<()> {
         // A picture waits for the submit in progress, so submits are shorter while clients are
         // connected.
         let is_watched = self.hub.n_clients() > 0;
@@ -302,7 +302,7 @@ impl Live {
     }
 
     /// Ends the input and a search for floaters. Returns the sessions and the results of the input.
-    pub fn finish(mut self) -> (Vec<Session>, crate::Result<InputResult>) {
+    pub fn finish(mut self) -> (Vec<Session>, anyhow::Result<InputResult>) {
         // Changes only the state; the rest of the status stays visible until the scores are
         // published.
         self.hub.set_state("saving");
@@ -310,7 +310,7 @@ impl Live {
             self.publish_status();
             self.hub.set_state("saving");
         }
-        (self.sessions, self.feed.finish().map_err(Into::into))
+        (self.sessions, self.feed.finish())
     }
 
     /// Why there is no model of this method.

@@ -28,7 +28,7 @@ impl Live {
     }
 
     /// Draws requested pictures as long as training keeps its share of the time.
-    pub(super) fn render(&mut self) -> crate::Result<()> {
+    pub(super) fn render(&mut self) -> anyhow::Result<()> {
         let started = Instant::now();
         if !self.is_training() || self.is_idle() || self.requests.is_paused {
             self.budget.refill(); // Training is idle, so drawing does not delay it.
@@ -88,7 +88,7 @@ impl Live {
     ///
     /// Only for a single model in real time, where this needs no other work: several models would
     /// need a choice of the next one, and lockstep the check whether a keyframe is due.
-    fn queue_steps(&mut self) -> crate::Result<()> {
+    fn queue_steps(&mut self) -> anyhow::Result<()> {
         let is_training =
             self.is_training() && !self.is_idle() && !self.is_scoring() && !self.requests.is_paused;
         if self.pace != Pace::RealTime || !is_training {

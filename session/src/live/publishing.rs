@@ -130,7 +130,7 @@ impl Live {
     }
 
     /// Publishes the status of the run to viewers, a few times per second.
-    pub(super) fn publish(&mut self) -> crate::Result<()> {
+    pub(super) fn publish(&mut self) -> anyhow::Result<()> {
         if self
             .publishing
             .status_at

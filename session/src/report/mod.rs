@@ -41,7 +41,7 @@ pub(crate) struct Page<'a> {
 
 impl Page<'_> {
     /// Writes the page into the folder.
-    pub(crate) fn write(&self) -> crate::Result<()> {
+    pub(crate) fn write(&self) -> anyhow::Result<()> {
         run_folder::write_atomic(&self.folder.join(FILE), &self.html())
     }
 

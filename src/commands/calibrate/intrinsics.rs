@@ -2,11 +2,12 @@
 
 use super::flags::{ReportFlag, RigFlags};
 use super::target_argument;
-use super::terminal::Terminal;
 use crate::exit::{BadArgument, Exit};
+use super::terminal::Terminal;
 use crate::print;
 use calibrate::{IntrinsicsTask, LensFile};
 use calibration::{ImageGrid, IntrinsicsCalibration, LensModel, LensTrial};
+use messages::InsufficientData;
 use report::calibration_report::Unused;
 use serde::Serialize;
 use std::collections::BTreeMap;

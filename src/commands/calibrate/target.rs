@@ -1,10 +1,10 @@
 //! `fieldrig calibrate target`: writes a calibration target to print.
 
 use super::target_argument;
-use crate::exit::BadArgument;
 use crate::print;
 use anyhow::Context;
 use calibrate::symmetry_warning;
+use messages::BadInput;
 use std::path::PathBuf;
 use targets::{Paper, TargetSpec};
 
@@ -31,7 +31,7 @@ pub(crate) struct Args {
 /// Writes the PDF file.
 pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
     // All errors below are about the arguments, so nothing is written before they are checked.
-    let bad = |error: targets::PrintError| BadArgument(error.to_string());
+    let bad = |error: targets::PrintError| BadInput(error.to_string());
     let paper: Paper = args.paper.parse().map_err(bad)?;
     let pdf = args.target.pdf(paper).map_err(bad)?;
     if args
@@ -39,13 +39,11 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
         .extension()
         .is_none_or(|extension| !extension.eq_ignore_ascii_case("pdf"))
     {
-        return Err(
-            BadArgument(format!("--out {}: must end with .pdf", args.out.display())).into(),
-        );
+        return Err(BadInput(format!("--out {}: must end with .pdf", args.out.display())).into());
     }
     // An old file may describe a printed target that is still in use, so it is never replaced.
     if args.out.exists() {
-        return Err(BadArgument(format!("{} exists", args.out.display())).into());
+        return Err(BadInput(format!("{} exists", args.out.display())).into());
     }
     // Only a warning: the target still serves for the lens.
     if let Some(warning) = symmetry_warning(&args.target) {

@@ -3,11 +3,12 @@
 use super::flags::ReportFlag;
 use super::{matrix_of, print_matrix};
 use crate::commands::number_in_range;
-use crate::exit::{self, Exit, InsufficientData};
+use crate::exit::{self, Exit};
 use crate::print;
 use calibrate::{TimeOffsetOutcome, TimeOffsetTask};
 use calibration::hand_eye::Refusal;
 use calibration::time_offset::{TimeOffset, TimeOffsetOptions};
+use messages::{BadInput, InsufficientData};
 use serde::Serialize;
 use std::path::PathBuf;
 

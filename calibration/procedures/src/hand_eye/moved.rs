@@ -16,6 +16,7 @@ use capture::open::{self, Devices};
 use capture::{ArmCapture, ArmDuringImage, CalibrationImage, HOLDING, Stop};
 use drivers::motion::OnLoss;
 use kinematics::{Chain, Transform};
+use messages::{BadInput, InsufficientData};
 use report::calibration_report::{Photo, Photos};
 use std::path::Path;
 use targets::{GrayImage, TargetSpec};
@@ -98,7 +99,7 @@ impl MovedArm {
         // The next Ctrl-C ends the hold in order, even if an earlier one has stopped the motion.
         self.stop.rearm("ending; the motors no longer hold the arm");
         log::info!("{HOLDING}");
-        Ok(self.capture.hold(&self.stop)?)
+        self.capture.hold(&self.stop)
     }
 }
 

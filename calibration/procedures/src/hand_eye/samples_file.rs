@@ -9,6 +9,7 @@ use crate::outputs;
 use calibration::hand_eye::{BoardObservation, HandEyeSample, Setup};
 use capture::camera_info;
 use kinematics::{Intrinsics, Transform};
+use messages::{BadInput, InsufficientData};
 use nalgebra::DMatrix;
 use report::calibration_report::{Photos, Unused};
 use std::collections::BTreeMap;

@@ -6,6 +6,7 @@ use crate::host::Host;
 use crate::scan::Scan;
 use calibration::hand_eye::Setup;
 use kinematics::{Chain, Intrinsics, Transform};
+use messages::InsufficientData;
 use nalgebra::DMatrix;
 use targets::TargetSpec;
 

@@ -5,11 +5,12 @@ mod printed;
 
 use super::flags::{ReportFlag, RigFlags};
 use super::target_argument;
-use super::terminal::Terminal;
 use crate::commands::number_in_range;
-use crate::exit::{self, BadArgument, Exit};
+use crate::exit::{self, Exit};
+use super::terminal::Terminal;
 use crate::print;
 use calibrate::{HandEyeSamples, HandEyeTask, Host, MotionOptions, RobotOptions};
+use messages::{BadInput, InsufficientData};
 use printed::{Printed, PrintedPose, PrintedSample};
 use std::path::PathBuf;
 use targets::TargetSpec;
@@ -145,7 +146,7 @@ fn calibrate_and_print(
 }
 
 impl Args {
-    fn task(&self) -> Result<HandEyeTask, BadArgument> {
+    fn task(&self) -> Result<HandEyeTask, BadInput> {
         // clap accepts only both of them.
         let robot = self.urdf.as_ref().zip(self.tip.as_ref());
         Ok(HandEyeTask {

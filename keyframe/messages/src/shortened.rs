@@ -1,18 +1,18 @@
-//! Shortens lists in messages. It is in this crate because all crates with such messages depend on
-//! this crate.
+//! Shortens lists in messages.
 
 use std::fmt::Display;
 
 /// The first `max` items of a list, and the number of the others: `a, b, c and 7 more`.
 ///
 /// ```
-/// use kinematics::shortened;
+/// use messages::shortened;
 ///
 /// assert_eq!(shortened(&["a", "b", "c"], 3, ", "), "a, b, c");
 /// assert_eq!(shortened(&["a", "b", "c"], 1, ", "), "a and 2 more");
 /// // Items that contain commas themselves are separated by something else.
 /// assert_eq!(shortened(&["a: 1, 2", "b: 3, 4", "c"], 2, "; "), "a: 1, 2; b: 3, 4; and 1 more");
 /// ```
+#[must_use]
 pub fn shortened<T: Display>(items: &[T], max: usize, separator: &str) -> String {
     let shown: Vec<String> = items.iter().take(max).map(T::to_string).collect();
     let shown = shown.join(separator);
