@@ -16,7 +16,7 @@ use kinematics::random::Random;
 use nalgebra::{UnitQuaternion, UnitVector3, Vector3};
 use serde::Serialize;
 use session::chart::{Axis, Chart, Line, Point, Scale};
-use session::{KeyframeTimes, Latency, Live, Table};
+use session::{KeyframeTimes, Latency, LiveLoop, Table};
 use std::collections::{BTreeMap, BTreeSet};
 use std::fmt;
 use std::time::Duration;
@@ -146,7 +146,7 @@ impl LiveRun {
     #[must_use]
     pub fn of(
         conditions: Conditions,
-        live: &Live,
+        live: &LiveLoop,
         viewers: &[Viewer],
         timeline: &Timeline,
     ) -> Self {

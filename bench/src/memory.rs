@@ -8,7 +8,7 @@ use crate::viewer::Viewer;
 use keyframe::counted;
 use kinematics::quantile::{Rank, quantile};
 use session::chart::{Axis, Chart, Line, Marker, Point, Scale};
-use session::{Live, Table};
+use session::{LiveLoop, Table};
 use std::collections::BTreeMap;
 use std::sync::Arc;
 use trainer::gpu::Gpu;
@@ -47,7 +47,7 @@ impl MemoryRun {
     /// # Errors
     ///
     /// If the system does not report the memory of this process.
-    pub fn add_sample(&mut self, live: &Live, gpu: &Gpu, viewers: &[Viewer]) -> Result<Sample> {
+    pub fn add_sample(&mut self, live: &LiveLoop, gpu: &Gpu, viewers: &[Viewer]) -> Result<Sample> {
         let (sample, gpu_buffers) = sample(live, gpu, viewers)?;
         self.gpu_buffers = gpu_buffers;
         self.samples.push(sample);
@@ -200,7 +200,7 @@ fn mb(bytes: f64) -> String {
 
 /// Memory of a run in progress, and its GPU buffers, bytes by label.
 pub(crate) fn sample(
-    live: &Live,
+    live: &LiveLoop,
     gpu: &Gpu,
     viewers: &[Viewer],
 ) -> Result<(Sample, BTreeMap<Arc<str>, u64>)> {

@@ -7,7 +7,7 @@ use crate::statistics::theil_sen;
 use crate::viewer::{ReceivedPicture, Viewer};
 use kinematics::quantile::median;
 use serde::Serialize;
-use session::Live;
+use session::LiveLoop;
 use session::chart::{Line, Point};
 use std::time::{Duration, Instant};
 use trainer::gpu::Gpu;
@@ -42,7 +42,7 @@ struct Moment {
 
 impl Timeline {
     /// Samples a run in progress if a second has passed since the last sample.
-    pub fn sample(&mut self, live: &Live, gpu: &Gpu, viewers: &[Viewer]) {
+    pub fn sample(&mut self, live: &LiveLoop, gpu: &Gpu, viewers: &[Viewer]) {
         let at = Instant::now();
         let session = &live.sessions()[0];
         let seconds = session.secs();

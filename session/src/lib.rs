@@ -2,7 +2,7 @@
 //! failures.
 //!
 //! A [`Session`] is one model in training with its clock, evaluations, checkpoints and reports.
-//! [`Data`] reads keyframes from disk; [`train`] and [`drive`] train on them. [`Live`] is the loop
+//! [`Data`] reads keyframes from disk; [`train`] and [`drive`] train on them. [`LiveLoop`] is the loop
 //! of a live run: it takes keyframes from a [`capture::Feed`] and draws pictures for viewers.
 //! [`finish`] saves and scores the models. Timing-dependent decisions are logged ([`DecisionLog`])
 //! and can be replayed ([`Replay`]). An [`Observer`] receives all reports.
@@ -42,7 +42,7 @@ mod inline_picture;
 mod kept_folder;
 mod latency;
 mod ledger;
-mod live;
+mod live_loop;
 pub mod methods;
 pub mod next_commands;
 mod observations;
@@ -78,7 +78,7 @@ pub use gpu_loss::lose_gpu_at_step;
 pub use kept_folder::KeptFolder;
 pub use latency::Latency;
 pub use ledger::{KeyframeTimes, Ledger, latencies};
-pub use live::{KeyframeChange, Live, LiveOptions, Pace};
+pub use live_loop::{KeyframeChange, LiveLoop, LiveOptions, Pace};
 pub use methods::methods_of;
 pub use observer::{
     DoneEvent, Evaluation, FinishedReport, Observer, ProfileEvent, SessionEvent, SessionProgress,

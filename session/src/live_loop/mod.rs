@@ -50,7 +50,7 @@ impl Pace {
 }
 
 /// A live run.
-pub struct Live {
+pub struct LiveLoop {
     /// The first model is drawn for requests that name no method.
     sessions: Vec<Session>,
     feed: Feed,
@@ -76,7 +76,7 @@ pub struct Live {
 /// Changes a keyframe before the models receive it.
 pub type KeyframeChange = Box<dyn FnMut(Arc<Keyframe>) -> Arc<Keyframe>>;
 
-impl Live {
+impl LiveLoop {
     /// Combines the parts. Training starts with the first call of [`Self::advance`].
     pub fn new(sessions: Vec<Session>, feed: Feed, hub: Hub, options: LiveOptions) -> Self {
         let is_software = sessions.first().is_some_and(Session::is_software);

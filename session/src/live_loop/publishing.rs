@@ -1,6 +1,6 @@
 //! Publishes keyframes, models and the status of a run to viewers.
 
-use super::Live;
+use super::LiveLoop;
 use crate::chunk_publisher::ChunkPublisher;
 use crate::ledger::Ledger;
 use crate::observations::{ModelState, ObservationPublisher, PosedKeyframe};
@@ -52,7 +52,7 @@ impl Publishing {
     }
 }
 
-impl Live {
+impl LiveLoop {
     /// Publishes the keyframes and the corrections of live images, as estimated by the first model.
     pub(super) fn publish_keyframes(&mut self) {
         let cameras: Vec<_> = self

@@ -1,6 +1,6 @@
 //! Applies the requests of operators: pausing, checkpoints, edits.
 
-use super::{Live, session_for_method};
+use super::{LiveLoop, session_for_method};
 use crate::editing::Editor;
 use viz::{Control, EditRequest};
 
@@ -31,7 +31,7 @@ impl Requests {
     }
 }
 
-impl Live {
+impl LiveLoop {
     /// Applies the actions that operators have requested. An evaluation is completed first.
     pub(super) fn apply_controls(&mut self) {
         // All images of an evaluation are scored on the same state of the model.

@@ -1,6 +1,6 @@
 //! Draws the pictures that viewers request.
 
-use super::{Live, Pace, session_for_method};
+use super::{LiveLoop, Pace, session_for_method};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 use trainer::QueuedPicture;
@@ -21,7 +21,7 @@ struct QueuedRender {
     queued: Result<QueuedPicture, trainer::Error>,
 }
 
-impl Live {
+impl LiveLoop {
     /// Whether a picture is requested and may be drawn now.
     pub(super) fn is_render_pending(&self) -> bool {
         self.budget.may_render() && self.hub.wait_for_request(Duration::ZERO)

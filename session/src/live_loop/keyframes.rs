@@ -1,6 +1,6 @@
 //! Passes keyframes on to the models.
 
-use super::{IDLE, Live, Pace};
+use super::{IDLE, LiveLoop, Pace};
 use crate::ledger::KeyframeTimes;
 use crate::scene_hint;
 use crate::session::Session;
@@ -17,7 +17,7 @@ const HINT_KEYFRAMES: usize = 5;
 /// keyframes by at most this time; a shorter one would use more of a processor.
 const POLL_PERIOD: Duration = Duration::from_millis(2);
 
-impl Live {
+impl LiveLoop {
     /// Pushes new keyframes to the models: all waiting keyframes in real time, or the keyframe that
     /// is due in lockstep. Does nothing during an evaluation.
     pub(super) fn take_keyframes(&mut self) -> crate::Result<()> {
