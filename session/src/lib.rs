@@ -2,8 +2,8 @@
 //! failures.
 //!
 //! A [`Session`] is one model in training with its clock, evaluations, checkpoints and reports.
-//! [`Data`] reads keyframes from disk; [`train`] and [`drive`] train on them. [`LiveLoop`] is the loop
-//! of a live run: it takes keyframes from a [`capture::Feed`] and draws pictures for viewers.
+//! [`Data`] reads keyframes from disk; [`train`] and [`drive`] train on them. [`LiveLoop`] is the
+//! loop of a live run: it takes keyframes from a [`capture::Feed`] and draws pictures for viewers.
 //! [`finish`] saves and scores the models. Timing-dependent decisions are logged ([`DecisionLog`])
 //! and can be replayed ([`Replay`]). An [`Observer`] receives all reports.
 //!
