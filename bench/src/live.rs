@@ -17,7 +17,7 @@ use nalgebra::{UnitQuaternion, UnitVector3, Vector3};
 use report::Table;
 use report::chart::{Axis, Chart, Line, Point, Scale};
 use serde::Serialize;
-use session::{KeyframeTimes, Latency, Live};
+use session::{KeyframeTimes, Latency, LiveLoop};
 use std::collections::{BTreeMap, BTreeSet};
 use std::fmt;
 use std::time::Duration;
@@ -147,7 +147,7 @@ impl LiveRun {
     #[must_use]
     pub fn of(
         conditions: Conditions,
-        live: &Live,
+        live: &LiveLoop,
         viewers: &[Viewer],
         timeline: &Timeline,
     ) -> Self {

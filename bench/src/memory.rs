@@ -10,7 +10,7 @@ use kinematics::quantile::{Rank, quantile};
 use messages::counted;
 use report::Table;
 use report::chart::{Axis, Chart, Line, Marker, Point, Scale};
-use session::Live;
+use session::LiveLoop;
 use std::collections::BTreeMap;
 use std::sync::Arc;
 
@@ -48,7 +48,7 @@ impl MemoryRun {
     /// # Errors
     ///
     /// If the system does not report the memory of this process.
-    pub fn add_sample(&mut self, live: &Live, gpu: &Gpu, viewers: &[Viewer]) -> Result<Sample> {
+    pub fn add_sample(&mut self, live: &LiveLoop, gpu: &Gpu, viewers: &[Viewer]) -> Result<Sample> {
         let (sample, gpu_buffers) = sample(live, gpu, viewers)?;
         self.gpu_buffers = gpu_buffers;
         self.samples.push(sample);
@@ -201,7 +201,7 @@ fn mb(bytes: f64) -> String {
 
 /// Memory of a run in progress, and its GPU buffers, bytes by label.
 pub(crate) fn sample(
-    live: &Live,
+    live: &LiveLoop,
     gpu: &Gpu,
     viewers: &[Viewer],
 ) -> Result<(Sample, BTreeMap<Arc<str>, u64>)> {

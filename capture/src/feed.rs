@@ -60,7 +60,7 @@ pub trait InputObserver: Send {
     /// Whether the motion of the robot is needed.
     fn needs_robot(&self) -> bool;
 
-    /// Receives a reading of the robot.
+    /// Receives the state of the robot.
     fn observe_robot(&self, robot: RobotState);
 
     /// Receives a scan of a range scanner.
@@ -419,7 +419,7 @@ impl Pump {
         self.observer.observe(LiveImage {
             camera: image.camera.clone(),
             stamp: image.stamp,
-            captured_at: self.captured_at(image.stamp),
+            captured_at: self.input.stamp_clock.captured_at(image.stamp),
             size_px: image.size_px,
             pixels,
             world_from_camera: Some(
@@ -433,25 +433,20 @@ impl Pump {
         });
     }
 
-    /// Passes a reading of the robot to the observer.
+    /// Passes the state of the robot to the observer.
     fn publish_robot(&mut self, sample: &Sample) {
-        let Some(reading) = self
+        let Some(mut state) = self
             .input
             .robot_motion
-            .push(sample)
+            .push(sample, &self.input.stamp_clock)
             .filter(|_| self.observer.needs_robot())
         else {
             return;
         };
-        let stations = self.input.stations.as_ref();
-        self.observer.observe_robot(RobotState {
-            stamp: reading.stamp,
-            captured_at: self.captured_at(reading.stamp),
-            world_from_base: stations.map_or(reading.world_from_base, |stations| {
-                stations.map_from_odom() * reading.world_from_base
-            }),
-            positions: reading.positions,
-        });
+        if let Some(stations) = &self.input.stations {
+            state.world_from_base = stations.map_from_odom() * state.world_from_base;
+        }
+        self.observer.observe_robot(state);
     }
 
     /// Passes a range scan to the observer.
@@ -462,14 +457,5 @@ impl Pump {
             scan,
             map_from_odom,
         });
-    }
-
-    /// Time at which a sample was captured, or now if its stamp is on another clock (recordings,
-    /// simulations).
-    fn captured_at(&self, stamp: Stamp) -> Instant {
-        self.input
-            .stamp_clock
-            .instant_of(stamp)
-            .unwrap_or_else(Instant::now)
     }
 }

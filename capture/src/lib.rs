@@ -58,7 +58,7 @@ pub use feed::{Feed, FeedItem, Input, InputObserver, InputResult, InputTimes};
 pub use join::{Change, Counts, Join, JoinEvent, PosedImage, Rejection, SampleUse};
 pub use nearest_name::nearest_name;
 pub use notes::Notes;
-pub use robot_motion::{RobotMotion, RobotReading};
+pub use robot_motion::RobotMotion;
 pub use stamp_clock::StampClock;
 pub use stations::{StationReport, Stations};
 pub use stop::Stop;

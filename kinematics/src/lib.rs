@@ -30,7 +30,7 @@
 
 pub mod camera;
 pub mod chain;
-pub mod clock;
+pub mod device_clock;
 mod error;
 pub mod history;
 mod inverse;
@@ -49,7 +49,7 @@ pub mod urdf;
 
 pub use camera::{Intrinsics, Lens};
 pub use chain::Chain;
-pub use clock::ClockMap;
+pub use device_clock::ClockMap;
 pub use error::Error;
 pub use history::{HistoryError, JointHistory, PoseHistory};
 pub use joints::JointState;

@@ -2,8 +2,8 @@
 //! failures.
 //!
 //! A [`Session`] is one model in training with its clock, evaluations, checkpoints and reports.
-//! [`Data`] reads keyframes from disk; [`train`] and [`drive`] train on them. [`Live`] is the loop
-//! of a live run: it takes keyframes from a [`capture::Feed`] and draws pictures for viewers.
+//! [`Data`] reads keyframes from disk; [`train`] and [`drive`] train on them. [`LiveLoop`] is the
+//! loop of a live run: it takes keyframes from a [`capture::Feed`] and draws pictures for viewers.
 //! [`finish`] saves and scores the models. Timing-dependent decisions are logged ([`DecisionLog`])
 //! and can be replayed ([`Replay`]). An [`Observer`] receives all reports.
 //!
@@ -25,7 +25,6 @@ pub mod camera_list;
 pub mod camera_path;
 pub mod checkpoints;
 mod chunk_publisher;
-mod clock;
 pub mod corrected_rig;
 mod data;
 mod dataset_export;
@@ -40,7 +39,7 @@ mod holdout;
 mod kept_folder;
 mod latency;
 mod ledger;
-mod live;
+mod live_loop;
 pub mod methods;
 pub mod next_commands;
 mod observations;
@@ -60,12 +59,12 @@ mod session;
 mod stored_keyframes;
 mod time_slices;
 mod training;
+mod training_clock;
 mod training_options;
 mod viewer;
 mod viewers;
 
 pub use checkpoints::{CheckpointOptions, Checkpoints, RunFlags, parse_period};
-pub use clock::Clock;
 pub use data::{Data, DataOptions, Purpose, expect, points_sha256};
 pub use dataset_export::{Written, write_nerfstudio};
 pub use decisions::{DecisionLog, RunDescription, Settings};
@@ -75,7 +74,7 @@ pub use gpu_loss::lose_gpu_at_step;
 pub use kept_folder::KeptFolder;
 pub use latency::Latency;
 pub use ledger::{KeyframeTimes, Ledger, latencies};
-pub use live::{KeyframeChange, Live, LiveOptions, Pace};
+pub use live_loop::{KeyframeChange, LiveLoop, LiveOptions, Pace};
 pub use methods::methods_of;
 pub use observer::{
     DoneEvent, Evaluation, FinishedReport, Observer, ProfileEvent, SessionEvent, SessionProgress,
@@ -90,6 +89,7 @@ pub use session::{
 };
 pub use stored_keyframes::StoredKeyframes;
 pub use training::{TrainingPlan, check_before_data, drive, limits, model_specs, train};
+pub use training_clock::Clock;
 pub use training_options::{AvailableData, REALIGN, Refine, RefineSettings, TrainingOptions};
 pub use viewer::{ModelViewer, ServedModel};
 pub use viewers::Viewers;

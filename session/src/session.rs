@@ -15,7 +15,6 @@ pub use training_time::Limits;
 
 use crate::checkpoints::{Checkpoints, Snapshot};
 use crate::chunk_publisher::ChunkPublisher;
-use crate::clock::Clock;
 use crate::decisions::DecisionLog;
 use crate::editing::{self, Editor};
 use crate::evaluate::Evaluator;
@@ -24,6 +23,7 @@ use crate::kept_folder::KeptFolder;
 use crate::next_commands::DataSource;
 use crate::observer::{Evaluation, Observer};
 use crate::recovery::Recovery;
+use crate::training_clock::Clock;
 use calibration::{Alignment, CalibratedCamera, CameraCorrection};
 use capture::Stop;
 use gpu::Gpu;

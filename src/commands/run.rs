@@ -31,7 +31,7 @@ use session::next_commands::{DataSource, quoted};
 use session::run_folder::{self, CreatedFolders};
 use session::{
     AvailableData, Checkpoints, Clock, DecisionLog, EndingSession, Evaluator, Evaluators,
-    FinishedModel, KeptFolder, Latency, Limits, Live, LiveOptions, ModelViewer, Pace, REALIGN,
+    FinishedModel, KeptFolder, Latency, Limits, LiveLoop, LiveOptions, ModelViewer, Pace, REALIGN,
     Recovery, RefineSettings, RunDescription, RunFlags, ServedModel, Session, Settings,
     StoredKeyframes, Viewers, checkpoints, corrected_rig, methods_of, recovery, robot_meshes,
 };
@@ -295,7 +295,7 @@ fn publish_end(hub: &Hub, models: &[FinishedModel]) {
 
 /// A run whose devices are open.
 pub(super) struct Running {
-    pub(super) live: Live,
+    pub(super) live: LiveLoop,
     pub(super) gpu: Arc<Gpu>,
     pub(super) page: ServedPage,
     stop: Stop,
@@ -487,7 +487,7 @@ pub(super) fn start(
     let held = sessions
         .first()
         .map_or(Vec::new(), |session| session.keyframes().to_vec());
-    let live = Live::new(sessions, feed, hub, options).resume_from(held);
+    let live = LiveLoop::new(sessions, feed, hub, options).resume_from(held);
     Ok(Running {
         live,
         gpu,
@@ -621,7 +621,7 @@ impl SessionSetup<'_> {
 
 /// Closes the recording and writes the keyframe lists after a GPU failure. Returns the error with a
 /// note of what was saved.
-fn keep_input(mut live: Live, folders: &[PathBuf], error: anyhow::Error) -> anyhow::Error {
+fn keep_input(mut live: LiveLoop, folders: &[PathBuf], error: anyhow::Error) -> anyhow::Error {
     // Described while the sessions still exist.
     let recoverable = live.describe_recoverable();
     let (sessions, input_result) = live.finish();
@@ -651,7 +651,7 @@ fn keep_input(mut live: Live, folders: &[PathBuf], error: anyhow::Error) -> anyh
 
 /// Saves the models, then reports errors of the input.
 fn save(
-    mut live: Live,
+    mut live: LiveLoop,
     args: &Args,
     rig: &Rig,
     folders: Vec<PathBuf>,

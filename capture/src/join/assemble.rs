@@ -1,6 +1,6 @@
 //! Converts device images to the arrays of a keyframe: decoded, undistorted, depth in meters.
 
-use super::motion::CameraPose;
+use super::camera_motion::CameraPose;
 use crate::{config, downscale};
 use anyhow::Context;
 use drivers::{Image, TruthImage};

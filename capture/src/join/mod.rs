@@ -5,8 +5,8 @@
 
 mod accept;
 mod assemble;
+mod camera_motion;
 mod change;
-mod motion;
 mod pixels;
 mod ranges;
 mod rejection;
@@ -17,8 +17,8 @@ mod store;
 mod tests;
 mod waiting;
 
+pub(crate) use camera_motion::{CameraPose, JointsRejection, Motion};
 pub use change::Change;
-pub(crate) use motion::{CameraPose, JointsRejection, Motion};
 pub use rejection::{Counts, Rejection, SampleUse};
 
 use crate::config::{self, BaseDriver, CameraDriver, Parent, Rig};

@@ -23,7 +23,7 @@ use crate::stamp_clock::StampClock;
 use anyhow::{Context, anyhow, bail};
 use drivers::recording::{RIG_FILE, Recorder, Recording, RecordingMetadata, URDF_FILE};
 use drivers::udp::DatagramMonitor;
-use drivers::{Live, Playback, Repeating, Sample, Source};
+use drivers::{LiveDevices, Playback, Repeating, Sample, Source};
 use kinematics::Chain;
 use messages::Setting;
 use std::path::Path;
@@ -149,7 +149,7 @@ pub(crate) fn rig_with_monitors(
     let (source, stamp_clock): (Box<dyn Source>, _) = if is_any_simulated(&rig) {
         simulate(&rig, real)?
     } else {
-        (Box::new(Live::new(real)?), StampClock::Computer)
+        (Box::new(LiveDevices::new(real)?), StampClock::Computer)
     };
     // Behind all devices, because the tags are searched in the images of any camera on the robot.
     let source = match rig.base.driver {

@@ -5,7 +5,7 @@ use crate::config::Depth;
 use crate::config::{ArmDriver, ArmMotion, BaseDriver, Camera, CameraDriver, Rig, ScannerDriver};
 use anyhow::{Context, bail};
 #[cfg(target_os = "linux")]
-use drivers::can::odrive::Endpoints;
+use drivers::can::odrive::{self, Endpoints};
 #[cfg(target_os = "linux")]
 use drivers::can::{self, CanArm, MovableArmConfig, MovableCanArm};
 #[cfg(target_os = "linux")]
@@ -187,19 +187,23 @@ fn movable_can_arm(rig: &Rig, motion: &ArmMotion) -> anyhow::Result<Box<dyn Mova
 #[cfg(target_os = "linux")]
 fn movable_config(rig: &Rig, motion: &ArmMotion) -> anyhow::Result<MovableArmConfig> {
     let path = &motion.odrive_endpoints;
-    let endpoints =
+    let read_endpoints =
         || Endpoints::parse(&files::read_text(path.as_ref())?).map_err(anyhow::Error::new);
     // Only ODrive axes with firmware 0.6 need this file, so an empty path is no error.
-    let odrive_endpoints = match path.as_str() {
+    let endpoints = match path.as_str() {
         "" => None,
-        _ => Some(endpoints().with_context(|| format!("arm.motion.odrive_endpoints {path:?}"))?),
+        _ => Some(
+            read_endpoints().with_context(|| format!("arm.motion.odrive_endpoints {path:?}"))?,
+        ),
     };
     let mut arm = can_config(rig);
     limit_efforts(&mut arm, &super::chain_of(rig)?);
+    for motor in &mut arm.motors {
+        odrive::set_endpoints(&mut motor.protocol, endpoints.as_ref());
+    }
     Ok(MovableArmConfig {
         arm,
         motion: motion_config(rig, motion)?,
-        odrive_endpoints,
     })
 }
 

@@ -6,7 +6,7 @@ use crate::config::{
 };
 use anyhow::bail;
 use drivers::motion::MotionLimits;
-use drivers::{Devices, Error, Live, Sample, Source};
+use drivers::{Devices, Error, LiveDevices, Sample, Source};
 use kinematics::{Intrinsics, Stamp, Transform};
 use std::sync::Arc;
 
@@ -48,7 +48,7 @@ pub(super) fn open(rig: &Rig, real: Devices) -> anyhow::Result<(Box<dyn Source>,
     devices.scanners.extend(real.scanners);
     devices.cameras.extend(real.cameras);
     let source = RealTime {
-        live: Live::new(devices)?,
+        live: LiveDevices::new(devices)?,
         truth,
         first_camera: Arc::clone(&rig.cameras[0].name),
         n_left: rig.sim.n_images,
@@ -74,7 +74,7 @@ pub(super) fn unlimited(rig: &Rig) -> anyhow::Result<sim::Config> {
 
 /// Live simulated devices with their ground truth.
 struct RealTime {
-    live: Live,
+    live: LiveDevices,
     truth: sim::LiveTruth,
     first_camera: Arc<str>,
     n_left: Option<u64>,

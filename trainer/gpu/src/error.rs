@@ -1,5 +1,7 @@
 //! Errors of the GPU.
 
+use messages::Setting;
+
 /// An error of the GPU, or of a kernel.
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]

@@ -1,6 +1,7 @@
 //! Draws the pictures that viewers request.
 
-use super::{Live, Pace, session_for_method};
+use super::{LiveLoop, Pace};
+use crate::session::Session;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 use trainer::QueuedPicture;
@@ -21,7 +22,21 @@ struct QueuedRender {
     queued: Result<QueuedPicture, trainer::Error>,
 }
 
-impl Live {
+impl QueuedRender {
+    /// Waits for the picture, whose rendering began at `began`, and sends it to its client.
+    fn deliver(self, session: &mut Session, began: Instant) {
+        let pending = self.pending.began_at(began);
+        let drawn = self
+            .queued
+            .and_then(|queued| session.finish_picture(queued, &pending.request, pending.packing()));
+        match drawn {
+            Ok(picture) => pending.deliver(picture),
+            Err(error) => pending.fail(&error.to_string()),
+        }
+    }
+}
+
+impl LiveLoop {
     /// Whether a picture is requested and may be drawn now.
     pub(super) fn is_render_pending(&self) -> bool {
         self.budget.may_render() && self.hub.pictures().wait_for_request(Duration::ZERO)
@@ -30,13 +45,13 @@ impl Live {
     /// Draws requested pictures as long as training keeps its share of the time.
     pub(super) fn render(&mut self) -> anyhow::Result<()> {
         let started = Instant::now();
-        if !self.is_training() || self.is_idle() || self.requests.is_paused {
+        if !self.is_training() || self.models.is_idle() || self.requests.is_paused {
             self.budget.refill(); // Training is idle, so drawing does not delay it.
         }
         while started.elapsed() < MAX_RENDER_TIME && self.is_render_pending() {
             // Work queued before the pictures counts as training time.
             let before = Instant::now();
-            for session in &mut self.sessions {
+            for session in &mut self.models.sessions {
                 session.n_total_steps()?;
             }
             self.budget.add_training(before.elapsed());
@@ -50,7 +65,8 @@ impl Live {
             };
             let mut began = before;
             for picture in queued {
-                self.deliver(picture, began);
+                let session = &mut self.models.sessions[picture.session_ix];
+                picture.deliver(session, began);
                 // The GPU draws the pictures one after the other. The time of the next one begins
                 // when this one is complete.
                 began = Instant::now();
@@ -89,12 +105,14 @@ impl Live {
     /// Only for a single model in real time, where this needs no other work: several models would
     /// need a choice of the next one, and lockstep the check whether a keyframe is due.
     fn queue_steps(&mut self) -> anyhow::Result<()> {
-        let is_training =
-            self.is_training() && !self.is_idle() && !self.is_scoring() && !self.requests.is_paused;
+        let is_training = self.is_training()
+            && !self.models.is_idle()
+            && !self.models.is_scoring()
+            && !self.requests.is_paused;
         if self.pace != Pace::RealTime || !is_training {
             return Ok(());
         }
-        let [session] = &mut self.sessions[..] else {
+        let [session] = &mut self.models.sessions[..] else {
             return Ok(());
         };
         if !session.is_over() {
@@ -107,16 +125,19 @@ impl Live {
     fn queue_picture(&mut self) -> Option<QueuedRender> {
         loop {
             let mut pending = self.hub.pictures().next_request()?;
-            if self.keyframes.is_empty() {
+            if self.accepted.list.is_empty() {
                 pending.fail("no keyframe yet");
                 continue;
             }
-            let Some(session_ix) = session_for_method(&self.sessions, pending.method()) else {
-                let reason = self.unknown_method(pending.method());
-                pending.fail(&reason);
-                continue;
+            let found = self.models.session_ix(pending.method());
+            let session_ix = match found {
+                Ok(session_ix) => session_ix,
+                Err(reason) => {
+                    pending.fail(&reason);
+                    continue;
+                }
             };
-            let session = &mut self.sessions[session_ix];
+            let session = &mut self.models.sessions[session_ix];
             pending.request.edits = Arc::clone(session.edits());
             let queued = session.queue_picture(&pending.request, pending.packing());
             // Determined now: steps that are queued behind the picture are not in it.
@@ -131,32 +152,12 @@ impl Live {
         }
     }
 
-    /// Waits for a picture, whose rendering began at `began`, and sends it to its client.
-    fn deliver(
-        &mut self,
-        QueuedRender {
-            pending,
-            session_ix,
-            queued,
-        }: QueuedRender,
-        began: Instant,
-    ) {
-        let pending = pending.began_at(began);
-        let session = &mut self.sessions[session_ix];
-        match queued
-            .and_then(|queued| session.finish_picture(queued, &pending.request, pending.packing()))
-        {
-            Ok(picture) => pending.deliver(picture),
-            Err(error) => pending.fail(&error.to_string()),
-        }
-    }
-
     /// Records which pictures of the first model clients have shown.
     pub(super) fn record_shown_pictures(&mut self) {
         for picture in self.hub.pictures().take_shown() {
             // The ledger has one time per keyframe. With several models, it would otherwise mix
             // models that receive different shares of the time.
-            if session_for_method(&self.sessions, picture.method.as_deref()) == Some(0) {
+            if self.models.session_ix(picture.method.as_deref()) == Ok(0) {
                 self.ledger.shown(&picture);
             }
         }

@@ -1,6 +1,6 @@
 //! Publishes keyframes, models and the status of a run to viewers.
 
-use super::Live;
+use super::LiveLoop;
 use crate::chunk_publisher::ChunkPublisher;
 use crate::ledger::Ledger;
 use crate::observations::{ModelState, ObservationPublisher, PosedKeyframe};
@@ -23,8 +23,9 @@ const SCORE_FRAC: f64 = 0.03;
 
 /// What was published, and what to publish next.
 pub(super) struct Publishing {
-    /// When the status was published; `None` if it is due.
-    pub(super) status_at: Option<Instant>,
+    hub: Hub,
+    /// When the status was published; `None` before the first time.
+    status_at: Option<Instant>,
     /// Corrected cameras of the published keyframes.
     cameras: Vec<CalibratedCamera>,
     /// Session whose latest score is refreshed next.
@@ -38,7 +39,7 @@ pub(super) struct Publishing {
 }
 
 impl Publishing {
-    pub(super) fn new(hub: &Hub, notes: Vec<String>, device_notes: Notes) -> Self {
+    pub(super) fn new(hub: Hub, notes: Vec<String>, device_notes: Notes) -> Self {
         Self {
             status_at: None,
             cameras: Vec::new(),
@@ -48,19 +49,17 @@ impl Publishing {
             device_notes,
             chunks: ChunkPublisher::new(hub.clone()),
             observations: ObservationPublisher::new(hub.clone()),
+            hub,
         }
     }
-}
 
-impl Live {
     /// Publishes the keyframes and the corrections of live images, as estimated by the first model.
-    pub(super) fn publish_keyframes(&mut self) {
-        let cameras: Vec<_> = self
-            .keyframes
+    pub(super) fn publish_keyframes(&mut self, keyframes: &[Arc<Keyframe>], session: &Session) {
+        let cameras: Vec<_> = keyframes
             .iter()
-            .map(|keyframe| self.sessions[0].camera_of(keyframe))
+            .map(|keyframe| session.camera_of(keyframe))
             .collect();
-        let posed = || self.keyframes.iter().zip(&cameras);
+        let posed = || keyframes.iter().zip(&cameras);
         // The keyframes are in order of arrival, and the last value of a key remains in the map.
         // Live images therefore get the correction of their camera's newest keyframe.
         self.hub.set_camera_corrections(
@@ -68,52 +67,41 @@ impl Live {
                 .map(|(keyframe, camera)| camera_correction(keyframe, camera))
                 .collect(),
         );
-        self.hub.set_keyframe_sources(&self.keyframes);
+        self.hub.set_keyframe_sources(keyframes);
         self.hub.set_keyframes(
             posed()
                 .map(|(keyframe, camera)| frustum(keyframe, camera))
                 .collect(),
         );
-        self.publishing.cameras = cameras;
+        self.cameras = cameras;
     }
 
     /// Publishes the keyframes again if corrections have moved one of them noticeably.
-    fn publish_moved_keyframes(&mut self) {
-        let session = &self.sessions[0];
-        let has_moved = self
-            .keyframes
+    fn publish_moved_keyframes(&mut self, keyframes: &[Arc<Keyframe>], session: &Session) {
+        let has_moved = keyframes
             .iter()
-            .zip(&self.publishing.cameras)
+            .zip(&self.cameras)
             .any(|(keyframe, published)| session.camera_of(keyframe).differs_noticeably(published));
         if has_moved {
-            self.publish_keyframes();
+            self.publish_keyframes(keyframes, session);
         }
     }
 
-    /// Publishes the models that clients draw themselves. Pictures and chunks share one budget.
-    pub(super) fn publish_chunks(&mut self) {
-        if !self.is_scoring() && self.budget.may_render() {
-            for session in &mut self.sessions {
-                self.budget
-                    .add_render(session.publish_chunks(&mut self.publishing.chunks));
-            }
+    /// Publishes when and how precisely each part of the scene was observed, if that is due. Depth
+    /// of cameras without depth is rendered with the first model. Returns the time spent.
+    fn publish_observations(
+        &mut self,
+        keyframes: &[Arc<Keyframe>],
+        session: &mut Session,
+        ledger: &Ledger,
+    ) -> Duration {
+        if !self.observations.is_due() {
+            return Duration::ZERO;
         }
-    }
-
-    /// Publishes when and how precisely each part of the scene was observed. Depth of cameras
-    /// without depth is rendered with the first model.
-    pub(super) fn publish_observations(&mut self) {
-        let can_render = self.is_training() && !self.is_scoring() && self.budget.may_render();
-        if !can_render || !self.publishing.observations.is_due() {
-            return;
-        }
-        let session = &mut self.sessions[0];
-        let keyframes: Vec<PosedKeyframe> = self
-            .keyframes
+        let keyframes: Vec<PosedKeyframe> = keyframes
             .iter()
             .map(|keyframe| posed_keyframe(session, keyframe))
             .collect();
-        let ledger = &self.ledger;
         let captured_at = |pose: &KeyframePose| captured_at(ledger, pose);
         let edits = Arc::clone(session.edits());
         let model = ModelState {
@@ -122,32 +110,50 @@ impl Live {
             captured_at: &captured_at,
         };
         let render = |request: &RenderRequest| session.render(request);
-        let spent = self
-            .publishing
-            .observations
-            .publish(&keyframes, &model, render);
-        self.budget.add_render(spent);
+        self.observations.publish(&keyframes, &model, render)
+    }
+}
+
+impl LiveLoop {
+    /// Publishes the models that clients draw themselves, and the observations of the scene.
+    /// Pictures, chunks and observations share one budget.
+    pub(super) fn publish_models(&mut self) {
+        if self.models.is_scoring() {
+            return;
+        }
+        if self.budget.may_render() {
+            for session in &mut self.models.sessions {
+                self.budget
+                    .add_render(session.publish_chunks(&mut self.publishing.chunks));
+            }
+        }
+        if self.is_training() && self.budget.may_render() {
+            let session = &mut self.models.sessions[0];
+            let spent =
+                self.publishing
+                    .publish_observations(&self.accepted.list, session, &self.ledger);
+            self.budget.add_render(spent);
+        }
     }
 
     /// Publishes the status of the run to viewers, a few times per second.
     pub(super) fn publish(&mut self) -> anyhow::Result<()> {
-        if self
-            .publishing
-            .status_at
-            .is_some_and(|published| published.elapsed() < PUBLISH_PERIOD)
-        {
+        // After an edit, viewers wait for the new status.
+        let has_edited = std::mem::take(&mut self.requests.has_edited);
+        let published = self.publishing.status_at;
+        if !has_edited && published.is_some_and(|at| at.elapsed() < PUBLISH_PERIOD) {
             return Ok(());
         }
         self.publishing.status_at = Some(Instant::now());
-        let clock_secs = self.sessions[0].secs();
+        let clock_secs = self.models.sessions[0].secs();
         if self.publishing.scoring_time.as_secs_f64() < SCORE_FRAC * clock_secs
-            && !self.is_scoring()
+            && !self.models.is_scoring()
         {
             let before = Instant::now();
             // Scores only one image at a time, so that viewers do not wait. The models take turns.
             self.publishing.next_refreshed =
-                (self.publishing.next_refreshed + 1) % self.sessions.len();
-            let session = &mut self.sessions[self.publishing.next_refreshed];
+                (self.publishing.next_refreshed + 1) % self.models.sessions.len();
+            let session = &mut self.models.sessions[self.publishing.next_refreshed];
             // A model without steps has no score yet, and drawing it would create its splats.
             if session.progress().step > 0 {
                 session.n_total_steps()?;
@@ -157,21 +163,23 @@ impl Live {
             }
             self.publishing.scoring_time += before.elapsed();
             self.budget.add_training(before.elapsed());
-            self.publish_moved_keyframes();
+            self.publishing
+                .publish_moved_keyframes(&self.accepted.list, &self.models.sessions[0]);
         }
         self.publish_status();
         Ok(())
     }
 
     pub(super) fn publish_status(&self) {
-        let movements = self.sessions[0]
+        let sessions = &self.models.sessions;
+        let movements = sessions[0]
             .alignment()
             .map_or(&[][..], |alignment| &alignment.movements[..]);
-        let mut models = self.sessions.iter().map(model_status);
+        let mut models = sessions.iter().map(model_status);
         self.hub.set_status(Status {
             state: self.state().to_owned(),
-            seconds: self.sessions[0].secs(),
-            keyframes: self.keyframes.len() as u64,
+            seconds: sessions[0].secs(),
+            keyframes: self.accepted.list.len() as u64,
             rejected: self.feed.rejected(),
             model: models.next().unwrap_or_default(),
             others: models.collect(),

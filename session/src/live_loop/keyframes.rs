@@ -1,11 +1,10 @@
 //! Passes keyframes on to the models.
 
-use super::{IDLE, Live, Pace};
+use super::{IDLE, LiveLoop, Pace};
 use crate::ledger::KeyframeTimes;
 use crate::scene_hint;
-use crate::session::Session;
 use capture::{Change, FeedItem, InputTimes};
-use keyframe::Keyframe;
+use keyframe::{Keyframe, Split};
 use kinematics::Stamp;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
@@ -17,36 +16,67 @@ const HINT_KEYFRAMES: usize = 5;
 /// keyframes by at most this time; a shorter one would use more of a processor.
 const POLL_PERIOD: Duration = Duration::from_millis(2);
 
-impl Live {
+/// Keyframes that were accepted and not evicted.
+#[derive(Default)]
+pub(super) struct AcceptedKeyframes {
+    /// In order of acceptance.
+    pub(super) list: Vec<Arc<Keyframe>>,
+    /// Number of keyframes evicted so far.
+    pub(super) n_evicted: u64,
+}
+
+impl AcceptedKeyframes {
+    /// Whether there is a training keyframe. With several cameras, the first keyframe of each is a
+    /// test keyframe.
+    pub(super) fn can_train(&self) -> bool {
+        self.list
+            .iter()
+            .any(|keyframe| keyframe.split == Split::Train)
+    }
+
+    fn evict(&mut self, camera: &Arc<str>, stamp: Stamp) {
+        self.n_evicted += 1;
+        self.list
+            .retain(|keyframe| keyframe.camera != *camera || keyframe.stamp != stamp);
+    }
+}
+
+impl LiveLoop {
     /// Pushes new keyframes to the models: all waiting keyframes in real time, or the keyframe that
     /// is due in lockstep. Does nothing during an evaluation.
     pub(super) fn take_keyframes(&mut self) -> anyhow::Result<()> {
-        if self.is_scoring() {
+        if self.models.is_scoring() {
             return Ok(());
         }
         if self.requests.is_paused && self.pace != Pace::RealTime {
             self.hub.pictures().wait_for_request(IDLE); // The next keyframe is due at a later step.
             return Ok(());
         }
-        self.apply_alignments()?;
+        if self.models.apply_alignments()? {
+            self.publishing
+                .publish_keyframes(&self.accepted.list, &self.models.sessions[0]);
+        }
         // Training time begins with the first image, so it includes the time until the first
         // keyframes.
         if let Some(first_image) = self.feed.first_image() {
-            self.sessions
+            self.models
+                .sessions
                 .iter_mut()
                 .for_each(|session| session.start_clock(first_image));
         }
-        let n_before = self.keyframes.len();
+        let n_before = self.accepted.list.len();
         match self.pace {
             Pace::RealTime => self.take_waiting_keyframes()?,
             Pace::Lockstep { steps_per_keyframe } => self.take_due_keyframes(steps_per_keyframe)?,
         }
-        if self.keyframes.len() != n_before {
-            self.publish_keyframes();
+        let accepted = &self.accepted.list;
+        if accepted.len() != n_before {
+            self.publishing
+                .publish_keyframes(accepted, &self.models.sessions[0]);
             // After these keyframes, the first view is final: later ones must not move the view of
             // operators.
-            if self.keyframes.len() <= self.start_keyframes.max(HINT_KEYFRAMES)
-                && let Some(hint) = scene_hint::from_keyframes(&self.keyframes)
+            if accepted.len() <= self.start_keyframes.max(HINT_KEYFRAMES)
+                && let Some(hint) = scene_hint::from_keyframes(accepted)
             {
                 self.hub.set_scene_hint(hint);
             }
@@ -56,7 +86,7 @@ impl Live {
 
     /// Takes all keyframes that wait in the queue. Waits for one if there is nothing to train.
     fn take_waiting_keyframes(&mut self) -> anyhow::Result<()> {
-        if !self.is_training() || self.is_idle() || self.requests.is_paused {
+        if !self.is_training() || self.models.is_idle() || self.requests.is_paused {
             let first = self.wait_for_change();
             first.map_or(Ok(()), |item| self.apply(item))?;
         }
@@ -68,7 +98,7 @@ impl Live {
 
     /// Takes keyframes as long as one is due at the current steps of the models.
     fn take_due_keyframes(&mut self, steps_per_keyframe: u64) -> anyhow::Result<()> {
-        while !self.feed.ended() && self.is_keyframe_due() {
+        while !self.feed.ended() && self.models.is_keyframe_due() {
             let Some(item) = self.wait_for_change() else {
                 break;
             };
@@ -77,22 +107,8 @@ impl Live {
             // An evicted keyframe makes room for a new one, and does not count. Before training
             // starts, keyframes are taken without steps in between.
             if is_new && self.is_training() {
-                for (at, session) in self.next_keyframe_at.iter_mut().zip(&self.sessions) {
-                    *at = session.progress().step + steps_per_keyframe;
-                }
+                self.models.schedule_next_keyframe(steps_per_keyframe);
             }
-        }
-        Ok(())
-    }
-
-    /// Applies the results of alignments that are ready.
-    fn apply_alignments(&mut self) -> anyhow::Result<()> {
-        let mut is_applied = false;
-        for session in &mut self.sessions {
-            is_applied |= session.poll_alignment(false)?;
-        }
-        if is_applied {
-            self.publish_keyframes();
         }
         Ok(())
     }
@@ -126,19 +142,13 @@ impl Live {
         }
     }
 
-    /// Whether each model has reached the step at which the next keyframe is due, or cannot train
-    /// further without it.
-    fn is_keyframe_due(&self) -> bool {
-        let is_due = |(session, at): (&Session, &u64)| {
-            session.progress().step >= *at || session.is_idle() || session.has_finished_steps()
-        };
-        self.sessions.iter().zip(&self.next_keyframe_at).all(is_due)
-    }
-
     fn apply(&mut self, FeedItem { change, times }: FeedItem) -> anyhow::Result<()> {
         match change {
             Change::Accepted(keyframe) => self.add_keyframe(keyframe, times),
-            Change::Evicted { camera, stamp } => self.remove_keyframe(&camera, stamp),
+            Change::Evicted { camera, stamp } => {
+                self.accepted.evict(&camera, stamp);
+                self.models.remove(&camera, stamp)
+            }
         }
     }
 
@@ -153,24 +163,9 @@ impl Live {
             None => keyframe,
         };
         // Read before the push, which may wait for queued steps.
-        let pushed_at_steps = self
-            .sessions
-            .iter()
-            .map(|session| session.progress().step)
-            .collect();
-        self.keyframes.push(keyframe.clone());
-        let mut pushed = Ok(());
-        // A model that has made all its steps gets no more keyframes, so that it equals a model
-        // trained alone.
-        for session in self
-            .sessions
-            .iter_mut()
-            .filter(|session| !session.has_finished_steps())
-        {
-            // Continues after a GPU failure, so that every session holds the keyframe for its
-            // restored model.
-            pushed = pushed.and(session.push(&keyframe));
-        }
+        let pushed_at_steps = self.models.steps();
+        self.accepted.list.push(keyframe.clone());
+        let pushed = self.models.push(&keyframe);
         if let Some(input) = times {
             self.ledger.push(KeyframeTimes {
                 camera: keyframe.camera.clone(),
@@ -184,22 +179,5 @@ impl Live {
             });
         }
         pushed
-    }
-
-    /// Removes an evicted keyframe from the models.
-    fn remove_keyframe(&mut self, camera: &Arc<str>, stamp: Stamp) -> anyhow::Result<()> {
-        self.n_evicted += 1;
-        self.keyframes
-            .retain(|keyframe| keyframe.camera != *camera || keyframe.stamp != stamp);
-        let mut removed = Ok(());
-        for session in self
-            .sessions
-            .iter_mut()
-            .filter(|session| !session.has_finished_steps())
-        {
-            // As in `add_keyframe`, a failure must not leave the sessions with different keyframes.
-            removed = removed.and(session.remove(camera, stamp));
-        }
-        removed
     }
 }

@@ -1,4 +1,4 @@
-//! What the devices of a robot see now, for those who watch a run.
+//! The current data of the devices of a robot, for the viewers of a run.
 
 use crate::RangePoints;
 use kinematics::{Stamp, Transform};

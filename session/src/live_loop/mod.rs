@@ -1,6 +1,8 @@
 //! The loop of a live run: takes keyframes, trains models, and draws pictures for viewers.
 
+mod keyframe_warning;
 mod keyframes;
+mod models;
 mod pictures;
 mod publishing;
 mod requests;
@@ -8,10 +10,13 @@ mod requests;
 use crate::ledger::Ledger;
 use crate::recoveries::{self, OpenGpu, Recoveries};
 use crate::render_budget::RenderBudget;
+use crate::scene_hint;
 use crate::session::Session;
-use crate::{methods, scene_hint, time_slices};
 use capture::{Feed, InputResult, Notes};
-use keyframe::{Keyframe, Split};
+use keyframe::Keyframe;
+use keyframe_warning::KeyframeWarning;
+use keyframes::AcceptedKeyframes;
+use models::Models;
 use publishing::Publishing;
 use requests::Requests;
 use std::sync::Arc;
@@ -19,9 +24,6 @@ use std::time::{Duration, Instant};
 use trainer::AlignTiming;
 use viz::Hub;
 
-/// Time without any keyframe until it is reported. A shorter time would warn while a robot has only
-/// just begun to move; after a longer one, an operator has waited in vain.
-const WARN_AFTER: Duration = Duration::from_secs(10);
 /// Maximum wait for a keyframe when there is nothing to do. Controls, edits and the status wait as
 /// long; a shorter wait would use more of a processor for checks without result.
 const IDLE: Duration = Duration::from_millis(10);
@@ -50,17 +52,13 @@ impl Pace {
 }
 
 /// A live run.
-pub struct Live {
-    /// The first model is drawn for requests that name no method.
-    sessions: Vec<Session>,
+pub struct LiveLoop {
+    models: Models,
     feed: Feed,
     hub: Hub,
     pace: Pace,
     start_keyframes: usize,
-    keyframes: Vec<Arc<Keyframe>>,
-    n_evicted: u64,
-    /// Step of each session at which the next keyframe is due in lockstep.
-    next_keyframe_at: Vec<u64>,
+    accepted: AcceptedKeyframes,
     budget: RenderBudget,
     recoveries: Recoveries,
     /// Times of the keyframes.
@@ -68,69 +66,39 @@ pub struct Live {
     keyframe_change: Option<KeyframeChange>,
     requests: Requests,
     publishing: Publishing,
-    started: Instant,
-    /// When to report that there is still no keyframe.
-    warn_after: Duration,
+    keyframe_warning: KeyframeWarning,
 }
 
 /// Changes a keyframe before the models receive it.
 pub type KeyframeChange = Box<dyn FnMut(Arc<Keyframe>) -> Arc<Keyframe>>;
 
-impl Live {
+impl LiveLoop {
     /// Combines the parts. Training starts with the first call of [`Self::advance`].
     pub fn new(sessions: Vec<Session>, feed: Feed, hub: Hub, options: LiveOptions) -> Self {
         let is_software = sessions.first().is_some_and(Session::is_software);
         Self {
-            next_keyframe_at: vec![0; sessions.len()],
-            sessions,
+            models: Models::new(sessions),
             feed,
-            publishing: Publishing::new(&hub, options.notes, options.device_notes),
+            publishing: Publishing::new(hub.clone(), options.notes, options.device_notes),
             hub,
             pace: options.pace,
             start_keyframes: options.start_keyframes,
-            keyframes: Vec::new(),
-            n_evicted: 0,
+            accepted: AcceptedKeyframes::default(),
             budget: RenderBudget::new(is_software),
             recoveries: Recoveries::new(options.open_gpu),
             ledger: Ledger::default(),
             keyframe_change: None,
             requests: Requests::default(),
-            started: Instant::now(),
-            warn_after: WARN_AFTER,
+            keyframe_warning: KeyframeWarning::start(),
         }
-    }
-
-    /// Reports, at growing intervals, that the run has no keyframe yet, and why.
-    fn warn_without_keyframes(&mut self) {
-        if !self.keyframes.is_empty()
-            || self.feed.ended()
-            || self.started.elapsed() < self.warn_after
-        {
-            return;
-        }
-        let rejected: Vec<String> = self
-            .feed
-            .rejected()
-            .iter()
-            .map(|(why, n)| format!("{n} {why}"))
-            .collect();
-        let reason = if rejected.is_empty() {
-            "no image has been joined with a pose".to_owned()
-        } else {
-            format!("images rejected: {}", rejected.join(", "))
-        };
-        log::warn!(
-            "no keyframe after {} s, so nothing is trained: {reason}",
-            self.warn_after.as_secs()
-        );
-        self.warn_after *= 2;
     }
 
     /// Continues with the keyframes of an earlier run, which the sessions already hold.
     pub fn resume_from(mut self, keyframes: Vec<Arc<Keyframe>>) -> Self {
-        self.keyframes = keyframes;
-        self.publish_keyframes();
-        if let Some(hint) = scene_hint::from_keyframes(&self.keyframes) {
+        self.accepted.list = keyframes;
+        self.publishing
+            .publish_keyframes(&self.accepted.list, &self.models.sessions[0]);
+        if let Some(hint) = scene_hint::from_keyframes(&self.accepted.list) {
             self.hub.set_scene_hint(hint);
         }
         self
@@ -145,19 +113,19 @@ impl Live {
     /// Whether the run is over: a limit was reached or cannot be reached, the devices failed, or
     /// the input ended without training data.
     pub fn is_over(&self) -> bool {
-        if self.is_scoring() {
+        if self.models.is_scoring() {
             return false; // An evaluation in progress is completed first.
         }
         // After one session has reached its limit, the run waits for all other sessions that can
         // still reach theirs.
         let is_done =
             |session: &Session| session.is_over() || (self.feed.ended() && session.is_idle());
-        let reached =
-            self.sessions.iter().any(Session::is_over) && self.sessions.iter().all(is_done);
+        let sessions = &self.models.sessions;
+        let reached = sessions.iter().any(Session::is_over) && sessions.iter().all(is_done);
         reached
             || self.has_exhausted_input()
             || self.feed.source_failed()
-            || (self.feed.ended() && !self.can_train())
+            || (self.feed.ended() && !self.accepted.can_train())
     }
 
     /// Whether the input ended and a model cannot reach its step limit without more keyframes.
@@ -165,6 +133,7 @@ impl Live {
     pub fn has_exhausted_input(&self) -> bool {
         self.is_finished()
             && self
+                .models
                 .sessions
                 .iter()
                 .any(|session| session.n_steps_remaining().is_some_and(|n| n > 0))
@@ -177,12 +146,12 @@ impl Live {
 
     /// Keyframes in the store, in order of acceptance.
     pub fn keyframes(&self) -> &[Arc<Keyframe>] {
-        &self.keyframes
+        &self.accepted.list
     }
 
     /// Number of keyframes evicted so far.
     pub fn n_evicted(&self) -> u64 {
-        self.n_evicted
+        self.accepted.n_evicted
     }
 
     /// Times at which each keyframe passed the stages from the camera to the screens of viewers.
@@ -192,42 +161,43 @@ impl Live {
 
     /// The models in training.
     pub fn sessions(&self) -> &[Session] {
-        &self.sessions
+        &self.models.sessions
     }
 
     /// Runs one cycle: takes keyframes, trains, draws and publishes. Reopens the GPU if it fails.
     pub fn advance(&mut self) -> anyhow::Result<()> {
-        self.warn_without_keyframes();
+        if self.accepted.list.is_empty() {
+            self.keyframe_warning.warn_when_due(&self.feed);
+        }
         // Requests of operators come first, so that the pictures and the status of this cycle
         // already show their effect.
-        self.apply_controls();
+        self.requests.apply_controls(&self.hub, &mut self.models);
         self.record_shown_pictures();
-        self.apply_edits();
+        self.requests.apply_edits(&self.hub, &mut self.models);
         // After a GPU failure, the remaining stages are skipped: each of them would fail, too.
         let advanced = self
             .take_keyframes()
             .and_then(|()| self.step())
             .and_then(|()| self.render())
-            .map(|()| self.publish_chunks())
-            .map(|()| self.publish_observations())
+            .map(|()| self.publish_models())
             .and_then(|()| self.publish());
-        advanced.or_else(|error| self.recoveries.recover(&mut self.sessions, error))
+        advanced.or_else(|error| self.recoveries.recover(&mut self.models.sessions, error))
     }
 
     /// Waits for queued work. Reopens the GPU if it failed, and returns whether it did.
     pub fn wait(&mut self) -> anyhow::Result<bool> {
-        match self.sessions.iter().try_for_each(Session::wait) {
+        match self.models.sessions.iter().try_for_each(Session::wait) {
             Ok(()) => Ok(false),
             Err(error) => self
                 .recoveries
-                .recover(&mut self.sessions, error)
+                .recover(&mut self.models.sessions, error)
                 .map(|()| true),
         }
     }
 
     /// Describes how to continue if the run fails now.
     pub fn describe_recoverable(&mut self) -> String {
-        recoveries::describe_recoverable(&mut self.sessions)
+        recoveries::describe_recoverable(&mut self.models.sessions)
     }
 
     /// Trains for one slice once there are enough keyframes. During an evaluation, scores one test
@@ -235,16 +205,16 @@ impl Live {
     fn step(&mut self) -> anyhow::Result<()> {
         // Checked even if no steps are made: callbacks may report a lost device at any time, and an
         // idle run must recover, too.
-        self.sessions.iter().try_for_each(Session::check_gpu)?;
+        self.models
+            .sessions
+            .iter()
+            .try_for_each(Session::check_gpu)?;
         if !self.is_training() {
             return Ok(());
         }
         // One image per cycle, so that requested pictures are drawn between two images.
-        if let Some(session) = self
-            .sessions
-            .iter_mut()
-            .find(|session| session.is_scoring())
-        {
+        let sessions = &mut self.models.sessions;
+        if let Some(session) = sessions.iter_mut().find(|session| session.is_scoring()) {
             let before = Instant::now();
             session.score_next()?;
             self.budget.add_training(before.elapsed());
@@ -252,7 +222,7 @@ impl Live {
         }
         if self.requests.is_paused {
             // Keyframes are still accepted, and checkpoints can be requested.
-            self.sessions
+            sessions
                 .iter_mut()
                 .try_for_each(Session::write_checkpoint_when_due)?;
         }
@@ -273,26 +243,25 @@ impl Live {
         // A picture waits for the submit in progress, so submits are shorter while clients are
         // connected.
         let is_watched = self.hub.n_clients() > 0;
-        self.sessions
+        let sessions = &mut self.models.sessions;
+        sessions
             .iter_mut()
             .for_each(|session| session.set_watched(is_watched));
         // In lockstep, no model trains beyond the step at which its next keyframe is due. After the
         // end of the input, no keyframe is due any more.
         let is_paced = self.pace != Pace::RealTime && !self.feed.ended();
-        let due = is_paced.then_some(&self.next_keyframe_at[..]);
-        let max_steps = |ix: usize, session: &Session| n_steps_until_due(due, ix, session);
         // Only in real time: the time of a step differs between runs, and a lockstep run must not
         // depend on it.
         if self.pace == Pace::RealTime {
-            self.sessions
+            sessions
                 .iter_mut()
                 .try_for_each(Session::pause_growth_when_slow)?;
         }
         let before = Instant::now();
-        let step_before = self.sessions[0].progress().step;
+        let step_before = sessions[0].progress().step;
         let hub = &self.hub;
         let budget = self.budget;
-        time_slices::train_next(&mut self.sessions, max_steps, || {
+        self.models.train_next(is_paced, || {
             budget.may_render() && hub.pictures().wait_for_request(Duration::ZERO)
         })?;
         self.budget.add_training(before.elapsed());
@@ -306,45 +275,22 @@ impl Live {
         // Changes only the state; the rest of the status stays visible until the scores are
         // published.
         self.hub.set_state("saving");
-        if self.erase_found(true) {
+        if self.requests.erase_found(true, &self.hub, &mut self.models) {
             self.publish_status();
             self.hub.set_state("saving");
         }
-        (self.sessions, self.feed.finish())
-    }
-
-    /// Why there is no model of this method.
-    fn unknown_method(&self, method: Option<&str>) -> String {
-        methods::unknown(self.sessions.iter().map(Session::kind), method)
-    }
-
-    fn is_scoring(&self) -> bool {
-        self.sessions.iter().any(Session::is_scoring)
+        (self.models.sessions, self.feed.finish())
     }
 
     fn is_training(&self) -> bool {
-        self.can_train() && (self.keyframes.len() >= self.start_keyframes || self.feed.ended())
-    }
-
-    /// Whether there is a training keyframe. With several cameras, the first keyframe of each is a
-    /// test keyframe.
-    fn can_train(&self) -> bool {
-        self.keyframes
-            .iter()
-            .any(|keyframe| keyframe.split == Split::Train)
-    }
-
-    /// Whether no model can train before the next keyframe arrives.
-    fn is_idle(&self) -> bool {
-        self.sessions
-            .iter()
-            .all(|session| session.is_idle() || session.has_finished_steps())
+        let has_enough = self.accepted.list.len() >= self.start_keyframes || self.feed.ended();
+        self.accepted.can_train() && has_enough
     }
 
     /// Whether the input ended and all training is done; the models stay visible until the user
     /// ends the run.
     fn is_finished(&self) -> bool {
-        self.feed.ended() && self.is_idle()
+        self.feed.ended() && self.models.is_idle()
     }
 
     fn state(&self) -> &'static str {
@@ -374,18 +320,4 @@ pub struct LiveOptions {
     pub device_notes: Notes,
     /// Reopens the GPU after a failure.
     pub open_gpu: OpenGpu,
-}
-
-/// Number of steps of a session until its next keyframe is due; unlimited without due steps.
-fn n_steps_until_due(due: Option<&[u64]>, session_ix: usize, session: &Session) -> u64 {
-    due.map_or(u64::MAX, |due| {
-        due[session_ix].saturating_sub(session.progress().step)
-    })
-}
-
-/// Index of the session of a method; of the first one if no method is given.
-fn session_for_method(sessions: &[Session], method: Option<&str>) -> Option<usize> {
-    sessions
-        .iter()
-        .position(|session| method.is_none_or(|name| session.kind().name() == name))
 }

@@ -46,7 +46,7 @@ pub struct Devices {
 /// are played back from files, the end of the last file also ends the source, after all samples
 /// read until then have been returned. Dropping the source stops the threads.
 #[derive(Debug)]
-pub struct Live {
+pub struct LiveDevices {
     shared: Arc<Shared>,
     threads: Vec<JoinHandle<()>>,
 }
@@ -75,7 +75,7 @@ struct State {
     stop: bool,
 }
 
-impl Live {
+impl LiveDevices {
     /// Starts reading.
     pub fn new(devices: Devices) -> Result<Self, Error> {
         let Devices {
@@ -352,7 +352,7 @@ impl State {
     }
 }
 
-impl Source for Live {
+impl Source for LiveDevices {
     fn next_sample(&mut self) -> Result<Option<Sample>, Error> {
         let mut state = self.shared.state.lock();
         loop {
@@ -377,7 +377,7 @@ impl Source for Live {
     }
 }
 
-impl Drop for Live {
+impl Drop for LiveDevices {
     fn drop(&mut self) {
         // Threads that wait for space in a queue are woken; the others notice it after at most
         // `POLL`.
@@ -481,7 +481,7 @@ mod tests {
 
     #[test]
     fn slow_caller_gets_newest_images_and_drop_counts() {
-        let mut live = Live::new(Devices {
+        let mut live = LiveDevices::new(Devices {
             cameras: vec![fast_camera(101)],
             ..Devices::default()
         })
@@ -552,7 +552,7 @@ mod tests {
             cameras: vec![Box::new(camera)],
             ..Devices::default()
         };
-        let mut live = Live::new(devices).expect("threads start");
+        let mut live = LiveDevices::new(devices).expect("threads start");
         while live.shared.state.lock().n_running > 0 {
             std::thread::yield_now();
         }
@@ -610,7 +610,7 @@ mod tests {
             arm: Some(arm),
             ..Devices::default()
         };
-        let mut live = Live::new(devices).expect("threads start");
+        let mut live = LiveDevices::new(devices).expect("threads start");
         let mut stamps = Vec::new();
         while let Some(sample) = live.next_sample().expect("the end is not an error") {
             if let Sample::Image(image) = sample {
@@ -623,7 +623,7 @@ mod tests {
 
     #[test]
     fn joints_arrive_in_stamp_order_and_drop_stops_threads() {
-        let mut live = Live::new(Devices {
+        let mut live = LiveDevices::new(Devices {
             arm: Some(Box::new(SlowArm { next: 0 })),
             ..Devices::default()
         })
