@@ -14,7 +14,7 @@ use keyframe::{Keyframe, scenes};
 use nalgebra::Point3;
 use std::path::Path;
 use std::sync::Arc;
-use trainer::gpu::{Gpu, GpuOptions};
+use gpu::{Gpu, GpuOptions};
 use trainer::splat::SplatOptions;
 use trainer::{ModelOptions, ModelSpec};
 

@@ -15,7 +15,7 @@ use keyframe::scenes::look_at;
 use nalgebra::{Point3, Vector3};
 use std::path::PathBuf;
 use std::sync::Arc;
-use trainer::gpu::{Gpu, GpuOptions};
+use gpu::{Gpu, GpuOptions};
 use trainer::{LoadedModel, Projection, RenderRequest};
 
 const DEFAULT_MODEL: &str = "target/example-model";

@@ -51,7 +51,7 @@ impl Models {
     }
 
     /// Pushes a keyframe to the models.
-    pub(super) fn push(&mut self, keyframe: &Arc<Keyframe>) -> crate::Result<()> {
+    pub(super) fn push(&mut self, keyframe: &Arc<Keyframe>) -> anyhow::Result<()> {
         let mut pushed = Ok(());
         for session in self.unfinished() {
             // Continues after a GPU failure, so that every session holds the keyframe for its
@@ -62,7 +62,7 @@ impl Models {
     }
 
     /// Removes an evicted keyframe from the models.
-    pub(super) fn remove(&mut self, camera: &str, stamp: Stamp) -> crate::Result<()> {
+    pub(super) fn remove(&mut self, camera: &str, stamp: Stamp) -> anyhow::Result<()> {
         let mut removed = Ok(());
         for session in self.unfinished() {
             // As in `push`, a failure must not leave the sessions with different keyframes.
@@ -80,7 +80,7 @@ impl Models {
     }
 
     /// Applies the results of alignments that are ready. Returns whether there were any.
-    pub(super) fn apply_alignments(&mut self) -> crate::Result<bool> {
+    pub(super) fn apply_alignments(&mut self) -> anyhow::Result<bool> {
         let mut is_applied = false;
         for session in &mut self.sessions {
             is_applied |= session.poll_alignment(false)?;
@@ -110,7 +110,7 @@ impl Models {
         &mut self,
         is_paced: bool,
         is_render_pending: impl Fn() -> bool,
-    ) -> crate::Result<()> {
+    ) -> anyhow::Result<()> {
         let due = is_paced.then_some(&self.next_keyframe_at[..]);
         let max_steps = |ix: usize, session: &Session| n_steps_until_due(due, ix, session);
         time_slices::train_next(&mut self.sessions, max_steps, is_render_pending)
