@@ -591,6 +591,33 @@ mod tests {
     }
 
     #[test]
+    fn recording_without_its_rig_file_needs_another_one() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let path = folder.path().join("run.mcap");
+        let rig = load("two-cameras.toml", &[]);
+        let metadata = RecordingMetadata {
+            joint_names: &rig.arm.joints,
+            ..RecordingMetadata::default()
+        };
+        let mut recorder = Recorder::create(&path, &metadata).expect("a new file");
+        let joints = kinematics::JointState {
+            stamp: kinematics::Stamp(5),
+            position: vec![0.0; 7],
+            velocity: vec![],
+            effort: vec![],
+        };
+        recorder.write(&Sample::Joints(joints)).expect("disk space");
+        recorder.finish().expect("disk space");
+        let error = recording(&path, None, &[]).err().expect("no rig file");
+        let message = format!("{error:#}");
+        assert!(
+            message.contains("contains no rig.toml") && message.contains("--rig"),
+            "{message}"
+        );
+        assert!(recording(&path, Some(rig), &[]).is_ok());
+    }
+
+    #[test]
     fn recording_stores_its_rig() {
         let folder = tempfile::tempdir().expect("a folder");
         let path = folder.path().join("run.mcap");
