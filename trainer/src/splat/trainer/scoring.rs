@@ -3,7 +3,7 @@
 use super::products::{self, Products};
 use super::renderer::DrawnView;
 use super::view_set::VIEWS_AT_ONCE;
-use super::{SplatTrainer, displayed};
+use super::SplatTrainer;
 use crate::splat::params::Camera;
 use crate::splat::trials::{ImageId, Scores};
 use crate::splat::views::{Level, camera_of};
