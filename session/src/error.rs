@@ -94,7 +94,7 @@ mod tests {
 
     #[test]
     fn gpu_errors_are_found_under_context() {
-        let lost = anyhow::Error::new(trainer::Error::DeviceLost).context("run");
+        let lost = anyhow::Error::new(gpu::Error::DeviceLost).context("run");
         assert!(is_gpu_error(&lost) && !is_gpu_unrecoverable(&lost));
         let ended = anyhow::Error::new(GpuUnrecoverable("resume it".into())).context("run");
         assert!(is_gpu_unrecoverable(&ended) && !is_gpu_error(&ended));

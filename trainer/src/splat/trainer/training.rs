@@ -294,7 +294,7 @@ pub(super) fn growth_key(seed: u64, step: u64) -> u32 {
 mod tests {
     use super::*;
     use crate::Method;
-    use crate::splat::cloud::synthetic_cloud;
+    use model_files::splat::cloud::synthetic_cloud;
     use crate::splat::training_tests::{keyframes, n_keyframes, options, request, train};
     use gpu::GpuOptions;
     use gpu::testing::{test_gpu, test_gpu_with};
