@@ -1,7 +1,6 @@
 //! Errors of the trainer.
 
 use keyframe::Keyframe;
-use messages::Setting;
 use std::path::PathBuf;
 use std::sync::Arc;
 

@@ -17,6 +17,7 @@ use drivers::udp::{DatagramMonitor, UdpArm, UdpBase, UdpScanner};
 #[cfg(target_os = "linux")]
 use drivers::v4l2::{Config, Settings, V4l2Camera, V4l2Format};
 use drivers::{Arm, Base, Devices, RangeScanner};
+use messages::BadInput;
 use std::net::{IpAddr, Ipv4Addr, SocketAddr};
 use std::time::Duration;
 

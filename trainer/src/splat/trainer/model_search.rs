@@ -7,7 +7,6 @@ use crate::splat::snapshot::Snapshot;
 use crate::splat::trials::{Due, SecondHalf, TrialContext, TrialEnd};
 use calibration::Candidate;
 use keyframe::Keyframe;
-use messages::Setting;
 use std::sync::Arc;
 
 impl SplatTrainer {
