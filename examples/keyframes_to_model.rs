@@ -10,11 +10,11 @@
 //! ```
 #![expect(clippy::print_stdout, reason = "an example prints its result")]
 
+use gpu::{Gpu, GpuOptions};
 use keyframe::{Keyframe, scenes};
 use nalgebra::Point3;
 use std::path::Path;
 use std::sync::Arc;
-use gpu::{Gpu, GpuOptions};
 use trainer::splat::SplatOptions;
 use trainer::{ModelOptions, ModelSpec};
 
@@ -37,14 +37,14 @@ fn main() -> anyhow::Result<()> {
         model.push(keyframe)?;
     }
     // One call queues at most a few milliseconds of work, so that the caller stays responsive.
-    while model.progress().step < N_STEPS && !model.is_idle() {
-        model.step(N_STEPS - model.progress().step)?;
+    while model.model().progress().step < N_STEPS && !model.is_idle() {
+        model.step(N_STEPS - model.model().progress().step)?;
     }
 
     let folder = Path::new(MODEL_FOLDER);
     std::fs::create_dir_all(folder)?;
     model.save(folder)?;
-    let progress = model.progress();
+    let progress = model.model().progress();
     println!(
         "{} splats after {} steps, saved in {MODEL_FOLDER}",
         progress.primitives, progress.step

@@ -11,11 +11,11 @@
 #![expect(clippy::print_stdout, reason = "an example prints its result")]
 
 use anyhow::Context;
+use gpu::{Gpu, GpuOptions};
 use keyframe::scenes::look_at;
 use nalgebra::{Point3, Vector3};
 use std::path::PathBuf;
 use std::sync::Arc;
-use gpu::{Gpu, GpuOptions};
 use trainer::{LoadedModel, Projection, RenderRequest};
 
 const DEFAULT_MODEL: &str = "target/example-model";
@@ -36,11 +36,11 @@ fn main() -> anyhow::Result<()> {
         ..
     } = trainer::load(gpu, &path)?;
 
-    let bounds = model.bounds()?.context("the model is empty")?;
+    let bounds = model.model_mut().bounds()?.context("the model is empty")?;
     let center = Point3::from(bounds.center_m);
     let eye = center + bounds.radius_m * Vector3::new(2.0, 1.0, 1.0);
     let [width, height] = SIZE_PX;
-    let picture = model.render(&RenderRequest {
+    let picture = model.model_mut().render(&RenderRequest {
         world_from_camera: look_at(eye, center),
         size_px: SIZE_PX,
         projection: Projection::Pinhole {
