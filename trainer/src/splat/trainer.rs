@@ -4,7 +4,6 @@ mod checkpoint;
 mod lazy_pipelines;
 mod learning_rates;
 mod model;
-mod model_search;
 mod model_size;
 mod optimizer;
 mod products;
@@ -15,6 +14,7 @@ mod saved_arrays;
 mod scoring;
 mod seeding;
 mod training;
+mod trial_runner;
 mod view_set;
 
 use super::bounds::bounds;
