@@ -1,63 +1,71 @@
 //! Runs the trials that decide which camera parameters are optimized and how large the model is.
 
-use super::SplatTrainer;
+use super::training::Training;
+use super::{gains, model_size, scoring};
 use crate::Error;
-use crate::splat::params::status;
 use crate::splat::snapshot::Snapshot;
-use crate::splat::trials::{Due, SecondHalf, TrialContext, TrialEnd};
+use crate::splat::trials::{Due, SecondHalf, SplatTrials, TrialContext, TrialEnd};
 use calibration::Candidate;
 use keyframe::Keyframe;
 use std::sync::Arc;
 
-impl SplatTrainer {
-    fn trial_context(&self) -> TrialContext {
-        TrialContext {
-            step: self.schedule.step,
-            n_splats: self.model.splats.n_splats,
-            is_mature: self.schedule.is_mature(),
-            sh_degree: self.model.splats.sh_degree,
-        }
-    }
+/// Runs the trials on the model in training.
+pub(super) struct TrialRunner<'a> {
+    pub(super) training: &'a mut Training,
+    pub(super) trials: &'a mut SplatTrials,
+}
 
-    fn due_trial(&self) -> Due {
-        self.trials.due(self.trial_context())
+impl TrialRunner<'_> {
+    fn due(&self) -> Due {
+        let Training {
+            schedule, model, ..
+        } = &*self.training;
+        self.trials.due(TrialContext {
+            step: schedule.step,
+            n_splats: model.splats.n_splats,
+            is_mature: schedule.is_mature(),
+            sh_degree: model.splats.sh_degree,
+        })
     }
 
     /// Starts, advances and ends trials until nothing is due, so that all effects of a trial's end
     /// apply at the same step. Postponing them to the next submit would make training depend on
     /// timing.
-    pub(super) fn try_when_due(&mut self) -> Result<(), Error> {
-        while self.due_trial() != Due::Nothing {
-            self.finish_in_flight()?; // A failed submit may reduce the step count.
-            match self.due_trial() {
+    pub(super) fn run_due(&mut self) -> Result<(), Error> {
+        while self.due() != Due::Nothing {
+            self.training.finish_in_flight()?; // A failed submit may reduce the step count.
+            match self.due() {
                 Due::Nothing => {}
-                Due::Begin(candidate) => self.begin_trial(candidate)?,
+                Due::Begin(candidate) => self.begin(candidate)?,
                 Due::BeginSecondHalf => self.begin_second_half()?,
                 Due::Arrival => self.add_next_arrival()?,
-                Due::Gains => self.try_gains()?,
-                Due::End => self.decide_trial()?,
+                Due::Gains => gains::try_gains(self.training, self.trials)?,
+                Due::End => self.decide()?,
                 Due::ReleaseValidation => self.release_validation()?,
             }
         }
         Ok(())
     }
 
-    fn begin_trial(&mut self, candidate: Candidate) -> Result<(), Error> {
-        match self.snapshot() {
-            Ok(snapshot) => self.trials.begin(candidate, snapshot, self.views.len()),
-            Err(error) => self.end_trials_without_memory(error)?,
+    fn begin(&mut self, candidate: Candidate) -> Result<(), Error> {
+        match self.training.snapshot() {
+            Ok(snapshot) => {
+                let n_views = self.training.views.len();
+                self.trials.begin(candidate, snapshot, n_views);
+            }
+            Err(error) => self.finish_without_memory(error)?,
         }
         Ok(())
     }
 
     /// Restores the state at the start of the trial and applies the tested change.
     fn begin_second_half(&mut self) -> Result<(), Error> {
-        let baseline_db = self.score_validation()?;
+        let baseline_db = scoring::score_validation(self.training, self.trials)?;
         // The trained baseline is kept: it is displayed during the second half, and restored if
         // the change is rejected.
-        let snapshot = match self.snapshot() {
+        let snapshot = match self.training.snapshot() {
             Ok(snapshot) => snapshot,
-            Err(error) => return self.end_trials_without_memory(error),
+            Err(error) => return self.finish_without_memory(error),
         };
         let Some(SecondHalf {
             from,
@@ -67,16 +75,19 @@ impl SplatTrainer {
         else {
             return Ok(());
         };
-        self.restore_snapshot(from)?;
+        self.restore(from)?;
         // Keyframes of the first half are added again at the steps of their arrival.
-        self.views
+        self.training
+            .views
             .retain(|keyframe| !arrived.iter().any(|other| Arc::ptr_eq(other, keyframe)));
         match candidate {
-            Candidate::Cameras(params) => self.model.cameras.enable(params),
-            Candidate::Halved { to, .. } => self.keep_most_contributing(to)?,
-            Candidate::ShDegree { to, .. } => self.lower_degree(to)?,
+            Candidate::Cameras(params) => self.training.model.cameras.enable(params),
+            Candidate::Halved { to, .. } => {
+                model_size::keep_most_contributing(self.training, to)?;
+            }
+            Candidate::ShDegree { to, .. } => model_size::lower_degree(self.training, to)?,
         }
-        self.prepare_training()
+        self.training.prepare_model()
     }
 
     /// Adds a keyframe in the second half, at the same step at which it arrived in the first half.
@@ -84,22 +95,22 @@ impl SplatTrainer {
         let Some(keyframe) = self.trials.next_arrival() else {
             return Ok(());
         };
-        self.add_arrival(keyframe)?;
-        self.prepare_training()
+        self.training.add_arrival(keyframe)?;
+        self.training.prepare_model()
     }
 
-    fn decide_trial(&mut self) -> Result<(), Error> {
-        let variant_db = self.score_validation()?;
+    fn decide(&mut self) -> Result<(), Error> {
+        let variant_db = scoring::score_validation(self.training, self.trials)?;
         let Some(finished) = self.trials.end(&variant_db) else {
             return Ok(());
         };
-        self.end_trial(finished)?;
-        self.prepare_training()
+        self.end(finished)?;
+        self.training.prepare_model()
     }
 
     /// Ends a trial. Restores the state without the change if the change was rejected. Then adds
     /// the keyframes that arrived in the second half.
-    fn end_trial(
+    fn end(
         &mut self,
         TrialEnd {
             restored,
@@ -108,38 +119,38 @@ impl SplatTrainer {
         }: TrialEnd,
     ) -> Result<(), Error> {
         if let Some(snapshot) = restored {
-            self.restore_snapshot(snapshot)?;
+            self.restore(snapshot)?;
             // The baseline was trained on these keyframes, so their splats exist. Seeding them
             // again would double the splats.
             seeded
                 .into_iter()
-                .for_each(|keyframe| self.views.push(keyframe));
+                .for_each(|keyframe| self.training.views.push(keyframe));
         }
         deferred
             .into_iter()
-            .try_for_each(|keyframe| self.add_arrival(keyframe))
+            .try_for_each(|keyframe| self.training.add_arrival(keyframe))
     }
 
     /// Cancels a trial that is in its second half.
-    pub(super) fn cancel_trial(&mut self) -> Result<(), Error> {
+    pub(super) fn cancel(&mut self) -> Result<(), Error> {
         // In the first half, the model in training is the one without the change.
         let Some(canceled) = self.trials.cancel() else {
             return Ok(());
         };
         log::info!("training stopped during a trial; saving the model without the tested change");
-        self.end_trial(canceled)
+        self.end(canceled)
     }
 
     /// Ends a trial without a decision; it is repeated.
-    pub(super) fn abort_trial(&mut self) -> Result<(), Error> {
+    pub(super) fn abort(&mut self) -> Result<(), Error> {
         self.trials
             .abort()
-            .map_or(Ok(()), |aborted| self.end_trial(aborted))
+            .map_or(Ok(()), |aborted| self.end(aborted))
     }
 
     /// Ends all trials, which need copies of the model, if there is no memory for them. Training
     /// continues.
-    fn end_trials_without_memory(&mut self, error: Error) -> Result<(), Error> {
+    fn finish_without_memory(&mut self, error: Error) -> Result<(), Error> {
         if !error.is_out_of_memory() {
             return Err(error);
         }
@@ -147,44 +158,21 @@ impl SplatTrainer {
         self.release_validation()
     }
 
-    pub(super) fn release_validation(&mut self) -> Result<(), Error> {
+    fn release_validation(&mut self) -> Result<(), Error> {
         let released: Vec<Arc<Keyframe>> = self.trials.finish();
         released
             .into_iter()
-            .try_for_each(|keyframe| self.add_view(keyframe))?;
-        self.prepare_training()
+            .try_for_each(|keyframe| self.training.add_view(keyframe))?;
+        self.training.prepare_model()
     }
 
-    pub(super) fn snapshot(&self) -> Result<Snapshot, Error> {
-        let gpu = &self.recorder.gpu;
-        let splats = &self.model.splats;
-        let cameras = &self.model.cameras;
-        Ok(Snapshot {
-            // Resizing to the same size copies the buffers.
-            splats: splats.resized(gpu, splats.capacity, splats.sh_degree)?,
-            cameras: (cameras.set, cameras.copy(gpu)?),
-            schedule: self.schedule,
-            scene: self.seeding.scene.clone(),
-        })
-    }
-
-    pub(super) fn restore_snapshot(&mut self, snapshot: Snapshot) -> Result<(), Error> {
-        self.recorder.passes.clear_bindings();
+    /// Restores a state and counts the reverted steps.
+    fn restore(&mut self, snapshot: Snapshot) -> Result<(), Error> {
         // The sum of steps and reverted steps stays the number of steps that were trained.
         // The snapshot may be from a later step, if the second half of a trial is canceled. Its first
         // half was reverted before, so the result is not negative.
         self.trials.n_reverted_steps =
-            self.trials.n_reverted_steps + self.schedule.step - snapshot.schedule.step;
-        self.model.splats = snapshot.splats;
-        self.model
-            .cameras
-            .restore_snapshot(&self.recorder.gpu, snapshot.cameras)?;
-        self.schedule = snapshot.schedule;
-        self.seeding.scene = snapshot.scene;
-        // Kernels derive learning rates and random numbers from their own step counter.
-        let step = u32::try_from(self.schedule.step).unwrap_or(u32::MAX);
-        self.optimizer
-            .write_counter(&self.recorder.gpu, status::STEP, step);
-        Ok(())
+            self.trials.n_reverted_steps + self.training.schedule.step - snapshot.schedule.step;
+        self.training.restore_snapshot(snapshot)
     }
 }
