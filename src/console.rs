@@ -2,7 +2,7 @@
 
 use crate::print;
 use indicatif::ProgressBar;
-use keyframe::counted;
+use messages::counted;
 use parking_lot::Mutex;
 use serde::Serialize;
 use session::next_commands::{self, SavedModel};
@@ -182,10 +182,11 @@ impl ReadBar {
             .is_none_or(|(noun, _)| *noun != progress.noun)
         {
             clear(&mut current);
-            // A recording has no known number of keyframes, so there is no bar to fill.
-            let template = match progress.noun {
-                "images" => "{bar:30} {pos} of {len} images",
-                "depth images" => "{bar:30} {pos} of {len} depth images",
+            // A recording has no known number of images and keyframes, so there is no bar to fill.
+            let template = match (progress.noun, progress.n_all) {
+                ("images", Some(_)) => "{bar:30} {pos} of {len} images",
+                ("images", None) => "{spinner} {pos} images",
+                ("depth images", _) => "{bar:30} {pos} of {len} depth images",
                 _ => "{spinner} {pos} keyframes",
             };
             let bar = print::bar(progress.n_all.map(|n| n as u64), template, self.is_hidden);
@@ -194,6 +195,11 @@ impl ReadBar {
         if let Some((_, bar)) = &*current {
             bar.set_position(progress.n_done as u64);
         }
+    }
+
+    /// Removes the bar until further progress.
+    pub(crate) fn end(&self) {
+        clear(&mut self.bar.lock());
     }
 }
 
@@ -205,6 +211,6 @@ fn clear(bar: &mut Option<(&'static str, ProgressBar)>) {
 
 impl Drop for ReadBar {
     fn drop(&mut self) {
-        clear(&mut self.bar.lock());
+        self.end();
     }
 }

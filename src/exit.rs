@@ -1,8 +1,7 @@
 //! Exit codes and the errors that lead to them.
 
 use crate::print;
-use capture::ConfigError;
-use keyframe::ErrorClass;
+use messages::ErrorClass;
 use std::io::ErrorKind;
 use std::process::ExitCode;
 
@@ -39,50 +38,13 @@ impl From<Exit> for ExitCode {
     }
 }
 
-/// A user error: invalid arguments, or an invalid rig file.
-#[derive(Debug, thiserror::Error)]
-#[error("{0}")]
-pub(crate) struct BadArgument(pub(crate) String);
-
-/// The input is not sufficient for a result.
-#[derive(Debug, thiserror::Error)]
-#[error("{0}")]
-pub(crate) struct InsufficientData(pub(crate) String);
-
 /// The exit code of an error.
 pub(crate) fn of(error: &anyhow::Error) -> Exit {
-    let has = |class| error.chain().any(|cause| class_of(cause) == Some(class));
-    // A rejected argument counts more than its consequences, so the whole chain is searched for it
-    // first.
-    if has(ErrorClass::BadInput) {
-        Exit::BadArguments
-    } else if has(ErrorClass::InsufficientData) {
-        Exit::InsufficientData
-    } else {
-        Exit::Failed
+    match session::class(error) {
+        ErrorClass::BadInput => Exit::BadArguments,
+        ErrorClass::InsufficientData => Exit::InsufficientData,
+        ErrorClass::Failed => Exit::Failed,
     }
-}
-
-/// The class of an error of this program or its libraries.
-fn class_of(error: &(dyn std::error::Error + 'static)) -> Option<ErrorClass> {
-    if error.is::<BadArgument>() || error.is::<ConfigError>() {
-        return Some(ErrorClass::BadInput);
-    }
-    if error.is::<InsufficientData>() {
-        return Some(ErrorClass::InsufficientData);
-    }
-    // The budget is an argument, so another one is a remedy.
-    if let Some(trainer::Error::BudgetTooSmall { .. }) = error.downcast_ref() {
-        return Some(ErrorClass::BadInput);
-    }
-    let of_session = || Some(error.downcast_ref::<session::Error>()?.class());
-    let of_capture = || Some(error.downcast_ref::<capture::Error>()?.class());
-    let of_keyframe = || Some(error.downcast_ref::<keyframe::Error>()?.class());
-    let of_calibration = || Some(error.downcast_ref::<calibration::Error>()?.class());
-    of_session()
-        .or_else(of_capture)
-        .or_else(of_keyframe)
-        .or_else(of_calibration)
 }
 
 /// Whether a command was rejected because of bad arguments or insufficient data.
@@ -116,21 +78,13 @@ pub(crate) fn is_broken_pipe(error: &anyhow::Error) -> bool {
 mod tests {
     use super::*;
     use anyhow::Context;
+    use messages::BadInput;
 
     #[test]
-    fn bad_argument_keeps_its_code_under_context() {
-        let error = anyhow::Error::new(BadArgument("unknown key".into())).context("rig file");
+    fn bad_input_keeps_its_code_under_context() {
+        let error = anyhow::Error::new(BadInput("unknown key".into())).context("rig file");
         assert_eq!(of(&error), Exit::BadArguments);
         assert_eq!(of(&anyhow::anyhow!("disk full")), Exit::Failed);
-        let budget = trainer::Error::BudgetTooSmall {
-            model: "neural field",
-            max_bytes: 1,
-            min_bytes: 2,
-        };
-        assert_eq!(
-            of(&anyhow::Error::new(budget).context("run")),
-            Exit::BadArguments
-        );
     }
 
     #[test]

@@ -1,7 +1,10 @@
-//! Checks that messages name only flags of the command that prints them.
+//! Checks that messages name only flags of the command that prints them, and that libraries name
+//! settings instead of flags.
 
 use crate::cli::Cli;
+use crate::flag_names::flag;
 use clap::CommandFactory;
+use messages::Setting;
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 use syn::buffer::{Cursor, TokenBuffer};
@@ -9,19 +12,12 @@ use syn::visit::Visit;
 use syn::{Attribute, Item, LitStr, Macro, Meta};
 
 /// Source files or folders, and the commands that print their messages. All these commands must
-/// accept a flag in a message, unless the message names a command that accepts it.
-const PRINTED_BY: [(&str, &[&str]); 24] = [
+/// accept a flag or setting in a message, unless the message names a command that accepts it.
+const PRINTED_BY: [(&str, &[&str]); 23] = [
     ("bench/src", &["bench"]),
+    ("calibration/procedures/src", &["calibrate"]),
     ("calibration/src/hand_eye", &["calibrate hand-eye"]),
     ("keyframe/src/error.rs", &["train", "eval", "bench"]),
-    (
-        "session/src/calibration_report",
-        &[
-            "calibrate intrinsics",
-            "calibrate hand-eye",
-            "calibrate scene",
-        ],
-    ),
     ("session/src/camera_path.rs", &["render"]),
     ("session/src/checkpoints.rs", &["run", "train"]),
     (
@@ -58,18 +54,29 @@ const PRINTED_BY: [(&str, &[&str]); 24] = [
         "viz/src/error.rs",
         &["run", "view", "calibrate intrinsics", "calibrate hand-eye"],
     ),
-    // These build command lines for other commands.
-    ("session/src/next_commands.rs", &["eval", "export"]),
+    // These build command lines for another command.
     ("src/commands/bench/live.rs", &["run"]),
     ("src/commands/bench/run_flags.rs", &["run"]),
 ];
 
 /// Exceptions: flags in messages of a command that does not accept them.
-const NOT_PRINTED: [(&str, &str); 2] = [
+const NOT_PRINTED: [(&str, &str); 1] = [
     // A flag for `eval`, which is printed as a command to run next.
     ("src/commands/run.rs", "rig"),
-    // Replaced by `--params` in messages.
-    ("session/src/scene_calibration.rs", "refine"),
+];
+
+/// Settings in messages of libraries that name a command which accepts them.
+const NAMED_WITH_COMMAND: [(&str, Setting, &str); 10] = [
+    ("capture/src/dataset.rs", Setting::Scale, "train"),
+    ("capture/src/open/mod.rs", Setting::Rig, "train"),
+    ("capture/src/open/mod.rs", Setting::Sim, "run"),
+    ("capture/src/supervised_arm.rs", Setting::Recover, "move"),
+    ("session/src/next_commands.rs", Setting::Keyframes, "eval"),
+    ("session/src/next_commands.rs", Setting::Out, "export"),
+    ("session/src/next_commands.rs", Setting::To, "export"),
+    ("session/src/training.rs", Setting::DepthFrom, "train"),
+    ("trainer/src/error.rs", Setting::MaxBytes, "train"),
+    ("trainer/src/error.rs", Setting::MaxSplats, "train"),
 ];
 
 /// Long flags of a command such as `train` or `bench curve`, and of its subcommands.
@@ -104,15 +111,7 @@ fn accepted_in(file: &str) -> Vec<BTreeSet<String>> {
     // The longest place is the most specific one.
     let places = PRINTED_BY.iter().filter(|(place, _)| is_in(file, place));
     if let Some((_, commands)) = places.max_by_key(|(place, _)| place.len()) {
-        return match is_in(file, "session/src/next_commands.rs") {
-            true => vec![
-                commands
-                    .iter()
-                    .flat_map(|command| flags_of(command))
-                    .collect(),
-            ],
-            false => commands.iter().map(|command| flags_of(command)).collect(),
-        };
+        return commands.iter().map(|command| flags_of(command)).collect();
     }
     let own = file
         .strip_prefix("src/commands/")
@@ -157,11 +156,43 @@ fn names_a_command_with(text: &str, flag: NamedFlag<'_>) -> bool {
             || text.contains(&format!("`{name}`"))
             || flag.before.ends_with(&format!("{name} "))
     };
-    // Flags of cargo in advice on how to build.
-    let is_of_cargo = ["features", "release"].contains(&flag.name) && text.contains("build");
     let cli = Cli::command();
     let mut commands = cli.get_subcommands().map(|command| command.get_name());
-    is_of_cargo || commands.any(|name| is_named(name) && flags_of(name).contains(flag.name))
+    is_of_cargo(text, flag)
+        || commands.any(|name| is_named(name) && flags_of(name).contains(flag.name))
+}
+
+/// Whether a flag in advice on how to build is one of cargo.
+fn is_of_cargo(text: &str, flag: NamedFlag<'_>) -> bool {
+    ["features", "release"].contains(&flag.name) && text.contains("build")
+}
+
+/// The settings that a source file names.
+fn settings_in(source: &str) -> Vec<Setting> {
+    let after = source.split("Setting::").skip(1);
+    let names = after.map(|rest| rest.split(|c: char| !c.is_alphanumeric()).next());
+    let all = Setting::ALL.iter().copied();
+    names
+        .filter_map(|name| {
+            all.clone()
+                .find(|setting| Some(&*format!("{setting:?}")) == name)
+        })
+        .collect()
+}
+
+/// Whether a source file names a command that accepts a flag, as `fieldrig train` or as a word.
+fn names_command_with(source: &str, command: &str, flag: &str) -> bool {
+    let is_named = [format!("fieldrig {command}"), format!("\"{command}\"")]
+        .iter()
+        .any(|text| source.contains(text));
+    is_named && flags_of(command).contains(flag)
+}
+
+/// The texts of a source file, without those of tests, documentation and help.
+fn texts_of(file: &str, source: &str) -> Vec<String> {
+    let mut texts = Texts::default();
+    texts.visit_file(&syn::parse_file(source).unwrap_or_else(|error| panic!("{file}: {error}")));
+    texts.0
 }
 
 /// The texts of a file, without those of tests, documentation and help.
@@ -233,18 +264,33 @@ impl<'ast> Visit<'ast> for Texts {
     }
 }
 
-/// Source files of all crates, except tests.
-fn source_files(root: &Path) -> Vec<PathBuf> {
+/// The workspace.
+fn root() -> &'static Path {
+    Path::new(env!("CARGO_MANIFEST_DIR"))
+}
+
+/// Source files of all libraries, except tests.
+fn library_files() -> Vec<(String, String)> {
+    let manifest = std::fs::read_to_string(root().join("Cargo.toml")).expect("a manifest");
+    let manifest: toml::Table = manifest.parse().expect("TOML");
+    let members = manifest["workspace"]["members"].as_array().expect("crates");
+    let names = members
+        .iter()
+        .map(|member| member.as_str().expect("a path"));
+    // The crate `messages` defines the settings, and its tests spell some of them as flags.
+    let libraries =
+        names.filter(|name| !name.starts_with("tests/") && !name.ends_with("/messages"));
+    source_files(
+        libraries
+            .map(|name| root().join(name).join("src"))
+            .collect(),
+    )
+}
+
+/// Source files in folders, except tests: their paths in the workspace and their contents.
+fn source_files(mut folders: Vec<PathBuf>) -> Vec<(String, String)> {
     let is_test =
         |path: &Path| path.to_string_lossy().ends_with("tests.rs") || path.ends_with("testing.rs");
-    let crates = std::fs::read_dir(root)
-        .expect("the workspace")
-        .flatten()
-        .map(|entry| entry.path().join("src"));
-    let mut folders: Vec<PathBuf> = crates
-        .chain([root.join("src")])
-        .filter(|folder| folder.is_dir())
-        .collect();
     let mut files = Vec::new();
     while let Some(folder) = folders.pop() {
         for path in std::fs::read_dir(folder)
@@ -265,38 +311,36 @@ fn source_files(root: &Path) -> Vec<PathBuf> {
         }
     }
     files.sort();
-    files
+    files.into_iter().map(read).collect()
+}
+
+/// The path of a source file in the workspace, and its contents.
+fn read(path: PathBuf) -> (String, String) {
+    let file = path.strip_prefix(root()).expect("in the workspace");
+    let source = std::fs::read_to_string(&path).expect("a source file");
+    (file.to_string_lossy().into_owned(), source)
 }
 
 #[test]
 fn messages_name_only_flags_of_their_command() {
-    let root = Path::new(env!("CARGO_MANIFEST_DIR"));
     let (mut n_flags, mut wrong) = (0, Vec::new());
-    for path in source_files(root) {
-        let file = path
-            .strip_prefix(root)
-            .expect("in the workspace")
-            .to_string_lossy()
-            .into_owned();
-        let source = std::fs::read_to_string(&path).expect("a source file");
-        let mut texts = Texts::default();
-        texts.visit_file(
-            &syn::parse_file(&source).unwrap_or_else(|error| panic!("{file}: {error}")),
-        );
+    // The flags of settings are checked where libraries name the settings.
+    let files = source_files(vec![root().join("src")]);
+    for (file, source) in files.iter().filter(|(file, _)| file != "src/flag_names.rs") {
+        let texts = texts_of(file, source);
         let texts: Vec<&String> = texts
-            .0
             .iter()
             .filter(|text| !flags_in(text).is_empty())
             .collect();
         if texts.is_empty() {
             continue;
         }
-        let accepted = accepted_in(&file);
+        let accepted = accepted_in(file);
         for text in texts {
             for flag in flags_in(text) {
                 n_flags += 1;
                 let is_accepted = accepted.iter().all(|flags| flags.contains(flag.name))
-                    || NOT_PRINTED.contains(&(&*file, flag.name))
+                    || NOT_PRINTED.contains(&(&**file, flag.name))
                     || names_a_command_with(text, flag);
                 if !is_accepted {
                     wrong.push(format!("{file}: --{} in {text:?}", flag.name));
@@ -309,7 +353,67 @@ fn messages_name_only_flags_of_their_command() {
         Vec::<String>::new(),
         "name the command that has the flag, or correct PRINTED_BY"
     );
-    assert!(n_flags > 100, "{n_flags} flags were found");
+    assert!(n_flags > 50, "{n_flags} flags were found");
+}
+
+#[test]
+fn libraries_name_settings_instead_of_flags() {
+    let files = library_files();
+    assert!(files.len() > 200, "{} files", files.len());
+    let mut named = Vec::new();
+    for (file, source) in &files {
+        for text in texts_of(file, source) {
+            let flags = flags_in(&text).into_iter();
+            let own = flags.filter(|flag| !is_of_cargo(&text, *flag));
+            named.extend(own.map(|flag| format!("{file}: --{} in {text:?}", flag.name)));
+        }
+    }
+    assert_eq!(named, Vec::<String>::new(), "name a `messages::Setting`");
+}
+
+#[test]
+fn libraries_name_only_settings_of_the_command_that_prints_them() {
+    let (mut n_settings, mut wrong) = (0, Vec::new());
+    let mut unused = NAMED_WITH_COMMAND.to_vec();
+    for (file, source) in library_files() {
+        let settings = settings_in(&source);
+        if settings.is_empty() {
+            continue;
+        }
+        let accepted = accepted_in(&file);
+        for setting in settings {
+            n_settings += 1;
+            let name = flag(setting).trim_start_matches("--");
+            let is_here =
+                |(place, other, _): &(&str, Setting, &str)| *place == file && *other == setting;
+            let is_named = NAMED_WITH_COMMAND
+                .iter()
+                .filter(|named| is_here(named))
+                .any(|(_, _, command)| names_command_with(&source, command, name));
+            unused.retain(|named| !is_here(named));
+            if !is_named && !accepted.iter().all(|flags| flags.contains(name)) {
+                wrong.push(format!("{file}: {setting:?}"));
+            }
+        }
+    }
+    assert_eq!(
+        wrong,
+        Vec::<String>::new(),
+        "name the command that has the flag, or correct PRINTED_BY or NAMED_WITH_COMMAND"
+    );
+    assert!(unused.is_empty(), "no message names {unused:?}");
+    assert!(n_settings > 60, "{n_settings} settings were found");
+}
+
+#[test]
+fn every_setting_is_a_flag() {
+    let cli = Cli::command();
+    let commands = cli.get_subcommands().map(|command| command.get_name());
+    let flags: BTreeSet<String> = commands.flat_map(flags_of).collect();
+    for setting in Setting::ALL {
+        let name = flag(*setting).strip_prefix("--").expect("two hyphens");
+        assert!(flags.contains(name), "{setting:?}: no command has --{name}");
+    }
 }
 
 #[test]

@@ -7,6 +7,7 @@ mod commands;
 mod console;
 mod data_args;
 mod exit;
+mod flag_names;
 #[cfg(test)]
 mod flag_tests;
 mod open_gpu;
@@ -24,6 +25,7 @@ fn main() -> ExitCode {
     // First, while the program has a single thread: changing the environment is unsafe with
     // several.
     keep_wayland_quiet();
+    messages::Setting::spell_as(flag_names::flag);
     let cli = cli::Cli::parse();
     print::start_log(cli.verbose);
     if cli.command.is_private() {

@@ -2,21 +2,23 @@
 
 use crate::allocator;
 use gpu::{Gpu, GpuOptions};
+use messages::BadInput;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Once};
 
 /// Opens the GPU. `FIELDRIG_GPU` selects one of several; `FIELDRIG_GPU_FEATURES=none` disables all
 /// optional features, and `no-matrices` only cooperative matrices.
-pub(crate) fn open_gpu() -> session::Result<Arc<Gpu>> {
+pub(crate) fn open_gpu() -> anyhow::Result<Arc<Gpu>> {
     let features = std::env::var_os("FIELDRIG_GPU_FEATURES");
     let [optional_features, matrices] =
         ["none", "no-matrices"].map(|word| features.as_ref().is_none_or(|value| value != word));
-    let adapter = match std::env::var("FIELDRIG_GPU") {
-        Ok(text) => Some(text.parse().map_err(|_| {
-            session::Error::BadInput(format!("FIELDRIG_GPU: {text:?} is not the number of a GPU"))
-        })?),
-        Err(_) => None,
-    };
+    let adapter =
+        match std::env::var("FIELDRIG_GPU") {
+            Ok(text) => Some(text.parse().map_err(|_| {
+                BadInput(format!("FIELDRIG_GPU: {text:?} is not the number of a GPU"))
+            })?),
+            Err(_) => None,
+        };
     // Installed before the GPU is used, because a lost device is detected at any time after that.
     hide_caught_panics();
     check_open_for_tests()?;

@@ -1,8 +1,8 @@
 //! Flags for the address of the page, and who may open it.
 
-use crate::exit::BadArgument;
 use crate::served_page::{ServedPage, Shared};
 use anyhow::Context;
+use messages::BadInput;
 use session::next_commands::quoted;
 use std::net::{Ipv4Addr, SocketAddr};
 use std::path::PathBuf;
@@ -46,18 +46,18 @@ impl PageArgs {
 
     /// Rejects an address that other machines can reach, unless the page is shared, and flags that
     /// this build lacks.
-    pub(crate) fn check(&self) -> Result<(), BadArgument> {
+    pub(crate) fn check(&self) -> Result<(), BadInput> {
         match self.listen {
             Some(address) if !address.ip().is_loopback() && !self.share => {
                 // The user can copy the command with the missing flag.
                 let command: Vec<String> = std::env::args().skip(1).map(|word| quoted(&word)).collect();
-                Err(BadArgument(format!(
+                Err(BadInput(format!(
                     "other machines can reach {address}, so the page must be encrypted and require a token: run \
                      `fieldrig {} --share`",
                     command.join(" ")
                 )))
             }
-            _ if self.foxglove.is_some() && !cfg!(feature = "foxglove") => Err(BadArgument(
+            _ if self.foxglove.is_some() && !cfg!(feature = "foxglove") => Err(BadInput(
                 "--foxglove: this program was built without Foxglove support: build with `--features foxglove`"
                     .to_owned(),
             )),
@@ -136,7 +136,7 @@ impl PageArgs {
 }
 
 /// The user's folder for data of this program.
-fn data_folder() -> Result<PathBuf, BadArgument> {
+fn data_folder() -> Result<PathBuf, BadInput> {
     let given = std::env::var_os("XDG_DATA_HOME")
         .map(PathBuf::from)
         // The XDG specification says to ignore relative paths.
@@ -146,7 +146,7 @@ fn data_folder() -> Result<PathBuf, BadArgument> {
         .or_else(in_home)
         .map(|folder| folder.join("fieldrig"))
         .ok_or_else(|| {
-            BadArgument(
+            BadInput(
                 "there is no home folder for the TLS certificate: set HOME, or use --certificate"
                     .to_owned(),
             )

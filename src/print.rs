@@ -322,13 +322,15 @@ pub(crate) fn bar(length: Option<u64>, template: &'static str, hidden: bool) -> 
 }
 
 /// The crates that log progress.
-const WORKSPACE_CRATES: [&str; 10] = [
+const WORKSPACE_CRATES: [&str; 12] = [
     "fieldrig",
     "bench",
+    "calibrate",
     "calibration",
     "capture",
     "drivers",
     "gpu",
+    "report",
     "session",
     "sim",
     "trainer",
@@ -391,5 +393,29 @@ mod tests {
             printable("\u{9b}31m\u{7f}\r\u{202e}x"),
             "\\u{9b}31m\\u{7f}\\u{d}\\u{202e}x"
         );
+    }
+
+    #[test]
+    fn blocked_stream_blocks_neither_the_program_nor_the_other_stream() {
+        static WRITTEN: Mutex<Vec<u8>> = Mutex::new(Vec::new());
+        let blocked = writer(|_| {
+            loop {
+                std::thread::park();
+            }
+        });
+        let other = writer(|bytes| WRITTEN.lock().extend_from_slice(bytes));
+        let n_queued = (0..2 * MAX_WAITING)
+            .filter(|_| send(&blocked, "log".to_owned()))
+            .count();
+        // The thread may hold one more chunk than the queue.
+        assert!(
+            (MAX_WAITING..=MAX_WAITING + 1).contains(&n_queued),
+            "{n_queued}"
+        );
+        assert!(send(&other, "result".to_owned()));
+        let (done, is_done) = sync_channel(1);
+        assert!(other.try_send(OutputChunk::Flush(done)).is_ok());
+        is_done.recv_timeout(MAX_FLUSH).expect("it is not blocked");
+        assert_eq!(*WRITTEN.lock(), b"result");
     }
 }

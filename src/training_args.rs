@@ -3,7 +3,7 @@
 use capture::config::{MAX_BYTES_RANGE, MAX_SPLATS_RANGE, SEED_RANGE};
 use clap::builder::{PossibleValuesParser, TypedValueParser};
 use clap::value_parser;
-use keyframe::listed;
+use messages::listed;
 use session::{Refine, TrainingOptions};
 use std::sync::LazyLock;
 use trainer::ModelKind;

@@ -4,10 +4,11 @@ use crate::findings::{BenchResult, Findings};
 use crate::runs::{Host, Job, NamedData, Run, Runs, RunsOptions};
 use crate::statistics::sample_std;
 use crate::variant::Variant;
-use crate::{Error, Result};
+use anyhow::Result;
 use kinematics::quantile::median;
+use messages::{BadInput, Setting};
+use report::Table;
 use serde::Serialize;
-use session::Table;
 use std::collections::HashSet;
 use std::path::PathBuf;
 use trainer::splat::{CountPolicy, SplatOptions};
@@ -126,15 +127,16 @@ pub fn run(options: &AblationOptions, host: &Host<'_>) -> Result<BenchResult> {
         .collect();
     if changes.is_empty() {
         let names: Vec<&str> = VARIANTS.iter().map(|change| change.name).collect();
-        return Err(Error::BadInput(format!(
-            "--only: no variant matches; variants: {}",
+        return Err(BadInput(format!(
+            "{}: no variant matches; variants: {}",
+            Setting::Only,
             names.join(", ")
-        )));
+        ))
+        .into());
     }
     if options.runs.training.count.is_some() {
-        return Err(Error::BadInput(
-            "--count: this bench sets it; remove the flag".into(),
-        ));
+        let message = format!("{}: this bench sets it; remove the flag", Setting::Count);
+        return Err(BadInput(message).into());
     }
     runs.expect((changes.len() as u64 + 1) * options.seeds);
     let mut baseline: Vec<Run> = Vec::new();

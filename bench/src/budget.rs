@@ -3,11 +3,12 @@
 use crate::findings::{BenchResult, Findings};
 use crate::runs::{Host, Job, NamedData, Run, Runs, RunsOptions};
 use crate::statistics::{db_per_doubling, extent};
-use crate::{Error, Result};
+use anyhow::Result;
 use kinematics::quantile::median;
+use messages::{BadInput, Setting};
+use report::Table;
+use report::chart::{Axis, Chart, Line, Marker, Point, Scale};
 use serde::Serialize;
-use session::Table;
-use session::chart::{Axis, Chart, Line, Marker, Point, Scale};
 use std::collections::HashSet;
 use std::path::PathBuf;
 use trainer::splat::{CountPolicy, SplatOptions};
@@ -67,9 +68,13 @@ struct Gain {
 pub fn run(options: &BudgetOptions, host: &Host<'_>) -> Result<BenchResult> {
     let limits = session::limits(options.seconds, options.steps, DEFAULT_SECONDS)?;
     if options.runs.training.max_splats.is_some() || options.runs.training.count.is_some() {
-        return Err(Error::BadInput(
-            "--max-splats, --count: this bench sets them; choose limits with --splats".into(),
-        ));
+        let message = format!(
+            "{}, {}: this bench sets them; choose limits with {}",
+            Setting::MaxSplats,
+            Setting::Count,
+            Setting::Splats
+        );
+        return Err(BadInput(message).into());
     }
     let mut caps: Vec<Option<u32>> = options.splats.iter().copied().map(Some).collect();
     caps.sort_unstable();

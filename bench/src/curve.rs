@@ -4,11 +4,13 @@ use crate::findings::{BenchResult, Findings};
 use crate::peer::Peer;
 use crate::runs::{Host, Job, NamedData, Run, Runs, RunsOptions};
 use crate::statistics::{extent, sample_std, secs_to};
-use crate::{Error, Result};
+use anyhow::Result;
 use kinematics::quantile::median;
+use messages::{BadInput, Setting};
+use report::Table;
+use report::chart::{Axis, Chart, Line, Point, Scale, compact_number};
 use serde::Serialize;
-use session::chart::{Axis, Chart, Line, Point, Scale, compact_number};
-use session::{Table, evaluation_schedule};
+use session::evaluation_schedule;
 use std::collections::{BTreeMap, HashSet};
 use std::path::PathBuf;
 use trainer::{ModelKind, ModelSpec};
@@ -102,7 +104,7 @@ struct TimeToQuality {
 pub fn run(options: &CurveOptions, host: &Host<'_>) -> Result<BenchResult> {
     let limits = session::limits(Some(options.seconds), None, DEFAULT_SECONDS)?;
     if options.seconds == 0.0 {
-        return Err(Error::BadInput("--seconds: must be above 0".into()));
+        return Err(BadInput(format!("{}: must be above 0", Setting::Seconds)).into());
     }
     let peers = options
         .peers

@@ -1,9 +1,9 @@
 //! Measures the training speed of a neural field.
 
 use crate::kernels::profile;
-use crate::{Error, Result};
+use anyhow::{Context, Result};
+use messages::Setting;
 use serde::Serialize;
-use session::Context;
 use session::OpenGpu;
 use trainer::nerf::bench::time_steps;
 
@@ -56,11 +56,11 @@ pub struct FieldRow {
 /// # Errors
 ///
 /// If the GPU cannot be opened or its memory is insufficient.
-pub fn measure<E: From<Error>>(
+pub fn measure(
     options: &FieldOptions,
     open_gpu: OpenGpu,
-    mut on_row: impl FnMut(&FieldRow) -> Result<(), E>,
-) -> Result<(), E> {
+    mut on_row: impl FnMut(&FieldRow) -> Result<()>,
+) -> Result<()> {
     let is_software = open_gpu()?.is_software();
     let default_samples: &[u32] = if is_software {
         &DEFAULT_SAMPLES_ON_CPU
@@ -86,7 +86,7 @@ pub fn measure<E: From<Error>>(
         // Every ray has the same number of samples.
         let n_samples = (n_samples / options.n_rays).max(1) * options.n_rays;
         let figures = time_steps(&gpu, options.n_rays, n_samples, n_repeats as usize)
-            .with_context(|| format!("{n_samples} samples: try fewer --samples"))?;
+            .with_context(|| format!("{n_samples} samples: try fewer {}", Setting::Samples))?;
         on_row(&FieldRow {
             rays: figures.n_rays,
             samples: figures.n_samples,

@@ -1,12 +1,11 @@
 //! Writes the results of a bench: JSON with every number, charts as SVG and PNG, and an HTML page.
 
-use crate::Result;
-use keyframe::failed;
+use anyhow::{Context, Result, anyhow};
+use report::Table;
+use report::chart::{Chart, raster};
+use report::chart::drawing::escaped;
 use serde_json::Value;
-use session::Context;
-use session::chart::drawing::escaped;
-use session::chart::{Chart, raster};
-use session::{Table, run_folder};
+use session::run_folder;
 use std::path::{Path, PathBuf};
 
 /// Results of a bench so far.
@@ -41,7 +40,7 @@ impl BenchResult {
         latest: Option<(Findings, PathBuf)>,
         data_losses: Vec<String>,
     ) -> Result<Self> {
-        let (findings, page) = latest.ok_or_else(|| failed!("there is nothing to train"))?;
+        let (findings, page) = latest.ok_or_else(|| anyhow!("there is nothing to train"))?;
         Ok(Self {
             findings,
             page,

@@ -1,12 +1,10 @@
 //! Memory of this process over time, and its growth rate once the keyframe store is full.
 
-use crate::Result;
 use crate::statistics::theil_sen;
 use crate::viewer::ReceivedPicture;
-use keyframe::failed;
+use anyhow::{Context, Result, anyhow};
 use kinematics::quantile::median;
 use serde::Serialize;
-use session::Context;
 
 /// Time to ignore after the keyframe store is full, while buffers reach their final size.
 const SETTLE_SECS: f64 = 60.0;
@@ -146,8 +144,8 @@ pub fn resident_bytes() -> Result<(u64, u64)> {
     let status = std::fs::read_to_string(STATUS).with_context(|| {
         format!("cannot read {STATUS}: resident memory is measured on Linux only")
     })?;
-    let now = kilobytes(&status, "VmRSS:").ok_or_else(|| failed!("{STATUS} has no line VmRSS"))?;
-    let peak = kilobytes(&status, "VmHWM:").ok_or_else(|| failed!("{STATUS} has no line VmHWM"))?;
+    let now = kilobytes(&status, "VmRSS:").ok_or_else(|| anyhow!("{STATUS} has no line VmRSS"))?;
+    let peak = kilobytes(&status, "VmHWM:").ok_or_else(|| anyhow!("{STATUS} has no line VmHWM"))?;
     Ok((now << 10, peak << 10))
 }
 

@@ -1,11 +1,11 @@
 //! Measures the speed of the splat kernels.
 
-use crate::{Error, Result};
+use anyhow::{Context, Result};
 use gpu::PassTiming;
+use messages::Setting;
 use model_files::splat::arrays::SplatArrays;
 use model_files::splat::cloud::{load_cloud_npz, scan_cloud, synthetic_cloud};
 use serde::Serialize;
-use session::Context;
 use session::OpenGpu;
 use std::path::PathBuf;
 use std::time::Duration;
@@ -87,11 +87,11 @@ pub struct KernelsRow {
 /// # Errors
 ///
 /// If the file of the cloud is invalid, the GPU cannot be opened, or its memory is insufficient.
-pub fn measure<E: From<Error>>(
+pub fn measure(
     options: &KernelsOptions,
     open_gpu: OpenGpu,
-    mut on_row: impl FnMut(&KernelsRow) -> Result<(), E>,
-) -> Result<(), E> {
+    mut on_row: impl FnMut(&KernelsRow) -> Result<()>,
+) -> Result<()> {
     let given = options
         .cloud
         .as_deref()
@@ -170,7 +170,11 @@ pub fn measure<E: From<Error>>(
             };
             let figures = time_kernels(&gpu, cloud, setup, repeats).with_context(|| {
                 let [width, height] = size_px;
-                format!("{width}x{height} pixels and {n_splats} splats: try fewer --splats or a smaller --size")
+                format!(
+                    "{width}x{height} pixels and {n_splats} splats: try fewer {} or a smaller {}",
+                    Setting::Splats,
+                    Setting::Size
+                )
             })?;
             let passes = profile(&figures.passes, options.profile);
             on_row(&KernelsRow {

@@ -27,7 +27,7 @@
 //! assert!(calibrated.within_1_ms_frac > 0.99);
 //! // A fixed latency cannot be detected from stamps.
 //! assert!((uncalibrated.median_millis - 5.0).abs() < 0.5);
-//! # Ok::<(), bench::Error>(())
+//! # Ok::<(), anyhow::Error>(())
 //! ```
 
 pub mod ablation;
@@ -59,6 +59,4 @@ pub use over_time::{Bucket, OverTime, Timeline, Trend};
 pub use runs::{
     BenchObserver, Disturbed, Host, Run, RunReport, RunScores, RunSettings, RunsOptions,
 };
-// Errors of benches come from sessions and files, so benches use the error type of `session`.
-pub use session::{Error, Result};
 pub use viewer::{ReceivedPicture, Viewer, ViewerOptions};

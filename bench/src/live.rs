@@ -10,13 +10,14 @@ use crate::over_time::{OverTime, Timeline};
 use crate::viewer::{ReceivedPicture, Viewer};
 use capture::config::Parent;
 use capture::{InputResult, Rig};
-use keyframe::counted;
 use kinematics::Transform;
 use kinematics::random::Random;
+use messages::counted;
 use nalgebra::{UnitQuaternion, UnitVector3, Vector3};
+use report::Table;
+use report::chart::{Axis, Chart, Line, Point, Scale};
 use serde::Serialize;
-use session::chart::{Axis, Chart, Line, Point, Scale};
-use session::{KeyframeTimes, Latency, Live, Table};
+use session::{KeyframeTimes, Latency, LiveLoop};
 use std::collections::{BTreeMap, BTreeSet};
 use std::fmt;
 use std::time::Duration;
@@ -146,7 +147,7 @@ impl LiveRun {
     #[must_use]
     pub fn of(
         conditions: Conditions,
-        live: &Live,
+        live: &LiveLoop,
         viewers: &[Viewer],
         timeline: &Timeline,
     ) -> Self {

@@ -1,15 +1,16 @@
 //! Memory use of a long run by component, and its growth rate once the keyframe store is full.
 
-use crate::Result;
 use crate::findings::Findings;
 use crate::growth::{Excluded, Growth, Sample, resident_bytes};
 use crate::statistics::extent;
 use crate::viewer::Viewer;
+use anyhow::Result;
 use gpu::Gpu;
-use keyframe::counted;
 use kinematics::quantile::{Rank, quantile};
-use session::chart::{Axis, Chart, Line, Marker, Point, Scale};
-use session::{Live, Table};
+use messages::counted;
+use report::Table;
+use report::chart::{Axis, Chart, Line, Marker, Point, Scale};
+use session::LiveLoop;
 use std::collections::BTreeMap;
 use std::sync::Arc;
 
@@ -47,7 +48,7 @@ impl MemoryRun {
     /// # Errors
     ///
     /// If the system does not report the memory of this process.
-    pub fn add_sample(&mut self, live: &Live, gpu: &Gpu, viewers: &[Viewer]) -> Result<Sample> {
+    pub fn add_sample(&mut self, live: &LiveLoop, gpu: &Gpu, viewers: &[Viewer]) -> Result<Sample> {
         let (sample, gpu_buffers) = sample(live, gpu, viewers)?;
         self.gpu_buffers = gpu_buffers;
         self.samples.push(sample);
@@ -200,7 +201,7 @@ fn mb(bytes: f64) -> String {
 
 /// Memory of a run in progress, and its GPU buffers, bytes by label.
 pub(crate) fn sample(
-    live: &Live,
+    live: &LiveLoop,
     gpu: &Gpu,
     viewers: &[Viewer],
 ) -> Result<(Sample, BTreeMap<Arc<str>, u64>)> {

@@ -7,9 +7,9 @@ use crate::statistics::theil_sen;
 use crate::viewer::{ReceivedPicture, Viewer};
 use gpu::Gpu;
 use kinematics::quantile::median;
+use report::chart::{Line, Point};
 use serde::Serialize;
-use session::Live;
-use session::chart::{Line, Point};
+use session::LiveLoop;
 use std::time::{Duration, Instant};
 
 /// Time between two samples.
@@ -42,7 +42,7 @@ struct Moment {
 
 impl Timeline {
     /// Samples a run in progress if a second has passed since the last sample.
-    pub fn sample(&mut self, live: &Live, gpu: &Gpu, viewers: &[Viewer]) {
+    pub fn sample(&mut self, live: &LiveLoop, gpu: &Gpu, viewers: &[Viewer]) {
         let at = Instant::now();
         let session = &live.sessions()[0];
         let seconds = session.secs();

@@ -1,6 +1,7 @@
 //! Reads curves measured with other trainers: JSON with `rows` of `seconds` and `psnr`.
 
-use crate::{Error, Result};
+use anyhow::Result;
+use messages::{BadInput, Setting};
 use serde::Deserialize;
 use std::path::Path;
 
@@ -36,7 +37,7 @@ impl Peer {
     /// If the file is unreadable or has another format.
     pub(crate) fn load(path: &Path) -> Result<Self> {
         let invalid =
-            |reason: &str| Error::BadInput(format!("--peer {}: {reason}", path.display()));
+            |reason: &str| BadInput(format!("{} {}: {reason}", Setting::Peer, path.display()));
         let text = files::read_text(path)
             .map_err(|error| invalid(&format!("cannot be read ({error})")))?;
         let file: File = serde_json::from_str(&text).map_err(|error| {
@@ -46,9 +47,7 @@ impl Peer {
         })?;
         // The time axis of the charts is logarithmic.
         if file.rows.is_empty() || file.rows.iter().any(|row| row.seconds <= 0.0) {
-            return Err(invalid(
-                "expected at least one row, and seconds above 0 in each",
-            ));
+            return Err(invalid("expected at least one row, and seconds above 0 in each").into());
         }
         let label = path.file_stem().map_or_else(
             || "peer".to_owned(),

@@ -1,14 +1,13 @@
 //! The runs of a bench. Each run is trained once and saved to a file, so that a bench restarted in
 //! the same folder does not repeat it.
 
-use crate::{Error, Result};
+use anyhow::{Context, Result, anyhow, ensure};
 use capture::Stop;
 use gpu::Gpu;
 use keyframe::{Keyframe, Split};
-use keyframe::{ensure, failed};
+use messages::{BadInput, InsufficientData, Setting};
 use model_files::InitialPoints;
 use serde::{Deserialize, Serialize};
-use session::Context;
 use session::methods::MAX_SPLATS;
 use session::run_folder::{self, CreatedFolders};
 use session::{
@@ -243,11 +242,12 @@ impl NamedData {
     pub(crate) fn single_model_spec(&self) -> Result<&ModelSpec> {
         match &self.model_specs[..] {
             [one] => Ok(one),
-            _ => Err(Error::BadInput(format!(
+            _ => Err(BadInput(format!(
                 "{}: this bench needs a single method, but the methods are {}",
                 self.name,
                 self.methods()
-            ))),
+            ))
+            .into()),
         }
     }
 
@@ -262,12 +262,13 @@ impl NamedData {
             _ => None,
         };
         options.ok_or_else(|| {
-            Error::BadInput(format!(
+            BadInput(format!(
                 "{}: this bench needs the method {}, but the method is {}",
                 self.name,
                 SplatOptions::METHOD,
                 self.methods()
             ))
+            .into()
         })
     }
 
@@ -343,11 +344,12 @@ impl<'a> Runs<'a> {
         // Ends the progress bar before the next message.
         drop(on_progress);
         if data.of_split(Split::Test).is_empty() {
-            let reason = "there are no test images, so nothing can be scored; see --holdout";
-            return Err(Error::InsufficientData(format!(
-                "{}: {reason}",
-                path.display()
-            )));
+            return Err(InsufficientData(format!(
+                "{}: there are no test images, so nothing can be scored; see {}",
+                path.display(),
+                Setting::Holdout
+            ))
+            .into());
         }
         let model_specs = session::model_specs(training, &data, None, self.gpu.is_software())?;
         let initial_points = data.initial_points();
@@ -372,11 +374,13 @@ impl<'a> Runs<'a> {
             // A run with other settings must not appear among these results.
             let cached = read(&path)?;
             if let Some(difference) = difference(&cached.settings, &settings)? {
-                return Err(Error::BadInput(format!(
-                    "--out {}: the saved run {} differs in {difference}; choose another folder",
+                return Err(BadInput(format!(
+                    "{} {}: the saved run {} differs in {difference}; choose another folder",
+                    Setting::Out,
                     self.out.display(),
                     job.name
-                )));
+                ))
+                .into());
             }
             self.report(&cached, true);
             return Ok(cached);
@@ -445,7 +449,8 @@ impl<'a> Runs<'a> {
         // An interrupted run is not saved, because it would count as a complete one.
         ensure!(
             session.is_over() || !self.host.stop.requested(),
-            "stopped early; to continue the bench, run the same command with --out {}",
+            "stopped early; to continue the bench, run the same command with {} {}",
+            Setting::Out,
             self.out.display()
         );
         session.score_without_saving()
@@ -525,7 +530,7 @@ fn difference(cached: &RunSettings, requested: &RunSettings) -> Result<Option<St
     let requested = fields(requested)?;
     let requested = requested
         .as_object()
-        .ok_or_else(|| failed!("settings are an object"))?;
+        .ok_or_else(|| anyhow!("settings are an object"))?;
     Ok(requested
         .iter()
         .find(|(key, value)| cached[key.as_str()] != **value)

@@ -5,13 +5,14 @@ use crate::findings::{BenchResult, Findings};
 use crate::runs::{Disturbed, Host, Job, NamedData, Run, Runs, RunsOptions};
 use crate::statistics::{Interpolation, break_point, extent};
 use crate::variant::Variant;
-use crate::{Error, Result};
-use keyframe::ensure;
+use anyhow::{Result, ensure};
 use keyframe::{Keyframe, Split};
 use kinematics::quantile::median;
+use messages::{BadInput, Setting};
+use report::Table;
+use report::chart::{Axis, Chart, Line, Marker, Point, Scale, compact_number};
 use serde::Serialize;
-use session::chart::{Axis, Chart, Line, Marker, Point, Scale, compact_number};
-use session::{Limits, Table};
+use session::Limits;
 use std::collections::HashSet;
 use std::path::PathBuf;
 use std::sync::Arc;
@@ -27,13 +28,13 @@ const NANOS_PER_SEC: f64 = 1e9;
 const NANOS_PER_COUNT: f64 = 1e6;
 
 /// All variants are trained on the same disturbed data; each gives one line per chart.
-const VARIANTS: &[Variant] = &[
-    Variant {
-        name: "with --refine",
-        change: |_| (),
-    },
-    Variant::CAMERAS_AS_GIVEN,
-];
+const VARIANTS: &[Variant] = &[REFINED, Variant::CAMERAS_AS_GIVEN];
+
+/// The cameras are refined as requested. The setting completes the name, see [`name_of`].
+const REFINED: Variant = Variant {
+    name: "with",
+    change: |_| (),
+};
 
 /// Options of [`run`].
 #[derive(Clone, Debug)]
@@ -80,7 +81,7 @@ struct DisturbanceResult {
 /// Results of one variant under one disturbance.
 #[derive(Clone, Debug, Serialize)]
 struct Curve {
-    name: &'static str,
+    name: String,
     /// Results by size, starting with the undisturbed data.
     points: Vec<Level>,
     breaks: Vec<Break>,
@@ -128,7 +129,7 @@ pub fn run(options: &StabilityOptions, host: &Host<'_>) -> Result<BenchResult> {
         });
         for &variant in &variants {
             let mut curve = Curve {
-                name: variant.name,
+                name: name_of(variant),
                 points: Vec::new(),
                 breaks: Vec::new(),
             };
@@ -138,7 +139,7 @@ pub fn run(options: &StabilityOptions, host: &Host<'_>) -> Result<BenchResult> {
                 // Findings are written after every size, so that an interrupted bench leaves
                 // results.
                 let variants = &mut results.last_mut().expect("pushed above").variants;
-                variants.retain(|curve| curve.name != variant.name);
+                variants.retain(|earlier| earlier.name != curve.name);
                 variants.push(curve.clone());
                 page = Some(findings(options, &runs, &data, &results)?);
             }
@@ -162,10 +163,20 @@ fn distinguished(options: &ModelOptions) -> Vec<&'static Variant> {
     }
     if distinguished.len() < VARIANTS.len() {
         log::warn!(
-            "no camera parameters are refined, so only one variant is measured; see --refine"
+            "no camera parameters are refined, so only one variant is measured; see {}",
+            Setting::Refine
         );
     }
     distinguished
+}
+
+/// Name of a variant in results.
+fn name_of(variant: &Variant) -> String {
+    if variant.name == REFINED.name {
+        format!("{} {}", variant.name, Setting::Refine)
+    } else {
+        variant.name.to_owned()
+    }
 }
 
 /// Trains with one size of the disturbance, once per seed.
@@ -193,6 +204,7 @@ fn measure(
         rate_hz: plan.rate_hz,
     });
     let mut finished = Vec::new();
+    let variant_name = name_of(variant);
     let ModelSpec {
         kind,
         options: base_options,
@@ -201,10 +213,7 @@ fn measure(
     for seed in first_seed..first_seed.saturating_add(options.seeds) {
         let seeded = base_options.clone().with(|model| model.common.seed = seed);
         finished.push(runs.run(Job {
-            name: format!(
-                "stability {} {} {size} seed {seed}",
-                data.name, variant.name
-            ),
+            name: format!("stability {} {variant_name} {size} seed {seed}", data.name),
             data,
             model_spec: ModelSpec {
                 kind: *kind,
@@ -212,7 +221,7 @@ fn measure(
             },
             limits,
             disturbed: disturbed.clone(),
-            variant: Some(variant.name.to_owned()),
+            variant: Some(variant_name.clone()),
             keyframes: &|| disturb(plan, &data.data.keyframes, level, seed, is_undisturbed),
             is_thorough: false,
         })?);
@@ -257,9 +266,12 @@ impl StabilityOptions {
     fn check(&self) -> Result<()> {
         let selected = &self.disturbances;
         if !self.levels.is_empty() && selected.len() != 1 {
-            return Err(Error::BadInput(
-                "--levels: needs a single disturbance in --disturb, because units differ".into(),
-            ));
+            let message = format!(
+                "{}: needs a single disturbance in {}, because units differ",
+                Setting::Levels,
+                Setting::Disturb
+            );
+            return Err(BadInput(message).into());
         }
         let min_level = if *selected == [Disturbance::Keyframes] {
             1.0
@@ -271,17 +283,18 @@ impl StabilityOptions {
             .iter()
             .find(|level| !level.is_finite() || **level < min_level)
         {
-            return Err(Error::BadInput(format!(
-                "--levels {level}: must be a number of at least {min_level}"
-            )));
+            return Err(BadInput(format!(
+                "{} {level}: must be a number of at least {min_level}",
+                Setting::Levels
+            ))
+            .into());
         }
         if self
             .rate_hz
             .is_some_and(|rate| !rate.is_finite() || rate <= 0.0)
         {
-            return Err(Error::BadInput(
-                "--rate-hz: must be a number above 0".into(),
-            ));
+            let message = format!("{}: must be a number above 0", Setting::RateHz);
+            return Err(BadInput(message).into());
         }
         Ok(())
     }
@@ -295,11 +308,14 @@ impl StabilityOptions {
             (true, _) => (NANOS_PER_SEC, None),
             (false, Some(rate_hz)) => (NANOS_PER_COUNT * rate_hz, Some(rate_hz)),
             (false, None) => {
-                let reason = "the images have no times; give their rate with --rate-hz";
-                let message = format!("clock-offset: {}: {reason}", data.path.display());
+                let message = format!(
+                    "clock-offset: {}: the images have no times; give their rate with {}",
+                    data.path.display(),
+                    Setting::RateHz
+                );
                 if selected.contains(&Disturbance::ClockOffset) {
                     if !self.can_skip_clock_offset {
-                        return Err(Error::BadInput(message));
+                        return Err(BadInput(message).into());
                     }
                     log::warn!("skipped: {message}");
                 }
@@ -417,7 +433,7 @@ impl DisturbanceResult {
                 .iter()
                 .map(|curve| {
                     curve.line(if self.variants.len() > 1 {
-                        curve.name
+                        &curve.name
                     } else {
                         of_one
                     })
@@ -490,7 +506,7 @@ impl DisturbanceResult {
             let undisturbed = curve.points.first().map_or(0.0, |point| point.psnr);
             let mut row = vec![
                 self.name.to_owned(),
-                curve.name.to_owned(),
+                curve.name.clone(),
                 format!("{undisturbed:.2}"),
             ];
             row.extend(curve.breaks.iter().map(|at| match at.level {
@@ -627,7 +643,7 @@ mod tests {
     #[test]
     fn break_points_are_computed_from_points() {
         let mut curve = Curve {
-            name: "plain",
+            name: "plain".into(),
             points: Vec::new(),
             breaks: Vec::new(),
         };

@@ -2,14 +2,14 @@
 //! with jitter.
 
 use crate::findings::{BenchResult, Findings};
-use crate::{Error, Result};
+use anyhow::{Context, Result};
 use kinematics::quantile::{Rank, median, quantile};
 use kinematics::random::Random;
 use kinematics::{ClockMap, JointHistory, JointState, Stamp};
+use messages::{BadInput, Setting};
+use report::Table;
+use report::chart::{Axis, Chart, Line, Point, Scale};
 use serde::Serialize;
-use session::Context;
-use session::Table;
-use session::chart::{Axis, Chart, Line, Point, Scale};
 use std::path::PathBuf;
 use std::time::Duration;
 
@@ -116,7 +116,7 @@ pub fn measure(options: &StampsOptions) -> Result<Vec<StampErrors>> {
 fn check(options: &StampsOptions) -> Result<()> {
     let numbers = [
         (
-            "--rates",
+            Setting::Rates,
             options
                 .rates_hz
                 .iter()
@@ -125,16 +125,16 @@ fn check(options: &StampsOptions) -> Result<()> {
             1.0..=10_000.0,
         ),
         (
-            "--rates",
+            Setting::Rates,
             options.rates_hz.iter().copied().fold(0.0, f64::max),
             1.0..=10_000.0,
         ),
-        ("--fixed-millis", options.fixed_millis, 0.0..=1000.0),
-        ("--jitter-millis", options.jitter_millis, 0.0..=1000.0),
-        ("--drift-ppm", options.drift_ppm, -200.0..=200.0),
-        ("--seconds", options.seconds, 1.0..=3600.0),
+        (Setting::FixedMillis, options.fixed_millis, 0.0..=1000.0),
+        (Setting::JitterMillis, options.jitter_millis, 0.0..=1000.0),
+        (Setting::DriftPpm, options.drift_ppm, -200.0..=200.0),
+        (Setting::Seconds, options.seconds, 1.0..=3600.0),
         (
-            "--settle-seconds",
+            Setting::SettleSeconds,
             options.settle_seconds,
             0.0..=options.seconds - 0.5,
         ),
@@ -143,11 +143,12 @@ fn check(options: &StampsOptions) -> Result<()> {
         .into_iter()
         .find(|(_, number, allowed)| !allowed.contains(number))
     {
-        Some((flag, number, allowed)) => Err(Error::BadInput(format!(
-            "{flag}: {number} is outside {} to {}",
+        Some((setting, number, allowed)) => Err(BadInput(format!(
+            "{setting}: {number} is outside {} to {}",
             allowed.start(),
             allowed.end()
-        ))),
+        ))
+        .into()),
         None => Ok(()),
     }
 }
@@ -376,30 +377,30 @@ mod tests {
 
     #[test]
     fn out_of_range_options_are_rejected() {
-        for (flag, options) in [
+        for (setting, options) in [
             (
-                "--seconds",
+                Setting::Seconds,
                 StampsOptions {
                     seconds: 0.0,
                     ..options()
                 },
             ),
             (
-                "--rates",
+                Setting::Rates,
                 StampsOptions {
                     rates_hz: vec![0.0, 30.0],
                     ..options()
                 },
             ),
             (
-                "--drift-ppm",
+                Setting::DriftPpm,
                 StampsOptions {
                     drift_ppm: -900.0,
                     ..options()
                 },
             ),
             (
-                "--settle-seconds",
+                Setting::SettleSeconds,
                 StampsOptions {
                     settle_seconds: 500.0,
                     ..options()
@@ -407,8 +408,9 @@ mod tests {
             ),
         ] {
             assert!(
-                check(&options).is_err_and(|error| error.to_string().contains(flag)),
-                "{flag}"
+                check(&options)
+                    .is_err_and(|error| error.to_string().contains(&setting.to_string())),
+                "{setting}"
             );
         }
     }

@@ -4,13 +4,11 @@
 //! To affect the measurement little, it decodes only the first picture with a new keyframe, and
 //! reports that it has shown it.
 
-use crate::Result;
-use keyframe::{ensure, failed};
+use anyhow::{Context, Result, anyhow, ensure};
 use kinematics::Transform;
 use nalgebra::{Point3, Vector3};
 use parking_lot::Mutex;
 use serde_json::{Value, json};
-use session::Context;
 use std::io::{BufRead, BufReader, Read, Write};
 use std::net::{Shutdown, SocketAddr, TcpStream};
 use std::sync::Arc;
@@ -344,9 +342,9 @@ impl Client {
         let jpeg = index(&color["offset"])
             .zip(index(&color["bytes"]))
             .and_then(|(offset, n)| payload.get(offset..)?.get(..n));
-        let jpeg = jpeg.ok_or_else(|| failed!("a picture without color: {header}"))?;
+        let jpeg = jpeg.ok_or_else(|| anyhow!("a picture without color: {header}"))?;
         image::load_from_memory_with_format(jpeg, image::ImageFormat::Jpeg)
-            .map_err(|error| failed!("cannot decode a picture: {error}"))?;
+            .map_err(|error| anyhow!("cannot decode a picture: {error}"))?;
         let Some(started) = self.server_started else {
             return Ok(());
         };
@@ -409,7 +407,7 @@ impl Client {
             }
             short @ 0..126 => u64::from(short),
             masked => {
-                return Err(failed!(
+                return Err(anyhow!(
                     "the server sent a masked frame (length byte {masked})"
                 ));
             }
@@ -435,7 +433,7 @@ impl Client {
             _ => {
                 frame.push(0x80 | 126);
                 let too_long = |_| {
-                    failed!(
+                    anyhow!(
                         "a message of {} bytes, expected at most 65535",
                         contents.len()
                     )
@@ -457,7 +455,7 @@ impl Client {
 fn scene_number(value: &Value) -> Result<f64> {
     value
         .as_f64()
-        .ok_or_else(|| failed!("a scene message lacks a number"))
+        .ok_or_else(|| anyhow!("a scene message lacks a number"))
 }
 
 /// An index or a length; `None` if it is not a whole number that this computer can address.
@@ -471,7 +469,7 @@ fn split(message: &[u8]) -> Result<(Value, &[u8])> {
         rest.split_at_checked(usize::try_from(u32::from_le_bytes(*length)).ok()?)
     });
     let (header, payload) = header
-        .ok_or_else(|| failed!("a binary message of {} bytes without header", message.len()))?;
+        .ok_or_else(|| anyhow!("a binary message of {} bytes without header", message.len()))?;
     Ok((serde_json::from_slice(header)?, payload))
 }
 

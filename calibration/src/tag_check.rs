@@ -266,7 +266,7 @@ impl std::fmt::Display for TagContradiction {
         let tags = format!(
             "{} {}",
             if names.len() == 1 { "tag" } else { "tags" },
-            keyframe::listed(&names, "and")
+            messages::listed(&names, "and")
         );
         let [angle, angle_sigma] = self.rotation_rad.map(f64::to_degrees);
         let [mm, mm_sigma] = self.translation_m.map(|m| 1e3 * m);

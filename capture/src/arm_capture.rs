@@ -2,13 +2,12 @@
 
 use crate::calibration_images::{ArmDuringImage, CalibrationImage, gray_of};
 use crate::config::{Camera, Rig};
-use crate::error::Context;
 use crate::open::{Movable, chain_of};
 use crate::stop::Stop;
 use crate::supervised_arm::SupervisedArm;
+use anyhow::{Context, bail};
 use drivers::Image;
 use drivers::motion::JointTarget;
-use keyframe::bail;
 use kinematics::{Chain, JointState, Stamp, Transform};
 use std::collections::VecDeque;
 use std::time::{Duration, Instant};
@@ -87,7 +86,7 @@ impl ArmCapture {
     ///
     /// # Errors
     /// If the robot description does not match the rig.
-    pub fn new(movable: Movable) -> crate::Result<Self> {
+    pub fn new(movable: Movable) -> anyhow::Result<Self> {
         let Movable { rig, arm, camera } = movable;
         let chain = chain_of(&rig)?;
         let order = chain.order_in(&rig.arm.joints)?;
@@ -110,7 +109,7 @@ impl ArmCapture {
     ///
     /// # Errors
     /// If the arm has stopped or reports nothing.
-    pub fn limit_distance(&mut self, max_distance_m: f64) -> crate::Result<()> {
+    pub fn limit_distance(&mut self, max_distance_m: f64) -> anyhow::Result<()> {
         let joints = self.joints()?;
         let flange = self.chain.forward(&joints)?;
         self.limit = Some((flange, max_distance_m));
@@ -135,7 +134,7 @@ impl ArmCapture {
     ///
     /// # Errors
     /// If the arm has stopped or reports nothing.
-    pub fn joints(&mut self) -> crate::Result<Vec<f64>> {
+    pub fn joints(&mut self) -> anyhow::Result<Vec<f64>> {
         let state = self.read()?;
         Ok(self.in_chain_order(&state.position))
     }
@@ -146,7 +145,7 @@ impl ArmCapture {
     /// # Errors
     /// If the arm stops because of a fault, does not reach a step, or leaves the limit of the
     /// distance. In the last two cases, it has returned to the previous step, or holds where it is.
-    pub fn move_to(&mut self, joints: &[f64], stop: &Stop) -> crate::Result<bool> {
+    pub fn move_to(&mut self, joints: &[f64], stop: &Stop) -> anyhow::Result<bool> {
         let from = self.joints()?;
         let largest = from
             .iter()
@@ -177,7 +176,7 @@ impl ArmCapture {
         Ok(true)
     }
 
-    fn step_to(&mut self, joints: &[f64], stop: &Stop) -> crate::Result<bool> {
+    fn step_to(&mut self, joints: &[f64], stop: &Stop) -> anyhow::Result<bool> {
         let free = self.read()?.position;
         // A command to stay here: the previous target, unless someone has moved the arm since then.
         // The sag of the last step is the best prediction for the next one, because the load
@@ -217,7 +216,7 @@ impl ArmCapture {
 
     /// Moves to positions of all joints. Returns the state at the end, or `None` if a stop was
     /// requested.
-    fn go(&mut self, position: &[f64], stop: &Stop) -> crate::Result<Option<JointState>> {
+    fn go(&mut self, position: &[f64], stop: &Stop) -> anyhow::Result<Option<JointState>> {
         let accepted = self.arm.command(&JointTarget {
             position: position.to_vec(),
         })?;
@@ -234,7 +233,7 @@ impl ArmCapture {
     }
 
     /// Why the arm must not continue from a state. `None` if it is where it should be.
-    fn problem(&self, state: &JointState, expected: &[f64]) -> crate::Result<Option<String>> {
+    fn problem(&self, state: &JointState, expected: &[f64]) -> anyhow::Result<Option<String>> {
         if let Some((ix, error)) = largest_error(&state.position, expected)
             && error > MAX_ERROR
         {
@@ -268,7 +267,7 @@ impl ArmCapture {
         stay: &[f64],
         expected: &[f64],
         stop: &Stop,
-    ) -> crate::Result<&'static str> {
+    ) -> anyhow::Result<&'static str> {
         // The previous step was reached without contact, so the way back to it is free.
         if let Some(state) = self.go(stay, stop)?
             && largest_error(&state.position, expected).is_none_or(|(_, error)| error <= MAX_ERROR)
@@ -287,7 +286,7 @@ impl ArmCapture {
     ///
     /// # Errors
     /// If a device fails, the arm does not come to rest, or no image can be decoded.
-    pub fn image(&mut self, stop: &Stop) -> crate::Result<Option<CalibrationImage>> {
+    pub fn image(&mut self, stop: &Stop) -> anyhow::Result<Option<CalibrationImage>> {
         // The wait starts at the newest state, not at one that has waited in a queue since before
         // the motion.
         self.read_queued()?;
@@ -349,7 +348,7 @@ impl ArmCapture {
 
     /// Waits until joint states cover an image that is exposed until `end`. Returns false if a stop
     /// was requested.
-    fn wait_for_states(&mut self, end: Stamp, wait: &Wait, stop: &Stop) -> crate::Result<bool> {
+    fn wait_for_states(&mut self, end: Stamp, wait: &Wait, stop: &Stop) -> anyhow::Result<bool> {
         while self.recent.back().is_none_or(|newest| newest.stamp < end) {
             if stop.requested() {
                 return Ok(false);
@@ -370,7 +369,7 @@ impl ArmCapture {
         image: &Image,
         gray: Vec<u8>,
         joints: Vec<f64>,
-    ) -> crate::Result<CalibrationImage> {
+    ) -> anyhow::Result<CalibrationImage> {
         let pose = self.chain.forward(&joints)?;
         Ok(CalibrationImage {
             secs: self
@@ -389,7 +388,7 @@ impl ArmCapture {
 
     /// Reads the joint states that have arrived, so that a slow caller does not fall behind.
     /// Simulated devices advance only when they are read.
-    fn read_queued(&mut self) -> crate::Result<()> {
+    fn read_queued(&mut self) -> anyhow::Result<()> {
         if self.camera.waits_for_caller() {
             return Ok(());
         }
@@ -397,7 +396,7 @@ impl ArmCapture {
         self.arm.read_queued(|state| remember(recent, state))
     }
 
-    fn check_wait(&self, wait: &Wait, now: Stamp, seen: &Seen) -> crate::Result<()> {
+    fn check_wait(&self, wait: &Wait, now: Stamp, seen: &Seen) -> anyhow::Result<()> {
         // Simulated devices stand still between reads, so only their own time counts.
         let secs = if self.camera.waits_for_caller() {
             now.secs_since(wait.began)
@@ -476,7 +475,7 @@ impl ArmCapture {
         self.order.iter().map(|ix| position[*ix]).collect()
     }
 
-    fn read(&mut self) -> crate::Result<JointState> {
+    fn read(&mut self) -> anyhow::Result<JointState> {
         let state = self.arm.read()?;
         remember(&mut self.recent, &state);
         Ok(state)
@@ -486,7 +485,7 @@ impl ArmCapture {
     ///
     /// # Errors
     /// If the arm stops because of a fault.
-    pub fn hold(&mut self, stop: &Stop) -> crate::Result<()> {
+    pub fn hold(&mut self, stop: &Stop) -> anyhow::Result<()> {
         self.arm.hold(stop, |_| ())
     }
 }

@@ -9,10 +9,11 @@ mod tests;
 
 use crate::config::{ArmDriver, Camera, Rig};
 use crate::open::{Opened, chain_of};
+use anyhow::bail;
 use drivers::{Image, Sample};
 use image::{DynamicImage, RgbImage};
-use keyframe::bail;
 use kinematics::{Chain, HistoryError, JointHistory, JointState, Stamp, Transform, transform};
+use messages::BadInput;
 use std::collections::VecDeque;
 use std::ops::ControlFlow;
 use std::time::Duration;
@@ -92,7 +93,7 @@ pub fn calibration_images(
     camera: &str,
     max_shift_px: f64,
     mut on_sample: impl FnMut(&Sample, &[CalibrationImage]) -> ControlFlow<()>,
-) -> crate::Result<CalibrationImages> {
+) -> anyhow::Result<CalibrationImages> {
     let Opened {
         rig,
         mut source,
@@ -141,13 +142,14 @@ struct Arm {
 }
 
 impl<'a> Reader<'a> {
-    fn new(rig: &'a Rig, camera: &str, max_shift_px: f64) -> crate::Result<Self> {
+    fn new(rig: &'a Rig, camera: &str, max_shift_px: f64) -> anyhow::Result<Self> {
         let Some(camera) = rig.cameras.iter().find(|other| &*other.name == camera) else {
             let names: Vec<&str> = rig.cameras.iter().map(|camera| &*camera.name).collect();
-            return Err(crate::Error::BadInput(format!(
+            return Err(BadInput(format!(
                 "the rig has no camera {camera:?}; it has {}",
                 names.join(", ")
-            )));
+            ))
+            .into());
         };
         if rig.has_moving_base() {
             bail!(
@@ -317,7 +319,7 @@ impl<'a> Reader<'a> {
 }
 
 impl Arm {
-    fn new(rig: &Rig) -> crate::Result<Self> {
+    fn new(rig: &Rig) -> anyhow::Result<Self> {
         let chain = chain_of(rig)?;
         let order = chain.order_in(&rig.arm.joints)?;
         let max_gap = Duration::from_secs_f64(rig.join.max_gap_millis * 1e-3);

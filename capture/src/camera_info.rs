@@ -365,7 +365,7 @@ fn notes(object: &Map<String, Value>, camera_matrix: &[f64; 9]) -> Result<Vec<St
     if !unknown.is_empty() {
         notes.push(format!(
             "unknown keys are not used: {}",
-            kinematics::shortened(&unknown, MAX_NAMED, ", ")
+            messages::shortened(&unknown, MAX_NAMED, ", ")
         ));
     }
     Ok(notes)

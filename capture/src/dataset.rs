@@ -1,11 +1,11 @@
 //! Converts the photos of a dataset to keyframes: decodes, undistorts, scales, and splits them.
 
-use crate::error::Context;
 use crate::{downscale, memory};
+use anyhow::{Context, ensure};
 use drivers::dataset::{Dataset, DatasetImage, DepthImage, ListedSplit};
-use keyframe::ensure;
-use keyframe::{DepthMap, Holdout, Keyframe, Split, counted};
+use keyframe::{DepthMap, Holdout, Keyframe, Split};
 use kinematics::{Intrinsics, Undistortion};
+use messages::{BadInput, Setting, counted};
 use rayon::prelude::*;
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::sync::{Arc, OnceLock};
@@ -47,7 +47,7 @@ pub fn load(
     holdout: Option<&Holdout>,
     scale_frac: f64,
     on_progress: &(dyn Fn(usize) + Sync),
-) -> crate::Result<LoadedDataset> {
+) -> anyhow::Result<LoadedDataset> {
     load_few_at_once(dataset, holdout, scale_frac, MAX_PX_AT_ONCE, on_progress)
 }
 
@@ -59,7 +59,7 @@ fn load_few_at_once(
     scale_frac: f64,
     max_px_at_once: u64,
     on_progress: &(dyn Fn(usize) + Sync),
-) -> crate::Result<LoadedDataset> {
+) -> anyhow::Result<LoadedDataset> {
     // Errors that need no decoding are reported before minutes are spent on it.
     for image in &dataset.images {
         downscale::intrinsics(&image.intrinsics, scale_frac).with_context(|| image.name.clone())?;
@@ -82,7 +82,7 @@ fn splits_of(
     dataset: &Dataset,
     holdout: Option<&Holdout>,
     names: &[&str],
-) -> crate::Result<Vec<Split>> {
+) -> anyhow::Result<Vec<Split>> {
     // The lists count only if they contain every photo.
     let listed = dataset
         .images
@@ -107,7 +107,7 @@ fn decode_all(
     scale_frac: f64,
     max_px_at_once: u64,
     on_progress: &(dyn Fn(usize) + Sync),
-) -> Vec<(String, crate::Result<Converted>)> {
+) -> Vec<(String, anyhow::Result<Converted>)> {
     let n_done = AtomicUsize::new(0);
     let camera: Arc<str> = CAMERA.into();
     // Photos with the same lens follow each other, so only one set of maps is in memory at a time.
@@ -142,8 +142,8 @@ fn decode_all(
 /// becomes a message.
 fn collect(
     dataset: &Dataset,
-    results: Vec<(String, crate::Result<Converted>)>,
-) -> crate::Result<LoadedDataset> {
+    results: Vec<(String, anyhow::Result<Converted>)>,
+) -> anyhow::Result<LoadedDataset> {
     let mut loaded = LoadedDataset {
         keyframes: Vec::new(),
         names: Vec::new(),
@@ -204,7 +204,7 @@ fn n_at_once(size_px: [u32; 2], max_px: u64, n_threads: usize) -> Option<usize> 
 /// Checks that the photos fit into memory once they are scaled. Their depth images are not counted.
 ///
 /// * `available_bytes`: memory that programs can still use.
-fn check_memory(dataset: &Dataset, scale_frac: f64, available_bytes: u64) -> crate::Result<()> {
+fn check_memory(dataset: &Dataset, scale_frac: f64, available_bytes: u64) -> anyhow::Result<()> {
     let n_bytes: u64 = dataset
         .images
         .iter()
@@ -227,18 +227,20 @@ fn check_memory(dataset: &Dataset, scale_frac: f64, available_bytes: u64) -> cra
     let remedy = match (100.0 * fitting).floor() / 100.0 {
         scale if scale >= downscale::MIN_SCALE => {
             format!(
-                "scale them to {scale} or less (--scale of `fieldrig train`, `eval` and `bench`)"
+                "scale them to {scale} or less ({} of `fieldrig train`, `eval` and `bench`)",
+                Setting::Scale
             )
         }
         _ => "use fewer photos".to_owned(),
     };
-    Err(crate::Error::BadInput(format!(
+    Err(BadInput(format!(
         "{}: {} take {:.1} GB of memory, but only {:.1} GB are available: {remedy}",
         dataset.path.display(),
         counted(dataset.images.len() as u64, "photo"),
         n_bytes as f64 / 1e9,
         available_bytes as f64 / 1e9
-    )))
+    ))
+    .into())
 }
 
 fn split_of(listed: ListedSplit) -> Split {
@@ -252,7 +254,7 @@ fn split_of(listed: ListedSplit) -> Split {
 /// The first messages in one line, and the number of the others.
 fn first_of(errors: &[String]) -> String {
     const MAX_SHOWN: usize = 3;
-    kinematics::shortened(errors, MAX_SHOWN, "; ")
+    messages::shortened(errors, MAX_SHOWN, "; ")
 }
 
 /// Undistortion maps of one lens; empty for a lens without distortion.
@@ -336,7 +338,7 @@ impl Converted {
 }
 
 /// Converts one photo. The caller sets camera and split.
-fn keyframe(lens: &LensMaps, image: &DatasetImage, scale_frac: f64) -> crate::Result<Converted> {
+fn keyframe(lens: &LensMaps, image: &DatasetImage, scale_frac: f64) -> anyhow::Result<Converted> {
     let loaded = image.load()?;
     let in_image = || image.name.clone();
     let depth = loaded
@@ -344,7 +346,7 @@ fn keyframe(lens: &LensMaps, image: &DatasetImage, scale_frac: f64) -> crate::Re
         .as_ref()
         .zip(image.depth.as_ref())
         .map(|(depth, file)| {
-            Ok::<_, crate::Error>(DepthMap {
+            Ok::<_, anyhow::Error>(DepthMap {
                 size_px: depth.intrinsics.size_px,
                 focal_px: depth.intrinsics.focal_px,
                 principal_px: depth.intrinsics.principal_px,

@@ -1,7 +1,7 @@
 //! Downscales training images by averaging areas, together with their intrinsics.
 
-use crate::Error;
 use kinematics::Intrinsics;
+use messages::BadInput;
 
 /// Minimum side of a scaled image in pixels: smaller images contain too little detail for training.
 const MIN_SIDE_PX: u32 = 16;
@@ -31,12 +31,12 @@ pub fn parse_scale(text: &str) -> Result<f64, String> {
 
 /// Intrinsics of images scaled to the fraction `share` of their width and height; returns an error
 /// if they become too small.
-pub(crate) fn intrinsics(full: &Intrinsics, share: f64) -> Result<Intrinsics, Error> {
+pub(crate) fn intrinsics(full: &Intrinsics, share: f64) -> Result<Intrinsics, BadInput> {
     let scaled = full.scaled(share);
     // An image that is not scaled may have any size.
     if scaled.size_px != full.size_px && scaled.size_px.iter().any(|side| *side < MIN_SIDE_PX) {
         let [[from_width, from_height], [width, height]] = [full.size_px, scaled.size_px];
-        return Err(Error::BadInput(format!(
+        return Err(BadInput(format!(
             "scale {share}: images of {from_width}x{from_height} pixels would have {width}x{height}, \
              the minimum is {MIN_SIDE_PX} along each side"
         )));

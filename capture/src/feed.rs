@@ -1,12 +1,12 @@
 //! The input side of a run: a thread reads the source, records and joins the samples, and corrects
 //! base poses at stations. Keyframes are delivered through a bounded queue.
 
-use crate::error::{Context, Error};
 use crate::join::{Change, Join, JoinEvent, PosedImage};
 use crate::robot_motion::RobotMotion;
 use crate::stamp_clock::StampClock;
 use crate::stations::Stations;
 use crate::stop::Stop;
+use anyhow::{Context, anyhow};
 use drivers::recording::Recorder;
 use drivers::{PixelFormat, Sample, Source};
 use keyframe::{LiveImage, LivePixels, RangePoints, RangeScan, RobotState};
@@ -60,7 +60,7 @@ pub trait InputObserver: Send {
     /// Whether the motion of the robot is needed.
     fn needs_robot(&self) -> bool;
 
-    /// Receives a reading of the robot.
+    /// Receives the state of the robot.
     fn observe_robot(&self, robot: RobotState);
 
     /// Receives a scan of a range scanner.
@@ -102,7 +102,7 @@ pub struct InputResult {
     /// Error that ended the input early.
     pub input_error: Option<drivers::Error>,
     /// Error that ended the recording early.
-    pub recording_error: Option<crate::Error>,
+    pub recording_error: Option<anyhow::Error>,
 }
 
 /// The running input.
@@ -124,7 +124,7 @@ impl Feed {
         input: Input,
         observer: Box<dyn InputObserver>,
         stop: Stop,
-    ) -> crate::Result<Self> {
+    ) -> anyhow::Result<Self> {
         let (sender, changes) = sync_channel(MAX_WAITING);
         let shared = Arc::new(Shared::default());
         let pump = Pump {
@@ -189,12 +189,12 @@ impl Feed {
     /// # Errors
     ///
     /// If the thread panicked, which is a bug.
-    pub fn finish(self) -> crate::Result<InputResult> {
+    pub fn finish(self) -> anyhow::Result<InputResult> {
         // Wakes an input thread that is waiting to send.
         drop(self.changes);
         self.thread
             .join()
-            .map_err(|_| Error::Failed("the input thread panicked: this is a bug".into()))
+            .map_err(|_| anyhow!("the input thread panicked: this is a bug"))
     }
 }
 
@@ -275,14 +275,14 @@ impl Pump {
 
     /// Records a sample. If the recording fails, for example because the disk is full, it ends, and
     /// the run continues.
-    fn record(&mut self, sample: &Sample, recording_error: &mut Option<Error>) {
+    fn record(&mut self, sample: &Sample, recording_error: &mut Option<anyhow::Error>) {
         if recording_error.is_some() {
             return;
         }
         if let Some(recorder) = &mut self.input.recorder
             && let Err(error) = recorder.write(sample)
         {
-            let error = Error::from(error);
+            let error = anyhow::Error::from(error);
             log::error!("the recording ends here, the run continues: {error:#}");
             *recording_error = Some(error);
         }
@@ -419,7 +419,7 @@ impl Pump {
         self.observer.observe(LiveImage {
             camera: image.camera.clone(),
             stamp: image.stamp,
-            captured_at: self.captured_at(image.stamp),
+            captured_at: self.input.stamp_clock.captured_at(image.stamp),
             size_px: image.size_px,
             pixels,
             world_from_camera: Some(
@@ -433,25 +433,20 @@ impl Pump {
         });
     }
 
-    /// Passes a reading of the robot to the observer.
+    /// Passes the state of the robot to the observer.
     fn publish_robot(&mut self, sample: &Sample) {
-        let Some(reading) = self
+        let Some(mut state) = self
             .input
             .robot_motion
-            .push(sample)
+            .push(sample, &self.input.stamp_clock)
             .filter(|_| self.observer.needs_robot())
         else {
             return;
         };
-        let stations = self.input.stations.as_ref();
-        self.observer.observe_robot(RobotState {
-            stamp: reading.stamp,
-            captured_at: self.captured_at(reading.stamp),
-            world_from_base: stations.map_or(reading.world_from_base, |stations| {
-                stations.map_from_odom() * reading.world_from_base
-            }),
-            positions: reading.positions,
-        });
+        if let Some(stations) = &self.input.stations {
+            state.world_from_base = stations.map_from_odom() * state.world_from_base;
+        }
+        self.observer.observe_robot(state);
     }
 
     /// Passes a range scan to the observer.
@@ -462,14 +457,5 @@ impl Pump {
             scan,
             map_from_odom,
         });
-    }
-
-    /// Time at which a sample was captured, or now if its stamp is on another clock (recordings,
-    /// simulations).
-    fn captured_at(&self, stamp: Stamp) -> Instant {
-        self.input
-            .stamp_clock
-            .instant_of(stamp)
-            .unwrap_or_else(Instant::now)
     }
 }

@@ -27,7 +27,7 @@
 //! assert_eq!(&*rig.cameras[0].name, "front");
 //! let join = Join::new(&rig)?;
 //! assert_eq!(join.counts().to_string(), "0 keyframes of 0 images");
-//! # Ok::<(), capture::Error>(())
+//! # Ok::<(), anyhow::Error>(())
 //! ```
 
 mod arm_capture;
@@ -37,7 +37,6 @@ pub mod config;
 pub mod dataset;
 pub mod doctor;
 pub mod downscale;
-mod error;
 mod feed;
 mod join;
 mod memory;
@@ -55,13 +54,12 @@ pub use calibration_images::{
     ArmDuringImage, CalibrationImage, CalibrationImages, calibration_images,
 };
 pub use config::{ConfigError, Override, Rig};
-pub use error::{Error, Result};
 pub use feed::{Feed, FeedItem, Input, InputObserver, InputResult, InputTimes};
 pub use join::{Change, Counts, Join, JoinEvent, PosedImage, Rejection, SampleUse};
 pub use nearest_name::nearest_name;
 pub use notes::Notes;
-pub use robot_motion::{RobotMotion, RobotReading};
+pub use robot_motion::RobotMotion;
 pub use stamp_clock::StampClock;
 pub use stations::{StationReport, Stations};
 pub use stop::Stop;
-pub use supervised_arm::{MotionEnd, SupervisedArm};
+pub use supervised_arm::{HOLDING, MotionEnd, SupervisedArm};

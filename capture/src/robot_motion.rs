@@ -1,7 +1,9 @@
 //! The current joint positions and base pose of the robot, for viewers.
 
 use crate::config::{BaseDriver, Rig};
+use crate::stamp_clock::StampClock;
 use drivers::Sample;
+use keyframe::RobotState;
 use kinematics::{Stamp, Transform};
 
 /// Follows the readings of the robot. Unlike the join, it returns every reading at once, without
@@ -18,19 +20,6 @@ pub struct RobotMotion {
     has_moving_base: bool,
 }
 
-/// Joint positions and base pose at one time.
-#[derive(Clone, Debug, PartialEq)]
-pub struct RobotReading {
-    /// Time of the reading: the older one of joint positions and base pose, so that neither is
-    /// older than its stamp.
-    pub stamp: Stamp,
-    /// Pose of the base, without the correction of its station.
-    pub world_from_base: Transform,
-    /// Positions of [`Arm::joints`](crate::config::Arm::joints) with their offsets, radians or
-    /// meters.
-    pub positions: Vec<f64>,
-}
-
 impl RobotMotion {
     /// The robot of a rig, without readings.
     #[must_use]
@@ -45,9 +34,11 @@ impl RobotMotion {
         }
     }
 
-    /// Takes a sample; returns a reading if the sample moves the robot and the pose of its base is
-    /// known.
-    pub fn push(&mut self, sample: &Sample) -> Option<RobotReading> {
+    /// Takes a sample; returns the state of the robot if the sample moves it and the pose of its
+    /// base is known. The stamp is the older one of joint positions and base pose, so that neither
+    /// is older than the stamp. The base pose lacks the correction of its station; joint positions
+    /// include their offsets.
+    pub fn push(&mut self, sample: &Sample, clock: &StampClock) -> Option<RobotState> {
         match sample {
             Sample::Joints(state) => {
                 let is_valid = state.position.len() == self.n_joints
@@ -63,8 +54,9 @@ impl RobotMotion {
                 let stamp = self
                     .base_stamp
                     .map_or(state.stamp, |base_stamp| base_stamp.min(state.stamp));
-                Some(RobotReading {
+                Some(RobotState {
                     stamp,
+                    captured_at: clock.captured_at(stamp),
                     world_from_base,
                     positions,
                 })
@@ -76,8 +68,9 @@ impl RobotMotion {
                 self.world_from_base = Some(pose.world_from_base);
                 self.base_stamp = Some(pose.stamp);
                 // Readings of the joints come more often than base poses.
-                (self.n_joints == 0).then(|| RobotReading {
+                (self.n_joints == 0).then(|| RobotState {
                     stamp: pose.stamp,
+                    captured_at: clock.captured_at(pose.stamp),
                     world_from_base: pose.world_from_base,
                     positions: Vec::new(),
                 })
@@ -90,7 +83,9 @@ impl RobotMotion {
 #[cfg(test)]
 mod tests {
     use super::RobotMotion;
+    use crate::StampClock;
     use drivers::{BasePose, Sample};
+    use keyframe::RobotState;
     use kinematics::{JointState, Stamp, Transform};
 
     fn joints(position: Vec<f64>) -> Sample {
@@ -113,6 +108,10 @@ mod tests {
         })
     }
 
+    fn push(robot: &mut RobotMotion, sample: &Sample) -> Option<RobotState> {
+        robot.push(sample, &StampClock::Unrelated)
+    }
+
     fn motion(n_joints: usize, world_from_base: Option<Transform>) -> RobotMotion {
         RobotMotion {
             n_joints,
@@ -127,22 +126,25 @@ mod tests {
     fn readings_have_offsets_and_the_latest_base_pose() {
         let mut moving = motion(2, None);
         assert_eq!(
-            moving.push(&joints(vec![1.0, 2.0])),
+            push(&mut moving, &joints(vec![1.0, 2.0])),
             None,
             "the base is nowhere yet"
         );
-        assert_eq!(moving.push(&base(3.0)), None, "the joints follow");
-        let reading = moving.push(&joints(vec![1.0, 2.0])).expect("a reading");
+        assert_eq!(push(&mut moving, &base(3.0)), None, "the joints follow");
+        let reading = push(&mut moving, &joints(vec![1.0, 2.0])).expect("a reading");
         assert_eq!(
             (reading.stamp, reading.world_from_base.translation.x),
             (Stamp(7), 3.0)
         );
         assert_eq!(reading.positions, [1.1, 2.1]);
         let mut fixed = motion(2, Some(Transform::identity()));
-        assert_eq!(fixed.push(&base(3.0)), None, "a fixed base does not move");
         assert_eq!(
-            fixed
-                .push(&joints(vec![0.0, 0.0]))
+            push(&mut fixed, &base(3.0)),
+            None,
+            "a fixed base does not move"
+        );
+        assert_eq!(
+            push(&mut fixed, &joints(vec![0.0, 0.0]))
                 .expect("a reading")
                 .world_from_base,
             Transform::identity()
@@ -152,23 +154,19 @@ mod tests {
     #[test]
     fn the_older_of_joints_and_base_counts() {
         let mut moving = motion(1, None);
-        assert_eq!(moving.push(&base(0.0)), None, "the joints follow");
+        assert_eq!(push(&mut moving, &base(0.0)), None, "the joints follow");
         assert_eq!(
-            moving
-                .push(&joints_at(8, vec![0.0]))
+            push(&mut moving, &joints_at(8, vec![0.0]))
                 .expect("a reading")
                 .stamp,
             Stamp(8),
             "the base is newer"
         );
-        let frozen = moving
-            .push(&joints_at(5_000, vec![0.0]))
-            .expect("a reading");
+        let frozen = push(&mut moving, &joints_at(5_000, vec![0.0])).expect("a reading");
         assert_eq!(frozen.stamp, Stamp(9), "the base has not reported since");
         let mut fixed = motion(1, Some(Transform::identity()));
         assert_eq!(
-            fixed
-                .push(&joints_at(5_000, vec![0.0]))
+            push(&mut fixed, &joints_at(5_000, vec![0.0]))
                 .expect("a reading")
                 .stamp,
             Stamp(5_000)
@@ -178,16 +176,15 @@ mod tests {
     #[test]
     fn invalid_readings_are_ignored() {
         let mut fixed = motion(2, Some(Transform::identity()));
-        assert_eq!(fixed.push(&joints(vec![1.0])), None);
-        assert_eq!(fixed.push(&joints(vec![1.0, f64::NAN])), None);
+        assert_eq!(push(&mut fixed, &joints(vec![1.0])), None);
+        assert_eq!(push(&mut fixed, &joints(vec![1.0, f64::NAN])), None);
     }
 
     #[test]
     fn a_base_without_joints_is_a_robot_too() {
         let mut moving = motion(0, None);
         assert_eq!(
-            moving
-                .push(&base(2.0))
+            push(&mut moving, &base(2.0))
                 .expect("a reading")
                 .world_from_base
                 .translation

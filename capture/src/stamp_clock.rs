@@ -39,6 +39,13 @@ impl StampClock {
             Self::Simulation | Self::Unrelated => None,
         }
     }
+
+    /// When a sample with this stamp was captured, or now if the stamp is on another clock
+    /// (recordings, simulations).
+    #[must_use]
+    pub fn captured_at(&self, stamp: Stamp) -> Instant {
+        self.instant_of(stamp).unwrap_or_else(Instant::now)
+    }
 }
 
 #[cfg(test)]

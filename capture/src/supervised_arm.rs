@@ -1,12 +1,12 @@
 //! Supervision of an arm that moves: its faults, requests to stop, and joint offsets.
 
 use crate::config::Rig;
-use crate::error::Context;
 use crate::stop::Stop;
+use anyhow::{Context, bail};
 use drivers::motion::{JointTarget, Motion};
 use drivers::{Error, MovableArm, clock};
-use keyframe::bail;
 use kinematics::JointState;
+use messages::Setting;
 use std::time::Duration;
 
 /// Duration of one wait for a joint state. It bounds the time until a request to stop is noticed.
@@ -14,6 +14,9 @@ const POLL: Duration = Duration::from_millis(50);
 /// A movable arm that reports nothing for this long counts as lost. It is longer than pauses of a
 /// busy computer, because an error here stops a motion.
 const MAX_SILENCE: Duration = Duration::from_secs(2);
+
+/// What a user has to do while an arm is held that its motors would release.
+pub const HOLDING: &str = "holding the arm; support it before you press Ctrl-C, because the motors then no longer hold it";
 
 /// A movable arm and its joint offsets. All positions include `arm.joint_offsets`, as everywhere
 /// else.
@@ -44,7 +47,7 @@ impl SupervisedArm {
     ///
     /// # Errors
     /// If the arm does not recover.
-    pub fn recover(&mut self) -> crate::Result<()> {
+    pub fn recover(&mut self) -> anyhow::Result<()> {
         Ok(self.arm.recover()?)
     }
 
@@ -52,7 +55,7 @@ impl SupervisedArm {
     ///
     /// # Errors
     /// If the arm has stopped because of a fault, or reports nothing.
-    pub fn read(&mut self) -> crate::Result<JointState> {
+    pub fn read(&mut self) -> anyhow::Result<JointState> {
         let deadline = clock::now().plus_secs(MAX_SILENCE.as_secs_f64());
         loop {
             match self.read_within(POLL)? {
@@ -69,13 +72,14 @@ impl SupervisedArm {
     }
 
     /// Reads the next joint state. `None` if none arrives in time.
-    fn read_within(&mut self, timeout: Duration) -> crate::Result<Option<JointState>> {
+    fn read_within(&mut self, timeout: Duration) -> anyhow::Result<Option<JointState>> {
         let state = self.arm.read(timeout);
         // Checked after every read, also one that timed out: an arm that has stopped because of a
         // fault may report nothing any more.
         if let Motion::Stopped { reason } = self.arm.motion() {
             bail!(
-                "the arm stopped: {reason}. Inspect it, then recover it with `fieldrig move --recover`"
+                "the arm stopped: {reason}. Inspect it, then recover it with `fieldrig move {}`",
+                Setting::Recover
             );
         }
         match state {
@@ -96,7 +100,7 @@ impl SupervisedArm {
     ///
     /// # Errors
     /// As [`SupervisedArm::read`].
-    pub fn read_queued(&mut self, mut on_state: impl FnMut(&JointState)) -> crate::Result<()> {
+    pub fn read_queued(&mut self, mut on_state: impl FnMut(&JointState)) -> anyhow::Result<()> {
         // Four seconds at 1 kHz. The limit ends the loop if states arrive faster than they are
         // read.
         const MAX_STATES: usize = 4000;
@@ -113,7 +117,7 @@ impl SupervisedArm {
     ///
     /// # Errors
     /// If the arm rejects it.
-    pub fn command(&mut self, requested: &JointTarget) -> crate::Result<JointTarget> {
+    pub fn command(&mut self, requested: &JointTarget) -> anyhow::Result<JointTarget> {
         // The driver reports positions of its encoders, without offsets.
         let requested = self.with_offsets(requested, -1.0);
         let accepted = self.arm.command(&requested)?;
@@ -143,7 +147,7 @@ impl SupervisedArm {
         &mut self,
         stop: &Stop,
         on_state: impl FnMut(&JointState),
-    ) -> crate::Result<MotionEnd> {
+    ) -> anyhow::Result<MotionEnd> {
         let end = self.follow_while_read(stop, on_state);
         // If the program can no longer read the arm, it must not leave it moving unsupervised. An
         // arm that has stopped by itself stays as it is.
@@ -162,7 +166,7 @@ impl SupervisedArm {
         &mut self,
         stop: &Stop,
         mut on_state: impl FnMut(&JointState),
-    ) -> crate::Result<MotionEnd> {
+    ) -> anyhow::Result<MotionEnd> {
         loop {
             let state = self.read()?;
             on_state(&state);
@@ -196,7 +200,7 @@ impl SupervisedArm {
         &mut self,
         stop: &Stop,
         mut on_state: impl FnMut(&JointState),
-    ) -> crate::Result<()> {
+    ) -> anyhow::Result<()> {
         while !stop.requested() {
             on_state(&self.read()?);
         }

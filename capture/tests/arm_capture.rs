@@ -273,14 +273,14 @@ mod emulated_controller {
         }
     }
 
-    fn connected(rate_hz: f64) -> capture::Result<(ArmCapture, Vec<f64>)> {
+    fn connected(rate_hz: f64) -> anyhow::Result<(ArmCapture, Vec<f64>)> {
         connected_as(rate_hz, |arm| arm)
     }
 
     fn connected_as(
         rate_hz: f64,
         wrap: impl FnOnce(Box<dyn MovableArm>) -> Box<dyn MovableArm>,
-    ) -> capture::Result<(ArmCapture, Vec<f64>)> {
+    ) -> anyhow::Result<(ArmCapture, Vec<f64>)> {
         let overrides = [
             Override::new("arm.driver", "franka"),
             Override::new("arm.motion.on_loss", "hold"),
@@ -297,7 +297,7 @@ mod emulated_controller {
     }
 
     /// Repeats a test that fails because the computer is busy.
-    fn unless_busy(test: impl Fn() -> capture::Result<()>) {
+    fn unless_busy(test: impl Fn() -> anyhow::Result<()>) {
         for attempt in 1..=MAX_ATTEMPTS {
             match test() {
                 Ok(()) => return,
@@ -321,7 +321,7 @@ mod emulated_controller {
     }
 
     /// The joints after the states that have arrived, and how far they move within half a second.
-    fn joints_and_drift(capture: &mut ArmCapture) -> capture::Result<(Vec<f64>, f64)> {
+    fn joints_and_drift(capture: &mut ArmCapture) -> anyhow::Result<(Vec<f64>, f64)> {
         let settled = Instant::now() + Duration::from_millis(200);
         let mut joints = capture.joints()?;
         while Instant::now() < settled {

@@ -17,13 +17,13 @@ mod seeds;
 #[cfg(test)]
 mod tests;
 
+pub use self::messages::messages;
 #[cfg(target_os = "linux")]
 pub use crate::can::fuzz::frames;
 #[cfg(target_os = "linux")]
 pub use crate::franka::{emulated::fuzz::client, fuzz::states};
 pub use crate::udp::fuzz::datagrams;
 pub use dataset::{nerfstudio, tum};
-pub use messages::messages;
 pub use pixels::pixels;
 pub use recording::recording;
 pub use seeds::{Seed, generated_seeds};

@@ -25,7 +25,7 @@ pub mod fuzz;
 #[cfg(feature = "nokhwa")]
 mod gap_estimator;
 pub mod jpeg;
-mod live;
+mod live_devices;
 pub mod motion;
 #[cfg(feature = "nokhwa")]
 pub mod nokhwa;
@@ -47,7 +47,7 @@ pub mod wire;
 mod yuv;
 
 pub use error::{Error, RecordedSpan};
-pub use live::{Devices, Live};
+pub use live_devices::{Devices, LiveDevices};
 pub use motion::MovableArm;
 pub use playback::{Playback, PlaybackClock};
 #[cfg(any(target_os = "linux", feature = "nokhwa", feature = "realsense"))]

@@ -7,7 +7,8 @@ use std::sync::{Arc, OnceLock};
 use std::time::{Duration, Instant};
 
 /// Images later than this are dropped: the time in which a camera at 30 Hz fills its queue in
-/// [`Live`](crate::Live). So a caller that is too slow loses images as it would with devices.
+/// [`LiveDevices`](crate::LiveDevices). So a caller that is too slow loses images as it would with
+/// devices.
 const MAX_DELAY: Duration = Duration::from_millis(270);
 
 /// A source whose samples are returned when they are due, by their stamps and their order.

@@ -1,6 +1,6 @@
 //! Errors of keyframes.
 
-use crate::ErrorClass;
+use messages::{ErrorClass, Setting};
 use std::path::PathBuf;
 
 /// An error of a keyframe or of a selection of keyframes.
@@ -58,7 +58,7 @@ pub enum Error {
         found: String,
     },
     /// Test images cannot be selected as requested.
-    #[error("--holdout {request}: {reason}")]
+    #[error("{} {request}: {reason}", Setting::Holdout)]
     Holdout {
         /// The requested number, file or name.
         request: String,

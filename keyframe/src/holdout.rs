@@ -21,29 +21,15 @@ impl Default for Holdout {
 }
 
 impl Holdout {
-    /// Parses the value of `--holdout`: a number, or a file with one name per line.
+    /// Reads the names of test photos from a file with one name per line.
     ///
     /// # Errors
     ///
-    /// If the argument is neither a number of at least 1 nor a readable file with at least one
-    /// name.
-    pub fn from_argument(argument: &str) -> Result<Self, Error> {
-        let invalid = |reason: &str| Error::Holdout {
-            request: argument.to_owned(),
-            reason: reason.to_owned(),
-        };
-        // Signed, so that a negative number is refused as a number, and not sought as a file.
-        if let Ok(every) = argument.parse::<i64>() {
-            return usize::try_from(every)
-                .ok()
-                .filter(|every| *every >= 1)
-                .map(Self::Every)
-                .ok_or_else(|| invalid("must be at least 1, or a file that lists photos"));
-        }
-        let text = files::read_text(Path::new(argument)).map_err(|error| {
-            invalid(&format!(
-                "neither a whole number nor a readable file ({error})"
-            ))
+    /// If the file cannot be read or contains no name.
+    pub fn from_list(path: &Path) -> Result<Self, Error> {
+        let text = files::read_text(path).map_err(|error| Error::Read {
+            path: path.to_owned(),
+            reason: error.to_string(),
         })?;
         let names: Vec<_> = text
             .lines()
@@ -52,10 +38,12 @@ impl Holdout {
             .map(str::to_owned)
             .collect();
         if names.is_empty() {
-            Err(invalid("the file lists no photo"))
-        } else {
-            Ok(Self::Named(names))
+            return Err(Error::Holdout {
+                request: path.display().to_string(),
+                reason: "the file lists no photo".into(),
+            });
         }
+        Ok(Self::Named(names))
     }
 
     /// The split of each photo, in the order of `names`.
@@ -179,32 +167,15 @@ mod tests {
     }
 
     #[test]
-    fn argument_is_a_number_or_a_file() {
-        assert_eq!(Holdout::from_argument("10").unwrap(), Holdout::Every(10));
-        assert_eq!(
-            Holdout::from_argument("1")
-                .unwrap()
-                .splits(&["a", "b"])
-                .unwrap(),
-            [Test, Test]
-        );
-        for invalid in ["0", "-3"] {
-            assert!(
-                Holdout::from_argument(invalid)
-                    .unwrap_err()
-                    .to_string()
-                    .contains("at least 1"),
-                "{invalid}"
-            );
-        }
-        assert!(Holdout::from_argument("no/such/file").is_err());
+    fn list_has_one_name_per_line() {
+        assert!(Holdout::from_list(Path::new("no/such/file")).is_err());
         let folder = tempfile::tempdir().unwrap();
         let file = folder.path().join("test.txt");
         std::fs::write(&file, "a.jpg\n\n b.jpg \n").unwrap();
         let names = vec!["a.jpg".to_owned(), "b.jpg".to_owned()];
-        assert_eq!(
-            Holdout::from_argument(file.to_str().unwrap()).unwrap(),
-            Holdout::Named(names)
-        );
+        assert_eq!(Holdout::from_list(&file).unwrap(), Holdout::Named(names));
+        std::fs::write(&file, "\n").unwrap();
+        let empty = Holdout::from_list(&file).unwrap_err().to_string();
+        assert!(empty.ends_with("the file lists no photo"), "{empty}");
     }
 }

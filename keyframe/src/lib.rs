@@ -31,28 +31,22 @@
 //! # Ok::<(), keyframe::Error>(())
 //! ```
 
-mod context;
-mod counted;
 mod error;
-mod error_class;
 mod fingerprint;
 mod holdout;
 mod keyframe;
 mod list;
-mod live;
 mod range_points;
 #[cfg(any(test, feature = "scenes"))]
 pub mod scenes;
 mod shutter;
+mod viewer_data;
 
-pub use context::write_chain;
-pub use counted::{counted, listed};
 pub use error::Error;
-pub use error_class::ErrorClass;
 pub use fingerprint::fingerprint;
 pub use holdout::Holdout;
 pub use keyframe::{BaseState, DepthMap, Keyframe, Split, Truth};
 pub use list::{KeyframeList, list_text, split_from_name, split_name};
-pub use live::{LiveImage, LivePixels, RangeScan, RobotState};
 pub use range_points::RangePoints;
 pub use shutter::Shutter;
+pub use viewer_data::{LiveImage, LivePixels, RangeScan, RobotState};

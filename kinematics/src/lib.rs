@@ -30,7 +30,7 @@
 
 pub mod camera;
 pub mod chain;
-pub mod clock;
+pub mod device_clock;
 mod error;
 pub mod history;
 mod inverse;
@@ -42,7 +42,6 @@ pub mod quantile;
 pub mod random;
 mod rounding;
 pub mod shape;
-mod shortened;
 pub mod stamp;
 pub mod transform;
 pub mod undistort;
@@ -50,13 +49,12 @@ pub mod urdf;
 
 pub use camera::{Intrinsics, Lens};
 pub use chain::Chain;
-pub use clock::ClockMap;
+pub use device_clock::ClockMap;
 pub use error::Error;
 pub use history::{HistoryError, JointHistory, PoseHistory};
 pub use joints::JointState;
 pub use projection::{MAX_INTRINSICS_PARAMS, Projection};
 pub use rounding::{f32_of, f32s_of};
-pub use shortened::shortened;
 pub use stamp::Stamp;
 pub use transform::{Transform, Twist};
 pub use undistort::Undistortion;

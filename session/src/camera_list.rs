@@ -1,8 +1,8 @@
 //! The camera poses of a run, stored in `cameras.json` next to the model. Viewers draw these
 //! cameras and derive the initial view from them.
 
-use crate::error::Context;
 use crate::{camera_path, run_folder};
+use anyhow::Context;
 use calibration::CalibratedCamera;
 use keyframe::{Keyframe, split_name};
 use kinematics::{Stamp, Transform};
@@ -62,7 +62,7 @@ pub(crate) fn of_model(method: &mut AlignedModel, keyframes: &[Arc<Keyframe>]) -
 }
 
 /// Writes the list, one camera per line.
-pub fn write(folder: &Path, cameras: &[PosedCamera]) -> crate::Result<()> {
+pub fn write(folder: &Path, cameras: &[PosedCamera]) -> anyhow::Result<()> {
     let lines: Vec<String> = cameras
         .iter()
         .map(serde_json::to_string)
@@ -74,7 +74,7 @@ pub fn write(folder: &Path, cameras: &[PosedCamera]) -> crate::Result<()> {
 }
 
 /// Reads the list; `None` if the folder has none.
-pub fn read(folder: &Path) -> crate::Result<Option<Vec<KeyframePose>>> {
+pub fn read(folder: &Path) -> anyhow::Result<Option<Vec<KeyframePose>>> {
     let path = folder.join(FILE);
     let text = match files::read_text(&path) {
         Ok(text) => text,
@@ -100,7 +100,7 @@ pub fn read(folder: &Path) -> crate::Result<Option<Vec<KeyframePose>>> {
             principal_px: camera.principal_px,
         })
     });
-    posed.collect::<crate::Result<_>>().map(Some)
+    posed.collect::<anyhow::Result<_>>().map(Some)
 }
 
 /// The 4x4 matrix of a pose, row major.

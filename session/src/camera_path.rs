@@ -1,9 +1,8 @@
 //! Viewpoints for rendering: a single pose, or a camera path exported by nerfstudio's viewer.
 
-use crate::Error;
-use crate::error::Context;
-use keyframe::ensure;
-use kinematics::{Transform, shortened, transform};
+use anyhow::{Context, ensure};
+use kinematics::{Transform, transform};
+use messages::{BadInput, Setting, shortened};
 use serde::Deserialize;
 use serde_json::Value;
 use std::collections::{BTreeMap, BTreeSet};
@@ -75,7 +74,7 @@ struct PathFileCamera {
 }
 
 impl PathFile {
-    fn size_px(&self) -> crate::Result<Option<[u32; 2]>> {
+    fn size_px(&self) -> anyhow::Result<Option<[u32; 2]>> {
         let width = whole_side("render_width", self.render_width)?;
         let height = whole_side("render_height", self.render_height)?;
         ensure!(
@@ -102,16 +101,16 @@ impl PathFile {
         let quoted: Vec<String> = unknown.iter().map(|key| format!("{key:?}")).collect();
         let named = shortened(&quoted, MAX_NAMED, ", ");
         let advice = if unknown.contains("crop") {
-            "; for \"crop\", use --crop"
+            format!("; for \"crop\", use {}", Setting::Crop)
         } else {
-            ""
+            String::new()
         };
         vec![format!("unknown keys are not used: {named}{advice}")]
     }
 }
 
 /// A width or height as a whole number of pixels; `None` if it is not given.
-fn whole_side(name: &str, side_px: Option<f64>) -> crate::Result<Option<u32>> {
+fn whole_side(name: &str, side_px: Option<f64>) -> anyhow::Result<Option<u32>> {
     let Some(side_px) = side_px else {
         return Ok(None);
     };
@@ -130,7 +129,7 @@ fn whole_side(name: &str, side_px: Option<f64>) -> crate::Result<Option<u32>> {
 impl CameraPath {
     /// Reads a nerfstudio camera path and converts its cameras to the axes of
     /// [`kinematics::camera`].
-    pub fn load(path: &Path) -> crate::Result<Self> {
+    pub fn load(path: &Path) -> anyhow::Result<Self> {
         let text =
             files::read_text(path).with_context(|| format!("cannot read {}", path.display()))?;
         Self::parse(&text).with_context(|| format!("the nerfstudio camera path {}", path.display()))
@@ -138,9 +137,9 @@ impl CameraPath {
 
     /// A path with one viewpoint, from the 16 numbers of `world_from_camera`, row major, with the
     /// axes of [`kinematics::camera`].
-    pub fn of_pose(numbers: &[f64]) -> Result<Self, Error> {
+    pub fn of_pose(numbers: &[f64]) -> anyhow::Result<Self> {
         let world_from_camera =
-            rigid(numbers).map_err(|error| Error::BadInput(format!("--pose: {error}")))?;
+            rigid(numbers).map_err(|error| BadInput(format!("{}: {error}", Setting::Pose)))?;
         let cameras = vec![PathCamera {
             world_from_camera,
             fov_y_rad: None,
@@ -153,7 +152,7 @@ impl CameraPath {
         })
     }
 
-    fn parse(text: &str) -> crate::Result<Self> {
+    fn parse(text: &str) -> anyhow::Result<Self> {
         let file: PathFile = serde_json::from_str(text)?;
         ensure!(!file.camera_path.is_empty(), "it contains no cameras");
         let camera_type = file.camera_type.as_deref().unwrap_or(PERSPECTIVE);
@@ -182,13 +181,13 @@ impl CameraPath {
 }
 
 /// Converts a row-major 4x4 matrix, whose numbers may be rounded, to a rigid transform.
-pub fn rigid(numbers: &[f64]) -> crate::Result<Transform> {
+pub fn rigid(numbers: &[f64]) -> anyhow::Result<Transform> {
     let rows: &[f64; 16] = numbers
         .try_into()
         .ok()
         .with_context(|| format!("a pose has 16 numbers, got {}", numbers.len()))?;
     let (pose, _) =
-        transform::from_rounded_rows(rows).map_err(|error| Error::BadInput(error.to_string()))?;
+        transform::from_rounded_rows(rows).map_err(|error| BadInput(error.to_string()))?;
     Ok(pose)
 }
 
@@ -261,7 +260,7 @@ mod tests {
         for (key, note) in [
             (
                 "crop",
-                "unknown keys are not used: \"crop\"; for \"crop\", use --crop",
+                "unknown keys are not used: \"crop\"; for \"crop\", use crop",
             ),
             ("smooth", "unknown keys are not used: \"smooth\""),
         ] {

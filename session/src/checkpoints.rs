@@ -1,11 +1,11 @@
 //! Checkpoints of a model in training: taken periodically and written on a separate thread.
 
-use crate::Error;
-use crate::error::Context;
 use crate::run_folder::{CHECKPOINT, expect_one_model};
 use crate::stored_keyframes::StoredKeyframes;
+use anyhow::Context;
 use background::Task;
 use keyframe::Keyframe;
+use messages::{BadInput, Setting};
 use model_files::Edits;
 use model_files::checkpoint::Checkpoint;
 use std::collections::BTreeMap;
@@ -68,7 +68,7 @@ pub fn parse_period(text: &str) -> Result<Duration, String> {
 
 /// Reads the checkpoint in a run folder. If the folder also contains the complete model, the edits
 /// are those saved with it, which operators may have changed after the end of the run.
-pub fn read(folder: &Path) -> crate::Result<Checkpoint> {
+pub fn read(folder: &Path) -> anyhow::Result<Checkpoint> {
     expect_one_model(folder)?;
     let mut checkpoint = Checkpoint::read(&folder.join(CHECKPOINT))
         .with_context(|| format!("no checkpoint to resume from in {}", folder.display()))?;
@@ -86,12 +86,14 @@ pub fn check_limit_not_passed(
     seconds: Option<f64>,
     checkpoint: &Checkpoint,
     subject: &str,
-) -> Result<(), Error> {
+) -> anyhow::Result<()> {
     match seconds.filter(|seconds| *seconds <= checkpoint.seconds) {
-        Some(seconds) => Err(Error::BadInput(format!(
-            "--seconds {seconds}: {subject} has already been trained for {:.1} s, which counts; give a larger limit",
+        Some(seconds) => Err(BadInput(format!(
+            "{} {seconds}: {subject} has already been trained for {:.1} s, which counts; give a larger limit",
+            Setting::Seconds,
             checkpoint.seconds
-        ))),
+        ))
+        .into()),
         None => Ok(()),
     }
 }
@@ -123,7 +125,7 @@ pub struct Checkpoints {
 
 /// A writer thread.
 struct WriterThread {
-    thread: Task<crate::Result<()>>,
+    thread: Task<anyhow::Result<()>>,
     /// `true` if it writes a checkpoint, `false` if it writes only keyframes.
     is_checkpoint: bool,
 }
@@ -296,7 +298,7 @@ impl Checkpoints {
     }
 
     /// Waits until the checkpoint in progress is on disk.
-    pub fn wait(&mut self) -> crate::Result<()> {
+    pub fn wait(&mut self) -> anyhow::Result<()> {
         let Some(WriterThread {
             thread,
             is_checkpoint,
@@ -330,7 +332,7 @@ pub struct CheckpointWrite {
 impl CheckpointWrite {
     /// Writes new keyframes, then the checkpoint, then removes keyframes that only the previous
     /// checkpoint needed.
-    fn write(self) -> crate::Result<()> {
+    fn write(self) -> anyhow::Result<()> {
         let started = Instant::now();
         let RunFlags { depth_from, flags } = self.run_flags;
         // In this order, the files on disk form a complete state at any time: the keyframes of the

@@ -1,11 +1,10 @@
 //! Writes a rig file with the calibration corrections that were estimated.
 
-use crate::Error;
-use crate::error::Context;
+use anyhow::Context;
 use calibration::{Alignment, CameraCorrection, Estimate};
 use capture::config::{Base, Camera, Parent, Rig, TimeOffset};
-use keyframe::listed;
 use kinematics::{Chain, Intrinsics, Stamp, Transform};
+use messages::{BadInput, Setting, listed};
 use nalgebra::{DMatrix, Translation3, UnitQuaternion, Vector3};
 use std::collections::BTreeMap;
 use std::fs::File;
@@ -23,7 +22,7 @@ pub fn corrected(
     rig: &Rig,
     alignment: Option<&Alignment>,
     learned: &BTreeMap<String, CameraCorrection>,
-) -> crate::Result<Rig> {
+) -> anyhow::Result<Rig> {
     let mut rig = rig.clone();
     let unaligned = Alignment::default();
     let alignment = alignment.unwrap_or(&unaligned);
@@ -82,17 +81,19 @@ fn has_extrinsics_of(estimates: &[Estimate], camera: &str) -> bool {
 /// A camera of a rig.
 ///
 /// # Errors
-/// [`Error::BadInput`] with the names of all cameras if there is none of this name.
-pub fn camera<'a>(rig: &'a Rig, name: &str) -> Result<&'a Camera, Error> {
+/// [`BadInput`] with the names of all cameras if there is none of this name.
+pub fn camera<'a>(rig: &'a Rig, name: &str) -> anyhow::Result<&'a Camera> {
     rig.cameras
         .iter()
         .find(|camera| *camera.name == *name)
         .ok_or_else(|| {
             let names: Vec<&str> = rig.cameras.iter().map(|camera| &*camera.name).collect();
-            Error::BadInput(format!(
-                "--camera {name}: the rig file has no such camera; it has {}",
+            BadInput(format!(
+                "{} {name}: the rig file has no such camera; it has {}",
+                Setting::Camera,
                 listed(&names, "and")
             ))
+            .into()
         })
 }
 
@@ -101,13 +102,13 @@ pub fn camera<'a>(rig: &'a Rig, name: &str) -> Result<&'a Camera, Error> {
 /// * `covariance`: that of the intrinsics, if it is known.
 ///
 /// # Errors
-/// [`Error::BadInput`] if there is no such camera, or if its images have another size.
+/// [`BadInput`] if there is no such camera, or if its images have another size.
 pub fn with_intrinsics(
     rig: &Rig,
     name: &str,
     intrinsics: &Intrinsics,
     covariance: Option<&DMatrix<f64>>,
-) -> Result<Rig, Error> {
+) -> anyhow::Result<Rig> {
     expect_size(camera(rig, name)?, intrinsics.size_px)?;
     let mut rig = rig.clone();
     for camera in rig
@@ -134,23 +135,25 @@ pub fn with_intrinsics(
 /// attached to the world.
 ///
 /// # Errors
-/// [`Error::BadInput`] if there is no such camera, or if it is attached to another frame than
+/// [`BadInput`] if there is no such camera, or if it is attached to another frame than
 /// `parent`.
 pub fn with_extrinsics(
     rig: &Rig,
     name: &str,
     parent: Parent,
     pose: &Transform,
-) -> Result<Rig, Error> {
+) -> anyhow::Result<Rig> {
     let given = camera(rig, name)?.parent;
     // Only a fixed base has one known pose in the world.
     let is_converted = (parent, given) == (Parent::Base, Parent::World) && !rig.has_moving_base();
     if given != parent && !is_converted {
-        return Err(Error::BadInput(format!(
-            "--camera {name}: its parent in the rig file is {}, but the calibrated pose is relative to the {}; change parent, or the setup of the calibration",
+        return Err(BadInput(format!(
+            "{} {name}: its parent in the rig file is {}, but the calibrated pose is relative to the {}; change parent, or the setup of the calibration",
+            Setting::Camera,
             name_of(given),
             name_of(parent)
-        )));
+        ))
+        .into());
     }
     let mut rig = rig.clone();
     let camera = rig.cameras.iter_mut().find(|camera| *camera.name == *name);
@@ -170,16 +173,18 @@ pub fn parent_from_camera(base: &Base, parent: Parent, pose: &Transform) -> Tran
 /// Checks that calibrated images have the size of a camera's images.
 ///
 /// # Errors
-/// [`Error::BadInput`] if not.
-pub fn expect_size(camera: &Camera, [width, height]: [u32; 2]) -> Result<(), Error> {
+/// [`BadInput`] if not.
+pub fn expect_size(camera: &Camera, [width, height]: [u32; 2]) -> anyhow::Result<()> {
     let [rig_width, rig_height] = camera.intrinsics.size_px;
     if [width, height] == camera.intrinsics.size_px {
         return Ok(());
     }
-    Err(Error::BadInput(format!(
-        "--camera {}: its images have {rig_width}x{rig_height} pixels in the rig file, but the calibrated images have {width}x{height}; calibrate this resolution, or change size_px",
+    Err(BadInput(format!(
+        "{} {}: its images have {rig_width}x{rig_height} pixels in the rig file, but the calibrated images have {width}x{height}; calibrate this resolution, or change size_px",
+        Setting::Camera,
         camera.name
-    )))
+    ))
+    .into())
 }
 
 fn name_of(parent: Parent) -> &'static str {
@@ -191,23 +196,27 @@ fn name_of(parent: Parent) -> &'static str {
 }
 
 /// Checks that a rig file can be written to this path.
-pub fn check_target_file(rig: &Rig, file: &Path) -> Result<(), Error> {
+pub fn check_target_file(rig: &Rig, file: &Path) -> anyhow::Result<()> {
     let folder = file
         .parent()
         .filter(|folder| !folder.as_os_str().is_empty())
         .unwrap_or(Path::new("."));
     if !folder.is_dir() || file.is_dir() {
-        return Err(Error::BadInput(format!(
-            "--write-rig {}: must be a file in an existing folder",
+        return Err(BadInput(format!(
+            "{} {}: must be a file in an existing folder",
+            Setting::WriteRig,
             file.display()
-        )));
+        ))
+        .into());
     }
     match other_robot(rig, file) {
-        Some(urdf) => Err(Error::BadInput(format!(
-            "--write-rig {}: {} is the URDF of another robot; write the rig file to a separate folder",
+        Some(urdf) => Err(BadInput(format!(
+            "{} {}: {} is the URDF of another robot; write the rig file to a separate folder",
+            Setting::WriteRig,
             file.display(),
             urdf.display()
-        ))),
+        ))
+        .into()),
         None => Ok(()),
     }
 }
@@ -223,7 +232,7 @@ fn other_robot(rig: &Rig, file: &Path) -> Option<PathBuf> {
 /// with the extension `.old`, or `.old2` and so on if that exists. Does not overwrite the URDF of
 /// another robot. Of two programs that write the same file at the same time, the second gets an
 /// error.
-pub fn write(rig: &Rig, file: &Path) -> crate::Result<()> {
+pub fn write(rig: &Rig, file: &Path) -> anyhow::Result<()> {
     check_target_file(rig, file)?;
     let linked = std::fs::read_link(file);
     // The previous file is copied while no other program can write it, so that the copy has the
@@ -595,7 +604,7 @@ mod tests {
         assert_eq!(moved.cameras[0].parent_from_camera, pose);
         assert_eq!(moved.cameras[0].intrinsics, before.intrinsics);
 
-        let message = |result: Result<Rig, Error>| result.unwrap_err().to_string();
+        let message = |result: anyhow::Result<Rig>| result.unwrap_err().to_string();
         let unknown = message(with_intrinsics(&rig, "wirst", &other, None));
         assert!(
             unknown.contains("wirst") && unknown.contains("wrist"),

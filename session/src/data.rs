@@ -1,19 +1,20 @@
 //! Input of `train` and `eval`: a dataset folder or a recording, as keyframes in host memory.
 
-use crate::Error;
 use crate::depth_from::{DepthSource, RenderedDepth};
+use crate::holdout::parse_holdout;
 use crate::methods::methods_of;
 use crate::read_progress::{OnReadProgress, ReadProgress};
 use crate::run_folder::{hex, is_recording};
 use crate::training_options::{AvailableData, MIN_IMAGES_PER_CAMERA};
+use anyhow::ensure;
 use capture::config::{Override, Rig};
 use capture::open::{self, Opened};
 use capture::{Join, JoinEvent, SampleUse, StationReport, Stations, dataset};
 use drivers::Sample;
 use gpu::Gpu;
-use keyframe::ensure;
-use keyframe::{Holdout, Keyframe, KeyframeList, Split, counted};
+use keyframe::{Holdout, Keyframe, KeyframeList, Split};
 use kinematics::Stamp;
+use messages::{BadInput, InsufficientData, Setting, counted};
 use model_files::InitialPoints;
 use model_files::splat::ply;
 use sha2::{Digest, Sha256};
@@ -38,14 +39,18 @@ pub struct DataOptions {
     pub scale: Option<f64>,
 }
 
+/// The options in the order of [`DataOptions::flags`], with their names in checkpoints.
+const SETTINGS: [(&str, Setting); 4] = [
+    ("holdout", Setting::Holdout),
+    ("keyframes", Setting::Keyframes),
+    ("rig", Setting::Rig),
+    ("scale", Setting::Scale),
+];
+
 impl DataOptions {
-    /// The test images selected by `--holdout`, if it is given.
-    pub fn holdout(&self) -> Result<Option<Holdout>, Error> {
-        Ok(self
-            .holdout
-            .as_deref()
-            .map(Holdout::from_argument)
-            .transpose()?)
+    /// The selected test images, if any are selected.
+    pub fn holdout(&self) -> anyhow::Result<Option<Holdout>> {
+        Ok(self.holdout.as_deref().map(parse_holdout).transpose()?)
     }
 
     /// Names and values of the given flags that affect keyframes. Paths of files are absolute.
@@ -67,10 +72,10 @@ impl DataOptions {
         let rig = self
             .rig
             .as_ref()
-            .map(|file| ["--rig".to_owned(), file.display().to_string()]);
+            .map(|file| [Setting::Rig.to_string(), file.display().to_string()]);
         let scale = self
             .scale
-            .map(|scale| ["--scale".to_owned(), scale.to_string()]);
+            .map(|scale| [Setting::Scale.to_string(), scale.to_string()]);
         rig.into_iter().chain(scale).flatten().collect()
     }
 
@@ -82,15 +87,19 @@ impl DataOptions {
         &self,
         subject: &str,
         before: &BTreeMap<String, String>,
-    ) -> Result<Self, Error> {
+    ) -> anyhow::Result<Self> {
         let now = self.flags();
-        for (name, value) in before {
+        for (name, setting) in SETTINGS {
             // A path with other contents is detected later, when keyframes are compared.
-            let is_other = |now: &String| now != value && is_number(now) && is_number(value);
-            if let Some(now) = now.get(name).filter(|now| is_other(now)) {
-                return Err(Error::BadInput(format!(
-                    "--{name} {now}: {subject} was trained with --{name} {value}"
-                )));
+            let is_other =
+                |now: &str, value: &str| now != value && is_number(now) && is_number(value);
+            if let (Some(now), Some(value)) = (now.get(name), before.get(name))
+                && is_other(now, value)
+            {
+                return Err(BadInput(format!(
+                    "{setting} {now}: {subject} was trained with {setting} {value}"
+                ))
+                .into());
             }
         }
         let unset_flag = |name: &str| before.get(name).filter(|_| !now.contains_key(name));
@@ -102,7 +111,7 @@ impl DataOptions {
         let scale = unset_flag("scale").map(|scale| scale.parse());
         let scale = scale
             .transpose()
-            .map_err(|_| Error::BadInput(format!("{subject}: the scale is not a number")))?;
+            .map_err(|_| BadInput(format!("{subject}: the scale is not a number")))?;
         let restored = Self {
             holdout: self.holdout.clone().or(image_flag("holdout").cloned()),
             keyframes: self
@@ -112,11 +121,11 @@ impl DataOptions {
             rig: self.rig.clone().or(unset_flag("rig").map(PathBuf::from)),
             scale: self.scale.or(scale),
         };
-        let restored_flags: Vec<String> = restored
-            .flags()
+        let all = restored.flags();
+        let restored_flags: Vec<String> = SETTINGS
             .iter()
             .filter(|(name, _)| !now.contains_key(*name))
-            .map(|(name, value)| format!("--{name} {value}"))
+            .filter_map(|(name, setting)| Some(format!("{setting} {}", all.get(*name)?)))
             .collect();
         if !restored_flags.is_empty() {
             log::info!(
@@ -200,7 +209,7 @@ impl Data {
         purpose: Purpose,
         overrides: &[Override],
         progress: OnReadProgress<'_>,
-    ) -> crate::Result<Self> {
+    ) -> anyhow::Result<Self> {
         let list = args
             .keyframes
             .as_deref()
@@ -231,7 +240,7 @@ impl Data {
         scale: f64,
         overrides: &[Override],
         progress: OnReadProgress<'_>,
-    ) -> crate::Result<Self> {
+    ) -> anyhow::Result<Self> {
         let selection = DataSelection {
             list: Some(list),
             holdout: None,
@@ -248,7 +257,7 @@ impl Data {
         purpose: Purpose,
         overrides: &[Override],
         progress: OnReadProgress<'_>,
-    ) -> crate::Result<Self> {
+    ) -> anyhow::Result<Self> {
         let DataSelection {
             list,
             holdout,
@@ -267,10 +276,12 @@ impl Data {
                 .transpose()?;
             Self::from_recording(path, rig, list, overrides, progress)?
         } else if let Some(rig) = rig {
-            return Err(Error::BadInput(format!(
-                "--rig {}: only recordings take a rig file",
+            return Err(BadInput(format!(
+                "{} {}: only recordings take a rig file",
+                Setting::Rig,
                 rig.display()
-            )));
+            ))
+            .into());
         } else {
             Self::from_folder(path, holdout.as_ref(), scale.unwrap_or(1.0), list, progress)?
         };
@@ -288,24 +299,25 @@ impl Data {
     }
 
     /// Returns an error if there is no image for this purpose.
-    fn check_split(&self, path: &Path, purpose: Purpose) -> Result<(), Error> {
+    fn check_split(&self, path: &Path, purpose: Purpose) -> anyhow::Result<()> {
         let (required_split, message) = match purpose {
             Purpose::Training => (Split::Train, "no training image"),
             Purpose::Scoring => (Split::Test, "no test image"),
         };
         if self.of_split(required_split).is_empty() {
             let n_images = counted(self.keyframes.len() as u64, "image");
-            return Err(Error::InsufficientData(format!(
+            return Err(InsufficientData(format!(
                 "{}: {message} among {n_images}",
                 path.display()
-            )));
+            ))
+            .into());
         }
         Ok(())
     }
 
     /// Returns an error if all pixels of all images are masked, and logs a warning if those of some
     /// images are.
-    fn check_masks(&self, path: &Path) -> Result<(), Error> {
+    fn check_masks(&self, path: &Path) -> anyhow::Result<()> {
         let n_masked = self
             .keyframes
             .iter()
@@ -313,11 +325,12 @@ impl Data {
             .count();
         // The usual cause is an inverted mask. Training would succeed with an empty model.
         if n_masked == self.keyframes.len() {
-            return Err(Error::InsufficientData(format!(
+            return Err(InsufficientData(format!(
                 "{}: no pixel of any image can be used: masks, transparency or lens parameters exclude all of them (black in \
                  a mask means \"do not use\")",
                 path.display()
-            )));
+            ))
+            .into());
         }
         if n_masked > 0 {
             let n_images = counted(n_masked as u64, "image");
@@ -330,7 +343,7 @@ impl Data {
     }
 
     /// The rig of a recording, before flags override its keys.
-    pub fn rig_as_given(path: &Path, args: &DataOptions) -> crate::Result<Rig> {
+    pub fn rig_as_given(path: &Path, args: &DataOptions) -> anyhow::Result<Rig> {
         let rig = args
             .rig
             .as_deref()
@@ -341,7 +354,7 @@ impl Data {
 
     /// The methods to train if no flag names any: those in the rig file of a recording, or else the
     /// default method.
-    pub fn default_methods(path: &Path, args: &DataOptions) -> crate::Result<Vec<ModelKind>> {
+    pub fn default_methods(path: &Path, args: &DataOptions) -> anyhow::Result<Vec<ModelKind>> {
         expect(path)?;
         if is_recording(path) {
             methods_of(&Self::rig_as_given(path, args)?)
@@ -411,7 +424,7 @@ impl Data {
             log::warn!("{shown}: these points are not used, because images have depth");
             return None;
         }
-        match ply::read_points(path).map_err(Error::from) {
+        match ply::read_points(path).map_err(anyhow::Error::from) {
             Ok((points, notes)) => {
                 for note in notes {
                     log::warn!("{shown}: {note}");
@@ -433,7 +446,7 @@ impl Data {
         gpu: Arc<Gpu>,
         source: &DepthSource,
         progress: OnReadProgress<'_>,
-    ) -> crate::Result<()> {
+    ) -> anyhow::Result<()> {
         let started = Instant::now();
         self.rendered_depth = Some(source.draw(gpu, &mut self.keyframes, progress)?);
         self.preparation_time += started.elapsed();
@@ -446,7 +459,7 @@ impl Data {
         scale: f64,
         list: Option<KeyframeList>,
         progress: OnReadProgress<'_>,
-    ) -> crate::Result<Self> {
+    ) -> anyhow::Result<Self> {
         let folder = drivers::dataset::read(path)?;
         let n_all = Some(folder.images.len());
         let on_image = |n_done: usize| report(progress, "images", n_done, n_all);
@@ -477,7 +490,7 @@ impl Data {
         list: Option<KeyframeList>,
         overrides: Vec<Override>,
         progress: OnReadProgress<'_>,
-    ) -> crate::Result<Self> {
+    ) -> anyhow::Result<Self> {
         Self::from_source(
             open::recording(path, rig, &overrides)?,
             list,
@@ -492,7 +505,7 @@ impl Data {
         opened: Opened,
         is_end: impl FnMut(&Sample) -> bool,
         progress: OnReadProgress<'_>,
-    ) -> crate::Result<Self> {
+    ) -> anyhow::Result<Self> {
         let mut data = Self::from_source(opened, None, is_end, progress)?;
         data.realign();
         Ok(data)
@@ -503,7 +516,7 @@ impl Data {
         list: Option<KeyframeList>,
         mut is_end: impl FnMut(&Sample) -> bool,
         progress: OnReadProgress<'_>,
-    ) -> crate::Result<Self> {
+    ) -> anyhow::Result<Self> {
         let Opened {
             rig,
             mut source,
@@ -554,7 +567,7 @@ impl Data {
     }
 
     /// Reassigns the splits, separately for each camera.
-    fn assign_splits(&mut self, holdout: &Holdout) -> crate::Result<()> {
+    fn assign_splits(&mut self, holdout: &Holdout) -> anyhow::Result<()> {
         let mut by_camera: BTreeMap<Arc<str>, Vec<usize>> = BTreeMap::new();
         for (ix, keyframe) in self.keyframes.iter().enumerate() {
             by_camera
@@ -573,7 +586,7 @@ impl Data {
     }
 
     /// Keeps only the listed keyframes, with the splits in the list.
-    fn take_only(&mut self, list: &KeyframeList) -> Result<(), Error> {
+    fn take_only(&mut self, list: &KeyframeList) -> anyhow::Result<()> {
         let images: Vec<(&str, Stamp)> = self
             .keyframes
             .iter()
@@ -636,7 +649,7 @@ pub fn points_sha256(points: &InitialPoints) -> String {
 }
 
 /// Returns an error if the path does not exist.
-pub fn expect(path: &Path) -> crate::Result<()> {
+pub fn expect(path: &Path) -> anyhow::Result<()> {
     ensure!(path.exists(), "{} does not exist", path.display());
     Ok(())
 }
@@ -694,7 +707,7 @@ mod tests {
         .to_string();
         assert_eq!(
             other,
-            "--scale 0.5: the checkpoint was trained with --scale 0.25"
+            "scale 0.5: the checkpoint was trained with scale 0.25"
         );
         assert!(
             again(&DataOptions {

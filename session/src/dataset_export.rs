@@ -1,10 +1,9 @@
 //! Exports keyframes as a nerfstudio dataset: color PNG, 16-bit depth, poses, split lists.
 
-use crate::error::Context;
+use anyhow::{Context, bail, ensure};
 use drivers::dataset::nerfstudio;
 use image::ExtendedColorType;
 use keyframe::{DepthMap, Keyframe, Split};
-use keyframe::{bail, ensure};
 use kinematics::{Transform, transform};
 use serde_json::{Map, Value, json};
 use std::path::Path;
@@ -53,7 +52,7 @@ pub struct Written {
 pub fn write_nerfstudio(
     out: &Path,
     keyframes: impl Iterator<Item = Arc<Keyframe>>,
-) -> crate::Result<Written> {
+) -> anyhow::Result<Written> {
     if let Some(existing) = ENTRIES
         .iter()
         .map(|entry| out.join(entry))
@@ -80,7 +79,7 @@ pub fn write_nerfstudio(
 fn write_dataset(
     folder: &Path,
     keyframes: impl Iterator<Item = Arc<Keyframe>>,
-) -> crate::Result<Written> {
+) -> anyhow::Result<Written> {
     let mut written = Written::default();
     let mut cameras = Vec::new();
     let mut frames = Vec::new();
@@ -135,7 +134,7 @@ fn write_frame(
     folder: &Path,
     keyframe: &Keyframe,
     written: &mut Written,
-) -> crate::Result<Map<String, Value>> {
+) -> anyhow::Result<Map<String, Value>> {
     let name = format!("{}_{:020}.png", keyframe.camera, keyframe.stamp.0);
     let [image, mask, depth_image] = [IMAGES, MASKS, DEPTH].map(|entry| format!("{entry}/{name}"));
     let mut frame = Map::new();
@@ -249,17 +248,17 @@ fn write_png(
     [width, height]: [u32; 2],
     bytes: &[u8],
     color: ExtendedColorType,
-) -> crate::Result<()> {
+) -> anyhow::Result<()> {
     let path = folder.join(file);
     let write = || {
         path.parent().map_or(Ok(()), std::fs::create_dir_all)?;
         image::save_buffer(&path, bytes, width, height, color)
     };
-    write().context(file)
+    write().with_context(|| file.to_owned())
 }
 
-fn write_text(folder: &Path, file: &str, text: &str) -> crate::Result<()> {
-    files::write(&folder.join(file), text).context(file)
+fn write_text(folder: &Path, file: &str, text: &str) -> anyhow::Result<()> {
+    files::write(&folder.join(file), text).with_context(|| file.to_owned())
 }
 
 #[cfg(test)]
@@ -306,7 +305,7 @@ mod tests {
     fn read_back(out: &Path) -> Vec<Arc<Keyframe>> {
         let dataset = drivers::dataset::read(out).unwrap();
         assert!(dataset.notes.is_empty(), "{:?}", dataset.notes);
-        let holdout = Holdout::from_argument(out.join(TEST_LIST).to_str().unwrap()).unwrap();
+        let holdout = Holdout::from_list(&out.join(TEST_LIST)).unwrap();
         dataset::load(&dataset, Some(&holdout), 1.0, &|_| ())
             .unwrap()
             .keyframes

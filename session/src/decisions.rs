@@ -4,11 +4,11 @@
 //! One JSON object per line, see `docs/reference/files.md`. The log contains steps but no times, so
 //! that replaying it with the same data gives the same model.
 
-use crate::Error;
-use crate::error::Context;
+use anyhow::{Context, anyhow};
 use keyframe::{Keyframe, Split, split_from_name, split_name};
 use kinematics::transform::{from_xyz_xyzw, to_xyz_xyzw};
 use kinematics::{Stamp, Transform};
+use messages::BadInput;
 use serde::{Deserialize, Serialize};
 use std::io::Write;
 use std::path::Path;
@@ -257,7 +257,7 @@ enum Line {
 impl DecisionLog {
     /// Creates the log in a run folder. A run that continues from a checkpoint writes a separate
     /// file and keeps the earlier log.
-    pub fn create(folder: &Path, settings: Settings) -> crate::Result<Self> {
+    pub fn create(folder: &Path, settings: Settings) -> anyhow::Result<Self> {
         // The earlier log reproduces the model of the checkpoint. This one continues from it.
         let name = match settings.from_step {
             None => FILE.to_owned(),
@@ -359,7 +359,7 @@ impl DecisionLog {
     /// # Errors
     ///
     /// If the log could not be written completely.
-    pub fn end(mut self, step: u64) -> crate::Result<()> {
+    pub fn end(mut self, step: u64) -> anyhow::Result<()> {
         self.log_activity(step);
         self.write(Line::Entry(Entry {
             step,
@@ -370,7 +370,7 @@ impl DecisionLog {
         let written = self
             .thread
             .join()
-            .map_err(|_| Error::Failed("the log thread panicked: this is a bug".into()))?;
+            .map_err(|_| anyhow!("the log thread panicked: this is a bug"))?;
         written.context("the decision log is incomplete")?;
         // If somebody has removed or renamed the log during the run, it is written again from the
         // file that is still open.
@@ -439,7 +439,7 @@ pub struct Decisions {
 }
 
 impl Decisions {
-    pub fn load(path: &Path) -> crate::Result<Self> {
+    pub fn load(path: &Path) -> anyhow::Result<Self> {
         let text = files::read_text(path)
             .with_context(|| format!("cannot read the decision log {path:?}"))?;
         Self::parse(&text).with_context(|| format!("the decision log {path:?}"))
@@ -462,8 +462,8 @@ impl Decisions {
             })
     }
 
-    fn parse(text: &str) -> crate::Result<Self> {
-        let invalid = Error::BadInput;
+    fn parse(text: &str) -> Result<Self, BadInput> {
+        let invalid = BadInput;
         let mut lines = text.split_inclusive('\n').zip(1..);
         let first = lines.next().map_or("", |(line, _)| line);
         // The version is checked before the other settings, because another version may have

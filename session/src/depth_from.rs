@@ -1,11 +1,12 @@
 //! `--depth-from`: renders depth for images without depth from a saved model.
 
-use crate::error::Context;
 use crate::evaluate::{self, CHECK_SAME_SCENE, MIN_ALPHA, MIN_COVERED_FRAC};
 use crate::read_progress::{OnReadProgress, ReadProgress};
-use crate::{Error, methods, run_folder};
+use anyhow::Context;
+use crate::{methods, run_folder};
 use gpu::Gpu;
-use keyframe::{DepthMap, Keyframe, Split, counted};
+use keyframe::{DepthMap, Keyframe, Split};
+use messages::{BadInput, InsufficientData, Setting, counted};
 use serde::Serialize;
 use sha2::{Digest, Sha256};
 use std::path::{Path, PathBuf};
@@ -34,8 +35,8 @@ pub struct RenderedDepth {
 
 impl DepthSource {
     /// The model in a folder, or in a single file of splats.
-    pub fn find(model: &Path) -> crate::Result<Self> {
-        let invalid = |error: crate::Error| Error::BadInput(format!("--depth-from: {error:#}"));
+    pub fn find(model: &Path) -> anyhow::Result<Self> {
+        let invalid = |error: anyhow::Error| BadInput(format!("{}: {error:#}", Setting::DepthFrom));
         run_folder::expect_model(model).map_err(invalid)?;
         let sha256 = if model.is_file() {
             let bytes = files::read(model, files::Budget::PLAIN)
@@ -57,10 +58,10 @@ impl DepthSource {
         gpu: Arc<Gpu>,
         keyframes: &mut [Arc<Keyframe>],
         progress: OnReadProgress<'_>,
-    ) -> crate::Result<RenderedDepth> {
+    ) -> anyhow::Result<RenderedDepth> {
         let model_name = self.model.display();
         let mut model = methods::load(gpu, &self.model)
-            .with_context(|| format!("--depth-from {model_name}"))?
+            .with_context(|| format!("{} {model_name}", Setting::DepthFrom))?
             .method;
         let mut totals = Filled::default();
         let mut n_images = 0;
@@ -86,9 +87,11 @@ impl DepthSource {
         // The usual cause is a model of another scene, or in another world frame.
         if totals.n_missing > 0 && totals.n_rendered == 0 {
             let message = "the model is not visible in any image that lacks depth";
-            return Err(Error::InsufficientData(format!(
-                "--depth-from {model_name}: {message}; {CHECK_SAME_SCENE}"
-            )));
+            return Err(InsufficientData(format!(
+                "{} {model_name}: {message}; {CHECK_SAME_SCENE}",
+                Setting::DepthFrom
+            ))
+            .into());
         }
         let rendered_frac = totals.n_rendered as f64 / totals.n_missing.max(1) as f64;
         let images = counted(n_images as u64, "image");
@@ -98,7 +101,10 @@ impl DepthSource {
         );
         match (totals.n_missing, rendered_frac) {
             (0, _) => {
-                log::warn!("--depth-from {model_name} has no effect: no training image lacks depth")
+                log::warn!(
+                    "{} {model_name} has no effect: no training image lacks depth",
+                    Setting::DepthFrom
+                );
             }
             (_, frac) if frac < MIN_COVERED_FRAC => log::warn!("{message}; {CHECK_SAME_SCENE}"),
             _ => log::info!("{message}"),
@@ -115,20 +121,20 @@ impl DepthSource {
 /// Returns an error unless the depth models used `before` and given `now` have the same SHA-256.
 ///
 /// `subject`: name of the earlier result in messages.
-pub fn check_same(subject: &str, before: Option<&str>, now: Option<&str>) -> Result<(), Error> {
-    match (before, now) {
-        (before, now) if before == now => Ok(()),
-        (None, _) => Err(Error::BadInput(format!(
-            "{subject} was made without --depth-from: remove the flag"
-        ))),
-        (Some(before), None) => Err(Error::BadInput(format!(
-            "{subject} used depth rendered from the model with the SHA-256 {before}: give that model with --depth-from"
-        ))),
-        (Some(before), Some(now)) => Err(Error::BadInput(format!(
+pub fn check_same(subject: &str, before: Option<&str>, now: Option<&str>) -> anyhow::Result<()> {
+    let setting = Setting::DepthFrom;
+    let message = match (before, now) {
+        (before, now) if before == now => return Ok(()),
+        (None, _) => format!("{subject} was made without {setting}: remove the flag"),
+        (Some(before), None) => format!(
+            "{subject} used depth rendered from the model with the SHA-256 {before}: give that model with {setting}"
+        ),
+        (Some(before), Some(now)) => format!(
             "{subject} used depth rendered from the model with the SHA-256 {before}, but the model given with \
-             --depth-from has {now}"
-        ))),
-    }
+             {setting} has {now}"
+        ),
+    };
+    Err(BadInput(message).into())
 }
 
 /// Pixel counts of one or several keyframes.
@@ -140,7 +146,7 @@ struct Filled {
 
 /// Renders the missing depth of one keyframe at the resolution of its depth image, or of its color
 /// image if it has no depth.
-fn fill(model: &mut AlignedModel, keyframe: &mut Arc<Keyframe>) -> crate::Result<Filled> {
+fn fill(model: &mut AlignedModel, keyframe: &mut Arc<Keyframe>) -> anyhow::Result<Filled> {
     // An image without depth gets an empty depth map with the lens and pose of its color image.
     let mut request_keyframe = keyframe.as_ref().clone();
     let depth = request_keyframe.depth.get_or_insert_with(|| DepthMap {

@@ -101,7 +101,7 @@ pub(crate) fn erase_floaters(
         .map_err(|error| error.to_string())?;
     Ok(format!(
         "removed floaters: {}",
-        keyframe::counted(n_erased, item)
+        messages::counted(n_erased, item)
     ))
 }
 

@@ -1,187 +1,103 @@
-//! Errors of this crate.
+//! Classes and causes of errors. Errors of this crate carry their context with `anyhow`, so causes
+//! are found in the chain.
 
-use keyframe::{ErrorClass, define_context, impl_from, write_chain};
-use std::error::Error as StdError;
-use std::fmt::{Display, Formatter};
+use capture::ConfigError;
+use messages::{BadInput, ErrorClass, InsufficientData};
+use std::error::Error;
 
-/// The result of a fallible operation of this crate.
-pub type Result<T, E = Error> = std::result::Result<T, E>;
+/// The GPU failed and the run could not continue on another device. The message describes how to
+/// continue.
+#[derive(Debug, thiserror::Error)]
+#[error("{0}")]
+pub(crate) struct GpuUnrecoverable(pub(crate) String);
 
-/// Reason why a session cannot train, evaluate, save or resume.
-///
-/// [`Error::class`] distinguishes invalid input, insufficient data and failures. `{}` prints the
-/// outermost context; `{:#}` also prints all causes.
-#[derive(Debug)]
-#[non_exhaustive]
-pub enum Error {
-    /// The arguments, or a file they name, are invalid.
-    BadInput(String),
-    /// There is not enough data for a result.
-    InsufficientData(String),
-    /// Something failed.
-    Failed(String),
-    /// The rig file is invalid, or a device or recording failed.
-    Capture(capture::Error),
-    /// A model cannot be created, trained, saved or loaded.
-    Trainer(trainer::Error),
-    /// A list of keyframes, a selection of test images, or a keyframe is invalid.
-    Keyframe(keyframe::Error),
-    /// A device, recording or dataset failed.
-    Driver(drivers::Error),
-    /// A lens, pose or robot description is invalid.
-    Kinematics(kinematics::Error),
-    /// A file cannot be read or written.
-    Io(std::io::Error),
-    /// An error of another library.
-    Other(Box<dyn StdError + Send + Sync>),
-    /// The GPU failed and the run could not continue on another device. The message describes how
-    /// to continue.
-    GpuUnrecoverable(String),
-    /// The operation that failed, with the cause.
-    Context {
-        /// The operation, or the file, device or image on which it failed.
-        context: String,
-        /// Why it failed.
-        source: Box<Self>,
-    },
+/// Whether the input is invalid, the data are insufficient, or an operation failed.
+#[must_use]
+pub fn class(error: &anyhow::Error) -> ErrorClass {
+    // An invalid input counts more than its consequences, so the whole chain is searched for it
+    // first.
+    [ErrorClass::BadInput, ErrorClass::InsufficientData]
+        .into_iter()
+        .find(|class| error.chain().any(|cause| class_of(cause) == Some(*class)))
+        .unwrap_or(ErrorClass::Failed)
 }
 
-impl Error {
-    /// Whether the input is invalid, the data are insufficient, or the operation failed.
-    #[must_use]
-    pub fn class(&self) -> ErrorClass {
-        match self {
-            Self::BadInput(_) | Self::Trainer(trainer::Error::BudgetTooSmall { .. }) => {
-                ErrorClass::BadInput
-            }
-            Self::InsufficientData(_) => ErrorClass::InsufficientData,
-            Self::Capture(error) => error.class(),
-            Self::Keyframe(error) => error.class(),
-            Self::Context { source, .. } => source.class(),
-            Self::Failed(_)
-            | Self::GpuUnrecoverable(_)
-            | Self::Trainer(_)
-            | Self::Driver(_)
-            | Self::Kinematics(_)
-            | Self::Io(_)
-            | Self::Other(_) => ErrorClass::Failed,
-        }
+/// The class of one error of a chain; `None` if its type has no classes.
+fn class_of(error: &(dyn Error + 'static)) -> Option<ErrorClass> {
+    if error.is::<BadInput>() || error.is::<ConfigError>() {
+        return Some(ErrorClass::BadInput);
     }
-
-    /// The error without its contexts.
-    fn root(&self) -> &Self {
-        match self {
-            Self::Context { source, .. } => source.root(),
-            _ => self,
-        }
+    if error.is::<InsufficientData>() {
+        return Some(ErrorClass::InsufficientData);
     }
-
-    /// Whether the GPU caused the error: it was lost or out of memory.
-    #[must_use]
-    pub fn is_gpu_error(&self) -> bool {
-        matches!(self.root(), Self::Trainer(error) if error.is_gpu_error())
+    // The budget is an argument, so another one is a remedy.
+    if let Some(trainer::Error::BudgetTooSmall { .. }) = error.downcast_ref() {
+        return Some(ErrorClass::BadInput);
     }
-
-    /// Whether the GPU failed and could not be reopened.
-    #[must_use]
-    pub fn is_gpu_unrecoverable(&self) -> bool {
-        matches!(self.root(), Self::GpuUnrecoverable(_))
-    }
-
-    /// Whether reading or writing a file failed, for example on a full disk.
-    #[must_use]
-    pub fn is_io(&self) -> bool {
-        let mut cause: Option<&(dyn StdError + 'static)> = Some(self.root());
-        while let Some(error) = cause {
-            // `source` of a variant skips the wrapped error itself, so the variants that hold an
-            // error of the system are matched here.
-            let is_io = match error.downcast_ref() {
-                Some(Self::Io(_)) => true,
-                Some(Self::Trainer(error)) => error
-                    .source()
-                    .is_some_and(|source| source.is::<std::io::Error>()),
-                _ => error.is::<std::io::Error>(),
-            };
-            if is_io {
-                return true;
-            }
-            cause = error.source();
-        }
-        false
-    }
-
-    /// Adds the operation that failed.
-    #[must_use]
-    pub fn with_context(self, context: impl Into<String>) -> Self {
-        Self::Context {
-            context: context.into(),
-            source: Box::new(self),
-        }
-    }
+    let of_keyframe = || Some(error.downcast_ref::<keyframe::Error>()?.class());
+    let of_calibration = || Some(error.downcast_ref::<calibration::Error>()?.class());
+    of_keyframe().or_else(of_calibration)
 }
 
-/// Writes the message. The alternate form `{:#}` appends the messages of all causes.
-impl Display for Error {
-    fn fmt(&self, f: &mut Formatter<'_>) -> std::fmt::Result {
-        match self {
-            Self::BadInput(text)
-            | Self::InsufficientData(text)
-            | Self::Failed(text)
-            | Self::GpuUnrecoverable(text) => f.write_str(text),
-            Self::Capture(error) => write_chain(f, error),
-            Self::Trainer(error) => write_chain(f, error),
-            Self::Keyframe(error) => write_chain(f, error),
-            Self::Driver(error) => write_chain(f, error),
-            Self::Kinematics(error) => write_chain(f, error),
-            Self::Io(error) => write_chain(f, error),
-            Self::Other(error) => write_chain(f, error.as_ref()),
-            Self::Context { context, source } if f.alternate() => {
-                write!(f, "{context}: {source:#}")
-            }
-            Self::Context { context, .. } => f.write_str(context),
-        }
-    }
+/// Whether the GPU caused the error: it was lost or out of memory.
+#[must_use]
+pub fn is_gpu_error(error: &anyhow::Error) -> bool {
+    error.chain().any(|cause| {
+        let of_trainer = || Some(cause.downcast_ref::<trainer::Error>()?.is_gpu_error());
+        let of_gpu = || Some(cause.downcast_ref::<gpu::Error>()?.is_gpu_error());
+        of_trainer().or_else(of_gpu).unwrap_or(false)
+    })
 }
 
-impl StdError for Error {
-    fn source(&self) -> Option<&(dyn StdError + 'static)> {
-        match self {
-            Self::BadInput(_)
-            | Self::InsufficientData(_)
-            | Self::Failed(_)
-            | Self::GpuUnrecoverable(_) => None,
-            Self::Capture(error) => error.source(),
-            Self::Trainer(error) => error.source(),
-            Self::Keyframe(error) => error.source(),
-            Self::Driver(error) => error.source(),
-            Self::Kinematics(error) => error.source(),
-            Self::Io(error) => error.source(),
-            Self::Other(error) => error.source(),
-            Self::Context { source, .. } => Some(source.as_ref()),
-        }
-    }
+/// Whether the GPU failed and could not be reopened.
+#[must_use]
+pub fn is_gpu_unrecoverable(error: &anyhow::Error) -> bool {
+    error.chain().any(|cause| cause.is::<GpuUnrecoverable>())
 }
 
-impl_from!(
-    Error: Capture(capture::Error), Capture(capture::ConfigError), Trainer(trainer::Error), Trainer(gpu::Error), Trainer(model_files::Error), Keyframe(keyframe::Error), Driver(drivers::Error), Kinematics(kinematics::Error), Io(std::io::Error), Other(image::ImageError), Other(resvg::usvg::Error), Other(serde_json::Error),
-);
-define_context!(Error);
+/// Whether reading or writing a file failed, for example on a full disk.
+pub(crate) fn is_io(error: &anyhow::Error) -> bool {
+    error.chain().any(|cause| cause.is::<std::io::Error>())
+}
 
 #[cfg(test)]
 mod tests {
     use super::*;
+    use anyhow::Context;
 
     #[test]
     fn context_keeps_the_class_and_the_causes() {
-        let error = Err::<(), _>(Error::BadInput("scale is 2".into()))
+        let error = Err::<(), _>(BadInput("scale is 2".into()))
             .context("rig.toml")
             .expect_err("an error");
-        assert_eq!(error.class(), ErrorClass::BadInput);
+        assert_eq!(class(&error), ErrorClass::BadInput);
         assert_eq!(format!("{error:#}"), "rig.toml: scale is 2");
         let missing = std::fs::read("no/such/file")
             .with_context(|| "the list")
             .expect_err("no file");
-        assert_eq!(missing.class(), ErrorClass::Failed);
+        assert_eq!(class(&missing), ErrorClass::Failed);
+        assert!(is_io(&missing) && !is_io(&error));
         assert!(format!("{missing:#}").starts_with("the list: "));
+    }
+
+    #[test]
+    fn too_small_a_budget_is_invalid_input() {
+        let budget = trainer::Error::BudgetTooSmall {
+            model: "neural field",
+            max_bytes: 1,
+            min_bytes: 2,
+        };
+        let error = anyhow::Error::new(budget).context("run");
+        assert_eq!(class(&error), ErrorClass::BadInput);
+        assert!(!is_gpu_error(&error));
+    }
+
+    #[test]
+    fn gpu_errors_are_found_under_context() {
+        let lost = anyhow::Error::new(trainer::Error::DeviceLost).context("run");
+        assert!(is_gpu_error(&lost) && !is_gpu_unrecoverable(&lost));
+        let ended = anyhow::Error::new(GpuUnrecoverable("resume it".into())).context("run");
+        assert!(is_gpu_unrecoverable(&ended) && !is_gpu_error(&ended));
+        assert_eq!(ended.root_cause().to_string(), "resume it");
     }
 }

@@ -3,9 +3,10 @@
 //!
 //! `train`, `run` and `eval` all use this code, so they report the same scores for the same model.
 
-use crate::error::Context;
+use anyhow::Context;
 use calibration::CalibratedCamera;
-use keyframe::{DepthMap, Keyframe, counted};
+use keyframe::{DepthMap, Keyframe};
+use messages::counted;
 use serde::Serialize;
 use std::borrow::Cow;
 use std::collections::BTreeMap;
@@ -127,7 +128,7 @@ pub struct Scores {
 impl Evaluator {
     /// Computes PSNR, SSIM, depth scores and, if the flag or `FIELDRIG_LPIPS_WEIGHTS` gives
     /// weights, LPIPS.
-    pub fn thorough(lpips_weights: Option<&Path>) -> crate::Result<Self> {
+    pub fn thorough(lpips_weights: Option<&Path>) -> anyhow::Result<Self> {
         Ok(Self {
             is_full: true,
             lpips: load_lpips(lpips_weights)?.map(Arc::new),
@@ -156,7 +157,7 @@ impl Evaluator {
         &self,
         method: &mut AlignedModel,
         keyframe: &Keyframe,
-    ) -> crate::Result<ImageScores> {
+    ) -> anyhow::Result<ImageScores> {
         // Scoring on the GPU needs no read-back of the picture. Other scores need the pixels.
         if !self.is_full
             && self.lpips.is_none()
@@ -184,7 +185,7 @@ impl Evaluator {
         &self,
         method: &mut AlignedModel,
         keyframe: &Keyframe,
-    ) -> crate::Result<ImageScores> {
+    ) -> anyhow::Result<ImageScores> {
         self.score(method, keyframe)
             .with_context(|| name_of(keyframe))
     }
@@ -199,14 +200,14 @@ impl Evaluator {
         method: &mut AlignedModel,
         tests: impl Iterator<Item = &'a Arc<Keyframe>>,
         mut meanwhile: impl FnMut(&mut AlignedModel, usize),
-    ) -> crate::Result<Vec<ImageScores>> {
+    ) -> anyhow::Result<Vec<ImageScores>> {
         // Two pictures per thread: one that is scored, and one that waits for it. More would only
         // use more memory.
         let max_waiting = 2 * rayon::current_num_threads();
         let (sender, receiver) = std::sync::mpsc::sync_channel(max_waiting);
         let mut scored: Vec<(usize, ImageScores)> = Vec::new();
         // In place: the method stays on this thread, because it cannot be sent to another one.
-        let all: crate::Result<()> = rayon::in_place_scope(|scope| {
+        let all: anyhow::Result<()> = rayon::in_place_scope(|scope| {
             let mut n_drawn = 0;
             // Fused, because the loop asks again after the last image.
             let mut tests = tests.fuse();
@@ -257,7 +258,7 @@ impl Evaluator {
         &self,
         method: &mut AlignedModel,
         keyframe: &'a Keyframe,
-    ) -> crate::Result<Drawn<'a>> {
+    ) -> anyhow::Result<Drawn<'a>> {
         let mut depth = None;
         let mut at_truth = None;
         if self.is_full {
@@ -292,7 +293,7 @@ struct Drawn<'a> {
 
 impl Drawn<'_> {
     /// Computes the scores, without the GPU.
-    fn scores(&self, evaluator: &Evaluator) -> crate::Result<ImageScores> {
+    fn scores(&self, evaluator: &Evaluator) -> anyhow::Result<ImageScores> {
         let Self {
             keyframe,
             picture,
@@ -540,7 +541,7 @@ fn request(keyframe: &Keyframe, lens: &CalibratedCamera) -> RenderRequest {
 fn draw_depth<'a>(
     method: &mut AlignedModel,
     keyframe: &'a Keyframe,
-) -> crate::Result<Option<(Picture, Cow<'a, DepthMap>)>> {
+) -> anyhow::Result<Option<(Picture, Cow<'a, DepthMap>)>> {
     let Some(full) = &keyframe.depth else {
         return Ok(None);
     };
@@ -555,7 +556,7 @@ fn draw_depth<'a>(
 
 /// Renders at the true pose, for the comparison with the noise-free image, which has no rolling
 /// shutter.
-fn draw_at_truth(method: &mut AlignedModel, keyframe: &Keyframe) -> crate::Result<Option<Picture>> {
+fn draw_at_truth(method: &mut AlignedModel, keyframe: &Keyframe) -> anyhow::Result<Option<Picture>> {
     let Some(truth) = &keyframe.truth else {
         return Ok(None);
     };

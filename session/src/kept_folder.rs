@@ -1,7 +1,7 @@
 //! The folder of a run, which somebody may remove or rename while the run continues.
 
-use crate::error::Context;
 use crate::run_folder;
+use anyhow::Context;
 use drivers::recording::{RIG_FILE, URDF_FILE};
 use files::{Kept, Place};
 use std::path::Path;
@@ -82,7 +82,7 @@ impl KeptFolder {
         };
     }
 
-    fn make_again(&self, path: &Path) -> crate::Result<Kept> {
+    fn make_again(&self, path: &Path) -> anyhow::Result<Kept> {
         let in_folder = || format!("cannot write {}", path.display());
         std::fs::create_dir_all(path).with_context(in_folder)?;
         // The lock went with the old folder. Without a new one, another run could use the folder.

@@ -2,8 +2,8 @@
 //! failures.
 //!
 //! A [`Session`] is one model in training with its clock, evaluations, checkpoints and reports.
-//! [`Data`] reads keyframes from disk; [`train`] and [`drive`] train on them. [`Live`] is the loop
-//! of a live run: it takes keyframes from a [`capture::Feed`] and draws pictures for viewers.
+//! [`Data`] reads keyframes from disk; [`train`] and [`drive`] train on them. [`LiveLoop`] is the
+//! loop of a live run: it takes keyframes from a [`capture::Feed`] and draws pictures for viewers.
 //! [`finish`] saves and scores the models. Timing-dependent decisions are logged ([`DecisionLog`])
 //! and can be replayed ([`Replay`]). An [`Observer`] receives all reports.
 //!
@@ -18,16 +18,13 @@
 //! // Every 10th image is a test image.
 //! let options = DataOptions { holdout: Some("10".into()), ..DataOptions::default() };
 //! assert!(options.holdout()?.is_some());
-//! # Ok::<(), session::Error>(())
+//! # Ok::<(), anyhow::Error>(())
 //! ```
 
-pub mod calibration_report;
 pub mod camera_list;
 pub mod camera_path;
-pub mod chart;
 pub mod checkpoints;
 mod chunk_publisher;
-mod clock;
 pub mod corrected_rig;
 mod data;
 mod dataset_export;
@@ -38,11 +35,11 @@ mod error;
 pub mod evaluate;
 pub mod evaluation_schedule;
 mod gpu_loss;
-mod inline_picture;
+mod holdout;
 mod kept_folder;
 mod latency;
 mod ledger;
-mod live;
+mod live_loop;
 pub mod methods;
 pub mod next_commands;
 mod observations;
@@ -60,25 +57,24 @@ mod scene_calibration;
 pub mod scene_hint;
 mod session;
 mod stored_keyframes;
-mod table;
 mod time_slices;
 mod training;
+mod training_clock;
 mod training_options;
 mod viewer;
 mod viewers;
 
 pub use checkpoints::{CheckpointOptions, Checkpoints, RunFlags, parse_period};
-pub use clock::Clock;
 pub use data::{Data, DataOptions, Purpose, expect, points_sha256};
 pub use dataset_export::{Written, write_nerfstudio};
 pub use decisions::{DecisionLog, RunDescription, Settings};
-pub use error::{Context, Error, Result};
+pub use error::{class, is_gpu_error, is_gpu_unrecoverable};
 pub use evaluate::Evaluator;
 pub use gpu_loss::lose_gpu_at_step;
 pub use kept_folder::KeptFolder;
 pub use latency::Latency;
 pub use ledger::{KeyframeTimes, Ledger, latencies};
-pub use live::{KeyframeChange, Live, LiveOptions, Pace};
+pub use live_loop::{KeyframeChange, LiveLoop, LiveOptions, Pace};
 pub use methods::methods_of;
 pub use observer::{
     DoneEvent, Evaluation, FinishedReport, Observer, ProfileEvent, SessionEvent, SessionProgress,
@@ -92,8 +88,8 @@ pub use session::{
     EndingSession, Evaluators, FinishedModel, Limits, Session, TrainingOutcome, finish,
 };
 pub use stored_keyframes::StoredKeyframes;
-pub use table::Table;
 pub use training::{TrainingPlan, check_before_data, drive, limits, model_specs, train};
+pub use training_clock::Clock;
 pub use training_options::{AvailableData, REALIGN, Refine, RefineSettings, TrainingOptions};
 pub use viewer::{ModelViewer, ServedModel};
 pub use viewers::Viewers;

@@ -1,11 +1,10 @@
 //! Names and options of models, as given on the command line and in rig files.
 
-use crate::Error;
 use crate::run_folder::{expect_model, expect_one_model};
 use capture::Rig;
 use capture::config::Train;
 use gpu::Gpu;
-use keyframe::listed;
+use messages::{BadInput, listed};
 use serde_json::Value;
 use std::path::Path;
 use std::sync::Arc;
@@ -34,14 +33,14 @@ pub fn describe(kinds: &[ModelKind]) -> String {
 /// # Errors
 ///
 /// If the folder contains several models, or its `model.json` is invalid.
-pub fn kind_of(path: &Path) -> crate::Result<Option<ModelKind>> {
+pub fn kind_of(path: &Path) -> anyhow::Result<Option<ModelKind>> {
     expect_one_model(path)?;
     Ok(ModelKind::of_saved(path)?)
 }
 
 /// Loads a saved model of any kind from its folder, or splats from a file. An empty model causes a
 /// warning.
-pub fn load(gpu: Arc<Gpu>, model: &Path) -> crate::Result<LoadedModel> {
+pub fn load(gpu: Arc<Gpu>, model: &Path) -> anyhow::Result<LoadedModel> {
     expect_model(model)?;
     let loaded = trainer::load(gpu, model)?;
     if let Some(note) = note_if_empty(model, &loaded) {
@@ -72,7 +71,7 @@ fn empty_note(path: &Path, kind: ModelKind) -> String {
 /// # Errors
 ///
 /// If a method is unknown.
-pub fn methods_of(rig: &Rig) -> crate::Result<Vec<ModelKind>> {
+pub fn methods_of(rig: &Rig) -> anyhow::Result<Vec<ModelKind>> {
     let known: Vec<_> = ModelKind::ALL
         .iter()
         .map(|kind| (kind.name(), *kind))
@@ -104,7 +103,7 @@ pub fn specs(
     kinds: &[ModelKind],
     common: &CommonOptions,
     settings: &Settings,
-) -> Result<Vec<ModelSpec>, Error> {
+) -> anyhow::Result<Vec<ModelSpec>> {
     // Options that a method does not have are skipped, so that one list serves a run of several
     // methods. Flags that no method has were rejected before.
     let spec = |kind: &ModelKind| ModelSpec::new(*kind, common.clone(), settings);
@@ -112,7 +111,7 @@ pub fn specs(
         .iter()
         .map(spec)
         .collect::<Result<_, _>>()
-        .map_err(|error| Error::BadInput(error.to_string()))
+        .map_err(|error| BadInput(error.to_string()).into())
 }
 
 /// Why there is no model of the requested method among these.

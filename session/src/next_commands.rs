@@ -1,6 +1,7 @@
 //! Suggested commands to run after training. They work as printed in the folder where training was
 //! started.
 
+use messages::Setting;
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use trainer::ModelKind;
@@ -71,7 +72,8 @@ pub fn for_models(models: &[SavedModel<'_>]) -> Vec<NextCommand> {
             let list = argument(&model.folder.join("keyframes.txt"));
             let mut words = vec!["eval", &*folder];
             let data = argument(data);
-            words.extend([&*data, "--keyframes", &list]);
+            let keyframes = Setting::Keyframes.to_string();
+            words.extend([&*data, &keyframes, &list]);
             words.extend(model.data.flags.iter().map(String::as_str));
             add("score the model again", &words);
         }
@@ -79,10 +81,11 @@ pub fn for_models(models: &[SavedModel<'_>]) -> Vec<NextCommand> {
             format, contents, ..
         }) = model.kind.entry().exports.first()
         {
-            let out = argument(&unused_file(&model_name(model.folder), format));
+            let file = argument(&unused_file(&model_name(model.folder), format));
+            let [to, out] = [Setting::To, Setting::Out].map(|setting| setting.to_string());
             add(
                 &format!("export the {contents}"),
-                &["export", &folder, "--to", format, "--out", &out],
+                &["export", &folder, &to, format, &out, &file],
             );
         }
     }
@@ -208,7 +211,7 @@ mod tests {
     fn commands_depend_on_the_kind_of_model() {
         let data = DataSource {
             path: Some("my data".into()),
-            flags: vec!["--scale".into(), "0.5".into()],
+            flags: vec!["scale".into(), "0.5".into()],
             ..DataSource::default()
         };
         let kind = |name| ModelKind::from_name(name).expect("registered");
@@ -231,17 +234,17 @@ mod tests {
             commands(&[model("splat", "runs/a b")]),
             [
                 "view 'runs/a b'",
-                "eval 'runs/a b' 'my data' --keyframes 'runs/a b/keyframes.txt' --scale 0.5",
-                "export 'runs/a b' --to spz --out 'a b.spz'",
+                "eval 'runs/a b' 'my data' keyframes 'runs/a b/keyframes.txt' scale 0.5",
+                "export 'runs/a b' format spz out 'a b.spz'",
             ]
         );
         assert_eq!(
             commands(&[model("nerf", "both/nerf"), model("tsdf", "both/tsdf")]),
             [
                 "view both",
-                "eval both/nerf 'my data' --keyframes both/nerf/keyframes.txt --scale 0.5",
-                "eval both/tsdf 'my data' --keyframes both/tsdf/keyframes.txt --scale 0.5",
-                "export both/tsdf --to glb --out tsdf.glb",
+                "eval both/nerf 'my data' keyframes both/nerf/keyframes.txt scale 0.5",
+                "eval both/tsdf 'my data' keyframes both/tsdf/keyframes.txt scale 0.5",
+                "export both/tsdf format glb out tsdf.glb",
             ]
         );
         let live = DataSource::default();

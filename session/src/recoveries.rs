@@ -1,9 +1,9 @@
 //! Recovers from a GPU failure during a run: reopens the device and continues every model from its
 //! newest checkpoint.
 
-use crate::Error;
-use crate::error::Context;
+use crate::error::{GpuUnrecoverable, is_gpu_error};
 use crate::session::Session;
+use anyhow::Context;
 use gpu::Gpu;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
@@ -29,7 +29,7 @@ pub fn describe_recoverable(sessions: &mut [Session]) -> String {
 }
 
 /// Opens the GPU, also after a failure.
-pub type OpenGpu = fn() -> crate::Result<Arc<Gpu>>;
+pub type OpenGpu = fn() -> anyhow::Result<Arc<Gpu>>;
 
 /// Counts the attempts of a run to reopen the GPU.
 #[derive(Debug)]
@@ -52,10 +52,14 @@ impl Recoveries {
 
     /// Continues all sessions on a reopened device if the GPU caused `error`. Returns an error if
     /// the cause was another one, or if all attempts fail.
-    pub fn recover(&mut self, sessions: &mut [Session], error: crate::Error) -> crate::Result<()> {
+    pub fn recover(
+        &mut self,
+        sessions: &mut [Session],
+        error: anyhow::Error,
+    ) -> anyhow::Result<()> {
         // Another device would not help against other errors. All models share the device, so all
         // of them must be able to restart.
-        if !error.is_gpu_error() || !sessions.iter().all(Session::can_restart) {
+        if !is_gpu_error(&error) || !sessions.iter().all(Session::can_restart) {
             return Err(error);
         }
         let began = Instant::now();
@@ -90,13 +94,14 @@ impl Recoveries {
             }
         }
         let recoverable = describe_recoverable(sessions);
-        Err(Error::GpuUnrecoverable(format!(
+        Err(GpuUnrecoverable(format!(
             "{error:#}; giving up after {MAX_RECOVERIES} attempts to reopen the GPU; {recoverable}"
-        )))
+        ))
+        .into())
     }
 }
 
-fn restart_all(sessions: &mut [Session], open_gpu: OpenGpu) -> crate::Result<()> {
+fn restart_all(sessions: &mut [Session], open_gpu: OpenGpu) -> anyhow::Result<()> {
     sessions.iter_mut().for_each(Session::drop_model); // Frees memory for the new models.
     let gpu = open_gpu().context("cannot reopen the GPU")?;
     sessions
@@ -112,7 +117,7 @@ mod tests {
 
     static N_OPENED: AtomicU32 = AtomicU32::new(0);
 
-    fn open_and_count() -> crate::Result<Arc<Gpu>> {
+    fn open_and_count() -> anyhow::Result<Arc<Gpu>> {
         N_OPENED.fetch_add(1, Ordering::Relaxed);
         Ok(Gpu::open(&GpuOptions::default())?)
     }

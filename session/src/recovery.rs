@@ -1,6 +1,7 @@
 //! Data for recovering a model from a GPU failure, and messages that describe how to continue.
 
 use crate::decisions::Settings;
+use crate::error::is_gpu_error;
 use crate::run_folder::CHECKPOINT;
 use keyframe::Keyframe;
 use std::path::{Path, PathBuf};
@@ -55,9 +56,9 @@ fn in_folder(folder: &Path) -> String {
 }
 
 /// Adds a description of how to continue to a GPU error.
-pub fn with_recoverable(error: crate::Error, recoverable: &str) -> crate::Error {
-    if error.is_gpu_error() && !recoverable.is_empty() {
-        error.with_context(format!(
+pub fn with_recoverable(error: anyhow::Error, recoverable: &str) -> anyhow::Error {
+    if is_gpu_error(&error) && !recoverable.is_empty() {
+        error.context(format!(
             "the GPU failed at the end of the run; {recoverable}"
         ))
     } else {

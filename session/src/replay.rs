@@ -2,14 +2,15 @@
 
 use crate::data::Data;
 use crate::decisions::{Decision, Decisions, Pushed};
+use crate::depth_from;
 use crate::methods::{MAX_SPLATS, SH_DEGREE};
 use crate::read_progress::OnReadProgress;
 use crate::session::Session;
-use crate::{Error, depth_from};
 use capture::Stop;
 use capture::config::Override;
 use keyframe::{Keyframe, KeyframeList};
 use kinematics::Stamp;
+use messages::{BadInput, InsufficientData, Setting};
 use std::collections::HashMap;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -26,10 +27,10 @@ pub struct Replay {
 
 impl Replay {
     /// Reads a log.
-    pub fn load(path: &Path) -> crate::Result<Self> {
+    pub fn load(path: &Path) -> anyhow::Result<Self> {
         let decisions = Decisions::load(path)?;
         let kind = ModelKind::from_name(&decisions.settings.method).ok_or_else(|| {
-            Error::BadInput(format!(
+            BadInput(format!(
                 "{}: unknown method {:?}",
                 path.display(),
                 decisions.settings.method
@@ -41,17 +42,18 @@ impl Replay {
         };
         model_spec
             .check()
-            .map_err(|error| Error::BadInput(format!("{}: line 1: {error}", path.display())))?;
+            .map_err(|error| BadInput(format!("{}: line 1: {error}", path.display())))?;
         let replay = Self {
             path: path.to_owned(),
             decisions,
             model_spec,
         };
         if replay.decisions.pushed().next().is_none() {
-            return Err(Error::InsufficientData(format!(
+            return Err(InsufficientData(format!(
                 "{} contains no keyframe to replay",
                 replay.name()
-            )));
+            ))
+            .into());
         }
         Ok(replay)
     }
@@ -63,7 +65,7 @@ impl Replay {
         path: &Path,
         rig: Option<PathBuf>,
         progress: OnReadProgress<'_>,
-    ) -> crate::Result<Data> {
+    ) -> anyhow::Result<Data> {
         let pushed = || self.decisions.pushed();
         let list: KeyframeList = pushed()
             .filter_map(|pushed| {
@@ -103,7 +105,7 @@ impl Replay {
     }
 
     /// Returns an error if a keyframe of the log is missing from the data or differs.
-    pub fn check_data(&self, path: &Path, data: &Data) -> Result<(), Error> {
+    pub fn check_data(&self, path: &Path, data: &Data) -> anyhow::Result<()> {
         let by_key = by_name(&data.keyframes);
         let name = self.name();
         let shown = path.display();
@@ -111,15 +113,17 @@ impl Replay {
             let camera = &*pushed.camera;
             let stamp = pushed.stamp_nanos;
             let Some(keyframe) = by_key.get(&(camera, stamp)) else {
-                return Err(Error::InsufficientData(format!(
+                return Err(InsufficientData(format!(
                     "{name} contains image {stamp} of camera {camera:?}, which is not in {shown}"
-                )));
+                ))
+                .into());
             };
             if !pushed.matches(keyframe) {
-                return Err(Error::InsufficientData(format!(
+                return Err(InsufficientData(format!(
                     "image {stamp} of camera {camera:?} differs in pixels, depth, intrinsics or pose between {shown} \
                      and {name}"
-                )));
+                ))
+                .into());
             }
         }
         Ok(())
@@ -127,7 +131,7 @@ impl Replay {
 
     /// Checks that depth was rendered from the same model as in the logged run, identified by its
     /// SHA-256.
-    pub fn check_depth_from(&self, sha256: Option<&str>) -> Result<(), Error> {
+    pub fn check_depth_from(&self, sha256: Option<&str>) -> anyhow::Result<()> {
         depth_from::check_same(
             &self.name(),
             self.decisions.settings.depth_from.as_deref(),
@@ -137,38 +141,45 @@ impl Replay {
 
     /// Checks that training starts from the same points as the logged run, identified by their
     /// SHA-256.
-    pub fn check_points(&self, sha256: Option<&str>) -> Result<(), Error> {
+    pub fn check_points(&self, sha256: Option<&str>) -> anyhow::Result<()> {
         let name = self.name();
         match (self.decisions.settings.points.as_deref(), sha256) {
             (log, here) if log == here => Ok(()),
-            (None, _) => Err(Error::InsufficientData(format!(
+            (None, _) => Err(InsufficientData(format!(
                 "{name} starts without points: remove ply_file_path from transforms.json"
-            ))),
-            (Some(log), here) => Err(Error::InsufficientData(format!(
+            ))
+            .into()),
+            (Some(log), here) => Err(InsufficientData(format!(
                 "{name} starts from points with the SHA-256 {log}, but the data {}: restore the file of ply_file_path",
                 here.map_or_else(
                     || "has no points".to_owned(),
                     |here| format!("has points with {here}")
                 )
-            ))),
+            ))
+            .into()),
         }
     }
 
     /// Checks that training starts at the same step as the log. `from_step`: step of the checkpoint
     /// that training continues from.
-    pub fn check_start(&self, from_step: Option<u64>) -> Result<(), Error> {
+    pub fn check_start(&self, from_step: Option<u64>) -> anyhow::Result<()> {
         let name = self.name();
         match (self.decisions.settings.from_step, from_step) {
             (log, here) if log == here => Ok(()),
-            (None, _) => Err(Error::BadInput(format!(
-                "{name} starts at the first step: remove --resume"
-            ))),
-            (Some(log), None) => Err(Error::BadInput(format!(
-                "{name} continues from step {log}: give the folder of that checkpoint with --resume"
-            ))),
-            (Some(log), Some(here)) => Err(Error::BadInput(format!(
+            (None, _) => Err(BadInput(format!(
+                "{name} starts at the first step: remove {}",
+                Setting::Resume
+            ))
+            .into()),
+            (Some(log), None) => Err(BadInput(format!(
+                "{name} continues from step {log}: give the folder of that checkpoint with {}",
+                Setting::Resume
+            ))
+            .into()),
+            (Some(log), Some(here)) => Err(BadInput(format!(
                 "{name} continues from step {log}, but the checkpoint is at step {here}"
-            ))),
+            ))
+            .into()),
         }
     }
 
@@ -194,7 +205,7 @@ impl Replay {
         session: &mut Session,
         keyframes: &[Arc<Keyframe>],
         stop: &Stop,
-    ) -> crate::Result<()> {
+    ) -> anyhow::Result<()> {
         let by_key = by_name(keyframes);
         session.start_clock(Instant::now());
         for entry in &self.decisions.entries {
@@ -208,11 +219,12 @@ impl Replay {
                 // A model that needs another keyframe would make no steps, and the loop would not
                 // end.
                 if session.step(entry.step - n_total_steps)? == 0 {
-                    return Err(Error::InsufficientData(format!(
+                    return Err(InsufficientData(format!(
                         "{} requires step {}, but there is nothing to train on",
                         self.name(),
                         entry.step
-                    )));
+                    ))
+                    .into());
                 }
             }
             if stop.requested() {

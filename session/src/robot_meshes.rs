@@ -1,6 +1,6 @@
 //! The robot of a rig as viewers draw it, with the mesh files that its URDF names.
 
-use crate::error::Context;
+use anyhow::Context;
 use capture::config::{ArmDriver, Rig};
 use files::Budget;
 use kinematics::shape::Geometry;
@@ -14,7 +14,7 @@ use viz::{MeshFormat, RobotDescription, RobotMesh};
 /// # Errors
 ///
 /// If the URDF is invalid, which [`Rig::load`] rules out.
-pub fn description(rig: &Rig, rig_file: &Path) -> crate::Result<Option<RobotDescription>> {
+pub fn description(rig: &Rig, rig_file: &Path) -> anyhow::Result<Option<RobotDescription>> {
     if rig.arm.driver == ArmDriver::None && !rig.has_moving_base() {
         return Ok(None);
     }

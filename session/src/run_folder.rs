@@ -1,10 +1,9 @@
 //! The folder of a run and its files.
 
-use crate::Error;
-use crate::error::Context;
+use anyhow::{Context, bail, ensure};
 use capture::config::Rig;
-use keyframe::{Keyframe, listed};
-use keyframe::{bail, ensure};
+use keyframe::Keyframe;
+use messages::{BadInput, Setting, listed};
 use model_files::Edits;
 use serde::Serialize;
 use sha2::{Digest, Sha256};
@@ -30,7 +29,7 @@ const LOCK: &str = ".lock";
 const SECS_PER_DAY: u64 = 86_400;
 
 /// Returns an error if a folder contains any model, so that results are never mixed or overwritten.
-pub fn check_no_model(folder: &Path) -> Result<(), Error> {
+pub fn check_no_model(folder: &Path) -> anyhow::Result<()> {
     // A run of several methods has one subfolder per method. The empty path is the folder itself.
     let subfolders = [PathBuf::new()]
         .into_iter()
@@ -41,50 +40,57 @@ pub fn check_no_model(folder: &Path) -> Result<(), Error> {
             .collect::<Vec<_>>()
     });
     match files.find(|file| folder.join(file).exists()) {
-        Some(file) => Err(Error::BadInput(format!(
-            "--out {}: the folder already contains a model ({}); give another folder",
+        Some(file) => Err(BadInput(format!(
+            "{} {}: the folder already contains a model ({}); give another folder",
+            Setting::Out,
             folder.display(),
             file.display()
-        ))),
+        ))
+        .into()),
         None => Ok(()),
     }
 }
 
 /// Returns an error if a folder contains any interrupted run, because a new run would replace its
 /// checkpoint.
-pub fn check_no_unfinished_run(out: &Path) -> Result<(), Error> {
+pub fn check_no_unfinished_run(out: &Path) -> anyhow::Result<()> {
     let folders = std::iter::once(out.to_owned())
         .chain(ModelKind::ALL.iter().map(|kind| out.join(kind.name())));
     match folders
         .into_iter()
         .find(|folder| folder.join(CHECKPOINT).exists())
     {
-        Some(folder) => Err(Error::BadInput(format!(
-            "--out {}: {} contains an interrupted run: continue it with --resume, or give another folder",
+        Some(folder) => Err(BadInput(format!(
+            "{} {}: {} contains an interrupted run: continue it with {}, or give another folder",
+            Setting::Out,
             out.display(),
-            folder.display()
-        ))),
+            folder.display(),
+            Setting::Resume
+        ))
+        .into()),
         None => Ok(()),
     }
 }
 
 /// Returns an error if results would be written into the folder of the data.
-pub fn check_not_data_folder(out: &Path, data: &Path) -> Result<(), Error> {
+pub fn check_not_data_folder(out: &Path, data: &Path) -> anyhow::Result<()> {
     // The same folder may have several names, for example through a link. A folder that does not
     // exist yet has no canonical path, and is no data.
     let canonical = |path: &Path| path.canonicalize().ok();
     match (canonical(out), canonical(data)) {
-        (Some(folder), Some(data)) if folder == data => Err(Error::BadInput(format!(
-            "--out {}: this is the folder of the data; give another folder",
+        (Some(folder), Some(data)) if folder == data => Err(BadInput(format!(
+            "{} {}: this is the folder of the data; give another folder",
+            Setting::Out,
             out.display()
-        ))),
+        ))
+        .into()),
         _ => Ok(()),
     }
 }
 
 /// Returns an error if a folder contains models only in subfolders for several methods. The error
 /// lists the subfolders.
-pub fn expect_one_model(folder: &Path) -> Result<(), Error> {
+pub fn expect_one_model(folder: &Path) -> anyhow::Result<()> {
     let holds_one = |folder: &Path| holds_model(folder) || folder.join(CHECKPOINT).exists();
     let inside: Vec<String> = ModelKind::ALL
         .iter()
@@ -95,16 +101,17 @@ pub fn expect_one_model(folder: &Path) -> Result<(), Error> {
     if inside.is_empty() || holds_one(folder) {
         return Ok(());
     }
-    Err(Error::BadInput(format!(
+    Err(BadInput(format!(
         "{}: the folder contains several methods; give {}",
         folder.display(),
         inside.join(" or ")
-    )))
+    ))
+    .into())
 }
 
 /// Returns an error unless the path is a model: an existing folder with exactly one model, or a
 /// file of splats.
-pub fn expect_model(model: &Path) -> crate::Result<()> {
+pub fn expect_model(model: &Path) -> anyhow::Result<()> {
     let shown = model.display();
     ensure!(model.exists(), "{shown} does not exist");
     if model.is_dir() {
@@ -114,9 +121,12 @@ pub fn expect_model(model: &Path) -> crate::Result<()> {
         }
         let has_checkpoint = model.join(CHECKPOINT).exists();
         let hint = if has_checkpoint {
-            " but has a checkpoint: train --resume continues from it"
+            format!(
+                " but has a checkpoint: train {} continues from it",
+                Setting::Resume
+            )
         } else {
-            ""
+            String::new()
         };
         bail!("{shown} contains no model{hint}");
     }
@@ -136,7 +146,7 @@ pub fn expect_model(model: &Path) -> crate::Result<()> {
             "or",
         );
         let message = format!("{shown} is not {described}; for a saved model, give its folder");
-        return Err(Error::BadInput(message));
+        return Err(BadInput(message).into());
     }
     Ok(())
 }
@@ -159,7 +169,7 @@ fn holds_model(folder: &Path) -> bool {
 
 /// The models at a path: the path itself or, for a run of several methods, the subfolders that
 /// contain a model. If there is no model, returns the error of [`expect_model`].
-pub fn models_at(path: &Path) -> crate::Result<Vec<PathBuf>> {
+pub fn models_at(path: &Path) -> anyhow::Result<Vec<PathBuf>> {
     let inside = ModelKind::ALL
         .iter()
         .map(|kind| path.join(kind.name()))
@@ -190,14 +200,14 @@ impl CreatedFolders {
         requested: Option<&Path>,
         kinds: &[ModelKind],
         rig: Option<&Rig>,
-    ) -> crate::Result<Vec<PathBuf>> {
+    ) -> anyhow::Result<Vec<PathBuf>> {
         let out = self.make(requested)?;
         let folders: Vec<PathBuf> = match kinds {
             [_] => vec![out.clone()],
             several => several
                 .iter()
                 .map(|kind| self.make(Some(&out.join(kind.name()))))
-                .collect::<crate::Result<_>>()?,
+                .collect::<anyhow::Result<_>>()?,
         };
         if let Some(rig) = rig {
             write_rig(rig, &out)?;
@@ -211,7 +221,7 @@ impl CreatedFolders {
 
     /// Creates the requested folder, or `runs/<UTC time>`. A folder that already contains a model
     /// is an error.
-    pub fn make(&mut self, requested: Option<&Path>) -> crate::Result<PathBuf> {
+    pub fn make(&mut self, requested: Option<&Path>) -> anyhow::Result<PathBuf> {
         // Listed before the folders exist, so that only those are removed that this run has made.
         let runs = missing_folders(Path::new(RUNS));
         let missing_parents = requested.map_or(Vec::new(), missing_folders);
@@ -254,7 +264,7 @@ impl CreatedFolders {
 }
 
 /// Writes the resolved rig file into a folder.
-fn write_rig(rig: &Rig, folder: &Path) -> crate::Result<()> {
+fn write_rig(rig: &Rig, folder: &Path) -> anyhow::Result<()> {
     rig.write_resolved(folder)
         .map(drop)
         .with_context(|| format!("cannot write into {}", folder.display()))
@@ -283,14 +293,16 @@ fn holds_recording(folder: &Path) -> bool {
         .any(|path| is_recording(&path))
 }
 
-fn make(requested: Option<&Path>) -> crate::Result<PathBuf> {
+fn make(requested: Option<&Path>) -> anyhow::Result<PathBuf> {
     if let Some(folder) = requested {
         // `report.json` and the next commands contain the name, and JSON is UTF-8.
         if folder.to_str().is_none() {
-            return Err(Error::BadInput(format!(
-                "--out {}: the name must be valid UTF-8",
+            return Err(BadInput(format!(
+                "{} {}: the name must be valid UTF-8",
+                Setting::Out,
                 folder.display()
-            )));
+            ))
+            .into());
         }
         check_no_model(folder)?;
         std::fs::create_dir_all(folder)
@@ -304,12 +316,12 @@ fn make(requested: Option<&Path>) -> crate::Result<PathBuf> {
 
 /// Creates a folder in the system's temporary folder, for a model that cannot be saved in its run
 /// folder.
-pub fn make_fallback_folder() -> crate::Result<PathBuf> {
+pub fn make_fallback_folder() -> anyhow::Result<PathBuf> {
     make_in(&std::env::temp_dir(), "fieldrig-")
 }
 
 /// Creates a new folder named after the current time.
-fn make_in(parent: &Path, prefix: &str) -> crate::Result<PathBuf> {
+fn make_in(parent: &Path, prefix: &str) -> anyhow::Result<PathBuf> {
     #[expect(
         clippy::disallowed_methods,
         reason = "only a readable name; no time is measured"
@@ -340,31 +352,33 @@ fn make_in(parent: &Path, prefix: &str) -> crate::Result<PathBuf> {
         }
     }
     bail!(
-        "{} and 98 numbered variants already exist: give a folder with --out",
-        parent.join(name).display()
+        "{} and 98 numbered variants already exist: give a folder with {}",
+        parent.join(name).display(),
+        Setting::Out
     )
 }
 
 /// Locks a folder against other runs for the lifetime of this process. A folder whose subfolders
 /// are links is rejected: it may come from somebody else, and files written through its links would
 /// replace other files.
-pub(crate) fn lock(folder: &Path) -> crate::Result<()> {
+pub(crate) fn lock(folder: &Path) -> anyhow::Result<()> {
     let of_methods = ModelKind::ALL.iter().map(|kind| kind.name());
     let subfolders = std::iter::once(KEYFRAMES)
         .chain(of_methods)
         .map(|name| folder.join(name));
     for subfolder in subfolders.chain([partial_model(folder)]) {
-        files::check_no_link(&subfolder).map_err(|link| Error::BadInput(link.to_string()))?;
+        files::check_no_link(&subfolder).map_err(|link| BadInput(link.to_string()))?;
     }
     let path = folder.join(LOCK);
     match files::lock(&path).with_context(|| format!("cannot write {}", path.display()))? {
         Some(file) => std::mem::forget(file), // The system releases the lock when the process ends.
         None => {
             let message = format!(
-                "--out {}: another run uses this folder; give another one",
+                "{} {}: another run uses this folder; give another one",
+                Setting::Out,
                 folder.display()
             );
-            return Err(Error::BadInput(message));
+            return Err(BadInput(message).into());
         }
     }
     Ok(())
@@ -377,7 +391,7 @@ fn partial_model(folder: &Path) -> PathBuf {
 
 /// Saves a model and its edits in a temporary subfolder and moves its files into place once it is
 /// complete.
-pub fn save_model(method: &mut AlignedModel, edits: &Edits, folder: &Path) -> crate::Result<()> {
+pub fn save_model(method: &mut AlignedModel, edits: &Edits, folder: &Path) -> anyhow::Result<()> {
     let partial_folder = partial_model(folder);
     // Left over if an earlier run was killed while saving. No other run saves now, because this one
     // has locked the folder.
@@ -408,7 +422,7 @@ pub fn save_model(method: &mut AlignedModel, edits: &Edits, folder: &Path) -> cr
 }
 
 /// Writes a report as indented JSON.
-pub fn write_json(path: &Path, report: &impl Serialize) -> crate::Result<()> {
+pub fn write_json(path: &Path, report: &impl Serialize) -> anyhow::Result<()> {
     let mut text =
         serde_json::to_string_pretty(report).context("cannot write the report as JSON")?;
     text.push('\n');
@@ -416,17 +430,17 @@ pub fn write_json(path: &Path, report: &impl Serialize) -> crate::Result<()> {
 }
 
 /// Writes a file atomically: `path` never refers to an incomplete file.
-pub fn write_atomic(path: &Path, text: &str) -> crate::Result<()> {
+pub fn write_atomic(path: &Path, text: &str) -> anyhow::Result<()> {
     files::write(path, text).with_context(|| format!("cannot write {}", path.display()))
 }
 
 /// Writes the list of keyframes and their splits that `--keyframes` accepts.
-pub fn write_keyframe_list(path: &Path, keyframes: &[Arc<Keyframe>]) -> crate::Result<()> {
+pub fn write_keyframe_list(path: &Path, keyframes: &[Arc<Keyframe>]) -> anyhow::Result<()> {
     write_atomic(path, &keyframe::list_text(keyframes.iter()))
 }
 
 /// SHA-256 over the model files of a folder, each preceded by its name and length.
-pub fn checkpoint_sha256(folder: &Path) -> crate::Result<String> {
+pub fn checkpoint_sha256(folder: &Path) -> anyhow::Result<String> {
     let mut hash = Sha256::new();
     let mut n_files = 0;
     for name in ModelKind::model_files() {
@@ -464,7 +478,7 @@ fn name_from_time(since_epoch: Duration) -> String {
 }
 
 /// Date and time of day in UTC, for readers.
-pub(crate) fn utc_now() -> String {
+pub fn utc_now() -> String {
     #[expect(clippy::disallowed_methods, reason = "only shown; no time is measured")]
     let secs = SystemTime::now()
         .duration_since(UNIX_EPOCH)
@@ -660,7 +674,7 @@ mod tests {
             std::fs::write(at(name), b"x").expect("file");
             assert!(message(name).contains("give its folder"), "{name}");
             if name == CHECKPOINT {
-                assert!(message("").contains("--resume"));
+                assert!(message("").contains("train resume"));
             }
         }
         std::fs::write(at("splats.ply"), b"x").expect("file");

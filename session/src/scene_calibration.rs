@@ -1,12 +1,13 @@
 //! Calibration of a rig's cameras from images of a static scene, without a target.
 
+use crate::Data;
 use crate::corrected_rig;
 use crate::training_options::{Refine, TrainingOptions};
-use crate::{Data, Error};
 use calibration::{Alignment, CameraRefinement, ExtrinsicsCovariance, ParamSet, PoseSigmas};
 use capture::config::{Parent, Rig};
-use keyframe::{Keyframe, Split, counted};
+use keyframe::{Keyframe, Split};
 use kinematics::Transform;
+use messages::{InsufficientData, Setting, counted};
 use std::collections::BTreeMap;
 use std::sync::Arc;
 
@@ -104,19 +105,14 @@ pub fn calibrate_scene(
     data: &Data,
     params: &[Refine],
     rig: Option<&Rig>,
-) -> Result<SceneCalibration, Error> {
+) -> anyhow::Result<SceneCalibration> {
     let options = TrainingOptions {
         refine: params.to_vec(),
         ..TrainingOptions::default()
     };
-    // The same rules as for training, whose messages name the flag of that command.
-    let choice = match options.refining(data.available(), Refine::Auto) {
-        Ok(settings) => without_image_poses(settings.align),
-        Err(Error::BadInput(reason)) => {
-            return Err(Error::BadInput(reason.replace("--refine", "--params")));
-        }
-        Err(error) => return Err(error),
-    };
+    // The same rules as for training.
+    let settings = options.estimating(Setting::Params, data.available(), Refine::Auto)?;
+    let choice = without_image_poses(settings.align);
     // Nothing is scored here, so test images would be wasted.
     let keyframes: Vec<_> = data.keyframes.iter().map(for_calibration).collect();
     let Some(alignment) = calibration::align(&keyframes, &choice) else {
@@ -126,9 +122,10 @@ pub fn calibrate_scene(
         } else {
             " or have texture; without depth, each camera needs at least 10 images"
         };
-        return Err(Error::InsufficientData(format!(
+        return Err(InsufficientData(format!(
             "the cameras cannot be calibrated from {n_images}: too few of them show the same surfaces{needed}. Move the camera around the scene, and turn it about all of its axes"
-        )));
+        ))
+        .into());
     };
     let mut refused: BTreeMap<String, Vec<String>> = BTreeMap::new();
     for direction in &alignment.unobservable {
@@ -213,7 +210,7 @@ fn corrected(
     given: &Rig,
     alignment: &Alignment,
     refused: &BTreeMap<String, String>,
-) -> Result<Rig, Error> {
+) -> anyhow::Result<Rig> {
     let mut rig = corrected_rig::corrected(given, Some(alignment), &BTreeMap::new())?;
     // An estimate along a direction that the motion does not determine is arbitrary. Other
     // corrections of the camera, such as its time offset, are kept.

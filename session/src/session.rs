@@ -15,7 +15,6 @@ pub use training_time::Limits;
 
 use crate::checkpoints::{Checkpoints, Snapshot};
 use crate::chunk_publisher::ChunkPublisher;
-use crate::clock::Clock;
 use crate::decisions::DecisionLog;
 use crate::editing::{self, Editor};
 use crate::evaluate::Evaluator;
@@ -24,6 +23,7 @@ use crate::kept_folder::KeptFolder;
 use crate::next_commands::DataSource;
 use crate::observer::{Evaluation, Observer};
 use crate::recovery::Recovery;
+use crate::training_clock::Clock;
 use calibration::{Alignment, CalibratedCamera, CameraCorrection};
 use capture::Stop;
 use gpu::Gpu;
@@ -232,7 +232,7 @@ impl Session {
     }
 
     /// Adds a keyframe to the model. Test keyframes are also kept for evaluation.
-    pub fn push(&mut self, keyframe: &Arc<Keyframe>) -> crate::Result<()> {
+    pub fn push(&mut self, keyframe: &Arc<Keyframe>) -> anyhow::Result<()> {
         // Held first: after a GPU failure in `push`, the restored model gets all keyframes in the
         // store, and this one must be among them.
         self.hold(keyframe);
@@ -248,7 +248,7 @@ impl Session {
     }
 
     /// Removes a keyframe.
-    pub fn remove(&mut self, camera: &str, stamp: Stamp) -> crate::Result<()> {
+    pub fn remove(&mut self, camera: &str, stamp: Stamp) -> anyhow::Result<()> {
         let is_other = |held: &Arc<Keyframe>| held.camera.as_ref() != camera || held.stamp != stamp;
         // The newest checkpoint may contain this keyframe. Resuming from it after a GPU failure
         // needs its description.
@@ -264,7 +264,7 @@ impl Session {
     }
 
     /// Creates splats for the keyframes so far.
-    pub fn seed(&mut self) -> crate::Result<()> {
+    pub fn seed(&mut self) -> anyhow::Result<()> {
         self.persistence.log_render();
         Ok(self.method.model_mut().seed()?)
     }
@@ -339,7 +339,7 @@ impl Session {
     }
 
     /// Waits for queued work and returns the total number of updates, including those of trials.
-    pub fn n_total_steps(&mut self) -> crate::Result<u64> {
+    pub fn n_total_steps(&mut self) -> anyhow::Result<u64> {
         Ok(self.method.n_total_steps()?)
     }
 
@@ -364,14 +364,14 @@ impl Session {
     }
 
     /// Trains for at most `max_steps` steps, and evaluates if an evaluation is due.
-    pub fn step(&mut self, max_steps: u64) -> crate::Result<u64> {
+    pub fn step(&mut self, max_steps: u64) -> anyhow::Result<u64> {
         let n = self.train_steps(max_steps)?;
         self.evaluate_when_due()?;
         Ok(n)
     }
 
     /// Trains for at most `max_steps` steps.
-    pub fn train_steps(&mut self, max_steps: u64) -> crate::Result<u64> {
+    pub fn train_steps(&mut self, max_steps: u64) -> anyhow::Result<u64> {
         let left = self.n_steps_remaining().unwrap_or(u64::MAX);
         // Logged even if no step is made: the request alone starts training on the keyframes so
         // far, which affects the model.
@@ -384,7 +384,7 @@ impl Session {
 
     /// Pauses the growth of the model while its steps take too long for a live run. A larger model
     /// would be trained and drawn even more slowly, so that an operator would see less.
-    pub(crate) fn pause_growth_when_slow(&mut self) -> crate::Result<()> {
+    pub(crate) fn pause_growth_when_slow(&mut self) -> anyhow::Result<()> {
         // Growth continues at half of the limit only. With a single limit, each change of the load
         // of the machine near it would pause and continue growth, and log this.
         match self.progress().step_millis {
@@ -395,7 +395,7 @@ impl Session {
     }
 
     /// Pauses or continues the growth of the model.
-    pub(crate) fn pause_growth(&mut self, is_paused: bool) -> crate::Result<()> {
+    pub(crate) fn pause_growth(&mut self, is_paused: bool) -> anyhow::Result<()> {
         if self.method.model_mut().pause_growth(is_paused)? {
             let Progress {
                 primitives,
@@ -414,7 +414,7 @@ impl Session {
 
     /// Applies the result of an alignment in the background if it is ready, or waits for it if
     /// `wait`. Returns whether a result was applied.
-    pub fn poll_alignment(&mut self, wait: bool) -> crate::Result<bool> {
+    pub fn poll_alignment(&mut self, wait: bool) -> anyhow::Result<bool> {
         let is_applied = self.method.poll_alignment(wait)?;
         if is_applied {
             self.refresh_corrections()?;
@@ -435,14 +435,14 @@ impl Session {
 
     /// Reads the corrections that are optimized with the scene, for [`Self::camera_of`]. Waits for
     /// queued work.
-    pub fn refresh_corrections(&mut self) -> crate::Result<()> {
+    pub fn refresh_corrections(&mut self) -> anyhow::Result<()> {
         self.learned = self.camera_corrections()?;
         Ok(())
     }
 
     /// Corrections of cameras that were optimized with the scene; they follow those of
     /// [`Self::alignment`].
-    pub fn camera_corrections(&mut self) -> crate::Result<BTreeMap<String, CameraCorrection>> {
+    pub fn camera_corrections(&mut self) -> anyhow::Result<BTreeMap<String, CameraCorrection>> {
         Ok(self.method.model_mut().camera_corrections()?)
     }
 
@@ -455,7 +455,7 @@ impl Session {
         &mut self,
         max_steps: impl Fn(&Self) -> u64,
         is_render_pending: impl Fn() -> bool,
-    ) -> crate::Result<()> {
+    ) -> anyhow::Result<()> {
         let started = Instant::now();
         let mut n_steps = 0;
         loop {
@@ -504,12 +504,12 @@ impl Session {
     }
 
     /// Returns an error if the GPU failed.
-    pub fn check_gpu(&self) -> crate::Result<()> {
+    pub fn check_gpu(&self) -> anyhow::Result<()> {
         Ok(self.gpu.check()?)
     }
 
     /// Waits for queued work.
-    pub fn wait(&self) -> crate::Result<()> {
+    pub fn wait(&self) -> anyhow::Result<()> {
         Ok(self.gpu.wait()?)
     }
 
@@ -542,7 +542,7 @@ impl Session {
     }
 
     /// Restores the model on another device from the newest checkpoint or else from scratch.
-    pub fn restart_on(&mut self, gpu: &Arc<Gpu>) -> crate::Result<()> {
+    pub fn restart_on(&mut self, gpu: &Arc<Gpu>) -> anyhow::Result<()> {
         self.method = self.persistence.restore(gpu, &self.keyframes)?;
         self.gpu = gpu.clone();
         // Checkpoints do not contain the initial points.
@@ -561,7 +561,7 @@ impl Session {
     }
 
     /// Writes a checkpoint, or the new keyframes, if they are due.
-    pub(crate) fn write_checkpoint_when_due(&mut self) -> crate::Result<()> {
+    pub(crate) fn write_checkpoint_when_due(&mut self) -> anyhow::Result<()> {
         // The folder must exist before a checkpoint is written into it.
         self.persistence.check_folders_when_due();
         let seconds = self.secs();
@@ -576,7 +576,7 @@ impl Session {
 
     /// Writes a checkpoint if one is due, and evaluates if an evaluation is due. A finished session
     /// does neither.
-    pub fn evaluate_when_due(&mut self) -> crate::Result<()> {
+    pub fn evaluate_when_due(&mut self) -> anyhow::Result<()> {
         if self.time.is_finished() {
             return Ok(());
         }
@@ -601,7 +601,7 @@ impl Session {
 
     /// Scores one more test image of the evaluation in progress, and reports the evaluation after
     /// its last image.
-    pub fn score_next(&mut self) -> crate::Result<()> {
+    pub fn score_next(&mut self) -> anyhow::Result<()> {
         let Some(mut evaluation) = self.scoreboard.take_pending() else {
             return Ok(());
         };
@@ -632,8 +632,8 @@ impl Session {
     /// Runs work that does not count as training time.
     fn without_clock<T>(
         &mut self,
-        work: impl FnOnce(&Scoreboard, &mut AlignedModel) -> crate::Result<T>,
-    ) -> crate::Result<T> {
+        work: impl FnOnce(&Scoreboard, &mut AlignedModel) -> anyhow::Result<T>,
+    ) -> anyhow::Result<T> {
         // Steps that are still queued are training time, so they are completed first.
         self.gpu.wait()?;
         self.persistence.log_render();
@@ -652,7 +652,7 @@ impl Session {
 
     /// Scores the test keyframe with the oldest score, for the PSNR curve between scheduled
     /// evaluations. Counts as training time.
-    pub fn refresh_psnr(&mut self) -> crate::Result<()> {
+    pub fn refresh_psnr(&mut self) -> anyhow::Result<()> {
         let Some(oldest) = self.scoreboard.next_to_refresh() else {
             return Ok(());
         };

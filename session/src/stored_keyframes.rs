@@ -3,11 +3,10 @@
 //! Each keyframe is a separate file in the layout of a checkpoint (`docs/reference/files.md`), with
 //! its color and depth as PNG. Ground truth from a simulator is left out.
 
-use crate::error::Context;
 use crate::run_folder::KEYFRAMES;
+use anyhow::{Context, ensure};
 use image::codecs::png::{CompressionType, FilterType, PngEncoder};
 use image::{ExtendedColorType, ImageEncoder};
-use keyframe::ensure;
 use keyframe::{BaseState, DepthMap, Keyframe, split_from_name, split_name};
 use kinematics::transform::{from_xyz_xyzw, to_xyz_xyzw};
 use kinematics::{Stamp, Twist};
@@ -74,7 +73,7 @@ impl StoredKeyframes {
     }
 
     /// Writes the keyframes that are not stored yet.
-    pub fn add(&self, keyframes: &[Arc<Keyframe>]) -> crate::Result<()> {
+    pub fn add(&self, keyframes: &[Arc<Keyframe>]) -> anyhow::Result<()> {
         std::fs::create_dir_all(&self.folder)
             .with_context(|| format!("cannot create {}", self.folder.display()))?;
         let existing = self.names()?;
@@ -88,7 +87,7 @@ impl StoredKeyframes {
     }
 
     /// Removes all files except those of these keyframes.
-    pub fn keep_only(&self, keyframes: &[Arc<Keyframe>]) -> crate::Result<()> {
+    pub fn keep_only(&self, keyframes: &[Arc<Keyframe>]) -> anyhow::Result<()> {
         let stored: BTreeSet<String> = keyframes.iter().map(|keyframe| name_of(keyframe)).collect();
         for name in self.names()?.difference(&stored) {
             let path = self.folder.join(name);
@@ -104,7 +103,7 @@ impl StoredKeyframes {
     /// # Errors
     ///
     /// Fails if the folder cannot be listed, or if none of its keyframes can be read.
-    pub fn read(&self) -> crate::Result<Vec<Arc<Keyframe>>> {
+    pub fn read(&self) -> anyhow::Result<Vec<Arc<Keyframe>>> {
         let names = self.names()?;
         let mut keyframes = Vec::new();
         let mut errors = Vec::new();
@@ -131,7 +130,7 @@ impl StoredKeyframes {
         Ok(keyframes)
     }
 
-    fn names(&self) -> crate::Result<BTreeSet<String>> {
+    fn names(&self) -> anyhow::Result<BTreeSet<String>> {
         let names = file_names(&self.folder)
             .with_context(|| format!("cannot list {}", self.folder.display()))?;
         let names = names.into_iter().filter_map(|name| name.into_string().ok());
@@ -159,7 +158,7 @@ fn name_of(keyframe: &Keyframe) -> String {
     format!("{}_{:020}.{EXTENSION}", keyframe.camera, keyframe.stamp.0)
 }
 
-fn to_checkpoint(keyframe: &Keyframe) -> crate::Result<Checkpoint> {
+fn to_checkpoint(keyframe: &Keyframe) -> anyhow::Result<Checkpoint> {
     let description = Description {
         camera: keyframe.camera.to_string(),
         stamp_nanos: keyframe.stamp.0,
@@ -210,7 +209,7 @@ fn to_checkpoint(keyframe: &Keyframe) -> crate::Result<Checkpoint> {
     })
 }
 
-fn keyframe_of(checkpoint: &Checkpoint) -> crate::Result<Keyframe> {
+fn keyframe_of(checkpoint: &Checkpoint) -> anyhow::Result<Keyframe> {
     ensure!(
         checkpoint.method == METHOD,
         "it contains a {}, expected a {METHOD}",
@@ -246,7 +245,7 @@ fn keyframe_of(checkpoint: &Checkpoint) -> crate::Result<Keyframe> {
 }
 
 /// Decodes the depth map of a stored keyframe.
-fn depth_of(checkpoint: &Checkpoint, description: &DepthDescription) -> crate::Result<DepthMap> {
+fn depth_of(checkpoint: &Checkpoint, description: &DepthDescription) -> anyhow::Result<DepthMap> {
     let bytes = pixels_of(checkpoint, DEPTH, description.size_px)?;
     // The four channels of a pixel are the bytes of its depth, as `png` has encoded them.
     let depth_m = bytes
@@ -264,7 +263,7 @@ fn depth_of(checkpoint: &Checkpoint, description: &DepthDescription) -> crate::R
 }
 
 /// Decodes a PNG of a stored keyframe to four bytes per pixel.
-fn pixels_of(checkpoint: &Checkpoint, name: &str, size_px: [u32; 2]) -> crate::Result<Vec<u8>> {
+fn pixels_of(checkpoint: &Checkpoint, name: &str, size_px: [u32; 2]) -> anyhow::Result<Vec<u8>> {
     let array = checkpoint.arrays.iter().find(|array| array.name == name);
     let png = &array
         .with_context(|| format!("array {name:?} is missing"))?
@@ -280,7 +279,7 @@ fn pixels_of(checkpoint: &Checkpoint, name: &str, size_px: [u32; 2]) -> crate::R
 
 /// Losslessly encodes four bytes per pixel. For depth, these are the bytes of an f32, which
 /// compress well because neighboring pixels are similar.
-fn png([width, height]: [u32; 2], bytes: &[u8]) -> crate::Result<Vec<u8>> {
+fn png([width, height]: [u32; 2], bytes: &[u8]) -> anyhow::Result<Vec<u8>> {
     let mut png = Vec::new();
     // A fast level and one fixed filter: keyframes arrive several times per second, and this thread
     // shares the processors with training and devices.

@@ -16,7 +16,7 @@ pub(crate) fn train_next(
     sessions: &mut [Session],
     max_steps: impl Fn(usize, &Session) -> u64,
     is_render_pending: impl Fn() -> bool,
-) -> crate::Result<()> {
+) -> anyhow::Result<()> {
     let can_train = |ix: usize, session: &Session| {
         !session.is_over() && !session.is_idle() && max_steps(ix, session) > 0
     };

@@ -6,11 +6,12 @@ use crate::observer::Observer;
 use crate::recoveries::{OpenGpu, Recoveries};
 use crate::session::{Evaluators, Limits, Session};
 use crate::training_options::{Refine, RefineSettings, TrainingOptions};
-use crate::{Error, run_folder, time_slices};
+use crate::{run_folder, time_slices};
 use capture::Stop;
 use capture::config::DEFAULT_SEED;
 use gpu::Gpu;
-use keyframe::{Keyframe, listed};
+use keyframe::Keyframe;
+use messages::{BadInput, InsufficientData, Setting, listed};
 use model_files::InitialPoints;
 use std::path::Path;
 use std::sync::Arc;
@@ -42,7 +43,7 @@ pub fn train(
     preparation_time: Duration,
     stop: &Stop,
     open_gpu: OpenGpu,
-) -> crate::Result<Session> {
+) -> anyhow::Result<Session> {
     let kind = plan.model_spec.kind;
     let mut method = plan.model_spec.start(gpu.clone())?;
     // Compiling kernels takes seconds and is not training.
@@ -77,7 +78,7 @@ pub fn drive(
     preparation_time: Duration,
     stop: &Stop,
     open_gpu: OpenGpu,
-) -> crate::Result<()> {
+) -> anyhow::Result<()> {
     // The clock starts earlier by the time of the preparation, which is part of the method.
     let now = Instant::now();
     let began = now.checked_sub(preparation_time).unwrap_or(now);
@@ -93,12 +94,14 @@ pub fn drive(
                 .filter(|kind| !kind.entry().needs_depth)
                 .map(|kind| kind.name())
                 .collect();
-            return Err(Error::InsufficientData(format!(
+            return Err(InsufficientData(format!(
                 "the method {} needs depth, but no training image has depth: \
-                 use `fieldrig train --depth-from` to render depth from another model of the scene, or use the method {}",
+                 use `fieldrig train {}` to render depth from another model of the scene, or use the method {}",
                 session.kind().name(),
+                Setting::DepthFrom,
                 listed(&others, "or")
-            )));
+            ))
+            .into());
         }
     }
     let is_done = |session: &Session| session.is_over() || session.is_idle();
@@ -131,7 +134,7 @@ pub fn model_specs(
     data: &Data,
     steps: Option<u64>,
     software: bool,
-) -> Result<Vec<ModelSpec>, Error> {
+) -> anyhow::Result<Vec<ModelSpec>> {
     let rig_methods = data.rig.as_ref().map(methods_of).transpose()?;
     let kinds = rig_methods
         .or(options.methods.clone())
@@ -193,7 +196,7 @@ pub fn check_before_data(
     options: &TrainingOptions,
     path: &Path,
     images: &DataOptions,
-) -> crate::Result<()> {
+) -> anyhow::Result<()> {
     let defaults = || Data::default_methods(path, images);
     let kinds = options.methods.clone().map_or_else(defaults, Ok)?;
     options.check_before_data(&kinds, run_folder::is_recording(path))
@@ -204,11 +207,10 @@ pub fn limits(
     seconds: Option<f64>,
     steps: Option<u64>,
     default_secs: f64,
-) -> Result<Limits, Error> {
+) -> anyhow::Result<Limits> {
     if seconds.is_some_and(|seconds| seconds.is_nan() || seconds < 0.0) {
-        return Err(Error::BadInput(
-            "--seconds: must be a number of at least 0".into(),
-        ));
+        let message = format!("{}: must be a number of at least 0", Setting::Seconds);
+        return Err(BadInput(message).into());
     }
     Ok(Limits {
         seconds: seconds.or(steps.is_none().then_some(default_secs)),

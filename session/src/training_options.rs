@@ -1,11 +1,10 @@
 //! Options shared by all commands that train. They override the keys of the same name in a rig
 //! file.
 
-use crate::Error;
 use crate::methods::{COUNT, MAX_SPLATS, describe};
 use calibration::{CameraRefinement, ParamSet, candidates};
 use capture::Override;
-use keyframe::listed;
+use messages::{BadInput, Setting, listed};
 use trainer::ModelKind;
 use trainer::splat::CountPolicy;
 
@@ -125,33 +124,34 @@ impl TrainingOptions {
     }
 
     /// Rejects flags for options that none of the methods has.
-    pub fn check_for(&self, kinds: &[ModelKind]) -> Result<(), Error> {
-        let flags = [
-            (self.max_splats.is_some(), "--max-splats", MAX_SPLATS),
-            (self.count.is_some(), "--count", COUNT),
+    pub fn check_for(&self, kinds: &[ModelKind]) -> anyhow::Result<()> {
+        let settings = [
+            (self.max_splats.is_some(), Setting::MaxSplats, MAX_SPLATS),
+            (self.count.is_some(), Setting::Count, COUNT),
         ];
         let is_unused = |option: &str| !kinds.iter().any(|kind| kind.has_option(option));
-        match flags
+        match settings
             .into_iter()
             .find(|(is_given, _, option)| *is_given && is_unused(option))
         {
-            Some((_, flag, option)) => {
+            Some((_, setting, option)) => {
                 let having = ModelKind::ALL
                     .iter()
                     .filter(|kind| kind.has_option(option))
                     .map(|kind| kind.name());
-                Err(Error::BadInput(format!(
-                    "{flag}: needs the method {}, but the method is {}",
+                Err(BadInput(format!(
+                    "{setting}: needs the method {}, but the method is {}",
                     listed(&having.collect::<Vec<_>>(), "or"),
                     describe(kinds)
-                )))
+                ))
+                .into())
             }
             None => Ok(()),
         }
     }
 
     /// Rejects flags that are invalid for any data, before the data is read.
-    pub fn check_before_data(&self, kinds: &[ModelKind], joints: bool) -> Result<(), Error> {
+    pub fn check_before_data(&self, kinds: &[ModelKind], joints: bool) -> anyhow::Result<()> {
         let all_available = AvailableData {
             joints,
             drifts: true,
@@ -170,7 +170,7 @@ impl TrainingOptions {
         &self,
         kinds: &[ModelKind],
         available: AvailableData,
-    ) -> Result<(), Error> {
+    ) -> anyhow::Result<()> {
         let is_other = |param: &Refine| matches!(param, Refine::Auto | Refine::None | Refine::Base);
         let is_known = |param: &Refine| {
             is_other(param) || available.can_align(*param) || can_learn(kinds, *param)
@@ -188,12 +188,14 @@ impl TrainingOptions {
         } else {
             " without measured depth"
         };
-        Err(Error::BadInput(format!(
-            "--refine {}: the method {} cannot estimate this{without}; it supports {}",
+        Err(BadInput(format!(
+            "{} {}: the method {} cannot estimate this{without}; it supports {}",
+            Setting::Refine,
             unknown.name(),
             describe(kinds),
             known.join(", ")
-        )))
+        ))
+        .into())
     }
 
     /// Which calibration parameters to estimate; `default_value` applies if the flag is not given.
@@ -201,7 +203,17 @@ impl TrainingOptions {
         &self,
         available: AvailableData,
         default_value: Refine,
-    ) -> Result<RefineSettings, Error> {
+    ) -> anyhow::Result<RefineSettings> {
+        self.estimating(Setting::Refine, available, default_value)
+    }
+
+    /// As [`Self::refining`]; `setting` is the one that the user gave.
+    pub(crate) fn estimating(
+        &self,
+        setting: Setting,
+        available: AvailableData,
+        default_value: Refine,
+    ) -> anyhow::Result<RefineSettings> {
         let requested = if self.refine.is_empty() {
             std::slice::from_ref(&default_value)
         } else {
@@ -209,9 +221,8 @@ impl TrainingOptions {
         };
         let has = |param| requested.contains(&param);
         if (has(Refine::Auto) || has(Refine::None)) && requested.len() > 1 {
-            return Err(Error::BadInput(
-                "--refine: auto and none cannot be combined with other values".into(),
-            ));
+            let message = format!("{setting}: auto and none cannot be combined with other values");
+            return Err(BadInput(message).into());
         }
         if has(Refine::Auto) {
             return Ok(available.auto_settings());
@@ -227,15 +238,11 @@ impl TrainingOptions {
             && let Some(param) = needs_depth.into_iter().find(|param| has(*param))
         {
             let message = "needs depth images measured by a camera";
-            return Err(Error::BadInput(format!(
-                "--refine {}: {message}",
-                param.name()
-            )));
+            return Err(BadInput(format!("{setting} {}: {message}", param.name())).into());
         }
         if has(Refine::Joints) && !available.joints {
-            return Err(Error::BadInput(
-                "--refine joints: needs a recording of an arm".into(),
-            ));
+            let message = format!("{setting} joints: needs a recording of an arm");
+            return Err(BadInput(message).into());
         }
         let set = param_set(requested);
         // Without measured depth, features of images give a first estimate, and training with the
@@ -269,7 +276,7 @@ impl TrainingOptions {
         &self,
         available: AvailableData,
         software: bool,
-    ) -> Result<RefineSettings, Error> {
+    ) -> anyhow::Result<RefineSettings> {
         if !self.refine.is_empty() || software {
             return self.refining(available, Refine::None);
         }
@@ -518,7 +525,7 @@ mod tests {
             .unwrap_err()
             .to_string();
         assert!(
-            message.contains("--max-splats") && message.contains("tsdf and nerf"),
+            message.contains("max_splats") && message.contains("tsdf and nerf"),
             "{message}"
         );
         let message = options
@@ -527,7 +534,7 @@ mod tests {
             .to_string();
         assert!(
             message.starts_with(
-                "--refine image-gains: the method tsdf cannot estimate this; it supports auto, none, base, extrinsics,"
+                "refine image-gains: the method tsdf cannot estimate this; it supports auto, none, base, extrinsics,"
             ),
             "{message}"
         );

@@ -295,7 +295,7 @@ impl ServedModel {
                     _ => format!("edits saved in {path}"),
                 }
             }
-            Err(error) => format!("cannot save the edits: {:#}", crate::Error::from(error)),
+            Err(error) => format!("cannot save the edits: {:#}", anyhow::Error::from(error)),
         }
     }
 }

@@ -472,7 +472,8 @@ impl Config {
                 .any(|other| other.name == camera.name)
             {
                 return Err(Error::DuplicateName {
-                    camera: camera.name.clone(),
+                    devices: "cameras",
+                    name: camera.name.clone(),
                 });
             }
             camera.check()?;
@@ -492,7 +493,8 @@ impl Config {
                 .any(|other| other.name == scanner.name)
             {
                 return Err(Error::DuplicateName {
-                    camera: scanner.name.clone(),
+                    devices: "range scanners",
+                    name: scanner.name.clone(),
                 });
             }
             scanner.check()?;
@@ -621,8 +623,8 @@ impl CameraConfig {
                 1.0,
             )?;
             check(&self.name, "hole_frac", depth.hole_frac, 0.0, 0.9)?;
-            check(&self.name, "depth min_m", depth.min_m, 0.0, 10.0)?;
-            check(&self.name, "depth max_m", depth.max_m, depth.min_m, 100.0)?;
+            check(&self.name, "depth min_m", depth.min_m, 0.0, 100.0)?;
+            check(&self.name, "depth max_m", depth.max_m, depth.min_m, 1000.0)?;
             check(
                 &self.name,
                 "meters_per_count",
@@ -688,7 +690,12 @@ mod tests {
         );
         config = Config::default();
         config.cameras.push(CameraConfig::wrist("wrist"));
-        assert!(matches!(config.check(), Err(Error::DuplicateName { .. })));
+        let message = config.check().expect_err("two cameras").to_string();
+        assert_eq!(message, "two cameras are named \"wrist\"");
+        config = Config::default();
+        config.scanners = vec![ScannerConfig::sixteen_rings("lidar"); 2];
+        let message = config.check().expect_err("two scanners").to_string();
+        assert_eq!(message, "two range scanners are named \"lidar\"");
         config = Config::default();
         let (name, spec) = ("wall".to_owned(), "chessboard:9x6:25".to_owned());
         let parent_from_board = Transform::identity();
@@ -703,5 +710,24 @@ mod tests {
             message.contains("wall") && message.contains("no unit"),
             "{message}"
         );
+    }
+
+    /// Rig files allow a depth range of up to 100 m to 1000 m for all cameras.
+    #[test]
+    fn depth_range_is_that_of_rig_files() {
+        let check = |min_m, max_m| with_depth_range(min_m, max_m).check();
+        assert!(check(100.0, 1000.0).is_ok());
+        let message = check(0.1, 1001.0).expect_err("too far").to_string();
+        assert!(message.contains("depth max_m"), "{message}");
+    }
+
+    fn with_depth_range(min_m: f64, max_m: f64) -> Config {
+        let mut config = Config::default();
+        config.cameras[0].depth = Some(DepthConfig {
+            min_m,
+            max_m,
+            ..DepthConfig::default()
+        });
+        config
     }
 }

@@ -55,11 +55,13 @@ pub enum Error {
         /// Cause.
         reason: String,
     },
-    /// Two cameras have the same name.
-    #[error("two cameras are named {camera:?}")]
+    /// Two devices of the same kind have the same name.
+    #[error("two {devices} are named {name:?}")]
     DuplicateName {
+        /// Kind of the devices, in the plural.
+        devices: &'static str,
         /// The name.
-        camera: String,
+        name: String,
     },
     /// A target is attached to the flange of a robot without an arm.
     #[error(

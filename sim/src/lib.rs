@@ -32,7 +32,7 @@ mod lab;
 mod lab_texture;
 mod lidar;
 mod light;
-mod live;
+mod live_rig;
 mod lockstep;
 mod mesh;
 mod motors;
@@ -69,7 +69,7 @@ pub use config::{
     SensorConfig, StampConfig, TargetConfig, TargetParent,
 };
 pub use error::Error;
-pub use live::{LiveRig, LiveTruth};
+pub use live_rig::{LiveRig, LiveTruth};
 pub use lockstep::Lockstep;
 pub use motors::MotorHistory;
 pub use rig::{PANDA_URDF, Rig, open};

@@ -7,7 +7,7 @@ use crate::commanded::CommandedRig;
 use crate::config::{Config, Parent, Scene};
 use crate::engine::{Cameras, Engine, history_nanos};
 use crate::follower::{Follower, Tour};
-use crate::live::LiveRig;
+use crate::live_rig::LiveRig;
 use crate::lockstep::Lockstep;
 use crate::motors::MotorHistory;
 use crate::render::Renderer;

@@ -1,6 +1,6 @@
 //! `fieldrig export`: converts models and recordings to formats of other programs.
 
-use crate::exit::{self, BadArgument, Exit};
+use crate::exit::{self, Exit};
 use crate::open_gpu::open_gpu;
 use crate::permission_args::PermissionArgs;
 use crate::{print, signals};
@@ -8,7 +8,8 @@ use anyhow::{Context, ensure};
 use capture::config::{Override, Rig};
 use capture::{Join, SampleUse, Stations, open};
 use clap::builder::{PossibleValue, PossibleValuesParser};
-use keyframe::{KeyframeList, counted, listed};
+use keyframe::KeyframeList;
+use messages::{BadInput, counted, listed};
 use session::{Written, methods, run_folder, write_nerfstudio};
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -93,7 +94,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     let has_cells = |kind: ModelKind| kind.entry().exports.iter().any(|export| export.has_cells);
     // A flag without an effect is probably a mistake.
     if args.cell_m.is_some() && !matches!(contents, Contents::Model(kind) if has_cells(kind)) {
-        return Err(BadArgument(format!("--cell-m: {} has no mesh", args.from.display())).into());
+        return Err(BadInput(format!("--cell-m: {} has no mesh", args.from.display())).into());
     }
     // Before the model is loaded, which may take long.
     check_file(args)?;
@@ -141,7 +142,7 @@ fn describe_exports(kind: ModelKind, format: &str) -> String {
 fn contents(path: &Path) -> anyhow::Result<Contents> {
     ensure!(
         path.exists(),
-        BadArgument(format!("{} does not exist", path.display()))
+        BadInput(format!("{} does not exist", path.display()))
     );
     if let Some(kind) = methods::kind_of(path)? {
         run_folder::expect_model(path)?;
@@ -150,13 +151,13 @@ fn contents(path: &Path) -> anyhow::Result<Contents> {
     let sentence = "not a model folder, a splat file or a recording";
     ensure!(
         path.is_file(),
-        BadArgument(format!("{}: {sentence}", path.display()))
+        BadInput(format!("{}: {sentence}", path.display()))
     );
     Ok(Contents::Recording)
 }
 
 /// Rejects an output file that exists or has the wrong extension.
-fn check_file(args: &Args) -> Result<(), BadArgument> {
+fn check_file(args: &Args) -> Result<(), BadInput> {
     let extension = &args.to;
     // This output is a folder.
     if extension == NERFSTUDIO {
@@ -168,12 +169,12 @@ fn check_file(args: &Args) -> Result<(), BadArgument> {
         .extension()
         .is_some_and(|actual| actual.eq_ignore_ascii_case(extension))
     {
-        return Err(BadArgument(format!(
+        return Err(BadInput(format!(
             "--out {out}: the file name must end in .{extension}"
         )));
     }
     if args.out.exists() {
-        return Err(BadArgument(format!(
+        return Err(BadInput(format!(
             "--out {out}: the file exists; choose another name"
         )));
     }
@@ -181,7 +182,7 @@ fn check_file(args: &Args) -> Result<(), BadArgument> {
 }
 
 fn unsupported(sentence: &str, args: &Args) -> anyhow::Error {
-    BadArgument(format!("{}: {sentence}", args.from.display())).into()
+    BadInput(format!("{}: {sentence}", args.from.display())).into()
 }
 
 /// Exports a model.
@@ -214,7 +215,7 @@ fn write_export(export: &Export, args: &Args, out: &Path) -> anyhow::Result<Expo
     };
     exported.map_err(|error| match error {
         // The cell width is an argument, so another one is a remedy.
-        trainer::Error::EmptyMesh { cell_m } => anyhow::Error::new(BadArgument(format!(
+        trainer::Error::EmptyMesh { cell_m } => anyhow::Error::new(BadInput(format!(
             "--cell-m {cell_m}: no triangles are left at this cell width; use a smaller one"
         ))),
         error => error.into(),

@@ -1,22 +1,20 @@
 //! `fieldrig move`: moves an arm to given joint positions, within its limits, under supervision.
 
-use crate::exit::{BadArgument, Exit};
+use crate::exit::Exit;
 use crate::{print, signals};
 use anyhow::bail;
-use capture::config::{ArmMotion, Rig};
-use capture::{Stop, SupervisedArm, open};
+use capture::config::Rig;
+use capture::{HOLDING, Stop, SupervisedArm, open};
 use drivers::clock;
 use drivers::motion::{JointTarget, OnLoss};
 use indicatif::ProgressBar;
 use kinematics::{JointState, Stamp};
+use messages::BadInput;
 use serde::Serialize;
 use std::path::PathBuf;
 
 /// A target may exceed the joint range by this much, rad or m.
 const TOLERANCE_RAD: f64 = 1e-4;
-
-/// What to do while an arm is held that its motors would release.
-pub(super) const HOLDING: &str = "holding the arm; support it before you press Ctrl-C, because the motors then no longer hold it";
 
 /// Flags of `move`.
 #[derive(Debug, clap::Args)]
@@ -82,7 +80,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     )?;
     signals::stop_when_output_closes(&stop)?;
     let rig = Rig::load(&args.rig_file, &[])?;
-    let motion = motion_of(&rig)?;
+    let motion = open::motion_of(&rig)?;
     check(args, &rig)?;
     let mut arm = SupervisedArm::new(open::movable_arm(&rig)?, &rig);
     let bar = print::bar(None, "{spinner} {elapsed} {msg}", args.json);
@@ -132,22 +130,12 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     Ok(Exit::Done)
 }
 
-/// How the arm of a rig may be moved.
-pub(super) fn motion_of(rig: &Rig) -> Result<&ArmMotion, BadArgument> {
-    rig.arm.motion.as_ref().ok_or_else(|| {
-        BadArgument(
-            "the rig file has no table [arm.motion], so its arm is only read: see docs/guide/moving-arms.md".to_owned(),
-        )
-    })
-}
-
-/// Checks the arguments against the rig file, before any device is opened.
-fn check(args: &Args, rig: &Rig) -> Result<(), BadArgument> {
+fn check(args: &Args, rig: &Rig) -> Result<(), BadInput> {
     let joints = &rig.arm.joints;
     if let Some(to) = args.to.as_ref().filter(|to| to.len() != joints.len()) {
         let n = to.len();
         let names = joints.join(", ");
-        return Err(BadArgument(format!(
+        return Err(BadInput(format!(
             "--to has {n} positions, the arm has {} joints: {names}",
             joints.len()
         )));
@@ -157,7 +145,7 @@ fn check(args: &Args, rig: &Rig) -> Result<(), BadArgument> {
         .iter()
         .find(|joint| args.by.iter().filter(|(by, _)| by == *joint).count() > 1)
     {
-        return Err(BadArgument(format!("--by: joint {joint:?} is given twice")));
+        return Err(BadInput(format!("--by: joint {joint:?} is given twice")));
     }
     if let Some((joint, _)) = args.by.iter().find(|(joint, _)| !joints.contains(joint)) {
         let available = if joints.is_empty() {
@@ -165,7 +153,7 @@ fn check(args: &Args, rig: &Rig) -> Result<(), BadArgument> {
         } else {
             joints.join(", ")
         };
-        return Err(BadArgument(format!(
+        return Err(BadInput(format!(
             "--by: unknown joint {joint:?}; joints of the arm: {available}"
         )));
     }
@@ -188,7 +176,7 @@ fn check_range(rig: &Rig, requested: &JointTarget, now: &JointState) -> anyhow::
         if (requested - now).abs() > TOLERANCE_RAD
             && !(lower - TOLERANCE_RAD..=upper + TOLERANCE_RAD).contains(&requested)
         {
-            return Err(BadArgument(format!(
+            return Err(BadInput(format!(
                 "joint {joint:?}: target {requested:.4} is outside its range of {lower:.4} to {upper:.4}; the joint is at {now:.4}, and nothing was moved"
             ))
             .into());

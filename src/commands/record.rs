@@ -1,7 +1,7 @@
 //! `fieldrig record`: writes everything that the devices send to a recording.
 
 use super::number_in_range;
-use crate::exit::{self, BadArgument, Exit, InsufficientData};
+use crate::exit::{self, Exit};
 use crate::permission_args::PermissionArgs;
 use crate::{print, signals};
 use capture::config::{ArmDriver, BaseDriver, Override, Rig};
@@ -9,6 +9,7 @@ use capture::open::{self, Devices, Opened};
 use drivers::recording::Recording;
 use drivers::{Image, Sample, Source};
 use kinematics::Stamp;
+use messages::{BadInput, InsufficientData};
 use serde::Serialize;
 use std::collections::BTreeMap;
 use std::path::PathBuf;
@@ -165,12 +166,12 @@ impl Recorded {
 }
 
 /// Rejects a lockstep simulation without an end, because it would fill the disk.
-fn check_end(args: &Args, rig: &Rig) -> Result<(), BadArgument> {
+fn check_end(args: &Args, rig: &Rig) -> Result<(), BadInput> {
     let is_endless =
         args.seconds.is_none() && rig.sim.duration_secs.is_none() && rig.sim.n_images.is_none();
     let is_simulated = args.sim || rig.arm.driver == ArmDriver::Sim;
     if is_simulated && rig.sim.lockstep && is_endless {
-        return Err(BadArgument(
+        return Err(BadInput(
             "a lockstep simulation without an end would fill the disk: limit it with --seconds"
                 .into(),
         ));

@@ -1,10 +1,10 @@
 //! `fieldrig render`: renders images of a saved model.
 
-use crate::exit::{BadArgument, Exit};
+use crate::exit::Exit;
 use crate::open_gpu::open_gpu;
 use crate::{print, signals};
 use anyhow::Context;
-use keyframe::counted;
+use messages::{BadInput, counted};
 use model_files::Aabb;
 use serde::Serialize;
 use session::camera_path::{CameraPath, PathCamera};
@@ -118,14 +118,14 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
         (Some(file), _) => CameraPath::load(file)?,
         (None, Some(pose)) => CameraPath::of_pose(&pose.0)?,
         (None, None) => {
-            return Err(BadArgument("either --camera-path or --pose is needed".into()).into());
+            return Err(BadInput("either --camera-path or --pose is needed".into()).into());
         }
     };
     for note in &path.notes {
         log::warn!("--camera-path: {note}");
     }
     if path.is_panoramic && !args.equirect {
-        return Err(BadArgument(
+        return Err(BadInput(
             "--camera-path: the path was made for panoramas; add --equirect".into(),
         )
         .into());
@@ -191,11 +191,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
 }
 
 impl Args {
-    fn request(
-        &self,
-        camera: &PathCamera,
-        size_px: [u32; 2],
-    ) -> Result<RenderRequest, BadArgument> {
+    fn request(&self, camera: &PathCamera, size_px: [u32; 2]) -> Result<RenderRequest, BadInput> {
         const DEFAULT_FOV_DEGREES: f64 = 60.0;
         let fov_y_rad = self
             .fov
@@ -203,7 +199,7 @@ impl Args {
             .or(camera.fov_y_rad)
             .unwrap_or(DEFAULT_FOV_DEGREES.to_radians());
         if !(fov_y_rad > 0.0 && fov_y_rad < std::f64::consts::PI) {
-            return Err(BadArgument(format!(
+            return Err(BadInput(format!(
                 "field of view {} degrees: must be above 0 and below 180",
                 fov_y_rad.to_degrees()
             )));
@@ -247,12 +243,12 @@ fn files(folder: &Path, ix: usize) -> [PathBuf; 2] {
 }
 
 /// Rejects a folder that already holds any of the `n` images or their depth.
-fn check_no_overwrite(folder: &Path, n: usize) -> Result<(), BadArgument> {
+fn check_no_overwrite(folder: &Path, n: usize) -> Result<(), BadInput> {
     match (0..n)
         .flat_map(|ix| files(folder, ix))
         .find(|file| file.exists())
     {
-        Some(file) => Err(BadArgument(format!(
+        Some(file) => Err(BadInput(format!(
             "--out: {} exists; choose another folder",
             file.display()
         ))),

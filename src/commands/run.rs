@@ -3,7 +3,7 @@
 use super::number_in_range;
 use crate::checkpoint_args::CheckpointArgs;
 use crate::console::{Console, OutputMode, print_next_commands};
-use crate::exit::{self, BadArgument, Exit, InsufficientData};
+use crate::exit::{self, Exit};
 use crate::open_gpu::open_gpu;
 use crate::page_args::PageArgs;
 use crate::permission_args::PermissionArgs;
@@ -20,8 +20,9 @@ use capture::{
 };
 use drivers::Source;
 use gpu::Gpu;
-use keyframe::{Keyframe, Split, counted};
+use keyframe::{Keyframe, Split};
 use kinematics::Stamp;
+use messages::{BadInput, InsufficientData, counted};
 use model_files::Edits;
 use model_files::checkpoint::Checkpoint;
 use serde::Serialize;
@@ -30,7 +31,7 @@ use session::next_commands::{DataSource, quoted};
 use session::run_folder::{self, CreatedFolders};
 use session::{
     AvailableData, Checkpoints, Clock, DecisionLog, EndingSession, Evaluator, Evaluators,
-    FinishedModel, KeptFolder, Latency, Limits, Live, LiveOptions, ModelViewer, Pace, REALIGN,
+    FinishedModel, KeptFolder, Latency, Limits, LiveLoop, LiveOptions, ModelViewer, Pace, REALIGN,
     Recovery, RefineSettings, RunDescription, RunFlags, ServedModel, Session, Settings,
     StoredKeyframes, Viewers, checkpoints, corrected_rig, methods_of, recovery, robot_meshes,
 };
@@ -228,14 +229,14 @@ fn drive(
         // The devices are stopped before saving, which may take minutes.
         stop.request();
         // Without a GPU, the model cannot be read back. Its last checkpoint and the input remain.
-        if error.is_gpu_error() || error.is_gpu_unrecoverable() {
-            return Err(keep_input(live, &folders, error).into());
+        if session::is_gpu_error(&error) || session::is_gpu_unrecoverable(&error) {
+            return Err(keep_input(live, &folders, error));
         }
         log::error!("training failed; saving the model so far: {error:#}");
         if let Err(error) = save(live, args, &rig, folders, &damage) {
             log::error!("{error:#}");
         }
-        return Err(error.into());
+        return Err(error);
     }
     if live.has_exhausted_input() {
         log::info!("the devices have ended and all their data is in the model");
@@ -294,7 +295,7 @@ fn publish_end(hub: &Hub, models: &[FinishedModel]) {
 
 /// A run whose devices are open.
 pub(super) struct Running {
-    pub(super) live: Live,
+    pub(super) live: LiveLoop,
     pub(super) gpu: Arc<Gpu>,
     pub(super) page: ServedPage,
     stop: Stop,
@@ -306,7 +307,7 @@ pub(super) struct Running {
 impl Running {
     /// Takes keyframes, trains for one slice, renders and publishes the status; returns `false`
     /// when the run is over or interrupted.
-    pub(super) fn run_time_slice(&mut self) -> session::Result<bool> {
+    pub(super) fn run_time_slice(&mut self) -> anyhow::Result<bool> {
         if self.stop.requested() || self.live.is_over() {
             return Ok(false);
         }
@@ -418,7 +419,7 @@ pub(super) fn start(
                     edits: Edits::default(),
                 })
             })
-            .collect::<session::Result<_>>()?,
+            .collect::<anyhow::Result<_>>()?,
     };
     // The page is served before kernels are compiled, so that its address in use is reported at
     // once, and viewers can connect meanwhile.
@@ -486,7 +487,7 @@ pub(super) fn start(
     let held = sessions
         .first()
         .map_or(Vec::new(), |session| session.keyframes().to_vec());
-    let live = Live::new(sessions, feed, hub, options).resume_from(held);
+    let live = LiveLoop::new(sessions, feed, hub, options).resume_from(held);
     Ok(Running {
         live,
         gpu,
@@ -620,7 +621,7 @@ impl SessionSetup<'_> {
 
 /// Closes the recording and writes the keyframe lists after a GPU failure. Returns the error with a
 /// note of what was saved.
-fn keep_input(mut live: Live, folders: &[PathBuf], error: session::Error) -> session::Error {
+fn keep_input(mut live: LiveLoop, folders: &[PathBuf], error: anyhow::Error) -> anyhow::Error {
     // Described while the sessions still exist.
     let recoverable = live.describe_recoverable();
     let (sessions, input_result) = live.finish();
@@ -640,17 +641,17 @@ fn keep_input(mut live: Live, folders: &[PathBuf], error: session::Error) -> ses
         }
         Err(error) => log::error!("{error:#}"),
     }
-    let is_already_reported = recoverable.is_empty() || error.is_gpu_unrecoverable();
+    let is_already_reported = recoverable.is_empty() || session::is_gpu_unrecoverable(&error);
     if is_already_reported {
         error
     } else {
-        error.with_context(format!("the run stopped early; {recoverable}"))
+        error.context(format!("the run stopped early; {recoverable}"))
     }
 }
 
 /// Saves the models, then reports errors of the input.
 fn save(
-    mut live: Live,
+    mut live: LiveLoop,
     args: &Args,
     rig: &Rig,
     folders: Vec<PathBuf>,
@@ -686,7 +687,7 @@ fn save(
                     Some(&hub),
                 )?;
             }
-            return Err(error.into());
+            return Err(error);
         }
     };
     // Errors are returned only at the end: the models may still be saved even if the disk is too
@@ -782,7 +783,7 @@ fn corrected_rigs(
     rig: &Rig,
     sessions: &mut [Session],
     folders: &[PathBuf],
-) -> session::Result<Vec<(Rig, PathBuf)>> {
+) -> anyhow::Result<Vec<(Rig, PathBuf)>> {
     let mut rigs = Vec::new();
     for (session, folder) in sessions.iter_mut().zip(folders) {
         let learned = session.camera_corrections()?;
@@ -1011,14 +1012,14 @@ impl Args {
                     opened
                 })
             }
-            None => Ok(open::rig(
+            None => open::rig(
                 rig,
                 if self.sim {
                     Devices::Sim
                 } else {
                     Devices::Real
                 },
-            )?),
+            ),
         }
     }
 
@@ -1057,7 +1058,7 @@ impl Args {
     }
 
     /// Recordings and lockstep simulations wait for the trainer; everything else runs in real time.
-    fn pace(&self, rig: &Rig) -> Result<Pace, BadArgument> {
+    fn pace(&self, rig: &Rig) -> Result<Pace, BadInput> {
         let is_simulated = self.sim || rig.arm.driver == ArmDriver::Sim;
         // A recording waits for the trainer unless a flag says otherwise.
         let is_lockstep = match self.from {
@@ -1071,7 +1072,7 @@ impl Args {
             return Ok(Pace::Lockstep { steps_per_keyframe });
         }
         match self.steps_per_keyframe {
-            Some(_) => Err(BadArgument(
+            Some(_) => Err(BadInput(
                 "--steps-per-keyframe: this run uses keyframes in real time, as they arrive; the flag needs --lockstep or --from"
                     .into(),
             )),

@@ -3,7 +3,7 @@
 use crate::checkpoint_args::CheckpointArgs;
 use crate::console::{Console, OutputMode, ReadBar, print_next_commands};
 use crate::data_args::DataArgs;
-use crate::exit::{self, BadArgument, Exit};
+use crate::exit::{self, Exit};
 use crate::open_gpu::open_gpu;
 use crate::permission_args::PermissionArgs;
 use crate::training_args::TrainingArgs;
@@ -11,7 +11,8 @@ use crate::{print, signals};
 use capture::StationReport;
 use capture::config::{Override, Rig};
 use gpu::Gpu;
-use keyframe::{Keyframe, Split, counted};
+use keyframe::{Keyframe, Split};
+use messages::{BadInput, counted};
 use model_files::Edits;
 use model_files::checkpoint::Checkpoint;
 use serde::Serialize;
@@ -231,7 +232,7 @@ fn train(args: &Args, created: &mut CreatedFolders) -> anyhow::Result<Exit> {
     if let Some(file) = &args.write_rig {
         let Some(rig) = &data.rig else {
             let data = args.data.display();
-            return Err(BadArgument(format!(
+            return Err(BadInput(format!(
                 "--write-rig: {data} contains no rig file; use a recording"
             ))
             .into());
@@ -261,7 +262,7 @@ fn train(args: &Args, created: &mut CreatedFolders) -> anyhow::Result<Exit> {
     if let (Some(steps), Some(subject)) = (given_steps, &subject)
         && steps < step
     {
-        return Err(BadArgument(format!(
+        return Err(BadInput(format!(
             "--steps {steps}: {subject} is at step {step}; use at least that many"
         ))
         .into());

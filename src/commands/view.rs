@@ -1,11 +1,12 @@
 //! `fieldrig view`: serves saved models on the web page.
 
 use super::run::notes;
-use crate::exit::{BadArgument, Exit};
+use crate::exit::Exit;
 use crate::open_gpu::open_gpu;
 use crate::page_args::PageArgs;
 use crate::signals;
 use kinematics::Transform;
+use messages::BadInput;
 use nalgebra::{Translation3, UnitQuaternion, Vector3};
 use serde_json::{Value, json};
 use session::{ModelViewer, ServedModel, camera_list, methods, run_folder, scene_hint};
@@ -72,7 +73,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     let model_from_page = args.up.model_from_page();
     let cameras = cameras(&paths);
     let models = paths.iter().map(|path| methods::load(gpu.clone(), path));
-    let mut models = models.collect::<session::Result<Vec<LoadedModel>>>()?;
+    let mut models = models.collect::<anyhow::Result<Vec<LoadedModel>>>()?;
     // Without cameras, the page needs another initial view, from outside the model. The bounds of a
     // model take time, so they are only computed then.
     let bounds = if cameras.is_empty() {
@@ -129,25 +130,25 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
 }
 
 /// Rejects paths that are often mistaken for a model. The error names the command to use instead.
-fn check_is_model(model: &Path) -> Result<(), BadArgument> {
+fn check_is_model(model: &Path) -> Result<(), BadInput> {
     let shown = model.display();
     let is_url = |scheme: &str| model.to_str().is_some_and(|text| text.starts_with(scheme));
     if ["http://", "https://", "ws://", "wss://"]
         .into_iter()
         .any(is_url)
     {
-        return Err(BadArgument(format!(
+        return Err(BadInput(format!(
             "{shown} is the address of a page: open it in a browser; view shows saved models and splat files"
         )));
     }
     if model.is_file() && run_folder::is_recording(model) {
-        return Err(BadArgument(format!(
+        return Err(BadInput(format!(
             "{shown} is a recording, not a model: train a model with `fieldrig train`, or watch one being trained with \
              `fieldrig run RIG.toml --from {shown}`"
         )));
     }
     if drivers::dataset::is_dataset_folder(model) && run_folder::models_at(model).is_err() {
-        return Err(BadArgument(format!(
+        return Err(BadInput(format!(
             "{shown} is a dataset, not a model: train a model with `fieldrig train {shown}` and pass the folder of that run"
         )));
     }

@@ -1,5 +1,6 @@
 //! Errors: specifications, detection, printing.
 
+use messages::Setting;
 use std::fmt;
 
 /// Forms of a target specification, for messages.
@@ -182,7 +183,8 @@ pub enum NotDetected {
     },
     /// The markers are those of a board with other counts.
     #[error(
-        "the markers form a board of {found} {what} (or more rows), not {expected}; correct --target"
+        "the markers form a board of {found} {what} (or more rows), not {expected}; correct {}",
+        Setting::Target
     )]
     OtherCounts {
         /// Columns of the board in the image, and the fewest rows that contain all its marker ids.
@@ -300,7 +302,7 @@ impl fmt::Display for Ids {
             return write!(f, "{} to {}", self.0[0], self.0[self.0.len() - 1]);
         }
         const SHOWN: usize = 8;
-        f.write_str(&kinematics::shortened(&self.0, SHOWN, ", "))
+        f.write_str(&messages::shortened(&self.0, SHOWN, ", "))
     }
 }
 

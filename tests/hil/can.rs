@@ -205,6 +205,7 @@ pub(crate) fn all_families() -> Vec<MotorConfig> {
                 "odrive",
                 Odrive {
                     node: odrive::Node::new(4).expect("a node"),
+                    endpoints: Some(odrive::emulated::endpoints()),
                 },
             )
         },

@@ -263,7 +263,6 @@ pub(crate) fn movable(bus: BusConfig, motors: &[MotorConfig], on_loss: OnLoss) -
             timeout: TIMEOUT,
             accept_no_watchdog: motors.iter().any(is_ak),
         },
-        odrive_endpoints: Some(odrive::emulated::endpoints()),
     }
 }
 
@@ -292,6 +291,7 @@ pub(crate) fn motors_with_watchdog() -> Vec<MotorConfig> {
             "odrive",
             Odrive {
                 node: odrive::Node::new(4).expect("a node"),
+                endpoints: Some(odrive::emulated::endpoints()),
             },
         ),
         drive(5),
@@ -583,16 +583,16 @@ fn unsafe_configurations_are_not_enabled() {
         &with(&|config| config.arm.motors[0].gains = Some(too_stiff)),
         "supports at most 500",
     );
-    let older_endpoints = || {
-        Some(odrive::Endpoints {
-            firmware: "0.6.8".to_owned(),
-            ..odrive::emulated::endpoints()
-        })
+    let older_endpoints = odrive::Endpoints {
+        firmware: "0.6.8".to_owned(),
+        ..odrive::emulated::endpoints()
     };
-    assert_rejected(
-        &with(&|config| config.odrive_endpoints = older_endpoints()),
-        "for firmware 0.6.8",
-    );
+    let set_older_endpoints = |config: &mut MovableArmConfig| {
+        for motor in &mut config.arm.motors {
+            odrive::set_endpoints(&mut motor.protocol, Some(&older_endpoints));
+        }
+    };
+    assert_rejected(&with(&set_older_endpoints), "for firmware 0.6.8");
     let narrow = MotionLimits {
         position: [1.0, 2.0],
         ..LIMITS

@@ -11,7 +11,7 @@ use capture::config::Rig;
 use drivers::can::emulated::{EmulatedProtocol, State};
 use drivers::can::{
     MotionProtocol, MotorConfig, MotorFamily, MotorProtocol, MotorQuery, MotorReading,
-    MotorSettings, MovableCanArm, Reports, Traffic, Watchdog, WatchdogPlan,
+    MotorSettings, MovableCanArm, Reports, Traffic, Watchdog,
 };
 use drivers::motion::{JointTarget, MovableArm, OnLoss};
 use drivers::wire::can::Frame;
@@ -349,8 +349,8 @@ impl MotorProtocol for Failing {
         self.protocol.traffic()
     }
 
-    fn watchdog(&self, plan: &WatchdogPlan) -> Watchdog {
-        self.protocol.watchdog(plan)
+    fn watchdog(&self) -> Watchdog {
+        self.protocol.watchdog()
     }
 
     fn motion(&self, limits: &Limits) -> Box<dyn MotionProtocol> {

@@ -7,7 +7,7 @@ mod realsense_scene;
 use drivers::align::DepthAlignment;
 use drivers::realsense::emulated::{BagWriter, EmulatedCamera, EmulatedDepth};
 use drivers::realsense::{Config, Filter, Pace, RealsenseCamera, Settings, Stream};
-use drivers::{Camera, Devices, Error, Image, Live, Sample, Source};
+use drivers::{Camera, Devices, Error, Image, LiveDevices, Sample, Source};
 use kinematics::{Intrinsics, Lens, Stamp};
 use realsense_scene::{
     BEGIN_NANOS, DEPTH_LATER_NANOS, PERIOD_NANOS, RATE_HZ, aligned_by_library, d435i, depth_image,
@@ -192,7 +192,7 @@ fn file_plays_in_real_time_and_fast_file_loses_nothing() {
     );
     // The file has more images than the queue of a live rig can hold.
     let open = RealsenseCamera::open(config(path, &camera, Pace::Fast)).unwrap();
-    let mut live = Live::new(Devices {
+    let mut live = LiveDevices::new(Devices {
         cameras: vec![Box::new(open)],
         ..Devices::default()
     })
@@ -228,7 +228,7 @@ fn file_on_the_clock_starts_at_its_stamps() {
         ..clock_config
     })
     .unwrap();
-    let mut live = Live::new(Devices {
+    let mut live = LiveDevices::new(Devices {
         cameras: vec![Box::new(open)],
         ..Devices::default()
     })
@@ -266,7 +266,7 @@ fn file_opened_late_starts_at_current_time_without_loss() {
         ..clock_config
     })
     .unwrap();
-    let mut live = Live::new(Devices {
+    let mut live = LiveDevices::new(Devices {
         cameras: vec![Box::new(open)],
         ..Devices::default()
     })

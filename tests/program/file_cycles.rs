@@ -1,46 +1,32 @@
 //! Checks that the source files of each crate do not import each other in cycles.
 //!
-//! The graph is read from the source: `use` items and paths such as `crate::join::Join`, followed
-//! through re-exports to the file that defines the name. A module may import from its parents, and
-//! a parent may re-export its children, so imports of a module's own submodules do not count. Test
-//! code does not count either.
+//! The graph is read from the source: `use` items and paths such as `crate::join::Join`, also in
+//! arguments of macros and attributes. Every name is followed through `use` items, also through
+//! re-exports of other files, to the file that defines it. Glob imports are not followed; the lint
+//! `wildcard_imports` rejects them. A module may import from its parents, and a parent may re-export
+//! its children, so imports of a module's own submodules do not count. Test code does not count
+//! either.
 #![expect(clippy::unwrap_used, reason = "a test that cannot continue may panic")]
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
+use syn::buffer::{Cursor, TokenBuffer};
 use syn::visit::Visit;
 use syn::{Attribute, Item, UseTree};
-
-/// Source folders of the crates, relative to the workspace.
-const ROOTS: [&str; 13] = [
-    "kinematics/src",
-    "keyframe/src",
-    "calibration/src",
-    "trainer/model-files/src",
-    "drivers/src",
-    "sim/src",
-    "capture/src",
-    "trainer/gpu/src",
-    "trainer/src",
-    "viz/src",
-    "session/src",
-    "targets/src",
-    "bench/src",
-    "src",
-];
 
 /// Path of a module within its crate; empty for the crate root.
 type Module = Vec<String>;
 /// The modules that each module imports from.
 type Graph = BTreeMap<Module, BTreeSet<Module>>;
 
-/// Imports and re-exports of one file.
+/// Imports of one file.
 #[derive(Default)]
 struct File {
     /// Paths as written: relative ones start with `self`, `super`, or the name of a submodule.
     paths: Vec<Module>,
-    /// Re-exported names and the paths that they refer to.
-    exports: BTreeMap<String, Module>,
+    /// Names of `use` items and the paths that they refer to. Private ones count, because
+    /// submodules can use them, too.
+    names: BTreeMap<String, Module>,
     /// Submodules in separate files that are compiled only for tests.
     test_modules: Vec<String>,
 }
@@ -96,13 +82,10 @@ impl<'ast> Visit<'ast> for File {
     }
 
     fn visit_item_use(&mut self, item: &'ast syn::ItemUse) {
-        let is_public = !matches!(item.vis, syn::Visibility::Inherited);
         let mut found = Vec::new();
         flatten(&item.tree, &mut Vec::new(), &mut found);
         for (name, path) in found {
-            if is_public {
-                self.exports.insert(name, path.clone());
-            }
+            self.names.insert(name, path.clone());
             self.paths.push(path);
         }
     }
@@ -118,12 +101,62 @@ impl<'ast> Visit<'ast> for File {
         }
         syn::visit::visit_path(self, path);
     }
+
+    fn visit_macro(&mut self, call: &'ast syn::Macro) {
+        let tokens = TokenBuffer::new2(call.tokens.clone());
+        find_paths(tokens.begin(), &mut self.paths);
+        syn::visit::visit_macro(self, call);
+    }
+
+    fn visit_meta_list(&mut self, attribute: &'ast syn::MetaList) {
+        let tokens = TokenBuffer::new2(attribute.tokens.clone());
+        find_paths(tokens.begin(), &mut self.paths);
+        syn::visit::visit_meta_list(self, attribute);
+    }
+}
+
+/// Appends the paths of several segments in tokens that are not parsed, such as arguments of
+/// macros.
+fn find_paths(mut tokens: Cursor<'_>, found: &mut Vec<Module>) {
+    loop {
+        if let Some((path, rest)) = path_at(tokens) {
+            if path.len() > 1 {
+                found.push(path);
+            }
+            tokens = rest;
+        } else if let Some((inside, _, _, rest)) = tokens.any_group() {
+            find_paths(inside, found);
+            tokens = rest;
+        } else if let Some((_, rest)) = tokens.token_tree() {
+            tokens = rest;
+        } else {
+            return;
+        }
+    }
+}
+
+/// The path at the start of some tokens, and the tokens after it.
+fn path_at(tokens: Cursor<'_>) -> Option<(Module, Cursor<'_>)> {
+    let (first, mut rest) = tokens.ident()?;
+    let mut path = vec![first.to_string()];
+    while let Some((segment, after)) = segment_at(rest) {
+        path.push(segment);
+        rest = after;
+    }
+    Some((path, rest))
+}
+
+/// The segment `::name` at the start of some tokens, and the tokens after it.
+fn segment_at(tokens: Cursor<'_>) -> Option<(String, Cursor<'_>)> {
+    let (first, rest) = tokens.punct()?;
+    let (second, rest) = rest.punct()?;
+    let (name, rest) = rest.ident()?;
+    let is_segment = first.as_char() == ':' && second.as_char() == ':';
+    is_segment.then(|| (name.to_string(), rest))
 }
 
 /// The visible names and full paths of a `use` tree.
 fn flatten(tree: &UseTree, prefix: &mut Module, found: &mut Vec<(String, Module)>) {
-    let full =
-        |prefix: &Module, last: String| prefix.iter().cloned().chain([last]).collect::<Module>();
     match tree {
         UseTree::Path(path) => {
             prefix.push(path.ident.to_string());
@@ -131,18 +164,27 @@ fn flatten(tree: &UseTree, prefix: &mut Module, found: &mut Vec<(String, Module)
             prefix.pop();
         }
         UseTree::Name(name) => {
-            found.push((name.ident.to_string(), full(prefix, name.ident.to_string())))
+            let path = full_path(prefix, &name.ident);
+            found.extend(path.last().cloned().map(|name| (name, path)));
         }
-        UseTree::Rename(name) => found.push((
-            name.rename.to_string(),
-            full(prefix, name.ident.to_string()),
-        )),
+        UseTree::Rename(name) => {
+            found.push((name.rename.to_string(), full_path(prefix, &name.ident)));
+        }
         UseTree::Glob(_) => found.push(("*".to_owned(), prefix.clone())),
         UseTree::Group(group) => group
             .items
             .iter()
             .for_each(|tree| flatten(tree, prefix, found)),
     }
+}
+
+/// The path of a name in a `use` tree. The name `self` is the path before it.
+fn full_path(prefix: &Module, name: &syn::Ident) -> Module {
+    let mut path = prefix.clone();
+    if name != "self" {
+        path.push(name.to_string());
+    }
+    path
 }
 
 fn parse(text: &str) -> File {
@@ -174,12 +216,16 @@ fn files_in(root: &Path) -> BTreeMap<Module, File> {
     files
 }
 
+/// Largest number of `use` items through which a name is followed.
+const MAX_DEPTH: u32 = 8;
+
 /// Converts a path that is used in `module` to a path from the crate root; `None` if it leads to
 /// another crate.
 fn absolute(
+    files: &BTreeMap<Module, File>,
     module: &Module,
     path: &[String],
-    is_module: impl Fn(&Module) -> bool,
+    depth: u32,
 ) -> Option<Module> {
     let mut base = module.clone();
     let mut rest = path;
@@ -193,18 +239,24 @@ fn absolute(
             }
         }
         first => {
-            base.push(first.to_owned());
-            if !is_module(&base) {
-                return None;
-            }
             rest = &path[1..];
+            base.push(first.to_owned());
+            if !files.contains_key(&base) {
+                let imported = files.get(module)?.names.get(first)?;
+                let full: Module = imported.iter().chain(rest).cloned().collect();
+                // The name of another crate refers to itself, as in `use serde;`.
+                let is_resolvable = depth < MAX_DEPTH && imported[0] != first;
+                return is_resolvable
+                    .then(|| absolute(files, module, &full, depth + 1))
+                    .flatten();
+            }
         }
     }
     base.extend_from_slice(rest);
     Some(base)
 }
 
-/// The file that defines the item at a path; follows re-exports.
+/// The file that defines the item at a path; follows `use` items.
 fn defining_file(files: &BTreeMap<Module, File>, path: &Module, depth: u32) -> Module {
     let length = (0..=path.len())
         .rev()
@@ -213,12 +265,15 @@ fn defining_file(files: &BTreeMap<Module, File>, path: &Module, depth: u32) -> M
     let (module, rest) = (path[..length].to_vec(), &path[length..]);
     let Some(target) = rest
         .first()
-        .and_then(|name| files.get(&module)?.exports.get(name))
+        .and_then(|name| files.get(&module)?.names.get(name))
     else {
         return module;
     };
-    match absolute(&module, target, |module| files.contains_key(module)) {
-        Some(target) if depth < 8 && target != *path => defining_file(files, &target, depth + 1),
+    let target: Module = target.iter().chain(&rest[1..]).cloned().collect();
+    match absolute(files, &module, &target, depth) {
+        Some(target) if depth < MAX_DEPTH && target != *path => {
+            defining_file(files, &target, depth + 1)
+        }
         _ => module,
     }
 }
@@ -238,7 +293,7 @@ fn graph(files: &BTreeMap<Module, File>) -> Graph {
         .filter(|(module, _)| !is_test(module))
         .map(|(module, file)| {
             let targets = file.paths.iter().filter_map(|path| {
-                let path = absolute(module, path, |module| files.contains_key(module))?;
+                let path = absolute(files, module, path, 0)?;
                 let target = defining_file(files, &path, 0);
                 (!target.starts_with(module) && !is_test(&target)).then_some(target)
             });
@@ -281,40 +336,108 @@ fn cycles(graph: &Graph) -> Vec<String> {
         .collect()
 }
 
+/// The crates of the workspace, as folders relative to it. The root is `.`.
+fn crates() -> Vec<String> {
+    let path = concat!(env!("CARGO_MANIFEST_DIR"), "/Cargo.toml");
+    let manifest: toml::Table = std::fs::read_to_string(path).unwrap().parse().unwrap();
+    let members = manifest["workspace"]["members"].as_array().unwrap();
+    members
+        .iter()
+        .map(|member| member.as_str().unwrap().to_owned())
+        .chain([".".to_owned()])
+        .collect()
+}
+
+/// All files of a crate of the workspace by module.
+fn files_of_crate(folder: &str) -> BTreeMap<Module, File> {
+    let workspace = Path::new(env!("CARGO_MANIFEST_DIR"));
+    files_in(&workspace.join(folder).join("src"))
+}
+
 #[test]
 fn files_do_not_import_each_other_in_cycles() {
-    let workspace = Path::new(env!("CARGO_MANIFEST_DIR"));
     let mut found = Vec::new();
-    for root in ROOTS {
-        let files = files_in(&workspace.join(root));
-        let graph = graph(&files);
-        assert!(
-            graph.len() == 1 || graph.values().any(|targets| !targets.is_empty()),
-            "{root}: no imports were found"
-        );
+    let mut n_files = 0;
+    let mut n_imports = 0;
+    for folder in crates() {
+        let graph = graph(&files_of_crate(&folder));
+        assert!(!graph.is_empty(), "{folder}: no files were found");
+        n_files += graph.len();
+        n_imports += graph.values().map(BTreeSet::len).sum::<usize>();
         found.extend(
             cycles(&graph)
                 .into_iter()
-                .map(|edge| format!("{root}: {edge}")),
+                .map(|edge| format!("{folder}: {edge}")),
         );
     }
+    assert!(
+        n_imports > n_files,
+        "only {n_imports} imports were found in {n_files} files"
+    );
     assert_eq!(found, Vec::<String>::new());
+}
+
+/// Imports of a motor family by code outside its folder. Families have a file `codec.rs`.
+fn imports_of_families(graph: &Graph) -> Vec<String> {
+    let families: BTreeSet<&[String]> = graph
+        .keys()
+        .filter(|module| module.len() == 3 && module[0] == "can" && module[2] == "codec")
+        .map(|module| &module[..2])
+        .collect();
+    assert!(!families.is_empty(), "no motor family was found");
+    let mut found = Vec::new();
+    for (module, targets) in graph {
+        for family in &families {
+            let imports = targets.iter().any(|target| target.starts_with(family));
+            if imports && !module.starts_with(family) {
+                found.push(format!("{} -> {}", module.join("::"), family.join("::")));
+            }
+        }
+    }
+    found
+}
+
+/// The list `FAMILIES` in `drivers/src/can/mod.rs` is an import of a module's own submodules, which
+/// does not count.
+#[test]
+fn code_for_all_motor_families_imports_no_family() {
+    let graph = graph(&files_of_crate("drivers"));
+    assert_eq!(imports_of_families(&graph), Vec::<String>::new());
+}
+
+/// Files of a crate by the path of their module, such as `a::b`.
+fn parse_all(sources: &[(&str, &str)]) -> BTreeMap<Module, File> {
+    sources
+        .iter()
+        .map(|(path, text)| (module_at(path), parse(text)))
+        .collect()
+}
+
+fn module_at(path: &str) -> Module {
+    path.split("::")
+        .filter(|part| !part.is_empty())
+        .map(str::to_owned)
+        .collect()
+}
+
+#[test]
+fn imports_of_a_motor_family_are_found_through_re_exports() {
+    let sources = [
+        ("", "mod can;"),
+        ("can", "mod a; mod plan; pub use a::Ids;"),
+        ("can::a", "mod codec; mod ids; pub use ids::Ids;"),
+        ("can::a::codec", "use super::Ids;"),
+        ("can::a::ids", "pub struct Ids;"),
+        ("can::plan", "use super::Ids;"),
+    ];
+    assert_eq!(
+        imports_of_families(&graph(&parse_all(&sources))),
+        ["can::plan -> can::a"]
+    );
 }
 
 #[test]
 fn cycles_are_found_through_re_exports_and_paths() {
-    let files = |sources: &[(&str, &str)]| -> BTreeMap<Module, File> {
-        let module = |name: &str| {
-            name.split("::")
-                .filter(|part| !part.is_empty())
-                .map(str::to_owned)
-                .collect()
-        };
-        sources
-            .iter()
-            .map(|(name, text)| (module(name), parse(text)))
-            .collect()
-    };
     let sources = [
         ("", "mod a; mod b; #[cfg(test)] mod t; pub use b::inner::B;"),
         ("a", "use crate::B; use super::t::T; pub struct A;"),
@@ -323,7 +446,7 @@ fn cycles_are_found_through_re_exports_and_paths() {
         ("t", "use crate::a::A;"),
     ];
     assert_eq!(
-        cycles(&graph(&files(&sources))),
+        cycles(&graph(&parse_all(&sources))),
         ["a -> b::inner", "b::inner -> a"]
     );
     let acyclic = [
@@ -335,5 +458,24 @@ fn cycles_are_found_through_re_exports_and_paths() {
             "pub struct B; #[cfg(test)] mod x { use crate::a::A; }",
         ),
     ];
-    assert_eq!(cycles(&graph(&files(&acyclic))), Vec::<String>::new());
+    assert_eq!(cycles(&graph(&parse_all(&acyclic))), Vec::<String>::new());
+}
+
+#[test]
+fn cycles_are_found_through_imported_modules_and_macros() {
+    let root = ("", "mod a; mod b;");
+    let b = ("b", "mod inner; pub use inner::B;");
+    let inner = ("b::inner", "use crate::a::A; pub struct B;");
+    for a in [
+        "use super::b; pub struct A(b::B);",
+        "use super::b::{self}; pub struct A(b::B);",
+        "pub struct A; fn f() { log::warn!(\"{:?}\", (crate::b::B)); }",
+        "#[error(\"{}\", crate::b::B)] pub struct A;",
+    ] {
+        assert_eq!(
+            cycles(&graph(&parse_all(&[root, ("a", a), b, inner]))),
+            ["a -> b::inner", "b::inner -> a"],
+            "{a}"
+        );
+    }
 }

@@ -8,7 +8,6 @@
 //! model moves along with them or restarts, see [`Method::recalibrate`].
 
 use crate::corrected_keyframe::{CorrectedKeyframe, id_of};
-use crate::floaters::PendingFloaters;
 use crate::model_metadata::{METADATA_FILE, read_metadata};
 use crate::model_options::{AlignTiming, CommonOptions};
 use crate::pending::PendingCheckpoint;
@@ -17,11 +16,9 @@ use calibration::{
     Alignment, AlignmentTask, CalibratedCamera, CameraRefinement, MOVEMENT_WINDOW, MovementTask,
     alignment_step,
 };
-use gpu::{Gpu, PassTiming};
 use keyframe::{Keyframe, Split};
 use kinematics::Stamp;
 use model_files::checkpoint::Checkpoint;
-use model_files::{Edits, InitialPoints};
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 use std::path::Path;

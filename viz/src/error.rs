@@ -1,5 +1,6 @@
 //! Errors that occur when the server starts.
 
+use messages::Setting;
 use std::net::SocketAddr;
 use std::path::PathBuf;
 
@@ -9,7 +10,8 @@ use std::path::PathBuf;
 pub enum Error {
     /// Another program uses the port.
     #[error(
-        "the address {address} is in use by another program: stop that program or choose another port with --listen"
+        "the address {address} is in use by another program: stop that program or choose another port with {}",
+        Setting::Listen
     )]
     AddressInUse {
         /// Requested address.
@@ -17,7 +19,8 @@ pub enum Error {
     },
     /// The address is reachable from other machines, and the server is not shared.
     #[error(
-        "other machines can reach the address {address}: add --share, which encrypts the page and requires a token"
+        "other machines can reach the address {address}: add {}, which encrypts the page and requires a token",
+        Setting::Share
     )]
     NotLoopback {
         /// Requested address.

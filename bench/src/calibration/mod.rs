@@ -13,13 +13,12 @@ mod scene;
 mod speed;
 mod stability;
 
-use crate::Result;
 use crate::findings::BenchResult;
+use anyhow::{Context, Result};
 use arm_configurations::ArmConfiguration;
 use coverage::Coverage;
 use rigs::RigResult;
 use serde::Serialize;
-use session::Context;
 use speed::Speed;
 use stability::Cell;
 use std::path::PathBuf;

@@ -6,8 +6,8 @@ use super::speed::Speed;
 use super::stability::{Cell, OutlierType, methods};
 use super::{ArmConfiguration, CalibrationOptions, Results, RigResult};
 use crate::findings::Findings;
-use session::Table;
-use session::chart::{Axis, Chart, Line, Point, Scale};
+use report::Table;
+use report::chart::{Axis, Chart, Line, Point, Scale};
 
 /// Conditions of the sweeps in the charts; each chart varies one of them.
 const BASE_SPREAD_DEG: f64 = 20.0;

@@ -2,11 +2,12 @@
 //! direction.
 
 use super::method::Errors;
-use crate::{Error, Result};
+use anyhow::Result;
 use capture::config::{Override, Rig};
 use capture::open::{self, Devices};
 use kinematics::random::Random;
 use kinematics::{Stamp, Transform};
+use messages::InsufficientData;
 use nalgebra::Vector3;
 use serde::Serialize;
 use session::{Data, Refine, calibrate_scene, ignore_progress};
@@ -38,7 +39,7 @@ pub(super) fn measure(rig_file: &Path, seed: u64, scan_secs: f64) -> Result<RigR
         Override::new("sim.lockstep", true),
         Override::new("sim.seed", seed_of_scene),
     ];
-    let mut rig = Rig::load(rig_file, &overrides).map_err(capture::Error::from)?;
+    let mut rig = Rig::load(rig_file, &overrides)?;
     // The simulated camera stays where it is. Only the pose in the rig file becomes wrong.
     let camera = &mut rig.cameras[0];
     let truth = camera
@@ -64,7 +65,7 @@ pub(super) fn measure(rig_file: &Path, seed: u64, scan_secs: f64) -> Result<RigR
     let started = Instant::now();
     let found = match calibrate_scene(&data, &[Refine::Auto], Some(&given)) {
         Ok(found) => found,
-        Err(Error::InsufficientData(_)) => {
+        Err(error) if error.is::<InsufficientData>() => {
             return Ok(RigResult::refused(seed, data.keyframes.len(), started));
         }
         Err(error) => return Err(error),

@@ -1,19 +1,14 @@
 //! Result of a hand-eye calibration: transforms, uncertainty, and errors per sample.
 
-use super::closed_form::ClosedForm;
-use super::error_sources;
-use super::evaluation::{self, Scatter};
-use super::geometry;
-use super::mistakes;
-use super::pose_fit::{self, HandEyeNoise, Measurement};
-use super::refine::{self, Refined};
-use super::samples;
-use super::selection;
+use super::geometry::{self, Scatter, Solution};
+use super::samples::{self, Sample, used};
+use super::solve::{self, HandEyeNoise, Refined};
 use super::{HandEyeInput, Setup};
+use crate::intrinsics::point_fits;
 use crate::least_squares::sigma_of;
-use crate::{BoardPoint, Error, PointFit};
+use crate::{Error, PointFit};
 use kinematics::{Intrinsics, Transform};
-use nalgebra::Matrix6;
+use nalgebra::{Matrix6, Vector3};
 
 /// Result of [`super::calibrate_hand_eye`].
 #[derive(Clone, Debug)]
@@ -45,8 +40,6 @@ pub struct HandEyeCalibration {
     pub held_out_rms_px: Option<f64>,
     /// Estimated measurement errors.
     pub noise: HandEyeNoise,
-    /// Closed form that gave the initial solution: that with the smallest leave-one-out scatter.
-    pub closed_form: ClosedForm,
     /// Intrinsics, if they were estimated, and their standard deviations in the order of
     /// [`Intrinsics::params`].
     pub intrinsics: Option<(Intrinsics, Vec<f64>)>,
@@ -112,39 +105,37 @@ pub struct SampleReport {
 const MAX_JOINT_SIGMA: f64 = 0.0175;
 
 /// Evaluates a refined solution.
+///
+/// * `repeated`: indices of the samples that were not used again.
 pub(super) fn report(
     input: &HandEyeInput<'_>,
     refined: &Refined,
-    without_board: &[usize],
     repeated: &[usize],
 ) -> Result<HandEyeCalibration, Error> {
-    let measurements = refined.measurements();
-    let boards = measurements
-        .iter()
-        .map(|m| refine::board_in_parent(&refined.solution, m));
-    let internal = || Error::HandEyeInput {
+    let boards: Vec<Transform> = used(&refined.samples)
+        .map(|sample| {
+            let solution = &refined.solution;
+            solution.board(&sample.a, &sample.chosen().camera_from_board)
+        })
+        .collect();
+    let scatter = geometry::scatter(&boards).ok_or_else(|| Error::HandEyeInput {
         why: "the board poses have no mean rotation".to_owned(),
-    };
-    let scatter = evaluation::scatter(&boards.collect::<Vec<_>>()).ok_or_else(internal)?;
-    let held_out = HeldOut::new(input, refined, &measurements);
+    })?;
+    let (held_out_scatter, held_out_rms_px) = held_out_errors(input, refined);
     let covariance = position_first(&refined.covariance.fixed_view::<6, 6>(0, 0).into_owned());
     let sigma =
         |first: usize| [0, 1, 2].map(|axis| sigma_of(covariance[(first + axis, first + axis)]));
     let mut samples = sample_reports(input, refined);
-    // Every sample has exactly one status.
-    debug_assert_eq!(
-        refined.samples.len() + without_board.len() + repeated.len(),
-        samples.len()
-    );
     for ix in repeated {
         samples[*ix].status = SampleStatus::Repeated;
     }
-    let rms_all_px = rms_px(input, refined, |_| Some(refined.solution));
+    let rms_px = rms_px(input, refined, |_| Some(refined.solution));
     let mut warnings = problems(input, refined, &samples);
     // Contradicting intrinsics are the more precise explanation.
     if refined.intrinsics_doubt.is_none() {
-        warnings.extend(error_sources::warning(&refined.noise, scatter, rms_all_px));
+        warnings.extend(large_errors(&refined.noise, scatter, rms_px));
     }
+    let estimated = refined.intrinsics.clone();
     Ok(HandEyeCalibration {
         setup: input.setup,
         parent_from_camera: refined.solution.x,
@@ -153,14 +144,11 @@ pub(super) fn report(
         sigma_mm: sigma(0).map(|sigma_m| 1e3 * sigma_m),
         sigma_deg: sigma(3).map(f64::to_degrees),
         scatter,
-        held_out_scatter: held_out.scatter,
-        rms_px: rms_all_px,
-        held_out_rms_px: held_out.rms_px,
+        held_out_scatter,
+        rms_px,
+        held_out_rms_px,
         noise: refined.noise,
-        closed_form: refined.closed_form,
-        intrinsics: refined
-            .intrinsics
-            .clone()
+        intrinsics: estimated
             .filter(|_| input.options.estimate_intrinsics)
             .map(|intrinsics| (intrinsics, refined.intrinsics_sigma.clone())),
         joint_offsets: joint_offsets(input, refined),
@@ -175,34 +163,28 @@ fn position_first(covariance: &Matrix6<f64>) -> Matrix6<f64> {
     Matrix6::from_fn(|row, column| covariance[((row + 3) % 6, (column + 3) % 6)])
 }
 
-/// Errors of held-out samples.
-struct HeldOut {
-    scatter: Option<Scatter>,
-    rms_px: Option<f64>,
-}
-
-impl HeldOut {
-    fn new(input: &HandEyeInput<'_>, refined: &Refined, measurements: &[Measurement]) -> Self {
-        // With corners, the weights were chosen by held-out errors.
-        let knows_noise = refined.noise.corner_px.is_some();
-        let folds = evaluation::held_out_solutions(
-            input.setup,
-            measurements,
-            refined.solution,
-            refined.weighting,
-            knows_noise,
-        );
-        let boards: Option<Vec<Transform>> = folds
-            .iter()
-            .zip(measurements)
-            .map(|(solution, m)| Some(refine::board_in_parent(solution.as_ref()?, m)))
-            .collect();
-        let scatter = boards
-            .filter(|boards| !boards.is_empty())
-            .and_then(|boards| evaluation::scatter(&boards));
-        let rms_px = scatter.and_then(|_| rms_px(input, refined, |used_ix| folds[used_ix]));
-        Self { scatter, rms_px }
-    }
+/// Scatter and RMS reprojection error of held-out samples.
+fn held_out_errors(input: &HandEyeInput<'_>, refined: &Refined) -> (Option<Scatter>, Option<f64>) {
+    let measurements = solve::measurements(&refined.samples);
+    // With corners, the weights were chosen by held-out errors.
+    let knows_noise = refined.noise.corner_px.is_some();
+    let folds = solve::held_out_solutions(
+        input.setup,
+        &measurements,
+        refined.solution,
+        refined.weighting,
+        knows_noise,
+    );
+    let boards: Option<Vec<Transform>> = folds
+        .iter()
+        .zip(&measurements)
+        .map(|(solution, m)| Some(solution.as_ref()?.board(&m.a, &m.camera_from_board)))
+        .collect();
+    let scatter = boards
+        .filter(|boards| !boards.is_empty())
+        .and_then(|boards| geometry::scatter(&boards));
+    let rms_px = scatter.and_then(|_| rms_px(input, refined, |used_ix| folds[used_ix]));
+    (scatter, rms_px)
 }
 
 /// RMS reprojection error of the used samples, with one solution per used sample. `None` for given
@@ -210,24 +192,15 @@ impl HeldOut {
 fn rms_px(
     input: &HandEyeInput<'_>,
     refined: &Refined,
-    solution: impl Fn(usize) -> Option<geometry::Solution>,
+    solution: impl Fn(usize) -> Option<Solution>,
 ) -> Option<f64> {
     let intrinsics = refined.intrinsics.as_ref()?;
-    let used = refined
-        .samples
-        .iter()
-        .zip(&refined.choice)
-        .zip(&refined.is_inlier)
-        .filter(|(_, is_inlier)| **is_inlier);
     let mut squares = 0.0;
     let mut n = 0;
-    for (used_ix, ((sample, choice), _)) in used.enumerate() {
-        let points = selection::corners(input, sample, *choice);
-        squares += evaluation::reprojection_squares(
-            &refine::predicted(&solution(used_ix)?, sample),
-            &points,
-            intrinsics,
-        );
+    for (used_ix, sample) in used(&refined.samples).enumerate() {
+        let points = sample.corners(input);
+        let predicted = solution(used_ix)?.camera_from_board(&sample.a);
+        squares += geometry::reprojection_squares(&predicted, &points, intrinsics);
         n += points.len();
     }
     (n > 0).then(|| (squares / n as f64).sqrt())
@@ -235,9 +208,8 @@ fn rms_px(
 
 /// The errors of all samples, in the order of the input.
 fn sample_reports(input: &HandEyeInput<'_>, refined: &Refined) -> Vec<SampleReport> {
-    let mut reports: Vec<SampleReport> = input
-        .samples
-        .iter()
+    let given = input.samples.iter();
+    let mut reports: Vec<SampleReport> = given
         .map(|sample| SampleReport {
             name: sample.name.clone(),
             status: SampleStatus::NoBoard,
@@ -249,10 +221,13 @@ fn sample_reports(input: &HandEyeInput<'_>, refined: &Refined) -> Vec<SampleRepo
             points: Vec::new(),
         })
         .collect();
-    for (ix, sample) in refined.samples.iter().enumerate() {
+    let solution = &refined.solution;
+    for sample in &refined.samples {
         let report = &mut reports[sample.sample_ix];
-        let residual = refine::sample_residual(&refined.solution, sample, refined.choice[ix]);
-        report.status = if refined.is_inlier[ix] {
+        let predicted = solution.camera_from_board(&sample.a);
+        let measured = &sample.chosen().camera_from_board;
+        let residual = geometry::residual(&predicted, measured);
+        report.status = if sample.is_used {
             SampleStatus::Used
         } else {
             SampleStatus::Outlier
@@ -260,45 +235,18 @@ fn sample_reports(input: &HandEyeInput<'_>, refined: &Refined) -> Vec<SampleRepo
         report.rotation_deg = Some(residual.fixed_rows::<3>(0).norm().to_degrees());
         report.position_mm = Some(1e3 * residual.fixed_rows::<3>(3).norm());
         // The squared distance has six degrees of freedom.
-        report.normalized = Some((refined.squared_distances[ix] / 6.0).sqrt());
-        let board =
-            sample.a * refined.solution.x * sample.candidates[refined.choice[ix]].camera_from_board;
-        report.board_offset_mm =
-            Some(((board.translation.vector - refined.solution.y.translation.vector) * 1e3).into());
-        let points = selection::corners(input, sample, refined.choice[ix]);
-        let pose = refine::predicted(&refined.solution, sample);
-        report.rms_px = refined
-            .intrinsics
-            .as_ref()
-            .filter(|_| !points.is_empty())
-            .map(|intrinsics| {
-                (evaluation::reprojection_squares(&pose, &points, intrinsics) / points.len() as f64)
-                    .sqrt()
-            });
+        report.normalized = Some((sample.squared_distance / 6.0).sqrt());
+        let board = solution.board(&sample.a, measured);
+        let offset_m = board.translation.vector - solution.y.translation.vector;
+        report.board_offset_mm = Some((offset_m * 1e3).into());
         if let Some(intrinsics) = &refined.intrinsics {
-            report.points = point_fits(&pose, &points, intrinsics);
+            let points = sample.corners(input);
+            let squares = geometry::reprojection_squares(&predicted, &points, intrinsics);
+            report.rms_px = (!points.is_empty()).then(|| (squares / points.len() as f64).sqrt());
+            report.points = point_fits(intrinsics, &predicted, &points);
         }
     }
     reports
-}
-
-/// Reprojection errors of corners. Corners that cannot be projected are left out.
-fn point_fits(
-    camera_from_board: &Transform,
-    points: &[BoardPoint],
-    intrinsics: &Intrinsics,
-) -> Vec<PointFit> {
-    points
-        .iter()
-        .filter_map(|point| {
-            let point_in_board = nalgebra::Point3::from(point.point_in_board);
-            let [u, v] = intrinsics.project(&(camera_from_board * point_in_board).coords)?;
-            Some(PointFit {
-                pixel: point.pixel,
-                residual_px: [point.pixel[0] - u, point.pixel[1] - v],
-            })
-        })
-        .collect()
 }
 
 /// One entry per joint of the chain, if offsets were estimated.
@@ -325,74 +273,40 @@ fn joint_offsets(input: &HandEyeInput<'_>, refined: &Refined) -> Vec<JointOffset
 }
 
 /// Names of the samples with a status.
-fn named(reports: &[SampleReport], status: SampleStatus) -> Vec<&str> {
-    reports
-        .iter()
-        .filter(|report| report.status == status)
-        .map(|report| report.name.as_str())
-        .collect()
+fn with_status(reports: &[SampleReport], status: SampleStatus) -> Vec<&str> {
+    let reports = reports.iter().filter(|report| report.status == status);
+    reports.map(|report| report.name.as_str()).collect()
 }
 
 /// Problems that do not invalidate the result: those of the lens, of single samples, and of their
 /// number.
 fn problems(input: &HandEyeInput<'_>, refined: &Refined, reports: &[SampleReport]) -> Vec<String> {
     let mut warnings: Vec<String> = refined.intrinsics_doubt.clone().into_iter().collect();
-    let outliers = named(reports, SampleStatus::Outlier);
-    if !outliers.is_empty() {
-        warnings.push(format!(
-            "{} samples disagree with the others and were not used: {}",
-            outliers.len(),
-            outliers.join(", ")
-        ));
+    let repeated = with_status(reports, SampleStatus::Repeated);
+    let are = if repeated.len() == 1 {
+        "sample is"
+    } else {
+        "samples are"
+    };
+    let repeat = format!("{are} identical to an earlier one and not used again");
+    for (names, problem) in [
+        (
+            with_status(reports, SampleStatus::Outlier),
+            "samples disagree with the others and were not used",
+        ),
+        (
+            with_status(reports, SampleStatus::NoBoard),
+            "images do not show enough corners for a pose",
+        ),
+        (mirrored(input, refined), "samples show the board mirrored"),
+        (repeated, repeat.as_str()),
+    ] {
+        if !names.is_empty() {
+            warnings.push(format!("{} {problem}: {}", names.len(), names.join(", ")));
+        }
     }
-    let without = named(reports, SampleStatus::NoBoard);
-    if !without.is_empty() {
-        warnings.push(format!(
-            "{} images do not show enough corners for a pose: {}",
-            without.len(),
-            without.join(", ")
-        ));
-    }
-    // A mirrored board in single samples is a detection with swapped corners; in most samples, it
-    // is the way the board is described.
-    let poses: Vec<(usize, Transform)> = refined
-        .samples
-        .iter()
-        .zip(&refined.choice)
-        .map(|(sample, choice)| {
-            (
-                sample.sample_ix,
-                sample.candidates[*choice].camera_from_board,
-            )
-        })
-        .collect();
-    let mirrored = mistakes::mirrored(&input.samples, &poses);
-    if !mirrored.is_empty() {
-        warnings.push(format!(
-            "{} samples show the board mirrored: {}",
-            mirrored.len(),
-            mirrored.join(", ")
-        ));
-    }
-    let repeated = named(reports, SampleStatus::Repeated);
-    if !repeated.is_empty() {
-        let what = if repeated.len() == 1 {
-            "sample is"
-        } else {
-            "samples are"
-        };
-        warnings.push(format!(
-            "{} {what} identical to an earlier one and not used again: {}",
-            repeated.len(),
-            repeated.join(", ")
-        ));
-    }
-    let n_used = refined
-        .is_inlier
-        .iter()
-        .filter(|is_inlier| **is_inlier)
-        .count();
-    let n_stops = samples::n_stops(&refined.samples, &refined.is_inlier);
+    let n_used = used(&refined.samples).count();
+    let n_stops = samples::n_stops(&refined.samples);
     if n_stops < n_used {
         warnings.push(format!(
             "{n_used} samples were taken at {n_stops} different robot poses: samples at the same pose share its error and count as one"
@@ -406,39 +320,86 @@ fn problems(input: &HandEyeInput<'_>, refined: &Refined, reports: &[SampleReport
     warnings
 }
 
-/// Distance of a calibration from the truth in its own uncertainty: 95 % of the results stay below
-/// 12.59.
-#[cfg(test)]
-pub(super) fn squared_error(calibration: &HandEyeCalibration, truth: &Transform) -> f64 {
-    let difference = calibration.parent_from_camera.inverse() * truth;
-    let rotation = difference.rotation.scaled_axis();
-    let translation = difference.translation.vector;
-    let error = nalgebra::Vector6::new(
-        translation.x,
-        translation.y,
-        translation.z,
-        rotation.x,
-        rotation.y,
-        rotation.z,
-    );
-    calibration
-        .covariance
-        .cholesky()
-        .map_or(f64::INFINITY, |factor| error.dot(&factor.solve(&error)))
+/// Names of the samples whose board is seen from the other side than in most samples: its corners
+/// are mirrored. In single samples, this is a detection with swapped corners; in most samples, it
+/// is the way the board is described.
+fn mirrored<'a>(input: &'a HandEyeInput<'_>, refined: &Refined) -> Vec<&'a str> {
+    // The board's z axis points away from a viewer of the printed side.
+    let is_front = |sample: &Sample| {
+        let pose = &sample.chosen().camera_from_board;
+        (pose.rotation * Vector3::z()).dot(&pose.translation.vector) > 0.0
+    };
+    let samples = &refined.samples;
+    let n_front = samples.iter().filter(|sample| is_front(sample)).count();
+    let majority = 2 * n_front >= samples.len();
+    samples
+        .iter()
+        .filter(|sample| is_front(sample) != majority)
+        .map(|sample| input.samples[sample.sample_ix].name.as_str())
+        .collect()
 }
 
-/// Covariance of a residual, for information gains.
-pub(super) fn residual_information(
-    setup: Setup,
-    measurement: &Measurement,
-    solution: &geometry::Solution,
-    noise: &HandEyeNoise,
-) -> Option<(geometry::Matrix6x12, Matrix6<f64>)> {
-    let predicted = solution.camera_from_board(&measurement.a);
-    // A future measurement is expected to have no residual.
-    let jacobian = geometry::residual_jacobian(&predicted, &nalgebra::Vector6::zeros());
-    let weight = pose_fit::covariance(setup, measurement, solution, noise)
-        .cholesky()?
-        .inverse();
-    Some((jacobian, weight))
+/// Errors that industrial arms, boards and calibrated cameras stay below. Lower limits would warn
+/// of inexpensive arms, whose errors are no mistake.
+const MAX_RMS_PX: f64 = 3.0;
+const MAX_SCATTER: Scatter = Scatter { mm: 5.0, deg: 0.5 };
+/// Residual of sharp corners after a separate fit of each image, pixels. A right lens leaves a few
+/// tenths of a pixel at most.
+const MAX_RESIDUAL_PX: f64 = 0.7;
+
+/// A sentence on the likely cause if the errors are larger than those of usual arms and cameras.
+///
+/// If each image on its own fits the board, lens and board are right, and the robot poses are not
+/// those of the images.
+fn large_errors(noise: &HandEyeNoise, scatter: Scatter, rms_px: Option<f64>) -> Option<String> {
+    let has_large_error = rms_px.is_some_and(|rms_px| rms_px > MAX_RMS_PX)
+        || scatter.mm > MAX_SCATTER.mm
+        || scatter.deg > MAX_SCATTER.deg;
+    has_large_error.then_some(())?;
+    let reprojection = rms_px.map_or_else(String::new, |rms_px| format!("{rms_px:.1} px, "));
+    let errors = format!(
+        "the errors are large ({reprojection}{:.1} mm and {:.2} degrees; errors are usually at most {MAX_RMS_PX} px, {} mm and {} degrees)",
+        scatter.mm, scatter.deg, MAX_SCATTER.mm, MAX_SCATTER.deg
+    );
+    // Checks of everything between a robot pose and its image, the most common mistakes first.
+    let robot = "check that the arm stood still in each image, that each pose belongs to its image (time offset), that the flange or tool frame is the same in all poses, and that the target and the camera did not move";
+    Some(match noise.residual_px {
+        Some(residual_px) if residual_px > MAX_RESIDUAL_PX => format!(
+            "{errors}; even single images differ from the board by {residual_px:.1} px, so the lens or the target is wrong: calibrate the intrinsics, and check that the target is flat and has the given size"
+        ),
+        Some(residual_px) => format!(
+            "{errors}, but single images fit the board within {residual_px:.1} px, so lens and target are right and the robot poses do not match the images: {robot}"
+        ),
+        None => format!("{errors}; {robot}, and that the intrinsics of the board poses are right"),
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn cause_of_large_errors_is_named() {
+        let noise = |residual_px| HandEyeNoise {
+            corner_px: residual_px,
+            residual_px,
+            rotation_rad: 1e-3,
+            translation_m: 1e-3,
+        };
+        let (small, large) = (Scatter { mm: 1.0, deg: 0.1 }, Scatter { mm: 4.0, deg: 0.8 });
+        assert_eq!(large_errors(&noise(Some(0.2)), small, Some(1.0)), None);
+        let robot = large_errors(&noise(Some(0.2)), large, Some(9.0)).unwrap();
+        assert!(
+            robot.contains("9.0 px, 4.0 mm and 0.80 degrees")
+                && robot.contains("robot poses do not match"),
+            "{robot}"
+        );
+        let lens = large_errors(&noise(Some(2.0)), small, Some(9.0)).unwrap();
+        assert!(lens.contains("the lens or the target is wrong"), "{lens}");
+        let poses = large_errors(&noise(None), large, None).unwrap();
+        assert!(
+            poses.contains("(4.0 mm") && poses.contains("time offset"),
+            "{poses}"
+        );
+    }
 }

@@ -3,9 +3,7 @@
 use super::homography::{self, homography};
 use crate::BoardPoint;
 use kinematics::{Intrinsics, Lens, Transform};
-use nalgebra::{
-    Matrix3, Matrix6, Point3, SVector, Translation3, UnitQuaternion, Vector2, Vector3, Vector6,
-};
+use nalgebra::{Matrix3, Matrix6, Point3, Translation3, UnitQuaternion, Vector2, Vector3, Vector6};
 
 /// Pose of a target and its reprojection error.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -170,35 +168,49 @@ pub(super) fn refine(
     })
 }
 
+/// Reprojection error of a point, projected minus detected, pixels, and its derivatives with respect
+/// to the step of [`moved`], one array per component. `None` if the lens cannot image the point.
+pub(crate) fn residual(
+    intrinsics: &Intrinsics,
+    point: &BoardPoint,
+    pose: &Transform,
+) -> Option<([f64; 2], [[f64; 6]; 2])> {
+    let in_camera = (pose * Point3::from(point.point_in_board)).coords;
+    let (pixel, by_point) = intrinsics.project_with_jacobian(&in_camera)?;
+    let by_rotation = by_point * by_rotation(pose, &point.point_in_board);
+    let rows = [0_usize, 1].map(|axis| {
+        let [a, b, c] = [0_usize, 1, 2].map(|ix| by_rotation[(axis, ix)]);
+        let [x, y, z] = [0_usize, 1, 2].map(|ix| by_point[(axis, ix)]);
+        [a, b, c, x, y, z]
+    });
+    Some(([0, 1].map(|axis| pixel[axis] - point.pixel[axis]), rows))
+}
+
 /// Normal equations of the reprojection error of one image, for the step of [`moved`].
-struct NormalEquations {
-    matrix: Matrix6<f64>,
-    gradient: Vector6<f64>,
+pub(crate) struct NormalEquations {
+    /// Information about the pose for corners with an error of one pixel.
+    pub(crate) matrix: Matrix6<f64>,
+    pub(crate) gradient: Vector6<f64>,
     /// Sum of the squared residuals.
     squares: f64,
 }
 
 impl NormalEquations {
-    fn new(intrinsics: &Intrinsics, points: &[BoardPoint], pose: &Transform) -> Option<Self> {
+    /// `None` if the lens cannot image a point.
+    pub(crate) fn new(
+        intrinsics: &Intrinsics,
+        points: &[BoardPoint],
+        pose: &Transform,
+    ) -> Option<Self> {
         let mut sums = Self {
             matrix: Matrix6::zeros(),
             gradient: Vector6::zeros(),
             squares: 0.0,
         };
         for point in points {
-            let in_camera = (pose * Point3::from(point.point_in_board)).coords;
-            let (pixel, by_point) = intrinsics.project_with_jacobian(&in_camera)?;
-            let by_rotation = by_point * by_rotation(pose, &point.point_in_board);
-            for axis in 0..2 {
-                let residual = pixel[axis] - point.pixel[axis];
-                let row = SVector::from([
-                    by_rotation[(axis, 0)],
-                    by_rotation[(axis, 1)],
-                    by_rotation[(axis, 2)],
-                    by_point[(axis, 0)],
-                    by_point[(axis, 1)],
-                    by_point[(axis, 2)],
-                ]);
+            let (residual, rows) = residual(intrinsics, point, pose)?;
+            for (residual, row) in residual.into_iter().zip(rows) {
+                let row = Vector6::from(row);
                 sums.matrix.ger(1.0, &row, &row, 1.0);
                 sums.gradient.axpy(residual, &row, 1.0);
                 sums.squares += residual * residual;

@@ -23,37 +23,17 @@ pub(super) struct Bundle {
 }
 
 impl Bundle {
-    /// Detected minus projected position of each point. `None` where the lens cannot image the
-    /// point.
-    pub(super) fn residuals(
-        &self,
-        image_ix: usize,
-        points: &[BoardPoint],
-    ) -> Vec<Option<Vector2<f64>>> {
-        let pose = &self.poses[image_ix];
+    /// Distances between detected and projected points, pixels; infinite where the lens cannot image
+    /// the point.
+    pub(super) fn errors_px(&self, image_ix: usize, points: &[BoardPoint]) -> Vec<f64> {
+        let error_px = |point: &BoardPoint| {
+            let in_camera = self.poses[image_ix] * Point3::from(point.point_in_board);
+            let [u, v] = self.intrinsics.project(&in_camera.coords)?;
+            Some(Vector2::new(point.pixel[0] - u, point.pixel[1] - v).norm())
+        };
         points
             .iter()
-            .map(|point| self.residual(pose, point))
-            .collect()
-    }
-
-    fn residual(&self, camera_from_board: &Transform, point: &BoardPoint) -> Option<Vector2<f64>> {
-        let in_camera = camera_from_board * Point3::from(point.point_in_board);
-        let projected = self.intrinsics.project(&in_camera.coords)?;
-        Some(Vector2::new(
-            point.pixel[0] - projected[0],
-            point.pixel[1] - projected[1],
-        ))
-    }
-
-    /// Norms of the residuals; infinite where the lens cannot image the point.
-    pub(super) fn errors_px(&self, image_ix: usize, points: &[BoardPoint]) -> Vec<f64> {
-        let norm = |residual: Option<Vector2<f64>>| {
-            residual.map_or(f64::INFINITY, |residual| residual.norm())
-        };
-        self.residuals(image_ix, points)
-            .into_iter()
-            .map(norm)
+            .map(|point| error_px(point).unwrap_or(f64::INFINITY))
             .collect()
     }
 

@@ -23,6 +23,7 @@ pub use board_pose::{BoardPose, board_pose};
 pub use grid::ImageGrid;
 pub use guidance::{ImageRegion, IntrinsicsAdvice, IntrinsicsGuidance, RECOMMENDED_IMAGES, Side};
 pub use next_view::NextView;
+pub(crate) use report::point_fits;
 pub use report::{
     EstimatedParam, ImageFit, IntrinsicsCalibration, PointFit, Rejected, RejectionReason,
 };

@@ -10,7 +10,7 @@ use super::selection::LensTrial;
 use crate::{BoardPoint, BoardView};
 use kinematics::quantile::median;
 use kinematics::{Intrinsics, Lens, Transform};
-use nalgebra::DMatrix;
+use nalgebra::{DMatrix, Point3};
 
 /// Result of [`super::calibrate_intrinsics`].
 #[derive(Clone, Debug)]
@@ -263,11 +263,12 @@ pub(super) fn report(
         .iter()
         .enumerate()
         .map(|(ix, view_ix)| {
-            let points = point_fits(&fit.state, ix, &kept.points[ix]);
+            let pose = fit.state.poses[ix];
+            let points = point_fits(&fit.state.intrinsics, &pose, &kept.points[ix]);
             ImageFit {
                 name: views[*view_ix].name.clone(),
                 rms_px: rms_px(points.iter()),
-                camera_from_board: fit.state.poses[ix],
+                camera_from_board: pose,
                 points,
             }
         })
@@ -309,15 +310,21 @@ pub(super) fn report(
     }
 }
 
-/// Points of an image with their residuals.
-fn point_fits(bundle: &Bundle, image_ix: usize, points: &[BoardPoint]) -> Vec<PointFit> {
-    let residuals = bundle.residuals(image_ix, points).into_iter().flatten();
+/// Reprojection errors of points. Points that the lens cannot image are left out.
+pub(crate) fn point_fits(
+    intrinsics: &Intrinsics,
+    camera_from_board: &Transform,
+    points: &[BoardPoint],
+) -> Vec<PointFit> {
     points
         .iter()
-        .zip(residuals)
-        .map(|(point, residual)| PointFit {
-            pixel: point.pixel,
-            residual_px: residual.into(),
+        .filter_map(|point| {
+            let in_camera = camera_from_board * Point3::from(point.point_in_board);
+            let [u, v] = intrinsics.project(&in_camera.coords)?;
+            Some(PointFit {
+                pixel: point.pixel,
+                residual_px: [point.pixel[0] - u, point.pixel[1] - v],
+            })
         })
         .collect()
 }
@@ -334,4 +341,27 @@ fn rms_px<'a>(points: impl Iterator<Item = &'a PointFit> + Clone) -> f64 {
         )
         .sum();
     (squares / points.count().max(1) as f64).sqrt()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::tests::{board, brown_conrady_camera, observe};
+    use super::*;
+
+    #[test]
+    fn point_behind_the_camera_does_not_shift_the_errors_of_the_others() {
+        let camera = brown_conrady_camera();
+        let pose = Transform::translation(-0.05, -0.08, 0.5);
+        let mut points = observe(&camera, &pose, &board());
+        points[3].pixel[0] += 2.0;
+        points[1].point_in_board.z = -1.0;
+        let fits = point_fits(&camera, &pose, &points);
+        assert_eq!(fits.len(), points.len() - 1);
+        assert_eq!(fits[2].pixel, points[3].pixel);
+        for (ix, fit) in fits.iter().enumerate() {
+            let expected = if ix == 2 { 2.0 } else { 0.0 };
+            let [x, y] = fit.residual_px;
+            assert!((x - expected).hypot(y) < 1e-9, "{ix}: {fit:?}");
+        }
+    }
 }

@@ -73,7 +73,7 @@ fn with_readings(images: impl IntoIterator<Item = Image>) -> Vec<Sample> {
     samples
 }
 
-fn read(rig: Rig, samples: Vec<Sample>) -> crate::Result<CalibrationImages> {
+fn read(rig: Rig, samples: Vec<Sample>) -> anyhow::Result<CalibrationImages> {
     let source = Box::new(Samples(samples.into_iter()));
     let opened = Opened {
         rig,

@@ -34,7 +34,7 @@ fn folder_of(n: usize, lens: &Value) -> tempfile::TempDir {
     folder
 }
 
-fn load_at(folder: &Path, scale_frac: f64) -> crate::Result<LoadedDataset> {
+fn load_at(folder: &Path, scale_frac: f64) -> anyhow::Result<LoadedDataset> {
     load(&drivers::dataset::read(folder)?, None, scale_frac, &|_| ())
 }
 
@@ -209,7 +209,7 @@ fn photos_that_exceed_the_memory_are_refused_with_a_scale() {
     };
     let text = message(n_bytes / 4);
     assert!(
-        text.contains("10 photos take") && text.contains("scale them to 0.5 or less (--scale of"),
+        text.contains("10 photos take") && text.contains("scale them to 0.5 or less (scale of"),
         "{text}"
     );
     assert!(message(10).ends_with("use fewer photos"));

@@ -4,7 +4,7 @@
 use super::{Finding, udp};
 use crate::config::{ArmDriver, BaseDriver, Rig};
 use crate::open::{self, Devices, Opened};
-use crate::{Join, JoinEvent, Rejection, Result, Stop};
+use crate::{Join, JoinEvent, Rejection, Stop};
 use drivers::udp::DatagramMonitor;
 use drivers::{Error, Sample, clock};
 use kinematics::Stamp;
@@ -129,7 +129,7 @@ impl Track {
 ///
 /// # Errors
 /// A device cannot be opened.
-pub fn listen(rig: &Rig, secs: f64, stop: &Stop) -> Result<ListenResult> {
+pub fn listen(rig: &Rig, secs: f64, stop: &Stop) -> anyhow::Result<ListenResult> {
     let (
         Opened {
             rig, mut source, ..

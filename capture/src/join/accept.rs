@@ -2,7 +2,7 @@
 //!
 //! The tests run from cheap to expensive: motion, then predicted blur and shear, then the pixels.
 
-use super::motion::{self, CameraPose};
+use super::camera_motion::{self, CameraPose};
 use super::pixels::{PixelStatistics, SharpnessHistory};
 use super::rejection::Rejection;
 use super::spacing::Spacing;
@@ -89,7 +89,7 @@ impl Acceptance {
                 Ok(())
             };
         };
-        let speed_px_s = motion::image_speed_px_s(twist, pinhole, depth_m);
+        let speed_px_s = camera_motion::image_speed_px_s(twist, pinhole, depth_m);
         // A camera that does not report its exposure is not tested for blur here. Its blurred
         // images are found by their sharpness.
         let blur_px = speed_px_s * exposure_secs.unwrap_or(0.0);

@@ -1,8 +1,8 @@
 //! Converts device images to the arrays of a keyframe: decoded, undistorted, depth in meters.
 
-use super::motion::CameraPose;
-use crate::error::Context;
+use super::camera_motion::CameraPose;
 use crate::{config, downscale};
+use anyhow::Context;
 use drivers::{Image, TruthImage};
 use keyframe::{DepthMap, Truth};
 use kinematics::quantile::{Rank, quantile};
@@ -19,7 +19,7 @@ pub(super) struct Undistorter {
 impl Undistorter {
     /// Creates the maps of a camera. `scale`: factor for the width and height of the undistorted
     /// images.
-    pub(super) fn new(intrinsics: &Intrinsics, scale: f64) -> crate::Result<Self> {
+    pub(super) fn new(intrinsics: &Intrinsics, scale: f64) -> anyhow::Result<Self> {
         let undistortion = (!intrinsics.is_pinhole()).then(|| Undistortion::new(intrinsics));
         let full = intrinsics.undistorted();
         Ok(Self {
@@ -46,7 +46,7 @@ impl Undistorter {
 
     /// Undistorts and scales `[height, width, 3]` to `[height, width, 4]`; alpha is 0 where the
     /// source image has no pixel.
-    pub(super) fn rgba(&self, rgb: &[u8]) -> crate::Result<Arc<[u8]>> {
+    pub(super) fn rgba(&self, rgb: &[u8]) -> anyhow::Result<Arc<[u8]>> {
         // At full size, no intermediate image is needed.
         if !self.is_downscaled() {
             return match &self.undistortion {
@@ -62,7 +62,7 @@ impl Undistorter {
         Ok(downscale::rgba(rgba, self.full.size_px, self.pinhole.size_px).into())
     }
 
-    fn depth_m(&self, depth_m: Vec<f32>) -> crate::Result<Vec<f32>> {
+    fn depth_m(&self, depth_m: Vec<f32>) -> anyhow::Result<Vec<f32>> {
         match &self.undistortion {
             Some(undistortion) => Ok(undistortion.apply_depth(&depth_m)?),
             None => Ok(depth_m),
@@ -84,7 +84,7 @@ pub(super) fn depth_map(
     depth: &config::Depth,
     undistorter: &Undistorter,
     camera_pose: &CameraPose,
-) -> crate::Result<DepthMap> {
+) -> anyhow::Result<DepthMap> {
     expect_size(image, &depth.intrinsics)?;
     let mut depth_m = undistorter.depth_m(image.decode_depth_m()?)?;
     #[expect(
@@ -109,7 +109,7 @@ pub(super) fn depth_map(
 }
 
 /// Decodes a color image to `[height, width, 3]`. Its size must be the one in the rig file.
-pub(super) fn rgb(image: &Image, intrinsics: &Intrinsics) -> crate::Result<Vec<u8>> {
+pub(super) fn rgb(image: &Image, intrinsics: &Intrinsics) -> anyhow::Result<Vec<u8>> {
     expect_size(image, intrinsics)?;
     Ok(image.decode_rgb()?)
 }
@@ -119,7 +119,7 @@ pub(super) fn truth(
     truth: &TruthImage,
     intrinsics: &Intrinsics,
     undistorter: &Undistorter,
-) -> crate::Result<Truth> {
+) -> anyhow::Result<Truth> {
     let rgba_srgb = undistorter
         .rgba(&rgb(&truth.image, intrinsics)?)
         .context("the true image")?;

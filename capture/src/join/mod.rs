@@ -5,8 +5,8 @@
 
 mod accept;
 mod assemble;
+mod camera_motion;
 mod change;
-mod motion;
 mod pixels;
 mod ranges;
 mod rejection;
@@ -17,13 +17,13 @@ mod store;
 mod tests;
 mod waiting;
 
+pub(crate) use camera_motion::{CameraPose, JointsRejection, Motion};
 pub use change::Change;
-pub(crate) use motion::{CameraPose, JointsRejection, Motion};
 pub use rejection::{Counts, Rejection, SampleUse};
 
 use crate::config::{self, BaseDriver, CameraDriver, Parent, Rig};
-use crate::error::Context;
 use accept::Acceptance;
+use anyhow::Context;
 use assemble::Undistorter;
 use drivers::{Image, Sample, TruthImage};
 use keyframe::{Keyframe, KeyframeList, RangePoints, Split};
@@ -119,7 +119,7 @@ impl Join {
     ///
     /// If the robot description does not match the rig, or the scaled training images would be too
     /// small.
-    pub fn new(rig: &Rig) -> crate::Result<Self> {
+    pub fn new(rig: &Rig) -> anyhow::Result<Self> {
         let join = &rig.join;
         let spacing = Spacing {
             translation_m: join.min_translation_m,
@@ -269,7 +269,7 @@ impl Join {
     /// # Errors
     ///
     /// If no keyframe of the list was found.
-    pub fn check_list(&self) -> crate::Result<Option<String>> {
+    pub fn check_list(&self) -> anyhow::Result<Option<String>> {
         let Some(list) = &self.list else {
             return Ok(None);
         };
@@ -509,7 +509,7 @@ impl Join {
 }
 
 impl CameraState {
-    fn new(camera: &config::Camera, rig: &Rig, spacing: Spacing) -> crate::Result<Self> {
+    fn new(camera: &config::Camera, rig: &Rig, spacing: Spacing) -> anyhow::Result<Self> {
         let named = || format!("camera {:?}", camera.name);
         let is_fixed = match camera.parent {
             Parent::Flange => false,
@@ -628,7 +628,7 @@ impl CameraState {
     }
 
     /// Logs the first decoding error of a camera; all of them are counted.
-    fn undecodable(&mut self, error: &crate::Error) -> Rejection {
+    fn undecodable(&mut self, error: &anyhow::Error) -> Rejection {
         if !std::mem::replace(&mut self.warned_undecodable, true) {
             log::warn!("{error:#}");
         }

@@ -1,7 +1,7 @@
 //! Range scans: transforms each point to the world frame with the scanner pose at the time of that
 //! point.
 
-use super::motion::Motion;
+use super::camera_motion::Motion;
 use crate::config::{Rig, Scanner};
 use drivers::RangeScan;
 use keyframe::{DepthMap, Keyframe, RangePoints};

@@ -1,6 +1,6 @@
 //! Reasons why images did not become keyframes, and their counts.
 
-use keyframe::counted;
+use messages::counted;
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 

@@ -4,11 +4,11 @@
 use super::real;
 use super::simulated::unlimited;
 use crate::config::{ArmDriver, Rig};
+use anyhow::bail;
 use drivers::franka::FciVersion;
 use drivers::franka::emulated::{EmulatedRobot, Limits, RobotConfig};
 use drivers::motion::{JointTarget, Motion, MovableArm};
 use drivers::{Arm, Camera, Error, clock};
-use keyframe::bail;
 use kinematics::{JointState, Transform};
 use sim::MotorHistory;
 use sim::wire::{JointTrack, emulate_fci};
@@ -20,7 +20,7 @@ use std::time::Duration;
 const ANSWER_WAIT: Duration = Duration::from_millis(15);
 
 /// Opens the camera, and the arm for motion. The address of the arm becomes that of the controller.
-pub(super) fn open(rig: &mut Rig) -> crate::Result<(Box<dyn MovableArm>, Box<dyn Camera>)> {
+pub(super) fn open(rig: &mut Rig) -> anyhow::Result<(Box<dyn MovableArm>, Box<dyn Camera>)> {
     if rig.arm.driver != ArmDriver::Franka {
         bail!(
             "sim.emulate_arm: only a controller of the driver \"franka\" can be emulated for a simulated camera"
@@ -38,7 +38,7 @@ pub(super) fn open(rig: &mut Rig) -> crate::Result<(Box<dyn MovableArm>, Box<dyn
         limits: Limits::panda(),
     };
     // The arm starts where the simulated arm is, or it would jump at the first image.
-    let track = JointTrack::at_rest(simulated.start_position()?).map_err(crate::Error::other)?;
+    let track = JointTrack::at_rest(simulated.start_position()?)?;
     let controller = emulate_fci(track, config, ANSWER_WAIT, Some(motors.clone()))?;
     rig.arm.address = controller.address().to_string();
     log::info!(

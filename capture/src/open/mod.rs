@@ -15,23 +15,28 @@ mod tags;
 pub use movable::{Movable, movable};
 #[cfg(target_os = "linux")]
 pub use real::franka_chain;
-pub use real::{check_motion, movable_arm, udp_arm_address};
+pub use real::{check_motion, motion_of, movable_arm, udp_arm_address};
 
 use crate::config::{ArmDriver, BaseDriver, CameraDriver, Override, Parent, Rig, ScannerDriver};
-use crate::error::{Context, Error};
 use crate::notes::Notes;
 use crate::stamp_clock::StampClock;
+use anyhow::{Context, anyhow, bail};
 use drivers::recording::{RIG_FILE, Recorder, Recording, RecordingMetadata, URDF_FILE};
 use drivers::udp::DatagramMonitor;
-use drivers::{Live, Playback, Repeating, Sample, Source};
-use keyframe::bail;
+use drivers::{LiveDevices, Playback, Repeating, Sample, Source};
 use kinematics::Chain;
+use messages::Setting;
 use std::path::Path;
 use std::sync::{Arc, OnceLock};
 use tags::TagBaseSource;
 
 /// Hint in error messages about devices that cannot be opened.
-const SIM_HINT: &str = "`fieldrig run --sim` replaces every device by its simulated twin";
+fn sim_hint() -> String {
+    format!(
+        "`fieldrig run {}` replaces every device by its simulated twin",
+        Setting::Sim
+    )
+}
 
 /// The port of a Franka controller.
 pub const FCI_PORT: u16 = 1337;
@@ -79,7 +84,7 @@ impl Opened {
     /// # Errors
     ///
     /// If the thread for the detection cannot be started.
-    pub fn with_tag_check(self, notes: &Notes) -> crate::Result<Self> {
+    pub fn with_tag_check(self, notes: &Notes) -> anyhow::Result<Self> {
         let source = tag_check::TagCheckSource::check(&self.rig, self.source, notes)?;
         Ok(Self { source, ..self })
     }
@@ -117,7 +122,7 @@ fn open_recording(
 ///
 /// If a device cannot be opened, a driver is not part of this build, or the rig file lacks a
 /// setting that a driver needs.
-pub fn rig(rig: Rig, devices: Devices) -> crate::Result<Opened> {
+pub fn rig(rig: Rig, devices: Devices) -> anyhow::Result<Opened> {
     rig_with_monitors(rig, devices).map(|(opened, _)| opened)
 }
 
@@ -125,7 +130,7 @@ pub fn rig(rig: Rig, devices: Devices) -> crate::Result<Opened> {
 pub(crate) fn rig_with_monitors(
     mut rig: Rig,
     devices: Devices,
-) -> crate::Result<(Opened, Vec<DatagramMonitor>)> {
+) -> anyhow::Result<(Opened, Vec<DatagramMonitor>)> {
     if devices == Devices::Sim {
         use_simulated_devices(&mut rig);
     }
@@ -133,19 +138,18 @@ pub(crate) fn rig_with_monitors(
     // The settings are checked before any device is opened, so that an error of the rig file does
     // not start cameras.
     if let Some(device) = unsupported_device(&rig) {
-        bail!("{device} cannot be opened by this version; {SIM_HINT}");
+        bail!("{device} cannot be opened by this version; {}", sim_hint());
     }
     check_arm(&rig)?;
     if devices == Devices::Sim {
         check_intrinsics(&rig)?;
     }
-    let opened =
-        real::open(&mut rig).map_err(|error| Error::Failed(format!("{error:#}; {SIM_HINT}")));
+    let opened = real::open(&mut rig).map_err(|error| anyhow!("{error:#}; {}", sim_hint()));
     let (real, monitors) = opened?;
     let (source, stamp_clock): (Box<dyn Source>, _) = if is_any_simulated(&rig) {
         simulate(&rig, real)?
     } else {
-        (Box::new(Live::new(real)?), StampClock::Computer)
+        (Box::new(LiveDevices::new(real)?), StampClock::Computer)
     };
     // Behind all devices, because the tags are searched in the images of any camera on the robot.
     let source = match rig.base.driver {
@@ -187,7 +191,7 @@ fn use_simulated_devices(rig: &mut Rig) {
 /// # Errors
 ///
 /// If the file is not a recording, contains no valid rig, or does not match the given rig.
-pub fn recording(path: &Path, rig: Option<Rig>, overrides: &[Override]) -> crate::Result<Opened> {
+pub fn recording(path: &Path, rig: Option<Rig>, overrides: &[Override]) -> anyhow::Result<Opened> {
     let recording = Recording::open(path)?;
     let mut rig = match rig {
         Some(rig) => rig,
@@ -242,7 +246,7 @@ fn in_recorded_order(offsets: &[f64], joints: &[String], recorded: &[String]) ->
 /// # Errors
 ///
 /// If the file cannot be written.
-pub fn recorder(path: &Path, rig: &Rig) -> crate::Result<Recorder> {
+pub fn recorder(path: &Path, rig: &Rig) -> anyhow::Result<Recorder> {
     let cameras: Vec<_> = rig
         .cameras
         .iter()
@@ -267,12 +271,12 @@ pub fn recorder(path: &Path, rig: &Rig) -> crate::Result<Recorder> {
 /// # Errors
 ///
 /// If the URDF of the rig has no such chain.
-pub fn chain_of(rig: &Rig) -> crate::Result<Chain> {
+pub fn chain_of(rig: &Rig) -> anyhow::Result<Chain> {
     let arm = &rig.arm;
     Chain::from_urdf(&arm.urdf_text, &arm.base_link, &arm.flange_link).context("the arm's URDF")
 }
 
-fn stored_rig(path: &Path, recording: &Recording, overrides: &[Override]) -> crate::Result<Rig> {
+fn stored_rig(path: &Path, recording: &Recording, overrides: &[Override]) -> anyhow::Result<Rig> {
     Ok(Rig::parse(
         RIG_FILE,
         stored_text(path, recording, RIG_FILE)?,
@@ -282,10 +286,11 @@ fn stored_rig(path: &Path, recording: &Recording, overrides: &[Override]) -> cra
 }
 
 /// The text of a file that is stored in a recording.
-fn stored_text<'a>(path: &Path, recording: &'a Recording, name: &str) -> crate::Result<&'a str> {
+fn stored_text<'a>(path: &Path, recording: &'a Recording, name: &str) -> anyhow::Result<&'a str> {
     let bytes = recording.attachment(name).with_context(|| {
         format!(
-            "the recording {path:?} contains no {name}, which fieldrig stores in it; if another program removed it, give the rig file with --rig to `fieldrig train`, `eval`, `export` or `calibrate`"
+            "the recording {path:?} contains no {name}, which fieldrig stores in it; if another program removed it, give the rig file with {} to `fieldrig train`, `eval`, `export` or `calibrate`",
+            Setting::Rig
         )
     })?;
     std::str::from_utf8(bytes)
@@ -306,7 +311,7 @@ fn without_readout_if_ideal(rig: &mut Rig) {
 }
 
 /// Checks that the rig has an arm if a camera is on the flange.
-fn check_arm(rig: &Rig) -> crate::Result<()> {
+fn check_arm(rig: &Rig) -> anyhow::Result<()> {
     let on_flange = rig
         .cameras
         .iter()
@@ -322,7 +327,7 @@ fn check_arm(rig: &Rig) -> crate::Result<()> {
 
 /// Checks that all intrinsics are known. Intrinsics that are stored in the camera are unknown
 /// unless the camera is opened.
-fn check_intrinsics(rig: &Rig) -> crate::Result<()> {
+fn check_intrinsics(rig: &Rig) -> anyhow::Result<()> {
     if let Some(camera) = rig
         .cameras
         .iter()
@@ -363,7 +368,7 @@ fn unsupported_device(rig: &Rig) -> Option<String> {
 }
 
 #[cfg(feature = "sim")]
-fn simulate(rig: &Rig, real: drivers::Devices) -> crate::Result<(Box<dyn Source>, StampClock)> {
+fn simulate(rig: &Rig, real: drivers::Devices) -> anyhow::Result<(Box<dyn Source>, StampClock)> {
     simulated::open(rig, real)
 }
 
@@ -378,7 +383,7 @@ fn base_moves(_scene: &str) -> bool {
 }
 
 #[cfg(not(feature = "sim"))]
-fn simulate(_rig: &Rig, _real: drivers::Devices) -> crate::Result<(Box<dyn Source>, StampClock)> {
+fn simulate(_rig: &Rig, _real: drivers::Devices) -> anyhow::Result<(Box<dyn Source>, StampClock)> {
     bail!(
         "this program was built without the simulator: build it with `cargo build --release --features sim`"
     )
@@ -424,7 +429,7 @@ mod tests {
                 .expect("no such driver")
         );
         assert!(
-            message.contains("rgbd") && message.contains("--sim"),
+            message.contains("rgbd") && message.contains("run sim`"),
             "{message}"
         );
     }
@@ -451,7 +456,7 @@ mod tests {
         let message = error_of(&on_base);
         assert!(
             message.contains("no V4L2 camera named \"no such serial\"")
-                && message.contains("--sim"),
+                && message.contains("run sim`"),
             "{message}"
         );
         let without_scale = [&on_base[..3], &on_base[5..]].concat();
@@ -503,7 +508,7 @@ mod tests {
             "--features realsense"
         };
         assert!(
-            message.contains(expected) && message.contains("--sim"),
+            message.contains(expected) && message.contains("run sim`"),
             "{message}"
         );
     }
@@ -583,6 +588,33 @@ mod tests {
             .err()
             .expect("no file");
         assert!(format!("{missing:#}").contains("no/such.mcap"));
+    }
+
+    #[test]
+    fn recording_without_its_rig_file_needs_another_one() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let path = folder.path().join("run.mcap");
+        let rig = load("two-cameras.toml", &[]);
+        let metadata = RecordingMetadata {
+            joint_names: &rig.arm.joints,
+            ..RecordingMetadata::default()
+        };
+        let mut recorder = Recorder::create(&path, &metadata).expect("a new file");
+        let joints = kinematics::JointState {
+            stamp: kinematics::Stamp(5),
+            position: vec![0.0; 7],
+            velocity: vec![],
+            effort: vec![],
+        };
+        recorder.write(&Sample::Joints(joints)).expect("disk space");
+        recorder.finish().expect("disk space");
+        let error = recording(&path, None, &[]).err().expect("no rig file");
+        let message = format!("{error:#}");
+        assert!(
+            message.contains("contains no rig.toml") && message.contains("--rig"),
+            "{message}"
+        );
+        assert!(recording(&path, Some(rig), &[]).is_ok());
     }
 
     #[test]

@@ -5,8 +5,8 @@ use super::{
     Devices, check_arm, check_intrinsics, use_simulated_devices, without_readout_if_ideal,
 };
 use crate::config::{ArmDriver, BaseDriver, Camera, CameraDriver, Rig};
+use anyhow::bail;
 use drivers::motion::MovableArm;
-use keyframe::bail;
 
 /// A camera and an arm that can be moved.
 pub struct Movable {
@@ -25,7 +25,7 @@ pub struct Movable {
 ///
 /// If the rig has no such camera, a device cannot be opened, the arm cannot be moved as configured,
 /// or only one of arm and camera is simulated.
-pub fn movable(rig: &Rig, devices: Devices, camera: &str) -> crate::Result<Movable> {
+pub fn movable(rig: &Rig, devices: Devices, camera: &str) -> anyhow::Result<Movable> {
     let mut rig = rig.clone();
     // Other devices would only take bandwidth, or fail although they are not needed.
     rig.cameras.retain(|other: &Camera| &*other.name == camera);
@@ -72,7 +72,7 @@ pub fn movable(rig: &Rig, devices: Devices, camera: &str) -> crate::Result<Movab
 }
 
 #[cfg(feature = "sim")]
-fn simulated(rig: Rig) -> crate::Result<Movable> {
+fn simulated(rig: Rig) -> anyhow::Result<Movable> {
     /// The defaults of `[arm.motion]`, which a simulated arm does not need.
     const DEFAULT_SECS: [f64; 2] = [0.5, 0.1];
     let motion = rig.arm.motion.as_ref();
@@ -88,20 +88,20 @@ fn simulated(rig: Rig) -> crate::Result<Movable> {
 }
 
 #[cfg(all(feature = "sim", target_os = "linux"))]
-fn emulated(mut rig: Rig) -> crate::Result<Movable> {
+fn emulated(mut rig: Rig) -> anyhow::Result<Movable> {
     let (arm, camera) = super::emulated::open(&mut rig)?;
     Ok(Movable { rig, arm, camera })
 }
 
 #[cfg(not(all(feature = "sim", target_os = "linux")))]
-fn emulated(_rig: Rig) -> crate::Result<Movable> {
+fn emulated(_rig: Rig) -> anyhow::Result<Movable> {
     bail!(
         "sim.emulate_arm needs Linux and a program built with `cargo build --release --features sim`"
     )
 }
 
 #[cfg(not(feature = "sim"))]
-fn simulated(_rig: Rig) -> crate::Result<Movable> {
+fn simulated(_rig: Rig) -> anyhow::Result<Movable> {
     bail!(
         "this program was built without the simulator: build it with `cargo build --release --features sim`"
     )

@@ -3,9 +3,9 @@
 #[cfg(target_os = "linux")]
 use crate::config::Depth;
 use crate::config::{ArmDriver, ArmMotion, BaseDriver, Camera, CameraDriver, Rig, ScannerDriver};
-use crate::error::Context;
+use anyhow::{Context, bail};
 #[cfg(target_os = "linux")]
-use drivers::can::odrive::Endpoints;
+use drivers::can::odrive::{self, Endpoints};
 #[cfg(target_os = "linux")]
 use drivers::can::{self, CanArm, MovableArmConfig, MovableCanArm};
 #[cfg(target_os = "linux")]
@@ -17,7 +17,7 @@ use drivers::udp::{DatagramMonitor, UdpArm, UdpBase, UdpScanner};
 #[cfg(target_os = "linux")]
 use drivers::v4l2::{Config, Settings, V4l2Camera, V4l2Format};
 use drivers::{Arm, Base, Devices, RangeScanner};
-use keyframe::bail;
+use messages::BadInput;
 use std::net::{IpAddr, Ipv4Addr, SocketAddr};
 use std::time::Duration;
 
@@ -29,7 +29,7 @@ const READ_ONLY: &str = "arms with this driver can only be read; to move the arm
 
 /// Opens all real devices of a rig, possibly none, with monitors of those that receive datagrams.
 /// Fills in calibration that is stored in a camera.
-pub(super) fn open(rig: &mut Rig) -> crate::Result<(Devices, Vec<DatagramMonitor>)> {
+pub(super) fn open(rig: &mut Rig) -> anyhow::Result<(Devices, Vec<DatagramMonitor>)> {
     let mut devices = Devices::default();
     let mut monitors = Vec::new();
     // Cameras first: some of them store intrinsics, which are copied to the rig before anything
@@ -87,12 +87,8 @@ pub(super) fn open(rig: &mut Rig) -> crate::Result<(Devices, Vec<DatagramMonitor
 ///
 /// If the rig file has no table `[arm.motion]`, the driver cannot move arms or does not support the
 /// settings, or the arm cannot be reached.
-pub fn movable_arm(rig: &Rig) -> crate::Result<Box<dyn MovableArm>> {
-    let Some(motion) = &rig.arm.motion else {
-        bail!(
-            "the rig file has no table [arm.motion], so its arm is only read; see docs/guide/moving-arms.md"
-        );
-    };
+pub fn movable_arm(rig: &Rig) -> anyhow::Result<Box<dyn MovableArm>> {
+    let motion = motion_of(rig)?;
     match rig.arm.driver {
         ArmDriver::Can => movable_can_arm(rig, motion),
         ArmDriver::Franka => movable_franka_arm(rig, motion),
@@ -100,12 +96,25 @@ pub fn movable_arm(rig: &Rig) -> crate::Result<Box<dyn MovableArm>> {
     }
 }
 
+/// How the arm of a rig may be moved.
+///
+/// # Errors
+///
+/// If the rig file does not say so.
+pub fn motion_of(rig: &Rig) -> Result<&ArmMotion, BadInput> {
+    rig.arm.motion.as_ref().ok_or_else(|| {
+        BadInput(
+            "the rig file has no table [arm.motion], so its arm is only read: see docs/guide/moving-arms.md".to_owned(),
+        )
+    })
+}
+
 /// Checks the motion settings as far as possible without the arm.
 ///
 /// # Errors
 ///
 /// If the driver cannot move arms or does not support the settings.
-pub fn check_motion(rig: &Rig) -> crate::Result<()> {
+pub fn check_motion(rig: &Rig) -> anyhow::Result<()> {
     let Some(motion) = &rig.arm.motion else {
         return Ok(());
     };
@@ -114,8 +123,7 @@ pub fn check_motion(rig: &Rig) -> crate::Result<()> {
         ArmDriver::Can => Ok(MovableCanArm::check(&movable_config(rig, motion)?)?),
         #[cfg(target_os = "linux")]
         ArmDriver::Franka => {
-            Ok(MovableFrankaArm::check(&motion_config(rig, motion)?)
-                .map_err(crate::Error::Failed)?)
+            MovableFrankaArm::check(&motion_config(rig, motion)?).map_err(anyhow::Error::msg)
         }
         _ => bail!("{READ_ONLY}"),
     }
@@ -127,7 +135,7 @@ pub(super) fn motion_limits(
     rig: &Rig,
     acceleration_secs: f64,
     jerk_secs: f64,
-) -> crate::Result<Vec<MotionLimits>> {
+) -> anyhow::Result<Vec<MotionLimits>> {
     let Rig { arm, .. } = rig;
     let chain = super::chain_of(rig)?;
     let mut limits = Vec::new();
@@ -154,7 +162,7 @@ pub(super) fn motion_limits(
 }
 
 #[cfg(target_os = "linux")]
-fn motion_config(rig: &Rig, motion: &ArmMotion) -> crate::Result<MotionConfig> {
+fn motion_config(rig: &Rig, motion: &ArmMotion) -> anyhow::Result<MotionConfig> {
     let limits = motion_limits(rig, motion.acceleration_secs, motion.jerk_secs)?;
     let timeout = Duration::from_secs_f64(motion.timeout_millis / 1000.0);
     let ArmMotion {
@@ -171,28 +179,32 @@ fn motion_config(rig: &Rig, motion: &ArmMotion) -> crate::Result<MotionConfig> {
 }
 
 #[cfg(target_os = "linux")]
-fn movable_can_arm(rig: &Rig, motion: &ArmMotion) -> crate::Result<Box<dyn MovableArm>> {
+fn movable_can_arm(rig: &Rig, motion: &ArmMotion) -> anyhow::Result<Box<dyn MovableArm>> {
     Ok(Box::new(MovableCanArm::open(&movable_config(
         rig, motion,
     )?)?))
 }
 
 #[cfg(target_os = "linux")]
-fn movable_config(rig: &Rig, motion: &ArmMotion) -> crate::Result<MovableArmConfig> {
+fn movable_config(rig: &Rig, motion: &ArmMotion) -> anyhow::Result<MovableArmConfig> {
     let path = &motion.odrive_endpoints;
-    let endpoints =
-        || Endpoints::parse(&files::read_text(path.as_ref())?).map_err(crate::Error::other);
+    let read_endpoints =
+        || Endpoints::parse(&files::read_text(path.as_ref())?).map_err(anyhow::Error::new);
     // Only ODrive axes with firmware 0.6 need this file, so an empty path is no error.
-    let odrive_endpoints = match path.as_str() {
+    let endpoints = match path.as_str() {
         "" => None,
-        _ => Some(endpoints().with_context(|| format!("arm.motion.odrive_endpoints {path:?}"))?),
+        _ => Some(
+            read_endpoints().with_context(|| format!("arm.motion.odrive_endpoints {path:?}"))?,
+        ),
     };
     let mut arm = can_config(rig);
     limit_efforts(&mut arm, &super::chain_of(rig)?);
+    for motor in &mut arm.motors {
+        odrive::set_endpoints(&mut motor.protocol, endpoints.as_ref());
+    }
     Ok(MovableArmConfig {
         arm,
         motion: motion_config(rig, motion)?,
-        odrive_endpoints,
     })
 }
 
@@ -212,7 +224,7 @@ fn limit_efforts(arm: &mut can::ArmConfig, chain: &kinematics::Chain) {
 }
 
 #[cfg(not(target_os = "linux"))]
-fn movable_can_arm(_rig: &Rig, _motion: &ArmMotion) -> crate::Result<Box<dyn MovableArm>> {
+fn movable_can_arm(_rig: &Rig, _motion: &ArmMotion) -> anyhow::Result<Box<dyn MovableArm>> {
     bail!("arms on CAN buses can only be moved on Linux")
 }
 
@@ -228,24 +240,24 @@ fn can_config(rig: &Rig) -> can::ArmConfig {
 
 /// Opens an arm with motors on CAN buses.
 #[cfg(target_os = "linux")]
-fn can_arm(rig: &Rig) -> crate::Result<Box<dyn Arm>> {
+fn can_arm(rig: &Rig) -> anyhow::Result<Box<dyn Arm>> {
     Ok(Box::new(CanArm::open(&can_config(rig))?))
 }
 
 #[cfg(not(target_os = "linux"))]
-fn can_arm(_rig: &Rig) -> crate::Result<Box<dyn Arm>> {
+fn can_arm(_rig: &Rig) -> anyhow::Result<Box<dyn Arm>> {
     bail!("arms on CAN buses can only be read on Linux")
 }
 
 /// Opens a Franka arm for reading over FCI.
 #[cfg(target_os = "linux")]
-fn franka_arm(rig: &Rig) -> crate::Result<Box<dyn Arm>> {
+fn franka_arm(rig: &Rig) -> anyhow::Result<Box<dyn Arm>> {
     Ok(Box::new(FrankaArm::open(&franka_config(rig)?)?))
 }
 
 /// Opens a Franka arm for motion over FCI.
 #[cfg(target_os = "linux")]
-fn movable_franka_arm(rig: &Rig, motion: &ArmMotion) -> crate::Result<Box<dyn MovableArm>> {
+fn movable_franka_arm(rig: &Rig, motion: &ArmMotion) -> anyhow::Result<Box<dyn MovableArm>> {
     let defaults = franka::ContactConfig::default();
     let contact = franka::ContactConfig {
         torque_nm: motion.contact_torque_nm.unwrap_or(defaults.torque_nm),
@@ -258,12 +270,12 @@ fn movable_franka_arm(rig: &Rig, motion: &ArmMotion) -> crate::Result<Box<dyn Mo
 }
 
 #[cfg(not(target_os = "linux"))]
-fn movable_franka_arm(_rig: &Rig, _motion: &ArmMotion) -> crate::Result<Box<dyn MovableArm>> {
+fn movable_franka_arm(_rig: &Rig, _motion: &ArmMotion) -> anyhow::Result<Box<dyn MovableArm>> {
     bail!("Franka arms can only be moved on Linux")
 }
 
 #[cfg(target_os = "linux")]
-fn franka_config(rig: &Rig) -> crate::Result<franka::ArmConfig> {
+fn franka_config(rig: &Rig) -> anyhow::Result<franka::ArmConfig> {
     let Rig { arm, .. } = rig;
     if arm.address.is_empty() {
         bail!(
@@ -283,7 +295,7 @@ fn franka_config(rig: &Rig) -> crate::Result<franka::ArmConfig> {
 ///
 /// If the URDF of the rig has no such chain.
 #[cfg(target_os = "linux")]
-pub fn franka_chain(rig: &Rig) -> crate::Result<kinematics::Chain> {
+pub fn franka_chain(rig: &Rig) -> anyhow::Result<kinematics::Chain> {
     let Rig { arm, .. } = rig;
     let robot = kinematics::urdf::Robot::parse(&arm.urdf_text).context("the arm's URDF")?;
     let path = robot
@@ -297,12 +309,12 @@ pub fn franka_chain(rig: &Rig) -> crate::Result<kinematics::Chain> {
 }
 
 #[cfg(not(target_os = "linux"))]
-fn franka_arm(_rig: &Rig) -> crate::Result<Box<dyn Arm>> {
+fn franka_arm(_rig: &Rig) -> anyhow::Result<Box<dyn Arm>> {
     bail!("Franka arms can only be read on Linux")
 }
 
 /// Opens an arm whose joint states are sent by another program.
-fn udp_arm(rig: &Rig) -> crate::Result<UdpArm> {
+fn udp_arm(rig: &Rig) -> anyhow::Result<UdpArm> {
     let arm = UdpArm::open(&rig.arm.joints, udp_arm_address(rig)?)?;
     log::info!("arm: listening on {}", arm.address());
     Ok(arm)
@@ -313,7 +325,7 @@ fn udp_arm(rig: &Rig) -> crate::Result<UdpArm> {
 /// # Errors
 ///
 /// If `arm.address` is not an IP address with a port.
-pub fn udp_arm_address(rig: &Rig) -> crate::Result<SocketAddr> {
+pub fn udp_arm_address(rig: &Rig) -> anyhow::Result<SocketAddr> {
     match &*rig.arm.address {
         "" => Ok(DEFAULT_ARM_ADDRESS),
         text => text.parse().with_context(|| {
@@ -324,7 +336,7 @@ pub fn udp_arm_address(rig: &Rig) -> crate::Result<SocketAddr> {
 
 /// Opens the color images of a V4L2 camera, and its depth images if the rig file configures depth.
 #[cfg(target_os = "linux")]
-fn v4l2_cameras(camera: &Camera) -> crate::Result<Vec<Box<dyn drivers::Camera>>> {
+fn v4l2_cameras(camera: &Camera) -> anyhow::Result<Vec<Box<dyn drivers::Camera>>> {
     // The settings of depth are checked before the color camera is opened.
     let depth = camera
         .depth
@@ -338,7 +350,7 @@ fn v4l2_cameras(camera: &Camera) -> crate::Result<Vec<Box<dyn drivers::Camera>>>
 }
 
 #[cfg(not(target_os = "linux"))]
-fn v4l2_cameras(camera: &Camera) -> crate::Result<Vec<Box<dyn drivers::Camera>>> {
+fn v4l2_cameras(camera: &Camera) -> anyhow::Result<Vec<Box<dyn drivers::Camera>>> {
     bail!(
         "camera {:?}: V4L2 is only available on Linux; use driver = \"nokhwa\" for webcams",
         camera.name
@@ -347,7 +359,7 @@ fn v4l2_cameras(camera: &Camera) -> crate::Result<Vec<Box<dyn drivers::Camera>>>
 
 /// Opens a camera with nokhwa, which sets only size, rate and format.
 #[cfg(feature = "nokhwa")]
-fn nokhwa_camera(camera: &Camera) -> crate::Result<Box<dyn drivers::Camera>> {
+fn nokhwa_camera(camera: &Camera) -> anyhow::Result<Box<dyn drivers::Camera>> {
     let Camera { name, v4l2, .. } = camera;
     if v4l2.gain.is_some() || v4l2.brightness.is_some() || v4l2.white_balance_kelvin.is_some() {
         bail!(
@@ -371,7 +383,7 @@ fn nokhwa_camera(camera: &Camera) -> crate::Result<Box<dyn drivers::Camera>> {
 }
 
 #[cfg(not(feature = "nokhwa"))]
-fn nokhwa_camera(camera: &Camera) -> crate::Result<Box<dyn drivers::Camera>> {
+fn nokhwa_camera(camera: &Camera) -> anyhow::Result<Box<dyn drivers::Camera>> {
     bail!(
         "camera {:?}: this program was built without nokhwa: build it with `cargo build --release --features nokhwa`; \
          on Linux, use driver = \"v4l2\" for webcams",
@@ -403,7 +415,7 @@ fn v4l2_color(camera: &Camera) -> Config {
 /// Settings of the depth images of a camera, which come from a separate device with automatic
 /// exposure.
 #[cfg(target_os = "linux")]
-fn v4l2_depth(camera: &Camera, depth: &Depth) -> crate::Result<Config> {
+fn v4l2_depth(camera: &Camera, depth: &Depth) -> anyhow::Result<Config> {
     let Some(meters_per_count) = depth.meters_per_count.filter(|_| !depth.device.is_empty()) else {
         let name = &camera.name;
         bail!(

@@ -2,8 +2,8 @@
 
 /// Opens a camera.
 #[cfg(not(feature = "realsense"))]
-pub(super) fn open(camera: &mut crate::config::Camera) -> crate::Result<Box<dyn drivers::Camera>> {
-    keyframe::bail!(
+pub(super) fn open(camera: &mut crate::config::Camera) -> anyhow::Result<Box<dyn drivers::Camera>> {
+    anyhow::bail!(
         "camera {:?}: this program was built without RealSense support: install the RealSense SDK (librealsense2) \
          and build it with `cargo build --release --features realsense`",
         camera.name
@@ -29,7 +29,7 @@ mod with_sdk {
 
     /// Opens a camera and copies calibration that the rig file omits from it. Values in the rig
     /// file take precedence.
-    pub(in crate::open) fn open(camera: &mut Camera) -> crate::Result<Box<dyn drivers::Camera>> {
+    pub(in crate::open) fn open(camera: &mut Camera) -> anyhow::Result<Box<dyn drivers::Camera>> {
         let open = RealsenseCamera::open(config(camera))?;
         let known = open.calibration();
         let UnknownCalibration {

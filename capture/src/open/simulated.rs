@@ -4,15 +4,15 @@ use crate::StampClock;
 use crate::config::{
     BaseDriver, Camera, CameraDriver, Depth, Parent, Rig, Scanner, ScannerDriver, SimTarget,
 };
+use anyhow::bail;
 use drivers::motion::MotionLimits;
-use drivers::{Devices, Error, Live, Sample, Source};
-use keyframe::bail;
+use drivers::{Devices, Error, LiveDevices, Sample, Source};
 use kinematics::{Intrinsics, Stamp, Transform};
 use std::sync::Arc;
 
 /// Opens the simulated rig, in lockstep or in real time according to the rig file. In real time,
 /// `real` devices run in parallel. Also returns the clock of the stamps.
-pub(super) fn open(rig: &Rig, real: Devices) -> crate::Result<(Box<dyn Source>, StampClock)> {
+pub(super) fn open(rig: &Rig, real: Devices) -> anyhow::Result<(Box<dyn Source>, StampClock)> {
     let mut config = config_of(rig)?;
     let any_real = real.arm.is_some()
         || real.base.is_some()
@@ -48,7 +48,7 @@ pub(super) fn open(rig: &Rig, real: Devices) -> crate::Result<(Box<dyn Source>, 
     devices.scanners.extend(real.scanners);
     devices.cameras.extend(real.cameras);
     let source = RealTime {
-        live: Live::new(devices)?,
+        live: LiveDevices::new(devices)?,
         truth,
         first_camera: Arc::clone(&rig.cameras[0].name),
         n_left: rig.sim.n_images,
@@ -58,12 +58,12 @@ pub(super) fn open(rig: &Rig, real: Devices) -> crate::Result<(Box<dyn Source>, 
 }
 
 /// Opens a simulated rig with an arm that moves by commands.
-pub(super) fn commanded(rig: &Rig, limits: &[MotionLimits]) -> crate::Result<sim::CommandedRig> {
+pub(super) fn commanded(rig: &Rig, limits: &[MotionLimits]) -> anyhow::Result<sim::CommandedRig> {
     Ok(sim::open(&unlimited(rig)?)?.into_commanded(limits)?)
 }
 
 /// The simulator configuration of a rig whose arm is commanded: without end and ground truth.
-pub(super) fn unlimited(rig: &Rig) -> crate::Result<sim::Config> {
+pub(super) fn unlimited(rig: &Rig) -> anyhow::Result<sim::Config> {
     Ok(sim::Config {
         duration_secs: None,
         n_images: None,
@@ -74,7 +74,7 @@ pub(super) fn unlimited(rig: &Rig) -> crate::Result<sim::Config> {
 
 /// Live simulated devices with their ground truth.
 struct RealTime {
-    live: Live,
+    live: LiveDevices,
     truth: sim::LiveTruth,
     first_camera: Arc<str>,
     n_left: Option<u64>,
@@ -109,7 +109,7 @@ impl Source for RealTime {
 }
 
 /// The simulator configuration of a rig.
-fn config_of(rig: &Rig) -> crate::Result<sim::Config> {
+fn config_of(rig: &Rig) -> anyhow::Result<sim::Config> {
     let Some(scene) = sim::Scene::from_name(&rig.sim.scene) else {
         let known: Vec<_> = sim::Scene::ALL.iter().map(|scene| scene.name()).collect();
         bail!(
@@ -164,7 +164,7 @@ fn config_of(rig: &Rig) -> crate::Result<sim::Config> {
             .targets
             .iter()
             .map(target_of)
-            .collect::<crate::Result<_>>()?,
+            .collect::<anyhow::Result<_>>()?,
         cameras: rig
             .cameras
             .iter()
@@ -174,7 +174,7 @@ fn config_of(rig: &Rig) -> crate::Result<sim::Config> {
     })
 }
 
-fn target_of((name, target): (&String, &SimTarget)) -> crate::Result<sim::TargetConfig> {
+fn target_of((name, target): (&String, &SimTarget)) -> anyhow::Result<sim::TargetConfig> {
     let (parent, parent_from_board) = match (target.world_from_board, target.flange_from_board) {
         (Some(_), Some(_)) => {
             bail!("sim.target.{name}: give either world_from_board or flange_from_board, not both")

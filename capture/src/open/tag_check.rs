@@ -45,7 +45,7 @@ impl TagCheckSource {
         rig: &Rig,
         source: Box<dyn Source>,
         notes: &Notes,
-    ) -> crate::Result<Box<dyn Source>> {
+    ) -> anyhow::Result<Box<dyn Source>> {
         // Tags that locate the base cannot check the poses that are computed from it.
         if rig.base.tags.is_empty() || rig.base.driver != BaseDriver::Fixed {
             return Ok(source);

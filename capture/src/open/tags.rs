@@ -3,12 +3,12 @@
 
 use crate::config::{BaseDriver, Camera, Parent, Rig};
 use crate::join::{CameraPose, Motion};
+use anyhow::bail;
 use drivers::tags::{
     LocateError, RollingShutterCamera, StationaryPoseFilter, TagDetections, TagDetector,
     TagPlacement, locate,
 };
 use drivers::{BasePose, Error, Image, Sample, Source};
-use keyframe::bail;
 use kinematics::{HistoryError, Stamp, Transform, Twist};
 use nalgebra::{Matrix6, Vector3, Vector6};
 use std::collections::{BTreeMap, VecDeque};
@@ -55,7 +55,7 @@ struct TagCounts {
 }
 
 impl TagBaseSource {
-    pub(super) fn new(rig: &Rig, source: Box<dyn Source>) -> crate::Result<Self> {
+    pub(super) fn new(rig: &Rig, source: Box<dyn Source>) -> anyhow::Result<Self> {
         // With the base at the origin, `Motion` returns poses of cameras relative to the base.
         let mut arm = rig.clone();
         arm.base.driver = BaseDriver::Fixed;

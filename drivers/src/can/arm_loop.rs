@@ -629,16 +629,14 @@ impl ArmLoop {
         };
         // Motors with a watchdog are left out. A resent command would reset their watchdog, and
         // they stop in any case.
-        prepared.shutdown(fail_safe, |movable_motor| {
-            has_no_watchdog(movable_motor, &self.plan)
-        });
+        prepared.shutdown(fail_safe, has_no_watchdog);
         // An answer soon after the stop may reply to an earlier command, so it does not prove that
         // the motor has received this one.
         let watchdog_deadline = *since + self.plan.timeout;
         let all = prepared.movable_motors.iter().zip(&prepared.last_heard);
         let silent_motors: Vec<_> = all
             .filter(|(movable_motor, last_heard)| {
-                has_no_watchdog(movable_motor, &self.plan) && last_heard.0 < watchdog_deadline
+                has_no_watchdog(movable_motor) && last_heard.0 < watchdog_deadline
             })
             .collect();
         if now < watchdog_deadline + STARTUP_TIMEOUT && !silent_motors.is_empty() {
@@ -657,8 +655,8 @@ impl ArmLoop {
 }
 
 /// Whether a motor would execute its last command forever if commands stopped.
-fn has_no_watchdog(movable_motor: &MovableMotor, plan: &WatchdogPlan) -> bool {
-    let watchdog = movable_motor.motor().protocol().watchdog(plan);
+fn has_no_watchdog(movable_motor: &MovableMotor) -> bool {
+    let watchdog = movable_motor.motor().protocol().watchdog();
     !watchdog.is_available()
 }
 

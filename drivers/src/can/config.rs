@@ -1,7 +1,6 @@
 //! Configuration of buses, motors and arms.
 
 use super::family::MotorProtocol;
-use super::odrive::Endpoints;
 use crate::motion::MotionConfig;
 use crate::wire::can::frame::BitRates;
 use std::sync::Arc;
@@ -26,8 +25,6 @@ pub struct MovableArmConfig {
     /// Limits of each joint, in the order of the motors, and the fail-safe behavior if this
     /// computer stops sending.
     pub motion: MotionConfig,
-    /// Endpoint numbers of `ODrive` axes. Without them, the watchdog of the axes cannot be set.
-    pub odrive_endpoints: Option<Endpoints>,
 }
 
 /// Configuration of a bus from the rig file.

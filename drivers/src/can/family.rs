@@ -87,7 +87,7 @@ pub trait MotorProtocol: Debug + Send + Sync {
     /// Traffic on its bus while it moves.
     fn traffic(&self) -> Traffic;
     /// Ability of the motor to detect missing commands.
-    fn watchdog(&self, plan: &WatchdogPlan) -> Watchdog;
+    fn watchdog(&self) -> Watchdog;
     /// The protocol that moves the motor. `limits` are the ranges of its raw values.
     fn motion(&self, limits: &Limits) -> Box<dyn MotionProtocol>;
 

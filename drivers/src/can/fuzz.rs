@@ -296,7 +296,10 @@ mod tests {
     fn implausible_motion_is_not_a_reading() {
         let node = odrive::Node::new(4).unwrap();
         let config = MotorConfig {
-            protocol: Arc::new(Odrive { node }),
+            protocol: Arc::new(Odrive {
+                node,
+                endpoints: None,
+            }),
             ..motors().remove(3)
         };
         let motor = Motor::with_limits(config, LIMITS);

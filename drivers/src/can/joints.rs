@@ -3,6 +3,13 @@
 use super::motor::Reading;
 use kinematics::{JointState, Stamp};
 
+/// Slower joints are not extrapolated, rad/s.
+///
+/// The integers of most motors have none for a velocity of 0: at rest, a motor reports the nearest
+/// one. With 12 bits and a range of 60 rad/s in both directions, that is 0.015 rad/s. If an answer
+/// is late by 0.2 s, extrapolation would move a joint at rest by 3 mrad.
+const MIN_EXTRAPOLATED_RAD_S: f64 = 0.015;
+
 /// A reading of one joint.
 #[derive(Debug)]
 pub(super) struct JointReading {
@@ -34,10 +41,8 @@ impl Joints {
         // position in all later states.
         self.newest.fill(None);
         let stamp = all.iter().map(|(stamp, _)| *stamp).max()?;
-        // Motors answer one after another. At 1 rad/s and 2 ms between the first and the last
-        // answer, joining them without extrapolation would be wrong by 2 mrad.
         let at = |(stamp_of_reading, reading): &(Stamp, Reading)| {
-            reading.position_rad + reading.velocity_rad_s * stamp.secs_since(*stamp_of_reading)
+            position_after(reading, stamp.secs_since(*stamp_of_reading))
         };
         Some(JointState {
             stamp,
@@ -54,6 +59,18 @@ impl Joints {
                 .collect::<Option<_>>()
                 .unwrap_or_default(),
         })
+    }
+}
+
+/// Position some time after a reading, rad.
+///
+/// Motors answer one after another. At 1 rad/s and 2 ms between the first and the last answer,
+/// joining them without extrapolation would be wrong by 2 mrad.
+fn position_after(reading: &Reading, secs: f64) -> f64 {
+    if reading.velocity_rad_s.abs() < MIN_EXTRAPOLATED_RAD_S {
+        reading.position_rad
+    } else {
+        reading.position_rad + reading.velocity_rad_s * secs
     }
 }
 
@@ -100,5 +117,15 @@ mod tests {
             None,
             "it starts over"
         );
+    }
+
+    #[test]
+    fn joints_at_rest_are_not_extrapolated() {
+        let mut joints = Joints::new(2);
+        let mut early = joint_reading(0, 0, 0.25);
+        early.reading.velocity_rad_s = -0.0073; // What a motor with 30 rad/s and 12 bits reports.
+        assert_eq!(joints.take(&early), None);
+        let state = joints.take(&joint_reading(1, 200, 0.5)).unwrap();
+        assert_eq!(state.position, [0.25, 0.5]);
     }
 }

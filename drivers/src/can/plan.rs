@@ -28,14 +28,11 @@ pub(super) fn watchdog_plan(config: &MovableArmConfig) -> Result<WatchdogPlan, E
         );
         return Err(Error::Motion { reason });
     }
-    // The plan comes before the checks of the motors, because whether a motor has a watchdog
-    // depends on the plan.
     let host = unused_node(config)?;
     let plan = WatchdogPlan {
         on_loss: motion_config.on_loss,
         timeout: motion_config.timeout,
         accept_no_watchdog: motion_config.accept_no_watchdog,
-        endpoints: config.odrive_endpoints.clone(),
         period: period(config, host),
         host,
     };
@@ -60,7 +57,7 @@ pub(super) fn check_motor(
     config: &MotorConfig,
     interface: &str,
 ) -> Result<(), Error> {
-    let watchdog = config.protocol.watchdog(plan);
+    let watchdog = config.protocol.watchdog();
     // Without a watchdog, the arm would continue after a crash of this computer. That must be a
     // decision of the person who wrote the rig file.
     if let Watchdog::Missing { reason, .. } = watchdog
@@ -176,7 +173,7 @@ mod tests {
     use super::super::config::{ArmConfig, BusConfig, FollowingLimits, Gains};
     use super::super::damiao::Damiao;
     use super::super::family::MotorProtocol;
-    use super::super::odrive::{self, Endpoints, Odrive};
+    use super::super::odrive::{self, Odrive};
     use super::super::robstride::{self, Robstride};
     use super::super::tmotor::{self, TMotor};
     use super::*;
@@ -211,7 +208,6 @@ mod tests {
                 timeout: Duration::from_millis(100),
                 accept_no_watchdog: false,
             },
-            odrive_endpoints: None,
         }
     }
 
@@ -256,7 +252,6 @@ mod tests {
         protocol: &Arc<dyn MotorProtocol>,
         on_loss: OnLoss,
         accept_no_watchdog: bool,
-        endpoints: Option<Endpoints>,
     ) -> Option<String> {
         let gains = Some(Gains {
             stiffness_nm_rad: 1.0,
@@ -276,7 +271,6 @@ mod tests {
             on_loss,
             timeout: Duration::from_millis(100),
             accept_no_watchdog,
-            endpoints,
             host: canopen::Node::new(127).expect("a node"),
             period: Duration::from_millis(5),
         };
@@ -303,8 +297,10 @@ mod tests {
             motor: 1,
             model: robstride::Model::Rs00,
         });
+        let node = odrive::Node::new(1).expect("a node");
         let odrive: Arc<dyn MotorProtocol> = Arc::new(Odrive {
-            node: odrive::Node::new(1).expect("a node"),
+            node,
+            endpoints: None,
         });
         let ak: Arc<dyn MotorProtocol> = Arc::new(TMotor {
             motor: 1,
@@ -329,7 +325,7 @@ mod tests {
             ),
             (&ak, OnLoss::Release, Some("accept_no_watchdog = true")),
         ] {
-            let reported = reported(protocol, on_loss, false, None);
+            let reported = reported(protocol, on_loss, false);
             let is_as_expected = match (&reported, expected) {
                 (Some(reported), Some(expected)) => {
                     reported.contains(expected) && reported.contains("\"elbow\" on \"can0\"")
@@ -339,17 +335,21 @@ mod tests {
             assert!(is_as_expected, "{protocol:?} {on_loss:?}: {reported:?}");
         }
         for on_loss in [OnLoss::Hold, OnLoss::Damp, OnLoss::Release] {
-            assert_eq!(reported(&ak, on_loss, true, None), None, "it was accepted");
+            assert_eq!(reported(&ak, on_loss, true), None, "it was accepted");
         }
-        let endpoints = Some(odrive::emulated::endpoints());
-        assert_eq!(
-            reported(&odrive, OnLoss::Release, false, endpoints.clone()),
-            None
-        );
+        assert_eq!(reported(&odrive, OnLoss::Hold, true), None);
+        let mut with_endpoints = odrive;
+        odrive::set_endpoints(&mut with_endpoints, Some(&odrive::emulated::endpoints()));
+        assert_eq!(reported(&with_endpoints, OnLoss::Release, false), None);
         assert!(
-            reported(&odrive, OnLoss::Hold, true, endpoints).is_some(),
+            reported(&with_endpoints, OnLoss::Hold, true).is_some(),
             "its watchdog can only release"
         );
-        assert_eq!(reported(&odrive, OnLoss::Hold, true, None), None);
+        let mut other = Arc::clone(&damiao);
+        odrive::set_endpoints(&mut other, Some(&odrive::emulated::endpoints()));
+        assert!(
+            other.as_ref() == damiao.as_ref(),
+            "a motor of another family"
+        );
     }
 }

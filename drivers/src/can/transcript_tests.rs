@@ -11,8 +11,7 @@ use super::frame_io::{BusEvent, FrameIo};
 use super::fuzz::motors;
 use super::motor::Motor;
 use super::movable_motor::MovableMotor;
-use super::odrive::Endpoints;
-use super::odrive::emulated;
+use super::odrive::{self, Endpoints, emulated};
 use super::plan::check_motor;
 use super::watchdog::WatchdogPlan;
 use super::{Gains, MotorConfig};
@@ -161,13 +160,12 @@ fn reading(config: &MotorConfig) -> String {
     bus.transcript.into_inner()
 }
 
-fn plan(on_loss: OnLoss, endpoints: Option<Endpoints>) -> WatchdogPlan {
+fn plan(on_loss: OnLoss) -> WatchdogPlan {
     let host = canopen::Node::new(127).unwrap();
     WatchdogPlan {
         on_loss,
         timeout: TIMEOUT,
         accept_no_watchdog: true,
-        endpoints,
         host,
         period: PERIOD,
     }
@@ -318,25 +316,33 @@ impl FrameIo for SilentBus {
     }
 }
 
+/// The motor with these endpoints, if it is an `ODrive` axis; otherwise, the same motor.
+fn with_endpoints(config: &MotorConfig, endpoints: Option<&Endpoints>) -> MotorConfig {
+    let mut config = config.clone();
+    odrive::set_endpoints(&mut config.protocol, endpoints);
+    config
+}
+
 fn conversation(config: &MotorConfig) -> String {
     let gains = Some(Gains {
         stiffness_nm_rad: 60.0,
         damping_nm_s_rad: 4.0,
     });
-    let config = &MotorConfig {
+    let without_endpoints = &MotorConfig {
         gains,
-        ..config.clone()
+        ..with_endpoints(config, None)
     };
+    let config = &with_endpoints(without_endpoints, Some(&emulated::endpoints()));
     let silence = Motor::set_up(&SilentBus, config).unwrap_err();
     let mut text = format!("## silent\n= {silence}\n## reading\n{}", reading(config));
     for on_loss in [OnLoss::Hold, OnLoss::Damp, OnLoss::Release] {
-        let [moved, without_endpoints] = [Some(emulated::endpoints()), None]
-            .map(|endpoints| moving(config, &plan(on_loss, endpoints)));
+        let [moved, moved_without] =
+            [config, without_endpoints].map(|config| moving(config, &plan(on_loss)));
         write!(text, "## moving, {}\n{moved}", on_loss.name()).unwrap();
-        if without_endpoints != moved {
+        if moved_without != moved {
             write!(
                 text,
-                "## moving without endpoints, {}\n{without_endpoints}",
+                "## moving without endpoints, {}\n{moved_without}",
                 on_loss.name()
             )
             .unwrap();
@@ -345,23 +351,24 @@ fn conversation(config: &MotorConfig) -> String {
     text += "## rejected\n";
     let strict = WatchdogPlan {
         accept_no_watchdog: false,
-        ..plan(OnLoss::Release, None)
+        ..plan(OnLoss::Release)
     };
-    text += &check_motor(&strict, config, "test0")
+    text += &check_motor(&strict, without_endpoints, "test0")
         .map_or_else(|error| format!("= {error}\n"), |()| String::new());
     let without_gains = MotorConfig {
         gains: None,
-        ..config.clone()
+        ..without_endpoints.clone()
     };
     text += &check_motor(&strict, &without_gains, "test0")
         .map_or_else(|error| format!("= {error}\n"), |()| String::new());
-    let lenient = plan(OnLoss::Release, Some(emulated::endpoints()));
+    let lenient = plan(OnLoss::Release);
     text += &rejected(config, &lenient, EmulatedMotor::ignore_timeout);
-    let endpoints = Endpoints {
+    let older_endpoints = Endpoints {
         firmware: "0.6.8".to_owned(),
         ..emulated::endpoints()
     };
-    text += &rejected(config, &plan(OnLoss::Release, Some(endpoints)), |_| {});
+    let with_older = with_endpoints(config, Some(&older_endpoints));
+    text += &rejected(&with_older, &lenient, |_| {});
     let gains = Some(Gains {
         stiffness_nm_rad: 3e4,
         damping_nm_s_rad: 4.0,

@@ -1,6 +1,5 @@
 //! The behavior of motors when commands of this computer stop, and its configuration.
 
-use super::odrive::Endpoints;
 use crate::motion::OnLoss;
 use crate::wire::can::canopen;
 use std::time::Duration;
@@ -14,8 +13,6 @@ pub struct WatchdogPlan {
     pub timeout: Duration,
     /// Whether to move motors without a watchdog.
     pub accept_no_watchdog: bool,
-    /// Endpoint numbers of `ODrive` axes. Without them, the watchdog of the axes cannot be set.
-    pub endpoints: Option<Endpoints>,
     /// Our CANopen node number, whose heartbeat the drives monitor.
     pub host: canopen::Node,
     /// Cycle period.

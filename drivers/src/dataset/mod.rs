@@ -185,7 +185,7 @@ fn plural(n: usize, noun: &str) -> (String, &'static str) {
 
 /// The first names, and how many more there are.
 fn first_names(names: &[String]) -> String {
-    kinematics::shortened(names, SkippedImages::MAX_NAMED, ", ")
+    messages::shortened(names, SkippedImages::MAX_NAMED, ", ")
 }
 
 #[cfg(test)]

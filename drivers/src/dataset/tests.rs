@@ -244,6 +244,12 @@ fn missing_and_garbage_images_are_skipped_and_counted() {
         text.contains("no usable image: 3 are missing, 1 cannot be used (garbage.jpg: "),
         "{text}"
     );
+    std::fs::remove_file(folder.path().join("garbage.jpg")).unwrap();
+    let text = read_error(&folder);
+    assert!(
+        text.contains("no usable image: 4 are missing, 0 cannot be used (such as "),
+        "{text}"
+    );
 }
 
 #[test]

@@ -7,7 +7,7 @@
 
 use super::{Config, Pace};
 use crate::clock;
-use kinematics::clock::WrappingMicros;
+use kinematics::device_clock::WrappingMicros;
 use kinematics::{ClockMap, Stamp};
 use realsense_rust::frame::FrameEx;
 use realsense_rust::kind::{Rs2FrameMetadata, Rs2TimestampDomain};

@@ -5,7 +5,9 @@ use crate::wire::datagram::{
     Clock, DatagramHeader, JointsDatagram, PoseDatagram, ScanPart, encode_joints, encode_pose,
     encode_scan,
 };
-use crate::{Arm, Base, Devices, Error, Live, RangePoint, RangeScanner, Sample, Source, clock};
+use crate::{
+    Arm, Base, Devices, Error, LiveDevices, RangePoint, RangeScanner, Sample, Source, clock,
+};
 use kinematics::Transform;
 use std::net::{SocketAddr, UdpSocket};
 use std::time::{Duration, Instant};
@@ -479,7 +481,7 @@ fn live_merges_devices_and_names_silent_one() {
         scanners: vec![Box::new(scanner)],
         ..Devices::default()
     };
-    let mut live = Live::new(devices).unwrap();
+    let mut live = LiveDevices::new(devices).unwrap();
     for seq in 0..3 {
         send_pose(&pose(now(seq), 0.0));
         send_scan(&part(now(seq), 0, 1, 1.0));

@@ -8,11 +8,12 @@ mod pictures;
 
 pub(crate) use pictures::{Comparison, Scored, compare};
 
-use crate::chart::drawing::escaped;
-use crate::chart::{Axis, Chart, Line, Point, Scale};
 use crate::next_commands::NextCommand;
-use crate::table::{Table, html_row};
 use crate::{evaluation_schedule, run_folder};
+use report::Table;
+use report::chart::drawing::escaped;
+use report::chart::{Axis, Chart, Line, Point, Scale};
+use report::table::html_row;
 use serde_json::{Map, Value};
 use std::fmt::Write;
 use std::path::Path;
@@ -40,7 +41,7 @@ pub(crate) struct Page<'a> {
 
 impl Page<'_> {
     /// Writes the page into the folder.
-    pub(crate) fn write(&self) -> crate::Result<()> {
+    pub(crate) fn write(&self) -> anyhow::Result<()> {
         run_folder::write_atomic(&self.folder.join(FILE), &self.html())
     }
 
@@ -54,7 +55,7 @@ impl Page<'_> {
             "<!doctype html>\n<html lang=\"en\"><head><meta charset=\"utf-8\">\n\
              <meta name=\"viewport\" content=\"width=device-width, initial-scale=1\">\n\
              <title>{title}</title>\n<style>\n{}</style></head>\n<body><main>\n<h1>{title}</h1>\n<p class=\"sub\">{}</p>\n",
-            include_str!("style.css"),
+            report::STYLE,
             escaped(&self.subtitle())
         );
         page.push_str(&figures(done, self.primitive));

@@ -1,11 +1,11 @@
 //! Test images next to the model's renders, small enough to embed in a page.
 
 use crate::evaluate;
-use crate::inline_picture::{data_uri, fit_size};
 use capture::downscale;
 use keyframe::Keyframe;
 use kinematics::f32s_of;
 use kinematics::quantile::trimmed_range;
+use report::inline_picture::{data_uri, fit_size};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 use trainer::{AlignedModel, Picture};
@@ -68,7 +68,7 @@ pub(crate) struct Scored<'a> {
 pub(crate) fn compare(
     method: &mut AlignedModel,
     scored: &[Scored<'_>],
-) -> crate::Result<Vec<Comparison>> {
+) -> anyhow::Result<Vec<Comparison>> {
     let started = Instant::now();
     let mut comparisons: Vec<(usize, Comparison)> = Vec::new();
     let mut n_bytes = 0;
@@ -122,7 +122,7 @@ fn selected(psnr: &[f64]) -> Vec<usize> {
 }
 
 impl Comparison {
-    fn of(method: &mut AlignedModel, scored: &Scored<'_>) -> crate::Result<Self> {
+    fn of(method: &mut AlignedModel, scored: &Scored<'_>) -> anyhow::Result<Self> {
         let keyframe = scored.keyframe;
         let rendered = evaluate::draw(method, keyframe, true)?;
         let [size_px, small_px] =
@@ -155,7 +155,7 @@ impl Comparison {
 
 impl DepthPicture {
     /// `None` if nothing was drawn.
-    fn of(picture: &Picture, size_px: [u32; 2]) -> crate::Result<Option<Self>> {
+    fn of(picture: &Picture, size_px: [u32; 2]) -> anyhow::Result<Option<Self>> {
         let subsampled = nearest_pixels(&picture.depth_m, picture.size_px, size_px);
         let valid = subsampled
             .iter()

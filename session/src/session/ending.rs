@@ -4,6 +4,7 @@ use super::Session;
 use super::outcome::TrainingOutcome;
 use super::reporter::{Reporter, ScoredModel};
 use crate::checkpoints::Snapshot;
+use crate::error::is_io;
 use crate::evaluate::Scores;
 use crate::next_commands::{DataSource, SavedModel};
 use crate::{camera_list, run_folder, viewer};
@@ -62,13 +63,13 @@ pub struct EndingSession<P> {
 pub fn finish(
     mut endings: Vec<EndingSession<impl Serialize>>,
     hub: Option<&Hub>,
-) -> crate::Result<Vec<FinishedModel>> {
+) -> anyhow::Result<Vec<FinishedModel>> {
     // The training time of all models ends before the first one is saved. Saving takes time, which
     // would otherwise count for the models that are saved later.
     let ended_secs: Vec<f64> = endings
         .iter_mut()
         .map(|ending| ending.session.stop_training())
-        .collect::<crate::Result<_>>()?;
+        .collect::<anyhow::Result<_>>()?;
     // All models are saved before scoring, so that a second Ctrl-C during scoring loses nothing.
     let mut errors = Errors::default();
     let mut saved = save_all(endings, ended_secs, &mut errors);
@@ -103,12 +104,12 @@ pub fn finish(
 /// Errors of several models. The first one is returned, all others are logged.
 #[derive(Default)]
 struct Errors {
-    first: Option<crate::Error>,
+    first: Option<anyhow::Error>,
 }
 
 impl Errors {
     /// Keeps the first error, and logs an error after it.
-    fn record(&mut self, error: crate::Error) {
+    fn record(&mut self, error: anyhow::Error) {
         if self.first.is_none() {
             self.first = Some(error);
         } else {
@@ -117,7 +118,7 @@ impl Errors {
     }
 
     /// Returns the first error, if there was one.
-    fn into_result(self) -> crate::Result<()> {
+    fn into_result(self) -> anyhow::Result<()> {
         self.first.map_or(Ok(()), Err)
     }
 }
@@ -168,7 +169,7 @@ fn save_all<P>(
 fn wait_for_checkpoints<P>(saved: &mut [SavedSession<P>], errors: &mut Errors) {
     for SavedSession { ending, .. } in saved {
         if let Err(error) = ending.session.persistence.wait() {
-            errors.record(error.with_context(format!(
+            errors.record(error.context(format!(
                 "the model was saved in {}, but not the last checkpoint",
                 ending.out.display()
             )));
@@ -181,18 +182,18 @@ struct Saved {
     folder: PathBuf,
     sha256: String,
     /// Why the model could not be saved in the run folder, if it was saved elsewhere.
-    failed: Option<crate::Error>,
+    failed: Option<anyhow::Error>,
 }
 
 impl Session {
     /// Scores the final model without saving it.
-    pub fn score_without_saving(mut self) -> crate::Result<TrainingOutcome> {
+    pub fn score_without_saving(mut self) -> anyhow::Result<TrainingOutcome> {
         let seconds = self.stop_training()?;
         self.score_at_end(seconds, None)
     }
 
     /// Waits for queued work and returns the training time in seconds.
-    fn stop_training(&mut self) -> crate::Result<f64> {
+    fn stop_training(&mut self) -> anyhow::Result<f64> {
         // Queued steps count as training time, so the time is read after them.
         self.gpu.wait()?;
         let seconds = self.time.end_secs();
@@ -201,7 +202,7 @@ impl Session {
     }
 
     /// Saves the model, in a temporary folder if `out` cannot be written. `seconds`: training time.
-    fn save(&mut self, out: &Path, seconds: f64) -> crate::Result<Saved> {
+    fn save(&mut self, out: &Path, seconds: f64) -> anyhow::Result<Saved> {
         self.persistence.check_folders();
         self.persistence.end_decisions(&mut self.method)?;
         let progress = self.progress();
@@ -233,13 +234,13 @@ impl Session {
             }),
             // The disk may be full, or the folder read-only. Other errors, such as a lost GPU,
             // would also occur in another folder.
-            Err(error) if error.is_io() => self.save_elsewhere(out, error),
+            Err(error) if is_io(&error) => self.save_elsewhere(out, error),
             Err(error) => Err(error),
         }
     }
 
     /// Saves the model in a temporary folder, because its run folder could not be written.
-    fn save_elsewhere(&mut self, out: &Path, save_error: crate::Error) -> crate::Result<Saved> {
+    fn save_elsewhere(&mut self, out: &Path, save_error: anyhow::Error) -> anyhow::Result<Saved> {
         match save_in_fallback_folder(&mut self.method, &self.edits) {
             Ok((folder, sha256)) => {
                 let context = format!(
@@ -250,13 +251,13 @@ impl Session {
                 Ok(Saved {
                     folder,
                     sha256,
-                    failed: Some(save_error.with_context(context)),
+                    failed: Some(save_error.context(context)),
                 })
             }
             Err(error) => {
                 log::error!("cannot save the model in a temporary folder either: {error:#}");
                 // The user can act on the first error, which concerns the requested folder.
-                Err(save_error.with_context(format!(
+                Err(save_error.context(format!(
                     "cannot save the model in {}; {}",
                     out.display(),
                     self.persistence.describe_unsaved()
@@ -282,7 +283,7 @@ impl Session {
         checkpoint_sha256: &str,
         details: &impl Serialize,
         hub: Option<&Hub>,
-    ) -> crate::Result<FinishedModel> {
+    ) -> anyhow::Result<FinishedModel> {
         let outcome = self.score_at_end(seconds, hub)?;
         let method = &mut self.method;
         // Rendered before profiling, because profiling trains the model further.
@@ -314,7 +315,7 @@ impl Session {
         })
     }
 
-    fn score_at_end(&mut self, seconds: f64, hub: Option<&Hub>) -> crate::Result<TrainingOutcome> {
+    fn score_at_end(&mut self, seconds: f64, hub: Option<&Hub>) -> anyhow::Result<TrainingOutcome> {
         self.gpu.wait()?;
         self.persistence.log_render();
         let mut work = WorkDuringScoring {
@@ -346,7 +347,7 @@ impl Session {
 fn save_in_fallback_folder(
     method: &mut AlignedModel,
     edits: &Edits,
-) -> crate::Result<(PathBuf, String)> {
+) -> anyhow::Result<(PathBuf, String)> {
     let folder = run_folder::make_fallback_folder()?;
     run_folder::save_model(method, edits, &folder)?;
     let sha256 = run_folder::checkpoint_sha256(&folder)?;

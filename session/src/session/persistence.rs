@@ -3,11 +3,13 @@
 
 use crate::checkpoints::{self, CheckpointWrite, Checkpoints, Snapshot};
 use crate::decisions::DecisionLog;
+use crate::error::is_gpu_error;
 use crate::kept_folder::KeptFolder;
 use crate::recovery::Recovery;
 use gpu::Gpu;
 use keyframe::{DepthMap, Keyframe};
 use kinematics::Stamp;
+use messages::Setting;
 use model_files::checkpoint::Checkpoint;
 use std::path::Path;
 use std::sync::Arc;
@@ -62,7 +64,7 @@ impl Persistence {
         &mut self,
         method: &mut AlignedModel,
         keyframe: &Arc<Keyframe>,
-    ) -> crate::Result<()> {
+    ) -> anyhow::Result<()> {
         if let Some(decisions) = &mut self.decisions {
             decisions.pushed(method.n_total_steps()?, keyframe);
         }
@@ -75,7 +77,7 @@ impl Persistence {
         method: &mut AlignedModel,
         camera: &str,
         stamp: Stamp,
-    ) -> crate::Result<()> {
+    ) -> anyhow::Result<()> {
         if let Some(decisions) = &mut self.decisions {
             decisions.removed(method.n_total_steps()?, camera, stamp);
         }
@@ -83,7 +85,7 @@ impl Persistence {
     }
 
     /// Logs that the result of an alignment was applied.
-    pub(super) fn log_alignment(&mut self, method: &mut AlignedModel) -> crate::Result<()> {
+    pub(super) fn log_alignment(&mut self, method: &mut AlignedModel) -> anyhow::Result<()> {
         if let Some(decisions) = &mut self.decisions {
             decisions.aligned(method.n_total_steps()?);
         }
@@ -95,7 +97,7 @@ impl Persistence {
         &mut self,
         method: &mut AlignedModel,
         is_paused: bool,
-    ) -> crate::Result<()> {
+    ) -> anyhow::Result<()> {
         if let Some(decisions) = &mut self.decisions {
             decisions.growth_paused(method.n_total_steps()?, is_paused);
         }
@@ -118,7 +120,7 @@ impl Persistence {
     }
 
     /// Ends the decision log. Write errors are logged.
-    pub(super) fn end_decisions(&mut self, method: &mut AlignedModel) -> crate::Result<()> {
+    pub(super) fn end_decisions(&mut self, method: &mut AlignedModel) -> anyhow::Result<()> {
         if let Some(decisions) = self.decisions.take()
             && let Err(error) = decisions.end(method.n_total_steps()?)
         {
@@ -147,7 +149,7 @@ impl Persistence {
     pub(super) fn write_checkpoint_when_due(
         &mut self,
         snapshot: Snapshot<'_>,
-    ) -> crate::Result<()> {
+    ) -> anyhow::Result<()> {
         let Some(checkpoints) = &mut self.checkpoints else {
             return Ok(());
         };
@@ -204,7 +206,7 @@ impl Persistence {
     }
 
     /// Waits until no checkpoint is being written.
-    pub(super) fn wait(&mut self) -> crate::Result<()> {
+    pub(super) fn wait(&mut self) -> anyhow::Result<()> {
         self.checkpoints.as_mut().map_or(Ok(()), Checkpoints::wait)
     }
 
@@ -224,7 +226,10 @@ impl Persistence {
     pub(super) fn describe_unsaved(&mut self) -> String {
         match self.describe_recoverable() {
             Some(left) if self.has_checkpoint() => {
-                format!("{left}; use --out to save the model in another folder")
+                format!(
+                    "{left}; use {} to save the model in another folder",
+                    Setting::Out
+                )
             }
             Some(left) => left,
             None => "there is no checkpoint either".to_owned(),
@@ -244,9 +249,9 @@ impl Persistence {
         &mut self,
         gpu: &Arc<Gpu>,
         keyframes: &[Arc<Keyframe>],
-    ) -> crate::Result<AlignedModel> {
+    ) -> anyhow::Result<AlignedModel> {
         let Some(recovery) = &self.recovery else {
-            keyframe::bail!("this run cannot continue on another device")
+            anyhow::bail!("this run cannot continue on another device")
         };
         let checkpoint = newest_checkpoint(self.checkpoints.as_mut(), recovery.resumed.as_deref());
         // A checkpoint requires all keyframes that its model was trained on, including those that
@@ -309,9 +314,9 @@ impl Persistence {
 fn newest_checkpoint(
     checkpoints: Option<&mut Checkpoints>,
     resumed_folder: Option<&Path>,
-) -> Option<crate::Result<Checkpoint>> {
+) -> Option<anyhow::Result<Checkpoint>> {
     match (checkpoints.and_then(Checkpoints::newest), resumed_folder) {
-        (Some(path), _) => Some(Checkpoint::read(path).map_err(crate::Error::from)),
+        (Some(path), _) => Some(Checkpoint::read(path).map_err(anyhow::Error::from)),
         (None, Some(folder)) => Some(checkpoints::read(folder)),
         (None, None) => None,
     }
@@ -326,9 +331,9 @@ fn contains(keyframes: &[Arc<Keyframe>], keyframe: &Arc<Keyframe>) -> bool {
 /// if the GPU failed.
 fn resume(
     gpu: &Arc<Gpu>,
-    checkpoint: crate::Result<Checkpoint>,
+    checkpoint: anyhow::Result<Checkpoint>,
     keyframes: &[Arc<Keyframe>],
-) -> crate::Result<Option<Resumed>> {
+) -> anyhow::Result<Option<Resumed>> {
     // Keyframes that were missing at the start of this run are still missing.
     let resume = |checkpoint| {
         Ok(trainer::resume_without_missing(
@@ -340,7 +345,7 @@ fn resume(
     match checkpoint.and_then(resume) {
         Ok((resumed, _)) => Ok(Some(resumed)),
         // The new device has failed, too: the caller tries again.
-        Err(error) if error.is_gpu_error() => Err(error),
+        Err(error) if is_gpu_error(&error) => Err(error),
         // The checkpoint is unusable, for example damaged. Starting again loses training time;
         // an error would lose the run.
         Err(error) => {

@@ -15,7 +15,7 @@ const PROFILE_WARM_UP: Duration = Duration::from_millis(700);
 
 /// GPU time of each kernel in a step in milliseconds: medians over [`N_PROFILED`] steps, in order
 /// of first execution.
-pub(super) fn profile(method: &mut dyn Method) -> crate::Result<Vec<(&'static str, f64)>> {
+pub(super) fn profile(method: &mut dyn Method) -> anyhow::Result<Vec<(&'static str, f64)>> {
     let mut names: Vec<&'static str> = Vec::new();
     let mut by_name: BTreeMap<&'static str, Vec<f64>> = BTreeMap::new();
     let began = Instant::now();

@@ -2,13 +2,13 @@
 
 use super::outcome::TrainingOutcome;
 use super::profile::profile;
-use crate::error::Context;
 use crate::evaluate::{ImageScores, Scores};
 use crate::next_commands::{self, DataSource, SavedModel};
 use crate::observer::{
     DoneEvent, Evaluation, FinishedReport, Observer, ProfileEvent, SessionEvent, SessionProgress,
 };
 use crate::{report, run_folder};
+use anyhow::Context;
 use calibration::{Alignment, CameraCorrection, TrialReport};
 use keyframe::Keyframe;
 use serde::Serialize;
@@ -51,7 +51,7 @@ pub(super) struct ScoredModel<'a, T: Serialize> {
     pub checkpoint_sha256: &'a str,
     pub outcome: &'a TrainingOutcome,
     /// Test images next to renders. If this is an error, the page is not written.
-    pub comparisons: crate::Result<Vec<report::Comparison>>,
+    pub comparisons: anyhow::Result<Vec<report::Comparison>>,
     /// GPU time of each kernel in a step in milliseconds, if profiling was requested.
     pub passes: Option<Vec<(&'static str, f64)>>,
     pub alignment: Option<&'a Alignment>,
@@ -171,7 +171,7 @@ impl Reporter {
         method: &mut AlignedModel,
         tests: impl Iterator<Item = &'a Arc<Keyframe>>,
         scores: &[ImageScores],
-    ) -> crate::Result<Vec<report::Comparison>> {
+    ) -> anyhow::Result<Vec<report::Comparison>> {
         let scored = tests.zip(scores).map(|(keyframe, scores)| report::Scored {
             keyframe,
             name: self.image_name(scores),
@@ -185,7 +185,7 @@ impl Reporter {
     pub(super) fn profile(
         &self,
         method: &mut dyn Method,
-    ) -> crate::Result<Option<Vec<(&'static str, f64)>>> {
+    ) -> anyhow::Result<Option<Vec<(&'static str, f64)>>> {
         self.profiles.then(|| profile(method)).transpose()
     }
 
@@ -193,7 +193,7 @@ impl Reporter {
     pub(super) fn report_end(
         &mut self,
         model: ScoredModel<'_, impl Serialize>,
-    ) -> crate::Result<()> {
+    ) -> anyhow::Result<()> {
         let ScoredModel { out, outcome, .. } = model;
         let done = DoneEvent {
             event: "done",
@@ -260,7 +260,7 @@ impl Reporter {
         out: &Path,
         report: &Report<'_, impl Serialize>,
         comparisons: &[report::Comparison],
-    ) -> crate::Result<()> {
+    ) -> anyhow::Result<()> {
         let n_tests = report.per_image.len();
         let model = SavedModel {
             kind: self.kind,

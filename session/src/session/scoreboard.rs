@@ -161,7 +161,7 @@ impl Scoreboard {
         &self,
         method: &mut AlignedModel,
         keyframe: &Keyframe,
-    ) -> crate::Result<ImageScores> {
+    ) -> anyhow::Result<ImageScores> {
         self.evaluators
             .during_training
             .score_named(method, keyframe)
@@ -177,7 +177,7 @@ impl Scoreboard {
         &self,
         method: &mut AlignedModel,
         meanwhile: impl FnMut(&mut AlignedModel, usize),
-    ) -> crate::Result<Vec<ImageScores>> {
+    ) -> anyhow::Result<Vec<ImageScores>> {
         self.evaluators
             .at_end
             .score_all(method, self.tests.iter(), meanwhile)

@@ -1,6 +1,6 @@
 //! Time accounting of a session: training time, its limits, and the use of a shared device.
 
-use crate::clock::Clock;
+use crate::training_clock::Clock;
 use std::time::{Duration, Instant};
 
 /// Limits of training, which stops when the first one is reached.

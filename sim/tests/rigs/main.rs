@@ -1,6 +1,6 @@
 //! Tests of the simulated rigs.
 
 mod common;
-mod live;
+mod live_rig;
 mod mobile;
 mod rig;

@@ -4,12 +4,13 @@
 use super::run_flags;
 use super::runs_args::print_result;
 use crate::commands::run::{self, DiscardedRun};
-use crate::exit::{self, Exit, InsufficientData};
+use crate::exit::{self, Exit};
 use crate::print;
 use anyhow::Context;
 use bench::live::{Conditions, HandEyeError, InputCounts, LiveRun, findings};
 use bench::{BenchResult, Disturbance, LiveDisturbance, Timeline, Viewer, ViewerOptions};
 use capture::{Rig, open};
+use messages::InsufficientData;
 use session::run_folder::CreatedFolders;
 use std::ffi::OsString;
 use std::path::{Path, PathBuf};
@@ -293,7 +294,7 @@ impl Args {
         };
         let viewers: Vec<Viewer> = (0..conditions.n_viewers)
             .map(|_| Viewer::connect(address, options))
-            .collect::<bench::Result<_>>()?;
+            .collect::<anyhow::Result<_>>()?;
         let mut timeline = Timeline::default();
         while running.run_time_slice()? {
             timeline.sample(&running.live, &running.gpu, &viewers);

@@ -4,11 +4,12 @@
 use super::run_flags;
 use super::runs_args::print_result;
 use crate::commands::run;
-use crate::exit::{BadArgument, Exit};
+use crate::exit::Exit;
 use crate::print;
 use anyhow::Context;
 use bench::memory::MemoryRun;
 use bench::{BenchResult, Sample, Viewer, ViewerOptions};
+use messages::BadInput;
 use session::run_folder::CreatedFolders;
 use std::ffi::OsString;
 use std::path::{Path, PathBuf};
@@ -92,7 +93,7 @@ fn measure(args: &Args, flags: &run::Args) -> anyhow::Result<(MemoryRun, Option<
     let address = running.page.address();
     let viewers: Vec<Viewer> = (0..args.viewers)
         .map(|_| Viewer::connect(address, ViewerOptions::default()))
-        .collect::<bench::Result<_>>()?;
+        .collect::<anyhow::Result<_>>()?;
     let every = Duration::from_secs_f64(args.every_secs);
     let mut measured = MemoryRun {
         input: args.input(),
@@ -146,7 +147,7 @@ fn describe(sample: &Sample) -> String {
 }
 
 impl Args {
-    fn check(&self) -> Result<(), BadArgument> {
+    fn check(&self) -> Result<(), BadInput> {
         for (flag, value, allowed) in [
             ("--seconds", self.seconds, 1.0..=1e6),
             ("--every-secs", self.every_secs, 0.01..=3600.0),
@@ -154,7 +155,7 @@ impl Args {
             if !allowed.contains(&value) {
                 let from = allowed.start();
                 let to = allowed.end();
-                return Err(BadArgument(format!(
+                return Err(BadInput(format!(
                     "{flag} {value}: must be a number from {from} to {to}"
                 )));
             }
@@ -162,7 +163,7 @@ impl Args {
         Ok(())
     }
 
-    fn run_flags(&self, folder: &Path) -> Result<run::Args, BadArgument> {
+    fn run_flags(&self, folder: &Path) -> Result<run::Args, BadInput> {
         let mut flags: Vec<OsString> = Vec::new();
         if self.sim {
             flags.push("--sim".into());

@@ -1,8 +1,8 @@
 //! Flags of `run` for benches that measure a run.
 
 use crate::commands::run;
-use crate::exit::BadArgument;
 use clap::Parser;
+use messages::BadInput;
 use std::ffi::OsString;
 use std::path::Path;
 
@@ -23,7 +23,7 @@ pub(super) fn parse(
     (out, json): (&Path, bool),
     flags: Vec<OsString>,
     given: &[OsString],
-) -> Result<run::Args, BadArgument> {
+) -> Result<run::Args, BadInput> {
     let mut line: Vec<OsString> = vec!["run".into(), rig_file.into()];
     line.extend(flags);
     line.extend(["--seconds".into(), seconds.to_string().into()]);
@@ -42,7 +42,7 @@ pub(super) fn parse(
         let message = error.to_string();
         // The rest of the message is the usage of this parser, which the user did not call.
         let first = message.lines().next().unwrap_or_default();
-        BadArgument(format!(
+        BadInput(format!(
             "flags of run: {}",
             first.strip_prefix("error: ").unwrap_or(first)
         ))

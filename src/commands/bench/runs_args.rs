@@ -39,7 +39,7 @@ impl RunsArgs {
     /// Runs a bench and prints its result.
     pub(super) fn run(
         &self,
-        bench: impl FnOnce(&Host<'_>) -> bench::Result<BenchResult>,
+        bench: impl FnOnce(&Host<'_>) -> anyhow::Result<BenchResult>,
     ) -> anyhow::Result<Exit> {
         let observer = Printer { json: self.json };
         let result = bench(&Host {

@@ -1,21 +1,17 @@
 //! `fieldrig calibrate intrinsics`: the lens of a camera from images of a target.
 
-use super::guide::Purpose;
-use super::images::{self, OtherSize};
-use super::lens::LensFile;
-use super::outputs::{self, ReportFlag, RigFlags, RigOutput};
-use super::scan::ScanOptions;
+use super::flags::{ReportFlag, RigFlags};
 use super::target_argument;
-use crate::exit::{Exit, InsufficientData};
+use crate::exit::{BadArgument, Exit};
+use super::terminal::Terminal;
 use crate::print;
-use calibration::{
-    BoardView, ImageGrid, IntrinsicsCalibration, IntrinsicsInput, LensModel, LensTrial,
-    calibrate_intrinsics,
-};
+use calibrate::{IntrinsicsTask, LensFile};
+use calibration::{ImageGrid, IntrinsicsCalibration, LensModel, LensTrial};
+use messages::InsufficientData;
+use report::calibration_report::Unused;
 use serde::Serialize;
-use session::calibration_report::{IntrinsicsReport, Photos, Unused};
 use std::collections::BTreeMap;
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 use targets::TargetSpec;
 
 const TARGET_HELP: &str = "The target, such as chessboard:9x6:25mm, charuco:5x7:34mm:26mm:5X5_100 or aprilgrid:6x6:20mm:0.3";
@@ -111,228 +107,33 @@ struct PrintedTrial<'a> {
     kept: bool,
 }
 
-/// What was detected in the images.
-struct Detected {
-    views: Vec<BoardView>,
-    sizes_px: Vec<[u32; 2]>,
-    /// Images without the target.
-    unused: Vec<Unused>,
-    photos: Photos,
-    /// Why there are no images.
-    no_images: Option<String>,
-    other_size: Option<OtherSize>,
-    warnings: Vec<String>,
-}
-
 /// Detects the target, calibrates, and prints the result.
 pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
-    // Checked first, so that a wrong path does not cost a calibration.
-    let report = args.report.open()?;
-    let mut rig = args.rig.open(&args.input)?;
-    let detected = args.detect(report.is_some(), rig.as_mut())?;
-    // Before the calibration, because its result could not be written.
-    if let (Some(rig), Some(size_px)) = (&rig, detected.sizes_px.first()) {
-        rig.expect_size(*size_px)?;
-    }
-    let result = args.calibrate(&detected);
-    let (calibration, written) = outputs::reported(result, report, |path, result| {
-        args.write_report(path, &detected, result)
-    })?;
-    let printed = printed(&calibration, &detected.unused);
+    let host = Terminal::new(Some(&args.rig.page), args.json);
+    let outcome = args.task()?.run(&host)?;
+    let printed = printed(&outcome.calibration, &outcome.unused);
     if args.json {
         print::json(&printed)?
     } else {
         describe(&printed)?
     }
-    for warning in warnings(&calibration) {
+    for warning in outcome.warnings() {
         log::warn!("{warning}");
     }
-    if let Some(rig) = &mut rig {
-        rig.set_intrinsics(
-            &calibration.intrinsics,
-            Some(&calibration.intrinsics_covariance()),
-        )?;
-        rig.write()?;
-    }
-    // The report comes last: the rig file is written even if the report could not be.
-    written?;
+    outcome.finish()?;
     Ok(Exit::Done)
 }
 
 impl Args {
-    /// Reads the images and detects the target. `output` gets the calibration that devices report.
-    fn detect(
-        &self,
-        keeps_photos: bool,
-        output: Option<&mut RigOutput>,
-    ) -> anyhow::Result<Detected> {
-        let options = ScanOptions {
-            keeps_photos,
-            is_hidden: self.json,
-            purpose: Purpose::Lens,
-        };
-        let (images, photos, no_images, warnings) =
-            match self
-                .rig
-                .read(&self.input, Some(&self.target), options, output)?
-            {
-                Some(mut scan) => (
-                    scan.detected(),
-                    scan.take_photos(),
-                    scan.no_images,
-                    scan.warnings,
-                ),
-                None => {
-                    let files = images::files(&self.input)?;
-                    let images = images::detect(&files, &self.target, self.json)?;
-                    (images, images::photos(&files), None, Vec::new())
-                }
-            };
-        let unused = images::unused(&images);
-        let other_size = images::other_size(images.iter(), &self.target);
-        let mut views = Vec::new();
-        let mut sizes_px = Vec::new();
-        for board in images.into_iter().filter_map(|image| image.board.ok()) {
-            views.push(board.view);
-            sizes_px.push(board.size_px);
-        }
-        let mut warnings = warnings;
-        // If the other size prevails, `calibrate` refuses with this text instead.
-        if let Some(size) = other_size.as_ref().filter(|size| !size.prevails) {
-            log::warn!("{}", size.text);
-            warnings.push(size.text.clone());
-        }
-        Ok(Detected {
-            views,
-            sizes_px,
-            unused,
-            photos,
-            no_images,
-            other_size,
-            warnings,
+    fn task(&self) -> Result<IntrinsicsTask, BadArgument> {
+        Ok(IntrinsicsTask {
+            input: self.input.clone(),
+            target: self.target.clone(),
+            model: self.model.into(),
+            rig: self.rig.options()?,
+            report: self.report.options(),
         })
     }
-
-    fn calibrate(&self, detected: &Detected) -> anyhow::Result<IntrinsicsCalibration> {
-        let Detected {
-            views,
-            sizes_px,
-            unused,
-            no_images,
-            other_size,
-            ..
-        } = detected;
-        if let Some(reason) = no_images {
-            return Err(InsufficientData(reason.clone()).into());
-        }
-        // A board of another size would be calibrated with wrong corners, so this is an error if
-        // most images show it.
-        if let Some(size) = other_size.as_ref().filter(|size| size.prevails) {
-            return Err(
-                InsufficientData(format!("{}: {}", self.input.display(), size.text)).into(),
-            );
-        }
-        if views.is_empty() {
-            // All images usually fail for the same reason. Those that cannot be read were reported
-            // before.
-            let read: Vec<&Unused> = unused
-                .iter()
-                .filter(|unused| !unused.is_unreadable)
-                .collect();
-            let reason = read.first().map_or(String::new(), |first| {
-                format!("; {}: {}", first.name, first.reason)
-            });
-            let input = self.input.display();
-            let target = &self.target;
-            let n = read.len();
-            let text = format!("{input}: {target} was not detected in any of {n} images{reason}");
-            return Err(InsufficientData(text).into());
-        }
-        Ok(calibrate_intrinsics(&IntrinsicsInput {
-            views,
-            sizes_px,
-            model: self.model.into(),
-        })?)
-    }
-
-    fn write_report(
-        &self,
-        path: &Path,
-        detected: &Detected,
-        result: &anyhow::Result<IntrinsicsCalibration>,
-    ) -> anyhow::Result<()> {
-        let calibration = result.as_ref().ok();
-        let warnings = detected
-            .warnings
-            .iter()
-            .cloned()
-            .chain(calibration.into_iter().flat_map(warnings))
-            .collect();
-        let Some(heading) = outputs::heading(&self.input, result, warnings) else {
-            return Ok(());
-        };
-        let rig_line = calibration.map(|calibration| {
-            format!(
-                "intrinsics = {}",
-                LensFile::of(&calibration.intrinsics).to_toml()
-            )
-        });
-        // Without images, the charts of the report still need a size.
-        const NO_IMAGE_PX: [u32; 2] = [640, 480];
-        let report = IntrinsicsReport {
-            heading: &heading,
-            target: &self.target.to_string(),
-            size_px: detected.sizes_px.first().copied().unwrap_or(NO_IMAGE_PX),
-            views: &detected.views,
-            unused: &detected.unused,
-            calibration,
-            rig_line: rig_line.as_deref(),
-            photos: &detected.photos,
-        };
-        outputs::write_report(path, &report.html())
-    }
-}
-
-/// Problems of a result, one sentence each.
-fn warnings(calibration: &IntrinsicsCalibration) -> Vec<String> {
-    [
-        uncertainty_warning(calibration),
-        aspect_warning(calibration.intrinsics.focal_px),
-    ]
-    .into_iter()
-    .flatten()
-    .collect()
-}
-
-/// A warning if pixels are not square.
-fn aspect_warning([fx, fy]: [f64; 2]) -> Option<String> {
-    const MAX_RATIO: f64 = 1.05;
-    let ratio = fy / fx;
-    // False for NaN.
-    let is_square = (1.0 / MAX_RATIO..=MAX_RATIO).contains(&ratio);
-    (!is_square).then(|| {
-        format!(
-            "the focal lengths differ by a factor of {ratio:.2} (fy / fx), but pixels of almost all cameras are square: check that the images were not stretched or scaled in one direction, that interlaced lines were not dropped, and that --target has the right squares (width and height)"
-        )
-    })
-}
-
-/// A warning if the result is not accurate.
-fn uncertainty_warning(calibration: &IntrinsicsCalibration) -> Option<String> {
-    const MAX_SIGMA_FRAC: f64 = 0.01;
-    let worst = largest(&calibration.uncertainty_px.values);
-    (worst > MAX_SIGMA_FRAC * f64::from(calibration.intrinsics.size_px[0])).then(|| {
-        format!(
-            "the projection is uncertain by {worst:.1} px; add images with the target tilted and near the corners of the image"
-        )
-    })
-}
-
-fn largest(values: &[Option<f64>]) -> f64 {
-    values
-        .iter()
-        .flatten()
-        .fold(0.0f64, |largest, value| largest.max(*value))
 }
 
 impl From<ModelArg> for LensModel {
@@ -464,7 +265,8 @@ fn describe(printed: &Printed<'_>) -> anyhow::Result<()> {
             .collect();
         print::line(format!("distortion       {}", distortion.join(", ")))?;
     }
-    let worst = largest(&printed.projection_sigma_px.values);
+    let sigmas_px = printed.projection_sigma_px.values.iter().flatten();
+    let worst = sigmas_px.copied().fold(0.0, f64::max);
     print::line(format!(
         "projection       +- {worst:.2} px (largest standard deviation in the image)"
     ))?;
@@ -480,18 +282,4 @@ fn describe(printed: &Printed<'_>) -> anyhow::Result<()> {
     }
     print::line(format!("rig file:\nintrinsics = {}", lens.to_toml()))?;
     Ok(())
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn stretched_images_are_named() {
-        assert_eq!(aspect_warning([600.0, 601.0]), None);
-        for [fx, fy] in [[600.0, 1200.0], [600.0, 300.0], [600.0, f64::NAN]] {
-            let warning = aspect_warning([fx, fy]).expect("pixels are not square");
-            assert!(warning.contains(&format!("{:.2}", fy / fx)), "{warning}");
-        }
-    }
 }

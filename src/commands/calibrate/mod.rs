@@ -1,17 +1,13 @@
 //! `fieldrig calibrate`: calibrates cameras, with a printed target or from images of any static
 //! scene.
 
-mod guide;
+mod flags;
 mod hand_eye;
-mod images;
 mod intrinsics;
-mod json_object;
-mod lens;
-mod outputs;
 mod page;
-mod scan;
 mod scene;
 mod target;
+mod terminal;
 mod time_offset;
 
 use crate::exit::Exit;
@@ -72,24 +68,4 @@ fn print_matrix(matrix: &[[f64; 4]; 4]) -> anyhow::Result<()> {
         print::line(format!("  {}", row.join(" ")))?;
     }
     Ok(())
-}
-
-/// The transform of a matrix in JSON: four lists of four numbers, or one list of 16, row by row.
-fn transform_of(value: &serde_json::Value) -> Result<Transform, String> {
-    let rows = value.as_array().map_or(0, Vec::len);
-    let row_of = |row: &serde_json::Value| row.as_array().filter(|row| row.len() == 4).cloned();
-    let given = value.as_array().cloned().unwrap_or_default();
-    // Four rows of four, or else the numbers themselves. Other shapes fail at the conversion below.
-    let flat = match given.iter().map(row_of).collect::<Option<Vec<_>>>() {
-        Some(rows) => rows.concat(),
-        None => given,
-    };
-    let numbers: Option<Vec<f64>> = flat.iter().map(serde_json::Value::as_f64).collect();
-    let numbers: Option<[f64; 16]> = numbers.and_then(|numbers| numbers.try_into().ok());
-    // One to three rows are likely a forgotten last row, which is worth a hint.
-    let numbers = numbers.ok_or_else(|| match rows {
-        1..=3 => format!("must be a matrix of 4 x 4 numbers, row by row; found {rows} rows"),
-        _ => "must be a matrix of 4 x 4 numbers, row by row".to_owned(),
-    })?;
-    transform::from_rows(&numbers).map_err(|error| error.to_string())
 }

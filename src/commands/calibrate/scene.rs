@@ -1,26 +1,18 @@
 //! `fieldrig calibrate scene`: calibrates the cameras of a rig from images of a static scene.
 
-use super::outputs::{self, ReportFlag, is_rig_file};
+use super::flags::ReportFlag;
+use super::terminal::Terminal;
 use super::{matrix_of, print_matrix};
-use crate::console::ReadBar;
-use crate::exit::{self, BadArgument, Exit, InsufficientData};
-use crate::{print, signals};
+use calibrate::{SceneOutcome, SceneTask};
+use crate::commands::number_in_range;
+use crate::exit::{self, Exit};
+use crate::print;
 use calibration::{CameraCorrection, Estimate, PoseSigmas, Trial, rigid_transform};
-use capture::config::{Override, Rig};
-use capture::open::{self, Devices};
-use keyframe::listed;
-use kinematics::Stamp;
+use messages::{BadInput, InsufficientData, listed};
 use serde::Serialize;
-use session::calibration_report::SceneReport;
-use session::{
-    Data, DataOptions, Purpose, Refine, RelativePose, SCENE_PARAMS, SceneCalibration,
-    calibrate_scene, corrected_rig,
-};
+use session::{Refine, RelativePose, SCENE_PARAMS, SceneCalibration};
 use std::collections::BTreeMap;
-use std::path::{Path, PathBuf};
-
-/// Time for which devices are read if no flag limits it, seconds.
-const DEFAULT_SECS: f64 = 30.0;
+use std::path::PathBuf;
 
 /// Flags of `calibrate scene`.
 #[derive(Debug, clap::Args)]
@@ -44,7 +36,7 @@ pub(crate) struct Args {
     #[arg(long)]
     sim: bool,
     /// With a rig file: read the devices for S seconds [default: 30]
-    #[arg(long, value_name = "S", value_parser = super::super::number_in_range(1.0..=3600.0))]
+    #[arg(long, value_name = "S", value_parser = number_in_range(1.0..=3600.0))]
     seconds: Option<f64>,
     /// Write the rig file with the accepted corrections. An existing file is kept with the
     /// extension .old
@@ -108,88 +100,24 @@ struct PrintedRelative {
 /// Calibrates and prints the estimates. Exit code 4 if the data do not determine the extrinsics of
 /// any camera.
 pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
-    // `auto` chooses the parameters itself, so a list contradicts it.
-    if args.params.len() > 1 && args.params.contains(&Refine::Auto) {
-        return Err(
-            BadArgument("--params: auto cannot be combined with other values".into()).into(),
-        );
-    }
-    // Checked first, so that a wrong path does not cost a calibration.
-    let report = args.report.open()?;
-    let given = args.rig_as_given()?;
-    // Checked before data is read, which may take long.
-    if let Some(file) = &args.write_rig {
-        let Some(rig) = &given else {
-            let input = args.input.display();
-            return Err(BadArgument(format!(
-                "--write-rig {}: {input} contains no rig file",
-                file.display()
-            ))
-            .into());
-        };
-        corrected_rig::check_target_file(rig, file)?;
-    }
-    let data = args.data()?;
-    // Devices may report calibration that the rig file does not contain.
-    let rig = if args.sim || data.rig.is_none() || !is_rig_file(&args.input) {
-        given
-    } else {
-        data.rig.clone()
-    };
-    let result = calibrate_scene(&data, &args.params, rig.as_ref()).map_err(anyhow::Error::from);
-    let (calibration, written) = outputs::reported(result, report, |path, result| {
-        args.write_report(path, &data, rig.as_ref(), result)
-    })?;
-    let exit = exit::from_losses(&data.data_losses);
-    let printed = printed(&data, &calibration, refusal(&data, &calibration));
+    let outcome = args.task().run(&Terminal::new(None, args.json))?;
+    let exit = exit::from_losses(&outcome.data.data_losses);
+    let printed = printed(&outcome);
     let is_refused = printed.refused.is_some();
     if args.json {
         print::json(&printed)?;
     } else {
-        describe(&printed, &calibration, args.params == [Refine::Auto])?;
+        describe(
+            &printed,
+            &outcome.calibration,
+            args.params == [Refine::Auto],
+        )?;
     }
-    if is_refused {
-        outputs::log_failure(written);
+    match outcome.finish() {
         // The reason is part of the JSON output, so it is not printed again.
-        return if args.json {
-            Ok(Exit::InsufficientData)
-        } else {
-            Err(InsufficientData(printed.refused.unwrap_or_default()).into())
-        };
+        Err(_) if is_refused && args.json => Ok(Exit::InsufficientData),
+        finished => finished.map(|()| exit),
     }
-    // A file without a correction would only look like a result.
-    if let (Some(file), Some(before), Some(after)) = (&args.write_rig, &rig, &calibration.rig) {
-        if after.has_same_calibration(before) {
-            log::info!(
-                "no correction was accepted: {} is not written",
-                file.display()
-            );
-        } else {
-            corrected_rig::write(after, file)?;
-            log::info!("rig file written to {}", file.display());
-        }
-    }
-    // The report comes last: the rig file is written even if the report could not be.
-    written?;
-    Ok(exit)
-}
-
-/// Why no camera could be calibrated; `None` if one could.
-fn refusal(data: &Data, calibration: &SceneCalibration) -> Option<String> {
-    let alignment = &calibration.alignment;
-    // Without validation images, no correction can be accepted, whatever the data show.
-    if alignment.estimates.is_empty() && !alignment.has_enough_validation_images() {
-        return Some(
-            "too few validation images to accept a correction; record more images".to_owned(),
-        );
-    }
-    let reasons = calibration
-        .refused
-        .iter()
-        .map(|(camera, reason)| format!("camera {camera:?}: {reason}"));
-    calibration
-        .is_refused(data)
-        .then(|| reasons.collect::<Vec<_>>().join("; "))
 }
 
 fn scene_param(text: &str) -> Result<Refine, String> {
@@ -206,128 +134,24 @@ fn scene_param(text: &str) -> Result<Refine, String> {
 }
 
 impl Args {
-    fn options(&self) -> DataOptions {
-        DataOptions {
+    fn task(&self) -> SceneTask {
+        SceneTask {
+            input: self.input.clone(),
             keyframes: self.keyframes.clone(),
             rig: self.rig.clone(),
-            ..DataOptions::default()
+            params: self.params.clone(),
+            sim: self.sim,
+            seconds: self.seconds,
+            write_rig: self.write_rig.clone(),
+            report: self.report.options(),
         }
-    }
-
-    fn write_report(
-        &self,
-        path: &Path,
-        data: &Data,
-        rig: Option<&Rig>,
-        result: &anyhow::Result<SceneCalibration>,
-    ) -> anyhow::Result<()> {
-        let calibration = result.as_ref().ok();
-        let Some(mut heading) = outputs::heading(&self.input, result, data.data_losses.clone())
-        else {
-            return Ok(());
-        };
-        if let Some(calibration) = calibration {
-            heading.refused = refusal(data, calibration);
-            let kept = calibration.refused.iter().map(|(camera, reason)| {
-                format!("camera {camera:?} keeps its extrinsics: {reason}")
-            });
-            heading
-                .warnings
-                // If all cameras are refused, the heading has the reasons already.
-                .extend(kept.filter(|_| heading.refused.is_none()));
-        }
-        let mut n_images: BTreeMap<String, usize> = BTreeMap::new();
-        for keyframe in &data.keyframes {
-            *n_images.entry(keyframe.camera.to_string()).or_default() += 1;
-        }
-        let n_images: Vec<(String, usize)> = n_images.into_iter().collect();
-        let report = SceneReport {
-            heading: &heading,
-            rig,
-            n_images: &n_images,
-            calibration,
-        };
-        outputs::write_report(path, &report.html())
-    }
-
-    /// The rig file, without settings that apply only to this command; `None` for a folder.
-    fn rig_as_given(&self) -> anyhow::Result<Option<Rig>> {
-        if !self.input.exists() {
-            return Err(BadArgument(format!("{} does not exist", self.input.display())).into());
-        }
-        if is_rig_file(&self.input) {
-            return Ok(Some(Rig::load(&self.input, &[])?));
-        }
-        // Dataset folders have no rig file.
-        let is_recording = session::run_folder::is_recording(&self.input);
-        Ok(is_recording
-            .then(|| Data::rig_as_given(&self.input, &self.options()))
-            .transpose()?)
-    }
-
-    fn data(&self) -> anyhow::Result<Data> {
-        let bar = ReadBar::new(self.json);
-        if !is_rig_file(&self.input) {
-            if self.sim || self.seconds.is_some() {
-                return Err(BadArgument(
-                    "--sim and --seconds need a rig file (.toml) as input".into(),
-                )
-                .into());
-            }
-            return Ok(Data::load(
-                &self.input,
-                &self.options(),
-                Purpose::Training,
-                &[],
-                &|read| bar.show(read),
-            )?);
-        }
-        // Both flags are about data that were recorded before.
-        if self.keyframes.is_some() || self.rig.is_some() {
-            return Err(
-                BadArgument("--keyframes and --rig need a recording as input".into()).into(),
-            );
-        }
-        let stop = signals::stop_on_signals_logging(
-            "calibrating with the images so far; Ctrl-C again exits at once",
-        )?;
-        // In lockstep, the result does not depend on the speed of this computer.
-        let overrides = if self.sim {
-            vec![Override::new("sim.lockstep", true)]
-        } else {
-            Vec::new()
-        };
-        let rig = Rig::load(&self.input, &overrides)?;
-        let opened = open::rig(
-            rig,
-            if self.sim {
-                Devices::Sim
-            } else {
-                Devices::Real
-            },
-        )?;
-        let seconds = self.seconds.unwrap_or(DEFAULT_SECS);
-        let mut first: Option<Stamp> = None;
-        let data = Data::from_devices(
-            opened,
-            |sample| {
-                // Counted by stamps, because a simulation does not run in real time.
-                let since_first = sample
-                    .stamp()
-                    .secs_since(*first.get_or_insert(sample.stamp()));
-                since_first > seconds || stop.requested()
-            },
-            &|read| bar.show(read),
-        )?;
-        Ok(data)
     }
 }
 
-fn printed<'a>(
-    data: &Data,
-    calibration: &'a SceneCalibration,
-    refused: Option<String>,
-) -> Printed<'a> {
+fn printed(outcome: &SceneOutcome) -> Printed<'_> {
+    let SceneOutcome {
+        data, calibration, ..
+    } = outcome;
     let cameras = calibration
         .rig
         .iter()
@@ -374,7 +198,7 @@ fn printed<'a>(
             .iter()
             .map(ToString::to_string)
             .collect(),
-        refused,
+        refused: outcome.refused.clone(),
     }
 }
 

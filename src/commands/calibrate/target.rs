@@ -1,9 +1,10 @@
 //! `fieldrig calibrate target`: writes a calibration target to print.
 
 use super::target_argument;
-use crate::exit::BadArgument;
 use crate::print;
 use anyhow::Context;
+use calibrate::symmetry_warning;
+use messages::BadInput;
 use std::path::PathBuf;
 use targets::{Paper, TargetSpec};
 
@@ -13,18 +14,6 @@ const DEFAULT_TARGET: &str = "charuco:5x7:34mm:26mm:5X5_100";
 const TARGET_HELP: &str = "Target to draw: chessboard:9x6:25mm (inner corners, square), charuco:5x7:34mm:26mm:5X5_100 \
      (squares, square, marker, dictionary), aprilgrid:6x6:20mm:0.3 (tags, tag, gap relative to the tag), \
      puzzleboard:12x9:20mm (squares, square) or tag:36h11:5:100mm (family, id, side)";
-
-/// A warning if the pose of a target is ambiguous.
-pub(super) fn symmetry_warning(target: &TargetSpec) -> Option<String> {
-    let turn = match target.symmetry().len() {
-        0 | 1 => return None,
-        2 => "half a turn",
-        _ => "a quarter turn",
-    };
-    Some(format!(
-        "{target} looks the same after {turn}, so a single image does not show how it is rotated; for hand-eye calibration, use a target whose orientation is unique, such as a chessboard with an even and an odd number of inner corners (9x6) or a ChArUco board"
-    ))
-}
 
 /// Flags of `calibrate target`.
 #[derive(Debug, clap::Args)]
@@ -42,7 +31,7 @@ pub(crate) struct Args {
 /// Writes the PDF file.
 pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
     // All errors below are about the arguments, so nothing is written before they are checked.
-    let bad = |error: targets::PrintError| BadArgument(error.to_string());
+    let bad = |error: targets::PrintError| BadInput(error.to_string());
     let paper: Paper = args.paper.parse().map_err(bad)?;
     let pdf = args.target.pdf(paper).map_err(bad)?;
     if args
@@ -50,13 +39,11 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
         .extension()
         .is_none_or(|extension| !extension.eq_ignore_ascii_case("pdf"))
     {
-        return Err(
-            BadArgument(format!("--out {}: must end with .pdf", args.out.display())).into(),
-        );
+        return Err(BadInput(format!("--out {}: must end with .pdf", args.out.display())).into());
     }
     // An old file may describe a printed target that is still in use, so it is never replaced.
     if args.out.exists() {
-        return Err(BadArgument(format!("{} exists", args.out.display())).into());
+        return Err(BadInput(format!("{} exists", args.out.display())).into());
     }
     // Only a warning: the target still serves for the lens.
     if let Some(warning) = symmetry_warning(&args.target) {

@@ -1,18 +1,16 @@
 //! `fieldrig calibrate time-offset`: the offset between the clocks of two pose streams.
 
-use super::outputs::{self, ReportFlag};
+use super::flags::ReportFlag;
 use super::{matrix_of, print_matrix};
-use crate::exit::{self, BadArgument, Exit, InsufficientData};
+use crate::commands::number_in_range;
+use crate::exit::{self, Exit};
 use crate::print;
+use calibrate::{TimeOffsetOutcome, TimeOffsetTask};
 use calibration::hand_eye::Refusal;
-use calibration::time_offset::{
-    MotionProfile, PoseSample, TimeOffset, TimeOffsetOptions, estimate_time_offset, motion_profile,
-};
-use kinematics::Transform;
-use nalgebra::{Quaternion, Translation3, UnitQuaternion};
+use calibration::time_offset::{TimeOffset, TimeOffsetOptions};
+use messages::{BadInput, InsufficientData};
 use serde::Serialize;
-use session::calibration_report::TimeOffsetReport;
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 
 /// Flags of `calibrate time-offset`.
 #[derive(Debug, clap::Args)]
@@ -30,7 +28,7 @@ pub(crate) struct Args {
     hand_eye: bool,
     /// Largest absolute offset to search, seconds [default: all offsets at which the streams
     /// overlap]
-    #[arg(long, value_name = "S", value_parser = super::super::number_in_range(0.001..=1e9))]
+    #[arg(long, value_name = "S", value_parser = number_in_range(0.001..=1e9))]
     max_offset: Option<f64>,
     #[command(flatten)]
     report: ReportFlag,
@@ -69,25 +67,7 @@ struct Printed {
 /// Estimates and prints the offset. Exit code 4 if the motion does not determine it, or a requested
 /// transform.
 pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
-    // Checked first, so that a wrong path does not cost a calibration.
-    let report = args.report.open()?;
-    let a = read(&args.a)?;
-    let b = read(&args.b)?;
-    let options = TimeOffsetOptions {
-        hand_eye: args.hand_eye,
-        max_offset_secs: args.max_offset,
-        ..TimeOffsetOptions::default()
-    };
-    let result = estimate_time_offset(&a, &b, &options).map_err(anyhow::Error::from);
-    let written = match report {
-        Some(path) => args.write_report(
-            path,
-            // A report without the profile is better than none.
-            motion_profile(&a, &b, &options).ok().as_ref(),
-            &result,
-        ),
-        None => Ok(()),
-    };
+    let TimeOffsetOutcome { result, written } = args.task().run()?;
     let printed = match result {
         Ok(offset) => Printed::of(&offset),
         Err(error) if exit::of(&error) == Exit::InsufficientData => Printed {
@@ -117,31 +97,17 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
 }
 
 impl Args {
-    fn write_report(
-        &self,
-        path: &Path,
-        profile: Option<&MotionProfile>,
-        result: &anyhow::Result<TimeOffset>,
-    ) -> anyhow::Result<()> {
-        let offset = result.as_ref().ok();
-        let refusal = offset.and_then(|offset| offset.hand_eye.as_ref()?.as_ref().err());
-        let warning = refusal
-            .map(|refusal| format!("the transform between the bodies is refused: {refusal}"));
-        let input = format!("{} and {}", self.a.display(), self.b.display());
-        let Some(heading) =
-            outputs::heading(Path::new(&input), result, warning.into_iter().collect())
-        else {
-            return Ok(());
-        };
-        outputs::write_report(
-            path,
-            &TimeOffsetReport {
-                heading: &heading,
-                profile,
-                offset,
-            }
-            .html(),
-        )
+    fn task(&self) -> TimeOffsetTask {
+        TimeOffsetTask {
+            a: self.a.clone(),
+            b: self.b.clone(),
+            options: TimeOffsetOptions {
+                hand_eye: self.hand_eye,
+                max_offset_secs: self.max_offset,
+                ..TimeOffsetOptions::default()
+            },
+            report: self.report.options(),
+        }
     }
 }
 
@@ -169,59 +135,6 @@ impl Printed {
             refused: None,
         }
     }
-}
-
-/// Reads the rows of a file. Comments and a header are skipped; a row of numbers that is not a pose
-/// is an error.
-fn read(path: &Path) -> anyhow::Result<Vec<PoseSample>> {
-    let text = outputs::read_text(path)?;
-    let mut samples = Vec::new();
-    for (ix, line) in text.lines().enumerate() {
-        let parsed = line
-            // Any usual separator, because such files come from many programs.
-            .split([',', ' ', ';', '\t'])
-            .filter(|field| !field.is_empty())
-            .map(str::parse::<f64>);
-        // Any line that is not all numbers counts as a comment or header.
-        let Ok(numbers) = parsed.collect::<Result<Vec<f64>, _>>() else {
-            continue;
-        };
-        if numbers.is_empty() {
-            continue;
-        }
-        let place = || format!("{}, line {}", path.display(), ix + 1);
-        let [secs, x, y, z, qx, qy, qz, qw] = <[f64; 8]>::try_from(numbers).map_err(|numbers| {
-            BadArgument(format!(
-                "{}: {} numbers, expected 8: t,x,y,z,qx,qy,qz,qw",
-                place(),
-                numbers.len()
-            ))
-        })?;
-        const MAX_NORM_ERROR: f64 = 0.01;
-        let quaternion = Quaternion::new(qw, qx, qy, qz);
-        if ![secs, x, y, z].iter().all(|value| value.is_finite()) {
-            return Err(BadArgument(format!("{}: t, x, y and z must be finite", place())).into());
-        }
-        let norm = quaternion.norm();
-        // Normalized afterwards. A larger deviation shows another order of the columns.
-        let is_unit = (norm - 1.0).abs() < MAX_NORM_ERROR; // False for NaN.
-        if !is_unit {
-            return Err(BadArgument(format!(
-                "{}: |qx,qy,qz,qw| is {norm:.3}, expected 1",
-                place()
-            ))
-            .into());
-        }
-        let pose = Transform::from_parts(
-            Translation3::new(x, y, z),
-            UnitQuaternion::from_quaternion(quaternion),
-        );
-        samples.push(PoseSample { secs, pose });
-    }
-    if samples.is_empty() {
-        return Err(BadArgument(format!("{}: no row t,x,y,z,qx,qy,qz,qw", path.display())).into());
-    }
-    Ok(samples)
 }
 
 fn describe(printed: &Printed) -> anyhow::Result<()> {

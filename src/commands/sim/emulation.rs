@@ -2,7 +2,7 @@
 
 use super::Args;
 use super::bag::CameraFiles;
-use crate::exit::{BadArgument, Exit};
+use crate::exit::Exit;
 use crate::{print, signals};
 use anyhow::{Context, bail};
 use capture::Stop;
@@ -12,6 +12,7 @@ use drivers::franka::FciVersion;
 use drivers::franka::emulated::{EmulatedRobot, Limits, RobotConfig};
 use drivers::{Sample, can, clock};
 use kinematics::{Stamp, Transform};
+use messages::BadInput;
 use serde::Serialize;
 use sim::wire::{
     DatagramTargets, DeviceScript, EmulatedMotors, EmulatedSenders, JointTrack, PlaybackClock,
@@ -134,7 +135,7 @@ fn load(rig_or_scene: &str) -> anyhow::Result<(String, Rig)> {
     let path = Path::new(rig_or_scene);
     if !path.exists() {
         let scenes: Vec<_> = SCENES.iter().map(|(name, ..)| *name).collect();
-        return Err(BadArgument(format!(
+        return Err(BadInput(format!(
             "there is no rig file {rig_or_scene:?}; scenes: {}",
             scenes.join(", ")
         ))
@@ -148,9 +149,9 @@ fn load(rig_or_scene: &str) -> anyhow::Result<(String, Rig)> {
 }
 
 /// Rejects a rig that cannot be emulated, before a minute is spent on its simulation.
-fn check(rig: &Rig) -> Result<(), BadArgument> {
+fn check(rig: &Rig) -> Result<(), BadInput> {
     if rig.arm.driver == ArmDriver::Sim {
-        return Err(BadArgument(
+        return Err(BadInput(
             "arm.driver is sim, which `fieldrig run` simulates itself; drivers that can be emulated: franka, can, udp"
                 .to_owned(),
         ));

@@ -1,5 +1,7 @@
 //! Errors of the GPU.
 
+use messages::Setting;
+
 /// An error of the GPU, or of a kernel.
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
@@ -31,8 +33,10 @@ pub enum Error {
     /// The GPU has no memory left for a buffer, or for commands; for commands, `label` is empty and
     /// `bytes` is 0.
     #[error(
-        "the GPU ran out of memory{}; close other programs that use it, use smaller images, or train a smaller model (--max-splats or --max-bytes of `fieldrig train` and `run`)",
-        buffer_suffix(label, *bytes)
+        "the GPU ran out of memory{}; close other programs that use it, use smaller images, or train a smaller model ({} or {} of `fieldrig train` and `run`)",
+        buffer_suffix(label, *bytes),
+        Setting::MaxSplats,
+        Setting::MaxBytes
     )]
     OutOfMemory {
         /// Name of the buffer.
@@ -49,7 +53,9 @@ pub enum Error {
     Internal(String),
     /// A buffer exceeds the adapter's limit.
     #[error(
-        "buffer {label}: {bytes} bytes are more than this GPU can bind ({limit_bytes} bytes); use smaller images, or train a smaller model (--max-splats or --max-bytes of `fieldrig train` and `run`)"
+        "buffer {label}: {bytes} bytes are more than this GPU can bind ({limit_bytes} bytes); use smaller images, or train a smaller model ({} or {} of `fieldrig train` and `run`)",
+        Setting::MaxSplats,
+        Setting::MaxBytes
     )]
     BufferTooLarge {
         /// Name of the buffer.

@@ -66,11 +66,11 @@ pub enum Error {
         source: serde_json::Error,
     },
     /// A model has the maximum number of edits.
-    #[error(
-        "a model has at most {} edits; undo one first",
-        crate::edits::MAX_EDITS
-    )]
-    TooManyEdits,
+    #[error("a model has at most {max_edits} edits; undo one first")]
+    TooManyEdits {
+        /// The maximum.
+        max_edits: usize,
+    },
     /// An edit has values that kernels cannot compute with.
     #[error("invalid edit: {reason}")]
     InvalidEdit {

@@ -5,8 +5,6 @@ use super::{NerfModel, NerfOptions};
 use crate::method_entry::{MethodEntry, boxed};
 use crate::model_options::{MethodOptions, default_options};
 use calibration::ParamSet;
-use gpu::Gpu;
-use model_files::checkpoint::Checkpoint;
 
 /// Registry entry of neural fields.
 pub(crate) static ENTRY: MethodEntry = MethodEntry {

@@ -42,14 +42,6 @@ pub(crate) struct Output {
 }
 
 impl Output {
-    /// A pinhole picture with or without depth.
-    pub(crate) fn picture(depth: bool) -> Self {
-        Self {
-            format: Format::Picture { depth },
-            face: None,
-        }
-    }
-
     /// A packed pinhole picture.
     pub(crate) fn packed(packing: Packing) -> Self {
         Self {

@@ -9,7 +9,6 @@ use crate::{Error, Method};
 use calibration::ParamSet;
 use gpu::Gpu;
 use model_files::Edits;
-use model_files::checkpoint::Checkpoint;
 use model_files::splat::file::{self, EXTENSIONS, Format, IN_FOLDER, UNSUPPORTED};
 use std::path::Path;
 use std::sync::Arc;

@@ -8,7 +8,6 @@ use crate::model_options::{MethodOptions, default_options};
 use calibration::ParamSet;
 use gpu::Gpu;
 use model_files::Edits;
-use model_files::checkpoint::Checkpoint;
 use model_files::mesh::{Mesh, write_glb, write_ply};
 use std::path::Path;
 use std::sync::Arc;

@@ -62,7 +62,7 @@ pub(crate) enum InvalidRequest {
     Views { max: usize },
     #[error("shown_millis is {got}, expected a time on the server's clock, 0 or more")]
     ShownTime { got: f64 },
-    #[error("topic is {got:?}, expected {}", keyframe::listed(known, "or"))]
+    #[error("topic is {got:?}, expected {}", messages::listed(known, "or"))]
     Topic {
         got: String,
         known: Vec<&'static str>,

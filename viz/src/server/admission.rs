@@ -4,7 +4,7 @@
 //! Addresses do not distinguish viewers from idle sockets: on this computer, all are the same. At a
 //! limit, a new connection replaces the least active one.
 
-use parking_lot::{Mutex, MutexGuard};
+use parking_lot::Mutex;
 use std::cmp::Reverse;
 use std::net::SocketAddr;
 use std::sync::Arc;

@@ -776,7 +776,7 @@ fn used_port_and_public_address_are_rejected() {
     let public: SocketAddr = "0.0.0.0:0".parse().expect("an address");
     let error = Server::start(ServerConfig { listen: public }, Hub::new()).expect_err("public");
     assert!(
-        matches!(error, Error::NotLoopback { .. }) && error.to_string().contains("--share"),
+        matches!(error, Error::NotLoopback { .. }) && error.to_string().contains("add share,"),
         "{error}"
     );
 }

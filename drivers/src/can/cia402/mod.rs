@@ -21,7 +21,7 @@ use super::family::{
 };
 use super::query::MotorQuery;
 use super::settings::{AllowedValues, MotorKey, MotorSettings, SettingValue};
-use super::watchdog::{Watchdog, WatchdogPlan};
+use super::watchdog::Watchdog;
 use crate::Error;
 use crate::motion::OnLoss;
 use crate::wire::can::Frame;
@@ -185,7 +185,7 @@ impl MotorProtocol for Cia402 {
         }
     }
 
-    fn watchdog(&self, _plan: &WatchdogPlan) -> Watchdog {
+    fn watchdog(&self) -> Watchdog {
         Watchdog::Available(&[OnLoss::Hold, OnLoss::Release])
     }
 

@@ -18,7 +18,7 @@ use super::family::{
 };
 use super::query::MotorQuery;
 use super::settings::{AllowedValues, MotorKey, MotorSettings, SettingValue};
-use super::watchdog::{Watchdog, WatchdogPlan};
+use super::watchdog::Watchdog;
 use crate::Error;
 use crate::motion::OnLoss;
 use crate::wire::can::mit::Limits;
@@ -199,7 +199,7 @@ impl MotorProtocol for Damiao {
         }
     }
 
-    fn watchdog(&self, _plan: &WatchdogPlan) -> Watchdog {
+    fn watchdog(&self) -> Watchdog {
         Watchdog::Available(&[OnLoss::Release])
     }
 

@@ -9,7 +9,10 @@ use std::sync::Arc;
 pub(super) fn fuzzing() -> FamilyFuzzing {
     let node = Node::new(4).expect("below 64");
     FamilyFuzzing {
-        motor: Arc::new(Odrive { node }),
+        motor: Arc::new(Odrive {
+            node,
+            endpoints: None,
+        }),
         run_codecs,
         #[cfg(test)]
         set_up: Vec::new(),

@@ -20,7 +20,7 @@ use super::family::{
 };
 use super::query::MotorQuery;
 use super::settings::MotorSettings;
-use super::watchdog::{Watchdog, WatchdogPlan};
+use super::watchdog::Watchdog;
 use crate::Error;
 use crate::motion::OnLoss;
 use crate::wire::can::Frame;
@@ -58,8 +58,10 @@ impl MotorFamily for OdriveFamily {
     }
 
     fn motor(&self, settings: &MotorSettings) -> Option<Arc<dyn MotorProtocol>> {
-        let node = Node::new(u8::try_from(settings.id).ok()?).ok()?;
-        Some(Arc::new(Odrive { node }))
+        Some(Arc::new(Odrive {
+            node: node_of(settings)?,
+            endpoints: None,
+        }))
     }
 
     #[cfg(any(test, fuzzing))]
@@ -69,10 +71,29 @@ impl MotorFamily for OdriveFamily {
 }
 
 /// An `ODrive` axis.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Odrive {
     /// Node ID of the axis.
     pub node: Node,
+    /// Endpoint numbers of its firmware. Without them, its watchdog cannot be set. They are not
+    /// among its settings, because the rig file names one file for all axes of an arm.
+    pub endpoints: Option<Endpoints>,
+}
+
+/// Sets the endpoint numbers of a motor if it is an `ODrive` axis. Other motors do not change.
+pub fn set_endpoints(motor: &mut Arc<dyn MotorProtocol>, endpoints: Option<&Endpoints>) {
+    if motor.family().name() != OdriveFamily.name() {
+        return;
+    }
+    if let Some(node) = node_of(&motor.settings()) {
+        let endpoints = endpoints.cloned();
+        *motor = Arc::new(Odrive { node, endpoints });
+    }
+}
+
+/// Node ID of the axis with these settings; `None` if the ID is not allowed.
+fn node_of(settings: &MotorSettings) -> Option<Node> {
+    Node::new(u8::try_from(settings.id).ok()?).ok()
 }
 
 impl MotorProtocol for Odrive {
@@ -131,10 +152,10 @@ impl MotorProtocol for Odrive {
         }
     }
 
-    fn watchdog(&self, plan: &WatchdogPlan) -> Watchdog {
+    fn watchdog(&self) -> Watchdog {
         // The endpoint numbers change with the firmware. Without the file of this firmware, a write
         // could change any other setting of the axis.
-        match plan.endpoints {
+        match self.endpoints {
             Some(_) => Watchdog::Available(&[OnLoss::Release]),
             None => Watchdog::Missing {
                 reason: "without arm.motion.odrive_endpoints the watchdog of this axis cannot be set",
@@ -146,7 +167,10 @@ impl MotorProtocol for Odrive {
     }
 
     fn motion(&self, _limits: &Limits) -> Box<dyn MotionProtocol> {
-        Box::new(motion::OdriveMotion { node: self.node })
+        Box::new(motion::OdriveMotion {
+            node: self.node,
+            endpoints: self.endpoints.clone(),
+        })
     }
 
     #[cfg(feature = "emulation")]

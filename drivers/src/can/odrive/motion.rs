@@ -18,6 +18,7 @@ const MAX_REPORT_INTERVAL: Duration = Duration::from_millis(50);
 #[derive(Debug)]
 pub(super) struct OdriveMotion {
     pub(super) node: Node,
+    pub(super) endpoints: Option<Endpoints>,
 }
 
 impl OdriveMotion {
@@ -78,7 +79,7 @@ impl MotionProtocol for OdriveMotion {
     }
 
     fn set_watchdog(&self, query: &MotorQuery<'_>, plan: &WatchdogPlan) -> Result<(), Error> {
-        let Some(endpoints) = &plan.endpoints else {
+        let Some(endpoints) = &self.endpoints else {
             return Ok(());
         };
         self.check_endpoints(query, endpoints)?;

@@ -19,7 +19,7 @@ use super::family::{
 };
 use super::query::MotorQuery;
 use super::settings::{AllowedValues, MotorKey, MotorSettings, word};
-use super::watchdog::{Watchdog, WatchdogPlan};
+use super::watchdog::Watchdog;
 use crate::Error;
 use crate::motion::OnLoss;
 use crate::wire::can::mit::Limits;
@@ -184,7 +184,7 @@ impl MotorProtocol for Robstride {
         }
     }
 
-    fn watchdog(&self, _plan: &WatchdogPlan) -> Watchdog {
+    fn watchdog(&self) -> Watchdog {
         Watchdog::Available(&[OnLoss::Release])
     }
 

@@ -19,7 +19,7 @@ use super::family::{
 };
 use super::query::MotorQuery;
 use super::settings::{AllowedValues, MotorKey, MotorSettings, word};
-use super::watchdog::{Watchdog, WatchdogPlan};
+use super::watchdog::Watchdog;
 use crate::Error;
 use crate::motion::OnLoss;
 use crate::wire::can::Frame;
@@ -147,7 +147,7 @@ impl MotorProtocol for TMotor {
         }
     }
 
-    fn watchdog(&self, _plan: &WatchdogPlan) -> Watchdog {
+    fn watchdog(&self) -> Watchdog {
         // All three are commands in MIT mode that the motor executes until the next one, so this
         // computer can send any of them as its last.
         let actions = &[OnLoss::Hold, OnLoss::Damp, OnLoss::Release];

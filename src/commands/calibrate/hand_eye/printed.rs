@@ -1,12 +1,12 @@
 //! The printed result of `fieldrig calibrate hand-eye`.
 
-use super::super::lens::LensFile;
-use super::super::{matrix_of, print_matrix};
+use crate::commands::calibrate::{matrix_of, print_matrix};
 use crate::print;
+use calibrate::{LensFile, pose_toml};
 use calibration::hand_eye::{HandEyeCalibration, NextPose, SampleStatus, Setup};
 use kinematics::Transform;
+use report::calibration_report::Unused;
 use serde::Serialize;
-use session::calibration_report::Unused;
 
 type Matrix = [[f64; 4]; 4];
 
@@ -182,22 +182,6 @@ impl Printed {
             ..Self::default()
         }
     }
-}
-
-/// The value of `parent_from_camera` in a rig file.
-pub(super) fn pose_toml(pose: &Transform) -> String {
-    let xyz_m = nine_digits(pose.translation.vector.as_slice());
-    let quat_xyzw = nine_digits(pose.rotation.coords.as_slice());
-    format!("{{ xyz_m = [{xyz_m}], quat_xyzw = [{quat_xyzw}] }}")
-}
-
-/// Numbers for a rig file. Nine digits are a nanometer, below any calibration error.
-fn nine_digits(values: &[f64]) -> String {
-    values
-        .iter()
-        .map(|value| format!("{value:.9}"))
-        .collect::<Vec<_>>()
-        .join(", ")
 }
 
 fn three(values: Option<[f64; 3]>, unit: &str) -> String {

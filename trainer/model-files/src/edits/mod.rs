@@ -98,7 +98,9 @@ impl Edits {
     /// computed with.
     pub fn push(&mut self, edit: Edit) -> Result<(), Error> {
         if self.0.len() >= MAX_EDITS {
-            return Err(Error::TooManyEdits);
+            return Err(Error::TooManyEdits {
+                max_edits: MAX_EDITS,
+            });
         }
         edit.check()
             .map_err(|reason| Error::InvalidEdit { reason })?;

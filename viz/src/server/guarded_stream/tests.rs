@@ -1,9 +1,12 @@
 use super::GuardedStream;
 use crate::server::admission::{Admission, Limits};
+use std::future::poll_fn;
 use std::io::ErrorKind;
+use std::pin::Pin;
 use std::sync::Arc;
+use std::task::{Context, Poll};
 use std::time::{Duration, Instant};
-use tokio::io::{AsyncReadExt, AsyncWriteExt};
+use tokio::io::{AsyncReadExt, AsyncWrite, AsyncWriteExt};
 use tokio::net::TcpStream;
 
 const LIMITS: Limits = Limits {
@@ -107,23 +110,30 @@ fn peers_that_do_not_read_time_out() {
     });
 }
 
+/// Writes until the kernel holds no more.
+async fn fill(stream: &mut GuardedStream) {
+    let bytes = vec![0; 1 << 20];
+    let mut is_blocked = |context: &mut Context<'_>| {
+        let written = Pin::new(&mut *stream).poll_write(context, &bytes);
+        Poll::Ready(written.is_pending())
+    };
+    while !poll_fn(&mut is_blocked).await {}
+}
+
 #[test]
 fn slow_peers_do_not_time_out() {
     run(async {
         let port = Port::open();
         let (mut stream, mut peer) = port.connect();
-        stream.write_timeout = 4 * WRITE_TIMEOUT;
-        // More than the kernel holds, for longer than one write may be blocked.
-        let n_bytes = 64 << 20;
-        let reading = async {
-            let mut bytes = vec![0; n_bytes / 16];
-            for _ in 0..16 {
-                tokio::time::sleep(WRITE_TIMEOUT / 2).await;
-                peer.read_exact(&mut bytes).await.expect("sent");
-            }
-        };
-        let bytes = vec![0; n_bytes];
-        let (sent, ()) = tokio::join!(stream.write_all(&bytes), reading);
-        assert!(sent.is_ok(), "each pause is shorter than the limit");
+        stream.write_timeout = TIMEOUT;
+        fill(&mut stream).await;
+        assert!(stream.write_timer.is_some(), "the peer does not read yet");
+        let mut bytes = vec![0; 1 << 20];
+        let reading = async { while peer.read(&mut bytes).await.expect("sent") > 0 {} };
+        tokio::select! {
+            sent = stream.write_all(b"more") => sent.expect("the peer reads again"),
+            () = reading => panic!("the stream is open"),
+        }
+        assert!(stream.write_timer.is_none(), "the time starts anew");
     });
 }

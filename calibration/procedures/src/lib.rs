@@ -1,0 +1,39 @@
+//! The procedures of `fieldrig calibrate`: they read or take images, estimate, and write a report and
+//! a rig file.
+//!
+//! A task holds the options of one procedure: [`IntrinsicsTask`] for the lens of a camera,
+//! [`HandEyeTask`] for its pose on a robot, [`SceneTask`] for the cameras of a rig without a target,
+//! and [`TimeOffsetTask`] for the clocks of two pose streams. Its outcome contains the estimates, and
+//! writes the rig file once they were printed. An arm can move to the poses that determine the
+//! result best ([`MotionOptions`]).
+//!
+//! The estimation itself is in the crate `calibration`, the detection of targets in `targets`. The
+//! program that runs a procedure implements [`Host`]: it requests stops, and shows the progress.
+
+mod error;
+mod guide;
+mod hand_eye;
+mod host;
+mod images;
+mod intrinsics;
+mod json_object;
+mod lens;
+mod outputs;
+mod scan;
+mod scene;
+mod scene_report;
+mod symmetry;
+mod time_offset;
+
+pub use error::{BadInput, InsufficientData};
+pub use hand_eye::{
+    CalibratedHandEye, HandEyeOutcome, HandEyeSamples, HandEyeTask, MotionOptions, MovedArm,
+    RobotOptions, pose_toml,
+};
+pub use host::{Activity, CameraView, Host};
+pub use intrinsics::{IntrinsicsOutcome, IntrinsicsTask};
+pub use lens::LensFile;
+pub use outputs::{ReportOptions, RigOptions};
+pub use scene::{SceneOutcome, SceneTask};
+pub use symmetry::symmetry_warning;
+pub use time_offset::{TimeOffsetOutcome, TimeOffsetTask};

@@ -1,0 +1,134 @@
+//! The offset between the clocks of two pose streams.
+
+use crate::error::BadInput;
+use crate::outputs::{self, ReportOptions};
+use calibration::time_offset::{
+    MotionProfile, PoseSample, TimeOffset, TimeOffsetOptions, estimate_time_offset, motion_profile,
+};
+use kinematics::Transform;
+use nalgebra::{Quaternion, Translation3, UnitQuaternion};
+use report::calibration_report::TimeOffsetReport;
+use std::path::{Path, PathBuf};
+
+/// What is estimated, and from what.
+#[derive(Clone, Debug)]
+pub struct TimeOffsetTask {
+    /// Poses of the first body as rows t,x,y,z,qx,qy,qz,qw (seconds, meters).
+    pub a: PathBuf,
+    /// Poses of the second body, which is rigidly attached to the first.
+    pub b: PathBuf,
+    /// How they are compared.
+    pub options: TimeOffsetOptions,
+    /// The report to write.
+    pub report: Option<ReportOptions>,
+}
+
+/// The result of an estimation, or why there is none.
+pub struct TimeOffsetOutcome {
+    /// The result, or why there is none.
+    pub result: anyhow::Result<TimeOffset>,
+    /// Whether the report was written.
+    pub written: anyhow::Result<()>,
+}
+
+impl TimeOffsetTask {
+    /// Reads both files, estimates the offset, and writes the report. Without a result, the outcome
+    /// contains the reason.
+    ///
+    /// # Errors
+    /// If a file cannot be read, or if no report can be written to the given path.
+    pub fn run(&self) -> anyhow::Result<TimeOffsetOutcome> {
+        // Checked first, so that a wrong path does not cost a calibration.
+        self.report.as_ref().map_or(Ok(()), ReportOptions::check)?;
+        let a = read(&self.a)?;
+        let b = read(&self.b)?;
+        let result = estimate_time_offset(&a, &b, &self.options).map_err(anyhow::Error::from);
+        let written = match &self.report {
+            Some(report) => self.write_report(
+                report,
+                // A report without the profile is better than none.
+                motion_profile(&a, &b, &self.options).ok().as_ref(),
+                &result,
+            ),
+            None => Ok(()),
+        };
+        Ok(TimeOffsetOutcome { result, written })
+    }
+
+    fn write_report(
+        &self,
+        report: &ReportOptions,
+        profile: Option<&MotionProfile>,
+        result: &anyhow::Result<TimeOffset>,
+    ) -> anyhow::Result<()> {
+        let offset = result.as_ref().ok();
+        let refusal = offset.and_then(|offset| offset.hand_eye.as_ref()?.as_ref().err());
+        let warning = refusal
+            .map(|refusal| format!("the transform between the bodies is refused: {refusal}"));
+        let input = format!("{} and {}", self.a.display(), self.b.display());
+        let Some(heading) =
+            report.heading(Path::new(&input), result, warning.into_iter().collect())
+        else {
+            return Ok(());
+        };
+        let page = TimeOffsetReport {
+            heading: &heading,
+            profile,
+            offset,
+        };
+        report.write(&page.html())
+    }
+}
+
+/// Reads the rows of a file. Comments and a header are skipped; a row of numbers that is not a pose
+/// is an error.
+fn read(path: &Path) -> anyhow::Result<Vec<PoseSample>> {
+    let text = outputs::read_text(path)?;
+    let mut samples = Vec::new();
+    for (ix, line) in text.lines().enumerate() {
+        let parsed = line
+            // Any usual separator, because such files come from many programs.
+            .split([',', ' ', ';', '\t'])
+            .filter(|field| !field.is_empty())
+            .map(str::parse::<f64>);
+        // Any line that is not all numbers counts as a comment or header.
+        let Ok(numbers) = parsed.collect::<Result<Vec<f64>, _>>() else {
+            continue;
+        };
+        if numbers.is_empty() {
+            continue;
+        }
+        let place = || format!("{}, line {}", path.display(), ix + 1);
+        let [secs, x, y, z, qx, qy, qz, qw] = <[f64; 8]>::try_from(numbers).map_err(|numbers| {
+            BadInput(format!(
+                "{}: {} numbers, expected 8: t,x,y,z,qx,qy,qz,qw",
+                place(),
+                numbers.len()
+            ))
+        })?;
+        const MAX_NORM_ERROR: f64 = 0.01;
+        let quaternion = Quaternion::new(qw, qx, qy, qz);
+        if ![secs, x, y, z].iter().all(|value| value.is_finite()) {
+            return Err(BadInput(format!("{}: t, x, y and z must be finite", place())).into());
+        }
+        let norm = quaternion.norm();
+        // Normalized afterwards. A larger deviation shows another order of the columns.
+        let is_unit = (norm - 1.0).abs() < MAX_NORM_ERROR; // False for NaN.
+        if !is_unit {
+            return Err(BadInput(format!(
+                "{}: |qx,qy,qz,qw| is {norm:.3}, expected 1",
+                place()
+            ))
+            .into());
+        }
+        let pose = Transform::from_parts(
+            Translation3::new(x, y, z),
+            UnitQuaternion::from_quaternion(quaternion),
+        );
+        samples.push(PoseSample { secs, pose });
+    }
+    if samples.is_empty() {
+        return Err(BadInput(format!("{}: no row t,x,y,z,qx,qy,qz,qw", path.display())).into());
+    }
+    Ok(samples)
+}

@@ -1,0 +1,151 @@
+//! Names of settings in messages. A library does not know how a program lets its users set an
+//! option, for example with a flag, so the program spells the names.
+
+use std::fmt::{Display, Formatter, Result};
+use std::sync::OnceLock;
+
+/// Defines the settings with the names that the options have in the libraries.
+macro_rules! settings {
+    ($($(#[$doc:meta])* $name:ident = $option:literal,)*) => {
+        /// Something that a user can set and that a message names.
+        ///
+        /// ```
+        /// use messages::Setting;
+        ///
+        /// // A program may spell the settings in another way: see `Setting::spell_as`.
+        /// assert_eq!(format!("{}: must be above 0", Setting::MaxSplats), "max_splats: must be above 0");
+        /// ```
+        #[derive(Clone, Copy, Debug, PartialEq, Eq)]
+        pub enum Setting {
+            $($(#[$doc])* $name,)*
+        }
+
+        impl Setting {
+            /// All settings.
+            pub const ALL: &[Self] = &[$(Self::$name,)*];
+
+            /// Name of the option in the libraries.
+            const fn option(self) -> &'static str {
+                match self {
+                    $(Self::$name => $option,)*
+                }
+            }
+        }
+    };
+}
+
+settings! {
+    /// Camera of a rig file to calibrate.
+    Camera = "camera",
+    /// Rule for the number of splats.
+    Count = "count",
+    /// Box outside of which a rendered scene is invisible.
+    Crop = "crop",
+    /// Model from which missing depth is rendered.
+    DepthFrom = "depth_from",
+    /// Kinds of disturbance that a bench measures.
+    Disturb = "disturbances",
+    /// Drift of the clock of a camera.
+    DriftPpm = "drift_ppm",
+    /// Constant latency of a camera.
+    FixedMillis = "fixed_millis",
+    /// Selection of test images.
+    Holdout = "holdout",
+    /// Random latency of a camera.
+    JitterMillis = "jitter_millis",
+    /// List of the keyframes to use.
+    Keyframes = "keyframes",
+    /// Sizes of a disturbance.
+    Levels = "levels",
+    /// Address of the server.
+    Listen = "listen",
+    /// Maximum GPU memory of a model.
+    MaxBytes = "max_bytes",
+    /// Maximum number of splats.
+    MaxSplats = "max_splats",
+    /// Variants that a bench trains.
+    Only = "only",
+    /// Folder of the results.
+    Out = "out",
+    /// Calibration parameters to estimate from a scene.
+    Params = "params",
+    /// Curves of other trainers.
+    Peer = "peers",
+    /// Viewpoint of a rendered image.
+    Pose = "pose",
+    /// Images per second of a dataset.
+    RateHz = "rate_hz",
+    /// Images per second of simulated cameras.
+    Rates = "rates_hz",
+    /// Recovery of an arm that has stopped.
+    Recover = "recover",
+    /// Calibration parameters that training refines.
+    Refine = "refine",
+    /// File of a calibration report.
+    Report = "report",
+    /// Folder of the run that training continues.
+    Resume = "resume",
+    /// Rig file that replaces the one stored in a recording.
+    Rig = "rig",
+    /// Numbers of samples of a neural field.
+    Samples = "n_samples",
+    /// Fraction to which images are scaled.
+    Scale = "scale",
+    /// Duration.
+    Seconds = "seconds",
+    /// Time at the start of a run that does not count.
+    SettleSeconds = "settle_seconds",
+    /// Whether other machines may open the page.
+    Share = "share",
+    /// Simulation of the devices of a rig.
+    Sim = "sim",
+    /// Image sizes.
+    Size = "sizes_px",
+    /// Numbers of splats.
+    Splats = "n_splats",
+    /// Printed calibration target.
+    Target = "target",
+    /// Format of an exported file.
+    To = "format",
+    /// Whether a hand-eye calibration also estimates the lens.
+    WithIntrinsics = "with_intrinsics",
+    /// Rig file into which a result is written.
+    WriteRig = "write_rig",
+}
+
+/// How the program spells a setting.
+static SPELLER: OnceLock<fn(Setting) -> &'static str> = OnceLock::new();
+
+impl Setting {
+    /// Sets how [`Display`] writes settings in this program, for example as flags. Until then, it
+    /// writes the names of the options in the libraries. Only the first call has an effect.
+    pub fn spell_as(speller: fn(Self) -> &'static str) {
+        let _ = SPELLER.set(speller);
+    }
+}
+
+impl Display for Setting {
+    fn fmt(&self, f: &mut Formatter<'_>) -> Result {
+        let spelled = SPELLER
+            .get()
+            .map_or(self.option(), |speller| speller(*self));
+        f.write_str(spelled)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::Setting;
+
+    #[test]
+    fn a_program_spells_the_settings_once() {
+        assert_eq!(Setting::MaxSplats.to_string(), "max_splats");
+        Setting::spell_as(|setting| match setting {
+            Setting::MaxSplats => "--max-splats",
+            _ => "another flag",
+        });
+        Setting::spell_as(|_| "a later speller");
+        assert_eq!(Setting::MaxSplats.to_string(), "--max-splats");
+        assert_eq!(Setting::Out.to_string(), "another flag");
+    }
+}

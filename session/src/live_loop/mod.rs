@@ -1,0 +1,323 @@
+//! The loop of a live run: takes keyframes, trains models, and draws pictures for viewers.
+
+mod keyframe_warning;
+mod keyframes;
+mod models;
+mod pictures;
+mod publishing;
+mod requests;
+
+use crate::ledger::Ledger;
+use crate::recoveries::{self, OpenGpu, Recoveries};
+use crate::render_budget::RenderBudget;
+use crate::scene_hint;
+use crate::session::Session;
+use capture::{Feed, InputResult, Notes};
+use keyframe::Keyframe;
+use keyframe_warning::KeyframeWarning;
+use keyframes::AcceptedKeyframes;
+use models::Models;
+use publishing::Publishing;
+use requests::Requests;
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+use trainer::AlignTiming;
+use viz::Hub;
+
+/// Maximum wait for a keyframe when there is nothing to do. Controls, edits and the status wait as
+/// long; a shorter wait would use more of a processor for checks without result.
+const IDLE: Duration = Duration::from_millis(10);
+
+/// When the models receive keyframes.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Pace {
+    /// In real time: as soon as a keyframe arrives.
+    RealTime,
+    /// In lockstep with training: one keyframe per fixed number of steps, so that a seed determines
+    /// the result.
+    Lockstep {
+        /// Steps between two keyframes.
+        steps_per_keyframe: u64,
+    },
+}
+
+impl Pace {
+    /// When the cameras are aligned.
+    pub fn align_timing(self) -> AlignTiming {
+        match self {
+            Self::RealTime => AlignTiming::RealTime,
+            Self::Lockstep { .. } => AlignTiming::Lockstep,
+        }
+    }
+}
+
+/// A live run.
+pub struct LiveLoop {
+    models: Models,
+    feed: Feed,
+    hub: Hub,
+    pace: Pace,
+    start_keyframes: usize,
+    accepted: AcceptedKeyframes,
+    budget: RenderBudget,
+    recoveries: Recoveries,
+    /// Times of the keyframes.
+    ledger: Ledger,
+    keyframe_change: Option<KeyframeChange>,
+    requests: Requests,
+    publishing: Publishing,
+    keyframe_warning: KeyframeWarning,
+}
+
+/// Changes a keyframe before the models receive it.
+pub type KeyframeChange = Box<dyn FnMut(Arc<Keyframe>) -> Arc<Keyframe>>;
+
+impl LiveLoop {
+    /// Combines the parts. Training starts with the first call of [`Self::advance`].
+    pub fn new(sessions: Vec<Session>, feed: Feed, hub: Hub, options: LiveOptions) -> Self {
+        let is_software = sessions.first().is_some_and(Session::is_software);
+        Self {
+            models: Models::new(sessions),
+            feed,
+            publishing: Publishing::new(hub.clone(), options.notes, options.device_notes),
+            hub,
+            pace: options.pace,
+            start_keyframes: options.start_keyframes,
+            accepted: AcceptedKeyframes::default(),
+            budget: RenderBudget::new(is_software),
+            recoveries: Recoveries::new(options.open_gpu),
+            ledger: Ledger::default(),
+            keyframe_change: None,
+            requests: Requests::default(),
+            keyframe_warning: KeyframeWarning::start(),
+        }
+    }
+
+    /// Continues with the keyframes of an earlier run, which the sessions already hold.
+    pub fn resume_from(mut self, keyframes: Vec<Arc<Keyframe>>) -> Self {
+        self.accepted.list = keyframes;
+        self.publishing
+            .publish_keyframes(&self.accepted.list, &self.models.sessions[0]);
+        if let Some(hint) = scene_hint::from_keyframes(&self.accepted.list) {
+            self.hub.set_scene_hint(hint);
+        }
+        self
+    }
+
+    /// Changes all following keyframes before the models receive them, for benchmarks with
+    /// disturbed data.
+    pub fn change_keyframes(&mut self, change: KeyframeChange) {
+        self.keyframe_change = Some(change);
+    }
+
+    /// Whether the run is over: a limit was reached or cannot be reached, the devices failed, or
+    /// the input ended without training data.
+    pub fn is_over(&self) -> bool {
+        if self.models.is_scoring() {
+            return false; // An evaluation in progress is completed first.
+        }
+        // After one session has reached its limit, the run waits for all other sessions that can
+        // still reach theirs.
+        let is_done =
+            |session: &Session| session.is_over() || (self.feed.ended() && session.is_idle());
+        let sessions = &self.models.sessions;
+        let reached = sessions.iter().any(Session::is_over) && sessions.iter().all(is_done);
+        reached
+            || self.has_exhausted_input()
+            || self.feed.source_failed()
+            || (self.feed.ended() && !self.accepted.can_train())
+    }
+
+    /// Whether the input ended and a model cannot reach its step limit without more keyframes.
+    /// Without a step limit, the run does not end, so that the result stays visible.
+    pub fn has_exhausted_input(&self) -> bool {
+        self.is_finished()
+            && self
+                .models
+                .sessions
+                .iter()
+                .any(|session| session.n_steps_remaining().is_some_and(|n| n > 0))
+    }
+
+    /// The hub that clients are connected to.
+    pub fn hub(&self) -> Hub {
+        self.hub.clone()
+    }
+
+    /// Keyframes in the store, in order of acceptance.
+    pub fn keyframes(&self) -> &[Arc<Keyframe>] {
+        &self.accepted.list
+    }
+
+    /// Number of keyframes evicted so far.
+    pub fn n_evicted(&self) -> u64 {
+        self.accepted.n_evicted
+    }
+
+    /// Times at which each keyframe passed the stages from the camera to the screens of viewers.
+    pub fn ledger(&self) -> &Ledger {
+        &self.ledger
+    }
+
+    /// The models in training.
+    pub fn sessions(&self) -> &[Session] {
+        &self.models.sessions
+    }
+
+    /// Runs one cycle: takes keyframes, trains, draws and publishes. Reopens the GPU if it fails.
+    pub fn advance(&mut self) -> anyhow::Result<()> {
+        if self.accepted.list.is_empty() {
+            self.keyframe_warning.warn_when_due(&self.feed);
+        }
+        // Requests of operators come first, so that the pictures and the status of this cycle
+        // already show their effect.
+        self.requests.apply_controls(&self.hub, &mut self.models);
+        self.record_shown_pictures();
+        self.requests.apply_edits(&self.hub, &mut self.models);
+        // After a GPU failure, the remaining stages are skipped: each of them would fail, too.
+        let advanced = self
+            .take_keyframes()
+            .and_then(|()| self.step())
+            .and_then(|()| self.render())
+            .map(|()| self.publish_models())
+            .and_then(|()| self.publish());
+        advanced.or_else(|error| self.recoveries.recover(&mut self.models.sessions, error))
+    }
+
+    /// Waits for queued work. Reopens the GPU if it failed, and returns whether it did.
+    pub fn wait(&mut self) -> anyhow::Result<bool> {
+        match self.models.sessions.iter().try_for_each(Session::wait) {
+            Ok(()) => Ok(false),
+            Err(error) => self
+                .recoveries
+                .recover(&mut self.models.sessions, error)
+                .map(|()| true),
+        }
+    }
+
+    /// Describes how to continue if the run fails now.
+    pub fn describe_recoverable(&mut self) -> String {
+        recoveries::describe_recoverable(&mut self.models.sessions)
+    }
+
+    /// Trains for one slice once there are enough keyframes. During an evaluation, scores one test
+    /// image instead. Does not train if a requested picture may be drawn now.
+    fn step(&mut self) -> anyhow::Result<()> {
+        // Checked even if no steps are made: callbacks may report a lost device at any time, and an
+        // idle run must recover, too.
+        self.models
+            .sessions
+            .iter()
+            .try_for_each(Session::check_gpu)?;
+        if !self.is_training() {
+            return Ok(());
+        }
+        // One image per cycle, so that requested pictures are drawn between two images.
+        let sessions = &mut self.models.sessions;
+        if let Some(session) = sessions.iter_mut().find(|session| session.is_scoring()) {
+            let before = Instant::now();
+            session.score_next()?;
+            self.budget.add_training(before.elapsed());
+            return Ok(());
+        }
+        if self.requests.is_paused {
+            // Keyframes are still accepted, and checkpoints can be requested.
+            sessions
+                .iter_mut()
+                .try_for_each(Session::write_checkpoint_when_due)?;
+        }
+        if self.is_finished() || self.requests.is_paused {
+            // Nothing is trained. Waits for a request, so that the loop does not use a whole
+            // processor.
+            self.hub.pictures().wait_for_request(IDLE);
+            return Ok(());
+        }
+        if self.is_render_pending() {
+            return Ok(());
+        }
+        self.train_slice()
+    }
+
+    /// Trains the next model for one slice.
+    fn train_slice(&mut self) -> anyhow::Result<()> {
+        // A picture waits for the submit in progress, so submits are shorter while clients are
+        // connected.
+        let is_watched = self.hub.n_clients() > 0;
+        let sessions = &mut self.models.sessions;
+        sessions
+            .iter_mut()
+            .for_each(|session| session.set_watched(is_watched));
+        // In lockstep, no model trains beyond the step at which its next keyframe is due. After the
+        // end of the input, no keyframe is due any more.
+        let is_paced = self.pace != Pace::RealTime && !self.feed.ended();
+        // Only in real time: the time of a step differs between runs, and a lockstep run must not
+        // depend on it.
+        if self.pace == Pace::RealTime {
+            sessions
+                .iter_mut()
+                .try_for_each(Session::pause_growth_when_slow)?;
+        }
+        let before = Instant::now();
+        let step_before = sessions[0].progress().step;
+        let hub = &self.hub;
+        let budget = self.budget;
+        self.models.train_next(is_paced, || {
+            budget.may_render() && hub.pictures().wait_for_request(Duration::ZERO)
+        })?;
+        self.budget.add_training(before.elapsed());
+        // Steps before this slice are complete, because at most one submit is in flight.
+        self.ledger.completed(step_before);
+        Ok(())
+    }
+
+    /// Ends the input and a search for floaters. Returns the sessions and the results of the input.
+    pub fn finish(mut self) -> (Vec<Session>, anyhow::Result<InputResult>) {
+        // Changes only the state; the rest of the status stays visible until the scores are
+        // published.
+        self.hub.set_state("saving");
+        if self.requests.erase_found(true, &self.hub, &mut self.models) {
+            self.publish_status();
+            self.hub.set_state("saving");
+        }
+        (self.models.sessions, self.feed.finish())
+    }
+
+    fn is_training(&self) -> bool {
+        let has_enough = self.accepted.list.len() >= self.start_keyframes || self.feed.ended();
+        self.accepted.can_train() && has_enough
+    }
+
+    /// Whether the input ended and all training is done; the models stay visible until the user
+    /// ends the run.
+    fn is_finished(&self) -> bool {
+        self.feed.ended() && self.models.is_idle()
+    }
+
+    fn state(&self) -> &'static str {
+        if self.is_finished() {
+            "finished"
+        } else if self.requests.is_paused {
+            "paused"
+        } else if self.is_training() {
+            "training"
+        } else if self.feed.first_image().is_some() {
+            "collecting keyframes"
+        } else {
+            "waiting for images"
+        }
+    }
+}
+
+/// Options of a live run.
+pub struct LiveOptions {
+    /// When the models receive keyframes.
+    pub pace: Pace,
+    /// Number of keyframes with which training starts.
+    pub start_keyframes: usize,
+    /// Notes shown on the page.
+    pub notes: Vec<String>,
+    /// Notes about the devices, which are added during the run and shown, too.
+    pub device_notes: Notes,
+    /// Reopens the GPU after a failure.
+    pub open_gpu: OpenGpu,
+}
