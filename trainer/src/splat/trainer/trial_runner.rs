@@ -168,8 +168,8 @@ impl TrialRunner<'_> {
 
     /// Restores a state and counts the reverted steps.
     fn restore(&mut self, snapshot: Snapshot) -> Result<(), Error> {
-        // The sum of steps and reverted steps stays the number of steps that were trained.
-        // The snapshot may be from a later step, if the second half of a trial is canceled. Its first
+        // The sum of steps and reverted steps stays the number of steps that were trained. The
+        // snapshot may be from a later step, if the second half of a trial is canceled. Its first
         // half was reverted before, so the result is not negative.
         self.trials.n_reverted_steps =
             self.trials.n_reverted_steps + self.training.schedule.step - snapshot.schedule.step;
