@@ -77,6 +77,11 @@ mod tests {
             .expect_err("no file");
         assert_eq!(class(&missing), ErrorClass::Failed);
         assert!(is_io(&missing) && !is_io(&error));
+        let refused = anyhow::Error::new(InsufficientData("too few images".into()));
+        assert_eq!(
+            class(&refused.context("camera")),
+            ErrorClass::InsufficientData
+        );
         assert!(format!("{missing:#}").starts_with("the list: "));
     }
 
@@ -94,8 +99,12 @@ mod tests {
 
     #[test]
     fn gpu_errors_are_found_under_context() {
-        let lost = anyhow::Error::new(trainer::Error::DeviceLost).context("run");
-        assert!(is_gpu_error(&lost) && !is_gpu_unrecoverable(&lost));
+        let of_trainer = anyhow::Error::new(trainer::Error::Gpu(gpu::Error::DeviceLost));
+        let of_gpu = anyhow::Error::new(gpu::Error::DeviceLost);
+        for lost in [of_trainer, of_gpu] {
+            let lost = lost.context("run");
+            assert!(is_gpu_error(&lost) && !is_gpu_unrecoverable(&lost));
+        }
         let ended = anyhow::Error::new(GpuUnrecoverable("resume it".into())).context("run");
         assert!(is_gpu_unrecoverable(&ended) && !is_gpu_error(&ended));
         assert_eq!(ended.root_cause().to_string(), "resume it");

@@ -1,11 +1,10 @@
 //! Reads image files, and detects a target in images.
 
-use crate::error::BadInput;
 use crate::host::Host;
 use calibration::{BoardPoint, BoardView};
 use capture::CalibrationImage;
 use image::ImageReader;
-use messages::BadInput;
+use messages::{BadInput, Setting};
 use rayon::prelude::*;
 use report::calibration_report::{Photo, Photos, Unused};
 use session::ReadProgress;
@@ -223,8 +222,10 @@ pub(crate) fn other_size<'a>(
     let given = target.to_string();
     let parts: Vec<&str> = given.split(':').collect();
     let remedy = match parts[..] {
-        ["chessboard", _, square] => format!("use --target chessboard:{found}:{square}"),
-        _ => "check the counts of --target".to_owned(),
+        ["chessboard", _, square] => {
+            format!("use {} chessboard:{found}:{square}", Setting::Target)
+        }
+        _ => format!("check the counts of {}", Setting::Target),
     };
     let prevails = n > n_detected;
     let others = match n_detected {

@@ -1,6 +1,5 @@
 //! The lens of a camera, from images of a target.
 
-use crate::error::InsufficientData;
 use crate::guide::Purpose;
 use crate::host::Host;
 use crate::images::{self, OtherSize};
@@ -10,6 +9,7 @@ use crate::scan::ScanOptions;
 use calibration::{
     BoardView, IntrinsicsCalibration, IntrinsicsInput, LensModel, calibrate_intrinsics,
 };
+use messages::{InsufficientData, Setting};
 use report::calibration_report::{IntrinsicsReport, Photos, Unused};
 use std::path::PathBuf;
 use targets::TargetSpec;
@@ -251,7 +251,8 @@ fn aspect_warning([fx, fy]: [f64; 2]) -> Option<String> {
     let is_square = (1.0 / MAX_RATIO..=MAX_RATIO).contains(&ratio);
     (!is_square).then(|| {
         format!(
-            "the focal lengths differ by a factor of {ratio:.2} (fy / fx), but pixels of almost all cameras are square: check that the images were not stretched or scaled in one direction, that interlaced lines were not dropped, and that --target has the right squares (width and height)"
+            "the focal lengths differ by a factor of {ratio:.2} (fy / fx), but pixels of almost all cameras are square: check that the images were not stretched or scaled in one direction, that interlaced lines were not dropped, and that {} has the right squares (width and height)",
+            Setting::Target
         )
     })
 }

@@ -1,6 +1,5 @@
 //! Reads JSON objects, with errors that name the file and the field.
 
-use crate::error::BadInput;
 use kinematics::{Transform, transform};
 use messages::BadInput;
 use serde::de::{Deserialize, Deserializer, Error as _, MapAccess, SeqAccess, Visitor};

@@ -1,6 +1,5 @@
 //! Intrinsics as JSON.
 
-use crate::error::BadInput;
 use crate::json_object::JsonObject;
 use kinematics::{Intrinsics, Lens};
 use messages::BadInput;

@@ -10,7 +10,6 @@
 //! The estimation itself is in the crate `calibration`, the detection of targets in `targets`. The
 //! program that runs a procedure implements [`Host`]: it requests stops, and shows the progress.
 
-mod error;
 mod guide;
 mod hand_eye;
 mod host;
@@ -25,7 +24,6 @@ mod scene_report;
 mod symmetry;
 mod time_offset;
 
-pub use error::{BadInput, InsufficientData};
 pub use hand_eye::{
     CalibratedHandEye, HandEyeOutcome, HandEyeSamples, HandEyeTask, MotionOptions, MovedArm,
     RobotOptions, pose_toml,

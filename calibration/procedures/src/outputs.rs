@@ -1,11 +1,10 @@
 //! Files that calibrations write: a rig file with the result, and a report.
 
 use anyhow::Context;
-use crate::error::{BadInput, is_refusal};
 use calibration::hand_eye::{JointOffset, Setup};
 use capture::config::{Camera, Parent, Rig};
 use kinematics::{Intrinsics, Transform};
-use messages::{BadInput, listed};
+use messages::{BadInput, ErrorClass, Setting, listed};
 use nalgebra::DMatrix;
 use report::calibration_report::{Heading, is_report};
 use session::{Data, DataOptions, corrected_rig, run_folder};
@@ -65,21 +64,39 @@ impl RigOptions {
         let problem = if kind != InputKind::Rig
             && (self.sim || self.seconds.is_some() || self.has_page_flags)
         {
-            "--sim, --seconds and the flags of the page (--listen, --share) need a rig file (.toml) as input".to_owned()
-        } else if kind == InputKind::Rig && self.rig.is_some() {
             format!(
-                "--rig: the input {} is a rig file, which is used; remove --rig",
+                "{}, {} and the flags of the page ({}, {}) need a rig file (.toml) as input",
+                Setting::Sim,
+                Setting::Seconds,
+                Setting::Listen,
+                Setting::Share
+            )
+        } else if kind == InputKind::Rig && self.rig.is_some() {
+            let setting = Setting::Rig;
+            format!(
+                "{setting}: the input {} is a rig file, which is used; remove {setting}",
                 input.display()
             )
         } else if kind != InputKind::Files {
             return Ok(());
         } else if self.write_rig.is_some() && self.rig.is_none() {
-            "--write-rig: the input contains no rig file; name the one to change with --rig RIG.toml".to_owned()
+            format!(
+                "{}: the input contains no rig file; name the one to change with {} RIG.toml",
+                Setting::WriteRig,
+                Setting::Rig
+            )
         } else if self.rig.is_some() && self.write_rig.is_none() {
-            "--rig: the rig file is only used to write the result into it; add --write-rig FILE"
-                .to_owned()
+            format!(
+                "{}: the rig file is only used to write the result into it; add {} FILE",
+                Setting::Rig,
+                Setting::WriteRig
+            )
         } else if self.camera.is_some() && self.write_rig.is_none() {
-            "--camera needs a recording or rig file as input, or --write-rig".to_owned()
+            format!(
+                "{} needs a recording or rig file as input, or {}",
+                Setting::Camera,
+                Setting::WriteRig
+            )
         } else {
             return Ok(());
         };
@@ -96,7 +113,8 @@ impl RigOptions {
         // All commands recognize rig files by this extension.
         if !is_rig_file(file) {
             return Err(BadInput(format!(
-                "--write-rig {}: must have the extension .toml",
+                "{} {}: must have the extension .toml",
+                Setting::WriteRig,
                 file.display()
             ))
             .into());
@@ -134,7 +152,8 @@ impl RigOptions {
                 let names: Vec<&str> = cameras.iter().map(|camera| &*camera.name).collect();
                 let names = listed(&names, "or");
                 Err(BadInput(format!(
-                    "the rig has several cameras; choose one with --camera: {names}"
+                    "the rig has several cameras; choose one with {}: {names}",
+                    Setting::Camera
                 ))
                 .into())
             }
@@ -218,8 +237,9 @@ impl RigOutput {
             || pairs.into_iter().any(|(a, b)| (a - b).abs() > MAX_PX);
         if differ {
             log::warn!(
-                "the pose of camera {:?} was estimated with other intrinsics than those of the rig file, which are kept; update them with `fieldrig calibrate intrinsics --write-rig`",
-                self.camera
+                "the pose of camera {:?} was estimated with other intrinsics than those of the rig file, which are kept; update them with `fieldrig calibrate intrinsics {}`",
+                self.camera,
+                Setting::WriteRig
             );
         }
         Ok(())
@@ -262,7 +282,8 @@ impl ReportOptions {
             .is_some_and(|extension| extension.eq_ignore_ascii_case("html"));
         if !folder.is_dir() || file.is_dir() || !is_page {
             return Err(BadInput(format!(
-                "--report {}: must be a file with the extension .html in an existing folder",
+                "{} {}: must be a file with the extension .html in an existing folder",
+                Setting::Report,
                 file.display()
             )));
         }
@@ -270,7 +291,8 @@ impl ReportOptions {
         // another page.
         if is_other_file(file) {
             return Err(BadInput(format!(
-                "--report {}: the file exists and is not a report of fieldrig; choose another name",
+                "{} {}: the file exists and is not a report of fieldrig; choose another name",
+                Setting::Report,
                 file.display()
             )));
         }
@@ -296,7 +318,7 @@ impl ReportOptions {
         let refused = match result {
             Ok(_) => None,
             // A refusal is a result, too: the report shows what is missing.
-            Err(error) if is_refusal(error) => {
+            Err(error) if session::class(error) == ErrorClass::InsufficientData => {
                 let text = format!("{error:#}");
                 Some(
                     // The heading already says that the calibration was refused.

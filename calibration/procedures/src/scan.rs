@@ -1,7 +1,6 @@
 //! Images of a target from a recording or from the devices of a rig, as input of `calibrate
 //! intrinsics` and `calibrate hand-eye`.
 
-use crate::error::{BadInput, InsufficientData};
 use crate::guide::{Guide, Purpose};
 use crate::host::{Activity, Host};
 use crate::images::{self, DetectedImage, OtherSize};
@@ -17,7 +16,7 @@ use capture::{
     ArmDuringImage, CalibrationImage, CalibrationImages, StampClock, calibration_images,
 };
 use kinematics::{Chain, Intrinsics, Stamp, Transform};
-use messages::{BadInput, InsufficientData};
+use messages::{BadInput, InsufficientData, Setting};
 use nalgebra::DMatrix;
 use report::calibration_report::{Photo, Photos, Unused};
 use session::{ReadProgress, corrected_rig};
@@ -80,9 +79,9 @@ impl RigOptions {
         }
         session::expect(input)?;
         let Some(target) = target else {
-            let example = "for example --target charuco:5x7:34mm:26mm:5X5_100";
+            let setting = Setting::Target;
             return Err(BadInput(format!(
-                "{}: --target is required with a recording or rig file, {example}",
+                "{}: {setting} is required with a recording or rig file, for example {setting} charuco:5x7:34mm:26mm:5X5_100",
                 input.display()
             ))
             .into());
@@ -218,7 +217,8 @@ fn no_images(input: &Path, rig: &Rig, camera: &Camera, found: &CalibrationImages
             let names: Vec<&str> = rig.cameras.iter().map(|camera| &*camera.name).collect();
             let names = messages::listed(&names, "and");
             format!(
-                "{input}: no image of camera {name:?}; the cameras of the rig are {names}: choose one with --camera"
+                "{input}: no image of camera {name:?}; the cameras of the rig are {names}: choose one with {}",
+                Setting::Camera
             )
         }
         (_, 0) => format!(

@@ -1,12 +1,12 @@
 //! The calibration of a rig's cameras from images of a static scene.
 
-use crate::error::{BadInput, InsufficientData};
 use crate::host::{Activity, Host};
 use crate::outputs::{self, ReportOptions, is_rig_file};
 use crate::scene_report::SceneReport;
 use capture::config::{Override, Rig};
 use capture::open::{self, Devices};
 use kinematics::Stamp;
+use messages::{BadInput, InsufficientData, Setting};
 use session::{
     Data, DataOptions, Purpose, Refine, SceneCalibration, calibrate_scene, corrected_rig,
     run_folder,
@@ -61,9 +61,11 @@ impl SceneTask {
     pub fn run(&self, host: &dyn Host) -> anyhow::Result<SceneOutcome> {
         // `auto` chooses the parameters itself, so a list contradicts it.
         if self.params.len() > 1 && self.params.contains(&Refine::Auto) {
-            return Err(
-                BadInput("--params: auto cannot be combined with other values".into()).into(),
-            );
+            return Err(BadInput(format!(
+                "{}: auto cannot be combined with other values",
+                Setting::Params
+            ))
+            .into());
         }
         // Checked first, so that a wrong path does not cost a calibration.
         self.report.as_ref().map_or(Ok(()), ReportOptions::check)?;
@@ -73,7 +75,8 @@ impl SceneTask {
             let Some(rig) = &given else {
                 let input = self.input.display();
                 return Err(BadInput(format!(
-                    "--write-rig {}: {input} contains no rig file",
+                    "{} {}: {input} contains no rig file",
+                    Setting::WriteRig,
                     file.display()
                 ))
                 .into());
@@ -87,8 +90,7 @@ impl SceneTask {
         } else {
             data.rig.clone()
         };
-        let result =
-            calibrate_scene(&data, &self.params, rig.as_ref()).map_err(anyhow::Error::from);
+        let result = calibrate_scene(&data, &self.params, rig.as_ref());
         let (calibration, written) =
             outputs::reported(result, self.report.as_ref(), |report, result| {
                 self.write_report(report, &data, rig.as_ref(), result)
@@ -157,17 +159,19 @@ impl SceneTask {
         }
         // Dataset folders have no rig file.
         let is_recording = run_folder::is_recording(&self.input);
-        Ok(is_recording
+        is_recording
             .then(|| Data::rig_as_given(&self.input, &self.options()))
-            .transpose()?)
+            .transpose()
     }
 
     fn data(&self, host: &dyn Host) -> anyhow::Result<Data> {
         if !is_rig_file(&self.input) {
             if self.sim || self.seconds.is_some() {
-                return Err(BadInput(
-                    "--sim and --seconds need a rig file (.toml) as input".into(),
-                )
+                return Err(BadInput(format!(
+                    "{} and {} need a rig file (.toml) as input",
+                    Setting::Sim,
+                    Setting::Seconds
+                ))
                 .into());
             }
             let data = Data::load(
@@ -178,11 +182,16 @@ impl SceneTask {
                 &|read| host.on_progress(read),
             );
             host.on_progress_end();
-            return Ok(data?);
+            return data;
         }
         // Both flags are about data that were recorded before.
         if self.keyframes.is_some() || self.rig.is_some() {
-            return Err(BadInput("--keyframes and --rig need a recording as input".into()).into());
+            return Err(BadInput(format!(
+                "{} and {} need a recording as input",
+                Setting::Keyframes,
+                Setting::Rig
+            ))
+            .into());
         }
         let stop = host.stop_requests(Activity::ReadImages)?;
         // In lockstep, the result does not depend on the speed of this computer.
@@ -214,7 +223,7 @@ impl SceneTask {
             &|read| host.on_progress(read),
         );
         host.on_progress_end();
-        Ok(data?)
+        data
     }
 }
 

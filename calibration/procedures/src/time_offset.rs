@@ -1,11 +1,11 @@
 //! The offset between the clocks of two pose streams.
 
-use crate::error::BadInput;
 use crate::outputs::{self, ReportOptions};
 use calibration::time_offset::{
     MotionProfile, PoseSample, TimeOffset, TimeOffsetOptions, estimate_time_offset, motion_profile,
 };
 use kinematics::Transform;
+use messages::BadInput;
 use nalgebra::{Quaternion, Translation3, UnitQuaternion};
 use report::calibration_report::TimeOffsetReport;
 use std::path::{Path, PathBuf};

@@ -611,7 +611,7 @@ mod tests {
         let error = recording(&path, None, &[]).err().expect("no rig file");
         let message = format!("{error:#}");
         assert!(
-            message.contains("contains no rig.toml") && message.contains("--rig"),
+            message.contains("contains no rig.toml") && message.contains("the rig file with rig"),
             "{message}"
         );
         assert!(recording(&path, Some(rig), &[]).is_ok());

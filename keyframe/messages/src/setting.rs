@@ -47,6 +47,8 @@ settings! {
     Disturb = "disturbances",
     /// Drift of the clock of a camera.
     DriftPpm = "drift_ppm",
+    /// Confirmation that an arm may move.
+    EnableMotion = "is_confirmed",
     /// Constant latency of a camera.
     FixedMillis = "fixed_millis",
     /// Selection of test images.
@@ -61,8 +63,12 @@ settings! {
     Listen = "listen",
     /// Maximum GPU memory of a model.
     MaxBytes = "max_bytes",
+    /// Maximum number of poses to which an arm moves.
+    MaxPoses = "max_poses",
     /// Maximum number of splats.
     MaxSplats = "max_splats",
+    /// How an arm moves during its calibration.
+    Move = "motion",
     /// Variants that a bench trains.
     Only = "only",
     /// Folder of the results.
@@ -105,10 +111,16 @@ settings! {
     Splats = "n_splats",
     /// Printed calibration target.
     Target = "target",
+    /// Link of a robot description that is the flange.
+    Tip = "tip",
     /// Format of an exported file.
     To = "format",
+    /// Robot description.
+    Urdf = "urdf",
     /// Whether a hand-eye calibration also estimates the lens.
     WithIntrinsics = "with_intrinsics",
+    /// Whether a hand-eye calibration also estimates joint offsets.
+    WithJoints = "with_joints",
     /// Rig file into which a result is written.
     WriteRig = "write_rig",
 }

@@ -1,9 +1,9 @@
 //! Flags of several commands.
 
 use crate::commands::number_in_range;
-use crate::exit::BadArgument;
 use crate::page_args::PageArgs;
 use calibrate::{ReportOptions, RigOptions};
+use messages::BadInput;
 use session::next_commands;
 use std::path::PathBuf;
 
@@ -34,7 +34,7 @@ pub(super) struct RigFlags {
 
 impl RigFlags {
     /// Options of the calibration.
-    pub(super) fn options(&self) -> Result<RigOptions, BadArgument> {
+    pub(super) fn options(&self) -> Result<RigOptions, BadInput> {
         self.page.check()?;
         Ok(RigOptions {
             camera: self.camera.clone(),

@@ -2,12 +2,12 @@
 
 use super::flags::{ReportFlag, RigFlags};
 use super::target_argument;
-use crate::exit::{BadArgument, Exit};
 use super::terminal::Terminal;
+use crate::exit::Exit;
 use crate::print;
 use calibrate::{IntrinsicsTask, LensFile};
 use calibration::{ImageGrid, IntrinsicsCalibration, LensModel, LensTrial};
-use messages::InsufficientData;
+use messages::BadInput;
 use report::calibration_report::Unused;
 use serde::Serialize;
 use std::collections::BTreeMap;
@@ -125,7 +125,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
 }
 
 impl Args {
-    fn task(&self) -> Result<IntrinsicsTask, BadArgument> {
+    fn task(&self) -> Result<IntrinsicsTask, BadInput> {
         Ok(IntrinsicsTask {
             input: self.input.clone(),
             target: self.target.clone(),

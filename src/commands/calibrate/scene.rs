@@ -3,12 +3,12 @@
 use super::flags::ReportFlag;
 use super::terminal::Terminal;
 use super::{matrix_of, print_matrix};
-use calibrate::{SceneOutcome, SceneTask};
 use crate::commands::number_in_range;
 use crate::exit::{self, Exit};
 use crate::print;
+use calibrate::{SceneOutcome, SceneTask};
 use calibration::{CameraCorrection, Estimate, PoseSigmas, Trial, rigid_transform};
-use messages::{BadInput, InsufficientData, listed};
+use messages::listed;
 use serde::Serialize;
 use session::{Refine, RelativePose, SCENE_PARAMS, SceneCalibration};
 use std::collections::BTreeMap;

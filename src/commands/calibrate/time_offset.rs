@@ -8,7 +8,7 @@ use crate::print;
 use calibrate::{TimeOffsetOutcome, TimeOffsetTask};
 use calibration::hand_eye::Refusal;
 use calibration::time_offset::{TimeOffset, TimeOffsetOptions};
-use messages::{BadInput, InsufficientData};
+use messages::InsufficientData;
 use serde::Serialize;
 use std::path::PathBuf;
 

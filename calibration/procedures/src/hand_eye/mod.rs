@@ -6,7 +6,6 @@ mod source;
 
 pub use moved::{MotionOptions, MovedArm};
 
-use crate::error::{BadInput, InsufficientData, is_refusal};
 use crate::guide::Purpose;
 use crate::host::Host;
 use crate::outputs::{self, ReportOptions, RigOptions, RigOutput};
@@ -19,6 +18,7 @@ use calibration::hand_eye::{
 };
 use kinematics::urdf::Robot;
 use kinematics::{Chain, Intrinsics, Lens, Transform};
+use messages::{BadInput, ErrorClass, InsufficientData, Setting};
 use moved::Request;
 use nalgebra::Vector3;
 use report::calibration_report::{HandEyeReport, Unused};
@@ -142,7 +142,8 @@ impl HandEyeTask {
         host: &dyn Host,
         output: Option<&mut RigOutput>,
     ) -> anyhow::Result<(Source, Option<MovedArm>)> {
-        let has = |what: &str, flag: &str| BadInput(format!("{flag}: {what}; remove the flag"));
+        let has =
+            |what: &str, setting: Setting| BadInput(format!("{setting}: {what}; remove the flag"));
         let (scan, arm) = if let Some(motion) = &self.motion {
             let (scan, arm) = motion.run(&self.request(host)?, output)?;
             (Some(scan), Some(arm))
@@ -160,18 +161,23 @@ impl HandEyeTask {
         };
         let source = match (scan, &self.target) {
             (Some(_), _) if self.robot.is_some() => {
-                return Err(has("the rig file names the robot description", "--urdf").into());
+                return Err(has("the rig file names the robot description", Setting::Urdf).into());
             }
             (Some(scan), Some(target)) => Source::Scan {
                 scan: Box::new(scan),
                 target: target.clone(),
             },
             (None, Some(_)) => {
-                return Err(has("the samples file contains the target", "--target").into());
+                return Err(has("the samples file contains the target", Setting::Target).into());
             }
             (_, None) if self.with_joints && self.robot.is_none() => {
-                let why = "--with-joints: with samples in JSON, --urdf and --tip are needed, too";
-                return Err(BadInput(why.to_owned()).into());
+                return Err(BadInput(format!(
+                    "{}: with samples in JSON, {} and {} are needed, too",
+                    Setting::WithJoints,
+                    Setting::Urdf,
+                    Setting::Tip
+                ))
+                .into());
             }
             (_, None) => {
                 let file = SamplesFile::read(&self.input)?;
@@ -188,12 +194,19 @@ impl HandEyeTask {
     /// What an arm calibrates that moves.
     fn request<'a>(&'a self, host: &'a dyn Host) -> anyhow::Result<Request<'a>> {
         let Some(target) = &self.target else {
-            let why = "--target is required with --move, for example --target charuco:5x7:34mm:26mm:5X5_100";
-            return Err(BadInput(why.to_owned()).into());
+            let setting = Setting::Target;
+            return Err(BadInput(format!(
+                "{setting} is required with {}, for example {setting} charuco:5x7:34mm:26mm:5X5_100",
+                Setting::Move
+            ))
+            .into());
         };
         if self.robot.is_some() {
-            let why = "--urdf: the rig file names the robot description; remove the flag";
-            return Err(BadInput(why.to_owned()).into());
+            return Err(BadInput(format!(
+                "{}: the rig file names the robot description; remove the flag",
+                Setting::Urdf
+            ))
+            .into());
         }
         Ok(Request {
             input: &self.input,
@@ -383,7 +396,7 @@ fn with_reason(error: anyhow::Error, source: &Source, samples: &Samples) -> anyh
         .filter(|unused| !unused.is_unreadable)
         .collect();
     match unused.first() {
-        Some(first) if is_refusal(&error) => {
+        Some(first) if session::class(&error) == ErrorClass::InsufficientData => {
             // Unreadable images do not count, because they say nothing about the target.
             let n_all = source.n_samples() - (samples.unused.len() - unused.len());
             let n = unused.len();

@@ -1,7 +1,6 @@
 //! `fieldrig calibrate hand-eye --move`: the arm itself moves to poses that show the target.
 
 use super::{next_pose_options, with_distortion};
-use crate::error::{BadInput, InsufficientData};
 use crate::host::{Activity, CameraView, Host};
 use crate::images::{self, DetectedImage};
 use crate::outputs::{self, InputKind, RigOptions, RigOutput};
@@ -16,7 +15,7 @@ use capture::open::{self, Devices};
 use capture::{ArmCapture, ArmDuringImage, CalibrationImage, HOLDING, Stop};
 use drivers::motion::OnLoss;
 use kinematics::{Chain, Transform};
-use messages::{BadInput, InsufficientData};
+use messages::{BadInput, InsufficientData, Setting};
 use report::calibration_report::{Photo, Photos};
 use std::path::Path;
 use targets::{GrayImage, TargetSpec};
@@ -126,31 +125,36 @@ impl MotionOptions {
         flags.check(request.input)?;
         if InputKind::of(request.input) != InputKind::Rig {
             return Err(BadInput(format!(
-                "--move needs a rig file (.toml) as input; {input} is not one"
+                "{} needs a rig file (.toml) as input; {input} is not one",
+                Setting::Move
             ))
             .into());
         }
         if flags.seconds.is_some() {
-            return Err(BadInput(
-                "--seconds cannot be combined with --move; limit the number of poses with --max-poses".to_owned(),
-            )
+            return Err(BadInput(format!(
+                "{} cannot be combined with {}; limit the number of poses with {}",
+                Setting::Seconds,
+                Setting::Move,
+                Setting::MaxPoses
+            ))
             .into());
         }
         let given = Rig::load(request.input, &[])?;
         let given_camera = flags.camera_of(&given)?.clone();
         let camera = &given_camera.name;
         if given.arm.driver == ArmDriver::None {
-            return Err(BadInput(format!("--move: {input}: the rig has no arm")).into());
+            return Err(BadInput(format!("{}: {input}: the rig has no arm", Setting::Move)).into());
         }
         let is_simulated = flags.sim || given.arm.driver == ArmDriver::Sim;
         if !is_simulated {
             open::motion_of(&given)?;
             open::check_motion(&given)?;
             if !self.is_confirmed {
-                return Err(BadInput(
-                    "--move moves the arm: add --enable-motion to confirm that nobody is within reach of the arm and that a hand is on the emergency stop"
-                        .to_owned(),
-                )
+                return Err(BadInput(format!(
+                    "{} moves the arm: add {} to confirm that nobody is within reach of the arm and that a hand is on the emergency stop",
+                    Setting::Move,
+                    Setting::EnableMotion
+                ))
                 .into());
             }
         }

@@ -1,6 +1,5 @@
 //! The samples file of `fieldrig calibrate hand-eye`, and the target in its images.
 
-use crate::error::{BadInput, InsufficientData};
 use crate::host::Host;
 use crate::images::{self, DetectedImage, ImageFile, OtherSize};
 use crate::json_object::{self, JsonObject};
@@ -9,7 +8,7 @@ use crate::outputs;
 use calibration::hand_eye::{BoardObservation, HandEyeSample, Setup};
 use capture::camera_info;
 use kinematics::{Intrinsics, Transform};
-use messages::{BadInput, InsufficientData};
+use messages::{BadInput, InsufficientData, Setting};
 use nalgebra::DMatrix;
 use report::calibration_report::{Photos, Unused};
 use std::collections::BTreeMap;
@@ -158,16 +157,19 @@ impl SamplesFile {
     /// Notes about parts of the file that do not affect the result, without a period.
     ///
     /// * `estimates_joints`: whether the offsets of joints are estimated.
-    pub(super) fn unused(&self, estimates_joints: bool) -> Vec<&'static str> {
+    pub(super) fn unused(&self, estimates_joints: bool) -> Vec<String> {
         let without_images = self.intrinsics.is_some() && !self.has_images();
         let without_flag =
             !estimates_joints && self.entries.iter().any(|entry| entry.joints.is_some());
         let notes = [
             (
                 without_images,
-                "intrinsics are not used, because no sample has an image",
+                "intrinsics are not used, because no sample has an image".to_owned(),
             ),
-            (without_flag, "joints are only used with --with-joints"),
+            (
+                without_flag,
+                format!("joints are only used with {}", Setting::WithJoints),
+            ),
         ];
         notes
             .into_iter()

@@ -1,7 +1,6 @@
 //! Samples of `fieldrig calibrate hand-eye` from a file, a recording or devices.
 
 use super::samples_file::{Samples, SamplesFile};
-use crate::error::InsufficientData;
 use crate::host::Host;
 use crate::scan::Scan;
 use calibration::hand_eye::Setup;

@@ -11,6 +11,7 @@ use super::pose_fit::{HandEyeNoise, PoseFit};
 use crate::least_squares::{self, BlockSums, Fit, Loss};
 use crate::{BoardPoint, Error};
 use kinematics::{Chain, Intrinsics, Transform};
+use messages::Setting;
 use nalgebra::{DMatrix, DVector, Matrix2x3, Matrix3, Point3, SMatrix, Vector3, Vector6};
 
 /// Threshold of the robust loss, in standard deviations of a corner. Outliers were removed before,
@@ -464,10 +465,11 @@ impl IntrinsicsDoubt {
         }
         let change = fixed.state.solution.x.inverse() * free.state.solution.x;
         let warning = format!(
-            "the corners contradict the given intrinsics: with free intrinsics, {}, and the camera moves by {:.1} mm and {:.2} degrees, which is included in the uncertainty; calibrate the intrinsics with calibrate intrinsics, or estimate them together with the pose (--with-intrinsics)",
+            "the corners contradict the given intrinsics: with free intrinsics, {}, and the camera moves by {:.1} mm and {:.2} degrees, which is included in the uncertainty; calibrate the intrinsics with calibrate intrinsics, or estimate them together with the pose ({})",
             change_of_intrinsics(intrinsics, &free.state.intrinsics),
             1e3 * change.translation.vector.norm(),
-            change.rotation.angle().to_degrees()
+            change.rotation.angle().to_degrees(),
+            Setting::WithIntrinsics
         );
         Some(Self {
             free: free.state.solution,

@@ -5,12 +5,12 @@ mod printed;
 
 use super::flags::{ReportFlag, RigFlags};
 use super::target_argument;
+use super::terminal::Terminal;
 use crate::commands::number_in_range;
 use crate::exit::{self, Exit};
-use super::terminal::Terminal;
 use crate::print;
 use calibrate::{HandEyeSamples, HandEyeTask, Host, MotionOptions, RobotOptions};
-use messages::{BadInput, InsufficientData};
+use messages::BadInput;
 use printed::{Printed, PrintedPose, PrintedSample};
 use std::path::PathBuf;
 use targets::TargetSpec;

@@ -339,7 +339,7 @@ fn parts_without_effect_are_named() {
     let intrinsics = "intrinsics are not used, because no sample has an image";
     assert_eq!(
         unused(&poses, false),
-        [intrinsics, "joints are only used with --with-joints"]
+        [intrinsics, "joints are only used with with_joints"]
     );
     assert_eq!(unused(&poses, true), [intrinsics]);
 }
