@@ -154,7 +154,7 @@ impl LiveRun {
         // Only the first model is measured; it is the one that viewers see.
         let session = &live.sessions()[0];
         let progress = session.progress();
-        let seconds = session.secs();
+        let seconds = session.time().secs();
         let pictures: Vec<Vec<ReceivedPicture>> = viewers.iter().map(Viewer::pictures).collect();
         Self {
             conditions,

@@ -208,7 +208,9 @@ pub(crate) fn sample(
     let gpu_buffers = gpu.live_bytes_by_label();
     let sessions = live.sessions();
     let sample = Sample {
-        seconds: sessions.first().map_or(0.0, |session| session.secs()),
+        seconds: sessions
+            .first()
+            .map_or(0.0, |session| session.time().secs()),
         resident_bytes: resident_bytes()?.0,
         gpu_bytes: gpu.live_bytes(),
         gpu_reserved_bytes: gpu.reserved_bytes(),

@@ -45,7 +45,7 @@ impl Timeline {
     pub fn sample(&mut self, live: &LiveLoop, gpu: &Gpu, viewers: &[Viewer]) {
         let at = Instant::now();
         let session = &live.sessions()[0];
-        let seconds = session.secs();
+        let seconds = session.time().secs();
         let is_due = self
             .moments
             .last()
@@ -65,7 +65,7 @@ impl Timeline {
                 at,
                 seconds,
                 step: session.progress().step,
-                psnr: session.psnr(),
+                psnr: session.scoreboard().psnr(),
                 host_bytes,
             });
         }

@@ -85,7 +85,8 @@ pub use recovery::Recovery;
 pub use replay::Replay;
 pub use scene_calibration::{RelativePose, SCENE_PARAMS, SceneCalibration, calibrate_scene};
 pub use session::{
-    EndingSession, Evaluators, FinishedModel, Limits, Session, TrainingOutcome, finish,
+    EndingSession, Evaluators, FinishedModel, Limits, Persistence, Scoreboard, Session,
+    SessionOptions, TrainingOutcome, TrainingTime, finish,
 };
 pub use stored_keyframes::StoredKeyframes;
 pub use training::{TrainingPlan, check_before_data, drive, limits, model_specs, train};

@@ -23,7 +23,7 @@ const RETRY_DELAY: Duration = Duration::from_secs(1);
 pub fn describe_recoverable(sessions: &mut [Session]) -> String {
     sessions
         .iter_mut()
-        .filter_map(Session::describe_recoverable)
+        .filter_map(|session| session.persistence().describe_recoverable())
         .collect::<Vec<_>>()
         .join("; ")
 }
@@ -59,7 +59,10 @@ impl Recoveries {
     ) -> anyhow::Result<()> {
         // Another device would not help against other errors. All models share the device, so all
         // of them must be able to restart.
-        if !is_gpu_error(&error) || !sessions.iter().all(Session::can_restart) {
+        let can_restart = sessions
+            .iter_mut()
+            .all(|session| session.persistence().can_restore());
+        if !is_gpu_error(&error) || !can_restart {
             return Err(error);
         }
         let began = Instant::now();
@@ -86,7 +89,7 @@ impl Recoveries {
                     sessions
                         .iter()
                         .take(1)
-                        .for_each(|session| session.exclude(began.elapsed()));
+                        .for_each(|session| session.time().exclude(began.elapsed()));
                     self.last = Some(Instant::now());
                     return Ok(());
                 }

@@ -207,7 +207,7 @@ impl Replay {
         stop: &Stop,
     ) -> anyhow::Result<()> {
         let by_key = by_name(keyframes);
-        session.start_clock(Instant::now());
+        session.time().start(Instant::now());
         for entry in &self.decisions.entries {
             // Trains up to the step of the decision. Steps of rejected trials count, too, because
             // the log contains total numbers of steps.
@@ -218,7 +218,7 @@ impl Replay {
                 }
                 // A model that needs another keyframe would make no steps, and the loop would not
                 // end.
-                if session.step(entry.step - n_total_steps)? == 0 {
+                if step(session, entry.step - n_total_steps)? == 0 {
                     return Err(InsufficientData(format!(
                         "{} requires step {}, but there is nothing to train on",
                         self.name(),
@@ -239,12 +239,12 @@ impl Replay {
                 Decision::Remove(removed) => {
                     session.remove(&removed.camera, Stamp(removed.stamp_nanos))?
                 }
-                Decision::Seed(_) => session.seed()?,
+                Decision::Seed(_) => session.viewed().seed()?,
                 // Waits: in the logged run, the result was ready at this step.
                 Decision::Align(_) => drop(session.poll_alignment(true)?),
                 Decision::PauseGrowth(is_paused) => session.pause_growth(*is_paused)?,
                 // Starts training on the keyframes so far without a step.
-                Decision::Begin(_) => drop(session.step(0)?),
+                Decision::Begin(_) => drop(step(session, 0)?),
                 // Restored keyframes are in the model of the checkpoint. A replay takes its own
                 // checkpoints.
                 Decision::Restored(_) | Decision::Checkpoint(_) | Decision::End(_) => {}
@@ -277,6 +277,14 @@ impl Replay {
     fn name(&self) -> String {
         format!("the log {}", self.path.display())
     }
+}
+
+/// Trains for at most `max_steps` steps, and evaluates if an evaluation is due. Returns the number
+/// of steps.
+fn step(session: &mut Session, max_steps: u64) -> anyhow::Result<u64> {
+    let n = session.train_steps(max_steps)?;
+    session.evaluate_when_due()?;
+    Ok(n)
 }
 
 fn by_name(keyframes: &[Arc<Keyframe>]) -> HashMap<(&str, i64), &Arc<Keyframe>> {

@@ -4,7 +4,13 @@
 //! results, which depend only on the steps and keyframes of a model.
 
 use crate::session::Session;
-use std::time::Duration;
+use std::time::{Duration, Instant};
+
+/// Approximate duration of a slice.
+///
+/// The device is idle for a moment at the end of each slice, so shorter slices train less. Longer
+/// slices delay new keyframes, the other models, and the status, which are handled between slices.
+const TIME_SLICE: Duration = Duration::from_millis(40);
 
 /// Trains the session with the least device time among those that can train, then runs all
 /// evaluations that are due.
@@ -23,7 +29,7 @@ pub(crate) fn train_next(
     let device_time: Vec<Option<Duration>> = sessions
         .iter()
         .enumerate()
-        .map(|(ix, session)| can_train(ix, session).then(|| session.device_time()))
+        .map(|(ix, session)| can_train(ix, session).then(|| session.time().device_time()))
         .collect();
     if let Some((ix, min_time)) = next(&device_time) {
         if sessions.len() == 1 {
@@ -34,13 +40,52 @@ pub(crate) fn train_next(
             // A session that was idle for a while does not catch up.
             sessions
                 .iter_mut()
-                .for_each(|session| session.raise_device_time(min_time));
-            sessions[ix].run_time_slice(|session| max_steps(ix, session), is_render_pending)?;
+                .for_each(|session| session.time_mut().raise_device_time(min_time));
+            run_slice(
+                &mut sessions[ix],
+                |session| max_steps(ix, session),
+                is_render_pending,
+            )?;
         }
     }
     // Of all sessions, not only of the one that has trained: the clock is common, so evaluations
     // and checkpoints of the others become due, too.
     sessions.iter_mut().try_for_each(Session::evaluate_when_due)
+}
+
+/// Trains a session for one slice on a shared device, at most `max_steps` steps. Queued work is
+/// complete when this returns.
+///
+/// `is_render_pending` returns whether a picture is requested, which ends the slice; called after
+/// each submit.
+fn run_slice(
+    session: &mut Session,
+    max_steps: impl Fn(&Session) -> u64,
+    is_render_pending: impl Fn() -> bool,
+) -> anyhow::Result<()> {
+    let started = Instant::now();
+    let mut n_steps = 0;
+    loop {
+        let n = session.train_steps(max_steps(session))?;
+        n_steps += n;
+        // In lockstep, 0 means that the next keyframe is due before the next step.
+        let is_at_end = session.is_over() || session.is_idle() || max_steps(session) == 0;
+        if n == 0 || is_at_end || started.elapsed() >= TIME_SLICE || is_render_pending() {
+            break;
+        }
+    }
+    // Waits for the queued steps. Otherwise, the next session would be charged for their time.
+    session.n_total_steps()?;
+    // A session that cannot train is charged a full slice, so that it is not selected every time.
+    session.time_mut().add_device_time(if n_steps == 0 {
+        TIME_SLICE
+    } else {
+        started.elapsed()
+    });
+    if session.has_finished_steps() {
+        session.time_mut().mark_finished();
+    }
+    Ok(())
 }
 
 /// Index and device time of the session with the least device time (the first one if several have

@@ -4,7 +4,7 @@ use crate::data::{Data, DataOptions};
 use crate::methods::{self, COUNT, MAX_SPLATS, Settings, methods_of};
 use crate::observer::Observer;
 use crate::recoveries::{OpenGpu, Recoveries};
-use crate::session::{Evaluators, Limits, Session};
+use crate::session::{Evaluators, Limits, Session, SessionOptions};
 use crate::training_options::{Refine, RefineSettings, TrainingOptions};
 use crate::{run_folder, time_slices};
 use capture::Stop;
@@ -48,16 +48,15 @@ pub fn train(
     let mut method = plan.model_spec.start(gpu.clone())?;
     // Compiling kernels takes seconds and is not training.
     method.model_mut().prepare()?;
-    let session = Session::new(
+    let mut session = Session::new(
         gpu,
         (kind, method),
-        plan.evaluators,
-        plan.limits,
-        plan.observer,
+        SessionOptions {
+            stop: stop.clone(),
+            initial_points: plan.initial_points,
+            ..SessionOptions::new(plan.evaluators, plan.limits, plan.observer)
+        },
     );
-    let mut session = session
-        .with_stop(stop)
-        .with_initial_points(plan.initial_points);
     drive(
         std::slice::from_mut(&mut session),
         keyframes,
@@ -83,7 +82,7 @@ pub fn drive(
     let now = Instant::now();
     let began = now.checked_sub(preparation_time).unwrap_or(now);
     for session in &mut *sessions {
-        session.start_clock(began);
+        session.time().start(began);
         for keyframe in keyframes {
             session.push(keyframe)?;
         }
@@ -118,11 +117,11 @@ pub fn drive(
             sessions
                 .iter_mut()
                 .filter(|session| session.is_idle())
-                .for_each(Session::mark_finished);
+                .for_each(|session| session.time_mut().mark_finished());
         }
-        match sessions.iter().try_for_each(Session::wait) {
+        match sessions.iter().try_for_each(|session| session.gpu().wait()) {
             Ok(()) => return Ok(()),
-            Err(error) => recoveries.recover(sessions, error)?,
+            Err(error) => recoveries.recover(sessions, error.into())?,
         }
     }
 }

@@ -32,8 +32,9 @@ use session::run_folder::{self, CreatedFolders};
 use session::{
     AvailableData, Checkpoints, Clock, DecisionLog, EndingSession, Evaluator, Evaluators,
     FinishedModel, KeptFolder, Latency, Limits, LiveLoop, LiveOptions, ModelViewer, Pace, REALIGN,
-    Recovery, RefineSettings, RunDescription, RunFlags, ServedModel, Session, Settings,
-    StoredKeyframes, Viewers, checkpoints, corrected_rig, methods_of, recovery, robot_meshes,
+    Recovery, RefineSettings, RunDescription, RunFlags, ServedModel, Session, SessionOptions,
+    Settings, StoredKeyframes, Viewers, checkpoints, corrected_rig, methods_of, recovery,
+    robot_meshes,
 };
 use std::collections::BTreeMap;
 use std::io::IsTerminal;
@@ -326,7 +327,9 @@ impl Running {
         let n_keyframes = keyframes.len();
         let (mut sessions, input_result) = self.live.finish();
         // The caller may remove the folders, so checkpoints in progress must finish first.
-        sessions.iter_mut().for_each(Session::wait_for_checkpoint);
+        sessions
+            .iter_mut()
+            .for_each(|session| session.persistence().wait_for_checkpoint());
         let input_result = input_result?;
         let counts = input_result.join.counts();
         let mut data_losses = counts.data_losses(SampleUse::ProcessedOnly);
@@ -582,27 +585,24 @@ impl SessionSetup<'_> {
             depth_from: None,
             flags: args.flags(self.limits),
         };
-        let session = Session::new(
+        let mut session = Session::new(
             self.gpu.clone(),
             (kind, method),
-            self.evaluators.clone(),
-            self.limits,
-            Box::new(console),
-        )
-        .with_stop(self.stop)
-        .with_edits(edits)
-        .with_stepwise_scoring()
-        .with_checkpoints(checkpoints.map(|to| to.with_flags(run_flags).with_keyframes(folder)))
-        .with_decisions(decisions)
-        .with_data(args.data_source(folder))
-        .with_folders(KeptFolder::of_run(folder, self.n_models > 1))
-        .with_recovery(recovery);
-        let mut session = match self.previous {
-            // Limits count from the start of the first run.
-            Some(previous) => session.with_elapsed_secs(previous.checkpoint.seconds),
-            None if self.n_models == 1 => session,
-            None => session.with_shared_clock(self.clock.clone()),
-        };
+            SessionOptions {
+                stop: self.stop.clone(),
+                clock: self.clock.clone(),
+                // Limits count from the start of the first run.
+                previous_secs: self.previous.map(|previous| previous.checkpoint.seconds),
+                edits,
+                scores_stepwise: true,
+                checkpoints: checkpoints.map(|to| to.with_flags(run_flags).with_keyframes(folder)),
+                decisions: Some(decisions),
+                recovery: Some(recovery),
+                folders: KeptFolder::of_run(folder, self.n_models > 1),
+                data: args.data_source(folder),
+                ..SessionOptions::new(self.evaluators.clone(), self.limits, Box::new(console))
+            },
+        );
         // The model of the checkpoint was trained on its keyframes already; only others are pushed.
         for keyframe in self.held {
             if is_new(keyframe) {
@@ -670,7 +670,9 @@ fn save(
     let mut latencies = live.ledger().latencies();
     // Closes the recording and ends the input thread, whose counts are then final.
     let (mut sessions, input_result) = live.finish();
-    sessions.iter_mut().for_each(Session::check_folders);
+    sessions
+        .iter_mut()
+        .for_each(|session| session.persistence().check_folders());
     let input_result = match input_result {
         Ok(input_result) => input_result,
         Err(error) => {

@@ -21,8 +21,8 @@ use session::next_commands::{DataSource, quoted};
 use session::run_folder::{self, CreatedFolders};
 use session::{
     Checkpoints, Clock, Data, DecisionLog, EndingSession, Evaluator, Evaluators, KeptFolder,
-    Limits, Purpose, REALIGN, Recovery, Replay, RunDescription, RunFlags, Session, Settings,
-    checkpoints, corrected_rig, points_sha256, recoveries, recovery,
+    Limits, Purpose, REALIGN, Recovery, Replay, RunDescription, RunFlags, Session, SessionOptions,
+    Settings, checkpoints, corrected_rig, points_sha256, recoveries, recovery,
 };
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -351,32 +351,29 @@ fn train(args: &Args, created: &mut CreatedFolders) -> anyhow::Result<Exit> {
         }
         let console = Console::new(OutputMode::of_command(args.json), limits, kinds.len());
         let checkpoints = Checkpoints::new(folder, args.checkpoints.options());
-        let session = Session::new(
+        sessions.push(Session::new(
             gpu.clone(),
             (kind, method),
-            evaluators.clone(),
-            limits,
-            Box::new(console),
-        )
-        .with_stop(&stop)
-        .with_initial_points(initial_points.clone())
-        .with_edits(edits)
-        .with_checkpoints(checkpoints.map(|to| to.with_flags(run_flags.clone())))
-        .with_profile(args.profile)
-        .with_decisions(decisions)
-        .with_folders(KeptFolder::of_run(folder, kinds.len() > 1))
-        .with_data(source.clone());
-        // A replay is not restarted after a GPU failure, because its log refers to step numbers.
-        let session = if replay.is_none() {
-            session.with_recovery(recovery)
-        } else {
-            session
-        };
-        sessions.push(match (&kinds[..], &checkpoint) {
-            ([_], Some(checkpoint)) => session.with_elapsed_secs(checkpoint.seconds),
-            ([_], None) => session,
-            _ => session.with_shared_clock(clock.clone()),
-        });
+            SessionOptions {
+                stop: stop.clone(),
+                clock: clock.clone(),
+                previous_secs: match (&kinds[..], &checkpoint) {
+                    ([_], Some(checkpoint)) => Some(checkpoint.seconds),
+                    _ => None,
+                },
+                initial_points: initial_points.clone(),
+                edits,
+                profiles: args.profile,
+                checkpoints: checkpoints.map(|to| to.with_flags(run_flags.clone())),
+                decisions: Some(decisions),
+                // A replay is not restarted after a GPU failure, because its log refers to step
+                // numbers.
+                recovery: replay.is_none().then_some(recovery),
+                folders: KeptFolder::of_run(folder, kinds.len() > 1),
+                data: source.clone(),
+                ..SessionOptions::new(evaluators.clone(), limits, Box::new(console))
+            },
+        ));
     }
     // Time for aligning base stations and rendering depth counts only in the first run.
     let preparation_time = if checkpoint.is_some() {
@@ -395,7 +392,8 @@ fn train(args: &Args, created: &mut CreatedFolders) -> anyhow::Result<Exit> {
         .as_ref()
         .map(|_| with_corrections(&Data::rig_as_given(&args.data, &images)?, &mut sessions));
     let startup_secs = sessions[0]
-        .clock_started()
+        .time()
+        .started()
         .map_or(0.0, |at| (at - started).as_secs_f64());
     let ending = |((session, out), seed): ((Session, PathBuf), u64)| EndingSession {
         details: TrainDetails {

@@ -61,8 +61,8 @@ impl LiveLoop {
         if let Some(first_image) = self.feed.first_image() {
             self.models
                 .sessions
-                .iter_mut()
-                .for_each(|session| session.start_clock(first_image));
+                .iter()
+                .for_each(|session| session.time().start(first_image));
         }
         let n_before = self.accepted.list.len();
         match self.pace {

@@ -75,7 +75,9 @@ pub type KeyframeChange = Box<dyn FnMut(Arc<Keyframe>) -> Arc<Keyframe>>;
 impl LiveLoop {
     /// Combines the parts. Training starts with the first call of [`Self::advance`].
     pub fn new(sessions: Vec<Session>, feed: Feed, hub: Hub, options: LiveOptions) -> Self {
-        let is_software = sessions.first().is_some_and(Session::is_software);
+        let is_software = sessions
+            .first()
+            .is_some_and(|session| session.gpu().is_software());
         Self {
             models: Models::new(sessions),
             feed,
@@ -131,12 +133,7 @@ impl LiveLoop {
     /// Whether the input ended and a model cannot reach its step limit without more keyframes.
     /// Without a step limit, the run does not end, so that the result stays visible.
     pub fn has_exhausted_input(&self) -> bool {
-        self.is_finished()
-            && self
-                .models
-                .sessions
-                .iter()
-                .any(|session| session.n_steps_remaining().is_some_and(|n| n > 0))
+        self.is_finished() && self.models.sessions.iter().any(has_steps_left)
     }
 
     /// The hub that clients are connected to.
@@ -186,11 +183,12 @@ impl LiveLoop {
 
     /// Waits for queued work. Reopens the GPU if it failed, and returns whether it did.
     pub fn wait(&mut self) -> anyhow::Result<bool> {
-        match self.models.sessions.iter().try_for_each(Session::wait) {
+        let sessions = &mut self.models.sessions;
+        match sessions.iter().try_for_each(|session| session.gpu().wait()) {
             Ok(()) => Ok(false),
             Err(error) => self
                 .recoveries
-                .recover(&mut self.models.sessions, error)
+                .recover(sessions, error.into())
                 .map(|()| true),
         }
     }
@@ -208,13 +206,16 @@ impl LiveLoop {
         self.models
             .sessions
             .iter()
-            .try_for_each(Session::check_gpu)?;
+            .try_for_each(|session| session.gpu().check())?;
         if !self.is_training() {
             return Ok(());
         }
         // One image per cycle, so that requested pictures are drawn between two images.
         let sessions = &mut self.models.sessions;
-        if let Some(session) = sessions.iter_mut().find(|session| session.is_scoring()) {
+        if let Some(session) = sessions
+            .iter_mut()
+            .find(|session| session.scoreboard().is_scoring())
+        {
             let before = Instant::now();
             session.score_next()?;
             self.budget.add_training(before.elapsed());
@@ -246,19 +247,17 @@ impl LiveLoop {
         let sessions = &mut self.models.sessions;
         sessions
             .iter_mut()
-            .for_each(|session| session.set_watched(is_watched));
+            .for_each(|session| session.viewed().set_watched(is_watched));
         // In lockstep, no model trains beyond the step at which its next keyframe is due. After the
         // end of the input, no keyframe is due any more.
         let is_paced = self.pace != Pace::RealTime && !self.feed.ended();
         // Only in real time: the time of a step differs between runs, and a lockstep run must not
         // depend on it.
         if self.pace == Pace::RealTime {
-            sessions
-                .iter_mut()
-                .try_for_each(Session::pause_growth_when_slow)?;
+            self.models.pause_growth_when_slow()?;
         }
         let before = Instant::now();
-        let step_before = sessions[0].progress().step;
+        let step_before = self.models.sessions[0].progress().step;
         let hub = &self.hub;
         let budget = self.budget;
         self.models.train_next(is_paced, || {
@@ -306,6 +305,14 @@ impl LiveLoop {
             "waiting for images"
         }
     }
+}
+
+/// Whether a session has a step limit and has not reached it.
+fn has_steps_left(session: &Session) -> bool {
+    session
+        .time()
+        .n_steps_remaining(session.progress().step)
+        .is_some_and(|n| n > 0)
 }
 
 /// Options of a live run.

@@ -1,6 +1,6 @@
 //! The models of a live run.
 
-use crate::session::Session;
+use crate::session::{MAX_LIVE_STEP_MILLIS, Session};
 use crate::{methods, time_slices};
 use keyframe::Keyframe;
 use kinematics::Stamp;
@@ -32,7 +32,9 @@ impl Models {
     }
 
     pub(super) fn is_scoring(&self) -> bool {
-        self.sessions.iter().any(Session::is_scoring)
+        self.sessions
+            .iter()
+            .any(|session| session.scoreboard().is_scoring())
     }
 
     /// Whether no model can train before the next keyframe arrives.
@@ -102,6 +104,21 @@ impl Models {
         for (at, session) in self.next_keyframe_at.iter_mut().zip(&self.sessions) {
             *at = session.progress().step + n_steps;
         }
+    }
+
+    /// Pauses the growth of each model while its steps take too long for a live run. A larger model
+    /// would be trained and drawn even more slowly, so that an operator would see less.
+    pub(super) fn pause_growth_when_slow(&mut self) -> anyhow::Result<()> {
+        for session in &mut self.sessions {
+            // Growth continues at half of the limit only. With a single limit, each change of the
+            // load of the machine near it would pause and continue growth, and log this.
+            match session.progress().step_millis {
+                millis if millis > MAX_LIVE_STEP_MILLIS => session.pause_growth(true)?,
+                millis if millis < 0.5 * MAX_LIVE_STEP_MILLIS => session.pause_growth(false)?,
+                _ => {}
+            }
+        }
+        Ok(())
     }
 
     /// Trains the next model for one slice; see [`time_slices::train_next`]. If `is_paced`, no model

@@ -26,9 +26,11 @@ impl QueuedRender {
     /// Waits for the picture, whose rendering began at `began`, and sends it to its client.
     fn deliver(self, session: &mut Session, began: Instant) {
         let pending = self.pending.began_at(began);
-        let drawn = self
-            .queued
-            .and_then(|queued| session.finish_picture(queued, &pending.request, pending.packing()));
+        let drawn = self.queued.and_then(|queued| {
+            session
+                .viewed()
+                .finish_picture(queued, &pending.request, pending.packing())
+        });
         match drawn {
             Ok(picture) => pending.deliver(picture),
             Err(error) => pending.fail(&error.to_string()),
@@ -139,7 +141,9 @@ impl LiveLoop {
             };
             let session = &mut self.models.sessions[session_ix];
             pending.request.edits = Arc::clone(session.edits());
-            let queued = session.queue_picture(&pending.request, pending.packing());
+            let queued = session
+                .viewed()
+                .queue_picture(&pending.request, pending.packing());
             // Determined now: steps that are queued behind the picture are not in it.
             let trained_on = self
                 .ledger

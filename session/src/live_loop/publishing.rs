@@ -109,7 +109,7 @@ impl Publishing {
             edits: &edits,
             captured_at: &captured_at,
         };
-        let render = |request: &RenderRequest| session.render(request);
+        let render = |request: &RenderRequest| session.viewed().render(request);
         self.observations.publish(&keyframes, &model, render)
     }
 }
@@ -124,7 +124,7 @@ impl LiveLoop {
         if self.budget.may_render() {
             for session in &mut self.models.sessions {
                 self.budget
-                    .add_render(session.publish_chunks(&mut self.publishing.chunks));
+                    .add_render(session.viewed().publish_chunks(&mut self.publishing.chunks));
             }
         }
         if self.is_training() && self.budget.may_render() {
@@ -145,7 +145,7 @@ impl LiveLoop {
             return Ok(());
         }
         self.publishing.status_at = Some(Instant::now());
-        let clock_secs = self.models.sessions[0].secs();
+        let clock_secs = self.models.sessions[0].time().secs();
         if self.publishing.scoring_time.as_secs_f64() < SCORE_FRAC * clock_secs
             && !self.models.is_scoring()
         {
@@ -178,7 +178,7 @@ impl LiveLoop {
         let mut models = sessions.iter().map(model_status);
         self.hub.set_status(Status {
             state: self.state().to_owned(),
-            seconds: sessions[0].secs(),
+            seconds: sessions[0].time().secs(),
             keyframes: self.accepted.list.len() as u64,
             rejected: self.feed.rejected(),
             model: models.next().unwrap_or_default(),
@@ -233,8 +233,8 @@ fn model_status(session: &Session) -> ModelStatus {
         bytes: progress.bytes,
         has_chunks: session.kind().entry().has_chunks,
         edits: session.edits().len(),
-        psnr: session.psnr(),
-        psnr_history: session.psnr_history().to_vec(),
+        psnr: session.scoreboard().psnr(),
+        psnr_history: session.scoreboard().psnr_history().to_vec(),
     }
 }
 

@@ -46,12 +46,12 @@ impl Requests {
                     let mut is_due = true;
                     // Every session is asked, also after one that writes no checkpoints.
                     for session in &mut models.sessions {
-                        is_due &= session.request_checkpoint();
+                        is_due &= session.persistence().request_checkpoint();
                     }
                     self.checkpoint_note = Some(if is_due {
                         format!(
                             "checkpoint requested after {:.0} s",
-                            models.sessions[0].secs()
+                            models.sessions[0].time().secs()
                         )
                     } else {
                         "this run writes no checkpoints".to_owned()
@@ -66,7 +66,9 @@ impl Requests {
         self.erase_found(false, hub, models);
         for request in hub.operator_requests().take_edits() {
             let edited = match models.session_ix(request.method()) {
-                Ok(session_ix) => models.sessions[session_ix].edit(&mut self.editor, &request),
+                Ok(session_ix) => models.sessions[session_ix]
+                    .viewed()
+                    .edit(&mut self.editor, &request),
                 Err(reason) => Err(reason),
             };
             self.report_edit(hub, &request, edited);
@@ -81,7 +83,7 @@ impl Requests {
         };
         let session_ix = models.session_ix(request.method()).unwrap_or_default();
         let session = &mut models.sessions[session_ix];
-        let erased = found.and_then(|floaters| session.erase_floaters(floaters));
+        let erased = found.and_then(|floaters| session.viewed().erase_floaters(floaters));
         self.report_edit(hub, &request, erased.map(Some));
         true
     }

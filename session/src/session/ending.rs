@@ -10,7 +10,7 @@ use crate::next_commands::{DataSource, SavedModel};
 use crate::{camera_list, run_folder, viewer};
 use model_files::Edits;
 use serde::Serialize;
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 use std::sync::Arc;
 use trainer::{AlignedModel, ModelKind};
 use viz::Hub;
@@ -68,7 +68,7 @@ pub fn finish(
     // would otherwise count for the models that are saved later.
     let ended_secs: Vec<f64> = endings
         .iter_mut()
-        .map(|ending| ending.session.stop_training())
+        .map(|ending| stop_training(&mut ending.session))
         .collect::<anyhow::Result<_>>()?;
     // All models are saved before scoring, so that a second Ctrl-C during scoring loses nothing.
     let mut errors = Errors::default();
@@ -82,18 +82,8 @@ pub fn finish(
         log::info!("saved; scoring the test images (Ctrl-C again skips this)");
     }
     let mut finished = Vec::new();
-    for SavedSession {
-        ending,
-        seconds,
-        sha256,
-    } in saved
-    {
-        let EndingSession {
-            session,
-            out,
-            details,
-        } = ending;
-        match session.report_end(&out, seconds, &sha256, &details, hub) {
+    for saved in saved {
+        match saved.report_end(hub) {
             Ok(model) => finished.push(model),
             Err(error) => errors.record(error),
         }
@@ -142,14 +132,14 @@ fn save_all<P>(
     let mut saved = Vec::new();
     for (mut ending, seconds) in endings.into_iter().zip(ended_secs) {
         // A model that cannot be saved does not prevent saving the others.
-        match ending.session.save(&ending.out, seconds) {
+        match ending.save(seconds) {
             Ok(Saved {
                 folder,
                 sha256,
                 failed,
             }) => {
                 ending.out = folder;
-                ending.session.write_cameras(&ending.out);
+                ending.write_cameras();
                 if let Some(error) = failed {
                     errors.record(error);
                 }
@@ -188,60 +178,96 @@ struct Saved {
 impl Session {
     /// Scores the final model without saving it.
     pub fn score_without_saving(mut self) -> anyhow::Result<TrainingOutcome> {
-        let seconds = self.stop_training()?;
-        self.score_at_end(seconds, None)
+        let seconds = stop_training(&mut self)?;
+        score_at_end(&mut self, seconds, None)
     }
+}
 
-    /// Waits for queued work and returns the training time in seconds.
-    fn stop_training(&mut self) -> anyhow::Result<f64> {
-        // Queued steps count as training time, so the time is read after them.
-        self.gpu.wait()?;
-        let seconds = self.time.end_secs();
-        self.reporter.report_training_ended();
-        Ok(seconds)
-    }
+/// Waits for queued work and returns the training time in seconds.
+fn stop_training(session: &mut Session) -> anyhow::Result<f64> {
+    // Queued steps count as training time, so the time is read after them.
+    session.gpu.wait()?;
+    let seconds = session.time.end_secs();
+    session.reporter.report_training_ended();
+    Ok(seconds)
+}
 
+/// Scores the final model on all test images. Clients of `hub` get pictures meanwhile.
+fn score_at_end(
+    session: &mut Session,
+    seconds: f64,
+    hub: Option<&Hub>,
+) -> anyhow::Result<TrainingOutcome> {
+    session.gpu.wait()?;
+    session.persistence.log_render();
+    let mut work = WorkDuringScoring {
+        n_all: session.scoreboard.tests().len(),
+        n_reported: None,
+        reporter: &mut session.reporter,
+        edits: &session.edits,
+        hub,
+    };
+    let per_image = session
+        .scoreboard
+        .score_all(&mut session.method, |method, n_scored| {
+            work.advance(method, n_scored);
+        })?;
+    let progress = session.progress();
+    Ok(TrainingOutcome {
+        seconds,
+        steps: progress.step,
+        scores: Scores::mean(&per_image),
+        primitives: progress.primitives,
+        bytes: progress.bytes,
+        evaluations: session.reporter.take_evaluations(),
+        per_image,
+    })
+}
+
+impl<P> EndingSession<P> {
     /// Saves the model, in a temporary folder if `out` cannot be written. `seconds`: training time.
-    fn save(&mut self, out: &Path, seconds: f64) -> anyhow::Result<Saved> {
-        self.persistence.check_folders();
-        self.persistence.end_decisions(&mut self.method)?;
-        let progress = self.progress();
+    fn save(&mut self, seconds: f64) -> anyhow::Result<Saved> {
+        let Self { session, out, .. } = self;
+        session.persistence.check_folders();
+        session.persistence.end_decisions(&mut session.method)?;
+        let progress = session.progress();
         if progress.step > 0 && progress.primitives == 0 {
             log::warn!("the model is empty: no observation could be used");
         }
         // Saving ends a trial in progress. The checkpoint is taken before that, so that a resumed
         // run completes the trial. An idle live run is not finished, because it may receive more
         // keyframes after it is resumed.
-        let is_live = self.persistence.keeps_keyframes();
-        let is_finished = self.is_over() || (self.is_idle() && !is_live);
-        let checkpoint = self.persistence.take_last_checkpoint(Snapshot {
-            method: &mut self.method,
-            keyframes: &self.keyframes,
-            edits: &self.edits,
+        let is_live = session.persistence.keeps_keyframes();
+        let is_finished = session.is_over() || (session.is_idle() && !is_live);
+        let checkpoint = session.persistence.take_last_checkpoint(Snapshot {
+            method: &mut session.method,
+            keyframes: &session.keyframes,
+            edits: &session.edits,
             seconds,
             is_finished,
         });
-        let saved = run_folder::save_model(&mut self.method, &self.edits, out)
+        let saved = run_folder::save_model(&mut session.method, &session.edits, out)
             .and_then(|()| run_folder::checkpoint_sha256(out));
         // The checkpoint is written after the model: if the disk has no space for both, the model
         // is the more important one.
-        self.persistence.write_checkpoint(checkpoint);
+        session.persistence.write_checkpoint(checkpoint);
         match saved {
             Ok(sha256) => Ok(Saved {
-                folder: out.to_owned(),
+                folder: out.clone(),
                 sha256,
                 failed: None,
             }),
             // The disk may be full, or the folder read-only. Other errors, such as a lost GPU,
             // would also occur in another folder.
-            Err(error) if is_io(&error) => self.save_elsewhere(out, error),
+            Err(error) if is_io(&error) => self.save_elsewhere(error),
             Err(error) => Err(error),
         }
     }
 
     /// Saves the model in a temporary folder, because its run folder could not be written.
-    fn save_elsewhere(&mut self, out: &Path, save_error: anyhow::Error) -> anyhow::Result<Saved> {
-        match save_in_fallback_folder(&mut self.method, &self.edits) {
+    fn save_elsewhere(&mut self, save_error: anyhow::Error) -> anyhow::Result<Saved> {
+        let Self { session, out, .. } = self;
+        match save_in_fallback_folder(&mut session.method, &session.edits) {
             Ok((folder, sha256)) => {
                 let context = format!(
                     "cannot save the model in {}; it was saved in {}",
@@ -260,7 +286,7 @@ impl Session {
                 Err(save_error.context(format!(
                     "cannot save the model in {}; {}",
                     out.display(),
-                    self.persistence.describe_unsaved()
+                    session.persistence.describe_unsaved()
                 )))
             }
         }
@@ -268,77 +294,57 @@ impl Session {
 
     /// Writes the list of camera poses with the model's corrections. Without this list, a viewer
     /// starts with an outside view of the model.
-    fn write_cameras(&mut self, out: &Path) {
-        let cameras = camera_list::of_model(&mut self.method, &self.keyframes);
+    fn write_cameras(&mut self) {
+        let Self { session, out, .. } = self;
+        let cameras = camera_list::of_model(&mut session.method, &session.keyframes);
         if let Err(error) = camera_list::write(out, &cameras) {
             log::warn!("{} was not written: {error:#}", camera_list::FILE);
         }
     }
+}
 
+impl<P: Serialize> SavedSession<P> {
     /// Scores the saved model, writes the report, and reports the end.
-    fn report_end(
-        mut self,
-        out: &Path,
-        seconds: f64,
-        checkpoint_sha256: &str,
-        details: &impl Serialize,
-        hub: Option<&Hub>,
-    ) -> anyhow::Result<FinishedModel> {
-        let outcome = self.score_at_end(seconds, hub)?;
-        let method = &mut self.method;
+    fn report_end(self, hub: Option<&Hub>) -> anyhow::Result<FinishedModel> {
+        let Self {
+            ending:
+                EndingSession {
+                    mut session,
+                    out,
+                    details,
+                },
+            seconds,
+            sha256,
+        } = self;
+        let outcome = score_at_end(&mut session, seconds, hub)?;
+        let method = &mut session.method;
         // Rendered before profiling, because profiling trains the model further.
         let comparisons =
-            self.reporter
-                .compare(method, self.scoreboard.tests(), &outcome.per_image);
-        let passes = self.reporter.profile(method.model_mut())?;
-        self.reporter.report_end(ScoredModel {
-            out,
-            checkpoint_sha256,
+            session
+                .reporter
+                .compare(method, session.scoreboard.tests(), &outcome.per_image);
+        let passes = session.reporter.profile(method.model_mut())?;
+        session.reporter.report_end(ScoredModel {
+            out: &out,
+            checkpoint_sha256: &sha256,
             outcome: &outcome,
             comparisons,
             passes,
             cameras: method.model_mut().camera_corrections()?,
             alignment: method.alignment(),
             trials: method.model().report(),
-            adapter: self.gpu.describe(),
-            details,
+            adapter: session.gpu.describe(),
+            details: &details,
         })?;
         Ok(FinishedModel {
-            kind: self.kind(),
-            method: self.method,
-            edits: self.edits,
-            folder: out.to_owned(),
+            kind: session.kind(),
+            method: session.method,
+            edits: session.edits,
+            folder: out,
             seconds,
             scores: outcome.scores,
-            data: self.reporter.into_data(),
+            data: session.reporter.into_data(),
             n_tests: outcome.per_image.len(),
-        })
-    }
-
-    fn score_at_end(&mut self, seconds: f64, hub: Option<&Hub>) -> anyhow::Result<TrainingOutcome> {
-        self.gpu.wait()?;
-        self.persistence.log_render();
-        let mut work = WorkDuringScoring {
-            n_all: self.scoreboard.tests().len(),
-            n_reported: None,
-            reporter: &mut self.reporter,
-            edits: &self.edits,
-            hub,
-        };
-        let per_image = self
-            .scoreboard
-            .score_all(&mut self.method, |method, n_scored| {
-                work.advance(method, n_scored);
-            })?;
-        let progress = self.progress();
-        Ok(TrainingOutcome {
-            seconds,
-            steps: progress.step,
-            scores: Scores::mean(&per_image),
-            primitives: progress.primitives,
-            bytes: progress.bytes,
-            evaluations: self.reporter.take_evaluations(),
-            per_image,
         })
     }
 }

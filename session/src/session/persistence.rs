@@ -16,8 +16,7 @@ use std::sync::Arc;
 use trainer::{AlignedModel, Resumed};
 
 /// Checkpoints, decision log and recovery data of a session.
-#[derive(Default)]
-pub(super) struct Persistence {
+pub struct Persistence {
     checkpoints: Option<Checkpoints>,
     decisions: Option<DecisionLog>,
     recovery: Option<Recovery>,
@@ -29,9 +28,22 @@ pub(super) struct Persistence {
 }
 
 impl Persistence {
-    /// Makes these folders again if they disappear.
-    pub(super) fn set_folders(&mut self, folders: Vec<KeptFolder>) {
-        self.folders = folders;
+    /// The persistent state of a new session. Without checkpoints, decisions or recovery, it writes
+    /// none of them. The folders are made again if they disappear.
+    pub(super) fn new(
+        checkpoints: Option<Checkpoints>,
+        decisions: Option<DecisionLog>,
+        recovery: Option<Recovery>,
+        folders: Vec<KeptFolder>,
+    ) -> Self {
+        Self {
+            checkpoints,
+            decisions,
+            recovery,
+            folders,
+            evicted: Vec::new(),
+            n_evicted_before_last: 0,
+        }
     }
 
     /// Checks the folders, at most once per second.
@@ -39,24 +51,9 @@ impl Persistence {
         self.folders.iter_mut().for_each(KeptFolder::check_when_due);
     }
 
-    /// Checks the folders before the results are written.
-    pub(super) fn check_folders(&mut self) {
+    /// Makes the folders of the run again if they have disappeared.
+    pub fn check_folders(&mut self) {
         self.folders.iter_mut().for_each(KeptFolder::check);
-    }
-
-    /// Enables checkpoints; `None` disables them.
-    pub(super) fn set_checkpoints(&mut self, checkpoints: Option<Checkpoints>) {
-        self.checkpoints = checkpoints;
-    }
-
-    /// Enables the decision log.
-    pub(super) fn set_decisions(&mut self, decisions: DecisionLog) {
-        self.decisions = Some(decisions);
-    }
-
-    /// Enables recovery on another device.
-    pub(super) fn set_recovery(&mut self, recovery: Recovery) {
-        self.recovery = Some(recovery);
     }
 
     /// Logs that a keyframe was pushed to the model.
@@ -138,7 +135,7 @@ impl Persistence {
     }
 
     /// Makes the next checkpoint due now. Returns false if the run writes no checkpoints.
-    pub(super) fn request_checkpoint(&mut self) -> bool {
+    pub(crate) fn request_checkpoint(&mut self) -> bool {
         self.checkpoints
             .as_mut()
             .map(Checkpoints::request)
@@ -205,19 +202,26 @@ impl Persistence {
         }
     }
 
-    /// Waits until no checkpoint is being written.
+    /// Waits until no checkpoint is being written, and returns the error of the last one.
     pub(super) fn wait(&mut self) -> anyhow::Result<()> {
         self.checkpoints.as_mut().map_or(Ok(()), Checkpoints::wait)
     }
 
+    /// Waits until no checkpoint is being written.
+    pub fn wait_for_checkpoint(&mut self) {
+        if let Err(error) = self.wait() {
+            log::debug!("the last checkpoint was not written: {error:#}");
+        }
+    }
+
     /// Whether a model can be restored on another device.
-    pub(super) fn can_restore(&self) -> bool {
+    pub(crate) fn can_restore(&self) -> bool {
         self.recovery.is_some()
     }
 
     /// Describes how to continue if the run fails now, as a sentence without a period; `None`
     /// without recovery.
-    pub(super) fn describe_recoverable(&mut self) -> Option<String> {
+    pub(crate) fn describe_recoverable(&mut self) -> Option<String> {
         let has_checkpoint = self.has_checkpoint();
         Some(self.recovery.as_ref()?.describe_recoverable(has_checkpoint))
     }

@@ -77,13 +77,19 @@ pub(super) struct Reporter {
 }
 
 impl Reporter {
-    /// A reporter on a model of this kind that sends events to `observer`.
-    pub(super) fn new(kind: ModelKind, observer: Box<dyn Observer>) -> Self {
+    /// A reporter on a model of this kind that sends events to `observer`. If `profiles`, it also
+    /// reports the GPU time of each kernel.
+    pub(super) fn new(
+        kind: ModelKind,
+        observer: Box<dyn Observer>,
+        data: DataSource,
+        profiles: bool,
+    ) -> Self {
         Self {
             kind,
-            data: DataSource::default(),
+            data,
             observer,
-            profiles: false,
+            profiles,
             evaluations: Vec::new(),
         }
     }
@@ -101,11 +107,6 @@ impl Reporter {
     /// The data source.
     pub(super) fn into_data(self) -> DataSource {
         self.data
-    }
-
-    /// Sets whether to report the GPU time of each kernel.
-    pub(super) fn set_profiles(&mut self, profiles: bool) {
-        self.profiles = profiles;
     }
 
     /// Reports the state of training.

@@ -33,7 +33,7 @@ pub struct Evaluators {
 }
 
 /// Test keyframes and their scores.
-pub(super) struct Scoreboard {
+pub struct Scoreboard {
     evaluators: Evaluators,
     /// Test keyframes, those with the oldest score first.
     tests: VecDeque<Arc<Keyframe>>,
@@ -50,23 +50,19 @@ pub(super) struct Scoreboard {
 }
 
 impl Scoreboard {
-    /// A scoreboard without test keyframes.
-    pub(super) fn new(evaluators: Evaluators) -> Self {
+    /// A scoreboard without test keyframes. If `is_stepwise`, the caller scores each evaluation,
+    /// image by image.
+    pub(super) fn new(evaluators: Evaluators, is_stepwise: bool) -> Self {
         Self {
             evaluators,
             tests: VecDeque::new(),
             schedule: EvaluationSchedule::default(),
             pending: None,
             spent: Duration::ZERO,
-            is_stepwise: false,
+            is_stepwise,
             newest_psnr: BTreeMap::new(),
             history: Vec::new(),
         }
-    }
-
-    /// Makes the caller score each evaluation, image by image.
-    pub(super) fn set_stepwise(&mut self) {
-        self.is_stepwise = true;
     }
 
     /// Whether the caller scores an evaluation image by image.
@@ -141,7 +137,7 @@ impl Scoreboard {
     }
 
     /// Whether an evaluation is in progress.
-    pub(super) fn is_scoring(&self) -> bool {
+    pub(crate) fn is_scoring(&self) -> bool {
         self.pending.is_some()
     }
 
@@ -212,13 +208,13 @@ impl Scoreboard {
     }
 
     /// Mean of the latest PSNR of all test keyframes, dB.
-    pub(super) fn psnr(&self) -> Option<f64> {
+    pub fn psnr(&self) -> Option<f64> {
         let n = self.newest_psnr.len();
         (n > 0).then(|| self.newest_psnr.values().sum::<f64>() / n as f64)
     }
 
     /// The history of [`Self::psnr`]: training seconds and dB.
-    pub(super) fn psnr_history(&self) -> &[(f64, f64)] {
+    pub(crate) fn psnr_history(&self) -> &[(f64, f64)] {
         &self.history
     }
 }
@@ -243,7 +239,7 @@ mod tests {
 
     /// Times of the evaluations up to 60 s of training, if each takes this long.
     fn evaluated(max_frac: Option<f64>, each: Duration) -> Vec<f64> {
-        let mut scoreboard = Scoreboard::new(evaluators(max_frac));
+        let mut scoreboard = Scoreboard::new(evaluators(max_frac), false);
         let mut evaluated = Vec::new();
         for secs in up_to(60.0) {
             assert!(scoreboard.is_due(secs));

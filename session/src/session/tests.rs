@@ -5,7 +5,8 @@ use gpu::{GpuOptions, PassTiming};
 use keyframe::Split;
 use kinematics::Transform;
 use std::path::Path;
-use trainer::{CorrectedKeyframe, Error, Method, PendingCheckpoint};
+use std::time::Duration;
+use trainer::{CorrectedKeyframe, Error, Method, PendingCheckpoint, Picture, RenderRequest};
 
 const SIZE_PX: [u32; 2] = [4, 2];
 const N_TESTS: u8 = 5;
@@ -97,7 +98,10 @@ fn test_keyframe(ix: u8) -> Arc<Keyframe> {
 }
 
 /// A session after one second of training, with an evaluation due, and the counter of its pictures.
-fn session_with_evaluation_due(stop: &Stop) -> (Session, std::rc::Rc<std::cell::Cell<u32>>) {
+fn session_with_evaluation_due(
+    stop: &Stop,
+    scores_stepwise: bool,
+) -> (Session, std::rc::Rc<std::cell::Cell<u32>>) {
     let method = Gray::default();
     let n_drawn = method.n_drawn.clone();
     let quick = Evaluator::psnr_only;
@@ -114,15 +118,16 @@ fn session_with_evaluation_due(stop: &Stop) -> (Session, std::rc::Rc<std::cell::
             ModelKind::default(),
             AlignedModel::unaligned(Box::new(method)),
         ),
-        evaluators,
-        Limits::default(),
-        Box::new(()),
-    )
-    .with_stop(stop);
+        SessionOptions {
+            stop: stop.clone(),
+            scores_stepwise,
+            ..SessionOptions::new(evaluators, Limits::default(), Box::new(()))
+        },
+    );
     for ix in 0..N_TESTS {
         session.push(&test_keyframe(ix)).expect("held");
     }
-    session.start_clock(
+    session.time().start(
         Instant::now()
             .checked_sub(Duration::from_secs(1))
             .expect("the machine has run for a second"),
@@ -134,23 +139,24 @@ fn session_with_evaluation_due(stop: &Stop) -> (Session, std::rc::Rc<std::cell::
 #[test]
 fn stepwise_scoring_equals_scoring_at_once() {
     let stop = Stop::default();
-    let (mut at_once, n_at_once) = session_with_evaluation_due(&stop);
+    let (mut at_once, n_at_once) = session_with_evaluation_due(&stop, false);
     at_once.evaluate_when_due().expect("scored");
-    assert!(!at_once.is_scoring() && n_at_once.get() == 3);
+    assert!(!at_once.scoreboard.is_scoring() && n_at_once.get() == 3);
 
-    let (session, n_drawn) = session_with_evaluation_due(&stop);
-    let mut stepwise = session.with_stepwise_scoring();
+    let (mut stepwise, n_drawn) = session_with_evaluation_due(&stop, true);
     stepwise.evaluate_when_due().expect("opened");
     assert!(
-        stepwise.is_scoring() && stepwise.reporter.evaluations().is_empty() && n_drawn.get() == 0,
+        stepwise.scoreboard.is_scoring()
+            && stepwise.reporter.evaluations().is_empty()
+            && n_drawn.get() == 0,
         "images are scored only by score_next"
     );
     for n in 1..=3 {
-        assert!(stepwise.is_scoring());
+        assert!(stepwise.scoreboard.is_scoring());
         stepwise.score_next().expect("scored");
         assert_eq!(n_drawn.get(), n, "one image at a time");
     }
-    assert!(!stepwise.is_scoring());
+    assert!(!stepwise.scoreboard.is_scoring());
     let [one, other] = [&at_once, &stepwise].map(|session| &session.reporter.evaluations()[0]);
     assert_eq!((one.n_images, one.step), (3, 1));
     assert_eq!((other.n_images, other.step), (3, 1));
@@ -160,7 +166,7 @@ fn stepwise_scoring_equals_scoring_at_once() {
         "{} s, expected the time when it was due",
         other.seconds
     );
-    assert!(stepwise.psnr() == at_once.psnr());
+    assert!(stepwise.scoreboard.psnr() == at_once.scoreboard.psnr());
     stepwise.score_next().expect("nothing to do");
     assert_eq!(
         (stepwise.reporter.evaluations().len(), n_drawn.get()),
@@ -203,13 +209,14 @@ fn scoring_in_parallel_equals_scoring_one_by_one() {
 #[test]
 fn evaluation_is_dropped_when_stopping() {
     let stop = Stop::default();
-    let (session, n_drawn) = session_with_evaluation_due(&stop);
-    let mut session = session.with_stepwise_scoring();
+    let (mut session, n_drawn) = session_with_evaluation_due(&stop, true);
     session.evaluate_when_due().expect("opened");
     session.score_next().expect("scored");
     stop.request();
     session.score_next().expect("dropped");
     assert!(
-        !session.is_scoring() && session.reporter.evaluations().is_empty() && n_drawn.get() == 1
+        !session.scoreboard.is_scoring()
+            && session.reporter.evaluations().is_empty()
+            && n_drawn.get() == 1
     );
 }

@@ -24,7 +24,7 @@ impl Limits {
 }
 
 /// Training time, its limits, and device time.
-pub(super) struct TrainingTime {
+pub struct TrainingTime {
     limits: Limits,
     clock: Clock,
     /// Time for which this session has used a shared device.
@@ -34,38 +34,33 @@ pub(super) struct TrainingTime {
 }
 
 impl TrainingTime {
-    /// The time of a new session. Its clock does not run until [`Self::start`].
-    pub(super) fn new(limits: Limits) -> Self {
+    /// The time of a new session.
+    pub(super) fn new(limits: Limits, clock: Clock) -> Self {
         Self {
             limits,
-            clock: Clock::default(),
+            clock,
             device_time: Duration::ZERO,
             finished_secs: None,
         }
     }
 
-    /// Replaces the clock.
-    pub(super) fn set_clock(&mut self, clock: Clock) {
-        self.clock = clock;
-    }
-
     /// Starts the clock unless it is already running.
-    pub(super) fn start(&self, at: Instant) {
+    pub(crate) fn start(&self, at: Instant) {
         self.clock.start(at);
     }
 
     /// Time at which the clock was started; `None` if it is not running.
-    pub(super) fn started(&self) -> Option<Instant> {
+    pub fn started(&self) -> Option<Instant> {
         self.clock.started()
     }
 
     /// Training time so far, seconds.
-    pub(super) fn secs(&self) -> f64 {
+    pub fn secs(&self) -> f64 {
         self.clock.secs()
     }
 
     /// Excludes a duration from the training time.
-    pub(super) fn exclude(&self, spent: Duration) {
+    pub(crate) fn exclude(&self, spent: Duration) {
         self.clock.exclude(spent);
     }
 
@@ -76,7 +71,7 @@ impl TrainingTime {
     }
 
     /// Number of steps left after `n_steps` steps; `None` without a step limit.
-    pub(super) fn n_steps_remaining(&self, n_steps: u64) -> Option<u64> {
+    pub(crate) fn n_steps_remaining(&self, n_steps: u64) -> Option<u64> {
         Some(self.limits.steps?.saturating_sub(n_steps))
     }
 
@@ -86,22 +81,23 @@ impl TrainingTime {
     }
 
     /// Time for which this session has used a shared device.
-    pub(super) fn device_time(&self) -> Duration {
+    pub(crate) fn device_time(&self) -> Duration {
         self.device_time
     }
 
     /// Adds time on a shared device.
-    pub(super) fn add_device_time(&mut self, spent: Duration) {
+    pub(crate) fn add_device_time(&mut self, spent: Duration) {
         self.device_time += spent;
     }
 
-    /// Raises the device time to at least `device_time`.
-    pub(super) fn raise_device_time(&mut self, device_time: Duration) {
+    /// Raises the device time to at least `device_time`, so that an idle session does not catch up
+    /// later.
+    pub(crate) fn raise_device_time(&mut self, device_time: Duration) {
         self.device_time = self.device_time.max(device_time);
     }
 
     /// Marks the session as finished at the current training time, unless it is already finished.
-    pub(super) fn mark_finished(&mut self) {
+    pub(crate) fn mark_finished(&mut self) {
         // Only the first mark counts: the session may be asked again while others still train.
         let secs = self.secs();
         self.finished_secs.get_or_insert(secs);

@@ -1,10 +1,10 @@
 //! The splat trainer: implements [`Method`] by combining the modules for training and drawing.
 
 mod checkpoint;
+mod gains;
 mod lazy_pipelines;
 mod learning_rates;
 mod model;
-mod model_search;
 mod model_size;
 mod optimizer;
 mod products;
@@ -15,20 +15,18 @@ mod saved_arrays;
 mod scoring;
 mod seeding;
 mod training;
+mod trial_runner;
 mod view_set;
 
 use super::bounds::bounds;
 use super::chunks::{Chunker, MAX_SH_DEGREE};
-use super::few_images::Scarcity;
+use super::few_images;
 use super::floaters::floaters;
-use super::kernels::TrainPipelines;
 use super::options::SplatOptions;
 use super::params::Camera;
 #[cfg(test)]
 use super::params::status;
-use super::schedule::Schedule;
-use super::seed;
-use super::trials::{SplatTrials, ValidationImage};
+use super::trials::{CountPolicy, SplatTrials, ValidationImage};
 use crate::floaters::PendingFloaters;
 use crate::model_chunks::PendingChunks;
 use crate::model_metadata::{METADATA_FILE, read_metadata};
@@ -44,39 +42,26 @@ use gpu::{Gpu, PassTiming};
 use keyframe::{Keyframe, Split};
 use kinematics::Stamp;
 use lazy_pipelines::LazyPipelines;
-use model::TrainedModel;
+use model_files::checkpoint::Checkpoint;
 use model_files::splat::arrays::SplatArrays;
 use model_files::splat::file::IN_FOLDER;
 use model_files::splat::ply;
 use model_files::{Edits, InitialPoints};
-use optimizer::Optimizer;
 use parking_lot::Mutex;
-use recorder::Recorder;
-use renderer::{DrawnView, Renderer};
-use seeding::Seeding;
+use renderer::DrawnView;
 use std::collections::BTreeMap;
 use std::path::Path;
 use std::sync::Arc;
-use training::SkippedSteps;
-use view_set::ViewSet;
+use training::Training;
+use trial_runner::TrialRunner;
 
 /// Trains 3D Gaussian splats on keyframes.
 #[derive(Debug)]
 pub struct SplatTrainer {
-    options: ModelOptions<SplatOptions>,
-    recorder: Recorder,
-    model: TrainedModel,
-    renderer: Renderer,
-    optimizer: Optimizer,
-    schedule: Schedule,
-    views: ViewSet,
-    seeding: Seeding,
+    training: Training,
     trials: SplatTrials,
-    skipped: SkippedSteps,
     /// Camera corrections loaded with a saved model.
     saved_corrections: BTreeMap<String, CameraCorrection>,
-    /// Background loaded with a saved model.
-    saved_background_srgb: [f32; 3],
     /// Encodes versions of the model for viewers, on another thread.
     chunker: Arc<Mutex<Chunker>>,
 }
@@ -94,26 +79,15 @@ impl SplatTrainer {
         options: ModelOptions<SplatOptions>,
         pipelines: LazyPipelines,
     ) -> Result<Self, Error> {
-        // Software adapters get coarser images, fewer seeds and less image memory by default.
-        let is_software = gpu.is_software();
         Ok(Self {
-            renderer: Renderer::new(&gpu)?,
-            model: TrainedModel::new(&gpu, &options)?,
-            optimizer: Optimizer::new(&gpu, &options, pipelines)?,
-            schedule: Schedule::new(options.common.n_planned_steps),
-            views: ViewSet::new(&options, is_software),
-            seeding: Seeding::new(&options, is_software),
             trials: SplatTrials::new(
                 &options.common.cameras,
                 options.specific.count,
                 options.specific.trial_steps,
             ),
-            skipped: SkippedSteps::default(),
+            training: Training::new(gpu, options, pipelines)?,
             saved_corrections: BTreeMap::new(),
-            saved_background_srgb: [0.0; 3],
             chunker: Arc::default(),
-            recorder: Recorder::new(gpu),
-            options,
         })
     }
 
@@ -126,38 +100,51 @@ impl SplatTrainer {
     ) -> Result<Self, Error> {
         let options = options.with(|options| options.specific.sh_degree = arrays.sh_degree);
         let mut trainer = Self::with_pipelines(gpu, options, LazyPipelines::OnDemand)?;
-        trainer.add(arrays)?;
+        trainer.training.add(arrays)?;
         Ok(trainer)
     }
 
     /// Loads the camera corrections and the background of a saved model from its `model.json`.
     pub fn with_saved_metadata(mut self, folder: &Path) -> Result<Self, Error> {
         let metadata = read_metadata(folder)?;
-        for difference in
-            metadata.differences(self.progress().primitives, self.options.specific.sh_degree)
-        {
+        let sh_degree = self.options().specific.sh_degree;
+        for difference in metadata.differences(self.progress().primitives, sh_degree) {
             log::warn!("{}: {difference}", folder.display());
         }
         self.saved_corrections = metadata.cameras;
-        self.saved_background_srgb = metadata.background_srgb;
+        self.training.saved_background_srgb = metadata.background_srgb;
         Ok(self)
+    }
+
+    /// Resumes training from a checkpoint as if it had not been interrupted. `keyframes` must
+    /// include all training keyframes of the checkpoint. Returns the remaining keyframes, to be
+    /// pushed or kept for testing.
+    ///
+    /// # Errors
+    ///
+    /// Fails if the checkpoint is invalid, if keyframes are missing or differ, or if the GPU has
+    /// too little memory.
+    pub fn resume(
+        gpu: Arc<Gpu>,
+        checkpoint: &Checkpoint,
+        keyframes: &[Arc<Keyframe>],
+    ) -> Result<(Self, Vec<Arc<Keyframe>>), Error> {
+        checkpoint::resume(gpu, checkpoint, keyframes)
     }
 
     /// The current splats.
     pub fn arrays(&mut self) -> Result<SplatArrays, Error> {
-        self.seed_from_depth()?;
-        self.finish_in_flight()?;
-        self.model.splats.read(&self.recorder.gpu)
+        self.training.arrays()
     }
 
     /// The options.
     pub fn options(&self) -> &ModelOptions<SplatOptions> {
-        &self.options
+        &self.training.options
     }
 
     /// Number of gradients dropped because they were not finite.
     pub fn n_non_finite(&self) -> u64 {
-        self.optimizer.n_non_finite
+        self.training.optimizer.n_non_finite
     }
 
     /// Results of the finished trials.
@@ -165,79 +152,24 @@ impl SplatTrainer {
         &self.trials.finished
     }
 
-    /// Number of training and validation images. During a trial, validation images that arrive do
-    /// not count, because both halves must have the same number at each step.
-    fn n_images(&self) -> usize {
-        let n_validation = match self.trials.running_trial() {
-            Some(trial) => trial.scored.len(),
-            None => self.trials.validation.len(),
-        };
-        self.views.len() + n_validation
-    }
-
-    fn learn(&mut self) -> Result<Arc<TrainPipelines>, Error> {
-        self.optimizer.pipelines.wait(&self.recorder.gpu)
-    }
-
-    /// Adds a training keyframe that arrives at the current step.
-    fn add_arrival(&mut self, keyframe: Arc<Keyframe>) -> Result<(), Error> {
-        self.schedule.extend_for_arrival();
-        self.add_view(keyframe)
-    }
-
-    fn add_view(&mut self, keyframe: Arc<Keyframe>) -> Result<(), Error> {
-        // The steps of a failed submit are repeated, and must be repeated on the same views.
-        self.finish_in_flight()?;
-        self.seeding.push(keyframe.clone());
-        self.views.push(keyframe);
-        Ok(())
-    }
-
-    /// Adds splats, up to the limit.
-    fn add(&mut self, arrays: &SplatArrays) -> Result<(), Error> {
-        self.model
-            .add(&mut self.recorder, &mut self.renderer, arrays)
-    }
-
-    /// Seeds discs at the uncovered depth readings of the keyframes that arrived since the last
-    /// call.
-    fn seed_from_depth(&mut self) -> Result<(), Error> {
-        match self.seeding.discs_from_depth(&self.views) {
-            Some(discs) => self.add(&discs),
-            None => Ok(()),
+    /// Maximum number of splats to which the model may grow at the current step.
+    fn max_splats(&self) -> u32 {
+        if !self.trials.may_grow() {
+            return 0;
         }
-    }
-
-    /// Seeds the areas that depth does not cover. Uses discs if any keyframe has depth; otherwise
-    /// balls at the initial points, if there are any, and a random cloud.
-    fn prepare_training(&mut self) -> Result<(), Error> {
-        // Depth comes first, because the other discs take their depths from its discs.
-        self.seed_from_depth()?;
-        for keyframe in self.seeding.take_unseeded() {
-            if let Some(discs) = self.seeding.discs_without_depth(&keyframe) {
-                self.add(&discs)?;
+        match self.training.options.specific.count {
+            CountPolicy::ToCap => u32::MAX,
+            CountPolicy::Tested => {
+                few_images::max_splats(self.training.views.len() + self.trials.n_validation())
             }
         }
-        if !self.model.cameras.set.is_empty() {
-            self.views
-                .assign_lenses(&self.recorder.gpu, &mut self.model.cameras)?;
+    }
+
+    fn trial_runner(&mut self) -> TrialRunner<'_> {
+        TrialRunner {
+            training: &mut self.training,
+            trials: &mut self.trials,
         }
-        // No keyframe has depth, or no reading is usable.
-        if self.model.splats.n_splats == 0 && !self.views.is_empty() {
-            let keyframes: Vec<&Keyframe> = self.views.keyframes().map(AsRef::as_ref).collect();
-            let n_max = self.options.cap() as usize;
-            let points = self.seeding.points.as_deref();
-            let balls = points
-                .map(|points| seed::balls(points, &keyframes, n_max))
-                .unwrap_or_default();
-            let cloud = seed::random_cloud(&keyframes, self.options.common.seed, n_max);
-            // Structure from motion finds no points where images have no texture. Therefore, there
-            // are at least as many splats as without points.
-            let n_random = cloud.n_splats().saturating_sub(balls.n_splats());
-            self.add(&balls)?;
-            self.add(&cloud.filtered(|ix| ix < n_random))?;
-        }
-        Ok(())
     }
 
     /// Draws one pinhole view of the displayed splats.
@@ -247,9 +179,9 @@ impl SplatTrainer {
         background_srgb: [f32; 3],
         output: Output,
     ) -> Result<Option<Rendered>, Error> {
-        let splats = self.trials.displayed(&self.model.splats);
-        self.renderer.picture(
-            &mut self.recorder,
+        let splats = self.trials.displayed(&self.training.model.splats);
+        self.training.renderer.picture(
+            &mut self.training.recorder,
             DrawnView {
                 splats,
                 camera,
@@ -266,10 +198,10 @@ impl SplatTrainer {
         background_srgb: [f32; 3],
         packing: Packing,
     ) -> Result<QueuedPicture, Error> {
-        self.seed_from_depth()?;
-        let splats = self.trials.displayed(&self.model.splats);
-        self.renderer.queue(
-            &mut self.recorder,
+        self.training.seed_from_depth()?;
+        let splats = self.trials.displayed(&self.training.model.splats);
+        self.training.renderer.queue(
+            &mut self.training.recorder,
             DrawnView {
                 splats,
                 camera,
@@ -278,12 +210,43 @@ impl SplatTrainer {
             packing,
         )
     }
+
+    /// PSNR in dB of a displayed view against a keyframe's image; `None` if their sizes differ or
+    /// training has not started.
+    fn psnr_of_view(
+        &mut self,
+        camera: &Camera,
+        background_srgb: [f32; 3],
+        keyframe: &Keyframe,
+    ) -> Result<Option<f64>, Error> {
+        // Not `wait`: a score must not be delayed by the compilation of training pipelines. The
+        // caller can score the picture on the CPU.
+        let Some(learn) = self.training.optimizer.pipelines.ready() else {
+            return Ok(None);
+        };
+        let rgba = keyframe.rgba_srgb.as_ref();
+        if rgba.len() != 4 * camera.size_px[0] as usize * camera.size_px[1] as usize {
+            return Ok(None);
+        }
+        let drawn = DrawnView {
+            splats: self.trials.displayed(&self.training.model.splats),
+            camera,
+            background_srgb,
+        };
+        let products = self.training.renderer.compare_with_upload(
+            &mut self.training.recorder,
+            drawn,
+            &learn.score,
+            rgba,
+        )?;
+        products::psnr(&products).map(Some)
+    }
 }
 
 impl Method for SplatTrainer {
     fn push(&mut self, keyframe: Arc<Keyframe>) -> Result<(), Error> {
         // A failed submit may reduce the step count, and the step of the arrival must be exact.
-        self.finish_in_flight()?;
+        self.training.finish_in_flight()?;
         if keyframe.split == Split::Test {
             return Ok(());
         }
@@ -306,31 +269,57 @@ impl Method for SplatTrainer {
             return Ok(());
         }
         // Both halves of a trial train on the same keyframes at the same steps.
-        if self.trials.defer_arrival(&keyframe, self.schedule.step) {
+        if self
+            .trials
+            .defer_arrival(&keyframe, self.training.schedule.step)
+        {
             return Ok(());
         }
-        self.add_live_arrival(keyframe)
+        gains::add_live_arrival(&mut self.training, &mut self.trials, keyframe)
     }
 
     fn remove(&mut self, camera: &str, stamp: Stamp) -> Result<(), Error> {
-        self.finish_in_flight()?; // The step of the removal must be exact.
+        self.training.finish_in_flight()?; // The step of the removal must be exact.
         let is_removed =
             |keyframe: &Keyframe| keyframe.camera.as_ref() == camera && keyframe.stamp == stamp;
-        self.views.retain(|keyframe| !is_removed(keyframe));
-        self.seeding.remove(is_removed);
+        self.training.views.retain(|keyframe| !is_removed(keyframe));
+        self.training.seeding.remove(is_removed);
         self.trials.remove(is_removed);
         // Bindings keep the buffers of removed images alive.
-        self.recorder.passes.clear_bindings();
+        self.training.recorder.passes.clear_bindings();
         Ok(())
     }
 
     fn set_initial_points(&mut self, points: &Arc<InitialPoints>) -> bool {
-        self.seeding.points = Some(points.clone());
+        self.training.seeding.points = Some(points.clone());
         true
     }
 
     fn step(&mut self, n: u64) -> Result<u64, Error> {
-        self.train(n)
+        if self.training.views.is_empty() {
+            return Ok(0);
+        }
+        self.training.prepare_model()?;
+        if self.training.model.splats.n_splats == 0 {
+            return Ok(0);
+        }
+        let learn = self.training.learn()?;
+        // Trials come before growth: a trial that starts at a growth step copies the model from
+        // before the growth, so that both halves grow at this step.
+        self.trial_runner().run_due()?;
+        let max_splats = self.max_splats();
+        self.training.grow_when_due(&learn, max_splats)?;
+        // After both, because they can change the step count and the next step with other work.
+        let n_left = self.trials.steps_left(self.training.schedule.step);
+        let n_validation = self.trials.n_validation();
+        let n_steps = self
+            .training
+            .submit_steps(&learn, n.min(n_left), n_validation)?;
+        // The caller stops here, so the step count must be exact.
+        if n_steps == n {
+            self.training.finish_in_flight()?;
+        }
+        Ok(n_steps)
     }
 
     fn is_idle(&self) -> bool {
@@ -338,33 +327,28 @@ impl Method for SplatTrainer {
     }
 
     fn n_total_steps(&mut self) -> Result<u64, Error> {
-        self.finish_in_flight()?;
-        Ok(self.schedule.step + self.trials.n_reverted_steps)
+        self.training.finish_in_flight()?;
+        Ok(self.training.schedule.step + self.trials.n_reverted_steps)
     }
 
     fn background_srgb(&self) -> [f32; 3] {
-        // A loaded model has no images, so it keeps the background with which it was saved.
-        if self.views.is_empty() {
-            self.saved_background_srgb
-        } else {
-            Scarcity::of_images(self.n_images()).background_srgb(self.views.mean_srgb())
-        }
+        self.training.background_srgb(self.trials.n_validation())
     }
 
     fn seed(&mut self) -> Result<(), Error> {
-        self.seed_from_depth()
+        self.training.seed_from_depth()
     }
 
     fn prepare(&mut self) -> Result<(), Error> {
-        self.learn().map(drop)
+        self.training.learn().map(drop)
     }
 
     fn profile_step(&mut self) -> Result<Vec<PassTiming>, Error> {
-        self.profile()
+        self.training.profile(self.trials.n_validation())
     }
 
     fn render(&mut self, request: &RenderRequest) -> Result<Picture, Error> {
-        self.seed_from_depth()?;
+        self.training.seed_from_depth()?;
         Rendered::picture(request, |camera, output| {
             self.draw_view(camera, request.background_srgb, output)
         })
@@ -375,7 +359,7 @@ impl Method for SplatTrainer {
         request: &RenderRequest,
         packing: Packing,
     ) -> Result<Rendered, Error> {
-        self.seed_from_depth()?;
+        self.training.seed_from_depth()?;
         Rendered::of(request, Format::Packed(packing), |camera, output| {
             self.draw_view(camera, request.background_srgb, output)
         })
@@ -397,10 +381,10 @@ impl Method for SplatTrainer {
                 .render_packed(request, packing)
                 .map(QueuedPicture::ready);
         };
-        if !self
-            .renderer
-            .may_pack(&mut self.recorder, packing, request.size_px)?
-        {
+        let Training {
+            recorder, renderer, ..
+        } = &mut self.training;
+        if !renderer.may_pack(recorder, packing, request.size_px)? {
             return self
                 .render_packed(request, packing)
                 .map(QueuedPicture::ready);
@@ -414,13 +398,13 @@ impl Method for SplatTrainer {
         only_changed: bool,
         edits: &Arc<Edits>,
     ) -> Result<Option<PendingChunks>, Error> {
-        let splats = self.trials.displayed(&self.model.splats);
+        let splats = self.trials.displayed(&self.training.model.splats);
         if splats.n_splats == 0 {
             return Ok(None);
         }
         // The copy is queued between two steps. The closure waits for it and encodes it on another
         // thread, so that training continues.
-        let gpu = Arc::clone(&self.recorder.gpu);
+        let gpu = Arc::clone(&self.training.recorder.gpu);
         let pending = splats.begin_read(&gpu, splats.active_degree().min(MAX_SH_DEGREE));
         let chunker = Arc::clone(&self.chunker);
         let edits = Arc::clone(edits);
@@ -431,11 +415,11 @@ impl Method for SplatTrainer {
     }
 
     fn find_floaters(&mut self, edits: &Arc<Edits>) -> Result<PendingFloaters, Error> {
-        let splats = self.trials.displayed(&self.model.splats);
+        let splats = self.trials.displayed(&self.training.model.splats);
         if splats.n_splats == 0 {
             return Err(Error::NoFloaters);
         }
-        let gpu = Arc::clone(&self.recorder.gpu);
+        let gpu = Arc::clone(&self.training.recorder.gpu);
         let edits = Arc::clone(edits);
         let pending = splats.begin_read(&gpu, 0);
         Ok(PendingFloaters::new(move || {
@@ -444,11 +428,11 @@ impl Method for SplatTrainer {
     }
 
     fn set_watched(&mut self, watched: bool) {
-        self.optimizer.submits.set_watched(watched);
+        self.training.optimizer.submits.set_watched(watched);
     }
 
     fn psnr(&mut self, request: &RenderRequest, keyframe: &Keyframe) -> Result<Option<f64>, Error> {
-        self.seed_from_depth()?;
+        self.training.seed_from_depth()?;
         let Projection::Pinhole {
             focal_px,
             principal_px,
@@ -469,10 +453,10 @@ impl Method for SplatTrainer {
 
     /// The estimated corrections, or the loaded ones if none are estimated.
     fn camera_corrections(&mut self) -> Result<BTreeMap<String, CameraCorrection>, Error> {
-        self.finish_in_flight()?;
+        self.training.finish_in_flight()?;
         // Corrections belong to the displayed splats: during a trial of camera parameters, those
         // in training differ.
-        let cameras = &self.model.cameras;
+        let cameras = &self.training.model.cameras;
         let displayed = self.trials.baseline().map(|snapshot| &snapshot.cameras);
         let (set, params) = displayed.map_or((cameras.set, &cameras.params), |(set, params)| {
             (*set, params)
@@ -480,7 +464,12 @@ impl Method for SplatTrainer {
         if set.is_empty() {
             return Ok(self.saved_corrections.clone());
         }
-        cameras.corrections(&self.recorder.gpu, set, params, self.seeding.scene.size_m)
+        cameras.corrections(
+            &self.training.recorder.gpu,
+            set,
+            params,
+            self.training.seeding.scene.size_m,
+        )
     }
 
     fn recalibrate(
@@ -488,27 +477,34 @@ impl Method for SplatTrainer {
         keyframes: &[CorrectedKeyframe],
         alignment: &Alignment,
     ) -> Result<(), Error> {
-        self.move_with_keyframes(keyframes, alignment)
+        self.training.finish_in_flight()?;
+        self.trial_runner().abort()?;
+        recalibration::move_with_keyframes(
+            &mut self.training,
+            &mut self.trials,
+            keyframes,
+            alignment,
+        )
     }
 
     fn pause_growth(&mut self, is_paused: bool) -> Result<bool, Error> {
         // Both halves of a comparison must grow alike.
         let is_compared = self.trials.running_trial().is_some();
-        if self.model.is_growth_paused == is_paused || is_compared {
+        if self.training.model.is_growth_paused == is_paused || is_compared {
             return Ok(false);
         }
-        self.finish_in_flight()?; // A failed submit may reduce the step count.
-        self.model.is_growth_paused = is_paused;
+        self.training.finish_in_flight()?; // A failed submit may reduce the step count.
+        self.training.model.is_growth_paused = is_paused;
         Ok(true)
     }
 
     fn progress(&self) -> Progress {
-        let displayed = self.trials.displayed(&self.model.splats);
+        let displayed = self.trials.displayed(&self.training.model.splats);
         Progress {
-            step: self.schedule.step,
+            step: self.training.schedule.step,
             primitives: displayed.n_splats.into(),
             bytes: displayed.bytes(),
-            step_millis: self.optimizer.submits.step_millis(),
+            step_millis: self.training.optimizer.submits.step_millis(),
         }
     }
 
@@ -517,9 +513,9 @@ impl Method for SplatTrainer {
     }
 
     fn save(&mut self, folder: &Path) -> Result<(), Error> {
-        self.finish_in_flight()?;
+        self.training.finish_in_flight()?;
         // A change whose trial has not ended is not proven, so it is not saved.
-        self.cancel_trial()?;
+        self.trial_runner().cancel()?;
         let arrays = self.arrays()?;
         std::fs::create_dir_all(folder).map_err(|source| Error::Write {
             path: folder.to_owned(),
@@ -528,10 +524,10 @@ impl Method for SplatTrainer {
         ply::write(&folder.join(IN_FOLDER), &arrays)?;
         let metadata = serde_json::json!({
             "method": SplatOptions::METHOD,
-            "steps": self.schedule.step,
+            "steps": self.training.schedule.step,
             "splats": arrays.n_splats(),
             "sh_degree": arrays.sh_degree,
-            "seed": self.options.common.seed,
+            "seed": self.training.options.common.seed,
             "trials": self.report(),
             "cameras": self.camera_corrections()?,
             "background_srgb": self.background_srgb(),
@@ -542,7 +538,7 @@ impl Method for SplatTrainer {
     }
 
     fn checkpoint(&mut self) -> Result<PendingCheckpoint, Error> {
-        self.take_checkpoint()
+        checkpoint::take(&mut self.training, &self.trials)
     }
 }
 
@@ -550,38 +546,40 @@ impl Method for SplatTrainer {
 #[cfg(test)]
 impl SplatTrainer {
     pub(super) fn assume_step_millis(&mut self, millis: f64) {
-        self.optimizer.submits.assume_step_millis(millis);
+        self.training.optimizer.submits.assume_step_millis(millis);
     }
 
     /// Creates the splats with which training starts.
     pub(super) fn prepare_for_test(&mut self) {
-        self.prepare_training().unwrap();
+        self.training.prepare_model().unwrap();
     }
 
     /// Limits the GPU memory for images, as on a software adapter.
     pub(super) fn limit_image_bytes(&mut self, max_bytes: u64) {
-        self.views.limit_image_bytes(max_bytes);
+        self.training.views.limit_image_bytes(max_bytes);
     }
 
     pub(super) fn image_bytes(&self) -> u64 {
-        self.views.image_bytes()
+        self.training.views.image_bytes()
     }
 
     pub(super) fn n_steps_on_gpu(&self) -> u64 {
-        self.recorder
+        self.training
+            .recorder
             .gpu
-            .read::<u32>(&self.optimizer.status, status::LEN)
+            .read::<u32>(&self.training.optimizer.status, status::LEN)
             .unwrap()[status::STEP]
             .into()
     }
 
     /// Number of seeded positions.
     pub(super) fn n_seeds(&self) -> usize {
-        self.seeding.scene.seeder.n_seeds()
+        self.training.seeding.scene.seeder.n_seeds()
     }
 
     pub(super) fn n_views_of(&self, keyframe: &Keyframe) -> usize {
-        self.views
+        self.training
+            .views
             .keyframes()
             .filter(|other| other.stamp == keyframe.stamp)
             .count()

@@ -277,6 +277,13 @@ impl SplatTrials {
         !matches!(self.trial_phase, SplatTrialPhase::Finished)
     }
 
+    /// Number of validation images. During a trial, those that arrive do not count, because both
+    /// halves must have the same number at each step.
+    pub(crate) fn n_validation(&self) -> usize {
+        self.running_trial()
+            .map_or(self.validation.len(), |trial| trial.scored.len())
+    }
+
     /// Whether densification may add splats.
     pub(crate) fn may_grow(&self) -> bool {
         // During the first halving, `count` is still `Growing`. Densification would undo the

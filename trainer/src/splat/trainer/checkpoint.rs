@@ -3,6 +3,7 @@
 
 use super::SplatTrainer;
 use super::saved_arrays::{CAMERA_PARAMS, PendingArrays, invalid_state, read_seeds, read_splats};
+use super::training::Training;
 use crate::Error;
 use crate::keyframe_signature::{self, KeyframeSignature};
 use crate::model_options::{MethodOptions, ModelOptions};
@@ -13,7 +14,7 @@ use crate::splat::options::SplatOptions;
 use crate::splat::params::status;
 use crate::splat::schedule::Schedule;
 use crate::splat::snapshot::{ObservedScene, Snapshot};
-use crate::splat::trials::{Arrival, RemainingTrials, RunningTrial};
+use crate::splat::trials::{Arrival, RemainingTrials, RunningTrial, SplatTrials};
 use calibration::{Candidate, ParamSet, Trial};
 use gpu::Gpu;
 use keyframe::Keyframe;
@@ -326,147 +327,128 @@ impl SavedKeyframes {
     }
 }
 
-impl SplatTrainer {
-    /// Captures the state after all queued steps. This call only copies the model within GPU
-    /// memory; [`PendingCheckpoint::finish`] copies it to the host and may run on any thread.
-    pub(super) fn take_checkpoint(&mut self) -> Result<PendingCheckpoint, Error> {
-        // Keyframes that wait for seeding are not part of a checkpoint, and the step count must be
-        // exact.
-        self.seed_from_depth()?;
-        self.finish_in_flight()?;
-        let gpu = &self.recorder.gpu;
-        let cameras = &self.model.cameras;
-        let (splats, schedule) = (&self.model.splats, &self.schedule);
-        let scene = &self.seeding.scene;
-        let state = SavedState {
-            // Defaults that depend on the adapter are fixed, so that training continues alike on
-            // another one.
-            options: self.options.clone().with(|options| {
-                options.specific.coarse_steps = Some(self.views.coarse_steps());
-                options.specific.seeds_per_image = Some(self.seeding.seeds_per_image());
-            }),
-            step: schedule.step,
-            model: ModelState::of(splats, cameras.set, schedule, scene),
-            n_non_finite: u32::try_from(self.optimizer.n_non_finite).unwrap_or(u32::MAX),
-            views: self
-                .views
-                .keyframes()
-                .map(|keyframe| KeyframeSignature::of(keyframe))
-                .collect(),
-            unseeded: self
-                .seeding
-                .unseeded()
-                .iter()
-                .filter_map(|keyframe| self.view_ix_of(keyframe))
-                .collect(),
-            slots: cameras.slots(),
-            remaining_trials: self.trials.remaining_trials(),
-            is_full: self.model.is_full(),
-            is_growth_paused: self.model.is_growth_paused,
-            finished_trials: self.trials.finished.clone(),
-            trial: self.trials.running_trial().map(TrialState::of),
-        };
-        let state = serde_json::to_value(state).map_err(|error| Error::CheckpointState {
-            reason: error.to_string(),
-        })?;
-        // Reading back begins now, so that the arrays belong to this step. Training may change the
-        // buffers before the reads are finished.
-        let params = (&cameras.params, cameras.used_bytes());
-        let mut halves = vec![PendingArrays::begin(gpu, "", splats, &scene.seeder, params)];
-        if let Some(RunningTrial { other, .. }) = self.trials.running_trial() {
-            let params = (&other.cameras.1, other.cameras.1.bytes());
-            halves.push(PendingArrays::begin(
-                gpu,
-                OTHER,
-                &other.splats,
-                &other.scene.seeder,
-                params,
-            ));
-        }
-        let gpu = gpu.clone();
-        Ok(PendingCheckpoint::new(move || {
-            let mut arrays = Vec::new();
-            halves
-                .into_iter()
-                .try_for_each(|half| half.finish(&gpu, &mut arrays))?;
-            Ok(Checkpoint::new(METHOD, state, arrays))
-        }))
-    }
-
-    /// Index of the view of a keyframe.
-    fn view_ix_of(&self, keyframe: &Arc<Keyframe>) -> Option<usize> {
-        self.views
+/// Captures the state after all queued steps. This call only copies the model within GPU
+/// memory; [`PendingCheckpoint::finish`] copies it to the host and may run on any thread.
+pub(super) fn take(
+    training: &mut Training,
+    trials: &SplatTrials,
+) -> Result<PendingCheckpoint, Error> {
+    // Keyframes that wait for seeding are not part of a checkpoint, and the step count must be
+    // exact.
+    training.seed_from_depth()?;
+    training.finish_in_flight()?;
+    let gpu = &training.recorder.gpu;
+    let cameras = &training.model.cameras;
+    let (splats, schedule) = (&training.model.splats, &training.schedule);
+    let scene = &training.seeding.scene;
+    let state = SavedState {
+        // Defaults that depend on the adapter are fixed, so that training continues alike on
+        // another one.
+        options: training.options.clone().with(|options| {
+            options.specific.coarse_steps = Some(training.views.coarse_steps());
+            options.specific.seeds_per_image = Some(training.seeding.seeds_per_image());
+        }),
+        step: schedule.step,
+        model: ModelState::of(splats, cameras.set, schedule, scene),
+        n_non_finite: u32::try_from(training.optimizer.n_non_finite).unwrap_or(u32::MAX),
+        views: training
+            .views
             .keyframes()
-            .position(|view| Arc::ptr_eq(view, keyframe))
-    }
-
-    /// Resumes training from a checkpoint as if it had not been interrupted. `keyframes` must
-    /// include all training keyframes of the checkpoint. Returns the remaining keyframes, to be
-    /// pushed or kept for testing.
-    ///
-    /// # Errors
-    ///
-    /// Fails if the checkpoint is invalid, if keyframes are missing or differ, or if the GPU has
-    /// too little memory.
-    pub fn resume(
-        gpu: Arc<Gpu>,
-        checkpoint: &Checkpoint,
-        keyframes: &[Arc<Keyframe>],
-    ) -> Result<(Self, Vec<Arc<Keyframe>>), Error> {
-        if checkpoint.method != METHOD {
-            return Err(invalid_state(format!(
-                "it was written by the method {:?}, expected {METHOD:?}",
-                checkpoint.method
-            )));
-        }
-        let mut state = checkpoint.state.clone();
-        remove_obsolete(&mut state);
-        let state: SavedState =
-            serde_json::from_value(state).map_err(|error| invalid_state(error.to_string()))?;
-        let SavedKeyframes {
-            views,
-            arrivals,
-            unseeded,
-            untrained,
-        } = SavedKeyframes::find(&state, keyframes)?;
-        // The kernels count steps in 32 bits.
-        let step = u32::try_from(state.step)
-            .map_err(|_| invalid_state(format!("step {} does not fit into 32 bits", state.step)))?;
-
-        let mut trainer = Self::new(gpu, state.options)?;
-        let gpu = &trainer.recorder.gpu;
-        trainer.model.splats = state.model.splats(gpu, checkpoint, "")?;
-        trainer.optimizer.write_counter(gpu, status::STEP, step);
-        trainer
-            .optimizer
-            .write_counter(gpu, status::N_NON_FINITE, state.n_non_finite);
-        trainer.optimizer.n_non_finite = state.n_non_finite.into();
-
-        trainer
-            .model
-            .cameras
-            .restore(gpu, &state.slots, state.model.params, checkpoint)?;
-        trainer
-            .trials
-            .restore(state.remaining_trials, state.finished_trials);
-        trainer.model.set_full(state.is_full);
-        trainer.model.is_growth_paused = state.is_growth_paused;
-        if let Some(trial) = state.trial {
-            let n_planned_steps = trainer.options.common.n_planned_steps;
-            trainer.trials.restore_trial(trial.restored(
-                gpu,
-                checkpoint,
-                n_planned_steps,
-                &arrivals,
-            )?);
-        }
-        trainer.views.replace(views);
-        trainer
+            .map(|keyframe| KeyframeSignature::of(keyframe))
+            .collect(),
+        unseeded: training
             .seeding
-            .restore(state.model.scene(checkpoint, "")?, unseeded);
-        trainer.schedule = state
-            .model
-            .schedule(state.step, trainer.options.common.n_planned_steps);
-        Ok((trainer, untrained))
+            .unseeded()
+            .iter()
+            .filter_map(|keyframe| training.views.position(keyframe))
+            .collect(),
+        slots: cameras.slots(),
+        remaining_trials: trials.remaining_trials(),
+        is_full: training.model.is_full(),
+        is_growth_paused: training.model.is_growth_paused,
+        finished_trials: trials.finished.clone(),
+        trial: trials.running_trial().map(TrialState::of),
+    };
+    let state = serde_json::to_value(state).map_err(|error| Error::CheckpointState {
+        reason: error.to_string(),
+    })?;
+    // Reading back begins now, so that the arrays belong to this step. Training may change the
+    // buffers before the reads are finished.
+    let params = (&cameras.params, cameras.used_bytes());
+    let mut halves = vec![PendingArrays::begin(gpu, "", splats, &scene.seeder, params)];
+    if let Some(RunningTrial { other, .. }) = trials.running_trial() {
+        let params = (&other.cameras.1, other.cameras.1.bytes());
+        halves.push(PendingArrays::begin(
+            gpu,
+            OTHER,
+            &other.splats,
+            &other.scene.seeder,
+            params,
+        ));
     }
+    let gpu = gpu.clone();
+    Ok(PendingCheckpoint::new(move || {
+        let mut arrays = Vec::new();
+        halves
+            .into_iter()
+            .try_for_each(|half| half.finish(&gpu, &mut arrays))?;
+        Ok(Checkpoint::new(METHOD, state, arrays))
+    }))
+}
+
+/// See [`SplatTrainer::resume`].
+pub(super) fn resume(
+    gpu: Arc<Gpu>,
+    checkpoint: &Checkpoint,
+    keyframes: &[Arc<Keyframe>],
+) -> Result<(SplatTrainer, Vec<Arc<Keyframe>>), Error> {
+    if checkpoint.method != METHOD {
+        return Err(invalid_state(format!(
+            "it was written by the method {:?}, expected {METHOD:?}",
+            checkpoint.method
+        )));
+    }
+    let mut state = checkpoint.state.clone();
+    remove_obsolete(&mut state);
+    let state: SavedState =
+        serde_json::from_value(state).map_err(|error| invalid_state(error.to_string()))?;
+    let SavedKeyframes {
+        views,
+        arrivals,
+        unseeded,
+        untrained,
+    } = SavedKeyframes::find(&state, keyframes)?;
+    // The kernels count steps in 32 bits.
+    let step = u32::try_from(state.step)
+        .map_err(|_| invalid_state(format!("step {} does not fit into 32 bits", state.step)))?;
+
+    let mut trainer = SplatTrainer::new(gpu, state.options)?;
+    let SplatTrainer {
+        training, trials, ..
+    } = &mut trainer;
+    let gpu = &training.recorder.gpu;
+    training.model.splats = state.model.splats(gpu, checkpoint, "")?;
+    training.optimizer.write_counter(gpu, status::STEP, step);
+    training
+        .optimizer
+        .write_counter(gpu, status::N_NON_FINITE, state.n_non_finite);
+    training.optimizer.n_non_finite = state.n_non_finite.into();
+
+    training
+        .model
+        .cameras
+        .restore(gpu, &state.slots, state.model.params, checkpoint)?;
+    trials.restore(state.remaining_trials, state.finished_trials);
+    training.model.set_full(state.is_full);
+    training.model.is_growth_paused = state.is_growth_paused;
+    let n_planned_steps = training.options.common.n_planned_steps;
+    if let Some(trial) = state.trial {
+        trials.restore_trial(trial.restored(gpu, checkpoint, n_planned_steps, &arrivals)?);
+    }
+    training.views.replace(views);
+    training
+        .seeding
+        .restore(state.model.scene(checkpoint, "")?, unseeded);
+    training.schedule = state.model.schedule(state.step, n_planned_steps);
+    Ok((trainer, untrained))
 }

@@ -1,9 +1,9 @@
 //! Reduces the model's size: computes the contribution of each splat, prunes the splats that
 //! contribute least, and lowers the SH degree.
 
-use super::SplatTrainer;
 use super::optimizer::StepContext;
 use super::recorder::Recorder;
+use super::training::Training;
 use super::view_set::VIEWS_AT_ONCE;
 use crate::Error;
 use crate::splat::buffers::SplatBuffers;
@@ -16,109 +16,115 @@ use gpu::Buffer;
 /// would be pruned.
 const MAX_VIEWS: usize = 64;
 
-impl SplatTrainer {
-    /// Contribution of each splat to the views: the sum of its blending weights, in pixels.
-    pub(super) fn contributions(&mut self, learn: &TrainPipelines) -> Result<Vec<f32>, Error> {
-        let n_splats = self.model.splats.n_splats;
-        let contributions = self
-            .recorder
-            .gpu
-            .storage("splat.contributions", 4 * u64::from(n_splats))?;
-        let stride = self.views.len().div_ceil(MAX_VIEWS).max(1);
-        let sampled_views: Vec<usize> = (0..self.views.len()).step_by(stride).collect();
-        // All sizes are reserved first, because new image buffers would lose the errors that are
-        // written to them next.
-        for view_ix in &sampled_views {
-            self.reserve_view(self.views.size_px((*view_ix, 0)))?;
-        }
-        self.optimizer.set_unit_errors(&mut self.recorder);
-        self.optimizer.set_n_splats(&self.recorder.gpu, n_splats);
-        // Dropped splats would contribute nothing.
-        self.optimizer.write_drop_frac(&self.recorder.gpu, 0.0);
-        for chunk in sampled_views.chunks(VIEWS_AT_ONCE) {
-            let next = chunk.iter().map(|view_ix| (*view_ix, 0)).collect();
-            self.views
-                .upload(&mut self.recorder, &next, self.schedule.step)?;
-            for view_ix in chunk {
-                self.add_contributions(learn, *view_ix, &contributions)?;
-            }
-        }
-        self.recorder.passes.clear_bindings();
-        Ok(self.recorder.gpu.read(&contributions, n_splats as usize)?)
+/// Contribution of each splat to the views: the sum of its blending weights, in pixels.
+fn contributions(training: &mut Training, learn: &TrainPipelines) -> Result<Vec<f32>, Error> {
+    let n_splats = training.model.splats.n_splats;
+    let contributions = training
+        .recorder
+        .gpu
+        .storage("splat.contributions", 4 * u64::from(n_splats))?;
+    let stride = training.views.len().div_ceil(MAX_VIEWS).max(1);
+    let sampled_views: Vec<usize> = (0..training.views.len()).step_by(stride).collect();
+    // All sizes are reserved first, because new image buffers would lose the errors that are
+    // written to them next.
+    for view_ix in &sampled_views {
+        training.reserve_view(training.views.size_px((*view_ix, 0)))?;
     }
-
-    /// Adds the blending weights of each splat in a view to `contributions`.
-    fn add_contributions(
-        &mut self,
-        learn: &TrainPipelines,
-        view_ix: usize,
-        contributions: &Buffer,
-    ) -> Result<(), Error> {
-        // Repeated with larger buffers until they suffice.
-        loop {
-            let Self {
-                recorder: Recorder { gpu, passes },
-                model,
-                renderer,
-                optimizer,
-                views,
-                ..
-            } = &mut *self;
-            let context = StepContext {
-                gpu,
-                learn,
-                renderer,
-                model,
-            };
-            let view = optimizer
-                .prepared_view(&context, passes, views.ready_level((view_ix, 0))?)?
-                .view;
-            view.draw_for_backward(passes, &renderer.pipelines, learn);
-            view.backward(passes, learn);
-            // Has no effect if a buffer was too small, so no view is counted twice.
-            view.contribute(passes, learn, contributions);
-            passes.submit(gpu);
-            let counters: Vec<u32> = gpu.read(&optimizer.status, status::LEN)?;
-            if !self
-                .renderer
-                .grow_scratch(&mut self.recorder, &counters, true)?
-            {
-                return Ok(());
-            }
-            self.optimizer.clear_failure(&self.recorder.gpu);
+    training.optimizer.set_unit_errors(&mut training.recorder);
+    training
+        .optimizer
+        .set_n_splats(&training.recorder.gpu, n_splats);
+    // Dropped splats would contribute nothing.
+    training
+        .optimizer
+        .write_drop_frac(&training.recorder.gpu, 0.0);
+    for chunk in sampled_views.chunks(VIEWS_AT_ONCE) {
+        let next = chunk.iter().map(|view_ix| (*view_ix, 0)).collect();
+        training
+            .views
+            .upload(&mut training.recorder, &next, training.schedule.step)?;
+        for view_ix in chunk {
+            add_contributions(training, learn, *view_ix, &contributions)?;
         }
     }
+    training.recorder.passes.clear_bindings();
+    Ok(training
+        .recorder
+        .gpu
+        .read(&contributions, n_splats as usize)?)
+}
 
-    /// Keeps the `n_kept` splats that contribute most, without changing their order.
-    pub(super) fn keep_most_contributing(&mut self, n_kept: u32) -> Result<(), Error> {
-        let learn = self.learn()?;
-        let contributions = self.contributions(&learn)?;
-        let mut by_contribution: Vec<u32> = (0..self.model.splats.n_splats).collect();
-        // Ties are resolved by index, so that a seed gives one result.
-        by_contribution.sort_by(|a, b| {
-            contributions[*b as usize]
-                .total_cmp(&contributions[*a as usize])
-                .then(a.cmp(b))
-        });
-        by_contribution.truncate(n_kept as usize);
-        by_contribution.sort_unstable();
-        self.model.splats = gather_splats(
-            &mut self.recorder,
-            &self.model.splats,
-            &learn,
-            &by_contribution,
-        )?;
-        self.recorder.passes.clear_bindings();
-        Ok(())
+/// Adds the blending weights of each splat in a view to `contributions`.
+fn add_contributions(
+    training: &mut Training,
+    learn: &TrainPipelines,
+    view_ix: usize,
+    contributions: &Buffer,
+) -> Result<(), Error> {
+    // Repeated with larger buffers until they suffice.
+    loop {
+        let Training {
+            recorder: Recorder { gpu, passes },
+            model,
+            renderer,
+            optimizer,
+            views,
+            ..
+        } = &mut *training;
+        let context = StepContext {
+            gpu,
+            learn,
+            renderer,
+            model,
+        };
+        let view = optimizer
+            .prepared_view(&context, passes, views.ready_level((view_ix, 0))?)?
+            .view;
+        view.draw_for_backward(passes, &renderer.pipelines, learn);
+        view.backward(passes, learn);
+        // Has no effect if a buffer was too small, so no view is counted twice.
+        view.contribute(passes, learn, contributions);
+        passes.submit(gpu);
+        let counters: Vec<u32> = gpu.read(&optimizer.status, status::LEN)?;
+        if !training
+            .renderer
+            .grow_scratch(&mut training.recorder, &counters, true)?
+        {
+            return Ok(());
+        }
+        training.optimizer.clear_failure(&training.recorder.gpu);
     }
+}
 
-    /// Lowers the SH degree.
-    pub(super) fn lower_degree(&mut self, sh_degree: u32) -> Result<(), Error> {
-        let splats = &mut self.model.splats;
-        *splats = splats.resized(&self.recorder.gpu, splats.capacity, sh_degree)?;
-        self.recorder.passes.clear_bindings();
-        Ok(())
-    }
+/// Keeps the `n_kept` splats that contribute most, without changing their order.
+pub(super) fn keep_most_contributing(training: &mut Training, n_kept: u32) -> Result<(), Error> {
+    let learn = training.learn()?;
+    let contributions = contributions(training, &learn)?;
+    let mut by_contribution: Vec<u32> = (0..training.model.splats.n_splats).collect();
+    // Ties are resolved by index, so that a seed gives one result.
+    by_contribution.sort_by(|a, b| {
+        contributions[*b as usize]
+            .total_cmp(&contributions[*a as usize])
+            .then(a.cmp(b))
+    });
+    by_contribution.truncate(n_kept as usize);
+    by_contribution.sort_unstable();
+    training.model.splats = gather_splats(
+        &mut training.recorder,
+        &training.model.splats,
+        &learn,
+        &by_contribution,
+    )?;
+    training.recorder.passes.clear_bindings();
+    Ok(())
+}
+
+/// Lowers the SH degree.
+pub(super) fn lower_degree(training: &mut Training, sh_degree: u32) -> Result<(), Error> {
+    let splats = &mut training.model.splats;
+    *splats = splats.resized(&training.recorder.gpu, splats.capacity, sh_degree)?;
+    training.recorder.passes.clear_bindings();
+    Ok(())
 }
 
 /// Copies the splats with the given indices, including their moments.
@@ -166,6 +172,7 @@ mod tests {
     use super::*;
     use crate::Method;
     use crate::eval::{PixelPair, psnr};
+    use crate::splat::SplatTrainer;
     use crate::splat::training_tests::{n_keyframes, noisy, options, request, test_psnr, train};
     use crate::splat::trials::CountPolicy;
     use calibration::Candidate;
@@ -207,15 +214,16 @@ mod tests {
     #[test]
     fn contributions_sum_to_coverage() {
         let (mut trainer, _) = some_trained(60);
-        let only = trainer.views.keyframe(0).clone();
-        trainer
+        let training = &mut trainer.training;
+        let only = training.views.keyframe(0).clone();
+        training
             .views
             .retain(|keyframe| Arc::ptr_eq(keyframe, &only));
-        let learn = trainer.learn().unwrap();
-        let contributions = trainer.contributions(&learn).unwrap();
+        let learn = training.learn().unwrap();
+        let contributions = contributions(training, &learn).unwrap();
         let n_pixels = only.size_px.iter().product::<u32>() as usize;
-        let image = &trainer.optimizer.image_buffers.as_ref().unwrap().image;
-        let colors: Vec<[f32; 4]> = trainer.recorder.gpu.read(image, n_pixels).unwrap();
+        let image = &training.optimizer.image_buffers.as_ref().unwrap().image;
+        let colors: Vec<[f32; 4]> = training.recorder.gpu.read(image, n_pixels).unwrap();
         let covered: f64 = colors
             .iter()
             .map(|[.., transmittance]| 1.0 - f64::from(*transmittance))
@@ -230,14 +238,15 @@ mod tests {
     #[test]
     fn most_contributing_splats_are_kept_unchanged() {
         let (mut trainer, _) = some_trained(120);
-        let learn = trainer.learn().unwrap();
-        let contributions = trainer.contributions(&learn).unwrap();
-        let before = words(&trainer);
-        let n_kept = trainer.model.splats.n_splats / 3;
-        trainer.keep_most_contributing(n_kept).unwrap();
-        let after = words(&trainer);
+        let training = &mut trainer.training;
+        let learn = training.learn().unwrap();
+        let contributions = contributions(training, &learn).unwrap();
+        let before = words(training);
+        let n_kept = training.model.splats.n_splats / 3;
+        keep_most_contributing(training, n_kept).unwrap();
+        let after = words(training);
         assert!(
-            trainer.model.splats.n_splats == n_kept && n_kept > 50,
+            training.model.splats.n_splats == n_kept && n_kept > 50,
             "{n_kept}"
         );
         let mut sorted = contributions.clone();
@@ -257,11 +266,11 @@ mod tests {
     }
 
     /// The words of each splat, for every plane of every buffer.
-    fn words(trainer: &SplatTrainer) -> Vec<Vec<Vec<u32>>> {
-        let splats = &trainer.model.splats;
+    fn words(training: &Training) -> Vec<Vec<Vec<u32>>> {
+        let splats = &training.model.splats;
         let mut all = Vec::new();
         for (buffer, n_planes, bytes) in splats.planes() {
-            let words: Vec<u32> = trainer
+            let words: Vec<u32> = training
                 .recorder
                 .gpu
                 .read(buffer, (buffer.bytes() / 4) as usize)
@@ -302,11 +311,11 @@ mod tests {
             .filter(|keyframe| keyframe.split != Split::Test)
             .count();
         assert!(
-            !tested.trials.holds_validation() && tested.views.len() == n_learned,
+            !tested.trials.holds_validation() && tested.training.views.len() == n_learned,
             "{reported:?}"
         );
         assert!(
-            tested.progress().primitives <= 2000 && tested.model.splats.sh_degree == 0,
+            tested.progress().primitives <= 2000 && tested.training.model.splats.sh_degree == 0,
             "{reported:?}"
         );
         let tests = keyframes
@@ -331,22 +340,22 @@ mod tests {
     #[test]
     fn running_trial_is_not_displayed() {
         let (mut trainer, keyframes) = some_trained(400);
-        let state = trainer.snapshot().unwrap();
+        let state = trainer.training.snapshot().unwrap();
         trainer
             .trials
             .begin(Candidate::Halved { from: 0, to: 0 }, state, 1);
         let view = request(keyframes[0].world_from_camera);
         let before = trainer.render(&view).unwrap();
         let n_before = trainer.progress().primitives;
-        let baseline = trainer.snapshot().unwrap();
+        let baseline = trainer.training.snapshot().unwrap();
         trainer
             .trials
             .begin_second_half(baseline, super::super::super::trials::Scores::new());
-        trainer.keep_most_contributing(50).unwrap();
+        keep_most_contributing(&mut trainer.training, 50).unwrap();
         assert_eq!(trainer.progress().primitives, n_before);
         assert!(trainer.render(&view).unwrap().rgba_srgb == before.rgba_srgb);
         let baseline = trainer.trials.cancel().unwrap().restored.unwrap();
-        trainer.restore_snapshot(baseline).unwrap();
+        trainer.training.restore_snapshot(baseline).unwrap();
         assert!(trainer.render(&view).unwrap().rgba_srgb == before.rgba_srgb);
     }
 }

@@ -6,18 +6,18 @@
 //! splat, the higher its weight. Coefficients of spherical harmonics are not rotated, because
 //! corrections are a few degrees at most.
 
-use super::SplatTrainer;
+use super::training::Training;
 use crate::corrected_keyframe::replacement;
 use crate::splat::buffers::SplatBuffers;
 use crate::splat::camera_params::CameraParams;
-use crate::{CorrectedKeyframe, Error, Method};
+use crate::splat::trials::SplatTrials;
+use crate::{CorrectedKeyframe, Error};
 use calibration::{Alignment, CameraCorrection, ParamSet};
 use gpu::Gpu;
 use keyframe::{DepthMap, Keyframe};
 use kinematics::{Intrinsics, Lens, Transform, f32s_of};
 use nalgebra::{Point3, Quaternion, UnitQuaternion, Vector3};
 use rayon::prelude::*;
-use std::collections::BTreeMap;
 use std::sync::Arc;
 
 /// Maximum number of keyframes that determine the motion of the splats, spread evenly over all.
@@ -37,47 +37,43 @@ const WITHOUT_DEPTH: f64 = 1e-4;
 /// Parameters of single images, which stay enabled. Shared parameters are part of the alignment.
 const IMAGE_PARAMS: ParamSet = ParamSet::IMAGE_POSES.union(ParamSet::IMAGE_GAINS);
 
-impl SplatTrainer {
-    /// Moves the splats with their keyframes; see [`Method::recalibrate`].
-    pub(super) fn move_with_keyframes(
-        &mut self,
-        keyframes: &[CorrectedKeyframe],
-        alignment: &Alignment,
-    ) -> Result<(), Error> {
-        self.finish_in_flight()?;
-        self.abort_trial()?;
-        let learned = if self.model.cameras.set.is_empty() {
-            BTreeMap::new()
-        } else {
-            self.camera_corrections()?
-        };
-        // The splats first: their motion depends on the cameras before the correction.
-        let gpu = self.recorder.gpu.clone();
-        let motions = motions(keyframes, |camera| learned.get(camera));
-        move_splats(&gpu, &self.model.splats, &motions)?;
-        // Then everything that refers to the keyframes. Views come before seeding, which takes the
-        // corrected depth from them.
-        let corrected = replacement(keyframes);
-        self.recorder.passes.clear_bindings();
-        self.views.replace_cameras(&gpu, &corrected);
-        self.seeding.replace_cameras(&corrected, &self.views);
-        self.trials
-            .validation
-            .iter_mut()
-            .for_each(|image| corrected(&mut image.keyframe));
-        // Camera parameters start at zero again, because the keyframes now contain the correction.
-        let mut params = self.model.cameras.set & IMAGE_PARAMS;
-        // Depth gives image poses to a few millimeters. The splats refine them, without a trial.
-        if alignment.has_image_poses() && self.trials.remove_candidate(ParamSet::IMAGE_POSES) {
-            params |= ParamSet::IMAGE_POSES;
-        }
-        self.model.cameras =
-            CameraParams::new(&gpu, self.options.common.cameras.always() | params)?;
-        // The splats must adapt to the corrected cameras, which needs learning rates that are not
-        // too small.
-        self.schedule.extend_for_arrival();
-        Ok(())
+/// Moves the splats with their keyframes; see [`Method::recalibrate`](crate::Method::recalibrate).
+/// No steps may be in flight, and no trial may be running.
+pub(super) fn move_with_keyframes(
+    training: &mut Training,
+    trials: &mut SplatTrials,
+    keyframes: &[CorrectedKeyframe],
+    alignment: &Alignment,
+) -> Result<(), Error> {
+    let learned = training.learned_corrections()?;
+    // The splats first: their motion depends on the cameras before the correction.
+    let gpu = training.recorder.gpu.clone();
+    let motions = motions(keyframes, |camera| learned.get(camera));
+    move_splats(&gpu, &training.model.splats, &motions)?;
+    // Then everything that refers to the keyframes. Views come before seeding, which takes the
+    // corrected depth from them.
+    let corrected = replacement(keyframes);
+    training.recorder.passes.clear_bindings();
+    training.views.replace_cameras(&gpu, &corrected);
+    training
+        .seeding
+        .replace_cameras(&corrected, &training.views);
+    trials
+        .validation
+        .iter_mut()
+        .for_each(|image| corrected(&mut image.keyframe));
+    // Camera parameters start at zero again, because the keyframes now contain the correction.
+    let mut params = training.model.cameras.set & IMAGE_PARAMS;
+    // Depth gives image poses to a few millimeters. The splats refine them, without a trial.
+    if alignment.has_image_poses() && trials.remove_candidate(ParamSet::IMAGE_POSES) {
+        params |= ParamSet::IMAGE_POSES;
     }
+    training.model.cameras =
+        CameraParams::new(&gpu, training.options.common.cameras.always() | params)?;
+    // The splats must adapt to the corrected cameras, which needs learning rates that are not
+    // too small.
+    training.schedule.extend_for_arrival();
+    Ok(())
 }
 
 /// A camera at its pose in the world.
@@ -291,8 +287,9 @@ fn move_splats(gpu: &Gpu, splats: &SplatBuffers, motions: &[Motion]) -> Result<(
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::Method;
     use crate::model_options::ModelOptions;
-    use crate::splat::SplatOptions;
+    use crate::splat::{SplatOptions, SplatTrainer};
     use calibration::scenes::{Miscalibration, capture, wrong_extrinsics};
     use gpu::testing::test_gpu;
     use kinematics::quantile::{Rank, quantile};

@@ -1,18 +1,31 @@
-//! The training loop: performs the work that is due before a submit, sends the submit, and applies
-//! its results.
+//! The model in training, with all that its steps need. A submit is prepared, sent, and its results
+//! are applied.
 
-use super::SplatTrainer;
+use super::lazy_pipelines::LazyPipelines;
 use super::learning_rates;
-use super::optimizer::StepContext;
+use super::model::TrainedModel;
+use super::optimizer::{Optimizer, StepContext};
 use super::recorder::Recorder;
+use super::renderer::Renderer;
+use super::seeding::Seeding;
+use super::view_set::ViewSet;
 use crate::Error;
-use crate::splat::few_images::{self, Scarcity};
+use crate::model_options::ModelOptions;
+use crate::splat::few_images::Scarcity;
 use crate::splat::kernels::TrainPipelines;
+use crate::splat::options::SplatOptions;
 use crate::splat::params::status;
-use crate::splat::trials::CountPolicy;
+use crate::splat::schedule::Schedule;
+use crate::splat::seed;
+use crate::splat::snapshot::Snapshot;
 use crate::splat::work_counts::WorkCounts;
-use gpu::PassTiming;
+use calibration::CameraCorrection;
+use gpu::{Gpu, PassTiming};
+use keyframe::Keyframe;
 use kinematics::f32_of;
+use model_files::splat::arrays::SplatArrays;
+use std::collections::BTreeMap;
+use std::sync::Arc;
 use std::time::Instant;
 
 /// Maximum number of steps per submit. A submit also ends at its time limit, so this number matters
@@ -23,31 +36,129 @@ const MAX_STEPS_PER_SUBMIT: u64 = 64;
 /// number would delay the pictures too much.
 const VIEWS_AT_ONCE_WATCHED: u64 = 4;
 
-impl SplatTrainer {
-    /// Queues at most `n` steps, see [`Method::step`](crate::Method::step).
-    pub(super) fn train(&mut self, n: u64) -> Result<u64, Error> {
-        if self.views.is_empty() {
-            return Ok(0);
+/// The model in training. It does not depend on trials, which change it from outside.
+#[derive(Debug)]
+pub(super) struct Training {
+    pub(super) options: ModelOptions<SplatOptions>,
+    pub(super) recorder: Recorder,
+    pub(super) model: TrainedModel,
+    pub(super) renderer: Renderer,
+    pub(super) optimizer: Optimizer,
+    pub(super) schedule: Schedule,
+    pub(super) views: ViewSet,
+    pub(super) seeding: Seeding,
+    /// Background loaded with a saved model.
+    pub(super) saved_background_srgb: [f32; 3],
+    skipped: SkippedSteps,
+}
+
+impl Training {
+    /// Training without splats and views.
+    pub(super) fn new(
+        gpu: Arc<Gpu>,
+        options: ModelOptions<SplatOptions>,
+        pipelines: LazyPipelines,
+    ) -> Result<Self, Error> {
+        // Software adapters get coarser images, fewer seeds and less image memory by default.
+        let is_software = gpu.is_software();
+        Ok(Self {
+            renderer: Renderer::new(&gpu)?,
+            model: TrainedModel::new(&gpu, &options)?,
+            optimizer: Optimizer::new(&gpu, &options, pipelines)?,
+            schedule: Schedule::new(options.common.n_planned_steps),
+            views: ViewSet::new(&options, is_software),
+            seeding: Seeding::new(&options, is_software),
+            saved_background_srgb: [0.0; 3],
+            skipped: SkippedSteps::default(),
+            recorder: Recorder::new(gpu),
+            options,
+        })
+    }
+
+    /// The training pipelines. Waits until they are compiled.
+    pub(super) fn learn(&mut self) -> Result<Arc<TrainPipelines>, Error> {
+        self.optimizer.pipelines.wait(&self.recorder.gpu)
+    }
+
+    /// Adds a training keyframe that arrives at the current step.
+    pub(super) fn add_arrival(&mut self, keyframe: Arc<Keyframe>) -> Result<(), Error> {
+        self.schedule.extend_for_arrival();
+        self.add_view(keyframe)
+    }
+
+    /// Adds a training keyframe that was available before.
+    pub(super) fn add_view(&mut self, keyframe: Arc<Keyframe>) -> Result<(), Error> {
+        // The steps of a failed submit are repeated, and must be repeated on the same views.
+        self.finish_in_flight()?;
+        self.seeding.push(keyframe.clone());
+        self.views.push(keyframe);
+        Ok(())
+    }
+
+    /// Adds splats, up to the limit.
+    pub(super) fn add(&mut self, arrays: &SplatArrays) -> Result<(), Error> {
+        self.model
+            .add(&mut self.recorder, &mut self.renderer, arrays)
+    }
+
+    /// Seeds discs at the uncovered depth readings of the keyframes that arrived since the last
+    /// call.
+    pub(super) fn seed_from_depth(&mut self) -> Result<(), Error> {
+        match self.seeding.discs_from_depth(&self.views) {
+            Some(discs) => self.add(&discs),
+            None => Ok(()),
         }
-        self.prepare_training()?;
-        if self.model.splats.n_splats == 0 {
-            return Ok(0);
+    }
+
+    /// Seeds the areas that depth does not cover. Uses discs if any keyframe has depth; otherwise
+    /// balls at the initial points, if there are any, and a random cloud.
+    pub(super) fn prepare_model(&mut self) -> Result<(), Error> {
+        // Depth comes first, because the other discs take their depths from its discs.
+        self.seed_from_depth()?;
+        for keyframe in self.seeding.take_unseeded() {
+            if let Some(discs) = self.seeding.discs_without_depth(&keyframe) {
+                self.add(&discs)?;
+            }
         }
-        let learn = self.learn()?;
-        // Trials come before growth: a trial that starts at a growth step copies the model from
-        // before the growth, so that both halves grow at this step.
-        self.try_when_due()?;
-        self.grow_when_due(&learn)?;
-        // After both, because they can change the step count and the next step with other work.
+        if !self.model.cameras.set.is_empty() {
+            self.views
+                .assign_lenses(&self.recorder.gpu, &mut self.model.cameras)?;
+        }
+        // No keyframe has depth, or no reading is usable.
+        if self.model.splats.n_splats == 0 && !self.views.is_empty() {
+            let keyframes: Vec<&Keyframe> = self.views.keyframes().map(AsRef::as_ref).collect();
+            let n_max = self.options.cap() as usize;
+            let points = self.seeding.points.as_deref();
+            let balls = points
+                .map(|points| seed::balls(points, &keyframes, n_max))
+                .unwrap_or_default();
+            let cloud = seed::random_cloud(&keyframes, self.options.common.seed, n_max);
+            // Structure from motion finds no points where images have no texture. Therefore, there
+            // are at least as many splats as without points.
+            let n_random = cloud.n_splats().saturating_sub(balls.n_splats());
+            self.add(&balls)?;
+            self.add(&cloud.filtered(|ix| ix < n_random))?;
+        }
+        Ok(())
+    }
+
+    /// Queues at most `n` steps in one submit, see [`Method::step`](crate::Method::step). Returns
+    /// their number. The model must have splats and views.
+    pub(super) fn submit_steps(
+        &mut self,
+        learn: &TrainPipelines,
+        n: u64,
+        n_validation: usize,
+    ) -> Result<u64, Error> {
         let n_steps = self.n_steps_of_submit(n);
         self.model
             .splats
             .set_active_degree(&self.recorder.gpu, self.schedule.active_degree());
-        self.write_settings();
+        self.write_settings(n_validation);
         let since = Instant::now();
         self.prepare_images(n_steps)?;
         for step in self.schedule.step..self.schedule.step + n_steps {
-            self.record_step(&learn, step)?;
+            self.record_step(learn, step)?;
         }
         let counters = self.optimizer.submit(&mut self.recorder);
         self.schedule.step += n_steps;
@@ -58,19 +169,15 @@ impl SplatTrainer {
         if !failed {
             self.optimizer.submits.begin(counters, n_steps, since);
         }
-        // The caller stops here, so the step count must be exact.
-        if n_steps == n {
-            self.finish_in_flight()?;
-        }
         Ok(n_steps)
     }
 
     /// Takes one step with timestamps around every pass.
-    pub(super) fn profile(&mut self) -> Result<Vec<PassTiming>, Error> {
+    pub(super) fn profile(&mut self, n_validation: usize) -> Result<Vec<PassTiming>, Error> {
         self.finish_in_flight()?;
-        self.prepare_training()?;
+        self.prepare_model()?;
         let learn = self.learn()?;
-        self.write_settings();
+        self.write_settings(n_validation);
         self.record_step(&learn, self.schedule.step)?;
         let timings = self.recorder.passes.submit_timed(&self.recorder.gpu)?;
         // The scratch buffers still hold the lists of this step.
@@ -88,8 +195,13 @@ impl SplatTrainer {
         Ok(timings)
     }
 
-    /// If a change of the splat count is due, replaces dead splats and adds splats up to the limit.
-    fn grow_when_due(&mut self, learn: &TrainPipelines) -> Result<(), Error> {
+    /// If a change of the splat count is due, replaces dead splats and adds splats up to
+    /// `max_splats`.
+    pub(super) fn grow_when_due(
+        &mut self,
+        learn: &TrainPipelines,
+        max_splats: u32,
+    ) -> Result<(), Error> {
         if !self.schedule.is_growth_due() {
             return Ok(());
         }
@@ -100,7 +212,7 @@ impl SplatTrainer {
         }
         self.schedule.last_growth_step = self.schedule.step;
         let key = growth_key(self.options.common.seed, self.schedule.step);
-        let n_new = self.n_new_splats();
+        let n_new = self.n_new_splats(max_splats);
         self.model
             .grow(&mut self.recorder, &mut self.renderer, learn, n_new, key)
     }
@@ -111,32 +223,40 @@ impl SplatTrainer {
         clippy::cast_sign_loss,
         reason = "saturates, then limited"
     )]
-    fn n_new_splats(&self) -> u32 {
+    fn n_new_splats(&self, max_splats: u32) -> u32 {
         let n_splats = self.model.splats.n_splats;
-        if !self.trials.may_grow() {
-            return 0;
-        }
         let n_new = (f64::from(n_splats) * self.options.specific.growth_frac).ceil() as u32;
-        let limit = match self.options.specific.count {
-            CountPolicy::ToCap => u32::MAX,
-            CountPolicy::Tested => few_images::max_splats(self.n_images()),
-        };
-        n_new.min(limit.saturating_sub(n_splats))
+        n_new.min(max_splats.saturating_sub(n_splats))
     }
 
     /// Number of steps of the next submit. The submit stays within its time limit and does not pass
-    /// a step at which other work is due.
+    /// a step at which the splat count or the SH degree may change.
     fn n_steps_of_submit(&self, n_requested: u64) -> u64 {
         // Before the first measurement, a step may take arbitrarily long.
         let by_time = self.optimizer.submits.n_steps_in_limit().unwrap_or(1);
         n_requested
             .min(by_time.clamp(1, MAX_STEPS_PER_SUBMIT))
             .min(self.schedule.steps_to_next_change())
-            .min(self.trials.steps_left(self.schedule.step))
+    }
+
+    /// How few images there are.
+    fn scarcity(&self, n_validation: usize) -> Scarcity {
+        Scarcity::of_images(self.views.len() + n_validation)
+    }
+
+    /// Background of pictures.
+    pub(super) fn background_srgb(&self, n_validation: usize) -> [f32; 3] {
+        // A loaded model has no images, so it keeps the background with which it was saved.
+        if self.views.is_empty() {
+            self.saved_background_srgb
+        } else {
+            self.scarcity(n_validation)
+                .background_srgb(self.views.mean_srgb())
+        }
     }
 
     /// Uploads the settings of the next steps.
-    fn write_settings(&self) {
+    fn write_settings(&self, n_validation: usize) {
         let Self {
             options,
             recorder: Recorder { gpu, .. },
@@ -156,7 +276,7 @@ impl SplatTrainer {
         optimizer.set_n_splats(gpu, n_splats);
         // Both fractions use `completed_frac`, which changes only at growth steps. The result
         // therefore does not depend on how many steps a submit holds.
-        let scarcity = Scarcity::of_images(self.n_images());
+        let scarcity = self.scarcity(n_validation);
         let drop_frac = scarcity.drop_frac(options.specific.drop_frac, schedule.completed_frac());
         optimizer.write_drop_frac(gpu, f32_of(drop_frac));
         optimizer.write_counter(gpu, status::DROP_SEED, growth_key(options.common.seed, 0));
@@ -186,7 +306,7 @@ impl SplatTrainer {
     /// Records the passes of one step.
     fn record_step(&mut self, learn: &TrainPipelines, step: u64) -> Result<(), Error> {
         let place = self.views.of_step(step);
-        // `train` has prepared the images of its steps, but `profile` has not.
+        // `submit_steps` has prepared the images of its steps, but `profile` has not.
         self.views
             .ensure_level(&mut self.recorder, place, self.schedule.step)?;
         self.reserve_view(self.views.size_px(place))?;
@@ -259,11 +379,63 @@ impl SplatTrainer {
             .write_counter(&self.recorder.gpu, status::STEP, next_step);
         Ok(())
     }
+
+    /// The current splats.
+    pub(super) fn arrays(&mut self) -> Result<SplatArrays, Error> {
+        self.seed_from_depth()?;
+        self.finish_in_flight()?;
+        self.model.splats.read(&self.recorder.gpu)
+    }
+
+    /// Current corrections of each camera, including those of a running trial. They apply to
+    /// keyframes that alignment has already corrected.
+    pub(super) fn learned_corrections(&self) -> Result<BTreeMap<String, CameraCorrection>, Error> {
+        let cameras = &self.model.cameras;
+        if cameras.set.is_empty() {
+            return Ok(BTreeMap::new());
+        }
+        cameras.corrections(
+            &self.recorder.gpu,
+            cameras.set,
+            &cameras.params,
+            self.seeding.scene.size_m,
+        )
+    }
+
+    /// Copies the state. Every keyframe must have been seeded.
+    pub(super) fn snapshot(&self) -> Result<Snapshot, Error> {
+        let gpu = &self.recorder.gpu;
+        let splats = &self.model.splats;
+        let cameras = &self.model.cameras;
+        Ok(Snapshot {
+            // Resizing to the same size copies the buffers.
+            splats: splats.resized(gpu, splats.capacity, splats.sh_degree)?,
+            cameras: (cameras.set, cameras.copy(gpu)?),
+            schedule: self.schedule,
+            scene: self.seeding.scene.clone(),
+        })
+    }
+
+    /// Continues from a snapshot.
+    pub(super) fn restore_snapshot(&mut self, snapshot: Snapshot) -> Result<(), Error> {
+        self.recorder.passes.clear_bindings();
+        self.model.splats = snapshot.splats;
+        self.model
+            .cameras
+            .restore_snapshot(&self.recorder.gpu, snapshot.cameras)?;
+        self.schedule = snapshot.schedule;
+        self.seeding.scene = snapshot.scene;
+        // Kernels derive learning rates and random numbers from their own step counter.
+        let step = u32::try_from(self.schedule.step).unwrap_or(u32::MAX);
+        self.optimizer
+            .write_counter(&self.recorder.gpu, status::STEP, step);
+        Ok(())
+    }
 }
 
 /// Steps that were skipped one after another.
 #[derive(Debug, Default)]
-pub(super) struct SkippedSteps {
+struct SkippedSteps {
     last: u64,
     n_consecutive: u64,
 }
@@ -294,12 +466,13 @@ pub(super) fn growth_key(seed: u64, step: u64) -> u32 {
 mod tests {
     use super::*;
     use crate::Method;
-    use model_files::splat::cloud::synthetic_cloud;
+    use crate::splat::SplatTrainer;
     use crate::splat::training_tests::{keyframes, n_keyframes, options, request, train};
+    use crate::splat::trials::CountPolicy;
     use gpu::GpuOptions;
     use gpu::testing::{test_gpu, test_gpu_with};
-    use keyframe::{Keyframe, Split};
-    use std::sync::Arc;
+    use keyframe::Split;
+    use model_files::splat::cloud::synthetic_cloud;
 
     const N_COVERING: u32 = 2000;
 
@@ -321,14 +494,15 @@ mod tests {
             .iter()
             .for_each(|keyframe| trainer.push(keyframe.clone()).unwrap());
         train(&mut trainer, 3);
-        trainer.finish_in_flight().unwrap();
-        let learn = trainer.learn().unwrap();
-        let n_more = N_COVERING - trainer.model.splats.n_splats;
-        trainer
+        let training = &mut trainer.training;
+        training.finish_in_flight().unwrap();
+        let learn = training.learn().unwrap();
+        let n_more = N_COVERING - training.model.splats.n_splats;
+        training
             .model
             .grow(
-                &mut trainer.recorder,
-                &mut trainer.renderer,
+                &mut training.recorder,
+                &mut training.renderer,
                 &learn,
                 n_more,
                 0,
@@ -340,10 +514,11 @@ mod tests {
     /// Moves 2000 splats in front of a camera, so close that each covers the image.
     fn cover(trainer: &mut SplatTrainer, keyframe: &Keyframe, log_scale: f32) {
         const N: usize = N_COVERING as usize;
-        assert_eq!(trainer.model.splats.n_splats, N_COVERING);
+        let training = &trainer.training;
+        assert_eq!(training.model.splats.n_splats, N_COVERING);
         let center = keyframe.world_from_camera * nalgebra::Point3::new(0.0, 0.0, 0.3);
         let [x, y, z] = kinematics::f32s_of(center.coords.into());
-        let (gpu, splats) = (&trainer.recorder.gpu, &trainer.model.splats);
+        let (gpu, splats) = (&training.recorder.gpu, &training.model.splats);
         gpu.write(&splats.means, 0, bytemuck::cast_slice(&[[x, y, z, 0.0]; N]));
         gpu.write(
             &splats.shapes,
@@ -367,7 +542,7 @@ mod tests {
                 .into_iter()
                 .find(|keyframe| keyframe.split == Split::Train);
             trainer.push(only.unwrap()).unwrap();
-            trainer.n_new_splats()
+            trainer.training.n_new_splats(trainer.max_splats())
         };
         assert_eq!(
             (n_new(CountPolicy::Tested), n_new(CountPolicy::ToCap)),
@@ -383,15 +558,15 @@ mod tests {
             .find(|keyframe| keyframe.split == Split::Train)
             .unwrap();
         cover(&mut trainer, covered, 0.05_f32.ln());
-        let n_splats = trainer.model.splats.n_splats;
+        let n_splats = trainer.training.model.splats.n_splats;
         train(&mut trainer, 40);
         assert_eq!(trainer.n_total_steps().unwrap(), 43);
         assert!(
-            trainer.skipped.n_consecutive > 0,
+            trainer.training.skipped.n_consecutive > 0,
             "the buffers were large enough for all images"
         );
         assert!(
-            trainer.model.is_full() && trainer.model.splats.n_splats == n_splats,
+            trainer.training.model.is_full() && trainer.training.model.splats.n_splats == n_splats,
             "the model still grows"
         );
         assert!(

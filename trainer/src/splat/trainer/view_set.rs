@@ -85,6 +85,12 @@ impl ViewSet {
         &self.views[view_ix].keyframe
     }
 
+    /// Index of the view of a keyframe.
+    pub(super) fn position(&self, keyframe: &Arc<Keyframe>) -> Option<usize> {
+        self.keyframes()
+            .position(|view| Arc::ptr_eq(view, keyframe))
+    }
+
     pub(super) fn push(&mut self, keyframe: Arc<Keyframe>) {
         self.views.push(TrainView::new(keyframe));
     }
