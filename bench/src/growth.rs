@@ -3,7 +3,7 @@
 use crate::statistics::theil_sen;
 use crate::viewer::ReceivedPicture;
 use anyhow::{Context, Result, anyhow};
-use kinematics::quantile::median;
+use numbers::quantile::median;
 use serde::Serialize;
 
 /// Time to ignore after the keyframe store is full, while buffers reach their final size.

@@ -6,7 +6,7 @@ use crate::memory;
 use crate::statistics::theil_sen;
 use crate::viewer::{ReceivedPicture, Viewer};
 use gpu::Gpu;
-use kinematics::quantile::median;
+use numbers::quantile::median;
 use report::chart::{Line, Point};
 use serde::Serialize;
 use session::LiveLoop;

@@ -3,10 +3,10 @@
 
 use crate::findings::{BenchResult, Findings};
 use anyhow::{Context, Result};
-use kinematics::quantile::{Rank, median, quantile};
-use kinematics::random::Random;
 use kinematics::{ClockMap, JointHistory, JointState, Stamp};
 use messages::{BadInput, Setting};
+use numbers::quantile::{Rank, median, quantile};
+use numbers::random::Random;
 use report::Table;
 use report::chart::{Axis, Chart, Line, Point, Scale};
 use serde::Serialize;

@@ -1,6 +1,6 @@
 //! Statistics over runs: spreads, times to a PSNR level, break points.
 
-use kinematics::quantile::median;
+use numbers::quantile::median;
 
 /// Smallest and largest value.
 pub(crate) fn extent(values: &[f64]) -> Option<[f64; 2]> {

@@ -1,8 +1,9 @@
 //! Calibration corrections of one camera, and their application to keyframes.
 
 use keyframe::{DepthMap, Keyframe, Shutter};
-use kinematics::{Stamp, Transform, Twist, f32_of, transform};
+use kinematics::{Stamp, Transform, Twist, transform};
 use nalgebra::{Translation3, UnitQuaternion, Vector3};
+use numbers::f32_of;
 use std::collections::BTreeMap;
 
 /// Estimated calibration correction of one camera.

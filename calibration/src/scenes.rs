@@ -3,9 +3,9 @@
 
 use crate::{CameraCorrection, rigid_transform};
 use keyframe::{DepthMap, Keyframe, Split};
-use kinematics::random::Random;
 use kinematics::{Stamp, Transform, Twist, transform};
 use nalgebra::{Isometry3, Point3, Translation3, UnitQuaternion, Vector3};
+use numbers::random::Random;
 use rayon::prelude::*;
 use std::sync::Arc;
 

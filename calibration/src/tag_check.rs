@@ -294,8 +294,8 @@ impl std::fmt::Display for TagContradiction {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use kinematics::random::Random;
     use nalgebra::Vector3;
+    use numbers::random::Random;
 
     const SIGMA_M: f64 = 0.0005;
     const SIGMA_RAD: f64 = 0.002;

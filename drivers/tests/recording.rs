@@ -7,10 +7,10 @@ use drivers::recording::{RIG_FILE, Recorder, Recording, RecordingMetadata};
 use drivers::{
     BasePose, Error, Image, PixelFormat, RangePoint, RangeScan, Sample, Source, TruthImage,
 };
-use kinematics::random::Random;
 use kinematics::{Intrinsics, JointState, Lens, Stamp, Transform};
 use mcap::Compression;
 use nalgebra::{Translation3, UnitQuaternion};
+use numbers::random::Random;
 use recompress::recompress;
 use std::path::Path;
 

@@ -1,8 +1,9 @@
 //! Scenes of known shapes, and exact keyframes of them.
 
 use crate::{DepthMap, Keyframe, Split};
-use kinematics::{Stamp, Transform, f32_of};
+use kinematics::{Stamp, Transform};
 use nalgebra::{Point3, UnitQuaternion, Vector3};
+use numbers::f32_of;
 use std::f64::consts::PI;
 use std::sync::Arc;
 

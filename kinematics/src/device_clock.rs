@@ -327,7 +327,7 @@ mod tests {
     )]
 
     use super::*;
-    use crate::random::Random;
+    use numbers::random::Random;
 
     const FIXED_NANOS: i64 = 5_000_000;
     const JITTER_NANOS: f64 = 75e6;

@@ -255,7 +255,7 @@ mod tests {
 
     use super::*;
     use crate::Lens;
-    use crate::random::Random;
+    use numbers::random::Random;
 
     fn camera(size_px: [u32; 2], lens: Lens) -> Intrinsics {
         let [width, height] = size_px.map(f64::from);

@@ -1,6 +1,6 @@
 //! Quantiles of durations.
 
-use kinematics::quantile::{Rank, quantile};
+use numbers::quantile::{Rank, quantile};
 use serde::Serialize;
 
 /// Median and 99th percentile of durations, milliseconds.

@@ -1,7 +1,7 @@
 //! Random numbers that depend only on a key and a counter, so that any image can be reproduced
 //! independently.
 
-use kinematics::random::{hash, nth_bits, unit_from_bits};
+use numbers::random::{hash, nth_bits, unit_from_bits};
 use std::sync::LazyLock;
 
 /// Random number stream of one key.

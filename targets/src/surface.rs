@@ -432,7 +432,7 @@ fn dot_near(
 mod tests {
     use super::*;
     use crate::layout::layouts;
-    use kinematics::random::Random;
+    use numbers::random::Random;
 
     fn is_black_in(shapes: &[Shape], point: [f64; 2]) -> bool {
         let covers = |shape: &Shape| match *shape {

@@ -4,9 +4,9 @@
 
 use crate::spec::TargetSpec;
 use crate::surface::{Surface, pixel_mean};
-use kinematics::random::Random;
 use kinematics::{Intrinsics, Transform};
 use nalgebra::Vector3;
+use numbers::random::Random;
 
 /// A camera in front of a target.
 #[derive(Clone, Debug)]

@@ -423,7 +423,7 @@ fn pictures_of_every_target_are_detected_at_their_exact_places() {
 
 #[test]
 fn images_without_targets_and_broken_images_are_errors() {
-    let mut random = kinematics::random::Random::new(5);
+    let mut random = numbers::random::Random::new(5);
     let noise = random.bytes(320 * 240);
     let gradient: Vec<u8> = (0..320 * 240_u32)
         .map(|at| u8::try_from(at % 320 / 2).unwrap())

@@ -13,7 +13,7 @@ use drivers::wire::can::mit::{Command as MitCommand, Limits, Motion};
 use drivers::wire::can::{Frame, Id, canopen};
 use drivers::{Arm, Error, clock};
 use kinematics::Stamp;
-use kinematics::quantile::{Rank, median, quantile};
+use numbers::quantile::{Rank, median, quantile};
 use std::process::Command;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};

@@ -12,7 +12,7 @@ use drivers::motion::{JointTarget, Motion, MotionConfig, MotionLimits, MovableAr
 use drivers::wire::can::{Frame, Id, canopen};
 use drivers::{Arm, clock};
 use kinematics::Stamp;
-use kinematics::random::Random;
+use numbers::random::Random;
 use parking_lot::{Mutex, MutexGuard};
 use socketcan::{CanErrorFrame, CanSocket, Socket};
 use std::io::{BufRead, BufReader, Write};

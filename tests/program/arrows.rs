@@ -10,28 +10,30 @@ const ALLOWED: &str = "
     background    ->
     files         ->
     messages      ->
+    numbers       ->
     test-features ->
-    kinematics    -> messages
-    drivers       -> files kinematics messages
-    test-support  -> drivers kinematics
+    kinematics    -> messages numbers
+    drivers       -> files kinematics messages numbers
+    test-support  -> drivers kinematics numbers
     gpu           -> messages test-support
-    keyframe      -> files kinematics messages
-    model-files   -> files kinematics
-    targets       -> kinematics messages
-    calibration   -> background keyframe kinematics messages
-    sim           -> drivers kinematics messages targets
-    capture       -> background calibration drivers files keyframe kinematics messages sim
-    report        -> calibration files kinematics messages
-    trainer       -> background calibration files gpu keyframe kinematics messages model-files
-    viz           -> files keyframe kinematics messages model-files trainer
+    keyframe      -> files kinematics messages numbers
+    model-files   -> files kinematics numbers
+    targets       -> kinematics messages numbers
+    calibration   -> background keyframe kinematics messages numbers
+    sim           -> drivers kinematics messages numbers targets
+    capture       -> background calibration drivers files keyframe kinematics messages numbers sim
+    report        -> calibration files kinematics messages numbers
+    trainer       -> background calibration files gpu keyframe kinematics messages model-files \
+                     numbers
+    viz           -> files keyframe kinematics messages model-files numbers trainer
     session       -> background calibration capture drivers files gpu keyframe kinematics messages \
-                     model-files report trainer viz
+                     model-files numbers report trainer viz
     calibrate     -> calibration capture drivers files keyframe kinematics messages report session \
                      targets
-    bench         -> calibration capture files gpu keyframe kinematics messages model-files report \
-                     session trainer
+    bench         -> calibration capture files gpu keyframe kinematics messages model-files numbers \
+                     report session trainer
     fieldrig      -> background bench calibrate calibration capture drivers files gpu keyframe \
-                     kinematics messages model-files report session sim targets trainer viz
+                     kinematics messages model-files numbers report session sim targets trainer viz
 ";
 
 /// Crates that only `fieldrig` may use, because only it prints and parses command lines.

@@ -1,6 +1,6 @@
 //! Approximate bounds of a model, for the initial view of a model without a list of cameras.
 
-use kinematics::quantile::{Rank, quantile};
+use numbers::quantile::{Rank, quantile};
 
 /// Fraction of the points inside the radius. Stray points and distant backgrounds stay outside.
 /// With a larger fraction, the initial view shows the background instead of the object; with a

@@ -1,6 +1,6 @@
 //! Reproducible pseudorandom numbers for tests of kernels.
 
-use kinematics::{f32_of, random};
+use numbers::{f32_of, random};
 
 /// Pseudorandom numbers rounded to f32, so that a kernel and its twin start from the same values.
 pub(crate) struct F32Random(random::Random);

@@ -6,10 +6,10 @@ use calibration::hand_eye::{
     BoardObservation, HandEyeInput, HandEyeOptions, HandEyeSample, JointOffset, Setup,
     calibrate_hand_eye,
 };
-use kinematics::quantile::median;
-use kinematics::random::Random;
 use kinematics::{Chain, Intrinsics, Transform};
 use nalgebra::Vector3;
+use numbers::quantile::median;
+use numbers::random::Random;
 use rayon::prelude::{IntoParallelIterator, ParallelIterator};
 use serde::Serialize;
 

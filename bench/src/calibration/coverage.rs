@@ -7,10 +7,10 @@ use calibration::hand_eye::{HandEyeOptions, calibrate_hand_eye};
 use calibration::{
     BoardView, IntrinsicsCalibration, IntrinsicsInput, LensModel, calibrate_intrinsics,
 };
-use kinematics::quantile::median;
-use kinematics::random::Random;
 use kinematics::{Intrinsics, Lens};
 use nalgebra::DVector;
+use numbers::quantile::median;
+use numbers::random::Random;
 use rayon::prelude::{IntoParallelIterator, ParallelIterator};
 use serde::Serialize;
 
@@ -65,7 +65,7 @@ fn column(runs: &[Run], ix: usize) -> Vec<f64> {
 }
 
 fn p95(mut values: Vec<f64>) -> f64 {
-    kinematics::quantile::quantile(&mut values, 0.95, kinematics::quantile::Rank::Upper)
+    numbers::quantile::quantile(&mut values, 0.95, numbers::quantile::Rank::Upper)
         .unwrap_or(f64::NAN)
 }
 

@@ -2,9 +2,9 @@
 
 use calibration::hand_eye::{BoardObservation, HandEyeInput, HandEyeOptions, HandEyeSample, Setup};
 use calibration::{BoardPoint, BoardView, board_pose};
-use kinematics::random::Random;
 use kinematics::{Intrinsics, Lens, Transform};
 use nalgebra::{Point3, UnitQuaternion, Vector3};
+use numbers::random::Random;
 
 const COLUMNS: u32 = 9;
 const ROWS: u32 = 6;

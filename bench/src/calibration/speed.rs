@@ -2,7 +2,7 @@
 
 use super::method::Method;
 use super::scene::{Noise, Scene};
-use kinematics::quantile::median;
+use numbers::quantile::median;
 use serde::Serialize;
 use std::time::Instant;
 

@@ -3,9 +3,9 @@
 use super::method::{Method, Outcome};
 use super::scene::{Noise, Scene};
 use calibration::hand_eye::{BoardObservation, HandEyeSample};
-use kinematics::quantile::median;
-use kinematics::random::Random;
 use nalgebra::Vector3;
+use numbers::quantile::median;
+use numbers::random::Random;
 use rayon::prelude::{IntoParallelIterator, IntoParallelRefIterator, ParallelIterator};
 use serde::Serialize;
 

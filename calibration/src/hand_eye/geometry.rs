@@ -184,7 +184,7 @@ pub(crate) fn median_distance_m<'a>(
     let distances: Vec<f64> = camera_from_board
         .map(|pose| pose.translation.vector.norm())
         .collect();
-    kinematics::quantile::median(&distances)
+    numbers::quantile::median(&distances)
 }
 
 /// How much the poses of the board that the samples imply differ.

@@ -4,9 +4,9 @@
 use super::geometry::{Solution, stacked};
 use super::*;
 use crate::BoardPoint;
-use kinematics::random::Random;
 use kinematics::{Lens, transform};
 use nalgebra::{Point3, SVector, UnitQuaternion, Vector3};
+use numbers::random::Random;
 
 /// A solution and a robot pose for tests of derivatives.
 pub(super) fn example() -> (Solution, Transform) {

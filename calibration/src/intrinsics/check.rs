@@ -5,8 +5,8 @@ use super::report::{Rejected, RejectionReason};
 use super::robust::MIN_POINTS;
 use crate::least_squares::Fit;
 use crate::{BoardPoint, BoardView, Error};
-use kinematics::quantile::median;
 use nalgebra::Vector3;
+use numbers::quantile::median;
 
 /// Minimum number of images: each gives two constraints on focal lengths and principal point.
 pub(super) const MIN_IMAGES: usize = 3;

@@ -4,9 +4,9 @@ use super::board_pose;
 use super::bundle::Bundle;
 use super::homography::{self, homography};
 use crate::BoardPoint;
-use kinematics::quantile::median;
 use kinematics::{Intrinsics, Lens, Transform};
 use nalgebra::{Matrix2, Matrix3, Matrix6, Translation3, Vector2, Vector6};
+use numbers::quantile::median;
 
 /// Focal lengths that are tried, relative to the longer side of the image: fields of view of about
 /// 20 to 100 degrees for a pinhole, and of 20 to 200 degrees for an equidistant fisheye.

@@ -8,9 +8,9 @@ use super::next_view::{self, NextView};
 use super::robust::RobustFit;
 use super::selection::LensTrial;
 use crate::{BoardPoint, BoardView};
-use kinematics::quantile::median;
 use kinematics::{Intrinsics, Lens, Transform};
 use nalgebra::{DMatrix, Point3};
+use numbers::quantile::median;
 
 /// Result of [`super::calibrate_intrinsics`].
 #[derive(Clone, Debug)]

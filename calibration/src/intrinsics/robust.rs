@@ -7,10 +7,10 @@ use super::homography::{self, homography};
 use super::initial::Start;
 use crate::BoardPoint;
 use crate::least_squares::{Fit, Loss};
-use kinematics::quantile::median;
-use kinematics::random::Random;
 use kinematics::{Intrinsics, Transform};
 use nalgebra::{Matrix3, Vector2};
+use numbers::quantile::median;
+use numbers::random::Random;
 
 /// Minimum number of corners that an image keeps; with fewer, its pose has no redundancy worth
 /// using.

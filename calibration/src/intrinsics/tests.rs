@@ -4,9 +4,9 @@ use super::{
     IntrinsicsCalibration, IntrinsicsInput, LensModel, RejectionReason, calibrate_intrinsics, grid,
 };
 use crate::{BoardPoint, BoardView, Error};
-use kinematics::random::Random;
 use kinematics::{Intrinsics, Lens, Transform};
 use nalgebra::{Point3, UnitQuaternion, Vector3};
+use numbers::random::Random;
 
 const SQUARE_M: f64 = 0.025;
 

@@ -1,8 +1,8 @@
 //! Tests of the solver on problems with known solutions.
 
 use super::{BlockSums, Loss, Options, Problem, minimize};
-use kinematics::random::Random;
 use nalgebra::{DMatrix, DVector, Vector2};
+use numbers::random::Random;
 
 /// Circles of one common radius: the radius is shared, the centers are local. Residuals are vectors
 /// from the nearest point of the circle at a known angle.

@@ -11,9 +11,9 @@ use super::solve::INFLATION;
 use super::sums::{self, PairSums, PixelSubset, ResidualOptions};
 use super::view::CorrectedView;
 use crate::{CameraCorrection, drift_weight, rigid_transform};
-use kinematics::quantile::{Rank, quantile};
 use kinematics::{Twist, transform};
 use nalgebra::{DVector, Matrix6, Vector6};
+use numbers::quantile::{Rank, quantile};
 use std::collections::BTreeMap;
 
 /// Bounds of the expected pose error of an image, meters and radians. The lower bound (next

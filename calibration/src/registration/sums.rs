@@ -4,8 +4,8 @@ use super::pairs::Pair;
 use super::prepared_image::{DepthSample, PreparedImage};
 use super::residual::{Correspondence, ParamColumns, Side, Tone};
 use super::view::CorrectedView;
-use kinematics::quantile::{Rank, quantile};
 use nalgebra::{DMatrix, DVector};
+use numbers::quantile::{Rank, quantile};
 use rayon::prelude::*;
 
 /// Number of standard deviations at which residuals get half the full weight (Cauchy weights, 95 %

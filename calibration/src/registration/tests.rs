@@ -4,10 +4,10 @@
 use super::*;
 use crate::scenes::*;
 use keyframe::Keyframe;
-use kinematics::quantile::{Rank, quantile};
-use kinematics::random::Random;
 use kinematics::{Transform, Twist, transform};
 use nalgebra::Vector3;
+use numbers::quantile::{Rank, quantile};
+use numbers::random::Random;
 
 fn align_given(miscalibration: &Miscalibration, set: ParamSet) -> Alignment {
     align(&capture(miscalibration), &CameraRefinement::Always(set)).unwrap()

@@ -202,7 +202,7 @@ impl Rates {
         // A single wrong pose gives a rate that would dominate the correlation.
         let mut sorted: Vec<f64> = values.iter().flatten().copied().collect();
         if let Some(limit) =
-            kinematics::quantile::quantile(&mut sorted, 0.95, kinematics::quantile::Rank::Nearest)
+            numbers::quantile::quantile(&mut sorted, 0.95, numbers::quantile::Rank::Nearest)
         {
             values
                 .iter_mut()

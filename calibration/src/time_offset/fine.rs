@@ -255,7 +255,7 @@ impl<'a> Orientations<'a> {
             .residuals(state)
             .map(|residual| residual.norm())
             .collect();
-        kinematics::quantile::median(&norms).unwrap_or(0.0) / MEDIAN_OF_NORM
+        numbers::quantile::median(&norms).unwrap_or(0.0) / MEDIAN_OF_NORM
     }
 
     /// Root mean square of the residuals.

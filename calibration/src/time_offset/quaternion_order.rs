@@ -64,7 +64,7 @@ pub(super) fn mistake(
 /// Median difference of the orientations after alignment, which single wrong poses do not affect.
 fn median_deg(offset: &TimeOffset) -> f64 {
     let residuals: Vec<f64> = offset.residuals.iter().map(|[_, deg]| *deg).collect();
-    kinematics::quantile::median(&residuals).unwrap_or(f64::INFINITY)
+    numbers::quantile::median(&residuals).unwrap_or(f64::INFINITY)
 }
 
 /// The poses for quaternions whose first number is w.

@@ -58,7 +58,7 @@ impl Stream {
             .windows(2)
             .map(|pair| pair[1].secs - pair[0].secs)
             .collect();
-        let step_secs = kinematics::quantile::median(&steps).unwrap_or(0.0);
+        let step_secs = numbers::quantile::median(&steps).unwrap_or(0.0);
         Ok(Self {
             samples: sorted,
             max_gap_secs: GAP * step_secs,
@@ -72,7 +72,7 @@ impl Stream {
             .windows(2)
             .map(|pair| pair[1].secs - pair[0].secs)
             .collect();
-        kinematics::quantile::median(&steps).unwrap_or(0.0)
+        numbers::quantile::median(&steps).unwrap_or(0.0)
     }
 
     /// The stream on a clock that advances by another factor.

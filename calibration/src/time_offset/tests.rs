@@ -4,8 +4,8 @@ use super::{PoseSample, TimeOffset, TimeOffsetOptions, estimate_time_offset};
 use crate::Error;
 use crate::hand_eye::Refusal;
 use kinematics::Transform;
-use kinematics::random::Random;
 use nalgebra::Vector3;
+use numbers::random::Random;
 
 /// A smooth motion with frequencies up to 1 Hz.
 struct Motion {

@@ -8,7 +8,7 @@ use crate::{Join, JoinEvent, Rejection, Stop};
 use drivers::udp::DatagramMonitor;
 use drivers::{Error, Sample, clock};
 use kinematics::Stamp;
-use kinematics::quantile::{Rank, quantile};
+use numbers::quantile::{Rank, quantile};
 use serde::Serialize;
 use std::collections::BTreeMap;
 use std::time::{Duration, Instant};

@@ -5,8 +5,8 @@ use crate::{config, downscale};
 use anyhow::Context;
 use drivers::{Image, TruthImage};
 use keyframe::{DepthMap, Truth};
-use kinematics::quantile::{Rank, quantile};
 use kinematics::{Intrinsics, Undistortion};
+use numbers::quantile::{Rank, quantile};
 use std::sync::Arc;
 
 /// Undistorts and scales the images of one camera. The maps are computed once.

@@ -1,6 +1,6 @@
 //! Pixel statistics of an image: brightness, clipping, sharpness.
 
-use kinematics::quantile::{Rank, quantile};
+use numbers::quantile::{Rank, quantile};
 
 /// Approximate width of the reduced image. A common width makes sharpness comparable between
 /// cameras and averages out noise.

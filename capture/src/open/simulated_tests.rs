@@ -13,7 +13,7 @@ use drivers::wire::datagram::{
 use drivers::{RangePoint, Sample};
 use keyframe::Keyframe;
 use kinematics::Transform;
-use kinematics::quantile::median;
+use numbers::quantile::median;
 use std::net::{SocketAddr, UdpSocket};
 use std::path::Path;
 use std::sync::Arc;

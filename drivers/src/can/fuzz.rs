@@ -177,7 +177,7 @@ mod tests {
     use crate::can::family::FamilyFuzzing;
     use crate::can::motor::Reading;
     use crate::can::odrive::{self, Odrive};
-    use kinematics::random::Random;
+    use numbers::random::Random;
     use std::sync::Arc;
 
     #[test]

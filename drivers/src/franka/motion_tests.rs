@@ -10,7 +10,7 @@ use super::tests::{
 use super::{ContactConfig, FciVersion, MovableFrankaArm, N_JOINTS};
 use crate::motion::{JointTarget, Motion, MotionConfig, MotionLimits, MovableArm, OnLoss};
 use kinematics::Transform;
-use kinematics::random::Random;
+use numbers::random::Random;
 use std::io::{BufRead, BufReader, Read, Write};
 use std::net::{SocketAddr, TcpListener, TcpStream, UdpSocket};
 use std::process::{Command, Stdio};

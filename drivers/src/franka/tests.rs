@@ -9,8 +9,8 @@ use crate::{Arm, Error};
 use franka::{
     ControllerMode, FrankaError, JointPositions, MoveStatus, RealtimeConfig, Robot, RobotMode,
 };
-use kinematics::random::Random;
 use kinematics::{Chain, Stamp, Transform};
+use numbers::random::Random;
 use std::io::{Read, Write};
 use std::net::{SocketAddr, TcpStream, UdpSocket};
 use std::sync::{Arc, Mutex};

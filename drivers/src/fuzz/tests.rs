@@ -1,7 +1,7 @@
 //! Feeds the seeds of the folder `fuzz`, unchanged and corrupted, to every reader.
 
 use super::*;
-use kinematics::random::Random;
+use numbers::random::Random;
 use std::path::{Path, PathBuf};
 
 type Reader = fn(&[u8]);

@@ -213,7 +213,7 @@ fn detection(tag: &apriltag::Detection) -> Option<TagDetection> {
 mod tests {
     use super::*;
     use crate::PixelFormat;
-    use kinematics::random::Random;
+    use numbers::random::Random;
 
     fn image(size_px: [u32; 2], format: PixelFormat, data: Vec<u8>) -> Image {
         let (camera, stamp) = ("wrist".into(), Stamp(5));

@@ -347,7 +347,7 @@ fn rms_error_px(intrinsics: &Intrinsics, corners: &[Corner], camera_from_world: 
 mod tests {
     use super::*;
     use kinematics::Lens;
-    use kinematics::random::Random;
+    use numbers::random::Random;
 
     fn camera(lens: Lens) -> Intrinsics {
         Intrinsics {

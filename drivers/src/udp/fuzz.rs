@@ -200,7 +200,7 @@ pub(crate) fn example_traffic() -> Vec<Vec<u8>> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use kinematics::random::Random;
+    use numbers::random::Random;
 
     #[test]
     fn corrupted_datagrams_move_no_joint() {

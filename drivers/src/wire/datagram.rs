@@ -645,7 +645,7 @@ fn invalid(reason: String) -> Malformed {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use kinematics::random::Random;
+    use numbers::random::Random;
 
     const HEADER: DatagramHeader = DatagramHeader {
         seq: 7,

@@ -111,7 +111,7 @@ pub fn unknown_fields(bytes: &[u8]) -> Vec<String> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use kinematics::random::Random;
+    use numbers::random::Random;
 
     #[test]
     fn joint_states_round_trip_exactly() {

@@ -14,8 +14,8 @@
 
 use keyframe::DepthMap;
 use kinematics::Stamp;
-use kinematics::quantile::{Rank, quantile};
 use nalgebra::{Matrix3, Point3, Vector3};
+use numbers::quantile::{Rank, quantile};
 use viz::{ObservationMap, ObservedCell};
 
 /// Number of cells along the longest side of the grid. With more cells, the map is sharper, but

@@ -3,8 +3,8 @@
 use crate::evaluate;
 use capture::downscale;
 use keyframe::Keyframe;
-use kinematics::f32s_of;
-use kinematics::quantile::trimmed_range;
+use numbers::f32s_of;
+use numbers::quantile::trimmed_range;
 use report::inline_picture::{data_uri, fit_size};
 use std::sync::Arc;
 use std::time::{Duration, Instant};

@@ -1,7 +1,7 @@
 //! GPU time of the kernels of a training step.
 
 use gpu::PassTiming;
-use kinematics::quantile::median;
+use numbers::quantile::median;
 use std::collections::BTreeMap;
 use std::time::{Duration, Instant};
 use trainer::Method;

@@ -2,8 +2,8 @@
 
 use drivers::recording::{RIG_FILE, Recording};
 use drivers::{Image, Sample, Source};
-use kinematics::quantile::median;
 use kinematics::{JointHistory, PoseHistory, Stamp};
+use numbers::quantile::median;
 use std::path::Path;
 use std::time::Duration;
 

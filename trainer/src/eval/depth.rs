@@ -108,8 +108,9 @@ pub fn surface_error(
 #[cfg(test)]
 mod tests {
     use super::*;
-    use kinematics::{Transform, f32_of};
+    use kinematics::Transform;
     use nalgebra::Vector3;
+    use numbers::f32_of;
 
     fn measured(depth_m: Vec<f32>) -> DepthMap {
         DepthMap {

@@ -208,7 +208,7 @@ fn gaussian() -> [f32; WINDOW] {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use kinematics::random::Random;
+    use numbers::random::Random;
 
     /// A picture of reproducible noise.
     fn noise(n_pixels: usize, seed: u64) -> Vec<u8> {

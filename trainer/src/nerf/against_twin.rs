@@ -16,8 +16,8 @@ use crate::mismatches::Mismatches;
 use crate::optim::reference::{Adam, Moments};
 use gpu::testing::test_gpu_with;
 use gpu::{Buffer, Gpu, GpuOptions, Passes};
-use kinematics::{f32_of, f32s_of};
 use model_files::contraction::contract;
+use numbers::{f32_of, f32s_of};
 
 /// Enough rays for more samples than one partial sum covers.
 const N_RAYS: u32 = 90;

@@ -12,9 +12,9 @@ use crate::Error;
 use crate::model_options::ModelOptions;
 use calibration::ParamSet;
 use gpu::{Gpu, PassTiming, PendingRead};
-use kinematics::random::{hash, unit_from_bits};
-use kinematics::{f32_of, f32s_of};
 use nalgebra::Vector3;
+use numbers::random::{hash, unit_from_bits};
+use numbers::{f32_of, f32s_of};
 use std::sync::Arc;
 use std::time::Instant;
 

@@ -2,10 +2,10 @@
 
 use crate::view::Camera;
 use keyframe::{Keyframe, Shutter};
-use kinematics::quantile::{Rank, quantile, trimmed_range};
 use kinematics::{Transform, Twist};
 use model_files::Aabb;
 use nalgebra::{Matrix3, Matrix4, Point3, Vector3};
+use numbers::quantile::{Rank, quantile, trimmed_range};
 use serde::{Deserialize, Serialize};
 
 /// Depth readings per keyframe that are used to estimate the extent. The extent is a quantile over

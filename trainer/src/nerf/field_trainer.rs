@@ -20,8 +20,8 @@ use crate::view::{Camera, ErasedSpace};
 use crate::{Error, Rendered};
 use calibration::{EMBEDDING_DIM, ParamSet};
 use gpu::{Buffer, Gpu, PassTiming, Passes, PendingRead};
-use kinematics::f32_of;
-use kinematics::random::{hash, unit_from_bits};
+use numbers::f32_of;
+use numbers::random::{hash, unit_from_bits};
 use rayon::prelude::*;
 use std::sync::Arc;
 

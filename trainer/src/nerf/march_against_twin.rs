@@ -10,8 +10,8 @@ use crate::mismatches::Mismatches;
 use crate::random::F32Random;
 use gpu::Passes;
 use gpu::testing::test_gpu;
-use kinematics::{f32_of, f32s_of};
 use model_files::contraction::contract;
+use numbers::{f32_of, f32s_of};
 
 const N_CELLS: u32 = 64;
 /// More rays than a workgroup scans at once.

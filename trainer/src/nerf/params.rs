@@ -1,7 +1,7 @@
 //! Small structs that kernels read, with the layouts of their WGSL counterparts.
 
 use super::reference::grid::GridShape;
-use kinematics::f32_of;
+use numbers::f32_of;
 
 /// `Batch` of `shared/ray_batch.wgsl`.
 #[repr(C)]

@@ -5,9 +5,9 @@ use super::extent::Extent;
 use super::params;
 use crate::view::depth_in_color_view;
 use keyframe::Keyframe;
-use kinematics::random::{hash, unit_from_bits};
-use kinematics::{f32_of, f32s_of};
 use nalgebra::Vector3;
+use numbers::random::{hash, unit_from_bits};
+use numbers::{f32_of, f32s_of};
 use rayon::prelude::*;
 use std::sync::{Arc, OnceLock};
 

@@ -5,8 +5,9 @@ use super::kernel;
 use crate::view::{Camera, LOW_PASS_PX2};
 use crate::{Error, RenderRequest};
 use gpu::{Buffer, Gpu, Passes, Pipeline};
-use kinematics::{Transform, f32s_of};
+use kinematics::Transform;
 use nalgebra::{Rotation3, Translation3, UnitQuaternion, Vector3};
+use numbers::f32s_of;
 use std::f64::consts::{FRAC_PI_2, PI};
 use std::sync::Arc;
 

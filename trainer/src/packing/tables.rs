@@ -140,7 +140,7 @@ pub(super) fn transform_tables(quality: u8) -> Vec<f32> {
     basis
         .chain(reciprocals)
         .chain(positions)
-        .map(kinematics::f32_of)
+        .map(numbers::f32_of)
         .collect()
 }
 

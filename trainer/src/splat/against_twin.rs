@@ -17,9 +17,10 @@ use calibration::ParamSet;
 use gpu::testing::test_gpu_with;
 use gpu::{Buffer, Gpu, GpuOptions, Passes};
 use keyframe::{Keyframe, Shutter, Split};
-use kinematics::{Stamp, Transform, Twist, f32_of};
+use kinematics::{Stamp, Transform, Twist};
 use model_files::splat::arrays::SplatArrays;
 use nalgebra::Vector3;
+use numbers::f32_of;
 use std::sync::Arc;
 
 /// Colors are near 1 and f32 has 24 bits of precision; sums of a few dozen terms and `exp` lose a

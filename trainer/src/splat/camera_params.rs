@@ -12,9 +12,10 @@ use crate::Error;
 use calibration::{CameraCorrection, ParamSet, drift_weight};
 use gpu::{Buffer, Gpu, Passes, Pipeline};
 use keyframe::Keyframe;
-use kinematics::{Stamp, Twist, f32_of, f32s_of};
+use kinematics::{Stamp, Twist};
 use model_files::checkpoint::Checkpoint;
 use nalgebra::Vector3;
+use numbers::{f32_of, f32s_of};
 use std::collections::BTreeMap;
 use std::sync::Arc;
 

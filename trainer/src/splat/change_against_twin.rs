@@ -8,8 +8,8 @@ use super::reference::{self, Splat, scene};
 use crate::loss::reference as loss_reference;
 use crate::mismatches::Mismatches;
 use gpu::{Gpu, GpuOptions, Passes};
-use kinematics::f32_of;
 use model_files::splat::arrays::SplatArrays;
+use numbers::f32_of;
 
 /// A small scene of splats with SH degree 3 and with values that f32 represents exactly.
 fn full_degree_scene(seed: u64, n: usize) -> Vec<Splat> {

@@ -7,13 +7,14 @@ use crate::method_entry::{ExportRequest, ExportWriter};
 use crate::{ChunkLayout, Error, Method, ModelKind, ModelOptions, Picture};
 use gpu::Gpu;
 use gpu::testing::test_gpu;
-use kinematics::random::Random;
-use kinematics::{Transform, f32_of};
+use kinematics::Transform;
 use model_files::Aabb;
 use model_files::edits::{Edit, Edits};
 use model_files::splat::arrays::SplatArrays;
 use model_files::splat::{file, ply};
 use nalgebra::Vector3;
+use numbers::f32_of;
+use numbers::random::Random;
 use std::sync::Arc;
 
 fn gpu() -> Arc<Gpu> {

@@ -3,7 +3,7 @@
 
 use super::options::SplatOptions;
 use super::params::Supervision;
-use kinematics::f32_of;
+use numbers::f32_of;
 
 /// From this number of images on, models are not regularized, and the number of splats is limited
 /// only by the options.

@@ -8,10 +8,10 @@
 use super::bounds::bounds;
 use crate::Bounds;
 use crate::floaters::{CellLabels, CellMask, Floaters, Groups};
-use kinematics::f32_of;
 use model_files::edits::CellGrid;
 use model_files::splat::arrays::SplatArrays;
 use nalgebra::{Quaternion, UnitQuaternion, Vector3};
+use numbers::f32_of;
 
 /// Cells along an axis: cells within the radius of the scene are 2 % of it wide. Smaller cells
 /// separate parts that are only loosely connected, such as thin objects. Larger ones join floaters

@@ -96,8 +96,8 @@ fn separate(points: &[[f32; 3]], range: &mut [u32], axis: usize) {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use kinematics::f32_of;
-    use kinematics::random::Random;
+    use numbers::f32_of;
+    use numbers::random::Random;
 
     /// Relative; sums of three numbers in another order.
     const TOLERANCE: f64 = 1e-12;

@@ -6,9 +6,10 @@ use super::training_tests::{keyframes, options, test_psnr, train};
 use crate::Method;
 use gpu::testing::test_gpu;
 use keyframe::{DepthMap, Keyframe};
-use kinematics::{Stamp, Transform, Twist, f32_of};
+use kinematics::{Stamp, Transform, Twist};
 use model_files::splat::cloud::synthetic_cloud;
 use nalgebra::{Point3, Vector3};
+use numbers::f32_of;
 use std::sync::Arc;
 
 /// Trains on valid and corrupted keyframes. The result must be about as good as with the valid

@@ -8,11 +8,11 @@
 use super::nearest::mean_spacings_m;
 use super::views::FAR_M;
 use keyframe::{DepthMap, Keyframe};
-use kinematics::random::Random;
-use kinematics::{f32_of, f32s_of};
 use model_files::InitialPoints;
 use model_files::splat::arrays::SplatArrays;
 use nalgebra::{Matrix3, Point3, Rotation3, UnitQuaternion, Vector3};
+use numbers::random::Random;
+use numbers::{f32_of, f32s_of};
 use rayon::prelude::*;
 use std::collections::HashSet;
 use std::sync::Arc;

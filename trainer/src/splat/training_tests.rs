@@ -11,11 +11,12 @@ use calibration::{CameraRefinement, ParamSet};
 use gpu::Gpu;
 use gpu::testing::test_gpu;
 use keyframe::{DepthMap, Keyframe, Split};
-use kinematics::{Stamp, Transform, f32s_of};
+use kinematics::{Stamp, Transform};
 use model_files::splat::arrays::SplatArrays;
 use model_files::splat::cloud::synthetic_cloud;
 use model_files::{Aabb, InitialPoints};
 use nalgebra::{Point3, Vector3};
+use numbers::f32s_of;
 use std::sync::Arc;
 
 const SIZE_PX: [u32; 2] = [96, 80];

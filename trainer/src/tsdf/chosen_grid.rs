@@ -5,8 +5,8 @@ use super::capacity::BYTES_PER_BLOCK;
 use super::options::TsdfOptions;
 use keyframe::DepthMap;
 use kinematics::Transform;
-use kinematics::quantile::{Rank, quantile};
 use nalgebra::{Matrix4, Translation3, UnitQuaternion};
+use numbers::quantile::{Rank, quantile};
 use serde::{Deserialize, Serialize};
 
 /// Range of automatically chosen voxel sizes, meters. It protects against a first image that is not

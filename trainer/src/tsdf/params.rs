@@ -4,7 +4,7 @@ use super::chosen_grid::VoxelGrid;
 use crate::view::rows_of;
 use calibration::CalibratedCamera;
 use keyframe::Keyframe;
-use kinematics::{f32_of, f32s_of};
+use numbers::{f32_of, f32s_of};
 
 /// `Field` of `shared/field.wgsl`.
 #[repr(C)]

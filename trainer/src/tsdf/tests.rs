@@ -6,12 +6,13 @@ use crate::{Error, Method, ModelKind, ModelOptions, Picture, Projection, RenderR
 use gpu::Gpu;
 use gpu::testing::test_gpu;
 use keyframe::Keyframe;
-use kinematics::quantile::{Rank, quantile};
-use kinematics::random::Random;
-use kinematics::{Stamp, Transform, f32_of};
+use kinematics::{Stamp, Transform};
 use model_files::Aabb;
 use model_files::checkpoint::Checkpoint;
 use nalgebra::{Point3, Vector3};
+use numbers::f32_of;
+use numbers::quantile::{Rank, quantile};
+use numbers::random::Random;
 use std::sync::Arc;
 
 pub(super) fn gpu() -> Arc<Gpu> {

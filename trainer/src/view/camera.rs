@@ -2,8 +2,9 @@
 
 use crate::RenderRequest;
 use keyframe::Shutter;
-use kinematics::{Transform, f32_of, f32s_of};
+use kinematics::Transform;
 use model_files::{Aabb, Edits};
+use numbers::{f32_of, f32s_of};
 use std::sync::Arc;
 
 /// Edge of a tile, pixels, as in Kerbl et al. 2023. Larger tiles sort fewer entries; in smaller

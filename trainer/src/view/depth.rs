@@ -6,9 +6,9 @@
 )]
 
 use keyframe::{DepthMap, Keyframe};
-use kinematics::f32_of;
-use kinematics::quantile::{Rank, quantile};
 use nalgebra::Point3;
+use numbers::f32_of;
+use numbers::quantile::{Rank, quantile};
 use std::sync::Arc;
 
 /// Median of the depth of a keyframe, meters; `None` without depth.

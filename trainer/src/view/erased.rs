@@ -2,10 +2,10 @@
 
 use crate::Error;
 use gpu::{Buffer, Gpu, Passes};
-use kinematics::{f32_of, f32s_of};
 use model_files::edits::{CellGrid, CellSet, Edit};
 use model_files::{Aabb, Edits};
 use nalgebra::{Matrix4, Vector3};
+use numbers::{f32_of, f32s_of};
 use std::sync::Arc;
 
 /// Words of an edit in [`words`], in groups of four: three rows of a transform, and two groups that

@@ -143,7 +143,7 @@ fn check_subscription(subscriptions: &mut Subscriptions, message: SubscribeMessa
 #[cfg(test)]
 mod tests {
     use super::check_messages;
-    use kinematics::random::Random;
+    use numbers::random::Random;
     use std::path::Path;
 
     /// The seeds of the fuzz target, unchanged and with changed, removed and repeated bytes.

@@ -148,7 +148,7 @@ fn symbol(code: u16, predicted: u16) -> Option<u8> {
 pub(crate) mod tests {
     use super::{CompactDepth, ESCAPE, Effort, compress};
     use flate2::read::ZlibDecoder;
-    use kinematics::random::Random;
+    use numbers::random::Random;
     use std::io::Read;
     use trainer::PackedDepth;
 

@@ -236,8 +236,8 @@ mod tests {
     use super::{KeyframeListUpdate, KeyframeLog, ListPosition, MAX_REMOVALS};
     use crate::client::protocol::MAX_CHANGED_KEYFRAMES;
     use crate::topics::updates::KeyframePose;
-    use kinematics::random::Random;
     use kinematics::{Stamp, Transform};
+    use numbers::random::Random;
     use serde_json::Value;
     use std::collections::BTreeMap;
 

@@ -80,7 +80,7 @@ fn camera_image(stamp: i64) -> LiveImage {
         appearance_of: None,
         depth: false,
     };
-    let mut random = kinematics::random::Random::new(u64::try_from(stamp).expect("positive"));
+    let mut random = numbers::random::Random::new(u64::try_from(stamp).expect("positive"));
     let mut rgba = analytic_scene::draw(&request).rgba_srgb;
     for value in &mut rgba {
         *value = value.saturating_add(u8::try_from(random.below(9)).expect("small"));

@@ -3,7 +3,7 @@
 use crate::slow::{Counter, Slow};
 use crate::tls;
 use crate::tls::TIMEOUT;
-use kinematics::random::Random;
+use numbers::random::Random;
 use serde_json::{Value, json};
 use std::io::{Read, Write};
 use std::net::{SocketAddr, TcpStream};

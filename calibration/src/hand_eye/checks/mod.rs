@@ -129,7 +129,7 @@ fn check_magnitudes(samples: &[HandEyeSample]) -> Result<(), Refusal> {
         .collect();
     // The median, because single positions may be wrong for other reasons.
     for (name, values) in [("base_from_flange", robot), ("the board", board)] {
-        let median = kinematics::quantile::median(&values).unwrap_or(0.0);
+        let median = numbers::quantile::median(&values).unwrap_or(0.0);
         if median > MAX_POSITION_M {
             return Err(Refusal::new(
                 format!(

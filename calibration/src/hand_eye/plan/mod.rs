@@ -284,7 +284,7 @@ mod tests {
     use super::super::{BoardObservation, HandEyeSample, calibrate_hand_eye};
     use super::*;
     use kinematics::Chain;
-    use kinematics::random::Random;
+    use numbers::random::Random;
 
     const PANDA: &str = include_str!("../../../../rigs/robots/panda.urdf");
     const START: [f64; 7] = [0.0, -0.3, 0.0, -2.2, 0.0, 2.2, 0.8];

@@ -10,9 +10,9 @@ use super::super::report::HandEyeCalibration;
 use super::super::samples::used;
 use super::super::solve::{self, Measurement};
 use super::super::{HandEyeInput, Setup};
-use kinematics::random::Random;
 use kinematics::{Chain, Intrinsics, Transform};
 use nalgebra::{DMatrix, Matrix6, Point3, Translation3, UnitQuaternion, Vector3, Vector6};
+use numbers::random::Random;
 
 /// Distance that configurations keep from the limits of the joints, radians or meters. Some
 /// controllers stop an arm shortly before its limits.

@@ -399,7 +399,7 @@ fn median_tip_rotation_rad(samples: &[HandEyeSample], chain: &Chain, factor: f64
         .iter()
         .map(|rotation| rotation.angle_to(&rotations[0]))
         .collect();
-    kinematics::quantile::median(&angles).unwrap_or(0.0)
+    numbers::quantile::median(&angles).unwrap_or(0.0)
 }
 
 /// Rejects joint values that do not explain the motion of the flange.

@@ -11,11 +11,11 @@ use crate::intrinsics::board_pose::{NormalEquations, moved, residual};
 use crate::intrinsics::homography;
 use crate::least_squares::{self, BlockSums, Loss};
 use crate::{BoardPoint, BoardView};
-use kinematics::random::Random;
 use kinematics::{Intrinsics, Transform};
 use nalgebra::{
     DVector, Matrix2, Matrix2x3, Matrix3, Matrix6, Rotation3, UnitQuaternion, Vector2, Vector3,
 };
+use numbers::random::Random;
 
 /// Minimum number of corners for a pose: a homography has eight parameters, and a corner two
 /// coordinates.
@@ -399,7 +399,7 @@ fn inlier_limit(errors: &[f64]) -> f64 {
     const DEVIATIONS: f64 = 4.5;
     /// Deviations of corners within an image are not normal. Below this, none counts as wrong.
     const MIN_PX: f64 = 0.5;
-    let median = kinematics::quantile::median(errors).unwrap_or(0.0);
+    let median = numbers::quantile::median(errors).unwrap_or(0.0);
     (DEVIATIONS * median / MEDIAN_OF_NORM).max(MIN_PX)
 }
 

@@ -12,11 +12,11 @@
 use super::super::geometry::{self, Solution, nearest_rotation};
 use super::super::samples::{Sample, used};
 use kinematics::Transform;
-use kinematics::random::Random;
 use nalgebra::{
     DMatrix, DVector, Matrix3, Quaternion, SMatrix, SVector, SymmetricEigen, Translation3,
     UnitQuaternion, Vector3,
 };
+use numbers::random::Random;
 
 /// An initial solution.
 #[derive(Clone, Debug)]
@@ -31,7 +31,7 @@ pub(crate) struct Consensus {
 impl Consensus {
     /// Median distance of the samples, meters.
     pub(crate) fn median_m(&self) -> f64 {
-        kinematics::quantile::median(&self.distances_m).unwrap_or(f64::INFINITY)
+        numbers::quantile::median(&self.distances_m).unwrap_or(f64::INFINITY)
     }
 
     /// Chooses the candidates, and excludes the samples that disagree with the solution.

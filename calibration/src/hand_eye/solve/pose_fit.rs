@@ -319,7 +319,7 @@ fn median_sigma(residuals: &[Vector6<f64>], first: usize) -> f64 {
         .iter()
         .map(|residual| residual.fixed_rows::<3>(first).norm())
         .collect();
-    (kinematics::quantile::median(&norms).unwrap_or(0.0) / MEDIAN_OF_NORM).max(MIN)
+    (numbers::quantile::median(&norms).unwrap_or(0.0) / MEDIAN_OF_NORM).max(MIN)
 }
 
 /// Derivatives of the covariance of a residual with respect to the variances, in the order of

@@ -5,8 +5,8 @@ use super::moving_camera::MovingCamera;
 use crate::registration::pairs::{Pair, spread_evenly};
 use keyframe::Keyframe;
 use kinematics::Transform;
-use kinematics::quantile::median;
 use nalgebra::Vector3;
+use numbers::quantile::median;
 use rayon::prelude::*;
 
 /// Maximum angle between the viewing directions of a pair, radians. Corners look too different

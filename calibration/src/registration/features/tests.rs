@@ -1,7 +1,7 @@
 use super::*;
 use crate::scenes::{Miscalibration, capture, remaining, wrong_extrinsics};
-use kinematics::random::Random;
 use nalgebra::Vector3;
+use numbers::random::Random;
 
 const EXTRINSICS: ParamSet = ParamSet::EXTRINSICS;
 

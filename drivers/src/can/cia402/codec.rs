@@ -364,7 +364,7 @@ fn checked_count(
 mod tests {
     use super::*;
     use crate::wire::can::canopen::{Node, encode_write};
-    use kinematics::random::Random;
+    use numbers::random::Random;
 
     const ALL: [State; 8] = [
         State::NotReadyToSwitchOn,

@@ -454,7 +454,7 @@ fn encode_thousandths(field: &'static str, value: f64) -> Result<[u8; 2], CanErr
 mod tests {
     use super::*;
     use crate::wire::can::testing::{random_frames, truncated_and_doubled};
-    use kinematics::random::Random;
+    use numbers::random::Random;
 
     const NODE: Node = Node(1);
 

@@ -96,7 +96,7 @@ fn length_prefix(datagram: &[u8]) -> [u8; 2] {
 mod tests {
     use super::*;
     use crate::franka::emulated::fuzz::seeds::state_datagrams;
-    use kinematics::random::Random;
+    use numbers::random::Random;
 
     #[test]
     fn corrupted_states_move_no_joint() {

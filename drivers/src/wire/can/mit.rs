@@ -190,7 +190,7 @@ fn low_twelve(first: u8, second: u8) -> u16 {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use kinematics::random::Random;
+    use numbers::random::Random;
 
     const LIMITS: Limits = Limits::of(12.5, 30.0, 10.0);
 

@@ -143,7 +143,7 @@ pub(crate) fn eight_bytes(
 #[cfg(test)]
 pub(crate) mod testing {
     use super::{Frame, Id};
-    use kinematics::random::Random;
+    use numbers::random::Random;
 
     /// Frames of random format, identifier, length and bytes; every fourth has the identifier `id`.
     pub(crate) fn random_frames(seed: u64, id: Id) -> impl Iterator<Item = Frame> {

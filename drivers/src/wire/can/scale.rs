@@ -75,7 +75,7 @@ impl Scale {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use kinematics::random::Random;
+    use numbers::random::Random;
 
     #[test]
     fn counts_round_trip_and_values_within_half_a_step() {

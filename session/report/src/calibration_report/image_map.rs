@@ -180,8 +180,8 @@ impl ImageMap {
             .collect();
         // A quantile instead of the maximum, so that one wrong corner does not make all other
         // arrows too short to see.
-        let rank = kinematics::quantile::Rank::Nearest;
-        let long_px = kinematics::quantile::quantile(&mut lengths, 0.95, rank).unwrap_or(0.0);
+        let rank = numbers::quantile::Rank::Nearest;
+        let long_px = numbers::quantile::quantile(&mut lengths, 0.95, rank).unwrap_or(0.0);
         let magnification =
             round_down(LONG_FRAC * self.size_px[0].max(self.size_px[1]) / long_px.max(1e-9));
         let stride = points.len().div_ceil(MAX_ARROWS).max(1);

@@ -50,7 +50,7 @@ fn write_to(file: &mut impl Write, mesh: &Mesh) -> std::io::Result<()> {
             if is_far {
                 file.write_all(&along.to_le_bytes())?;
             } else {
-                file.write_all(&kinematics::f32_of(along).to_le_bytes())?;
+                file.write_all(&numbers::f32_of(along).to_le_bytes())?;
             }
         }
         for along in mesh.normals[ix] {

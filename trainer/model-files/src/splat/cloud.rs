@@ -2,9 +2,9 @@
 
 use crate::Error;
 use crate::splat::arrays::SplatArrays;
-use kinematics::random::Random;
 use npyz::npz::file_name_from_array_name;
 use npyz::{NpyFile, Order};
+use numbers::random::Random;
 use std::fs::File;
 use std::io::{self, BufReader};
 use std::path::Path;

@@ -8,7 +8,7 @@ use super::ray::{self, Sample, Target, Weights};
 use crate::random::F32Random;
 
 fn rounded(value: f64) -> f64 {
-    f64::from(kinematics::f32_of(value))
+    f64::from(numbers::f32_of(value))
 }
 
 pub(crate) const EMBEDDING_DIM: usize = 3;

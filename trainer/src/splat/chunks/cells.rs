@@ -144,7 +144,7 @@ mod tests {
     use super::{
         Cell, MAX_SPLATS, MAX_SPLATS_KEPT, MAX_SPLATS_MERGED, N_LEVELS, leaves, location_codes,
     };
-    use kinematics::random::Random;
+    use numbers::random::Random;
     use std::collections::BTreeMap;
 
     #[expect(clippy::cast_possible_truncation, reason = "random positions")]

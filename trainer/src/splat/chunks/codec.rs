@@ -1,8 +1,8 @@
 //! Encodes splats in 16 bytes each, and their view-dependent color in another 16.
 
 use crate::model_chunks::{ChunkData, ChunkLayout};
-use kinematics::f32_of;
 use model_files::splat::arrays::SplatArrays;
+use numbers::f32_of;
 use std::f64::consts::FRAC_1_SQRT_2;
 use std::ops::Range;
 

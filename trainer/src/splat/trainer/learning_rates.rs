@@ -5,7 +5,7 @@ use crate::splat::options::SplatOptions;
 use crate::splat::params::Rule;
 use crate::splat::schedule::Schedule;
 use crate::splat::snapshot::ObservedScene;
-use kinematics::f32_of;
+use numbers::f32_of;
 
 // The rates and Adam's parameters are those of Kerbl et al. 2023 and its reference implementation.
 

@@ -15,8 +15,9 @@ use crate::{CorrectedKeyframe, Error};
 use calibration::{Alignment, CameraCorrection, ParamSet};
 use gpu::Gpu;
 use keyframe::{DepthMap, Keyframe};
-use kinematics::{Intrinsics, Lens, Transform, f32s_of};
+use kinematics::{Intrinsics, Lens, Transform};
 use nalgebra::{Point3, Quaternion, UnitQuaternion, Vector3};
+use numbers::f32s_of;
 use rayon::prelude::*;
 use std::sync::Arc;
 
@@ -292,7 +293,7 @@ mod tests {
     use crate::splat::{SplatOptions, SplatTrainer};
     use calibration::scenes::{Miscalibration, capture, wrong_extrinsics};
     use gpu::testing::test_gpu;
-    use kinematics::quantile::{Rank, quantile};
+    use numbers::quantile::{Rank, quantile};
 
     /// Median distance of the splats from the depth readings of these keyframes, meters along z.
     fn surface_error_m(trainer: &mut SplatTrainer, keyframes: &[Arc<Keyframe>]) -> f64 {

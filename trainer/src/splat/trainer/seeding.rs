@@ -6,9 +6,9 @@ use crate::splat::options::SplatOptions;
 use crate::splat::seed::{Density, Seeder};
 use crate::splat::snapshot::ObservedScene;
 use keyframe::Keyframe;
-use kinematics::quantile::{Rank, quantile};
 use model_files::InitialPoints;
 use model_files::splat::arrays::SplatArrays;
+use numbers::quantile::{Rank, quantile};
 use std::sync::Arc;
 
 /// Maximum share of the splat limit for the seeds of one image, so that enough remains for the

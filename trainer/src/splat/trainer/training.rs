@@ -22,8 +22,8 @@ use crate::splat::work_counts::WorkCounts;
 use calibration::CameraCorrection;
 use gpu::{Gpu, PassTiming};
 use keyframe::Keyframe;
-use kinematics::f32_of;
 use model_files::splat::arrays::SplatArrays;
+use numbers::f32_of;
 use std::collections::BTreeMap;
 use std::sync::Arc;
 use std::time::Instant;
@@ -517,7 +517,7 @@ mod tests {
         let training = &trainer.training;
         assert_eq!(training.model.splats.n_splats, N_COVERING);
         let center = keyframe.world_from_camera * nalgebra::Point3::new(0.0, 0.0, 0.3);
-        let [x, y, z] = kinematics::f32s_of(center.coords.into());
+        let [x, y, z] = numbers::f32s_of(center.coords.into());
         let (gpu, splats) = (&training.recorder.gpu, &training.model.splats);
         gpu.write(&splats.means, 0, bytemuck::cast_slice(&[[x, y, z, 0.0]; N]));
         gpu.write(

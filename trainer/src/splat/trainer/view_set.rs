@@ -8,7 +8,7 @@ use crate::splat::options::SplatOptions;
 use crate::splat::views::{self, Keep, Level, LevelImages, Order, TrainView};
 use gpu::{Buffer, Gpu};
 use keyframe::Keyframe;
-use kinematics::f32_of;
+use numbers::f32_of;
 use rayon::prelude::*;
 use std::collections::BTreeSet;
 use std::ops::Range;

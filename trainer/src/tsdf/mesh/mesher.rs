@@ -3,10 +3,10 @@
 use crate::tsdf::block::{BLOCK_EDGE, GridCoord};
 use crate::tsdf::chosen_grid::VoxelGrid;
 use crate::tsdf::params::MeshVertex;
-use kinematics::f32_of;
 use model_files::Edits;
 use model_files::mesh::Mesh;
 use nalgebra::Vector3;
+use numbers::f32_of;
 use rayon::prelude::*;
 use std::collections::{BTreeMap, BTreeSet, HashMap};
 use std::sync::Arc;

@@ -165,7 +165,7 @@ fn check(limits: &Limits, before: &CommandedJoints, now: &CommandedJoints) {
 mod tests {
     use super::seeds::example_traffic;
     use super::*;
-    use kinematics::random::Random;
+    use numbers::random::Random;
 
     #[test]
     fn only_a_started_motion_moves_joints() {

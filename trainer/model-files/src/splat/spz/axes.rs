@@ -179,7 +179,7 @@ mod tests {
     /// The color in a direction equals the color of the flipped splat in the flipped direction.
     #[test]
     fn colors_follow_the_flip() {
-        let mut random = kinematics::random::Random::new(5);
+        let mut random = numbers::random::Random::new(5);
         let mut coefficients: Vec<[f64; 3]> = (0..16)
             .map(|_| std::array::from_fn(|_| random.normal()))
             .collect();

@@ -34,7 +34,7 @@ pub fn median(values: &[f64]) -> Option<f64> {
 /// The quantile at `frac`, from 0 to 1. `None` if there are no values. Reorders the values.
 ///
 /// ```
-/// use kinematics::quantile::{Rank, quantile};
+/// use numbers::quantile::{Rank, quantile};
 ///
 /// let mut values = [4.0, 1.0, 3.0, 2.0];
 /// assert_eq!(quantile(&mut values, 0.5, Rank::Lower), Some(2.0));
