@@ -1,6 +1,7 @@
 //! Datasets on disk: posed photos in nerfstudio and TUM RGB-D folders.
 
 pub mod nerfstudio;
+mod other_formats;
 mod posed_image;
 pub mod tum;
 
@@ -51,6 +52,14 @@ pub fn is_dataset_folder(path: &Path) -> bool {
 
 /// Reads a dataset folder of either kind; `path` may also name a `transforms.json`.
 pub fn read(path: &Path) -> Result<Dataset, Error> {
+    if path.is_file()
+        && let Some(hint) = other_formats::hint(path)
+    {
+        return Err(Error::DatasetFile {
+            path: path.to_owned(),
+            reason: format!("{}{hint}", nerfstudio::OTHER_FILE),
+        });
+    }
     if is_nerfstudio(path) {
         return nerfstudio::read(path);
     }
@@ -59,6 +68,7 @@ pub fn read(path: &Path) -> Result<Dataset, Error> {
     }
     Err(Error::NotADataset {
         path: path.to_owned(),
+        hint: other_formats::hint(path).unwrap_or_default(),
     })
 }
 
