@@ -176,10 +176,7 @@ impl Drop for FrankaArm {
 
 /// Waits for the first state of a controller that has accepted the connection, and returns it with
 /// its source address.
-fn first_state(
-    address: &str,
-    connection: &Connection,
-) -> Result<(SocketAddr, RobotState), Error> {
+fn first_state(address: &str, connection: &Connection) -> Result<(SocketAddr, RobotState), Error> {
     let Connection { network, version } = connection;
     let deadline = clock::now() + MAX_SILENCE;
     let mut buffer = [0; MAX_STATE_BYTES];
@@ -468,6 +465,12 @@ impl StateReader {
 mod tests {
     use super::super::tests::{TEST_TIMEOUT, config, robot, swinging_joints_at};
     use super::*;
+
+    #[test]
+    fn maximum_silence_is_documented() {
+        let row = format!("| Franka arm | {} s |", MAX_SILENCE.as_secs());
+        assert!(include_str!("../../../docs/reference/rig.md").contains(&row));
+    }
 
     #[test]
     fn stalled_thread_does_not_shift_stamps() {
