@@ -114,9 +114,9 @@ fn implausible_lens(intrinsics: &Intrinsics) -> Option<String> {
 fn named_coefficients(lens: &Lens) -> String {
     const BROWN_CONRADY: [&str; 8] = ["k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"];
     const KANNALA_BRANDT: [&str; 4] = ["k1", "k2", "k3", "k4"];
-    let names = match lens {
-        Lens::KannalaBrandt(_) => &KANNALA_BRANDT[..],
-        Lens::Pinhole | Lens::BrownConrady(_) | Lens::RationalBrownConrady(_) => &BROWN_CONRADY[..],
+    let names: &[&str] = match lens {
+        Lens::KannalaBrandt(_) => &KANNALA_BRANDT,
+        Lens::Pinhole | Lens::BrownConrady(_) | Lens::RationalBrownConrady(_) => &BROWN_CONRADY,
     };
     let named: Vec<String> = std::iter::zip(names, lens.coefficients())
         .filter(|(_, value)| **value != 0.0)
