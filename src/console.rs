@@ -7,6 +7,7 @@ use parking_lot::Mutex;
 use serde::Serialize;
 use session::next_commands::{self, SavedModel};
 use session::{FinishedModel, Limits, Observer, ReadProgress, SessionEvent};
+use std::time::{Duration, Instant};
 
 /// What is printed about a session.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -157,6 +158,41 @@ fn whole_secs(secs: f64) -> u64 {
     secs as u64
 }
 
+/// Lines about progress, for outputs that are not a terminal and show no progress bar.
+pub(crate) struct ProgressLines {
+    is_shown: bool,
+    n_last: usize,
+    last_at: Instant,
+}
+
+impl ProgressLines {
+    /// Few enough lines for a log of an hour.
+    const PERIOD: Duration = Duration::from_secs(10);
+
+    /// Lines for work that begins at `now`, in place of a hidden bar.
+    pub(crate) fn new(is_shown: bool, now: Instant) -> Self {
+        Self {
+            is_shown,
+            n_last: 0,
+            last_at: now,
+        }
+    }
+
+    /// Whether a line is due at `now`: more is done than in the last line, at least a period after
+    /// it, and something remains.
+    pub(crate) fn is_due(&mut self, n_done: usize, n_all: usize, now: Instant) -> bool {
+        let is_due = self.is_shown
+            && n_done > self.n_last
+            && n_done < n_all
+            && now.duration_since(self.last_at) >= Self::PERIOD;
+        if is_due {
+            self.n_last = n_done;
+            self.last_at = now;
+        }
+        is_due
+    }
+}
+
 /// A progress bar for reading images; cleared when it is dropped.
 pub(crate) struct ReadBar {
     is_hidden: bool,
@@ -212,5 +248,37 @@ fn clear(bar: &mut Option<(&'static str, ProgressBar)>) {
 impl Drop for ReadBar {
     fn drop(&mut self) {
         self.end();
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn progress_lines_are_due_every_ten_seconds_when_something_is_done() {
+        let start = Instant::now();
+        let at = |secs: u64| start + Duration::from_secs(secs);
+        let mut lines = ProgressLines::new(true, start);
+        for (n_done, secs, expected) in [
+            (1, 9, false),
+            (1, 10, true),
+            (2, 12, false),
+            // Nothing is done since the last line.
+            (1, 25, false),
+            (3, 31, true),
+            (4, 40, false),
+            (4, 41, true),
+            // The result follows.
+            (5, 99, false),
+        ] {
+            assert_eq!(
+                lines.is_due(n_done, 5, at(secs)),
+                expected,
+                "{n_done} after {secs} s"
+            );
+        }
+        let mut hidden = ProgressLines::new(false, start);
+        assert!(!hidden.is_due(1, 5, at(60)));
     }
 }

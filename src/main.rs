@@ -32,7 +32,9 @@ fn main() -> ExitCode {
         // New folders get the mode 0700, and new files 0600.
         rustix::process::umask(rustix::fs::Mode::from_raw_mode(0o077));
     }
-    let result = start_threads().and_then(|()| cli.command.run());
+    let result = signals::fail_writes_at_size_limit()
+        .and_then(|()| start_threads())
+        .and_then(|()| cli.command.run());
     if let Err(error) = &result
         && !exit::is_broken_pipe(error)
     {

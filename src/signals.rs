@@ -1,20 +1,24 @@
 //! Signals that end a command: it stops, saves, and exits.
 //!
-//! SIGINT (Ctrl-C), SIGTERM and SIGHUP (the terminal was closed) request an orderly stop. A second
-//! Ctrl-C ends the process at once, and so does SIGQUIT; arms with CAN motors get their fail-safe
-//! command before that. SIGHUP never ends the process at once, because closing a terminal sends it
-//! more than once: from the kernel to the foreground group, and from the shell to its jobs. If
-//! SIGHUP is ignored, as under `nohup`, it stays ignored.
+//! SIGINT (Ctrl-C), SIGTERM, SIGHUP (the terminal was closed) and SIGXCPU (the limit of processor
+//! time was reached) request an orderly stop. A second Ctrl-C ends the process at once, and so does
+//! SIGQUIT; arms with CAN motors get their fail-safe command before that. SIGHUP never ends the
+//! process at once, because closing a terminal sends it more than once: from the kernel to the
+//! foreground group, and from the shell to its jobs. The kernel repeats SIGXCPU every second. If
+//! SIGHUP or SIGXCPU is ignored, as SIGHUP is under `nohup`, it stays ignored.
+//!
+//! SIGXFSZ (a file reached the limit of its size) does not end a command: the write fails instead.
 
 use anyhow::Context;
 use capture::Stop;
 use files::partial;
 use rustix::event::{PollFd, PollFlags, poll};
 use rustix::io::Errno;
-use signal_hook::consts::{SIGHUP, SIGINT, SIGQUIT, SIGTERM};
+use signal_hook::consts::{SIGHUP, SIGINT, SIGQUIT, SIGTERM, SIGXCPU, SIGXFSZ};
 use signal_hook::iterator::Signals;
-use signal_hook::low_level;
+use signal_hook::{flag, low_level};
 use std::os::fd::AsFd;
+use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
@@ -24,8 +28,17 @@ const SIGNAL_EXIT_BASE: i32 = 128;
 /// its group.
 const MIN_BETWEEN: Duration = Duration::from_millis(500);
 
-/// Handles SIGINT, SIGTERM and SIGHUP of a command that saves its results; at most once per
-/// process.
+/// Lets a write beyond the limit of the file size (`ulimit -f`) fail with an error, as on a full
+/// disk. By default, SIGXFSZ would end the process without saving.
+pub(crate) fn fail_writes_at_size_limit() -> anyhow::Result<()> {
+    // Nobody reads the flag: with any handler, the write returns an error.
+    flag::register(SIGXFSZ, Arc::new(AtomicBool::new(false)))
+        .context("cannot install signal handlers")?;
+    Ok(())
+}
+
+/// Handles SIGINT, SIGTERM, SIGHUP and SIGXCPU of a command that saves its results; at most once
+/// per process.
 pub(crate) fn stop_on_signals() -> anyhow::Result<Stop> {
     stop_on_signals_logging("stopping and saving; Ctrl-C again exits at once")
 }
@@ -108,11 +121,12 @@ pub(crate) fn remove_partial_files_on_signals() -> anyhow::Result<()> {
     Ok(())
 }
 
-/// The signals that request a stop; without SIGHUP if it is ignored.
+/// The signals that request a stop; without SIGHUP and SIGXCPU if they are ignored.
 fn termination_signals() -> impl Iterator<Item = i32> {
-    [SIGINT, SIGTERM]
+    let unless_ignored = [SIGHUP, SIGXCPU]
         .into_iter()
-        .chain((!is_ignored(SIGHUP)).then_some(SIGHUP))
+        .filter(|signal| !is_ignored(*signal));
+    [SIGINT, SIGTERM].into_iter().chain(unless_ignored)
 }
 
 /// Whether this process was started with the signal ignored, which Linux reports in `/proc`.

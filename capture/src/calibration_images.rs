@@ -79,6 +79,37 @@ pub struct CalibrationImages {
     pub damage: Option<String>,
 }
 
+impl CalibrationImages {
+    /// How many images are used, and how many are not for each reason.
+    #[must_use]
+    pub fn summary(&self) -> String {
+        let n_used = self.images.len();
+        let n_similar = self
+            .n_read
+            .saturating_sub(n_used + self.n_fast + self.n_unusable);
+        let similar = if n_used < MAX_IMAGES {
+            "similar to a used image".to_owned()
+        } else {
+            format!("similar to a used image or beyond the maximum of {MAX_IMAGES}")
+        };
+        let unused: Vec<String> = [
+            (n_similar, similar.as_str()),
+            (self.n_fast, "during a fast motion of the arm"),
+            (self.n_unusable, "without joint readings or damaged"),
+        ]
+        .into_iter()
+        .filter(|(n, _)| *n > 0)
+        .map(|(n, reason)| format!("{n} {reason}"))
+        .collect();
+        let used = format!("{n_used} of {} images used", self.n_read);
+        if unused.is_empty() {
+            used
+        } else {
+            format!("{used}; not used: {}", unused.join(", "))
+        }
+    }
+}
+
 /// Reads the images of a camera until `on_sample` breaks or the samples end.
 ///
 /// * `max_shift_px`: maximum predicted image motion over readout, exposure and stamp uncertainty,

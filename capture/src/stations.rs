@@ -11,9 +11,10 @@
 use crate::config::{BaseDriver, Parent, Rig};
 use crate::join::Change;
 use background::{Task, run_in_background_pool};
-use calibration::{StationCorrection, register_station};
+use calibration::{MIN_VALIDATION_IMAGES, StationCorrection, register_station};
 use keyframe::{BaseState, Keyframe, Split};
 use kinematics::{Stamp, Transform};
+use messages::counted;
 use serde::Serialize;
 use std::collections::{BTreeSet, VecDeque};
 use std::sync::Arc;
@@ -568,6 +569,13 @@ impl std::fmt::Display for StationReport {
                 "its images do not overlap with earlier ones; the previous correction is kept",
             )?,
             Some(correction) if correction.kept => write!(f, "{correction}")?,
+            // Nothing is known about a gain that is measured on fewer images.
+            Some(correction) if correction.n_validation_images < MIN_VALIDATION_IMAGES => write!(
+                f,
+                "the previous correction is kept, because this one can be checked on {} only, and {MIN_VALIDATION_IMAGES} are needed: \
+                 {correction}",
+                counted(correction.n_validation_images as u64, "validation image")
+            )?,
             Some(correction) => write!(
                 f,
                 "the previous correction is kept, as this one is uncertain or not significant: {correction}"
@@ -743,6 +751,46 @@ mod tests {
             )
         };
         keyframes.iter().map(shown).collect()
+    }
+
+    #[test]
+    fn reason_of_a_rejection_is_stated() {
+        let report = |n_validation_images: usize, kept: bool| {
+            let correction = StationCorrection {
+                translation_m: [0.01, 0.0, 0.0],
+                translation_sigma_m: [0.001; 3],
+                rotation_rad: [0.0; 3],
+                rotation_sigma_rad: [0.001; 3],
+                unobservable: Vec::new(),
+                gain_db: 1.0,
+                standard_error_db: 0.1,
+                n_validation_images,
+                n_pairs: 20,
+                kept,
+            };
+            StationReport {
+                station: 2,
+                n_keyframes: 30,
+                correction: Some(correction),
+                base_error: None,
+            }
+            .to_string()
+        };
+        let too_few = report(MIN_VALIDATION_IMAGES - 1, false);
+        assert!(
+            too_few.contains("can be checked on 3 validation images only, and 4 are needed")
+                && !too_few.contains("not significant"),
+            "{too_few}"
+        );
+        let one = report(1, false);
+        assert!(one.contains("on 1 validation image only"), "{one}");
+        let uncertain = report(MIN_VALIDATION_IMAGES, false);
+        assert!(
+            uncertain.contains("uncertain or not significant"),
+            "{uncertain}"
+        );
+        let kept = report(MIN_VALIDATION_IMAGES, true);
+        assert!(kept.starts_with("base at station 2: moved by"), "{kept}");
     }
 
     #[test]

@@ -306,11 +306,13 @@ pub enum Error {
     },
     /// A folder is not a dataset.
     #[error(
-        "{path:?} is not a dataset: expected transforms.json (nerfstudio) or rgb.txt (TUM RGB-D) in it"
+        "{path:?} is not a dataset: expected transforms.json (nerfstudio) or rgb.txt (TUM RGB-D) in it{hint}"
     )]
     NotADataset {
         /// The folder.
         path: PathBuf,
+        /// The format of another program that was recognized, and what to do; empty if none was.
+        hint: String,
     },
     /// A dataset file is malformed or has invalid contents.
     #[error("{path:?}: {reason}")]

@@ -643,6 +643,15 @@ mod tests {
     }
 
     #[test]
+    fn maximum_silence_is_documented() {
+        let row = format!(
+            "| devices that send over UDP | {} s |",
+            MAX_SILENCE.as_secs()
+        );
+        assert!(include_str!("../../docs/reference/rig.md").contains(&row));
+    }
+
+    #[test]
     fn samples_of_multiple_devices_are_merged_by_stamp() {
         let mut state = State {
             queues: vec![VecDeque::new(); 2],

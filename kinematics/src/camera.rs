@@ -126,15 +126,63 @@ impl Intrinsics {
     /// Returns `None` if the pixel is not finite or if no direction in front of the camera projects
     /// to it.
     pub fn unproject(&self, pixel: [f64; 2]) -> Option<Vector3<f64>> {
-        let distorted = Vector2::new(
-            (pixel[0] - self.principal_px[0]) / self.focal_px[0],
-            (pixel[1] - self.principal_px[1]) / self.focal_px[1],
-        );
+        let distorted = self.distorted_at(pixel);
         if !distorted.iter().all(|value| value.is_finite()) {
             return None;
         }
         let plane = self.lens_in_use().undistort(distorted)?;
         Some(Vector3::new(plane.x, plane.y, 1.0))
+    }
+
+    /// The distorted point of the plane `z = 1` at a pixel.
+    fn distorted_at(&self, pixel: [f64; 2]) -> Vector2<f64> {
+        Vector2::new(
+            (pixel[0] - self.principal_px[0]) / self.focal_px[0],
+            (pixel[1] - self.principal_px[1]) / self.focal_px[1],
+        )
+    }
+
+    /// Fraction of the image, 0 to 1, in which no real lens has these coefficients. There, the
+    /// model is not monotonic, so that no direction projects to the pixel, or the distortion moves
+    /// points outwards to more than 1.5 times their distance from the principal point.
+    pub fn implausible_lens_frac(&self) -> f64 {
+        /// Number of pixels that are examined in each row and column of a grid.
+        const N_PER_SIDE: u32 = 8;
+        if self.is_pinhole() {
+            return 0.0;
+        }
+        let at = |axis: usize, ix: u32| {
+            f64::from(self.size_px[axis]) * (f64::from(ix) + 0.5) / f64::from(N_PER_SIDE)
+        };
+        let mut n_implausible = 0;
+        for row in 0..N_PER_SIDE {
+            for column in 0..N_PER_SIDE {
+                if !self.is_lens_plausible_at([at(0, column), at(1, row)]) {
+                    n_implausible += 1;
+                }
+            }
+        }
+        f64::from(n_implausible) / f64::from(N_PER_SIDE * N_PER_SIDE)
+    }
+
+    /// Whether a real lens may have these coefficients, as far as this pixel shows.
+    fn is_lens_plausible_at(&self, pixel: [f64; 2]) -> bool {
+        // Pincushion distortion of real lenses stays below 1.2. Barrel distortion has no such
+        // limit: wide lenses compress the edge of the image.
+        const MAX_STRETCH: f64 = 1.5;
+        // Almost 90 degrees from the axis.
+        const SIDEWAYS: Vector2<f64> = Vector2::new(1e9, 0.0);
+        let lens = self.lens_in_use();
+        let is_fisheye = matches!(lens, Lens::KannalaBrandt(_));
+        let Some(ray) = self.unproject(pixel) else {
+            // A fisheye may also image directions behind the camera. Its model then rises up to 90
+            // degrees.
+            return is_fisheye && lens.distort(SIDEWAYS).is_some();
+        };
+        // Without distortion, a fisheye is linear in the angle from the axis.
+        let radius = ray.xy().norm();
+        let undistorted_radius = if is_fisheye { radius.atan() } else { radius };
+        self.distorted_at(pixel).norm() <= MAX_STRETCH * undistorted_radius
     }
 
     /// Returns the intrinsics for the image scaled by `frac`. Its size is rounded to whole pixels,
@@ -325,6 +373,43 @@ mod tests {
         let [u, v] = camera.project(&Vector3::new(1.0, 0.5, 2.0)).unwrap();
         assert!((u - (600.0 * x + 321.5)).abs() < 1e-10);
         assert!((v - (580.0 * y + 238.25)).abs() < 1e-10);
+    }
+
+    #[test]
+    fn coefficients_of_no_real_lens_are_implausible() {
+        for lens in lenses() {
+            assert_eq!(camera(lens).implausible_lens_frac(), 0.0, "{lens:?}");
+        }
+        // More than 180 degrees.
+        let wide = Intrinsics {
+            focal_px: [150.0, 150.0],
+            ..camera(Lens::KannalaBrandt([0.0; 4]))
+        };
+        assert_eq!(wide.implausible_lens_frac(), 0.0);
+        for lens in [
+            // Monotonic, but the edge of the image shows directions near its center.
+            Lens::BrownConrady([10.0, 0.0, 0.0, 0.0, 0.0]),
+            // They rise only up to a ring within the image.
+            Lens::BrownConrady([-3.0, 0.0, 0.0, 0.0, 0.0]),
+            Lens::RationalBrownConrady([0.0, 0.0, 0.0, 0.0, 0.0, 10.0, 0.0, 0.0]),
+            Lens::KannalaBrandt([-10.0, 0.0, 0.0, 0.0]),
+            // Overflows.
+            Lens::BrownConrady([1e308; 5]),
+        ] {
+            let implausible_frac = camera(lens).implausible_lens_frac();
+            assert!(implausible_frac > 0.5, "{lens:?}: {implausible_frac}");
+            let rectified = Intrinsics {
+                rectified: true,
+                ..camera(lens)
+            };
+            assert_eq!(rectified.implausible_lens_frac(), 0.0);
+        }
+        // On the small field of view of a long lens, the same coefficient hardly distorts.
+        let narrow = Intrinsics {
+            focal_px: [6000.0, 5800.0],
+            ..camera(Lens::BrownConrady([10.0, 0.0, 0.0, 0.0, 0.0]))
+        };
+        assert_eq!(narrow.implausible_lens_frac(), 0.0);
     }
 
     #[test]

@@ -94,6 +94,20 @@ pub struct RefineSettings {
     pub with_scene: CameraRefinement,
 }
 
+impl RefineSettings {
+    /// All parameters that may be estimated.
+    fn params(&self) -> ParamSet {
+        [&self.align, &self.with_scene]
+            .into_iter()
+            .flat_map(|choice| {
+                [choice.always(), choice.watched()]
+                    .into_iter()
+                    .chain(choice.candidates().iter().copied())
+            })
+            .collect()
+    }
+}
+
 /// Properties of the data that limit which calibration parameters can be estimated.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct AvailableData {
@@ -287,6 +301,27 @@ impl TrainingOptions {
             with_scene,
             ..settings
         })
+    }
+
+    /// On a software adapter: which calibration parameters are not estimated by default, and how to
+    /// request them. `None` if the user has chosen the parameters.
+    #[must_use]
+    pub fn note_on_software_adapter(&self, available: AvailableData) -> Option<String> {
+        if !self.refine.is_empty() {
+            return None;
+        }
+        let on_gpu = available.auto_settings().params();
+        let names: Vec<&str> = Refine::ALL
+            .into_iter()
+            .filter(|(_, param)| on_gpu.intersects(param_set(&[*param])))
+            .map(|(name, _)| name)
+            .collect();
+        Some(format!(
+            "no GPU: errors of the calibration, such as a wrong camera pose, are not estimated ({}), because that takes minutes; \
+             {} auto requests it",
+            names.join(", "),
+            Setting::Refine
+        ))
     }
 
     /// The rig file keys that the flags override.
@@ -506,6 +541,31 @@ mod tests {
             );
         }
         assert_eq!(refining(&[], true, true), Ok(RefineSettings::default()));
+    }
+
+    #[test]
+    fn note_on_software_adapters_names_what_is_not_estimated() {
+        let note = |requested: &[Refine], depth| {
+            TrainingOptions {
+                refine: requested.to_vec(),
+                ..TrainingOptions::default()
+            }
+            .note_on_software_adapter(available(true, depth))
+        };
+        let with_depth = note(&[], true).expect("a note");
+        assert!(
+            with_depth.contains("a wrong camera pose")
+                && with_depth.contains("extrinsics, time-offset, joints")
+                && with_depth.contains("refine auto"),
+            "{with_depth}"
+        );
+        let without = note(&[], false).expect("a note");
+        assert!(
+            without.contains("extrinsics") && !without.contains("joints"),
+            "{without}"
+        );
+        assert_eq!(note(&[Refine::Auto], true), None);
+        assert_eq!(note(&[Refine::None], true), None);
     }
 
     #[test]

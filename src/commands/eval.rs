@@ -1,6 +1,6 @@
 //! `fieldrig eval`: scores a saved model on test images.
 
-use crate::console::ReadBar;
+use crate::console::{ProgressLines, ReadBar};
 use crate::data_args::DataArgs;
 use crate::exit::{self, Exit};
 use crate::open_gpu::open_gpu;
@@ -12,6 +12,7 @@ use session::evaluate::{ImageScores, Scores, warn_if_hardly_covered};
 use session::{Data, Evaluator, Purpose, methods};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
+use std::time::Instant;
 
 /// Flags of `eval`.
 #[derive(Debug, clap::Args)]
@@ -88,8 +89,12 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
         "{bar:30} {elapsed} scored {pos} of {len} images",
         args.json,
     );
+    let mut lines = ProgressLines::new(scored.is_hidden() && !args.json, Instant::now());
     let images = evaluator.score_all(&mut model, tests.iter(), |_, n_scored| {
-        scored.set_position(n_scored as u64)
+        scored.set_position(n_scored as u64);
+        if lines.is_due(n_scored, tests.len(), Instant::now()) {
+            log::info!("scored {n_scored} of {} images", tests.len());
+        }
     })?;
     scored.finish_and_clear();
     // An empty model has its own note, and covers nothing anyway.

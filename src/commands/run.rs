@@ -402,6 +402,10 @@ pub(super) fn start(
         align,
         with_scene: cameras,
     } = training.refining_live(available, gpu.is_software())?;
+    // A resumed run continues with the parameters of the first one.
+    if previous.is_none() {
+        args.training.log_unestimated(available, &gpu);
+    }
     let common = CommonOptions {
         cameras,
         align,

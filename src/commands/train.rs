@@ -486,12 +486,15 @@ impl Args {
         }
         let model_specs = match replay {
             Some(replay) => vec![replay.model_spec()],
-            None => session::model_specs(
-                &self.training.options(),
-                data,
-                self.plan_steps.or(self.steps),
-                gpu.is_software(),
-            )?,
+            None => {
+                self.training.log_unestimated(data.available(), gpu);
+                session::model_specs(
+                    &self.training.options(),
+                    data,
+                    self.plan_steps.or(self.steps),
+                    gpu.is_software(),
+                )?
+            }
         };
         model_specs
             .into_iter()

@@ -180,6 +180,68 @@ fn training_survives_a_closed_terminal_without_sighup() {
 }
 
 #[test]
+fn training_saves_at_the_limit_of_processor_time() {
+    let folder = tempfile::tempdir().unwrap();
+    let folder = folder.path();
+    wall::write(&folder.join("data"), true, 0.0);
+    let args = [
+        "train",
+        "data",
+        "--seconds",
+        "60",
+        "--max-splats",
+        "600",
+        "--out",
+        "out",
+    ];
+    let mut run = OnTerminal::start(folder, &args, false);
+    run.wait_for("step");
+    // The kernel sends it every second after the soft limit.
+    for _ in 0..2 {
+        let limit = Command::new("kill")
+            .args(["-XCPU", &run.child.id().to_string()])
+            .status();
+        assert!(limit.unwrap().success());
+    }
+    run.wait_for("stopping and saving");
+    assert!(run.close().code().is_some(), "it is not ended by a signal");
+    expect_model(folder, "out");
+}
+
+#[test]
+fn writes_beyond_the_limit_of_the_file_size_fail_as_on_a_full_disk() {
+    let folder = tempfile::tempdir().unwrap();
+    let folder = folder.path();
+    wall::write(&folder.join("data"), true, 0.0);
+    // At most 100 kB: enough for the lists, but not for the model.
+    let limited = "ulimit -f 100; exec \"$0\" \"$@\"";
+    let mut train = Command::new("sh");
+    train.args(["-c", limited, EXE]).args([
+        "train",
+        "data",
+        "--steps",
+        "120",
+        "--max-splats",
+        "60000",
+        "--checkpoint-secs",
+        "0",
+        "--out",
+        "out",
+    ]);
+    let output = train
+        .env("TMPDIR", folder)
+        .current_dir(folder)
+        .output()
+        .unwrap();
+    let printed = String::from_utf8_lossy(&output.stderr);
+    assert_eq!(output.status.code(), Some(1), "{printed}");
+    assert!(
+        printed.contains("cannot save the model in out") && printed.contains("too large"),
+        "{printed}"
+    );
+}
+
+#[test]
 fn training_is_not_blocked_by_a_full_terminal() {
     let folder = tempfile::tempdir().unwrap();
     let folder = folder.path();

@@ -50,6 +50,42 @@ fn received() -> tempfile::TempDir {
     folder
 }
 
+/// Without the corrections and the background, scores and images are worse.
+#[test]
+fn model_without_its_metadata_is_named() {
+    let folder = tempfile::tempdir().unwrap();
+    let folder = folder.path();
+    dataset(&folder.join("data"));
+    let trained = run(
+        folder,
+        &[
+            "train",
+            "data",
+            "--steps",
+            "4",
+            "--max-splats",
+            "200",
+            "--out",
+            "run",
+        ],
+    );
+    assert!(trained.status.success(), "{}", text(&trained));
+    let warning = "run has no model.json: the corrections of the cameras and the background of the model are unknown";
+    let complete = run(folder, &["eval", "run", "data"]);
+    assert!(
+        complete.status.success() && !text(&complete).contains("has no model.json"),
+        "{}",
+        text(&complete)
+    );
+    std::fs::remove_file(folder.join("run/model.json")).unwrap();
+    let incomplete = run(folder, &["eval", "run", "data"]);
+    assert!(
+        incomplete.status.success() && text(&incomplete).contains(warning),
+        "{}",
+        text(&incomplete)
+    );
+}
+
 #[test]
 fn links_in_a_received_run_are_not_followed() {
     let received = received();

@@ -116,13 +116,7 @@ impl RigOptions {
         for warning in &warnings {
             log::warn!("{warning}");
         }
-        log::info!(
-            "{} of {} images used: the others show the same pose, the arm moves too fast in {}, and {} have no robot pose",
-            found.images.len(),
-            found.n_read,
-            found.n_fast,
-            found.n_unusable
-        );
+        log::info!("{}", found.summary());
         let no_images = found
             .images
             .is_empty()

@@ -214,3 +214,34 @@ fn unknown_cameras_and_moving_bases_are_rejected() {
         .to_string();
     assert!(error.contains("base.driver"), "{error}");
 }
+
+#[test]
+fn summary_names_only_reasons_that_occurred() {
+    let image = CalibrationImage {
+        secs: 0.0,
+        size_px: [1, 1],
+        gray: vec![0],
+        arm: None,
+    };
+    let found = |n_used: usize, n_read, n_fast, n_unusable| CalibrationImages {
+        images: vec![image.clone(); n_used],
+        n_read,
+        n_fast,
+        n_unusable,
+        damage: None,
+    };
+    assert_eq!(found(12, 12, 0, 0).summary(), "12 of 12 images used");
+    assert_eq!(
+        found(12, 20, 0, 3).summary(),
+        "12 of 20 images used; not used: 5 similar to a used image, 3 without joint readings or damaged"
+    );
+    assert_eq!(
+        found(1, 3, 2, 0).summary(),
+        "1 of 3 images used; not used: 2 during a fast motion of the arm"
+    );
+    assert!(
+        found(MAX_IMAGES, MAX_IMAGES + 1, 0, 0)
+            .summary()
+            .ends_with("1 similar to a used image or beyond the maximum of 300")
+    );
+}

@@ -71,7 +71,10 @@ pub enum ArmDriver {
 }
 
 choices! {
-    ArmDriver { None = "none", Franka = "franka", Can = "can", Udp = "udp", Sim = "sim" }
+    ArmDriver {
+        None = "none", Franka = "franka", Can = "can", Udp = "udp", Sim = "sim";
+        else "for another arm, use \"udp\": the program of the arm sends the joint states, see docs/guide/arms.md"
+    }
 }
 
 /// Reads the arm without its robot description, and the path of the description, which is empty if

@@ -44,13 +44,16 @@ pub(super) trait Keys: Sized {
 pub(super) trait Choice: Copy + PartialEq + 'static {
     /// The names.
     const NAMES: &'static [(&'static str, Self)];
+    /// What to do if no name fits, for the error about another value.
+    const HINT: Option<&'static str> = None;
 }
 
-/// Defines the names of a type's values in rig files.
+/// Defines the names of a type's values in rig files, and what to do if none fits.
 macro_rules! choices {
-    ($($Type:ty { $($Variant:ident = $name:literal),* })*) => {$(
+    ($($Type:ty { $($Variant:ident = $name:literal),* $(; else $hint:literal)? })*) => {$(
         impl $crate::config::key::Choice for $Type {
             const NAMES: &'static [(&'static str, Self)] = &[$(($name, Self::$Variant)),*];
+            $(const HINT: Option<&'static str> = Some($hint);)?
         }
     )*};
 }
@@ -327,7 +330,7 @@ impl<T: Choice> Key for T {
     type Limits = ();
 
     fn read(keys: &mut Section<'_>, key: &'static str, (): ()) -> Option<Self> {
-        keys.parse(key, choice, names::<T>)
+        keys.parse(key, choice, names_and_hint::<T>)
     }
 
     fn write(&self) -> Option<Value> {
@@ -343,6 +346,14 @@ fn choice<T: Choice>(value: &Value) -> Option<T> {
         .iter()
         .find(|(name, _)| value.as_str() == Some(name))
         .map(|(_, choice)| *choice)
+}
+
+fn names_and_hint<T: Choice>() -> String {
+    let names = names::<T>();
+    match T::HINT {
+        Some(hint) => format!("{names}; {hint}"),
+        None => names,
+    }
 }
 
 fn names<T: Choice>() -> String {

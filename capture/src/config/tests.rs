@@ -675,6 +675,30 @@ fn invalid_value_error_names_line_or_flag() {
 }
 
 #[test]
+fn unknown_arm_driver_error_names_the_driver_for_other_arms() {
+    let message = parse(
+        &RIG.replacen("driver = \"sim\"", "driver = \"feetech\"", 1),
+        &[],
+    )
+    .expect_err("no such driver")
+    .to_string();
+    assert!(
+        message.contains(
+            "arm.driver is \"feetech\", allowed: \"none\", \"franka\", \"can\", \"udp\", \"sim\"; for another arm, use \"udp\""
+        ) && message.contains("docs/guide/arms.md"),
+        "{message}"
+    );
+    // Cameras have other drivers.
+    let message = parse(
+        &RIG.replacen("driver = \"v4l2\"", "driver = \"feetech\"", 1),
+        &[],
+    )
+    .expect_err("no such driver")
+    .to_string();
+    assert!(!message.contains("another arm"), "{message}");
+}
+
+#[test]
 fn bundled_rig_files_are_valid_and_round_trip() {
     let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("../rigs");
     let mut n_rigs = 0;

@@ -52,18 +52,28 @@ pub(super) fn realsense(rig: Option<&Rig>) -> Vec<Finding> {
             .iter()
             .any(|device| camera.device.is_empty() || device.serial == camera.device);
         if !is_connected {
-            let message = format!(
-                "camera {:?}: no RealSense camera {:?} is connected",
-                camera.name, camera.device
-            );
-            findings.push(Finding::fail(
-                CHECK,
-                message,
-                "list the connected cameras with fieldrig devices",
-            ));
+            findings.push(not_connected(camera));
         }
     }
     findings
+}
+
+/// The problem that the camera is not connected. An empty serial number means any camera.
+#[cfg(any(feature = "realsense", test))]
+fn not_connected(camera: &Camera) -> Finding {
+    let serial = if camera.device.is_empty() {
+        String::new()
+    } else {
+        format!("with the serial number {:?} ", camera.device)
+    };
+    Finding::fail(
+        "realsense",
+        format!(
+            "camera {:?}: no RealSense camera {serial}is connected",
+            camera.name
+        ),
+        "list the connected cameras with fieldrig devices",
+    )
 }
 
 #[cfg(not(feature = "realsense"))]
@@ -114,6 +124,25 @@ fn missing_file(camera: &Camera) -> Finding {
 mod tests {
     use super::*;
     use crate::doctor::testing::bundled_rig;
+
+    #[test]
+    fn missing_serial_number_is_not_part_of_the_message() {
+        let message = |device: &str| {
+            let overrides = [
+                ("camera.wrist.driver", "realsense"),
+                ("camera.wrist.device", device),
+            ];
+            not_connected(&bundled_rig("static-arm.toml", &overrides).cameras[0]).message
+        };
+        assert_eq!(
+            message(""),
+            "camera \"wrist\": no RealSense camera is connected"
+        );
+        assert_eq!(
+            message("021"),
+            "camera \"wrist\": no RealSense camera with the serial number \"021\" is connected"
+        );
+    }
 
     #[test]
     fn missing_files_are_reported() {

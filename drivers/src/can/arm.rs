@@ -378,6 +378,12 @@ mod tests {
     use super::*;
 
     #[test]
+    fn maximum_silence_is_documented() {
+        let row = format!("| CAN motors | {} s |", MAX_SILENCE.as_secs());
+        assert!(include_str!("../../../docs/reference/rig.md").contains(&row));
+    }
+
+    #[test]
     fn rate_keeps_classic_bus_load_under_70_percent() {
         let bus = BusConfig {
             interface: "can0".to_owned(),

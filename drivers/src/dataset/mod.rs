@@ -1,13 +1,14 @@
 //! Datasets on disk: posed photos in nerfstudio and TUM RGB-D folders.
 
 pub mod nerfstudio;
+mod other_formats;
 mod posed_image;
 pub mod tum;
 
 pub use posed_image::{DatasetImage, DepthFile, DepthImage, ListedSplit, LoadedImage};
 
 use crate::Error;
-use kinematics::Intrinsics;
+use kinematics::{Intrinsics, Lens};
 use std::path::{Path, PathBuf};
 
 /// The usable images of a folder.
@@ -51,6 +52,14 @@ pub fn is_dataset_folder(path: &Path) -> bool {
 
 /// Reads a dataset folder of either kind; `path` may also name a `transforms.json`.
 pub fn read(path: &Path) -> Result<Dataset, Error> {
+    if path.is_file()
+        && let Some(hint) = other_formats::hint(path)
+    {
+        return Err(Error::DatasetFile {
+            path: path.to_owned(),
+            reason: format!("{}{hint}", nerfstudio::OTHER_FILE),
+        });
+    }
     if is_nerfstudio(path) {
         return nerfstudio::read(path);
     }
@@ -59,11 +68,12 @@ pub fn read(path: &Path) -> Result<Dataset, Error> {
     }
     Err(Error::NotADataset {
         path: path.to_owned(),
+        hint: other_formats::hint(path).unwrap_or_default(),
     })
 }
 
 /// Describes a focal length or principal point that no camera has, such as the result of a division
-/// by almost zero.
+/// by almost zero, or lens coefficients that no lens has.
 fn implausible(intrinsics: &Intrinsics) -> Option<String> {
     /// Relative to the longer side: fields of view from 0.06 to 176 degrees.
     const FOCAL: std::ops::RangeInclusive<f64> = 0.02..=1000.0;
@@ -77,12 +87,42 @@ fn implausible(intrinsics: &Intrinsics) -> Option<String> {
         .any(|focal_px| !FOCAL.contains(&(focal_px / longer)));
     let [x, y] = intrinsics.principal_px;
     let center = !(CENTER.contains(&(x / width)) && CENTER.contains(&(y / height)));
-    (focal || center).then(|| {
-        format!(
+    if focal || center {
+        return Some(format!(
             "focal lengths {:?} and principal point {:?} are implausible for {width} x {height} pixels",
             intrinsics.focal_px, intrinsics.principal_px
+        ));
+    }
+    implausible_lens(intrinsics)
+}
+
+fn implausible_lens(intrinsics: &Intrinsics) -> Option<String> {
+    /// Coefficients that were fitted without measurements in the corners are often wrong there.
+    const MAX_IMPLAUSIBLE_FRAC: f64 = 1.0 / 3.0;
+    let implausible_frac = intrinsics.implausible_lens_frac();
+    (implausible_frac > MAX_IMPLAUSIBLE_FRAC).then(|| {
+        format!(
+            "the lens coefficients ({}) are implausible in {:.0} % of the image: no lens distorts so strongly; check them and the \
+             focal length",
+            named_coefficients(&intrinsics.lens),
+            100.0 * implausible_frac
         )
     })
+}
+
+/// The coefficients that are not 0, with their names.
+fn named_coefficients(lens: &Lens) -> String {
+    const BROWN_CONRADY: [&str; 8] = ["k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"];
+    const KANNALA_BRANDT: [&str; 4] = ["k1", "k2", "k3", "k4"];
+    let names: &[&str] = match lens {
+        Lens::KannalaBrandt(_) => &KANNALA_BRANDT,
+        Lens::Pinhole | Lens::BrownConrady(_) | Lens::RationalBrownConrady(_) => &BROWN_CONRADY,
+    };
+    let named: Vec<String> = std::iter::zip(names, lens.coefficients())
+        .filter(|(_, value)| **value != 0.0)
+        .map(|(name, value)| format!("{name} = {value}"))
+        .collect();
+    named.join(", ")
 }
 
 /// Positions beyond this are assumed to be mistakes, meters. Scenes are far smaller, and f32, in

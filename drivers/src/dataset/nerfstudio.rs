@@ -20,6 +20,9 @@ use std::path::{Path, PathBuf};
 
 /// File that identifies such a folder.
 pub const FILE_NAME: &str = "transforms.json";
+/// The reason why another file is no input.
+pub(super) const OTHER_FILE: &str =
+    "not a recording (.mcap), a dataset folder or a transforms.json";
 /// Relative difference of two focal lengths that are meant to be equal. Rounded angles differ by
 /// far less; angles of another camera or axis differ by more.
 const MAX_FOCAL_DIFFERENCE: f64 = 0.01;
@@ -70,10 +73,7 @@ pub fn read(path: &Path) -> Result<Dataset, Error> {
         source,
     })?;
     if !text.trim_start().starts_with('{') {
-        return Err(file_error(
-            &file,
-            "not a recording (.mcap), a dataset folder or a transforms.json".to_owned(),
-        ));
+        return Err(file_error(&file, OTHER_FILE.to_owned()));
     }
     let mut document: Document = serde_json::from_str(&json::nan_as_null(&text))
         .map_err(|error| file_error(&file, error.to_string()))?;

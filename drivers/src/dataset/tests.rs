@@ -648,6 +648,45 @@ fn rounded_poses_are_read_with_a_note() {
 }
 
 #[test]
+fn lens_coefficients_of_no_real_lens_are_refused() {
+    let (folder, document) = small_folder();
+    for (camera_model, k1) in [
+        ("OPENCV", 10.0),
+        ("OPENCV", -3.0),
+        ("OPENCV_FISHEYE", -10.0),
+    ] {
+        let mut changed = document.clone();
+        changed["camera_model"] = json!(camera_model);
+        changed["k1"] = json!(k1);
+        write_transforms(&folder, &changed);
+        let text = read_error(&folder);
+        assert!(
+            text.contains("transforms.json")
+                && text.contains(&format!("(k1 = {k1}) are implausible")),
+            "{text}"
+        );
+    }
+    // The directions of the corners are unknown, as with coefficients that were fitted to the
+    // center of the images. The remaining pixels are used.
+    let mut changed = document.clone();
+    changed["k1"] = json!(-0.3);
+    write_transforms(&folder, &changed);
+    assert_eq!(read(folder.path()).unwrap().images.len(), 2);
+
+    let folder = tum_folder();
+    std::fs::write(
+        folder.path().join("calibration.txt"),
+        "5 5 3.5 2.5 10 0 0 0\n",
+    )
+    .unwrap();
+    assert!(
+        read_error(&folder).contains("(k1 = 10) are implausible"),
+        "{}",
+        read_error(&folder)
+    );
+}
+
+#[test]
 fn files_of_windows_programs_are_read() {
     let (folder, mut document) = small_folder();
     std::fs::create_dir(folder.path().join("images")).unwrap();

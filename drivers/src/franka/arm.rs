@@ -94,7 +94,7 @@ impl FrankaArm {
         }
         let connection = Arc::new(Connection::open(address)?);
         let version = connection.version;
-        let first = first_state(address, &connection)?;
+        let (sender, first) = first_state(address, &connection)?;
         // A wrong robot description would give every image a wrong pose, and the error would look
         // like a bad calibration. So it is detected before anything is read or moved.
         check_kinematics(config, &first).map_err(|reason| fault(address, reason))?;
@@ -108,7 +108,7 @@ impl FrankaArm {
         let name = "franka".to_owned();
         let thread = std::thread::Builder::new()
             .name(name)
-            .spawn(move || reader.run(&connection, &reading));
+            .spawn(move || reader.run(&connection, sender, &reading));
         let thread = thread.map_err(|source| Error::Thread {
             device: device.clone(),
             source,
@@ -174,16 +174,20 @@ impl Drop for FrankaArm {
     }
 }
 
-/// Waits for the first state of a controller that has accepted the connection.
-fn first_state(address: &str, connection: &Connection) -> Result<RobotState, Error> {
+/// Waits for the first state of a controller that has accepted the connection, and returns it with
+/// its source address.
+fn first_state(address: &str, connection: &Connection) -> Result<(SocketAddr, RobotState), Error> {
     let Connection { network, version } = connection;
     let deadline = clock::now() + MAX_SILENCE;
     let mut buffer = [0; MAX_STATE_BYTES];
     loop {
         // After a receive error, a state may still arrive.
         let n = network.udp.blocking_receive(&mut buffer).unwrap_or(0);
-        match decode(*version, &buffer[..n]) {
-            Some(first) => return Ok(first.state),
+        let sender = network
+            .udp_peer()
+            .filter(|peer| peer.ip() == network.server_ip);
+        match sender.zip(decode(*version, &buffer[..n])) {
+            Some((sender, first)) => return Ok((sender, first.state)),
             None if clock::now() < deadline => {}
             None => {
                 // Requests work, so TCP is not blocked. States come over UDP, to a port that a
@@ -286,9 +290,10 @@ impl StateReader {
         }
     }
 
-    fn run(mut self, connection: &Connection, shared: &Shared) {
+    /// Reads the states of `sender`, the source address of the first state.
+    fn run(mut self, connection: &Connection, sender: SocketAddr, shared: &Shared) {
         realtime::request_realtime(&format!("arm at {}", self.address));
-        if let Err(reason) = self.read(connection, shared) {
+        if let Err(reason) = self.read(connection, sender, shared) {
             // The caller of a motion learns that it has ended even if nobody reads joint states.
             if let Some(motion_loop) = &mut self.motion_loop {
                 motion_loop.handle_disconnect(&reason);
@@ -302,7 +307,12 @@ impl StateReader {
     }
 
     /// Receives states until asked to stop. Returns the reason if no more states can be received.
-    fn read(&mut self, connection: &Connection, shared: &Shared) -> Result<(), String> {
+    fn read(
+        &mut self,
+        connection: &Connection,
+        sender: SocketAddr,
+        shared: &Shared,
+    ) -> Result<(), String> {
         let network = &connection.network;
         let mut buffer = [0; MAX_STATE_BYTES];
         // States that were queued in the meantime arrive all at once, so they are useless for
@@ -319,10 +329,10 @@ impl StateReader {
             // answered: for the earlier ones, an answer would come too late.
             let mut newest = None;
             while let Some(n) = received {
-                // Datagrams from other addresses are rejected.
-                let from = network
-                    .udp_peer()
-                    .filter(|peer| peer.ip() == network.server_ip);
+                // A controller sends all states of a connection from one port. Datagrams of other
+                // senders are rejected, also those from other ports of its address: their numbers
+                // would restart the sequence.
+                let from = network.udp_peer().filter(|peer| *peer == sender);
                 let state = from.zip(decode(self.version, &buffer[..n]));
                 if !self.handle_datagram(shared, state, at, &mut newest) {
                     return Ok(());
@@ -455,6 +465,12 @@ impl StateReader {
 mod tests {
     use super::super::tests::{TEST_TIMEOUT, config, robot, swinging_joints_at};
     use super::*;
+
+    #[test]
+    fn maximum_silence_is_documented() {
+        let row = format!("| Franka arm | {} s |", MAX_SILENCE.as_secs());
+        assert!(include_str!("../../../docs/reference/rig.md").contains(&row));
+    }
 
     #[test]
     fn stalled_thread_does_not_shift_stamps() {

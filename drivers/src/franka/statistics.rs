@@ -18,7 +18,8 @@ pub struct StateStatistics {
     pub n_lost: u64,
     /// States that arrived twice, or after a later one.
     pub n_late: u64,
-    /// Datagrams that are not states of this robot, or whose time is impossible.
+    /// Datagrams that are not states of this robot, that come from another address or port than its
+    /// first state, or whose time is impossible.
     pub n_rejected: u64,
     /// States dropped from a full queue because the caller did not read them.
     pub n_dropped: u64,

@@ -1,6 +1,7 @@
 //! Tests over loopback sockets: our driver, and franka-rs as a client that moves, against emulated
 //! robots.
 
+use super::emulated::fuzz::seeds::state_datagrams;
 use super::emulated::{
     CommandedJoints, EmulatedRobot, JointSimulator, Joints, Limits, RobotConfig,
 };
@@ -458,6 +459,35 @@ fn malformed_bytes_stop_neither_robot_nor_client() {
         "{statistics}"
     );
     thread.join().unwrap();
+}
+
+#[test]
+fn states_from_another_port_of_the_controller_are_rejected() {
+    // Few enough for the receive buffer of a socket.
+    const N_FOREIGN: u32 = 20;
+    let emulated = robot(
+        FciVersion::V10,
+        Box::new(|stamp, _| swinging_joints_at(stamp)),
+    );
+    let mut state_port = 0;
+    let mut arm = FrankaArm::open_with(&config(emulated.address()), |connection, _| {
+        state_port = connection.network.udp.port();
+        Ok(None)
+    })
+    .unwrap();
+    let earlier = arm.read(TEST_TIMEOUT).unwrap().stamp;
+    let n_rejected = arm.statistics().n_rejected;
+    // The same address as that of the emulated robot, and valid states with other numbers.
+    let foreign = UdpSocket::bind(FREE_PORT).unwrap();
+    for state in state_datagrams(FciVersion::V10, N_FOREIGN) {
+        foreign.send_to(&state, ("127.0.0.1", state_port)).unwrap();
+    }
+    let deadline = Instant::now() + TEST_TIMEOUT;
+    while arm.statistics().n_rejected < n_rejected + u64::from(N_FOREIGN) {
+        assert!(Instant::now() < deadline, "{}", arm.statistics());
+        assert!(arm.read(TEST_TIMEOUT).unwrap().stamp > earlier);
+    }
+    assert_eq!(arm.statistics().n_restarts, 0, "{}", arm.statistics());
 }
 
 /// A client that only sends the connection request; the second socket receives states.

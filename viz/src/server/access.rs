@@ -1,6 +1,6 @@
 //! Who may use a server, and what for: tokens, roles, and the origins of pages.
 
-use axum::http::{HeaderMap, HeaderName, header};
+use axum::http::{HeaderMap, HeaderName, StatusCode, header};
 use serde::Serialize;
 use std::net::IpAddr;
 use subtle::ConstantTimeEq;
@@ -108,6 +108,8 @@ pub(crate) enum Refusal {
     ForeignOrigin,
     #[error("only pages of this server may use it")]
     ForeignPage,
+    #[error("a request must have one Host header")]
+    SeveralHosts,
     #[error(
         "this server requires a token: open the complete address that fieldrig printed when it started"
     )]
@@ -116,12 +118,27 @@ pub(crate) enum Refusal {
     WrongToken,
 }
 
+impl Refusal {
+    /// The HTTP status of the response.
+    pub(crate) fn status(self) -> StatusCode {
+        match self {
+            Self::ForeignOrigin | Self::ForeignPage => StatusCode::FORBIDDEN,
+            // RFC 9112, section 3.2: a proxy and the server could use different ones.
+            Self::SeveralHosts => StatusCode::BAD_REQUEST,
+            Self::NoToken | Self::WrongToken => StatusCode::UNAUTHORIZED,
+        }
+    }
+}
+
 impl Access {
     /// Allows only pages of this server: other web sites in the same browser can also reach it.
     ///
     /// The `Host` of a local server must be a loopback address, because the domain of another site
     /// may resolve to this computer. Such a site has neither a token nor a valid certificate.
     pub(crate) fn check_origin(&self, headers: &HeaderMap) -> Result<(), Refusal> {
+        if headers.get_all(header::HOST).iter().nth(1).is_some() {
+            return Err(Refusal::SeveralHosts);
+        }
         let text = |name| headers.get(name).and_then(|value| value.to_str().ok());
         let (scheme, refusal) = match self {
             Self::Local => ("http://", Refusal::ForeignOrigin),
@@ -236,6 +253,19 @@ mod tests {
             Access::Local.check_origin(&HeaderMap::new()),
             Err(Refusal::ForeignOrigin)
         );
+    }
+
+    #[test]
+    fn several_hosts_are_rejected() {
+        for access in [
+            Access::Local,
+            Access::Tokens(Tokens::random().expect("random numbers")),
+        ] {
+            for second in ["localhost", "example.com"] {
+                let hosts = headers(&[(header::HOST, "localhost"), (header::HOST, second)]);
+                assert_eq!(access.check_origin(&hosts), Err(Refusal::SeveralHosts));
+            }
+        }
     }
 
     #[test]

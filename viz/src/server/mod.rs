@@ -47,8 +47,8 @@ const GOODBYE_TIMEOUT: Duration = Duration::from_millis(500);
 /// A connection is closed if the headers of a request take longer than this, or the next request
 /// arrives later than this.
 const HEADER_TIMEOUT: Duration = Duration::from_secs(3);
-/// Maximum size of a request including its headers, bytes.
-const MAX_REQUEST_BYTES: usize = 32 * 1024;
+/// Maximum size of the headers of a request including its first line, bytes. Longer ones get 431.
+const MAX_HEADER_BYTES: usize = 32 * 1024;
 /// Pause after a failed accept, so that a permanent failure does not keep a processor busy.
 const ACCEPT_PAUSE: Duration = Duration::from_millis(50);
 /// Size of the kernel's send buffer per connection, bytes; Linux doubles it. For slow clients, data
@@ -341,7 +341,9 @@ where
     let served = http1::Builder::new()
         .timer(TokioTimer::new())
         .header_read_timeout(HEADER_TIMEOUT)
-        .max_buf_size(MAX_REQUEST_BYTES)
+        // The buffer may grow beyond its maximum by a part of a read.
+        .max_header_size(MAX_HEADER_BYTES)
+        .max_buf_size(MAX_HEADER_BYTES)
         .serve_connection(TokioIo::new(stream), service)
         .with_upgrades()
         .await;
@@ -499,7 +501,7 @@ async fn reject_foreign_origins(
 ) -> Response {
     match app_state.access.check_origin(request.headers()) {
         Ok(()) => next.run(request).await,
-        Err(refusal) => (StatusCode::FORBIDDEN, refusal.to_string()).into_response(),
+        Err(refusal) => (refusal.status(), refusal.to_string()).into_response(),
     }
 }
 
@@ -514,6 +516,6 @@ async fn require_token(
             request.extensions_mut().insert(role);
             next.run(request).await
         }
-        Err(refusal) => (StatusCode::UNAUTHORIZED, refusal.to_string()).into_response(),
+        Err(refusal) => (refusal.status(), refusal.to_string()).into_response(),
     }
 }

@@ -211,6 +211,32 @@ fn client_slots_are_released_after_any_disconnection() {
 }
 
 #[test]
+fn ambiguous_and_long_headers_are_refused() {
+    let (_hub, server) = start();
+    for (headers, status) in [
+        (String::new(), "200"),
+        ("Host: example.com\r\n".to_owned(), "400"),
+        ("Host: localhost\r\n".to_owned(), "400"),
+        (format!("X-Long: {}\r\n", "x".repeat(31 << 10)), "200"),
+        (format!("X-Long: {}\r\n", "x".repeat(33 << 10)), "431"),
+        (format!("X-Long: {}\r\n", "x".repeat(40 << 10)), "431"),
+    ] {
+        let mut stream = connect(server.address());
+        let head = "GET /status HTTP/1.1\r\nHost: localhost\r\nConnection: close";
+        // The server may close the connection before it has received everything.
+        let _ = write!(stream, "{head}\r\n{headers}\r\n");
+        let mut answer = Vec::new();
+        let _ = stream.read_to_end(&mut answer);
+        let answer = String::from_utf8_lossy(&answer);
+        assert!(
+            answer.starts_with(&format!("HTTP/1.1 {status} ")),
+            "{} bytes of headers: {answer}",
+            headers.len()
+        );
+    }
+}
+
+#[test]
 fn half_open_and_idle_connections_are_closed() {
     let (_hub, server) = start();
     let mut half_open = connect(server.address());

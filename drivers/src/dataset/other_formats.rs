@@ -1,0 +1,178 @@
+//! Recognizes data in the formats of other programs, so that the error names the format and what to
+//! do.
+
+use std::path::Path;
+
+/// A format that is not read.
+struct OtherFormat {
+    /// Name with its article.
+    name: &'static str,
+    /// Files and folders; one of them identifies a folder of this format.
+    members: &'static [&'static str],
+    /// Extensions, in lower case, of a file of this format, or of a file in a folder.
+    extensions: &'static [&'static str],
+    /// What to do.
+    remedy: &'static str,
+}
+
+/// The formats. The first match counts, so formats that contain others come first.
+static OTHER_FORMATS: [OtherFormat; 7] = [
+    OtherFormat {
+        name: "a raw export of Polycam",
+        members: &["keyframes/cameras", "keyframes/corrected_cameras"],
+        extensions: &[],
+        remedy: "convert it with `ns-process-data polycam` of nerfstudio",
+    },
+    OtherFormat {
+        name: "an export of Record3D",
+        members: &["EXR_RGBD", "rgbd"],
+        extensions: &["r3d"],
+        remedy: "export it as EXR and JPG sequence, and convert it with `ns-process-data record3d` of nerfstudio",
+    },
+    OtherFormat {
+        name: "a LeRobot dataset",
+        members: &["meta/info.json"],
+        extensions: &[],
+        remedy: "it has no camera poses: record the robot with `fieldrig record`, or write images and camera poses as transforms.json",
+    },
+    OtherFormat {
+        name: "a ROS bag",
+        members: &["metadata.yaml"],
+        extensions: &["bag", "db3"],
+        remedy: "write its images and camera poses as a TUM RGB-D folder, or as transforms.json",
+    },
+    OtherFormat {
+        name: "a COLMAP model",
+        members: &[
+            "sparse",
+            "colmap",
+            "cameras.bin",
+            "cameras.txt",
+            "database.db",
+        ],
+        extensions: &[],
+        remedy: "convert it with `ns-process-data images --skip-colmap` of nerfstudio",
+    },
+    OtherFormat {
+        name: "a video without camera poses",
+        members: &[],
+        extensions: &["mp4", "mov", "mkv", "avi", "webm"],
+        remedy: "estimate them with `ns-process-data video` of nerfstudio",
+    },
+    OtherFormat {
+        name: "photos without camera poses",
+        members: &["images"],
+        extensions: &["jpg", "jpeg", "png", "heic"],
+        remedy: "estimate them with `ns-process-data images` of nerfstudio",
+    },
+];
+
+/// The format of a file or folder and what to do, if it is known: the end of an error message.
+pub(super) fn hint(path: &Path) -> Option<String> {
+    let format = OTHER_FORMATS.iter().find(|format| format.matches(path))?;
+    Some(format!(
+        "; it looks like {}: {} (see docs/reference/datasets.md)",
+        format.name, format.remedy
+    ))
+}
+
+impl OtherFormat {
+    fn matches(&self, path: &Path) -> bool {
+        if path.is_file() {
+            return self.has_extension(path);
+        }
+        self.members.iter().any(|name| path.join(name).exists()) || self.contains_file(path)
+    }
+
+    /// Whether a folder contains a file with one of the extensions.
+    fn contains_file(&self, folder: &Path) -> bool {
+        /// More entries are not examined, so that a huge folder costs no time.
+        const MAX_ENTRIES: usize = 10_000;
+        let Ok(entries) = std::fs::read_dir(folder) else {
+            return false;
+        };
+        entries
+            .take(MAX_ENTRIES)
+            .flatten()
+            .any(|entry| self.has_extension(&entry.path()))
+    }
+
+    fn has_extension(&self, file: &Path) -> bool {
+        let extension = file.extension().and_then(|extension| extension.to_str());
+        extension.is_some_and(|extension| {
+            self.extensions
+                .contains(&extension.to_ascii_lowercase().as_str())
+        })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// A folder with one empty file.
+    fn folder_with(file: &str) -> tempfile::TempDir {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join(file);
+        std::fs::create_dir_all(path.parent().unwrap()).unwrap();
+        std::fs::write(path, "").unwrap();
+        folder
+    }
+
+    #[test]
+    fn formats_of_other_programs_are_named_with_a_remedy() {
+        for (file, name, remedy) in [
+            (
+                "keyframes/corrected_cameras/1.json",
+                "Polycam",
+                "ns-process-data polycam",
+            ),
+            (
+                "EXR_RGBD/metadata.json",
+                "Record3D",
+                "ns-process-data record3d",
+            ),
+            ("scan.r3d", "Record3D", "ns-process-data record3d"),
+            ("meta/info.json", "LeRobot", "fieldrig record"),
+            ("metadata.yaml", "ROS bag", "TUM RGB-D"),
+            ("day.bag", "ROS bag", "TUM RGB-D"),
+            ("sparse/0/cameras.bin", "COLMAP", "--skip-colmap"),
+            ("cameras.txt", "COLMAP", "--skip-colmap"),
+            ("walk.MP4", "video", "ns-process-data video"),
+            ("images/1.jpg", "photos", "ns-process-data images"),
+            ("1.JPG", "photos", "ns-process-data images"),
+        ] {
+            let folder = folder_with(file);
+            let text = crate::dataset::read(folder.path()).unwrap_err().to_string();
+            assert!(
+                text.contains("expected transforms.json")
+                    && text.contains(name)
+                    && text.contains(remedy),
+                "{file}: {text}"
+            );
+        }
+        for file in ["scan.r3d", "day.bag", "bag_0.db3", "walk.mp4"] {
+            let folder = folder_with(file);
+            let text = crate::dataset::read(&folder.path().join(file))
+                .unwrap_err()
+                .to_string();
+            assert!(
+                text.contains("not a recording (.mcap)") && text.contains("it looks like"),
+                "{file}: {text}"
+            );
+        }
+        assert_eq!(hint(folder_with("notes.txt").path()), None);
+    }
+
+    #[test]
+    fn formats_are_documented() {
+        let page = include_str!("../../../docs/reference/datasets.md");
+        for format in &OTHER_FORMATS {
+            assert!(
+                page.contains(&format!("| {} |", format.name)),
+                "{}",
+                format.name
+            );
+        }
+    }
+}
