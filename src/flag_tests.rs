@@ -13,7 +13,7 @@ use syn::{Attribute, Item, LitStr, Macro, Meta};
 
 /// Source files or folders, and the commands that print their messages. All these commands must
 /// accept a flag or setting in a message, unless the message names a command that accepts it.
-const PRINTED_BY: [(&str, &[&str]); 23] = [
+const PRINTED_BY: [(&str, &[&str]); 24] = [
     ("bench/src", &["bench"]),
     ("calibration/procedures/src", &["calibrate"]),
     ("calibration/src/hand_eye", &["calibrate hand-eye"]),
@@ -26,10 +26,10 @@ const PRINTED_BY: [(&str, &[&str]); 23] = [
     ),
     ("session/src/data.rs", &["train", "eval", "bench"]),
     ("session/src/depth_from.rs", &["train"]),
-    ("session/src/replay.rs", &["train"]),
     ("session/src/run_folder.rs", &["run", "train"]),
     ("session/src/scene_calibration.rs", &["calibrate scene"]),
     ("session/src/session/persistence.rs", &["run", "train"]),
+    ("session/src/train_plan", &["train"]),
     ("session/src/training.rs", &["train", "bench"]),
     (
         "session/src/training_options.rs",
@@ -37,6 +37,7 @@ const PRINTED_BY: [(&str, &[&str]); 23] = [
     ),
     ("src/commands/bench", &["bench"]),
     ("src/commands/calibrate", &["calibrate"]),
+    ("src/console.rs", &["run", "train"]),
     (
         "src/page_args.rs",
         &["run", "view", "calibrate intrinsics", "calibrate hand-eye"],

@@ -1,11 +1,12 @@
 //! Training sessions: train models on keyframes, evaluate them on a schedule, and recover from
 //! failures.
 //!
-//! A [`Session`] is one model in training with its clock, evaluations, checkpoints and reports.
-//! [`Data`] reads keyframes from disk; [`train`] and [`drive`] train on them. [`LiveLoop`] is the
-//! loop of a live run: it takes keyframes from a [`capture::Feed`] and draws pictures for viewers.
-//! [`finish`] saves and scores the models. Timing-dependent decisions are logged ([`DecisionLog`])
-//! and can be replayed ([`Replay`]). An [`Observer`] receives all reports.
+//! [`TrainPlan::run`] carries out a whole training run on data from disk. A [`Session`] is one model
+//! in training with its clock, evaluations, checkpoints and reports. [`Data`] reads keyframes from
+//! disk; [`train`] and [`drive`] train on them. [`LiveLoop`] is the loop of a live run: it takes
+//! keyframes from a [`capture::Feed`] and draws pictures for viewers. [`finish`] saves and scores the
+//! models. Timing-dependent decisions are logged ([`DecisionLog`]) and can be replayed. An
+//! [`Observer`] receives all reports.
 //!
 //! ```
 //! use keyframe::{Keyframe, Split};
@@ -45,19 +46,21 @@ pub mod next_commands;
 mod observations;
 mod observer;
 mod pending_evaluation;
+mod previous_run;
 mod read_progress;
 pub mod recoveries;
 pub mod recovery;
 mod render_budget;
-mod replay;
 mod report;
 pub mod robot_meshes;
 pub mod run_folder;
 mod scene_calibration;
 pub mod scene_hint;
 mod session;
+mod session_setup;
 mod stored_keyframes;
 mod time_slices;
+mod train_plan;
 mod training;
 mod training_clock;
 mod training_options;
@@ -79,15 +82,17 @@ pub use methods::methods_of;
 pub use observer::{
     DoneEvent, Evaluation, FinishedReport, Observer, ProfileEvent, SessionEvent, SessionProgress,
 };
+pub use previous_run::FinishedRun;
 pub use read_progress::{OnReadProgress, ReadProgress, ignore_progress};
 pub use recoveries::OpenGpu;
 pub use recovery::Recovery;
-pub use replay::Replay;
 pub use scene_calibration::{RelativePose, SCENE_PARAMS, SceneCalibration, calibrate_scene};
 pub use session::{
     EndingSession, Evaluators, FinishedModel, Limits, Session, TrainingOutcome, finish,
 };
+pub use session_setup::{NewObserver, Services};
 pub use stored_keyframes::StoredKeyframes;
+pub use train_plan::{TrainOutcome, TrainPlan, Trained};
 pub use training::{TrainingPlan, check_before_data, drive, limits, model_specs, train};
 pub use training_clock::Clock;
 pub use training_options::{AvailableData, REALIGN, Refine, RefineSettings, TrainingOptions};
