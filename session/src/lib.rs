@@ -3,9 +3,9 @@
 //!
 //! [`TrainPlan::run`] carries out a whole training run on data from disk. A [`Session`] is one model
 //! in training with its clock, evaluations, checkpoints and reports. [`Data`] reads keyframes from
-//! disk; [`train`] and [`drive`] train on them. [`LiveLoop`] is the loop of a live run: it takes
-//! keyframes from a [`capture::Feed`] and draws pictures for viewers. [`finish`] saves and scores the
-//! models. Timing-dependent decisions are logged ([`DecisionLog`]) and can be replayed. An
+//! disk, and [`UnsavedTraining`] trains on them without a run folder. [`LiveLoop`] is the loop of a
+//! live run: it takes keyframes from a [`capture::Feed`] and draws pictures for viewers. [`finish`]
+//! saves and scores the models. Timing-dependent decisions are logged ([`DecisionLog`]) and can be replayed. An
 //! [`Observer`] receives all reports.
 //!
 //! ```
@@ -93,7 +93,7 @@ pub use session::{
 pub use session_setup::{NewObserver, Services};
 pub use stored_keyframes::StoredKeyframes;
 pub use train_plan::{TrainOutcome, TrainPlan, Trained};
-pub use training::{TrainingPlan, check_before_data, drive, limits, model_specs, train};
+pub use training::{UnsavedTraining, check_before_data, limits, model_specs};
 pub use training_clock::Clock;
 pub use training_options::{AvailableData, REALIGN, Refine, RefineSettings, TrainingOptions};
 pub use viewer::{ModelViewer, ServedModel};
