@@ -1,8 +1,8 @@
 //! Training sessions: train models on keyframes, evaluate them on a schedule, and recover from
 //! failures.
 //!
-//! [`TrainPlan::run`] carries out a whole training run on data from disk. A [`Session`] is one model
-//! in training with its clock, evaluations, checkpoints and reports. [`Data`] reads keyframes from
+//! [`TrainPlan::run`] carries out a whole training run on data from disk, and [`RunPlan::prepare`]
+//! begins a live run. A [`Session`] is one model in training with its clock, evaluations, checkpoints and reports. [`Data`] reads keyframes from
 //! disk, and [`UnsavedTraining`] trains on them without a run folder. [`LiveLoop`] is the loop of a
 //! live run: it takes keyframes from a [`capture::Feed`] and draws pictures for viewers. [`finish`]
 //! saves and scores the models. Timing-dependent decisions are logged ([`DecisionLog`]) and can be replayed. An
@@ -54,6 +54,7 @@ mod render_budget;
 mod report;
 pub mod robot_meshes;
 pub mod run_folder;
+mod run_plan;
 mod scene_calibration;
 pub mod scene_hint;
 mod session;
@@ -86,6 +87,10 @@ pub use previous_run::FinishedRun;
 pub use read_progress::{OnReadProgress, ReadProgress, ignore_progress};
 pub use recoveries::OpenGpu;
 pub use recovery::Recovery;
+pub use run_plan::{
+    DiscardedRun, EndedRun, OpenedRun, PreparedRun, PreviousLiveRun, RunInProgress, RunInput, RunPlan,
+    SavedRun,
+};
 pub use scene_calibration::{RelativePose, SCENE_PARAMS, SceneCalibration, calibrate_scene};
 pub use session::{
     EndingSession, Evaluators, FinishedModel, Limits, Session, TrainingOutcome, finish,
@@ -97,4 +102,4 @@ pub use training::{UnsavedTraining, check_before_data, limits, model_specs};
 pub use training_clock::Clock;
 pub use training_options::{AvailableData, REALIGN, Refine, RefineSettings, TrainingOptions};
 pub use viewer::{ModelViewer, ServedModel};
-pub use viewers::Viewers;
+pub use viewers::{Viewers, gpu_notes};

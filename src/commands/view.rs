@@ -1,6 +1,5 @@
 //! `fieldrig view`: serves saved models on the web page.
 
-use super::run::notes;
 use crate::exit::Exit;
 use crate::open_gpu::open_gpu;
 use crate::page_args::PageArgs;
@@ -9,7 +8,7 @@ use kinematics::Transform;
 use messages::BadInput;
 use nalgebra::{Translation3, UnitQuaternion, Vector3};
 use serde_json::{Value, json};
-use session::{ModelViewer, ServedModel, camera_list, methods, run_folder, scene_hint};
+use session::{ModelViewer, ServedModel, camera_list, gpu_notes, methods, run_folder, scene_hint};
 use std::path::{Path, PathBuf};
 use trainer::{Bounds, LoadedModel, ModelKind, Progress};
 use viz::{Hub, KeyframePose, ModelStatus, SceneHint, Status};
@@ -85,7 +84,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
         .iter()
         .zip(&models)
         .filter_map(|(path, model)| methods::note_if_empty(path, model));
-    let notes = notes(&gpu).into_iter().chain(empty_notes).collect();
+    let notes = gpu_notes(&gpu).into_iter().chain(empty_notes).collect();
     let mut statuses = paths
         .iter()
         .zip(&models)

@@ -81,13 +81,14 @@ pub struct Trained {
     /// Descriptions of data that could not be read.
     pub data_losses: Vec<String>,
     /// The rig with the estimated calibration, and its file.
-    corrected_rig: Option<(anyhow::Result<Rig>, PathBuf)>,
+    corrected_rig: Option<Box<(anyhow::Result<Rig>, PathBuf)>>,
 }
 
 impl Trained {
     /// Writes the rig with the estimated calibration, if the plan names a file for it.
     pub fn write_rig(&mut self) -> anyhow::Result<()> {
-        if let Some((rig, file)) = self.corrected_rig.take() {
+        if let Some(corrected) = self.corrected_rig.take() {
+            let (rig, file) = *corrected;
             corrected_rig::write(&rig?, &file)?;
             log::info!("rig file written to {}", file.display());
         }

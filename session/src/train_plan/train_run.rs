@@ -369,7 +369,7 @@ impl TrainRun<'_> {
         // saved.
         let corrected_rig = self.plan.write_rig.as_ref().map(|file| {
             let rig = self.corrected_rig(&selection.images, &mut sessions);
-            (rig, file.clone())
+            Box::new((rig, file.clone()))
         });
         let startup_secs = sessions[0]
             .clock_started()
