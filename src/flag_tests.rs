@@ -13,10 +13,11 @@ use syn::{Attribute, Item, LitStr, Macro, Meta};
 
 /// Source files or folders, and the commands that print their messages. All these commands must
 /// accept a flag or setting in a message, unless the message names a command that accepts it.
-const PRINTED_BY: [(&str, &[&str]); 25] = [
+const PRINTED_BY: [(&str, &[&str]); 26] = [
     ("bench/src", &["bench"]),
     ("calibration/procedures/src", &["calibrate"]),
     ("calibration/src/hand_eye", &["calibrate hand-eye"]),
+    ("capture/src/record.rs", &["record"]),
     ("keyframe/src/error.rs", &["train", "eval", "bench"]),
     ("session/src/camera_path.rs", &["render"]),
     ("session/src/checkpoints.rs", &["run", "train"]),

@@ -55,6 +55,7 @@ mod report;
 pub mod robot_meshes;
 pub mod run_folder;
 mod run_plan;
+mod saved_view;
 mod scene_calibration;
 pub mod scene_hint;
 mod session;
@@ -91,6 +92,7 @@ pub use run_plan::{
     DiscardedRun, EndedRun, OpenedRun, PreparedRun, PreviousLiveRun, RunInProgress, RunInput, RunPlan,
     SavedRun,
 };
+pub use saved_view::publish_saved;
 pub use scene_calibration::{RelativePose, SCENE_PARAMS, SceneCalibration, calibrate_scene};
 pub use session::{
     EndingSession, Evaluators, FinishedModel, Limits, Session, TrainingOutcome, finish,
@@ -102,4 +104,4 @@ pub use training::{UnsavedTraining, check_before_data, limits, model_specs};
 pub use training_clock::Clock;
 pub use training_options::{AvailableData, REALIGN, Refine, RefineSettings, TrainingOptions};
 pub use viewer::{ModelViewer, ServedModel};
-pub use viewers::{Viewers, gpu_notes};
+pub use viewers::Viewers;

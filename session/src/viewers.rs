@@ -30,8 +30,7 @@ impl InputObserver for Viewers {
 }
 
 /// Notes about the GPU that the page shows to its viewers.
-#[must_use]
-pub fn gpu_notes(gpu: &Gpu) -> Vec<String> {
+pub(crate) fn gpu_notes(gpu: &Gpu) -> Vec<String> {
     if gpu.is_software() {
         vec!["no GPU: kernels run on the CPU, which is slow".to_owned()]
     } else {
