@@ -63,8 +63,9 @@ const PRINTED_BY: [(&str, &[&str]); 26] = [
 ];
 
 /// Settings in messages of libraries that name a command which accepts them.
-const NAMED_WITH_COMMAND: [(&str, Setting, &str); 10] = [
+const NAMED_WITH_COMMAND: [(&str, Setting, &str); 11] = [
     ("capture/src/dataset.rs", Setting::Scale, "train"),
+    ("capture/src/found_devices.rs", Setting::Sim, "run"),
     ("capture/src/open/mod.rs", Setting::Rig, "train"),
     ("capture/src/open/mod.rs", Setting::Sim, "run"),
     ("capture/src/supervised_arm.rs", Setting::Recover, "move"),

@@ -38,6 +38,7 @@ pub mod dataset;
 pub mod doctor;
 pub mod downscale;
 mod feed;
+mod found_devices;
 mod join;
 mod memory;
 mod nearest_name;
@@ -56,6 +57,7 @@ pub use calibration_images::{
 };
 pub use config::{ConfigError, Override, Rig};
 pub use feed::{Feed, FeedItem, Input, InputObserver, InputResult, InputTimes};
+pub use found_devices::{DeviceInfo, found_devices};
 pub use join::{Change, Counts, Join, JoinEvent, PosedImage, Rejection, SampleUse};
 pub use nearest_name::nearest_name;
 pub use notes::Notes;
