@@ -51,6 +51,7 @@ mod read_progress;
 pub mod recoveries;
 pub mod recovery;
 mod render_budget;
+pub mod rendered_files;
 mod report;
 pub mod robot_meshes;
 pub mod run_folder;
