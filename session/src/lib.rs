@@ -73,7 +73,7 @@ mod viewers;
 
 pub use checkpoints::{CheckpointOptions, Checkpoints, RunFlags, parse_period};
 pub use data::{Data, DataOptions, Purpose, expect, points_sha256};
-pub use dataset_export::{Written, write_nerfstudio};
+pub use dataset_export::{RecordingExport, Written, write_nerfstudio};
 pub use decisions::{DecisionLog, RunDescription, Settings};
 pub use error::{class, is_gpu_error, is_gpu_unrecoverable};
 pub use eval_plan::{EvalOutcome, EvalPlan, NamedScores};
