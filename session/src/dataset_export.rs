@@ -1,4 +1,5 @@
-//! Exports keyframes, such as those of a recording, as a nerfstudio dataset: color PNG, 16-bit depth, poses, split lists.
+//! Exports keyframes, such as those of a recording, as a nerfstudio dataset: color PNG, 16-bit
+//! depth, poses, split lists.
 
 use anyhow::{Context, bail, ensure};
 use capture::config::{Override, Rig};
