@@ -19,7 +19,7 @@ use crate::{corrected_rig, next_commands, training};
 use capture::config::Rig;
 use messages::Setting;
 use replay::Replay;
-use schedule::{Free, Schedule};
+use schedule::{Schedule, UntilLimit};
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use std::time::Instant;
@@ -154,7 +154,7 @@ impl TrainPlan {
     fn schedule(&self) -> anyhow::Result<Box<dyn Schedule>> {
         match &self.replay_decisions {
             Some(log) => Ok(Box::new(Replay::load(log)?)),
-            None => Ok(Box::new(Free)),
+            None => Ok(Box::new(UntilLimit)),
         }
     }
 

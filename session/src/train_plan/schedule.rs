@@ -15,77 +15,21 @@ use std::sync::Arc;
 use std::time::Duration;
 use trainer::ModelSpec;
 
-/// Decides what a training run trains on, and when.
+/// Decides what a training run trains on, and when. By default, all keyframes are pushed at once,
+/// and training ends at a limit.
 pub(super) trait Schedule {
     /// The limits of the run. `previous_secs`: training time of the run that it continues.
-    fn limits(&self, plan: &TrainPlan, previous_secs: f64) -> anyhow::Result<Limits>;
-
-    /// Checks the SHA-256 of the model from which depth is rendered.
-    fn check_depth_from(&self, sha256: Option<&str>) -> anyhow::Result<()>;
-
-    /// The images to read.
-    fn images(
-        &self,
-        plan: &TrainPlan,
-        previous: Option<&PreviousRun>,
-    ) -> anyhow::Result<DataOptions>;
-
-    /// Reads the images.
-    fn load_data(
-        &self,
-        path: &Path,
-        images: &DataOptions,
-        overrides: &[Override],
-        progress: OnReadProgress<'_>,
-    ) -> anyhow::Result<Data>;
-
-    /// Checks the keyframes, and the SHA-256 of the points from which training starts.
-    fn check_data(
-        &self,
-        path: &Path,
-        data: &Data,
-        points_sha256: Option<&str>,
-    ) -> anyhow::Result<()>;
-
-    /// The methods and options of a run that continues no other one.
-    fn model_specs(
-        &self,
-        plan: &TrainPlan,
-        data: &Data,
-        is_software: bool,
-    ) -> anyhow::Result<Vec<ModelSpec>>;
-
-    /// Checks the step of the checkpoint that training continues from, and the GPU.
-    fn check_start(&self, from_step: Option<u64>, adapter: &str) -> anyhow::Result<()>;
-
-    /// Whether training can continue on another device after a GPU failure.
-    fn can_recover(&self) -> bool;
-
-    /// Pushes the keyframes to the models, and trains the models to the end.
-    ///
-    /// * `preparation_time`: time already spent on the keyframes, which counts as training time.
-    fn drive(
-        &self,
-        sessions: &mut [Session],
-        keyframes: &[Arc<Keyframe>],
-        preparation_time: Duration,
-        services: Services<'_>,
-    ) -> anyhow::Result<()>;
-}
-
-/// Pushes all keyframes at once, and trains until a limit.
-pub(super) struct Free;
-
-impl Schedule for Free {
     fn limits(&self, plan: &TrainPlan, previous_secs: f64) -> anyhow::Result<Limits> {
         let Limits { seconds, steps } = plan.limits;
         training::limits(seconds, steps, previous_secs + DEFAULT_SECONDS)
     }
 
+    /// Checks the SHA-256 of the model from which depth is rendered.
     fn check_depth_from(&self, _sha256: Option<&str>) -> anyhow::Result<()> {
         Ok(())
     }
 
+    /// The images to read.
     fn images(
         &self,
         plan: &TrainPlan,
@@ -100,6 +44,7 @@ impl Schedule for Free {
         Ok(plan.images.clone())
     }
 
+    /// Reads the images.
     fn load_data(
         &self,
         path: &Path,
@@ -110,6 +55,7 @@ impl Schedule for Free {
         Data::load(path, images, Purpose::Training, overrides, progress)
     }
 
+    /// Checks the keyframes, and the SHA-256 of the points from which training starts.
     fn check_data(
         &self,
         _path: &Path,
@@ -119,6 +65,7 @@ impl Schedule for Free {
         Ok(())
     }
 
+    /// The methods and options of a run that continues no other one.
     fn model_specs(
         &self,
         plan: &TrainPlan,
@@ -129,14 +76,19 @@ impl Schedule for Free {
         training::model_specs(&plan.training, data, n_steps, is_software)
     }
 
+    /// Checks the step of the checkpoint that training continues from, and the GPU.
     fn check_start(&self, _from_step: Option<u64>, _adapter: &str) -> anyhow::Result<()> {
         Ok(())
     }
 
+    /// Whether training can continue on another device after a GPU failure.
     fn can_recover(&self) -> bool {
         true
     }
 
+    /// Pushes the keyframes to the models, and trains the models to the end.
+    ///
+    /// * `preparation_time`: time already spent on the keyframes, which counts as training time.
     fn drive(
         &self,
         sessions: &mut [Session],
@@ -148,3 +100,8 @@ impl Schedule for Free {
         training::drive(sessions, keyframes, preparation_time, stop, open_gpu)
     }
 }
+
+/// Trains until a limit.
+pub(super) struct UntilLimit;
+
+impl Schedule for UntilLimit {}
