@@ -2,11 +2,12 @@
 //! failures.
 //!
 //! [`TrainPlan::run`] carries out a whole training run on data from disk, and [`RunPlan::prepare`]
-//! begins a live run. A [`Session`] is one model in training with its clock, evaluations, checkpoints and reports. [`Data`] reads keyframes from
-//! disk, and [`UnsavedTraining`] trains on them without a run folder. [`LiveLoop`] is the loop of a
-//! live run: it takes keyframes from a [`capture::Feed`] and draws pictures for viewers. [`finish`]
-//! saves and scores the models. Timing-dependent decisions are logged ([`DecisionLog`]) and can be replayed. An
-//! [`Observer`] receives all reports.
+//! begins a live run. A [`Session`] is one model in training with its clock, evaluations,
+//! checkpoints and reports. [`Data`] reads keyframes from disk, and [`UnsavedTraining`] trains on
+//! them without a run folder. [`LiveLoop`] is the loop of a live run: it takes keyframes from a
+//! [`capture::Feed`] and draws pictures for viewers. [`finish`] saves and scores the models.
+//! Timing-dependent decisions are logged ([`DecisionLog`]) and can be replayed. An [`Observer`]
+//! receives all reports.
 //!
 //! ```
 //! use keyframe::{Keyframe, Split};
@@ -92,8 +93,8 @@ pub use read_progress::{OnReadProgress, ReadProgress, ignore_progress};
 pub use recoveries::OpenGpu;
 pub use recovery::Recovery;
 pub use run_plan::{
-    DiscardedRun, EndedRun, OpenedRun, PreparedRun, PreviousLiveRun, RunInProgress, RunInput, RunPlan,
-    SavedRun,
+    DiscardedRun, EndedRun, OpenedRun, PreparedRun, PreviousLiveRun, RunInProgress, RunInput,
+    RunPlan, SavedRun,
 };
 pub use saved_view::publish_saved;
 pub use scene_calibration::{RelativePose, SCENE_PARAMS, SceneCalibration, calibrate_scene};
