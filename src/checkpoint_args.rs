@@ -11,14 +11,6 @@ pub(crate) struct CheckpointArgs {
     checkpoint_secs: Option<Duration>,
 }
 
-impl From<CheckpointOptions> for CheckpointArgs {
-    fn from(options: CheckpointOptions) -> Self {
-        Self {
-            checkpoint_secs: options.period,
-        }
-    }
-}
-
 impl CheckpointArgs {
     /// The flag as an option.
     pub(crate) fn options(self) -> CheckpointOptions {

@@ -1,12 +1,13 @@
 //! Prints the reports of training sessions, and progress bars.
 
+use crate::exit::Exit;
 use crate::print;
 use indicatif::ProgressBar;
 use messages::counted;
 use parking_lot::Mutex;
 use serde::Serialize;
 use session::next_commands::{self, SavedModel};
-use session::{FinishedModel, Limits, Observer, ReadProgress, SessionEvent};
+use session::{FinishedModel, FinishedRun, Limits, Observer, ReadProgress, SessionEvent};
 use std::time::{Duration, Instant};
 
 /// What is printed about a session.
@@ -146,6 +147,37 @@ pub(crate) fn print_next_commands(models: &[FinishedModel]) {
     for line in next_commands::lines(&next_commands::for_models(&models)) {
         print::report(line);
     }
+}
+
+/// Prints that a run which was to be continued has reached its limits.
+pub(crate) fn print_finished_run(run: &FinishedRun, json: bool) -> anyhow::Result<Exit> {
+    let FinishedRun {
+        folder,
+        seconds,
+        limits,
+    } = run;
+    if json {
+        print::report_json(
+            &serde_json::json!({ "event": "finished", "seconds": seconds, "out": folder }),
+        )?;
+        return Ok(Exit::Done);
+    }
+    let limits = [
+        limits.steps.map(|steps| format!("--steps {steps}")),
+        limits.seconds.map(|secs| format!("--seconds {secs}")),
+    ];
+    let limits: Vec<String> = limits.into_iter().flatten().collect();
+    let limits = if limits.is_empty() {
+        String::new()
+    } else {
+        format!("{}, ", limits.join(" "))
+    };
+    print::report(format_args!(
+        "nothing left to do: the run in {} is finished ({limits}{seconds:.1} s) and its model is saved there; \
+         to continue it, use a larger --steps or --seconds",
+        folder.display()
+    ));
+    Ok(Exit::Done)
 }
 
 /// Whole seconds for the progress bar.

@@ -47,11 +47,6 @@ pub(crate) fn of(error: &anyhow::Error) -> Exit {
     }
 }
 
-/// Whether a command was rejected because of bad arguments or insufficient data.
-pub(crate) fn is_rejection(error: &anyhow::Error) -> bool {
-    matches!(of(error), Exit::BadArguments | Exit::InsufficientData)
-}
-
 /// Logs each loss of data as a warning and returns the exit code.
 pub(crate) fn from_losses(data_losses: &[String]) -> Exit {
     for loss in data_losses {

@@ -3,9 +3,8 @@
 use capture::config::{MAX_BYTES_RANGE, MAX_SPLATS_RANGE, SEED_RANGE};
 use clap::builder::{PossibleValuesParser, TypedValueParser};
 use clap::value_parser;
-use gpu::Gpu;
 use messages::listed;
-use session::{AvailableData, Refine, TrainingOptions};
+use session::{Refine, TrainingOptions};
 use std::sync::LazyLock;
 use trainer::ModelKind;
 use trainer::splat::CountPolicy;
@@ -111,15 +110,6 @@ pub(crate) enum CountArg {
 }
 
 impl TrainingArgs {
-    /// On a software adapter, logs which calibration parameters are not estimated by default.
-    pub(crate) fn log_unestimated(&self, available: AvailableData, gpu: &Gpu) {
-        if gpu.is_software()
-            && let Some(note) = self.options().note_on_software_adapter(available)
-        {
-            log::info!("{note}");
-        }
-    }
-
     /// The flags as options.
     pub(crate) fn options(&self) -> TrainingOptions {
         TrainingOptions {

@@ -12,7 +12,7 @@ use session::methods::MAX_SPLATS;
 use session::run_folder::{self, CreatedFolders};
 use session::{
     Data, DataOptions, Evaluation, Evaluator, Evaluators, Limits, Observer, OpenGpu, Purpose,
-    ReadProgress, TrainingOptions, TrainingOutcome, TrainingPlan, ignore_progress,
+    ReadProgress, Services, TrainingOptions, TrainingOutcome, UnsavedTraining, ignore_progress,
 };
 use std::collections::HashSet;
 use std::path::{Path, PathBuf};
@@ -421,8 +421,11 @@ impl<'a> Runs<'a> {
         if let Some(steps) = job.limits.steps {
             model_spec.options.common.n_planned_steps = steps;
         }
-        let plan = TrainingPlan {
+        let keyframes = (job.keyframes)();
+        let training = UnsavedTraining {
             model_spec,
+            keyframes: &keyframes,
+            preparation_time: job.data.data.preparation_time,
             // The points are not disturbed, and would reveal the true scene.
             initial_points: job
                 .data
@@ -436,16 +439,13 @@ impl<'a> Runs<'a> {
                 at_end: thorough,
             },
             limits: job.limits,
-            observer: self.host.observer.training(job.limits),
         };
-        let session = session::train(
-            self.gpu.clone(),
-            plan,
-            &(job.keyframes)(),
-            job.data.data.preparation_time,
-            &self.host.stop,
-            self.host.open_gpu,
-        )?;
+        let services = Services {
+            open_gpu: self.host.open_gpu,
+            stop: &self.host.stop,
+            observer: &|limits, _n_sessions| self.host.observer.training(limits),
+        };
+        let session = training.run(self.gpu.clone(), services)?;
         // An interrupted run is not saved, because it would count as a complete one.
         ensure!(
             session.is_over() || !self.host.stop.requested(),

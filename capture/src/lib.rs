@@ -5,9 +5,9 @@
 //! [`open::recording`] a recording, as one source of samples. A [`Join`] turns the samples into
 //! keyframes: it pairs each image with the pose of its camera at mid-exposure, rejects images that
 //! are blurred, badly exposed or too close to others, and bounds the memory. [`Stations`] corrects
-//! the drift of a moving base. [`Feed`] does all of this on a separate thread. [`dataset`] loads
-//! datasets with known poses instead. [`doctor`] checks whether this computer and its devices are
-//! ready.
+//! the drift of a moving base. [`Feed`] does all of this on a separate thread. [`RecordPlan`] records
+//! the samples. [`dataset`] loads datasets with known poses instead. [`doctor`] checks whether this
+//! computer and its devices are ready.
 //!
 //! ```
 //! use capture::{Join, Rig};
@@ -37,12 +37,16 @@ pub mod config;
 pub mod dataset;
 pub mod doctor;
 pub mod downscale;
+#[cfg(all(feature = "sim", feature = "realsense", target_os = "linux"))]
+pub mod emulation;
 mod feed;
+mod found_devices;
 mod join;
 mod memory;
 mod nearest_name;
 mod notes;
 pub mod open;
+mod record;
 mod robot_motion;
 mod stamp_clock;
 mod stations;
@@ -55,9 +59,11 @@ pub use calibration_images::{
 };
 pub use config::{ConfigError, Override, Rig};
 pub use feed::{Feed, FeedItem, Input, InputObserver, InputResult, InputTimes};
+pub use found_devices::{DeviceInfo, found_devices};
 pub use join::{Change, Counts, Join, JoinEvent, PosedImage, Rejection, SampleUse};
 pub use nearest_name::nearest_name;
 pub use notes::Notes;
+pub use record::{RecordPlan, Recorded, WrittenRecording};
 pub use robot_motion::RobotMotion;
 pub use stamp_clock::StampClock;
 pub use stations::{StationReport, Stations};

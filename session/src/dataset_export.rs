@@ -1,12 +1,15 @@
-//! Exports keyframes as a nerfstudio dataset: color PNG, 16-bit depth, poses, split lists.
+//! Exports keyframes, such as those of a recording, as a nerfstudio dataset: color PNG, 16-bit
+//! depth, poses, split lists.
 
 use anyhow::{Context, bail, ensure};
+use capture::config::{Override, Rig};
+use capture::{Join, SampleUse, Stations, open};
 use drivers::dataset::nerfstudio;
 use image::ExtendedColorType;
-use keyframe::{DepthMap, Keyframe, Split};
+use keyframe::{DepthMap, Keyframe, KeyframeList, Split};
 use kinematics::{Transform, transform};
 use serde_json::{Map, Value, json};
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 /// Depth unit: millimeters, which readers assume if the file does not specify a unit.
@@ -72,6 +75,58 @@ pub fn write_nerfstudio(
         .with_context(in_out)?;
     files::create_folder(out, &ENTRIES, |folder| write_dataset(folder, keyframes))
         .with_context(in_out)
+}
+
+/// A recording to export as a dataset.
+#[derive(Clone, Debug)]
+pub struct RecordingExport {
+    /// The recording.
+    pub recording: PathBuf,
+    /// Rig file that replaces the one stored in the recording.
+    pub rig: Option<PathBuf>,
+    /// List of the keyframes to export; those that a run would accept if `None`.
+    pub keyframes: Option<PathBuf>,
+    /// Folder to write.
+    pub out: PathBuf,
+}
+
+impl RecordingExport {
+    /// Exports the keyframes. Returns what was written, and descriptions of data that are missing.
+    ///
+    /// * `on_sample`: called after each sample.
+    pub fn run(&self, on_sample: &mut dyn FnMut()) -> anyhow::Result<(Written, Vec<String>)> {
+        // An export has the full resolution, whatever the scale of training.
+        let overrides = [Override::new("train.scale", 1.0)];
+        let rig = self
+            .rig
+            .as_deref()
+            .map(|file| Rig::load(file, &overrides))
+            .transpose()?;
+        let mut opened = open::recording(&self.recording, rig, &overrides)?;
+        let mut join = Join::new(&opened.rig)?;
+        if let Some(list) = &self.keyframes {
+            join = join.taking_only(KeyframeList::load(list)?);
+        }
+        while let Some(sample) = opened.source.next_sample()? {
+            join.push(sample);
+            on_sample();
+        }
+        // Images that still wait for a later joint state are decided now.
+        join.finish();
+        let missing_from_list = join.check_list()?;
+        let mut keyframes: Vec<_> = join.keyframes().cloned().collect();
+        // As in training, so that the exported poses are those that a model would use.
+        if let Some(mut stations) = Stations::new(&opened.rig) {
+            keyframes = stations.corrected(keyframes);
+        }
+        let written = write_nerfstudio(&self.out, keyframes.into_iter())
+            .with_context(|| format!("cannot export {}", self.recording.display()))?;
+        log::info!("{}", join.counts());
+        let mut data_losses = join.counts().data_losses(SampleUse::ProcessedOnly);
+        data_losses.extend(opened.damage.get().cloned());
+        data_losses.extend(missing_from_list);
+        Ok((written, data_losses))
+    }
 }
 
 /// Writes the files of a dataset. Errors name them relative to the folder, which has a temporary

@@ -109,7 +109,7 @@ impl Settings {
 
 /// A decision and the step at which it was made.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-pub struct Entry {
+pub(crate) struct Entry {
     /// Number of updates before the decision, including those of rejected trials.
     pub step: u64,
     #[serde(flatten)]
@@ -119,7 +119,7 @@ pub struct Entry {
 /// The kind of decision.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
-pub enum Decision {
+pub(crate) enum Decision {
     /// A keyframe that the model in the checkpoint was trained on.
     Restored(Pushed),
     /// A keyframe was added.
@@ -145,7 +145,7 @@ pub enum Decision {
 /// A keyframe that was added.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
-pub struct Pushed {
+pub(crate) struct Pushed {
     pub camera: String,
     pub stamp_nanos: i64,
     split: String,
@@ -160,7 +160,7 @@ pub struct Pushed {
 /// A keyframe that was removed.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
-pub struct Removed {
+pub(crate) struct Removed {
     pub camera: String,
     pub stamp_nanos: i64,
 }
@@ -168,7 +168,7 @@ pub struct Removed {
 /// The JSON value `true`.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(into = "bool", try_from = "bool")]
-pub struct True;
+pub(crate) struct True;
 
 impl From<True> for bool {
     fn from(_: True) -> Self {
@@ -200,7 +200,7 @@ impl Pushed {
 
     /// The keyframe as it was added: `reported` with the logged correction of its base pose
     /// applied.
-    pub fn corrected(&self, reported: &Arc<Keyframe>) -> Arc<Keyframe> {
+    pub(crate) fn corrected(&self, reported: &Arc<Keyframe>) -> Arc<Keyframe> {
         match self.map_from_odom {
             Some(numbers) => Arc::new(reported.with_base_correction(&from_xyz_xyzw(numbers))),
             None => reported.clone(),
@@ -209,12 +209,12 @@ impl Pushed {
 
     /// The split of the keyframe. Always `Some` for a log that was read, because the parser checks
     /// it.
-    pub fn split(&self) -> Option<Split> {
+    pub(crate) fn split(&self) -> Option<Split> {
         split_from_name(&self.split)
     }
 
     /// Whether a keyframe has the same pixels, depth, intrinsics, pose and velocity.
-    pub fn matches(&self, keyframe: &Keyframe) -> bool {
+    pub(crate) fn matches(&self, keyframe: &Keyframe) -> bool {
         self.fingerprint == fingerprint_of(keyframe)
     }
 }
@@ -433,27 +433,27 @@ impl Line {
 
 /// A log that was read.
 #[derive(Clone, Debug, PartialEq)]
-pub struct Decisions {
+pub(crate) struct Decisions {
     pub settings: Settings,
     pub entries: Vec<Entry>,
 }
 
 impl Decisions {
-    pub fn load(path: &Path) -> anyhow::Result<Self> {
+    pub(crate) fn load(path: &Path) -> anyhow::Result<Self> {
         let text = files::read_text(path)
             .with_context(|| format!("cannot read the decision log {path:?}"))?;
         Self::parse(&text).with_context(|| format!("the decision log {path:?}"))
     }
 
     /// Whether the log contains the end of training. The log of a killed run does not.
-    pub fn is_complete(&self) -> bool {
+    pub(crate) fn is_complete(&self) -> bool {
         self.entries
             .last()
             .is_some_and(|entry| entry.decision == Decision::End(True))
     }
 
     /// The keyframes in the log, in order.
-    pub fn pushed(&self) -> impl Iterator<Item = &Pushed> {
+    pub(crate) fn pushed(&self) -> impl Iterator<Item = &Pushed> {
         self.entries
             .iter()
             .filter_map(|entry| match &entry.decision {

@@ -22,6 +22,14 @@ pub fn class(error: &anyhow::Error) -> ErrorClass {
         .unwrap_or(ErrorClass::Failed)
 }
 
+/// Whether a run was rejected because of bad input or insufficient data.
+pub(crate) fn is_rejection(error: &anyhow::Error) -> bool {
+    matches!(
+        class(error),
+        ErrorClass::BadInput | ErrorClass::InsufficientData
+    )
+}
+
 /// The class of one error of a chain; `None` if its type has no classes.
 fn class_of(error: &(dyn Error + 'static)) -> Option<ErrorClass> {
     if error.is::<BadInput>() || error.is::<ConfigError>() {

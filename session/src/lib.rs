@@ -1,11 +1,13 @@
 //! Training sessions: train models on keyframes, evaluate them on a schedule, and recover from
 //! failures.
 //!
-//! A [`Session`] is one model in training with its clock, evaluations, checkpoints and reports.
-//! [`Data`] reads keyframes from disk; [`train`] and [`drive`] train on them. [`LiveLoop`] is the
-//! loop of a live run: it takes keyframes from a [`capture::Feed`] and draws pictures for viewers.
-//! [`finish`] saves and scores the models. Timing-dependent decisions are logged ([`DecisionLog`])
-//! and can be replayed ([`Replay`]). An [`Observer`] receives all reports.
+//! [`TrainPlan::run`] carries out a whole training run on data from disk, and [`RunPlan::prepare`]
+//! begins a live run. A [`Session`] is one model in training with its clock, evaluations,
+//! checkpoints and reports. [`Data`] reads keyframes from disk, and [`UnsavedTraining`] trains on
+//! them without a run folder. [`LiveLoop`] is the loop of a live run: it takes keyframes from a
+//! [`capture::Feed`] and draws pictures for viewers. [`finish`] saves and scores the models.
+//! Timing-dependent decisions are logged ([`DecisionLog`]) and can be replayed. An [`Observer`]
+//! receives all reports.
 //!
 //! ```
 //! use keyframe::{Keyframe, Split};
@@ -32,6 +34,7 @@ mod decisions;
 pub mod depth_from;
 mod editing;
 mod error;
+mod eval_plan;
 pub mod evaluate;
 pub mod evaluation_schedule;
 mod gpu_loss;
@@ -45,19 +48,24 @@ pub mod next_commands;
 mod observations;
 mod observer;
 mod pending_evaluation;
+mod previous_run;
 mod read_progress;
 pub mod recoveries;
 pub mod recovery;
 mod render_budget;
-mod replay;
+pub mod rendered_files;
 mod report;
 pub mod robot_meshes;
 pub mod run_folder;
+mod run_plan;
+mod saved_view;
 mod scene_calibration;
 pub mod scene_hint;
 mod session;
+mod session_setup;
 mod stored_keyframes;
 mod time_slices;
+mod train_plan;
 mod training;
 mod training_clock;
 mod training_options;
@@ -66,9 +74,10 @@ mod viewers;
 
 pub use checkpoints::{CheckpointOptions, Checkpoints, RunFlags, parse_period};
 pub use data::{Data, DataOptions, Purpose, expect, points_sha256};
-pub use dataset_export::{Written, write_nerfstudio};
+pub use dataset_export::{RecordingExport, Written, write_nerfstudio};
 pub use decisions::{DecisionLog, RunDescription, Settings};
 pub use error::{class, is_gpu_error, is_gpu_unrecoverable};
+pub use eval_plan::{EvalOutcome, EvalPlan, NamedScores};
 pub use evaluate::Evaluator;
 pub use gpu_loss::lose_gpu_at_step;
 pub use kept_folder::KeptFolder;
@@ -79,17 +88,24 @@ pub use methods::methods_of;
 pub use observer::{
     DoneEvent, Evaluation, FinishedReport, Observer, ProfileEvent, SessionEvent, SessionProgress,
 };
+pub use previous_run::FinishedRun;
 pub use read_progress::{OnReadProgress, ReadProgress, ignore_progress};
 pub use recoveries::OpenGpu;
 pub use recovery::Recovery;
-pub use replay::Replay;
+pub use run_plan::{
+    DiscardedRun, EndedRun, OpenedRun, PreparedRun, PreviousLiveRun, RunInProgress, RunInput,
+    RunPlan, SavedRun,
+};
+pub use saved_view::publish_saved;
 pub use scene_calibration::{RelativePose, SCENE_PARAMS, SceneCalibration, calibrate_scene};
 pub use session::{
     EndingSession, Evaluators, FinishedModel, Limits, Persistence, Scoreboard, Session,
     SessionOptions, TrainingOutcome, TrainingTime, finish,
 };
+pub use session_setup::{NewObserver, Services};
 pub use stored_keyframes::StoredKeyframes;
-pub use training::{TrainingPlan, check_before_data, drive, limits, model_specs, train};
+pub use train_plan::{TrainOutcome, TrainPlan, Trained};
+pub use training::{UnsavedTraining, check_before_data, limits, model_specs};
 pub use training_clock::Clock;
 pub use training_options::{AvailableData, REALIGN, Refine, RefineSettings, TrainingOptions};
 pub use viewer::{ModelViewer, ServedModel};

@@ -72,6 +72,28 @@ pub fn check_no_unfinished_run(out: &Path) -> anyhow::Result<()> {
     }
 }
 
+/// Checks the folder that was requested for the results of a run, if any: the results of another
+/// run would be overwritten.
+///
+/// * `resume`: folder of the run that is continued.
+/// * `data`: folder of the data.
+pub(crate) fn check_out(
+    out: Option<&Path>,
+    resume: Option<&Path>,
+    data: Option<&Path>,
+) -> anyhow::Result<()> {
+    let Some(out) = out else { return Ok(()) };
+    check_no_model(out)?;
+    if let Some(data) = data {
+        check_not_data_folder(out, data)?;
+    }
+    if resume == Some(out) {
+        Ok(())
+    } else {
+        check_no_unfinished_run(out)
+    }
+}
+
 /// Returns an error if results would be written into the folder of the data.
 pub fn check_not_data_folder(out: &Path, data: &Path) -> anyhow::Result<()> {
     // The same folder may have several names, for example through a link. A folder that does not

@@ -2,9 +2,9 @@
 
 use crate::data::{Data, DataOptions};
 use crate::methods::{self, COUNT, MAX_SPLATS, Settings, methods_of};
-use crate::observer::Observer;
 use crate::recoveries::{OpenGpu, Recoveries};
 use crate::session::{Evaluators, Limits, Session, SessionOptions};
+use crate::session_setup::Services;
 use crate::training_options::{Refine, RefineSettings, TrainingOptions};
 use crate::{run_folder, time_slices};
 use capture::Stop;
@@ -19,59 +19,62 @@ use std::time::{Duration, Instant};
 use trainer::splat::CountPolicy;
 use trainer::{self, CommonOptions, ModelKind, ModelSpec};
 
-/// All inputs of a training run except its keyframes.
-pub struct TrainingPlan {
+/// Training of a new model that is not saved, such as one run of a bench.
+pub struct UnsavedTraining<'a> {
     /// Method and options of the model.
     pub model_spec: ModelSpec,
+    /// The images.
+    pub keyframes: &'a [Arc<Keyframe>],
+    /// Time already spent on preparing the keyframes; it counts as training time.
+    pub preparation_time: Duration,
     /// Points from which the model starts if no keyframe has depth.
     pub initial_points: Option<Arc<InitialPoints>>,
     /// How the model is scored.
     pub evaluators: Evaluators,
     /// When to stop.
     pub limits: Limits,
-    /// Receives the events.
-    pub observer: Box<dyn Observer>,
 }
 
-/// Trains a new model until a limit or until `stop` is requested.
-///
-/// The clock starts once all pipelines are compiled. Seeding counts as training time.
-pub fn train(
-    gpu: Arc<Gpu>,
-    plan: TrainingPlan,
-    keyframes: &[Arc<Keyframe>],
-    preparation_time: Duration,
-    stop: &Stop,
-    open_gpu: OpenGpu,
-) -> anyhow::Result<Session> {
-    let kind = plan.model_spec.kind;
-    let mut method = plan.model_spec.start(gpu.clone())?;
-    // Compiling kernels takes seconds and is not training.
-    method.model_mut().prepare()?;
-    let mut session = Session::new(
-        gpu,
-        (kind, method),
-        SessionOptions {
-            stop: stop.clone(),
-            initial_points: plan.initial_points,
-            ..SessionOptions::new(plan.evaluators, plan.limits, plan.observer)
-        },
-    );
-    drive(
-        std::slice::from_mut(&mut session),
-        keyframes,
-        preparation_time,
-        stop,
-        open_gpu,
-    )?;
-    Ok(session)
+impl UnsavedTraining<'_> {
+    /// Trains until a limit or until a stop is requested.
+    ///
+    /// The clock starts once all pipelines are compiled. Seeding counts as training time.
+    pub fn run(self, gpu: Arc<Gpu>, services: Services<'_>) -> anyhow::Result<Session> {
+        let Services {
+            open_gpu,
+            stop,
+            observer,
+        } = services;
+        let kind = self.model_spec.kind;
+        let mut method = self.model_spec.start(gpu.clone())?;
+        // Compiling kernels takes seconds and is not training.
+        method.model_mut().prepare()?;
+        let observer = observer(self.limits, 1);
+        let mut session = Session::new(
+            gpu,
+            (kind, method),
+            SessionOptions {
+                stop: stop.clone(),
+                initial_points: self.initial_points,
+                ..SessionOptions::new(self.evaluators, self.limits, observer)
+            },
+        );
+        drive(
+            std::slice::from_mut(&mut session),
+            self.keyframes,
+            self.preparation_time,
+            stop,
+            open_gpu,
+        )?;
+        Ok(session)
+    }
 }
 
 /// Starts the clock, pushes the keyframes to all models, and trains each until a limit or until
 /// `stop` is requested.
 ///
 /// `preparation_time`: time already spent on preparing the keyframes; it counts as training time.
-pub fn drive(
+pub(crate) fn drive(
     sessions: &mut [Session],
     keyframes: &[Arc<Keyframe>],
     preparation_time: Duration,

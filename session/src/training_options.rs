@@ -303,10 +303,16 @@ impl TrainingOptions {
         })
     }
 
+    /// On a software adapter, logs which calibration parameters are not estimated by default.
+    pub(crate) fn log_unestimated(&self, available: AvailableData, is_software: bool) {
+        if is_software && let Some(note) = self.note_on_software_adapter(available) {
+            log::info!("{note}");
+        }
+    }
+
     /// On a software adapter: which calibration parameters are not estimated by default, and how to
     /// request them. `None` if the user has chosen the parameters.
-    #[must_use]
-    pub fn note_on_software_adapter(&self, available: AvailableData) -> Option<String> {
+    fn note_on_software_adapter(&self, available: AvailableData) -> Option<String> {
         if !self.refine.is_empty() {
             return None;
         }

@@ -5,12 +5,9 @@ use crate::open_gpu::open_gpu;
 use crate::permission_args::PermissionArgs;
 use crate::{print, signals};
 use anyhow::{Context, ensure};
-use capture::config::{Override, Rig};
-use capture::{Join, SampleUse, Stations, open};
 use clap::builder::{PossibleValue, PossibleValuesParser};
-use keyframe::KeyframeList;
 use messages::{BadInput, counted, listed};
-use session::{Written, methods, run_folder, write_nerfstudio};
+use session::{RecordingExport, Written, methods, run_folder};
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use trainer::ModelKind;
@@ -223,39 +220,17 @@ fn write_export(export: &Export, args: &Args, out: &Path) -> anyhow::Result<Expo
 }
 
 fn export_recording(args: &Args) -> anyhow::Result<Exit> {
-    // An export has the full resolution, whatever the scale of training.
-    let overrides = [Override::new("train.scale", 1.0)];
-    let rig = args
-        .rig
-        .as_deref()
-        .map(|file| Rig::load(file, &overrides))
-        .transpose()?;
-    let mut opened = open::recording(&args.from, rig, &overrides)?;
-    let mut join = Join::new(&opened.rig)?;
-    if let Some(list) = &args.keyframes {
-        join = join.taking_only(KeyframeList::load(list)?);
-    }
+    let export = RecordingExport {
+        recording: args.from.clone(),
+        rig: args.rig.clone(),
+        keyframes: args.keyframes.clone(),
+        out: args.out.clone(),
+    };
     let bar = print::bar(None, "{spinner} reading {pos} samples", false);
-    while let Some(sample) = opened.source.next_sample()? {
-        join.push(sample);
-        bar.inc(1);
-    }
-    // Images that still wait for a later joint state are decided now.
-    join.finish();
+    let exported = export.run(&mut || bar.inc(1));
     bar.finish_and_clear();
-    let missing_from_list = join.check_list()?;
-    let mut keyframes: Vec<_> = join.keyframes().cloned().collect();
-    // As in training, so that the exported poses are those that a model would use.
-    if let Some(mut stations) = Stations::new(&opened.rig) {
-        keyframes = stations.corrected(keyframes);
-    }
-    let written = write_nerfstudio(&args.out, keyframes.into_iter())
-        .with_context(|| format!("cannot export {}", args.from.display()))?;
-    log::info!("{}", join.counts());
+    let (written, data_losses) = exported?;
     print::report(format!("{} -> {}", sentence(written), args.out.display()));
-    let mut data_losses = join.counts().data_losses(SampleUse::ProcessedOnly);
-    data_losses.extend(opened.damage.get().cloned());
-    data_losses.extend(missing_from_list);
     Ok(exit::from_losses(&data_losses))
 }
 

@@ -9,12 +9,12 @@ use model_files::Aabb;
 use serde::Serialize;
 use session::camera_path::{CameraPath, PathCamera};
 use session::evaluate::{covered_frac, warn_if_hardly_covered};
-use session::methods;
 use session::run_folder::expect_model;
-use std::path::{Path, PathBuf};
+use session::{methods, rendered_files};
+use std::path::PathBuf;
 use std::sync::Arc;
 use std::time::Instant;
-use trainer::{LoadedModel, Picture, Projection, RenderRequest};
+use trainer::{LoadedModel, Projection, RenderRequest};
 
 /// Image size if neither a flag nor the camera path gives one.
 const DEFAULT_SIZE_PX: [u32; 2] = [1280, 720];
@@ -138,7 +138,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
         .collect::<Result<Vec<_>, _>>()?;
     // Everything that can be refused is checked before the GPU is opened and the model is loaded.
     expect_model(&args.model)?;
-    check_no_overwrite(&args.out, requests.len())?;
+    rendered_files::check_no_overwrite(&args.out, requests.len())?;
     signals::remove_partial_files_on_signals()?;
     let loaded = methods::load(open_gpu()?, &args.model)?;
     let is_empty = methods::note_if_empty(&args.model, &loaded).is_some();
@@ -166,7 +166,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
         })?;
         let draw_millis = since.elapsed().as_secs_f64() * 1e3;
         covered_fracs.push(covered_frac(&picture));
-        let (picture, depth) = write(&args.out, ix, &picture, args.depth)?;
+        let (picture, depth) = rendered_files::write(&args.out, ix, &picture, args.depth)?;
         let rendered = RenderedPicture {
             picture,
             depth,
@@ -234,71 +234,6 @@ impl Args {
     }
 }
 
-/// File names of an image and its depth.
-fn files(folder: &Path, ix: usize) -> [PathBuf; 2] {
-    [
-        folder.join(format!("{ix:05}.png")),
-        folder.join(format!("{ix:05}_depth.npy")),
-    ]
-}
-
-/// Rejects a folder that already holds any of the `n` images or their depth.
-fn check_no_overwrite(folder: &Path, n: usize) -> Result<(), BadInput> {
-    match (0..n)
-        .flat_map(|ix| files(folder, ix))
-        .find(|file| file.exists())
-    {
-        Some(file) => Err(BadInput(format!(
-            "--out: {} exists; choose another folder",
-            file.display()
-        ))),
-        None => Ok(()),
-    }
-}
-
-/// Writes an image and optionally its depth; returns their files.
-fn write(
-    folder: &Path,
-    ix: usize,
-    picture: &Picture,
-    with_depth: bool,
-) -> anyhow::Result<(PathBuf, Option<PathBuf>)> {
-    let [file, depth] = files(folder, ix);
-    files::create_from(&file, |inside| write_png(inside, picture))
-        .with_context(|| format!("cannot write {}", file.display()))?;
-    let depth = with_depth.then_some(depth);
-    if let Some(depth) = &depth {
-        files::create(depth, |file| write_npy(file, picture))
-            .with_context(|| format!("cannot write {}", depth.display()))?;
-    }
-    Ok((file, depth))
-}
-
-fn write_png(file: &Path, picture: &Picture) -> anyhow::Result<()> {
-    let [width, height] = picture.size_px;
-    Ok(image::save_buffer(
-        file,
-        &picture.rgba_srgb,
-        width,
-        height,
-        image::ExtendedColorType::Rgba8,
-    )?)
-}
-
-/// Writes depth as a `[height, width]` array of 32-bit floats.
-fn write_npy(file: &mut std::fs::File, picture: &Picture) -> std::io::Result<()> {
-    use npyz::WriterBuilder;
-    let [width, height] = picture.size_px.map(u64::from);
-    let to = std::io::BufWriter::new(file);
-    let mut writer = npyz::WriteOptions::new()
-        .default_dtype()
-        .shape(&[height, width])
-        .writer(to)
-        .begin_nd()?;
-    writer.extend(picture.depth_m.iter())?;
-    writer.finish()
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -325,26 +260,5 @@ mod tests {
         ] {
             assert!(corners(invalid).is_err(), "{invalid}");
         }
-    }
-
-    #[test]
-    fn depth_files_hold_the_rendered_depth() {
-        let folder = tempfile::tempdir().expect("folder");
-        let picture = Picture {
-            size_px: [2, 3],
-            rgba_srgb: vec![255; 24],
-            depth_m: vec![0.0, 1.0, 2.0, 3.0, 4.0, 5.5],
-        };
-        let (file, depth) = write(folder.path(), 7, &picture, true).expect("written");
-        let bytes = std::fs::read(depth.expect("requested")).expect("a file");
-        let read = npyz::NpyFile::new(&bytes[..]).expect("npy");
-        assert_eq!(read.shape(), [3, 2]);
-        assert_eq!(read.into_vec::<f32>().expect("floats"), picture.depth_m);
-        assert!(file.ends_with("00007.png"));
-        check_no_overwrite(folder.path(), 7).expect("the eighth image is not requested");
-        let message = check_no_overwrite(folder.path(), 8)
-            .expect_err("the file exists")
-            .0;
-        assert!(message.contains("00007.png exists"), "{message}");
     }
 }

@@ -43,7 +43,7 @@ pub(crate) struct Args {
 /// Simulates the rig, then emulates its devices until Ctrl-C.
 #[cfg(all(feature = "sim", feature = "realsense", target_os = "linux"))]
 pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
-    emulation::run(args)
+    emulated::run(args)
 }
 
 /// Reports that this build lacks the required features.
@@ -56,6 +56,4 @@ pub(crate) fn run(_args: &Args) -> anyhow::Result<Exit> {
 }
 
 #[cfg(all(feature = "sim", feature = "realsense", target_os = "linux"))]
-mod bag;
-#[cfg(all(feature = "sim", feature = "realsense", target_os = "linux"))]
-mod emulation;
+mod emulated;

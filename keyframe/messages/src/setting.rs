@@ -51,6 +51,8 @@ settings! {
     EnableMotion = "is_confirmed",
     /// Constant latency of a camera.
     FixedMillis = "fixed_millis",
+    /// Recording that replaces the devices.
+    From = "recording",
     /// Selection of test images.
     Holdout = "holdout",
     /// Random latency of a camera.
@@ -61,6 +63,8 @@ settings! {
     Levels = "levels",
     /// Address of the server.
     Listen = "listen",
+    /// Whether a simulation waits for the trainer.
+    Lockstep = "is_lockstep",
     /// Maximum GPU memory of a model.
     MaxBytes = "max_bytes",
     /// Maximum number of poses to which an arm moves.
@@ -83,6 +87,8 @@ settings! {
     RateHz = "rate_hz",
     /// Images per second of simulated cameras.
     Rates = "rates_hz",
+    /// File to which the data of the devices are recorded.
+    Record = "record",
     /// Recovery of an arm that has stopped.
     Recover = "recover",
     /// Calibration parameters that training refines.
@@ -109,6 +115,10 @@ settings! {
     Size = "sizes_px",
     /// Numbers of splats.
     Splats = "n_splats",
+    /// Number of optimizer steps.
+    Steps = "steps",
+    /// Optimizer steps between two keyframes.
+    StepsPerKeyframe = "steps_per_keyframe",
     /// Printed calibration target.
     Target = "target",
     /// Link of a robot description that is the flange.

@@ -3,7 +3,7 @@
 
 use super::run_flags;
 use super::runs_args::print_result;
-use crate::commands::run::{self, DiscardedRun};
+use crate::commands::run::{self, Running};
 use crate::exit::{self, Exit};
 use crate::print;
 use anyhow::Context;
@@ -11,7 +11,7 @@ use bench::live::{Conditions, HandEyeError, InputCounts, LiveRun, findings};
 use bench::{BenchResult, Disturbance, LiveDisturbance, Timeline, Viewer, ViewerOptions};
 use capture::{Rig, open};
 use messages::InsufficientData;
-use session::run_folder::CreatedFolders;
+use session::DiscardedRun;
 use std::ffi::OsString;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
@@ -275,15 +275,15 @@ impl Args {
             flags,
             &self.run_flags,
         )?;
-        let mut running = run::start(&flags, None, &mut CreatedFolders::default())?;
+        let Running { mut run, page, .. } = run::start(&flags, None)?;
         // A disturbance in the middle of the run shows how fast the model recovers.
         let change = conditions
             .disturbance
             .and_then(|disturbance| disturbance.keyframe_change(1, 0.5 * self.seconds));
         if let Some(change) = change {
-            running.live.change_keyframes(change);
+            run.live.change_keyframes(change);
         }
-        let address = running.page.address();
+        let address = page.address();
         let period = self.picture_rate.map_or(Duration::ZERO, |rate_hz| {
             Duration::from_secs_f64(1.0 / rate_hz)
         });
@@ -296,18 +296,18 @@ impl Args {
             .map(|_| Viewer::connect(address, options))
             .collect::<anyhow::Result<_>>()?;
         let mut timeline = Timeline::default();
-        while running.run_time_slice()? {
-            timeline.sample(&running.live, &running.gpu, &viewers);
+        while run.run_time_slice()? {
+            timeline.sample(&run.live, &run.gpu, &viewers);
         }
         // Measured before the viewers disconnect, because their latencies are part of it.
-        let measured = LiveRun::of(conditions, &running.live, &viewers, &timeline);
+        let measured = LiveRun::of(conditions, &run.live, &viewers, &timeline);
         drop(viewers);
         let DiscardedRun {
             input_result,
             data_losses,
             no_model_reason,
             is_interrupted,
-        } = running.discard()?;
+        } = run.discard()?;
         let input = InputCounts::of(&input_result);
         match (input_result.input_error, no_model_reason) {
             // An interruption explains all other problems, so it comes first.

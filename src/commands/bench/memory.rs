@@ -3,14 +3,13 @@
 
 use super::run_flags;
 use super::runs_args::print_result;
-use crate::commands::run;
+use crate::commands::run::{self, Running};
 use crate::exit::Exit;
 use crate::print;
 use anyhow::Context;
 use bench::memory::MemoryRun;
 use bench::{BenchResult, Sample, Viewer, ViewerOptions};
 use messages::BadInput;
-use session::run_folder::CreatedFolders;
 use std::ffi::OsString;
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
@@ -89,8 +88,8 @@ pub(super) fn run(args: &Args) -> anyhow::Result<Exit> {
 
 /// Returns the measurements of a run, and the device error that ended it early, if any.
 fn measure(args: &Args, flags: &run::Args) -> anyhow::Result<(MemoryRun, Option<drivers::Error>)> {
-    let mut running = run::start(flags, None, &mut CreatedFolders::default())?;
-    let address = running.page.address();
+    let Running { mut run, page, .. } = run::start(flags, None)?;
+    let address = page.address();
     let viewers: Vec<Viewer> = (0..args.viewers)
         .map(|_| Viewer::connect(address, ViewerOptions::default()))
         .collect::<anyhow::Result<_>>()?;
@@ -98,13 +97,13 @@ fn measure(args: &Args, flags: &run::Args) -> anyhow::Result<(MemoryRun, Option<
     let mut measured = MemoryRun {
         input: args.input(),
         n_viewers: args.viewers,
-        is_software: running.gpu.is_software(),
+        is_software: run.gpu.is_software(),
         ..MemoryRun::default()
     };
     let mut due = Instant::now();
     let mut last_printed = None;
     let mut written = Instant::now();
-    while running.run_time_slice()? {
+    while run.run_time_slice()? {
         let now = Instant::now();
         if now < due {
             continue;
@@ -112,7 +111,7 @@ fn measure(args: &Args, flags: &run::Args) -> anyhow::Result<(MemoryRun, Option<
         // From now on and not from the last due time, so that a long step is not followed by
         // several samples at once.
         due = now + every;
-        let sample = measured.add_sample(&running.live, &running.gpu, &viewers)?;
+        let sample = measured.add_sample(&run.live, &run.gpu, &viewers)?;
         if args.json {
             print::report_json(&serde_json::json!({ "event": "sample", "sample": sample }))?;
         } else if last_printed
@@ -129,7 +128,7 @@ fn measure(args: &Args, flags: &run::Args) -> anyhow::Result<(MemoryRun, Option<
         }
     }
     drop(viewers);
-    Ok((measured, running.discard()?.input_result.input_error))
+    Ok((measured, run.discard()?.input_result.input_error))
 }
 
 fn describe(sample: &Sample) -> String {

@@ -1,19 +1,17 @@
-//! Emulates the devices of a rig file on the wire.
+//! Emulates the devices of a rig file on the wire, for the drivers of this or of other programs.
 
-use super::Args;
-use super::bag::CameraFiles;
-use crate::exit::Exit;
-use crate::{print, signals};
+mod camera_files;
+
+use crate::config::{ArmDriver, BaseDriver, Rig, ScannerDriver};
+use crate::open::{self, Devices, FCI_PORT, Opened};
+use crate::stop::Stop;
 use anyhow::{Context, bail};
-use capture::Stop;
-use capture::config::{ArmDriver, BaseDriver, Rig, ScannerDriver};
-use capture::open::{self, Devices, FCI_PORT, Opened};
+use camera_files::CameraFiles;
 use drivers::franka::FciVersion;
 use drivers::franka::emulated::{EmulatedRobot, Limits, RobotConfig};
 use drivers::{Sample, can, clock};
 use kinematics::{Stamp, Transform};
 use messages::BadInput;
-use serde::Serialize;
 use sim::wire::{
     DatagramTargets, DeviceScript, EmulatedMotors, EmulatedSenders, JointTrack, PlaybackClock,
     emulate_fci,
@@ -24,8 +22,6 @@ use std::time::Duration;
 
 /// Recording of the simulation, next to the rig file.
 const SIMULATION_FILE: &str = "script.mcap";
-/// How often Ctrl-C is checked.
-const POLL: Duration = Duration::from_millis(50);
 
 /// Scenes with a bundled rig file for emulated devices.
 const SCENES: [(&str, &str, &str); 2] = [
@@ -41,89 +37,192 @@ const SCENES: [(&str, &str, &str); 2] = [
     ),
 ];
 
-/// Printed when all devices are ready.
-#[derive(Debug, Serialize)]
-struct ReadyEvent<'a> {
-    event: &'static str,
-    /// The rig file to run against the emulated devices.
-    rig: &'a Path,
-    /// Seconds until the playback begins, and its length.
-    starts_in_secs: f64,
-    seconds: f64,
-    devices: &'a [String],
+/// What is emulated, and when.
+#[derive(Clone, Debug)]
+pub struct EmulationPlan {
+    /// A rig file, or the name of a scene.
+    pub rig_or_scene: String,
+    /// Folder for the rig file to run against the emulated devices; `sim-NAME` if `None`.
+    pub out: Option<PathBuf>,
+    /// Recording of the rig that is played back; a simulation if `None`.
+    pub recording: Option<PathBuf>,
+    /// Length of the playback, seconds.
+    pub seconds: f64,
+    /// Time until the playback begins, seconds.
+    pub start_in_secs: f64,
+    /// Version of FCI that an emulated Franka controller uses: 5 or 10.
+    pub fci: String,
+    /// Time for which an emulated Franka controller waits for each command during a motion.
+    pub answer_wait: Duration,
 }
 
-pub(super) fn run(args: &Args) -> anyhow::Result<Exit> {
-    let stop = signals::stop_on_signals()?;
-    let (name, mut rig) = load(&args.rig_or_scene)?;
-    check(&rig)?;
-    if rig.arm.driver == ArmDriver::Franka {
-        // Checked before simulating for a minute.
-        let address = fci_address(&rig.arm.address)?;
-        TcpListener::bind(address)
-            .with_context(|| format!("cannot emulate the controller at {address}"))?;
-    }
-    let folder = args
-        .out
-        .clone()
-        .unwrap_or_else(|| PathBuf::from(format!("sim-{name}")));
-    std::fs::create_dir_all(&folder)
-        .with_context(|| format!("cannot create the folder {}", folder.display()))?;
-    // All samples are prepared before the playback: simulating and encoding would not keep up with
-    // real time.
-    let recording = match &args.from {
-        Some(path) => path.clone(),
-        None => match simulate(args, &rig, &folder, &stop)? {
-            Some(path) => path,
-            None => return Ok(Exit::Done),
-        },
-    };
-    let mut camera_files = CameraFiles::new(&rig, &folder)?;
-    let Some(script) = read(&recording, args, &mut camera_files, &stop)? else {
-        return Ok(Exit::Done);
-    };
-    let mut descriptions = camera_files.finish(&mut rig)?;
-    let first = script.joints.first().map(|state| state.stamp);
-    let first = first
-        .or(script.poses.first().map(|pose| pose.stamp))
-        .unwrap_or_default();
-    let playback_clock = PlaybackClock {
-        scripted: first,
-        emulated: clock::now().plus_secs(args.start_in),
-    };
-    // The playback time is known only now, so the stamps of the camera files are shifted by an
-    // offset in the rig file.
-    for camera in &mut rig.cameras {
-        camera.realsense.clock_offset_nanos = playback_clock
-            .emulated
-            .0
-            .saturating_sub(playback_clock.scripted.0);
-    }
-    let rig_file = write_rig(&folder, &rig)?;
-    // Last, because the playback time is running.
-    let emulated = EmulatedDevices::start(&rig, &script, playback_clock, args)?;
-    descriptions.extend(emulated.descriptions.iter().cloned());
-    if args.json {
-        print::report_json(&ReadyEvent {
-            event: "ready",
-            rig: &rig_file,
-            starts_in_secs: args.start_in,
-            seconds: args.seconds,
-            devices: &descriptions,
-        })?;
-    } else {
-        for device in &descriptions {
-            print::report(device);
+/// Work before the playback. Each stage reports the seconds of the playback that are done.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Stage {
+    /// The rig is simulated into a recording.
+    Simulating,
+    /// The samples are encoded.
+    Preparing,
+}
+
+/// Emulated devices, which reply until they are dropped.
+pub struct Emulation {
+    /// The rig file to run against the devices.
+    pub rig_file: PathBuf,
+    /// One description per device.
+    pub descriptions: Vec<String>,
+    /// Time at which the playback begins.
+    pub starts_at: Stamp,
+    _devices: EmulatedDevices,
+}
+
+impl EmulationPlan {
+    /// Prepares the samples, and starts the devices. Returns `None` if `stop` is requested.
+    ///
+    /// * `on_progress`: called after each sample.
+    ///
+    /// # Errors
+    ///
+    /// If the rig cannot be emulated, or a device or a file cannot be created.
+    pub fn start(
+        &self,
+        stop: &Stop,
+        on_progress: &mut dyn FnMut(Stage, f64),
+    ) -> anyhow::Result<Option<Emulation>> {
+        let (name, mut rig) = load(&self.rig_or_scene)?;
+        check(&rig)?;
+        if rig.arm.driver == ArmDriver::Franka {
+            // Checked before simulating for a minute.
+            let address = fci_address(&rig.arm.address)?;
+            TcpListener::bind(address)
+                .with_context(|| format!("cannot emulate the controller at {address}"))?;
         }
-        print::report(format_args!(
-            "Playing back {:.1} s, starting in {:.1} s. In another terminal: fieldrig run {}",
-            args.seconds,
-            args.start_in,
-            rig_file.display()
-        ));
+        let folder = self
+            .out
+            .clone()
+            .unwrap_or_else(|| PathBuf::from(format!("sim-{name}")));
+        std::fs::create_dir_all(&folder)
+            .with_context(|| format!("cannot create the folder {}", folder.display()))?;
+        // All samples are prepared before the playback: simulating and encoding would not keep up
+        // with real time.
+        let recording = match &self.recording {
+            Some(path) => path.clone(),
+            None => match self.simulate(&rig, &folder, stop, on_progress)? {
+                Some(path) => path,
+                None => return Ok(None),
+            },
+        };
+        let mut camera_files = CameraFiles::new(&rig, &folder)?;
+        let Some(script) = self.read(&recording, &mut camera_files, stop, on_progress)? else {
+            return Ok(None);
+        };
+        let mut descriptions = camera_files.finish(&mut rig)?;
+        let first = script.joints.first().map(|state| state.stamp);
+        let first = first
+            .or(script.poses.first().map(|pose| pose.stamp))
+            .unwrap_or_default();
+        let playback_clock = PlaybackClock {
+            scripted: first,
+            emulated: clock::now().plus_secs(self.start_in_secs),
+        };
+        // The playback time is known only now, so the stamps of the camera files are shifted by an
+        // offset in the rig file.
+        for camera in &mut rig.cameras {
+            camera.realsense.clock_offset_nanos = playback_clock
+                .emulated
+                .0
+                .saturating_sub(playback_clock.scripted.0);
+        }
+        let rig_file = write_rig(&folder, &rig)?;
+        // Last, because the playback time is running.
+        let devices = EmulatedDevices::start(&rig, &script, playback_clock, self)?;
+        descriptions.extend(devices.descriptions.iter().cloned());
+        Ok(Some(Emulation {
+            rig_file,
+            descriptions,
+            starts_at: playback_clock.emulated,
+            _devices: devices,
+        }))
     }
-    wait(&stop, playback_clock.emulated, args)?;
-    Ok(Exit::Done)
+
+    /// Simulates the rig into a recording; `None` if interrupted.
+    fn simulate(
+        &self,
+        rig: &Rig,
+        folder: &Path,
+        stop: &Stop,
+        on_progress: &mut dyn FnMut(Stage, f64),
+    ) -> anyhow::Result<Option<PathBuf>> {
+        let mut simulated = rig.clone();
+        // The simulation is recorded, not watched, so it need not run in real time.
+        simulated.sim.lockstep = true;
+        let Opened {
+            rig, mut source, ..
+        } = open::rig(simulated, Devices::Sim)?;
+        let path = folder.join(SIMULATION_FILE);
+        // A leftover of an earlier or interrupted simulation.
+        match std::fs::remove_file(&path) {
+            Err(error) if error.kind() != std::io::ErrorKind::NotFound => {
+                return Err(error).with_context(|| format!("cannot replace {}", path.display()));
+            }
+            _ => {}
+        }
+        let mut recorder = open::recorder(&path, &rig)?;
+        let mut first: Option<Stamp> = None;
+        while let Some(sample) = source.next_sample()? {
+            let secs = sample
+                .stamp()
+                .secs_since(*first.get_or_insert(sample.stamp()));
+            if secs > self.seconds {
+                break;
+            }
+            if stop.requested() {
+                return Ok(None);
+            }
+            on_progress(Stage::Simulating, secs);
+            recorder.write(&sample)?;
+        }
+        // An interrupted simulation is left unfinished, and removed by the next one.
+        recorder.finish()?;
+        Ok(Some(path))
+    }
+
+    /// Reads the samples of the first `seconds` of a recording; images go to the camera files.
+    /// `None` if interrupted.
+    fn read(
+        &self,
+        recording: &Path,
+        camera_files: &mut CameraFiles,
+        stop: &Stop,
+        on_progress: &mut dyn FnMut(Stage, f64),
+    ) -> anyhow::Result<Option<DeviceScript>> {
+        let Opened {
+            mut source, damage, ..
+        } = open::recording(recording, None, &[])?;
+        let mut script = DeviceScript::default();
+        let mut first: Option<Stamp> = None;
+        while let Some(sample) = source.next_sample()? {
+            let secs = sample
+                .stamp()
+                .secs_since(*first.get_or_insert(sample.stamp()));
+            if secs > self.seconds {
+                break;
+            }
+            if stop.requested() {
+                return Ok(None);
+            }
+            on_progress(Stage::Preparing, secs);
+            match sample {
+                Sample::Image(image) => camera_files.take(image)?,
+                other => script.take(other),
+            }
+        }
+        // A damaged recording still has data to play back.
+        if let Some(damage) = damage.get() {
+            log::warn!("{damage}; the data before that is played back");
+        }
+        Ok(Some(script))
+    }
 }
 
 /// The rig and its name.
@@ -159,82 +258,6 @@ fn check(rig: &Rig) -> Result<(), BadInput> {
     Ok(())
 }
 
-/// Simulates the rig into a recording; `None` if interrupted.
-fn simulate(args: &Args, rig: &Rig, folder: &Path, stop: &Stop) -> anyhow::Result<Option<PathBuf>> {
-    let mut simulated = rig.clone();
-    // The simulation is recorded, not watched, so it need not run in real time.
-    simulated.sim.lockstep = true;
-    let Opened {
-        rig, mut source, ..
-    } = open::rig(simulated, Devices::Sim)?;
-    let path = folder.join(SIMULATION_FILE);
-    // A leftover of an earlier or interrupted simulation.
-    match std::fs::remove_file(&path) {
-        Err(error) if error.kind() != std::io::ErrorKind::NotFound => {
-            return Err(error).with_context(|| format!("cannot replace {}", path.display()));
-        }
-        _ => {}
-    }
-    let mut recorder = open::recorder(&path, &rig)?;
-    let bar = print::bar(None, "{spinner} {elapsed} {msg}", args.json);
-    let mut first: Option<Stamp> = None;
-    while let Some(sample) = source.next_sample()? {
-        let secs = sample
-            .stamp()
-            .secs_since(*first.get_or_insert(sample.stamp()));
-        if secs > args.seconds {
-            break;
-        }
-        if stop.requested() {
-            return Ok(None);
-        }
-        bar.set_message(format!("{secs:.1} of {:.1} s simulated", args.seconds));
-        recorder.write(&sample)?;
-    }
-    // An interrupted simulation is left unfinished, and removed by the next one.
-    recorder.finish()?;
-    bar.finish_and_clear();
-    Ok(Some(path))
-}
-
-/// Reads the samples of the first `args.seconds` of a recording; images go to the camera files.
-/// `None` if interrupted.
-fn read(
-    recording: &Path,
-    args: &Args,
-    camera_files: &mut CameraFiles,
-    stop: &Stop,
-) -> anyhow::Result<Option<DeviceScript>> {
-    let Opened {
-        mut source, damage, ..
-    } = open::recording(recording, None, &[])?;
-    let bar = print::bar(None, "{spinner} {elapsed} {msg}", args.json);
-    let mut script = DeviceScript::default();
-    let mut first: Option<Stamp> = None;
-    while let Some(sample) = source.next_sample()? {
-        let secs = sample
-            .stamp()
-            .secs_since(*first.get_or_insert(sample.stamp()));
-        if secs > args.seconds {
-            break;
-        }
-        if stop.requested() {
-            return Ok(None);
-        }
-        bar.set_message(format!("{secs:.1} of {:.1} s prepared", args.seconds));
-        match sample {
-            Sample::Image(image) => camera_files.take(image)?,
-            other => script.take(other),
-        }
-    }
-    bar.finish_and_clear();
-    // A damaged recording still has data to play back.
-    if let Some(damage) = damage.get() {
-        log::warn!("{damage}; the data before that is played back");
-    }
-    Ok(Some(script))
-}
-
 /// Writes the rig file to run against the emulated devices, and the robot description next to it.
 fn write_rig(folder: &Path, rig: &Rig) -> anyhow::Result<PathBuf> {
     let path = folder.join(drivers::recording::RIG_FILE);
@@ -260,7 +283,7 @@ impl EmulatedDevices {
         rig: &Rig,
         script: &DeviceScript,
         playback_clock: PlaybackClock,
-        args: &Args,
+        plan: &EmulationPlan,
     ) -> anyhow::Result<Self> {
         let track = || {
             JointTrack::new(&script.joints, playback_clock)
@@ -272,12 +295,12 @@ impl EmulatedDevices {
         let mut descriptions = Vec::new();
         match rig.arm.driver {
             ArmDriver::Franka => {
-                let answer_wait = Duration::from_secs_f64(args.answer_wait / 1000.0);
-                let open = emulate_fci(track()?, robot_config(rig, &args.fci)?, answer_wait, None)?;
+                let config = robot_config(rig, &plan.fci)?;
+                let open = emulate_fci(track()?, config, plan.answer_wait, None)?;
                 descriptions.push(format!(
                     "arm: a Franka controller at {}, FCI {}",
                     open.address(),
-                    args.fci
+                    plan.fci
                 ));
                 robot = Some(open);
             }
@@ -363,39 +386,13 @@ fn fci_address(text: &str) -> anyhow::Result<SocketAddr> {
     }
 }
 
-/// Waits for Ctrl-C. The devices stand still after the playback.
-fn wait(stop: &Stop, starts_at: Stamp, args: &Args) -> anyhow::Result<()> {
-    let bar = print::bar(None, "{spinner} {msg}", args.json);
-    let mut is_over = false;
-    while !stop.requested() {
-        let secs = clock::now().secs_since(starts_at);
-        bar.set_message(match secs {
-            ..0.0 => format!("starts in {:.1} s", -secs),
-            _ if secs < args.seconds => format!("{secs:.1} of {:.1} s played back", args.seconds),
-            _ => "playback has ended; devices stand still until Ctrl-C".to_owned(),
-        });
-        if secs >= args.seconds && !std::mem::replace(&mut is_over, true) {
-            if args.json {
-                print::report_json(&serde_json::json!({ "event": "over" }))?;
-            } else {
-                print::report(
-                    "Playback has ended: the emulated devices stand still but respond until Ctrl-C.",
-                );
-            }
-        }
-        std::thread::sleep(POLL);
-    }
-    bar.finish_and_clear();
-    Ok(())
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
 
     #[test]
     fn wire_scenes_match_the_simulated_scenes() {
-        let rigs = Path::new(env!("CARGO_MANIFEST_DIR")).join("rigs");
+        let rigs = Path::new(env!("CARGO_MANIFEST_DIR")).join("../rigs");
         for (name, ..) in SCENES {
             let (_, wire) = load(name).expect("the scene is bundled");
             let mut plain = Rig::load(&rigs.join(format!("{name}.toml")), &[])
@@ -418,7 +415,7 @@ mod tests {
 
     #[test]
     fn unsupported_rigs_are_rejected_before_simulating() {
-        let rigs = Path::new(env!("CARGO_MANIFEST_DIR")).join("rigs");
+        let rigs = Path::new(env!("CARGO_MANIFEST_DIR")).join("../rigs");
         let plain = Rig::load(&rigs.join("static-arm.toml"), &[]).expect("the rig file is bundled");
         assert!(check(&plain).is_err_and(|error| error.to_string().contains("arm.driver is sim")));
         assert!(

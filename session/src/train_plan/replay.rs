@@ -1,11 +1,15 @@
-//! `train --replay-decisions`: trains with the decisions of a log.
+//! Trains with the decisions in the log of an earlier run.
 
-use crate::data::Data;
+use super::TrainPlan;
+use super::schedule::Schedule;
+use crate::data::{Data, DataOptions};
 use crate::decisions::{Decision, Decisions, Pushed};
 use crate::depth_from;
 use crate::methods::{MAX_SPLATS, SH_DEGREE};
+use crate::previous_run::PreviousRun;
 use crate::read_progress::OnReadProgress;
-use crate::session::Session;
+use crate::session::{Limits, Session};
+use crate::session_setup::Services;
 use capture::Stop;
 use capture::config::Override;
 use keyframe::{Keyframe, KeyframeList};
@@ -14,20 +18,19 @@ use messages::{BadInput, InsufficientData, Setting};
 use std::collections::HashMap;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
-use std::time::Instant;
+use std::time::{Duration, Instant};
 use trainer::{ModelKind, ModelSpec};
 
 /// A decision log to replay.
-pub struct Replay {
+pub(super) struct Replay {
     path: PathBuf,
-    /// The decisions of the log.
-    pub decisions: Decisions,
+    decisions: Decisions,
     model_spec: ModelSpec,
 }
 
 impl Replay {
     /// Reads a log.
-    pub fn load(path: &Path) -> anyhow::Result<Self> {
+    pub(super) fn load(path: &Path) -> anyhow::Result<Self> {
         let decisions = Decisions::load(path)?;
         let kind = ModelKind::from_name(&decisions.settings.method).ok_or_else(|| {
             BadInput(format!(
@@ -58,54 +61,8 @@ impl Replay {
         Ok(replay)
     }
 
-    /// Loads exactly the keyframes that the log lists. [`Self::check_data`] checks that their
-    /// contents are the same.
-    pub fn load_data(
-        &self,
-        path: &Path,
-        rig: Option<PathBuf>,
-        progress: OnReadProgress<'_>,
-    ) -> anyhow::Result<Data> {
-        let pushed = || self.decisions.pushed();
-        let list: KeyframeList = pushed()
-            .filter_map(|pushed| {
-                Some((
-                    pushed.camera.clone(),
-                    Stamp(pushed.stamp_nanos),
-                    pushed.split()?,
-                ))
-            })
-            .collect();
-        let mut data = Data::of_list(
-            path,
-            list,
-            rig,
-            self.decisions.settings.scale,
-            &self.overrides(),
-            progress,
-        )?;
-        let as_pushed: HashMap<(&str, i64), &Pushed> = pushed()
-            .map(|pushed| ((&*pushed.camera, pushed.stamp_nanos), pushed))
-            .collect();
-        // The data have base poses as reported. The logged run has corrected them at stations, and
-        // these corrections depend on timing, so they come from the log.
-        for keyframe in &mut data.keyframes {
-            if let Some(pushed) = as_pushed.get(&(&*keyframe.camera, keyframe.stamp.0)) {
-                *keyframe = pushed.corrected(keyframe);
-            }
-        }
-        if !self.decisions.is_complete() {
-            let last = self.decisions.entries.last().map_or(0, |entry| entry.step);
-            let name = self.name();
-            data.data_losses.push(format!(
-                "{name} is truncated: replaying up to its last step, {last}"
-            ));
-        }
-        Ok(data)
-    }
-
     /// Returns an error if a keyframe of the log is missing from the data or differs.
-    pub fn check_data(&self, path: &Path, data: &Data) -> anyhow::Result<()> {
+    fn check_keyframes(&self, path: &Path, data: &Data) -> anyhow::Result<()> {
         let by_key = by_name(&data.keyframes);
         let name = self.name();
         let shown = path.display();
@@ -129,19 +86,9 @@ impl Replay {
         Ok(())
     }
 
-    /// Checks that depth was rendered from the same model as in the logged run, identified by its
-    /// SHA-256.
-    pub fn check_depth_from(&self, sha256: Option<&str>) -> anyhow::Result<()> {
-        depth_from::check_same(
-            &self.name(),
-            self.decisions.settings.depth_from.as_deref(),
-            sha256,
-        )
-    }
-
     /// Checks that training starts from the same points as the logged run, identified by their
     /// SHA-256.
-    pub fn check_points(&self, sha256: Option<&str>) -> anyhow::Result<()> {
+    fn check_points(&self, sha256: Option<&str>) -> anyhow::Result<()> {
         let name = self.name();
         match (self.decisions.settings.points.as_deref(), sha256) {
             (log, here) if log == here => Ok(()),
@@ -162,7 +109,7 @@ impl Replay {
 
     /// Checks that training starts at the same step as the log. `from_step`: step of the checkpoint
     /// that training continues from.
-    pub fn check_start(&self, from_step: Option<u64>) -> anyhow::Result<()> {
+    fn check_from_step(&self, from_step: Option<u64>) -> anyhow::Result<()> {
         let name = self.name();
         match (self.decisions.settings.from_step, from_step) {
             (log, here) if log == here => Ok(()),
@@ -183,13 +130,8 @@ impl Replay {
         }
     }
 
-    /// The method and options of the logged run.
-    pub fn model_spec(&self) -> ModelSpec {
-        self.model_spec.clone()
-    }
-
     /// Logs a warning if the GPU adapter differs from the adapter in the log.
-    pub fn check_adapter(&self, adapter: &str) {
+    fn check_adapter(&self, adapter: &str) {
         let logged_adapter = &self.decisions.settings.adapter;
         if logged_adapter != adapter {
             log::warn!(
@@ -200,7 +142,7 @@ impl Replay {
     }
 
     /// Replays the decisions, each at its step.
-    pub fn drive(
+    fn replay(
         &self,
         session: &mut Session,
         keyframes: &[Arc<Keyframe>],
@@ -279,12 +221,119 @@ impl Replay {
     }
 }
 
-/// Trains for at most `max_steps` steps, and evaluates if an evaluation is due. Returns the number
-/// of steps.
-fn step(session: &mut Session, max_steps: u64) -> anyhow::Result<u64> {
-    let n = session.train_steps(max_steps)?;
-    session.evaluate_when_due()?;
-    Ok(n)
+impl Schedule for Replay {
+    /// No limits: a replay ends with the decisions of its log.
+    fn limits(&self, _plan: &TrainPlan, _previous_secs: f64) -> anyhow::Result<Limits> {
+        Ok(Limits::default())
+    }
+
+    /// Checks that depth was rendered from the same model as in the logged run.
+    fn check_depth_from(&self, sha256: Option<&str>) -> anyhow::Result<()> {
+        depth_from::check_same(
+            &self.name(),
+            self.decisions.settings.depth_from.as_deref(),
+            sha256,
+        )
+    }
+
+    fn images(
+        &self,
+        plan: &TrainPlan,
+        _previous: Option<&PreviousRun>,
+    ) -> anyhow::Result<DataOptions> {
+        Ok(DataOptions {
+            scale: Some(self.decisions.settings.scale),
+            ..plan.images.clone()
+        })
+    }
+
+    /// Loads exactly the keyframes that the log lists. [`Self::check_data`] checks that their
+    /// contents are the same.
+    fn load_data(
+        &self,
+        path: &Path,
+        images: &DataOptions,
+        _overrides: &[Override],
+        progress: OnReadProgress<'_>,
+    ) -> anyhow::Result<Data> {
+        let pushed = || self.decisions.pushed();
+        let list: KeyframeList = pushed()
+            .filter_map(|pushed| {
+                Some((
+                    pushed.camera.clone(),
+                    Stamp(pushed.stamp_nanos),
+                    pushed.split()?,
+                ))
+            })
+            .collect();
+        let mut data = Data::of_list(
+            path,
+            list,
+            images.rig.clone(),
+            self.decisions.settings.scale,
+            &self.overrides(),
+            progress,
+        )?;
+        let as_pushed: HashMap<(&str, i64), &Pushed> = pushed()
+            .map(|pushed| ((&*pushed.camera, pushed.stamp_nanos), pushed))
+            .collect();
+        // The data have base poses as reported. The logged run has corrected them at stations, and
+        // these corrections depend on timing, so they come from the log.
+        for keyframe in &mut data.keyframes {
+            if let Some(pushed) = as_pushed.get(&(&*keyframe.camera, keyframe.stamp.0)) {
+                *keyframe = pushed.corrected(keyframe);
+            }
+        }
+        if !self.decisions.is_complete() {
+            let last = self.decisions.entries.last().map_or(0, |entry| entry.step);
+            let name = self.name();
+            data.data_losses.push(format!(
+                "{name} is truncated: replaying up to its last step, {last}"
+            ));
+        }
+        Ok(data)
+    }
+
+    fn check_data(
+        &self,
+        path: &Path,
+        data: &Data,
+        points_sha256: Option<&str>,
+    ) -> anyhow::Result<()> {
+        self.check_keyframes(path, data)?;
+        self.check_points(points_sha256)
+    }
+
+    fn model_specs(
+        &self,
+        _plan: &TrainPlan,
+        _data: &Data,
+        _is_software: bool,
+    ) -> anyhow::Result<Vec<ModelSpec>> {
+        Ok(vec![self.model_spec.clone()])
+    }
+
+    fn check_start(&self, from_step: Option<u64>, adapter: &str) -> anyhow::Result<()> {
+        self.check_from_step(from_step)?;
+        self.check_adapter(adapter);
+        Ok(())
+    }
+
+    /// A replay is not restarted after a GPU failure, because its log refers to step numbers.
+    fn can_recover(&self) -> bool {
+        false
+    }
+
+    fn drive(
+        &self,
+        sessions: &mut [Session],
+        keyframes: &[Arc<Keyframe>],
+        _preparation_time: Duration,
+        services: Services<'_>,
+    ) -> anyhow::Result<()> {
+        // A log is that of a single model.
+        self.replay(&mut sessions[0], keyframes, services.stop)
+    }
 }
 
 fn by_name(keyframes: &[Arc<Keyframe>]) -> HashMap<(&str, i64), &Arc<Keyframe>> {

@@ -1,7 +1,7 @@
 //! Writes the images of a recording to RealSense bag files.
 
+use crate::config::{Camera, CameraDriver, Rig};
 use anyhow::Context;
-use capture::config::{Camera, CameraDriver, Rig};
 use drivers::realsense::Pace;
 use drivers::realsense::emulated::{BagWriter, EmulatedCamera, EmulatedDepth};
 use drivers::{Image, PixelFormat};

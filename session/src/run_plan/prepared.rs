@@ -1,0 +1,279 @@
+//! The start of a live run: its devices, its folders and its sessions.
+
+use super::RunPlan;
+use super::in_progress::RunInProgress;
+use super::previous::PreviousLiveRun;
+use crate::checkpoints::RunFlags;
+use crate::evaluate::Evaluator;
+use crate::live_loop::{LiveLoop, LiveOptions, Pace};
+use crate::robot_meshes;
+use crate::run_folder::CreatedFolders;
+use crate::session::{Evaluators, Session};
+use crate::session_setup::{Services, SessionSetup};
+use crate::training_clock::Clock;
+use crate::viewers::{Viewers, gpu_notes};
+use capture::config::Rig;
+use capture::open::{self, Opened};
+use capture::{Feed, Input, Join, Notes, RobotMotion, StampClock, Stations, doctor};
+use drivers::Source;
+use gpu::Gpu;
+use keyframe::Keyframe;
+use kinematics::Stamp;
+use std::path::Path;
+use std::sync::Arc;
+use trainer::{ModelKind, Resumed};
+use viz::Hub;
+
+/// Maximum time of the scheduled evaluations, as a fraction of the training time. With more, the
+/// scores are known more often, but the model is worse at the same time.
+const MAX_EVALUATION_FRAC: f64 = 0.1;
+/// Keyframes wait during an evaluation, so it must be short, especially on a software adapter.
+const MAX_IMAGES_SCORED_LIVE: usize = 12;
+const MAX_IMAGES_SCORED_LIVE_ON_CPU: usize = 4;
+
+/// A run whose models are made.
+pub struct PreparedRun<'a> {
+    rig: Rig,
+    parts: Parts<'a>,
+    hub: Hub,
+}
+
+/// A run whose devices are open.
+pub struct OpenedRun<'a> {
+    opened: Opened,
+    device_notes: Notes,
+    parts: Parts<'a>,
+    hub: Hub,
+}
+
+/// The parts of a run besides its input.
+pub(super) struct Parts<'a> {
+    pub(super) plan: RunPlan,
+    pub(super) previous: Option<PreviousLiveRun>,
+    pub(super) services: Services<'a>,
+    pub(super) kinds: Vec<ModelKind>,
+    /// Whether any camera measures depth.
+    pub(super) has_depth: bool,
+    pub(super) pace: Pace,
+    pub(super) gpu: Arc<Gpu>,
+    pub(super) models: Vec<Resumed>,
+}
+
+/// Camera and stamp of a keyframe that was evicted for lack of memory.
+type Evicted = (Arc<str>, Stamp);
+
+impl<'a> PreparedRun<'a> {
+    pub(super) fn new(rig: Rig, parts: Parts<'a>) -> Self {
+        Self {
+            rig,
+            parts,
+            hub: Hub::new(),
+        }
+    }
+
+    /// The hub of the clients that view the run.
+    #[must_use]
+    pub fn hub(&self) -> &Hub {
+        &self.hub
+    }
+
+    /// Compiles kernels and opens the devices.
+    pub fn open_devices(mut self) -> anyhow::Result<OpenedRun<'a>> {
+        for finding in doctor::suspicious_values(&self.rig) {
+            log::warn!("{finding}");
+        }
+        // Compile kernels before the first image, so that keyframes do not wait.
+        self.parts
+            .models
+            .iter_mut()
+            .try_for_each(|model| model.method.model_mut().prepare())?;
+        // Only now the devices, because their data is used from the first sample on.
+        let device_notes = Notes::default();
+        let opened = self.parts.plan.open(self.rig)?;
+        Ok(OpenedRun {
+            opened: opened.with_tag_check(&device_notes)?,
+            device_notes,
+            parts: self.parts,
+            hub: self.hub,
+        })
+    }
+}
+
+impl OpenedRun<'_> {
+    /// Creates the folders, makes the sessions, and starts to read the devices. Removes the folders
+    /// if this fails.
+    pub fn start(self) -> anyhow::Result<RunInProgress> {
+        let mut created = CreatedFolders::default();
+        match self.start_in(&mut created) {
+            Ok(run) => Ok(RunInProgress { created, ..run }),
+            Err(error) => {
+                created.remove_created();
+                Err(error)
+            }
+        }
+    }
+
+    fn start_in(self, created: &mut CreatedFolders) -> anyhow::Result<RunInProgress> {
+        let Self {
+            opened,
+            device_notes,
+            parts,
+            hub,
+        } = self;
+        let Opened {
+            rig,
+            source,
+            damage,
+            stamp_clock,
+        } = opened;
+        let Parts {
+            plan,
+            previous,
+            services,
+            kinds,
+            has_depth,
+            pace,
+            gpu,
+            models,
+        } = parts;
+        // Folders come after the devices, whose rig, with the calibration that cameras report, is
+        // written there.
+        let folders = created.make_each(plan.out(), &kinds, Some(&rig))?;
+        let held = previous
+            .as_ref()
+            .map_or(&[][..], |previous| &previous.keyframes);
+        let (input, evicted) = input(&plan, &rig, (source, stamp_clock), held)?;
+        if let Some(robot) = robot_meshes::description(&rig, &plan.rig_file)? {
+            hub.set_robot(robot);
+        }
+        let stop = services.stop.clone();
+        let feed = Feed::start(input, Box::new(Viewers(hub.clone())), stop.clone())?;
+        let setup = SessionSetup {
+            services,
+            gpu: &gpu,
+            evaluators: evaluators(&gpu)?,
+            limits: plan.limits,
+            clock: Clock::default(),
+            n_models: kinds.len(),
+            previous: previous.as_ref().map(|previous| &previous.run),
+            keyframes: held,
+            data: plan.recorded_data(),
+            scale: rig.train.scale,
+            initial_points: None,
+            points_sha256: None,
+            checkpoints: plan.checkpoints,
+            profiles: false,
+            run_flags: RunFlags {
+                depth_from: None,
+                flags: plan.flags(),
+            },
+            is_live: true,
+            can_recover: true,
+        };
+        let sessions = models
+            .into_iter()
+            .zip(&folders)
+            .map(|(resumed, folder)| session(&setup, &plan, resumed, folder, &evicted))
+            .collect::<anyhow::Result<Vec<Session>>>()?;
+        let options = LiveOptions {
+            pace,
+            start_keyframes: rig
+                .join
+                .start_keyframes_or_default(pace == Pace::RealTime, has_depth),
+            notes: gpu_notes(&gpu),
+            device_notes,
+            open_gpu: services.open_gpu,
+        };
+        let held = sessions
+            .first()
+            .map_or(Vec::new(), |session| session.keyframes().to_vec());
+        Ok(RunInProgress {
+            live: LiveLoop::new(sessions, feed, hub, options).resume_from(held),
+            gpu,
+            plan,
+            stop,
+            rig,
+            folders,
+            damage,
+            created: CreatedFolders::default(),
+        })
+    }
+}
+
+/// The input, with the keyframes of the previous run restored. Also returns keyframes that exceed
+/// the memory limit.
+fn input(
+    plan: &RunPlan,
+    rig: &Rig,
+    (source, stamp_clock): (Box<dyn Source>, StampClock),
+    previous: &[Arc<Keyframe>],
+) -> anyhow::Result<(Input, Vec<Evicted>)> {
+    let (join, evicted) = Join::new(rig)?.resume_from(previous);
+    let recorder = plan
+        .record
+        .as_deref()
+        .map(|file| open::recorder(file, rig))
+        .transpose()?;
+    let camera_intrinsics = rig.cameras.iter().map(|camera| {
+        let intrinsics = &camera.intrinsics;
+        (
+            camera.name.clone(),
+            (intrinsics.focal_px, intrinsics.principal_px),
+        )
+    });
+    let input = Input {
+        source,
+        join,
+        stations: Stations::new(rig).map(|stations| stations.resume_from(previous)),
+        recorder,
+        robot_motion: RobotMotion::new(rig),
+        stamp_clock,
+        camera_intrinsics: camera_intrinsics.collect(),
+    };
+    Ok((input, evicted))
+}
+
+/// How the models of a live run are scored.
+fn evaluators(gpu: &Gpu) -> anyhow::Result<Evaluators> {
+    Ok(Evaluators {
+        during_training: Evaluator::psnr_only(),
+        max_images_during_training: if gpu.is_software() {
+            MAX_IMAGES_SCORED_LIVE_ON_CPU
+        } else {
+            MAX_IMAGES_SCORED_LIVE
+        },
+        max_frac_during_training: Some(MAX_EVALUATION_FRAC),
+        at_end: Evaluator::thorough(None)?,
+    })
+}
+
+/// The session of one model, with the keyframes of the previous run.
+///
+/// * `evicted`: those of them that exceed the memory limit of this run.
+fn session(
+    setup: &SessionSetup<'_>,
+    plan: &RunPlan,
+    resumed: Resumed,
+    folder: &Path,
+    evicted: &[Evicted],
+) -> anyhow::Result<Session> {
+    let untrained = resumed.untrained.clone();
+    let mut session = setup.session(
+        resumed,
+        folder,
+        plan.data_source(folder),
+        plan.resume_command(folder),
+    )?;
+    // The model of the checkpoint was trained on its keyframes already; only others are pushed.
+    for keyframe in setup.keyframes {
+        if untrained.iter().any(|other| Arc::ptr_eq(other, keyframe)) {
+            session.push(keyframe)?;
+        } else {
+            session.hold(keyframe);
+        }
+    }
+    for (camera, stamp) in evicted {
+        session.remove(camera, *stamp)?;
+    }
+    Ok(session)
+}

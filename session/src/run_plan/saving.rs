@@ -1,0 +1,376 @@
+//! Saves the models of a live run, and ends it.
+
+use super::RunPlan;
+use super::no_model::no_model_reason;
+use crate::error::is_rejection;
+use crate::latency::Latency;
+use crate::live_loop::LiveLoop;
+use crate::next_commands::DataSource;
+use crate::run_folder::{self, CreatedFolders};
+use crate::session::{self, EndingSession, FinishedModel, Session};
+use crate::viewer::ServedModel;
+use crate::{corrected_rig, recovery};
+use capture::config::Rig;
+use capture::{Counts, InputResult, SampleUse, StationReport};
+use keyframe::{Keyframe, Split};
+use messages::InsufficientData;
+use serde::Serialize;
+use std::collections::BTreeMap;
+use std::path::PathBuf;
+use std::sync::{Arc, OnceLock};
+use std::time::Duration;
+use viz::{Hub, RunResult};
+
+/// Name of the rig file with the corrections of a run.
+const CORRECTED_RIG: &str = "corrected-rig.toml";
+/// Time for which the server stays up, so that connected clients receive the last status. They are
+/// on this computer or a local network, where a message arrives within milliseconds.
+const FINAL_STATUS_TIME: Duration = Duration::from_millis(400);
+
+/// A run whose models are saved and scored. [`Self::end`] returns the errors of its input.
+pub struct SavedRun {
+    /// The models; none if there was nothing to train on.
+    pub models: Vec<FinishedModel>,
+    hub: Hub,
+    data_losses: Vec<String>,
+    /// Whether the keyframe lists were written.
+    listed: anyhow::Result<()>,
+    /// The rig files of the models whose cameras were corrected.
+    corrected_rigs: anyhow::Result<Vec<(Rig, PathBuf)>>,
+    /// Error that ended the input early.
+    input_error: Option<drivers::Error>,
+    /// Why there was nothing to train on.
+    no_model_reason: Option<String>,
+    /// Error that ended the training early.
+    pub(super) failure: Option<anyhow::Error>,
+    pub(super) created: CreatedFolders,
+    pub(super) has_keyframes: bool,
+}
+
+/// A run that has ended without an error.
+pub struct EndedRun {
+    /// The models, for viewers that stay connected.
+    pub models: Vec<ServedModel>,
+    /// Descriptions of data that are missing.
+    pub data_losses: Vec<String>,
+}
+
+impl SavedRun {
+    /// Publishes the result to viewers, writes corrected rig files, and returns the errors of the
+    /// run. Removes the folders of a run that is rejected.
+    pub fn end(mut self) -> anyhow::Result<EndedRun> {
+        // The page shows the result before errors are returned, because viewers have waited for it.
+        publish_end(&self.hub, &self.models);
+        let created = std::mem::take(&mut self.created);
+        let has_keyframes = self.has_keyframes;
+        let failure = self.failure.take();
+        let ended = match (failure, self.finish_files()) {
+            (None, ended) => ended,
+            (Some(failure), ended) => {
+                match ended {
+                    Ok(ended) => log_losses(&ended.data_losses),
+                    Err(error) => log::error!("{error:#}"),
+                }
+                Err(failure)
+            }
+        };
+        // The folder of a run that failed before its first keyframe contains nothing of use.
+        let is_useless = |error: &anyhow::Error| !has_keyframes || is_rejection(error);
+        created.keep_unless(ended.as_ref().is_err_and(is_useless));
+        ended
+    }
+
+    /// Writes corrected rig files, and returns the first error of the lists, the files and the
+    /// input.
+    fn finish_files(self) -> anyhow::Result<EndedRun> {
+        self.listed?;
+        for (rig, file) in self.corrected_rigs? {
+            corrected_rig::write(&rig, &file)?;
+            log::info!(
+                "rig file with the estimated corrections written to {}",
+                file.display()
+            );
+        }
+        if let Some(error) = self.input_error {
+            return Err(anyhow::Error::new(error).context("a device failed"));
+        }
+        if let Some(reason) = self.no_model_reason {
+            return Err(InsufficientData(reason).into());
+        }
+        Ok(EndedRun {
+            models: self.models.into_iter().map(served).collect(),
+            data_losses: self.data_losses,
+        })
+    }
+}
+
+/// A finished model as the page shows it after the run.
+fn served(model: FinishedModel) -> ServedModel {
+    let FinishedModel {
+        kind,
+        method,
+        edits,
+        folder,
+        ..
+    } = model;
+    ServedModel {
+        kind,
+        method,
+        edits,
+        path: folder,
+    }
+}
+
+/// Logs each loss of data as a warning.
+fn log_losses(data_losses: &[String]) {
+    for loss in data_losses {
+        log::warn!("data loss: {loss}");
+    }
+}
+
+/// Saves and scores the models. Errors of the input are returned only at the end of the run.
+pub(super) fn save(
+    mut live: LiveLoop,
+    plan: &RunPlan,
+    rig: &Rig,
+    folders: Vec<PathBuf>,
+    damage: &OnceLock<String>,
+) -> anyhow::Result<SavedRun> {
+    // Everything that describes the run is read first, because `finish` consumes it.
+    let hub = live.hub();
+    let n_keyframes = live.keyframes().len();
+    let n_train = live
+        .keyframes()
+        .iter()
+        .filter(|keyframe| keyframe.split == Split::Train)
+        .count();
+    let max_position_error_m = max_position_error_m(live.keyframes());
+    let recoverable = live.describe_recoverable();
+    let latencies = live.ledger().latencies();
+    // Closes the recording and ends the input thread, whose counts are then final.
+    let (mut sessions, input_result) = live.finish();
+    sessions.iter_mut().for_each(Session::check_folders);
+    let input_result = match input_result {
+        Ok(input_result) => input_result,
+        Err(error) => {
+            // Save the models even if the input has failed.
+            if n_train > 0 {
+                save_after_input_failure(sessions, folders, &error, &hub)?;
+            }
+            return Err(error);
+        }
+    };
+    // Errors are returned only at the end: the models may still be saved even if the disk is too
+    // full for the lists.
+    let list = |(session, folder): (&Session, &PathBuf)| {
+        run_folder::write_keyframe_list(&folder.join("keyframes.txt"), session.keyframes())
+    };
+    let listed = sessions.iter().zip(&folders).try_for_each(list);
+    log::info!("{}", input_result.join.counts());
+    // Commands that score the model later need a complete recording at this path.
+    let is_moved = plan.record.as_ref().is_some_and(|file| !file.exists());
+    let is_recorded = input_result.recording_error.is_none() && !is_moved;
+    let data_losses = data_losses(plan, &input_result, damage);
+    // Estimated before the models are saved, because saving consumes the sessions.
+    let corrected_rigs = corrected_rigs(rig, &mut sessions, &folders);
+    let mut details = DetailsOfRun {
+        seed: rig.train.seed,
+        input_result: &input_result,
+        data_losses: &data_losses,
+        latencies,
+        max_position_error_m,
+    };
+    let mut endings = Vec::new();
+    for (session, out) in sessions.into_iter().zip(folders) {
+        endings.push(EndingSession {
+            details: details.of(&session),
+            session: if is_recorded {
+                session
+            } else {
+                session.with_data(DataSource::default())
+            },
+            out,
+        });
+    }
+    let mut models = Vec::new();
+    if n_train > 0 {
+        let finished = session::finish(endings, Some(&hub));
+        models = finished.map_err(|error| recovery::with_recoverable(error, &recoverable))?;
+    }
+    let no_model_reason =
+        (n_train == 0).then(|| no_model_reason(n_keyframes, input_result.join.counts(), rig));
+    Ok(SavedRun {
+        models,
+        hub,
+        data_losses,
+        listed,
+        corrected_rigs,
+        input_error: input_result.input_error,
+        no_model_reason,
+        failure: None,
+        created: CreatedFolders::default(),
+        has_keyframes: n_keyframes > 0,
+    })
+}
+
+/// Saves the models of a run whose input thread has failed.
+fn save_after_input_failure(
+    sessions: Vec<Session>,
+    folders: Vec<PathBuf>,
+    error: &anyhow::Error,
+    hub: &Hub,
+) -> anyhow::Result<()> {
+    let ending = |(session, out): (Session, PathBuf)| EndingSession {
+        details: serde_json::json!({ "data_losses": [error.to_string()] }),
+        session,
+        out,
+    };
+    let endings = sessions.into_iter().zip(folders).map(ending).collect();
+    session::finish(endings, Some(hub)).map(drop)
+}
+
+/// Descriptions of the data that are missing.
+fn data_losses(
+    plan: &RunPlan,
+    input_result: &InputResult,
+    damage: &OnceLock<String>,
+) -> Vec<String> {
+    let is_recorded = plan.record.is_some() && plan.recording().is_none();
+    let use_of_samples = if is_recorded {
+        SampleUse::Recorded
+    } else {
+        SampleUse::ProcessedOnly
+    };
+    let mut data_losses = input_result.join.counts().data_losses(use_of_samples);
+    data_losses.extend(
+        input_result
+            .recording_error
+            .as_ref()
+            .map(|error| format!("the recording is incomplete: {error:#}")),
+    );
+    data_losses.extend(damage.get().cloned());
+    data_losses
+}
+
+/// The entries of the report besides scores.
+#[derive(Debug, Serialize)]
+struct RunDetails {
+    method: &'static str,
+    seed: u64,
+    keyframes: usize,
+    evicted: u64,
+    rejected: BTreeMap<&'static str, u64>,
+    device_skipped: u64,
+    /// Number of range scans, which are stored in addition to the keyframes, and number of their
+    /// points.
+    range_scans: usize,
+    range_points: usize,
+    data_losses: Vec<String>,
+    /// Estimated base pose at each station after the first.
+    stations: Vec<StationReport>,
+    /// Durations from mid-exposure to the model and to viewers, by name; only for the first model.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    latencies: Vec<(String, Latency)>,
+    /// Largest camera position error of a keyframe, meters; only in simulation.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    max_position_error_m: Option<f64>,
+}
+
+/// The entries of all reports of a run.
+struct DetailsOfRun<'a> {
+    seed: u64,
+    input_result: &'a InputResult,
+    data_losses: &'a [String],
+    latencies: Vec<(String, Latency)>,
+    max_position_error_m: Option<f64>,
+}
+
+impl DetailsOfRun<'_> {
+    /// The entries for one model. Only the first one gets the latencies.
+    fn of(&mut self, session: &Session) -> RunDetails {
+        let InputResult { join, stations, .. } = self.input_result;
+        let Counts {
+            evicted,
+            rejected,
+            device_skipped,
+            ..
+        } = join.counts();
+        RunDetails {
+            method: session.kind().name(),
+            seed: self.seed,
+            keyframes: session.keyframes().len(),
+            evicted: *evicted,
+            rejected: rejected.iter().map(|(why, n)| (why.name(), *n)).collect(),
+            device_skipped: *device_skipped,
+            range_scans: join.range_scans().count(),
+            range_points: join
+                .range_scans()
+                .map(|scan| scan.points_in_world_m.len())
+                .sum(),
+            data_losses: self.data_losses.to_vec(),
+            stations: stations
+                .as_ref()
+                .map_or(Vec::new(), |stations| stations.reports().to_vec()),
+            latencies: std::mem::take(&mut self.latencies),
+            max_position_error_m: self.max_position_error_m,
+        }
+    }
+}
+
+/// The corrected rig files, with their paths, of the models whose cameras were corrected.
+fn corrected_rigs(
+    rig: &Rig,
+    sessions: &mut [Session],
+    folders: &[PathBuf],
+) -> anyhow::Result<Vec<(Rig, PathBuf)>> {
+    let mut rigs = Vec::new();
+    for (session, folder) in sessions.iter_mut().zip(folders) {
+        let learned = session.camera_corrections()?;
+        let corrected = corrected_rig::corrected(rig, session.alignment(), &learned)?;
+        // An unchanged file would only look like a correction.
+        if !corrected.has_same_calibration(rig) {
+            rigs.push((corrected, folder.join(CORRECTED_RIG)));
+        }
+    }
+    Ok(rigs)
+}
+
+/// Largest position error of the keyframes; `None` if no true poses are known (only simulators
+/// report them).
+fn max_position_error_m(keyframes: &[Arc<Keyframe>]) -> Option<f64> {
+    keyframes
+        .iter()
+        .filter_map(position_error_m)
+        .reduce(f64::max)
+}
+
+fn position_error_m(keyframe: &Arc<Keyframe>) -> Option<f64> {
+    let truth = keyframe
+        .truth
+        .as_ref()?
+        .world_from_camera
+        .translation
+        .vector;
+    Some((keyframe.world_from_camera.translation.vector - truth).norm())
+}
+
+/// Publishes the result of a run to its page.
+fn publish_end(hub: &Hub, models: &[FinishedModel]) {
+    let name = |model: &FinishedModel| match models.len() {
+        1 => model.scores.to_string(),
+        _ => format!("{} {}", model.kind.name(), model.scores),
+    };
+    // Several models have a subfolder each.
+    let folder = models.first().map(|model| match models.len() {
+        1 => model.folder.as_path(),
+        _ => model.folder.parent().unwrap_or(&model.folder),
+    });
+    hub.set_run_result(RunResult {
+        folder: folder.map(|folder| folder.display().to_string()),
+        scores: models.iter().map(name).collect::<Vec<_>>().join("; "),
+        seconds: models.iter().map(|model| model.seconds).fold(0.0, f64::max),
+    });
+    if hub.n_clients() > 0 {
+        std::thread::sleep(FINAL_STATUS_TIME); // Clients keep showing the result after the server has stopped.
+    }
+}
