@@ -6,7 +6,6 @@ use super::saving::{self, SavedRun};
 use crate::error::{is_gpu_error, is_gpu_unrecoverable, is_rejection};
 use crate::live_loop::LiveLoop;
 use crate::run_folder::{self, CreatedFolders};
-use crate::session::Session;
 use capture::config::Rig;
 use capture::{InputResult, SampleUse, Stop};
 use gpu::Gpu;
@@ -83,10 +82,10 @@ impl RunInProgress {
             Err(error) => {
                 log::error!("training failed; saving the model so far: {error:#}");
                 match saving::save(live, &plan, &rig, folders, &damage) {
-                    Ok(saved) => Ok(SavedRun {
-                        failure: Some(error),
-                        ..saved
-                    }),
+                    Ok(mut saved) => {
+                        saved.failure = Some(error);
+                        Ok(saved)
+                    }
                     Err(save_error) => {
                         log::error!("{save_error:#}");
                         Err(error)
@@ -95,11 +94,11 @@ impl RunInProgress {
             }
         };
         match saved {
-            Ok(saved) => Ok(SavedRun {
-                created,
-                has_keyframes,
-                ..saved
-            }),
+            Ok(mut saved) => {
+                saved.created = created;
+                saved.has_keyframes = has_keyframes;
+                Ok(saved)
+            }
             Err(error) => {
                 // The folder of a run that failed before its first keyframe contains nothing of
                 // use.
@@ -132,7 +131,9 @@ impl RunInProgress {
         let n_keyframes = keyframes.len();
         let (mut sessions, input_result) = self.live.finish();
         // The caller may remove the folders, so checkpoints in progress must finish first.
-        sessions.iter_mut().for_each(Session::wait_for_checkpoint);
+        sessions
+            .iter_mut()
+            .for_each(|session| session.persistence().wait_for_checkpoint());
         let input_result = input_result?;
         let counts = input_result.join.counts();
         let mut data_losses = counts.data_losses(SampleUse::ProcessedOnly);

@@ -149,7 +149,9 @@ pub(super) fn save(
     let latencies = live.ledger().latencies();
     // Closes the recording and ends the input thread, whose counts are then final.
     let (mut sessions, input_result) = live.finish();
-    sessions.iter_mut().for_each(Session::check_folders);
+    sessions
+        .iter_mut()
+        .for_each(|session| session.persistence().check_folders());
     let input_result = match input_result {
         Ok(input_result) => input_result,
         Err(error) => {

@@ -221,6 +221,14 @@ impl Replay {
     }
 }
 
+/// Trains for at most `max_steps` steps, and evaluates if an evaluation is due. Returns the number
+/// of steps.
+fn step(session: &mut Session, max_steps: u64) -> anyhow::Result<u64> {
+    let n = session.train_steps(max_steps)?;
+    session.evaluate_when_due()?;
+    Ok(n)
+}
+
 impl Schedule for Replay {
     /// No limits: a replay ends with the decisions of its log.
     fn limits(&self, _plan: &TrainPlan, _previous_secs: f64) -> anyhow::Result<Limits> {
