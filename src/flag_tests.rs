@@ -13,7 +13,7 @@ use syn::{Attribute, Item, LitStr, Macro, Meta};
 
 /// Source files or folders, and the commands that print their messages. All these commands must
 /// accept a flag or setting in a message, unless the message names a command that accepts it.
-const PRINTED_BY: [(&str, &[&str]); 28] = [
+const PRINTED_BY: [(&str, &[&str]); 33] = [
     ("bench/src", &["bench"]),
     (
         "calibration/procedures/src/hand_eye",
