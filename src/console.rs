@@ -190,7 +190,7 @@ fn whole_secs(secs: f64) -> u64 {
     secs as u64
 }
 
-/// Lines about progress, for outputs that are not a terminal and show no progress bar.
+/// Lines about progress, for outputs that show no progress bar because they are not a terminal.
 pub(crate) struct ProgressLines {
     is_shown: bool,
     n_last: usize,
@@ -198,7 +198,7 @@ pub(crate) struct ProgressLines {
 }
 
 impl ProgressLines {
-    /// Few enough lines for a log of an hour.
+    /// At most 360 lines per hour.
     const PERIOD: Duration = Duration::from_secs(10);
 
     /// Lines for work that begins at `now`, in place of a hidden bar.
@@ -210,8 +210,8 @@ impl ProgressLines {
         }
     }
 
-    /// Whether a line is due at `now`: more is done than in the last line, at least a period after
-    /// it, and something remains.
+    /// Whether a line is due at `now`: a period has passed since the last line, more is done than
+    /// then, and something remains.
     pub(crate) fn is_due(&mut self, n_done: usize, n_all: usize, now: Instant) -> bool {
         let is_due = self.is_shown
             && n_done > self.n_last
@@ -296,7 +296,7 @@ mod tests {
             (1, 9, false),
             (1, 10, true),
             (2, 12, false),
-            // Nothing is done since the last line.
+            // There was no progress since the last line.
             (1, 25, false),
             (3, 31, true),
             (4, 40, false),

@@ -1,8 +1,8 @@
-//! Names of flags in the messages of libraries, which know only the settings.
+//! Names of flags for the settings in the messages of libraries.
 
 use messages::Setting;
 
-/// The flag that sets something.
+/// The flag of a setting.
 pub(crate) fn flag(setting: Setting) -> &'static str {
     match setting {
         Setting::Camera => "--camera",

@@ -182,7 +182,7 @@ fn names_a_command_with(text: &str, flag: NamedFlag<'_>) -> bool {
         || commands.any(|name| is_named(name) && flags_of(name).contains(flag.name))
 }
 
-/// Whether a flag in advice on how to build is one of cargo.
+/// Whether a flag in a text about building belongs to cargo.
 fn is_of_cargo(text: &str, flag: NamedFlag<'_>) -> bool {
     ["features", "release"].contains(&flag.name) && text.contains("build")
 }

@@ -86,7 +86,8 @@ impl Disturbance {
         }
     }
 
-    /// How break points between two sizes are interpolated.
+    /// How a break point between two sizes is interpolated; see
+    /// [`break_point`](crate::statistics::break_point).
     pub(crate) fn interpolation(self) -> Interpolation {
         match self {
             Self::Keyframes => Interpolation::Log,
@@ -175,7 +176,7 @@ fn six_normals(seed: u64, camera: &str, stamp: Stamp) -> [f64; 6] {
     normals
 }
 
-/// A number from 0 to 1, without both ends, from eight bytes.
+/// A number between 0 and 1, both exclusive, from eight bytes.
 fn uniform(bytes: &[u8]) -> f64 {
     // 53 bits fill the fraction of a f64; the offset of 0.5 keeps the logarithm finite.
     let bits = u64::from_le_bytes(bytes.try_into().expect("eight bytes")) >> 11;
@@ -213,8 +214,8 @@ fn clock_offset(keyframes: &[Arc<Keyframe>], offset_nanos: f64) -> Vec<Arc<Keyfr
 /// Pose and velocity at a time, interpolated between the neighboring states or extrapolated beyond
 /// the ends.
 fn at(trajectory: &Trajectory, nanos: f64) -> Option<(Transform, Option<Twist>)> {
-    // Clamped to the first and the last interval, beyond which `frac` is below 0 or above 1. A
-    // single keyframe defines no interval.
+    // Times outside the trajectory use its first or last interval, with `frac` below 0 or above 1.
+    // A single keyframe defines no interval.
     let next = trajectory.partition_point(|(stamp, ..)| (stamp.0 as f64) < nanos);
     let next = next.clamp(1, trajectory.len().checked_sub(1).filter(|last| *last > 0)?);
     let [(stamp_a, a, twist_a), (stamp_b, b, twist_b)] = [&trajectory[next - 1], &trajectory[next]];

@@ -59,7 +59,8 @@ pub struct KernelsOptions {
     /// Whether the camera is inside the cloud, so that only some of the splats are visible.
     pub inside: bool,
     /// Whether to measure a step like those of a scan with depth: its splats are distributed
-    /// unevenly, and the loss includes D-SSIM and depth. Without `cloud` and `inside`.
+    /// unevenly, and the loss includes D-SSIM and depth. Cannot be combined with `cloud` or
+    /// `inside`.
     pub scan: bool,
     /// Whether to report the GPU time of each pass.
     pub profile: bool,

@@ -30,7 +30,7 @@ const NANOS_PER_COUNT: f64 = 1e6;
 /// All variants are trained on the same disturbed data; each gives one line per chart.
 const VARIANTS: &[Variant] = &[REFINED, Variant::CAMERAS_AS_GIVEN];
 
-/// The cameras are refined as requested. The setting completes the name, see [`name_of`].
+/// The cameras are refined as requested. [`name_of`] adds the name of the setting.
 const REFINED: Variant = Variant {
     name: "with",
     change: |_| (),

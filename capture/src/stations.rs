@@ -569,7 +569,7 @@ impl std::fmt::Display for StationReport {
                 "its images do not overlap with earlier ones; the previous correction is kept",
             )?,
             Some(correction) if correction.kept => write!(f, "{correction}")?,
-            // Nothing is known about a gain that is measured on fewer images.
+            // With fewer images, the uncertainty of the gain is unknown.
             Some(correction) if correction.n_validation_images < MIN_VALIDATION_IMAGES => write!(
                 f,
                 "the previous correction is kept, because this one can be checked on {} only, and {MIN_VALIDATION_IMAGES} are needed: \

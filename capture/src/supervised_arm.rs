@@ -15,7 +15,7 @@ const POLL: Duration = Duration::from_millis(50);
 /// busy computer, because an error here stops a motion.
 const MAX_SILENCE: Duration = Duration::from_secs(2);
 
-/// What a user has to do while an arm is held that its motors would release.
+/// Instruction for the user while an arm is held that its motors would release.
 pub const HOLDING: &str = "holding the arm; support it before you press Ctrl-C, because the motors then no longer hold it";
 
 /// A movable arm and its joint offsets. All positions include `arm.joint_offsets`, as everywhere

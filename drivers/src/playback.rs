@@ -6,8 +6,8 @@ use std::collections::BTreeMap;
 use std::sync::{Arc, OnceLock};
 use std::time::{Duration, Instant};
 
-/// Images later than this are dropped: the time in which a camera at 30 Hz fills its queue in
-/// [`LiveDevices`](crate::LiveDevices). So a caller that is too slow loses images as it would with
+/// Images that are later than this are dropped. A camera at 30 Hz fills its queue in
+/// [`LiveDevices`](crate::LiveDevices) in this time, so a slow caller loses images as it would with
 /// devices.
 const MAX_DELAY: Duration = Duration::from_millis(270);
 

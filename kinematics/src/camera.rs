@@ -142,8 +142,8 @@ impl Intrinsics {
         )
     }
 
-    /// Fraction of the image, 0 to 1, in which no real lens has these coefficients. There, the
-    /// model is not monotonic, so that no direction projects to the pixel, or the distortion moves
+    /// Fraction of the image, 0 to 1, in which the lens coefficients are implausible. There, no
+    /// direction projects to the pixel, because the model is not monotonic, or the distortion moves
     /// points outwards to more than 1.5 times their distance from the principal point.
     pub fn implausible_lens_frac(&self) -> f64 {
         /// Number of pixels that are examined in each row and column of a grid.
@@ -165,7 +165,7 @@ impl Intrinsics {
         f64::from(n_implausible) / f64::from(N_PER_SIDE * N_PER_SIDE)
     }
 
-    /// Whether a real lens may have these coefficients, as far as this pixel shows.
+    /// Whether the lens coefficients are plausible at a pixel.
     fn is_lens_plausible_at(&self, pixel: [f64; 2]) -> bool {
         // Pincushion distortion of real lenses stays below 1.2. Barrel distortion has no such
         // limit: wide lenses compress the edge of the image.
@@ -175,11 +175,11 @@ impl Intrinsics {
         let lens = self.lens_in_use();
         let is_fisheye = matches!(lens, Lens::KannalaBrandt(_));
         let Some(ray) = self.unproject(pixel) else {
-            // A fisheye may also image directions behind the camera. Its model then rises up to 90
-            // degrees.
+            // A fisheye lens may also image directions behind the camera. Its model must then be
+            // monotonic up to 90 degrees.
             return is_fisheye && lens.distort(SIDEWAYS).is_some();
         };
-        // Without distortion, a fisheye is linear in the angle from the axis.
+        // Without distortion, the radius in a fisheye image is linear in the angle from the axis.
         let radius = ray.xy().norm();
         let undistorted_radius = if is_fisheye { radius.atan() } else { radius };
         self.distorted_at(pixel).norm() <= MAX_STRETCH * undistorted_radius
@@ -387,9 +387,9 @@ mod tests {
         };
         assert_eq!(wide.implausible_lens_frac(), 0.0);
         for lens in [
-            // Monotonic, but the edge of the image shows directions near its center.
+            // Monotonic, but the edge of the image shows directions near the optical axis.
             Lens::BrownConrady([10.0, 0.0, 0.0, 0.0, 0.0]),
-            // They rise only up to a ring within the image.
+            // Monotonic only within a circle that is smaller than the image.
             Lens::BrownConrady([-3.0, 0.0, 0.0, 0.0, 0.0]),
             Lens::RationalBrownConrady([0.0, 0.0, 0.0, 0.0, 0.0, 10.0, 0.0, 0.0]),
             Lens::KannalaBrandt([-10.0, 0.0, 0.0, 0.0]),
@@ -404,7 +404,7 @@ mod tests {
             };
             assert_eq!(rectified.implausible_lens_frac(), 0.0);
         }
-        // On the small field of view of a long lens, the same coefficient hardly distorts.
+        // In the small field of view of a long lens, the same coefficient has little effect.
         let narrow = Intrinsics {
             focal_px: [6000.0, 5800.0],
             ..camera(Lens::BrownConrady([10.0, 0.0, 0.0, 0.0, 0.0]))

@@ -89,7 +89,7 @@ pub fn check_limit_not_passed(
 ) -> anyhow::Result<()> {
     match seconds.filter(|seconds| *seconds <= checkpoint.seconds) {
         Some(seconds) => Err(BadInput(format!(
-            "{} {seconds}: {subject} has already been trained for {:.1} s, which counts; give a larger limit",
+            "{} {seconds}: {subject} has already been trained for {:.1} s, which is part of the limit; give a larger limit",
             Setting::Seconds,
             checkpoint.seconds
         ))

@@ -81,7 +81,7 @@ fn has_extrinsics_of(estimates: &[Estimate], camera: &str) -> bool {
 /// A camera of a rig.
 ///
 /// # Errors
-/// [`BadInput`] with the names of all cameras if there is none of this name.
+/// [`BadInput`] with the names of all cameras if none has this name.
 pub fn camera<'a>(rig: &'a Rig, name: &str) -> anyhow::Result<&'a Camera> {
     rig.cameras
         .iter()
@@ -97,7 +97,7 @@ pub fn camera<'a>(rig: &'a Rig, name: &str) -> anyhow::Result<&'a Camera> {
         })
 }
 
-/// The rig with other intrinsics of a camera. Depth images with the same lens get them, too.
+/// The rig with other intrinsics of a camera. They also apply to depth images with the same lens.
 ///
 /// * `covariance`: that of the intrinsics, if it is known.
 ///
@@ -131,8 +131,8 @@ pub fn with_intrinsics(
     Ok(rig)
 }
 
-/// The rig with another pose of a camera. A pose in a fixed base is converted for a camera that is
-/// attached to the world.
+/// The rig with another pose of a camera. A pose relative to a fixed base is converted if the
+/// camera is attached to the world.
 ///
 /// # Errors
 /// [`BadInput`] if there is no such camera, or if it is attached to another frame than
@@ -173,7 +173,7 @@ pub fn parent_from_camera(base: &Base, parent: Parent, pose: &Transform) -> Tran
 /// Checks that calibrated images have the size of a camera's images.
 ///
 /// # Errors
-/// [`BadInput`] if not.
+/// [`BadInput`] if the sizes differ.
 pub fn expect_size(camera: &Camera, [width, height]: [u32; 2]) -> anyhow::Result<()> {
     let [rig_width, rig_height] = camera.intrinsics.size_px;
     if [width, height] == camera.intrinsics.size_px {

@@ -1,5 +1,5 @@
-//! Classes and causes of errors. Errors of this crate carry their context with `anyhow`, so causes
-//! are found in the chain.
+//! Classes and causes of errors. Errors of this crate have context from `anyhow`, so their causes
+//! are in the error chain.
 
 use capture::ConfigError;
 use messages::{BadInput, ErrorClass, InsufficientData};
@@ -14,7 +14,7 @@ pub(crate) struct GpuUnrecoverable(pub(crate) String);
 /// Whether the input is invalid, the data are insufficient, or an operation failed.
 #[must_use]
 pub fn class(error: &anyhow::Error) -> ErrorClass {
-    // An invalid input counts more than its consequences, so the whole chain is searched for it
+    // Invalid input has priority over its consequences, so the whole chain is searched for it
     // first.
     [ErrorClass::BadInput, ErrorClass::InsufficientData]
         .into_iter()
@@ -30,7 +30,7 @@ pub(crate) fn is_rejection(error: &anyhow::Error) -> bool {
     )
 }
 
-/// The class of one error of a chain; `None` if its type has no classes.
+/// The class of one error of a chain; `None` if errors of its type have no class.
 fn class_of(error: &(dyn Error + 'static)) -> Option<ErrorClass> {
     if error.is::<BadInput>() || error.is::<ConfigError>() {
         return Some(ErrorClass::BadInput);

@@ -356,7 +356,7 @@ impl Session {
             self.persistence.log_render();
             let scoring_began = Instant::now();
             let scores = self.scoreboard.score(&mut self.method, &keyframe)?;
-            // Work that scoring has queued is completed before its time is taken.
+            // The time includes the work that scoring has queued on the GPU.
             self.gpu.wait()?;
             self.time.exclude(scoring_began.elapsed());
             evaluation.add(scores, before.elapsed());

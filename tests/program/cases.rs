@@ -1,5 +1,6 @@
-//! Inputs of the kinds that people met, in `shared/data/cases` and `shared/data/hostile`, with the
-//! right answers. Each test is skipped where they are absent.
+//! Inputs that are like those in public bug reports, and hostile inputs, with the expected results.
+//! The inputs are in `cases` and `hostile` in the folder of the test data. Without them, these
+//! tests are skipped.
 #![expect(clippy::unwrap_used, reason = "a test that cannot continue may panic")]
 
 use serde_json::Value;

@@ -1,6 +1,6 @@
-//! Files that come from somebody else change nothing outside their folder, and special files are
-//! refused. The inputs of these kinds in `shared/data/hostile` are made here, because they depend
-//! on the version of checkpoints.
+//! Files that a user has received from others change nothing outside their folder, and special
+//! files are refused. The tests make these inputs themselves, because they depend on the version of
+//! checkpoints.
 #![expect(clippy::unwrap_used, reason = "a test that cannot continue may panic")]
 
 use crate::photos::dataset;

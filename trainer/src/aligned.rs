@@ -1,11 +1,11 @@
 //! A scene model, and the alignment of its cameras while it trains.
 //!
 //! Alignment runs in parallel with training, once or repeatedly as keyframes arrive. Its result is
-//! applied a fixed number of steps after it began, so that a seed gives one result; in real time,
+//! applied a fixed number of steps after it began, so that a seed gives one result. In real time,
 //! it is applied when the caller asks for it ([`AlignedModel::poll_alignment`]), so that training
-//! never waits. Alignment from features, without depth, takes only seconds, so it precedes the
-//! first step if it runs once. A result that changes the corrections replaces the keyframes; the
-//! model moves along with them or restarts, see [`Method::recalibrate`].
+//! never waits. A single alignment from features, without depth, takes only seconds and precedes
+//! the first step. A result that changes the corrections replaces the keyframes; the model moves
+//! along with them or restarts, see [`Method::recalibrate`].
 
 use crate::corrected_keyframe::{CorrectedKeyframe, id_of};
 use crate::model_metadata::{METADATA_FILE, read_metadata};
@@ -44,7 +44,7 @@ pub type ResumedModel<M = Box<dyn Method>> = (M, Vec<Arc<Keyframe>>);
 
 /// A scene model, and the alignment of its keyframes' cameras if that is requested.
 ///
-/// This type has the functions in which alignment takes part. Everything else is done by the model
+/// This type has the functions that involve alignment. All others are functions of the model
 /// ([`Self::model_mut`]).
 pub struct AlignedModel {
     model: Box<dyn Method>,
@@ -80,7 +80,8 @@ struct AlignedState {
     n_references: Option<usize>,
     /// Number of original keyframes when alignment began; `None` before that.
     n_begun: Option<usize>,
-    /// Whether the alignment task is done. Only in checkpoints, like the next two fields.
+    /// Whether the alignment task is done. This and the next two fields are set only in
+    /// checkpoints.
     is_aligned: bool,
     /// Result of the alignment task.
     alignment: Option<Alignment>,
@@ -211,13 +212,13 @@ impl AlignedModel {
         Ok((aligned, untrained))
     }
 
-    /// The model, for everything in which alignment takes no part.
+    /// The model, for functions that do not involve alignment.
     pub fn model(&self) -> &dyn Method {
         self.model.as_ref()
     }
 
-    /// The model, for everything in which alignment takes no part. It must be trained, and get its
-    /// keyframes, through [`Self::step`] and [`Self::push`] only.
+    /// The model, for functions that do not involve alignment. Train it only with [`Self::step`],
+    /// and add keyframes only with [`Self::push`].
     pub fn model_mut(&mut self) -> &mut dyn Method {
         self.model.as_mut()
     }
@@ -366,7 +367,7 @@ impl AlignedModel {
 
     /// Takes a checkpoint of the model and its alignment; see [`Method::checkpoint`].
     pub fn checkpoint(&mut self) -> Result<PendingCheckpoint, Error> {
-        // Without alignment, the checkpoint is that of the model.
+        // Without alignment, the checkpoint of the model is sufficient.
         if self.state.choice == CameraRefinement::default() && self.alignment().is_none() {
             return self.model.checkpoint();
         }

@@ -139,8 +139,8 @@ pub trait Method {
     fn bounds(&mut self) -> Result<Option<Bounds>, Error> {
         Ok(None)
     }
-    /// Corrections of cameras that were optimized with the scene, by name. They follow those of
-    /// alignment. Waits for queued work.
+    /// Corrections of cameras that were optimized with the scene, by name. They are applied after
+    /// the corrections of alignment. Waits for queued work.
     fn camera_corrections(&mut self) -> Result<BTreeMap<String, CameraCorrection>, Error> {
         Ok(BTreeMap::new())
     }

@@ -1,5 +1,5 @@
-//! What a calibration needs of the program that runs it: requests to stop, and someone to receive
-//! its progress.
+//! The interface between a calibration and the program that runs it: stop requests, progress, and
+//! views of camera images.
 
 use calibration::BoardView;
 use capture::Stop;
@@ -7,7 +7,7 @@ use capture::config::Camera;
 use drivers::Image;
 use session::ReadProgress;
 
-/// What a calibration is about to do, and a user may stop.
+/// An activity of a calibration that a user can stop.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Activity {
     /// Images are read from a recording or from devices, until a stop is requested.
@@ -21,20 +21,21 @@ pub enum Activity {
 
 /// The program that runs a calibration.
 pub trait Host: Sync {
-    /// Begins to listen for requests to stop; called at most once, before an activity.
+    /// Starts listening for stop requests. Called at most once, before an activity.
     ///
     /// # Errors
-    /// If the program cannot receive requests.
+    /// If the program cannot receive stop requests.
     fn stop_requests(&self, activity: Activity) -> anyhow::Result<Stop>;
 
-    /// Images were read, or the target was searched in some of them. Called from several threads.
+    /// Reports how many images have been read or searched for the target. Called from several
+    /// threads.
     fn on_progress(&self, progress: ReadProgress);
 
-    /// No progress follows of the items that were counted last.
+    /// Reports that the items counted last are complete.
     fn on_progress_end(&self);
 
-    /// Opens a view of a camera whose images are about to be taken from a device, by an activity
-    /// that a user watches. It is closed when it is dropped.
+    /// Opens a view in which a user can watch the images of a camera during an activity. Dropping
+    /// the view closes it.
     ///
     /// # Errors
     /// If images cannot be shown as requested.
@@ -42,7 +43,7 @@ pub trait Host: Sync {
     -> anyhow::Result<Box<dyn CameraView>>;
 }
 
-/// Shows a user who moves the target or the arm what the camera sees, and what to do next.
+/// Shows camera images and instructions to the user who moves the target or watches the arm.
 pub trait CameraView {
     /// Shows an image of any camera of the rig.
     fn show_live(&mut self, image: &Image);
@@ -50,7 +51,7 @@ pub trait CameraView {
     /// Shows a gray image in which the target was searched, with the corners that were found.
     fn show_searched(&mut self, size_px: [u32; 2], gray: &[u8], view: Option<&BoardView>);
 
-    /// Shows what to do, or what happens.
+    /// Shows an instruction or a status.
     fn advise(&mut self, text: &str);
 
     /// Shows that no more images are taken.

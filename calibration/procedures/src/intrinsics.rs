@@ -14,7 +14,7 @@ use report::calibration_report::{IntrinsicsReport, Photos, Unused};
 use std::path::PathBuf;
 use targets::TargetSpec;
 
-/// What is calibrated, and from what.
+/// An intrinsic calibration: its input and options.
 #[derive(Clone, Debug)]
 pub struct IntrinsicsTask {
     /// A folder of images, a recording, or a rig file whose devices are read.
@@ -29,14 +29,14 @@ pub struct IntrinsicsTask {
     pub report: Option<ReportOptions>,
 }
 
-/// The result of a calibration.
+/// The outcome of an intrinsic calibration.
 pub struct IntrinsicsOutcome {
     /// The estimates.
     pub calibration: IntrinsicsCalibration,
     /// Images that cannot be read or do not show the target.
     pub unused: Vec<Unused>,
     rig: Option<RigOutput>,
-    /// Whether the report was written.
+    /// The result of writing the report.
     written: anyhow::Result<()>,
 }
 

@@ -2,13 +2,14 @@
 //! a rig file.
 //!
 //! A task holds the options of one procedure: [`IntrinsicsTask`] for the lens of a camera,
-//! [`HandEyeTask`] for its pose on a robot, [`SceneTask`] for the cameras of a rig without a target,
-//! and [`TimeOffsetTask`] for the clocks of two pose streams. Its outcome contains the estimates, and
-//! writes the rig file once they were printed. An arm can move to the poses that determine the
-//! result best ([`MotionOptions`]).
+//! [`HandEyeTask`] for its pose on a robot, [`SceneTask`] for the cameras of a rig without a
+//! target, and [`TimeOffsetTask`] for the clocks of two pose streams. Running a task returns an
+//! outcome, which contains the estimates and can write the rig file. If requested, the arm moves to
+//! the poses that determine the result best ([`MotionOptions`]).
 //!
 //! The estimation itself is in the crate `calibration`, the detection of targets in `targets`. The
-//! program that runs a procedure implements [`Host`]: it requests stops, and shows the progress.
+//! program that runs a procedure implements [`Host`]: it passes on stop requests and shows the
+//! progress.
 
 mod guide;
 mod hand_eye;

@@ -13,8 +13,8 @@ use std::path::{Path, PathBuf};
 /// How the images of one camera are read, and where its calibration is written.
 #[derive(Clone, Debug, Default)]
 pub struct RigOptions {
-    /// The camera to calibrate, with a recording or rig file as input; the camera in the rig file,
-    /// with `write_rig`. `None`: the only one.
+    /// Name of the camera to calibrate in a recording or rig file, or of the camera to change in
+    /// the rig file for `write_rig`. `None`: the only camera.
     pub camera: Option<String>,
     /// With a recording: the rig file to read it with, instead of the one stored in it. With image
     /// files: the rig file to write the result into.
@@ -25,7 +25,7 @@ pub struct RigOptions {
     pub sim: bool,
     /// Time for which devices are read, seconds; only with a rig file as input.
     pub seconds: Option<f64>,
-    /// Whether the page was configured, which only devices need.
+    /// Whether flags of the page were given. They are only allowed if the input is a rig file.
     pub has_page_flags: bool,
 }
 
@@ -259,11 +259,11 @@ fn parent_of(setup: Setup) -> Parent {
     }
 }
 
-/// A report to write: an HTML page with the result, its uncertainty and the errors of all samples;
-/// also if the calibration is refused.
+/// A report to write: an HTML page with the result, its uncertainty and the errors of all samples.
+/// It is also written if the calibration is refused.
 #[derive(Clone, Debug)]
 pub struct ReportOptions {
-    /// The file, with the extension `.html`. Another report is replaced.
+    /// The file, with the extension `.html`. An existing report is replaced.
     pub file: PathBuf,
     /// The command line, which is shown at the end.
     pub command: String,
@@ -307,8 +307,8 @@ impl ReportOptions {
         Ok(())
     }
 
-    /// The heading of the report on a result. `None` for errors that are not a refusal: they have
-    /// no report.
+    /// The heading of the report on a result. `None` for errors other than a refusal, because no
+    /// report is written for them.
     pub(crate) fn heading<T>(
         &self,
         input: &Path,

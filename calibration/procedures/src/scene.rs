@@ -17,7 +17,7 @@ use std::path::PathBuf;
 /// Time for which devices are read if no flag limits it, seconds.
 const DEFAULT_SECS: f64 = 30.0;
 
-/// What is calibrated, and from what.
+/// A calibration from a scene: its input and options.
 #[derive(Clone, Debug)]
 pub struct SceneTask {
     /// A recording, a dataset folder, or a rig file whose devices are read.
@@ -38,7 +38,7 @@ pub struct SceneTask {
     pub report: Option<ReportOptions>,
 }
 
-/// The result of a calibration.
+/// The outcome of a calibration from a scene.
 pub struct SceneOutcome {
     /// The images.
     pub data: Data,
@@ -49,7 +49,7 @@ pub struct SceneOutcome {
     /// The rig before the calibration, if there is one.
     before: Option<Rig>,
     write_rig: Option<PathBuf>,
-    /// Whether the report was written.
+    /// The result of writing the report.
     written: anyhow::Result<()>,
 }
 

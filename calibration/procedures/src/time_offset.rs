@@ -10,7 +10,7 @@ use nalgebra::{Quaternion, Translation3, UnitQuaternion};
 use report::calibration_report::TimeOffsetReport;
 use std::path::{Path, PathBuf};
 
-/// What is estimated, and from what.
+/// An estimation of a time offset: its input and options.
 #[derive(Clone, Debug)]
 pub struct TimeOffsetTask {
     /// Poses of the first body as rows t,x,y,z,qx,qy,qz,qw (seconds, meters).
@@ -23,17 +23,17 @@ pub struct TimeOffsetTask {
     pub report: Option<ReportOptions>,
 }
 
-/// The result of an estimation, or why there is none.
+/// The outcome of an estimation.
 pub struct TimeOffsetOutcome {
-    /// The result, or why there is none.
+    /// The result, or the reason why there is none.
     pub result: anyhow::Result<TimeOffset>,
-    /// Whether the report was written.
+    /// The result of writing the report.
     pub written: anyhow::Result<()>,
 }
 
 impl TimeOffsetTask {
-    /// Reads both files, estimates the offset, and writes the report. Without a result, the outcome
-    /// contains the reason.
+    /// Reads both files, estimates the offset, and writes the report. If there is no result, the
+    /// outcome contains the reason.
     ///
     /// # Errors
     /// If a file cannot be read, or if no report can be written to the given path.

@@ -161,7 +161,7 @@ pub(crate) fn nearest_rotation(correlation: &Matrix3<f64>) -> Option<UnitQuatern
     ))
 }
 
-/// Sum of the rotation matrices: its nearest rotation is the mean.
+/// Sum of the rotation matrices. The rotation nearest to it is their mean.
 pub(crate) fn rotation_sum(poses: &[Transform]) -> Matrix3<f64> {
     poses
         .iter()

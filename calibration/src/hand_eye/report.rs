@@ -106,7 +106,7 @@ const MAX_JOINT_SIGMA: f64 = 0.0175;
 
 /// Evaluates a refined solution.
 ///
-/// * `repeated`: indices of the samples that were not used again.
+/// * `repeated`: indices of the samples that are identical to an earlier one. They are not used.
 pub(super) fn report(
     input: &HandEyeInput<'_>,
     refined: &Refined,
@@ -288,7 +288,7 @@ fn problems(input: &HandEyeInput<'_>, refined: &Refined, reports: &[SampleReport
     } else {
         "samples are"
     };
-    let repeat = format!("{are} identical to an earlier one and not used again");
+    let repeat = format!("{are} identical to an earlier one and not used");
     for (names, problem) in [
         (
             with_status(reports, SampleStatus::Outlier),
@@ -320,9 +320,9 @@ fn problems(input: &HandEyeInput<'_>, refined: &Refined, reports: &[SampleReport
     warnings
 }
 
-/// Names of the samples whose board is seen from the other side than in most samples: its corners
-/// are mirrored. In single samples, this is a detection with swapped corners; in most samples, it
-/// is the way the board is described.
+/// Names of the samples that show the board from the other side than most samples, so that its
+/// corners are mirrored. In a few samples, this means that the detection swapped corners. If most
+/// samples show the back, the board is described that way.
 fn mirrored<'a>(input: &'a HandEyeInput<'_>, refined: &Refined) -> Vec<&'a str> {
     // The board's z axis points away from a viewer of the printed side.
     let is_front = |sample: &Sample| {

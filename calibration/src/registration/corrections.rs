@@ -69,8 +69,8 @@ impl Corrections {
         for (ix, param) in layout.params.iter().enumerate() {
             let delta = step[ix];
             match *param {
-                // Motions are composed as a whole, when their first part comes; the other five
-                // parts are skipped below.
+                // A motion has six parameters. The first one applies all six; the other five are
+                // skipped below.
                 CalibrationParam::Extrinsics(camera, 0) => {
                     let correction = &mut self.by_camera[camera];
                     // The step is a motion of the camera. The correction is applied after

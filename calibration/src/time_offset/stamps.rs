@@ -1,4 +1,4 @@
-//! Names mistakes in the stamps of a stream: wrong units, rounded stamps, several bodies in one
+//! Detects mistakes in the stamps of a stream: wrong units, rounded stamps, several bodies in one
 //! file.
 
 use super::PoseSample;
@@ -14,8 +14,8 @@ const UNITS: [(&str, f64); 3] = [
 /// factor of 1000, the ratio of neighboring units, so that a step fits one unit only.
 const USUAL_STEPS_SECS: std::ops::RangeInclusive<f64> = 0.0004..=0.4;
 
-/// The unit of stamps that are not seconds. Real steps of several seconds look like milliseconds,
-/// so this explains only streams that are of no use otherwise.
+/// The unit of stamps that are not seconds. Stamps in seconds with steps of several seconds look
+/// like milliseconds, so this is only used to explain streams that cannot be used.
 ///
 /// * `step_secs`: typical difference of consecutive stamps.
 pub(super) fn unit_mistake(name: &str, step_secs: f64) -> Option<Refusal> {
@@ -75,9 +75,10 @@ fn is_conflict(pair: &[PoseSample]) -> bool {
         && (difference.rotation.angle() > SAME_RAD || difference.translation.vector.norm() > SAME_M)
 }
 
-/// Describes stamps that several different poses share. A few of them are dropped.
+/// Describes stamps that several different poses share. `None` if there are only a few, which are
+/// removed later.
 pub(super) fn repeated_stamps(name: &str, sorted: &[PoseSample]) -> Option<String> {
-    /// Fewer are left to deduplication.
+    /// Up to this fraction, repeated stamps are removed by deduplication.
     const MAX_FRAC: f64 = 0.2;
     let mut conflicts = sorted.windows(2).filter(|pair| is_conflict(pair));
     let n_conflicts = conflicts.clone().count();

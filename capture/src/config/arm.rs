@@ -73,7 +73,7 @@ pub enum ArmDriver {
 choices! {
     ArmDriver {
         None = "none", Franka = "franka", Can = "can", Udp = "udp", Sim = "sim";
-        else "for another arm, use \"udp\": the program of the arm sends the joint states, see docs/guide/arms.md"
+        else "for another arm, use \"udp\" and send its joint states from another program, see docs/guide/arms.md"
     }
 }
 

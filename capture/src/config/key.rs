@@ -44,11 +44,11 @@ pub(super) trait Keys: Sized {
 pub(super) trait Choice: Copy + PartialEq + 'static {
     /// The names.
     const NAMES: &'static [(&'static str, Self)];
-    /// What to do if no name fits, for the error about another value.
+    /// Hint that is added to the error about an unknown name.
     const HINT: Option<&'static str> = None;
 }
 
-/// Defines the names of a type's values in rig files, and what to do if none fits.
+/// Defines the names of a type's values in rig files, and optionally a hint for unknown names.
 macro_rules! choices {
     ($($Type:ty { $($Variant:ident = $name:literal),* $(; else $hint:literal)? })*) => {$(
         impl $crate::config::key::Choice for $Type {

@@ -1,8 +1,8 @@
 //! The rig file: TOML -> checked types, and back to the effective rig file that reproduces a run.
 //!
 //! Every key is in `docs/reference/rig.md`. Unknown keys are errors; flags override keys of the
-//! same name. In the code, a key is a field of the struct of its table, with its default and range
-//! (macro `keys!`).
+//! same name. In the code, each table is a struct, and each key is a field with its default and
+//! range (macro `keys!`).
 
 mod arm;
 mod base;
@@ -195,7 +195,7 @@ impl Rig {
     /// If a file cannot be written.
     pub fn write_resolved(&self, folder: &Path) -> std::io::Result<PathBuf> {
         let path = folder.join(drivers::recording::RIG_FILE);
-        // The description first: a rig file that is complete can then always be read.
+        // The robot description is written first, so that a complete rig file can always be read.
         files::write(
             &folder.join(drivers::recording::URDF_FILE),
             &self.arm.urdf_text,

@@ -3,11 +3,11 @@
 use super::motor::Reading;
 use kinematics::{JointState, Stamp};
 
-/// Slower joints are not extrapolated, rad/s.
+/// Positions of slower joints are not extrapolated, rad/s.
 ///
-/// The integers of most motors have none for a velocity of 0: at rest, a motor reports the nearest
-/// one. With 12 bits and a range of 60 rad/s in both directions, that is 0.015 rad/s. If an answer
-/// is late by 0.2 s, extrapolation would move a joint at rest by 3 mrad.
+/// Most motors encode the velocity as an integer that cannot represent 0, so a motor at rest
+/// reports the nearest velocity. With 12 bits for -60 to 60 rad/s, this is 0.015 rad/s. If an
+/// answer is 0.2 s late, extrapolation would move a joint at rest by 3 mrad.
 const MIN_EXTRAPOLATED_RAD_S: f64 = 0.015;
 
 /// A reading of one joint.
@@ -64,8 +64,8 @@ impl Joints {
 
 /// Position some time after a reading, rad.
 ///
-/// Motors answer one after another. At 1 rad/s and 2 ms between the first and the last answer,
-/// joining them without extrapolation would be wrong by 2 mrad.
+/// Motors answer one after another. At 1 rad/s and with 2 ms between the first and the last answer,
+/// a state without extrapolation would be wrong by 2 mrad.
 fn position_after(reading: &Reading, secs: f64) -> f64 {
     if reading.velocity_rad_s.abs() < MIN_EXTRAPOLATED_RAD_S {
         reading.position_rad

@@ -20,7 +20,7 @@ use std::path::{Path, PathBuf};
 
 /// File that identifies such a folder.
 pub const FILE_NAME: &str = "transforms.json";
-/// The reason why another file is no input.
+/// Reason of the error about a file that is not an input.
 pub(super) const OTHER_FILE: &str =
     "not a recording (.mcap), a dataset folder or a transforms.json";
 /// Relative difference of two focal lengths that are meant to be equal. Rounded angles differ by

@@ -1,5 +1,5 @@
-//! Recognizes data in the formats of other programs, so that the error names the format and what to
-//! do.
+//! Recognizes data in the formats of other programs, so that the error can name the format and
+//! explain what to do.
 
 use std::path::Path;
 
@@ -15,7 +15,8 @@ struct OtherFormat {
     remedy: &'static str,
 }
 
-/// The formats. The first match counts, so formats that contain others come first.
+/// The formats. The first match is reported. Some formats also contain files of another format, so
+/// they come before it.
 static OTHER_FORMATS: [OtherFormat; 7] = [
     OtherFormat {
         name: "a raw export of Polycam",
@@ -86,7 +87,7 @@ impl OtherFormat {
 
     /// Whether a folder contains a file with one of the extensions.
     fn contains_file(&self, folder: &Path) -> bool {
-        /// More entries are not examined, so that a huge folder costs no time.
+        /// Maximum number of entries to examine, so that huge folders take little time.
         const MAX_ENTRIES: usize = 10_000;
         let Ok(entries) = std::fs::read_dir(folder) else {
             return false;

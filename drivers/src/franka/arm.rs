@@ -329,9 +329,9 @@ impl StateReader {
             // answered: for the earlier ones, an answer would come too late.
             let mut newest = None;
             while let Some(n) = received {
-                // A controller sends all states of a connection from one port. Datagrams of other
-                // senders are rejected, also those from other ports of its address: their numbers
-                // would restart the sequence.
+                // A controller sends all states of a connection from one port. Datagrams from other
+                // senders are rejected, even from other ports of its address, because their message
+                // numbers would restart the sequence.
                 let from = network.udp_peer().filter(|peer| *peer == sender);
                 let state = from.zip(decode(self.version, &buffer[..n]));
                 if !self.handle_datagram(shared, state, at, &mut newest) {

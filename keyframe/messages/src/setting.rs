@@ -1,5 +1,5 @@
-//! Names of settings in messages. A library does not know how a program lets its users set an
-//! option, for example with a flag, so the program spells the names.
+//! Names of settings in messages. Users set options in different ways, for example with flags. A
+//! program therefore defines how messages spell the names.
 
 use std::fmt::{Display, Formatter, Result};
 use std::sync::OnceLock;
@@ -7,7 +7,7 @@ use std::sync::OnceLock;
 /// Defines the settings with the names that the options have in the libraries.
 macro_rules! settings {
     ($($(#[$doc:meta])* $name:ident = $option:literal,)*) => {
-        /// Something that a user can set and that a message names.
+        /// An option that users can set and that messages name.
         ///
         /// ```
         /// use messages::Setting;
@@ -105,7 +105,7 @@ settings! {
     Scale = "scale",
     /// Duration.
     Seconds = "seconds",
-    /// Time at the start of a run that does not count.
+    /// Time at the start of a run that is not evaluated.
     SettleSeconds = "settle_seconds",
     /// Whether other machines may open the page.
     Share = "share",

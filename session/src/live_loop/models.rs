@@ -73,8 +73,8 @@ impl Models {
         removed
     }
 
-    /// The models that receive keyframes. A model that has made all its steps gets no more, so that
-    /// it equals a model trained alone.
+    /// The models that receive keyframes. A model that has made all its steps receives no more
+    /// keyframes, so that it equals a model trained alone.
     fn unfinished(&mut self) -> impl Iterator<Item = &mut Session> {
         self.sessions
             .iter_mut()
@@ -110,8 +110,9 @@ impl Models {
     /// would be trained and drawn even more slowly, so that an operator would see less.
     pub(super) fn pause_growth_when_slow(&mut self) -> anyhow::Result<()> {
         for session in &mut self.sessions {
-            // Growth continues at half of the limit only. With a single limit, each change of the
-            // load of the machine near it would pause and continue growth, and log this.
+            // Growth continues only below half of the limit. With a single limit, small changes of
+            // the machine's load would pause and continue growth repeatedly, and each change would
+            // be logged.
             match session.progress().step_millis {
                 millis if millis > MAX_LIVE_STEP_MILLIS => session.pause_growth(true)?,
                 millis if millis < 0.5 * MAX_LIVE_STEP_MILLIS => session.pause_growth(false)?,

@@ -16,7 +16,7 @@ use std::sync::Arc;
 pub struct SessionOptions {
     /// How the model is scored.
     pub evaluators: Evaluators,
-    /// When training is over.
+    /// When training ends.
     pub limits: Limits,
     /// Receives the events.
     pub observer: Box<dyn Observer>,

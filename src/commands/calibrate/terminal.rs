@@ -69,7 +69,7 @@ impl Host for Terminal<'_> {
             .context("this calibration shows no images of a camera")?;
         // The motions of an arm are logged, so that they can be read afterwards.
         let is_hidden = self.is_json || activity != Activity::ReadImages;
-        // The bar first, so that the addresses of the page are printed above it.
+        // The bar is created first, so that the addresses of the page are printed above it.
         let bar = print::bar(None, "{spinner} {msg}", is_hidden);
         let page = GuidancePage::start(page, camera)?;
         Ok(Box::new(TerminalView { bar, page }))

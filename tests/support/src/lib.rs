@@ -1,4 +1,4 @@
-//! What the tests of several crates share. Only tests depend on this crate.
+//! Code that the tests of several crates share. Only tests depend on this crate.
 //!
 //! - [`data_folder`] finds real data, [`skip`] reports a test that cannot run on this machine.
 //! - [`Stalls`] measures when the machine could not run a test, so that deadlines of real protocols

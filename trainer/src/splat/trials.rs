@@ -320,8 +320,8 @@ impl SplatTrials {
             return Due::Nothing;
         }
         if self.validation.len() < MIN_VALIDATION_IMAGES {
-            // Wait for more images, but not indefinitely: images that validate nothing are more
-            // useful for training.
+            // Wait for more images, but not indefinitely: without trials, validation images are
+            // more useful for training.
             return if context.step < 2 * self.steps.first_trial {
                 Due::Nothing
             } else {
@@ -545,7 +545,7 @@ impl SplatTrials {
             "{candidate}: PSNR without the change {baseline_db:.3?} dB, with it {variant_db:.3?} dB"
         );
         let mut trial = Trial::of(candidate, baseline_db, variant_db);
-        // A reduction that improved the score is no credit for later ones: its gain may be noise.
+        // Gains of earlier reductions do not compensate later losses, because they may be noise.
         let total_loss_db: f64 = self
             .finished
             .iter()

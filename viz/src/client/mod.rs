@@ -175,8 +175,7 @@ impl Reader<'_> {
         }
     }
 
-    /// Reads until the client disconnects, and ignores what it sends: the writer disconnects it,
-    /// or has done so.
+    /// Reads and discards messages until the client disconnects. The writer closes the connection.
     async fn discard(&mut self) {
         while let Some(Ok(message)) = self.stream.next().await {
             if matches!(message, Message::Close(_)) {
@@ -229,8 +228,8 @@ impl Reader<'_> {
     fn render(&self, message: &RenderMessage) -> Result<(), InvalidRequest> {
         let view_request = ViewRequest::check(message)?;
         if let Some(viewpoint) = Viewpoint::of(&view_request) {
-            // Only the writer of this client needs it, so the hub is not informed: views change
-            // many times per second.
+            // Only the writer of this client needs the viewpoint. The hub is not informed, because
+            // views change many times per second.
             self.demand
                 .send_modify(|demand| demand.viewpoint = Some(viewpoint));
         }

@@ -88,7 +88,7 @@ impl PictureRequests {
         self.queue().collect(client)
     }
 
-    /// Makes the place of a picture free that was sent or will not be.
+    /// Frees the place of a picture that was sent or will not be sent.
     pub(crate) fn release(&self, client: u64) {
         self.queue().release(client);
         // There is room for another picture of this client, so its next request can be rendered.

@@ -136,7 +136,7 @@ impl Queue {
     ///
     /// Only the last stage is kept if it is expected to be fast.
     pub(crate) fn view_request(&mut self, client: u64, mut view_request: ViewRequest) -> bool {
-        // The client is about to leave, so an error would reach nobody.
+        // The client is about to disconnect and would not receive an error.
         let Some(waiting) = self.clients.get_mut(&client) else {
             return true;
         };

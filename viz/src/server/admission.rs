@@ -94,8 +94,8 @@ pub(crate) struct Connection {
 struct Activity {
     /// Whether a complete request has arrived.
     has_requested: bool,
-    /// Time of the last request, or at which the kernel last accepted data for the peer; at first,
-    /// the time at which the connection was opened.
+    /// Time of the last activity: when the last request arrived, or when the kernel last accepted
+    /// data for the peer. Initially, when the connection was opened.
     active_at: Instant,
     /// When the connection was accepted as a WebSocket client. The fields below are used from then
     /// on.
@@ -109,8 +109,8 @@ struct Activity {
     has_answered: bool,
 }
 
-/// How important it is that a client stays: the least important client is replaced first. Among
-/// equals, the times decide.
+/// Importance of a client. The least important client is replaced first. Within a variant, the
+/// times decide.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 enum Importance {
     /// It has not answered the ping of this time.
@@ -120,7 +120,7 @@ enum Importance {
     NeverUsed(Instant),
     /// It sent its last message at this time.
     Idle(Instant),
-    /// A viewer in use, admitted at this time. Those before it were there first.
+    /// A viewer in use, admitted at this time. Earlier viewers are more important.
     Viewer(Reverse<Instant>),
     /// An operator in use.
     Operator,
@@ -138,8 +138,8 @@ impl Admission {
     /// Adds a connection. At the limit, it replaces another one.
     pub(crate) fn admit(&self, peer: Option<SocketAddr>) -> Arc<Connection> {
         if self.connections.lock().len() >= self.limits.connections {
-            // It leaves later, when its task notices. Until then, there may be one more connection
-            // than the limit.
+            // The task of the evicted connection drops it later. Until then, there may be one more
+            // connection than the limit.
             self.evict();
         }
         let connection = Arc::new(Connection::new(peer));
@@ -147,8 +147,9 @@ impl Admission {
         connection
     }
 
-    /// Closes the connection without a client that has been idle longest. Half-open requests come
-    /// first. Clients are replaced only by other clients.
+    /// Closes the oldest connection without a complete request, or else the connection that has
+    /// been idle longest. WebSocket clients are never evicted here; only other clients replace
+    /// them.
     pub(crate) fn evict(&self) {
         let connections = self.connections.lock();
         let candidates =
@@ -263,8 +264,8 @@ impl Connection {
         (n_bytes > 0).then_some(n_bytes)
     }
 
-    /// Returns whether a ping is due. At most one ping is unanswered at a time, so that its time is
-    /// that of the first one.
+    /// Returns whether a ping is due. At most one ping is unanswered at a time, so that the time
+    /// limit starts with the first one.
     pub(crate) fn start_ping(&self) -> bool {
         let mut activity = self.activity.lock();
         let is_due = activity.pinged.is_none();

@@ -1,8 +1,8 @@
 //! The kinds of data that clients receive besides pictures, each of which is a topic.
 //!
 //! A topic has two halves. [`Topic`] takes new data from the hub, and encodes it once for all
-//! clients. [`Feed`] decides what one client receives next. What the halves share is known to the
-//! topic alone.
+//! clients. [`Feed`] decides what one client receives next. The data that both halves share are
+//! private to the topic.
 //!
 //! To add a topic, write a module and an entry of [`TOPICS`]. If all clients receive the same
 //! messages, implement [`SharedTopic`](shared_topic::SharedTopic), which needs a name, a period and
@@ -95,8 +95,8 @@ pub(crate) enum Priority {
     Background,
 }
 
-/// The half of a topic that encodes new data once for all clients. It works outside the tasks of
-/// clients, on the server's thread.
+/// The half of a topic that encodes new data once for all clients. It runs on the server's thread,
+/// outside the tasks of clients.
 pub(crate) trait Topic: Send + Sync {
     /// Encodes what is new and due, if a client receives it. Work that takes more than a
     /// millisecond belongs on a thread for blocking tasks.
@@ -121,7 +121,7 @@ pub(crate) trait Feed: Send {
     }
 }
 
-/// What the topics need to know to encode.
+/// Data that topics need for encoding.
 pub(crate) struct EncodeContext<'a> {
     pub(crate) hub: &'a Hub,
     pub(crate) clock: ServerClock,

@@ -142,8 +142,8 @@ impl PublishedChunks<'_> {
                 .map(|list| (**list).clone())
                 .unwrap_or_default();
             list.world_from_model = world_from_model;
-            // Changes of chunks that were dropped in the meantime are discarded. The run sends all
-            // chunks when it sees that none are there (`contains`).
+            // Changes of chunks that were dropped in the meantime are discarded. If `contains`
+            // returns false, the run sends all chunks.
             if list.apply(chunks) {
                 lists.insert(method.into(), Arc::new(list));
             }

@@ -1,5 +1,5 @@
-//! A topic that exists only in tests: what a new topic needs is in this file and in one entry of
-//! the list of topics.
+//! A topic that exists only in tests. A new topic needs a file like this one and an entry in the
+//! list of topics.
 
 use crate::Hub;
 use crate::clock::ServerClock;

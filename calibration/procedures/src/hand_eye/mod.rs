@@ -27,16 +27,16 @@ use source::Source;
 use std::path::PathBuf;
 use targets::TargetSpec;
 
-/// What is calibrated, and from what.
+/// A hand-eye calibration: its input and options.
 #[derive(Clone, Debug)]
 pub struct HandEyeTask {
     /// A samples file (JSON), a recording, or a rig file whose devices are read.
     pub input: PathBuf,
     /// The target; only with a recording or rig file.
     pub target: Option<TargetSpec>,
-    /// Whether the intrinsics are estimated, too. It needs images.
+    /// Whether the intrinsics are also estimated, which requires images.
     pub with_intrinsics: bool,
-    /// Whether the offsets of all joints except the first and the last are estimated, too.
+    /// Whether the offsets of all joints except the first and the last are also estimated.
     pub with_joints: bool,
     /// The arm; only with a samples file.
     pub robot: Option<RobotOptions>,
@@ -68,7 +68,7 @@ pub struct HandEyeSamples {
 pub struct CalibratedHandEye {
     /// The estimates.
     pub calibration: HandEyeCalibration,
-    /// The poses that would lower the uncertainty most.
+    /// The poses that would reduce the uncertainty most.
     pub next_poses: Vec<NextPose>,
     /// Intrinsics that were given or estimated; `None` without images.
     pub intrinsics: Option<Intrinsics>,
@@ -76,20 +76,21 @@ pub struct CalibratedHandEye {
     pub rig_pose: Transform,
 }
 
-/// The result of a calibration, or why there is none.
+/// The outcome of a hand-eye calibration.
 pub struct HandEyeOutcome {
-    /// The result, or why there is none.
+    /// The result, or the reason why there is none.
     pub result: anyhow::Result<CalibratedHandEye>,
     source: Source,
     samples: Samples,
     rig: Option<RigOutput>,
-    /// Whether the report was written.
+    /// The result of writing the report.
     written: anyhow::Result<()>,
 }
 
 impl HandEyeTask {
-    /// Reads the samples file or the images of a recording or rig, or moves the arm to take images.
-    /// An arm that has moved must be finished with the result of the calibration.
+    /// Reads a samples file, or takes the images from a recording or from the devices of a rig. If
+    /// the arm moves to take the images, it is returned, and [`MovedArm::finish`] must be called
+    /// with the result of the calibration.
     ///
     /// # Errors
     /// If the input does not fit the options, or if it cannot be read.
@@ -101,7 +102,7 @@ impl HandEyeTask {
         Ok((HandEyeSamples { source, rig }, arm))
     }
 
-    /// Calibrates, and writes the report. Without a result, the outcome contains the reason.
+    /// Calibrates, and writes the report. If there is no result, the outcome contains the reason.
     ///
     /// # Errors
     /// If the images cannot be read, or if a result would not fit the rig file to write.
@@ -191,7 +192,7 @@ impl HandEyeTask {
         Ok((source, arm))
     }
 
-    /// What an arm calibrates that moves.
+    /// The request for a calibration with a moving arm.
     fn request<'a>(&'a self, host: &'a dyn Host) -> anyhow::Result<Request<'a>> {
         let Some(target) = &self.target else {
             let setting = Setting::Target;

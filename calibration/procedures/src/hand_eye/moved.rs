@@ -38,10 +38,11 @@ pub struct MotionOptions {
     pub is_confirmed: bool,
     /// Maximum number of poses.
     pub max_poses: u16,
-    /// The standard deviations of the position at which the motion ends, millimeters.
+    /// Goal for the standard deviations of the camera position, millimeters. The motion ends when
+    /// they are below it.
     pub goal_mm: f64,
-    /// Maximum distance of the flange from its position at the start, millimeters. `None`: 300;
-    /// with a camera on the flange, at most half its distance to the target.
+    /// Maximum distance of the flange from its position at the start, millimeters. `None`: 300, but
+    /// at most half the distance to the target if the camera is on the flange.
     pub max_distance_mm: Option<f64>,
 }
 
@@ -56,8 +57,8 @@ pub struct MovedArm {
 }
 
 impl MovedArm {
-    /// Holds an arm whose motors would release it, until Ctrl-C. Returns the result of the
-    /// calibration, or why the motion was not completed.
+    /// If the motors would release the arm at the end of the program, holds it until Ctrl-C.
+    /// Returns the result of the calibration, or the reason why the motion was not completed.
     ///
     /// # Errors
     /// If the calibration or the motion failed, or if the arm has stopped because of a fault.
@@ -102,7 +103,7 @@ impl MovedArm {
     }
 }
 
-/// What is calibrated, and how.
+/// The input and options of a calibration with a moving arm.
 pub(super) struct Request<'a> {
     pub(super) input: &'a Path,
     pub(super) target: &'a TargetSpec,

@@ -1,6 +1,6 @@
-//! Whether the samples and the result can be trusted: names common mistakes in the input (wrong
-//! units, inverted transforms, mirrored boards, lists that are off by one), contradictions, and
-//! directions that are not observable.
+//! Checks the samples and the result. Reports common mistakes in the input (wrong units, inverted
+//! transforms, mirrored boards, lists that are off by one), contradictions, and directions that are
+//! not observable.
 
 mod rotations;
 
@@ -17,7 +17,7 @@ use crate::least_squares::sigma_of;
 use kinematics::Transform;
 use nalgebra::{DMatrix, SymmetricEigen, Vector3};
 
-/// Finds an initial solution, and names mistakes in the samples.
+/// Finds an initial solution, and reports mistakes in the samples.
 ///
 /// # Errors
 /// [`Error::Refused`] if the samples contain a known mistake, do not determine the result, or
@@ -185,7 +185,8 @@ fn likely_board(sample: &Sample) -> &Transform {
     &sample.candidates[0].camera_from_board
 }
 
-/// Whether the board poses follow from corners. An input has either corners or poses.
+/// Whether the board poses were computed from corners. An input contains either corners or board
+/// poses.
 fn has_images(samples: &[Sample]) -> bool {
     samples
         .iter()

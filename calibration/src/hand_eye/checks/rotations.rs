@@ -132,7 +132,7 @@ pub(crate) fn axis_name(axis: &Vector3<f64>, body: &str) -> String {
     )
 }
 
-/// The rotations across an axis of a body that are missing.
+/// Describes the missing rotations: those about the axes perpendicular to an axis of a body.
 pub(super) fn rotations_across(axis: &Vector3<f64>, body: &str) -> String {
     let [first, second] = [["y", "z"], ["x", "z"], ["x", "y"]][axis.iamax()];
     format!(

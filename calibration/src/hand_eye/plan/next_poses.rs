@@ -265,7 +265,8 @@ impl Scene<'_> {
             .collect()
     }
 
-    /// The information of a new sample, as if its board pose were as accurate as those so far.
+    /// The information of a new sample. Its board pose is assumed to be as accurate as those of the
+    /// previous samples.
     fn information(&self, measurement: &Measurement) -> Option<DMatrix<f64>> {
         let refined = &self.calibration.refined;
         let solution = &refined.solution;

@@ -122,7 +122,7 @@ pub(crate) struct Sorted {
     pub(crate) repeated: Vec<usize>,
 }
 
-/// Candidates of all samples that differ from each other.
+/// Candidates of all samples, except repeated samples.
 ///
 /// # Errors
 /// If the input is invalid or has too few samples.
@@ -131,7 +131,7 @@ pub(crate) fn prepare(input: &HandEyeInput<'_>) -> Result<Sorted, Error> {
     Ok(sort(input, input.intrinsics.as_ref()))
 }
 
-/// Candidates of all samples of a valid input that differ from each other.
+/// Candidates of all samples of a valid input, except repeated samples.
 pub(crate) fn sort(input: &HandEyeInput<'_>, intrinsics: Option<&Intrinsics>) -> Sorted {
     let mut sorted = Sorted {
         usable: Vec::new(),
@@ -245,7 +245,7 @@ fn invalid(why: impl Into<String>) -> Error {
     Error::HandEyeInput { why: why.into() }
 }
 
-/// An error for invalid input unless a condition is met.
+/// Returns an error for invalid input unless a condition is met.
 fn require(is_met: bool, why: impl FnOnce() -> String) -> Result<(), Error> {
     if is_met { Ok(()) } else { Err(invalid(why())) }
 }

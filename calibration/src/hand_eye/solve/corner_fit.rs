@@ -1,5 +1,6 @@
-//! Minimization of the reprojection error over hand-eye, board pose, robot pose errors and, when
-//! asked, intrinsics and joint offsets, and whether it contradicts the given intrinsics.
+//! Minimizes the reprojection error over the hand-eye transform, the board pose, the errors of the
+//! robot poses and, if requested, intrinsics and joint offsets. Also checks whether the corners
+//! contradict the given intrinsics.
 //!
 //! Each stop of the robot has a small unknown error with an estimated variance. These local
 //! parameters are eliminated by the Schur complement of the solver.
@@ -32,7 +33,7 @@ impl Free {
     };
 }
 
-/// Where a minimization starts.
+/// Data and initial values of a minimization.
 #[derive(Clone, Copy)]
 pub(super) struct Start<'a> {
     pub(super) input: &'a HandEyeInput<'a>,

@@ -41,7 +41,7 @@ pub(crate) struct Refined {
 }
 
 impl Refined {
-    /// The result of a fit, without standard deviations of other parameters and without doubts.
+    /// The result of a fit that estimates only the hand-eye transform and the board pose.
     fn new(samples: Vec<Sample>, fit: PoseFit, intrinsics: Option<Intrinsics>) -> Self {
         // The 95 % quantile of F with 6 and n degrees of freedom relative to that of chi squared /
         // 6, to first order.
@@ -100,7 +100,7 @@ fn refine_with_given(
     given: Intrinsics,
 ) -> Result<Refined, Error> {
     // A fit with free intrinsics shows whether the given ones are right, and how their uncertainty
-    // changes the result. It may fail for few images; then nothing is known.
+    // changes the result. This fit may fail if there are few images; both are then unknown.
     let start = Start {
         input,
         samples: &samples,
@@ -314,11 +314,11 @@ fn relinearize(
 /// Minimizes the reprojection error with the intrinsics and joints of the start, and with the
 /// weights that predict held-out images best.
 ///
-/// Errors of the lens model that are common to all images look like errors of the robot. Then
-/// smaller robot errors predict held-out images better; without any, the fit minimizes the
-/// reprojection error. The alternatives are compared by the product of three held-out errors, which
-/// does not depend on units: reprojection, position of the board, and its rotation. The covariance
-/// follows from the estimated noise in all cases.
+/// If the lens model has errors that are common to all images, the estimated robot errors are too
+/// large. Weights for smaller robot errors then predict held-out images better. Weights without
+/// robot errors minimize the reprojection error alone. The alternatives are compared by the product
+/// of three held-out errors, which does not depend on units: reprojection, position of the board,
+/// and its rotation. The covariance follows from the estimated noise in all cases.
 fn minimize_weighted(start: Start<'_>) -> Result<PoseFit, Error> {
     const FACTORS: [f64; 5] = [1.0, 0.5, 0.25, 0.1, 0.0];
     let setup = start.input.setup;

@@ -90,7 +90,7 @@ pub(crate) struct Measurement {
 }
 
 impl Measurement {
-    /// A measurement that is alone at its stop.
+    /// The only measurement at its stop.
     pub(crate) fn new(
         a: Transform,
         camera_from_board: Transform,
@@ -156,8 +156,8 @@ pub(super) struct PoseFit {
 
 /// Fits a solution to the measurements.
 ///
-/// * `knows_noise`: keeps the weights of the given noise. Otherwise, they follow from the estimated
-///   noise.
+/// * `knows_noise`: whether the weights follow from the given noise. Otherwise, the noise is
+///   estimated.
 ///
 /// # Errors
 /// If fewer than three measurements are given.

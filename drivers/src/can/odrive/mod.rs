@@ -75,8 +75,9 @@ impl MotorFamily for OdriveFamily {
 pub struct Odrive {
     /// Node ID of the axis.
     pub node: Node,
-    /// Endpoint numbers of its firmware. Without them, its watchdog cannot be set. They are not
-    /// among its settings, because the rig file names one file for all axes of an arm.
+    /// Endpoint numbers of its firmware. Without them, its watchdog cannot be set. They are
+    /// separate from the settings of the motor, because the rig file names one file for all axes of
+    /// an arm.
     pub endpoints: Option<Endpoints>,
 }
 

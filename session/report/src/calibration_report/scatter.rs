@@ -25,7 +25,8 @@ pub(super) fn svg(axes: [&str; 2], points: &[ScatterPoint]) -> String {
         .flat_map(|point| point.at);
     let step = tick_step(used.map(f64::abs).fold(1e-6, f64::max));
     let range = 2.0 * step;
-    // Points at the edge are beyond the last tick, to distinguish them from points on it.
+    // Points outside the range are drawn beyond the last tick, to distinguish them from points on
+    // the tick.
     let to = |value: f64| REACH * (value / range).clamp(-1.12, 1.12);
     let mut shapes = String::new();
     for tick in [-2.0, -1.0, 0.0, 1.0, 2.0] {
@@ -77,7 +78,7 @@ pub(super) fn svg(axes: [&str; 2], points: &[ScatterPoint]) -> String {
     )
 }
 
-/// Tick step: the smallest round number of which two steps cover `largest`.
+/// The smallest round tick step such that two steps cover `largest`.
 fn tick_step(largest: f64) -> f64 {
     // Two ticks on each side of the center, so that a step is about half of the largest value.
     let half = largest / 2.0;
@@ -91,7 +92,7 @@ fn tick_step(largest: f64) -> f64 {
 
 /// A number without zeros at its end.
 fn short(value: f64) -> String {
-    // Adding 0 turns -0 into 0, whose sign would be printed.
+    // Adding 0 turns -0 into 0, so that no sign is printed.
     let text = format!("{:.4}", value + 0.0);
     text.trim_end_matches('0').trim_end_matches('.').to_owned()
 }

@@ -147,7 +147,7 @@ fn calibrate_and_print(
 
 impl Args {
     fn task(&self) -> Result<HandEyeTask, BadInput> {
-        // clap accepts only both of them.
+        // clap requires both or neither.
         let robot = self.urdf.as_ref().zip(self.tip.as_ref());
         Ok(HandEyeTask {
             input: self.input.clone(),

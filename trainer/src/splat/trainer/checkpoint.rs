@@ -88,8 +88,8 @@ struct TrialState {
     n_other_param_bytes: u64,
 }
 
-/// Removes what earlier versions stored about searches for the number of splats. Their runs
-/// continue without such a search.
+/// Removes the state of searches for the number of splats, which earlier versions stored. Runs of
+/// these versions continue without a search.
 fn remove_obsolete(state: &mut Value) {
     remove_fields(Some(&mut *state), &["growth_search"]);
     remove_fields(state.pointer_mut("/remaining_trials"), &["doubling"]);

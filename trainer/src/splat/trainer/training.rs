@@ -1,5 +1,5 @@
-//! The model in training, with all that its steps need. A submit is prepared, sent, and its results
-//! are applied.
+//! The model in training, and everything that a training step needs. A submit is prepared and sent;
+//! later, its results are applied.
 
 use super::lazy_pipelines::LazyPipelines;
 use super::learning_rates;
@@ -36,7 +36,7 @@ const MAX_STEPS_PER_SUBMIT: u64 = 64;
 /// number would delay the pictures too much.
 const VIEWS_AT_ONCE_WATCHED: u64 = 4;
 
-/// The model in training. It does not depend on trials, which change it from outside.
+/// The model in training. It does not depend on trials; they change it through its functions.
 #[derive(Debug)]
 pub(super) struct Training {
     pub(super) options: ModelOptions<SplatOptions>,
@@ -86,7 +86,7 @@ impl Training {
         self.add_view(keyframe)
     }
 
-    /// Adds a training keyframe that was available before.
+    /// Adds a training keyframe without extending the schedule.
     pub(super) fn add_view(&mut self, keyframe: Arc<Keyframe>) -> Result<(), Error> {
         // The steps of a failed submit are repeated, and must be repeated on the same views.
         self.finish_in_flight()?;
@@ -239,7 +239,7 @@ impl Training {
             .min(self.schedule.steps_to_next_change())
     }
 
-    /// How few images there are.
+    /// Whether there are few images.
     fn scarcity(&self, n_validation: usize) -> Scarcity {
         Scarcity::of_images(self.views.len() + n_validation)
     }

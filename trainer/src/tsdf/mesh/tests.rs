@@ -1,4 +1,4 @@
-//! Meshes of known shapes: accuracy and closedness.
+//! Checks that meshes of known shapes are accurate and closed.
 
 use crate::Method;
 use crate::model_options::ModelOptions;

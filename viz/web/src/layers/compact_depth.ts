@@ -1,4 +1,4 @@
-// Decodes the depth format `compact_half`; the encoder is viz/src/compact_depth.rs.
+// Decodes the depth format `compact_half`; the encoder is viz/src/pictures/compact_depth.rs.
 
 import { inflated } from "./zlib";
 
