@@ -3,8 +3,8 @@
 use crate::pictures::picture::live_jpeg;
 use crate::topics::keyframes::KeyframePoses;
 use crate::topics::live_images::LiveImages;
-use crate::topics::robot::RobotDescription;
-use crate::topics::updates::{KeyframePose, Status};
+use crate::topics::published_data::{KeyframePose, Status};
+use crate::topics::robot_description::RobotDescription;
 use crate::{Error, Hub};
 use ::foxglove::messages::{
     CameraCalibration, CompressedImage, FrameTransform, FrameTransforms, JointState, JointStates,

@@ -40,9 +40,11 @@ pub use server::access::{Role, Token, Tokens};
 pub use server::certificate::Certificate;
 pub use server::{Server, ServerConfig, Sharing};
 pub use topics::model_chunks::PublishedChunks;
-pub use topics::observation_map::{ObservationMap, ObservedCell};
-pub use topics::robot::{MeshFormat, RobotDescription, RobotMesh};
-pub use topics::updates::{Guidance, KeyframePose, ModelStatus, RunResult, SceneHint, Status};
+pub use topics::observations::{ObservationMap, ObservedCell};
+pub use topics::published_data::{
+    Guidance, KeyframePose, ModelStatus, RunResult, SceneHint, Status,
+};
+pub use topics::robot_description::{MeshFormat, RobotDescription, RobotMesh};
 
 /// Handles the messages of a client, one per line, and panics if a result is inconsistent.
 #[cfg(fuzzing)]

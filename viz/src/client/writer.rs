@@ -19,7 +19,7 @@ use crate::server::access::Role;
 use crate::server::admission::Connection;
 use crate::server::server_context::ServerContext;
 use crate::topics::client_updates::{ClientUpdates, NextUpdate};
-use crate::topics::robot::RobotStateMessage;
+use crate::topics::robot_description::RobotStateMessage;
 use crate::topics::robot_state::RobotDescriptionTopic;
 use crate::topics::shared_topic::SharedTopic;
 use axum::body::Bytes;

@@ -18,7 +18,7 @@ use crate::server::client_log::ClientLog;
 use crate::server::guarded_stream::GuardedStream;
 use crate::server::page::{FILES, has_version};
 use crate::server::server_context::ServerContext;
-use crate::topics::robot::RobotDescription;
+use crate::topics::robot_description::RobotDescription;
 use crate::topics::{self, Publisher};
 use crate::{Error, Hub, Status, client};
 use axum::extract::{Extension, Path, Request, State, WebSocketUpgrade};

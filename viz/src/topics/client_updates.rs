@@ -144,12 +144,12 @@ mod tests {
     use crate::topics::keyframe_points::PointTopic;
     use crate::topics::keyframes::{KeyframeTopic, SharedLog};
     use crate::topics::live_images::LiveImageTopic;
+    use crate::topics::published_data::KeyframePose;
     use crate::topics::robot_state::RobotDescriptionTopic;
     use crate::topics::scene::SceneTopic;
     use crate::topics::shared_topic::LatestMessages;
     use crate::topics::status::StatusTopic;
     use crate::topics::subscriptions::Subscriptions;
-    use crate::topics::updates::KeyframePose;
     use crate::topics::{EncodedMessage, TOPICS, Topic};
     use axum::extract::ws::Message;
     use kinematics::{Stamp, Transform};

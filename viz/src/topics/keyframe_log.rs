@@ -2,7 +2,7 @@
 
 use crate::client::protocol::MAX_CHANGED_KEYFRAMES;
 use crate::client::server_message::{NumberedKeyframe, ServerMessage};
-use crate::topics::updates::KeyframePose;
+use crate::topics::published_data::KeyframePose;
 use std::collections::{BTreeMap, VecDeque};
 use std::sync::Arc;
 
@@ -235,7 +235,7 @@ fn has_changed(before: &KeyframePose, after: &KeyframePose) -> bool {
 mod tests {
     use super::{KeyframeListUpdate, KeyframeLog, ListPosition, MAX_REMOVALS};
     use crate::client::protocol::MAX_CHANGED_KEYFRAMES;
-    use crate::topics::updates::KeyframePose;
+    use crate::topics::published_data::KeyframePose;
     use kinematics::{Stamp, Transform};
     use numbers::random::Random;
     use serde_json::Value;

@@ -4,7 +4,7 @@
 use crate::Hub;
 use crate::client::server_message::{KeyframeMessage, ServerMessage};
 use crate::topics::keyframe_log::{KeyframeListUpdate, KeyframeLog, ListPosition};
-use crate::topics::updates::KeyframePose;
+use crate::topics::published_data::KeyframePose;
 use crate::topics::{
     ClientState, DefaultRate, EncodeContext, EncodedMessage, Feed, LastSent, Priority, Publisher,
     Throttle, Timer, Topic, TopicEntry, receiver, take_if_changed,

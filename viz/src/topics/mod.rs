@@ -17,10 +17,11 @@ mod keyframe_points;
 pub(crate) mod keyframes;
 pub(crate) mod live_images;
 pub(crate) mod model_chunks;
-pub(crate) mod observation_map;
+pub(crate) mod observations;
 mod positions;
-pub(crate) mod range_scan;
-pub(crate) mod robot;
+pub(crate) mod published_data;
+pub(crate) mod range_scans;
+pub(crate) mod robot_description;
 pub(crate) mod robot_state;
 mod scene;
 pub(crate) mod shared_topic;
@@ -28,7 +29,6 @@ mod status;
 pub(crate) mod subscriptions;
 #[cfg(test)]
 mod test_topic;
-pub(crate) mod updates;
 
 use crate::Hub;
 use crate::clock::ServerClock;
@@ -49,10 +49,10 @@ pub(crate) const TOPICS: &[TopicEntry] = &[
     shared_topic::entry::<base_path::BasePathTopic>(),
     shared_topic::entry::<robot_state::RobotDescriptionTopic>(),
     live_images::ENTRY,
-    shared_topic::entry::<range_scan::RangeScanTopic>(),
+    shared_topic::entry::<range_scans::RangeScanTopic>(),
     keyframes::ENTRY,
     keyframe_points::ENTRY,
-    shared_topic::entry::<observation_map::ObservationTopic>(),
+    shared_topic::entry::<observations::ObservationTopic>(),
     model_chunks::ENTRY,
     #[cfg(test)]
     shared_topic::entry::<test_topic::Weather>(),

@@ -4,7 +4,7 @@ use crate::Hub;
 use crate::client::server_message::ServerMessage;
 use crate::clock::ServerClock;
 use crate::topics::base_path::BasePath;
-use crate::topics::robot::{RobotDescription, RobotMessage};
+use crate::topics::robot_description::{RobotDescription, RobotMessage};
 use crate::topics::shared_topic::SharedTopic;
 use crate::topics::{DefaultRate, Priority};
 use axum::extract::ws::Message;

@@ -3,8 +3,8 @@
 use crate::Hub;
 use crate::client::server_message::ServerMessage;
 use crate::clock::ServerClock;
+use crate::topics::published_data::SceneHint;
 use crate::topics::shared_topic::SharedTopic;
-use crate::topics::updates::SceneHint;
 use crate::topics::{DefaultRate, Priority};
 use axum::extract::ws::Message;
 use std::sync::Arc;

@@ -27,7 +27,7 @@ import { LiveImagesTopic } from "./topics/live_images";
 import { ModelChunksTopic } from "./topics/model_chunks";
 import { ObservationsTopic, TINTS } from "./topics/observations";
 import { RangeScansTopic } from "./topics/range_scans";
-import { robotTopic } from "./topics/robot";
+import { robotTopic } from "./topics/robot_state";
 import { statusTopic } from "./topics/status";
 import { Topics } from "./topics/topic";
 import { ViewSettings } from "./view/view_settings";
