@@ -1,23 +1,18 @@
 //! Agrees with a client on a protocol version and on capabilities.
 
 use crate::client::protocol::{BASE_PROTOCOL_VERSION, ClientHello, PROTOCOL_VERSION};
+use crate::topics::TOPICS;
 
-/// Names of the capabilities of this server.
-pub(crate) const CAPABILITIES: [&str; 15] = [
+/// Names of the capabilities of this server, except those of topics.
+const CAPABILITIES: [&str; 9] = [
     "views",
     "subscribe",
     "compact_depth",
     KEYFRAME_CHANGES,
     PARTS,
     HEARTBEAT,
-    "robot",
-    "keyframe_points",
-    "range_scans",
-    "base_path",
     "control",
     "edit",
-    "model_chunks",
-    "observations",
     "shown",
 ];
 const KEYFRAME_CHANGES: &str = "keyframe_changes";
@@ -45,6 +40,12 @@ pub(crate) struct Agreement {
     pub(crate) names: Vec<&'static str>,
     /// The same capabilities.
     pub(crate) negotiated: Negotiated,
+}
+
+/// Names of the capabilities of this server.
+pub(crate) fn capabilities() -> impl Iterator<Item = &'static str> {
+    let of_topics = TOPICS.iter().filter_map(|entry| entry.capability);
+    CAPABILITIES.into_iter().chain(of_topics)
 }
 
 /// Agrees on the newest version that both sides support. The error is the reason why there is none,
@@ -85,8 +86,7 @@ pub(crate) fn negotiate(hello: &ClientHello) -> Result<Agreement, String> {
         ));
     }
     // In the order of the server, each name once, whatever the client sends.
-    let names: Vec<_> = CAPABILITIES
-        .into_iter()
+    let names: Vec<_> = capabilities()
         .filter(|name| hello.capabilities.iter().any(|wanted| wanted == name))
         .collect();
     let has = |name| names.contains(&name);

@@ -55,6 +55,9 @@ pub(crate) enum ServerMessage<'a> {
     RobotState(RobotStateMessage),
     /// Positions of a moving base so far.
     BasePath { points_m: Vec<[f64; 3]> },
+    /// The message of the topic in `topics/test_topic.rs`.
+    #[cfg(test)]
+    Weather { celsius: f64 },
     /// Chunks of a model that no longer exist.
     ModelChunksRemoved { method: &'a str, ids: Vec<u64> },
     /// Reason why a message was invalid or a picture failed.

@@ -5,7 +5,7 @@
 //! than 100 ms. Everything else waits here, where newer data replaces older data.
 
 use crate::client::link_rate::LinkRate;
-use crate::client::negotiation::{Agreement, CAPABILITIES, Negotiated};
+use crate::client::negotiation::{Agreement, Negotiated, capabilities};
 use crate::client::protocol::{BASE_PROTOCOL_VERSION, PROTOCOL_VERSION};
 use crate::client::server_message::{BinaryHeader, PartHeader, ServerMessage, frame};
 use crate::demands::Demand;
@@ -327,10 +327,11 @@ impl Writer<'_> {
     }
 
     async fn send_hello(&mut self) -> ClientFlow {
+        let capabilities: Vec<_> = capabilities().collect();
         let hello = ServerMessage::Hello {
             protocol: BASE_PROTOCOL_VERSION,
             protocols: [BASE_PROTOCOL_VERSION, PROTOCOL_VERSION],
-            capabilities: &CAPABILITIES,
+            capabilities: &capabilities,
             server: concat!("fieldrig ", env!("CARGO_PKG_VERSION")),
             client: self.client,
             role: self.role,

@@ -2,7 +2,7 @@
 
 use crate::client::server_message::ServerMessage;
 use crate::clock::ServerClock;
-use crate::topics::shared_topic::SharedTopic;
+use crate::topics::shared_topic::{SharedTopic, only_message};
 use crate::topics::{DefaultRate, Priority};
 use axum::extract::ws::Message;
 use nalgebra::Vector3;
@@ -30,13 +30,10 @@ impl SharedTopic for BasePathTopic {
     type Source = BasePath;
 
     fn encode(&mut self, path: &BasePath, _: ServerClock) -> Vec<(Arc<str>, Message)> {
-        vec![(
-            "".into(),
-            ServerMessage::BasePath {
-                points_m: path.rounded(),
-            }
-            .to_message(),
-        )]
+        let message = ServerMessage::BasePath {
+            points_m: path.rounded(),
+        };
+        only_message(Some(message.to_message()))
     }
 }
 

@@ -35,6 +35,7 @@ pub(crate) const ENTRY: TopicEntry = TopicEntry {
     name: NAME,
     default: DefaultRate::Off,
     priority: Priority::Keyframes,
+    capability: Some(NAME),
     start: |hub| Arc::new(PointTopic::new(hub)),
 };
 

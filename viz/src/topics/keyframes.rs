@@ -30,6 +30,7 @@ pub(crate) const ENTRY: TopicEntry = TopicEntry {
     name: NAME,
     default: DefaultRate::Period(Duration::from_secs(1)),
     priority: Priority::Keyframes,
+    capability: None,
     start: |hub| Arc::new(KeyframeTopic::new(hub)),
 };
 

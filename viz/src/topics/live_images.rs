@@ -34,6 +34,7 @@ pub(crate) const ENTRY: TopicEntry = TopicEntry {
     name: LIVE_IMAGES,
     default: DefaultRate::Period(DEFAULT_PERIOD),
     priority: Priority::Live,
+    capability: None,
     start: |hub| Arc::new(LiveImageTopic::new(hub)),
 };
 

@@ -5,8 +5,8 @@
 //! private to the topic.
 //!
 //! To add a topic, write a module and an entry of [`TOPICS`]. If all clients receive the same
-//! messages, implement [`SharedTopic`](shared_topic::SharedTopic), which needs a name, a period and
-//! a function that encodes. `docs/reference/protocol.md` lists the topics.
+//! messages, implement [`SharedTopic`](shared_topic::SharedTopic), as `base_path.rs` does.
+//! ARCHITECTURE.md lists the other files of a topic, `docs/reference/protocol.md` all topics.
 
 mod base_path;
 pub(crate) mod chunk_list;
@@ -66,6 +66,8 @@ pub(crate) struct TopicEntry {
     pub(crate) default: DefaultRate,
     /// When it is sent.
     pub(crate) priority: Priority,
+    /// Capability of servers that have the topic; `None` if all servers have it.
+    pub(crate) capability: Option<&'static str>,
     /// Starts the half that encodes.
     start: fn(&Hub) -> Arc<dyn Topic>,
 }
@@ -344,4 +346,55 @@ fn receiver<T: Default + Send + Sync + 'static>(hub: &Hub) -> watch::Receiver<T>
     // A new receiver counts the present value as seen, but no client has received it.
     receiver.mark_changed();
     receiver
+}
+
+#[cfg(test)]
+mod tests {
+    use super::{DefaultRate, TOPICS};
+    use std::path::Path;
+
+    #[test]
+    fn every_topic_is_in_the_docs_and_on_the_page_under_the_same_name() {
+        let folder = Path::new(env!("CARGO_MANIFEST_DIR"));
+        let read = |path: &str| {
+            std::fs::read_to_string(folder.join(path))
+                .unwrap_or_else(|error| panic!("{path}: {error}"))
+        };
+        let docs = read("../docs/reference/protocol.md");
+        let page = read("web/src/main.ts");
+        // The topic of `test_topic.rs` exists only in tests.
+        for entry in TOPICS.iter().filter(|entry| entry.name != "weather") {
+            let name = entry.name;
+            assert!(
+                folder.join(format!("src/topics/{name}.rs")).is_file(),
+                "src/topics/{name}.rs is missing"
+            );
+            if entry.default == DefaultRate::Always {
+                // Nobody can subscribe to it: the page handles its message directly.
+                assert!(page.contains(&format!("case \"{name}\"")), "{name}");
+                continue;
+            }
+            assert!(
+                docs.contains(&format!("\n| `{name}` | [")),
+                "{name} is not in the table of topics in docs/reference/protocol.md"
+            );
+            assert!(
+                page.contains(&format!("\"./topics/{name}\"")),
+                "{name} is not imported by web/src/main.ts"
+            );
+            let module = read(&format!("web/src/topics/{name}.ts"));
+            let has = |field: &str, value: &str| {
+                module.contains(&format!("{field}: \"{value}\""))
+                    || module.contains(&format!("{field} = \"{value}\""))
+            };
+            assert!(has("name", name), "web/src/topics/{name}.ts: name");
+            match entry.capability {
+                Some(value) => assert!(
+                    has("capability", value) && docs.contains(&format!("`{value}`")),
+                    "{name}: capability {value}"
+                ),
+                None => assert!(!module.contains("capability"), "{name}: no capability"),
+            }
+        }
+    }
 }

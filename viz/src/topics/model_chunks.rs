@@ -22,6 +22,7 @@ pub(crate) const ENTRY: TopicEntry = TopicEntry {
     name: MODEL_CHUNKS,
     default: DefaultRate::Off,
     priority: Priority::Background,
+    capability: Some(MODEL_CHUNKS),
     start: |hub| {
         Arc::new(ChunkTopic {
             lists: Mutex::new(receiver(hub)),

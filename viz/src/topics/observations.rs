@@ -3,7 +3,7 @@
 use crate::Hub;
 use crate::client::server_message::{BinaryHeader, ObservationsHeader, frame};
 use crate::clock::ServerClock;
-use crate::topics::shared_topic::SharedTopic;
+use crate::topics::shared_topic::{SharedTopic, only_message};
 use crate::topics::{DefaultRate, Priority};
 use axum::extract::ws::Message;
 use flate2::Compression;
@@ -69,10 +69,7 @@ impl SharedTopic for ObservationTopic {
         let message = source
             .as_ref()
             .map(|packed| Message::binary(packed.message(clock)));
-        message
-            .map(|message| ("".into(), message))
-            .into_iter()
-            .collect()
+        only_message(message)
     }
 }
 

@@ -1,4 +1,9 @@
-//! Data that the training thread publishes to viewers. Viewers receive only the latest values.
+//! Data of topics that `client/server_message.rs` converts to messages. Viewers receive only the
+//! latest values.
+//!
+//! The data of a topic are usually defined in its file, as in `base_path.rs`. The types here cannot
+//! be there: `server_message.rs` uses them, and the files of their topics use `server_message.rs`,
+//! so the files would import each other in a cycle.
 
 use kinematics::{Stamp, Transform};
 use serde::Serialize;

@@ -5,14 +5,14 @@ use crate::client::server_message::ServerMessage;
 use crate::clock::ServerClock;
 use crate::topics::base_path::BasePath;
 use crate::topics::robot_description::{RobotDescription, RobotMessage};
-use crate::topics::shared_topic::SharedTopic;
+use crate::topics::shared_topic::{SharedTopic, only_message};
 use crate::topics::{DefaultRate, Priority};
 use axum::extract::ws::Message;
 use keyframe::RobotState;
 use std::sync::Arc;
 
-/// The robot's description, which clients need before its states. Writers send the states
-/// themselves, as soon as they arrive.
+/// The robot's description, which clients need before its states. `client/writer.rs` sends the
+/// states, which do not wait for the period of a topic.
 #[derive(Default)]
 pub(crate) struct RobotDescriptionTopic;
 
@@ -20,16 +20,14 @@ impl SharedTopic for RobotDescriptionTopic {
     const NAME: &'static str = "robot_state";
     const DEFAULT: DefaultRate = DefaultRate::Off;
     const PRIORITY: Priority = Priority::Short;
+    const CAPABILITY: Option<&'static str> = Some("robot");
     type Source = Option<Arc<RobotDescription>>;
 
     fn encode(&mut self, source: &Self::Source, _: ServerClock) -> Vec<(Arc<str>, Message)> {
         let message = source
             .as_ref()
             .map(|robot| ServerMessage::Robot(&RobotMessage::from(&**robot)).to_message());
-        message
-            .map(|message| ("".into(), message))
-            .into_iter()
-            .collect()
+        only_message(message)
     }
 }
 
@@ -51,8 +49,9 @@ impl Hub {
 
     /// Whether a client draws the robot, or the path of its base is due.
     pub fn needs_robot_state(&self) -> bool {
-        // States are made on the thread that joins the samples, which should not work for nobody.
-        // The path is recorded even if no client is connected, so that later clients get all of it.
+        // States are computed on the thread that joins the samples. It should not compute them if
+        // nobody uses them. The path is an exception: it is recorded even if no client is connected,
+        // so that later clients receive all of it.
         self.is_observed()
             || self.latest::<BasePath>().borrow().is_due()
             || self.demands().has_topic(RobotDescriptionTopic::NAME)

@@ -4,7 +4,7 @@ use crate::Hub;
 use crate::client::server_message::ServerMessage;
 use crate::clock::ServerClock;
 use crate::topics::published_data::SceneHint;
-use crate::topics::shared_topic::SharedTopic;
+use crate::topics::shared_topic::{SharedTopic, only_message};
 use crate::topics::{DefaultRate, Priority};
 use axum::extract::ws::Message;
 use std::sync::Arc;
@@ -17,16 +17,14 @@ impl SharedTopic for SceneTopic {
     const NAME: &'static str = "scene";
     const DEFAULT: DefaultRate = DefaultRate::Always;
     const PRIORITY: Priority = Priority::Short;
+    const CAPABILITY: Option<&'static str> = None;
     type Source = Option<Arc<SceneHint>>;
 
     fn encode(&mut self, source: &Self::Source, _: ServerClock) -> Vec<(Arc<str>, Message)> {
         let message = source
             .as_ref()
             .map(|hint| ServerMessage::from(&**hint).to_message());
-        message
-            .map(|message| ("".into(), message))
-            .into_iter()
-            .collect()
+        only_message(message)
     }
 }
 

@@ -22,14 +22,26 @@ pub(crate) trait SharedTopic: Default + Send + 'static {
     const DEFAULT: DefaultRate;
     /// When it is sent.
     const PRIORITY: Priority;
-    /// Minimum time between two versions.
+    /// Minimum time between two versions. A topic needs one if its data change more often than
+    /// clients can use them.
     const PERIOD: Duration = Duration::ZERO;
-    /// The data in the hub.
+    /// Capability of servers that have the topic; `None` if all servers have it.
+    const CAPABILITY: Option<&'static str> = Some(Self::NAME);
+    /// The data in the hub, which [`Hub::latest`] finds by this type.
     type Source: Clone + Default + Send + Sync + 'static;
 
-    /// The messages that have changed with the data, by key. A topic with a single message uses the
-    /// empty key.
+    /// The messages to send for these data, by key. A client receives the latest message of each
+    /// key. A topic with several keys, such as one for each scanner, returns only the messages that
+    /// have changed since the last call. A topic with one message returns [`only_message`].
     fn encode(&mut self, source: &Self::Source, clock: ServerClock) -> Vec<(Arc<str>, Message)>;
+}
+
+/// The messages of a topic that has only one.
+pub(crate) fn only_message(message: Option<Message>) -> Vec<(Arc<str>, Message)> {
+    message
+        .map(|message| ("".into(), message))
+        .into_iter()
+        .collect()
 }
 
 /// The entry of a topic.
@@ -38,6 +50,7 @@ pub(crate) const fn entry<T: SharedTopic>() -> TopicEntry {
         name: T::NAME,
         default: T::DEFAULT,
         priority: T::PRIORITY,
+        capability: T::CAPABILITY,
         start: |hub| Arc::new(LatestMessages::<T>::new(hub)),
     }
 }

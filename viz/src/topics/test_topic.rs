@@ -1,12 +1,18 @@
-//! A topic that exists only in tests. A new topic needs a file like this one and an entry in the
-//! list of topics.
+//! A topic that exists only in tests, as a template. Like every topic of which all clients receive
+//! the same text message, it has this file, an entry in `TOPICS`, and a variant of `ServerMessage`.
+//!
+//! A topic that clients use also has a public function of [`Hub`], an export of its data type in
+//! `lib.rs`, a message in `tests/viewer/protocol.rs`, a module of the page, and a description:
+//! ARCHITECTURE.md lists the files. `base_path.rs` is the smallest complete example.
 
 use crate::Hub;
+use crate::client::server_message::ServerMessage;
 use crate::clock::ServerClock;
-use crate::topics::shared_topic::SharedTopic;
+use crate::topics::shared_topic::{SharedTopic, only_message};
 use crate::topics::{DefaultRate, Priority};
 use axum::extract::ws::Message;
 use std::sync::Arc;
+use std::time::Duration;
 
 /// The air temperature at the robot.
 #[derive(Default)]
@@ -16,16 +22,14 @@ impl SharedTopic for Weather {
     const NAME: &'static str = "weather";
     const DEFAULT: DefaultRate = DefaultRate::Off;
     const PRIORITY: Priority = Priority::Background;
+    // Temperatures change slowly.
+    const PERIOD: Duration = Duration::from_millis(50);
     type Source = Option<Celsius>;
 
     fn encode(&mut self, source: &Self::Source, _: ServerClock) -> Vec<(Arc<str>, Message)> {
-        let message = source.map(|Celsius(celsius)| {
-            Message::text(format!(r#"{{"type":"weather","celsius":{celsius}}}"#))
-        });
-        message
-            .map(|message| ("".into(), message))
-            .into_iter()
-            .collect()
+        let message =
+            source.map(|Celsius(celsius)| ServerMessage::Weather { celsius }.to_message());
+        only_message(message)
     }
 }
 

@@ -571,7 +571,15 @@ fn every_wire_field_is_documented_and_typed() {
         viz::PROTOCOL_VERSION
     )));
     assert!(page.contains(&format!("PROTOCOL_VERSION = {};", viz::PROTOCOL_VERSION)));
-    for message in one_of_each() {
+    let messages = one_of_each();
+    for kind in kinds_of(&docs) {
+        assert!(
+            OTHER_MESSAGES.contains(&kind)
+                || messages.iter().any(|message| message["type"] == kind),
+            "add {kind} to one_of_each"
+        );
+    }
+    for message in messages {
         let kind = message["type"].as_str().expect("a type");
         let section = section_of(&docs, kind);
         for name in message
@@ -592,6 +600,10 @@ fn every_wire_field_is_documented_and_typed() {
     }
 }
 
+/// Messages that [`one_of_each`] does not contain, because the server sends them only with depth
+/// images or over slow connections.
+const OTHER_MESSAGES: [&str; 2] = ["keyframe_points", "part"];
+
 /// One message of each type that the server sends.
 fn one_of_each() -> Vec<Value> {
     let (hub, server) = start();
@@ -608,6 +620,10 @@ fn one_of_each() -> Vec<Value> {
     hub.set_robot(robot::description());
     hub.set_robot_state(robot::state(0.0));
     let mut messages = vec![client.text()];
+    let mut subscribed = Client::connect(server.address());
+    subscribed.send_json(&json!({"type": "subscribe", "topic": "robot_state", "rate_hz": 60}));
+    messages.push(subscribed.text_of("robot"));
+    drop(subscribed);
     messages.extend(["scene", "status", "keyframes", "heartbeat"].map(|kind| client.text_of(kind)));
     client.send_json(&json!({"type": "hello", "protocols": [3, 4], "capabilities": ["keyframe_changes", "parts"]}));
     client.send_json(&json!({"type": "subscribe", "topic": "robot_state", "rate_hz": 60}));
@@ -732,10 +748,23 @@ fn both_chunks() -> Vec<ModelChunk> {
     [(1, mesh), (2, splats)].map(chunk).into()
 }
 
+/// The part of the docs about messages from the server.
+fn from_server(docs: &str) -> &str {
+    &docs[docs.find("## From the server").expect("the chapter")..]
+}
+
+/// The types of the messages from the server that the docs describe.
+fn kinds_of(docs: &str) -> impl Iterator<Item = &str> {
+    from_server(docs)
+        .split("\n### `")
+        .skip(1)
+        .filter_map(|section| section.split_once('`'))
+        .map(|(kind, _)| kind)
+}
+
 /// The part of the docs about a message from the server.
 fn section_of<'a>(docs: &'a str, kind: &str) -> &'a str {
-    let from_server = &docs[docs.find("## From the server").expect("the chapter")..];
-    let section = from_server
+    let section = from_server(docs)
         .split("\n### ")
         .find(|section| section.starts_with(&format!("`{kind}`")));
     section.unwrap_or_else(|| panic!("docs/reference/protocol.md has no section about {kind}"))

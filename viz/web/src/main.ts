@@ -48,7 +48,7 @@ window.addEventListener("hashchange", () => {
 document.addEventListener("visibilitychange", () => {
   if (!document.hidden) view.local.clear();
 });
-const connection = new Connection(`${location.protocol === "https:" ? "wss" : "ws"}://${location.host}/ws`, {
+const connection: Connection = new Connection(`${location.protocol === "https:" ? "wss" : "ws"}://${location.host}/ws`, {
   state(state, text) {
     const shown = element("connection");
     const before = shown.dataset.state;
@@ -71,7 +71,7 @@ const connection = new Connection(`${location.protocol === "https:" ? "wss" : "w
   },
   text: receiveText,
   binary: receiveBinary,
-});
+}, () => topics.capabilities);
 const robotAge = new RobotAge(view.robot, connection.clock);
 const changed = (): void => topics.update();
 const keyframes = new KeyframesTopic(view);
@@ -185,7 +185,7 @@ function forgetSurfaces(): void {
 
 /** Chooses whether the page or the server draws the model. */
 function updateLocalModel(model: ModelStatus): void {
-  const isPossible = connection.supports("model_chunks") && model.has_chunks === true;
+  const isPossible = topics.isSupported(chunks) && model.has_chunks === true;
   element("toggle-local").hidden = !isPossible;
   const method = isPossible && isDrawnLocally && showsModel ? model.method : null;
   chunks.method = method;

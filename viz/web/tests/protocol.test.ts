@@ -39,22 +39,25 @@ test("truncated messages and invalid headers are rejected", () => {
 });
 
 test("both sides use the capabilities that both have", () => {
-  const agreement = agree(HELLO);
+  const topics = ["tides", "weather"];
+  const agreement = agree({ ...HELLO, capabilities: [...HELLO.capabilities!, "weather"] }, topics);
   assert.ok(typeof agreement !== "string");
-  assert.deepEqual([...agreement.capabilities], ["views", "parts"]);
-  assert.deepEqual(agreement.hello, { type: "hello", protocols: [3, 4], capabilities: CAPABILITIES });
+  assert.deepEqual([...agreement.capabilities], ["views", "parts", "weather"]);
+  const capabilities = [...CAPABILITIES, ...topics];
+  assert.deepEqual(agreement.hello, { type: "hello", protocols: [3, 4], capabilities });
 });
 
 test("an old server gets no reply that it does not understand", () => {
   const { protocols: _, capabilities: __, ...old } = HELLO;
-  const agreement = agree({ ...old, protocol: 3 });
+  const agreement = agree({ ...old, protocol: 3 }, []);
   assert.ok(typeof agreement !== "string");
   assert.deepEqual([agreement.capabilities.size, agreement.hello], [0, null]);
 });
 
 test("servers without a common version are refused with both ranges", () => {
-  const tooNew = agree({ ...HELLO, protocol: 6, protocols: [5, 6] });
+  const tooNew = agree({ ...HELLO, protocol: 6, protocols: [5, 6] }, []);
   assert.equal(tooNew, "the server uses protocol version 5 to 6, this page 3 to 4: reload the page");
   const { protocols: _, ...old } = HELLO;
-  assert.equal(agree({ ...old, protocol: 2 }), "the server uses protocol version 2, this page 3 to 4: reload the page");
+  const tooOld = agree({ ...old, protocol: 2 }, []);
+  assert.equal(tooOld, "the server uses protocol version 2, this page 3 to 4: reload the page");
 });

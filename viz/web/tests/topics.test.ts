@@ -3,7 +3,7 @@ import { beforeEach, test } from "node:test";
 import type { Connection } from "../src/connection/connection";
 import type { LiveImages } from "../src/panels/live_images";
 import type { OrbitView } from "../src/view/orbit_view";
-import type { Capability, ClientMessage, SubscribeMessage } from "../src/connection/protocol";
+import type { ClientMessage, SubscribeMessage } from "../src/connection/protocol";
 import { KeyframePointsTopic } from "../src/topics/keyframe_points";
 import { LiveImagesTopic } from "../src/topics/live_images";
 import { ModelChunksTopic } from "../src/topics/model_chunks";
@@ -23,11 +23,12 @@ beforeEach(() => {
   });
 });
 
-function setUp(capabilities: Capability[], extra: Topic[] = []) {
+function setUp(capabilities: string[], extra: Topic[] = []) {
   const messages: SubscribeMessage[] = [];
   const connection = {
     isOpen: true,
-    supports: (capability: Capability) => capabilities.includes(capability),
+    supports: (capability: string) => capabilities.includes(capability),
+    supportsTopic: (capability: string) => capabilities.includes(capability),
     send: (message: ClientMessage) => messages.push(message as SubscribeMessage),
   };
   const layer = { clear: () => undefined };

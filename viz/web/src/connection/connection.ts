@@ -50,7 +50,12 @@ export class Connection {
   private retryAt = 0;
   private nRetries = 0;
 
-  constructor(private readonly url: string, private readonly events: ConnectionEvents) {
+  /** `topicCapabilities` is called when a server has sent its capabilities. */
+  constructor(
+    private readonly url: string,
+    private readonly events: ConnectionEvents,
+    private readonly topicCapabilities: () => readonly string[],
+  ) {
     this.open();
     window.setInterval(() => {
       const late = performance.now() - this.checkedAt;
@@ -66,6 +71,11 @@ export class Connection {
 
   /** Whether the server has a capability that the page can use. */
   supports(capability: Capability): boolean {
+    return this.capabilities.has(capability);
+  }
+
+  /** Whether the server has a topic with this capability. */
+  supportsTopic(capability: string): boolean {
     return this.capabilities.has(capability);
   }
 
@@ -178,7 +188,7 @@ export class Connection {
         this.goodbye = "";
         this.refusal = "";
         this.hasHello = true;
-        const agreement = agree(message);
+        const agreement = agree(message, this.topicCapabilities());
         if (typeof agreement === "string") {
           this.goodbye = agreement;
           this.disconnect();

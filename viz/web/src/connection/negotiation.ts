@@ -9,8 +9,11 @@ export interface Agreement {
   hello: HelloMessage | null;
 }
 
-/** The reply to a server's hello, or the reason why this page cannot use the server. */
-export function agree(hello: Hello): Agreement | string {
+/**
+ * The reply to a server's hello, or the reason why this page cannot use the server. The page can use its own
+ * capabilities and those of its topics.
+ */
+export function agree(hello: Hello, topicCapabilities: readonly string[]): Agreement | string {
   const [oldest, newest] = hello.protocols ?? [hello.protocol, hello.protocol];
   if (newest < OLDEST_PROTOCOL_VERSION || oldest > PROTOCOL_VERSION) {
     return (
@@ -19,10 +22,11 @@ export function agree(hello: Hello): Agreement | string {
     );
   }
   const offered = hello.capabilities ?? [];
+  const usable = [...CAPABILITIES, ...topicCapabilities];
   return {
-    capabilities: new Set(CAPABILITIES.filter((name) => offered.includes(name))),
+    capabilities: new Set(usable.filter((name) => offered.includes(name))),
     hello: hello.protocols
-      ? { type: "hello", protocols: [OLDEST_PROTOCOL_VERSION, PROTOCOL_VERSION], capabilities: CAPABILITIES }
+      ? { type: "hello", protocols: [OLDEST_PROTOCOL_VERSION, PROTOCOL_VERSION], capabilities: usable }
       : null,
   };
 }

@@ -4,7 +4,7 @@
 export const PROTOCOL_VERSION = 4;
 /** Oldest protocol version of this page. */
 export const OLDEST_PROTOCOL_VERSION = 3;
-/** Capabilities that this page can use. */
+/** Capabilities that this page can use, except those of topics. */
 export const CAPABILITIES = [
   "views",
   "subscribe",
@@ -12,14 +12,8 @@ export const CAPABILITIES = [
   "keyframe_changes",
   "parts",
   "heartbeat",
-  "robot",
-  "keyframe_points",
-  "range_scans",
-  "base_path",
   "control",
   "edit",
-  "model_chunks",
-  "observations",
   "shown",
 ] as const;
 export type Capability = (typeof CAPABILITIES)[number];
@@ -314,21 +308,6 @@ export interface PartHeader {
   bytes: number;
 }
 
-export type TextMessage =
-  | Hello
-  | Welcome
-  | Status
-  | Scene
-  | Keyframes
-  | KeyframeChanges
-  | Robot
-  | RobotState
-  | BasePath
-  | ModelChunksRemoved
-  | ErrorMessage
-  | Heartbeat
-  | Pong
-  | Goodbye;
 /** A scan of a range scanner, in world axes relative to the scanner. */
 export interface RangeScanHeader {
   type: "range_scan";
@@ -352,6 +331,24 @@ export interface ObservationsHeader {
   log_step: number;
 }
 
+/** Every text message from the server. */
+export type TextMessage =
+  | Hello
+  | Welcome
+  | Status
+  | Scene
+  | Keyframes
+  | KeyframeChanges
+  | Robot
+  | RobotState
+  | BasePath
+  | ModelChunksRemoved
+  | ErrorMessage
+  | Heartbeat
+  | Pong
+  | Goodbye;
+
+/** Every header of a binary message from the server, except of parts. */
 export type BinaryHeader =
   | PictureHeader
   | LiveImageHeader

@@ -1,9 +1,10 @@
 // The kinds of data that the page receives besides pictures, each of which is a topic.
 //
-// To add a topic, write a module with a `Topic`, and add it to the list in main.ts.
+// To add a topic, write a module with a `Topic`, and add it to the list in main.ts. The module has the name of the
+// topic, and its messages are in protocol.ts.
 
 import type { Connection } from "../connection/connection";
-import type { Capability, SubscribeMessage } from "../connection/protocol";
+import type { SubscribeMessage } from "../connection/protocol";
 
 /** A message, or the header of a binary message. */
 export interface Typed {
@@ -25,7 +26,7 @@ export interface Topic {
   /** Name in `subscribe`. */
   readonly name: string;
   /** Capability of servers that have the topic. Without one, all servers have it. */
-  readonly capability?: Capability;
+  readonly capability?: string;
   readonly receivers: readonly Receiver[];
   /** What the page needs now. */
   subscriptions(isHidden: boolean): Subscription[];
@@ -60,6 +61,16 @@ export class Topics {
     });
   }
 
+  /** Capabilities of the topics. */
+  get capabilities(): string[] {
+    return this.topics.flatMap((topic) => topic.capability ?? []);
+  }
+
+  /** Whether the server has a topic. */
+  isSupported(topic: Topic): boolean {
+    return topic.capability === undefined || this.connection.supportsTopic(topic.capability);
+  }
+
   /** Forgets what was received, and subscribes anew: a new connection has the server's defaults. */
   restart(): void {
     for (const topic of this.topics) topic.restart(this.isSupported(topic));
@@ -88,9 +99,5 @@ export class Topics {
     const receiver = this.receivers.get(message.type);
     receiver?.receive(message, payload);
     return receiver !== undefined;
-  }
-
-  private isSupported(topic: Topic): boolean {
-    return topic.capability === undefined || this.connection.supports(topic.capability);
   }
 }
