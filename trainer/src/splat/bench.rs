@@ -9,7 +9,7 @@ use super::buffers::{ImageBuffers, Scratch, ScratchSize, SplatBuffers, n_bins, n
 use super::few_images::Scarcity;
 use super::kernels::{DrawPipelines, TrainPipelines};
 use super::options::SplatOptions;
-use super::params::{Camera, LOW_PASS_PX2, Rule, Supervision, status};
+use super::params::{Camera, LOW_PASS_PX2, MIN_OPACITY, Rule, Supervision, status};
 use super::passes::{Target, ViewPasses};
 use super::work_counts::WorkCounts;
 use crate::packing::{JPEG_QUALITY, Output, Reader};
@@ -479,6 +479,6 @@ fn rule() -> Rule {
         seed: 0,
         update_all: 1,
         schedule_start: 0.0,
-        unused: 0,
+        noise_center: MIN_OPACITY,
     }
 }

@@ -1,7 +1,7 @@
 //! Tests of the kernels that bin, update and grow splats, against their f64 twins.
 
 use super::against_twin::{KernelFixture, TargetBuffers, arrays_of, target_of, unambiguous_pixels};
-use super::params::{Growth, Rule, status};
+use super::params::{Growth, MIN_OPACITY, Rule, status};
 use super::passes::{GrowthBuffers, grow};
 use super::reference::change::{self, SplatMoments};
 use super::reference::{self, Splat, scene};
@@ -101,7 +101,7 @@ const RULE: Rule = Rule {
     log_scale_range: [-3.0, -1.5], // Some of the scene's splats are outside.
     seed: 11,
     update_all: 1,
-    unused: 0,
+    noise_center: MIN_OPACITY,
 };
 
 #[test]
@@ -220,7 +220,7 @@ fn growth_matches_the_twin() {
         capacity: fixture.splats.capacity,
         n_sh_rest: 45,
         child_spread: 0.5,
-        min_opacity: 0.005,
+        min_opacity: MIN_OPACITY,
         unused: 0.0,
     };
     let expected = change::grow(
@@ -321,7 +321,7 @@ fn dead_splats_have_no_children() {
         capacity: fixture.splats.capacity,
         n_sh_rest: 0,
         child_spread: 0.5,
-        min_opacity: 0.005,
+        min_opacity: MIN_OPACITY,
         unused: 0.0,
     };
     gpu.write(&fixture.splats.error_sums, 0, bytemuck::cast_slice(&errors));

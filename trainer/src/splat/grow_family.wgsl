@@ -29,7 +29,7 @@ fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u,
     let n = min(n_children[parent] + 1u, MAX_FAMILY);
     let shape = shapes[splat_ix];
     let opacity = clamp(1.0 / (1.0 + exp(-shape.w)), 1e-4, 0.9999);
-    let shared_opacity = clamp(1.0 - pow(1.0 - opacity, 1.0 / f32(n)), 0.005, 0.9999);
+    let shared_opacity = clamp(1.0 - pow(1.0 - opacity, 1.0 / f32(n)), growth.min_opacity, 0.9999);
     var weight = 0.0;
     for (var i = 1u; i <= n; i++) {
         var choose = 1.0;    // binomial coefficient (i - 1 choose k)

@@ -437,7 +437,7 @@ mod tests {
                 seed,
                 update_all,
                 schedule_start,
-                unused
+                noise_center
             ]
         );
         assert_layout!(

@@ -6,6 +6,9 @@ use crate::model_options::{MethodOptions, ModelOptions};
 use serde::{Deserialize, Serialize};
 
 /// Options of a [`super::SplatTrainer`], besides those that all methods share.
+///
+/// Checkpoints store them. A new field therefore needs `#[serde(default)]`, or `default = ..` with
+/// the value that training used before, so that older checkpoints can be read.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct SplatOptions {
@@ -101,5 +104,38 @@ impl ModelOptions<SplatOptions> {
             .max_splats
             .min(u32::try_from(by_bytes).unwrap_or(u32::MAX))
             .max(1)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::SplatOptions;
+
+    /// The options that every checkpoint contains. Do not add new ones.
+    const REQUIRED: [&str; 12] = [
+        "max_splats",
+        "count",
+        "sh_degree",
+        "dssim_frac",
+        "depth_per_m",
+        "random_background",
+        "cost_images",
+        "growth_frac",
+        "noise",
+        "drop_frac",
+        "coarse_steps",
+        "seeds_per_image",
+    ];
+
+    #[test]
+    fn options_of_older_checkpoints_can_be_read() {
+        let mut options = serde_json::to_value(SplatOptions::default()).expect("plain data");
+        options
+            .as_object_mut()
+            .expect("an object")
+            .retain(|name, _| REQUIRED.contains(&name.as_str()));
+        let read: SplatOptions =
+            serde_json::from_value(options).expect("newer options have defaults");
+        assert_eq!(read, SplatOptions::default());
     }
 }

@@ -47,7 +47,7 @@ pub(crate) struct Rule {
     pub(crate) seed: u32,
     pub(crate) update_all: u32,
     pub(crate) schedule_start: f32,
-    pub(crate) unused: u32,
+    pub(crate) noise_center: f32,
 }
 
 /// Number of parameters of a camera or an image, as in `shared/camera_params.wgsl`.
@@ -103,6 +103,12 @@ pub(crate) mod status {
     /// Length of the array.
     pub(crate) const LEN: usize = 16;
 }
+
+/// Opacity below which a splat is dead, that is, replaced by a child of another splat, as in
+/// 3DGS-MCMC (Kheradmand et al. 2024). At most 0.5 % of a pixel depends on such a splat. It is also
+/// the minimum opacity of a member of a family, which would otherwise be dead at once, and the
+/// opacity at which exploration noise has half its maximum.
+pub(crate) const MIN_OPACITY: f32 = 0.005;
 
 /// `Growth` of shared/growth.wgsl.
 #[repr(C)]

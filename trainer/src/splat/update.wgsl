@@ -39,7 +39,7 @@ struct Rule {
     seed: u32,
     update_all: u32,              // 1: also update splats that are not visible in this view
     schedule_start: f32,          // step at which the planned steps begin
-    unused: u32,
+    noise_center: f32,            // opacity at which the noise has half its maximum
 }
 
 @group(0) @binding(0) var<uniform> view: View;
@@ -288,7 +288,7 @@ fn update_splat(splat_ix: u32, n_touched: u32, sum: Gradient) -> CameraGradient 
     let shape_step = adam4(4u, splat_ix, vec4f(v_log_scale, v_opacity_logit) + cost_gradient);
 
     // Noise moves nearly transparent splats to positions where they may be useful.
-    let noise_weight = 1.0 / (1.0 + exp(100.0 * (opacity - 0.005)));
+    let noise_weight = 1.0 / (1.0 + exp(100.0 * (opacity - rule.noise_center)));
     let normal = normal3(vec3u(splat_ix, atomicLoad(&status[STEP]), rule.seed));
     let stretched = p.rotation * (p.scale * p.scale * (transpose(p.rotation) * normal));
     let jitter = rule.noise * mean_rate * noise_weight * stretched;

@@ -106,12 +106,12 @@ pub(crate) fn update(
 
     // Phase 3: noise moves nearly transparent splats to positions where they may be useful
     // (Kheradmand et al. 2024, section 4.1). It is the product of the covariance and a normal
-    // vector, and fades out above the opacity of 0.005, below which splats count as dead.
+    // vector, and fades out above the opacity below which splats are dead.
     let [w, x, y, z] = splat.rotation_wxyz;
     let rotation = UnitQuaternion::from_quaternion(Quaternion::new(w, x, y, z));
     let along = rotation.inverse() * Vector3::from(normal3([splat_ix, step, rule.seed]));
     let variance = Vector3::from(splat.log_scale.map(|scale| (2.0 * scale).exp()));
-    let noise_weight = 1.0 / (1.0 + (100.0 * (opacity - 0.005)).exp());
+    let noise_weight = 1.0 / (1.0 + (100.0 * (opacity - f64::from(rule.noise_center))).exp());
     let jitter = rotation * variance.component_mul(&along) * (noise * mean_rate * noise_weight);
 
     // Phase 4: values stay in range. A logit of 12 is an opacity that differs from 1 by 6e-6, where
@@ -196,7 +196,11 @@ pub(crate) fn grow(splats: &[Splat], errors: &[f64], growth: &Growth) -> Grown {
             .copied()
             .unwrap_or(0);
         if n > 0 {
-            share_opacity(splat, (n + 1).min(MAX_FAMILY));
+            share_opacity(
+                splat,
+                (n + 1).min(MAX_FAMILY),
+                f64::from(growth.min_opacity),
+            );
         }
     }
     Grown {
@@ -215,11 +219,11 @@ fn choose(n: u32, k: u32) -> f64 {
 
 /// Sets the opacity and size of one of `n` splats so that together they look like the original
 /// splat.
-fn share_opacity(splat: &mut Splat, n: u32) {
+fn share_opacity(splat: &mut Splat, n: u32, min_opacity: f64) {
     // `n` splats of the new opacity at the same place are as opaque as the original one. The scale
     // follows from Kheradmand et al. 2024, equation 9.
     let opacity = sigmoid(splat.opacity_logit).clamp(1e-4, 0.9999);
-    let shared = (1.0 - (1.0 - opacity).powf(1.0 / f64::from(n))).clamp(0.005, 0.9999);
+    let shared = (1.0 - (1.0 - opacity).powf(1.0 / f64::from(n))).clamp(min_opacity, 0.9999);
     let term = |i: u32, k: u32| {
         let sign = if k.is_multiple_of(2) { 1.0 } else { -1.0 };
         sign * choose(i - 1, k) * shared.powf(f64::from(k + 1)) / f64::from(k + 1).sqrt()

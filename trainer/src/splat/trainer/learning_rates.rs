@@ -2,7 +2,7 @@
 
 use crate::model_options::ModelOptions;
 use crate::splat::options::SplatOptions;
-use crate::splat::params::Rule;
+use crate::splat::params::{MIN_OPACITY, Rule};
 use crate::splat::schedule::Schedule;
 use crate::splat::snapshot::ObservedScene;
 use numbers::f32_of;
@@ -73,6 +73,6 @@ pub(super) fn rule(
         // Without depth, many splats start at wrong positions. Costs and noise then act in every
         // step, also on splats that its image does not show.
         update_all: u32::from(!scene.has_depth),
-        unused: 0,
+        noise_center: MIN_OPACITY,
     }
 }

@@ -8,7 +8,7 @@ use crate::splat::buffers::{SplatBuffers, n_sh_rest};
 use crate::splat::camera_params::CameraParams;
 use crate::splat::kernels::TrainPipelines;
 use crate::splat::options::SplatOptions;
-use crate::splat::params::Growth;
+use crate::splat::params::{Growth, MIN_OPACITY};
 use crate::splat::passes::{self, GrowthBuffers};
 use gpu::Gpu;
 use model_files::splat::arrays::SplatArrays;
@@ -17,9 +17,6 @@ use model_files::splat::arrays::SplatArrays;
 /// 3DGS-MCMC places children at the parent's mean. With a larger spread, a family no longer renders
 /// as its parent did. With a smaller one, its members take longer to separate.
 const CHILD_SPREAD: f32 = 0.5;
-/// Splats below this opacity are replaced, as in 3DGS-MCMC (Kheradmand et al. 2024). At most 0.5 %
-/// of a pixel depends on such a splat.
-const MIN_OPACITY: f32 = 0.005;
 
 /// Splats and camera parameters in training.
 #[derive(Debug)]
