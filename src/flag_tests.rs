@@ -13,7 +13,7 @@ use syn::{Attribute, Item, LitStr, Macro, Meta};
 
 /// Source files or folders, and the commands that print their messages. All these commands must
 /// accept a flag or setting in a message, unless the message names a command that accepts it.
-const PRINTED_BY: [(&str, &[&str]); 33] = [
+const PRINTED_BY: [(&str, &[&str]); 34] = [
     ("bench/src", &["bench"]),
     (
         "calibration/procedures/src/hand_eye",
@@ -48,6 +48,7 @@ const PRINTED_BY: [(&str, &[&str]); 33] = [
     ("session/src/data.rs", &["train", "eval", "bench"]),
     ("session/src/depth_from.rs", &["train"]),
     ("session/src/eval_plan.rs", &["eval"]),
+    ("session/src/method_options.rs", &["run", "train", "bench"]),
     ("session/src/rendered_files.rs", &["render"]),
     ("session/src/run_folder.rs", &["run", "train"]),
     ("session/src/run_plan", &["run"]),

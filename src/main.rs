@@ -10,6 +10,7 @@ mod exit;
 mod flag_names;
 #[cfg(test)]
 mod flag_tests;
+mod number_args;
 mod open_gpu;
 mod page_args;
 mod permission_args;

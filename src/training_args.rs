@@ -22,6 +22,17 @@ static METHOD_HELP: LazyLock<String> = LazyLock::new(|| {
     )
 });
 
+/// Ids of all flags of [`TrainingArgs`], which flags such as `--resume` exclude. With the id of
+/// their group instead, clap would list all of them in its message.
+pub(crate) const TRAINING_ARGS: [&str; 6] = [
+    "method",
+    "seed",
+    "max_bytes",
+    "max_splats",
+    "refine",
+    "count",
+];
+
 /// Which models to train, and their limits.
 #[derive(Clone, Debug, clap::Args)]
 pub(crate) struct TrainingArgs {
@@ -129,6 +140,17 @@ impl TrainingArgs {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use clap::Args as _;
+
+    #[test]
+    fn all_training_flags_are_listed() {
+        let command = TrainingArgs::augment_args(clap::Command::new("training"));
+        let ids: Vec<_> = command
+            .get_arguments()
+            .map(|argument| argument.get_id().as_str())
+            .collect();
+        assert_eq!(ids, TRAINING_ARGS);
+    }
 
     fn kind(name: &str) -> ModelKind {
         ModelKind::from_name(name).expect("registered")

@@ -1,14 +1,14 @@
 //! The runs of a bench. Each run is trained once and saved to a file, so that a bench restarted in
 //! the same folder does not repeat it.
 
-use anyhow::{Context, Result, anyhow, ensure};
+use anyhow::{Context, Result, ensure};
 use capture::Stop;
 use gpu::Gpu;
 use keyframe::{Keyframe, Split};
 use messages::{BadInput, InsufficientData, Setting};
 use model_files::InitialPoints;
 use serde::{Deserialize, Serialize};
-use session::methods::MAX_SPLATS;
+use serde_json::Value;
 use session::run_folder::{self, CreatedFolders};
 use session::{
     Data, DataOptions, Evaluation, Evaluator, Evaluators, Limits, Observer, OpenGpu, Purpose,
@@ -100,6 +100,9 @@ pub struct RunSettings {
     pub max_splats: Option<u64>,
     /// Maximum GPU memory of the model, bytes; `None`: no limit.
     pub max_bytes: Option<u64>,
+    /// All options of the model, including those above.
+    #[serde(default)]
+    pub options: ModelOptions,
     /// Limit of the training time, seconds.
     pub seconds: Option<f64>,
     /// Limit of the optimizer steps.
@@ -366,22 +369,7 @@ impl<'a> Runs<'a> {
     pub(crate) fn run(&mut self, job: Job<'_>) -> Result<Run> {
         self.n_done += 1;
         let settings = self.settings(&job);
-        let path = self
-            .out
-            .join(RUNS)
-            .join(format!("{}.json", file_name(&job.name)));
-        if path.exists() {
-            // A run with other settings must not appear among these results.
-            let cached = read(&path)?;
-            if let Some(difference) = difference(&cached.settings, &settings)? {
-                return Err(BadInput(format!(
-                    "{} {}: the saved run {} differs in {difference}; choose another folder",
-                    Setting::Out,
-                    self.out.display(),
-                    job.name
-                ))
-                .into());
-            }
+        if let Some(cached) = saved_run(&self.out, &job.name, &settings)? {
             self.report(&cached, true);
             return Ok(cached);
         }
@@ -404,7 +392,7 @@ impl<'a> Runs<'a> {
                 bytes: outcome.bytes,
             },
         };
-        run_folder::write_json(&path, &run)?;
+        run_folder::write_json(&path_of(&self.out, &run.name), &run)?;
         self.report(&run, false);
         Ok(run)
     }
@@ -468,9 +456,10 @@ impl<'a> Runs<'a> {
                 .model_spec
                 .options
                 .specific
-                .get(MAX_SPLATS)
-                .and_then(serde_json::Value::as_u64),
+                .get("max_splats")
+                .and_then(Value::as_u64),
             max_bytes: job.model_spec.options.common.max_bytes,
+            options: job.model_spec.options.clone(),
             seconds: job.limits.seconds,
             steps: job.limits.steps,
             scale: images.scale,
@@ -510,6 +499,33 @@ fn from_evaluation(evaluation: &Evaluation) -> RunScores {
     }
 }
 
+/// The file of a run in the folder of a bench.
+fn path_of(out: &Path, name: &str) -> PathBuf {
+    out.join(RUNS).join(format!("{}.json", file_name(name)))
+}
+
+/// The run with this name that is saved in the folder of a bench; `None` if there is none.
+///
+/// # Errors
+///
+/// If its settings differ, because it must not appear among the results of the others.
+fn saved_run(out: &Path, name: &str, settings: &RunSettings) -> Result<Option<Run>> {
+    let path = path_of(out, name);
+    if !path.exists() {
+        return Ok(None);
+    }
+    let saved = read(&path)?;
+    if let Some(difference) = difference(&saved.settings, settings)? {
+        return Err(BadInput(format!(
+            "{} {}: the saved run {name} differs in {difference}; choose another folder",
+            Setting::Out,
+            out.display(),
+        ))
+        .into());
+    }
+    Ok(Some(saved))
+}
+
 fn read(path: &Path) -> Result<Run> {
     let message = || {
         format!(
@@ -526,15 +542,18 @@ fn difference(cached: &RunSettings, requested: &RunSettings) -> Result<Option<St
     // Compared as JSON, which has the names of the settings for the message.
     let fields =
         |settings: &RunSettings| serde_json::to_value(settings).context("settings are plain data");
-    let cached = fields(cached)?;
-    let requested = fields(requested)?;
-    let requested = requested
-        .as_object()
-        .ok_or_else(|| anyhow!("settings are an object"))?;
-    Ok(requested
+    Ok(first_difference(&fields(cached)?, &fields(requested)?))
+}
+
+/// Description of the first value of an object that differs. For values that are objects, it names
+/// the first of their values that differs.
+fn first_difference(cached: &Value, requested: &Value) -> Option<String> {
+    let (key, value) = requested
+        .as_object()?
         .iter()
-        .find(|(key, value)| cached[key.as_str()] != **value)
-        .map(|(key, value)| format!("{key} ({} saved, {value} now)", cached[key.as_str()])))
+        .find(|(key, value)| cached[key.as_str()] != **value)?;
+    let saved = &cached[key.as_str()];
+    first_difference(saved, value).or_else(|| Some(format!("{key} ({saved} saved, {value} now)")))
 }
 
 /// Derives a name for data from its path, with a number if the name is already used.
@@ -574,6 +593,7 @@ fn file_name(name: &str) -> String {
 #[cfg(test)]
 pub(crate) mod tests {
     use super::*;
+    use trainer::splat::CountPolicy;
 
     /// A run with the given curve and size.
     pub(crate) fn run(name: &str, curve: &[(f64, f64)], n_splats: u64) -> Run {
@@ -593,6 +613,7 @@ pub(crate) mod tests {
             seed: 1,
             max_splats: Some(1000),
             max_bytes: None,
+            options: ModelOptions::default(),
             seconds: Some(4.0),
             steps: None,
             scale: None,
@@ -642,6 +663,37 @@ pub(crate) mod tests {
             .expect("plain")
             .expect("one differs");
         assert_eq!(message, "max_splats (1000 saved, 2000 now)");
+    }
+
+    #[test]
+    fn saved_runs_with_other_options_are_refused() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let out = folder.path();
+        std::fs::create_dir(out.join(RUNS)).expect("a folder");
+        let options = |count: CountPolicy| {
+            ModelOptions::<SplatOptions>::from(SplatOptions {
+                count,
+                ..SplatOptions::default()
+            })
+            .to_json()
+        };
+        let mut saved = run("a", &[(1.0, 20.0)], 1);
+        assert_eq!(saved_run(out, "a", &saved.settings).expect("no run"), None);
+        saved.settings.options = options(CountPolicy::ToCap);
+        run_folder::write_json(&path_of(out, "a"), &saved).expect("written");
+        let same = saved_run(out, "a", &saved.settings).expect("the same settings");
+        assert_eq!(same, Some(saved.clone()));
+        let requested = RunSettings {
+            options: options(CountPolicy::Tested),
+            ..saved.settings
+        };
+        let message = saved_run(out, "a", &requested)
+            .expect_err("another rule")
+            .to_string();
+        assert!(
+            message.contains(r#"differs in count ("ToCap" saved, "Tested" now)"#),
+            "{message}"
+        );
     }
 
     #[test]

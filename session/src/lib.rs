@@ -43,6 +43,7 @@ mod kept_folder;
 mod latency;
 mod ledger;
 mod live_loop;
+mod method_options;
 pub mod methods;
 pub mod next_commands;
 mod observations;

@@ -1,14 +1,14 @@
 //! Trains models on keyframes from disk, for `train` and `bench`.
 
 use crate::data::{Data, DataOptions};
-use crate::methods::{self, COUNT, MAX_SPLATS, Settings, methods_of};
+use crate::method_options;
+use crate::methods::methods_of;
 use crate::recoveries::{OpenGpu, Recoveries};
 use crate::session::{Evaluators, Limits, Session, SessionOptions};
 use crate::session_setup::Services;
 use crate::training_options::{Refine, RefineSettings, TrainingOptions};
 use crate::{run_folder, time_slices};
 use capture::Stop;
-use capture::config::DEFAULT_SEED;
 use gpu::Gpu;
 use keyframe::Keyframe;
 use messages::{BadInput, InsufficientData, Setting, listed};
@@ -152,44 +152,19 @@ pub fn model_specs(
         if software { Refine::None } else { Refine::Auto },
     )?;
     options.check_learned(&kinds, available)?;
-    let count = options.count.unwrap_or(if software {
+    let default_count = if software {
         CountPolicy::ToCap
     } else {
         CountPolicy::Tested
-    });
-    let (common, mut settings) = match &data.rig {
-        Some(rig) => methods::options(&rig.train, steps),
-        None => options_without_rig(options, steps),
     };
-    settings.push((COUNT, serde_json::json!(count)));
-    methods::specs(
-        &kinds,
-        &CommonOptions {
-            cameras,
-            align,
-            ..common
-        },
-        &settings,
-    )
-}
-
-/// Options from flags alone.
-fn options_without_rig(options: &TrainingOptions, steps: Option<u64>) -> (CommonOptions, Settings) {
-    let defaults = CommonOptions::default();
+    let train = data.rig.as_ref().map(|rig| &rig.train);
     let common = CommonOptions {
-        seed: options.seed.unwrap_or(DEFAULT_SEED),
-        max_bytes: options.max_bytes,
-        n_planned_steps: steps.unwrap_or(defaults.n_planned_steps),
-        ..defaults
+        cameras,
+        align,
+        ..method_options::common(options, train, steps)
     };
-    (
-        common,
-        options
-            .max_splats
-            .map(|n| (MAX_SPLATS, n.into()))
-            .into_iter()
-            .collect(),
-    )
+    let settings = method_options::settings(options, train, default_count);
+    method_options::specs(&kinds, &common, &settings)
 }
 
 /// Checks the flags that do not depend on the contents of the data, so that errors appear before

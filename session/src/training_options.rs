@@ -1,10 +1,9 @@
 //! Options shared by all commands that train. They override the keys of the same name in a rig
 //! file.
 
-use crate::methods::{COUNT, MAX_SPLATS, describe};
+use crate::methods::describe;
 use calibration::{CameraRefinement, ParamSet, candidates};
-use capture::Override;
-use messages::{BadInput, Setting, listed};
+use messages::{BadInput, Setting};
 use trainer::ModelKind;
 use trainer::splat::CountPolicy;
 
@@ -135,33 +134,6 @@ impl TrainingOptions {
     /// The requested scene models; `None` if the flag is not given.
     pub fn methods(&self) -> Option<&[ModelKind]> {
         self.methods.as_deref()
-    }
-
-    /// Rejects flags for options that none of the methods has.
-    pub fn check_for(&self, kinds: &[ModelKind]) -> anyhow::Result<()> {
-        let settings = [
-            (self.max_splats.is_some(), Setting::MaxSplats, MAX_SPLATS),
-            (self.count.is_some(), Setting::Count, COUNT),
-        ];
-        let is_unused = |option: &str| !kinds.iter().any(|kind| kind.has_option(option));
-        match settings
-            .into_iter()
-            .find(|(is_given, _, option)| *is_given && is_unused(option))
-        {
-            Some((_, setting, option)) => {
-                let having = ModelKind::ALL
-                    .iter()
-                    .filter(|kind| kind.has_option(option))
-                    .map(|kind| kind.name());
-                Err(BadInput(format!(
-                    "{setting}: needs the method {}, but the method is {}",
-                    listed(&having.collect::<Vec<_>>(), "or"),
-                    describe(kinds)
-                ))
-                .into())
-            }
-            None => Ok(()),
-        }
     }
 
     /// Rejects flags that are invalid for any data, before the data is read.
@@ -330,25 +302,6 @@ impl TrainingOptions {
         ))
     }
 
-    /// The rig file keys that the flags override.
-    pub fn overrides(&self) -> Vec<Override> {
-        let mut overrides = Vec::new();
-        if let Some(kinds) = self.methods() {
-            overrides.push(Override::new("train.method", method_names(kinds)));
-        }
-        if let Some(seed) = self.seed {
-            overrides.push(Override::new("train.seed", seed.cast_signed()));
-        }
-        if let Some(bytes) = self.max_bytes {
-            overrides.push(Override::new("train.max_bytes", bytes.cast_signed()));
-        }
-        if let Some(n) = self.max_splats {
-            overrides.push(Override::new("train.max_splats", n.cast_signed()));
-        }
-        overrides.extend(self.realign().map(|is_on| Override::new(REALIGN, is_on)));
-        overrides
-    }
-
     /// Whether the pose of a mobile base is re-estimated at each station; `None` if `--refine` is
     /// not given.
     pub fn realign(&self) -> Option<bool> {
@@ -358,18 +311,6 @@ impl TrainingOptions {
                 .any(|param| matches!(param, Refine::Auto | Refine::Base))
         };
         (!self.refine.is_empty()).then(is_on)
-    }
-}
-
-/// The value of `train.method`: a string, or a list of strings for several methods.
-fn method_names(kinds: &[ModelKind]) -> toml::Value {
-    match kinds {
-        [one] => one.name().into(),
-        several => several
-            .iter()
-            .map(|kind| kind.name())
-            .collect::<Vec<_>>()
-            .into(),
     }
 }
 

@@ -4,8 +4,8 @@
 mod gpu;
 mod page_address;
 
-use super::number_in_range;
 use crate::exit::Exit;
+use crate::number_args::number_in_range;
 use crate::{print, signals};
 use capture::Rig;
 use capture::doctor::{self, Finding, Verdict};

@@ -1,7 +1,7 @@
 //! `fieldrig record`: writes everything that the devices send to a recording.
 
-use super::number_in_range;
 use crate::exit::{self, Exit};
+use crate::number_args::number_in_range;
 use crate::permission_args::PermissionArgs;
 use crate::{print, signals};
 use capture::{RecordPlan, WrittenRecording};

@@ -1,14 +1,14 @@
 //! `fieldrig run`: opens devices, joins their samples, trains, and serves the page.
 
-use super::number_in_range;
 use crate::checkpoint_args::CheckpointArgs;
 use crate::console::{Console, OutputMode, print_finished_run, print_next_commands};
 use crate::exit::{self, Exit};
+use crate::number_args::number_in_range;
 use crate::open_gpu::open_gpu;
 use crate::page_args::PageArgs;
 use crate::permission_args::PermissionArgs;
 use crate::served_page::ServedPage;
-use crate::training_args::TrainingArgs;
+use crate::training_args::{TRAINING_ARGS, TrainingArgs};
 use crate::{print, signals};
 use capture::Stop;
 use session::{
@@ -46,7 +46,7 @@ pub(crate) struct Args {
     record: Option<PathBuf>,
     /// Continue a run that crashed or was stopped, from the checkpoint and keyframes in its folder
     /// and with its flags. New keyframes are added; --record and --listen are not restored
-    #[arg(long, value_name = "FOLDER", conflicts_with_all = ["from", "method", "seed", "max_bytes", "max_splats", "refine", "count"])]
+    #[arg(long, value_name = "FOLDER", conflicts_with = "from", conflicts_with_all = TRAINING_ARGS)]
     resume: Option<PathBuf>,
     /// Stop S seconds after the first image; time before --resume counts [default: run until
     /// Ctrl-C]

@@ -1,8 +1,8 @@
 //! `fieldrig sim`: emulates a rig's devices on the wire, for the drivers of `fieldrig run` or of
 //! other programs.
 
-use super::number_in_range;
 use crate::exit::Exit;
+use crate::number_args::number_in_range;
 use std::path::PathBuf;
 
 /// Flags of `sim`.

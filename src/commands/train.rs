@@ -7,7 +7,7 @@ use crate::exit::{self, Exit};
 use crate::open_gpu::open_gpu;
 use crate::permission_args::PermissionArgs;
 use crate::signals;
-use crate::training_args::TrainingArgs;
+use crate::training_args::{TRAINING_ARGS, TrainingArgs};
 use session::{Limits, Services, TrainOutcome, TrainPlan};
 use std::path::PathBuf;
 
@@ -21,11 +21,11 @@ pub(crate) struct Args {
     /// Continue from the checkpoint in this folder, on the same data and with its flags; no other
     /// flag is needed. A larger --steps or --seconds continues a finished run; model settings
     /// cannot be changed
-    #[arg(long, value_name = "FOLDER", conflicts_with_all = ["method", "seed", "max_bytes", "max_splats", "refine", "count", "plan_steps"])]
+    #[arg(long, value_name = "FOLDER", conflicts_with_all = TRAINING_ARGS, conflicts_with = "plan_steps")]
     resume: Option<PathBuf>,
     /// Repeat the timing-dependent decisions in this decisions.jsonl of an earlier run. With the
     /// same data, this gives the same model
-    #[arg(long, value_name = "FILE", conflicts_with_all = ["method", "seed", "max_bytes", "max_splats", "refine", "count", "plan_steps", "seconds", "steps", "holdout", "keyframes", "scale"])]
+    #[arg(long, value_name = "FILE", conflicts_with_all = TRAINING_ARGS, conflicts_with_all = ["plan_steps", "seconds", "steps", "holdout", "keyframes", "scale"])]
     replay_decisions: Option<PathBuf>,
     /// Stop after S seconds of training; loading and scoring do not count, time before --resume
     /// does [default: 120, unless --steps is given]

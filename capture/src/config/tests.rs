@@ -83,7 +83,7 @@ fn with(key: &'static str, value: &str) -> Result<Rig, ConfigError> {
 }
 
 /// Key, a valid value that differs from the current one, and an invalid value.
-const KEYS: [(&str, &str, &str); 186] = [
+const KEYS: &[(&str, &str, &str)] = &[
     ("arm.rate_hz", "500", "0"),
     ("arm.bus.can0.bitrate_hz", "500_000", "1"),
     ("arm.bus.can0.data_bitrate_hz", "5_000_000", "9_000_000"),
@@ -433,7 +433,7 @@ const KEYS: [(&str, &str, &str); 186] = [
 fn every_key_takes_effect_and_rejects_invalid_values() {
     let rig = parse(RIG, &[]).expect("a good rig file");
     let mut invalid = Vec::new();
-    for (key, good, bad) in KEYS {
+    for &(key, good, bad) in KEYS {
         match with(key, good) {
             // The path of the robot description is not part of the rig, and other motor families
             // need other keys.
@@ -467,7 +467,7 @@ fn names(message: &str, key: &str) -> bool {
 
 #[test]
 fn resolved_file_gives_the_same_rig() {
-    for (key, good, _) in KEYS {
+    for &(key, good, _) in KEYS {
         let rig = with(key, good).expect("a good value");
         let again =
             parse(&rig.to_toml(), &[]).unwrap_or_else(|e| panic!("{key}: {e}\n{}", rig.to_toml()));

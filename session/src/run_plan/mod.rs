@@ -19,7 +19,8 @@ pub use saving::{EndedRun, SavedRun};
 use crate::checkpoints::CheckpointOptions;
 use crate::data::DataOptions;
 use crate::live_loop::Pace;
-use crate::methods::{self, COUNT, methods_of};
+use crate::method_options;
+use crate::methods::methods_of;
 use crate::next_commands::{self, DataSource};
 use crate::previous_run::{FinishedRun, PreviousRun, limit_flags, out_folder};
 use crate::run_folder;
@@ -168,9 +169,8 @@ impl RunPlan {
         kinds: &[ModelKind],
         pace: Pace,
     ) -> anyhow::Result<Vec<Resumed>> {
-        let (common, mut settings) = methods::options(&rig.train, self.limits.steps);
-        let count = self.training.count.unwrap_or(CountPolicy::ToCap);
-        settings.push((COUNT, serde_json::json!(count)));
+        let train = Some(&rig.train);
+        let settings = method_options::settings(&self.training, train, CountPolicy::ToCap);
         let available = available_data(rig);
         self.training.log_unestimated(available, gpu.is_software());
         let RefineSettings {
@@ -182,10 +182,10 @@ impl RunPlan {
             align,
             align_timing: pace.align_timing(),
             detects_movements: !rig.has_moving_base(),
-            ..common
+            ..method_options::common(&self.training, train, self.limits.steps)
         };
         let mut models = Vec::new();
-        for model_spec in methods::specs(kinds, &common, &settings)? {
+        for model_spec in method_options::specs(kinds, &common, &settings)? {
             models.push(Resumed {
                 method: model_spec.start(gpu.clone())?,
                 model_spec,

@@ -5,7 +5,7 @@ use super::schedule::Schedule;
 use crate::data::{Data, DataOptions};
 use crate::decisions::{Decision, Decisions, Pushed};
 use crate::depth_from;
-use crate::methods::{MAX_SPLATS, SH_DEGREE};
+use crate::method_options;
 use crate::previous_run::PreviousRun;
 use crate::read_progress::OnReadProgress;
 use crate::session::{Limits, Session};
@@ -199,14 +199,11 @@ impl Replay {
     /// of the replay.
     fn overrides(&self) -> Vec<Override> {
         let ModelSpec { kind, options } = &self.model_spec;
-        let specific =
-            |key, name: &str| Some(Override::new(key, options.specific.get(name)?.as_i64()?));
         let mut overrides = vec![
             Override::new("train.method", kind.name()),
             Override::new("train.seed", options.common.seed.cast_signed()),
         ];
-        overrides.extend(specific("train.max_splats", MAX_SPLATS));
-        overrides.extend(specific("train.sh_degree", SH_DEGREE));
+        overrides.extend(method_options::keys_of(options));
         overrides.extend(
             options
                 .common

@@ -2,6 +2,7 @@
 
 use super::runs_args::print_result;
 use crate::exit::Exit;
+use crate::number_args::number_in_range;
 use bench::calibration::{CalibrationOptions, CoverageScenes, Part};
 use std::path::PathBuf;
 
@@ -53,7 +54,7 @@ pub(crate) struct Args {
     #[arg(long, value_name = "N", default_value_t = 15, value_parser = clap::value_parser!(u16).range(5..=1000))]
     poses: u16,
     /// With coverage: standard deviation of the corners in pixels
-    #[arg(long, value_name = "PX", default_value_t = 0.1, value_parser = super::super::number_in_range(0.001..=10.0))]
+    #[arg(long, value_name = "PX", default_value_t = 0.1, value_parser = number_in_range(0.001..=10.0))]
     corner_px: f64,
     /// With coverage: seed of the first scene
     #[arg(long, value_name = "N", default_value_t = 0, value_parser = clap::value_parser!(u64).range(0..=1_000_000))]
@@ -71,7 +72,7 @@ pub(crate) struct Args {
     #[arg(long, value_name = "N", default_value_t = 1, requires = "rig", value_parser = clap::value_parser!(u64).range(1..=1000))]
     first_rig: u64,
     /// With --rig: length of each scan in seconds
-    #[arg(long, value_name = "S", default_value_t = 30.0, requires = "rig", value_parser = super::super::number_in_range(1.0..=3600.0))]
+    #[arg(long, value_name = "S", default_value_t = 30.0, requires = "rig", value_parser = number_in_range(1.0..=3600.0))]
     seconds: f64,
     /// Folder for charts and numbers [default: bench-calibration]
     #[arg(long, value_name = "DIR", default_value = "bench-calibration")]

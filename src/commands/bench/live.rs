@@ -5,6 +5,7 @@ use super::run_flags;
 use super::runs_args::print_result;
 use crate::commands::run::{self, Running};
 use crate::exit::{self, Exit};
+use crate::number_args::number_in_range;
 use crate::print;
 use anyhow::Context;
 use bench::live::{Conditions, HandEyeError, InputCounts, LiveRun, findings};
@@ -26,7 +27,7 @@ pub(crate) struct Args {
     rig: Option<PathBuf>,
     /// Length of each run in seconds, counted from the first image. After the end of the recording,
     /// training continues
-    #[arg(long, value_name = "S", default_value_t = 60.0, value_parser = super::super::number_in_range(1.0..=1e6))]
+    #[arg(long, value_name = "S", default_value_t = 60.0, value_parser = number_in_range(1.0..=1e6))]
     seconds: f64,
     /// Play the recording again whenever it ends. If a run takes two minutes or more, the change
     /// per hour of latency, accuracy, training speed and memory is reported
@@ -43,7 +44,7 @@ pub(crate) struct Args {
     panorama: bool,
     /// Pictures that each viewer requests per second, if they arrive that fast [default: back to
     /// back]
-    #[arg(long, value_name = "HZ", value_parser = super::super::number_in_range(0.1..=1000.0))]
+    #[arg(long, value_name = "HZ", value_parser = number_in_range(0.1..=1000.0))]
     picture_rate: Option<f64>,
     /// Repeat the run with one viewer and a wrong hand-eye calibration: degrees and millimeters in
     /// random directions

@@ -1,6 +1,6 @@
 //! Flags of several commands.
 
-use crate::commands::number_in_range;
+use crate::number_args::number_in_range;
 use crate::page_args::PageArgs;
 use calibrate::{ReportOptions, RigOptions};
 use messages::BadInput;

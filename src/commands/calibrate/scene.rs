@@ -3,8 +3,8 @@
 use super::flags::ReportFlag;
 use super::terminal::Terminal;
 use super::{matrix_of, print_matrix};
-use crate::commands::number_in_range;
 use crate::exit::{self, Exit};
+use crate::number_args::number_in_range;
 use crate::print;
 use calibrate::{SceneOutcome, SceneTask};
 use calibration::{CameraCorrection, Estimate, PoseSigmas, Trial, rigid_transform};

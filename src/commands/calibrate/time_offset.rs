@@ -2,8 +2,8 @@
 
 use super::flags::ReportFlag;
 use super::{matrix_of, print_matrix};
-use crate::commands::number_in_range;
 use crate::exit::{self, Exit};
+use crate::number_args::number_in_range;
 use crate::print;
 use calibrate::{TimeOffsetOutcome, TimeOffsetTask};
 use calibration::hand_eye::Refusal;
