@@ -16,7 +16,9 @@ pub mod align;
 pub mod can;
 pub mod clock;
 pub mod dataset;
+mod datagrams;
 mod decode;
+pub mod device_names;
 mod error;
 #[cfg(target_os = "linux")]
 pub mod franka;

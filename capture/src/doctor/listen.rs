@@ -1,12 +1,12 @@
 //! Measures rates, latencies and losses of a rig's devices, with the drivers of `run`. Nothing is
 //! moved.
 
-use super::{Finding, udp};
+use super::{Finding, datagrams};
 use crate::config::{ArmDriver, BaseDriver, Rig};
 use crate::open::{self, Devices, Opened};
 use crate::{Join, JoinEvent, Rejection, Stop};
 use drivers::udp::DatagramMonitor;
-use drivers::{Error, Sample, clock};
+use drivers::{Error, Sample, clock, device_names};
 use kinematics::Stamp;
 use numbers::quantile::{Rank, quantile};
 use serde::Serialize;
@@ -183,8 +183,9 @@ pub fn listen(rig: &Rig, secs: f64, stop: &Stop) -> anyhow::Result<ListenResult>
     let is_simulated = open::is_any_simulated(&rig);
     let expected = expected(&rig);
     findings.extend(missing(&rig, &expected, &tracks, &monitors));
-    let of_datagrams =
-        |monitor: &DatagramMonitor| udp::datagrams(monitor, tracks.contains_key(monitor.device()));
+    let of_datagrams = |monitor: &DatagramMonitor| {
+        datagrams::received(monitor, tracks.contains_key(monitor.device()))
+    };
     findings.extend(monitors.iter().filter_map(of_datagrams));
     let devices: Vec<_> = tracks
         .into_iter()
@@ -204,12 +205,12 @@ pub fn listen(rig: &Rig, secs: f64, stop: &Stop) -> anyhow::Result<ListenResult>
 fn device_of(sample: &Sample) -> Option<(String, u64)> {
     Some(match sample {
         Sample::Image(image) if image.is_depth() => {
-            (format!("camera {:?} depth", image.camera), image.n_skipped)
+            (device_names::camera_depth(&image.camera), image.n_skipped)
         }
-        Sample::Image(image) => (format!("camera {:?}", image.camera), image.n_skipped),
-        Sample::Joints(_) => ("arm".to_owned(), 0),
-        Sample::Base(_) => ("base".to_owned(), 0),
-        Sample::Range(scan) => (format!("range scanner {:?}", scan.scanner), 0),
+        Sample::Image(image) => (device_names::camera(&image.camera), image.n_skipped),
+        Sample::Joints(_) => (device_names::ARM.to_owned(), 0),
+        Sample::Base(_) => (device_names::BASE.to_owned(), 0),
+        Sample::Range(scan) => (device_names::range_scanner(&scan.scanner), 0),
         Sample::Truth(_) | Sample::BaseTruth(_) => return None,
     })
 }
@@ -248,26 +249,26 @@ fn join_finding(join: &Join) -> Option<Finding> {
 fn expected(rig: &Rig) -> BTreeMap<String, Option<f64>> {
     let mut expected = BTreeMap::new();
     for camera in &rig.cameras {
-        expected.insert(format!("camera {:?}", camera.name), Some(camera.rate_hz));
+        expected.insert(device_names::camera(&camera.name), Some(camera.rate_hz));
         if camera.depth.is_some() {
             expected.insert(
-                format!("camera {:?} depth", camera.name),
+                device_names::camera_depth(&camera.name),
                 Some(camera.rate_hz),
             );
         }
     }
     match rig.arm.driver {
         ArmDriver::None => {}
-        ArmDriver::Franka => drop(expected.insert("arm".to_owned(), Some(1000.0))),
+        ArmDriver::Franka => drop(expected.insert(device_names::ARM.to_owned(), Some(1000.0))),
         // Motors that report without polling choose their own rates.
-        _ => drop(expected.insert("arm".to_owned(), None)),
+        _ => drop(expected.insert(device_names::ARM.to_owned(), None)),
     }
     if rig.base.driver != BaseDriver::Fixed {
-        expected.insert("base".to_owned(), None);
+        expected.insert(device_names::BASE.to_owned(), None);
     }
     for scanner in &rig.scanners {
         expected.insert(
-            format!("range scanner {:?}", scanner.name),
+            device_names::range_scanner(&scanner.name),
             Some(scanner.rate_hz),
         );
     }
@@ -277,9 +278,9 @@ fn expected(rig: &Rig) -> BTreeMap<String, Option<f64>> {
 /// The device that sent no data, if the error is about such a device.
 fn silent_device(error: &Error) -> Option<String> {
     match error {
-        Error::NoJoints { .. } => Some("arm".to_owned()),
-        Error::NoBasePose { .. } => Some("base".to_owned()),
-        Error::NoScan { scanner, .. } => Some(format!("range scanner {scanner:?}")),
+        Error::NoJoints { .. } => Some(device_names::ARM.to_owned()),
+        Error::NoBasePose { .. } => Some(device_names::BASE.to_owned()),
+        Error::NoScan { scanner, .. } => Some(device_names::range_scanner(scanner)),
         _ => None,
     }
 }
@@ -313,7 +314,7 @@ fn missing(
         let remedy = match monitors.iter().find(|monitor| monitor.device() == device) {
             Some(monitor) if monitor.counts().n_received > 0 => continue,
             Some(monitor) => format!("start its sender, and let it send to {}", monitor.address()),
-            None if rig.base.driver == BaseDriver::Tags && device == "base" => {
+            None if rig.base.driver == BaseDriver::Tags && device == device_names::BASE => {
                 "no image gave its pose: check base.tag_family, and the sizes and poses of the tags"
                     .to_owned()
             }

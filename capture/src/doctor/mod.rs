@@ -5,6 +5,7 @@ mod calibration;
 #[cfg(target_os = "linux")]
 mod can;
 mod clock;
+mod datagrams;
 mod franka;
 mod governor;
 mod listen;
@@ -12,7 +13,6 @@ mod memory;
 mod motion;
 mod realsense;
 mod realtime;
-mod udp;
 #[cfg(target_os = "linux")]
 mod usb;
 mod video_devices;
@@ -130,7 +130,7 @@ pub fn check(rig: Option<&Rig>) -> Vec<Finding> {
     findings.extend(rig.into_iter().flat_map(calibration::calibration));
     findings.extend(
         rig.into_iter()
-            .flat_map(|rig| udp::senders(rig).into_iter().chain(realsense::files(rig))),
+            .flat_map(|rig| datagrams::senders(rig).into_iter().chain(realsense::files(rig))),
     );
     findings
 }

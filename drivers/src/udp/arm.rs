@@ -1,9 +1,9 @@
 //! An arm whose joint states are received over UDP, for example from the program that moves it.
 
-use super::counts::{DatagramCounts, DatagramMonitor};
 use super::reader::DatagramReader;
+use crate::datagrams::counts::{DatagramCounts, DatagramMonitor};
 use crate::wire::datagram::decode_joints;
-use crate::{Arm, Error};
+use crate::{Arm, Error, device_names};
 use kinematics::JointState;
 use std::net::SocketAddr;
 use std::time::Duration;
@@ -20,7 +20,7 @@ impl UdpArm {
     pub fn open(joint_names: &[String], address: SocketAddr) -> Result<Self, Error> {
         Ok(Self {
             names: joint_names.to_vec(),
-            states: DatagramReader::open("arm", "joint states", address)?,
+            states: DatagramReader::open(device_names::ARM, "joint states", address)?,
         })
     }
 

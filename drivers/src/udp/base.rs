@@ -1,9 +1,9 @@
 //! A base whose poses are received over UDP, for example from its own localization.
 
-use super::counts::{DatagramCounts, DatagramMonitor, count_and_warn};
 use super::reader::DatagramReader;
+use crate::datagrams::counts::{DatagramCounts, DatagramMonitor, count_and_warn};
 use crate::wire::datagram::decode_pose;
-use crate::{Base, BasePose, Error};
+use crate::{Base, BasePose, Error, device_names};
 use std::net::SocketAddr;
 use std::time::{Duration, Instant};
 
@@ -22,7 +22,7 @@ impl UdpBase {
     /// accepted.
     pub fn open(address: SocketAddr, max_sigma: [f64; 2]) -> Result<Self, Error> {
         Ok(Self {
-            poses: DatagramReader::open("base", "poses", address)?,
+            poses: DatagramReader::open(device_names::BASE, "poses", address)?,
             max_sigma,
         })
     }
@@ -59,7 +59,12 @@ impl Base for UdpBase {
                     let what = format_args!(
                         "skipped a pose with a standard deviation of {m:.3} m and {rad:.4} rad"
                     );
-                    count_and_warn("base", &mut self.poses.counts.n_uncertain, 1, what);
+                    count_and_warn(
+                        device_names::BASE,
+                        &mut self.poses.counts.n_uncertain,
+                        1,
+                        what,
+                    );
                     // The reader has published the counts before this pose was checked.
                     self.poses.publish_counts();
                 }

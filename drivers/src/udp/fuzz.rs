@@ -1,10 +1,10 @@
 //! Fuzz target for datagrams to an arm, a base and a range scanner.
 
 use super::reader::DatagramReader;
-use super::receiver::ReceivedDatagram;
 use super::scanner::UdpScanner;
 use super::sequence::SequenceTracker;
 use crate::RangePoint;
+use crate::datagrams::receiver::ReceivedDatagram;
 use crate::wire::datagram::{
     Clock, DatagramHeader, JointsDatagram, PoseDatagram, ScanPart, decode_joints, decode_pose,
     encode_joints, encode_pose, encode_scan,

@@ -1,9 +1,10 @@
 //! Reads values that each fit in one datagram.
 
-use super::counts::{CLOCK_RESTARTED, DatagramCounts, DatagramMonitor, Senders, count_and_warn};
-use super::receiver::{ReceivedDatagram, Receiver};
 use super::sequence::{self, SequencePosition, SequenceTracker};
 use crate::Error;
+use crate::datagrams::counts::{CLOCK_RESTARTED, DatagramCounts, DatagramMonitor, count_and_warn};
+use crate::datagrams::receiver::{ReceivedDatagram, Receiver};
+use crate::datagrams::senders::Senders;
 use crate::wire::Malformed;
 use crate::wire::datagram::DatagramHeader;
 use kinematics::Stamp;

@@ -1,10 +1,11 @@
 //! A range scanner whose scans are received over UDP, each in one or more datagrams.
 
-use super::counts::{CLOCK_RESTARTED, DatagramCounts, DatagramMonitor, Senders, count_and_warn};
-use super::receiver::{ReceivedDatagram, Receiver};
 use super::sequence::{self, SequencePosition, SequenceTracker};
+use crate::datagrams::counts::{CLOCK_RESTARTED, DatagramCounts, DatagramMonitor, count_and_warn};
+use crate::datagrams::receiver::{ReceivedDatagram, Receiver};
+use crate::datagrams::senders::Senders;
 use crate::wire::datagram::{DatagramHeader, ScanPart, decode_scan};
-use crate::{Error, RangePoint, RangeScan, RangeScanner};
+use crate::{Error, RangePoint, RangeScan, RangeScanner, device_names};
 use kinematics::Stamp;
 use std::collections::VecDeque;
 use std::net::SocketAddr;
@@ -38,7 +39,7 @@ struct PartialScan {
 impl UdpScanner {
     /// Listens for the scanner of this name. With port 0, a free port is used.
     pub fn open(name: &str, address: SocketAddr) -> Result<Self, Error> {
-        let receiver = Receiver::open(format!("range scanner {name:?}"), address)?;
+        let receiver = Receiver::open(device_names::range_scanner(name), address)?;
         let monitor = DatagramMonitor::new(receiver.device(), receiver.address());
         Ok(Self {
             name: name.into(),

@@ -24,17 +24,17 @@ const MAX_BUFFERED_AGE: Duration = Duration::from_millis(200);
 const POLL: Duration = Duration::from_millis(100);
 
 /// A datagram with its arrival time and sender.
-pub(super) struct ReceivedDatagram {
-    pub(super) at: Stamp,
-    pub(super) from: SocketAddr,
-    pub(super) bytes: Vec<u8>,
+pub(crate) struct ReceivedDatagram {
+    pub(crate) at: Stamp,
+    pub(crate) from: SocketAddr,
+    pub(crate) bytes: Vec<u8>,
     /// Number of datagrams dropped before this one.
-    pub(super) n_dropped: u64,
+    pub(crate) n_dropped: u64,
 }
 
 /// A bound socket and its thread; dropping it frees the port.
 #[derive(Debug)]
-pub(super) struct Receiver {
+pub(crate) struct Receiver {
     device: String,
     address: SocketAddr,
     shared: Arc<Shared>,
@@ -60,7 +60,7 @@ struct State {
 
 impl Receiver {
     /// Listens. With port 0, a free port is used. `device` is the name of the device in messages.
-    pub(super) fn open(device: String, address: SocketAddr) -> Result<Self, Error> {
+    pub(crate) fn open(device: String, address: SocketAddr) -> Result<Self, Error> {
         let bound = UdpSocket::bind(address).and_then(|socket| {
             socket.set_read_timeout(Some(POLL))?;
             Ok((socket.local_addr()?, socket))
@@ -97,17 +97,17 @@ impl Receiver {
     }
 
     /// Address it listens on.
-    pub(super) fn address(&self) -> SocketAddr {
+    pub(crate) fn address(&self) -> SocketAddr {
         self.address
     }
 
     /// Name of the device in messages.
-    pub(super) fn device(&self) -> &str {
+    pub(crate) fn device(&self) -> &str {
         &self.device
     }
 
     /// Returns the oldest queued datagram, or `None` if none came until `until`.
-    pub(super) fn next(&self, until: Instant) -> Result<Option<ReceivedDatagram>, Error> {
+    pub(crate) fn next(&self, until: Instant) -> Result<Option<ReceivedDatagram>, Error> {
         let mut state = self.shared.state.lock();
         // Otherwise, the first read would return a burst of old values, and the clock map would
         // start with their delays.

@@ -1,23 +1,25 @@
-//! Checks the UDP addresses on which a rig listens.
+//! Checks the UDP addresses on which a rig listens, and the datagrams that arrive there.
 
 use super::Finding;
 use crate::config::{ArmDriver, BaseDriver, Rig, ScannerDriver};
 use crate::open;
+use drivers::device_names;
 use drivers::udp::{DatagramCounts, DatagramMonitor};
 use std::net::UdpSocket;
 
 /// Checks that no other program uses the UDP addresses of the rig.
 pub(super) fn senders(rig: &Rig) -> Vec<Finding> {
-    let base = (rig.base.driver == BaseDriver::Udp).then(|| ("base".to_owned(), rig.base.address));
+    let base = (rig.base.driver == BaseDriver::Udp)
+        .then(|| (device_names::BASE.to_owned(), rig.base.address));
     let scanners = rig
         .scanners
         .iter()
         .filter(|scanner| scanner.driver == ScannerDriver::Udp);
     let scanners =
-        scanners.map(|scanner| (format!("range scanner {:?}", scanner.name), scanner.address));
+        scanners.map(|scanner| (device_names::range_scanner(&scanner.name), scanner.address));
     let arm = (rig.arm.driver == ArmDriver::Udp).then(|| open::udp_arm_address(rig));
     let (arm, invalid) = match arm {
-        Some(Ok(address)) => (Some(("arm".to_owned(), address)), None),
+        Some(Ok(address)) => (Some((device_names::ARM.to_owned(), address)), None),
         Some(Err(error)) => (
             None,
             Some(Finding::fail(
@@ -49,7 +51,7 @@ pub(super) fn senders(rig: &Rig) -> Vec<Finding> {
 /// arrived.
 ///
 /// * `has_data`: whether the device delivered any data.
-pub(super) fn datagrams(monitor: &DatagramMonitor, has_data: bool) -> Option<Finding> {
+pub(super) fn received(monitor: &DatagramMonitor, has_data: bool) -> Option<Finding> {
     finding(
         monitor.device(),
         &monitor.counts(),
