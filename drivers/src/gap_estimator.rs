@@ -5,9 +5,10 @@ use kinematics::Stamp;
 /// If an image is late by more than this many periods, images were dropped before it. Smaller
 /// delays are jitter. A smaller value counts jitter as lost images, a larger one misses losses.
 const LATE_PERIODS: f64 = 0.75;
-/// Fraction of the delay by which the next due time is corrected, because the actual frame rate
-/// differs from the nominal rate. A larger value follows the rate faster, but lets one late image
-/// move the due time; 0.05 averages over about 20 images.
+/// Fraction of the delay of an image by which the next due time is shifted. Without this correction,
+/// due times would drift away from the images, because the actual frame rate differs from the
+/// nominal rate. With a larger value, a single late image shifts the due time more; 0.05 averages
+/// over about 20 images.
 const DRIFT_GAIN: f64 = 0.05;
 
 /// Estimates when the images of a camera are due. Images may be late, but never early.

@@ -12,21 +12,22 @@ use std::time::{Duration, Instant};
 
 /// A camera that can be opened repeatedly.
 ///
-/// Images that the camera queued before it was opened must not be returned. Stamps of cameras
-/// without a clock are taken when the last byte of an image has arrived.
+/// An implementation must not return images that were queued before the camera was opened. If the
+/// camera has no clock, it stamps an image when the last byte has arrived.
 pub(crate) trait ReopenableCamera: Debug {
     /// The open camera. Dropping it closes the camera.
     type Stream: Debug;
     /// A problem of this kind of camera.
     type Problem: Display;
 
-    /// Opens the camera. Must return within about 100 ms, because the caller cannot stop in the
-    /// meantime: a camera that takes longer is opened by a thread of its own, and
-    /// [`Self::describe`] returns `None` until it is open.
+    /// Opens the camera. Must return within about 100 ms, because the caller cannot be stopped in
+    /// the meantime. If opening takes longer, it must run on another thread; until it has ended,
+    /// [`Self::describe`] returns `None`.
     fn open(&mut self) -> Result<Self::Stream, Failure<Self::Problem>>;
 
-    /// Description of device, mode and settings for the log; `None` as long as the camera is still
-    /// being opened.
+    /// Description of device, mode and settings for the log; `None` while the camera is still being
+    /// opened. If opening proves nothing, as for a camera that only sends datagrams, it is `None`
+    /// until the first image. A camera counts as reconnected once it has a description.
     fn describe(&self, stream: &Self::Stream) -> Option<String>;
 
     /// Waits for the next image. Returns `None` if no image arrived; the caller may call again if

@@ -12,7 +12,7 @@ pub struct DatagramCounts {
     pub n_received: u64,
     /// Number of datagrams with a wrong format, another device name, or an impossible stamp.
     pub n_rejected: u64,
-    /// Number of missing sequence numbers and missing parts of scans.
+    /// Number of values whose sequence number is missing, plus the number of missing parts of scans.
     pub n_lost: u64,
     /// Number of joint states that name none of the arm's joints.
     pub n_other: u64,
