@@ -15,8 +15,8 @@
 pub mod align;
 pub mod can;
 pub mod clock;
-pub mod dataset;
 mod datagrams;
+pub mod dataset;
 mod decode;
 pub mod device_names;
 mod error;

@@ -128,10 +128,11 @@ pub fn check(rig: Option<&Rig>) -> Vec<Finding> {
     findings.extend(franka::franka(rig));
     findings.extend(rig.and_then(motion::motion));
     findings.extend(rig.into_iter().flat_map(calibration::calibration));
-    findings.extend(
-        rig.into_iter()
-            .flat_map(|rig| datagrams::senders(rig).into_iter().chain(realsense::files(rig))),
-    );
+    findings.extend(rig.into_iter().flat_map(|rig| {
+        datagrams::senders(rig)
+            .into_iter()
+            .chain(realsense::files(rig))
+    }));
     findings
 }
 
