@@ -2,8 +2,8 @@
 
 use anyhow::{Context, Result, anyhow};
 use report::Table;
-use report::chart::{Chart, raster};
 use report::chart::drawing::escaped;
+use report::chart::{Chart, raster};
 use serde_json::Value;
 use session::run_folder;
 use std::path::{Path, PathBuf};

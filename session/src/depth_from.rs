@@ -2,8 +2,8 @@
 
 use crate::evaluate::{self, CHECK_SAME_SCENE, MIN_ALPHA, MIN_COVERED_FRAC};
 use crate::read_progress::{OnReadProgress, ReadProgress};
-use anyhow::Context;
 use crate::{methods, run_folder};
+use anyhow::Context;
 use gpu::Gpu;
 use keyframe::{DepthMap, Keyframe, Split};
 use messages::{BadInput, InsufficientData, Setting, counted};

@@ -556,7 +556,10 @@ fn draw_depth<'a>(
 
 /// Renders at the true pose, for the comparison with the noise-free image, which has no rolling
 /// shutter.
-fn draw_at_truth(method: &mut AlignedModel, keyframe: &Keyframe) -> anyhow::Result<Option<Picture>> {
+fn draw_at_truth(
+    method: &mut AlignedModel,
+    keyframe: &Keyframe,
+) -> anyhow::Result<Option<Picture>> {
     let Some(truth) = &keyframe.truth else {
         return Ok(None);
     };
