@@ -2,7 +2,7 @@
 //!
 //! A command whose result is its output (`devices`, `metrics`) prints with [`line()`] and [`json`],
 //! which fail if stdout fails. A command whose result is a file (`train`, `run`, `record`) prints
-//! with [`report`] and [`report_json`], which never fail: a closed terminal or a full disk loses
+//! with [`report()`] and [`report_json`], which never fail: a closed terminal or a full disk loses
 //! lines, not the model. A thread per stream writes the lines, so that a terminal or a program that
 //! accepts no output blocks neither this program nor the other stream. [`has_lost_output`] returns
 //! whether any lines of stdout were lost.
@@ -30,7 +30,7 @@ pub(crate) struct StdoutError(#[source] pub(crate) std::io::Error);
 
 /// The progress bars on stderr; log lines are printed above them.
 static BARS: LazyLock<MultiProgress> = LazyLock::new(|| MultiProgress::with_draw_target(target()));
-/// Whether any line of [`report`] could not be written.
+/// Whether any line of [`report()`] could not be written.
 static LOST_OUTPUT: AtomicBool = AtomicBool::new(false);
 
 /// Maximum number of output chunks that wait to be written. With a queue, a terminal that accepts
@@ -259,7 +259,7 @@ pub(crate) fn report(text: impl Display) {
     report_styled(printable(&text.to_string()));
 }
 
-/// Prints text of this program as [`report`] does, with its colors.
+/// Prints text of this program as [`report()`] does, with its colors.
 pub(crate) fn report_styled(text: impl Display) {
     if !send(&STDOUT, format!("{text}\n")) {
         log_lost("it accepts no more output");
@@ -281,7 +281,7 @@ pub(crate) fn error(error: &anyhow::Error) {
     );
 }
 
-/// Whether any line of [`report`] was lost.
+/// Whether any line of [`report()`] was lost.
 pub(crate) fn has_lost_output() -> bool {
     LOST_OUTPUT.load(Ordering::Relaxed)
 }
@@ -291,7 +291,7 @@ pub(crate) fn json(value: &impl Serialize) -> anyhow::Result<()> {
     Ok(line(json_text(value)?)?)
 }
 
-/// Prints one JSON object on its own line, as [`report`] does.
+/// Prints one JSON object on its own line, as [`report()`] does.
 ///
 /// # Errors
 ///
