@@ -179,13 +179,17 @@ fn names_a_command_with(text: &str, flag: NamedFlag<'_>) -> bool {
     };
     let cli = Cli::command();
     let mut commands = cli.get_subcommands().map(|command| command.get_name());
-    is_of_cargo(text, flag)
+    is_of_other_program(text, flag)
         || commands.any(|name| is_named(name) && flags_of(name).contains(flag.name))
 }
 
-/// Whether a flag in a text about building belongs to cargo.
-fn is_of_cargo(text: &str, flag: NamedFlag<'_>) -> bool {
-    ["features", "release"].contains(&flag.name) && text.contains("build")
+/// Whether a flag belongs to another program that the text names: to cargo, or to nerfstudio.
+fn is_of_other_program(text: &str, flag: NamedFlag<'_>) -> bool {
+    match flag.name {
+        "features" | "release" => text.contains("build"),
+        "skip-colmap" => text.contains("ns-process-data"),
+        _ => false,
+    }
 }
 
 /// The settings that a source file names.
@@ -382,7 +386,7 @@ fn libraries_name_settings_instead_of_flags() {
     for (file, source) in &files {
         for text in texts_of(file, source) {
             let flags = flags_in(&text).into_iter();
-            let own = flags.filter(|flag| !is_of_cargo(&text, *flag));
+            let own = flags.filter(|flag| !is_of_other_program(&text, *flag));
             named.extend(own.map(|flag| format!("{file}: --{} in {text:?}", flag.name)));
         }
     }

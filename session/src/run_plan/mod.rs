@@ -172,7 +172,6 @@ impl RunPlan {
         let train = Some(&rig.train);
         let settings = method_options::settings(&self.training, train, CountPolicy::ToCap);
         let available = available_data(rig);
-        self.training.log_unestimated(available, gpu.is_software());
         let RefineSettings {
             align,
             with_scene: cameras,

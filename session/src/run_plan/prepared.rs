@@ -1,8 +1,8 @@
 //! The start of a live run: its devices, its folders and its sessions.
 
-use super::RunPlan;
 use super::in_progress::RunInProgress;
 use super::previous::PreviousLiveRun;
+use super::{RunPlan, available_data};
 use crate::checkpoints::RunFlags;
 use crate::evaluate::Evaluator;
 use crate::live_loop::{LiveLoop, LiveOptions, Pace};
@@ -81,6 +81,11 @@ impl<'a> PreparedRun<'a> {
     pub fn open_devices(mut self) -> anyhow::Result<OpenedRun<'a>> {
         for finding in doctor::suspicious_values(&self.rig) {
             log::warn!("{finding}");
+        }
+        // A resumed run continues with the parameters of the first one.
+        if self.parts.previous.is_none() {
+            let training = &self.parts.plan.training;
+            training.log_unestimated(available_data(&self.rig), self.parts.gpu.is_software());
         }
         // Compile kernels before the first image, so that keyframes do not wait.
         self.parts
