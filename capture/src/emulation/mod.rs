@@ -9,7 +9,7 @@ use anyhow::{Context, bail};
 use camera_files::CameraFiles;
 use drivers::franka::FciVersion;
 use drivers::franka::emulated::{EmulatedRobot, Limits, RobotConfig};
-use drivers::{Sample, can, clock};
+use drivers::{Sample, Source, can, clock};
 use kinematics::{Stamp, Transform};
 use messages::BadInput;
 use sim::wire::{
@@ -168,6 +168,26 @@ impl EmulationPlan {
             _ => {}
         }
         let mut recorder = open::recorder(&path, &rig)?;
+        let is_complete = self.for_each_sample(source.as_mut(), stop, |sample, secs| {
+            on_progress(Stage::Simulating, secs);
+            Ok(recorder.write(&sample)?)
+        })?;
+        if !is_complete {
+            return Ok(None);
+        }
+        // An interrupted simulation is left unfinished, and removed by the next one.
+        recorder.finish()?;
+        Ok(Some(path))
+    }
+
+    /// Passes on the samples of the first `seconds`, and their time since the first one in seconds.
+    /// Returns false if interrupted.
+    fn for_each_sample(
+        &self,
+        source: &mut dyn Source,
+        stop: &Stop,
+        mut take: impl FnMut(Sample, f64) -> anyhow::Result<()>,
+    ) -> anyhow::Result<bool> {
         let mut first: Option<Stamp> = None;
         while let Some(sample) = source.next_sample()? {
             let secs = sample
@@ -177,14 +197,11 @@ impl EmulationPlan {
                 break;
             }
             if stop.requested() {
-                return Ok(None);
+                return Ok(false);
             }
-            on_progress(Stage::Simulating, secs);
-            recorder.write(&sample)?;
+            take(sample, secs)?;
         }
-        // An interrupted simulation is left unfinished, and removed by the next one.
-        recorder.finish()?;
-        Ok(Some(path))
+        Ok(true)
     }
 
     /// Reads the samples of the first `seconds` of a recording; images go to the camera files.
@@ -200,22 +217,16 @@ impl EmulationPlan {
             mut source, damage, ..
         } = open::recording(recording, None, &[])?;
         let mut script = DeviceScript::default();
-        let mut first: Option<Stamp> = None;
-        while let Some(sample) = source.next_sample()? {
-            let secs = sample
-                .stamp()
-                .secs_since(*first.get_or_insert(sample.stamp()));
-            if secs > self.seconds {
-                break;
-            }
-            if stop.requested() {
-                return Ok(None);
-            }
+        let is_complete = self.for_each_sample(source.as_mut(), stop, |sample, secs| {
             on_progress(Stage::Preparing, secs);
             match sample {
                 Sample::Image(image) => camera_files.take(image)?,
                 other => script.take(other),
             }
+            Ok(())
+        })?;
+        if !is_complete {
+            return Ok(None);
         }
         // A damaged recording still has data to play back.
         if let Some(damage) = damage.get() {

@@ -17,15 +17,7 @@ const MIN_SCALE: f32 = 1e-9;
 
 /// Reads a `.splat` file. Splats with invalid numbers are left out, with a warning.
 pub fn read(path: &Path) -> Result<SplatArrays, Error> {
-    let bytes = files::read(path, files::Budget::SPLATS).map_err(|source| Error::Read {
-        path: path.to_owned(),
-        source,
-    })?;
-    let splats = from_bytes(&bytes).map_err(|reason| Error::SplatFile {
-        path: path.to_owned(),
-        reason,
-    })?;
-    splats.without_invalid(path)
+    super::read_with(path, |bytes| Ok((from_bytes(bytes)?, Vec::new())))
 }
 
 fn from_bytes(bytes: &[u8]) -> Result<SplatArrays, String> {

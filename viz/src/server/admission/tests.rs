@@ -23,7 +23,7 @@ fn run(test: impl Future<Output = ()>) {
     runtime.expect("a runtime").block_on(test);
 }
 
-/// Sends what a page sends as soon as it is connected.
+/// Records the first message of a page, and its answer to a ping.
 fn act_like_page(connection: &Connection) {
     connection.record_message();
     assert!(connection.start_ping());

@@ -29,18 +29,7 @@ const UNUSED: [&str; 5] = ["nx", "ny", "nz", "label", "id"];
 /// Splats with invalid numbers are left out, and properties that are not used are named, both with
 /// a warning.
 pub fn read(path: &Path) -> Result<SplatArrays, Error> {
-    let bytes = files::read(path, files::Budget::SPLATS).map_err(|source| Error::Read {
-        path: path.to_owned(),
-        source,
-    })?;
-    let (splats, notes) = from_bytes(&bytes).map_err(|reason| Error::SplatFile {
-        path: path.to_owned(),
-        reason,
-    })?;
-    for note in notes {
-        log::warn!("{}: {note}", path.display());
-    }
-    splats.without_invalid(path)
+    super::read_with(path, from_bytes)
 }
 
 /// Writes a `.ply` file of splats as little-endian f32. A failed write leaves no partial file at

@@ -32,18 +32,7 @@ const MAX_FRACTIONAL_BITS: u8 = 16;
 
 /// Reads a `.spz` file of splats.
 pub fn read(path: &Path) -> Result<SplatArrays, Error> {
-    let bytes = files::read(path, files::Budget::SPLATS).map_err(|source| Error::Read {
-        path: path.to_owned(),
-        source,
-    })?;
-    let (splats, notes) = from_bytes(&bytes).map_err(|reason| Error::SplatFile {
-        path: path.to_owned(),
-        reason,
-    })?;
-    for note in notes {
-        log::warn!("{}: {note}", path.display());
-    }
-    splats.without_invalid(path)
+    super::read_with(path, from_bytes)
 }
 
 /// Writes a `.spz` file of splats. A failed write leaves no partial file at `path`.
