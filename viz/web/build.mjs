@@ -21,7 +21,7 @@ await build({
   legalComments: "eof",
   logLevel: "info",
 });
-await build({ entryPoints: [join(here, "src/app.css")], outfile: join(here, "dist/app.css"), minify: true });
+await build({ entryPoints: [join(here, "src/app.css")], outfile: join(here, "dist/app.css"), bundle: true, minify: true });
 copyFileSync(join(here, "src/index.html"), join(here, "dist/index.html"));
 // Cargo looks for the bundle again when the build script is younger than its last build.
 const now = new Date();
