@@ -128,6 +128,7 @@ packages:
 OPTIONAL = $(if $(filter demand,$(FIELDRIG_HIL)),,--optional)
 test-packages: cargo
 	@$(STEP) packages scripts/install-packages.sh build gpu sim web nokhwa $(OPTIONAL) realsense browser hil
+	@scripts/fetch-qemu.sh || [ "$$FIELDRIG_HIL" != demand ]
 
 check-packages: cargo
 	@scripts/install-packages.sh build gpu sim web nokhwa $(OPTIONAL) realsense

@@ -166,6 +166,27 @@ check_libclang() {
     need "libclang${version:+-common-$version}-dev" "headers of clang ${version:+$version }for $library"
 }
 
+# qemu_libraries: prints the packages of all libraries that QEMU of Debian 12 loads.
+qemu_libraries() {
+    echo libaio1 libasound2 libbpf1 libbrlapi0.8 libc6 libcacard0 libcap-ng0 libcapstone4 libepoxy0 libfdt1 libfuse3-3 \
+        libgbm1 libgcc-s1 libglib2.0-0 libgmp10 libgnutls30 libhogweed6 libibverbs1 libjpeg62-turbo libncursesw6 \
+        libnettle8 libnuma1 libpixman-1-0 libpmem1 libpng16-16 librdmacm1 libsasl2-2 libseccomp2 libslirp0 libsndio7.0 \
+        libspice-server1 libtinfo6 libudev1 liburing2 libusb-1.0-0 libusbredirparser1 libvdeplug2 libzstd1 zlib1g
+}
+
+# check_qemu: a newer qemu-utils, such as that of backports, conflicts with the QEMU of Debian 12. It is not removed: then only QEMU's libraries
+# are installed, and scripts/fetch-qemu.sh unpacks QEMU into .deps/qemu.
+check_qemu() {
+    installed=$(dpkg-query -W -f '${Version}' qemu-utils 2>/dev/null || true)
+    if [ -x /usr/bin/qemu-system-x86_64 ] || [ -z "$installed" ] || dpkg --compare-versions "$installed" lt 1:8.0; then
+        need_file /usr/bin/qemu-system-x86_64 qemu-system-x86 "emulates CAN cards for the tests"
+    else
+        for package in $(qemu_libraries); do
+            need_package "$package" "used by QEMU, which emulates CAN cards for the tests"
+        done
+    fi
+}
+
 # check GROUP: adds the missing packages of a group.
 check() {
     case "$1" in
@@ -223,7 +244,7 @@ check() {
         need_command bc bc "builds this kernel"
         need_command xz xz-utils "unpacks their source"
         need_package busybox-static "starts the tests in the virtual machines"
-        need_file /usr/bin/qemu-system-x86_64 qemu-system-x86 "emulates CAN cards for the tests"
+        check_qemu
         need_file /usr/sbin/ip iproute2 "sets up the CAN cards"
         python_has 'import ensurepip, venv' || need python3-venv "runs the Franka simulator and libfranka for the tests"
         ;;

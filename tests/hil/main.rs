@@ -97,7 +97,7 @@ fn cameras_and_buses_in_virtual_kernel() {
 
 #[test]
 fn can_cards_in_virtual_machine() {
-    run_inside(&[qemu::PROGRAM, qemu::IP, "/usr/bin/apt-get"], || {
+    run_inside(&[qemu::program(), qemu::IP, "/usr/bin/apt-get"], || {
         let folder = root_folder();
         let kernel = kernel("debian-kernel.sh");
         let root = folder.join("root-qemu");

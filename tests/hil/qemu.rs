@@ -13,7 +13,14 @@ use std::os::unix::fs::FileExt;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
 
-pub(crate) const PROGRAM: &str = "/usr/bin/qemu-system-x86_64";
+/// QEMU if its package is installed, and where `scripts/fetch-qemu.sh` unpacks it otherwise.
+const PROGRAMS: [&str; 2] = [
+    "/usr/bin/qemu-system-x86_64",
+    concat!(
+        env!("CARGO_MANIFEST_DIR"),
+        "/.deps/qemu/usr/bin/qemu-system-x86_64"
+    ),
+];
 /// The `ip` of busybox does not support bit rates.
 pub(crate) const IP: &str = "/usr/sbin/ip";
 
@@ -46,6 +53,14 @@ pub(crate) const ACCEPT_ALL: [u8; 4] = [0xFF; 4];
 /// Bits of the status register for errors and bus-off.
 const STATUS_ERRORS: u8 = 0xC0;
 
+/// The path of QEMU; if it is missing, the path of the installed package.
+pub(crate) fn program() -> &'static str {
+    PROGRAMS
+        .into_iter()
+        .find(|path| Path::new(path).exists())
+        .unwrap_or(PROGRAMS[0])
+}
+
 pub(crate) fn install_root(root: &Path) {
     super::install_root(root, INIT, &[(PathBuf::from(IP), "ip")]);
     write_script(&root.join("bin/sudo"), SUDO);
@@ -54,7 +69,7 @@ pub(crate) fn install_root(root: &Path) {
 /// Boots the machine, waits until it ends, and returns the console output. `kernel` is the folder
 /// of `debian-kernel.sh`.
 pub(crate) fn boot(kernel: &Path, root: &Path) -> String {
-    let mut command = Command::new(PROGRAM);
+    let mut command = Command::new(program());
     command
         .args([
             "-machine", "pc", "-accel", "tcg", "-cpu", "max", "-smp", "1", "-m", "768",
