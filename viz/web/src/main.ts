@@ -1,13 +1,15 @@
 // The operator's page: connects the connection, the view and the readouts.
 
 import { keepToken, showRole } from "./connection/access";
+import { announceStates } from "./panels/announcer";
 import { Banner } from "./panels/banner";
 import { Connection } from "./connection/connection";
 import { EditControls } from "./panels/edit_controls";
 import { element } from "./panels/element";
+import { showGestureHint } from "./panels/gesture_hint";
 import { showGuidance } from "./panels/guidance";
 import { setUpHelp } from "./panels/help";
-import { action, endsWithEscape, setFlying, setUpKeys, toggle } from "./keys";
+import { action, closesWithEscape, endsWithEscape, setFlying, setUpKeys, toggle } from "./keys";
 import { LinkReadout } from "./connection/link_readout";
 import { LiveImages } from "./panels/live_images";
 import { ModelSwitch } from "./panels/model_switch";
@@ -18,6 +20,7 @@ import { Readouts } from "./panels/readouts";
 import { RenderScheduler } from "./connection/render_scheduler";
 import { RobotAge } from "./panels/robot_age";
 import { RunControls } from "./panels/run_controls";
+import { setUpSidePanel } from "./panels/side_panel";
 import { ShownLatency } from "./connection/shown_latency";
 import { SideView } from "./layers/side_view";
 import { Surroundings } from "./layers/surroundings";
@@ -31,6 +34,8 @@ import { RangeScansTopic } from "./topics/range_scans";
 import { robotTopic } from "./topics/robot_state";
 import { statusTopic } from "./topics/status";
 import { Topics } from "./topics/topic";
+import { setUpToolbar } from "./panels/toolbar";
+import { Tooltip } from "./panels/tooltip";
 import { ViewSettings } from "./view/view_settings";
 
 let stages = [0.1, 0.5, 1];
@@ -222,6 +227,11 @@ async function showPicture(header: PictureHeader, payload: Uint8Array<ArrayBuffe
 }
 
 setUpKeys(() => view.changed());
+announceStates();
+setUpToolbar();
+setUpSidePanel();
+showGestureHint();
+new Tooltip();
 toggle("toggle-fly", "y", (isOn) => {
   view.flies = isOn;
   setFlying(isOn);
@@ -254,6 +264,7 @@ toggle("toggle-keyframes", "k", (isOn) => (view.overlays.showsKeyframes = isOn))
 toggle("toggle-crop", "x", (isOn) => (view.crop.enabled = isOn));
 toggle("toggle-measure", "d", (isOn) => (view.measure.enabled = isOn));
 endsWithEscape("toggle-fly", "toggle-measure");
+closesWithEscape("mode", () => images.isEnlarged, () => images.reduce());
 toggle("toggle-images", "i", (isOn) => (liveImages.shown = isOn));
 const switchPanel = panels({ "toggle-layers": "layers", "toggle-settings": "settings", "toggle-edit": "edit" });
 const togglePanel = (button: string): void => {
