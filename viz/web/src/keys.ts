@@ -147,7 +147,7 @@ function focusOf(target: EventTarget | null): Focus {
 function titleOf(binding: KeyBinding): string {
   const { chords, help } = binding;
   const isShown = chords.length > 0 && !(isFlying && chords.some(({ key }) => isMovementKey(key)));
-  return isShown ? `${help} (${keysLabel(binding)})` : help;
+  return isShown ? `${help} (${keysLabel(binding)})`.trim() : help;
 }
 
 function withoutKeys(title: string, binding: KeyBinding): string {
