@@ -430,6 +430,12 @@ fn check_tooltip_of_focus(page: &mut Page) {
         "document.getElementById('tooltip')?.hidden === false",
     );
     assert!(page.is("document.activeElement.getAttribute('aria-describedby') === 'tooltip'"));
+    let first = page.browser.evaluate("document.activeElement.id");
+    page.key("ArrowRight", "ArrowRight", 0);
+    assert!(page.is("document.activeElement.closest('#toolbar') !== null"));
+    assert_ne!(page.browser.evaluate("document.activeElement.id"), first);
+    page.key("ArrowLeft", "ArrowLeft", 0);
+    assert_eq!(page.browser.evaluate("document.activeElement.id"), first);
     let text = page.browser.text("tooltip");
     assert!(
         text.contains('(') && text.ends_with(')'),

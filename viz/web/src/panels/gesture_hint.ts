@@ -6,8 +6,6 @@ import { basicGestures } from "./gestures";
 
 /** Key under which the browser stores that the hint was shown. */
 const SEEN_KEY = "gestures-seen";
-/** Long enough to read it twice. */
-const SHOWN_MILLIS = 20_000;
 /** After the first gesture, the hint stays this long for the other two. */
 const AFTER_GESTURE_MILLIS = 3000;
 /** Duration of the transition in styles/hints.css. */
@@ -21,14 +19,13 @@ export function showGestureHint(): void {
   const gestures = basicGestures(kinds.includes("touch") && !kinds.includes("mouse") ? "touch" : "mouse");
   hint.replaceChildren(...gestures.map(phrase));
   hint.hidden = false;
-  let timer = window.setTimeout(() => fade(hint), SHOWN_MILLIS);
-  const moved = (): void => {
-    window.clearTimeout(timer);
-    timer = window.setTimeout(() => fade(hint), AFTER_GESTURE_MILLIS);
+  const used = new AbortController();
+  const use = (): void => {
+    used.abort();
+    window.setTimeout(() => fade(hint), AFTER_GESTURE_MILLIS);
   };
-  const canvas = element("canvas");
   for (const kind of ["pointerdown", "wheel", "keydown"] as const) {
-    canvas.addEventListener(kind, moved, { once: true, passive: true });
+    element("canvas").addEventListener(kind, use, { signal: used.signal, passive: true });
   }
 }
 

@@ -3,6 +3,8 @@
 import { closesWithEscape } from "../keys";
 import { element } from "./element";
 
+const STEPS: Record<string, number> = { ArrowLeft: -1, ArrowRight: 1 };
+
 export function setUpToolbar(): void {
   appendLateButtons();
   const [toolbar, more] = [element("toolbar"), element("show-more")];
@@ -16,6 +18,18 @@ export function setUpToolbar(): void {
     if (event.target instanceof Element && event.target.closest("button")) show(event.target === more && !isOpen());
   });
   closesWithEscape("panel", isOpen, () => show(false));
+  toolbar.addEventListener("keydown", (event) => {
+    if (moveFocus(toolbar, STEPS[event.key] ?? 0)) event.preventDefault();
+  });
+}
+
+/** Moves the focus to the next or the previous button of the toolbar, as arrow keys do in toolbars. */
+function moveFocus(toolbar: HTMLElement, step: number): boolean {
+  const buttons = [...toolbar.querySelectorAll("button")].filter((button) => button.checkVisibility() && !button.disabled);
+  const ix = buttons.findIndex((button) => button === document.activeElement);
+  if (step === 0 || ix < 0) return false;
+  buttons[(ix + step + buttons.length) % buttons.length]!.focus();
+  return true;
 }
 
 /** Moves buttons that depend on the model or the robot behind all others, in the order in which they appear. */
