@@ -17,6 +17,10 @@ const TIMEOUT: Duration = Duration::from_secs(300);
 /// most of the time.
 pub const NO_DRAWING: &str = include_str!("no_drawing.js");
 
+/// The hint at the first visit would cover a part of the view, so the page believes that this
+/// browser has shown it. Pages without an origin have no storage.
+const LATER_VISIT: &str = "try { localStorage.setItem('gestures-seen', '1'); } catch {}\n";
+
 /// A running browser with one page.
 pub struct Browser {
     process: Child,
@@ -142,7 +146,7 @@ impl Browser {
         browser.call("Page.enable", json!({}));
         browser.call(
             "Page.addScriptToEvaluateOnNewDocument",
-            json!({"source": script}),
+            json!({"source": format!("{LATER_VISIT}{script}")}),
         );
         browser.call("Page.navigate", json!({"url": url}));
         browser

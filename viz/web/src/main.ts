@@ -1,12 +1,15 @@
 // The operator's page: connects the connection, the view and the readouts.
 
 import { keepToken, showRole } from "./connection/access";
+import { announceStates } from "./panels/announcer";
 import { Banner } from "./panels/banner";
 import { Connection } from "./connection/connection";
 import { EditControls } from "./panels/edit_controls";
 import { element } from "./panels/element";
+import { showGestureHint } from "./panels/gesture_hint";
 import { showGuidance } from "./panels/guidance";
-import { setUpHelp, showKeysInTitles } from "./panels/help";
+import { setUpHelp } from "./panels/help";
+import { action, closesWithEscape, endsWithEscape, setFlying, setUpKeys, toggle } from "./keys";
 import { LinkReadout } from "./connection/link_readout";
 import { LiveImages } from "./panels/live_images";
 import { ModelSwitch } from "./panels/model_switch";
@@ -17,6 +20,7 @@ import { Readouts } from "./panels/readouts";
 import { RenderScheduler } from "./connection/render_scheduler";
 import { RobotAge } from "./panels/robot_age";
 import { RunControls } from "./panels/run_controls";
+import { setUpSidePanel } from "./panels/side_panel";
 import { ShownLatency } from "./connection/shown_latency";
 import { SideView } from "./layers/side_view";
 import { Surroundings } from "./layers/surroundings";
@@ -30,6 +34,8 @@ import { RangeScansTopic } from "./topics/range_scans";
 import { robotTopic } from "./topics/robot_state";
 import { statusTopic } from "./topics/status";
 import { Topics } from "./topics/topic";
+import { setUpToolbar } from "./panels/toolbar";
+import { Tooltip } from "./panels/tooltip";
 import { ViewSettings } from "./view/view_settings";
 
 let stages = [0.1, 0.5, 1];
@@ -150,7 +156,6 @@ function receiveText(message: TextMessage): void {
     case "hello":
       stages = message.default_stages;
       showRole(message.role);
-      showKeysInTitles(!isPressed("toggle-fly"));
       break;
     case "scene":
       view.setScene(message);
@@ -221,35 +226,15 @@ async function showPicture(header: PictureHeader, payload: Uint8Array<ArrayBuffe
   });
 }
 
-function isPressed(id: string): boolean {
-  return element(id).getAttribute("aria-pressed") === "true";
-}
-
-function toggle(id: string, key: string, apply: (isOn: boolean) => void): void {
-  const button = element(id, HTMLButtonElement);
-  const flip = (): void => {
-    const isOn = !isPressed(id);
-    button.setAttribute("aria-pressed", String(isOn));
-    apply(isOn);
-    view.changed();
-  };
-  action(id, key, flip);
-}
-
-function action(id: string, key: string, act: () => void): void {
-  element(id).addEventListener("click", act);
-  window.addEventListener("keydown", (event) => {
-    const isPlain = !event.ctrlKey && !event.metaKey && !event.altKey && !event.repeat;
-    if (element(id).hidden || event.target instanceof HTMLInputElement || event.target instanceof HTMLSelectElement) {
-      return;
-    }
-    if (isPlain && event.key.toLowerCase() === key) act();
-  });
-}
-
+setUpKeys(() => view.changed());
+announceStates();
+setUpToolbar();
+setUpSidePanel();
+showGestureHint();
+new Tooltip();
 toggle("toggle-fly", "y", (isOn) => {
   view.flies = isOn;
-  showKeysInTitles(!isOn);
+  setFlying(isOn);
 });
 action("reset-view", "r", () => view.reset());
 action("full-screen", "u", () => {
@@ -278,6 +263,8 @@ toggle("toggle-grid", "g", (isOn) => (view.overlays.showsGround = isOn));
 toggle("toggle-keyframes", "k", (isOn) => (view.overlays.showsKeyframes = isOn));
 toggle("toggle-crop", "x", (isOn) => (view.crop.enabled = isOn));
 toggle("toggle-measure", "d", (isOn) => (view.measure.enabled = isOn));
+endsWithEscape("toggle-fly", "toggle-measure");
+closesWithEscape("mode", () => images.isEnlarged, () => images.reduce());
 toggle("toggle-images", "i", (isOn) => (liveImages.shown = isOn));
 const switchPanel = panels({ "toggle-layers": "layers", "toggle-settings": "settings", "toggle-edit": "edit" });
 const togglePanel = (button: string): void => {

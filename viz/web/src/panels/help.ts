@@ -1,63 +1,124 @@
-// The list of keys, made from the titles of the buttons and the keys of the fly mode.
+// The help: gestures and keys in groups, for the devices of this user only.
 
+import { action, keyBindings, keysLabel } from "../keys";
+import { devices } from "./devices";
 import { element } from "./element";
+import { GESTURES } from "./gestures";
 
-/** While flying, these keys have no other meaning. */
-const FLY_KEYS = [
-  ["W A S D", "Fly mode: forward, left, back, right. The arrow keys do the same"],
-  ["Q E", "Fly mode: down and up"],
-  ["Shift", "Fly mode: faster"],
-] as const;
+interface Group {
+  title: string;
+  rows: [how: string, what: string][];
+}
 
-/** A title with its key in parentheses. */
-const KEY_IN_TITLE = /^(.*?) \((.)\)(.*)$/;
+/** Keys that belong to no button. */
+const VIEW_KEYS: Group = {
+  title: "Keys: view, after a click on it",
+  rows: [
+    ["← → ↑ ↓", "Orbit"],
+    ["Shift + ← → ↑ ↓", "Pan"],
+    ["+ −", "Zoom"],
+  ],
+};
+const FLY_KEYS: Group = {
+  title: "Keys: while flying",
+  rows: [
+    ["W A S D", "Forward, left, back, right. The arrow keys do the same"],
+    ["Q E", "Down and up"],
+    ["Shift", "Faster"],
+  ],
+};
+const CLOSE_KEYS: Group = {
+  title: "Keys: everywhere",
+  rows: [["Esc", "Close the topmost panel, or end flying and measuring"]],
+};
 
 export function setUpHelp(): void {
   const dialog = element("help", HTMLDialogElement);
-  const show = (): void => {
-    const canEdit = !element("toggle-edit", HTMLButtonElement).hidden;
-    const rows = buttons().flatMap((button) => {
-      const match = KEY_IN_TITLE.exec(fullTitle(button));
-      const isAvailable = !button.hidden && (!button.closest(".edit") || canEdit);
-      return match && isAvailable ? [row(match[2]!, match[1]! + match[3]!)] : [];
-    });
-    rows.push(...FLY_KEYS.map(([key, meaning]) => row(key, meaning)));
-    element("keys").replaceChildren(...rows.flat());
-    if (dialog.open) dialog.close();
-    else dialog.showModal();
-  };
-  element("show-help").addEventListener("click", show);
-  window.addEventListener("keydown", (event) => {
-    if (event.key === "?") show();
+  const filter = element("help-filter", HTMLInputElement);
+  action("show-help", "?", () => {
+    if (dialog.open) {
+      dialog.close();
+      return;
+    }
+    element("keys").replaceChildren(...groups().map(section));
+    filter.value = "";
+    search("");
+    dialog.showModal();
+    element("close-help").focus(); // Not the field: on phones, a keyboard would open.
   });
-  dialog.addEventListener("click", () => dialog.close());
+  filter.addEventListener("input", () => search(filter.value));
+  element("close-help").addEventListener("click", () => dialog.close());
+  dialog.addEventListener("click", (event) => {
+    if (event.target === dialog && isOutside(dialog, event)) dialog.close();
+  });
 }
 
-/** Shows the keys in the titles of buttons again, or hides those that have another meaning while flying. */
-export function showKeysInTitles(isShown: boolean): void {
-  for (const button of buttons()) {
-    const title = fullTitle(button);
-    const [, before, key, after] = KEY_IN_TITLE.exec(title) ?? [];
-    if (key === undefined || button.disabled) continue; // The title of a disabled button says why it is disabled.
-    const isFlyKey = FLY_KEYS.some(([keys]) => keys.split(" ").includes(key));
-    button.dataset.title = title;
-    button.title = isShown || !isFlyKey ? title : before! + after!;
+function groups(): Group[] {
+  const present = devices();
+  const gestures = (["mouse", "touch"] as const)
+    .filter((device) => present.includes(device))
+    .map((device) => ({
+      title: device === "mouse" ? "Mouse" : "Touch screen",
+      rows: GESTURES[device].map(({ how, what }): [string, string] => [how, what]),
+    }));
+  return present.includes("keyboard") ? [...gestures, VIEW_KEYS, ...boundKeys(), FLY_KEYS, CLOSE_KEYS] : gestures;
+}
+
+/** The keys of all buttons that exist now, in the groups of the buttons. */
+function boundKeys(): Group[] {
+  const found = new Map<string, Group>();
+  for (const binding of keyBindings()) {
+    const { button, chords, group, help } = binding;
+    if (chords.length === 0 || button.hidden || isPartOfHidden(button)) continue;
+    const entry = found.get(group) ?? { title: `Keys: ${group.charAt(0).toLowerCase()}${group.slice(1)}`, rows: [] };
+    entry.rows.push([keysLabel(binding), help]);
+    found.set(group, entry);
   }
+  return [...found.values()];
 }
 
-function buttons(): HTMLButtonElement[] {
-  return [...document.querySelectorAll<HTMLButtonElement>(".toolbar button, .layers button, .edit button")];
+/** Whether a button is in a panel that cannot be opened, because its own button is hidden. */
+function isPartOfHidden(button: HTMLElement): boolean {
+  const panel = button.closest(".panel");
+  const opener = panel && document.querySelector<HTMLElement>(`[aria-controls="${panel.id}"]`);
+  return opener?.hidden === true;
 }
 
-/** The original title, even while another one is shown. */
-function fullTitle(button: HTMLButtonElement): string {
-  return button.dataset.title ?? button.title;
+function section({ title, rows }: Group): HTMLElement {
+  const made = document.createElement("section");
+  const list = document.createElement("dl");
+  list.append(...rows.map(row));
+  made.append(withText("h3", title), list);
+  return made;
 }
 
-function row(key: string, meaning: string): HTMLElement[] {
-  const term = document.createElement("dt");
-  const details = document.createElement("dd");
-  term.textContent = key;
-  details.textContent = meaning;
-  return [term, details];
+function row([how, what]: [string, string]): HTMLElement {
+  const made = document.createElement("div");
+  made.append(withText("dt", how), withText("dd", what));
+  return made;
+}
+
+function withText(tag: string, text: string): HTMLElement {
+  const made = document.createElement(tag);
+  made.textContent = text;
+  return made;
+}
+
+/** Shows only entries with this text. */
+function search(text: string): void {
+  const wanted = text.trim().toLowerCase();
+  let nShown = 0;
+  for (const group of document.querySelectorAll<HTMLElement>("#keys section")) {
+    const rows = [...group.querySelectorAll<HTMLElement>("dl > div")];
+    for (const row of rows) row.hidden = !row.textContent.toLowerCase().includes(wanted);
+    const n = rows.filter((row) => !row.hidden).length;
+    group.hidden = n === 0;
+    nShown += n;
+  }
+  element("help-empty").textContent = nShown === 0 ? `No entry contains "${text.trim()}".` : "";
+}
+
+function isOutside(dialog: HTMLElement, { clientX, clientY }: MouseEvent): boolean {
+  const { left, right, top, bottom } = dialog.getBoundingClientRect();
+  return clientX < left || clientX > right || clientY < top || clientY > bottom;
 }

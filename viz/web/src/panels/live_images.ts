@@ -98,9 +98,20 @@ export class LiveImages {
     this.showDock();
   }
 
+  /** Whether an image is enlarged. */
+  get isEnlarged(): boolean {
+    return [...this.resized.values()].includes(true);
+  }
+
+  /** Returns all images to their first size. */
+  reduce(): void {
+    for (const { figure } of this.slots.values()) this.setEnlarged(figure, false);
+  }
+
   private setEnlarged(figure: HTMLElement, isEnlarged: boolean): void {
     if (figure.classList.contains("enlarged") === isEnlarged) return;
     figure.classList.toggle("enlarged", isEnlarged);
+    figure.querySelector("canvas")!.ariaExpanded = String(isEnlarged);
     this.resized.set(figure.dataset.camera!, isEnlarged);
     this.onResize();
   }
@@ -130,6 +141,7 @@ export class LiveImages {
       storeCameras(this.docked);
       this.place(slot);
     });
+    makeButton(canvas, `Enlarge the image of ${camera}`);
     const slot: Slot = { figure, canvas, caption, age, dock, capturedMillis: -Infinity, waiting: null, isDecoding: false };
     this.place(slot);
     this.slots.set(camera, slot);
@@ -144,6 +156,18 @@ export class LiveImages {
       age.textContent = millis > LIVE_MILLIS ? ageText(millis) : "live";
     }
   }
+}
+
+/** Lets the keyboard click an element: the image, because its figure contains another button. */
+function makeButton(target: HTMLElement, name: string): void {
+  target.tabIndex = 0;
+  target.role = "button";
+  target.ariaLabel = name;
+  target.addEventListener("keydown", (event) => {
+    if (event.key !== "Enter" && event.key !== " ") return;
+    event.preventDefault();
+    target.click();
+  });
 }
 
 function storedCameras(): Set<string> {

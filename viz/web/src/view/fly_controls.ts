@@ -1,21 +1,10 @@
 // Flies: keys move the eye, dragging turns the view. On touch screens, the left thumb moves and the right one turns.
 
 import * as THREE from "three";
+import { isKeptByFocus } from "../keys";
 import { element } from "../panels/element";
+import { MOVEMENTS } from "./movement_keys";
 
-/** Directions of keys by their position on the keyboard: right, up, forward. */
-const KEYS: Record<string, [number, number, number]> = {
-  KeyW: [0, 0, 1],
-  KeyS: [0, 0, -1],
-  KeyA: [-1, 0, 0],
-  KeyD: [1, 0, 0],
-  KeyE: [0, 1, 0],
-  KeyQ: [0, -1, 0],
-  ArrowUp: [0, 0, 1],
-  ArrowDown: [0, 0, -1],
-  ArrowLeft: [-1, 0, 0],
-  ArrowRight: [1, 0, 0],
-};
 /** Speed in radii of the scene per second, and the factor of the Shift key. */
 const SPEED = 0.6;
 const FAST = 4;
@@ -93,7 +82,7 @@ export class FlyControls {
 
   private wanted(): THREE.Vector3 {
     const wanted = new THREE.Vector3();
-    for (const code of this.keys) wanted.add(new THREE.Vector3(...(KEYS[code] ?? [0, 0, 0])));
+    for (const code of this.keys) wanted.add(new THREE.Vector3(...(MOVEMENTS[code] ?? [0, 0, 0])));
     if (wanted.length() > 1) wanted.normalize();
     for (const { isStick, begin, last } of this.touches.values()) {
       const along = last.clone().sub(begin).divideScalar(STICK_PX).clampLength(0, 1);
@@ -129,10 +118,9 @@ export class FlyControls {
   }
 
   private press(event: KeyboardEvent): void {
-    const isTyping = event.target instanceof HTMLInputElement || event.target instanceof HTMLSelectElement;
-    if (!this.isOn || isTyping || event.ctrlKey || event.metaKey || event.altKey) return;
+    if (!this.isOn || isKeptByFocus(event) || event.ctrlKey || event.metaKey || event.altKey) return;
     this.keys.add(event.code);
-    if (!(event.code in KEYS)) return;
+    if (!(event.code in MOVEMENTS)) return;
     event.preventDefault();
     event.stopImmediatePropagation();
   }

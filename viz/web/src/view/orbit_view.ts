@@ -22,6 +22,7 @@ import { RobotLayer } from "../layers/robot_layer";
 import { ScanLayer } from "../layers/scan_layer";
 import type { ServerClock } from "../connection/server_clock";
 import { surfacePoint } from "./surface_picker";
+import { listenToViewKeys } from "./view_keys";
 
 const VERTICAL_FOV_DEGREES = 50;
 /** Duration of the motion back to the front of a surface. */
@@ -87,6 +88,7 @@ export class OrbitView {
     this.camera.position.set(1, -1, 1);
     this.controls = new OrbitControls(this.camera, canvas);
     this.controls.addEventListener("change", () => this.moved());
+    listenToViewKeys(canvas, this.controls);
     this.fly = new FlyControls(this.camera, this.controls.target, canvas, () => {
       this.hasUserMoved = true;
       this.moved();

@@ -1,0 +1,55 @@
+// At the first visit, the three basic gestures are shown over the view until the user has made one.
+
+import { devices } from "./devices";
+import { element } from "./element";
+import { basicGestures } from "./gestures";
+
+/** Key under which the browser stores that the hint was shown. */
+const SEEN_KEY = "gestures-seen";
+/** After the first gesture, the hint stays this long for the other two. */
+const AFTER_GESTURE_MILLIS = 3000;
+/** Duration of the transition in styles/hints.css. */
+const FADE_MILLIS = 1500;
+
+/** Shows the hint unless this browser has shown it before. */
+export function showGestureHint(): void {
+  if (wasSeen()) return;
+  const hint = element("gesture-hint");
+  const kinds = devices().filter((device) => device !== "keyboard");
+  const gestures = basicGestures(kinds.includes("touch") && !kinds.includes("mouse") ? "touch" : "mouse");
+  hint.replaceChildren(...gestures.map(phrase));
+  hint.hidden = false;
+  const used = new AbortController();
+  const use = (): void => {
+    used.abort();
+    window.setTimeout(() => fade(hint), AFTER_GESTURE_MILLIS);
+  };
+  for (const kind of ["pointerdown", "wheel", "keydown"] as const) {
+    element("canvas").addEventListener(kind, use, { signal: used.signal, passive: true });
+  }
+}
+
+function phrase([how, what]: [string, string]): HTMLElement {
+  const [made, name] = [document.createElement("span"), document.createElement("b")];
+  name.textContent = what;
+  made.append(`${how}: `, name);
+  return made;
+}
+
+function fade(hint: HTMLElement): void {
+  hint.classList.add("is-fading");
+  window.setTimeout(() => (hint.hidden = true), FADE_MILLIS);
+  try {
+    localStorage.setItem(SEEN_KEY, "1");
+  } catch {
+    // The next visit shows it again.
+  }
+}
+
+function wasSeen(): boolean {
+  try {
+    return localStorage.getItem(SEEN_KEY) !== null;
+  } catch {
+    return false; // The browser stores nothing for this page.
+  }
+}

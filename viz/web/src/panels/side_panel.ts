@@ -1,0 +1,35 @@
+// The side panel with the values of the run: open beside the view, but a sheet over the view on phones.
+
+import { action, closesWithEscape } from "../keys";
+import { element } from "./element";
+
+/** The windows that styles/phone.css regards as phones. */
+const phones = matchMedia("(max-width: 599px), (max-height: 500px)");
+
+export function setUpSidePanel(): void {
+  const panel = element("run");
+  const show = (isOpen: boolean): void => {
+    panel.hidden = !isOpen;
+    element("toggle-run").setAttribute("aria-expanded", String(isOpen));
+  };
+  action("toggle-run", "5", () => show(panel.hidden === true));
+  closesWithEscape("panel", () => phones.matches && !panel.hidden, () => show(false));
+  // On phones, it would cover other panels, or they would cover it.
+  element("toolbar").addEventListener("click", (event) => {
+    if (!phones.matches || !(event.target instanceof Element)) return;
+    const opener = event.target.closest("[aria-controls]");
+    if (!opener || opener.id === "show-more") return;
+    const isRunOpen = opener.id === "toggle-run" && !panel.hidden;
+    if (isRunOpen) for (const other of openPanels()) other.click();
+    show(isRunOpen);
+  });
+  phones.addEventListener("change", () => show(!phones.matches));
+  show(!phones.matches);
+}
+
+/** The buttons of the panels of the toolbar that are open. */
+function openPanels(): NodeListOf<HTMLElement> {
+  return document.querySelectorAll<HTMLElement>(
+    "#toolbar [aria-controls][aria-expanded='true']:not(#toggle-run, #show-more)",
+  );
+}
