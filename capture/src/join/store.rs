@@ -27,6 +27,19 @@ pub(super) struct KeyframeStore {
     bytes: u64,
 }
 
+/// How full the store is.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct StoreUse {
+    /// Number of keyframes in the store.
+    pub keyframes: usize,
+    /// Maximum number of keyframes.
+    pub max_keyframes: usize,
+    /// Memory of the keyframes, bytes.
+    pub bytes: u64,
+    /// Maximum memory of the keyframes, bytes.
+    pub max_bytes: u64,
+}
+
 #[derive(Debug)]
 struct StoreEntry {
     keyframe: Arc<Keyframe>,
@@ -48,6 +61,15 @@ impl KeyframeStore {
 
     pub(super) fn iter(&self) -> impl Iterator<Item = &Arc<Keyframe>> {
         self.kept.iter().map(|kept| &kept.keyframe)
+    }
+
+    pub(super) fn usage(&self) -> StoreUse {
+        StoreUse {
+            keyframes: self.kept.len(),
+            max_keyframes: self.max_keyframes,
+            bytes: self.bytes,
+            max_bytes: self.max_bytes,
+        }
     }
 
     /// Adds a keyframe; returns the cameras and stamps of the evicted ones.

@@ -145,11 +145,12 @@ impl LiveLoop {
                 .viewed()
                 .queue_picture(&pending.request, pending.packing());
             // Determined now: steps that are queued behind the picture are not in it.
-            let trained_on = self
-                .ledger
-                .trained_keyframes(session_ix, session.progress().step);
+            let step = session.progress().step;
+            let trained_on = self.ledger.trained_keyframes(session_ix, step);
             return Some(QueuedRender {
-                pending: pending.of_keyframes(trained_on),
+                pending: pending
+                    .of_keyframes(trained_on)
+                    .of_model(session.kind().name(), step),
                 session_ix,
                 queued,
             });

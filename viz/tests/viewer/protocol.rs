@@ -712,6 +712,7 @@ fn range_scan() -> RangeScan {
             points_in_world_m: [[1.0, 2.0, 3.0]].into(),
         }),
         map_from_odom: Transform::identity(),
+        captured_at: Instant::now(),
     }
 }
 
