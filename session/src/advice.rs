@@ -337,7 +337,7 @@ mod tests {
         for (n, n_all, text) in [
             (1, 2, "1 of 2 images are"),
             (667, 1000, "2 of 3 images are"),
-            (74, 100, "3 of 4 images are"),
+            (745, 1000, "3 of 4 images are"),
             (94, 100, "9 of 10 images are"),
             (999, 1000, "More than 9 of 10 images are"),
             (5, 5, "All images are"),
