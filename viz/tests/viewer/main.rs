@@ -7,6 +7,7 @@ mod client;
 mod eye_page;
 #[cfg(feature = "foxglove")]
 mod foxglove;
+mod labels_page;
 mod local_page;
 mod model_chunks;
 mod models;

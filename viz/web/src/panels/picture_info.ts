@@ -10,6 +10,7 @@ export class PictureInfo {
   private answerMillis = 0;
   private readonly info = element("picture-info");
   private readonly text = element("picture-text");
+  private readonly marks = [...this.info.querySelectorAll(".stages i")];
 
   /**
    * `latestStep`: number of steps of a model now, if it is known. `stages`: scales of the stages that the marks stand
@@ -99,7 +100,7 @@ export class PictureInfo {
 
   /** Fills the marks of the stages up to a scale. */
   private showStages(scale: number): void {
-    this.info.querySelectorAll(".stages i").forEach((mark, ix) => {
+    this.marks.forEach((mark, ix) => {
       mark.classList.toggle("done", scale >= (this.stages()[ix] ?? 1) - 1e-9);
     });
   }
