@@ -38,7 +38,6 @@ mod error;
 mod eval_plan;
 pub mod evaluate;
 pub mod evaluation_schedule;
-mod final_scores;
 mod gpu_loss;
 mod holdout;
 mod kept_folder;

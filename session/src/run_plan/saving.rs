@@ -3,7 +3,6 @@
 use super::RunPlan;
 use super::no_model::no_model_reason;
 use crate::error::is_rejection;
-use crate::final_scores::show_final_scores;
 use crate::latency::Latency;
 use crate::live_loop::LiveLoop;
 use crate::next_commands::DataSource;
@@ -368,7 +367,6 @@ fn publish_end(hub: &Hub, models: &[FinishedModel]) {
         1 => model.folder.as_path(),
         _ => model.folder.parent().unwrap_or(&model.folder),
     });
-    hub.change_status(|status| show_final_scores(status, models));
     hub.set_run_result(RunResult {
         folder: folder.map(|folder| folder.display().to_string()),
         scores: models.iter().map(name).collect::<Vec<_>>().join("; "),

@@ -40,31 +40,29 @@ impl Hub {
     }
 
     /// Replaces the state in the latest status and keeps its numbers, for example while the model
-    /// is saved. Advice is removed, because it describes the previous state.
+    /// is saved.
     pub fn set_state(&self, state: &str) {
-        self.change_status(|status| {
-            state.clone_into(&mut status.state);
-            status.operator.advice = None;
-            status.operator.paused_by = None;
-        });
+        self.change_status(|status| state.clone_into(&mut status.state));
     }
 
     /// Sets the result of the run. Clients continue to show it after the server has stopped.
     pub fn set_run_result(&self, result: RunResult) {
         self.change_status(|status| {
             "finished".clone_into(&mut status.state);
-            status.operator.advice = None;
-            status.operator.paused_by = None;
             status.result = Some(result);
         });
     }
 
-    /// Changes the latest status.
+    /// Changes the latest status. If the state changes, but not what was said about the previous
+    /// state, this is removed.
     pub fn change_status(&self, change: impl FnOnce(&mut Status)) {
         // Within the lock, so that two threads do not overwrite each other's changes.
         self.latest::<Option<Arc<Status>>>().send_modify(|latest| {
             let mut status = latest.as_deref().cloned().unwrap_or_default();
             change(&mut status);
+            if let Some(previous) = latest.as_deref() {
+                remove_outdated(&mut status, previous);
+            }
             // Read within the lock, too: a client that joins afterwards changes this status.
             status.operator.clients = self.pictures().clients();
             *latest = Some(Arc::new(status));
@@ -74,6 +72,20 @@ impl Hub {
     /// The latest status, if the run has published one.
     pub(crate) fn status(&self) -> Option<Arc<Status>> {
         self.latest::<Option<Arc<Status>>>().borrow().clone()
+    }
+}
+
+/// Removes what describes the previous state: the advice, and who has paused.
+fn remove_outdated(status: &mut Status, previous: &Status) {
+    if status.state == previous.state {
+        return;
+    }
+    let (operator, before) = (&mut status.operator, &previous.operator);
+    if operator.advice == before.advice {
+        operator.advice = None;
+    }
+    if operator.paused_by == before.paused_by {
+        operator.paused_by = None;
     }
 }
 
@@ -137,5 +149,15 @@ mod tests {
         hub.set_state("saving");
         let saving = hub.status().expect("a status");
         assert_eq!((&*saving.state, &saving.operator.advice), ("saving", &None));
+        hub.change_status(|status| {
+            "paused".clone_into(&mut status.state);
+            status.operator.paused_by = Some(3);
+        });
+        hub.change_status(|status| status.seconds = 5.0);
+        let paused = hub.status().expect("a status");
+        assert_eq!(paused.operator.paused_by, Some(3), "it is the same state");
+        hub.set_state("saving");
+        let saving = hub.status().expect("a status");
+        assert_eq!(saving.operator.paused_by, None);
     }
 }
