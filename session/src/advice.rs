@@ -165,10 +165,10 @@ fn hint(situation: &Situation) -> Option<String> {
     if recent.received >= MIN_IMAGES && recent.accepted == 0 && is_still {
         return Some("The cameras see nothing new: move the robot".to_owned());
     }
-    (store.keyframes > 0 && store.keyframes >= store.max_keyframes).then(|| {
+    store.is_full().then(|| {
         format!(
-            "The store of {} keyframes is full: new ones replace similar ones",
-            store.max_keyframes
+            "The store is full with {} keyframes: new ones replace similar ones",
+            store.keyframes
         )
     })
 }
@@ -221,6 +221,7 @@ mod tests {
             store: StoreUse {
                 keyframes: 30,
                 max_keyframes: 400,
+                max_bytes: 1,
                 ..StoreUse::default()
             },
             start_keyframes: 12,
@@ -326,7 +327,7 @@ mod tests {
         assert_eq!(
             (&*advice.text, advice.is_warning),
             (
-                "Scanning. The store of 400 keyframes is full: new ones replace similar ones",
+                "Scanning. The store is full with 400 keyframes: new ones replace similar ones",
                 false
             )
         );

@@ -40,6 +40,19 @@ pub struct StoreUse {
     pub max_bytes: u64,
 }
 
+impl StoreUse {
+    /// Whether there is no room for another keyframe of average size, so that it will replace
+    /// others.
+    #[must_use]
+    pub fn is_full(&self) -> bool {
+        let n = self.keyframes as u64;
+        let next_bytes = self.bytes.checked_div(n).unwrap_or_default();
+        n > 0
+            && (self.keyframes >= self.max_keyframes
+                || self.bytes.saturating_add(next_bytes) > self.max_bytes)
+    }
+}
+
 #[derive(Debug)]
 struct StoreEntry {
     keyframe: Arc<Keyframe>,
@@ -171,6 +184,20 @@ impl KeyframeStore {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn a_store_is_full_if_the_next_keyframe_exceeds_a_limit() {
+        let store = |keyframes, bytes| StoreUse {
+            keyframes,
+            max_keyframes: 4,
+            bytes,
+            max_bytes: 100,
+        };
+        assert!(!store(0, 0).is_full() && !store(3, 30).is_full());
+        assert!(store(4, 40).is_full(), "in number");
+        assert!(store(3, 76).is_full(), "in bytes");
+        assert!(!store(3, 75).is_full());
+    }
     use kinematics::Transform;
     use nalgebra::Vector3;
 

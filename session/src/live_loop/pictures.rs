@@ -141,16 +141,15 @@ impl LiveLoop {
             };
             let session = &mut self.models.sessions[session_ix];
             pending.request.edits = Arc::clone(session.edits());
-            let queued = session
-                .viewed()
-                .queue_picture(&pending.request, pending.packing());
+            let mut model = session.viewed();
+            let queued = model.queue_picture(&pending.request, pending.packing());
+            let pending = model.label(pending);
             // Determined now: steps that are queued behind the picture are not in it.
-            let step = session.progress().step;
-            let trained_on = self.ledger.trained_keyframes(session_ix, step);
+            let trained_on = self
+                .ledger
+                .trained_keyframes(session_ix, session.progress().step);
             return Some(QueuedRender {
-                pending: pending
-                    .of_keyframes(trained_on)
-                    .of_model(session.kind().name(), step),
+                pending: pending.of_keyframes(trained_on),
                 session_ix,
                 queued,
             });

@@ -245,6 +245,7 @@ impl LiveLoop {
                 max_keyframes: store.max_keyframes as u64,
                 bytes: store.bytes,
                 max_bytes: store.max_bytes,
+                is_full: store.is_full(),
             }),
             paused_by: self.requests.paused_by,
             checkpoint: self.requests.checkpoint(),

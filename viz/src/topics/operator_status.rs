@@ -76,6 +76,8 @@ pub struct KeyframeStore {
     pub bytes: u64,
     /// Maximum memory of the keyframes, bytes.
     pub max_bytes: u64,
+    /// Whether there is no room for another keyframe.
+    pub is_full: bool,
 }
 
 /// A client of the server.

@@ -130,6 +130,7 @@ fn lossy_status() -> Status {
                 max_keyframes: 400,
                 bytes: 500_000_000,
                 max_bytes: 8_000_000_000,
+                is_full: true,
             }),
             infos: vec!["edited".to_owned()],
             ..OperatorStatus::default()

@@ -119,6 +119,7 @@ export interface KeyframeStore {
   max_keyframes: number;
   bytes: number;
   max_bytes: number;
+  is_full: boolean;
 }
 
 /** What the operator should do, while images are taken for a calibration. */

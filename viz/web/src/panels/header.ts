@@ -49,10 +49,9 @@ export class Header {
 
   private showCounts({ images, store }: Status): void {
     const dropped = images?.dropped ?? 0;
-    const isFull = store !== undefined && store.keyframes > 0 && store.keyframes >= store.max_keyframes;
     const chips = [
       { id: "dropped", text: dropped > 0 ? `${countText(dropped)} dropped` : "" },
-      { id: "store", text: isFull ? "store full" : "" },
+      { id: "store", text: store?.is_full ? "store full" : "" },
     ];
     for (const chip of chips) text(chip.id, chip.text);
     if (store) element("store").title = `${storeText(store)} of keyframes; new ones replace similar ones`;
