@@ -187,16 +187,16 @@ mod tests {
 
     #[test]
     fn a_store_is_full_if_the_next_keyframe_exceeds_a_limit() {
-        let store = |keyframes, bytes| StoreUse {
+        let used = |keyframes, bytes| StoreUse {
             keyframes,
             max_keyframes: 4,
             bytes,
             max_bytes: 100,
         };
-        assert!(!store(0, 0).is_full() && !store(3, 30).is_full());
-        assert!(store(4, 40).is_full(), "in number");
-        assert!(store(3, 76).is_full(), "in bytes");
-        assert!(!store(3, 75).is_full());
+        assert!(!used(0, 0).is_full() && !used(3, 30).is_full());
+        assert!(used(4, 40).is_full(), "in number");
+        assert!(used(3, 76).is_full(), "in bytes");
+        assert!(!used(3, 75).is_full());
     }
     use kinematics::Transform;
     use nalgebra::Vector3;
