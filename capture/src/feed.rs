@@ -1,6 +1,7 @@
 //! The input side of a run: a thread reads the source, records and joins the samples, and corrects
 //! base poses at stations. Keyframes are delivered through a bounded queue.
 
+use crate::input_counts::InputCounts;
 use crate::join::{Change, Join, JoinEvent, PosedImage};
 use crate::robot_motion::RobotMotion;
 use crate::stamp_clock::StampClock;
@@ -73,6 +74,7 @@ struct Shared {
     first_image: OnceLock<Instant>,
     rejected: Mutex<BTreeMap<String, u64>>,
     source_failed: AtomicBool,
+    counts: Mutex<InputCounts>,
 }
 
 /// The parts of the input.
@@ -126,7 +128,11 @@ impl Feed {
         stop: Stop,
     ) -> anyhow::Result<Self> {
         let (sender, changes) = sync_channel(MAX_WAITING);
-        let shared = Arc::new(Shared::default());
+        // A resumed run has keyframes before its first sample.
+        let shared = Arc::new(Shared {
+            counts: Mutex::new(InputCounts::of(&input.join)),
+            ..Shared::default()
+        });
         let pump = Pump {
             input,
             observer,
@@ -157,6 +163,12 @@ impl Feed {
     #[must_use]
     pub fn rejected(&self) -> BTreeMap<String, u64> {
         self.shared.rejected.lock().clone()
+    }
+
+    /// What happened to the images so far, and how full the store is.
+    #[must_use]
+    pub fn counts(&self) -> InputCounts {
+        *self.shared.counts.lock()
     }
 
     /// Waits at most `timeout` for the next change. Returns `None` if none arrived or the input has
@@ -246,6 +258,8 @@ impl Pump {
             let newest = sample.stamp();
             let events = self.input.join.push(sample);
             let newest = self.input.join.shifted(newest);
+            // Before the keyframes, because sending them waits while the trainer is busy.
+            *self.shared.counts.lock() = InputCounts::of(&self.input.join);
             if self
                 .forward(events)
                 .and_then(|()| self.advance_to(newest))
@@ -454,6 +468,7 @@ impl Pump {
         let stations = self.input.stations.as_ref();
         let map_from_odom = stations.map_or_else(Transform::identity, Stations::map_from_odom);
         self.observer.observe_range_scan(RangeScan {
+            captured_at: self.input.stamp_clock.captured_at(scan.stamp),
             scan,
             map_from_odom,
         });

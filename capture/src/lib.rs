@@ -41,6 +41,7 @@ pub mod downscale;
 pub mod emulation;
 mod feed;
 mod found_devices;
+mod input_counts;
 mod join;
 mod memory;
 mod nearest_name;
@@ -60,7 +61,8 @@ pub use calibration_images::{
 pub use config::{ConfigError, Override, Rig};
 pub use feed::{Feed, FeedItem, Input, InputObserver, InputResult, InputTimes};
 pub use found_devices::{DeviceInfo, found_devices};
-pub use join::{Change, Counts, Join, JoinEvent, PosedImage, Rejection, SampleUse};
+pub use input_counts::InputCounts;
+pub use join::{Change, Counts, Join, JoinEvent, PosedImage, Rejection, SampleUse, StoreUse};
 pub use nearest_name::nearest_name;
 pub use notes::Notes;
 pub use record::{RecordPlan, Recorded, WrittenRecording};

@@ -63,4 +63,6 @@ pub struct RangeScan {
     pub scan: Arc<RangePoints>,
     /// Corrects the world coordinates of the points.
     pub map_from_odom: Transform,
+    /// Begin of the revolution; when the scan was read, if its stamp is on another clock.
+    pub captured_at: Instant,
 }

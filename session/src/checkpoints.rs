@@ -121,6 +121,21 @@ pub struct Checkpoints {
     writer: Option<WriterThread>,
     /// Whether this run has written a checkpoint.
     has_any: bool,
+    /// What has become of the last checkpoint that was requested.
+    requested: Option<CheckpointProgress>,
+}
+
+/// What has become of a checkpoint that was requested.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum CheckpointProgress {
+    /// It is due.
+    Due,
+    /// It is being written.
+    Writing,
+    /// It is on disk.
+    Written,
+    /// It could not be written, for this reason.
+    Failed(String),
 }
 
 /// A writer thread.
@@ -158,6 +173,7 @@ impl Checkpoints {
             last_keyframes: Instant::now(),
             writer: None,
             has_any: false,
+            requested: None,
         })
     }
 
@@ -221,6 +237,20 @@ impl Checkpoints {
     /// Makes the next checkpoint due now.
     pub fn request(&mut self) {
         self.due_after = Duration::ZERO;
+        self.requested = Some(CheckpointProgress::Due);
+    }
+
+    /// What has become of the last requested checkpoint; `None` if none was requested.
+    pub fn requested(&mut self) -> Option<&CheckpointProgress> {
+        let has_ended = self
+            .writer
+            .as_ref()
+            .is_some_and(|writer| writer.thread.is_finished());
+        // Does not wait, because the writer has ended. This logs its error, if there was one.
+        if has_ended && self.requested == Some(CheckpointProgress::Writing) {
+            self.wait_and_warn();
+        }
+        self.requested.as_ref()
     }
 
     /// Waits for the checkpoint in progress, then starts a checkpoint of the current state.
@@ -260,6 +290,9 @@ impl Checkpoints {
             thread,
             is_checkpoint: true,
         });
+        if self.requested == Some(CheckpointProgress::Due) {
+            self.requested = Some(CheckpointProgress::Writing);
+        }
         // A checkpoint also writes the new keyframes.
         self.last = Instant::now();
         self.last_keyframes = Instant::now();
@@ -308,6 +341,12 @@ impl Checkpoints {
         };
         match thread.join() {
             Ok(written) => {
+                if is_checkpoint && self.requested == Some(CheckpointProgress::Writing) {
+                    self.requested = Some(match &written {
+                        Ok(()) => CheckpointProgress::Written,
+                        Err(error) => CheckpointProgress::Failed(format!("{error:#}")),
+                    });
+                }
                 written?;
                 // Set only after success: `newest` must not name a file that does not exist.
                 self.has_any |= is_checkpoint;
@@ -419,6 +458,32 @@ mod tests {
         assert_eq!(n_edits(), 2);
         edits_of(0).write(folder).expect("written");
         assert_eq!(n_edits(), 0, "all edits were undone");
+    }
+
+    #[test]
+    fn a_requested_checkpoint_is_reported_when_it_is_on_disk() {
+        let options = CheckpointOptions::default();
+        let mut checkpoints = Checkpoints::new(Path::new("unused"), options).expect("enabled");
+        assert_eq!(checkpoints.requested(), None);
+        // The first writer fails, and the second one does not.
+        let results = [Err(anyhow::anyhow!("the disk is full")), Ok(())];
+        let expected = [
+            CheckpointProgress::Failed("the disk is full".to_owned()),
+            CheckpointProgress::Written,
+        ];
+        for (result, expected) in results.into_iter().zip(expected) {
+            checkpoints.request();
+            assert_eq!(checkpoints.requested(), Some(&CheckpointProgress::Due));
+            checkpoints.requested = Some(CheckpointProgress::Writing);
+            checkpoints.writer = Some(WriterThread {
+                thread: Task::start("checkpoint", move || result),
+                is_checkpoint: true,
+            });
+            while checkpoints.requested() == Some(&CheckpointProgress::Writing) {
+                std::thread::yield_now();
+            }
+            assert_eq!(checkpoints.requested(), Some(&expected));
+        }
     }
 
     #[test]

@@ -23,6 +23,7 @@
 //! # Ok::<(), anyhow::Error>(())
 //! ```
 
+mod advice;
 pub mod camera_list;
 pub mod camera_path;
 pub mod checkpoints;
@@ -51,6 +52,7 @@ mod observer;
 mod pending_evaluation;
 mod previous_run;
 mod read_progress;
+mod recent_images;
 pub mod recoveries;
 pub mod recovery;
 mod render_budget;
@@ -59,6 +61,7 @@ mod report;
 pub mod robot_meshes;
 pub mod run_folder;
 mod run_plan;
+mod run_state;
 mod saved_view;
 mod scene_calibration;
 pub mod scene_hint;
@@ -73,6 +76,7 @@ mod training_options;
 mod viewer;
 mod viewers;
 
+pub use advice::{ImageFlow, Situation, advise};
 pub use checkpoints::{CheckpointOptions, Checkpoints, RunFlags, parse_period};
 pub use data::{Data, DataOptions, Purpose, expect, points_sha256};
 pub use dataset_export::{RecordingExport, Written, write_nerfstudio};
@@ -97,6 +101,7 @@ pub use run_plan::{
     DiscardedRun, EndedRun, OpenedRun, PreparedRun, PreviousLiveRun, RunInProgress, RunInput,
     RunPlan, SavedRun,
 };
+pub use run_state::RunState;
 pub use saved_view::publish_saved;
 pub use scene_calibration::{RelativePose, SCENE_PARAMS, SceneCalibration, calibrate_scene};
 pub use session::{

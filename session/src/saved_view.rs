@@ -7,7 +7,7 @@ use nalgebra::Point3;
 use serde_json::Value;
 use std::path::{Path, PathBuf};
 use trainer::{Bounds, LoadedModel, ModelKind, Progress};
-use viz::{Hub, KeyframePose, ModelStatus, SceneHint, Status};
+use viz::{Hub, Identity, KeyframePose, ModelStatus, OperatorStatus, SceneHint, Status};
 
 /// Publishes the cameras, the status and the initial view of saved models.
 ///
@@ -43,6 +43,10 @@ pub fn publish_saved(
         model: statuses.next().unwrap_or_default(),
         others: statuses.collect(),
         notes,
+        operator: OperatorStatus {
+            identity: Some(identity(paths)),
+            ..OperatorStatus::default()
+        },
         ..Status::default()
     };
     let cameras = in_page(cameras, model_from_page);
@@ -52,6 +56,20 @@ pub fn publish_saved(
     hub.set_keyframes(cameras);
     hub.set_status(status);
     Ok(())
+}
+
+/// Name of the folder or file of the model. Several models of a run have a folder in common.
+fn identity(paths: &[PathBuf]) -> Identity {
+    let first = paths.first().map(PathBuf::as_path);
+    let named = match (first, paths.len()) {
+        (Some(path), 2..) => path.parent(),
+        (path, _) => path,
+    };
+    let name = named.and_then(Path::file_name);
+    Identity {
+        run: name.map(|name| name.to_string_lossy().into_owned()),
+        ..Identity::default()
+    }
 }
 
 /// The cameras of the first model whose folder lists them. An unreadable list only causes a
@@ -137,7 +155,9 @@ fn trained_status(model: &Path, kind: ModelKind, progress: &Progress) -> ModelSt
         step_millis: None,
         primitives: progress.primitives,
         primitives_label: kind.entry().primitives_label.to_owned(),
-        bytes: progress.bytes,
+        // A loaded model needs less memory than one in training. The number in the report is the one
+        // that the run has shown.
+        bytes: done["bytes"].as_u64().unwrap_or(progress.bytes),
         has_chunks: kind.entry().has_chunks,
         edits: 0,
         psnr: done["psnr"].as_f64(),
@@ -164,6 +184,19 @@ mod tests {
     use serde_json::json;
 
     #[test]
+    fn a_saved_model_is_named_after_its_folder_or_file() {
+        let name = |paths: &[&str]| {
+            let paths: Vec<PathBuf> = paths.iter().map(PathBuf::from).collect();
+            identity(&paths).run
+        };
+        assert_eq!(name(&["files/guitar.ply"]).as_deref(), Some("guitar.ply"));
+        assert_eq!(name(&["runs/kitchen"]).as_deref(), Some("kitchen"));
+        let several = ["runs/kitchen/splat", "runs/kitchen/tsdf"];
+        assert_eq!(name(&several).as_deref(), Some("kitchen"));
+        assert_eq!(name(&[]), None);
+    }
+
+    #[test]
     fn model_status_uses_the_report_scores() {
         let folder = tempfile::tempdir().expect("a folder");
         let progress = Progress {
@@ -177,13 +210,16 @@ mod tests {
             (None, 0, 5, 80)
         );
         let text = json!({
-            "done": { "psnr": 23.5, "steps": 700, "seconds": 8.0 },
+            "done": { "psnr": 23.5, "steps": 700, "seconds": 8.0, "bytes": 120 },
             "evaluations": [{ "seconds": 0.5, "psnr": 20.0 }, { "seconds": 1.0, "psnr": null }, { "seconds": 2.0, "psnr": 22.0 }],
         });
         std::fs::write(folder.path().join("report.json"), text.to_string())
             .expect("the file is writable");
         let status = trained_status(folder.path(), ModelKind::default(), &progress);
-        assert_eq!((status.psnr, status.step), (Some(23.5), 700));
+        assert_eq!(
+            (status.psnr, status.step, status.bytes),
+            (Some(23.5), 700, 120)
+        );
         assert_eq!(status.psnr_history, [(0.5, 20.0), (2.0, 22.0), (8.0, 23.5)]);
     }
 }

@@ -243,14 +243,25 @@ impl ModelViewer {
             Ok(model) => model,
             Err(reason) => return pending.fail(&reason),
         };
+        let pending = of_model(pending, model.kind, model.method.model());
         answer_with(pending, request, model.method.model_mut(), &model.edits);
     }
 }
 
 /// Draws a requested picture of a model whose frame is the world frame of the page.
-pub(crate) fn answer(pending: PendingRender, method: &mut dyn Method, edits: &Arc<Edits>) {
+pub(crate) fn answer(
+    pending: PendingRender,
+    kind: ModelKind,
+    method: &mut dyn Method,
+    edits: &Arc<Edits>,
+) {
     let request = pending.request.clone();
-    answer_with(pending, request, method, edits);
+    answer_with(of_model(pending, kind, method), request, method, edits);
+}
+
+/// Labels a requested picture with the model that draws it.
+fn of_model(pending: PendingRender, kind: ModelKind, method: &dyn Method) -> PendingRender {
+    pending.of_model(kind.name(), method.progress().step)
 }
 
 fn answer_with(

@@ -6,6 +6,7 @@
 use crate::small_rig;
 use gpu::{Gpu, GpuOptions};
 use serde_json::Value;
+use std::cell::Cell;
 use std::io::{BufRead, BufReader};
 use std::path::Path;
 use std::process::{Command, Output, Stdio};
@@ -944,16 +945,40 @@ fn pause_save_and_resume(url: &str) {
         &request("pause", &|status| status["state"] == "paused"),
         "step",
     );
-    let is_saved = |status: &Value| {
-        status["notes"]
-            .to_string()
-            .contains("checkpoint requested after")
-    };
-    let saved_at = number(&request("save", &is_saved), "step");
-    assert_eq!(saved_at, paused_at, "no step while paused");
+    let saving = request("save", &|status| status["checkpoint"].is_object());
+    assert_eq!(number(&saving, "step"), paused_at, "no step while paused");
+    check_operator_status(&saving);
+    // A run that was paused before its first keyframe writes the checkpoint only when it continues.
+    let (has_trained, is_written) = (Cell::new(false), Cell::new(false));
     request("resume", &|status| {
-        status["state"] == "training" && number(status, "step") > paused_at
+        if status["state"] == "training" && number(status, "step") > paused_at {
+            has_trained.set(true);
+        }
+        if status["checkpoint"]["state"] == "written" {
+            let infos = status["infos"].to_string();
+            assert!(infos.contains("checkpoint written after"), "{infos}");
+            is_written.set(true);
+        }
+        has_trained.get() && is_written.get()
     });
+}
+
+/// The status of a paused run names its robot and folder, and says who has paused it.
+fn check_operator_status(status: &Value) {
+    assert_eq!(
+        (&status["identity"]["rig"], &status["identity"]["run"]),
+        (&Value::from("rig"), &Value::from("cut"))
+    );
+    let client = &status["clients"][0];
+    assert_eq!(
+        (&client["role"], &status["paused_by"]),
+        (&Value::from("operator"), &client["id"])
+    );
+    let advice = status["advice"]["text"].as_str().expect("a sentence");
+    assert!(advice.starts_with("Paused by client "), "{advice}");
+    let (images, store) = (&status["images"], &status["store"]);
+    let n_stored = number(images, "accepted") - number(images, "evicted");
+    assert_eq!(number(store, "keyframes"), n_stored);
 }
 
 #[test]

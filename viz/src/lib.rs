@@ -33,7 +33,7 @@ pub use error::Error;
 pub use foxglove_server::FoxgloveServer;
 pub use hub::Hub;
 pub use keyframe::{LiveImage, LivePixels, RangeScan, RobotState};
-pub use operator_requests::OperatorRequests;
+pub use operator_requests::{ControlRequest, OperatorRequests};
 pub use pictures::picture_requests::{PendingRender, PictureRequests};
 pub use pictures::picture_times::{NewestKeyframe, ShownPicture, TrainedKeyframes};
 pub use server::access::{Role, Token, Tokens};
@@ -41,6 +41,10 @@ pub use server::certificate::Certificate;
 pub use server::{Server, ServerConfig, Sharing};
 pub use topics::model_chunks::PublishedChunks;
 pub use topics::observations::{ObservationMap, ObservedCell};
+pub use topics::operator_status::{
+    Advice, CheckpointState, ConnectedClient, Identity, ImageCounts, KeyframeStore, OperatorStatus,
+    RequestedCheckpoint,
+};
 pub use topics::published_data::{
     Guidance, KeyframePose, ModelStatus, RunResult, SceneHint, Status,
 };

@@ -8,17 +8,33 @@ use parking_lot::Mutex;
 /// model.
 pub(crate) const MAX_WAITING_EDITS: usize = 64;
 
+/// An action that an operator has requested.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct ControlRequest {
+    /// What to do.
+    pub action: Control,
+    /// Number of the client that requested it.
+    pub client: u64,
+}
+
 /// Requests of operators that the run has not taken yet.
 #[derive(Debug, Default)]
 pub struct OperatorRequests {
     /// Actions without repetitions.
-    controls: Mutex<Vec<Control>>,
+    controls: Mutex<Vec<ControlRequest>>,
     edits: Mutex<Vec<EditRequest>>,
 }
 
 impl OperatorRequests {
     /// The actions that operators have requested since the last call, in order.
     pub fn take_controls(&self) -> Vec<Control> {
+        let requests = self.take_control_requests().into_iter();
+        requests.map(|request| request.action).collect()
+    }
+
+    /// The actions that operators have requested since the last call, in order, with the clients
+    /// that requested them.
+    pub fn take_control_requests(&self) -> Vec<ControlRequest> {
         std::mem::take(&mut *self.controls.lock())
     }
 
@@ -28,12 +44,12 @@ impl OperatorRequests {
     }
 
     /// Requests an action of the run.
-    pub(crate) fn control(&self, action: Control) {
+    pub(crate) fn control(&self, request: ControlRequest) {
         let mut controls = self.controls.lock();
         // Repeated clicks count once, and as the last action: after pause, resume and pause, the
         // run must pause.
-        controls.retain(|earlier| *earlier != action);
-        controls.push(action);
+        controls.retain(|earlier| earlier.action != request.action);
+        controls.push(request);
     }
 
     /// Requests an edit. Returns false if too many edits are waiting.

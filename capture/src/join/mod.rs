@@ -20,6 +20,7 @@ mod waiting;
 pub(crate) use camera_motion::{CameraPose, JointsRejection, Motion};
 pub use change::Change;
 pub use rejection::{Counts, Rejection, SampleUse};
+pub use store::StoreUse;
 
 use crate::config::{self, BaseDriver, CameraDriver, Parent, Rig};
 use accept::Acceptance;
@@ -251,6 +252,12 @@ impl Join {
     #[must_use]
     pub fn counts(&self) -> &Counts {
         &self.counts
+    }
+
+    /// How full the store of keyframes is.
+    #[must_use]
+    pub fn store_use(&self) -> StoreUse {
+        self.store.usage()
     }
 
     /// The keyframes in the store, in order of acceptance.

@@ -27,6 +27,32 @@ pub(super) struct KeyframeStore {
     bytes: u64,
 }
 
+/// How full the store is.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct StoreUse {
+    /// Number of keyframes in the store.
+    pub keyframes: usize,
+    /// Maximum number of keyframes.
+    pub max_keyframes: usize,
+    /// Memory of the keyframes, bytes.
+    pub bytes: u64,
+    /// Maximum memory of the keyframes, bytes.
+    pub max_bytes: u64,
+}
+
+impl StoreUse {
+    /// Whether there is no room for another keyframe of average size, so that it will replace
+    /// others.
+    #[must_use]
+    pub fn is_full(&self) -> bool {
+        let n = self.keyframes as u64;
+        let next_bytes = self.bytes.checked_div(n).unwrap_or_default();
+        n > 0
+            && (self.keyframes >= self.max_keyframes
+                || self.bytes.saturating_add(next_bytes) > self.max_bytes)
+    }
+}
+
 #[derive(Debug)]
 struct StoreEntry {
     keyframe: Arc<Keyframe>,
@@ -48,6 +74,15 @@ impl KeyframeStore {
 
     pub(super) fn iter(&self) -> impl Iterator<Item = &Arc<Keyframe>> {
         self.kept.iter().map(|kept| &kept.keyframe)
+    }
+
+    pub(super) fn usage(&self) -> StoreUse {
+        StoreUse {
+            keyframes: self.kept.len(),
+            max_keyframes: self.max_keyframes,
+            bytes: self.bytes,
+            max_bytes: self.max_bytes,
+        }
     }
 
     /// Adds a keyframe; returns the cameras and stamps of the evicted ones.
@@ -149,6 +184,20 @@ impl KeyframeStore {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn a_store_is_full_if_the_next_keyframe_exceeds_a_limit() {
+        let used = |keyframes, bytes| StoreUse {
+            keyframes,
+            max_keyframes: 4,
+            bytes,
+            max_bytes: 100,
+        };
+        assert!(!used(0, 0).is_full() && !used(3, 30).is_full());
+        assert!(used(4, 40).is_full(), "in number");
+        assert!(used(3, 76).is_full(), "in bytes");
+        assert!(!used(3, 75).is_full());
+    }
     use kinematics::Transform;
     use nalgebra::Vector3;
 

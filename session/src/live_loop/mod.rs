@@ -10,6 +10,7 @@ mod requests;
 use crate::ledger::Ledger;
 use crate::recoveries::{self, OpenGpu, Recoveries};
 use crate::render_budget::RenderBudget;
+use crate::run_state::RunState;
 use crate::scene_hint;
 use crate::session::Session;
 use capture::{Feed, InputResult, Notes};
@@ -22,7 +23,7 @@ use requests::Requests;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 use trainer::AlignTiming;
-use viz::Hub;
+use viz::{Hub, Identity};
 
 /// Maximum wait for a keyframe when there is nothing to do. Controls, edits and the status wait as
 /// long; a shorter wait would use more of a processor for checks without result.
@@ -81,7 +82,12 @@ impl LiveLoop {
         Self {
             models: Models::new(sessions),
             feed,
-            publishing: Publishing::new(hub.clone(), options.notes, options.device_notes),
+            publishing: Publishing::new(
+                hub.clone(),
+                options.identity,
+                options.notes,
+                options.device_notes,
+            ),
             hub,
             pace: options.pace,
             start_keyframes: options.start_keyframes,
@@ -292,17 +298,17 @@ impl LiveLoop {
         self.feed.ended() && self.models.is_idle()
     }
 
-    fn state(&self) -> &'static str {
+    fn state(&self) -> RunState {
         if self.is_finished() {
-            "finished"
+            RunState::Finished
         } else if self.requests.is_paused {
-            "paused"
+            RunState::Paused
         } else if self.is_training() {
-            "training"
+            RunState::Training
         } else if self.feed.first_image().is_some() {
-            "collecting keyframes"
+            RunState::Collecting
         } else {
-            "waiting for images"
+            RunState::Waiting
         }
     }
 }
@@ -321,6 +327,8 @@ pub struct LiveOptions {
     pub pace: Pace,
     /// Number of keyframes with which training starts.
     pub start_keyframes: usize,
+    /// Which robot and run the page shows.
+    pub identity: Identity,
     /// Notes shown on the page.
     pub notes: Vec<String>,
     /// Notes about the devices, which are added during the run and shown, too.

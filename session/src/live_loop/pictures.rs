@@ -141,9 +141,9 @@ impl LiveLoop {
             };
             let session = &mut self.models.sessions[session_ix];
             pending.request.edits = Arc::clone(session.edits());
-            let queued = session
-                .viewed()
-                .queue_picture(&pending.request, pending.packing());
+            let mut model = session.viewed();
+            let queued = model.queue_picture(&pending.request, pending.packing());
+            let pending = model.label(pending);
             // Determined now: steps that are queued behind the picture are not in it.
             let trained_on = self
                 .ledger

@@ -1,9 +1,11 @@
 //! Publishes keyframes, models and the status of a run to viewers.
 
 use super::LiveLoop;
+use crate::advice::{ImageFlow, Situation, advise};
 use crate::chunk_publisher::ChunkPublisher;
 use crate::ledger::Ledger;
 use crate::observations::{ModelState, ObservationPublisher, PosedKeyframe};
+use crate::recent_images::RecentImages;
 use crate::session::Session;
 use calibration::CalibratedCamera;
 use capture::Notes;
@@ -12,7 +14,9 @@ use kinematics::Transform;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 use trainer::RenderRequest;
-use viz::{Hub, KeyframePose, ModelStatus, Status};
+use viz::{
+    Hub, Identity, ImageCounts, KeyframePose, KeyframeStore, ModelStatus, OperatorStatus, Status,
+};
 
 /// Period of status messages. Shorter periods make the numbers of the page harder to read and send
 /// more; longer ones delay the results of controls and edits.
@@ -24,6 +28,9 @@ const SCORE_FRAC: f64 = 0.03;
 /// What was published, and what to publish next.
 pub(super) struct Publishing {
     hub: Hub,
+    identity: Identity,
+    started: Instant,
+    recent_images: RecentImages,
     /// When the status was published; `None` before the first time.
     status_at: Option<Instant>,
     /// Corrected cameras of the published keyframes.
@@ -39,8 +46,16 @@ pub(super) struct Publishing {
 }
 
 impl Publishing {
-    pub(super) fn new(hub: Hub, notes: Vec<String>, device_notes: Notes) -> Self {
+    pub(super) fn new(
+        hub: Hub,
+        identity: Identity,
+        notes: Vec<String>,
+        device_notes: Notes,
+    ) -> Self {
         Self {
+            identity,
+            started: Instant::now(),
+            recent_images: RecentImages::default(),
             status_at: None,
             cameras: Vec::new(),
             next_refreshed: 0,
@@ -170,14 +185,16 @@ impl LiveLoop {
         Ok(())
     }
 
-    pub(super) fn publish_status(&self) {
+    pub(super) fn publish_status(&mut self) {
+        self.requests.update_checkpoint(&mut self.models);
+        let operator = self.operator_status();
         let sessions = &self.models.sessions;
         let movements = sessions[0]
             .alignment()
             .map_or(&[][..], |alignment| &alignment.movements[..]);
         let mut models = sessions.iter().map(model_status);
         self.hub.set_status(Status {
-            state: self.state().to_owned(),
+            state: self.state().name().to_owned(),
             seconds: sessions[0].time().secs(),
             keyframes: self.accepted.list.len() as u64,
             rejected: self.feed.rejected(),
@@ -187,10 +204,54 @@ impl LiveLoop {
             notes: (self.publishing.notes.iter().cloned())
                 .chain(self.publishing.device_notes.list())
                 .chain(movements.iter().map(ToString::to_string))
-                .chain(self.requests.notes())
+                .chain(self.requests.warnings())
+                .chain(operator.infos.iter().cloned())
                 .collect(),
+            operator,
             ..Status::default()
         });
+    }
+
+    /// What the operator's header shows.
+    fn operator_status(&mut self) -> OperatorStatus {
+        let counts = self.feed.counts();
+        let store = counts.store;
+        let total = ImageFlow {
+            received: counts.images,
+            dropped: counts.dropped,
+            accepted: counts.accepted,
+            rejected: self.feed.rejected(),
+        };
+        let situation = Situation {
+            state: self.state(),
+            has_input_ended: self.feed.ended(),
+            run_secs: self.publishing.started.elapsed().as_secs_f64(),
+            recent: self.publishing.recent_images.push(Instant::now(), total),
+            store,
+            start_keyframes: self.start_keyframes,
+            paused_by: self.requests.paused_by,
+        };
+        OperatorStatus {
+            identity: Some(self.publishing.identity.clone()),
+            advice: Some(advise(&situation)),
+            images: Some(ImageCounts {
+                received: counts.images,
+                dropped: counts.dropped,
+                accepted: counts.accepted,
+                evicted: counts.evicted,
+            }),
+            store: Some(KeyframeStore {
+                keyframes: store.keyframes as u64,
+                max_keyframes: store.max_keyframes as u64,
+                bytes: store.bytes,
+                max_bytes: store.max_bytes,
+                is_full: store.is_full(),
+            }),
+            paused_by: self.requests.paused_by,
+            checkpoint: self.requests.checkpoint(),
+            infos: self.requests.infos().collect(),
+            ..OperatorStatus::default()
+        }
     }
 }
 

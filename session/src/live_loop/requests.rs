@@ -1,16 +1,19 @@
 //! Applies the requests of operators: pausing, checkpoints, edits.
 
 use super::models::Models;
+use crate::checkpoints::CheckpointProgress;
 use crate::editing::Editor;
-use viz::{Control, EditRequest, Hub};
+use viz::{CheckpointState, Control, EditRequest, Hub, RequestedCheckpoint};
 
 /// Requests of operators, and their results.
 #[derive(Default)]
 pub(super) struct Requests {
     /// Whether an operator has paused training.
     pub(super) is_paused: bool,
-    /// Result of the last checkpoint that an operator requested.
-    checkpoint_note: Option<String>,
+    /// Number of the client that has paused training.
+    pub(super) paused_by: Option<u64>,
+    /// The last checkpoint that an operator requested.
+    checkpoint: Option<RequestedCheckpoint>,
     editor: Editor,
     /// Result of the last edit.
     edit_note: Option<String>,
@@ -21,15 +24,59 @@ pub(super) struct Requests {
 }
 
 impl Requests {
-    /// Notes on checkpoints and edits, for viewers.
-    pub(super) fn notes(&self) -> impl Iterator<Item = String> {
-        [
-            self.checkpoint_note.clone(),
-            self.edit_note.clone(),
-            self.editor.note(),
-        ]
-        .into_iter()
-        .flatten()
+    /// Notes on checkpoints and edits that only inform.
+    pub(super) fn infos(&self) -> impl Iterator<Item = String> {
+        let checkpoint = self.checkpoint_note(|state| state != CheckpointState::Failed);
+        [checkpoint, self.edit_note.clone(), self.editor.note()]
+            .into_iter()
+            .flatten()
+    }
+
+    /// Notes on checkpoints that could not be written.
+    pub(super) fn warnings(&self) -> Option<String> {
+        self.checkpoint_note(|state| state == CheckpointState::Failed)
+    }
+
+    fn checkpoint_note(&self, is_shown: impl Fn(CheckpointState) -> bool) -> Option<String> {
+        let shown = self.checkpoint.as_ref().filter(|it| is_shown(it.state));
+        shown.map(|checkpoint| checkpoint.text.clone())
+    }
+
+    /// The last checkpoint that an operator requested.
+    pub(super) fn checkpoint(&self) -> Option<RequestedCheckpoint> {
+        self.checkpoint.clone()
+    }
+
+    /// Adopts what has become of the requested checkpoint of each model.
+    pub(super) fn update_checkpoint(&mut self, models: &mut Models) {
+        let is_pending =
+            |checkpoint: &RequestedCheckpoint| checkpoint.state == CheckpointState::Requested;
+        if !self.checkpoint.as_ref().is_some_and(is_pending) {
+            return;
+        }
+        let secs = models.sessions[0].time().secs();
+        let mut is_written = true;
+        for session in &mut models.sessions {
+            match session.persistence().requested_checkpoint() {
+                Some(CheckpointProgress::Written) => {}
+                Some(CheckpointProgress::Failed(reason)) => {
+                    self.checkpoint = Some(RequestedCheckpoint {
+                        state: CheckpointState::Failed,
+                        text: format!("the checkpoint could not be written: {reason}"),
+                    });
+                    return;
+                }
+                Some(CheckpointProgress::Due | CheckpointProgress::Writing) | None => {
+                    is_written = false;
+                }
+            }
+        }
+        if is_written {
+            self.checkpoint = Some(RequestedCheckpoint {
+                state: CheckpointState::Written,
+                text: format!("checkpoint written after {secs:.0} s"),
+            });
+        }
     }
 
     /// Applies the actions that operators have requested. An evaluation is completed first.
@@ -38,24 +85,35 @@ impl Requests {
         if models.is_scoring() {
             return;
         }
-        for control in hub.operator_requests().take_controls() {
-            match control {
-                Control::Pause => self.is_paused = true,
-                Control::Resume => self.is_paused = false,
+        for request in hub.operator_requests().take_control_requests() {
+            match request.action {
+                Control::Pause => {
+                    self.is_paused = true;
+                    self.paused_by.get_or_insert(request.client);
+                }
+                Control::Resume => {
+                    self.is_paused = false;
+                    self.paused_by = None;
+                }
                 Control::Save => {
                     let mut is_due = true;
                     // Every session is asked, also after one that writes no checkpoints.
                     for session in &mut models.sessions {
                         is_due &= session.persistence().request_checkpoint();
                     }
-                    self.checkpoint_note = Some(if is_due {
-                        format!(
-                            "checkpoint requested after {:.0} s",
-                            models.sessions[0].time().secs()
+                    let secs = models.sessions[0].time().secs();
+                    let (state, text) = if is_due {
+                        (
+                            CheckpointState::Requested,
+                            format!("checkpoint requested after {secs:.0} s"),
                         )
                     } else {
-                        "this run writes no checkpoints".to_owned()
-                    });
+                        (
+                            CheckpointState::Failed,
+                            "this run writes no checkpoints".to_owned(),
+                        )
+                    };
+                    self.checkpoint = Some(RequestedCheckpoint { state, text });
                 }
             }
         }

@@ -19,10 +19,11 @@ use drivers::Source;
 use gpu::Gpu;
 use keyframe::Keyframe;
 use kinematics::Stamp;
-use std::path::Path;
+use std::ffi::OsStr;
+use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use trainer::{ModelKind, Resumed};
-use viz::Hub;
+use viz::{Hub, Identity};
 
 /// Maximum time of the scheduled evaluations, as a fraction of the training time. With more, the
 /// scores are known more often, but the model is worse at the same time.
@@ -148,7 +149,13 @@ impl OpenedRun<'_> {
             .as_ref()
             .map_or(&[][..], |previous| &previous.keyframes);
         let (input, evicted) = input(&plan, &rig, (source, stamp_clock), held)?;
-        if let Some(robot) = robot_meshes::description(&rig, &plan.rig_file)? {
+        let robot = robot_meshes::description(&rig, &plan.rig_file)?;
+        let identity = identity(
+            &plan,
+            &folders,
+            robot.as_ref().map(|robot| robot.robot.name()),
+        );
+        if let Some(robot) = robot {
             hub.set_robot(robot);
         }
         let stop = services.stop.clone();
@@ -185,6 +192,7 @@ impl OpenedRun<'_> {
             start_keyframes: rig
                 .join
                 .start_keyframes_or_default(pace == Pace::RealTime, has_depth),
+            identity,
             notes: gpu_notes(&gpu),
             device_notes,
             open_gpu: services.open_gpu,
@@ -202,6 +210,21 @@ impl OpenedRun<'_> {
             damage,
             created: CreatedFolders::default(),
         })
+    }
+}
+
+/// Which robot and run this is. Several models have a folder each in that of the run.
+fn identity(plan: &RunPlan, folders: &[PathBuf], robot: Option<&str>) -> Identity {
+    let name = |name: Option<&OsStr>| name.map(|name| name.to_string_lossy().into_owned());
+    let first = folders.first().map(PathBuf::as_path);
+    let run = match folders.len() {
+        2.. => first.and_then(Path::parent),
+        _ => first,
+    };
+    Identity {
+        rig: name(plan.rig_file.file_stem()),
+        robot: robot.map(str::to_owned),
+        run: name(run.and_then(Path::file_name)),
     }
 }
 

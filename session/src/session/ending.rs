@@ -395,7 +395,10 @@ impl WorkDuringScoring<'_> {
                         "cannot render {other} while {scored_method} is scored; try again later"
                     ));
                 }
-                None => viewer::answer(pending, method.model_mut(), self.edits),
+                None => {
+                    let kind = self.reporter.kind();
+                    viewer::answer(pending, kind, method.model_mut(), self.edits);
+                }
             }
         }
     }

@@ -1,7 +1,7 @@
 //! The persistent state of a session: checkpoints for resuming, a decision log for replaying, and
 //! data for continuing on another device.
 
-use crate::checkpoints::{self, CheckpointWrite, Checkpoints, Snapshot};
+use crate::checkpoints::{self, CheckpointProgress, CheckpointWrite, Checkpoints, Snapshot};
 use crate::decisions::DecisionLog;
 use crate::error::is_gpu_error;
 use crate::kept_folder::KeptFolder;
@@ -140,6 +140,11 @@ impl Persistence {
             .as_mut()
             .map(Checkpoints::request)
             .is_some()
+    }
+
+    /// What has become of the last requested checkpoint; `None` if none was requested.
+    pub(crate) fn requested_checkpoint(&mut self) -> Option<&CheckpointProgress> {
+        self.checkpoints.as_mut()?.requested()
     }
 
     /// Starts a checkpoint if one is due.

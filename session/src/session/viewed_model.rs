@@ -9,7 +9,7 @@ use std::sync::Arc;
 use std::time::Duration;
 use trainer::floaters::Floaters;
 use trainer::{AlignedModel, ModelKind, Packing, Picture, QueuedPicture, RenderRequest, Rendered};
-use viz::EditRequest;
+use viz::{EditRequest, PendingRender};
 
 /// Draws and edits the model of a session.
 pub(crate) struct ViewedModel<'a> {
@@ -31,6 +31,11 @@ impl ViewedModel<'_> {
     pub(crate) fn render(&mut self, request: &RenderRequest) -> Result<Picture, trainer::Error> {
         self.persistence.log_render();
         self.method.model_mut().render(request)
+    }
+
+    /// Labels a requested picture with this model, which draws it.
+    pub(crate) fn label(&self, pending: PendingRender) -> PendingRender {
+        pending.of_model(self.kind.name(), self.method.model().progress().step)
     }
 
     /// Starts to render a picture, packed if `packing` is given; see

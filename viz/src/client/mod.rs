@@ -20,7 +20,7 @@ use crate::client::writer::{Reply, Writer};
 use crate::clock::ServerClock;
 use crate::demands::Demand;
 use crate::edit::EditRequest;
-use crate::operator_requests::MAX_WAITING_EDITS;
+use crate::operator_requests::{ControlRequest, MAX_WAITING_EDITS};
 use crate::pictures::queue::MAX_VIEWS;
 use crate::pictures::view_request::{InvalidRequest, ViewRequest};
 use crate::pictures::viewpoint::Viewpoint;
@@ -28,6 +28,7 @@ use crate::server::access::Role;
 use crate::server::admission::Connection;
 use crate::server::client_log::ClientLog;
 use crate::server::server_context::ServerContext;
+use crate::topics::status::refresh_clients;
 use axum::extract::ws::{Message, WebSocket};
 use futures_util::StreamExt;
 use futures_util::stream::SplitStream;
@@ -61,6 +62,7 @@ pub(crate) async fn serve(
         hub: &server_context.hub,
         client,
     };
+    refresh_clients(&server_context.hub);
     let log = &server_context.log;
     log.line(format_args!("client {client} connected as {}", role.name()));
     let (sink, stream) = socket.split();
@@ -114,6 +116,7 @@ struct ClientGuard<'a> {
 impl Drop for ClientGuard<'_> {
     fn drop(&mut self) {
         self.hub.leave(self.client);
+        refresh_clients(self.hub);
     }
 }
 
@@ -198,7 +201,10 @@ impl Reader<'_> {
             ClientMessage::Control(ControlMessage { action }) => {
                 self.log
                     .line(format_args!("client {}: {action:?}", self.client));
-                self.hub.operator_requests().control(action);
+                self.hub.operator_requests().control(ControlRequest {
+                    action,
+                    client: self.client,
+                });
             }
             ClientMessage::Shown(message) => self.shown(&message)?,
             ClientMessage::Edit(message) => self.edit(&message)?,

@@ -160,6 +160,7 @@ pub(crate) struct PointsHeader {
 pub(crate) struct RangeScanHeader<'a> {
     pub(crate) scanner: &'a str,
     pub(crate) stamp_nanos: i64,
+    pub(crate) captured_millis: f64,
     pub(crate) origin_m: [f64; 3],
     pub(crate) n_points: usize,
     pub(crate) meters_per_count: f64,
@@ -211,6 +212,11 @@ pub(crate) struct PictureHeader {
     pub(crate) last: bool,
     pub(crate) size_px: [u32; 2],
     pub(crate) full_size_px: [u32; 2],
+    /// The model that was drawn, and its number of steps.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub(crate) method: Option<String>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub(crate) step: Option<u64>,
     pub(crate) world_from_camera: [f64; 16],
     pub(crate) projection: ProjectionMessage,
     pub(crate) near_m: f64,

@@ -8,6 +8,7 @@ use crate::pictures::queue::{DrawnPicture, Outgoing, Queue, RenderJob};
 use crate::pictures::view_request::ViewRequest;
 use crate::pose::row_major;
 use crate::server::access::Role;
+use crate::topics::operator_status::ConnectedClient;
 use parking_lot::{Condvar, Mutex, MutexGuard};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
@@ -35,6 +36,7 @@ impl PictureRequests {
             pictures: Arc::clone(self),
             job,
             trained_on: None,
+            model: None,
             is_released: false,
         })
     }
@@ -69,6 +71,11 @@ impl PictureRequests {
     /// Number of connected clients.
     pub(crate) fn n_clients(&self) -> usize {
         self.queue().n_clients()
+    }
+
+    /// The connected clients, in the order in which they joined.
+    pub(crate) fn clients(&self) -> Vec<ConnectedClient> {
+        self.queue().clients()
     }
 
     /// Adds a request. Returns false if the client has too many views.
@@ -121,6 +128,14 @@ impl PictureRequests {
     }
 }
 
+/// The model in a picture.
+#[derive(Clone, Debug)]
+struct DrawnModel {
+    method: String,
+    /// Number of optimizer steps.
+    step: u64,
+}
+
 /// A picture for which a client is waiting. If it is dropped without an answer, the client receives
 /// nothing for this stage.
 #[derive(Debug)]
@@ -131,6 +146,7 @@ pub struct PendingRender {
     pictures: Arc<PictureRequests>,
     job: RenderJob,
     trained_on: Option<TrainedKeyframes>,
+    model: Option<DrawnModel>,
     is_released: bool,
 }
 
@@ -138,6 +154,17 @@ impl PendingRender {
     /// Requested model; the first if `None`. The name comes from the client and may not exist.
     pub fn method(&self) -> Option<&str> {
         self.job.view_request.method.as_deref()
+    }
+
+    /// Sets the model that is drawn: its method and its number of steps. Clients label the picture
+    /// with it, so it must not be taken from the request.
+    #[must_use]
+    pub fn of_model(mut self, method: &str, step: u64) -> Self {
+        self.model = Some(DrawnModel {
+            method: method.to_owned(),
+            step,
+        });
+        self
     }
 
     /// Sets the keyframes on which the model has been trained, of which the client is informed.
@@ -211,6 +238,8 @@ impl PendingRender {
             full_size_px: view_request.request.size_px,
             world_from_camera: row_major(&view_request.request.world_from_camera),
             projection: projection_message(&view_request.request.projection),
+            method: self.model.as_ref().map(|model| model.method.clone()),
+            step: self.model.as_ref().map(|model| model.step),
             near_m: view_request.request.near_m,
             far_m: view_request.request.far_m,
             waited_millis: (self.started - view_request.received).as_secs_f64() * 1e3,

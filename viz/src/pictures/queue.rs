@@ -6,6 +6,7 @@ use crate::client::server_message::PictureHeader;
 use crate::pictures::picture_times::{TrainedKeyframes, UnreportedPictures};
 use crate::pictures::view_request::ViewRequest;
 use crate::server::access::Role;
+use crate::topics::operator_status::ConnectedClient;
 use std::collections::{BTreeMap, VecDeque};
 use std::ops::Bound;
 use std::sync::Arc;
@@ -128,6 +129,17 @@ impl Queue {
     /// Number of connected clients.
     pub(crate) fn n_clients(&self) -> usize {
         self.clients.len()
+    }
+
+    /// The connected clients, in the order in which they joined.
+    pub(crate) fn clients(&self) -> Vec<ConnectedClient> {
+        let clients = self.clients.iter();
+        clients
+            .map(|(&id, waiting)| ConnectedClient {
+                id,
+                role: waiting.role,
+            })
+            .collect()
     }
 
     /// Adds a request. Stages of the older request for the same view that have not been started are

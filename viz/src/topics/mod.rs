@@ -18,6 +18,7 @@ pub(crate) mod keyframes;
 pub(crate) mod live_images;
 pub(crate) mod model_chunks;
 pub(crate) mod observations;
+pub(crate) mod operator_status;
 mod positions;
 pub(crate) mod published_data;
 pub(crate) mod range_scans;
@@ -25,7 +26,7 @@ pub(crate) mod robot_description;
 pub(crate) mod robot_state;
 mod scene;
 pub(crate) mod shared_topic;
-mod status;
+pub(crate) mod status;
 pub(crate) mod subscriptions;
 #[cfg(test)]
 mod test_topic;

@@ -5,6 +5,7 @@
 //! be there: `server_message.rs` uses them, and the files of their topics use `server_message.rs`,
 //! so the files would import each other in a cycle.
 
+use crate::topics::operator_status::OperatorStatus;
 use kinematics::{Stamp, Transform};
 use serde::Serialize;
 use std::collections::BTreeMap;
@@ -40,6 +41,9 @@ pub struct Status {
     /// What the operator should do, for commands that take images without training.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub guidance: Option<Guidance>,
+    /// What the operator's header shows.
+    #[serde(flatten)]
+    pub operator: OperatorStatus,
 }
 
 /// What the operator should do next. While there is guidance, the page shows the camera images
@@ -76,7 +80,7 @@ pub struct ModelStatus {
     pub primitives: u64,
     /// Label of that number, such as `Voxel blocks`.
     pub primitives_label: String,
-    /// GPU memory used by the model, bytes.
+    /// GPU memory used by the model, bytes; for a saved model, at the end of its training.
     pub bytes: u64,
     /// Whether the model can be sent in chunks, so that clients can draw it themselves.
     pub has_chunks: bool,

@@ -32,7 +32,7 @@ impl SharedTopic for RangeScanTopic {
     const PRIORITY: Priority = Priority::Live;
     type Source = RangeScans;
 
-    fn encode(&mut self, scans: &RangeScans, _: ServerClock) -> Vec<(Arc<str>, Message)> {
+    fn encode(&mut self, scans: &RangeScans, clock: ServerClock) -> Vec<(Arc<str>, Message)> {
         let mut messages = Vec::new();
         for (scanner, scan) in scans {
             // The map has the scans of all scanners, but usually only one of them is new.
@@ -40,7 +40,7 @@ impl SharedTopic for RangeScanTopic {
             if known.is_some_and(|known| Arc::ptr_eq(&known, scan)) {
                 continue;
             }
-            if let Some(packed) = pack_range_scan(scan) {
+            if let Some(packed) = pack_range_scan(scan, clock) {
                 messages.push((Arc::clone(scanner), Message::binary(packed)));
             }
         }
@@ -59,10 +59,11 @@ impl Hub {
 }
 
 /// The binary message with a scan; `None` without points.
-fn pack_range_scan(range_scan: &RangeScan) -> Option<Vec<u8>> {
+fn pack_range_scan(range_scan: &RangeScan, clock: ServerClock) -> Option<Vec<u8>> {
     let RangeScan {
         scan,
         map_from_odom,
+        captured_at,
     } = range_scan;
     // Relative to the scanner, counts of 16 bits have the finest step. Relative to the world, they
     // would have to cover the distance to its origin, too.
@@ -81,6 +82,7 @@ fn pack_range_scan(range_scan: &RangeScan) -> Option<Vec<u8>> {
     let header = RangeScanHeader {
         scanner: &scan.scanner,
         stamp_nanos: scan.stamp.0,
+        captured_millis: clock.millis(*captured_at),
         origin_m: origin.into(),
         n_points: points.len(),
         meters_per_count,
@@ -90,10 +92,11 @@ fn pack_range_scan(range_scan: &RangeScan) -> Option<Vec<u8>> {
 
 #[cfg(test)]
 mod tests {
-    use super::{MAX_POINTS, pack_range_scan};
+    use super::{MAX_POINTS, ServerClock, pack_range_scan};
     use keyframe::{RangePoints, RangeScan};
     use kinematics::{Stamp, Transform};
     use nalgebra::Vector3;
+    use std::time::Instant;
 
     fn scan(n: usize) -> RangeScan {
         let point = |ix: usize| {
@@ -110,13 +113,14 @@ mod tests {
             }
             .into(),
             map_from_odom: Transform::rotation(Vector3::new(0.0, 0.0, 0.3)),
+            captured_at: Instant::now(),
         }
     }
 
     #[test]
     fn points_are_corrected_and_relative_to_the_scanner() {
         let range_scan = scan(20_000);
-        let message = pack_range_scan(&range_scan).expect("points");
+        let message = pack_range_scan(&range_scan, ServerClock::start()).expect("points");
         let n_header = u32::from_le_bytes(message[..4].try_into().expect("4 bytes")) as usize;
         let header: serde_json::Value =
             serde_json::from_slice(&message[4..4 + n_header]).expect("JSON");
@@ -144,6 +148,6 @@ mod tests {
 
     #[test]
     fn empty_scans_are_not_sent() {
-        assert_eq!(pack_range_scan(&scan(0)), None);
+        assert_eq!(pack_range_scan(&scan(0), ServerClock::start()), None);
     }
 }

@@ -8,6 +8,7 @@ mod eye_page;
 #[cfg(feature = "foxglove")]
 mod foxglove;
 mod hands_page;
+mod labels_page;
 mod local_page;
 mod model_chunks;
 mod models;

@@ -271,7 +271,7 @@ fn page_renders_scene_and_overlays_correctly() {
     );
 
     check_switch(&mut browser, &render_thread);
-    check_live_frustum(&mut browser, &full);
+    check_live_frustum(&mut browser, &hub, &full);
     check_picture(&mut browser, &full);
     let turned = check_drag(&mut browser, &render_thread, &full);
     check_picture(&mut browser, &turned);
@@ -331,9 +331,13 @@ fn check_switch(browser: &mut Browser, render_thread: &RenderThread) {
 }
 
 /// The live camera's frustum is drawn according to the request's projection.
-fn check_live_frustum(browser: &mut Browser, request: &RenderRequest) {
+fn check_live_frustum(browser: &mut Browser, hub: &Hub, request: &RenderRequest) {
     const REACH_PX: i64 = 2; // Rounding to pixels, and lines one pixel wide.
+    // The frustum fades if no images arrive.
+    let images = Camera::start(hub.clone());
+    wait_for(browser, "a live image", |browser| label(browser) == "live");
     let shot = canvas_shot(browser);
+    images.stop();
     let camera = side_camera();
     let depth = 1.6 * 0.12 * 0.8; // Depth of the drawn frustum: see web/src/layers/overlays.ts.
     let corner = |u: f64, v: f64| {

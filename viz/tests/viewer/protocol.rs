@@ -18,9 +18,10 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 use trainer::{ChunkData, ChunkLayout, ModelChunk, ModelChunks};
 use viz::{
-    Control, EditAction, Error, Hub, KeyframePose, LiveImage, LivePixels, ModelStatus,
-    ObservationMap, ObservedCell, PendingRender, RangeScan, SceneHint, Server, ServerConfig,
-    Status,
+    Advice, CheckpointState, Control, ControlRequest, EditAction, Error, Hub, Identity,
+    ImageCounts, KeyframePose, KeyframeStore, LiveImage, LivePixels, ModelStatus, ObservationMap,
+    ObservedCell, OperatorStatus, PendingRender, RangeScan, RequestedCheckpoint, SceneHint, Server,
+    ServerConfig, Status,
 };
 
 fn start() -> (Hub, Server) {
@@ -152,8 +153,21 @@ fn client_selects_the_model() {
     let pending = next(&hub);
     assert_eq!(pending.method(), Some("tsdf"));
     let picture = draw(&pending.request);
-    pending.deliver(picture);
-    assert_eq!(client.binary_of("picture").0["id"], json!(2));
+    // The header names the model that was drawn, not the one in the request.
+    pending.of_model("splat", 1520).deliver(picture);
+    let header = client.binary_of("picture").0;
+    assert_eq!(
+        (&header["id"], &header["method"], &header["step"]),
+        (&json!(2), &json!("splat"), &json!(1520))
+    );
+    message["id"] = json!(3);
+    client.send_json(&message);
+    draw_all(&hub, 1);
+    let header = client.binary_of("picture").0;
+    assert!(
+        header.get("method").is_none() && header.get("step").is_none(),
+        "without a model, the request is not taken for it"
+    );
 }
 
 #[test]
@@ -398,6 +412,39 @@ fn actions_of_operators_reach_the_run_once() {
         [Control::Pause, Control::Save]
     );
     assert_eq!(hub.operator_requests().take_controls(), []);
+    client.send_json(&json!({"type": "control", "action": "resume"}));
+    client.settle();
+    let status = status_with_clients(&hub, &mut client);
+    let expected = ControlRequest {
+        action: Control::Resume,
+        client: status["clients"][0]["id"].as_u64().expect("a number"),
+    };
+    assert_eq!(
+        hub.operator_requests().take_control_requests(),
+        [expected],
+        "the request names its client"
+    );
+}
+
+/// Publishes a status, and returns what the client receives.
+fn status_with_clients(hub: &Hub, client: &mut Client) -> Value {
+    hub.set_status(Status::default());
+    client.text_of("status")
+}
+
+#[test]
+fn the_status_lists_the_clients_and_their_roles() {
+    let (hub, server) = start();
+    hub.set_status(Status::default());
+    let mut client = Client::connect(server.address());
+    let id = client.text_of("hello")["client"].clone();
+    let expected = json!([{"id": id, "role": "operator"}]);
+    // Each wait ends with an error of the connection if no such status arrives.
+    while client.text_of("status")["clients"] != expected {}
+    let other = Client::connect(server.address());
+    while client.text_of("status")["clients"].as_array().map(Vec::len) != Some(2) {}
+    drop(other);
+    while client.text_of("status")["clients"] != expected {}
 }
 
 #[test]
@@ -609,6 +656,7 @@ fn one_of_each() -> Vec<Value> {
     let (hub, server) = start();
     hub.set_status(Status {
         others: vec![model_status("tsdf", 30)],
+        operator: full_operator_status(),
         ..Status::default()
     });
     hub.set_scene_hint(SceneHint {
@@ -658,7 +706,9 @@ fn one_of_each() -> Vec<Value> {
     });
     messages.push(client.binary_of("live_image").0);
     client.send_json(&render_message(1));
-    draw_all(&hub, 1);
+    let pending = next(&hub);
+    let picture = draw(&pending.request);
+    pending.of_model("splat", 1).deliver(picture);
     messages.push(client.binary_of("picture").0);
     client.send_json(
         &json!({"type": "subscribe", "topic": "model_chunks", "rate_hz": 1, "method": "tsdf"}),
@@ -688,6 +738,22 @@ fn one_of_each() -> Vec<Value> {
     messages
 }
 
+/// An operator's status with all optional fields.
+fn full_operator_status() -> OperatorStatus {
+    OperatorStatus {
+        identity: Some(Identity::default()),
+        advice: Some(Advice::default()),
+        images: Some(ImageCounts::default()),
+        store: Some(KeyframeStore::default()),
+        paused_by: Some(1),
+        checkpoint: Some(RequestedCheckpoint {
+            state: CheckpointState::Written,
+            text: String::new(),
+        }),
+        ..OperatorStatus::default()
+    }
+}
+
 fn observation_map() -> ObservationMap {
     ObservationMap {
         cell_m: 0.5,
@@ -712,6 +778,7 @@ fn range_scan() -> RangeScan {
             points_in_world_m: [[1.0, 2.0, 3.0]].into(),
         }),
         map_from_odom: Transform::identity(),
+        captured_at: Instant::now(),
     }
 }
 

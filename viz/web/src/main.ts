@@ -7,6 +7,7 @@ import { Connection } from "./connection/connection";
 import { EditControls } from "./panels/edit_controls";
 import { element } from "./panels/element";
 import { showGestureHint } from "./panels/gesture_hint";
+import { Header } from "./panels/header";
 import { showGuidance } from "./panels/guidance";
 import { setUpHelp } from "./panels/help";
 import { action, closesWithEscape, endsWithEscape, setFlying, setUpKeys, toggle } from "./keys";
@@ -14,7 +15,9 @@ import { LinkReadout } from "./connection/link_readout";
 import { LiveImages } from "./panels/live_images";
 import { ModelSwitch } from "./panels/model_switch";
 import { BACKGROUND, OrbitView } from "./view/orbit_view";
+import { OverlayAges } from "./panels/overlay_ages";
 import { panels } from "./panels/panels";
+import { PictureInfo } from "./panels/picture_info";
 import type { BinaryHeader, ModelStatus, PictureHeader, Status, TextMessage } from "./connection/protocol";
 import { Readouts } from "./panels/readouts";
 import { RenderScheduler } from "./connection/render_scheduler";
@@ -36,6 +39,7 @@ import { statusTopic } from "./topics/status";
 import { Topics } from "./topics/topic";
 import { setUpToolbar } from "./panels/toolbar";
 import { Tooltip } from "./panels/tooltip";
+import { TrainingPanel } from "./panels/training_panel";
 import { ViewSettings } from "./view/view_settings";
 
 let stages = [0.1, 0.5, 1];
@@ -44,6 +48,8 @@ let latestStep = -1;
 let showsModel = true;
 
 const readouts = new Readouts();
+const header = new Header();
+const trainingPanel = new TrainingPanel();
 const banner = new Banner();
 const view = openView();
 keepToken();
@@ -79,6 +85,8 @@ const connection: Connection = new Connection(`${location.protocol === "https:" 
   binary: receiveBinary,
 }, () => topics.capabilities);
 const robotAge = new RobotAge(view.robot, connection.clock);
+const overlayAges = new OverlayAges(view, () => connection.clock);
+const pictureInfo = new PictureInfo(view, () => connection.clock, latestStepOf, () => stages);
 const changed = (): void => topics.update();
 const keyframes = new KeyframesTopic(view);
 const images = new LiveImages(() => connection.clock, changed);
@@ -103,12 +111,20 @@ new LinkReadout(connection);
 const shownLatency = new ShownLatency(connection);
 const models = new ModelSwitch(() => {
   shownLatency.forget();
+  pictureInfo.modelChanged();
   scheduler.restart();
   forgetSurfaces();
   if (latestStatus) showStatus(latestStatus);
 });
 let isDrawnLocally = false;
-const scheduler = new RenderScheduler(connection, () => view.view(), () => stages, BACKGROUND, () => models.method);
+const scheduler = new RenderScheduler(
+  connection,
+  () => view.view(),
+  () => stages,
+  BACKGROUND,
+  () => models.method,
+  pictureInfo,
+);
 const edits = new EditControls(connection, view.crop, () => models.method);
 const sides = [new SideView(connection, "surroundings"), new SideView(connection, "video")] as const;
 const surroundings = new Surroundings(
@@ -145,9 +161,12 @@ function receiveStatus(status: Status): void {
   models.list(status);
   showStatus(status);
   runControls.show(status);
+  header.show(status);
+  trainingPanel.show(status);
   banner.setRunResult(status.result);
   showGuidance(status.guidance, banner, liveImages);
   robotAge.hasEnded = banner.isFinished;
+  overlayAges.hasEnded = banner.isFinished;
 }
 
 function receiveText(message: TextMessage): void {
@@ -155,6 +174,7 @@ function receiveText(message: TextMessage): void {
   switch (message.type) {
     case "hello":
       stages = message.default_stages;
+      header.client = message.client;
       showRole(message.role);
       break;
     case "scene":
@@ -180,6 +200,11 @@ function showStatus(status: Status): void {
   else if (isChanged) surroundings.modelChanged();
   latestStep = model.step;
   updateLocalModel(model);
+}
+
+/** Number of steps of a model, as far as the status says. */
+function latestStepOf(method: string | undefined): number | undefined {
+  return [latestStatus, ...(latestStatus?.others ?? [])].find((model) => model?.method === method)?.step;
 }
 
 /** Forgets where surfaces are, because the model is another one or parts of it are gone. */
@@ -217,13 +242,7 @@ async function showPicture(header: PictureHeader, payload: Uint8Array<ArrayBuffe
   view.changed();
   view.seePicture();
   element("notice").textContent = "";
-  if (!header.color) return;
-  const [width, height] = header.size_px;
-  const percent = Math.round(100 * header.scale);
-  element("picture-text").textContent = `${width} × ${height} (${percent} %) in ${millis.toFixed(0)} ms`;
-  document.querySelectorAll(".stages i").forEach((mark, ix) => {
-    mark.classList.toggle("done", header.scale >= (stages[ix] ?? 1) - 1e-9);
-  });
+  if (header.color) pictureInfo.drawn(millis);
 }
 
 setUpKeys(() => view.changed());
@@ -298,6 +317,7 @@ function frame(): void {
   shownLatency.frameBegins();
   settings.tick();
   scheduler.tick();
+  pictureInfo.update();
   if (!view.usesSurroundings || settings.isPlaying) {
     surroundings.forget();
     view.forgetSurroundings();

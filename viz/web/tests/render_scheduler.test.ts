@@ -127,6 +127,31 @@ test("a request without an answer is repeated after a timeout, or when it has fa
   assert.equal(requests.length, 3);
 });
 
+test("an observer follows every change of what is wanted, and every request", (context) => {
+  const clock = fakeClock(context);
+  const events: (number | "changed")[] = [];
+  const connection = { isOpen: true, supports: () => true, send: () => undefined };
+  const scheduler = new RenderScheduler(
+    connection as unknown as Connection,
+    () => VIEW,
+    () => [0.25, 1],
+    [0, 0, 0],
+    () => "splat",
+    { viewChanged: () => events.push("changed"), requested: (id) => events.push(id) },
+  );
+  scheduler.moved();
+  scheduler.tick();
+  clock.millis = 200;
+  scheduler.tick();
+  scheduler.answered({ id: 2, last: true, scale: 1 } as PictureHeader);
+  scheduler.modelChanged();
+  clock.millis = 10_000;
+  scheduler.tick();
+  assert.deepEqual(events, ["changed", 1, 2, 3], "a refresh shows the same view");
+  scheduler.restart();
+  assert.deepEqual(events.slice(4), ["changed"]);
+});
+
 test("a page that draws the model itself requests only the depth of the resting view", (context) => {
   const { scheduler, requests, clock } = setUp(context);
   scheduler.drawsLocally = true;

@@ -80,6 +80,46 @@ export interface Status extends ModelStatus {
   notes: string[];
   result: RunResult | null;
   guidance?: Guidance;
+  /** These fields are for the operator's header; older servers have none of them. */
+  identity?: Identity;
+  advice?: Advice;
+  images?: ImageCounts;
+  store?: KeyframeStore;
+  clients?: { id: number; role: Role }[];
+  paused_by?: number;
+  checkpoint?: { state: "requested" | "written" | "failed"; text: string };
+  /** The notes that only inform. */
+  infos?: string[];
+}
+
+/** Which robot and run a server shows. */
+export interface Identity {
+  rig: string | null;
+  robot: string | null;
+  run: string | null;
+}
+
+/** What the run does, and what the operator should do. */
+export interface Advice {
+  text: string;
+  is_warning: boolean;
+}
+
+/** What happened to the images since the start of the run. */
+export interface ImageCounts {
+  received: number;
+  dropped: number;
+  accepted: number;
+  evicted: number;
+}
+
+/** How full the store of keyframes is. */
+export interface KeyframeStore {
+  keyframes: number;
+  max_keyframes: number;
+  bytes: number;
+  max_bytes: number;
+  is_full: boolean;
 }
 
 /** What the operator should do, while images are taken for a calibration. */
@@ -211,6 +251,9 @@ export interface PictureHeader {
   last: boolean;
   size_px: [number, number];
   full_size_px: [number, number];
+  /** The model that was drawn, and its number of steps; missing on older servers. */
+  method?: string;
+  step?: number;
   world_from_camera: number[];
   projection: Projection;
   near_m: number;
@@ -313,6 +356,8 @@ export interface RangeScanHeader {
   type: "range_scan";
   scanner: string;
   stamp_nanos: number;
+  /** Begin of the revolution on the server's clock; missing on older servers. */
+  captured_millis?: number;
   origin_m: [number, number, number];
   n_points: number;
   meters_per_count: number;

@@ -33,6 +33,14 @@ const MOVING_SCALES = [0.1, 0.15, 0.25, 0.35, 0.5, 0.7, 1];
 /** Timeouts for answers, while moving and at rest. */
 const TIMEOUT_MILLIS = { moving: 3000, resting: 30_000 };
 
+/** Follows what is wanted and what is requested. */
+export interface RequestObserver {
+  /** Another view, model or part of the scene is wanted than in the requests so far. */
+  viewChanged(): void;
+  /** A picture of what is wanted now was requested. */
+  requested(id: number): void;
+}
+
 export class RenderScheduler {
   private id = 0;
   private requestedAt = 0;
@@ -57,11 +65,13 @@ export class RenderScheduler {
     private readonly stages: () => number[],
     private readonly background: [number, number, number],
     private readonly method: () => string | undefined,
+    private readonly observer?: RequestObserver,
   ) {}
 
   /** Called when the view has changed. */
   moved(): void {
     this.movedAt = performance.now();
+    this.observer?.viewChanged();
     // Does not wait for a full picture of the old view: the next request replaces it.
     if (this.isResting) this.isWaiting = false;
     this.isResting = false;
@@ -82,6 +92,7 @@ export class RenderScheduler {
 
   /** Discards pending requests, which will not be answered. */
   restart(): void {
+    this.observer?.viewChanged();
     this.isWaiting = false;
     this.isResting = false;
   }
@@ -137,6 +148,7 @@ export class RenderScheduler {
     this.hasUpdate = false;
     const outputs: RenderMessage["outputs"] = this.isLocal ? ["depth"] : ["color", "depth"];
     this.connection.send({ type: "render", id: this.id, ...this.picture(this.view()), stages, outputs });
+    this.observer?.requested(this.id);
   }
 
   /** What pictures of a view have in common with those of the main view. */

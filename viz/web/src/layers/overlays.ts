@@ -2,11 +2,12 @@
 
 import * as THREE from "three";
 import { worldFromCamera } from "../view/convention";
+import { FRESH_MILLIS, freshness } from "./freshness";
 import { type Occlusion, ON_SURFACE } from "./occlusion";
 import type { NumberedKeyframe, PosedCamera, Scene } from "../connection/protocol";
 
-/** Colors of the newest keyframe and of keyframes that are much older than AGE_SECS. */
-const NEW_COLOR = new THREE.Color(0x4cc2a6);
+/** Colors of the newest keyframe, unlike that of live cameras, and of keyframes that are much older than AGE_SECS. */
+const NEW_COLOR = new THREE.Color(0xc792ea);
 const OLD_COLOR = new THREE.Color(0x9aa4b2);
 /** The color of a keyframe of this age is halfway between both. */
 const AGE_SECS = 10;
@@ -23,6 +24,9 @@ interface LiveCamera {
   worldFromCamera: THREE.Matrix4;
   /** Changes whenever other lines must be drawn. */
   key: string;
+  /** Mid-exposure of the newest image, on the server's clock. */
+  capturedMillis: number;
+  isOutdated: boolean;
 }
 
 export class Overlays {
@@ -97,12 +101,23 @@ export class Overlays {
     this.keyframes.geometry.setAttribute("color", new THREE.Float32BufferAttribute(colors, 3));
   }
 
-  /** Sets whether the poses of the live cameras are current; if not, they are drawn faintly. */
+  /** Sets whether the connection is open; if not, the poses of the live cameras are not current. */
   setLive(isLive: boolean): void {
     this.isLive = isLive;
-    for (const { lines } of this.live.values()) {
-      (lines.material as THREE.LineBasicMaterial).opacity = isLive ? 1 : 0.3;
+  }
+
+  /** Draws live cameras the more faintly, the older their newest image is. Returns whether this is a change. */
+  showAges(ageMillis: (capturedMillis: number) => number): boolean {
+    let isChange = false;
+    for (const camera of this.live.values()) {
+      const age = this.isLive ? ageMillis(camera.capturedMillis) : Infinity;
+      const material = camera.lines.material as THREE.LineBasicMaterial;
+      const opacity = freshness(age);
+      isChange ||= material.opacity !== opacity;
+      material.opacity = opacity;
+      camera.isOutdated = age > FRESH_MILLIS;
     }
+    return isChange;
   }
 
   /** Removes the live cameras: a new server may have others. */
@@ -117,18 +132,21 @@ export class Overlays {
 
   /** Poses of the live cameras in the world. */
   cameraPoses(): [string, PosedFrame][] {
-    const isOutdated = !this.isLive;
-    return [...this.live].map(([name, { worldFromCamera }]) => [name, { worldFromFrame: worldFromCamera, isOutdated }]);
+    const posed = ({ worldFromCamera: worldFromFrame, isOutdated }: LiveCamera): PosedFrame => ({ worldFromFrame, isOutdated });
+    return [...this.live].map(([name, camera]) => [name, posed(camera)]);
   }
 
-  /** Draws a camera at its current pose; returns whether the pose changed. */
-  setLiveCamera(camera: PosedCamera): boolean {
+  /** Draws a camera at its pose when an image was captured; returns whether the pose changed. */
+  setLiveCamera(camera: PosedCamera, capturedMillis: number): boolean {
     const key = [...camera.world_from_camera, ...camera.focal_px, this.frustumDepth].join();
     const before = this.live.get(camera.camera);
+    if (before) before.capturedMillis = capturedMillis;
     if (before?.key === key) return false;
     const lines = before?.lines ?? this.lines(LIVE_COLOR, 1);
     if (!before) this.cameras.add(lines);
-    this.live.set(camera.camera, { lines, worldFromCamera: worldFromCamera(camera.world_from_camera), key });
+    const isOutdated = before?.isOutdated ?? false;
+    const pose = worldFromCamera(camera.world_from_camera);
+    this.live.set(camera.camera, { lines, worldFromCamera: pose, key, capturedMillis, isOutdated });
     setLines(lines, frustum(camera, 1.6 * this.frustumDepth));
     return true;
   }

@@ -12,6 +12,9 @@ import type { Occlusion } from "./occlusion";
 import type { DepthPart, PictureHeader } from "../connection/protocol";
 import type { PosedDepth } from "../view/surface_picker";
 
+/** Saturation of a picture that is not the wanted one. Its brightness stays, so that it can still be read. */
+const FADED_SATURATION = 0.15;
+
 const N_COLUMNS = 256;
 const N_ROWS = 144;
 
@@ -44,6 +47,7 @@ const VERTEX = /* glsl */ `${DEPTH}
 const FRAGMENT = /* glsl */ `${TINT}${DEPTH}
   uniform sampler2D colorMap;
   uniform float opacity;
+  uniform float saturation;
   uniform bool isMoved;
   uniform vec2 sizePx;
   uniform vec2 focalPx;
@@ -76,6 +80,7 @@ const FRAGMENT = /* glsl */ `${TINT}${DEPTH}
     if (isMoved && abs(pointInPicture.z - depth) > tolerance(uv, depth)) discard;
     vec3 pointInWorld = (worldFromPicture * vec4(pointInPicture * (depth / pointInPicture.z), 1.0)).xyz;
     vec3 color = texture2D(colorMap, uv).rgb;
+    color = mix(vec3(dot(color, vec3(0.299, 0.587, 0.114))), color, saturation);
     gl_FragColor = vec4(rendered > 0.0 ? tinted(color, pointInWorld) : color, opacity);
   }`;
 
@@ -92,10 +97,14 @@ export class PictureLayer {
   readonly mesh: THREE.Mesh<THREE.BufferGeometry, THREE.ShaderMaterial>;
   /** The depth of the shown picture. */
   posedDepth: PosedDepth | null = null;
+  /** Whether a picture may be shown; asked when it is decoded, because by then another model may be wanted. */
+  accepts: (header: PictureHeader) => boolean = () => true;
   private isEnabled = true;
   /** Whether the newest picture has colors. */
   private hasColor = false;
   private shown: { id: number; stage: number } | null = null;
+  /** Header of the picture whose colors are shown. */
+  private coloredHeader: PictureHeader | null = null;
   private waiting: Received | null = null;
   private isDecoding = false;
   /** Number of servers so far. */
@@ -118,6 +127,7 @@ export class PictureLayer {
         emptyDepth: { value: 1 },
         isMoved: { value: false },
         opacity: { value: 1 },
+        saturation: { value: 1 },
         ...observations.uniforms,
       },
       transparent: true,
@@ -132,6 +142,20 @@ export class PictureLayer {
   set enabled(enabled: boolean) {
     this.isEnabled = enabled;
     this.mesh.visible = enabled && this.hasColor;
+  }
+
+  /** Header of the picture whose colors are shown; null if there is none. */
+  get header(): PictureHeader | null {
+    return this.hasColor ? this.coloredHeader : null;
+  }
+
+  /** Removes most of the colors of a picture that is not the wanted one. Returns whether this is a change. */
+  setFaded(isFaded: boolean): boolean {
+    const { saturation } = this.mesh.material.uniforms as Record<string, THREE.IUniform>;
+    const value = isFaded ? FADED_SATURATION : 1;
+    const isChange = saturation!.value !== value;
+    saturation!.value = value;
+    return isChange;
   }
 
   /** Opacity of the picture, 0 to 1. */
@@ -181,14 +205,17 @@ export class PictureLayer {
     const isOlder =
       this.shown &&
       (this.shown.id > header.id || (this.shown.id === header.id && this.shown.stage > header.stage));
-    if (isOlder || server !== this.nServers) {
+    if (isOlder || server !== this.nServers || !this.accepts(header)) {
       bitmap?.close();
       return false;
     }
     this.shown = { id: header.id, stage: header.stage };
     const uniforms = this.mesh.material.uniforms as Record<string, THREE.IUniform>;
     this.hasColor = bitmap !== null;
-    if (bitmap) replaceTexture(uniforms.colorMap!, colorTexture(bitmap));
+    if (bitmap) {
+      replaceTexture(uniforms.colorMap!, colorTexture(bitmap));
+      this.coloredHeader = header;
+    }
     replaceTexture(uniforms.depthMap!, depth);
     const worldFromPicture = worldFromCamera(header.world_from_camera);
     uniforms.worldFromPicture!.value = worldFromPicture;

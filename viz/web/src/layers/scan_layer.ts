@@ -1,6 +1,7 @@
 // The latest scan of each range scanner, colored by height, and the path of the base.
 
 import * as THREE from "three";
+import { freshness } from "./freshness";
 import { type Occlusion, ON_SURFACE } from "./occlusion";
 import type { RangeScanHeader } from "../connection/protocol";
 
@@ -9,19 +10,23 @@ const PATH_COLOR = 0xe3b341;
 /** Hues of the lowest and of the highest point. */
 const HUES = [0.66, 0.05] as const;
 
+/** The latest scan of a scanner. */
+interface Scan {
+  points: THREE.Points<THREE.BufferGeometry, THREE.PointsMaterial>;
+  /** Begin of the revolution, on the server's clock; null if the server does not report it. */
+  capturedMillis: number | null;
+}
+
 export class ScanLayer {
   readonly root = new THREE.Group();
   private readonly scans = new THREE.Group();
-  private readonly material: THREE.PointsMaterial;
-  private readonly byScanner = new Map<string, THREE.Points>();
+  /** A material for each scanner, because scans of different ages have different opacities. */
+  private readonly materials = new Map<string, THREE.PointsMaterial>();
+  private readonly byScanner = new Map<string, Scan>();
   private readonly path: THREE.Line;
   private hasPath = false;
 
-  constructor(occlusion: Occlusion) {
-    this.material = occlusion.apply(
-      new THREE.PointsMaterial({ size: SIZE_PX, sizeAttenuation: false, vertexColors: true }),
-      ON_SURFACE,
-    );
+  constructor(private readonly occlusion: Occlusion) {
     const line = new THREE.LineBasicMaterial({ color: PATH_COLOR });
     this.path = new THREE.Line(new THREE.BufferGeometry(), occlusion.apply(line, ON_SURFACE));
     this.path.frustumCulled = false;
@@ -47,12 +52,43 @@ export class ScanLayer {
     const geometry = new THREE.BufferGeometry();
     geometry.setAttribute("position", new THREE.Int16BufferAttribute(counts, 3));
     geometry.setAttribute("color", new THREE.Float32BufferAttribute(heightColors(counts), 3));
-    const points = new THREE.Points(geometry, this.material);
+    const points = new THREE.Points(geometry, this.material(header.scanner));
     points.frustumCulled = false;
     points.position.fromArray(header.origin_m);
     points.scale.setScalar(header.meters_per_count);
-    this.byScanner.set(header.scanner, points);
+    this.byScanner.set(header.scanner, { points, capturedMillis: header.captured_millis ?? null });
     this.scans.add(points);
+  }
+
+  /** Draws scans the more faintly, the older they are. Returns whether this is a change. */
+  showAges(ageMillis: (capturedMillis: number) => number): boolean {
+    let isChange = false;
+    for (const { points, capturedMillis } of this.byScanner.values()) {
+      const opacity = capturedMillis === null ? 1 : freshness(ageMillis(capturedMillis));
+      isChange ||= points.material.opacity !== opacity;
+      points.material.opacity = opacity;
+    }
+    return isChange;
+  }
+
+  /** The oldest of the drawn scans; null without scans of known age. */
+  oldest(ageMillis: (capturedMillis: number) => number): { scanner: string; ageMillis: number } | null {
+    let oldest: { scanner: string; ageMillis: number } | null = null;
+    for (const [scanner, { capturedMillis }] of this.byScanner) {
+      if (capturedMillis === null) continue;
+      const age = ageMillis(capturedMillis);
+      if (!oldest || age > oldest.ageMillis) oldest = { scanner, ageMillis: age };
+    }
+    return this.scans.visible ? oldest : null;
+  }
+
+  private material(scanner: string): THREE.PointsMaterial {
+    const known = this.materials.get(scanner);
+    if (known) return known;
+    const options = { size: SIZE_PX, sizeAttenuation: false, vertexColors: true, transparent: true };
+    const material = this.occlusion.apply(new THREE.PointsMaterial(options), ON_SURFACE);
+    this.materials.set(scanner, material);
+    return material;
   }
 
   /** Shows the path of the base, in world. */
@@ -68,7 +104,7 @@ export class ScanLayer {
   }
 
   private remove(scanner: string): void {
-    const points = this.byScanner.get(scanner);
+    const points = this.byScanner.get(scanner)?.points;
     if (!points) return;
     points.geometry.dispose();
     this.scans.remove(points);

@@ -2,34 +2,65 @@
 
 import { Chart, timeText } from "./chart";
 import { element } from "./element";
+import { storeText } from "./header";
+import { bytesText, countText, stepTimeText } from "./quantities";
 import type { ModelStatus, Status } from "../connection/protocol";
 
 export class Readouts {
   private readonly chart = new Chart(element("chart", HTMLCanvasElement));
 
   show(status: Status, model: ModelStatus): void {
-    text("state", status.state);
     text("method", status.others.length === 0 ? model.method : ""); // Otherwise the switch shows the method.
     text("psnr", model.psnr === null ? "–" : model.psnr.toFixed(2));
     text("seconds", timeText(status.seconds));
-    text("step", count(model.step));
-    text("step-millis", model.step_millis === null ? "–" : `${model.step_millis.toPrecision(3)} ms`);
+    text("step", countText(model.step));
+    text("step-millis", stepTimeText(model.step_millis));
     text("primitives-label", model.primitives_label || "Primitives");
-    text("primitives", count(model.primitives));
+    text("primitives", countText(model.primitives));
     text("bytes", bytesText(model.bytes));
-    text("keyframes", count(status.keyframes));
-    // A saved model lists only accepted keyframes.
-    for (const id of ["rejected-label", "rejected-total"]) element(id).hidden = status.state === "viewing";
-    const reasons = Object.entries(status.rejected).sort((a, b) => b[1] - a[1]);
-    text("rejected-total", count(reasons.reduce((sum, [, n]) => sum + n, 0)));
-    element("rejected").replaceChildren(
-      ...reasons.flatMap(([reason, n]) => [child("dt", reason.replaceAll("_", " ")), child("dd", count(n))]),
-    );
-    element("notes-card").hidden = status.notes.length === 0;
-    element("notes").replaceChildren(...status.notes.map((note) => child("li", note)));
+    showKeyframes(status);
+    showNotes(status);
     const others = [status, ...status.others].filter((other) => other.method !== model.method);
     this.chart.set(model.psnr_history, others.map((other) => other.psnr_history));
   }
+}
+
+/** What became of the images. Saved models only have a number of keyframes, and files of other programs not even that. */
+function showKeyframes({ state, keyframes, rejected, images, store }: Status): void {
+  const isSaved = state === "viewing";
+  element("keyframes-card").hidden = isSaved && keyframes === 0;
+  const reasons = Object.entries(rejected).sort((a, b) => b[1] - a[1]);
+  const nRejected = reasons.reduce((sum, [, n]) => sum + n, 0);
+  row("keyframes", store ? storeText(store) : countText(keyframes));
+  row("accepted", images ? countText(images.accepted) : null);
+  row("evicted", images && images.evicted > 0 ? countText(images.evicted) : null);
+  row("dropped-total", images ? countText(images.dropped) : null);
+  row("rejected-total", isSaved ? null : countText(nRejected));
+  element("rejected").replaceChildren(
+    ...reasons.flatMap(([reason, n]) => [child("dt", reason.replaceAll("_", " ")), child("dd", countText(n))]),
+  );
+}
+
+/** Shows a value, or hides it with its label if it is null. */
+function row(id: string, value: string | null): void {
+  element(`${id}-label`).hidden = value === null;
+  element(id).hidden = value === null;
+  if (value !== null) text(id, value);
+}
+
+/** Warnings come first. The button for checkpoints shows the note on its result. */
+function showNotes({ notes, infos, checkpoint }: Status): void {
+  const isInfo = (note: string): boolean => infos?.includes(note) ?? false;
+  const shown = notes.filter((note) => note !== checkpoint?.text);
+  const sorted = [...shown.filter((note) => !isInfo(note)), ...shown.filter(isInfo)];
+  element("notes-card").hidden = sorted.length === 0;
+  element("notes").replaceChildren(
+    ...sorted.map((note) => {
+      const item = child("li", note);
+      item.dataset.kind = isInfo(note) ? "info" : "warning";
+      return item;
+    }),
+  );
 }
 
 function text(id: string, value: string): void {
@@ -40,14 +71,4 @@ function child(tag: string, value: string): HTMLElement {
   const made = document.createElement(tag);
   made.textContent = value;
   return made;
-}
-
-function count(n: number): string {
-  return n.toLocaleString("en-US");
-}
-
-function bytesText(bytes: number): string {
-  if (bytes < 1024 * 1024) return `${(bytes / 1024).toFixed(0)} KiB`;
-  if (bytes < 1024 ** 3) return `${(bytes / 1024 ** 2).toFixed(1)} MiB`;
-  return `${(bytes / 1024 ** 3).toFixed(2)} GiB`;
 }

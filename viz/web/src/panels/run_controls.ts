@@ -22,8 +22,11 @@ export class RunControls {
   }
 
   show(status: Status): void {
+    element("save-note").textContent = status.checkpoint?.text ?? "";
+    element("save-note").dataset.state = status.checkpoint?.state ?? "";
     this.isPaused = status.state === "paused";
     element("pause").textContent = this.isPaused ? "Continue" : "Pause";
+    element("pause").dataset.paused = String(this.isPaused);
     const isRunning = CONTROLLABLE.includes(status.state);
     // Undoing all edits must be saved, too.
     const canSaveEdits = SAVED.includes(status.state) && this.connection.supports("edit");

@@ -26,7 +26,8 @@ export class LiveImagesTopic implements Topic {
       if (!header.world_from_camera) return;
       this.latest = header;
       element("look-live", HTMLButtonElement).disabled = false;
-      const hasMoved = this.view.overlays.setLiveCamera({ ...header, world_from_camera: header.world_from_camera });
+      const posed = { ...header, world_from_camera: header.world_from_camera };
+      const hasMoved = this.view.overlays.setLiveCamera(posed, header.captured_millis);
       if (hasMoved) this.view.changed();
     }),
   ];

@@ -1,0 +1,35 @@
+// Fades live cameras and range scans that have become old, and shows the age of the scans.
+
+import type { ServerClock } from "../connection/server_clock";
+import { FRESH_MILLIS } from "../layers/freshness";
+import type { OrbitView } from "../view/orbit_view";
+import { element } from "./element";
+
+const PERIOD_MILLIS = 100;
+
+export class OverlayAges {
+  /** Whether the run has ended, so that old data are expected. */
+  hasEnded = false;
+
+  constructor(
+    private readonly view: OrbitView,
+    private readonly clock: () => ServerClock,
+  ) {
+    window.setInterval(() => this.show(), PERIOD_MILLIS);
+  }
+
+  private show(): void {
+    const ageMillis = (capturedMillis: number): number => this.clock().age(capturedMillis) ?? Infinity;
+    const haveCamerasChanged = this.view.overlays.showAges(ageMillis);
+    const haveScansChanged = this.view.scans.showAges(ageMillis);
+    if (haveCamerasChanged || haveScansChanged) this.view.changed();
+    const label = element("scan-age");
+    const oldest = this.view.scans.oldest(ageMillis);
+    label.hidden = oldest === null || oldest.ageMillis <= FRESH_MILLIS || this.hasEnded;
+    if (oldest && !label.hidden) label.textContent = `${oldest.scanner} ${ageText(oldest.ageMillis)}`;
+  }
+}
+
+function ageText(millis: number): string {
+  return Number.isFinite(millis) ? `${(millis / 1000).toFixed(1)} s old` : "not live";
+}

@@ -1,0 +1,111 @@
+// Shows which model, stage and age the drawn picture has, and removes the colors of a picture that is not the wanted one.
+
+import type { ServerClock } from "../connection/server_clock";
+import type { OrbitView } from "../view/orbit_view";
+import { element } from "./element";
+import { type DrawnHeader, labelText, PictureLabel, type PictureStatus } from "./picture_label";
+
+export class PictureInfo {
+  private readonly label = new PictureLabel();
+  private answerMillis = 0;
+  private readonly info = element("picture-info");
+  private readonly text = element("picture-text");
+  private readonly marks = [...this.info.querySelectorAll(".stages i")];
+
+  /**
+   * `latestStep`: number of steps of a model now, if it is known. `stages`: scales of the stages that the marks stand
+   * for.
+   */
+  constructor(
+    private readonly view: OrbitView,
+    private readonly clock: () => ServerClock,
+    private readonly latestStep: (method: string | undefined) => number | undefined,
+    private readonly stages: () => number[],
+  ) {
+    view.picture.accepts = (header) => this.label.accepts(header);
+  }
+
+  /** Another view is wanted. */
+  viewChanged(): void {
+    this.label.viewChanged(performance.now());
+    this.update();
+  }
+
+  /** Another model is wanted. */
+  modelChanged(): void {
+    this.label.modelChanged(performance.now());
+    this.update();
+  }
+
+  /** A picture was requested. */
+  requested(id: number): void {
+    this.label.requested(id, performance.now());
+    this.update();
+  }
+
+  /** A picture is drawn. `answerMillis`: time from its request to its arrival. */
+  drawn(answerMillis: number): void {
+    this.answerMillis = answerMillis;
+    this.update();
+  }
+
+  /** Shows the state of now. To be called for every display refresh, and after every event. */
+  update(): void {
+    const now = performance.now();
+    this.label.show(this.view.picture.header, now);
+    const status = this.label.status(now);
+    if (this.view.picture.setFaded(status.state === "old")) this.view.changed();
+    if (this.view.local.root.visible) {
+      this.showLocal(status);
+      return;
+    }
+    const { header } = this.label;
+    this.set({
+      state: status.state,
+      method: header?.method ?? "",
+      step: numberText(header?.step),
+      request: numberText(status.request),
+      shownRequest: numberText(header?.id),
+    });
+    const text = labelText(header, status, this.answerMillis, header && this.ageMillis(header, status));
+    if (this.text.textContent !== text) this.text.textContent = text;
+    this.showStages(status.isOfView ? (header?.scale ?? 0) : 0);
+  }
+
+  /** The page draws the model itself, with the chunks of one model only; their number is shown as they arrive. */
+  private showLocal(status: PictureStatus): void {
+    const { method, progress } = this.view.local;
+    this.set({
+      state: progress.nIncomplete > 0 ? "waiting" : "current",
+      method: method ?? "",
+      step: "",
+      request: numberText(status.request),
+      shownRequest: "",
+    });
+    this.showStages(progress.nIncomplete > 0 ? 0 : 1);
+  }
+
+  /** Age of the picture, if it matters: the model has changed since, or the view has. */
+  private ageMillis(header: DrawnHeader, status: PictureStatus): number | null {
+    const latestStep = this.latestStep(header.method);
+    const isOutdated = latestStep !== undefined && header.step !== undefined && latestStep > header.step;
+    return isOutdated || !status.isOfView ? this.clock().age(header.sent_millis) : null;
+  }
+
+  private set(values: Record<string, string>): void {
+    for (const [name, value] of Object.entries(values)) {
+      if (this.info.dataset[name] !== value) this.info.dataset[name] = value;
+    }
+  }
+
+  /** Fills the marks of the stages up to a scale. */
+  private showStages(scale: number): void {
+    this.marks.forEach((mark, ix) => {
+      mark.classList.toggle("done", scale >= (this.stages()[ix] ?? 1) - 1e-9);
+    });
+  }
+}
+
+function numberText(value: number | null | undefined): string {
+  return value === null || value === undefined ? "" : String(value);
+}

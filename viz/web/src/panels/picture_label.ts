@@ -1,0 +1,121 @@
+// What the drawn picture is, and whether it is the one that was asked for. A state machine without DOM.
+//
+// The view and the model that the operator wants change at any time. Each request takes what is wanted at its time. A
+// picture is current as long as nothing has changed since its request. All facts about a picture come from the header
+// that was drawn, so that a label can be late, but never describes another picture.
+
+import type { PictureHeader } from "../connection/protocol";
+
+/** A drawn picture is noticeably outdated after this time. */
+const OLD_MILLIS = 1000;
+
+/** The parts of a header that describe a picture. */
+export type DrawnHeader = Pick<PictureHeader, "id" | "method" | "step" | "scale" | "size_px" | "sent_millis">;
+
+/** `current`: it is of the wanted view and model. `old`: it is not for more than a second, or of another model. */
+export type PictureState = "current" | "waiting" | "old";
+
+export interface PictureStatus {
+  state: PictureState;
+  /** Whether view and model are the wanted ones, possibly at a lower resolution. */
+  isOfView: boolean;
+  /** How long the operator has been waiting for another picture; null if it is complete. */
+  waitingMillis: number | null;
+  /** Newest request. */
+  request: number | null;
+}
+
+export class PictureLabel {
+  /** When each request became outdated; null as long as its view and model are wanted. */
+  private readonly outdatedAt = new Map<number, number | null>();
+  private newest: number | null = null;
+  /** The first request of the wanted model. */
+  private firstOfModel = 0;
+  private firstRequestAt: number | null = null;
+  /** When the drawn picture, or a finer stage of it, was drawn. */
+  private drawnAt = 0;
+  private drawn: DrawnHeader | null = null;
+
+  /** Another view is wanted. */
+  viewChanged(now: number): void {
+    for (const [id, at] of this.outdatedAt) if (at === null) this.outdatedAt.set(id, now);
+  }
+
+  /** Another model is wanted. */
+  modelChanged(now: number): void {
+    this.viewChanged(now);
+    this.firstOfModel = (this.newest ?? -1) + 1;
+  }
+
+  /** A picture of what is wanted now was requested. Numbers of requests grow. */
+  requested(id: number, now: number): void {
+    this.newest = id;
+    this.firstRequestAt ??= now;
+    this.outdatedAt.set(id, null);
+  }
+
+  /** Whether a picture may be drawn: late stages of another model must not. */
+  accepts({ id }: Pick<DrawnHeader, "id">): boolean {
+    return id >= this.firstOfModel;
+  }
+
+  /** Adopts the header of the picture that is drawn from now on; null if none is drawn. */
+  show(header: DrawnHeader | null, now: number): void {
+    if (header === this.drawn) return;
+    this.drawn = header;
+    this.drawnAt = now;
+    if (!header) return;
+    // Earlier requests cannot be drawn any more.
+    for (const id of this.outdatedAt.keys()) if (id < header.id) this.outdatedAt.delete(id);
+  }
+
+  /** The header of the drawn picture. */
+  get header(): DrawnHeader | null {
+    return this.drawn;
+  }
+
+  status(now: number): PictureStatus {
+    const request = this.newest;
+    if (!this.drawn) {
+      const waitingMillis = this.firstRequestAt === null ? null : now - this.firstRequestAt;
+      return { state: "waiting", isOfView: false, waitingMillis, request };
+    }
+    // A request that is not known was made before the picture that was drawn last, so it is outdated.
+    const outdatedAt = this.outdatedAt.has(this.drawn.id) ? this.outdatedAt.get(this.drawn.id)! : this.drawnAt;
+    const isOfView = outdatedAt === null;
+    if (isOfView && this.drawn.scale >= 1 - 1e-9) return { state: "current", isOfView, waitingMillis: null, request };
+    const waitingMillis = now - (outdatedAt ?? this.drawnAt);
+    const isOfOtherModel = this.drawn.id < this.firstOfModel;
+    if (isOfOtherModel || waitingMillis > OLD_MILLIS) return { state: "old", isOfView, waitingMillis, request };
+    return { state: isOfView ? "current" : "waiting", isOfView, waitingMillis, request };
+  }
+}
+
+/** The label of a picture. `answerMillis`: time from its request to its arrival. `ageMillis`: null if it is not old. */
+export function labelText(
+  header: DrawnHeader | null,
+  { isOfView, waitingMillis, state }: PictureStatus,
+  answerMillis: number,
+  ageMillis: number | null,
+): string {
+  if (!header) return `no picture yet${waitingText(waitingMillis)}`;
+  const age = ageMillis !== null && ageMillis > OLD_MILLIS ? `${secondsText(ageMillis)} old` : "";
+  const what = [header.method ?? "", age].filter((part) => part !== "").join(", ");
+  const [width, height] = header.size_px;
+  const size = `${width} × ${height} (${Math.round(100 * header.scale)} %)`;
+  const isLate = state !== "current";
+  const details = isOfView ? (isLate ? size : `${size} in ${answerMillis.toFixed(0)} ms`) : "";
+  const text = [what, details].filter((part) => part !== "").join(" · ");
+  return isLate ? `${text}${waitingText(waitingMillis)}`.replace(/^ · /, "") : text;
+}
+
+function waitingText(millis: number | null): string {
+  if (millis === null) return "";
+  // Fast pictures of a moving view would otherwise show changing numbers that mean nothing.
+  return millis < 300 ? " · waiting" : ` · waiting ${secondsText(millis)}`;
+}
+
+function secondsText(millis: number): string {
+  const seconds = millis / 1000;
+  return seconds < 120 ? `${seconds.toFixed(seconds < 10 ? 1 : 0)} s` : `${Math.round(seconds / 60)} min`;
+}
