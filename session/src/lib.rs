@@ -84,7 +84,7 @@ pub use gpu_loss::lose_gpu_at_step;
 pub use kept_folder::KeptFolder;
 pub use latency::Latency;
 pub use ledger::{KeyframeTimes, Ledger, latencies};
-pub use live_loop::{KeyframeChange, LiveLoop, LiveOptions, Pace};
+pub use live_loop::{EndedLoop, KeyframeChange, LiveLoop, LiveOptions, Pace};
 pub use methods::methods_of;
 pub use observer::{
     DoneEvent, Evaluation, FinishedReport, Observer, ProfileEvent, SessionEvent, SessionProgress,
@@ -97,10 +97,10 @@ pub use run_plan::{
     DiscardedRun, EndedRun, OpenedRun, PreparedRun, PreviousLiveRun, RunInProgress, RunInput,
     RunPlan, SavedRun,
 };
-pub use saved_view::publish_saved;
+pub use saved_view::{publish_loading, publish_saved};
 pub use scene_calibration::{RelativePose, SCENE_PARAMS, SceneCalibration, calibrate_scene};
 pub use session::{
-    EndingSession, Evaluators, FinishedModel, Limits, Persistence, Scoreboard, Session,
+    EndViewers, EndingSession, Evaluators, FinishedModel, Limits, Persistence, Scoreboard, Session,
     SessionOptions, TrainingOutcome, TrainingTime, finish,
 };
 pub use session_setup::{NewObserver, Services};

@@ -7,7 +7,7 @@ use nalgebra::Point3;
 use serde_json::Value;
 use std::path::{Path, PathBuf};
 use trainer::{Bounds, LoadedModel, ModelKind, Progress};
-use viz::{Hub, KeyframePose, ModelStatus, SceneHint, Status};
+use viz::{Hub, KeyframePose, ModelStatus, SceneHint, StateProgress, Status};
 
 /// Publishes the cameras, the status and the initial view of saved models.
 ///
@@ -52,6 +52,19 @@ pub fn publish_saved(
     hub.set_keyframes(cameras);
     hub.set_status(status);
     Ok(())
+}
+
+/// Publishes that a saved model is being read, before [`publish_saved`].
+///
+/// * `ix`: index of the model in `paths`.
+pub fn publish_loading(hub: &Hub, paths: &[PathBuf], ix: usize) {
+    let name = paths[ix].display();
+    let text = match paths.len() {
+        1 => name.to_string(),
+        n_all => format!("{} of {n_all}: {name}", ix + 1),
+    };
+    let progress = StateProgress::of_parts(text, ix, paths.len());
+    hub.set_state_and_progress("loading the model", Some(progress.at_startup()));
 }
 
 /// The cameras of the first model whose folder lists them. An unreadable list only causes a

@@ -1,5 +1,6 @@
 //! A training session: one model in training, with scheduled evaluations and checkpoints.
 
+mod end_viewers;
 mod ending;
 mod options;
 mod outcome;
@@ -10,6 +11,7 @@ mod scoreboard;
 mod training_time;
 mod viewed_model;
 
+pub use end_viewers::EndViewers;
 pub use ending::{EndingSession, FinishedModel, finish};
 pub use options::SessionOptions;
 pub use outcome::TrainingOutcome;

@@ -247,12 +247,9 @@ impl ModelViewer {
     }
 }
 
-/// Draws a requested picture of a model whose frame is the world frame of the page.
-pub(crate) fn answer(pending: PendingRender, method: &mut dyn Method, edits: &Arc<Edits>) {
-    let request = pending.request.clone();
-    answer_with(pending, request, method, edits);
-}
-
+/// Draws a picture and sends it to the client that has requested it.
+///
+/// * `request`: what to draw, in the world frame of the model.
 fn answer_with(
     pending: PendingRender,
     request: RenderRequest,
