@@ -412,4 +412,6 @@ fn set_initial_points(method: &mut AlignedModel, points: Option<&Arc<InitialPoin
 }
 
 #[cfg(test)]
+mod ending_tests;
+#[cfg(test)]
 mod tests;

@@ -329,7 +329,7 @@ impl LiveLoop {
             let text = format!("scoring {n_scored} of {n_all} test images");
             return Some(StateProgress::of_parts(text, n_scored, n_all));
         }
-        if self.is_finished() || self.requests.is_paused || self.is_training() {
+        if self.is_finished() || self.is_training() {
             return None;
         }
         let n_keyframes = self.accepted.list.len();
