@@ -64,7 +64,6 @@ fn assert_not_black(browser: &mut Browser, when: &str) {
                 .any(|value| *value > MAX_BLACK)
         })
         .count();
-    #[expect(clippy::cast_precision_loss, reason = "a number of pixels")]
     let visible_frac = n_visible as f64 / n_all as f64;
     if visible_frac < MIN_VISIBLE_FRAC {
         let file = PathBuf::from(env!("CARGO_TARGET_TMPDIR")).join("page-black.png");
@@ -142,13 +141,13 @@ fn progress(text: &str, n_done: usize, n_all: usize) -> StateProgress {
     StateProgress::of_parts(text.to_owned(), n_done, n_all)
 }
 
-fn training(step: u64) -> Status {
+fn trained() -> Status {
     Status {
         state: "training".to_owned(),
         keyframes: 5,
         model: ModelStatus {
             method: "splat".to_owned(),
-            step,
+            step: 100,
             ..ModelStatus::default()
         },
         ..Status::default()
@@ -169,6 +168,8 @@ fn the_page_says_what_happens_until_there_is_a_picture() {
         let picture = drawn.draw(&pending.request);
         pending.deliver(picture);
     });
+    // Dropped before the thread, which waits as long as pictures are held back.
+    let _release = pictures.clone();
     let profile = profile("startup");
     let mut browser = Browser::open(&program, &profile, &server.url(), WINDOW_PX);
 
@@ -213,10 +214,10 @@ fn check_startup(browser: &mut Browser, hub: &Hub, pictures: &Pictures) {
     assert_not_black(browser, "while the model is empty");
     pictures.have_content.store(true, Ordering::Relaxed);
     // The page requests pictures after each change of the model.
-    let mut step = 0;
+    let mut edit_revision = 0;
     wait_for(browser, "a picture", |browser| {
-        step += 1;
-        hub.set_status(training(step));
+        edit_revision += 1;
+        hub.change_status(|status| status.edit_revision = edit_revision);
         is_covered(browser) == Some(false)
     });
     assert_not_black(browser, "with a picture");
@@ -225,6 +226,7 @@ fn check_startup(browser: &mut Browser, hub: &Hub, pictures: &Pictures) {
 /// A page that is loaded while pictures wait shows why.
 fn check_reload_while_scoring(browser: &mut Browser, hub: &Hub, pictures: &Pictures) {
     pictures.hold(true);
+    hub.set_status(trained());
     hub.set_state_and_progress(
         "scoring, 12 of 50 images",
         Some(progress("12 of 50 test images", 12, 50)),
