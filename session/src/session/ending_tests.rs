@@ -246,13 +246,17 @@ fn viewers_get_pictures_of_all_models_while_each_is_scored() {
     drop(server);
     let received = client.join().expect("no panic");
 
-    let scores = |models: &[FinishedModel]| -> Vec<_> {
-        models
-            .iter()
-            .map(|model| (model.kind, model.scores.clone(), model.n_tests))
-            .collect()
+    let results = |models: &[FinishedModel]| -> Vec<_> {
+        let result = |model: &FinishedModel| {
+            let saved = std::fs::read(model.folder.join("splats.ply")).expect("saved");
+            (model.kind, model.scores.clone(), saved)
+        };
+        models.iter().map(result).collect()
     };
-    assert!(scores(&watched) == scores(&unwatched), "the scores differ");
+    assert!(
+        results(&watched) == results(&unwatched),
+        "the results differ"
+    );
     assert_eq!(watched.len(), METHODS.len());
     let drawn = drawn.borrow();
     let is_test = |(_, size_px): &(_, [u32; 2])| *size_px == TEST_PX;
