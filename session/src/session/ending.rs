@@ -313,11 +313,28 @@ impl Viewing<'_> {
     /// Shows viewers how many test images are scored.
     fn show_scored(&self, n_scored: usize, n_all: usize) {
         if let Some(viewers) = self.viewers.as_deref() {
-            let text = format!("{n_scored} of {n_all} test images");
+            let is_only_model = self.before.is_empty() && self.after.is_empty();
+            let model = if is_only_model {
+                String::new()
+            } else {
+                format!(" of the model {}", self.kind.name())
+            };
+            let text = format!("{n_scored} of {n_all} test images{model}");
             viewers.show(
                 &format!("scoring, {n_scored} of {n_all} images"),
                 StateProgress::of_parts(text, n_scored, n_all),
             );
+        }
+    }
+
+    /// Shows viewers that the report is being written.
+    fn show_reporting(&self) {
+        if let Some(viewers) = self.viewers.as_deref() {
+            let progress = StateProgress {
+                text: "writing the report".to_owned(),
+                ..StateProgress::default()
+            };
+            viewers.show("saving", progress);
         }
     }
 }
@@ -406,6 +423,7 @@ fn report_end(
         reporter,
         mut viewing,
     } = session;
+    viewing.show_reporting();
     // Rendered before profiling, because profiling trains the model further.
     let comparisons = reporter.compare(method, scoreboard.tests(), &outcome.per_image, |method| {
         viewing.serve(method)
