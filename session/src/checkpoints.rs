@@ -300,6 +300,13 @@ impl Checkpoints {
         self.due_after = self.period;
     }
 
+    /// Whether a checkpoint or keyframes are being written.
+    pub(crate) fn is_writing(&self) -> bool {
+        self.writer
+            .as_ref()
+            .is_some_and(|writer| !writer.thread.is_finished())
+    }
+
     fn wait_and_warn(&mut self) {
         let is_checkpoint = self
             .writer

@@ -108,16 +108,26 @@ impl ChunkPublisher {
         began.elapsed()
     }
 
+    /// Waits for chunks that are being encoded, and publishes them.
+    pub(crate) fn wait(&mut self) {
+        if let Some(encoding) = self.task.take() {
+            self.publish_encoded(encoding);
+        }
+    }
+
     /// Publishes the chunks that are encoded.
     fn finish(&mut self) {
-        let Some(Encoding {
+        if let Some(encoding) = self.task.take_if(|task| task.thread.is_finished()) {
+            self.publish_encoded(encoding);
+        }
+    }
+
+    fn publish_encoded(&mut self, encoding: Encoding) {
+        let Encoding {
             name,
             began,
             thread,
-        }) = self.task.take_if(|task| task.thread.is_finished())
-        else {
-            return;
-        };
+        } = encoding;
         // The time from start to start is the time of encoding, divided by its allowed fraction.
         let pause = Duration::from_secs_f64(began.elapsed().as_secs_f64() / MAX_ENCODE_FRAC);
         if let Some(published) = self.models.get_mut(name) {

@@ -69,6 +69,13 @@ impl Editor {
             .map(|_| "looking for floaters …".to_owned())
     }
 
+    /// Whether a search is running.
+    pub(crate) fn is_searching(&self) -> bool {
+        self.search
+            .as_ref()
+            .is_some_and(|search| !search.thread.is_finished())
+    }
+
     /// Takes the result of the search if it is ready, or waits for it if `wait`: the request and
     /// the floaters, or the reason why there are none.
     pub(crate) fn take_found(

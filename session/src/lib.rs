@@ -88,7 +88,7 @@ pub use gpu_loss::lose_gpu_at_step;
 pub use kept_folder::KeptFolder;
 pub use latency::Latency;
 pub use ledger::{KeyframeTimes, Ledger, latencies};
-pub use live_loop::{KeyframeChange, LiveLoop, LiveOptions, Pace};
+pub use live_loop::{EndedLoop, KeyframeChange, LiveLoop, LiveOptions, Pace};
 pub use methods::methods_of;
 pub use observer::{
     DoneEvent, Evaluation, FinishedReport, Observer, ProfileEvent, SessionEvent, SessionProgress,
@@ -102,10 +102,10 @@ pub use run_plan::{
     RunPlan, SavedRun,
 };
 pub use run_state::RunState;
-pub use saved_view::publish_saved;
+pub use saved_view::{publish_loading, publish_saved};
 pub use scene_calibration::{RelativePose, SCENE_PARAMS, SceneCalibration, calibrate_scene};
 pub use session::{
-    EndingSession, Evaluators, FinishedModel, Limits, Persistence, Scoreboard, Session,
+    EndViewers, EndingSession, Evaluators, FinishedModel, Limits, Persistence, Scoreboard, Session,
     SessionOptions, TrainingOutcome, TrainingTime, finish,
 };
 pub use session_setup::{NewObserver, Services};

@@ -69,6 +69,12 @@ impl PendingEvaluation {
         self.remaining.is_empty() || !self.images.is_empty() && self.spent >= self.max_spent
     }
 
+    /// Number of scored images, and of all images.
+    pub(crate) fn progress(&self) -> (usize, usize) {
+        let n_scored = self.images.len();
+        (n_scored, n_scored + self.remaining.len())
+    }
+
     /// The time that scoring has taken.
     pub(crate) fn spent(&self) -> Duration {
         self.spent

@@ -7,7 +7,9 @@ use nalgebra::Point3;
 use serde_json::Value;
 use std::path::{Path, PathBuf};
 use trainer::{Bounds, LoadedModel, ModelKind, Progress};
-use viz::{Hub, Identity, KeyframePose, ModelStatus, OperatorStatus, SceneHint, Status};
+use viz::{
+    Hub, Identity, KeyframePose, ModelStatus, OperatorStatus, SceneHint, StateProgress, Status,
+};
 
 /// Publishes the cameras, the status and the initial view of saved models.
 ///
@@ -70,6 +72,19 @@ fn identity(paths: &[PathBuf]) -> Identity {
         run: name.map(|name| name.to_string_lossy().into_owned()),
         ..Identity::default()
     }
+}
+
+/// Publishes that a saved model is being read, before [`publish_saved`].
+///
+/// * `ix`: index of the model in `paths`.
+pub fn publish_loading(hub: &Hub, paths: &[PathBuf], ix: usize) {
+    let name = paths[ix].display();
+    let text = match paths.len() {
+        1 => name.to_string(),
+        n_all => format!("{} of {n_all}: {name}", ix + 1),
+    };
+    let progress = StateProgress::of_parts(text, ix, paths.len());
+    hub.set_state_and_progress("loading the model", Some(progress.at_startup()));
 }
 
 /// The cameras of the first model whose folder lists them. An unreadable list only causes a

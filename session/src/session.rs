@@ -1,5 +1,6 @@
 //! A training session: one model in training, with scheduled evaluations and checkpoints.
 
+mod end_viewers;
 mod ending;
 mod options;
 mod outcome;
@@ -10,6 +11,7 @@ mod scoreboard;
 mod training_time;
 mod viewed_model;
 
+pub use end_viewers::EndViewers;
 pub use ending::{EndingSession, FinishedModel, finish};
 pub use options::SessionOptions;
 pub use outcome::TrainingOutcome;
@@ -409,5 +411,7 @@ fn set_initial_points(method: &mut AlignedModel, points: Option<&Arc<InitialPoin
     points.is_none_or(|points| method.model_mut().set_initial_points(points))
 }
 
+#[cfg(test)]
+mod ending_tests;
 #[cfg(test)]
 mod tests;

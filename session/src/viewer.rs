@@ -248,22 +248,14 @@ impl ModelViewer {
     }
 }
 
-/// Draws a requested picture of a model whose frame is the world frame of the page.
-pub(crate) fn answer(
-    pending: PendingRender,
-    kind: ModelKind,
-    method: &mut dyn Method,
-    edits: &Arc<Edits>,
-) {
-    let request = pending.request.clone();
-    answer_with(of_model(pending, kind, method), request, method, edits);
-}
-
 /// Labels a requested picture with the model that draws it.
 fn of_model(pending: PendingRender, kind: ModelKind, method: &dyn Method) -> PendingRender {
     pending.of_model(kind.name(), method.progress().step)
 }
 
+/// Draws a picture and sends it to the client that has requested it.
+///
+/// * `request`: what to draw, in the world frame of the model.
 fn answer_with(
     pending: PendingRender,
     request: RenderRequest,

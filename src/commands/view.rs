@@ -8,7 +8,7 @@ use kinematics::Transform;
 use messages::BadInput;
 use nalgebra::{Translation3, UnitQuaternion, Vector3};
 use serde_json::json;
-use session::{ModelViewer, ServedModel, methods, publish_saved, run_folder};
+use session::{ModelViewer, ServedModel, methods, publish_loading, publish_saved, run_folder};
 use std::path::{Path, PathBuf};
 use trainer::LoadedModel;
 use viz::Hub;
@@ -70,8 +70,11 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     let page = args.page.serve_or_free_port(&hub)?;
 
     let model_from_page = args.up.model_from_page();
-    let models = paths.iter().map(|path| methods::load(gpu.clone(), path));
-    let mut models = models.collect::<anyhow::Result<Vec<LoadedModel>>>()?;
+    let mut models: Vec<LoadedModel> = Vec::new();
+    for (ix, path) in paths.iter().enumerate() {
+        publish_loading(&hub, &paths, ix);
+        models.push(methods::load(gpu.clone(), path)?);
+    }
     publish_saved(&hub, &gpu, &mut models, &paths, &model_from_page)?;
     let methods: Vec<&str> = models.iter().map(|model| model.kind.name()).collect();
     page.print(args.json, json!({ "methods": methods }))?;

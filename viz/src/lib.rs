@@ -46,7 +46,7 @@ pub use topics::operator_status::{
     RequestedCheckpoint,
 };
 pub use topics::published_data::{
-    Guidance, KeyframePose, ModelStatus, RunResult, SceneHint, Status,
+    Guidance, KeyframePose, ModelStatus, RunResult, SceneHint, StateProgress, Status,
 };
 pub use topics::robot_description::{MeshFormat, RobotDescription, RobotMesh};
 

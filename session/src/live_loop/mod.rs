@@ -7,12 +7,14 @@ mod pictures;
 mod publishing;
 mod requests;
 
+use crate::error::is_gpu_error;
 use crate::ledger::Ledger;
 use crate::recoveries::{self, OpenGpu, Recoveries};
 use crate::render_budget::RenderBudget;
 use crate::run_state::RunState;
 use crate::scene_hint;
-use crate::session::Session;
+use crate::session::{EndViewers, Session};
+use background::Task;
 use capture::{Feed, InputResult, Notes};
 use keyframe::Keyframe;
 use keyframe_warning::KeyframeWarning;
@@ -23,7 +25,7 @@ use requests::Requests;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 use trainer::AlignTiming;
-use viz::{Hub, Identity};
+use viz::{Hub, Identity, StateProgress};
 
 /// Maximum wait for a keyframe when there is nothing to do. Controls, edits and the status wait as
 /// long; a shorter wait would use more of a processor for checks without result.
@@ -184,19 +186,24 @@ impl LiveLoop {
             .and_then(|()| self.render())
             .map(|()| self.publish_models())
             .and_then(|()| self.publish());
-        advanced.or_else(|error| self.recoveries.recover(&mut self.models.sessions, error))
+        advanced.or_else(|error| self.recover(error))
     }
 
     /// Waits for queued work. Reopens the GPU if it failed, and returns whether it did.
     pub fn wait(&mut self) -> anyhow::Result<bool> {
-        let sessions = &mut self.models.sessions;
+        let sessions = &self.models.sessions;
         match sessions.iter().try_for_each(|session| session.gpu().wait()) {
             Ok(()) => Ok(false),
-            Err(error) => self
-                .recoveries
-                .recover(sessions, error.into())
-                .map(|()| true),
+            Err(error) => self.recover(error.into()).map(|()| true),
         }
+    }
+
+    /// Reopens the GPU if it caused `error`. Nothing can be drawn meanwhile, so viewers see why.
+    fn recover(&mut self, error: anyhow::Error) -> anyhow::Result<()> {
+        if is_gpu_error(&error) {
+            self.hub.set_state("reopening the GPU");
+        }
+        self.recoveries.recover(&mut self.models.sessions, error)
     }
 
     /// Describes how to continue if the run fails now.
@@ -275,16 +282,40 @@ impl LiveLoop {
         Ok(())
     }
 
-    /// Ends the input and a search for floaters. Returns the sessions and the results of the input.
-    pub fn finish(mut self) -> (Vec<Session>, anyhow::Result<InputResult>) {
+    /// Ends the input and a search for floaters. Viewers get pictures meanwhile.
+    pub fn finish(mut self) -> EndedLoop {
+        let chunks = self.publishing.take_chunks();
+        let mut viewers = EndViewers::new(self.hub.clone(), self.budget, chunks);
         // Changes only the state; the rest of the status stays visible until the scores are
         // published.
-        self.hub.set_state("saving");
+        let closing = StateProgress {
+            text: "closing the devices".to_owned(),
+            ..StateProgress::default()
+        };
+        viewers.show("saving", closing.clone());
+        while self.requests.is_searching() {
+            self.models.serve_waiting(&mut viewers);
+        }
         if self.requests.erase_found(true, &self.hub, &mut self.models) {
             self.publish_status();
-            self.hub.set_state("saving");
+            viewers.show("saving", closing);
         }
-        (self.models.sessions, self.feed.finish())
+        let Self {
+            mut models, feed, ..
+        } = self;
+        // The input ends on its own thread, which may still write a recording.
+        let ending = Task::start("end of the input", || feed.finish());
+        while !ending.is_finished() {
+            models.serve_waiting(&mut viewers);
+        }
+        let input_result = ending
+            .join()
+            .unwrap_or_else(|panic| std::panic::resume_unwind(panic));
+        EndedLoop {
+            sessions: models.sessions,
+            input_result,
+            viewers,
+        }
     }
 
     fn is_training(&self) -> bool {
@@ -296,6 +327,38 @@ impl LiveLoop {
     /// ends the run.
     fn is_finished(&self) -> bool {
         self.feed.ended() && self.models.is_idle()
+    }
+
+    /// How far the work is that [`Self::state`] names.
+    fn state_progress(&self) -> Option<StateProgress> {
+        if let Some((n_scored, n_all)) = self.models.scoring_progress() {
+            let text = format!("scoring {n_scored} of {n_all} test images");
+            return Some(StateProgress::of_parts(text, n_scored, n_all));
+        }
+        if self.is_finished() || self.is_training() {
+            return None;
+        }
+        let n_keyframes = self.accepted.list.len();
+        let progress = if self.feed.first_image().is_none() {
+            StateProgress {
+                text: "no image has arrived yet".to_owned(),
+                ..StateProgress::default()
+            }
+        } else {
+            let n_start = self.start_keyframes.max(1);
+            let n_rejected: u64 = self.feed.rejected().values().sum();
+            // Before the first keyframe, rejected images are the only sign that images arrive.
+            let rejected = match (n_keyframes, n_rejected) {
+                (_, 0) | (1.., _) => String::new(),
+                (0, n) => format!("; {} rejected", messages::counted(n, "image")),
+            };
+            let text = format!(
+                "{} of {n_start} keyframes{rejected}",
+                n_keyframes.min(n_start)
+            );
+            StateProgress::of_parts(text, n_keyframes, n_start)
+        };
+        Some(progress.at_startup())
     }
 
     fn state(&self) -> RunState {
@@ -311,6 +374,16 @@ impl LiveLoop {
             RunState::Waiting
         }
     }
+}
+
+/// What remains of a live run after its input has ended.
+pub struct EndedLoop {
+    /// The models.
+    pub sessions: Vec<Session>,
+    /// Results of the input.
+    pub input_result: anyhow::Result<InputResult>,
+    /// The viewers, who wait for pictures.
+    pub viewers: EndViewers,
 }
 
 /// Whether a session has a step limit and has not reached it.

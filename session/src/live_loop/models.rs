@@ -1,6 +1,6 @@
 //! The models of a live run.
 
-use crate::session::{MAX_LIVE_STEP_MILLIS, Session};
+use crate::session::{EndViewers, MAX_LIVE_STEP_MILLIS, Session};
 use crate::{methods, time_slices};
 use keyframe::Keyframe;
 use kinematics::Stamp;
@@ -35,6 +35,24 @@ impl Models {
         self.sessions
             .iter()
             .any(|session| session.scoreboard().is_scoring())
+    }
+
+    /// Number of scored images, and of all images, of the evaluation in progress.
+    pub(super) fn scoring_progress(&self) -> Option<(usize, usize)> {
+        self.sessions
+            .iter()
+            .find_map(|session| session.scoreboard().progress())
+    }
+
+    /// Serves viewers for a moment, while work on another thread is in progress.
+    pub(super) fn serve_waiting(&mut self, viewers: &mut EndViewers) {
+        let mut viewed: Vec<_> = self.sessions.iter_mut().map(Session::viewed).collect();
+        let spent = viewers.serve_waiting(&mut viewed);
+        // All sessions share one clock, so the time is excluded only once.
+        self.sessions
+            .iter()
+            .take(1)
+            .for_each(|session| session.time().exclude(spent));
     }
 
     /// Whether no model can train before the next keyframe arrives.

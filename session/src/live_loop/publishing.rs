@@ -68,6 +68,11 @@ impl Publishing {
         }
     }
 
+    /// Takes the publisher of chunks, which is also needed while the run ends.
+    pub(super) fn take_chunks(&mut self) -> ChunkPublisher {
+        std::mem::replace(&mut self.chunks, ChunkPublisher::new(self.hub.clone()))
+    }
+
     /// Publishes the keyframes and the corrections of live images, as estimated by the first model.
     pub(super) fn publish_keyframes(&mut self, keyframes: &[Arc<Keyframe>], session: &Session) {
         let cameras: Vec<_> = keyframes
@@ -133,16 +138,14 @@ impl LiveLoop {
     /// Publishes the models that clients draw themselves, and the observations of the scene.
     /// Pictures, chunks and observations share one budget.
     pub(super) fn publish_models(&mut self) {
-        if self.models.is_scoring() {
-            return;
-        }
         if self.budget.may_render() {
             for session in &mut self.models.sessions {
                 self.budget
                     .add_render(session.viewed().publish_chunks(&mut self.publishing.chunks));
             }
         }
-        if self.is_training() && self.budget.may_render() {
+        let is_idle = !self.is_training() || self.models.is_scoring();
+        if !is_idle && self.budget.may_render() {
             let session = &mut self.models.sessions[0];
             let spent =
                 self.publishing
@@ -195,6 +198,7 @@ impl LiveLoop {
         let mut models = sessions.iter().map(model_status);
         self.hub.set_status(Status {
             state: self.state().name().to_owned(),
+            progress: self.state_progress(),
             seconds: sessions[0].time().secs(),
             keyframes: self.accepted.list.len() as u64,
             rejected: self.feed.rejected(),

@@ -133,6 +133,11 @@ impl Requests {
         }
     }
 
+    /// Whether a search for floaters is running.
+    pub(super) fn is_searching(&self) -> bool {
+        self.editor.is_searching()
+    }
+
     /// Erases floaters once they are found, or waits for them if `wait`. Returns whether a search
     /// has ended.
     pub(super) fn erase_found(&mut self, wait: bool, hub: &Hub, models: &mut Models) -> bool {

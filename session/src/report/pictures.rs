@@ -65,22 +65,28 @@ pub(crate) struct Scored<'a> {
 
 /// Renders an evenly spread selection of test images, including the best and the worst, in the
 /// order of `scored`.
+///
+/// * `meanwhile`: called between two images.
 pub(crate) fn compare(
     method: &mut AlignedModel,
     scored: &[Scored<'_>],
+    mut meanwhile: impl FnMut(&mut AlignedModel),
 ) -> anyhow::Result<Vec<Comparison>> {
-    let started = Instant::now();
+    let mut spent = Duration::ZERO;
     let mut comparisons: Vec<(usize, Comparison)> = Vec::new();
     let mut n_bytes = 0;
     for ix in selected(&scored.iter().map(|image| image.psnr).collect::<Vec<_>>()) {
-        if !comparisons.is_empty() && started.elapsed() > MAX_RENDER_TIME {
+        if !comparisons.is_empty() && spent > MAX_RENDER_TIME {
             log::info!(
                 "report.html shows only {} test images: rendering more takes too long",
                 comparisons.len()
             );
             break;
         }
+        let before = Instant::now();
         let comparison = Comparison::of(method, &scored[ix])?;
+        spent += before.elapsed();
+        meanwhile(method);
         n_bytes += comparison.n_bytes();
         // One comparison is shown in any case.
         if n_bytes > MAX_TEXT_BYTES && !comparisons.is_empty() {

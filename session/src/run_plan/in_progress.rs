@@ -4,7 +4,7 @@ use super::RunPlan;
 use super::no_model::no_model_reason;
 use super::saving::{self, SavedRun};
 use crate::error::{is_gpu_error, is_gpu_unrecoverable, is_rejection};
-use crate::live_loop::LiveLoop;
+use crate::live_loop::{EndedLoop, LiveLoop};
 use crate::run_folder::{self, CreatedFolders};
 use capture::config::Rig;
 use capture::{InputResult, SampleUse, Stop};
@@ -129,7 +129,11 @@ impl RunInProgress {
             .iter()
             .any(|keyframe| keyframe.split == Split::Train);
         let n_keyframes = keyframes.len();
-        let (mut sessions, input_result) = self.live.finish();
+        let EndedLoop {
+            mut sessions,
+            input_result,
+            ..
+        } = self.live.finish();
         // The caller may remove the folders, so checkpoints in progress must finish first.
         sessions
             .iter_mut()
@@ -153,7 +157,11 @@ impl RunInProgress {
 fn keep_input(mut live: LiveLoop, folders: &[PathBuf], error: anyhow::Error) -> anyhow::Error {
     // Described while the sessions still exist.
     let recoverable = live.describe_recoverable();
-    let (sessions, input_result) = live.finish();
+    let EndedLoop {
+        sessions,
+        input_result,
+        ..
+    } = live.finish();
     for (session, folder) in sessions.iter().zip(folders) {
         if let Err(error) =
             run_folder::write_keyframe_list(&folder.join("keyframes.txt"), session.keyframes())

@@ -10,6 +10,7 @@ mod no_model;
 mod prepared;
 mod previous;
 mod saving;
+mod startup;
 
 pub use in_progress::{DiscardedRun, RunInProgress};
 pub use prepared::{OpenedRun, PreparedRun};

@@ -2,7 +2,7 @@
 
 use super::in_progress::RunInProgress;
 use super::previous::PreviousLiveRun;
-use super::{RunPlan, available_data};
+use super::{RunPlan, available_data, startup};
 use crate::checkpoints::RunFlags;
 use crate::evaluate::Evaluator;
 use crate::live_loop::{LiveLoop, LiveOptions, Pace};
@@ -65,11 +65,9 @@ type Evicted = (Arc<str>, Stamp);
 
 impl<'a> PreparedRun<'a> {
     pub(super) fn new(rig: Rig, parts: Parts<'a>) -> Self {
-        Self {
-            rig,
-            parts,
-            hub: Hub::new(),
-        }
+        let hub = Hub::new();
+        startup::publish(&hub, &parts.kinds);
+        Self { rig, parts, hub }
     }
 
     /// The hub of the clients that view the run.
@@ -89,11 +87,13 @@ impl<'a> PreparedRun<'a> {
             training.log_unestimated(available_data(&self.rig), self.parts.gpu.is_software());
         }
         // Compile kernels before the first image, so that keyframes do not wait.
-        self.parts
-            .models
-            .iter_mut()
-            .try_for_each(|model| model.method.model_mut().prepare())?;
+        for (model, kind) in self.parts.models.iter_mut().zip(&self.parts.kinds) {
+            let text = format!("for the model {}", kind.name());
+            startup::show(&self.hub, "compiling kernels", text);
+            model.method.model_mut().prepare()?;
+        }
         // Only now the devices, because their data is used from the first sample on.
+        startup::show(&self.hub, "opening devices", startup::devices(&self.rig));
         let device_notes = Notes::default();
         let opened = self.parts.plan.open(self.rig)?;
         Ok(OpenedRun {
@@ -142,6 +142,7 @@ impl OpenedRun<'_> {
             gpu,
             models,
         } = parts;
+        startup::show(&hub, "starting", "making the models".to_owned());
         // Folders come after the devices, whose rig, with the calibration that cameras report, is
         // written there.
         let folders = created.make_each(plan.out(), &kinds, Some(&rig))?;

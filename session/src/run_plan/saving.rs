@@ -4,10 +4,10 @@ use super::RunPlan;
 use super::no_model::no_model_reason;
 use crate::error::is_rejection;
 use crate::latency::Latency;
-use crate::live_loop::LiveLoop;
+use crate::live_loop::{EndedLoop, LiveLoop};
 use crate::next_commands::DataSource;
 use crate::run_folder::{self, CreatedFolders};
-use crate::session::{self, EndingSession, FinishedModel, Session};
+use crate::session::{self, EndViewers, EndingSession, FinishedModel, Session};
 use crate::viewer::ServedModel;
 use crate::{corrected_rig, recovery};
 use capture::config::Rig;
@@ -148,7 +148,11 @@ pub(super) fn save(
     let recoverable = live.describe_recoverable();
     let latencies = live.ledger().latencies();
     // Closes the recording and ends the input thread, whose counts are then final.
-    let (mut sessions, input_result) = live.finish();
+    let EndedLoop {
+        mut sessions,
+        input_result,
+        mut viewers,
+    } = live.finish();
     sessions
         .iter_mut()
         .for_each(|session| session.persistence().check_folders());
@@ -157,7 +161,7 @@ pub(super) fn save(
         Err(error) => {
             // Save the models even if the input has failed.
             if n_train > 0 {
-                save_after_input_failure(sessions, folders, &error, &hub)?;
+                save_after_input_failure(sessions, folders, &error, &mut viewers)?;
             }
             return Err(error);
         }
@@ -196,7 +200,7 @@ pub(super) fn save(
     }
     let mut models = Vec::new();
     if n_train > 0 {
-        let finished = session::finish(endings, Some(&hub));
+        let finished = session::finish(endings, Some(&mut viewers));
         models = finished.map_err(|error| recovery::with_recoverable(error, &recoverable))?;
     }
     let no_model_reason =
@@ -220,7 +224,7 @@ fn save_after_input_failure(
     sessions: Vec<Session>,
     folders: Vec<PathBuf>,
     error: &anyhow::Error,
-    hub: &Hub,
+    viewers: &mut EndViewers,
 ) -> anyhow::Result<()> {
     let ending = |(session, out): (Session, PathBuf)| EndingSession {
         details: serde_json::json!({ "data_losses": [error.to_string()] }),
@@ -228,7 +232,7 @@ fn save_after_input_failure(
         out,
     };
     let endings = sessions.into_iter().zip(folders).map(ending).collect();
-    session::finish(endings, Some(hub)).map(drop)
+    session::finish(endings, Some(viewers)).map(drop)
 }
 
 /// Descriptions of the data that are missing.

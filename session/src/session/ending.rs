@@ -1,19 +1,25 @@
 //! Ends training: saves and scores models, and writes their reports.
 
 use super::Session;
+use super::end_viewers::EndViewers;
 use super::outcome::TrainingOutcome;
+use super::persistence::Persistence;
 use super::reporter::{Reporter, ScoredModel};
+use super::scoreboard::Scoreboard;
+use super::viewed_model::ViewedModel;
 use crate::checkpoints::Snapshot;
 use crate::error::is_io;
 use crate::evaluate::Scores;
 use crate::next_commands::{DataSource, SavedModel};
-use crate::{camera_list, run_folder, viewer};
+use crate::{camera_list, run_folder};
+use background::Task;
+use gpu::Gpu;
 use model_files::Edits;
 use serde::Serialize;
 use std::path::PathBuf;
 use std::sync::Arc;
 use trainer::{AlignedModel, ModelKind};
-use viz::Hub;
+use viz::StateProgress;
 
 /// A trained model that has been saved and scored and is still in GPU memory.
 pub struct FinishedModel {
@@ -59,10 +65,10 @@ pub struct EndingSession<P> {
 /// Saves all models, then scores each one and writes its report. Returns the models so that they
 /// can be viewed.
 ///
-/// * `hub`: its clients get pictures of each model while it is scored.
+/// * `viewers`: they get pictures of all models between the saved files and the scored images.
 pub fn finish(
     mut endings: Vec<EndingSession<impl Serialize>>,
-    hub: Option<&Hub>,
+    mut viewers: Option<&mut EndViewers>,
 ) -> anyhow::Result<Vec<FinishedModel>> {
     // The training time of all models ends before the first one is saved. Saving takes time, which
     // would otherwise count for the models that are saved later.
@@ -72,22 +78,34 @@ pub fn finish(
         .collect::<anyhow::Result<_>>()?;
     // All models are saved before scoring, so that a second Ctrl-C during scoring loses nothing.
     let mut errors = Errors::default();
-    let mut saved = save_all(endings, ended_secs, &mut errors);
+    let saved = save_all(
+        &mut endings,
+        &ended_secs,
+        &mut errors,
+        viewers.as_deref_mut(),
+    );
     // Checkpoints are written on other threads, so they are complete only after this wait.
-    wait_for_checkpoints(&mut saved, &mut errors);
-    if saved
-        .iter()
-        .any(|saved| saved.ending.session.stop.requested())
-    {
+    wait_for_checkpoints(&mut endings, &saved, &mut errors, viewers.as_deref_mut());
+    let is_stopped = |ending: &EndingSession<_>| ending.session.stop.requested();
+    if saved.iter().any(Option::is_some) && endings.iter().any(is_stopped) {
         log::info!("saved; scoring the test images (Ctrl-C again skips this)");
     }
-    let mut finished = Vec::new();
-    for saved in saved {
-        match saved.report_end(hub) {
-            Ok(model) => finished.push(model),
-            Err(error) => errors.record(error),
-        }
+    let mut scored = Vec::new();
+    for (ix, (saved, seconds)) in saved.into_iter().zip(ended_secs).enumerate() {
+        let outcome = saved
+            .map(|saved| report_end(&mut endings, ix, &saved, seconds, viewers.as_deref_mut()));
+        scored.push(outcome.transpose().unwrap_or_else(|error| {
+            errors.record(error);
+            None
+        }));
     }
+    if let Some(viewers) = viewers {
+        viewers.finish_chunks();
+    }
+    let finished = endings.into_iter().zip(scored);
+    let finished = finished
+        .filter_map(|(ending, outcome)| Some(ending.into_finished(outcome?)))
+        .collect();
     errors.into_result().map(|()| finished)
 }
 
@@ -113,51 +131,92 @@ impl Errors {
     }
 }
 
-/// A session whose model is saved.
-struct SavedSession<P> {
-    /// The session, with the folder in which its model was saved.
-    ending: EndingSession<P>,
-    /// Training time, seconds.
-    seconds: f64,
-    /// Checksum of the saved model.
-    sha256: String,
-}
-
-/// Saves all models. Those that cannot be saved are left out.
+/// Saves all models. The results have the order of the sessions; those that cannot be saved have
+/// none.
 fn save_all<P>(
-    endings: Vec<EndingSession<P>>,
-    ended_secs: Vec<f64>,
+    endings: &mut [EndingSession<P>],
+    ended_secs: &[f64],
     errors: &mut Errors,
-) -> Vec<SavedSession<P>> {
+    mut viewers: Option<&mut EndViewers>,
+) -> Vec<Option<Saved>> {
+    let n_all = endings.len();
     let mut saved = Vec::new();
-    for (mut ending, seconds) in endings.into_iter().zip(ended_secs) {
+    for (ix, seconds) in ended_secs.iter().enumerate() {
+        if let Some(viewers) = viewers.as_deref_mut() {
+            let text = match n_all {
+                1 => "writing the model".to_owned(),
+                _ => format!("writing model {} of {n_all}", ix + 1),
+            };
+            viewers.show("saving", StateProgress::of_parts(text, ix, n_all));
+            // A checkpoint in progress would make the next one wait.
+            serve_while(viewers, endings, |endings| {
+                endings[ix].session.persistence.is_writing()
+            });
+        }
         // A model that cannot be saved does not prevent saving the others.
-        match ending.save(seconds) {
-            Ok(Saved {
-                folder,
-                sha256,
-                failed,
-            }) => {
-                ending.out = folder;
-                ending.write_cameras();
-                if let Some(error) = failed {
+        saved.push(match save(endings, ix, *seconds, viewers.as_deref_mut()) {
+            Ok(mut saved) => {
+                if let Some(error) = saved.failed.take() {
                     errors.record(error);
                 }
-                saved.push(SavedSession {
-                    ending,
-                    seconds,
-                    sha256,
-                });
+                Some(saved)
             }
-            Err(error) => errors.record(error),
-        }
+            Err(error) => {
+                errors.record(error);
+                None
+            }
+        });
     }
     saved
 }
 
+/// Saves one of the models, and lists its cameras. Viewers get pictures while its checksum is
+/// computed.
+fn save<P>(
+    endings: &mut [EndingSession<P>],
+    ix: usize,
+    seconds: f64,
+    viewers: Option<&mut EndViewers>,
+) -> anyhow::Result<Saved> {
+    let ending = &mut endings[ix];
+    let failed = ending.save(seconds)?;
+    ending.write_cameras();
+    let folder = ending.out.clone();
+    let checksum = Task::start("checksum", move || run_folder::checkpoint_sha256(&folder));
+    if let Some(viewers) = viewers {
+        serve_while(viewers, endings, |_| !checksum.is_finished());
+    }
+    let sha256 = match checksum.join() {
+        Ok(sha256) => sha256?,
+        Err(panic) => std::panic::resume_unwind(panic),
+    };
+    Ok(Saved { sha256, failed })
+}
+
 /// Waits until the last checkpoint of each saved model is on disk.
-fn wait_for_checkpoints<P>(saved: &mut [SavedSession<P>], errors: &mut Errors) {
-    for SavedSession { ending, .. } in saved {
+fn wait_for_checkpoints<P>(
+    endings: &mut [EndingSession<P>],
+    saved: &[Option<Saved>],
+    errors: &mut Errors,
+    viewers: Option<&mut EndViewers>,
+) {
+    if let Some(viewers) = viewers {
+        let progress = StateProgress {
+            text: "writing the last checkpoint".to_owned(),
+            ..StateProgress::default()
+        };
+        viewers.show("saving", progress);
+        serve_while(viewers, endings, |endings| {
+            endings
+                .iter()
+                .any(|ending| ending.session.persistence.is_writing())
+        });
+    }
+    for (ending, _) in endings
+        .iter_mut()
+        .zip(saved)
+        .filter(|(_, saved)| saved.is_some())
+    {
         if let Err(error) = ending.session.persistence.wait() {
             errors.record(error.context(format!(
                 "the model was saved in {}, but not the last checkpoint",
@@ -167,9 +226,28 @@ fn wait_for_checkpoints<P>(saved: &mut [SavedSession<P>], errors: &mut Errors) {
     }
 }
 
+/// Serves viewers as long as work on another thread is in progress.
+fn serve_while<P>(
+    viewers: &mut EndViewers,
+    endings: &mut [EndingSession<P>],
+    is_in_progress: impl Fn(&[EndingSession<P>]) -> bool,
+) {
+    while is_in_progress(endings) {
+        viewers.serve_waiting(&mut viewed(endings));
+    }
+}
+
+/// The models of all sessions.
+fn viewed<P>(endings: &mut [EndingSession<P>]) -> Vec<ViewedModel<'_>> {
+    endings
+        .iter_mut()
+        .map(|ending| ending.session.viewed())
+        .collect()
+}
+
 /// A model on disk.
 struct Saved {
-    folder: PathBuf,
+    /// Checksum of the model.
     sha256: String,
     /// Why the model could not be saved in the run folder, if it was saved elsewhere.
     failed: Option<anyhow::Error>,
@@ -179,7 +257,8 @@ impl Session {
     /// Scores the final model without saving it.
     pub fn score_without_saving(mut self) -> anyhow::Result<TrainingOutcome> {
         let seconds = stop_training(&mut self)?;
-        score_at_end(&mut self, seconds, None)
+        let mut parts = ScoredSession::of(&mut self, Vec::new(), Vec::new(), None);
+        score_at_end(&mut parts, seconds)
     }
 }
 
@@ -192,41 +271,198 @@ fn stop_training(session: &mut Session) -> anyhow::Result<f64> {
     Ok(seconds)
 }
 
-/// Scores the final model on all test images. Clients of `hub` get pictures meanwhile.
-fn score_at_end(
-    session: &mut Session,
-    seconds: f64,
-    hub: Option<&Hub>,
-) -> anyhow::Result<TrainingOutcome> {
-    session.gpu.wait()?;
-    session.persistence.log_render();
-    let mut work = WorkDuringScoring {
-        n_all: session.scoreboard.tests().len(),
-        n_reported: None,
-        reporter: &mut session.reporter,
-        edits: &session.edits,
-        hub,
-    };
-    let per_image = session
-        .scoreboard
-        .score_all(&mut session.method, |method, n_scored| {
-            work.advance(method, n_scored);
-        })?;
-    let progress = session.progress();
+/// A session while its model is scored, and the viewers of all models.
+struct ScoredSession<'a> {
+    method: &'a mut AlignedModel,
+    scoreboard: &'a Scoreboard,
+    reporter: &'a mut Reporter,
+    viewing: Viewing<'a>,
+}
+
+/// What drawing for viewers needs, besides the model that is being scored.
+struct Viewing<'a> {
+    kind: ModelKind,
+    gpu: &'a Gpu,
+    persistence: &'a mut Persistence,
+    edits: &'a mut Arc<Edits>,
+    /// The models before and after the scored one. Viewers can draw them, too.
+    before: Vec<ViewedModel<'a>>,
+    after: Vec<ViewedModel<'a>>,
+    viewers: Option<&'a mut EndViewers>,
+}
+
+impl Viewing<'_> {
+    /// Serves viewers between two renders of the scored model.
+    fn serve(&mut self, method: &mut AlignedModel) {
+        let Some(viewers) = self.viewers.as_deref_mut() else {
+            return;
+        };
+        let mut models: Vec<ViewedModel<'_>> =
+            self.before.iter_mut().map(ViewedModel::reborrow).collect();
+        models.push(ViewedModel {
+            kind: self.kind,
+            method,
+            gpu: self.gpu,
+            persistence: &mut *self.persistence,
+            edits: &mut *self.edits,
+        });
+        models.extend(self.after.iter_mut().map(ViewedModel::reborrow));
+        viewers.serve(&mut models);
+    }
+
+    /// Shows viewers how many test images are scored.
+    fn show_scored(&self, n_scored: usize, n_all: usize) {
+        if let Some(viewers) = self.viewers.as_deref() {
+            let is_only_model = self.before.is_empty() && self.after.is_empty();
+            let model = if is_only_model {
+                String::new()
+            } else {
+                format!(" of the model {}", self.kind.name())
+            };
+            let text = format!("{n_scored} of {n_all} test images{model}");
+            viewers.show(
+                &format!("scoring, {n_scored} of {n_all} images"),
+                StateProgress::of_parts(text, n_scored, n_all),
+            );
+        }
+    }
+
+    /// Shows viewers that the report is being written.
+    fn show_reporting(&self) {
+        if let Some(viewers) = self.viewers.as_deref() {
+            let progress = StateProgress {
+                text: "writing the report".to_owned(),
+                ..StateProgress::default()
+            };
+            viewers.show("saving", progress);
+        }
+    }
+}
+
+impl<'a> ScoredSession<'a> {
+    /// The parts of a session.
+    ///
+    /// * `before`, `after`: the models of the other sessions, in order.
+    fn of(
+        session: &'a mut Session,
+        before: Vec<ViewedModel<'a>>,
+        after: Vec<ViewedModel<'a>>,
+        viewers: Option<&'a mut EndViewers>,
+    ) -> Self {
+        let kind = session.kind();
+        Self {
+            method: &mut session.method,
+            scoreboard: &session.scoreboard,
+            reporter: &mut session.reporter,
+            viewing: Viewing {
+                kind,
+                gpu: &session.gpu,
+                persistence: &mut session.persistence,
+                edits: &mut session.edits,
+                before,
+                after,
+                viewers,
+            },
+        }
+    }
+}
+
+/// Scores the final model on all test images. Viewers get pictures meanwhile.
+fn score_at_end(session: &mut ScoredSession<'_>, seconds: f64) -> anyhow::Result<TrainingOutcome> {
+    let ScoredSession {
+        method,
+        scoreboard,
+        reporter,
+        viewing,
+    } = session;
+    viewing.gpu.wait()?;
+    viewing.persistence.log_render();
+    let n_all = scoreboard.tests().len();
+    let mut n_reported = None;
+    let per_image = scoreboard.score_all(method, |method, n_scored| {
+        // Called often, also without progress, so that viewers do not wait for the next score.
+        if n_reported.replace(n_scored) != Some(n_scored) {
+            reporter.report_scoring(n_scored, n_all);
+            viewing.show_scored(n_scored, n_all);
+        }
+        viewing.serve(method);
+    })?;
+    let progress = method.model().progress();
     Ok(TrainingOutcome {
         seconds,
         steps: progress.step,
         scores: Scores::mean(&per_image),
         primitives: progress.primitives,
         bytes: progress.bytes,
-        evaluations: session.reporter.take_evaluations(),
+        evaluations: reporter.take_evaluations(),
         per_image,
     })
 }
 
+/// Scores one of the saved models, writes its report, and reports the end.
+///
+/// * `seconds`: training time.
+fn report_end(
+    endings: &mut [EndingSession<impl Serialize>],
+    ix: usize,
+    saved: &Saved,
+    seconds: f64,
+    viewers: Option<&mut EndViewers>,
+) -> anyhow::Result<ModelOutcome> {
+    let (before, rest) = endings.split_at_mut(ix);
+    let (ending, after) = rest
+        .split_first_mut()
+        .expect("there is a session for each saved model");
+    let adapter = ending.session.gpu.describe();
+    let mut session =
+        ScoredSession::of(&mut ending.session, viewed(before), viewed(after), viewers);
+    let outcome = score_at_end(&mut session, seconds)?;
+    let ScoredSession {
+        method,
+        scoreboard,
+        reporter,
+        mut viewing,
+    } = session;
+    viewing.show_reporting();
+    // Rendered before profiling, because profiling trains the model further.
+    let comparisons = reporter.compare(method, scoreboard.tests(), &outcome.per_image, |method| {
+        viewing.serve(method)
+    });
+    let passes = reporter.profile(method.model_mut())?;
+    reporter.report_end(ScoredModel {
+        out: &ending.out,
+        checkpoint_sha256: &saved.sha256,
+        outcome: &outcome,
+        comparisons,
+        passes,
+        cameras: method.model_mut().camera_corrections()?,
+        alignment: method.alignment(),
+        trials: method.model().report(),
+        adapter,
+        details: &ending.details,
+    })?;
+    viewing.serve(method);
+    Ok(ModelOutcome {
+        seconds,
+        n_tests: outcome.per_image.len(),
+        scores: outcome.scores,
+    })
+}
+
+/// What is known about a model after it was scored.
+struct ModelOutcome {
+    /// Training time, seconds.
+    seconds: f64,
+    scores: Scores,
+    n_tests: usize,
+}
+
 impl<P> EndingSession<P> {
-    /// Saves the model, in a temporary folder if `out` cannot be written. `seconds`: training time.
-    fn save(&mut self, seconds: f64) -> anyhow::Result<Saved> {
+    /// Saves the model. If `out` cannot be written, a temporary folder becomes `out`, and the reason
+    /// is returned.
+    ///
+    /// * `seconds`: training time.
+    fn save(&mut self, seconds: f64) -> anyhow::Result<Option<anyhow::Error>> {
         let Self { session, out, .. } = self;
         session.persistence.check_folders();
         session.persistence.end_decisions(&mut session.method)?;
@@ -246,39 +482,32 @@ impl<P> EndingSession<P> {
             seconds,
             is_finished,
         });
-        let saved = run_folder::save_model(&mut session.method, &session.edits, out)
-            .and_then(|()| run_folder::checkpoint_sha256(out));
+        let saved = run_folder::save_model(&mut session.method, &session.edits, out);
         // The checkpoint is written after the model: if the disk has no space for both, the model
         // is the more important one.
         session.persistence.write_checkpoint(checkpoint);
         match saved {
-            Ok(sha256) => Ok(Saved {
-                folder: out.clone(),
-                sha256,
-                failed: None,
-            }),
+            Ok(()) => Ok(None),
             // The disk may be full, or the folder read-only. Other errors, such as a lost GPU,
             // would also occur in another folder.
-            Err(error) if is_io(&error) => self.save_elsewhere(error),
+            Err(error) if is_io(&error) => self.save_elsewhere(error).map(Some),
             Err(error) => Err(error),
         }
     }
 
-    /// Saves the model in a temporary folder, because its run folder could not be written.
-    fn save_elsewhere(&mut self, save_error: anyhow::Error) -> anyhow::Result<Saved> {
+    /// Saves the model in a temporary folder, because its run folder could not be written. Returns
+    /// the error to report.
+    fn save_elsewhere(&mut self, save_error: anyhow::Error) -> anyhow::Result<anyhow::Error> {
         let Self { session, out, .. } = self;
         match save_in_fallback_folder(&mut session.method, &session.edits) {
-            Ok((folder, sha256)) => {
+            Ok(folder) => {
                 let context = format!(
                     "cannot save the model in {}; it was saved in {}",
                     out.display(),
                     folder.display()
                 );
-                Ok(Saved {
-                    folder,
-                    sha256,
-                    failed: Some(save_error.context(context)),
-                })
+                *out = folder;
+                Ok(save_error.context(context))
             }
             Err(error) => {
                 log::error!("cannot save the model in a temporary folder either: {error:#}");
@@ -301,105 +530,26 @@ impl<P> EndingSession<P> {
             log::warn!("{} was not written: {error:#}", camera_list::FILE);
         }
     }
-}
 
-impl<P: Serialize> SavedSession<P> {
-    /// Scores the saved model, writes the report, and reports the end.
-    fn report_end(self, hub: Option<&Hub>) -> anyhow::Result<FinishedModel> {
-        let Self {
-            ending:
-                EndingSession {
-                    mut session,
-                    out,
-                    details,
-                },
-            seconds,
-            sha256,
-        } = self;
-        let outcome = score_at_end(&mut session, seconds, hub)?;
-        let method = &mut session.method;
-        // Rendered before profiling, because profiling trains the model further.
-        let comparisons =
-            session
-                .reporter
-                .compare(method, session.scoreboard.tests(), &outcome.per_image);
-        let passes = session.reporter.profile(method.model_mut())?;
-        session.reporter.report_end(ScoredModel {
-            out: &out,
-            checkpoint_sha256: &sha256,
-            outcome: &outcome,
-            comparisons,
-            passes,
-            cameras: method.model_mut().camera_corrections()?,
-            alignment: method.alignment(),
-            trials: method.model().report(),
-            adapter: session.gpu.describe(),
-            details: &details,
-        })?;
-        Ok(FinishedModel {
+    /// The finished model.
+    fn into_finished(self, outcome: ModelOutcome) -> FinishedModel {
+        let Self { session, out, .. } = self;
+        FinishedModel {
             kind: session.kind(),
             method: session.method,
             edits: session.edits,
             folder: out,
-            seconds,
+            seconds: outcome.seconds,
             scores: outcome.scores,
             data: session.reporter.into_data(),
-            n_tests: outcome.per_image.len(),
-        })
+            n_tests: outcome.n_tests,
+        }
     }
 }
 
-/// Saves a model in a new temporary folder. Returns the folder and the checksum of the model.
-fn save_in_fallback_folder(
-    method: &mut AlignedModel,
-    edits: &Edits,
-) -> anyhow::Result<(PathBuf, String)> {
+/// Saves a model in a new temporary folder, which is returned.
+fn save_in_fallback_folder(method: &mut AlignedModel, edits: &Edits) -> anyhow::Result<PathBuf> {
     let folder = run_folder::make_fallback_folder()?;
     run_folder::save_model(method, edits, &folder)?;
-    let sha256 = run_folder::checkpoint_sha256(&folder)?;
-    Ok((folder, sha256))
-}
-
-/// What happens while a model is scored: progress is reported, and viewers get pictures.
-struct WorkDuringScoring<'a> {
-    /// Number of test images.
-    n_all: usize,
-    /// The progress that was last reported.
-    n_reported: Option<usize>,
-    reporter: &'a mut Reporter,
-    edits: &'a Arc<Edits>,
-    hub: Option<&'a Hub>,
-}
-
-impl WorkDuringScoring<'_> {
-    /// Reports that `n_scored` images are scored, and draws at most one picture.
-    fn advance(&mut self, method: &mut AlignedModel, n_scored: usize) {
-        // Called often, also without progress, so that viewers do not wait for the next score.
-        if self.n_reported.replace(n_scored) != Some(n_scored) {
-            let n_all = self.n_all;
-            self.reporter.report_scoring(n_scored, n_all);
-            if let Some(hub) = self.hub {
-                hub.set_state(&format!("scoring, {n_scored} of {n_all} images"));
-            }
-        }
-        if let Some(pending) = self.hub.and_then(|hub| hub.pictures().next_request()) {
-            let scored_method = self.reporter.kind().name();
-            let other = pending
-                .method()
-                .filter(|name| *name != scored_method)
-                .map(str::to_owned);
-            match other {
-                // Only the model that is scored is available here. A viewer repeats its request.
-                Some(other) => {
-                    pending.fail(&format!(
-                        "cannot render {other} while {scored_method} is scored; try again later"
-                    ));
-                }
-                None => {
-                    let kind = self.reporter.kind();
-                    viewer::answer(pending, kind, method.model_mut(), self.edits);
-                }
-            }
-        }
-    }
+    Ok(folder)
 }

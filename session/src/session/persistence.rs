@@ -207,6 +207,13 @@ impl Persistence {
         }
     }
 
+    /// Whether a checkpoint or keyframes are being written on a separate thread.
+    pub(super) fn is_writing(&self) -> bool {
+        self.checkpoints
+            .as_ref()
+            .is_some_and(Checkpoints::is_writing)
+    }
+
     /// Waits until no checkpoint is being written, and returns the error of the last one.
     pub(super) fn wait(&mut self) -> anyhow::Result<()> {
         self.checkpoints.as_mut().map_or(Ok(()), Checkpoints::wait)

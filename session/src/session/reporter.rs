@@ -166,12 +166,13 @@ impl Reporter {
     }
 
     /// Renders test images for the report. `scores` has one entry per test image, in the same
-    /// order.
+    /// order. `meanwhile` is called between two images.
     pub(super) fn compare<'a>(
         &self,
         method: &mut AlignedModel,
         tests: impl Iterator<Item = &'a Arc<Keyframe>>,
         scores: &[ImageScores],
+        meanwhile: impl FnMut(&mut AlignedModel),
     ) -> anyhow::Result<Vec<report::Comparison>> {
         let scored = tests.zip(scores).map(|(keyframe, scores)| report::Scored {
             keyframe,
@@ -179,7 +180,7 @@ impl Reporter {
             psnr: scores.psnr,
             ssim: scores.ssim,
         });
-        report::compare(method, &scored.collect::<Vec<_>>())
+        report::compare(method, &scored.collect::<Vec<_>>(), meanwhile)
     }
 
     /// GPU time of each kernel in a step in milliseconds, if profiling was requested.

@@ -141,6 +141,11 @@ impl Scoreboard {
         self.pending.is_some()
     }
 
+    /// Number of scored images, and of all images, of the evaluation in progress.
+    pub(crate) fn progress(&self) -> Option<(usize, usize)> {
+        self.pending.as_ref().map(PendingEvaluation::progress)
+    }
+
     /// Takes the evaluation in progress. It is aborted unless it is returned with
     /// [`Self::continue_with`].
     pub(super) fn take_pending(&mut self) -> Option<PendingEvaluation> {

@@ -21,6 +21,22 @@ pub(crate) struct ViewedModel<'a> {
 }
 
 impl ViewedModel<'_> {
+    /// The kind of model.
+    pub(crate) fn kind(&self) -> ModelKind {
+        self.kind
+    }
+
+    /// The same model, borrowed for a shorter time.
+    pub(super) fn reborrow(&mut self) -> ViewedModel<'_> {
+        ViewedModel {
+            kind: self.kind,
+            method: &mut *self.method,
+            gpu: self.gpu,
+            persistence: &mut *self.persistence,
+            edits: &mut *self.edits,
+        }
+    }
+
     /// Creates splats for the keyframes so far.
     pub(crate) fn seed(&mut self) -> anyhow::Result<()> {
         self.persistence.log_render();
@@ -69,6 +85,18 @@ impl ViewedModel<'_> {
             // grows the buffer.
             (None, Some(packing)) => model.render_packed(request, packing),
             (None, None) => model.render(request).map(Rendered::Picture),
+        }
+    }
+
+    /// Draws a requested picture and sends it, or the reason why this failed, to its client.
+    pub(crate) fn answer(&mut self, mut pending: PendingRender) {
+        pending.request.edits = Arc::clone(self.edits);
+        let drawn = self
+            .queue_picture(&pending.request, pending.packing())
+            .and_then(|queued| self.finish_picture(queued, &pending.request, pending.packing()));
+        match drawn {
+            Ok(picture) => pending.deliver(picture),
+            Err(error) => pending.fail(&error.to_string()),
         }
     }
 

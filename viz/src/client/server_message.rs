@@ -187,6 +187,9 @@ pub(crate) struct ChunkHeader<'a> {
     pub(crate) is_coarse: bool,
     pub(crate) n_chunks: usize,
     pub(crate) n_incomplete: usize,
+    pub(crate) n_unsent: usize,
+    pub(crate) n_incomplete_in_view: Option<usize>,
+    pub(crate) n_unsent_in_view: Option<usize>,
     pub(crate) world_from_model: [f64; 16],
     #[serde(flatten)]
     pub(crate) layout: ChunkLayout,

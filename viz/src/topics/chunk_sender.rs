@@ -73,7 +73,7 @@ impl ChunkSender {
         if let Some(chunk) = first_needed(list, viewpoint, is_unsent) {
             // Meshes, and chunks of few splats, have no coarse form.
             let is_fine = chunk.chunk.coarse.is_none();
-            return self.send(list, &chunk, is_fine, subscription);
+            return self.send(list, &chunk, is_fine, subscription, viewpoint);
         }
         // Removed chunks were replaced by others, which the client has by now. If they were removed
         // earlier, the picture would have holes.
@@ -84,7 +84,7 @@ impl ChunkSender {
         let is_coarse =
             |chunk: &&Arc<VersionedChunk>| self.copy_of(chunk).is_some_and(|copy| !copy.is_fine);
         if let Some(chunk) = first_needed(list, viewpoint, is_coarse) {
-            return self.send(list, &chunk, true, subscription);
+            return self.send(list, &chunk, true, subscription, viewpoint);
         }
         // Changes, which never end while the model is trained. Only they wait for the budget. The
         // largest come first. Changes that the client has missed add up, so every chunk has its
@@ -102,7 +102,7 @@ impl ChunkSender {
             let secs = -self.balance_bytes / subscription.max_bytes_per_sec;
             return NextChunk::WaitUntil(now + Duration::from_secs_f64(secs));
         }
-        self.send(list, &chunk, true, subscription)
+        self.send(list, &chunk, true, subscription, viewpoint)
     }
 
     /// What the client has of a chunk.
@@ -146,6 +146,7 @@ impl ChunkSender {
         chunk: &VersionedChunk,
         is_fine: bool,
         subscription: &ChunkSubscription,
+        viewpoint: Option<&Viewpoint>,
     ) -> NextChunk {
         let VersionedChunk {
             version,
@@ -161,11 +162,7 @@ impl ChunkSender {
             },
         );
         // After the chunk was counted: the page shows how much is left after this message.
-        let n_incomplete = list
-            .chunks
-            .keys()
-            .filter(|id| !self.sent.get(id).is_some_and(|sent| sent.is_fine))
-            .count();
+        let remaining = self.remaining(list, viewpoint);
         let data = if is_fine {
             &chunk.fine
         } else {
@@ -176,7 +173,10 @@ impl ChunkSender {
             id: chunk.id,
             is_coarse: !is_fine,
             n_chunks: list.chunks.len(),
-            n_incomplete,
+            n_incomplete: remaining.n_incomplete,
+            n_unsent: remaining.n_unsent,
+            n_incomplete_in_view: viewpoint.map(|_| remaining.n_incomplete_in_view),
+            n_unsent_in_view: viewpoint.map(|_| remaining.n_unsent_in_view),
             world_from_model: row_major(&list.world_from_model),
             layout: data.layout,
         };
@@ -186,6 +186,44 @@ impl ChunkSender {
         self.balance_bytes = (self.balance_bytes - bytes.len() as f64).max(-max_debt_bytes);
         NextChunk::Send(Message::binary(bytes))
     }
+
+    /// Counts the chunks that the client lacks.
+    fn remaining(&self, list: &ChunkList, viewpoint: Option<&Viewpoint>) -> Remaining {
+        let mut remaining = Remaining::default();
+        for chunk in list.chunks.values() {
+            let copy = self.copy_of(chunk);
+            if copy.is_some_and(|copy| copy.is_fine) {
+                continue;
+            }
+            let n_unsent = usize::from(copy.is_none());
+            remaining.n_incomplete += 1;
+            remaining.n_unsent += n_unsent;
+            if viewpoint.is_some_and(|viewpoint| !is_hidden(list, viewpoint, chunk)) {
+                remaining.n_incomplete_in_view += 1;
+                remaining.n_unsent_in_view += n_unsent;
+            }
+        }
+        remaining
+    }
+}
+
+/// Numbers of chunks that a client lacks.
+#[derive(Debug, Default)]
+struct Remaining {
+    /// Chunks that it has only in the coarse form, or not at all.
+    n_incomplete: usize,
+    /// Chunks that it does not have at all.
+    n_unsent: usize,
+    /// Those of the incomplete chunks that are in its view.
+    n_incomplete_in_view: usize,
+    /// Those of the unsent chunks that are in its view.
+    n_unsent_in_view: usize,
+}
+
+/// Whether a chunk is outside the view.
+fn is_hidden(list: &ChunkList, viewpoint: &Viewpoint, chunk: &VersionedChunk) -> bool {
+    let (is_hidden, _) = viewpoint.rank(&list.world_from_model, &chunk.chunk.fine.layout);
+    is_hidden
 }
 
 /// The chunk that is needed first for a view; without a view, the one that has changed most.
@@ -257,6 +295,8 @@ mod tests {
         viewpoint: Option<Viewpoint>,
         now: Instant,
         n_bytes: usize,
+        /// Header of the last chunk.
+        header: Option<Value>,
     }
 
     impl Receiver {
@@ -267,6 +307,7 @@ mod tests {
                 viewpoint: None,
                 now: Instant::now(),
                 n_bytes: 0,
+                header: None,
             }
         }
 
@@ -296,7 +337,9 @@ mod tests {
                     } else {
                         ""
                     };
-                    format!("{}{suffix}", header["id"])
+                    let name = format!("{}{suffix}", header["id"]);
+                    self.header = Some(header);
+                    name
                 }
                 other => {
                     let text: Value =
@@ -364,6 +407,50 @@ mod tests {
             Vec::new(),
         ));
         assert_eq!(client.receive(&list), ["2", "3", "1"]);
+    }
+
+    #[test]
+    fn messages_count_what_the_view_still_lacks() {
+        let mut list = ChunkList::default();
+        let at = |id, z: f32| {
+            let mut chunk = chunk(id, 1.0, 1000);
+            chunk.fine.layout = cube([0.0, 0.0, z]);
+            chunk
+        };
+        list.apply(complete(vec![at(1, 2.0), at(2, 5.0), at(3, -1.0)]));
+        let mut client = Receiver {
+            viewpoint: Some(viewpoint(0.0, 0.0)),
+            ..Receiver::new()
+        };
+        let mut counts = Vec::new();
+        while client.receive_one(&list).is_some() {
+            let header = client.header.take().expect("a chunk");
+            counts.push(
+                [
+                    "n_unsent",
+                    "n_unsent_in_view",
+                    "n_incomplete",
+                    "n_incomplete_in_view",
+                ]
+                .map(|name| header[name].as_u64().expect("a number")),
+            );
+        }
+        assert_eq!(
+            counts,
+            [
+                [2, 1, 3, 2],
+                [1, 0, 3, 2],
+                [0, 0, 3, 2],
+                [0, 0, 2, 1],
+                [0, 0, 1, 0],
+                [0, 0, 0, 0]
+            ]
+        );
+        // Without a view, it is not known what is in it.
+        client = Receiver::new();
+        client.receive_one(&list).expect("a chunk");
+        let header = client.header.take().expect("a chunk");
+        assert!(header["n_unsent_in_view"].is_null() && header["n_unsent"] == 2);
     }
 
     #[test]

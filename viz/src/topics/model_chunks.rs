@@ -13,7 +13,7 @@ use kinematics::Transform;
 use parking_lot::Mutex;
 use std::collections::BTreeMap;
 use std::sync::Arc;
-use std::time::Duration;
+use std::time::{Duration, Instant};
 use tokio::sync::watch;
 use trainer::ModelChunks;
 
@@ -29,6 +29,11 @@ pub(crate) const ENTRY: TopicEntry = TopicEntry {
         })
     },
 };
+
+/// Maximum time for which chunks wait until the client has requested a picture, so that those in
+/// its view come first. A page requests one as soon as it is connected; other programs may never
+/// request any.
+const MAX_WAIT_FOR_VIEW: Duration = Duration::from_secs(1);
 
 /// Chunks of models by method.
 type ModelLists = BTreeMap<Arc<str>, Arc<ChunkList>>;
@@ -57,6 +62,7 @@ impl Topic for ChunkTopic {
         Box::new(ChunkFeed {
             lists: self.lists.lock().clone(),
             sender: ChunkSender::default(),
+            awaits_view_since: None,
         })
     }
 }
@@ -65,6 +71,24 @@ impl Topic for ChunkTopic {
 struct ChunkFeed {
     lists: watch::Receiver<ModelLists>,
     sender: ChunkSender,
+    /// When the first chunk was due, but the view of the client was not known.
+    awaits_view_since: Option<Instant>,
+}
+
+impl ChunkFeed {
+    /// Whether chunks should still wait for the view of the client.
+    fn awaits_view(&mut self, client: &ClientState<'_>, timer: &mut Timer) -> bool {
+        if client.viewpoint.is_some() {
+            return false;
+        }
+        let since = *self.awaits_view_since.get_or_insert(timer.now);
+        let until = since + MAX_WAIT_FOR_VIEW;
+        let is_early = timer.now < until;
+        if is_early {
+            timer.wait_until(until);
+        }
+        is_early
+    }
 }
 
 impl Feed for ChunkFeed {
@@ -73,6 +97,9 @@ impl Feed for ChunkFeed {
         let subscription = client.subscriptions.model_chunks.as_ref()?;
         // The run may not have made chunks since the client has subscribed.
         let list = self.lists.borrow().get(&subscription.method).cloned()?;
+        if self.awaits_view(client, timer) {
+            return None;
+        }
         match self
             .sender
             .next(&list, subscription, client.viewpoint, timer.now)

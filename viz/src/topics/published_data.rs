@@ -21,6 +21,9 @@ const MAX_HISTORY: usize = 512;
 pub struct Status {
     /// One or two words for the operator, such as `waiting for images` or `training`.
     pub state: String,
+    /// How far the work is that `state` names, if there is more to say about it.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub progress: Option<StateProgress>,
     /// Wall time since the first image, seconds.
     pub seconds: f64,
     /// Number of stored keyframes.
@@ -44,6 +47,37 @@ pub struct Status {
     /// What the operator's header shows.
     #[serde(flatten)]
     pub operator: OperatorStatus,
+}
+
+/// How far the work is that the state of a [`Status`] names.
+#[derive(Clone, Debug, Default, PartialEq, Serialize)]
+pub struct StateProgress {
+    /// A few words for the operator, such as `3 of 5 keyframes`.
+    pub text: String,
+    /// Completed part of the work, 0 to 1; `None` if it is not known.
+    pub done_frac: Option<f64>,
+    /// Whether the model has not been started yet, so that pictures may be empty or missing.
+    pub is_startup: bool,
+}
+
+impl StateProgress {
+    /// Progress of work that consists of `n_all` equal parts.
+    pub fn of_parts(text: String, n_done: usize, n_all: usize) -> Self {
+        Self {
+            text,
+            done_frac: (n_all > 0).then(|| n_done.min(n_all) as f64 / n_all as f64),
+            is_startup: false,
+        }
+    }
+
+    /// The same progress, before the model is started.
+    #[must_use]
+    pub fn at_startup(self) -> Self {
+        Self {
+            is_startup: true,
+            ..self
+        }
+    }
 }
 
 /// What the operator should do next. While there is guidance, the page shows the camera images

@@ -3,7 +3,7 @@
 use crate::Hub;
 use crate::client::server_message::ServerMessage;
 use crate::clock::ServerClock;
-use crate::topics::published_data::{RunResult, Status};
+use crate::topics::published_data::{RunResult, StateProgress, Status};
 use crate::topics::shared_topic::{SharedTopic, only_message};
 use crate::topics::{DefaultRate, Priority};
 use axum::extract::ws::Message;
@@ -42,13 +42,22 @@ impl Hub {
     /// Replaces the state in the latest status and keeps its numbers, for example while the model
     /// is saved.
     pub fn set_state(&self, state: &str) {
-        self.change_status(|status| state.clone_into(&mut status.state));
+        self.set_state_and_progress(state, None);
+    }
+
+    /// Replaces the state and its progress in the latest status and keeps its numbers.
+    pub fn set_state_and_progress(&self, state: &str, progress: Option<StateProgress>) {
+        self.change_status(|status| {
+            state.clone_into(&mut status.state);
+            status.progress = progress;
+        });
     }
 
     /// Sets the result of the run. Clients continue to show it after the server has stopped.
     pub fn set_run_result(&self, result: RunResult) {
         self.change_status(|status| {
             "finished".clone_into(&mut status.state);
+            status.progress = None;
             status.result = Some(result);
         });
     }

@@ -3,6 +3,7 @@
 
 mod admission;
 mod analytic_scene;
+mod black_page;
 mod client;
 mod eye_page;
 #[cfg(feature = "foxglove")]

@@ -25,6 +25,7 @@ import { RobotAge } from "./panels/robot_age";
 import { RunControls } from "./panels/run_controls";
 import { setUpSidePanel } from "./panels/side_panel";
 import { ShownLatency } from "./connection/shown_latency";
+import { Skeleton } from "./panels/skeleton";
 import { SideView } from "./layers/side_view";
 import { Surroundings } from "./layers/surroundings";
 import { basePathTopic } from "./topics/base_path";
@@ -52,13 +53,14 @@ const header = new Header();
 const trainingPanel = new TrainingPanel();
 const banner = new Banner();
 const view = openView();
+const skeleton = new Skeleton(element("view"), element("canvas"));
 keepToken();
 window.addEventListener("hashchange", () => {
   if (keepToken()) location.reload(); // The server assigns the role when the page connects.
 });
 // A page that becomes visible subscribes again, and receives all chunks again.
 document.addEventListener("visibilitychange", () => {
-  if (!document.hidden) view.local.clear();
+  if (!document.hidden) view.local.renew();
 });
 const connection: Connection = new Connection(`${location.protocol === "https:" ? "wss" : "ws"}://${location.host}/ws`, {
   state(state, text) {
@@ -70,9 +72,11 @@ const connection: Connection = new Connection(`${location.protocol === "https:" 
     shown.textContent = hasEnded ? "the server has stopped" : text;
     // Operators who control the robot by the picture must see that it is frozen.
     banner.setConnection(state, text);
+    skeleton.setConnection(state);
     view.overlays.setLive(state === "open");
     if (state === "open" && !wasOpen) {
       view.picture.forget();
+      skeleton.awaitPicture();
       scheduler.restart();
       shownLatency.forget();
       forgetSurfaces();
@@ -147,17 +151,21 @@ function openView(): OrbitView {
   const view = new OrbitView(canvas, () => scheduler.moved(), () => connection.clock);
   // Mobile browsers discard the WebGL context of background pages. These listeners must run after the renderer's.
   canvas.addEventListener("webglcontextlost", () => {
+    skeleton.isContextLost = true;
     banner.setGraphics("The WebGL context of this page was lost: if the scene does not return, reload the page");
   });
   canvas.addEventListener("webglcontextrestored", () => {
     banner.setGraphics("");
     view.contextRestored();
+    skeleton.isContextLost = false;
+    scheduler.restart();
   });
   return view;
 }
 
 function receiveStatus(status: Status): void {
   latestStatus = status;
+  skeleton.setStatus(status);
   models.list(status);
   showStatus(status);
   runControls.show(status);
@@ -184,7 +192,8 @@ function receiveText(message: TextMessage): void {
       if (edits.failed(message)) break;
       if (sides.some((side) => side.fail(message))) break;
       scheduler.failed(message.id);
-      element("notice").textContent = message.message;
+      // The skeleton says what is missing.
+      element("notice").textContent = skeleton.isVisible && !latestStatus?.keyframes ? "" : message.message;
       break;
   }
 }
@@ -219,7 +228,6 @@ function updateLocalModel(model: ModelStatus): void {
   element("toggle-local").hidden = !isPossible;
   const method = isPossible && isDrawnLocally && showsModel ? model.method : null;
   chunks.method = method;
-  scheduler.drawsLocally = method !== null;
 }
 
 function receiveBinary(header: BinaryHeader, payload: Uint8Array<ArrayBuffer>): void {
@@ -239,6 +247,8 @@ async function showPicture(header: PictureHeader, payload: Uint8Array<ArrayBuffe
   }
   if (header.color && showsModel) shownLatency.pictureReady(header, receivedAt);
   else shownLatency.restart();
+  skeleton.pictureShown(view.picture.posedDepth?.depth ?? null);
+  if (header.color) view.local.pictureArrived();
   view.changed();
   view.seePicture();
   element("notice").textContent = "";
@@ -272,6 +282,7 @@ element("look-live", HTMLButtonElement).disabled = true;
 toggle("toggle-model", "m", (isOn) => {
   showsModel = isOn;
   view.showsModel = isOn;
+  skeleton.showsModel = isOn;
   if (latestStatus) showStatus(latestStatus);
 });
 toggle("toggle-local", "j", (isOn) => {
@@ -316,6 +327,9 @@ toggle("toggle-occlude", "o", (isOn) => (view.occlusion.enabled = isOn));
 function frame(): void {
   shownLatency.frameBegins();
   settings.tick();
+  // Until the chunks in view have arrived, pictures of the server are shown.
+  scheduler.drawsLocally = view.local.replacesPictures;
+  chunks.showProgress();
   scheduler.tick();
   pictureInfo.update();
   if (!view.usesSurroundings || settings.isPlaying) {

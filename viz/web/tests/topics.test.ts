@@ -31,7 +31,7 @@ function setUp(capabilities: string[], extra: Topic[] = []) {
     supportsTopic: (capability: string) => capabilities.includes(capability),
     send: (message: ClientMessage) => messages.push(message as SubscribeMessage),
   };
-  const layer = { clear: () => undefined };
+  const layer = { clear: () => undefined, renew: () => undefined };
   const view = { overlays: { forgetLive: () => undefined }, scans: layer, points: layer, local: layer };
   const images = { resized: new Map<string, boolean>(), forget: () => undefined };
   const changed = (): void => topics.update();

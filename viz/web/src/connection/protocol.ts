@@ -71,6 +71,8 @@ export interface ModelStatus {
 export interface Status extends ModelStatus {
   type: "status";
   state: string;
+  /** How far the work is that `state` names, if there is more to say about it. */
+  progress?: StateProgress;
   seconds: number;
   keyframes: number;
   rejected: Record<string, number>;
@@ -120,6 +122,15 @@ export interface KeyframeStore {
   bytes: number;
   max_bytes: number;
   is_full: boolean;
+}
+
+/** How far the work is that a state names. */
+export interface StateProgress {
+  text: string;
+  /** Completed part of the work, 0 to 1; null if it is not known. */
+  done_frac: number | null;
+  /** Whether the model has not been started yet, so that pictures may be empty or missing. */
+  is_startup: boolean;
 }
 
 /** What the operator should do, while images are taken for a calibration. */
@@ -309,6 +320,11 @@ interface ChunkHeader {
   /** Number of chunks of the model, and of those that are missing or coarse after this message. */
   n_chunks: number;
   n_incomplete: number;
+  /** Number of chunks that are missing after this message; missing on older servers. */
+  n_unsent: number | undefined;
+  /** The same numbers for the view of the newest request; null if there was none, missing on older servers. */
+  n_incomplete_in_view: number | null | undefined;
+  n_unsent_in_view: number | null | undefined;
   world_from_model: number[];
 }
 

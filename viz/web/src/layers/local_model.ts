@@ -1,130 +1,157 @@
 // The model that the page draws itself, in the chunks that the server sends.
+//
+// Whatever was on screen stays there until the new chunks can replace it without holes: the server's picture, or an
+// older copy of a model, after another model was chosen or the connection was restored.
 
 import * as THREE from "three";
-import { worldFromCamera } from "../view/convention";
 import type { Crop } from "../view/crop_box";
-import { MeshLayer } from "./mesh_layer";
+import type { ChunkArrival } from "./chunk_arrival";
+import { LocalCopy } from "./local_copy";
 import type { ObservationLayer } from "./observation_layer";
 import type { ModelChunkHeader, ModelChunksRemoved } from "../connection/protocol";
-import { SplatLayer } from "./splat_layer";
 import type { View } from "../connection/render_scheduler";
 
 export class LocalModel {
   readonly root = new THREE.Group();
-  /** Number of chunks of the model, and of those that are missing or coarse. */
-  progress = { nChunks: 0, nIncomplete: 0 };
-  private readonly meshes: MeshLayer;
-  private readonly splats: SplatLayer;
-  private readonly worldFromModel = new THREE.Matrix4();
-  private drawn: string | null = null;
-  /** Chunks are decoded one after the other, so that older ones do not replace newer ones. */
-  private decoding: Promise<void> = Promise.resolve();
-  /** Counts the resets; chunks from before are dropped. */
-  private generation = 0;
+  private requested: string | null = null;
+  /** The copy that is drawn; null if the server's picture is shown. */
+  private shown: LocalCopy | null = null;
+  /** The copy that will be drawn as soon as it can be. */
+  private next: LocalCopy | null = null;
+  private shownCrop: Crop | undefined;
 
   constructor(
-    observations: ObservationLayer,
+    private readonly observations: ObservationLayer,
     private readonly changed: () => void,
   ) {
-    this.meshes = new MeshLayer(observations);
-    this.splats = new SplatLayer(observations, changed);
-    this.root.add(this.meshes.root, this.splats.mesh);
-    this.meshes.root.matrixAutoUpdate = false;
     this.root.visible = false;
   }
 
   /** The model to draw; null if the server draws it. */
   set method(method: string | null) {
-    if (method === this.drawn) return;
-    this.drawn = method;
-    this.clear();
+    if (method === this.requested) return;
+    this.requested = method;
+    this.renew();
   }
 
   get method(): string | null {
-    return this.drawn;
+    return this.requested;
   }
 
-  /** Whether there is anything to draw. */
-  get hasChunks(): boolean {
-    return this.progress.nChunks > 0;
+  /** Whether a copy is drawn instead of the server's picture. */
+  get isShown(): boolean {
+    return this.shown !== null;
+  }
+
+  /** Whether the server's pictures are not needed. */
+  get replacesPictures(): boolean {
+    const { shown, requested } = this;
+    return shown !== null && shown.method === requested && shown.arrival.coversView;
+  }
+
+  /** The drawn method, and how much of it has arrived; null if nothing is drawn. */
+  get drawn(): { method: string; arrival: ChunkArrival } | null {
+    return this.shown;
+  }
+
+  /** The method that is being loaded, and how much of it has arrived; null if nothing is loaded. */
+  get loading(): { method: string; arrival: ChunkArrival } | null {
+    return this.next;
   }
 
   /** Draws the depth of the splats, see splat_depth.ts; null if that is not possible. */
   drawDepth(renderer: THREE.WebGLRenderer, camera: THREE.Camera, sizePx: [number, number]): THREE.Texture | null {
-    return this.splats.drawDepth(renderer, camera, sizePx);
+    return this.shown?.drawDepth(renderer, camera, sizePx) ?? null;
   }
 
   /** Whether the model is a mesh, which hides what lies behind it. */
   get hasDepth(): boolean {
-    return this.meshes.root.children.length > 0;
+    return this.shown !== null && this.shown.meshes.root.children.length > 0;
   }
 
   /** The first surface of the drawn mesh on a ray: its distance and normal. */
   hit(from: THREE.Vector3, direction: THREE.Vector3, maxM: number): { distance: number; normal: THREE.Vector3 } | null {
-    return this.root.visible ? this.meshes.hit(from, direction, maxM) : null;
+    return this.root.visible && this.shown ? this.shown.meshes.hit(from, direction, maxM) : null;
   }
 
-  /** Drops all chunks. The server sends them again after a new subscription. */
-  clear(): void {
-    this.generation += 1;
-    this.progress = { nChunks: 0, nIncomplete: 0 };
-    this.meshes.clear();
-    this.splats.clear();
+  /**
+   * Begins a new copy, because a new subscription or connection begins with all chunks. The drawn copy stays until the
+   * new one can replace it.
+   */
+  renew(): void {
+    this.next?.dispose();
+    this.next = this.requested === null ? null : new LocalCopy(this.requested, this.observations, this.changed);
+    if (this.next) this.next.crop = this.shownCrop;
     this.changed();
   }
 
   /** To be called when the WebGL context is restored. */
   contextRestored(): void {
-    this.splats.contextRestored();
+    this.shown?.contextRestored();
+    this.next?.contextRestored();
   }
 
   /** Adds a chunk or replaces its older version. */
   receive(header: ModelChunkHeader, payload: Uint8Array<ArrayBuffer>): void {
-    if (header.method !== this.drawn) return;
-    this.progress = { nChunks: header.n_chunks, nIncomplete: header.n_incomplete };
-    this.worldFromModel.copy(worldFromCamera(header.world_from_model));
-    this.meshes.root.matrix.copy(this.worldFromModel);
-    this.meshes.root.matrixWorldNeedsUpdate = true;
-    this.enqueue(async (isCurrent) => {
-      if (header.kind === "mesh") await this.meshes.set(header, payload, isCurrent);
-      else this.splats.set(header, payload);
-    });
+    if (header.method === this.requested) this.receiver?.receive(header, payload);
   }
 
   removed({ method, ids }: ModelChunksRemoved): void {
-    if (method !== this.drawn) return;
-    this.enqueue(async () => {
-      for (const id of ids) {
-        this.meshes.remove(id);
-        this.splats.remove(id);
-      }
-    });
+    if (method === this.requested) this.receiver?.remove(ids);
+  }
+
+  /** To be called when a new picture of the server with colors can be shown. It replaces a copy that is out of date. */
+  pictureArrived(): void {
+    if (!this.shown || this.replacesPictures) return;
+    if (this.shown.method === this.requested && !this.next) {
+      this.shown.root.removeFromParent();
+      this.next = this.shown; // It has holes in the view of the picture, and is shown again when it has none.
+    } else {
+      this.shown.dispose();
+    }
+    this.shown = null;
+    this.changed();
   }
 
   set crop(crop: Crop | undefined) {
-    this.meshes.crop = crop;
-    this.splats.crop = crop;
+    this.shownCrop = crop;
+    if (this.shown) this.shown.crop = crop;
+    if (this.next) this.next.crop = crop;
   }
 
-  /** Prepares to draw a view in a buffer of this size. */
-  setView(view: View, sizePx: [number, number]): void {
+  /**
+   * Prepares to draw a view in a buffer of this size, if `root` is visible. Replaces the drawn copy if the next one is
+   * ready.
+   *
+   * `hasPicture` says whether the server's picture shows this view exactly.
+   */
+  setView(view: View, sizePx: [number, number], hasPicture: boolean): void {
     if (!this.root.visible) return;
-    const scale = [0, 1].map((axis) => sizePx[axis]! / view.size_px[axis]!);
-    const focalPx: [number, number] = [
-      view.projection.focal_px[0] * scale[0]!,
-      view.projection.focal_px[1] * scale[1]!,
-    ];
-    const depthRange: [number, number] = [view.near_m, view.far_m];
-    this.splats.setView(worldFromCamera(view.world_from_camera), this.worldFromModel, sizePx, focalPx, depthRange);
+    const { next } = this;
+    if (next?.prepare(this.isReady(next, hasPicture), view, sizePx)) this.showNext(next);
+    this.shown?.setView(view, sizePx);
   }
 
-  /** Decodes and changes chunks one after the other. */
-  private enqueue(act: (isCurrent: () => boolean) => Promise<void>): void {
-    const { generation } = this;
-    const isCurrent = (): boolean => generation === this.generation;
-    this.decoding = this.decoding
-      .then(() => (isCurrent() ? act(isCurrent) : undefined))
-      .catch((error: unknown) => console.error("cannot draw a part of the model:", error))
-      .then(this.changed);
+  /** Whether a copy can be drawn without holes, and is not worse than what is on screen. */
+  private isReady(next: LocalCopy, hasPicture: boolean): boolean {
+    const { arrival } = next;
+    // An older copy of the same model is complete, and hardly differs.
+    if (this.shown?.method === next.method) return arrival.hasAll && arrival.completesView;
+    // While the view is at rest, the server's picture is better than coarse chunks. It cannot move with the view.
+    if (!this.shown && hasPicture) return arrival.completesView;
+    return arrival.coversView;
+  }
+
+  private showNext(next: LocalCopy): void {
+    this.shown?.dispose();
+    this.shown = next;
+    this.next = null;
+    this.root.add(next.root);
+    this.changed();
+  }
+
+  /** The copy to which new chunks belong. */
+  private get receiver(): LocalCopy | null {
+    return this.next ?? this.shown;
   }
 }

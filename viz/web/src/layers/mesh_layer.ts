@@ -58,8 +58,10 @@ export class MeshLayer {
     this.chunks.delete(id);
   }
 
-  clear(): void {
+  /** Frees all memory. The layer must not be drawn any more. */
+  dispose(): void {
     for (const id of [...this.chunks.keys()]) this.remove(id);
+    this.material.dispose();
   }
 
   /** The first observed side of a surface on a ray: its distance, at most `maxM`, and its normal. */

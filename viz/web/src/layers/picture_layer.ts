@@ -170,6 +170,11 @@ export class PictureLayer {
     uniforms.isMoved!.value = worldFromView.elements.some((value, ix) => Math.abs(value - picture[ix]!) > 1e-4);
   }
 
+  /** Whether the picture shows exactly the view of the last `setView`. */
+  get showsView(): boolean {
+    return this.hasColor && this.mesh.material.uniforms.isMoved!.value === false;
+  }
+
   /**
    * Shows a picture, unless a newer one arrives while an older one is decoded. Returns whether it did. A picture may
    * consist of depth only.

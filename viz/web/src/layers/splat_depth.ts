@@ -22,6 +22,12 @@ export class SplatDepth {
     this.material.defines = { WRITES_DEPTH: 1 };
   }
 
+  /** Frees all memory. */
+  dispose(): void {
+    this.target?.dispose();
+    this.material.dispose();
+  }
+
   /** Checks again what the GPU can draw: a lost WebGL context can draw nothing. */
   contextRestored(): void {
     this.isPossible = null;

@@ -20,6 +20,11 @@ export class SplatLayer {
   private isSorting = false;
   /** What the newest requested order is for, and whether the splats have changed since. */
   private sortedFor = "";
+  /** Counts the changes of the splats. */
+  private nChanges = 0;
+  /** Number of changes in the order that was requested last, and in the one that was received last. */
+  private nChangesRequested = 0;
+  private nChangesSorted = 0;
 
   constructor(
     observations: ObservationLayer,
@@ -84,7 +89,7 @@ export class SplatLayer {
     const free = old.slice(units.length);
     if (free.length > 0) this.post({ kind: "free", units: free });
     this.post({ kind: "set", units, words: base, minM: header.min_m, maxM: header.max_m }, [base.buffer]);
-    this.sortedFor = "";
+    this.splatsChanged();
   }
 
   remove(id: number): void {
@@ -93,12 +98,32 @@ export class SplatLayer {
     this.memory.free(units);
     this.units.delete(id);
     this.post({ kind: "free", units });
+    this.splatsChanged();
+  }
+
+  private splatsChanged(): void {
+    this.nChanges += 1;
     this.sortedFor = "";
   }
 
-  clear(): void {
-    for (const id of [...this.units.keys()]) this.remove(id);
-    this.mesh.geometry.instanceCount = 0;
+  /** Frees all memory. The layer must not be drawn any more. */
+  dispose(): void {
+    this.units.clear(); // An order that arrives later is ignored.
+    this.worker?.terminate();
+    this.memory.dispose();
+    this.depth.dispose();
+    this.mesh.geometry.dispose();
+    this.mesh.material.dispose();
+  }
+
+  /** Number of changes of the splats so far, for `isSorted`. */
+  get version(): number {
+    return this.nChanges;
+  }
+
+  /** Whether the splats of a version are sorted, so that they can be drawn. */
+  isSorted(version: number): boolean {
+    return this.units.size === 0 || this.nChangesSorted >= version;
   }
 
   /** Draws only splats with their center in a box. */
@@ -142,6 +167,7 @@ export class SplatLayer {
     if (this.isSorting || view === this.sortedFor) return;
     this.isSorting = true;
     this.sortedFor = view;
+    this.nChangesRequested = this.nChanges;
     this.post({ kind: "sort", forward: [x, y, z], offset });
   }
 
@@ -163,6 +189,7 @@ export class SplatLayer {
     slots.addUpdateRange(0, order.length);
     slots.needsUpdate = true;
     geometry.instanceCount = order.length;
+    this.nChangesSorted = this.nChangesRequested;
     this.changed();
   }
 

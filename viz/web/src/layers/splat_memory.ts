@@ -29,6 +29,11 @@ export class SplatMemory {
     }
   }
 
+  /** Frees the textures. */
+  dispose(): void {
+    for (const texture of [this.base, this.harmonics, this.units]) texture.dispose();
+  }
+
   /** Number of splats for which there is memory. */
   get capacity(): number {
     return this.nRows * ROW_SPLATS;

@@ -1,5 +1,6 @@
 // Chunks of the model that the page draws itself.
 
+import type { ChunkArrival } from "../layers/chunk_arrival";
 import { element } from "../panels/element";
 import type { OrbitView } from "../view/orbit_view";
 import type { ModelChunkHeader, ModelChunksRemoved } from "../connection/protocol";
@@ -12,10 +13,7 @@ export class ModelChunksTopic implements Topic {
   readonly name = "model_chunks";
   readonly capability = "model_chunks";
   readonly receivers = [
-    on<ModelChunkHeader>("model_chunk", (header, payload) => {
-      this.view.local.receive(header, payload);
-      this.showProgress();
-    }),
+    on<ModelChunkHeader>("model_chunk", (header, payload) => this.view.local.receive(header, payload)),
     on<ModelChunksRemoved>("model_chunks_removed", (message) => this.view.local.removed(message)),
   ];
   private drawn: string | null = null;
@@ -34,12 +32,22 @@ export class ModelChunksTopic implements Topic {
   }
 
   restart(): void {
-    this.view.local.clear();
+    this.view.local.renew();
   }
 
-  private showProgress(): void {
-    const { nChunks, nIncomplete } = this.view.local.progress;
-    element("picture-text").textContent =
-      nIncomplete > 0 ? `drawn here: ${nChunks - nIncomplete} of ${nChunks} parts` : `drawn here: ${nChunks} parts`;
+  /** Shows what is drawn here and what is being loaded. To be called for every display refresh. */
+  showProgress(): void {
+    const { drawn, loading } = this.view.local;
+    if (drawn) setText("picture-text", `drawn here: ${partsText(drawn.arrival)}`);
+    setText("local-text", loading ? `loading ${loading.method}: ${partsText(loading.arrival)}` : "");
   }
+}
+
+function partsText({ nChunks, nIncomplete }: ChunkArrival): string {
+  return nIncomplete > 0 ? `${nChunks - nIncomplete} of ${nChunks} parts` : `${nChunks} parts`;
+}
+
+function setText(id: string, text: string): void {
+  const shown = element(id);
+  if (shown.textContent !== text) shown.textContent = text;
 }

@@ -424,12 +424,13 @@ export class OrbitView {
     this.isStale = false;
     const view = this.view();
     this.picture.setView(worldFromCamera(view.world_from_camera));
-    // The server's picture stays until the first chunks have arrived.
-    const isLocal = this.local.method !== null && this.local.hasChunks;
+    this.local.root.visible = this.isModelShown;
+    this.local.crop = view.crop;
+    // The server's picture stays until the chunks in view have arrived.
+    this.local.setView(view, [this.canvas.width, this.canvas.height], this.picture.showsView);
+    const isLocal = this.local.isShown;
     this.picture.enabled = this.isModelShown && !isLocal;
     this.local.root.visible = this.isModelShown && isLocal;
-    this.local.crop = view.crop;
-    this.local.setView(view, [this.canvas.width, this.canvas.height]);
     const hasDepthBuffer = isLocal && this.local.hasDepth;
     this.occlusion.usesDepthBuffer = hasDepthBuffer;
     const needsSplatDepth = isLocal && !hasDepthBuffer && this.occlusion.enabled && this.hasOccludable;

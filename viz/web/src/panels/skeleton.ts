@@ -1,0 +1,90 @@
+// A visible background with what is happening, in place of a view that would be black.
+//
+// It is shown until the first picture, and while the browser has discarded what was drawn. After a reconnection, the
+// last picture stays, but gray, until a new one has arrived.
+
+import type { ConnectionState } from "../connection/connection";
+import type { Status } from "../connection/protocol";
+import { isNothingShown, type Knowledge, type Shown, skeletonText } from "./skeleton_text";
+
+export class Skeleton {
+  private readonly root = document.createElement("div");
+  private readonly title = document.createElement("strong");
+  private readonly detail = document.createElement("span");
+  private readonly bar = document.createElement("progress");
+  private readonly known: Knowledge = { connection: "connecting", status: null, isContextLost: false };
+  private readonly shown: Shown = { hasPicture: false, hasContent: false, isStartup: false, isContextLost: false };
+  private isAwaiting = false;
+  private isModelShown = true;
+
+  /** `view` contains the canvas, which the skeleton covers. */
+  constructor(
+    private readonly view: HTMLElement,
+    canvas: HTMLElement,
+  ) {
+    this.root.id = "skeleton";
+    this.root.className = "skeleton";
+    const text = document.createElement("p");
+    text.setAttribute("role", "status");
+    text.append(this.title, this.detail);
+    this.bar.setAttribute("aria-label", "Progress");
+    this.root.append(text, this.bar);
+    canvas.after(this.root);
+    this.show();
+  }
+
+  setConnection(connection: ConnectionState): void {
+    this.known.connection = connection;
+    this.show();
+  }
+
+  setStatus(status: Status): void {
+    this.known.status = status;
+    this.shown.isStartup = status.progress?.is_startup === true;
+    this.show();
+  }
+
+  /** Whether the operator wants to see the model. Without it, an empty view is expected. */
+  set showsModel(isShown: boolean) {
+    this.isModelShown = isShown;
+    this.show();
+  }
+
+  set isContextLost(isLost: boolean) {
+    this.known.isContextLost = isLost;
+    this.shown.isContextLost = isLost;
+    if (!isLost) this.awaitPicture();
+    this.show();
+  }
+
+  /** The shown picture is out of date until the next one: the server was away, or the browser has drawn anew. */
+  awaitPicture(): void {
+    this.isAwaiting = this.shown.hasPicture;
+    this.show();
+  }
+
+  /** To be called when a picture is shown; `depth` is 0 where it shows the background. */
+  pictureShown(depth: Float32Array | null): void {
+    this.isAwaiting = false;
+    this.shown.hasPicture = true;
+    this.shown.hasContent ||= depth?.some((meters) => meters > 0) ?? true;
+    this.show();
+  }
+
+  /** Whether the view is covered. */
+  get isVisible(): boolean {
+    return !this.root.hidden;
+  }
+
+  private show(): void {
+    this.root.hidden = !isNothingShown(this.shown) || (!this.isModelShown && !this.known.isContextLost);
+    this.view.classList.toggle("awaiting", this.isAwaiting);
+    if (this.root.hidden) return;
+    const { title, detail, doneFrac } = skeletonText(this.known);
+    // Otherwise, screen readers would repeat it.
+    if (this.title.textContent !== title) this.title.textContent = title;
+    if (this.detail.textContent !== detail) this.detail.textContent = detail;
+    this.bar.hidden = doneFrac === null;
+    if (doneFrac !== null) this.bar.value = doneFrac;
+  }
+}

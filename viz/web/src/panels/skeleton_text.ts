@@ -1,0 +1,48 @@
+// What the view says while there is no picture.
+
+import type { ConnectionState } from "../connection/connection";
+import type { Status } from "../connection/protocol";
+
+/** What the page knows about the run before the first picture. */
+export interface Knowledge {
+  connection: ConnectionState;
+  status: Pick<Status, "state" | "progress"> | null;
+  /** Whether the browser has lost the WebGL context, so that nothing can be drawn. */
+  isContextLost: boolean;
+}
+
+export interface SkeletonText {
+  title: string;
+  detail: string;
+  /** Completed part of what is being done, 0 to 1; null if it is not known. */
+  doneFrac: number | null;
+}
+
+/** States in which the first picture will follow as soon as it is drawn. */
+const DRAWS_AT_ONCE = ["training", "viewing", "paused", "finished"];
+
+export function skeletonText({ connection, status, isContextLost }: Knowledge): SkeletonText {
+  const plain = (title: string, detail = ""): SkeletonText => ({ title, detail, doneFrac: null });
+  if (isContextLost) return plain("Waiting for the graphics context", "the browser has discarded it");
+  if (connection === "connecting") return plain("Connecting to the server");
+  if (connection === "lost" || connection === "refused") return plain("No connection to the server");
+  if (!status || status.state === "") return plain("Connected", "waiting for the state of the run");
+  const title = status.state.charAt(0).toUpperCase() + status.state.slice(1);
+  if (status.progress) return { title, detail: status.progress.text, doneFrac: status.progress.done_frac };
+  return plain(title, DRAWS_AT_ONCE.includes(status.state) ? "drawing the first picture" : "a picture follows");
+}
+
+/** What decides whether the view is covered. */
+export interface Shown {
+  hasPicture: boolean;
+  /** Whether a picture has shown anything but the background. */
+  hasContent: boolean;
+  /** Whether the model has not been started yet. */
+  isStartup: boolean;
+  isContextLost: boolean;
+}
+
+/** Whether there is nothing to see yet. Before the model is started, pictures may show only the background. */
+export function isNothingShown({ hasPicture, hasContent, isStartup, isContextLost }: Shown): boolean {
+  return isContextLost || !hasPicture || (isStartup && !hasContent);
+}
