@@ -802,6 +802,7 @@ fn page_shows_connection_loss_and_run_result() {
         folder: Some("runs/2026-03-01-kitchen".to_owned()),
         scores: "PSNR 26.76 dB".to_owned(),
         seconds: 98.4,
+        ..RunResult::default()
     });
     drop(server);
     wait_for(&mut browser, "the stopped server", |browser| {

@@ -9,6 +9,7 @@ import { showGuidance } from "./panels/guidance";
 import { setUpHelp, showKeysInTitles } from "./panels/help";
 import { LinkReadout } from "./connection/link_readout";
 import { LiveImages } from "./panels/live_images";
+import { ModelSourceCard } from "./panels/model_source";
 import { ModelSwitch } from "./panels/model_switch";
 import { BACKGROUND, OrbitView } from "./view/orbit_view";
 import { panels } from "./panels/panels";
@@ -17,6 +18,7 @@ import { Readouts } from "./panels/readouts";
 import { RenderScheduler } from "./connection/render_scheduler";
 import { RobotAge } from "./panels/robot_age";
 import { RunControls } from "./panels/run_controls";
+import { RunEnd } from "./panels/run_end";
 import { ShownLatency } from "./connection/shown_latency";
 import { SideView } from "./layers/side_view";
 import { Surroundings } from "./layers/surroundings";
@@ -53,11 +55,13 @@ const connection: Connection = new Connection(`${location.protocol === "https:" 
     const shown = element("connection");
     const before = shown.dataset.state;
     const wasOpen = before === "open" || before === "silent";
-    const hasEnded = state === "lost" && banner.isFinished;
+    const hasEnded = state === "lost" && connection.hasStopped && banner.isFinished;
     shown.dataset.state = hasEnded ? "ended" : state;
     shown.textContent = hasEnded ? "the server has stopped" : text;
     // Operators who control the robot by the picture must see that it is frozen.
-    banner.setConnection(state, text);
+    banner.setConnection(state, text, hasEnded);
+    runEnd.setEnded(hasEnded);
+    modelSource.setEnded(hasEnded);
     view.overlays.setLive(state === "open");
     if (state === "open" && !wasOpen) {
       view.picture.forget();
@@ -93,6 +97,8 @@ const topics = new Topics(connection, [
   chunks,
 ]);
 const runControls = new RunControls(connection);
+const runEnd = new RunEnd();
+const modelSource = new ModelSourceCard((up) => view.turnUp(up));
 new LinkReadout(connection);
 const shownLatency = new ShownLatency(connection);
 const models = new ModelSwitch(() => {
@@ -139,7 +145,9 @@ function receiveStatus(status: Status): void {
   models.list(status);
   showStatus(status);
   runControls.show(status);
-  banner.setRunResult(status.result);
+  banner.setStatus(status);
+  runEnd.show(status);
+  modelSource.show(status);
   showGuidance(status.guidance, banner, liveImages);
   robotAge.hasEnded = banner.isFinished;
 }

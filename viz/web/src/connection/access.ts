@@ -33,9 +33,14 @@ export async function refusalReason(): Promise<string> {
 export function showRole(role: Role | undefined): void {
   const isViewer = role === "viewer";
   element("role").textContent = isViewer ? "viewer" : "";
+  disableControls(isViewer ? VIEWER_REASON : "");
+}
+
+/** Disables the controls with `data-operator` and shows why, or enables them if there is no reason. */
+export function disableControls(reason: string): void {
   for (const control of document.querySelectorAll<HTMLButtonElement>("[data-operator]")) {
     control.dataset.title ??= control.title;
-    control.disabled = isViewer;
-    control.title = isViewer ? VIEWER_REASON : control.dataset.title;
+    control.disabled = reason !== "";
+    control.title = reason || control.dataset.title;
   }
 }
