@@ -403,7 +403,10 @@ fn publish_end(hub: &Hub, saved: &SavedRun) {
         1 => model.folder.as_path(),
         _ => model.folder.parent().unwrap_or(&model.folder),
     });
-    publish_final_scores(hub, models);
+    let final_scores = models
+        .iter()
+        .filter_map(|model| Some((model.kind.name(), model.seconds, model.scores.psnr?)));
+    publish_final_scores(hub, final_scores);
     viz::publish_files(
         hub,
         served_files::of_models(models.iter().map(|model| (model.kind, &model.folder))),
@@ -422,16 +425,44 @@ fn publish_end(hub: &Hub, saved: &SavedRun) {
 
 /// Replaces the last scores of the training by those of the saved models, so that the page shows
 /// the PSNR of the verdict.
-fn publish_final_scores(hub: &Hub, models: &[FinishedModel]) {
+///
+/// * `scores`: name of the method, training time in seconds, and PSNR of each scored model.
+fn publish_final_scores<'a>(hub: &Hub, scores: impl Iterator<Item = (&'a str, f64, f64)> + Clone) {
     hub.change_status(|status| {
         for shown in std::iter::once(&mut status.model).chain(&mut status.others) {
-            let model = models
-                .iter()
-                .find(|model| model.kind.name() == shown.method);
-            if let Some((model, psnr)) = model.and_then(|model| Some((model, model.scores.psnr?))) {
+            let of_model = scores.clone().find(|(name, ..)| *name == shown.method);
+            if let Some((_, seconds, psnr)) = of_model {
                 shown.psnr = Some(psnr);
-                shown.psnr_history.push((model.seconds, psnr));
+                shown.psnr_history.push((seconds, psnr));
             }
         }
     });
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use viz::{ModelStatus, Status};
+
+    #[test]
+    fn page_shows_the_final_scores() {
+        let hub = Hub::new();
+        let model = |method: &str, psnr| ModelStatus {
+            method: method.to_owned(),
+            psnr: Some(psnr),
+            psnr_history: vec![(8.0, psnr)],
+            ..ModelStatus::default()
+        };
+        hub.set_status(Status {
+            model: model("splat", 25.2),
+            others: vec![model("tsdf", 18.0)],
+            ..Status::default()
+        });
+        publish_final_scores(&hub, [("splat", 10.0, 24.85)].into_iter());
+        hub.change_status(|status| {
+            assert_eq!(status.model.psnr, Some(24.85));
+            assert_eq!(status.model.psnr_history, [(8.0, 25.2), (10.0, 24.85)]);
+            assert_eq!(status.others, [model("tsdf", 18.0)], "it was not scored");
+        });
+    }
 }

@@ -48,7 +48,7 @@ window.addEventListener("hashchange", () => {
 });
 // A page that becomes visible subscribes again, and receives all chunks again.
 document.addEventListener("visibilitychange", () => {
-  if (!document.hidden) view.local.clear();
+  if (!document.hidden && connection.isOpen) view.local.clear();
 });
 const connection: Connection = new Connection(`${location.protocol === "https:" ? "wss" : "ws"}://${location.host}/ws`, {
   state(state, text) {
@@ -248,9 +248,8 @@ function action(id: string, key: string, act: () => void): void {
   element(id).addEventListener("click", act);
   window.addEventListener("keydown", (event) => {
     const isPlain = !event.ctrlKey && !event.metaKey && !event.altKey && !event.repeat;
-    if (element(id).hidden || event.target instanceof HTMLInputElement || event.target instanceof HTMLSelectElement) {
-      return;
-    }
+    const isUnavailable = element(id).hidden || element(id).matches(":disabled");
+    if (isUnavailable || event.target instanceof HTMLInputElement || event.target instanceof HTMLSelectElement) return;
     if (isPlain && event.key.toLowerCase() === key) act();
   });
 }

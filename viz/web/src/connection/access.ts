@@ -33,12 +33,18 @@ export async function refusalReason(): Promise<string> {
 export function showRole(role: Role | undefined): void {
   const isViewer = role === "viewer";
   element("role").textContent = isViewer ? "viewer" : "";
-  disableControls(isViewer ? VIEWER_REASON : "");
+  disable("[data-server]", "");
+  disable("[data-operator]", isViewer ? VIEWER_REASON : "");
 }
 
-/** Disables the controls with `data-operator` and shows why, or enables them if there is no reason. */
-export function disableControls(reason: string): void {
-  for (const control of document.querySelectorAll<HTMLButtonElement>("[data-operator]")) {
+/** Disables everything that needs a server, until one says hello. */
+export function disableServerControls(reason: string): void {
+  disable("[data-server], [data-operator]", reason);
+}
+
+/** Disables controls and shows why, or enables them if there is no reason. */
+function disable(selector: string, reason: string): void {
+  for (const control of document.querySelectorAll<HTMLButtonElement>(selector)) {
     control.dataset.title ??= control.title;
     control.disabled = reason !== "";
     control.title = reason || control.dataset.title;

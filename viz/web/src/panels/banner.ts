@@ -55,9 +55,14 @@ export class Banner {
         : (guidance?.text ?? this.graphics);
     const banner = element("banner");
     if (banner.textContent !== text) banner.textContent = text; // Otherwise screen readers would repeat it.
-    const kind = isUnexplained || guidance?.is_finished ? "finished" : guidance ? "guidance" : "graphics";
-    banner.dataset.kind = hasProblem ? this.connection : text === "" ? "open" : kind;
+    banner.dataset.kind = hasProblem ? this.connection : text === "" ? "open" : this.kindOfNotice(isUnexplained);
     element("view").classList.toggle("stale", hasProblem);
+  }
+
+  private kindOfNotice(isEnd: boolean): string {
+    if (isEnd) return "ended";
+    if (this.guidance === null) return "graphics";
+    return this.guidance.is_finished ? "finished" : "guidance";
   }
 }
 

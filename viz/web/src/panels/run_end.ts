@@ -1,6 +1,6 @@
 // The end of a run: a panel with the verdict, the folder and the files. It can be closed, and opened again from the header.
 
-import { disableControls } from "../connection/access";
+import { disableServerControls } from "../connection/access";
 import type { RunResult, Status } from "../connection/protocol";
 import { timeText } from "./chart";
 import { element } from "./element";
@@ -39,7 +39,7 @@ export class RunEnd {
   setEnded(hasEnded: boolean): void {
     if (hasEnded === this.hasEnded) return;
     this.hasEnded = hasEnded;
-    if (hasEnded) disableControls(ENDED); // The next hello enables them.
+    if (hasEnded) disableServerControls(ENDED); // The next hello enables them.
     this.update();
   }
 
