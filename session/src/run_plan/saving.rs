@@ -20,7 +20,7 @@ use std::collections::BTreeMap;
 use std::path::PathBuf;
 use std::sync::{Arc, OnceLock};
 use std::time::Duration;
-use viz::{Hub, RunResult, Verdict};
+use viz::{Grade, Hub, RunResult, Verdict};
 
 /// Name of the rig file with the corrections of a run.
 const CORRECTED_RIG: &str = "corrected-rig.toml";
@@ -418,8 +418,27 @@ fn publish_end(hub: &Hub, saved: &SavedRun) {
         verdict: Some(saved.verdict()),
         problems: saved.problems(),
     });
+    wait_for_clients(hub);
+}
+
+/// Publishes why a run has ended without a result. The error says what was saved.
+pub(super) fn publish_failure(hub: &Hub, error: &anyhow::Error) {
+    hub.set_run_result(RunResult {
+        verdict: Some(Verdict {
+            grade: Grade::Unknown,
+            text: "The run ended with an error".to_owned(),
+        }),
+        problems: vec![format!("{error:#}")],
+        ..RunResult::default()
+    });
+    wait_for_clients(hub);
+}
+
+/// Waits until connected clients have received the last status, which they keep showing after the
+/// server has stopped.
+fn wait_for_clients(hub: &Hub) {
     if hub.n_clients() > 0 {
-        std::thread::sleep(FINAL_STATUS_TIME); // Clients keep showing the result after the server has stopped.
+        std::thread::sleep(FINAL_STATUS_TIME);
     }
 }
 

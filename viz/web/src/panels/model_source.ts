@@ -13,6 +13,8 @@ const ENDED = "The program has ended";
 
 export class ModelSourceCard {
   private readonly card = element("source-card");
+  /** Where the controls are in a run. */
+  private readonly training = element("controls").parentElement;
   private status: Status | null = null;
   private hasEnded = false;
   private chosenUp: Axis | null = null;
@@ -36,8 +38,16 @@ export class ModelSourceCard {
   private update(): void {
     const source = this.status?.source;
     this.card.hidden = source === undefined;
-    if (!this.status || !source) return;
-    hideTraining(this.status);
+    if (!this.status) return;
+    if (!source) {
+      this.restoreTraining();
+      return;
+    }
+    showTraining({
+      psnr: [this.status, ...this.status.others].some((model) => model.psnr !== null),
+      seconds: false,
+      keyframes: this.status.keyframes > 0,
+    });
     const files = this.status.files ?? [];
     const facts = factsOf(source, this.status);
     const shown = JSON.stringify([source, files, facts, this.hasEnded]);
@@ -60,6 +70,16 @@ export class ModelSourceCard {
     if (source.kind === "file") this.card.append(this.upChooser(source));
     // The edits of this model are saved here, because there is no training.
     this.card.append(element("controls"));
+  }
+
+  /** Undoes the changes for a source, because the page has reconnected to a run. */
+  private restoreTraining(): void {
+    if (this.shown === "") return;
+    this.shown = "";
+    this.training?.append(element("controls"));
+    showTraining({ psnr: true, seconds: true, keyframes: true });
+    if (this.chosenUp) this.turnUp(upInWorld("z", "z"));
+    this.chosenUp = null;
   }
 
   private upChooser(source: ModelSource): HTMLElement {
@@ -87,16 +107,12 @@ export class ModelSourceCard {
   }
 }
 
-/** Hides the cards of values that only a run has. */
-function hideTraining(status: Status): void {
-  const models = [status, ...status.others];
-  const hide = (id: string, isHidden: boolean): void => {
+/** Shows or hides the cards of values that only a run has, each named by one of its elements. */
+function showTraining(shown: Record<"psnr" | "seconds" | "keyframes", boolean>): void {
+  for (const [id, isShown] of Object.entries(shown)) {
     const card = element(id).closest<HTMLElement>(".card");
-    if (card) card.hidden = isHidden;
-  };
-  hide("psnr", models.every((model) => model.psnr === null));
-  hide("seconds", true);
-  hide("keyframes", status.keyframes === 0);
+    if (card) card.hidden = !isShown;
+  }
 }
 
 /** Names and values of the facts about a source and its models. */

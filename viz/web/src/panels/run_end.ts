@@ -97,10 +97,9 @@ export function verdictText(result: RunResult): string {
 }
 
 function rows(result: RunResult): [string, string][] {
-  return [
-    ["Saved in", result.folder ?? "nothing was saved"],
-    ["Training time", timeText(result.seconds)],
-  ];
+  const folder: [string, string][] = result.folder === null ? [] : [["Saved in", result.folder]];
+  const time: [string, string][] = result.seconds > 0 ? [["Training time", timeText(result.seconds)]] : [];
+  return [...folder, ...time];
 }
 
 function stateText(hasEnded: boolean): string {
