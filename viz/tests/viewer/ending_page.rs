@@ -502,6 +502,15 @@ fn viewing(kind: SourceKind) -> Status {
     }
 }
 
+/// Publishes what `view` publishes.
+fn publish_view(hub: &Hub, kind: SourceKind, file: &Path) {
+    hub.set_status(viewing(kind));
+    publish_files(
+        hub,
+        vec![served("splat.spz", Some("guitar.spz"), file.to_owned())],
+    );
+}
+
 #[test]
 fn saved_models_and_files_have_a_panel_of_their_own() {
     let Some(program) = browser_for_page() else {
@@ -511,20 +520,13 @@ fn saved_models_and_files_have_a_panel_of_their_own() {
     let served = Served::start(viewing(SourceKind::File));
     let path = folder.path().join("guitar.spz");
     std::fs::write(&path, "spz").expect("written");
-    publish_files(
-        &served.hub,
-        vec![crate::downloads::served(
-            "splat.spz",
-            Some("guitar.spz"),
-            path,
-        )],
-    );
+    publish_view(&served.hub, SourceKind::File, &path);
     let profile = profile("source");
     let mut browser = Browser::open(&program, &profile, &served.server.url(), DESKTOP_PX);
     wait_for_full_picture(&mut browser);
     check_file(&mut browser);
     check_up_axis(&mut browser, &served);
-    check_saved(&mut browser, &served.hub);
+    check_saved(&mut browser, &served.hub, &path);
     check_incomplete_map(&mut browser, &served.hub);
     check_end_of_view(&mut browser, served);
     drop(browser);
@@ -582,8 +584,20 @@ fn check_up_axis(browser: &mut Browser, served: &Served) {
 }
 
 /// A saved model has its score and the facts of its training.
-fn check_saved(browser: &mut Browser, hub: &Hub) {
-    hub.set_status(viewing(SourceKind::Saved));
+fn check_saved(browser: &mut Browser, hub: &Hub, file: &Path) {
+    // A run at the same address shows its training again.
+    hub.set_status(training());
+    wait_until(
+        browser,
+        "the training",
+        "document.getElementById('seconds')?.closest('[hidden]') === null",
+    );
+    wait_until(
+        browser,
+        "no source",
+        "document.getElementById('source-card')?.hidden",
+    );
+    publish_view(hub, SourceKind::Saved, file);
     wait_for(browser, "the facts", |browser| {
         let text = browser.text("source-card");
         ["kitchen", "Good: 31.2 dB", "scan.mcap", "1,520", "61 s"]
