@@ -63,6 +63,7 @@ impl RunInProgress {
         }
         // The devices are stopped before saving, which may take minutes.
         self.stop.request();
+        let hub = self.live.hub();
         let Self {
             live,
             plan,
@@ -100,6 +101,7 @@ impl RunInProgress {
                 Ok(saved)
             }
             Err(error) => {
+                saving::publish_failure(&hub, &error);
                 // The folder of a run that failed before its first keyframe contains nothing of
                 // use.
                 created.keep_unless(!has_keyframes || is_rejection(&error));

@@ -386,7 +386,7 @@ fn the_header_and_the_panels_answer_the_questions_of_an_operator() {
 /// The page says which robot it shows, what to do, and who is connected.
 fn check_identity(browser: &mut Browser) {
     assert_eq!(browser.text("rig"), "static-arm");
-    assert_eq!(browser.text("run"), "panda · 2026-11-28-kitchen");
+    assert_eq!(browser.text("run-name"), "panda · 2026-11-28-kitchen");
     assert_eq!(browser.text("badge"), "S");
     let title = browser.evaluate("document.title");
     assert_eq!(title, "static-arm · training · fieldrig");

@@ -5,6 +5,8 @@ mod admission;
 mod analytic_scene;
 mod black_page;
 mod client;
+mod downloads;
+mod ending_page;
 mod eye_page;
 #[cfg(feature = "foxglove")]
 mod foxglove;

@@ -13,6 +13,7 @@ import { setUpHelp } from "./panels/help";
 import { action, closesWithEscape, endsWithEscape, setFlying, setUpKeys, toggle } from "./keys";
 import { LinkReadout } from "./connection/link_readout";
 import { LiveImages } from "./panels/live_images";
+import { ModelSourceCard } from "./panels/model_source";
 import { ModelSwitch } from "./panels/model_switch";
 import { BACKGROUND, OrbitView } from "./view/orbit_view";
 import { OverlayAges } from "./panels/overlay_ages";
@@ -24,6 +25,7 @@ import { RenderScheduler } from "./connection/render_scheduler";
 import { RobotAge } from "./panels/robot_age";
 import { RunControls } from "./panels/run_controls";
 import { setUpSidePanel } from "./panels/side_panel";
+import { RunEnd } from "./panels/run_end";
 import { ShownLatency } from "./connection/shown_latency";
 import { Skeleton } from "./panels/skeleton";
 import { SideView } from "./layers/side_view";
@@ -60,18 +62,20 @@ window.addEventListener("hashchange", () => {
 });
 // A page that becomes visible subscribes again, and receives all chunks again.
 document.addEventListener("visibilitychange", () => {
-  if (!document.hidden) view.local.renew();
+  if (!document.hidden && connection.isOpen) view.local.renew();
 });
 const connection: Connection = new Connection(`${location.protocol === "https:" ? "wss" : "ws"}://${location.host}/ws`, {
   state(state, text) {
     const shown = element("connection");
     const before = shown.dataset.state;
     const wasOpen = before === "open" || before === "silent";
-    const hasEnded = state === "lost" && banner.isFinished;
+    const hasEnded = state === "lost" && connection.hasStopped && banner.isFinished;
     shown.dataset.state = hasEnded ? "ended" : state;
     shown.textContent = hasEnded ? "the server has stopped" : text;
     // Operators who control the robot by the picture must see that it is frozen.
-    banner.setConnection(state, text);
+    banner.setConnection(state, text, hasEnded);
+    runEnd.setEnded(hasEnded);
+    modelSource.setEnded(hasEnded);
     skeleton.setConnection(state);
     view.overlays.setLive(state === "open");
     if (state === "open" && !wasOpen) {
@@ -111,6 +115,8 @@ const topics = new Topics(connection, [
   chunks,
 ]);
 const runControls = new RunControls(connection);
+const runEnd = new RunEnd();
+const modelSource = new ModelSourceCard((up) => view.turnUp(up));
 new LinkReadout(connection);
 const shownLatency = new ShownLatency(connection);
 const models = new ModelSwitch(() => {
@@ -171,7 +177,9 @@ function receiveStatus(status: Status): void {
   runControls.show(status);
   header.show(status);
   trainingPanel.show(status);
-  banner.setRunResult(status.result);
+  banner.setStatus(status);
+  runEnd.show(status);
+  modelSource.show(status);
   showGuidance(status.guidance, banner, liveImages);
   robotAge.hasEnded = banner.isFinished;
   overlayAges.hasEnded = banner.isFinished;

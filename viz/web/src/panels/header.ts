@@ -26,7 +26,7 @@ export class Header {
     badge.hidden = name === "";
     document.title = [name, state, "fieldrig"].filter((part) => part !== "").join(" · ");
     text("rig", name);
-    text("run", detailsOf(identity));
+    text("run-name", detailsOf(identity));
     if (name === this.icon || name === "") return;
     this.icon = name;
     badge.textContent = letterOf(name);

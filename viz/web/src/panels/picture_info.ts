@@ -55,7 +55,7 @@ export class PictureInfo {
     this.label.show(this.view.picture.header, now);
     const status = this.label.status(now);
     if (this.view.picture.setFaded(status.state === "old")) this.view.changed();
-    if (this.view.local.root.visible) {
+    if (this.view.local.root.visible && this.view.local.isShown) {
       this.showLocal(status);
       return;
     }
@@ -72,17 +72,18 @@ export class PictureInfo {
     this.showStages(status.isOfView ? (header?.scale ?? 0) : 0);
   }
 
-  /** The page draws the model itself, with the chunks of one model only; their number is shown as they arrive. */
+  /** The page draws the model itself, and shows how many of its chunks have arrived. */
   private showLocal(status: PictureStatus): void {
-    const { method, progress } = this.view.local;
+    const { drawn, loading } = this.view.local;
+    const isComplete = drawn !== null && loading === null && drawn.arrival.completesView;
     this.set({
-      state: progress.nIncomplete > 0 ? "waiting" : "current",
-      method: method ?? "",
+      state: isComplete ? "current" : "waiting",
+      method: drawn?.method ?? "",
       step: "",
       request: numberText(status.request),
       shownRequest: "",
     });
-    this.showStages(progress.nIncomplete > 0 ? 0 : 1);
+    this.showStages(isComplete ? 1 : 0);
   }
 
   /** Age of the picture, if it matters: the model has changed since, or the view has. */
