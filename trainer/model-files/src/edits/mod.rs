@@ -141,6 +141,18 @@ impl Edits {
         self.0.iter().any(|edit| edit.erases(point_m))
     }
 
+    /// Whether nothing of a splat remains in pictures: a box contains it as a whole, or an edit of
+    /// cells its center.
+    ///
+    /// * `half_axes_m`: half axes in world of the ellipsoid within which the splat is drawn.
+    #[must_use]
+    pub fn hide_splat(&self, center_m: [f64; 3], half_axes_m: [[f64; 3]; 3]) -> bool {
+        self.0.iter().any(|edit| match edit {
+            Edit::Box(aabb) => aabb.contains_ellipsoid(center_m, half_axes_m),
+            Edit::Cells(cells) => cells.contains(center_m),
+        })
+    }
+
     /// Reads the edits in the folder of a saved model; none if the folder has no such file, or for
     /// a single file.
     ///
