@@ -39,6 +39,7 @@ pub use pictures::picture_times::{NewestKeyframe, ShownPicture, TrainedKeyframes
 pub use server::access::{Role, Token, Tokens};
 pub use server::certificate::Certificate;
 pub use server::{Server, ServerConfig, Sharing};
+pub use topics::edit_status::{ErasedBox, LastEdit, SavedEdits};
 pub use topics::model_chunks::PublishedChunks;
 pub use topics::observations::{ObservationMap, ObservedCell};
 pub use topics::published_data::{

@@ -2,7 +2,7 @@
 
 use super::models::Models;
 use crate::editing::Editor;
-use viz::{Control, EditRequest, Hub};
+use viz::{Control, EditRequest, Hub, LastEdit};
 
 /// Requests of operators, and their results.
 #[derive(Default)]
@@ -12,8 +12,7 @@ pub(super) struct Requests {
     /// Result of the last checkpoint that an operator requested.
     checkpoint_note: Option<String>,
     editor: Editor,
-    /// Result of the last edit.
-    edit_note: Option<String>,
+    pub(super) last_edit: Option<LastEdit>,
     /// Number of times that edits of any model have changed.
     pub(super) edit_revision: u64,
     /// Whether an edit was applied or begun since this flag was cleared.
@@ -25,7 +24,7 @@ impl Requests {
     pub(super) fn notes(&self) -> impl Iterator<Item = String> {
         [
             self.checkpoint_note.clone(),
-            self.edit_note.clone(),
+            self.last_edit.as_ref().map(|edit| edit.text.clone()),
             self.editor.note(),
         ]
         .into_iter()
@@ -98,8 +97,11 @@ impl Requests {
         match edited {
             Ok(note) => {
                 // Without a note, a search was started and nothing has changed yet.
-                if note.is_some() {
-                    self.edit_note = note;
+                if let Some(text) = note {
+                    self.last_edit = Some(LastEdit {
+                        client: request.client(),
+                        text,
+                    });
                     self.edit_revision += 1;
                 }
                 self.has_edited = true;

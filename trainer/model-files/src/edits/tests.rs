@@ -77,6 +77,31 @@ fn boxes_hide_only_splats_that_they_contain_as_a_whole() {
 }
 
 #[test]
+fn undone_edits_are_made_again_until_a_new_edit() {
+    let mut edits = Edits::default();
+    assert!(matches!(edits.redo(), Err(Error::NothingToRedo)));
+    let made = [
+        Edit::Box(rotated_box()),
+        Edit::Cells(CellSet::new(GRID, [3])),
+    ];
+    for edit in &made {
+        edits.push(edit.clone()).unwrap();
+    }
+    edits.undo().unwrap();
+    edits.undo().unwrap();
+    assert!(edits.is_empty() && edits.n_undone() == 2);
+    assert_eq!(edits, Edits::default(), "undone edits do not count");
+    assert_eq!(serde_json::to_value(&edits).unwrap(), json!([]));
+    edits.redo().unwrap();
+    assert_eq!(edits.as_slice(), &made[..1]);
+    edits.push(made[1].clone()).unwrap();
+    assert!(edits.n_undone() == 0 && matches!(edits.redo(), Err(Error::NothingToRedo)));
+    edits.undo().unwrap();
+    edits.redo().unwrap();
+    assert_eq!(edits.as_slice(), &made);
+}
+
+#[test]
 fn number_of_edits_is_limited() {
     let mut edits = Edits::default();
     for _ in 0..MAX_EDITS {
