@@ -172,10 +172,8 @@ fn boxes_cut_splats_where_they_leave_them() {
         n_of_parts[usize::from(is_erased)] += 1;
         let part = if is_cropped { &cropped } else { &erased };
         // Two kernels may round differently.
-        let differences = pixels(part)[ix]
-            .iter()
-            .zip(pixel)
-            .map(|(a, b)| a.abs_diff(*b));
+        let of_part = &pixels(part)[ix];
+        let differences = of_part.iter().zip(pixel).map(|(a, b)| a.abs_diff(*b));
         assert!(differences.max() <= Some(1), "pixel {ix}");
     }
     // The needle is about 3.3 standard deviations of 0.6 m long on each side, the box 0.4 m.

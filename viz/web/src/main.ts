@@ -2,6 +2,7 @@
 
 import { keepToken, showRole } from "./connection/access";
 import { Banner } from "./panels/banner";
+import { BoxPanel } from "./panels/box_panel";
 import { Connection } from "./connection/connection";
 import { EditControls } from "./panels/edit_controls";
 import { element } from "./panels/element";
@@ -104,6 +105,7 @@ const models = new ModelSwitch(() => {
 let isDrawnLocally = false;
 const scheduler = new RenderScheduler(connection, () => view.view(), () => stages, BACKGROUND, () => models.method);
 const edits = new EditControls(connection, view.crop, () => models.method);
+new BoxPanel(view.crop);
 const sides = [new SideView(connection, "surroundings"), new SideView(connection, "video")] as const;
 const surroundings = new Surroundings(
   sides[0],
@@ -150,6 +152,7 @@ function receiveText(message: TextMessage): void {
     case "hello":
       stages = message.default_stages;
       showRole(message.role);
+      edits.client = message.client;
       showKeysInTitles(!isPressed("toggle-fly"));
       break;
     case "scene":
@@ -189,6 +192,7 @@ function updateLocalModel(model: ModelStatus): void {
   element("toggle-local").hidden = !isPossible;
   const method = isPossible && isDrawnLocally && showsModel ? model.method : null;
   chunks.method = method;
+  view.local.erased = model.erased_boxes ?? [];
   scheduler.drawsLocally = method !== null;
 }
 
@@ -290,8 +294,6 @@ action("toggle-edit", "q", () => {
   const button = element("toggle-edit", HTMLButtonElement);
   if (!button.hidden && !button.disabled) togglePanel("toggle-edit");
 });
-action("erase-box", "w", () => edits.eraseBox());
-action("remove-floaters", "a", () => edits.removeFloaters());
 action("undo-edit", "z", () => edits.undoLast());
 toggle("toggle-follow", "l", (isOn) => (view.follows = isOn));
 toggle("toggle-points", "p", (isOn) => (points.shown = isOn));

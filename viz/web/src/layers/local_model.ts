@@ -106,6 +106,11 @@ export class LocalModel {
     this.splats.crop = crop;
   }
 
+  /** Erased boxes. Meshes arrive without the erased triangles, but a box can cut splats. */
+  set erased(boxes: Crop[]) {
+    if (this.splats.setErased(boxes)) this.changed();
+  }
+
   /** Prepares to draw a view in a buffer of this size. */
   setView(view: View, sizePx: [number, number]): void {
     if (!this.root.visible) return;

@@ -15,7 +15,8 @@ export class Readouts {
     text("step", count(model.step));
     text("step-millis", model.step_millis === null ? "–" : `${model.step_millis.toPrecision(3)} ms`);
     text("primitives-label", model.primitives_label || "Primitives");
-    text("primitives", count(model.primitives));
+    // Edits hide splats only when the model is drawn or exported.
+    text("primitives", `${count(model.primitives)}${model.edits > 0 ? " before edits" : ""}`);
     text("bytes", bytesText(model.bytes));
     text("keyframes", count(status.keyframes));
     // A saved model lists only accepted keyframes.

@@ -33,7 +33,7 @@ export class RunControls {
     element("pause").hidden = !isRunning;
     const save = element("save", HTMLButtonElement);
     save.textContent = isRunning ? "Save checkpoint" : "Save edits";
-    save.dataset.title = isRunning ? "Write a checkpoint now" : "Save the edits in the folder of the model";
+    save.dataset.title = isRunning ? "Write a checkpoint now" : "Save the edits in the folder of the model, or an edited copy of a single file beside it";
     if (!save.disabled) save.title = save.dataset.title; // Otherwise, the title says why.
   }
 }
