@@ -4,6 +4,7 @@
 mod admission;
 mod analytic_scene;
 mod client;
+mod edits_page;
 mod eye_page;
 #[cfg(feature = "foxglove")]
 mod foxglove;

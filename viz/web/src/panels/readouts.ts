@@ -14,9 +14,10 @@ export class Readouts {
     text("seconds", timeText(status.seconds));
     text("step", count(model.step));
     text("step-millis", model.step_millis === null ? "–" : `${model.step_millis.toPrecision(3)} ms`);
-    text("primitives-label", model.primitives_label || "Primitives");
     // Edits hide splats only when the model is drawn or exported.
-    text("primitives", `${count(model.primitives)}${model.edits > 0 ? " before edits" : ""}`);
+    const note = model.edits > 0 ? " before edits" : "";
+    text("primitives-label", `${model.primitives_label || "Primitives"}${note}`);
+    text("primitives", count(model.primitives));
     text("bytes", bytesText(model.bytes));
     text("keyframes", count(status.keyframes));
     // A saved model lists only accepted keyframes.
