@@ -209,7 +209,11 @@ mod tests {
         ];
         assert_eq!(
             status["erased_boxes"],
-            json!([{"world_from_box": world_from_box, "min_m": [-1.0; 3], "max_m": [1.0; 3]}])
+            json!([{
+                "world_from_box": world_from_box,
+                "min_m": [-1.0, -1.0, -1.0],
+                "max_m": [1.0, 1.0, 1.0],
+            }])
         );
     }
 
