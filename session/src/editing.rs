@@ -41,6 +41,10 @@ impl Editor {
                 .undo()
                 .map(|()| Some("undid the last edit".to_owned()))
                 .map_err(Error::from),
+            EditAction::Redo => Arc::make_mut(edits)
+                .redo()
+                .map(|()| Some("redid the last undone edit".to_owned()))
+                .map_err(Error::from),
             // A second search would find the same floaters again.
             EditAction::RemoveFloaters if self.search.is_some() => {
                 return Err(

@@ -33,6 +33,7 @@ mod data;
 mod dataset_export;
 mod decisions;
 pub mod depth_from;
+mod edited_copy;
 mod editing;
 mod error;
 mod eval_plan;

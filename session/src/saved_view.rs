@@ -35,7 +35,7 @@ pub fn publish_saved(
     let mut statuses = Vec::new();
     for (path, model) in paths.iter().zip(&*models) {
         notes.extend(methods::note_if_empty(path, model));
-        statuses.push(model_status(path, model));
+        statuses.push(model_status(path, model, model_from_page));
     }
     let report = paths.first().map_or(Value::Null, |path| report(path));
     let kinds: Vec<ModelKind> = models.iter().map(|model| model.kind).collect();
@@ -153,11 +153,9 @@ fn first_view(
 }
 
 /// Size and scores of a model at the end of its training.
-fn model_status(path: &Path, model: &LoadedModel) -> ModelStatus {
-    ModelStatus {
-        edits: model.edits.len(),
-        ..trained_status(path, model.kind, &model.method.model().progress())
-    }
+fn model_status(path: &Path, model: &LoadedModel, model_from_page: &Transform) -> ModelStatus {
+    trained_status(path, model.kind, &model.method.model().progress())
+        .with_edits(&model.edits, &model_from_page.inverse())
 }
 
 fn trained_status(model: &Path, kind: ModelKind, progress: &Progress) -> ModelStatus {
@@ -174,7 +172,6 @@ fn trained_status(model: &Path, kind: ModelKind, progress: &Progress) -> ModelSt
         // that the run has shown.
         bytes: done["bytes"].as_u64().unwrap_or(progress.bytes),
         has_chunks: kind.entry().has_chunks,
-        edits: 0,
         psnr: done["psnr"].as_f64(),
         psnr_history: evaluations
             .into_iter()
@@ -182,6 +179,7 @@ fn trained_status(model: &Path, kind: ModelKind, progress: &Progress) -> ModelSt
             .chain([done])
             .filter_map(scored_point)
             .collect(),
+        ..ModelStatus::default()
     }
 }
 

@@ -1,6 +1,7 @@
 //! Draws trained models for viewers: the loop of `view`, and of a run after its training.
 
 use crate::chunk_publisher::ChunkPublisher;
+use crate::edited_copy;
 use crate::editing::{self, Editor};
 use crate::methods;
 use crate::observations::{ModelState, ObservationPublisher, PosedKeyframe};
@@ -12,7 +13,8 @@ use std::sync::Arc;
 use std::time::Duration;
 use trainer::{AlignedModel, Method, ModelKind, RenderRequest, Rendered};
 use viz::{
-    Control, EditAction, EditRequest, Hub, KeyframePose, ModelStatus, PendingRender, Status,
+    Control, EditAction, EditRequest, Hub, KeyframePose, LastEdit, PendingRender, SavedEdits,
+    Status,
 };
 
 /// Maximum response time to Ctrl-C while no client requests a picture. Edits wait as long; a
@@ -27,7 +29,7 @@ pub struct ServedModel {
     pub method: AlignedModel,
     /// Erased space, in the model's world.
     pub edits: Arc<Edits>,
-    /// Folder or file of the saved model. Only folders can hold edits.
+    /// Folder or file of the saved model. Edits are stored in the folder, or in a copy of the file.
     pub path: PathBuf,
 }
 
@@ -43,8 +45,10 @@ pub struct ModelViewer {
     /// Pose of the page's world, which is z up, in the model's world.
     model_from_page: Transform,
     editor: Editor,
-    /// The edits in the folders of the models.
+    /// The edits that are stored.
     saved: Vec<Arc<Edits>>,
+    /// Number of requests to save them.
+    n_saves: u64,
     /// What the last edit or save did.
     note: Option<String>,
     published_notes: Vec<String>,
@@ -71,6 +75,7 @@ impl ModelViewer {
             hub,
             model_from_page: Transform::identity(),
             editor: Editor::default(),
+            n_saves: 0,
             note: None,
             published_notes: Vec::new(),
         }
@@ -109,7 +114,7 @@ impl ModelViewer {
         self.models
             .iter()
             .zip(&self.saved)
-            .any(|(model, saved)| model.path.is_dir() && model.edits != *saved)
+            .any(|(model, saved)| model.edits != *saved)
     }
 
     fn publish_observations(&mut self) {
@@ -163,13 +168,32 @@ impl ModelViewer {
             .take_controls()
             .contains(&Control::Save)
         {
-            let saved = self.models.iter_mut().zip(&mut self.saved);
-            let notes: Vec<String> = saved
-                .map(|(model, saved)| model.save_edits(saved))
-                .collect();
-            self.note = Some(notes.join("; "));
-            self.publish_notes();
+            self.save_edits();
         }
+    }
+
+    /// Saves the edits of all models, and publishes the result.
+    fn save_edits(&mut self) {
+        let saved = self.models.iter_mut().zip(&mut self.saved);
+        let results: Vec<Result<String, String>> = saved
+            .map(|(model, saved)| model.save_edits(saved))
+            .collect();
+        let has_failed = results.iter().any(Result::is_err);
+        let texts: Vec<String> = results
+            .into_iter()
+            .map(|result| result.unwrap_or_else(|reason| reason))
+            .collect();
+        let text = texts.join("; ");
+        self.n_saves += 1;
+        let saved_edits = SavedEdits {
+            revision: self.n_saves,
+            text: text.clone(),
+            has_failed,
+        };
+        self.hub
+            .change_status(|status| status.saved_edits = Some(saved_edits));
+        self.note = Some(text);
+        self.publish_notes();
     }
 
     /// Makes an edit; see [`Editor::apply`].
@@ -190,7 +214,10 @@ impl ModelViewer {
         match edited {
             Ok(None) => {}
             Ok(Some(note)) => {
-                self.publish_edits();
+                self.publish_edits(LastEdit {
+                    client: request.client(),
+                    text: note.clone(),
+                });
                 let is_unsaved = self.has_unsaved_edits();
                 self.note = Some(if is_unsaved {
                     format!("{note}; not saved yet")
@@ -203,20 +230,29 @@ impl ModelViewer {
         self.publish_notes();
     }
 
-    /// Publishes the numbers of edits.
-    fn publish_edits(&self) {
+    /// Publishes the edits.
+    fn publish_edits(&self, edit: LastEdit) {
+        let page_from_model = self.model_from_page.inverse();
         self.hub.change_status(
             |Status {
                  model,
                  others,
                  edit_revision,
+                 last_edit,
                  ..
              }| {
-                for ModelStatus { method, edits, .. } in std::iter::once(model).chain(others) {
-                    let model = self.models.iter().find(|model| model.kind.name() == method);
-                    *edits = model.map_or(0, |model| model.edits.len());
+                for status in std::iter::once(model).chain(others) {
+                    let edited = self
+                        .models
+                        .iter()
+                        .find(|model| model.kind.name() == status.method);
+                    if let Some(edited) = edited {
+                        *status =
+                            std::mem::take(status).with_edits(&edited.edits, &page_from_model);
+                    }
                 }
                 *edit_revision += 1;
+                *last_edit = Some(edit);
             },
         );
     }
@@ -277,29 +313,33 @@ fn answer_with(
 }
 
 impl ServedModel {
-    /// Writes the edits into the folder of the model, and updates `saved`. Returns a note on the
-    /// result.
-    fn save_edits(&mut self, saved: &mut Arc<Edits>) -> String {
+    /// Stores the edits, and updates `saved`. Returns a sentence on the result, or on why they could
+    /// not be stored.
+    fn save_edits(&mut self, saved: &mut Arc<Edits>) -> Result<String, String> {
+        let written = if self.path.is_dir() {
+            self.write_edits()
+        } else {
+            edited_copy::save(&self.path, &self.edits).map(|out| match out {
+                Some(out) => format!("edited model saved as {}", out.display()),
+                None => "nothing was saved, because there are no edits".to_owned(),
+            })
+        };
+        let written = written.map_err(|error| format!("cannot save the edits: {error:#}"))?;
+        *saved = Arc::clone(&self.edits);
+        Ok(written)
+    }
+
+    /// Writes the edits into the folder of the model.
+    fn write_edits(&mut self) -> anyhow::Result<String> {
+        self.edits.write(&self.path)?;
+        self.method
+            .model_mut()
+            .write_for_others(&self.path, &self.edits)?;
         let path = self.path.display();
-        if !self.path.is_dir() {
-            return format!("edits cannot be saved: {path} is not a model folder");
-        }
-        let model = self.method.model_mut();
-        let written = self
-            .edits
-            .write(&self.path)
-            .map_err(trainer::Error::from)
-            .and_then(|()| model.write_for_others(&self.path, &self.edits));
-        match written {
-            Ok(()) => {
-                *saved = Arc::clone(&self.edits);
-                match self.edits.len() {
-                    0 => format!("edits saved in {path}: none are left"),
-                    _ => format!("edits saved in {path}"),
-                }
-            }
-            Err(error) => format!("cannot save the edits: {:#}", anyhow::Error::from(error)),
-        }
+        Ok(match self.edits.len() {
+            0 => format!("edits saved in {path}: none are left"),
+            _ => format!("edits saved in {path}"),
+        })
     }
 }
 

@@ -13,6 +13,8 @@ pub enum EditAction {
     RemoveFloaters,
     /// Undoes the last edit.
     Undo,
+    /// Makes the last undone edit again.
+    Redo,
 }
 
 impl std::fmt::Display for EditAction {
@@ -30,6 +32,7 @@ impl std::fmt::Display for EditAction {
             }
             Self::RemoveFloaters => formatter.write_str("remove floaters"),
             Self::Undo => formatter.write_str("undo"),
+            Self::Redo => formatter.write_str("redo"),
         }
     }
 }
@@ -55,6 +58,7 @@ impl EditRequest {
             }
             (EditKind::RemoveFloaters, None) => EditAction::RemoveFloaters,
             (EditKind::Undo, None) => EditAction::Undo,
+            (EditKind::Redo, None) => EditAction::Redo,
             _ => return Err(InvalidRequest::EditBox),
         };
         Ok(Self {
@@ -74,6 +78,11 @@ impl EditRequest {
             method: None,
             action,
         }
+    }
+
+    /// Number of the client that sent it; 0 for nobody.
+    pub fn client(&self) -> u64 {
+        self.client
     }
 
     /// The model to edit; the first if `None`. The name comes from the client and may not exist.

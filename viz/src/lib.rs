@@ -40,6 +40,7 @@ pub use server::access::{Role, Token, Tokens};
 pub use server::certificate::Certificate;
 pub use server::downloads::{OpenFile, ServedFile, publish_files};
 pub use server::{Server, ServerConfig, Sharing};
+pub use topics::edit_status::{ErasedBox, LastEdit, SavedEdits};
 pub use topics::model_chunks::PublishedChunks;
 pub use topics::observations::{ObservationMap, ObservedCell};
 pub use topics::operator_status::{

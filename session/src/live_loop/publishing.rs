@@ -205,6 +205,7 @@ impl LiveLoop {
             model: models.next().unwrap_or_default(),
             others: models.collect(),
             edit_revision: self.requests.edit_revision,
+            last_edit: self.requests.last_edit.clone(),
             notes: (self.publishing.notes.iter().cloned())
                 .chain(self.publishing.device_notes.list())
                 .chain(movements.iter().map(ToString::to_string))
@@ -297,10 +298,11 @@ fn model_status(session: &Session) -> ModelStatus {
         primitives_label: session.kind().entry().primitives_label.to_owned(),
         bytes: progress.bytes,
         has_chunks: session.kind().entry().has_chunks,
-        edits: session.edits().len(),
         psnr: session.scoreboard().psnr(),
         psnr_history: session.scoreboard().psnr_history().to_vec(),
+        ..ModelStatus::default()
     }
+    .with_edits(session.edits(), &Transform::identity())
 }
 
 fn frustum(keyframe: &Keyframe, camera: &CalibratedCamera) -> KeyframePose {

@@ -3,7 +3,7 @@
 use super::models::Models;
 use crate::checkpoints::CheckpointProgress;
 use crate::editing::Editor;
-use viz::{CheckpointState, Control, EditRequest, Hub, RequestedCheckpoint};
+use viz::{CheckpointState, Control, EditRequest, Hub, LastEdit, RequestedCheckpoint};
 
 /// Requests of operators, and their results.
 #[derive(Default)]
@@ -15,8 +15,7 @@ pub(super) struct Requests {
     /// The last checkpoint that an operator requested.
     checkpoint: Option<RequestedCheckpoint>,
     editor: Editor,
-    /// Result of the last edit.
-    edit_note: Option<String>,
+    pub(super) last_edit: Option<LastEdit>,
     /// Number of times that edits of any model have changed.
     pub(super) edit_revision: u64,
     /// Whether an edit was applied or begun since this flag was cleared.
@@ -27,7 +26,8 @@ impl Requests {
     /// Notes on checkpoints and edits that only inform.
     pub(super) fn infos(&self) -> impl Iterator<Item = String> {
         let checkpoint = self.checkpoint_note(|state| state != CheckpointState::Failed);
-        [checkpoint, self.edit_note.clone(), self.editor.note()]
+        let edit = self.last_edit.as_ref().map(|edit| edit.text.clone());
+        [checkpoint, edit, self.editor.note()]
             .into_iter()
             .flatten()
     }
@@ -161,8 +161,11 @@ impl Requests {
         match edited {
             Ok(note) => {
                 // Without a note, a search was started and nothing has changed yet.
-                if note.is_some() {
-                    self.edit_note = note;
+                if let Some(text) = note {
+                    self.last_edit = Some(LastEdit {
+                        client: request.client(),
+                        text,
+                    });
                     self.edit_revision += 1;
                 }
                 self.has_edited = true;

@@ -1,7 +1,7 @@
 //! A box in space.
 
 use kinematics::Transform;
-use nalgebra::Point3;
+use nalgebra::{Point3, Vector3};
 
 /// A box aligned with the axes of its frame, meters.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -23,5 +23,25 @@ impl Aabb {
             .world_from_box
             .inverse_transform_point(&Point3::from(point_m));
         (0..3).all(|axis| (self.min_m[axis]..=self.max_m[axis]).contains(&in_box[axis]))
+    }
+
+    /// Whether the box contains an ellipsoid as a whole; false also for some that it contains.
+    ///
+    /// * `half_axes_m`: half axes in world, in any order.
+    #[must_use]
+    pub fn contains_ellipsoid(&self, center_m: [f64; 3], half_axes_m: [[f64; 3]; 3]) -> bool {
+        let box_from_world = self.world_from_box.inverse();
+        let center = box_from_world * Point3::from(center_m);
+        let half_axes = half_axes_m.map(|half_axis| box_from_world * Vector3::from(half_axis));
+        (0..3).all(|axis| {
+            // The ellipsoid extends this far in both directions of the axis.
+            let extents = half_axes.map(|half_axis| half_axis[axis]);
+            let extent = extents
+                .iter()
+                .map(|along| along * along)
+                .sum::<f64>()
+                .sqrt();
+            center[axis] - extent >= self.min_m[axis] && center[axis] + extent <= self.max_m[axis]
+        })
     }
 }

@@ -80,4 +80,7 @@ pub enum Error {
     /// A model has no edit that could be undone.
     #[error("there is nothing to undo")]
     NothingToUndo,
+    /// No edit of a model was undone since the last new edit.
+    #[error("there is nothing to redo")]
+    NothingToRedo,
 }

@@ -31,17 +31,43 @@ fn is_in_cells(point: vec3f, n_cells: u32, first: u32, n_ranges: u32) -> bool {
     return low < n_ranges && erased_range(first, low).x <= cell;
 }
 
+// First group of words of an edit.
+fn group_of_edit(ix: u32) -> u32 {
+    return 1u + GROUPS_PER_EDIT * ix;
+}
+
+// A point in the frame and units of an edit.
+fn point_in_edit(group: u32, at: vec3f) -> vec3f {
+    let homogeneous = vec4f(at, 1.0);
+    return vec3f(row_of_edit(group, homogeneous), row_of_edit(group + 1u, homogeneous), row_of_edit(group + 2u, homogeneous));
+}
+
+fn is_box(group: u32) -> bool {
+    return erased[group + 4u].w == 0u;
+}
+
+fn min_of_box(group: u32) -> vec3f {
+    return bitcast<vec3f>(erased[group + 3u].xyz);
+}
+
+fn max_of_box(group: u32) -> vec3f {
+    return bitcast<vec3f>(erased[group + 4u].xyz);
+}
+
+// Whether an edit of cells erases a point.
+fn cells_erase(group: u32, at: vec3f) -> bool {
+    let cells = erased[group + 3u];
+    return is_in_cells(point_in_edit(group, at), cells.x, cells.w, erased[group + 4u].w);
+}
+
 fn is_erased(at: vec3f) -> bool {
     let n_edits = erased[0].x;
     for (var ix = 0u; ix < n_edits; ix++) {
-        let group = 1u + GROUPS_PER_EDIT * ix;
-        let homogeneous = vec4f(at, 1.0);
-        let point = vec3f(row_of_edit(group, homogeneous), row_of_edit(group + 1u, homogeneous), row_of_edit(group + 2u, homogeneous));
-        let a = erased[group + 3u];
-        let b = erased[group + 4u];
-        if b.w == 0u {
-            if all(point >= bitcast<vec3f>(a.xyz)) && all(point <= bitcast<vec3f>(b.xyz)) { return true; }
-        } else if is_in_cells(point, a.x, a.w, b.w) {
+        let group = group_of_edit(ix);
+        if is_box(group) {
+            let point = point_in_edit(group, at);
+            if all(point >= min_of_box(group)) && all(point <= max_of_box(group)) { return true; }
+        } else if cells_erase(group, at) {
             return true;
         }
     }

@@ -27,14 +27,6 @@ fn camera_from_world(view: View, point_in_world: vec3f) -> vec3f {
     return vec3f(dot(view.camera_row_0, point), dot(view.camera_row_1, point), dot(view.camera_row_2, point));
 }
 
-// Whether a point is inside the crop box. True if there is no crop box.
-fn inside_crop(view: View, point_in_world: vec3f) -> bool {
-    if view.crop_min.w == 0.0 { return true; }
-    let point = vec4f(point_in_world, 1.0);
-    let point_in_box = vec3f(dot(view.crop_row_0, point), dot(view.crop_row_1, point), dot(view.crop_row_2, point));
-    return all(point_in_box >= view.crop_min.xyz) && all(point_in_box <= view.crop_max.xyz);
-}
-
 // Index of the workgroup when dispatch counts are folded to x and y.
 fn folded(wg: vec3u, n_wgs: vec3u) -> u32 {
     return wg.y * n_wgs.x + wg.x;

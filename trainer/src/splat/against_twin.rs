@@ -29,7 +29,7 @@ const COLOR_ABS: f64 = 2e-5;
 /// Gradients are f32 sums over hundreds of pixels.
 const GRADIENT_REL: f64 = 2e-3;
 /// Within this relative distance of a threshold, f32 and f64 may decide differently.
-const MARGIN: f64 = 1e-4;
+pub(super) const MARGIN: f64 = 1e-4;
 
 pub(super) struct KernelFixture {
     pub(super) gpu: Arc<Gpu>,
@@ -65,7 +65,7 @@ pub(super) fn arrays_of(splats: &[Splat]) -> SplatArrays {
     }
 }
 
-fn camera_of(view: &View) -> Camera {
+pub(super) fn camera_of(view: &View) -> Camera {
     let twist = Twist {
         linear_m_s: Vector3::from(view.linear_m),
         angular_rad_s: Vector3::from(view.angular_rad),
@@ -137,7 +137,7 @@ impl KernelFixture {
             status: &self.status,
             view: &self.view,
             size_px: self.size_px,
-            erased: None,
+            clipping: None,
         }
     }
 
@@ -148,8 +148,16 @@ impl KernelFixture {
     }
 
     pub(super) fn render(&self) -> (Vec<[f32; 4]>, Vec<f32>) {
-        let mut passes = Passes::default();
-        self.passes().draw(&mut passes, &self.draw);
+        self.render_passes(&self.passes(), Passes::default())
+    }
+
+    /// Renders with these passes for the view, recorded after `passes`.
+    pub(super) fn render_passes(
+        &self,
+        view_passes: &ViewPasses<'_>,
+        mut passes: Passes,
+    ) -> (Vec<[f32; 4]>, Vec<f32>) {
+        view_passes.draw(&mut passes, &self.draw);
         passes.submit(&self.gpu);
         let n = (self.size_px[0] * self.size_px[1]) as usize;
         (
@@ -160,7 +168,7 @@ impl KernelFixture {
 }
 
 /// Options for both kernel variants: with and without the adapter's optional features.
-fn adapter_options() -> [GpuOptions; 2] {
+pub(super) fn adapter_options() -> [GpuOptions; 2] {
     [
         GpuOptions::default(),
         GpuOptions {
@@ -171,10 +179,13 @@ fn adapter_options() -> [GpuOptions; 2] {
 }
 
 pub(super) fn unambiguous_pixels(view: &View, splats: &[Splat]) -> Vec<bool> {
-    let unambiguous: Vec<bool> = reference::rasterize::threshold_margins(view, splats)
-        .iter()
-        .map(|margin| *margin > MARGIN)
-        .collect();
+    let margins = reference::rasterize::threshold_margins(view, splats);
+    are_unambiguous(margins.iter().map(|margin| *margin > MARGIN))
+}
+
+/// Collects which pixels are unambiguous. Asserts that almost all of them are.
+pub(super) fn are_unambiguous(pixels: impl Iterator<Item = bool>) -> Vec<bool> {
+    let unambiguous: Vec<bool> = pixels.collect();
     assert!(
         unambiguous
             .iter()
@@ -272,9 +283,19 @@ fn more_opaque(splat: &Splat, drop_frac: f32) -> Splat {
 
 /// Compares the fixture's picture with that of the twin.
 fn check_picture(fixture: &KernelFixture, view: &View, splats: &[Splat]) {
-    let expected = reference::render(view, splats);
-    let unambiguous = unambiguous_pixels(view, splats);
-    let (image, depth) = fixture.render();
+    check_image(
+        &fixture.render(),
+        &reference::render(view, splats),
+        &unambiguous_pixels(view, splats),
+    );
+}
+
+/// Compares a color image with transmittance, and a depth image, with those of the twin.
+pub(super) fn check_image(
+    (image, depth): &(Vec<[f32; 4]>, Vec<f32>),
+    expected: &RenderedImage,
+    unambiguous: &[bool],
+) {
     let mut mismatches = Mismatches::default();
     for pixel in (0..image.len()).filter(|pixel| unambiguous[*pixel]) {
         for channel in 0..3 {

@@ -298,7 +298,7 @@ impl KernelBench {
             status: &self.status,
             view: &self.view,
             size_px: self.size_px,
-            erased: None,
+            clipping: None,
         }
     }
 

@@ -79,38 +79,113 @@ fn scene_with_floaters() -> SplatArrays {
     arrays
 }
 
+/// The scene with smaller discs, so that the boxes contain some of them as a whole.
+fn scene_of_small_discs() -> SplatArrays {
+    let mut arrays = scene();
+    arrays.log_scales.fill([-1.2, -1.2, -4.0]);
+    arrays
+}
+
+fn n_uncovered(picture: &Picture) -> usize {
+    let pixels = picture.rgba_srgb.chunks_exact(4);
+    pixels.filter(|pixel| pixel[3] < 64).count()
+}
+
+/// The pixels of a picture that differ from the background.
+fn covered(picture: &Picture) -> Vec<bool> {
+    picture
+        .rgba_srgb
+        .chunks_exact(4)
+        .map(|pixel| pixel[3] > 0)
+        .collect()
+}
+
 #[test]
-fn pictures_equal_those_of_a_model_without_the_erased_splats() {
-    let arrays = scene();
+fn pictures_lack_erased_space_until_the_edit_is_undone() {
+    let arrays = scene_of_small_discs();
     let mut model = model_of(&arrays);
     let whole = picture(&mut model, &Arc::default());
     let one = edits_of([erased_box([1.0, 0.0, 5.5])]);
     let two = edits_of([erased_box([1.0, 0.0, 5.5]), erased_box([-2.0, 0.5, 5.0])]);
+    let mut n_before = n_uncovered(&whole);
     for edits in [&one, &two] {
-        let left = arrays.clone().without_erased(edits);
+        // Splats that no box cuts are drawn as in a model that has only them.
+        let left = arrays.clone().without_hidden(edits);
         assert!(
             left.n_splats() < arrays.n_splats() && left.n_splats() > 300,
             "{} splats",
             left.n_splats()
         );
         let erased = picture(&mut model, edits);
-        assert!(is_same(
-            &erased,
-            &picture(&mut model_of(&left), &Arc::default())
-        ));
-        let n_uncovered = erased
-            .rgba_srgb
-            .chunks_exact(4)
-            .filter(|pixel| pixel[3] < 64)
-            .count();
+        assert!(is_same(&erased, &picture(&mut model_of(&left), edits)));
+        let n_after = n_uncovered(&erased);
         assert!(
-            n_uncovered > 100,
-            "{n_uncovered} pixels show the background"
+            n_after > n_before + 50,
+            "{n_after} pixels show the background, {n_before} before"
         );
+        n_before = n_after;
     }
     assert!(
         is_same(&picture(&mut model, &Arc::default()), &whole),
         "after an undo"
+    );
+}
+
+/// A needle along x with its center inside a box that is much shorter.
+fn needle_and_box() -> (SplatArrays, Aabb) {
+    let mut arrays = scene().filtered(|ix| ix == 0);
+    arrays.means = vec![[0.0, 0.0, 5.0]];
+    arrays.rotations_wxyz = vec![[1.0, 0.0, 0.0, 0.0]];
+    arrays.log_scales = vec![[-0.5, -3.0, -3.0]];
+    let aabb = Aabb {
+        world_from_box: Transform::translation(0.0, 0.0, 5.0),
+        min_m: [-0.4, -1.0, -1.0],
+        max_m: [0.4, 1.0, 1.0],
+    };
+    (arrays, aabb)
+}
+
+#[test]
+fn boxes_cut_splats_where_they_leave_them() {
+    let (arrays, aabb) = needle_and_box();
+    let mut model = model_of(&arrays);
+    let mut request = request(Transform::identity());
+    let whole = model.render(&request).unwrap();
+    request.crop = Some(aabb);
+    let cropped = model.render(&request).unwrap();
+    request.crop = None;
+    request.edits = edits_of([Edit::Box(aabb)]);
+    let erased = model.render(&request).unwrap();
+    // Every pixel belongs to one of the two parts.
+    let mut n_of_parts = [0; 2];
+    let pixels = |picture: &Picture| {
+        let bytes = picture.rgba_srgb.chunks_exact(4).map(<[u8]>::to_vec);
+        bytes.collect::<Vec<_>>()
+    };
+    let of_parts = covered(&cropped).into_iter().zip(covered(&erased));
+    for (ix, (pixel, (is_cropped, is_erased))) in pixels(&whole).iter().zip(of_parts).enumerate() {
+        if pixel[3] == 0 {
+            assert!(!is_cropped && !is_erased, "pixel {ix}");
+            continue;
+        }
+        assert!(is_cropped != is_erased, "pixel {ix}");
+        n_of_parts[usize::from(is_erased)] += 1;
+        let part = if is_cropped { &cropped } else { &erased };
+        // Two kernels may round differently.
+        let of_part = &pixels(part)[ix];
+        let differences = of_part.iter().zip(pixel).map(|(a, b)| a.abs_diff(*b));
+        assert!(differences.max() <= Some(1), "pixel {ix}");
+    }
+    // The needle is about 3.3 standard deviations of 0.6 m long on each side, the box 0.4 m.
+    let [n_inside, n_outside] = n_of_parts;
+    assert!(
+        n_inside > 10 && n_outside > n_inside,
+        "{n_inside} pixels inside, {n_outside} outside"
+    );
+    assert_eq!(
+        arrays.without_hidden(&request.edits).n_splats(),
+        1,
+        "a part of the splat remains"
     );
 }
 
@@ -141,10 +216,12 @@ fn training_and_scores_ignore_edits() {
 }
 
 #[test]
-fn chunks_and_exports_lack_erased_splats() {
-    let arrays = scene();
+fn chunks_lack_hidden_splats_and_exports_lack_erased_ones() {
+    let arrays = scene_of_small_discs();
     let edits = edits_of([erased_box([1.0, 0.0, 5.5])]);
     let left = arrays.clone().without_erased(&edits);
+    let shown = arrays.clone().without_hidden(&edits);
+    assert!(left.n_splats() < shown.n_splats() && shown.n_splats() < arrays.n_splats());
     let mut model = model_of(&arrays);
     let mut n_in_chunks = |edits: &Arc<Edits>| -> usize {
         let chunks = model
@@ -163,7 +240,7 @@ fn chunks_and_exports_lack_erased_splats() {
             .map(|chunk| n_splats(&chunk.fine.layout))
             .sum()
     };
-    assert_eq!(n_in_chunks(&edits), left.n_splats());
+    assert_eq!(n_in_chunks(&edits), shown.n_splats());
     assert_eq!(n_in_chunks(&Arc::default()), arrays.n_splats());
     let undone = model
         .queue_chunks(true, &edits)

@@ -73,8 +73,15 @@ macro_rules! update_sources {
 /// Imports of `update` when camera parameters are also optimized.
 const WITH_CAMERA: &[Source] = update_sources!("camera_sums_tree");
 
-/// Imports of `erase`.
-const ERASE: &[Source] = &[shared::FOLDED, MODEL, source!("space"), source!("erased")];
+/// Imports of `clip`.
+const CLIP: &[Source] = &[
+    VIEW,
+    MODEL,
+    PROJECTION,
+    source!("splat_clip"),
+    source!("space"),
+    source!("erased"),
+];
 
 /// Imports of the per-pixel kernels.
 macro_rules! blend_sources {
@@ -94,11 +101,38 @@ macro_rules! tile_sources {
 }
 // Variants of one kernel differ only in the source of one import. Shared code is written once, and
 // each variant is compiled without branches for the others.
-const RASTERIZE: &[Source] = tile_sources!(source!("segments", "segments_none"));
-const RASTERIZE_SEGMENTS: &[Source] = tile_sources!(source!("segments", "segments_stored"));
+const RASTERIZE: &[Source] = tile_sources!(
+    source!("segments", "segments_none"),
+    source!("clips", "clips_none")
+);
+const RASTERIZE_SEGMENTS: &[Source] = tile_sources!(
+    source!("segments", "segments_stored"),
+    source!("clips", "clips_none")
+);
+const RASTERIZE_CLIPPED: &[Source] = tile_sources!(
+    source!("segments", "segments_none"),
+    source!("clips", "clips_tile"),
+    source!("clipping"),
+    source!("splat_clip"),
+    source!("space"),
+    source!("erased")
+);
 const BACKWARD: &[Source] = tile_sources!(source!("sums", "sums_subgroup"));
 const BACKWARD_BY_MEMORY: &[Source] = tile_sources!(source!("sums", "sums_memory"));
-const BLEND_STRIPS: &[Source] = blend_sources!(source!("pixels", "pixels_4"), source!("strips"));
+const BLEND_STRIPS: &[Source] = blend_sources!(
+    source!("pixels", "pixels_4"),
+    source!("strips"),
+    source!("clips", "clips_none")
+);
+const BLEND_STRIPS_CLIPPED: &[Source] = blend_sources!(
+    source!("pixels", "pixels_4"),
+    source!("strips"),
+    source!("clips", "clips_strips"),
+    source!("clipping"),
+    source!("splat_clip"),
+    source!("space"),
+    source!("erased")
+);
 
 macro_rules! kernel {
     ($name:literal) => {
@@ -127,6 +161,8 @@ macro_rules! kernel {
 /// The per-pixel kernels, in the variant that suits the adapter.
 struct Blend {
     rasterize: Kernel,
+    /// `rasterize` that clips splats at boxes.
+    rasterize_clipped: Kernel,
     /// Also divides the lists of the tiles into segments, if `backward` processes segments.
     rasterize_segments: Option<Kernel>,
     backward: Kernel,
@@ -140,6 +176,7 @@ fn blend(gpu: &Gpu) -> Blend {
         // after the other, so few lanes per tile are faster.
         Some(8) => Blend {
             rasterize: kernel!("rasterize_strips", BLEND_STRIPS),
+            rasterize_clipped: kernel!("rasterize_strips", BLEND_STRIPS_CLIPPED),
             rasterize_segments: None,
             backward: kernel!("backward_strips", BLEND_STRIPS),
             subgroup: None,
@@ -147,6 +184,7 @@ fn blend(gpu: &Gpu) -> Blend {
         // A workgroup has 128 lanes, so larger subgroups would not be full.
         Some(lanes) if (16..=128).contains(&lanes) => Blend {
             rasterize: kernel!("rasterize", RASTERIZE),
+            rasterize_clipped: kernel!("rasterize", RASTERIZE_CLIPPED),
             rasterize_segments: Some(kernel!("rasterize", RASTERIZE_SEGMENTS)),
             backward: kernel!("backward", BACKWARD),
             subgroup: Some(lanes),
@@ -154,6 +192,7 @@ fn blend(gpu: &Gpu) -> Blend {
         // Without subgroups of a known size, lanes are summed through workgroup memory.
         _ => Blend {
             rasterize: kernel!("rasterize", RASTERIZE),
+            rasterize_clipped: kernel!("rasterize", RASTERIZE_CLIPPED),
             rasterize_segments: Some(kernel!("rasterize", RASTERIZE_SEGMENTS)),
             backward: kernel!("backward", BACKWARD_BY_MEMORY),
             subgroup: None,
@@ -165,7 +204,7 @@ fn blend(gpu: &Gpu) -> Blend {
 #[cfg(test)]
 pub(crate) const KERNELS: &[Kernel] = &[
     kernel!("project"),
-    kernel!("erase", ERASE),
+    kernel!("clip", CLIP),
     kernel!("count_bins"),
     kernel!("sum_bins"),
     kernel!("scan_bins"),
@@ -174,7 +213,9 @@ pub(crate) const KERNELS: &[Kernel] = &[
     kernel!("tile_bits"),
     kernel!("rasterize", RASTERIZE),
     kernel!("rasterize", RASTERIZE_SEGMENTS),
+    kernel!("rasterize", RASTERIZE_CLIPPED),
     kernel!("rasterize_strips", BLEND_STRIPS),
+    kernel!("rasterize_strips", BLEND_STRIPS_CLIPPED),
     kernel!("finish"),
     kernel!("loss", "ssim", SHARED),
     kernel!("loss", "ssim_strips", LOSS_STRIPS),
@@ -218,7 +259,6 @@ macro_rules! compile {
 pub(crate) struct DrawPipelines {
     pub(crate) sort: RadixSort,
     pub(crate) project: Pipeline,
-    pub(crate) erase: Pipeline,
     pub(crate) count_bins: Pipeline,
     pub(crate) sum_bins: Pipeline,
     pub(crate) scan_bins: Pipeline,
@@ -239,7 +279,6 @@ impl DrawPipelines {
             has_segments: blend.rasterize_segments.is_some(),
         }, {
             project: kernel!("project"), &[];
-            erase: kernel!("erase", ERASE), &[];
             count_bins: kernel!("count_bins"), &[];
             sum_bins: kernel!("sum_bins"), &[];
             scan_bins: kernel!("scan_bins"), &[];
@@ -249,6 +288,22 @@ impl DrawPipelines {
             rasterize: blend.rasterize, &[];
             finish: kernel!("finish"), &[];
         })
+    }
+}
+
+/// Pipelines for pictures with a crop box or erased space.
+#[derive(Debug)]
+pub(crate) struct ClipPipelines {
+    pub(crate) clip: Pipeline,
+    pub(crate) rasterize: Pipeline,
+}
+
+impl ClipPipelines {
+    pub(crate) fn new(gpu: &Gpu) -> Result<Self, Error> {
+        let rasterize = blend(gpu).rasterize_clipped;
+        let [clip, rasterize] =
+            Pipeline::compile_all(gpu, [(kernel!("clip", CLIP), &[][..]), (rasterize, &[])])?;
+        Ok(Self { clip, rasterize })
     }
 }
 
@@ -374,7 +429,7 @@ impl TrainPipelines {
 #[cfg(test)]
 mod tests {
     use super::KERNELS;
-    use gpu::testing::{assert_layout, assert_valid};
+    use gpu::testing::{assert_layout, assert_valid, layout_in_wgsl};
 
     #[test]
     fn structs_have_the_same_layout_in_rust_and_wgsl() {
@@ -490,6 +545,13 @@ mod tests {
             Gathering,
             [n_kept, n_planes, words, from_capacity, to_capacity]
         );
+    }
+
+    #[test]
+    fn clips_have_the_size_of_their_buffer() {
+        use crate::splat::clipping::CLIP_BYTES;
+        let (fields, bytes) = layout_in_wgsl(KERNELS, "Clip");
+        assert_eq!(bytes as u64, CLIP_BYTES, "{fields:?}");
     }
 
     #[test]

@@ -15,6 +15,9 @@ mod change_against_twin;
 mod checkpoint_tests;
 mod chunks;
 #[cfg(test)]
+mod clip_against_twin;
+mod clipping;
+#[cfg(test)]
 mod edit_tests;
 mod entry;
 mod few_images;

@@ -3,6 +3,7 @@
 use super::buffers::{
     BLOCK, GROUP, ImageBuffers, Scratch, SplatBuffers, WINDOW_BINS, n_bins, n_tiles,
 };
+use super::clipping::Clipping;
 use super::kernels::{DrawPipelines, Ssim, TrainPipelines};
 use super::params::{Growth, TILE_PX};
 use crate::Error;
@@ -18,8 +19,8 @@ pub(crate) struct ViewPasses<'a> {
     pub(crate) status: &'a Buffer,
     pub(crate) view: &'a Buffer,
     pub(crate) size_px: [u32; 2],
-    /// Erased space; `None` in training, and if nothing is erased.
-    pub(crate) erased: Option<&'a Buffer>,
+    /// `None` in training, and without a crop box and erased space.
+    pub(crate) clipping: Option<Clipping<'a>>,
 }
 
 /// The target that a picture is compared with.
@@ -138,11 +139,19 @@ impl ViewPasses<'_> {
     /// Projects, sorts, bins and rasterizes the splats. Needs no memory for gradients.
     pub(crate) fn draw(&self, passes: &mut Passes, pipelines: &DrawPipelines) {
         self.list(passes, pipelines, &self.scratch.capacity_for_drawing);
+        let mut buffers = self.rasterized();
+        let rasterize = match &self.clipping {
+            Some(clipping) => {
+                buffers.extend(clipping.buffers());
+                &clipping.pipelines.rasterize
+            }
+            None => &pipelines.rasterize,
+        };
         passes.dispatch(
             self.gpu,
-            &pipelines.rasterize,
+            rasterize,
             u64::from(n_tiles(self.size_px)),
-            &self.rasterized(),
+            &buffers,
         );
     }
 
@@ -232,14 +241,18 @@ impl ViewPasses<'_> {
             ]
             .concat(),
         );
-        // A separate kernel, so that training, which never erases, does not pay for the check.
-        if let Some(erased) = self.erased {
-            let means = ("means", &splats.means);
+        // A separate kernel, so that training and other pictures do not pay for it.
+        if let Some(clipping) = &self.clipping {
+            let [means, rotations, shapes, ..] = splats.parameters();
+            let [erased, clips] = clipping.buffers();
+            let projected = ("projected_splats", &scratch.projected_splats);
             passes.dispatch(
                 gpu,
-                &pipelines.erase,
+                &clipping.pipelines.clip,
                 n_blocks,
-                &[model, means, ("erased", erased), keys],
+                &[
+                    view, model, means, rotations, shapes, projected, erased, keys, clips,
+                ],
             );
         }
         pipelines.sort.sort(gpu, passes, &scratch.by_depth, status);

@@ -56,7 +56,7 @@ fn project(splat_ix: u32) -> u32 {
     // The low-pass enlarges the splat; a model with this flag keeps the product of opacity and area.
     if model.is_antialiased != 0u { opacity *= projection.compensation; }
     // These comparisons are false for NaN, so a splat with a NaN is invisible.
-    let visible = projection.visible && opacity > MIN_ALPHA && projection.determinant > 0.0 && inside_crop(view, mean)
+    let visible = projection.visible && opacity > MIN_ALPHA && projection.determinant > 0.0
         && abs(projection.mean_px.x) < 1e6 && abs(projection.mean_px.y) < 1e6 && projection.covariance.x + projection.covariance.z < 1e12;
     if !visible || is_dropped(splat_ix, drop_frac) { return INVISIBLE; }
 

@@ -12,6 +12,7 @@
 #import coverage
 #import tile_queue
 #import segments
+#import clips
 
 const LANES = 128u;
 
@@ -63,6 +64,7 @@ fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u,
             n_batches++;
             if lane < 16u { atomicStore(&wg_reaching[lane], 0u); }
             take_batch(lane, batch, n_queued, tile);
+            queue_clips(lane, batch, n_queued);
             assign_to_quarters(lane, n_queued - batch);
             for (var part = 0u; part < BATCH / 32u; part++) {
                 var bits = atomicLoad(&wg_reaching[quarter * 4u + part]);
@@ -75,11 +77,16 @@ fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u,
                     bits &= bits - 1u;
                     let splat = wg_splats[i];
                     let second = wg_splats[j];
-                    let power = power_at(splat.conic, splat.position.x - center_x, splat.position.y - center_y);
-                    let power_2 = power_at(second.conic, second.position.x - center_x, second.position.y - center_y);
-                    let hit = blend.live & within_reach(splat.conic, power);
+                    let dx = splat.position.x - center_x;
+                    let dy = splat.position.y - center_y;
+                    let dx_2 = second.position.x - center_x;
+                    let dy_2 = second.position.y - center_y;
+                    let power = power_at(splat.conic, dx, dy);
+                    let power_2 = power_at(second.conic, dx_2, dy_2);
+                    let hit = clipped(blend.live & within_reach(splat.conic, power), queued_clip(i), dx, dy);
                     blend = blended(blend, hit, power, splat.position.wz, splat.color.rgb, bitcast<u32>(splat.color.w));
-                    let hit_2 = PxB(has_second) & blend.live & within_reach(second.conic, power_2);
+                    let reached_2 = PxB(has_second) & blend.live & within_reach(second.conic, power_2);
+                    let hit_2 = clipped(reached_2, queued_clip(j), dx_2, dy_2);
                     blend = blended(blend, hit_2, power_2, second.position.wz, second.color.rgb, bitcast<u32>(second.color.w));
                 }
             }

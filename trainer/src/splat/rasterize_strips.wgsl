@@ -9,6 +9,7 @@
 #import rasterize_bindings
 #import strips
 #import coverage
+#import clips
 
 var<workgroup> wg_blends: array<Blend, 64>; // [N_STRIPS, LANES], state between two queues
 
@@ -37,6 +38,7 @@ fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u,
                 let conic = projected_splats[splat_ix].conic;
                 let color = projected_splats[splat_ix].color;
                 let half = halved(conic);
+                let clip = clip_of(splat_ix);
                 let owned = part + lane < queued.x;
                 var reaching = or_of_lanes(select(0u, 1u << lane, owned && reaches_strip(position, conic, top)));
                 loop {
@@ -45,8 +47,11 @@ fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u,
                     reaching &= reaching - 1u;
                     let at = subgroupShuffle(position, i);
                     let shape = subgroupShuffle(half, i);
-                    let power = power_at(shape, at.x - center_x, at.y - center_y);
-                    let hit = blend.live & within_reach(shape, power) & PxB(some);
+                    let dx = at.x - center_x;
+                    let dy = at.y - center_y;
+                    let power = power_at(shape, dx, dy);
+                    let reached = blend.live & within_reach(shape, power) & PxB(some);
+                    let hit = clipped(reached, shuffled_clip(clip, i), dx, dy);
                     blend = blended(blend, hit, power, at.wz, subgroupShuffle(color, i).rgb, subgroupShuffle(entry, i) - tile.begin);
                     continuing {
                         break if reaching == 0u;

@@ -409,7 +409,7 @@ impl Method for SplatTrainer {
         let chunker = Arc::clone(&self.chunker);
         let edits = Arc::clone(edits);
         Ok(Some(PendingChunks::new(move || {
-            let arrays = pending.finish(&gpu)?.without_erased(&edits);
+            let arrays = pending.finish(&gpu)?.without_hidden(&edits);
             Ok(chunker.lock().chunks(&arrays, only_changed))
         })))
     }

@@ -148,6 +148,8 @@ pub(crate) enum EditKind {
     RemoveFloaters,
     /// Undoes the last edit.
     Undo,
+    /// Makes the last undone edit again.
+    Redo,
 }
 
 /// Fields of `ping`.

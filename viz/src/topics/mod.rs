@@ -12,6 +12,7 @@ mod base_path;
 pub(crate) mod chunk_list;
 mod chunk_sender;
 pub(crate) mod client_updates;
+pub(crate) mod edit_status;
 mod keyframe_log;
 mod keyframe_points;
 pub(crate) mod keyframes;

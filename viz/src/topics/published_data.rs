@@ -5,8 +5,10 @@
 //! be there: `server_message.rs` uses them, and the files of their topics use `server_message.rs`,
 //! so the files would import each other in a cycle.
 
+use crate::topics::edit_status::{ErasedBox, LastEdit, SavedEdits};
 use crate::topics::operator_status::OperatorStatus;
 use kinematics::{Stamp, Transform};
+use model_files::Edits;
 use serde::Serialize;
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -37,6 +39,12 @@ pub struct Status {
     pub others: Vec<ModelStatus>,
     /// Changes whenever the edits of a model change, even if their number does not.
     pub edit_revision: u64,
+    /// The last edit.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub last_edit: Option<LastEdit>,
+    /// The result of the last request to save the edits of saved models.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub saved_edits: Option<SavedEdits>,
     /// Messages that the operator should read, for example that a camera disconnected.
     pub notes: Vec<String>,
     /// The result, once the run has ended and its model is saved.
@@ -203,10 +211,30 @@ pub struct ModelStatus {
     pub has_chunks: bool,
     /// Number of edits that can be undone.
     pub edits: usize,
+    /// Number of undone edits that can be redone.
+    pub undone_edits: usize,
+    /// The erased boxes, for clients that draw the model themselves: a box can cut splats.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    pub erased_boxes: Vec<ErasedBox>,
     /// Mean PSNR over the test keyframes, dB; `None` before the first evaluation.
     pub psnr: Option<f64>,
     /// `(seconds, psnr)` of every evaluation so far, in order.
     pub psnr_history: Vec<(f64, f64)>,
+}
+
+impl ModelStatus {
+    /// Sets the fields on edits.
+    ///
+    /// * `page_from_model`: pose of the frame in which the coordinates of the edits are.
+    #[must_use]
+    pub fn with_edits(self, edits: &Edits, page_from_model: &Transform) -> Self {
+        Self {
+            edits: edits.len(),
+            undone_edits: edits.n_undone(),
+            erased_boxes: ErasedBox::list(edits, page_from_model),
+            ..self
+        }
+    }
 }
 
 impl Status {
@@ -257,6 +285,58 @@ pub struct KeyframePose {
 #[cfg(test)]
 mod tests {
     use super::{MAX_HISTORY, ModelStatus, Status};
+    use kinematics::Transform;
+    use model_files::edits::{CellGrid, CellSet, Edit};
+    use model_files::{Aabb, Edits};
+    use nalgebra::Vector3;
+    use serde_json::json;
+
+    #[test]
+    fn erased_boxes_are_in_the_frame_of_the_page() {
+        let page_from_model = Transform::new(Vector3::new(1.0, 2.0, 3.0), Vector3::zeros());
+        let status_of = |edits: &Edits| {
+            let status = ModelStatus::default().with_edits(edits, &page_from_model);
+            serde_json::to_value(status).expect("numbers and text")
+        };
+        let mut edits = Edits::default();
+        let nothing = status_of(&edits);
+        assert_eq!(
+            (&nothing["edits"], nothing.get("erased_boxes")),
+            (&json!(0), None)
+        );
+        let grid = CellGrid {
+            center_m: [0.0; 3],
+            radius_m: 1.0,
+            n_cells: 4,
+        };
+        let cells = CellSet::new(grid, [1]);
+        edits.push(Edit::Cells(cells)).expect("valid cells");
+        for x in [10.0, 20.0] {
+            let aabb = Aabb {
+                world_from_box: Transform::new(Vector3::new(x, 0.0, 0.0), Vector3::zeros()),
+                min_m: [-1.0; 3],
+                max_m: [1.0; 3],
+            };
+            edits.push(Edit::Box(aabb)).expect("a valid box");
+        }
+        edits.undo().expect("there are three");
+        let status = status_of(&edits);
+        assert_eq!(
+            (&status["edits"], &status["undone_edits"]),
+            (&json!(2), &json!(1))
+        );
+        let world_from_box = [
+            1.0, 0.0, 0.0, 11.0, 0.0, 1.0, 0.0, 2.0, 0.0, 0.0, 1.0, 3.0, 0.0, 0.0, 0.0, 1.0,
+        ];
+        assert_eq!(
+            status["erased_boxes"],
+            json!([{
+                "world_from_box": world_from_box,
+                "min_m": [-1.0, -1.0, -1.0],
+                "max_m": [1.0, 1.0, 1.0],
+            }])
+        );
+    }
 
     #[test]
     fn long_curves_are_thinned_keeping_ends() {

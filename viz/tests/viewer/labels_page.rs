@@ -464,7 +464,7 @@ fn check_pause(page: &mut Page) {
     }
     assert_ne!(color(browser), training);
     assert_eq!(browser.text("pause"), "Continue");
-    assert_eq!(browser.text("save-note"), "checkpoint written after 98 s");
+    assert_eq!(browser.text("checkpoint-note"), "checkpoint written after 98 s");
     let notes = browser.text("notes");
     assert!(!notes.contains("checkpoint"), "it is shown once: {notes}");
 }

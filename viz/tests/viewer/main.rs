@@ -7,6 +7,7 @@ mod black_page;
 mod client;
 mod downloads;
 mod ending_page;
+mod edits_page;
 mod eye_page;
 #[cfg(feature = "foxglove")]
 mod foxglove;

@@ -207,6 +207,7 @@ fn publish_updates(hub: &Hub) {
             edits: 2,
             psnr: Some(26.76),
             psnr_history: (0..50).map(curve).collect(),
+            ..ModelStatus::default()
         },
         others: vec![ModelStatus {
             method: "tsdf".to_owned(),
@@ -327,7 +328,7 @@ fn check_switch(browser: &mut Browser, render_thread: &RenderThread) {
     wait_for(browser, "a full picture of it", |browser| {
         browser.text("picture-text").contains("100 %")
     });
-    assert_eq!(browser.text("primitives-label"), "Splats");
+    assert_eq!(browser.text("primitives-label"), "Splats before edits");
 }
 
 /// The live camera's frustum is drawn according to the request's projection.
@@ -416,9 +417,9 @@ fn check_distance(browser: &mut Browser, request: &RenderRequest) {
     click_on(browser, request, Point3::new(-0.45, 0.2, 0.0));
     click_on(browser, request, Point3::new(0.25, 0.1, 0.0));
     wait_for(browser, "a distance", |browser| {
-        browser.text("distance").contains("vertical")
+        distance_text(browser).contains("vertical")
     });
-    let text = browser.text("distance");
+    let text = distance_text(browser);
     let millimeters: Vec<f64> = text
         .split(|c: char| !c.is_ascii_digit())
         .filter_map(|n| n.parse().ok())
@@ -434,12 +435,16 @@ fn check_distance(browser: &mut Browser, request: &RenderRequest) {
     );
     save_and_restore(browser, "distance");
     click_on(browser, request, Point3::new(0.0, 50.0, 12.0));
-    assert_eq!(browser.text("distance"), "no surface here");
+    assert!(browser.text("measure-hint").starts_with("No surface"));
     browser.click("toggle-measure");
-    assert_eq!(
-        browser.evaluate("document.getElementById('distance').hidden"),
-        true
-    );
+    assert_eq!(distance_text(browser), "");
+}
+
+/// Text of the last measurement.
+fn distance_text(browser: &mut Browser) -> String {
+    let text =
+        browser.evaluate("document.querySelector('.distance:last-child span')?.textContent ?? ''");
+    text.as_str().unwrap_or_default().to_owned()
 }
 
 /// A click on a camera image enlarges it, and its images arrive in a larger size.

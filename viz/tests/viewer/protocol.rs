@@ -457,6 +457,7 @@ fn edits_of_operators_reach_the_run_in_order() {
     );
     client.send_json(&json!({"type": "edit", "action": "remove_floaters"}));
     client.send_json(&json!({"type": "edit", "action": "undo", "id": 8}));
+    client.send_json(&json!({"type": "edit", "action": "redo"}));
     let flat = json!({"min_m": [0, 0, 0], "max_m": [1, 0, 1]});
     for (message, named) in [
         (
@@ -497,6 +498,7 @@ fn edits_of_operators_reach_the_run_in_order() {
         ),
         (None, EditAction::RemoveFloaters),
         (None, EditAction::Undo),
+        (None, EditAction::Redo),
     ];
     assert_eq!(actions, expected);
     hub.reject_edit(&edits[1], "there are none");

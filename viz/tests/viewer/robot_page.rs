@@ -349,9 +349,9 @@ fn project(request: &RenderRequest, point: &Point3<f64>) -> [i64; 2] {
 
 /// While flying, W, A, S, D, Q and E move the eye, so titles do not show them as keys of buttons.
 fn check_titles(browser: &mut Browser) {
-    let titles = "['toggle-measure', 'erase-box', 'look-top'] \
+    let titles = "['toggle-measure', 'toggle-scans', 'look-top'] \
                   .map((id) => /\\((.)\\)/.exec(document.getElementById(id).title)?.[1]).join()";
-    for expected in [",,T", "D,W,T"] {
+    for expected in [",,T", "D,S,T"] {
         browser.click("toggle-fly");
         assert_eq!(browser.evaluate(titles), expected);
     }

@@ -183,13 +183,13 @@ fn wait_for_edits(browser: &mut Browser, hub: &Hub) -> Vec<EditRequest> {
     edits
 }
 
-/// Erases the box, removes floaters and undoes edits, with buttons and with keys.
+/// Erases the box, removes floaters and undoes edits, with buttons.
 fn edit_model(browser: &mut Browser, hub: &Hub) {
     let is_enabled = "document.getElementById('toggle-edit').disabled === false";
     wait_for(browser, "the button", |browser| {
         browser.evaluate(is_enabled) == json!(true)
     });
-    press(browser, "w");
+    press(browser, "Delete");
     browser.click("toggle-edit");
     assert_eq!(
         hub.operator_requests().take_edits(),
@@ -213,7 +213,7 @@ fn edit_model(browser: &mut Browser, hub: &Hub) {
     wait_for(browser, "the number of edits", |browser| {
         browser.text("undo-edit") == "Undo (3)"
     });
-    press(browser, "a");
+    browser.click("remove-floaters");
     assert_eq!(browser.text("edit-note"), "looking for floaters …");
     let edits = wait_for_edits(browser, hub);
     assert_eq!(*edits[0].action(), EditAction::RemoveFloaters);
@@ -229,7 +229,7 @@ fn edit_model(browser: &mut Browser, hub: &Hub) {
     });
     assert_eq!(browser.text("edit-note"), "");
 
-    press(browser, "a");
+    browser.click("remove-floaters");
     assert_eq!(browser.text("edit-note"), "looking for floaters …");
     wait_for_edits(browser, hub);
     // An undo and another edit: only the revision differs.

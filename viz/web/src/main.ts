@@ -3,6 +3,7 @@
 import { keepToken, showRole } from "./connection/access";
 import { announceStates } from "./panels/announcer";
 import { Banner } from "./panels/banner";
+import { BoxPanel } from "./panels/box_panel";
 import { Connection } from "./connection/connection";
 import { EditControls } from "./panels/edit_controls";
 import { element } from "./panels/element";
@@ -136,6 +137,7 @@ const scheduler = new RenderScheduler(
   pictureInfo,
 );
 const edits = new EditControls(connection, view.crop, () => models.method);
+new BoxPanel(view.crop);
 const sides = [new SideView(connection, "surroundings"), new SideView(connection, "video")] as const;
 const surroundings = new Surroundings(
   sides[0],
@@ -192,6 +194,7 @@ function receiveText(message: TextMessage): void {
       stages = message.default_stages;
       header.client = message.client;
       showRole(message.role);
+      edits.client = message.client;
       break;
     case "scene":
       view.setScene(message);
@@ -236,6 +239,7 @@ function updateLocalModel(model: ModelStatus): void {
   element("toggle-local").hidden = !isPossible;
   const method = isPossible && isDrawnLocally && showsModel ? model.method : null;
   chunks.method = method;
+  view.local.erased = model.erased_boxes ?? [];
 }
 
 function receiveBinary(header: BinaryHeader, payload: Uint8Array<ArrayBuffer>): void {
@@ -315,8 +319,6 @@ action("toggle-edit", "q", () => {
   const button = element("toggle-edit", HTMLButtonElement);
   if (!button.hidden && !button.disabled) togglePanel("toggle-edit");
 });
-action("erase-box", "w", () => edits.eraseBox());
-action("remove-floaters", "a", () => edits.removeFloaters());
 action("undo-edit", "z", () => edits.undoLast());
 toggle("toggle-follow", "l", (isOn) => (view.follows = isOn));
 toggle("toggle-points", "p", (isOn) => (points.shown = isOn));

@@ -77,10 +77,21 @@ fn check_box(
     Ok(())
 }
 
-/// The edits of a model, oldest first.
-#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+/// The edits of a model, oldest first. Edits that were undone are remembered, but neither stored
+/// nor compared.
+#[derive(Clone, Debug, Default, Serialize, Deserialize)]
 #[serde(try_from = "Vec<StoredEdit>", into = "Vec<StoredEdit>")]
-pub struct Edits(Vec<Edit>);
+pub struct Edits {
+    made: Vec<Edit>,
+    /// The edit that was undone last is the last one.
+    undone: Vec<Edit>,
+}
+
+impl PartialEq for Edits {
+    fn eq(&self, other: &Self) -> bool {
+        self.made == other.made
+    }
+}
 
 /// Content of [`FILE`].
 #[derive(Serialize, Deserialize)]
@@ -90,21 +101,22 @@ struct File {
 }
 
 impl Edits {
-    /// Adds an edit.
+    /// Adds an edit. Edits that were undone before can no longer be made again.
     ///
     /// # Errors
     ///
     /// Fails if there are [`MAX_EDITS`] already, or if the edit is too large or too far away to be
     /// computed with.
     pub fn push(&mut self, edit: Edit) -> Result<(), Error> {
-        if self.0.len() >= MAX_EDITS {
+        if self.made.len() >= MAX_EDITS {
             return Err(Error::TooManyEdits {
                 max_edits: MAX_EDITS,
             });
         }
         edit.check()
             .map_err(|reason| Error::InvalidEdit { reason })?;
-        self.0.push(edit);
+        self.made.push(edit);
+        self.undone.clear();
         Ok(())
     }
 
@@ -114,31 +126,62 @@ impl Edits {
     ///
     /// Fails if there is none.
     pub fn undo(&mut self) -> Result<(), Error> {
-        self.0.pop().map(drop).ok_or(Error::NothingToUndo)
+        let edit = self.made.pop().ok_or(Error::NothingToUndo)?;
+        self.undone.push(edit);
+        Ok(())
+    }
+
+    /// Makes the edit again that was undone last.
+    ///
+    /// # Errors
+    ///
+    /// Fails if none was undone since the last new edit.
+    pub fn redo(&mut self) -> Result<(), Error> {
+        let edit = self.undone.pop().ok_or(Error::NothingToRedo)?;
+        self.made.push(edit);
+        Ok(())
+    }
+
+    /// Number of edits that can be made again.
+    #[must_use]
+    pub fn n_undone(&self) -> usize {
+        self.undone.len()
     }
 
     /// Number of edits.
     #[must_use]
     pub fn len(&self) -> usize {
-        self.0.len()
+        self.made.len()
     }
 
     /// Whether nothing is erased.
     #[must_use]
     pub fn is_empty(&self) -> bool {
-        self.0.is_empty()
+        self.made.is_empty()
     }
 
     /// The edits, oldest first.
     #[must_use]
     pub fn as_slice(&self) -> &[Edit] {
-        &self.0
+        &self.made
     }
 
     /// Whether a point in world, meters, is erased.
     #[must_use]
     pub fn erases(&self, point_m: [f64; 3]) -> bool {
-        self.0.iter().any(|edit| edit.erases(point_m))
+        self.made.iter().any(|edit| edit.erases(point_m))
+    }
+
+    /// Whether nothing of a splat remains in pictures: a box contains it as a whole, or an edit of
+    /// cells its center.
+    ///
+    /// * `half_axes_m`: half axes in world of the ellipsoid within which the splat is drawn.
+    #[must_use]
+    pub fn hide_splat(&self, center_m: [f64; 3], half_axes_m: [[f64; 3]; 3]) -> bool {
+        self.made.iter().any(|edit| match edit {
+            Edit::Box(aabb) => aabb.contains_ellipsoid(center_m, half_axes_m),
+            Edit::Cells(cells) => cells.contains(center_m),
+        })
     }
 
     /// Reads the edits in the folder of a saved model; none if the folder has no such file, or for

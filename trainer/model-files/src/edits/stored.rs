@@ -23,7 +23,7 @@ pub(super) enum StoredEdit {
 
 impl From<Edits> for Vec<StoredEdit> {
     fn from(edits: Edits) -> Self {
-        edits.0.into_iter().map(StoredEdit::from).collect()
+        edits.made.into_iter().map(StoredEdit::from).collect()
     }
 }
 
@@ -55,11 +55,11 @@ impl TryFrom<Vec<StoredEdit>> for Edits {
                 stored.len()
             ));
         }
-        stored
-            .into_iter()
-            .map(Edit::try_from)
-            .collect::<Result<_, _>>()
-            .map(Self)
+        let made: Result<Vec<Edit>, String> = stored.into_iter().map(Edit::try_from).collect();
+        Ok(Self {
+            made: made?,
+            undone: Vec::new(),
+        })
     }
 }
 

@@ -47,6 +47,61 @@ fn boxes_are_erased_in_their_frame() {
 }
 
 #[test]
+fn boxes_hide_only_splats_that_they_contain_as_a_whole() {
+    let aabb = rotated_box();
+    let mut edits = Edits::default();
+    edits.push(Edit::Box(aabb)).unwrap();
+    let in_world = |vector: [f64; 3]| (aabb.world_from_box * Vector3::from(vector)).into();
+    let center = aabb.world_from_box * nalgebra::Point3::new(0.0, 1.0, 0.62);
+    for (along_m, is_hidden) in [
+        ([0.1, 0.1, 0.1], true),
+        ([0.9, 0.1, 0.1], true),
+        ([1.1, 0.1, 0.1], false),
+        ([0.1, 1.1, 0.1], false),
+        ([0.1, 0.1, 0.15], false),
+    ] {
+        let [x, y, z] = along_m;
+        // Half axes in the order of a rotated splat.
+        let half_axes = [[0.0, y, 0.0], [0.0, 0.0, z], [x, 0.0, 0.0]].map(in_world);
+        assert_eq!(
+            edits.hide_splat(center.coords.into(), half_axes),
+            is_hidden,
+            "{along_m:?}"
+        );
+    }
+    // Half axes along no axis of the box: the ellipsoid is a sphere.
+    let half_axes = [[0.08, 0.06, 0.0], [-0.06, 0.08, 0.0], [0.0, 0.0, 0.1]].map(in_world);
+    assert!(edits.hide_splat(center.coords.into(), half_axes));
+    let outside = aabb.world_from_box * nalgebra::Point3::new(1.05, 1.0, 0.62);
+    assert!(!edits.hide_splat(outside.coords.into(), half_axes));
+}
+
+#[test]
+fn undone_edits_are_made_again_until_a_new_edit() {
+    let mut edits = Edits::default();
+    assert!(matches!(edits.redo(), Err(Error::NothingToRedo)));
+    let made = [
+        Edit::Box(rotated_box()),
+        Edit::Cells(CellSet::new(GRID, [3])),
+    ];
+    for edit in &made {
+        edits.push(edit.clone()).unwrap();
+    }
+    edits.undo().unwrap();
+    edits.undo().unwrap();
+    assert!(edits.is_empty() && edits.n_undone() == 2);
+    assert_eq!(edits, Edits::default(), "undone edits do not count");
+    assert_eq!(serde_json::to_value(&edits).unwrap(), json!([]));
+    edits.redo().unwrap();
+    assert_eq!(edits.as_slice(), &made[..1]);
+    edits.push(made[1].clone()).unwrap();
+    assert!(edits.n_undone() == 0 && matches!(edits.redo(), Err(Error::NothingToRedo)));
+    edits.undo().unwrap();
+    edits.redo().unwrap();
+    assert_eq!(edits.as_slice(), &made);
+}
+
+#[test]
 fn number_of_edits_is_limited() {
     let mut edits = Edits::default();
     for _ in 0..MAX_EDITS {

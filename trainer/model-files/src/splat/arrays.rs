@@ -2,6 +2,7 @@
 
 use crate::Error;
 use crate::edits::Edits;
+use nalgebra::{Quaternion, UnitQuaternion, Vector3};
 use rayon::prelude::*;
 use std::path::Path;
 
@@ -223,7 +224,36 @@ impl SplatArrays {
         }
     }
 
-    /// The splats whose means are not in erased space.
+    /// The splats of which pictures show a part. Boxes cut splats pixel by pixel, so a splat with
+    /// its mean in an erased box may remain.
+    #[must_use]
+    pub fn without_hidden(self, edits: &Edits) -> Self {
+        if edits.is_empty() {
+            self
+        } else {
+            self.filtered(|ix| {
+                !edits.hide_splat(self.means[ix].map(f64::from), self.half_axes_m(ix))
+            })
+        }
+    }
+
+    /// Half axes in world of the ellipsoid within which a splat is drawn, meters.
+    fn half_axes_m(&self, ix: usize) -> [[f64; 3]; 3] {
+        let [w, x, y, z] = self.rotations_wxyz[ix].map(f64::from);
+        let rotation = UnitQuaternion::from_quaternion(Quaternion::new(w, x, y, z));
+        // At this number of standard deviations, alpha falls below the minimum.
+        let opacity = 1.0 / (1.0 + (-f64::from(self.opacity_logits[ix])).exp());
+        let reach = (2.0 * (opacity / MIN_ALPHA).ln()).max(0.0).sqrt();
+        std::array::from_fn(|axis| {
+            let half_m = reach * f64::from(self.log_scales[ix][axis]).exp();
+            let mut half_axis = Vector3::zeros();
+            half_axis[axis] = half_m;
+            (rotation * half_axis).into()
+        })
+    }
+
+    /// The splats whose means are not in erased space. Files hold whole splats, so this is what is
+    /// exported.
     #[must_use]
     pub fn without_erased(self, edits: &Edits) -> Self {
         if edits.is_empty() {

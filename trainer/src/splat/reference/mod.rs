@@ -1,7 +1,7 @@
 //! Plain CPU version of splatting in f64. Tests compare every kernel of `splat` with it.
 //!
 //! `project` projects each splat onto the image plane, and `rasterize` composites the splats pixel
-//! by pixel; each has a backward function. Discrete decisions (visibility, depth order,
+//! by pixel; each has a backward function. `clip` limits splats to a box in pictures. Discrete decisions (visibility, depth order,
 //! contributors of each pixel) are made once, in [`decide`], and kept fixed while gradients are
 //! computed.
 //!
@@ -10,6 +10,7 @@
 
 #[cfg(test)]
 pub(crate) mod change;
+pub mod clip;
 pub mod project;
 #[cfg(test)]
 pub(crate) mod random;
@@ -23,9 +24,10 @@ pub mod scene;
 mod tests;
 
 pub use crate::loss::rendered_image::{RenderedImage, Upstream};
+pub use clip::Clipping;
 use kinematics::Transform;
 pub use project::{project, project_backward};
-pub use rasterize::{Decisions, decide};
+pub use rasterize::{Decisions, decide, decide_clipped};
 
 /// Raw, optimized values of one splat.
 #[derive(Clone, Debug, Default, PartialEq)]
@@ -145,6 +147,11 @@ pub struct RenderGrad {
 /// Renders the splats.
 pub fn render(view: &View, splats: &[Splat]) -> RenderedImage {
     render_decided(view, splats, &decide(view, splats))
+}
+
+/// Renders the part of the splats that is shown.
+pub fn render_clipped(view: &View, splats: &[Splat], clipping: &Clipping) -> RenderedImage {
+    render_decided(view, splats, &decide_clipped(view, splats, clipping))
 }
 
 /// Renders the splats with fixed decisions, as finite differences require.

@@ -6,7 +6,7 @@
 
 use super::{Projected, ProjectedGrad, Splat, SplatGrad, View, ViewGrad};
 use model_files::spherical_harmonics as sh;
-use nalgebra::{Matrix2, Matrix2x3, Matrix3, Vector2, Vector3};
+use nalgebra::{Matrix2, Matrix2x3, Matrix3, Matrix3x2, Vector2, Vector3};
 
 /// Minimum alpha that is drawn.
 pub const MIN_ALPHA: f64 = 1.0 / 255.0;
@@ -73,6 +73,16 @@ pub fn project_at(view: &View, splat: &Splat, row_share: f64) -> Projected {
             reach * parts.cov_px2[(1, 1)].sqrt(),
         ],
     }
+}
+
+/// Change of the splat's conditional mean in world with the position of a pixel, meters per pixel.
+///
+/// The mean of the splat given its projection is `mean + C J^T (J C J^T + B)^-1 offset_px` for the
+/// covariance `C` in world, the Jacobian `J` and the low-pass `B`. Because of the low-pass, it never
+/// leaves the ellipsoid within which the splat is drawn.
+pub(super) fn mean_given_pixel(view: &View, splat: &Splat, row_share: f64) -> Matrix3x2<f64> {
+    let parts = Parts::new(view, splat, row_share);
+    parts.cov_in_world * parts.image_from_world.transpose() * parts.conic
 }
 
 /// Gradient with respect to the splat's raw values and the view, given the gradient with respect to

@@ -2,6 +2,7 @@
 //!
 //! Source: Kerbl et al. 2023, section 6 and appendix C.
 
+use super::clip::{Clipping, RayPoints};
 use super::project::{MIN_ALPHA, project, row_share};
 use super::{Projected, ProjectedGrad, RenderedImage, Splat, Upstream, View};
 
@@ -24,6 +25,12 @@ pub struct Decisions {
 
 /// Decides which splats are visible, their order, and the contributors of each pixel.
 pub fn decide(view: &View, splats: &[Splat]) -> Decisions {
+    decide_clipped(view, splats, &Clipping::default())
+}
+
+/// [`decide`] for the part of the splats that is shown.
+pub fn decide_clipped(view: &View, splats: &[Splat], clipping: &Clipping) -> Decisions {
+    let clipped = ClippedSplats::new(view, splats, clipping);
     let projected: Vec<_> = splats.iter().map(|splat| project(view, splat)).collect();
     let front_to_back = front_to_back(&projected);
     Decisions {
@@ -34,7 +41,7 @@ pub fn decide(view: &View, splats: &[Splat]) -> Decisions {
             .collect(),
         contributors: view
             .pixel_centers()
-            .map(|center_px| contributors(&front_to_back, &center_px))
+            .map(|center_px| contributors(&front_to_back, &clipped, &center_px))
             .collect(),
     }
 }
@@ -118,24 +125,91 @@ pub fn composite_backward(
 /// [`MIN_TRANSMITTANCE`], and the depths of consecutive splats with each other unless they are
 /// equal. Arithmetic with larger rounding errors may decide differently.
 pub fn threshold_margins(view: &View, splats: &[Splat]) -> Vec<f64> {
+    threshold_margins_clipped(view, splats, &Clipping::default())
+}
+
+/// [`threshold_margins`] for the part of the splats that is shown.
+pub fn threshold_margins_clipped(view: &View, splats: &[Splat], clipping: &Clipping) -> Vec<f64> {
+    let clipped = ClippedSplats::new(view, splats, clipping);
     let projected: Vec<_> = splats.iter().map(|splat| project(view, splat)).collect();
     let front_to_back = front_to_back(&projected);
     view.pixel_centers()
-        .map(|center_px| threshold_margin(&front_to_back, &center_px))
+        .map(|center_px| threshold_margin(&front_to_back, &clipped, &center_px))
         .collect()
 }
 
-fn threshold_margin(front_to_back: &[(usize, Projected)], center_px: &[f64; 2]) -> f64 {
+/// Smallest distance of a splat's point on each pixel's ray from a side of a box, meters.
+#[cfg(test)]
+pub(crate) fn clip_margins_m(view: &View, splats: &[Splat], clipping: &Clipping) -> Vec<f64> {
+    let clipped = ClippedSplats::new(view, splats, clipping);
+    let projected: Vec<_> = splats.iter().map(|splat| project(view, splat)).collect();
+    let front_to_back = front_to_back(&projected);
+    let margin_m = |center_px: [f64; 2]| {
+        let covering = front_to_back
+            .iter()
+            .filter(|(_, splat)| Coverage::new(splat, &center_px).is_drawn());
+        covering
+            .map(|(splat_ix, splat)| clipped.margin_m(*splat_ix, splat, &center_px))
+            .fold(f64::INFINITY, f64::min)
+    };
+    view.pixel_centers().map(margin_m).collect()
+}
+
+/// The splats of a view, with the part of them that is shown.
+struct ClippedSplats<'a> {
+    clipping: &'a Clipping,
+    /// Empty if everything is shown.
+    points: Vec<RayPoints>,
+}
+
+impl<'a> ClippedSplats<'a> {
+    fn new(view: &View, splats: &[Splat], clipping: &'a Clipping) -> Self {
+        let cut = if clipping.is_empty() { &[] } else { splats };
+        Self {
+            clipping,
+            points: cut
+                .iter()
+                .map(|splat| RayPoints::new(view, splat))
+                .collect(),
+        }
+    }
+
+    /// Whether a splat is shown at the pixel at `center_px`.
+    fn shows(&self, splat_ix: usize, splat: &Projected, center_px: &[f64; 2]) -> bool {
+        self.points
+            .get(splat_ix)
+            .is_none_or(|points| self.clipping.shows(points, offset_px(splat, center_px)))
+    }
+
+    /// Distance of the splat's point on the ray of the pixel from a side of a box, meters.
+    #[cfg(test)]
+    fn margin_m(&self, splat_ix: usize, splat: &Projected, center_px: &[f64; 2]) -> f64 {
+        self.points.get(splat_ix).map_or(f64::INFINITY, |points| {
+            self.clipping.margin_m(points, offset_px(splat, center_px))
+        })
+    }
+}
+
+/// Vector from the center of the splat to the pixel at `center_px`.
+fn offset_px(splat: &Projected, center_px: &[f64; 2]) -> [f64; 2] {
+    [0, 1].map(|axis| center_px[axis] - splat.mean_px[axis])
+}
+
+fn threshold_margin(
+    front_to_back: &[(usize, Projected)],
+    clipped: &ClippedSplats<'_>,
+    center_px: &[f64; 2],
+) -> f64 {
     let distance = |value: f64, threshold: f64| (value / threshold - 1.0).abs();
     let mut margin = f64::INFINITY;
     let mut transmittance = 1.0;
     let mut depth_in_front = None;
-    for (_, splat) in front_to_back {
+    for (splat_ix, splat) in front_to_back {
         let coverage = Coverage::new(splat, center_px);
         margin = margin
             .min(distance(coverage.unclamped, MIN_ALPHA))
             .min(distance(coverage.unclamped, MAX_ALPHA));
-        if !coverage.is_drawn() {
+        if !coverage.is_drawn() || !clipped.shows(*splat_ix, splat, center_px) {
             continue;
         }
         if let Some(depth_in_front) = depth_in_front.filter(|&depth| depth != splat.depth) {
@@ -173,12 +247,16 @@ fn depth_bits(depth: f64) -> u32 {
 }
 
 /// Indices of the splats that contribute to the pixel at `center_px`.
-fn contributors(front_to_back: &[(usize, Projected)], center_px: &[f64; 2]) -> Vec<usize> {
+fn contributors(
+    front_to_back: &[(usize, Projected)],
+    clipped: &ClippedSplats<'_>,
+    center_px: &[f64; 2],
+) -> Vec<usize> {
     let mut added = Vec::new();
     let mut transmittance = 1.0;
     for (splat_ix, splat) in front_to_back {
         let coverage = Coverage::new(splat, center_px);
-        if !coverage.is_drawn() {
+        if !coverage.is_drawn() || !clipped.shows(*splat_ix, splat, center_px) {
             continue;
         }
         transmittance *= 1.0 - coverage.alpha();

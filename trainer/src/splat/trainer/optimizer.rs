@@ -211,7 +211,7 @@ impl Optimizer {
             },
             size_px: level.size_px,
             // Edits never affect training.
-            erased: None,
+            clipping: None,
         };
         Ok(PreparedView { view, level, lens })
     }

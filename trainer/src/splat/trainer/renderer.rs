@@ -5,13 +5,12 @@ use super::products::{self, Products};
 use super::recorder::Recorder;
 use crate::packing::{Format, Output, Reader};
 use crate::splat::buffers::{ImageBuffers, Scratch, ScratchSize, SplatBuffers, n_bins, n_tiles};
+use crate::splat::clipping::Clipper;
 use crate::splat::kernels::DrawPipelines;
 use crate::splat::params::{Camera, Supervision, View, status};
 use crate::splat::passes::ViewPasses;
-use crate::view::ErasedSpace;
 use crate::{Error, Packing, QueuedPicture, Rendered};
 use gpu::{Buffer, Gpu, PendingRead, Pipeline};
-use nalgebra::Matrix4;
 
 /// Minimum capacity of the bin lists, in entries. Few large splats need many entries each, so small
 /// models would otherwise overflow in their first steps.
@@ -31,7 +30,7 @@ pub(super) struct Renderer {
     status: Buffer,
     view: Buffer,
     background: Buffer,
-    erased: ErasedSpace,
+    clipper: Clipper,
     /// Buffer for images uploaded for comparison, kept for reuse.
     compared: Option<Buffer>,
     reader: Reader,
@@ -68,7 +67,7 @@ impl Renderer {
                 "splat.background",
                 &<Supervision as bytemuck::Zeroable>::zeroed(),
             ),
-            erased: ErasedSpace::none(gpu)?,
+            clipper: Clipper::new(gpu)?,
             compared: None,
             reader: Reader::default(),
         })
@@ -226,13 +225,8 @@ impl Renderer {
         // of this view are recorded.
         self.reserve_view(recorder, splats.capacity, size_px, false)?;
         reserve_image(recorder, &mut self.image_buffers, size_px, false)?;
-        let erased = self.erased.set(
-            &recorder.gpu,
-            &mut recorder.passes,
-            &camera.edits,
-            Matrix4::identity(),
-        )?;
-        let erased = (!camera.edits.is_empty()).then_some(erased);
+        let Recorder { gpu, passes } = &mut *recorder;
+        let clipping = self.clipper.prepare(gpu, passes, camera, splats.capacity)?;
         let image_buffers = self
             .image_buffers
             .as_ref()
@@ -252,7 +246,7 @@ impl Renderer {
             status: &self.status,
             view: &self.view,
             size_px,
-            erased,
+            clipping,
         };
         passes.draw(list, &self.pipelines);
         passes.finish(list, &self.pipelines, &self.background);

@@ -1,5 +1,7 @@
 // The messages of docs/reference/protocol.md.
 
+import type { Crop } from "../view/oriented_box";
+
 /** Newest protocol version of this page. */
 export const PROTOCOL_VERSION = 4;
 /** Oldest protocol version of this page. */
@@ -63,6 +65,10 @@ export interface ModelStatus {
   has_chunks: boolean;
   /** Number of edits that can be undone; missing on older servers. */
   edits: number;
+  /** Number of undone edits that can be redone; missing on older servers. */
+  undone_edits?: number;
+  /** The erased boxes in world, which cut splats; missing if there are none. */
+  erased_boxes?: Crop[];
   psnr: number | null;
   psnr_history: [number, number][];
 }
@@ -79,6 +85,10 @@ export interface Status extends ModelStatus {
   others: ModelStatus[];
   /** Changes whenever the edits of a model change; missing on older servers. */
   edit_revision: number;
+  /** The last edit; missing before the first one. */
+  last_edit?: LastEdit;
+  /** Result of the last request to save edits; missing before the first one. */
+  saved_edits?: SavedEdits;
   notes: string[];
   result: RunResult | null;
   guidance?: Guidance;
@@ -135,6 +145,21 @@ export interface StateProgress {
   done_frac: number | null;
   /** Whether the model has not been started yet, so that pictures may be empty or missing. */
   is_startup: boolean;
+}
+
+/** An edit, and the client that requested it. */
+export interface LastEdit {
+  client: number;
+  /** What was done, such as "erased a box". */
+  text: string;
+}
+
+/** Where edits were saved, or why they could not be saved. */
+export interface SavedEdits {
+  /** Counts the requests. */
+  revision: number;
+  text: string;
+  has_failed: boolean;
 }
 
 /** What the operator should do, while images are taken for a calibration. */
@@ -483,8 +508,8 @@ export interface ControlMessage {
 export interface EditMessage {
   type: "edit";
   id: number;
-  action: "erase" | "remove_floaters" | "undo";
-  box?: { min_m: [number, number, number]; max_m: [number, number, number] };
+  action: "erase" | "remove_floaters" | "undo" | "redo";
+  box?: Crop;
   method?: string | undefined;
 }
 

@@ -77,6 +77,11 @@ export class LocalCopy {
     this.splats.crop = crop;
   }
 
+  /** Cuts boxes out of the splats. Returns whether they have changed. */
+  setErased(boxes: Crop[]): boolean {
+    return this.splats.setErased(boxes);
+  }
+
   /** Prepares to draw a view in a buffer of this size. */
   setView(view: View, sizePx: [number, number]): void {
     const scale = [0, 1].map((axis) => sizePx[axis]! / view.size_px[axis]!);

@@ -19,6 +19,7 @@ export class LocalModel {
   /** The copy that will be drawn as soon as it can be. */
   private next: LocalCopy | null = null;
   private shownCrop: Crop | undefined;
+  private erasedBoxes: Crop[] = [];
 
   constructor(
     private readonly observations: ObservationLayer,
@@ -82,6 +83,7 @@ export class LocalModel {
     this.next?.dispose();
     this.next = this.requested === null ? null : new LocalCopy(this.requested, this.observations, this.changed);
     if (this.next) this.next.crop = this.shownCrop;
+    this.next?.setErased(this.erasedBoxes);
     this.changed();
   }
 
@@ -117,6 +119,13 @@ export class LocalModel {
     this.shownCrop = crop;
     if (this.shown) this.shown.crop = crop;
     if (this.next) this.next.crop = crop;
+  }
+
+  /** Erased boxes. Meshes arrive without the erased triangles, but a box can cut splats. */
+  set erased(boxes: Crop[]) {
+    this.erasedBoxes = boxes;
+    const haveChanged = [this.shown, this.next].map((copy) => copy?.setErased(boxes) ?? false);
+    if (haveChanged.some((hasChanged) => hasChanged)) this.changed();
   }
 
   /**

@@ -1,7 +1,7 @@
 // Draws a mesh that arrives in chunks.
 
 import * as THREE from "three";
-import type { Crop } from "../view/crop_box";
+import { boxFromWorld, type Crop } from "../view/oriented_box";
 import { type ObservationLayer, TINT } from "./observation_layer";
 import { SOLID } from "./occlusion";
 import type { MeshChunkHeader } from "../connection/protocol";
@@ -75,12 +75,15 @@ export class MeshLayer {
 
   /** Draws only the part of the mesh in a box. */
   set crop(crop: Crop | undefined) {
-    const axes = [0, 1, 2].map((axis) => new THREE.Vector3().setComponent(axis, 1));
     const planes = crop
-      ? axes.flatMap((axis, ix) => [
-          new THREE.Plane(axis, -crop.min_m[ix]!),
-          new THREE.Plane(axis.clone().negate(), crop.max_m[ix]!),
-        ])
+      ? boxFromWorld(crop).flatMap((row, axis) => {
+          // A row of the transform is the axis of the box, and the offset of coordinates along it.
+          const along = new THREE.Vector3(row.x, row.y, row.z);
+          return [
+            new THREE.Plane(along, row.w - crop.min_m[axis]!),
+            new THREE.Plane(along.clone().negate(), crop.max_m[axis]! - row.w),
+          ];
+        })
       : [];
     this.planes.splice(0, this.planes.length, ...planes);
   }

@@ -11,7 +11,7 @@ export class SplatDepth {
   private target: THREE.WebGLRenderTarget | null = null;
   /** Whether the GPU can draw to the target; null before the first attempt. */
   private isPossible: boolean | null = null;
-  private readonly material: THREE.RawShaderMaterial;
+  readonly material: THREE.RawShaderMaterial;
 
   /** Draws with the uniforms of the material for colors. */
   constructor(colors: THREE.RawShaderMaterial) {

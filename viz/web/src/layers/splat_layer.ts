@@ -1,20 +1,20 @@
 // Draws Gaussian splats that arrive in chunks.
 
 import * as THREE from "three";
-import type { Crop } from "../view/crop_box";
+import type { Crop } from "../view/oriented_box";
 import type { ObservationLayer } from "./observation_layer";
 import type { SplatChunkHeader } from "../connection/protocol";
+import { SplatClip } from "./splat_clip";
 import { SplatDepth } from "./splat_depth";
 import { SplatMemory } from "./splat_memory";
 import { SPLAT_FRAGMENT, SPLAT_VERTEX } from "./splat_shader";
 import type { FreeUnits, SetChunk, Sort, SortResult } from "./splat_sorter";
 
-const FAR_AWAY = 1e9;
-
 export class SplatLayer {
   readonly mesh: THREE.Mesh<THREE.InstancedBufferGeometry, THREE.RawShaderMaterial>;
   private readonly depth: SplatDepth;
   private readonly memory = new SplatMemory();
+  private readonly clip = new SplatClip();
   private readonly units = new Map<number, number[]>();
   private worker: Worker | null = null;
   private isSorting = false;
@@ -58,15 +58,13 @@ export class SplatLayer {
         focalPx: { value: new THREE.Vector2() },
         principalPx: { value: new THREE.Vector2() },
         depthRange: { value: new THREE.Vector2() },
-        cropMin: { value: new THREE.Vector3() },
-        cropMax: { value: new THREE.Vector3() },
+        ...this.clip.uniforms,
         ...observations.uniforms,
       },
     });
     this.mesh = new THREE.Mesh(geometry, material);
     this.mesh.frustumCulled = false;
     this.depth = new SplatDepth(material);
-    this.crop = undefined;
   }
 
   /** To be called when the WebGL context is restored. */
@@ -126,10 +124,27 @@ export class SplatLayer {
     return this.units.size === 0 || this.nChangesSorted >= version;
   }
 
-  /** Draws only splats with their center in a box. */
+  /** Draws only the part of the splats in a box. */
   set crop(crop: Crop | undefined) {
-    this.vector3("cropMin").fromArray(crop?.min_m ?? [-FAR_AWAY, -FAR_AWAY, -FAR_AWAY]);
-    this.vector3("cropMax").fromArray(crop?.max_m ?? [FAR_AWAY, FAR_AWAY, FAR_AWAY]);
+    this.setBoxes(crop, this.clip.boxes[1]);
+  }
+
+  /** Cuts boxes out of the splats. Returns whether they have changed. */
+  setErased(erased: Crop[]): boolean {
+    return this.setBoxes(this.clip.boxes[0], erased);
+  }
+
+  private setBoxes(crop: Crop | undefined, erased: Crop[]): boolean {
+    const hasChanged = this.clip.set(crop, erased);
+    // Without boxes, the shaders do not even contain the code for them.
+    for (const material of [this.mesh.material, this.depth.material]) {
+      const defines = (material.defines ??= {});
+      if (this.clip.isUsed === "CLIPS" in defines) continue;
+      if (this.clip.isUsed) defines.CLIPS = 1;
+      else delete defines.CLIPS;
+      material.needsUpdate = true;
+    }
+    return hasChanged;
   }
 
   /** Prepares to draw from a camera. `worldFromCamera` is in fieldrig's convention. */
@@ -201,7 +216,7 @@ export class SplatLayer {
     this.worker.postMessage(message, transfer);
   }
 
-  private vector3(name: "cropMin" | "cropMax" | "eyeInModel"): THREE.Vector3 {
+  private vector3(name: "eyeInModel"): THREE.Vector3 {
     return this.mesh.material.uniforms[name]!.value as THREE.Vector3;
   }
 }

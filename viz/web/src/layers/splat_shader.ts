@@ -1,7 +1,8 @@
-// Draws a splat as a quad. The twin of trainer/src/shared/projection.wgsl and coverage.wgsl: local pictures must equal
-// those of the server. trainer/src/splat/chunks/codec.rs encodes the splats.
+// Draws a splat as a quad. The twin of trainer/src/shared/projection.wgsl and coverage.wgsl, and with CLIPS of
+// trainer/src/splat/clip.wgsl and shared/clipping.wgsl: local pictures must equal those of the server. trainer/src/splat/chunks/codec.rs encodes the splats.
 
 import { TINT } from "./observation_layer";
+import { CLIP_FRAGMENT, CLIP_VERTEX } from "./splat_clip";
 import { UNIT_SPLATS } from "./splat_sorter";
 
 /** Texels per row of the textures with one texel per splat. */
@@ -26,14 +27,15 @@ export const SPLAT_VERTEX = /* glsl */ `
   uniform vec2 focalPx;
   uniform vec2 principalPx;
   uniform vec2 depthRange;
-  uniform vec3 cropMin;
-  uniform vec3 cropMax;
   in vec3 position;
   in uint slot;
   out vec2 deviations;
   flat out vec4 color;
   flat out float reach;
   flat out float depth;
+#ifdef CLIPS
+${CLIP_VERTEX}
+#endif
 ${TINT}
 
   const float MIN_ALPHA = 1.0 / 255.0;
@@ -83,14 +85,14 @@ ${TINT}
     uvec3 counts = uvec3(words.x & 8191u, (words.x >> 13u) & 8191u, (words.x >> 26u) | ((words.y & 127u) << 6u));
     vec3 mean = low.xyz + vec3(counts) * grid.xyz;
     vec3 inWorld = (worldFromModel * vec4(mean, 1.0)).xyz;
-    if (any(lessThan(inWorld, cropMin)) || any(greaterThan(inWorld, cropMax))) return;
     vec3 point = (cameraFromModel * vec4(mean, 1.0)).xyz;
     if (point.z < depthRange.x || point.z > depthRange.y) return;
     float alpha = float(words.w & 255u) / 255.0;
     if (alpha < MIN_ALPHA) return;
 
     vec3 logScale = grid.w + vec3(uvec3(words.y >> 7u, words.y >> 15u, words.y >> 23u) & 255u) * steps.x + low.w;
-    mat3 axes = mat3(cameraFromModel) * rotationOf(words.z);
+    mat3 rotation = rotationOf(words.z);
+    mat3 axes = mat3(cameraFromModel) * rotation;
     vec3 scale = exp(logScale);
     axes[0] *= scale.x;
     axes[1] *= scale.y;
@@ -119,8 +121,17 @@ ${TINT}
       : xx >= yy ? vec2(1.0, 0.0) : vec2(0.0, 1.0);
     vec2 lengths = sqrt(max(vec2(middle + spread, middle - spread), vec2(0.0)));
     deviations = position.xy * sqrt(reach);
-    vec2 px = focalPx * ratio + principalPx
-      + along * lengths.x * deviations.x + vec2(-along.y, along.x) * lengths.y * deviations.y;
+    vec2 offsetPx = along * lengths.x * deviations.x + vec2(-along.y, along.x) * lengths.y * deviations.y;
+#ifdef CLIPS
+    mat3 worldAxes = mat3(worldFromModel) * rotation;
+    worldAxes[0] *= scale.x;
+    worldAxes[1] *= scale.y;
+    worldAxes[2] *= scale.z;
+    if (isHidden(inWorld, worldAxes * sqrt(reach))) return;
+    vec2 conicPx = vec2(yy * offsetPx.x - xy * offsetPx.y, xx * offsetPx.y - xy * offsetPx.x) / (xx * yy - xy * xy);
+    clipPoint = inWorld + worldAxes * rowX * conicPx.x + worldAxes * rowY * conicPx.y;
+#endif
+    vec2 px = focalPx * ratio + principalPx + offsetPx;
     gl_Position = vec4(2.0 * px.x / sizePx.x - 1.0, 1.0 - 2.0 * px.y / sizePx.y, 0.0, 1.0);
 
     depth = point.z;
@@ -138,9 +149,15 @@ export const SPLAT_FRAGMENT = /* glsl */ `
   flat in float reach;
   flat in float depth;
   out vec4 blended;
+#ifdef CLIPS
+${CLIP_FRAGMENT}
+#endif
   void main() {
     float square = dot(deviations, deviations);
     if (square > reach) discard;
+#ifdef CLIPS
+    if (!isShown()) discard;
+#endif
     float alpha = min(0.999, color.a * exp(-0.5 * square));
 #ifdef WRITES_DEPTH
     blended = vec4(depth * alpha, alpha, 0.0, alpha);

@@ -1,25 +1,36 @@
-// Erases parts of the model: the buttons of a panel, and the box that is erased.
+// Erases parts of the model: the buttons of a panel, their keys, and the box that is erased.
 
 import type { Connection } from "../connection/connection";
 import type { CropBox } from "../view/crop_box";
+import { type EditState, editNews } from "./edit_news";
 import { element } from "./element";
 import type { EditMessage, ErrorMessage, ModelStatus, Status } from "../connection/protocol";
+import { showToast } from "./toast";
 
 /** Ids of edits begin here, so that they differ from those of pictures. */
 const FIRST_ID = 2 ** 40;
 
 export class EditControls {
+  /** Number of this client. */
+  client = 0;
   private readonly opener = element("toggle-edit", HTMLButtonElement);
   private readonly undo = element("undo-edit", HTMLButtonElement);
+  private readonly redo = element("redo-edit", HTMLButtonElement);
   private readonly note = element("edit-note");
   private nSent = 0;
   private shown: string | undefined;
+  private before: EditState | null = null;
 
   constructor(
     private readonly connection: Connection,
     private readonly box: CropBox,
     private readonly method: () => string | undefined,
-  ) {}
+  ) {
+    element("erase-box").addEventListener("click", () => this.eraseBox());
+    element("remove-floaters").addEventListener("click", () => this.removeFloaters());
+    this.redo.addEventListener("click", () => this.redoLast());
+    window.addEventListener("keydown", (event) => this.keyDown(event));
+  }
 
   /** Whether the panel is open. */
   get isOpen(): boolean {
@@ -32,46 +43,94 @@ export class EditControls {
   }
 
   /** Erases the box. */
-  eraseBox(): void {
+  private eraseBox(): void {
     this.send({ action: "erase", box: this.box.corners }, "");
   }
 
   /** Erases small unconnected parts. */
-  removeFloaters(): void {
+  private removeFloaters(): void {
     this.send({ action: "remove_floaters" }, "looking for floaters …");
   }
 
   /** Undoes the last edit. */
   undoLast(): void {
-    this.send({ action: "undo" }, "");
+    if (!this.undo.disabled) this.send({ action: "undo" }, "");
+  }
+
+  /** Makes the last undone edit again. */
+  private redoLast(): void {
+    if (!this.redo.disabled) this.send({ action: "redo" }, "");
+  }
+
+  /** Delete erases the box that is shown; Ctrl+Z and Ctrl+Shift+Z undo and redo. */
+  private keyDown(event: KeyboardEvent): void {
+    const { target, key } = event;
+    const isTyping = target instanceof HTMLInputElement || target instanceof HTMLSelectElement;
+    if (!this.isOpen || isTyping || event.defaultPrevented || event.altKey) return;
+    const hasControl = event.ctrlKey || event.metaKey;
+    if (key === "Delete" && !hasControl && !event.repeat && this.box.isVisible) this.eraseBox();
+    else if (key.toLowerCase() === "z" && hasControl && event.shiftKey) this.redoLast();
+    else if (key.toLowerCase() === "z" && hasControl) this.undoLast();
+    else return;
+    event.preventDefault();
   }
 
   /** Shows the edits of the model on the page. Returns whether the edits of any model have changed. */
   show(status: Status, model: ModelStatus): boolean {
     this.opener.hidden = !this.connection.supports("edit");
     const nEdits = model.edits ?? 0;
+    const nUndone = model.undone_edits ?? 0;
     this.undo.disabled = this.opener.disabled || nEdits === 0;
     this.undo.textContent = nEdits > 0 ? `Undo (${nEdits})` : "Undo";
+    this.redo.disabled = this.opener.disabled || nUndone === 0;
+    this.redo.textContent = nUndone > 0 ? `Redo (${nUndone})` : "Redo";
+    const hasNews = this.showNews(status);
     // The number does not change if an undo and another edit come between two messages.
     const shown = `${nEdits} ${status.edit_revision}`;
     if (shown === this.shown) return false;
     this.shown = shown;
-    this.note.textContent = "";
+    if (!hasNews) this.setNote("", false);
     return true;
+  }
+
+  /** Says who has changed the edits, and where they were saved. Returns whether there is a new note. */
+  private showNews(status: Status): boolean {
+    const { edit_revision, last_edit, saved_edits } = status;
+    const now: EditState = { edit_revision, last_edit, saved_edits };
+    const { toast, note, hasFailed } = editNews(this.before, now, this.client);
+    if (toast !== null) showToast(toast);
+    if (note !== null) this.setNote(note, hasFailed);
+    const isSaved = saved_edits?.revision !== this.before?.saved_edits?.revision;
+    if (this.before && isSaved) this.setSaveNote(note ?? "", hasFailed);
+    this.before = now;
+    return note !== null;
   }
 
   /** Shows why an edit failed. Returns false if the message is about something else. */
   failed(message: ErrorMessage): boolean {
     if (message.id === null || message.id < FIRST_ID) return false;
-    this.note.textContent = message.message;
+    this.setNote(message.message, true);
     return true;
+  }
+
+  private setNote(text: string, hasFailed: boolean): void {
+    this.note.textContent = text;
+    this.note.classList.toggle("failed", hasFailed);
+  }
+
+  /** Shows the result of saving at the button in the side panel, too. */
+  private setSaveNote(text: string, hasFailed: boolean): void {
+    const note = element("save-note");
+    note.textContent = text;
+    note.hidden = text === "";
+    note.classList.toggle("failed", hasFailed);
   }
 
   private send(edit: Pick<EditMessage, "action" | "box">, note: string): void {
     // Keys reach this function even if the buttons are disabled.
     if (!this.isOpen || this.opener.disabled) return;
     this.nSent += 1;
-    this.note.textContent = note;
+    this.setNote(note, false);
     this.connection.send({ type: "edit", id: FIRST_ID + this.nSent, method: this.method(), ...edit });
   }
 }

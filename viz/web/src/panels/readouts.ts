@@ -15,7 +15,9 @@ export class Readouts {
     text("seconds", timeText(status.seconds));
     text("step", countText(model.step));
     text("step-millis", stepTimeText(model.step_millis));
-    text("primitives-label", model.primitives_label || "Primitives");
+    // Edits hide splats only when the model is drawn or exported.
+    const note = model.edits > 0 ? " before edits" : "";
+    text("primitives-label", `${model.primitives_label || "Primitives"}${note}`);
     text("primitives", countText(model.primitives));
     text("bytes", bytesText(model.bytes));
     showKeyframes(status);

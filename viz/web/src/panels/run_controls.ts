@@ -22,8 +22,8 @@ export class RunControls {
   }
 
   show(status: Status): void {
-    element("save-note").textContent = status.checkpoint?.text ?? "";
-    element("save-note").dataset.state = status.checkpoint?.state ?? "";
+    element("checkpoint-note").textContent = status.checkpoint?.text ?? "";
+    element("checkpoint-note").dataset.state = status.checkpoint?.state ?? "";
     this.isPaused = status.state === "paused";
     element("pause").textContent = this.isPaused ? "Continue" : "Pause";
     element("pause").dataset.paused = String(this.isPaused);
@@ -36,7 +36,7 @@ export class RunControls {
     element("pause").hidden = !isRunning;
     const save = element("save", HTMLButtonElement);
     save.textContent = isRunning ? "Save checkpoint" : "Save edits";
-    save.dataset.title = isRunning ? "Write a checkpoint now" : "Save the edits in the folder of the model";
+    save.dataset.title = isRunning ? "Write a checkpoint now" : "Save the edits in the folder of the model, or an edited copy of a single file beside it";
     if (!save.disabled) save.title = save.dataset.title; // Otherwise, the title says why.
   }
 }

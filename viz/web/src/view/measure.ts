@@ -1,7 +1,8 @@
-// Measures the distance between two points of the model's surface that the user clicks on.
+// Measures distances between points of the model's surface that the user clicks on.
 
 import * as THREE from "three";
 import { element } from "../panels/element";
+import { placeLabel } from "./label_places";
 
 const COLOR = 0xe3b341;
 /** Radius of a point, relative to its distance from the viewer. */
@@ -9,12 +10,29 @@ const POINT_SIZE = 0.006;
 /** Longer movements between press and release are drags. */
 const MAX_CLICK_PX = 4;
 
+const FIRST_POINT = "Click on two points of the model to measure their distance.";
+const SECOND_POINT = "Click on the second point. Esc cancels.";
+const NEXT_POINT = "Click on two points for the next distance. Delete removes the last one.";
+const NO_SURFACE = "No surface there. Click on the model.";
+
+/** Two points and their distance. */
+interface Measurement {
+  root: THREE.Group;
+  ends: [THREE.Mesh, THREE.Mesh];
+  label: HTMLElement;
+}
+
 export class MeasureTool {
   readonly root = new THREE.Group();
-  private readonly label = element("distance");
-  private readonly line: THREE.Line;
-  private readonly spheres: THREE.Mesh[];
-  private points: THREE.Vector3[] = [];
+  private readonly hint = element("measure-hint");
+  private readonly labels = element("distances");
+  private readonly sphere = new THREE.SphereGeometry(1, 16, 12);
+  // Always visible, like the handles of the crop box.
+  private readonly pointMaterial = new THREE.MeshBasicMaterial({ color: COLOR, depthTest: false, transparent: true });
+  private readonly lineMaterial = new THREE.LineBasicMaterial({ color: COLOR, depthTest: false, transparent: true });
+  private readonly measurements: Measurement[] = [];
+  /** The first point of the next measurement. */
+  private begun: THREE.Mesh | null = null;
   private pressed: [number, number] | null = null;
 
   constructor(
@@ -23,40 +41,57 @@ export class MeasureTool {
     private readonly surfaceAt: (x: number, y: number) => THREE.Vector3 | null,
     private readonly changed: () => void,
   ) {
-    // Always visible, like the handles of the crop box.
-    const onTop = { color: COLOR, depthTest: false, transparent: true };
-    this.line = new THREE.Line(new THREE.BufferGeometry(), new THREE.LineBasicMaterial(onTop));
-    this.line.frustumCulled = false;
-    const sphere = new THREE.SphereGeometry(1, 16, 12);
-    this.spheres = [0, 1].map(() => new THREE.Mesh(sphere, new THREE.MeshBasicMaterial(onTop)));
-    for (const drawn of [this.line, ...this.spheres]) drawn.renderOrder = 3;
-    this.root.add(this.line, ...this.spheres);
     this.root.visible = false;
     canvas.addEventListener("pointerdown", (event) => {
       this.pressed = event.isPrimary && event.button === 0 ? [event.offsetX, event.offsetY] : null;
     });
     canvas.addEventListener("pointerup", (event) => this.release(event));
-    this.setPoints([]);
+    // Before other listeners, so that Delete and Esc have only one effect.
+    window.addEventListener("keydown", (event) => this.keyDown(event), { capture: true });
   }
 
-  /** Whether clicks set points. Switching the tool off removes them. */
+  /** Whether clicks set points. Switching the tool off removes all measurements. */
   set enabled(enabled: boolean) {
     this.root.visible = enabled;
-    this.setPoints([]);
+    this.canvas.classList.toggle("measuring", enabled);
+    this.hint.hidden = !enabled;
+    this.cancel();
+    while (this.measurements.length > 0) this.remove(this.measurements[0]!);
+    this.update();
   }
 
-  /** Places the label, and gives the points their size on the screen. */
+  /** Places the labels, and gives the points their size on the screen. */
   update(): void {
     if (!this.root.visible) return;
-    for (const sphere of this.spheres) {
+    this.camera.updateMatrixWorld();
+    const points = this.spheres().map((sphere) => {
       sphere.scale.setScalar(POINT_SIZE * sphere.position.distanceTo(this.camera.position));
+      return this.onScreen(sphere.position);
+    });
+    const inView = points.filter((point) => point !== null);
+    for (const { ends, label } of this.measurements) {
+      const [from, to] = ends.map(({ position }) => this.onScreen(position));
+      label.hidden = !from || !to;
+      if (!from || !to) continue;
+      const size = { width: label.offsetWidth, height: label.offsetHeight };
+      const view = { left: 0, top: 0, right: this.canvas.clientWidth, bottom: this.canvas.clientHeight };
+      const { x, y } = placeLabel([from, to], size, view, inView);
+      label.style.left = `${x.toFixed(1)}px`;
+      label.style.top = `${y.toFixed(1)}px`;
     }
-    const [from, to] = this.points;
-    if (!from || !to) return;
-    const middle = from.clone().lerp(to, 0.5).project(this.camera);
-    this.label.hidden = middle.z > 1; // Behind the viewer.
-    this.label.style.left = `${(50 * (1 + middle.x)).toFixed(2)}%`;
-    this.label.style.top = `${(50 * (1 - middle.y)).toFixed(2)}%`;
+  }
+
+  private spheres(): THREE.Mesh[] {
+    const all = this.measurements.flatMap(({ ends }) => ends);
+    return this.begun ? [...all, this.begun] : all;
+  }
+
+  /** A point in pixels of the canvas; null behind the viewer. */
+  private onScreen(point: THREE.Vector3): { x: number; y: number } | null {
+    const ndc = point.clone().project(this.camera);
+    if (ndc.z > 1) return null;
+    const { clientWidth, clientHeight } = this.canvas;
+    return { x: 0.5 * (1 + ndc.x) * clientWidth, y: 0.5 * (1 - ndc.y) * clientHeight };
   }
 
   private release(event: PointerEvent): void {
@@ -65,29 +100,82 @@ export class MeasureTool {
     if (!this.root.visible || !pressed) return;
     if (Math.hypot(event.offsetX - pressed[0], event.offsetY - pressed[1]) > MAX_CLICK_PX) return;
     const point = this.surfaceAt(event.offsetX, event.offsetY);
-    if (!point) {
-      this.label.hidden = false;
-      this.label.textContent = "no surface here";
-      this.label.style.left = `${((100 * event.offsetX) / this.canvas.clientWidth).toFixed(2)}%`;
-      this.label.style.top = `${((100 * event.offsetY) / this.canvas.clientHeight).toFixed(2)}%`;
-      return;
-    }
-    this.setPoints(this.points.length === 1 ? [this.points[0]!, point] : [point]);
+    if (point) this.addPoint(point);
+    else this.hint.textContent = NO_SURFACE;
   }
 
-  private setPoints(points: THREE.Vector3[]): void {
-    this.points = points;
-    this.spheres.forEach((sphere, ix) => {
-      sphere.visible = ix < points.length;
-      if (points[ix]) sphere.position.copy(points[ix]);
-    });
-    this.line.visible = points.length === 2;
-    this.line.geometry.dispose();
-    this.line.geometry = new THREE.BufferGeometry().setFromPoints(points);
-    const [from, to] = points;
-    this.label.hidden = !to;
-    if (from && to) this.label.textContent = distanceText(from, to);
+  private addPoint(point: THREE.Vector3): void {
+    const sphere = this.pointAt(point);
+    const { begun } = this;
+    this.begun = begun ? null : sphere;
+    if (begun) this.finish(begun, sphere);
+    else this.root.add(sphere);
+    this.showHint();
     this.changed();
+  }
+
+  private pointAt(point: THREE.Vector3): THREE.Mesh {
+    const sphere = new THREE.Mesh(this.sphere, this.pointMaterial);
+    sphere.position.copy(point);
+    sphere.renderOrder = 3;
+    return sphere;
+  }
+
+  private finish(from: THREE.Mesh, to: THREE.Mesh): void {
+    const geometry = new THREE.BufferGeometry().setFromPoints([from.position, to.position]);
+    const line = new THREE.Line(geometry, this.lineMaterial);
+    line.frustumCulled = false;
+    line.renderOrder = 3;
+    const root = new THREE.Group();
+    root.add(line, from, to);
+    this.root.add(root);
+    const measurement: Measurement = { root, ends: [from, to], label: document.createElement("div") };
+    const text = document.createElement("span");
+    text.textContent = distanceText(from.position, to.position);
+    const remove = document.createElement("button");
+    remove.textContent = "×";
+    remove.title = "Remove this measurement";
+    remove.setAttribute("aria-label", `Remove the measurement ${text.textContent}`);
+    remove.addEventListener("click", () => this.remove(measurement));
+    measurement.label.className = "distance";
+    measurement.label.append(text, remove);
+    this.labels.append(measurement.label);
+    this.measurements.push(measurement);
+  }
+
+  private remove(measurement: Measurement): void {
+    this.measurements.splice(this.measurements.indexOf(measurement), 1);
+    this.root.remove(measurement.root);
+    for (const child of measurement.root.children) {
+      if (child instanceof THREE.Line) child.geometry.dispose();
+    }
+    measurement.label.remove();
+    this.showHint();
+    this.changed();
+  }
+
+  /** Removes the first point of the next measurement. */
+  private cancel(): void {
+    if (this.begun) this.root.remove(this.begun);
+    this.begun = null;
+    this.showHint();
+    this.changed();
+  }
+
+  private keyDown(event: KeyboardEvent): void {
+    const isTyping = event.target instanceof HTMLInputElement || event.target instanceof HTMLSelectElement;
+    if (!this.root.visible || isTyping || event.ctrlKey || event.metaKey || event.altKey) return;
+    const last = this.measurements.at(-1);
+    if (this.begun && (event.key === "Escape" || event.key === "Delete")) this.cancel();
+    else if (last && event.key === "Delete") this.remove(last);
+    else return;
+    event.preventDefault();
+    event.stopImmediatePropagation();
+  }
+
+  private showHint(): void {
+    if (this.begun) this.hint.textContent = SECOND_POINT;
+    else this.hint.textContent = this.measurements.length > 0 ? NEXT_POINT : FIRST_POINT;
   }
 }
 

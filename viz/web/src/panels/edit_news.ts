@@ -1,0 +1,40 @@
+// What to say about edits that have changed since the last status.
+
+import type { LastEdit, SavedEdits } from "../connection/protocol";
+
+/** The part of a status that is about edits of any model. */
+export interface EditState {
+  edit_revision: number;
+  last_edit?: LastEdit | undefined;
+  saved_edits?: SavedEdits | undefined;
+}
+
+export interface EditNews {
+  /** An edit of another client, for all to see. */
+  toast: string | null;
+  /** The edit of this client, or the result of saving; null to keep the present note. */
+  note: string | null;
+  hasFailed: boolean;
+}
+
+/** What has changed between two statuses; `before` is null for the first one, which is no news. */
+export function editNews(before: EditState | null, now: EditState, client: number): EditNews {
+  const news: EditNews = { toast: null, note: null, hasFailed: false };
+  if (!before) return news;
+  if (now.edit_revision !== before.edit_revision) {
+    const edit = now.last_edit;
+    const isOwn = edit?.client === client;
+    news.note = edit && isOwn ? sentence(edit.text) : "";
+    if (edit && !isOwn) news.toast = `client ${edit.client} ${edit.text}`;
+  }
+  const saved = now.saved_edits;
+  if (saved && saved.revision !== before.saved_edits?.revision) {
+    news.note = sentence(saved.text);
+    news.hasFailed = saved.has_failed;
+  }
+  return news;
+}
+
+function sentence(text: string): string {
+  return text.charAt(0).toUpperCase() + text.slice(1);
+}
