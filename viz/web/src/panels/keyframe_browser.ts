@@ -129,6 +129,8 @@ export class KeyframeBrowser {
 
   private sort(order: KeyframeOrder): void {
     this.order = order;
+    // The model may have changed since the last time.
+    if (order === "error") this.survey.forget();
     this.survey.enabled = order === "error";
     this.showTitle();
   }
@@ -185,7 +187,7 @@ export class KeyframeBrowser {
   }
 
   private display(comparison: Comparison): void {
-    const { keyframe, photo, render, errors } = comparison;
+    const { photo, render, errors } = comparison;
     this.compared = comparison;
     this.panel.showPhoto(photo);
     this.panel.showRender(render);
@@ -196,7 +198,6 @@ export class KeyframeBrowser {
     this.panel.showProblem(problems.join(". "));
     if (typeof photo !== "string") this.panel.showErrors(errors, [photo.image.width, photo.image.height]);
     else this.panel.showErrors(null, [0, 0]);
-    if (errors) this.survey.psnrOf.set(keyframeKey(keyframe), errors.psnr);
     this.showTexts();
   }
 
@@ -276,6 +277,8 @@ export class KeyframeBrowser {
   private refresh(): void {
     if (!this.panel.isOpen || document.hidden) return;
     this.panel.canSort = this.photos.isPossible;
+    // There may be new keyframes, or another model.
+    this.survey.enabled = this.order === "error";
     this.showTexts();
     const isDue = this.isOutdated && performance.now() - this.comparedAt > REFRESH_MILLIS;
     if (isDue && !this.isComparing && this.sources.connection.isOpen) void this.compare();

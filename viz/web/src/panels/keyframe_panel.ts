@@ -37,6 +37,7 @@ export class KeyframePanel {
   private readonly error = make("canvas", { id: "keyframe-error", role: "img", ariaLabel: "Map of the error" });
   private readonly facts = make("dl", { id: "keyframe-facts" });
   private readonly faults = make("ul", { id: "keyframe-faults" });
+  private shownFacts = "";
   private readonly progress = make("span", { id: "keyframe-progress" });
 
   constructor(parent: HTMLElement, private readonly events: PanelEvents) {
@@ -81,7 +82,7 @@ export class KeyframePanel {
     for (const { style } of [this.views, this.error]) style.aspectRatio = `${width} / ${height}`;
     this.views.dataset.missing = "";
     this.problem.textContent = note;
-    this.faults.replaceChildren();
+    this.showFacts([], []);
     this.root.dataset.state = "waiting";
   }
 
@@ -115,11 +116,18 @@ export class KeyframePanel {
   }
 
   showFacts(facts: [string, string][], faults: string[]): void {
-    this.facts.replaceChildren(
-      ...facts.flatMap(([name, value]) => [make("dt", { textContent: name }), make("dd", { textContent: value })]),
-    );
-    this.faults.replaceChildren(...faults.map((fault) => make("li", { textContent: fault })));
     this.root.dataset.state = "shown";
+    // Ages are updated all the time. Elements that stay the same can be selected and copied.
+    const key = JSON.stringify([facts, faults]);
+    if (key === this.shownFacts) return;
+    this.shownFacts = key;
+    const rows = facts.map(([name, value]) => {
+      const row = make("div");
+      row.append(make("dt", { textContent: name }), make("dd", { textContent: value }));
+      return row;
+    });
+    this.facts.replaceChildren(...rows);
+    this.faults.replaceChildren(...faults.map((fault) => make("li", { textContent: fault })));
   }
 
   private head(): HTMLElement {
