@@ -350,6 +350,8 @@ fn check_wiper(browser: &mut Browser) {
 
 /// All keyframes are measured, and the worst one is the first.
 fn check_order(browser: &mut Browser) {
+    /// The order is that of small pictures, in which the errors of compression differ.
+    const MAX_DISORDER_DB: f64 = 4.0;
     browser.evaluate(
         "(() => { const order = document.getElementById('keyframe-order'); order.value = 'error'; \
          order.dispatchEvent(new Event('change')); })()",
@@ -366,8 +368,6 @@ fn check_order(browser: &mut Browser) {
         psnrs.push(number.unwrap_or_else(|error| panic!("{psnr:?}: {error}")));
         press(browser, "ArrowRight");
     }
-    // The order is that of small pictures, in which the errors of compression differ.
-    const MAX_DISORDER_DB: f64 = 4.0;
     let is_ordered = |pair: &[f64]| pair[0] < pair[1] + MAX_DISORDER_DB;
     assert!(psnrs.windows(2).all(is_ordered), "{psnrs:?}");
     assert!(psnrs[0] + 5.0 < psnrs[CASES.len() - 1], "{psnrs:?}");
@@ -474,13 +474,13 @@ fn check_missing_photograph(browser: &mut Browser, hub: &Hub) {
 
 /// The page says where to look next, relative to the live camera.
 fn check_coverage(browser: &mut Browser, hub: &Hub) {
+    const N_CELLS: u32 = 20;
     wait_for(browser, "the button", |browser| {
         browser.evaluate("document.getElementById('toggle-coverage').hidden") == false
     });
     browser.click("toggle-coverage");
     wait_for(browser, "a subscription", |_| hub.needs_observations());
     // A floor of which a corner was seen by one keyframe only.
-    const N_CELLS: u32 = 20;
     let cells = (0..N_CELLS).flat_map(|y| (0..N_CELLS).map(move |x| [x, y]));
     let observed = cells.map(|[x, y]| ObservedCell {
         ix: (x + N_CELLS * y) as usize,
