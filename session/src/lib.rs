@@ -52,6 +52,7 @@ pub mod next_commands;
 mod observations;
 mod observer;
 mod pending_evaluation;
+mod photographs;
 mod previous_run;
 mod read_progress;
 mod recent_images;

@@ -13,6 +13,8 @@ mod eye_page;
 mod foxglove;
 mod hands_page;
 mod labels_page;
+mod keyframe_browser_page;
+mod keyframe_images;
 mod local_page;
 mod model_chunks;
 mod models;

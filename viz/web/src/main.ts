@@ -4,6 +4,7 @@ import { keepToken, showRole } from "./connection/access";
 import { announceStates } from "./panels/announcer";
 import { Banner } from "./panels/banner";
 import { BoxPanel } from "./panels/box_panel";
+import { CoverageHint } from "./panels/coverage_hint";
 import { Connection } from "./connection/connection";
 import { EditControls } from "./panels/edit_controls";
 import { element } from "./panels/element";
@@ -12,6 +13,7 @@ import { Header } from "./panels/header";
 import { showGuidance } from "./panels/guidance";
 import { setUpHelp } from "./panels/help";
 import { action, closesWithEscape, endsWithEscape, setFlying, setUpKeys, toggle } from "./keys";
+import { KeyframeBrowser } from "./panels/keyframe_browser";
 import { LinkReadout } from "./connection/link_readout";
 import { LiveImages } from "./panels/live_images";
 import { ModelSourceCard } from "./panels/model_source";
@@ -44,12 +46,14 @@ import { Topics } from "./topics/topic";
 import { setUpToolbar } from "./panels/toolbar";
 import { Tooltip } from "./panels/tooltip";
 import { TrainingPanel } from "./panels/training_panel";
+import { setUpSavePicture } from "./view/save_picture";
 import { ViewSettings } from "./view/view_settings";
 
 let stages = [0.1, 0.5, 1];
 let latestStatus: Status | null = null;
 let latestStep = -1;
 let showsModel = true;
+let sceneRadiusM = 1;
 
 const readouts = new Readouts();
 const header = new Header();
@@ -86,6 +90,8 @@ const connection: Connection = new Connection(`${location.protocol === "https:" 
       shownLatency.forget();
       forgetSurfaces();
       for (const side of sides) side.restart();
+      browser.restart();
+      coverage.restart();
       topics.restart();
     }
     if (shown.dataset.state !== before) view.changed();
@@ -125,6 +131,7 @@ const models = new ModelSwitch(() => {
   pictureInfo.modelChanged();
   scheduler.restart();
   forgetSurfaces();
+  browser.modelChanged(true);
   if (latestStatus) showStatus(latestStatus);
 });
 let isDrawnLocally = false;
@@ -146,6 +153,16 @@ const surroundings = new Surroundings(
   () => view.forgetSurfaces(),
 );
 const settings = new ViewSettings(view, scheduler, sides[1]);
+setUpSavePicture(view);
+const browser = new KeyframeBrowser({
+  connection,
+  view,
+  topic: keyframes,
+  common: () => scheduler.picture({ ...view.view(), crop: undefined }),
+  live: () => liveImages.latest,
+  radiusM: () => sceneRadiusM,
+});
+const coverage = new CoverageHint({ view, topic: observations, live: () => liveImages.latest });
 
 function openView(): OrbitView {
   if (!document.createElement("canvas").getContext("webgl2")) {
@@ -198,10 +215,12 @@ function receiveText(message: TextMessage): void {
       break;
     case "scene":
       view.setScene(message);
+      coverage.setScene(message);
+      sceneRadiusM = message.radius_m;
       break;
     case "error":
       if (edits.failed(message)) break;
-      if (sides.some((side) => side.fail(message))) break;
+      if (sides.some((side) => side.fail(message)) || browser.fail(message)) break;
       scheduler.failed(message.id);
       // The skeleton says what is missing.
       element("notice").textContent = skeleton.isVisible && !latestStatus?.keyframes ? "" : message.message;
@@ -216,6 +235,7 @@ function showStatus(status: Status): void {
   const isEdited = edits.show(status, model);
   const isChanged = model.step !== latestStep;
   if (isChanged || isEdited) scheduler.modelChanged();
+  if (isChanged || isEdited) browser.modelChanged(isEdited);
   if (isEdited) forgetSurfaces();
   else if (isChanged) surroundings.modelChanged();
   latestStep = model.step;
@@ -243,6 +263,7 @@ function updateLocalModel(model: ModelStatus): void {
 }
 
 function receiveBinary(header: BinaryHeader, payload: Uint8Array<ArrayBuffer>): void {
+  if (browser.receive(header, payload)) return;
   if (header.type !== "picture") topics.receive(header, payload);
   else if (!sides.some((side) => side.receive(header, payload))) void showPicture(header, payload);
 }
@@ -285,7 +306,7 @@ action("full-screen", "u", () => {
 setUpHelp();
 action("look-top", "t", () => view.lookAlong("top"));
 action("look-front", "f", () => view.lookAlong("front"));
-action("look-nearest", "n", () => view.lookFromNearest(keyframes.list.keyframes));
+action("look-nearest", "n", () => browser.toggle());
 action("look-live", "c", () => {
   const pose = liveImages.latest?.world_from_camera;
   if (pose) view.lookFrom(pose);
@@ -330,6 +351,7 @@ for (const { id, key, quantity } of TINTS) {
     observations.tint = isOn ? quantity : null;
   });
 }
+toggle("toggle-coverage", "4", (isOn) => (coverage.enabled = isOn));
 toggle("toggle-robot", "b", (isOn) => (view.robot.enabled = isOn));
 toggle("toggle-frames", "h", (isOn) => (view.frames.enabled = isOn));
 toggle("toggle-occlude", "o", (isOn) => (view.occlusion.enabled = isOn));

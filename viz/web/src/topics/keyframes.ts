@@ -10,6 +10,8 @@ const HZ = 2;
 export class KeyframesTopic implements Topic {
   readonly name = "keyframes";
   readonly list = new KeyframeList();
+  /** Called after changes of the list. */
+  onChange: () => void = () => undefined;
   readonly receivers = [
     on<Keyframes>("keyframes", (message) => {
       this.view.overlays.setKeyframes(message.keyframes);
@@ -20,6 +22,7 @@ export class KeyframesTopic implements Topic {
       this.view.points.setKeyframes(this.list.keyframes);
       this.view.overlays.setKeyframes(this.list.keyframes);
       this.view.changed();
+      this.onChange();
     }),
   ];
 
