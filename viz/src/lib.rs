@@ -42,7 +42,7 @@ pub use server::{Server, ServerConfig, Sharing};
 pub use topics::model_chunks::PublishedChunks;
 pub use topics::observations::{ObservationMap, ObservedCell};
 pub use topics::published_data::{
-    Guidance, KeyframePose, ModelStatus, RunResult, SceneHint, Status,
+    Guidance, KeyframePose, ModelStatus, RunResult, SceneBounds, SceneHint, Status,
 };
 pub use topics::robot_description::{MeshFormat, RobotDescription, RobotMesh};
 

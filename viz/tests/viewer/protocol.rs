@@ -19,8 +19,8 @@ use std::time::{Duration, Instant};
 use trainer::{ChunkData, ChunkLayout, ModelChunk, ModelChunks};
 use viz::{
     Control, EditAction, Error, Hub, KeyframePose, LiveImage, LivePixels, ModelStatus,
-    ObservationMap, ObservedCell, PendingRender, RangeScan, SceneHint, Server, ServerConfig,
-    Status,
+    ObservationMap, ObservedCell, PendingRender, RangeScan, SceneBounds, SceneHint, Server,
+    ServerConfig, Status,
 };
 
 fn start() -> (Hub, Server) {
@@ -611,11 +611,16 @@ fn one_of_each() -> Vec<Value> {
         others: vec![model_status("tsdf", 30)],
         ..Status::default()
     });
-    hub.set_scene_hint(SceneHint {
+    let hint = SceneHint {
         center_m: [0.0; 3],
         radius_m: 1.0,
         world_from_camera: Transform::identity(),
-    });
+    };
+    let bounds = SceneBounds {
+        min_m: [-0.6, -0.5, 0.0],
+        max_m: [0.6, 0.5, 0.4],
+    };
+    hub.set_scene(hint, bounds);
     let mut client = Client::connect(server.address());
     hub.set_robot(robot::description());
     hub.set_robot_state(robot::state(0.0));
