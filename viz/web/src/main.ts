@@ -30,6 +30,7 @@ import { RangeScansTopic } from "./topics/range_scans";
 import { robotTopic } from "./topics/robot_state";
 import { statusTopic } from "./topics/status";
 import { Topics } from "./topics/topic";
+import { ViewControls } from "./view/view_controls";
 import { ViewSettings } from "./view/view_settings";
 
 let stages = [0.1, 0.5, 1];
@@ -112,6 +113,7 @@ const surroundings = new Surroundings(
   () => view.forgetSurfaces(),
 );
 const settings = new ViewSettings(view, scheduler, sides[1]);
+const viewControls = new ViewControls(view, images);
 
 function openView(): OrbitView {
   if (!document.createElement("canvas").getContext("webgl2")) {
@@ -238,6 +240,10 @@ function toggle(id: string, key: string, apply: (isOn: boolean) => void): void {
 
 function action(id: string, key: string, act: () => void): void {
   element(id).addEventListener("click", act);
+  onKey(id, key, act);
+}
+
+function onKey(id: string, key: string, act: () => void): void {
   window.addEventListener("keydown", (event) => {
     const isPlain = !event.ctrlKey && !event.metaKey && !event.altKey && !event.repeat;
     if (element(id).hidden || event.target instanceof HTMLInputElement || event.target instanceof HTMLSelectElement) {
@@ -251,6 +257,8 @@ toggle("toggle-fly", "y", (isOn) => {
   view.flies = isOn;
   showKeysInTitles(!isOn);
 });
+for (const key of ["0", "home"]) onKey("look-overview", key, () => view.showOverview());
+element("look-overview").addEventListener("click", () => view.showOverview());
 action("reset-view", "r", () => view.reset());
 action("full-screen", "u", () => {
   if (document.fullscreenElement) void document.exitFullscreen();
@@ -260,10 +268,7 @@ setUpHelp();
 action("look-top", "t", () => view.lookAlong("top"));
 action("look-front", "f", () => view.lookAlong("front"));
 action("look-nearest", "n", () => view.lookFromNearest(keyframes.list.keyframes));
-action("look-live", "c", () => {
-  const pose = liveImages.latest?.world_from_camera;
-  if (pose) view.lookFrom(pose);
-});
+action("look-live", "c", () => viewControls.rideNext());
 element("look-live", HTMLButtonElement).disabled = true;
 toggle("toggle-model", "m", (isOn) => {
   showsModel = isOn;
@@ -293,6 +298,7 @@ action("toggle-edit", "q", () => {
 action("erase-box", "w", () => edits.eraseBox());
 action("remove-floaters", "a", () => edits.removeFloaters());
 action("undo-edit", "z", () => edits.undoLast());
+toggle("toggle-cut", "3", (isOn) => (view.isCut = isOn));
 toggle("toggle-follow", "l", (isOn) => (view.follows = isOn));
 toggle("toggle-points", "p", (isOn) => (points.shown = isOn));
 toggle("toggle-scans", "s", (isOn) => (scans.shown = isOn));
@@ -318,6 +324,7 @@ function frame(): void {
     surroundings.tick(() => view.view(), models.method, view.isFlyingOrStopped);
   }
   view.draw();
+  viewControls.update();
   requestAnimationFrame(frame);
 }
 requestAnimationFrame(frame);

@@ -115,6 +115,7 @@ export class LocalModel {
       view.projection.focal_px[1] * scale[1]!,
     ];
     const depthRange: [number, number] = [view.near_m, view.far_m];
+    this.meshes.setView(worldFromCamera(view.world_from_camera), view.near_m);
     this.splats.setView(worldFromCamera(view.world_from_camera), this.worldFromModel, sizePx, focalPx, depthRange);
   }
 

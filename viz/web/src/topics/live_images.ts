@@ -8,6 +8,8 @@ import { on, type Subscription, type Topic } from "./topic";
 
 /** An image is labeled live for half a second. */
 const HZ = 4;
+/** The view moves with the poses of the camera that it rides on. */
+const RIDDEN_HZ = 12;
 /** Limits of the height of camera images, in CSS pixels: see `.live canvas` in app.css. */
 const IMAGE_HEIGHT = { min: 90, max: 190, ofWindow: 0.22 };
 const MAX_IMAGE_WIDTH_PX = 640;
@@ -18,15 +20,14 @@ const IMAGE_STEP_PX = 16;
 
 export class LiveImagesTopic implements Topic {
   readonly name = "live_images";
-  /** The newest image with a pose. */
-  latest: LiveImageHeader | null = null;
   readonly receivers = [
     on<LiveImageHeader>("live_image", (header, payload) => {
       this.images.show(header, payload);
       if (!header.world_from_camera) return;
-      this.latest = header;
       element("look-live", HTMLButtonElement).disabled = false;
-      const hasMoved = this.view.overlays.setLiveCamera({ ...header, world_from_camera: header.world_from_camera });
+      const posed = { ...header, world_from_camera: header.world_from_camera };
+      this.view.attachment.seen(posed);
+      const hasMoved = this.view.overlays.setLiveCamera(posed);
       if (hasMoved) this.view.changed();
     }),
   ];
@@ -59,13 +60,18 @@ export class LiveImagesTopic implements Topic {
     const sizePx = (isLarge: boolean): [number, number] => (isLarge || this.fillsView ? ENLARGED_PX : this.thumbnailPx());
     return [
       { rate_hz: HZ, size_px: sizePx(false) },
-      ...cameras.map(([camera, isEnlarged]) => ({ rate_hz: HZ, camera, size_px: sizePx(isEnlarged && this.isShown) })),
+      ...cameras.map(([camera, isEnlarged]) => ({
+        rate_hz: camera === this.images.ridden ? RIDDEN_HZ : HZ,
+        camera,
+        size_px: sizePx(isEnlarged && this.isShown),
+      })),
     ];
   }
 
   restart(): void {
     this.images.forget();
     this.view.overlays.forgetLive();
+    this.view.attachment.forgetCameras();
   }
 
   private thumbnailPx(): [number, number] {

@@ -1,8 +1,8 @@
 // What is needed to show a view again, as plain data.
 
 /**
- * How the view moves. `overview`: it shows everything, and follows growing bounds until the user moves. `chase`: it moves
- * with a frame of the robot. `ride`: it is attached to a camera.
+ * How the view moves. `overview`: it shows everything, and follows growing bounds until the user moves it. `chase`: it
+ * moves with a frame of the robot. `ride`: it is attached to a camera.
  */
 export type ViewMode = "overview" | "orbit" | "fly" | "chase" | "ride";
 
