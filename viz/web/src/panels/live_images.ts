@@ -122,7 +122,7 @@ export class LiveImages {
     const age = document.createElement("span");
     name.textContent = camera;
     const dock = document.createElement("button");
-    caption.append(name, age, rideButton(camera, this.ridden === camera, () => this.ride(camera)), dock);
+    caption.append(name, age, dock, rideButton(camera, this.ridden === camera, () => this.ride(camera)));
     figure.append(canvas, caption);
     figure.dataset.camera = camera;
     figure.addEventListener("click", () => {
