@@ -14,7 +14,7 @@ const FORWARD = new Vector3(0, 1, 0);
 test("a blocked motion names the side of the wall", () => {
   const text = (x: number, y: number): string => blockText(blockOf(new Vector3(x, y, 0), FORWARD, true));
   assert.equal(text(0.1, -1), "A wall is behind you");
-  assert.equal(text(0.1, 2), "A wall is in front of you");
+  assert.equal(text(0.1, 2), "A surface is in front of you");
   assert.equal(text(1, 0.1), "A wall is beside you");
   assert.match(blockText(blockOf(new Vector3(0, -1, 0), FORWARD, false)), /behind you is hidden/);
   assert.ok(canBeCut(blockOf(FORWARD, FORWARD, false)));

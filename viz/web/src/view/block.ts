@@ -25,7 +25,7 @@ const PLACES: Record<Direction, string> = { ahead: "in front of you", behind: "b
 export function blockText(block: Block): string {
   switch (block.by) {
     case "surface":
-      return `A wall is ${PLACES[block.direction]}`;
+      return `A ${block.direction === "ahead" ? "surface" : "wall"} is ${PLACES[block.direction]}`;
     case "unknown space":
       return `What is ${PLACES[block.direction]} is hidden and not known yet`;
     case "near end":

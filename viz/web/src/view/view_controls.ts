@@ -62,14 +62,19 @@ export class ViewControls {
     const mode = [view.mode, riddenCamera, frame, view.robot.linkNames.length, view.isCut].join();
     if (mode === this.shownMode) return;
     this.shownMode = mode;
-    press("toggle-fly", view.mode === "fly");
+    this.showFlying(view.mode === "fly");
     press("toggle-follow", view.mode === "chase");
     press("look-live", view.mode === "ride");
     press("toggle-cut", view.isCut);
-    showKeysInTitles(view.mode !== "fly");
     this.frames.show(view.robot, frame);
     this.images.ridden = riddenCamera;
     element("cut-chip").hidden = !view.isCut;
+  }
+
+  private showFlying(isFlying: boolean): void {
+    if (isFlying === (element("toggle-fly").getAttribute("aria-pressed") === "true")) return;
+    press("toggle-fly", isFlying);
+    showKeysInTitles(!isFlying);
   }
 
   /** Says why the eye was stopped, and offers to cut the wall away. */
