@@ -3,6 +3,7 @@ import { test } from "node:test";
 import { Box3, BoxGeometry, Mesh, type Material, PerspectiveCamera, Vector3 } from "three";
 import { blockOf, blockText, canBeCut } from "../src/view/block";
 import { Cut } from "../src/view/cut";
+import { hiddenDistanceM } from "../src/view/hidden_robot";
 import { LinkLook, nearOpacity } from "../src/layers/link_look";
 import type { Occlusion } from "../src/layers/occlusion";
 import { arrowPlace } from "../src/view/robot_arrow";
@@ -62,6 +63,23 @@ test("an arrow at the border points to a robot outside of the picture", () => {
   assertClose([above.x, above.y, above.angleRad], [400, 96, -Math.PI / 2], 1e-6);
   const behind = place(boxAt(0, -5, 0))!;
   assertClose([behind.x, behind.y, behind.angleRad], [400, 316, Math.PI / 2], 1e-6);
+});
+
+test("the model hides the robot only if it hides all of it", () => {
+  const robot = boxAt(0, 4, 0);
+  const eye = new Vector3();
+  const wallAt = (y: number, maxX: number) => (point: Vector3) =>
+    point.x <= maxX ? point.clone().multiplyScalar(y / point.y) : null;
+  const distance = hiddenDistanceM(robot, eye, wallAt(2, 1));
+  // Up to the closest corner.
+  assertClose([distance ?? NaN], [4 - 0.25 * Math.sqrt(3)], 1e-9);
+  assert.equal(hiddenDistanceM(robot, eye, wallAt(2, 0.1)), null, "one side is visible");
+  assert.equal(hiddenDistanceM(robot, eye, wallAt(4.1, 1)), null, "the wall is behind it");
+  assert.equal(hiddenDistanceM(robot, eye, () => null), null);
+  assert.equal(hiddenDistanceM(new Box3(), eye, wallAt(2, 1)), null);
+  const cut = new Cut();
+  cut.beginAt(3.5, 3);
+  assertClose([cut.depthM(3, 0.01), cut.depthM(4, 0.01)], [3.5, 4.5], 1e-9);
 });
 
 test("a link fades close to the eye, and disappears around it", () => {

@@ -1,9 +1,14 @@
-// Says why the eye does not move on.
+// Says why the eye does not move on, or does not see the robot.
 
 import type { Vector3 } from "three";
 
-/** What stopped the eye: a surface, space that is hidden so far, or the shortest or longest distance to the target. */
-export type Block = { by: "surface" | "unknown space"; direction: Direction } | { by: "near end" | "far end" };
+/**
+ * What stopped the eye: a surface, space that is hidden so far, or the shortest or longest distance to the target; or what
+ * the robot is hidden by.
+ */
+export type Block =
+  | { by: "surface" | "unknown space"; direction: Direction }
+  | { by: "near end" | "far end" | "model before robot" };
 
 /** Where the eye was about to go, in the view. */
 type Direction = "ahead" | "behind" | "beside";
@@ -32,10 +37,12 @@ export function blockText(block: Block): string {
       return "The view is at the point that it orbits: double-click on another point, or fly (Y)";
     case "far end":
       return "The zoom ends here: everything is in the picture";
+    case "model before robot":
+      return "The model hides the robot";
   }
 }
 
-/** Whether cutting away what is between eye and target lets the eye move on. */
+/** Whether the cut removes it. */
 export function canBeCut({ by }: Block): boolean {
-  return by === "surface" || by === "unknown space";
+  return by !== "near end" && by !== "far end";
 }

@@ -18,6 +18,11 @@ export class Cut {
     this.keptM = isAtWall ? KEPT_BEFORE_WALL_FRAC * distanceM : KEPT_FRAC * Math.min(distanceM, sceneRadiusM);
   }
 
+  /** Begins with a model that starts at this depth, for a target at this distance; meters. */
+  beginAt(depthM: number, distanceM: number): void {
+    this.keptM = distanceM - depthM;
+  }
+
   end(): void {
     this.keptM = null;
   }

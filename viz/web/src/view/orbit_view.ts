@@ -12,6 +12,7 @@ import { Cut } from "./cut";
 import { type DepthMap, PictureDepthMap } from "../layers/depth_map";
 import { EyeMotion } from "./eye_motion";
 import { FlyControls } from "./fly_controls";
+import { hiddenDistanceM } from "./hidden_robot";
 import { FrameLayer } from "../layers/frame_layer";
 import { LocalModel } from "../layers/local_model";
 import { MeasureTool } from "./measure";
@@ -19,6 +20,7 @@ import { ObservationLayer } from "../layers/observation_layer";
 import { Occlusion, type OcclusionDepth } from "../layers/occlusion";
 import { Overlays } from "../layers/overlays";
 import { PictureLayer } from "../layers/picture_layer";
+import { PictureSurface } from "./picture_surface";
 import { PointsLayer } from "../layers/points_layer";
 import type { PosedCamera, Scene } from "../connection/protocol";
 import type { View } from "../connection/render_scheduler";
@@ -26,7 +28,6 @@ import { RobotLayer } from "../layers/robot_layer";
 import { ScanLayer } from "../layers/scan_layer";
 import { SceneViews } from "./scene_views";
 import type { ServerClock } from "../connection/server_clock";
-import { surfacePoint } from "./surface_picker";
 import { cameraAlong, viewOfCamera } from "./view_request";
 import type { ViewMode, ViewState } from "./view_state";
 
@@ -60,6 +61,7 @@ export class OrbitView {
   readonly attachment: Attachment;
   private readonly sceneViews: SceneViews;
   private readonly cut = new Cut();
+  private readonly surface: PictureSurface;
   /** The part of the scene to draw. */
   readonly crop: CropBox;
   readonly measure: MeasureTool;
@@ -70,6 +72,8 @@ export class OrbitView {
   /** Until then, the view shows everything, or the first view of an older server. */
   private hasUserMoved = false;
   private hasAskedForOverview = false;
+  /** Distance of the robot from the eye of the overview if the model hides it, meters; otherwise null. */
+  private hiddenRobotM: number | null = null;
   private isStale = true;
   private isModelShown = true;
 
@@ -86,6 +90,7 @@ export class OrbitView {
     this.renderer.setPixelRatio(Math.min(devicePixelRatio, 2));
     this.camera.up.set(0, 0, 1);
     this.camera.position.set(1, -1, 1);
+    this.surface = new PictureSurface(this.picture, this.camera, canvas);
     this.controls = new OrbitControls(this.camera, canvas);
     this.motion = new EyeMotion(
       this.camera,
@@ -102,7 +107,7 @@ export class OrbitView {
       this.forgetSurroundings();
       onMove();
     });
-    this.measure = new MeasureTool(this.camera, canvas, (x, y) => this.surfaceAt(x, y), () => this.changed());
+    this.measure = new MeasureTool(this.camera, canvas, (x, y) => this.surface.at(x, y), () => this.changed());
     this.world.add(this.crop.root, this.measure.root);
     this.renderer.autoClear = false;
     this.background.add(this.picture.mesh, this.local.root);
@@ -269,7 +274,7 @@ export class OrbitView {
     this.fly.enabled = flies;
     this.controls.enabled = !flies;
     // Both look at the target, which is where the surface is, so that an orbit begins without a jump.
-    const ahead = this.surfaceAt(0.5 * this.canvas.clientWidth, 0.5 * this.canvas.clientHeight);
+    const ahead = this.surface.ahead();
     const { position } = this.camera;
     const distance = ahead?.distanceTo(position) ?? this.controls.target.distanceTo(position);
     const forward = this.camera.getWorldDirection(new THREE.Vector3());
@@ -286,6 +291,13 @@ export class OrbitView {
   seePicture(): void {
     const { posedDepth } = this.picture;
     if (posedDepth) this.see("picture", new PictureDepthMap(posedDepth));
+    this.hiddenRobotM = this.mode === "overview" ? this.robotBehindModel() : null;
+  }
+
+  /** Distance of the robot if the model hides it; otherwise null. */
+  private robotBehindModel(): number | null {
+    if (!this.isModelShown || !this.occlusion.enabled || this.isCut) return null;
+    return hiddenDistanceM(this.sceneViews.robotBox(), this.camera.position, (point) => this.surface.toward(point));
   }
 
   /** Forgets the surfaces of another model. */
@@ -325,9 +337,10 @@ export class OrbitView {
     this.onMove();
   }
 
-  /** What stopped the eye last, and when; null if nothing has. */
+  /** What stopped the eye last or hides the robot, and when; null if there is nothing. */
   get block(): { what: Block; at: number } | null {
-    return this.motion.block;
+    const isHidden = this.hiddenRobotM !== null && this.mode === "overview" && !this.isCut;
+    return isHidden ? { what: { by: "model before robot" }, at: performance.now() } : this.motion.block;
   }
 
   private get targetDistanceM(): number {
@@ -340,31 +353,21 @@ export class OrbitView {
   }
 
   set isCut(isCut: boolean) {
-    const { block } = this.motion;
+    const { block } = this;
     const isAtWall = block !== null && canBeCut(block.what) && performance.now() - block.at < CUT_WALL_MILLIS;
-    if (isCut) this.cut.begin(this.targetDistanceM, this.sceneViews.radiusM, isAtWall);
-    else this.cut.end();
+    const distanceM = this.targetDistanceM;
+    if (!isCut) this.cut.end();
+    else if (block?.what.by === "model before robot") this.cut.beginAt(this.hiddenRobotM ?? distanceM, distanceM);
+    else this.cut.begin(distanceM, this.sceneViews.radiusM, isAtWall);
+    this.hiddenRobotM = null;
     this.motion.forgetPlaces();
     this.isStale = true;
     this.onMove();
   }
 
-  /** The point of the model's surface at a pixel of the canvas; null if there is none. */
-  private surfaceAt(x: number, y: number): THREE.Vector3 | null {
-    const depth = this.picture.posedDepth;
-    if (!depth) return null;
-    const { clientWidth, clientHeight } = this.canvas;
-    const raycaster = new THREE.Raycaster();
-    raycaster.setFromCamera(
-      new THREE.Vector2((2 * x) / clientWidth - 1, 1 - (2 * y) / clientHeight),
-      this.camera,
-    );
-    return surfacePoint(raycaster.ray, depth, this.camera.near, this.camera.far);
-  }
-
   /** Turns toward the surface at a pixel of the canvas, which becomes the center of the orbit. */
   private pivotAt(x: number, y: number): void {
-    const point = this.surfaceAt(x, y);
+    const point = this.surface.at(x, y);
     if (!point) return;
     this.hasUserMoved = true;
     this.controls.target.copy(point);
@@ -374,6 +377,7 @@ export class OrbitView {
   /** Attaches the view to a camera until the user moves it. */
   ride(camera: string): void {
     this.flies = false;
+    if (this.isCut) this.isCut = false; // The camera sees what is in front of it.
     this.hasUserMoved = true;
     this.attachment.startRide(camera);
   }
