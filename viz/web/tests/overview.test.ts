@@ -15,10 +15,11 @@ import {
 import { type Heading, OverviewKeeper } from "../src/view/overview_keeper";
 import { assertClose } from "./close";
 
+const UP = new Vector3(0, 0, 1);
 const LENSES = [
-  { fovDegrees: 50, aspect: 1.6 },
-  { fovDegrees: 50, aspect: 0.5 },
-  { fovDegrees: 90, aspect: 1 },
+  { fovDegrees: 50, aspect: 1.6, up: UP },
+  { fovDegrees: 50, aspect: 0.5, up: UP },
+  { fovDegrees: 90, aspect: 1, up: UP },
 ];
 const AHEAD: Heading = { rad: 0, isRobot: true };
 
@@ -29,7 +30,7 @@ function box(min: [number, number, number], max: [number, number, number]): Box3
 /** Where points are in the picture, -1 to 1 from left to right and from bottom to top. */
 function inPicture(points: Vector3[], { eye, target }: Viewpoint, lens: (typeof LENSES)[0]): Vector3[] {
   const camera = new PerspectiveCamera(lens.fovDegrees, lens.aspect, 0.01, 100);
-  camera.up.set(0, 0, 1);
+  camera.up.copy(lens.up);
   camera.position.copy(eye);
   camera.lookAt(target);
   camera.updateMatrixWorld();
@@ -47,6 +48,14 @@ test("a view of everything contains all points, and is as close as possible", ()
       assertClose(view.target.clone().sub(view.eye).normalize().toArray(), direction.clone().normalize().toArray(), 1e-9);
     }
   }
+});
+
+test("a world with another direction of up is seen from above, too", () => {
+  const lens = { ...LENSES[0]!, up: new Vector3(0, -1, 0) };
+  const corners = cornersOf([box([-1, -2, 0], [4, 1, 1.5])]);
+  const view = viewOf(corners, overviewDirection(0, false), lens);
+  assert.ok(view.eye.dot(lens.up) > view.target.dot(lens.up) + 1);
+  for (const { x, y } of inPicture(corners, view, lens)) assert.ok(Math.abs(x) < 0.87 && Math.abs(y) < 0.87);
 });
 
 test("a single point is seen from a small distance", () => {

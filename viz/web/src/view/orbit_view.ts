@@ -10,6 +10,7 @@ import type { PathView } from "./camera_path";
 import { CropBox } from "./crop_box";
 import { Cut } from "./cut";
 import { type DepthMap, PictureDepthMap } from "../layers/depth_map";
+import type { Viewpoint } from "./eye_guard";
 import { EyeMotion } from "./eye_motion";
 import { FlyControls } from "./fly_controls";
 import { hiddenDistanceM } from "./hidden_robot";
@@ -134,7 +135,7 @@ export class OrbitView {
 
   /** Adopts a scene. Until the user moves the view, it shows everything, or the first view of an older server. */
   setScene(scene: Scene): void {
-    const isNew = JSON.stringify(scene) !== JSON.stringify(this.sceneViews.scene);
+    const isNew = JSON.stringify(scene) !== JSON.stringify(this.scene);
     this.sceneViews.scene = scene;
     if (!isNew) return;
     this.isStale = true;
@@ -152,6 +153,10 @@ export class OrbitView {
     if (!this.hasUserMoved && !this.keepsOverview) this.lookFrom(scene.world_from_camera);
   }
 
+  private get scene(): Scene | null {
+    return this.sceneViews.scene;
+  }
+
   /** Shows everything: the scene, the robot and its path. The view stays so until the user moves it. */
   showOverview(): void {
     this.attachment.end();
@@ -162,15 +167,14 @@ export class OrbitView {
 
   /** Whether the view shows everything until the user moves it. */
   private get keepsOverview(): boolean {
-    return !this.hasUserMoved && (this.hasAskedForOverview || this.sceneViews.scene?.bounds !== undefined);
+    return !this.hasUserMoved && (this.hasAskedForOverview || this.scene?.bounds !== undefined);
   }
 
   /** Returns to the view of the first camera. */
   reset(): void {
-    const { scene } = this.sceneViews;
-    if (!scene) return;
+    if (!this.scene) return;
     this.hasUserMoved = true;
-    this.lookFrom(scene.world_from_camera);
+    this.lookFrom(this.scene.world_from_camera);
   }
 
   /** Looks along a camera's axis, upright, and orbits the point on it that is closest to the scene's center. */
@@ -178,7 +182,7 @@ export class OrbitView {
     const pose = worldFromCamera(rowMajor);
     const eye = new THREE.Vector3().setFromMatrixPosition(pose);
     const forward = new THREE.Vector3().setFromMatrixColumn(pose, 2);
-    this.jump(eye, eye.clone().addScaledVector(forward, this.sceneViews.distanceAhead(eye, forward)));
+    this.jump({ eye, target: eye.clone().addScaledVector(forward, this.sceneViews.distanceAhead(eye, forward)) });
   }
 
   /** Looks at everything from above, or from the front of the robot. */
@@ -186,13 +190,13 @@ export class OrbitView {
     const view = this.sceneViews.along(direction);
     if (!view) return;
     this.hasUserMoved = true;
-    this.jump(view.eye, view.target);
+    this.jump(view);
   }
 
   /** Looks from another place, which need not be reachable. A view that follows the robot continues from there. */
-  private jump(eye: THREE.Vector3, target: THREE.Vector3): void {
+  private jump(viewpoint: Viewpoint): void {
     this.attachment.endRide();
-    this.motion.jump({ eye, target });
+    this.motion.jump(viewpoint);
   }
 
   /** Looks from the keyframe closest to the current view. */
@@ -214,7 +218,7 @@ export class OrbitView {
   showPathView(view: PathView): void {
     this.fovDegrees = view.fovDegrees;
     this.hasUserMoved = true;
-    this.jump(view.position, view.target);
+    this.jump({ eye: view.position, target: view.target });
   }
 
   /** The current view, for the camera path. */
@@ -247,9 +251,10 @@ export class OrbitView {
   /** Returns to a view. A ride begins once the pose of its camera is known. All other views are upright. */
   restore({ position, target, mode, fovDegrees, attachedTo }: ViewState): void {
     this.attachment.end();
+    if (this.isCut) this.isCut = false; // It depends on the view.
     this.flies = mode === "fly";
     if (fovDegrees !== undefined) this.fovDegrees = fovDegrees;
-    this.jump(new THREE.Vector3(...position), new THREE.Vector3(...target));
+    this.jump({ eye: new THREE.Vector3(...position), target: new THREE.Vector3(...target) });
     if (mode === "chase") this.attachment.startChase(true);
     if (mode === "chase" && attachedTo !== undefined) this.attachment.frame = attachedTo;
     if (mode === "ride" && attachedTo !== undefined) this.attachment.startRide(attachedTo);

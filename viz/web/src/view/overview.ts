@@ -1,6 +1,6 @@
 // Views of everything: from where the bounds of the scene, the robot and its path fill the picture.
 
-import { Box3, type Matrix4, Vector3 } from "three";
+import { Box3, type Matrix4, Quaternion, Vector3 } from "three";
 import type { Scene } from "../connection/protocol";
 import { worldFromCamera } from "./convention";
 import type { Viewpoint } from "./eye_guard";
@@ -18,10 +18,11 @@ const MIN_DISTANCE_M = 0.05;
 /** A camera that looks down more steeply than this has the heading of the upper edge of its image. */
 const MIN_HORIZONTAL = 0.3;
 
-/** Vertical field of view, and width by height. */
+/** Vertical field of view, width by height, and the direction that points up in the picture. */
 export interface Lens {
   fovDegrees: number;
   aspect: number;
+  up: Vector3;
 }
 
 /** The relevant parts of a scene. */
@@ -63,10 +64,14 @@ export function frontDirection(robotHeadingRad: number | null): Vector3 {
   return new Vector3(-Math.cos(robotHeadingRad), -Math.sin(robotHeadingRad), 0);
 }
 
-/** The closest viewpoint in a direction from which all points are in the picture. The target is amid them. */
-export function viewOf(points: Vector3[], direction: Vector3, { fovDegrees, aspect }: Lens): Viewpoint {
-  const forward = direction.clone().normalize();
-  const right = forward.clone().cross(new Vector3(0, 0, 1)).normalize();
+/**
+ * The closest viewpoint from which all points are in the picture. The direction is given for a world that is z up; if
+ * another direction points up, it turns with it. The target is amid the points.
+ */
+export function viewOf(points: Vector3[], direction: Vector3, { fovDegrees, aspect, up: upInWorld }: Lens): Viewpoint {
+  const upright = new Quaternion().setFromUnitVectors(new Vector3(0, 0, 1), upInWorld);
+  const forward = direction.clone().normalize().applyQuaternion(upright);
+  const right = forward.clone().cross(upInWorld).normalize();
   const up = right.clone().cross(forward);
   const tangent = Math.tan((fovDegrees * Math.PI) / 360) * FILLED_FRAC;
   const depths = points.map((point) => point.dot(forward));

@@ -98,6 +98,7 @@ export class SceneViews {
   }
 
   private get lens(): Lens {
-    return { fovDegrees: this.camera.fov, aspect: this.camera.aspect };
+    const { fov, aspect, up } = this.camera;
+    return { fovDegrees: fov, aspect, up };
   }
 }
