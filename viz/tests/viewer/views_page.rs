@@ -129,7 +129,7 @@ fn cube(half_m: f64) -> SceneBounds {
 
 fn corners(bounds: &SceneBounds) -> Vec<Point3<f64>> {
     let side = |bit: usize, ix: usize| {
-        if ix >> bit & 1 == 0 {
+        if (ix >> bit) & 1 == 0 {
             bounds.min_m
         } else {
             bounds.max_m
