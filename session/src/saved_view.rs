@@ -1,16 +1,15 @@
 //! Shows saved models to viewers: their cameras, scores and initial view.
 
 use crate::model_source::report;
-use crate::{camera_list, methods, model_source, scene_hint, served_files, viewers};
+use crate::scene_hint::SceneView;
+use crate::{camera_list, methods, model_source, served_files, viewers};
 use gpu::Gpu;
 use kinematics::Transform;
 use nalgebra::Point3;
 use serde_json::Value;
 use std::path::{Path, PathBuf};
 use trainer::{Bounds, LoadedModel, ModelKind, Progress};
-use viz::{
-    Hub, Identity, KeyframePose, ModelStatus, OperatorStatus, SceneHint, StateProgress, Status,
-};
+use viz::{Hub, Identity, KeyframePose, ModelStatus, OperatorStatus, StateProgress, Status};
 
 /// Publishes the cameras, the status and the initial view of saved models.
 ///
@@ -24,13 +23,7 @@ pub fn publish_saved(
     model_from_page: &Transform,
 ) -> anyhow::Result<()> {
     let cameras = cameras(paths);
-    // Without cameras, the page needs another initial view, from outside the model. The bounds of a
-    // model take time, so they are only computed then.
-    let bounds = if cameras.is_empty() {
-        bounds(models)?
-    } else {
-        None
-    };
+    let bounds = bounds(models)?;
     let mut notes = viewers::gpu_notes(gpu);
     let mut statuses = Vec::new();
     for (path, model) in paths.iter().zip(&*models) {
@@ -55,8 +48,8 @@ pub fn publish_saved(
         ..Status::default()
     };
     let cameras = in_page(cameras, model_from_page);
-    if let Some(hint) = first_view(&cameras, bounds, model_from_page) {
-        hub.set_scene_hint(hint);
+    if let Some(view) = first_view(&cameras, bounds, model_from_page) {
+        view.publish(hub);
     }
     hub.set_keyframes(cameras);
     hub.set_status(status);
@@ -130,26 +123,25 @@ fn bounds(models: &mut [LoadedModel]) -> anyhow::Result<Option<Bounds>> {
     Ok(None)
 }
 
-/// The initial view: from the first camera or, without cameras, from outside the model; `None` for
-/// an empty model.
+/// The extent of the model, and the view of its first camera; `None` for an empty model.
 fn first_view(
     cameras: &[KeyframePose],
     bounds: Option<Bounds>,
     model_from_page: &Transform,
-) -> Option<SceneHint> {
-    let poses = cameras
+) -> Option<SceneView> {
+    let poses: Vec<_> = cameras
         .iter()
         .map(|camera| camera.world_from_camera)
         .collect();
-    scene_hint::from_cameras(poses).or_else(|| {
-        let bounds = bounds?;
+    let in_page = bounds.map(|bounds| {
         // The frame of the page may differ from that of the model.
         let center = model_from_page.inverse() * Point3::from(bounds.center_m);
-        Some(scene_hint::from_bounds(&Bounds {
+        Bounds {
             center_m: center.coords.into(),
             ..bounds
-        }))
-    })
+        }
+    });
+    SceneView::of_model(&poses, in_page.as_ref())
 }
 
 /// Size and scores of a model at the end of its training.

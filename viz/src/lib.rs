@@ -49,8 +49,8 @@ pub use topics::operator_status::{
     RequestedCheckpoint,
 };
 pub use topics::published_data::{
-    FileLink, Grade, Guidance, KeyframePose, ModelSource, ModelStatus, RunResult, SceneHint,
-    SourceKind, StateProgress, Status, Verdict,
+    FileLink, Grade, Guidance, KeyframePose, ModelSource, ModelStatus, RunResult, SceneBounds,
+    SceneHint, SourceKind, StateProgress, Status, Verdict,
 };
 pub use topics::robot_description::{MeshFormat, RobotDescription, RobotMesh};
 

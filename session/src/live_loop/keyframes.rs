@@ -2,16 +2,12 @@
 
 use super::{IDLE, LiveLoop, Pace};
 use crate::ledger::KeyframeTimes;
-use crate::scene_hint;
 use capture::{Change, FeedItem, InputTimes};
 use keyframe::{Keyframe, Split};
 use kinematics::Stamp;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-/// Minimum number of keyframes that determine the first view of the scene. With few keyframes, the
-/// optical axes may not yet determine a common point; a view that changes later disturbs operators.
-const HINT_KEYFRAMES: usize = 5;
 /// Polling period while waiting for a keyframe or a picture request. It delays pictures and
 /// keyframes by at most this time; a shorter one would use more of a processor.
 const POLL_PERIOD: Duration = Duration::from_millis(2);
@@ -73,13 +69,7 @@ impl LiveLoop {
         if accepted.len() != n_before {
             self.publishing
                 .publish_keyframes(accepted, &self.models.sessions[0]);
-            // After these keyframes, the first view is final: later ones must not move the view of
-            // operators.
-            if accepted.len() <= self.start_keyframes.max(HINT_KEYFRAMES)
-                && let Some(hint) = scene_hint::from_keyframes(accepted)
-            {
-                self.hub.set_scene_hint(hint);
-            }
+            self.scene.publish(accepted, &self.hub);
         }
         Ok(())
     }

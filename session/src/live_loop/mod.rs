@@ -1,5 +1,6 @@
 //! The loop of a live run: takes keyframes, trains models, and draws pictures for viewers.
 
+mod growing_scene;
 mod keyframe_warning;
 mod keyframes;
 mod models;
@@ -12,10 +13,10 @@ use crate::ledger::Ledger;
 use crate::recoveries::{self, OpenGpu, Recoveries};
 use crate::render_budget::RenderBudget;
 use crate::run_state::RunState;
-use crate::scene_hint;
 use crate::session::{EndViewers, Session};
 use background::Task;
 use capture::{Feed, InputResult, Notes};
+use growing_scene::GrowingScene;
 use keyframe::Keyframe;
 use keyframe_warning::KeyframeWarning;
 use keyframes::AcceptedKeyframes;
@@ -62,6 +63,7 @@ pub struct LiveLoop {
     pace: Pace,
     start_keyframes: usize,
     accepted: AcceptedKeyframes,
+    scene: GrowingScene,
     budget: RenderBudget,
     recoveries: Recoveries,
     /// Times of the keyframes.
@@ -94,6 +96,7 @@ impl LiveLoop {
             pace: options.pace,
             start_keyframes: options.start_keyframes,
             accepted: AcceptedKeyframes::default(),
+            scene: GrowingScene::default(),
             budget: RenderBudget::new(is_software),
             recoveries: Recoveries::new(options.open_gpu),
             ledger: Ledger::default(),
@@ -108,9 +111,7 @@ impl LiveLoop {
         self.accepted.list = keyframes;
         self.publishing
             .publish_keyframes(&self.accepted.list, &self.models.sessions[0]);
-        if let Some(hint) = scene_hint::from_keyframes(&self.accepted.list) {
-            self.hub.set_scene_hint(hint);
-        }
+        self.scene.publish(&self.accepted.list, &self.hub);
         self
     }
 

@@ -4,7 +4,7 @@ use crate::client::protocol::{DepthFormat, ProjectionMessage};
 use crate::clock::ServerClock;
 use crate::pose::row_major;
 use crate::server::access::Role;
-use crate::topics::published_data::{KeyframePose, SceneHint, Status};
+use crate::topics::published_data::{KeyframePose, PublishedScene, SceneBounds, Status};
 use crate::topics::robot_description::{RobotMessage, RobotStateMessage};
 use axum::extract::ws::Message;
 use keyframe::LiveImage;
@@ -39,6 +39,8 @@ pub(crate) enum ServerMessage<'a> {
         center_m: [f64; 3],
         radius_m: f64,
         world_from_camera: [f64; 16],
+        #[serde(skip_serializing_if = "Option::is_none")]
+        bounds: Option<SceneBounds>,
     },
     /// Poses of all stored keyframes.
     Keyframes { keyframes: Vec<KeyframeMessage<'a>> },
@@ -119,12 +121,13 @@ impl<'a> NumberedKeyframe<'a> {
     }
 }
 
-impl From<&SceneHint> for ServerMessage<'_> {
-    fn from(hint: &SceneHint) -> Self {
+impl From<&PublishedScene> for ServerMessage<'_> {
+    fn from(PublishedScene { hint, bounds }: &PublishedScene) -> Self {
         Self::Scene {
             center_m: hint.center_m,
             radius_m: hint.radius_m,
             world_from_camera: row_major(&hint.world_from_camera),
+            bounds: *bounds,
         }
     }
 }

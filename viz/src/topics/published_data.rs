@@ -265,6 +265,23 @@ pub struct SceneHint {
     pub world_from_camera: Transform,
 }
 
+/// A box along the axes of the world that contains the relevant parts of a scene.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize)]
+pub struct SceneBounds {
+    /// Corner with the smallest coordinates, meters.
+    pub min_m: [f64; 3],
+    /// Corner with the largest coordinates, meters.
+    pub max_m: [f64; 3],
+}
+
+/// What is known about a scene.
+#[derive(Clone, Debug, PartialEq)]
+pub(crate) struct PublishedScene {
+    pub(crate) hint: SceneHint,
+    /// `None` if only the hint is known: clients then begin with its view.
+    pub(crate) bounds: Option<SceneBounds>,
+}
+
 /// Pose and lens of an accepted keyframe, drawn as a frustum.
 #[derive(Clone, Debug, PartialEq)]
 pub struct KeyframePose {

@@ -19,9 +19,9 @@ use viz::{Hub, ModelStatus, SceneHint, Server, ServerConfig, Status};
 
 const WINDOW_PX: [u32; 2] = [900, 440];
 /// Inner sides of the walls, and a pillar in the room: corners, meters.
-const ROOM: [[f64; 3]; 2] = [[-2.0, -1.5, 0.0], [2.0, 1.5, 2.4]];
+pub(crate) const ROOM: [[f64; 3]; 2] = [[-2.0, -1.5, 0.0], [2.0, 1.5, 2.4]];
 const PILLAR: [[f64; 3]; 2] = [[0.4, -0.3, 0.0], [0.8, 0.3, 2.4]];
-const WALL_M: f64 = 0.2;
+pub(crate) const WALL_M: f64 = 0.2;
 const RADIUS_M: f64 = 2.0;
 /// Of the page: 0.005 times the radius.
 const NEAR_M: f64 = 0.01;
@@ -30,7 +30,7 @@ const REST: Duration = Duration::from_millis(450);
 const FIRST_EYE: Point3<f64> = Point3::new(-1.0, 0.6, 1.2);
 
 /// Distance of a point in the room to the nearest surface; negative in and behind walls.
-fn clearance(point: Vector3<f64>) -> f64 {
+pub(crate) fn clearance(point: Vector3<f64>) -> f64 {
     let inside = |[min, max]: [[f64; 3]; 2]| {
         (0..3)
             .map(|axis| (point[axis] - min[axis]).min(max[axis] - point[axis]))
@@ -98,7 +98,7 @@ fn draw(request: &RenderRequest, has_pillar: bool) -> Picture {
 }
 
 /// Draws the room on a thread, and records the requests for the main view.
-struct Renderer {
+pub(crate) struct Renderer {
     requests: Arc<Mutex<Vec<RenderRequest>>>,
     n_panoramas: Arc<AtomicUsize>,
     has_panoramas: Arc<AtomicBool>,
@@ -149,7 +149,7 @@ impl Renderer {
             .collect()
     }
 
-    fn last(&self) -> RenderRequest {
+    pub(crate) fn last(&self) -> RenderRequest {
         self.requests
             .lock()
             .expect("no panic")
@@ -158,7 +158,7 @@ impl Renderer {
             .clone()
     }
 
-    fn eye(&self) -> Vector3<f64> {
+    pub(crate) fn eye(&self) -> Vector3<f64> {
         self.last().world_from_camera.translation.vector
     }
 
@@ -171,10 +171,10 @@ impl Renderer {
 static BROWSER: Mutex<()> = Mutex::new(());
 
 /// The page in the room.
-struct Page {
+pub(crate) struct Page {
     _alone: MutexGuard<'static, ()>,
-    browser: Browser,
-    renderer: Renderer,
+    pub(crate) browser: Browser,
+    pub(crate) renderer: Renderer,
     hub: Hub,
     profile: PathBuf,
     _server: Server,
@@ -182,7 +182,7 @@ struct Page {
 
 impl Page {
     /// `None` without Chromium.
-    fn open(name: &str, has_panoramas: bool, radius_m: f64) -> Option<Self> {
+    pub(crate) fn open(name: &str, has_panoramas: bool, radius_m: f64) -> Option<Self> {
         let program = browser_for_page()?;
         let alone = BROWSER.lock().unwrap_or_else(PoisonError::into_inner);
         let hub = Hub::new();
@@ -222,7 +222,7 @@ impl Page {
     }
 
     /// Waits until the view is at rest and shown in full.
-    fn rest(&mut self) {
+    pub(crate) fn rest(&mut self) {
         self.browser.next_frame();
         let mut n_requests = usize::MAX;
         let renderer = &self.renderer;
@@ -311,7 +311,7 @@ impl Page {
         });
     }
 
-    fn close(self) {
+    pub(crate) fn close(self) {
         let Self {
             browser,
             renderer,

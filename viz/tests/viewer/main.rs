@@ -34,3 +34,4 @@ mod slow;
 mod tls;
 mod unsupported_page;
 mod video_page;
+mod views_page;

@@ -20,7 +20,8 @@ use trainer::{ChunkData, ChunkLayout, ModelChunk, ModelChunks};
 use viz::{
     Advice, CheckpointState, Control, ControlRequest, EditAction, Error, Hub, Identity,
     ImageCounts, KeyframePose, KeyframeStore, LiveImage, LivePixels, ModelStatus, ObservationMap,
-    ObservedCell, OperatorStatus, PendingRender, RangeScan, RequestedCheckpoint, SceneHint, Server,
+    ObservedCell, OperatorStatus, PendingRender, RangeScan, RequestedCheckpoint, SceneBounds,
+    SceneHint, Server,
     ServerConfig, Status,
 };
 
@@ -661,11 +662,16 @@ fn one_of_each() -> Vec<Value> {
         operator: full_operator_status(),
         ..Status::default()
     });
-    hub.set_scene_hint(SceneHint {
+    let hint = SceneHint {
         center_m: [0.0; 3],
         radius_m: 1.0,
         world_from_camera: Transform::identity(),
-    });
+    };
+    let bounds = SceneBounds {
+        min_m: [-0.6, -0.5, 0.0],
+        max_m: [0.6, 0.5, 0.4],
+    };
+    hub.set_scene(hint, bounds);
     let mut client = Client::connect(server.address());
     hub.set_robot(robot::description());
     hub.set_robot_state(robot::state(0.0));

@@ -261,14 +261,27 @@ fn check_pivot(browser: &mut Browser, run: &Run) {
     });
 }
 
-/// The buttons for the views from above and from the front.
+/// The buttons for the views from above and from the front of the robot. Afterwards, the view is
+/// along y again, from below the robot's arm.
 fn check_views(browser: &mut Browser, run: &Run) {
-    for (button, forward) in [("look-top", -Vector3::z()), ("look-front", Vector3::y())] {
+    let base = robot::state(0.0).world_from_base;
+    let front = -(base.rotation * Vector3::x());
+    for (button, forward) in [("look-top", -Vector3::z()), ("look-front", front)] {
         browser.click(button);
         full_request(browser, run, button, |request| {
             (request.world_from_camera.rotation * Vector3::z() - forward).norm() < 0.01
         });
     }
+    browser.click("reset-view");
+    let [left, top, width, height] = canvas_bounds(browser).map(u32::cast_signed);
+    let [x, y] = [left + width / 2, top + height / 2];
+    browser.mouse("mousePressed", [x, y]);
+    (1..=3).for_each(|step| browser.mouse("mouseMoved", [x, y - 10 * step]));
+    browser.mouse("mouseReleased", [x, y - 30]);
+    full_request(browser, run, "a lower view along y", |request| {
+        let forward = request.world_from_camera.rotation * Vector3::z();
+        forward.z > 0.1 && forward.x.abs() < 1e-6
+    });
 }
 
 /// The axes of a link are drawn where it is, although they lie inside its body.
@@ -419,31 +432,20 @@ fn check_crop(browser: &mut Browser, run: &Run) {
     });
 }
 
-/// The view follows the arm.
+/// The view follows the base, but not the arm.
 fn check_follow(browser: &mut Browser, run: &Run) {
-    let tip = |angle: f64| {
-        let chain = Chain::from_urdf(robot::URDF, "pedestal", "arm").expect("a chain");
-        (robot::state(angle).world_from_base * chain.forward(&[angle]).expect("a pose"))
-            .translation
-            .vector
-    };
-    // The last joint rotates the arm about its own axis, so that the origin of its link stays.
-    assert!((tip(0.9) - tip(0.2)).norm() < 1e-9);
-    let before = full_request(browser, run, "a full picture", |_| true)
-        .world_from_camera
-        .translation
-        .vector;
+    let eye = |request: &RenderRequest| request.world_from_camera.translation.vector;
+    let before = eye(&full_request(browser, run, "a full picture", |_| true));
     browser.click("toggle-follow");
     run.rotate_to(0.2);
     std::thread::sleep(Duration::from_millis(300));
+    let resting = eye(&full_request(browser, run, "a full picture", |_| true));
+    assert!((resting - before).norm() < 1e-6, "the arm moves alone");
     run.move_base(0.25);
     full_request(
         browser,
         run,
         "a view that has moved with the base",
-        |request| {
-            let moved = request.world_from_camera.translation.vector - before;
-            (moved - Vector3::new(0.25, 0.0, 0.0)).norm() < 1e-3
-        },
+        |request| (eye(request) - before - Vector3::new(0.25, 0.0, 0.0)).norm() < 1e-3,
     );
 }

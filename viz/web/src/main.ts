@@ -47,6 +47,7 @@ import { setUpToolbar } from "./panels/toolbar";
 import { Tooltip } from "./panels/tooltip";
 import { TrainingPanel } from "./panels/training_panel";
 import { setUpSavePicture } from "./view/save_picture";
+import { ViewControls } from "./view/view_controls";
 import { ViewSettings } from "./view/view_settings";
 
 let stages = [0.1, 0.5, 1];
@@ -163,6 +164,7 @@ const browser = new KeyframeBrowser({
   radiusM: () => sceneRadiusM,
 });
 const coverage = new CoverageHint({ view, topic: observations, live: () => liveImages.latest });
+const viewControls = new ViewControls(view, images);
 
 function openView(): OrbitView {
   if (!document.createElement("canvas").getContext("webgl2")) {
@@ -298,6 +300,7 @@ toggle("toggle-fly", "y", (isOn) => {
   view.flies = isOn;
   setFlying(isOn);
 });
+action("look-overview", "0 Home", () => view.showOverview());
 action("reset-view", "r", () => view.reset());
 action("full-screen", "u", () => {
   if (document.fullscreenElement) void document.exitFullscreen();
@@ -307,10 +310,7 @@ setUpHelp();
 action("look-top", "t", () => view.lookAlong("top"));
 action("look-front", "f", () => view.lookAlong("front"));
 action("look-nearest", "n", () => browser.toggle());
-action("look-live", "c", () => {
-  const pose = liveImages.latest?.world_from_camera;
-  if (pose) view.lookFrom(pose);
-});
+action("look-live", "c", () => viewControls.rideNext());
 element("look-live", HTMLButtonElement).disabled = true;
 toggle("toggle-model", "m", (isOn) => {
   showsModel = isOn;
@@ -341,6 +341,7 @@ action("toggle-edit", "q", () => {
   if (!button.hidden && !button.disabled) togglePanel("toggle-edit");
 });
 action("undo-edit", "z", () => edits.undoLast());
+toggle("toggle-cut", "3", (isOn) => (view.isCut = isOn));
 toggle("toggle-follow", "l", (isOn) => (view.follows = isOn));
 toggle("toggle-points", "p", (isOn) => (points.shown = isOn));
 toggle("toggle-scans", "s", (isOn) => (scans.shown = isOn));
@@ -371,6 +372,7 @@ function frame(): void {
     surroundings.tick(() => view.view(), models.method, view.isFlyingOrStopped);
   }
   view.draw();
+  viewControls.update();
   requestAnimationFrame(frame);
 }
 requestAnimationFrame(frame);

@@ -60,7 +60,8 @@ function setState(layer: RobotLayer, joints: number[]): void {
 test("links follow the joint positions and the pose of the base", () => {
   const layer = layerOf(ROBOT);
   assert.deepEqual(layer.linkPoses(), [], "the state is unknown");
-  assert.equal(layer.tip, null);
+  assert.equal(layer.linkPose("base"), null);
+  assert.ok(layer.box().isEmpty());
   setState(layer, [Math.PI / 2, -Math.PI / 2]);
   const found = positions(layer);
   assertClose(found.base!, [10, 20, 0], 1e-9);
@@ -69,7 +70,11 @@ test("links follow the joint positions and the pose of the base", () => {
   assertClose(found.lower!, [10, 22, 1], 1e-9);
   // The angles cancel each other: the gripper slides along world x.
   assertClose(found.gripper!, [10 + 0.25 * Math.PI + 0.1, 22, 1], 1e-9);
-  assertClose(layer.tip!.toArray(), [10, 22, 1], 1e-9);
+  // The last joint of the list moves the link "lower".
+  assert.deepEqual(layer.namedLinks, { base: "base", tool: "lower" });
+  const tool = new Vector3().setFromMatrixPosition(layer.linkPose("lower")!);
+  assertClose(tool.toArray(), [10, 22, 1], 1e-9);
+  assertClose(layer.box().min.toArray(), [10, 20, -0.5], 1e-9);
 });
 
 test("a joint can mimic a joint that mimics another one", () => {

@@ -32,7 +32,8 @@ function setUp(capabilities: string[], extra: Topic[] = []) {
     send: (message: ClientMessage) => messages.push(message as SubscribeMessage),
   };
   const layer = { clear: () => undefined, renew: () => undefined };
-  const view = { overlays: { forgetLive: () => undefined }, scans: layer, points: layer, local: layer };
+  const attachment = { forgetCameras: () => undefined };
+  const view = { overlays: { forgetLive: () => undefined }, attachment, scans: layer, points: layer, local: layer };
   const images = { resized: new Map<string, boolean>(), forget: () => undefined };
   const changed = (): void => topics.update();
   const given = <T>(value: unknown): T => value as T;

@@ -218,6 +218,8 @@ export interface Scene {
   center_m: [number, number, number];
   radius_m: number;
   world_from_camera: number[];
+  /** The relevant parts, without the robot; missing on older servers, whose center and radius show only the first keyframes. */
+  bounds?: { min_m: [number, number, number]; max_m: [number, number, number] };
 }
 
 /** Pose and lens of a camera at one moment; enough to draw its frustum. */

@@ -1,6 +1,6 @@
 // Finds the keyframe whose frustum was clicked.
 
-import { Matrix4, Vector3 } from "three";
+import { type Matrix4, Vector3 } from "three";
 import type { PosedCamera } from "../connection/protocol";
 import type { View } from "../connection/render_scheduler";
 import { worldFromCamera } from "../view/convention";

@@ -90,7 +90,9 @@ export class LocalCopy {
       view.projection.focal_px[1] * scale[1]!,
     ];
     const depthRange: [number, number] = [view.near_m, view.far_m];
-    this.splats.setView(worldFromCamera(view.world_from_camera), this.worldFromModel, sizePx, focalPx, depthRange);
+    const worldFromEye = worldFromCamera(view.world_from_camera);
+    this.meshes.setView(worldFromEye, view.near_m);
+    this.splats.setView(worldFromEye, this.worldFromModel, sizePx, focalPx, depthRange);
   }
 
   /**

@@ -11,7 +11,9 @@ const BYTES_PER_VERTEX = 9;
 
 export class MeshLayer {
   readonly root = new THREE.Group();
-  private readonly planes: THREE.Plane[] = [];
+  /** Of the crop box, and in front of the eye. */
+  private readonly planes: THREE.Plane[] = [new THREE.Plane(new THREE.Vector3(), 1)];
+  private readonly near = this.planes[0]!;
   private readonly material: THREE.MeshBasicMaterial;
   private readonly chunks = new Map<number, THREE.Mesh>();
 
@@ -68,7 +70,7 @@ export class MeshLayer {
   hit(from: THREE.Vector3, direction: THREE.Vector3, maxM: number): { distance: number; normal: THREE.Vector3 } | null {
     this.root.updateMatrixWorld();
     const hits = new THREE.Raycaster(from, direction, 0, maxM).intersectObjects(this.root.children, false);
-    const hit = hits.find(({ point }) => this.planes.every((plane) => plane.distanceToPoint(point) >= 0));
+    const hit = hits.find(({ point }) => this.planes.every((plane) => plane === this.near || plane.distanceToPoint(point) >= 0));
     if (!hit?.face) return null;
     return { distance: hit.distance, normal: hit.face.normal.clone().transformDirection(hit.object.matrixWorld) };
   }
@@ -85,7 +87,14 @@ export class MeshLayer {
           ];
         })
       : [];
-    this.planes.splice(0, this.planes.length, ...planes);
+    this.planes.splice(0, this.planes.length, this.near, ...planes);
+  }
+
+  /** Draws only what is at least this deep in the view of a camera, in fieldrig's convention. */
+  setView(worldFromCamera: THREE.Matrix4, nearM: number): void {
+    const forward = new THREE.Vector3().setFromMatrixColumn(worldFromCamera, 2);
+    const eye = new THREE.Vector3().setFromMatrixPosition(worldFromCamera);
+    this.near.set(forward, -forward.dot(eye) - nearM);
   }
 }
 

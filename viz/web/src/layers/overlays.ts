@@ -15,6 +15,9 @@ const AGE_SECS = 10;
 const LIVE_COLOR = 0x4cc2a6;
 const SELECTED_COLOR = 0xe3b341;
 
+/** Length of the frustums of keyframes, at most: in a hall, longer ones would hide each other. */
+const MAX_FRUSTUM_M = 0.2;
+
 /** A pose in the world. */
 export interface PosedFrame {
   worldFromFrame: THREE.Matrix4;
@@ -76,7 +79,7 @@ export class Overlays {
 
   /** Creates grid and axes for a scene of this size. */
   setScene(scene: Scene): void {
-    this.frustumDepth = 0.12 * scene.radius_m;
+    this.frustumDepth = Math.min(0.12 * scene.radius_m, MAX_FRUSTUM_M);
     // A round cell size close to a fifth of the radius.
     const cell = 10 ** Math.round(Math.log10(scene.radius_m / 5));
     const nCells = 2 * Math.ceil((1.6 * scene.radius_m) / cell);

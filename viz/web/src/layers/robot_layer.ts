@@ -5,14 +5,13 @@ import { ColladaLoader } from "three/examples/jsm/loaders/ColladaLoader.js";
 import { OBJLoader } from "three/examples/jsm/loaders/OBJLoader.js";
 import { STLLoader } from "three/examples/jsm/loaders/STLLoader.js";
 import { worldFromCamera as matrixOf } from "../view/convention";
-import { type Occlusion, SOLID } from "./occlusion";
+import { LinkLook } from "./link_look";
+import type { Occlusion } from "./occlusion";
 import type { PosedFrame } from "./overlays";
 import type { Robot, RobotJoint, RobotShape, RobotState } from "../connection/protocol";
 
 /** Color of shapes without one. */
 const DEFAULT_COLOR = [0.72, 0.75, 0.79, 1] as const;
-/** Opacity while the state is outdated. */
-const OUTDATED_OPACITY = 0.35;
 const N_SEGMENTS = 48;
 
 interface MovingJoint {
@@ -28,9 +27,7 @@ export class RobotLayer {
   private described = "";
   private joints: MovingJoint[] = [];
   private readonly links = new Map<string, THREE.Group>();
-  private readonly materials = new Map<string, THREE.MeshLambertMaterial>();
-  /** Writes only depth, so that a faint robot does not show its own inside. */
-  private readonly depthOnly: THREE.MeshBasicMaterial;
+  private readonly looks = new Map<string, LinkLook>();
   private base: THREE.Group | null = null;
   private isOutdated = false;
   private isEnabled = true;
@@ -39,8 +36,6 @@ export class RobotLayer {
   constructor(private readonly occlusion: Occlusion, private readonly changed: () => void) {
     this.root.visible = false;
     this.root.matrixAutoUpdate = false;
-    const material = new THREE.MeshBasicMaterial({ colorWrite: false, side: THREE.DoubleSide, visible: false });
-    this.depthOnly = this.occlusion.apply(material, SOLID);
   }
 
   /** Whether the robot is drawn once its state is known. */
@@ -64,7 +59,10 @@ export class RobotLayer {
     for (const { name, shapes } of robot.links) {
       const link = new THREE.Group();
       link.name = name;
-      for (const shape of shapes) this.addShape(link, shape);
+      const look = new LinkLook(this.occlusion);
+      look.outdated = this.isOutdated;
+      this.looks.set(name, look);
+      for (const shape of shapes) this.addShape(link, look, shape);
       this.links.set(name, link);
     }
     const children = new Set<string>();
@@ -109,13 +107,36 @@ export class RobotLayer {
     this.changed();
   }
 
-  /** Position of the last link that the joints move; null if the state is unknown. */
-  get tip(): THREE.Vector3 | null {
-    if (!this.robot || !this.hasState) return null;
+  /** The link whose pose is sent, and the last link that the joints move; null before the robot is known. */
+  get namedLinks(): { base: string; tool: string } | null {
+    if (!this.robot) return null;
     const last = this.robot.joint_names.at(-1);
-    const child = this.robot.joints.find((joint) => joint.name === last)?.child ?? this.robot.base_link;
-    const link = this.links.get(child);
-    return link ? new THREE.Vector3().setFromMatrixPosition(link.matrixWorld) : null;
+    const child = this.robot.joints.find((joint) => joint.name === last)?.child;
+    return { base: this.robot.base_link, tool: child ?? this.robot.base_link };
+  }
+
+  /** Names of all links. */
+  get linkNames(): string[] {
+    return [...this.links.keys()];
+  }
+
+  /** Pose of a link in the world; null if it is unknown. */
+  linkPose(name: string): THREE.Matrix4 | null {
+    return (this.hasState && this.links.get(name)?.matrixWorld) || null;
+  }
+
+  /** A box around the robot in the world; empty if its state is unknown. */
+  box(): THREE.Box3 {
+    const box = new THREE.Box3();
+    if (!this.hasState) return box;
+    box.setFromObject(this.root);
+    for (const link of this.links.values()) box.expandByPoint(new THREE.Vector3().setFromMatrixPosition(link.matrixWorld));
+    return box;
+  }
+
+  /** Fades the links that are close to the eye. */
+  fadeNear(eye: THREE.Vector3): void {
+    for (const look of this.looks.values()) look.fadeNear(eye);
   }
 
   /** Poses of the links in the world; none if the state is unknown. */
@@ -129,8 +150,7 @@ export class RobotLayer {
   setOutdated(isOutdated: boolean): void {
     if (isOutdated === this.isOutdated) return;
     this.isOutdated = isOutdated;
-    for (const material of this.materials.values()) this.fade(material);
-    this.depthOnly.visible = isOutdated;
+    for (const look of this.looks.values()) look.outdated = isOutdated;
     this.changed();
   }
 
@@ -140,37 +160,38 @@ export class RobotLayer {
     });
     this.root.clear();
     this.links.clear();
+    this.looks.clear();
     this.joints = [];
     this.hasState = false;
     this.root.visible = false;
   }
 
-  private addShape(link: THREE.Group, shape: RobotShape): void {
+  private addShape(link: THREE.Group, look: LinkLook, shape: RobotShape): void {
     const pose = new THREE.Group();
     pose.matrixAutoUpdate = false;
     pose.matrix.copy(matrixOf(shape.link_from_shape));
     link.add(pose);
-    const material = this.material(shape.color_srgba ?? DEFAULT_COLOR);
+    const material = look.material(shape.color_srgba ?? DEFAULT_COLOR);
     if (shape.kind === "mesh") {
       pose.scale.set(...shape.scale);
       pose.matrix.scale(pose.scale);
-      void this.loadMesh(pose, shape.url, shape.format, material);
+      void this.loadMesh(pose, look, shape, material);
     } else {
-      this.addMesh(pose, geometryOf(shape), material);
+      addMesh(pose, look, geometryOf(shape), material);
     }
   }
 
   private async loadMesh(
     pose: THREE.Group,
-    url: string,
-    format: "stl" | "dae" | "obj",
+    look: LinkLook,
+    { url, format }: RobotShape & { kind: "mesh" },
     material: THREE.MeshLambertMaterial,
   ): Promise<void> {
     try {
       if (format === "stl") {
-        this.addMesh(pose, await new STLLoader().loadAsync(url), material);
+        addMesh(pose, look, await new STLLoader().loadAsync(url), material);
       } else if (format === "obj") {
-        this.addObject(pose, await new OBJLoader().loadAsync(url), () => material);
+        addObject(pose, look, await new OBJLoader().loadAsync(url), () => material);
       } else {
         const collada = await new ColladaLoader().loadAsync(url);
         if (!collada) throw new Error("not a COLLADA file");
@@ -178,9 +199,9 @@ export class RobotLayer {
         collada.scene.rotation.set(0, 0, 0);
         const own = (old: THREE.Material): THREE.Material => {
           const color = (old as THREE.MeshPhongMaterial).color;
-          return color ? this.material([color.r, color.g, color.b, 1]) : material;
+          return color ? look.material([color.r, color.g, color.b, 1]) : material;
         };
-        this.addObject(pose, collada.scene, own);
+        addObject(pose, look, collada.scene, own);
       }
     } catch (error) {
       console.warn(`cannot draw the mesh ${url}: ${String(error)}`);
@@ -188,51 +209,30 @@ export class RobotLayer {
     this.root.updateMatrixWorld(true);
     this.changed();
   }
+}
 
-  private addMesh(parent: THREE.Object3D, geometry: THREE.BufferGeometry, material: THREE.Material): void {
-    parent.add(new THREE.Mesh(geometry, material), new THREE.Mesh(geometry, this.depthOnly));
-  }
+function addMesh(parent: THREE.Object3D, look: LinkLook, geometry: THREE.BufferGeometry, material: THREE.Material): void {
+  const mesh = new THREE.Mesh(geometry, material);
+  parent.add(mesh, look.add(mesh));
+}
 
-  /** Adds the meshes of a loaded file with materials that hide occluded fragments. */
-  private addObject(
-    parent: THREE.Object3D,
-    object: THREE.Object3D,
-    replace: (old: THREE.Material) => THREE.Material,
-  ): void {
-    const meshes: THREE.Mesh[] = [];
-    object.traverse((part) => {
-      if (part instanceof THREE.Mesh) meshes.push(part);
-    });
-    for (const mesh of meshes) {
-      const old = mesh.material as THREE.Material | THREE.Material[];
-      mesh.material = Array.isArray(old) ? old.map(replace) : replace(old);
-      mesh.add(new THREE.Mesh(mesh.geometry, this.depthOnly));
-    }
-    parent.add(object);
+/** Adds the meshes of a loaded file with materials that hide occluded fragments. */
+function addObject(
+  parent: THREE.Object3D,
+  look: LinkLook,
+  object: THREE.Object3D,
+  replace: (old: THREE.Material) => THREE.Material,
+): void {
+  const meshes: THREE.Mesh[] = [];
+  object.traverse((part) => {
+    if (part instanceof THREE.Mesh) meshes.push(part);
+  });
+  for (const mesh of meshes) {
+    const old = mesh.material as THREE.Material | THREE.Material[];
+    mesh.material = Array.isArray(old) ? old.map(replace) : replace(old);
+    mesh.add(look.add(mesh));
   }
-
-  /** Shapes of one color share a material. */
-  private material(color: readonly number[]): THREE.MeshLambertMaterial {
-    const key = color.map((channel) => channel.toFixed(3)).join();
-    let material = this.materials.get(key);
-    if (!material) {
-      const [red, green, blue, opacity] = color as [number, number, number, number];
-      material = this.occlusion.apply(
-        new THREE.MeshLambertMaterial({ color: new THREE.Color(red, green, blue), side: THREE.DoubleSide }),
-        SOLID,
-      );
-      material.userData.opacity = opacity;
-      this.fade(material);
-      this.materials.set(key, material);
-    }
-    return material;
-  }
-
-  private fade(material: THREE.MeshLambertMaterial): void {
-    const opacity = (material.userData.opacity as number) * (this.isOutdated ? OUTDATED_OPACITY : 1);
-    material.opacity = opacity;
-    material.transparent = opacity < 1;
-  }
+  parent.add(object);
 }
 
 /** Position of a joint, following the joints that it mimics. */

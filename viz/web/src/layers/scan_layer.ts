@@ -98,6 +98,11 @@ export class ScanLayer {
     this.path.geometry = new THREE.BufferGeometry().setFromPoints(points.map((point) => new THREE.Vector3(...point)));
   }
 
+  /** A box around the path, in world; empty without a path. */
+  get pathBox(): THREE.Box3 {
+    return this.hasPath ? new THREE.Box3().setFromObject(this.path) : new THREE.Box3();
+  }
+
   /** Removes all scans. */
   clear(): void {
     for (const scanner of [...this.byScanner.keys()]) this.remove(scanner);

@@ -2,6 +2,7 @@
 
 import { element } from "./element";
 import type { LiveImageHeader } from "../connection/protocol";
+import { markRidden, rideButton } from "./ride_button";
 import type { ServerClock } from "../connection/server_clock";
 
 /** Older images are not labeled live. */
@@ -25,6 +26,9 @@ interface Slot {
 export class LiveImages {
   /** Cameras whose image has been enlarged, and whether it still is. */
   readonly resized = new Map<string, boolean>();
+  /** Called when the user wants the view to ride on a camera, or to leave it. */
+  ride: (camera: string) => void = () => undefined;
+  private riddenCamera: string | null = null;
   private isEnabled = true;
   private hasDock = true;
   /** Cameras whose image the user has moved to the side panel. */
@@ -129,7 +133,7 @@ export class LiveImages {
     const age = document.createElement("span");
     name.textContent = camera;
     const dock = document.createElement("button");
-    caption.append(name, age, dock);
+    caption.append(name, age, dock, rideButton(camera, this.ridden === camera, () => this.ride(camera)));
     figure.append(canvas, caption);
     figure.dataset.camera = camera;
     figure.addEventListener("click", () => {
@@ -146,6 +150,20 @@ export class LiveImages {
     this.place(slot);
     this.slots.set(camera, slot);
     return slot;
+  }
+
+  /** The camera that the view rides on; null if there is none. */
+  get ridden(): string | null {
+    return this.riddenCamera;
+  }
+
+  set ridden(ridden: string | null) {
+    if (ridden === this.riddenCamera) return;
+    this.riddenCamera = ridden;
+    for (const [camera, { figure }] of this.slots) markRidden(figure, camera === ridden);
+    // Its images have a rate of their own from now on.
+    if (ridden !== null && !this.resized.has(ridden)) this.resized.set(ridden, false);
+    this.onResize();
   }
 
   private showAges(): void {

@@ -8,6 +8,8 @@ import { on, type Subscription, type Topic } from "./topic";
 
 /** An image is labeled live for half a second. */
 const HZ = 4;
+/** The view moves with the poses of the camera that it rides on. */
+const RIDDEN_HZ = 12;
 /** Limits of the height of camera images, in CSS pixels: see `.live canvas` in app.css. */
 const IMAGE_HEIGHT = { min: 90, max: 190, ofWindow: 0.22 };
 const MAX_IMAGE_WIDTH_PX = 640;
@@ -27,6 +29,7 @@ export class LiveImagesTopic implements Topic {
       this.latest = header;
       element("look-live", HTMLButtonElement).disabled = false;
       const posed = { ...header, world_from_camera: header.world_from_camera };
+      this.view.attachment.seen(posed);
       const hasMoved = this.view.overlays.setLiveCamera(posed, header.captured_millis);
       if (hasMoved) this.view.changed();
     }),
@@ -60,13 +63,18 @@ export class LiveImagesTopic implements Topic {
     const sizePx = (isLarge: boolean): [number, number] => (isLarge || this.fillsView ? ENLARGED_PX : this.thumbnailPx());
     return [
       { rate_hz: HZ, size_px: sizePx(false) },
-      ...cameras.map(([camera, isEnlarged]) => ({ rate_hz: HZ, camera, size_px: sizePx(isEnlarged && this.isShown) })),
+      ...cameras.map(([camera, isEnlarged]) => ({
+        rate_hz: camera === this.images.ridden ? RIDDEN_HZ : HZ,
+        camera,
+        size_px: sizePx(isEnlarged && this.isShown),
+      })),
     ];
   }
 
   restart(): void {
     this.images.forget();
     this.view.overlays.forgetLive();
+    this.view.attachment.forgetCameras();
   }
 
   private thumbnailPx(): [number, number] {

@@ -21,7 +21,6 @@ export function robotTopic(view: OrbitView, age: RobotAge): Topic {
       on<RobotState>("robot_state", (message) => {
         view.robot.setState(message);
         age.received(message);
-        view.follow();
       }),
     ],
     subscriptions: (isHidden) => [{ rate_hz: isHidden ? 0 : HZ }],

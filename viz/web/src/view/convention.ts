@@ -19,6 +19,11 @@ export function worldFromCamera(rowMajor: number[]): Matrix4 {
   return new Matrix4().fromArray(rowMajor).transpose();
 }
 
+/** Pose of a three.js camera that sees what a fieldrig camera sees, from 16 numbers, row major. */
+export function worldFromThreeCamera(rowMajor: number[]): Matrix4 {
+  return worldFromCamera(rowMajor).multiply(THREE_FROM_OURS);
+}
+
 /** Lens of a three.js camera for a picture of this size: square pixels, principal point in the center. */
 export function pinholeOfThreeCamera(camera: PerspectiveCamera, [width, height]: [number, number]): Pinhole {
   const halfAngle = (camera.fov * Math.PI) / 360;

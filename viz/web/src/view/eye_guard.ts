@@ -40,6 +40,8 @@ export class EyeGuard {
   private hasGood = false;
   /** Whether maps of all directions arrive. Others do not show whether the eye has passed a surface beside it. */
   private hasComplete = false;
+  /** Whether the last motion that was limited ended at a surface, and not at the edge of unknown space. */
+  isStoppedBySurface = false;
 
   constructor(private readonly hitMesh: HitMesh) {}
 
@@ -77,6 +79,7 @@ export class EyeGuard {
     const from = this.trail.at(-1)?.eye;
     if (!from || from.equals(to)) return to;
     const first = this.march(from, to);
+    this.isStoppedBySurface = first.isSurface;
     if (!first.normal || !slides) return first.eye;
     const rest = to.clone().sub(first.eye);
     const into = Math.min(0, rest.dot(first.normal));
@@ -111,7 +114,7 @@ export class EyeGuard {
   }
 
   /** Moves until a surface is too close. Motions away from surfaces are always possible. */
-  private march(from: Vector3, to: Vector3): { eye: Vector3; normal: Vector3 | null } {
+  private march(from: Vector3, to: Vector3): { eye: Vector3; normal: Vector3 | null; isSurface: boolean } {
     const margin = this.marginM;
     const motion = to.clone().sub(from);
     const length = motion.length();
@@ -124,16 +127,16 @@ export class EyeGuard {
     let eye = from.clone();
     for (let step = 1; step <= n; step++) {
       const next = from.clone().addScaledVector(motion, step / n);
-      if (hit && (length * step) / n > hit.distance - margin) return { eye, normal: hit.normal };
+      if (hit && (length * step) / n > hit.distance - margin) return { eye, normal: hit.normal, isSurface: true };
       // Out of unknown space, there is a way back to where the surroundings were seen from.
       const isBack = !wasKnown && complete && next.distanceTo(complete.origin) < eye.distanceTo(complete.origin);
-      if (complete && !isBack && !this.isKnown(next)) return { eye, normal: null };
+      if (complete && !isBack && !this.isKnown(next)) return { eye, normal: null, isSurface: false };
       for (const { map, minM } of maps) {
-        if (this.clearanceOfBall(map, next) < minM) return { eye, normal: this.normal(map, eye) };
+        if (this.clearanceOfBall(map, next) < minM) return { eye, normal: this.normal(map, eye), isSurface: true };
       }
       eye = next;
     }
-    return { eye: n > 0 ? to : from, normal: null };
+    return { eye: n > 0 ? to : from, normal: null, isSurface: false };
   }
 
   /** Whether a point is visible from the origin of a map in all directions, or in front of a surface in a picture. */

@@ -2,12 +2,18 @@
 
 import * as THREE from "three";
 import { OrbitControls } from "three/examples/jsm/controls/OrbitControls.js";
-import { pinholeOfThreeCamera, poseOfThreeCamera, worldFromCamera } from "./convention";
+import { type ArrowPlace, arrowPlace } from "./robot_arrow";
+import { Attachment } from "./attachment";
+import { type Block, canBeCut } from "./block";
+import { worldFromCamera } from "./convention";
 import type { PathView } from "./camera_path";
 import { CropBox } from "./crop_box";
+import { Cut } from "./cut";
 import { type DepthMap, PictureDepthMap } from "../layers/depth_map";
-import { EyeGuard, type Viewpoint } from "./eye_guard";
+import type { Viewpoint } from "./eye_guard";
+import { EyeMotion } from "./eye_motion";
 import { FlyControls } from "./fly_controls";
+import { hiddenDistanceM } from "./hidden_robot";
 import { FrameLayer } from "../layers/frame_layer";
 import { LocalModel } from "../layers/local_model";
 import { MeasureTool } from "./measure";
@@ -15,25 +21,24 @@ import { ObservationLayer } from "../layers/observation_layer";
 import { Occlusion, type OcclusionDepth } from "../layers/occlusion";
 import { Overlays } from "../layers/overlays";
 import { PictureLayer } from "../layers/picture_layer";
+import { PictureSurface } from "./picture_surface";
 import { PointsLayer } from "../layers/points_layer";
 import type { PosedCamera, Scene } from "../connection/protocol";
 import type { View } from "../connection/render_scheduler";
 import { RobotLayer } from "../layers/robot_layer";
 import { ScanLayer } from "../layers/scan_layer";
+import { SceneViews } from "./scene_views";
 import type { ServerClock } from "../connection/server_clock";
-import { surfacePoint } from "./surface_picker";
+import { cameraAlong, viewOfCamera } from "./view_request";
+import type { ViewMode, ViewState } from "./view_state";
+import { turnControls } from "./up_axis";
 import { listenToViewKeys } from "./view_keys";
-import { outsideView, turnControls, uprightRotation } from "./up_axis";
 
 const VERTICAL_FOV_DEGREES = 50;
-/** Duration of the motion back to the front of a surface. */
-const RETURN_MILLIS = 250;
-/** Closer to surfaces than this, in radii of the scene, new surroundings of the eye are needed: older ones are too coarse. */
+/** Closer to surfaces than this, in sizes of details, new surroundings of the eye are needed: older ones are too coarse. */
 const NEAR_SHARE = 1 / 2;
-/** The same holds for this long after the eye has come closer to its target or was stopped. */
-const APPROACH_MILLIS = 1000;
-/** An orbit changes the distance to the target by rounding errors; an approach to less than this part of it. */
-const MIN_APPROACH = 1 - 1e-6;
+/** A wall that has stopped the eye within this time is what the cut is for. */
+const CUT_WALL_MILLIS = 10_000;
 /** The color --ground in app.css. */
 export const BACKGROUND: [number, number, number] = [0x0b / 255, 0x0e / 255, 0x13 / 255];
 
@@ -54,23 +59,24 @@ export class OrbitView {
   private readonly renderer: THREE.WebGLRenderer;
   private readonly controls: OrbitControls;
   private readonly fly: FlyControls;
-  private readonly guard = new EyeGuard((from, direction, maxM) => this.local.hit(from, direction, maxM));
-  /** The viewpoint after the last motion. */
-  private readonly viewpoint: Viewpoint = { eye: new THREE.Vector3(), target: new THREE.Vector3() };
-  private isPlacing = false;
-  /** When the eye last came closer to its target, and when a surface or unknown space last stopped it. */
-  private approachedAt = -Infinity;
-  private stoppedAt = -Infinity;
-  private returning: { from: Viewpoint; to: Viewpoint; began: number } | null = null;
+  private readonly motion: EyeMotion;
+  /** What the view moves with. */
+  readonly attachment: Attachment;
+  private readonly sceneViews: SceneViews;
+  private readonly cut = new Cut();
+  private readonly surface: PictureSurface;
   /** The part of the scene to draw. */
   readonly crop: CropBox;
   readonly measure: MeasureTool;
   /** Larger windows are rendered at this width and upscaled. */
   maxPictureWidthPx = 1280;
-  private followed: THREE.Vector3 | null = null;
-  private followsRobot = false;
-  private scene: Scene | null = null;
+  /** Where to draw the arrow to the robot; null while the robot is in the picture. */
+  arrow: ArrowPlace | null = null;
+  /** Until then, the view shows everything, or the first view of an older server. */
   private hasUserMoved = false;
+  private hasAskedForOverview = false;
+  /** Distance of the robot from the eye of the overview if the model hides it, meters; otherwise null. */
+  private hiddenRobotM: number | null = null;
   private isStale = true;
   private isModelShown = true;
   /** Whether another direction than the server's points up. */
@@ -89,21 +95,26 @@ export class OrbitView {
     this.renderer.setPixelRatio(Math.min(devicePixelRatio, 2));
     this.camera.up.set(0, 0, 1);
     this.camera.position.set(1, -1, 1);
+    this.surface = new PictureSurface(this.picture, this.camera, canvas);
     this.controls = new OrbitControls(this.camera, canvas);
-    this.controls.addEventListener("change", () => this.moved());
     listenToViewKeys(canvas, this.controls);
-    this.fly = new FlyControls(this.camera, this.controls.target, canvas, () => {
-      this.hasUserMoved = true;
-      this.moved();
-    });
+    this.motion = new EyeMotion(
+      this.camera,
+      this.controls,
+      (from, direction, maxM) => this.local.hit(from, direction, maxM),
+      () => this.isModelShown && !this.isCut,
+      (isByUser) => this.hasMoved(isByUser),
+    );
+    this.sceneViews = new SceneViews(this.camera, this.robot, this.scans);
+    this.attachment = new Attachment(this.camera, this.controls.target, this.motion, this.robot, this.sceneViews);
+    this.fly = new FlyControls(this.camera, this.controls.target, canvas, () => this.motion.moved());
     this.crop = new CropBox(this.camera, canvas, () => {
       this.isStale = true;
       this.forgetSurroundings();
       onMove();
     });
-    this.measure = new MeasureTool(this.camera, canvas, (x, y) => this.surfaceAt(x, y), () => this.changed());
+    this.measure = new MeasureTool(this.camera, canvas, (x, y) => this.surface.at(x, y), () => this.changed());
     this.world.add(this.crop.root, this.measure.root);
-    this.controls.addEventListener("start", () => (this.hasUserMoved = true));
     this.renderer.autoClear = false;
     this.background.add(this.picture.mesh, this.local.root);
     this.renderer.localClippingEnabled = true;
@@ -127,40 +138,61 @@ export class OrbitView {
     this.changed();
   }
 
-  /** Adopts a scene; the camera moves to its initial view unless the user has moved it. */
+  /** Adopts a scene. Until the user moves the view, it shows everything, or the first view of an older server. */
   setScene(scene: Scene): void {
     const isNew = JSON.stringify(scene) !== JSON.stringify(this.scene);
-    this.scene = scene;
+    this.sceneViews.scene = scene;
     if (!isNew) return;
     this.isStale = true;
     this.overlays.setScene(scene);
-    this.frames.radiusM = scene.radius_m;
+    const { detailM } = this.sceneViews;
+    this.frames.radiusM = detailM;
     this.crop.setScene(scene);
-    this.camera.near = Math.max(0.005 * scene.radius_m, 0.005);
+    this.camera.near = Math.max(0.005 * detailM, 0.005);
     this.camera.far = 400 * this.camera.near + 40 * scene.radius_m;
     this.camera.updateProjectionMatrix();
     this.controls.minDistance = 2 * this.camera.near;
     this.controls.maxDistance = 12 * scene.radius_m;
-    this.guard.nearM = this.camera.near;
-    this.fly.radiusM = scene.radius_m;
-    if (!this.hasUserMoved) this.reset();
+    this.motion.nearM = this.camera.near;
+    this.fly.radiusM = detailM;
+    if (!this.hasUserMoved && !this.keepsOverview) this.lookFrom(scene.world_from_camera);
   }
 
-  /** Returns to the scene's initial view. */
+  private get scene(): Scene | null {
+    return this.sceneViews.scene;
+  }
+
+  /** Shows everything: the scene, the robot and its path. The view stays so until the user moves it. */
+  showOverview(): void {
+    this.attachment.end();
+    this.hasUserMoved = false;
+    this.hasAskedForOverview = true;
+    this.sceneViews.restartOverview();
+  }
+
+  /** Whether the view shows everything until the user moves it. */
+  private get keepsOverview(): boolean {
+    return !this.hasUserMoved && (this.hasAskedForOverview || this.scene?.bounds !== undefined);
+  }
+
+  /** Returns to the view of the first camera. */
   reset(): void {
     if (!this.scene) return;
     // The server's view is upright only for its own direction of up.
-    if (this.isTurned) this.jump(outsideView(this.scene, this.camera));
-    else this.lookFrom(this.scene.world_from_camera);
+    if (this.isTurned) {
+      this.showOverview();
+      return;
+    }
+    this.hasUserMoved = true;
+    this.lookFrom(this.scene.world_from_camera);
   }
 
-  /** Turns the view so that this direction of the world points up, and looks at the scene from outside. */
+  /** Turns the view so that this direction of the world points up, and shows everything. */
   turnUp(up: THREE.Vector3): void {
     turnControls(this.controls, up);
     this.isTurned = true;
     this.overlays.setUp(up, this.scene);
-    this.hasUserMoved = true;
-    this.reset();
+    this.showOverview();
   }
 
   /** Looks along a camera's axis, upright, and orbits the point on it that is closest to the scene's center. */
@@ -168,22 +200,21 @@ export class OrbitView {
     const pose = worldFromCamera(rowMajor);
     const eye = new THREE.Vector3().setFromMatrixPosition(pose);
     const forward = new THREE.Vector3().setFromMatrixColumn(pose, 2);
-    const center = new THREE.Vector3(...(this.scene?.center_m ?? [0, 0, 0]));
-    const along = Math.max(center.sub(eye).dot(forward), 0.2 * (this.scene?.radius_m ?? 1));
-    this.jump({ eye, target: eye.clone().addScaledVector(forward, along) });
+    this.jump({ eye, target: eye.clone().addScaledVector(forward, this.sceneViews.distanceAhead(eye, forward)) });
   }
 
-  /** Looks at the center of the scene from this direction. */
+  /** Looks at everything from above, or from the front of the robot. */
   lookAlong(direction: "top" | "front"): void {
-    if (!this.scene) return;
-    const center = new THREE.Vector3(...this.scene.center_m);
-    const halfAngle = (this.camera.fov * Math.PI) / 360;
-    const distance = (1.15 * this.scene.radius_m) / Math.tan(halfAngle) / Math.min(1, this.camera.aspect);
-    // Almost from above: exactly from above, the direction of "up" would be undefined.
-    const from = direction === "top" ? new THREE.Vector3(0, -1e-3, 1) : new THREE.Vector3(0, -1, 0);
-    from.applyQuaternion(uprightRotation(this.camera.up));
+    const view = this.sceneViews.along(direction);
+    if (!view) return;
     this.hasUserMoved = true;
-    this.jump({ eye: center.clone().addScaledVector(from, distance), target: center });
+    this.jump(view);
+  }
+
+  /** Looks from another place, which need not be reachable. A view that follows the robot continues from there. */
+  private jump(viewpoint: Viewpoint): void {
+    this.attachment.endRide();
+    this.motion.jump(viewpoint);
   }
 
   /** Looks from a keyframe. */
@@ -210,176 +241,173 @@ export class OrbitView {
     return { position: this.camera.position, target: this.controls.target, fovDegrees: this.camera.fov };
   }
 
+  /** How the view moves. */
+  get mode(): ViewMode {
+    if (this.fly.enabled) return "fly";
+    if (this.attachment.riddenCamera !== null) return "ride";
+    if (this.attachment.isChasing) return "chase";
+    return this.hasUserMoved ? "orbit" : "overview";
+  }
+
+  /** The current view, so that it can be restored. */
+  state(): ViewState {
+    const { mode } = this;
+    const state: ViewState = {
+      position: this.camera.position.toArray(),
+      target: this.controls.target.toArray(),
+      up: new THREE.Vector3(0, 1, 0).applyQuaternion(this.camera.quaternion).toArray(),
+      mode,
+      fovDegrees: this.attachment.fovDegrees,
+    };
+    const attachedTo = mode === "ride" ? this.attachment.riddenCamera : mode === "chase" ? this.attachment.frame : null;
+    return attachedTo === null ? state : { ...state, attachedTo };
+  }
+
+  /** Returns to a view. A ride begins once the pose of its camera is known. All other views are upright. */
+  restore({ position, target, mode, fovDegrees, attachedTo }: ViewState): void {
+    this.attachment.end();
+    if (this.isCut) this.isCut = false; // It depends on the view.
+    this.flies = mode === "fly";
+    if (fovDegrees !== undefined) this.fovDegrees = fovDegrees;
+    this.jump({ eye: new THREE.Vector3(...position), target: new THREE.Vector3(...target) });
+    if (mode === "chase") this.attachment.startChase(true);
+    if (mode === "chase" && attachedTo !== undefined) this.attachment.frame = attachedTo;
+    if (mode === "ride" && attachedTo !== undefined) this.attachment.startRide(attachedTo);
+    this.hasUserMoved = mode !== "overview";
+  }
+
   /** Vertical field of view, degrees. */
   set fovDegrees(degrees: number) {
     if (degrees === this.camera.fov) return;
+    this.attachment.endRide();
     this.camera.fov = degrees;
     this.camera.updateProjectionMatrix();
+    this.sceneViews.refitOverview();
     this.isStale = true;
     this.onMove();
   }
 
   /** Whether the view flies instead of orbiting a point. */
   set flies(flies: boolean) {
+    if (flies === this.fly.enabled) return;
+    if (flies) this.attachment.end();
     this.fly.enabled = flies;
     this.controls.enabled = !flies;
     // Both look at the target, which is where the surface is, so that an orbit begins without a jump.
-    const ahead = this.surfaceAt(0.5 * this.canvas.clientWidth, 0.5 * this.canvas.clientHeight);
+    const ahead = this.surface.ahead();
     const { position } = this.camera;
     const distance = ahead?.distanceTo(position) ?? this.controls.target.distanceTo(position);
     const forward = this.camera.getWorldDirection(new THREE.Vector3());
     this.controls.target.copy(position).addScaledVector(forward, Math.max(distance, this.controls.minDistance));
-    this.moved();
+    this.motion.moved();
   }
 
   /** Adopts newer knowledge of the model's surfaces, and returns to the front of them if the eye has passed one. */
   see(name: string, map: DepthMap): void {
-    if (!this.isModelShown || this.returning) return;
-    const good = this.guard.see(name, map);
-    if (good) this.returning = { from: this.copyOfViewpoint(), to: good, began: performance.now() };
+    this.motion.see(name, map);
   }
 
   /** Adopts the depth of a new picture. */
   seePicture(): void {
     const { posedDepth } = this.picture;
     if (posedDepth) this.see("picture", new PictureDepthMap(posedDepth));
+    this.hiddenRobotM = this.mode === "overview" ? this.robotBehindModel() : null;
+  }
+
+  /** Distance of the robot if the model hides it; otherwise null. */
+  private robotBehindModel(): number | null {
+    if (!this.isModelShown || !this.occlusion.enabled || this.isCut) return null;
+    return hiddenDistanceM(this.sceneViews.robotBox(), this.camera.position, (point) => this.surface.toward(point));
   }
 
   /** Forgets the surfaces of another model. */
   forgetSurfaces(): void {
-    this.guard.forget();
+    this.motion.forgetSurfaces();
   }
 
   /** Forgets the surroundings of the eye, because newer ones are not requested. */
   forgetSurroundings(): void {
-    this.guard.forgetComplete();
+    this.motion.forgetSurroundings();
   }
 
   /** Whether the user moves the eye in a model of which only pictures show the surfaces. */
   get usesSurroundings(): boolean {
     const isMesh = this.local.root.visible && this.local.hasDepth;
-    return this.isModelShown && this.picture.posedDepth !== null && !this.followsRobot && !isMesh;
+    const isSolid = this.isModelShown && !this.isCut;
+    return isSolid && this.picture.posedDepth !== null && !this.attachment.isOn && !isMesh;
   }
 
   /** Whether the eye may soon be at a surface. */
   get needsSurroundings(): boolean {
-    const isApproaching = performance.now() - this.approachedAt < APPROACH_MILLIS;
-    const nearM = NEAR_SHARE * (this.scene?.radius_m ?? 0);
-    return this.isFlyingOrStopped || isApproaching || !(this.guard.freeRadiusM(this.camera.position) > nearM);
+    const isNear = !(this.motion.freeRadiusM > NEAR_SHARE * this.sceneViews.detailM);
+    return this.isFlyingOrStopped || this.motion.isApproaching || isNear;
   }
 
   /** Whether changes of the model matter to the motion of the eye. */
   get isFlyingOrStopped(): boolean {
-    return this.fly.enabled || performance.now() - this.stoppedAt < APPROACH_MILLIS;
+    return this.fly.enabled || this.motion.wasStopped;
   }
 
-  /** Called after each motion by the user: stops before surfaces. */
-  private moved(): void {
-    if (this.isPlacing) return;
-    const { position } = this.camera;
-    const { target } = this.controls;
-    if (this.returning) {
-      this.place(this.copyOfViewpoint());
-      return;
+  private hasMoved(isByUser: boolean): void {
+    if (isByUser) {
+      this.hasUserMoved = true;
+      this.attachment.endRide();
     }
-    if (position.equals(this.viewpoint.eye) && target.equals(this.viewpoint.target)) return;
-    const isShifted = !target.equals(this.viewpoint.target);
-    const allowed = this.isModelShown ? this.guard.limit(position, isShifted) : position;
-    const isCloser = position.distanceTo(target) < MIN_APPROACH * this.viewpoint.eye.distanceTo(target);
-    if (!isShifted && isCloser) this.approachedAt = performance.now();
-    if (!allowed.equals(position)) {
-      this.stoppedAt = performance.now();
-      // Eye and target move together in shifts; otherwise, the eye moves around the target or toward it.
-      if (isShifted) target.add(allowed).sub(position);
-      position.copy(allowed);
-      this.camera.lookAt(target);
-      if (position.equals(this.viewpoint.eye) && target.equals(this.viewpoint.target)) return;
-    }
-    this.guard.moved(this.adoptViewpoint());
     this.isStale = true;
     this.onMove();
   }
 
-  /** Looks from another place, which need not be reachable. */
-  private jump(viewpoint: Viewpoint): void {
-    this.returning = null;
-    this.place(viewpoint);
-    this.guard.jump(this.viewpoint, false);
+  /** What stopped the eye last or hides the robot, and when; null if there is nothing. */
+  get block(): { what: Block; at: number } | null {
+    const isHidden = this.hiddenRobotM !== null && this.mode === "overview" && !this.isCut;
+    return isHidden ? { what: { by: "model before robot" }, at: performance.now() } : this.motion.block;
   }
 
-  private place({ eye, target }: Viewpoint): void {
-    this.camera.position.copy(eye);
-    this.controls.target.copy(target);
-    this.isPlacing = true;
-    this.controls.update();
-    this.isPlacing = false;
-    this.adoptViewpoint();
+  private get targetDistanceM(): number {
+    return this.camera.position.distanceTo(this.controls.target);
+  }
+
+  /** Whether the part of the model between eye and target is cut away. Surfaces do not stop the eye then. */
+  get isCut(): boolean {
+    return this.cut.isOn;
+  }
+
+  set isCut(isCut: boolean) {
+    const { block } = this;
+    const isAtWall = block !== null && canBeCut(block.what) && performance.now() - block.at < CUT_WALL_MILLIS;
+    const distanceM = this.targetDistanceM;
+    if (!isCut) this.cut.end();
+    else if (block?.what.by === "model before robot") this.cut.beginAt(this.hiddenRobotM ?? distanceM, distanceM);
+    else this.cut.begin(distanceM, this.sceneViews.radiusM, isAtWall);
+    this.hiddenRobotM = null;
+    this.motion.forgetPlaces();
     this.isStale = true;
     this.onMove();
-  }
-
-  /** Moves back to the front of a surface, and ignores other motions meanwhile. */
-  private moveBack(): void {
-    if (!this.returning) return;
-    const { from, to, began } = this.returning;
-    const share = THREE.MathUtils.smoothstep((performance.now() - began) / RETURN_MILLIS, 0, 1);
-    const between = (get: (viewpoint: Viewpoint) => THREE.Vector3): THREE.Vector3 => get(from).clone().lerp(get(to), share);
-    this.place({ eye: between(({ eye }) => eye), target: between(({ target }) => target) });
-    if (share < 1) return;
-    this.returning = null;
-    this.guard.jump(this.viewpoint, true);
-  }
-
-  private adoptViewpoint(): Viewpoint {
-    this.viewpoint.eye.copy(this.camera.position);
-    this.viewpoint.target.copy(this.controls.target);
-    return this.viewpoint;
-  }
-
-  private copyOfViewpoint(): Viewpoint {
-    return { eye: this.viewpoint.eye.clone(), target: this.viewpoint.target.clone() };
-  }
-
-  /** The point of the model's surface at a pixel of the canvas; null if there is none. */
-  private surfaceAt(x: number, y: number): THREE.Vector3 | null {
-    const depth = this.picture.posedDepth;
-    if (!depth) return null;
-    const { clientWidth, clientHeight } = this.canvas;
-    const raycaster = new THREE.Raycaster();
-    raycaster.setFromCamera(
-      new THREE.Vector2((2 * x) / clientWidth - 1, 1 - (2 * y) / clientHeight),
-      this.camera,
-    );
-    return surfacePoint(raycaster.ray, depth, this.camera.near, this.camera.far);
   }
 
   /** Turns toward the surface at a pixel of the canvas, which becomes the center of the orbit. */
   private pivotAt(x: number, y: number): void {
-    const point = this.surfaceAt(x, y);
+    const point = this.surface.at(x, y);
     if (!point) return;
     this.hasUserMoved = true;
     this.controls.target.copy(point);
     this.controls.update();
   }
 
-  /** Whether the camera moves with the robot. */
-  set follows(follows: boolean) {
-    this.followsRobot = follows;
-    this.followed = follows ? this.robot.tip : null;
+  /** Attaches the view to a camera until the user moves it. */
+  ride(camera: string): void {
+    this.flies = false;
+    if (this.isCut) this.isCut = false; // The camera sees what is in front of it.
+    this.hasUserMoved = true;
+    this.attachment.startRide(camera);
   }
 
-  /** Called when the robot has moved. */
-  follow(): void {
-    const tip = this.followsRobot ? this.robot.tip : null;
-    if (!tip) return;
-    if (this.followed && this.followed.distanceTo(tip) > 0) {
-      const motion = tip.clone().sub(this.followed);
-      this.camera.position.add(motion);
-      this.controls.target.add(motion);
-      this.hasUserMoved = true;
-      this.controls.update();
-    }
-    this.followed = tip;
+  /** Whether the view moves with the robot. */
+  set follows(follows: boolean) {
+    this.flies = false;
+    if (!follows) this.attachment.end();
+    else this.attachment.startChase(this.arrow === null);
+    this.hasUserMoved = true;
   }
 
   /** The current view. */
@@ -389,28 +417,13 @@ export class OrbitView {
       Math.max(1, Math.round(this.canvas.width * scale)),
       Math.max(1, Math.round(this.canvas.height * scale)),
     ];
-    return {
-      world_from_camera: poseOfThreeCamera(this.camera),
-      size_px,
-      projection: pinholeOfThreeCamera(this.camera, size_px),
-      near_m: this.camera.near,
-      far_m: this.camera.far,
-      crop: this.crop.crop, // Omitted from the message if undefined.
-    };
+    return viewOfCamera(this.camera, size_px, this.cut.depthM(this.targetDistanceM, this.camera.near), this.crop.crop);
   }
 
   /** The current view from a place on the camera path. */
-  viewAlong({ position, target, fovDegrees }: PathView, [width, height]: [number, number]): View {
-    const camera = new THREE.PerspectiveCamera(fovDegrees, width / height);
-    camera.up.copy(this.camera.up);
-    camera.position.copy(position);
-    camera.lookAt(target);
-    return {
-      ...this.view(),
-      world_from_camera: poseOfThreeCamera(camera),
-      size_px: [width, height],
-      projection: pinholeOfThreeCamera(camera, [width, height]),
-    };
+  viewAlong(along: PathView, sizePx: [number, number]): View {
+    const nearM = this.cut.depthM(along.position.distanceTo(along.target), this.camera.near);
+    return viewOfCamera(cameraAlong(along, sizePx, this.camera), sizePx, nearM, this.crop.crop);
   }
 
   /** Depth at which pixels without any model are placed. */
@@ -432,7 +445,10 @@ export class OrbitView {
   /** Draws only if something has changed: on a robot's computer the page shares the cores with other programs. */
   draw(): void {
     this.fly.update();
-    this.moveBack();
+    this.motion.moveBack();
+    this.attachment.update();
+    const overview = this.keepsOverview ? this.sceneViews.overview() : null;
+    if (overview) this.motion.jump(overview);
     if (!this.isStale) return;
     this.isStale = false;
     const view = this.view();
@@ -450,6 +466,8 @@ export class OrbitView {
     this.occlusion.local = needsSplatDepth ? this.splatDepth(view) : null;
     this.crop.update();
     this.measure.update();
+    this.robot.fadeNear(this.camera.position);
+    this.arrow = arrowPlace(this.sceneViews.robotBox(), this.camera, [this.canvas.clientWidth, this.canvas.clientHeight]);
     if (this.frames.isVisible) {
       const cameras = this.overlays.cameraPoses().map(([name, posed]) => [`camera ${name}`, posed] as const);
       this.frames.update(new Map([...this.robot.linkPoses(), ...cameras]), this.camera);
@@ -484,6 +502,7 @@ export class OrbitView {
     this.renderer.setSize(clientWidth, clientHeight, false);
     this.camera.aspect = clientWidth / Math.max(1, clientHeight);
     this.camera.updateProjectionMatrix();
+    this.sceneViews.refitOverview();
     this.isStale = true;
   }
 }
