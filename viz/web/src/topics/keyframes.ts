@@ -18,12 +18,30 @@ export class KeyframesTopic implements Topic {
     on<KeyframeChanges>("keyframe_changes", (message) => {
       this.list.apply(message);
       this.view.points.setKeyframes(this.list.keyframes);
-      this.view.overlays.setKeyframes(this.list.keyframes);
-      this.view.changed();
+      this.show();
+      this.onChange();
     }),
   ];
+  /** Called after each change of the list. */
+  onChange = (): void => {};
+  private untilNanos: number | null = null;
 
   constructor(private readonly view: OrbitView) {}
+
+  /** Draws only the keyframes up to this time on the clock of the rig; all of them if null. */
+  showUntil(nanos: number | null): void {
+    this.untilNanos = nanos;
+    this.show();
+  }
+
+  private show(): void {
+    const { untilNanos } = this;
+    const all = this.list.keyframes;
+    const shown = untilNanos === null ? all : all.filter((keyframe) => keyframe.stamp_nanos <= untilNanos);
+    this.view.points.showOnly(untilNanos === null ? null : new Set(shown.map((keyframe) => keyframe.id)));
+    this.view.overlays.setKeyframes(shown);
+    this.view.changed();
+  }
 
   subscriptions(isHidden: boolean): { rate_hz: number }[] {
     return [{ rate_hz: isHidden ? 0 : HZ }];

@@ -89,6 +89,19 @@ export class CropBox {
     return { min_m: this.box.min.toArray(), max_m: this.box.max.toArray() };
   }
 
+  /** The box if the user has changed it; null if it still follows the scene. */
+  get changedBox(): Crop | null {
+    return this.hasUserChanged ? this.corners : null;
+  }
+
+  /** Restores a box that the user has changed earlier. */
+  restore({ min_m, max_m }: Crop): void {
+    this.box.set(new THREE.Vector3(...min_m), new THREE.Vector3(...max_m));
+    this.hasUserChanged = true;
+    this.place();
+    this.changed();
+  }
+
   /** Sets the relevant part of the scene. */
   setScene(scene: Scene): void {
     this.radius = scene.radius_m;
