@@ -22,6 +22,7 @@ import { RobotLayer } from "../layers/robot_layer";
 import { ScanLayer } from "../layers/scan_layer";
 import type { ServerClock } from "../connection/server_clock";
 import { surfacePoint } from "./surface_picker";
+import type { ViewState } from "./view_state";
 
 const VERTICAL_FOV_DEGREES = 50;
 /** Duration of the motion back to the front of a surface. */
@@ -193,6 +194,25 @@ export class OrbitView {
   /** The current view, for the camera path. */
   pathView(): PathView {
     return { position: this.camera.position, target: this.controls.target, fovDegrees: this.camera.fov };
+  }
+
+  /** The current view, so that it can be restored. */
+  state(): ViewState {
+    const mode = this.fly.enabled ? "fly" : this.followsRobot ? "chase" : this.hasUserMoved ? "orbit" : "overview";
+    return {
+      position: this.camera.position.toArray(),
+      target: this.controls.target.toArray(),
+      up: this.camera.up.toArray(),
+      mode,
+      fovDegrees: this.camera.fov,
+    };
+  }
+
+  /** Returns to a view. */
+  restore({ position, target, mode, fovDegrees }: ViewState): void {
+    if (fovDegrees !== undefined) this.fovDegrees = fovDegrees;
+    this.hasUserMoved = mode !== "overview";
+    this.jump({ eye: new THREE.Vector3(...position), target: new THREE.Vector3(...target) });
   }
 
   /** Vertical field of view, degrees. */

@@ -1,0 +1,42 @@
+// What is needed to show a view again, as plain data.
+
+/**
+ * How the view moves. `overview`: it shows everything, and follows growing bounds until the user moves. `chase`: it moves
+ * with a frame of the robot. `ride`: it is attached to a camera.
+ */
+export type ViewMode = "overview" | "orbit" | "fly" | "chase" | "ride";
+
+type Point = [number, number, number];
+
+export interface ViewState {
+  /** The eye and the point that it orbits, in world, meters. */
+  position: Point;
+  target: Point;
+  /** Upward direction of the picture, in world. Only while riding on a camera, the view can be tilted sideways. */
+  up: Point;
+  mode: ViewMode;
+  /** Vertical field of view, degrees; without it, the present one stays. */
+  fovDegrees?: number;
+  /** The followed frame in the mode `chase`, the camera in the mode `ride`. */
+  attachedTo?: string;
+}
+
+const MODES: readonly unknown[] = ["overview", "orbit", "fly", "chase", "ride"] satisfies ViewMode[];
+
+/** Whether a value, for example from an address or from the browser's storage, is a view that can be restored. */
+export function isViewState(value: unknown): value is ViewState {
+  if (typeof value !== "object" || value === null) return false;
+  const { position, target, up, mode, fovDegrees, attachedTo } = value as Record<string, unknown>;
+  const isOptional = (field: unknown, type: string): boolean => field === undefined || typeof field === type;
+  return (
+    [position, target, up].every(isPoint) &&
+    MODES.includes(mode) &&
+    isOptional(attachedTo, "string") &&
+    isOptional(fovDegrees, "number") &&
+    !(Number(fovDegrees) <= 0 || Number(fovDegrees) >= 180)
+  );
+}
+
+function isPoint(value: unknown): value is Point {
+  return Array.isArray(value) && value.length === 3 && value.every((coordinate) => Number.isFinite(coordinate));
+}
