@@ -11,6 +11,7 @@ import { LinkReadout } from "./connection/link_readout";
 import { LiveImages } from "./panels/live_images";
 import { ModelSwitch } from "./panels/model_switch";
 import { BACKGROUND, OrbitView } from "./view/orbit_view";
+import { NamedViews } from "./panels/named_views";
 import { panels } from "./panels/panels";
 import type { BinaryHeader, ModelStatus, PictureHeader, Status, TextMessage } from "./connection/protocol";
 import { Readouts } from "./panels/readouts";
@@ -30,6 +31,8 @@ import { RangeScansTopic } from "./topics/range_scans";
 import { robotTopic } from "./topics/robot_state";
 import { statusTopic } from "./topics/status";
 import { Topics } from "./topics/topic";
+import { TimeSlider } from "./panels/time_slider";
+import { ViewMemory } from "./view/view_memory";
 import { ViewSettings } from "./view/view_settings";
 
 let stages = [0.1, 0.5, 1];
@@ -142,6 +145,7 @@ function receiveStatus(status: Status): void {
   banner.setRunResult(status.result);
   showGuidance(status.guidance, banner, liveImages);
   robotAge.hasEnded = banner.isFinished;
+  namedViews.runIs(status);
 }
 
 function receiveText(message: TextMessage): void {
@@ -279,7 +283,13 @@ toggle("toggle-keyframes", "k", (isOn) => (view.overlays.showsKeyframes = isOn))
 toggle("toggle-crop", "x", (isOn) => (view.crop.enabled = isOn));
 toggle("toggle-measure", "d", (isOn) => (view.measure.enabled = isOn));
 toggle("toggle-images", "i", (isOn) => (liveImages.shown = isOn));
-const switchPanel = panels({ "toggle-layers": "layers", "toggle-settings": "settings", "toggle-edit": "edit" });
+const switchPanel = panels({
+  "toggle-layers": "layers",
+  "toggle-settings": "settings",
+  "toggle-edit": "edit",
+  "toggle-views": "views",
+  "toggle-history": "history",
+});
 const togglePanel = (button: string): void => {
   switchPanel(button);
   edits.opened();
@@ -290,6 +300,7 @@ action("toggle-edit", "q", () => {
   const button = element("toggle-edit", HTMLButtonElement);
   if (!button.hidden && !button.disabled) togglePanel("toggle-edit");
 });
+for (const id of ["toggle-views", "toggle-history"]) element(id).addEventListener("click", () => togglePanel(id));
 action("erase-box", "w", () => edits.eraseBox());
 action("remove-floaters", "a", () => edits.removeFloaters());
 action("undo-edit", "z", () => edits.undoLast());
@@ -306,6 +317,11 @@ for (const { id, key, quantity } of TINTS) {
 toggle("toggle-robot", "b", (isOn) => (view.robot.enabled = isOn));
 toggle("toggle-frames", "h", (isOn) => (view.frames.enabled = isOn));
 toggle("toggle-occlude", "o", (isOn) => (view.occlusion.enabled = isOn));
+
+// After all toggles have their listeners, because restoring a view presses them.
+const memory = new ViewMemory(view, settings, models);
+const namedViews = new NamedViews(memory);
+new TimeSlider(keyframes, view);
 
 function frame(): void {
   shownLatency.frameBegins();

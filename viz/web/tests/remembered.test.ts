@@ -9,23 +9,23 @@ import {
   NOTHING,
   onlyView,
   type Remembered,
-  type RememberedView,
   textInFragment,
 } from "../src/view/remembered";
+import type { ViewState } from "../src/view/view_state";
 
-const VIEW: RememberedView = {
-  positionM: [1.25, -0.000001, 12.5],
-  targetM: [0, 0.333333, -4],
+const VIEW: ViewState = {
+  position: [1.25, -0.000001, 12.5],
+  target: [0, 0.333333, -4],
   up: [0, 0, 1],
   fovDegrees: 50,
   mode: "orbit",
 };
 const PATH = [
-  { positionM: [1, 2, 3], targetM: [0, 0, 0], fovDegrees: 40.5 },
-  { positionM: [-1, 2, 3], targetM: [0, 0, 0.5], fovDegrees: 60 },
+  { position: [1, 2, 3], target: [0, 0, 0], fovDegrees: 40.5 },
+  { position: [-1, 2, 3], target: [0, 0, 0.5], fovDegrees: 60 },
 ] satisfies Remembered["path"];
 const ALL: Remembered = {
-  view: { ...VIEW, up: [0, -1, 0], mode: "follow-base", fovDegrees: 71.25 },
+  view: { ...VIEW, up: [0, -1, 0], mode: "chase", attachedTo: "tool0", fovDegrees: 71.25 },
   switched: ["grid", "keyframes"],
   crop: { min_m: [-1, -2, -3], max_m: [1, 2, 3.5] },
   method: "mean_color",
@@ -44,8 +44,13 @@ test("the text needs no escapes in an address, and a usual one is short", () => 
   assert.equal(textInFragment(fragmentWith(encoded(ALL))), encoded(ALL));
 });
 
+test("frames whose names need escapes are left out", () => {
+  const view: ViewState = { ...VIEW, mode: "ride", attachedTo: "wrist camera" };
+  assert.deepEqual(decoded(encoded({ ...NOTHING, view }))?.view, { ...VIEW, mode: "ride" });
+});
+
 test("whole numbers keep their zeros, and zero has no sign", () => {
-  const view = { ...VIEW, positionM: [100, -200, 0.1] as [number, number, number], targetM: [-0, 1e-9, -1e-9] as [number, number, number] };
+  const view: ViewState = { ...VIEW, position: [100, -200, 0.1], target: [-0, 1e-9, -1e-9] };
   assert.equal(encoded({ ...NOTHING, view }), "1~p100_-200_0.1~t0_0_0~f50");
 });
 
@@ -91,8 +96,12 @@ test("hostile and damaged texts give no view, and never fail", () => {
 });
 
 test("valid parts beside damaged ones are kept, with safe defaults", () => {
-  const remembered = decoded("1~p1_2_3~t0_0_0~u0_0_0~m<b>~f999~l?_grid_grid~c1~znew");
-  assert.deepEqual(remembered, { ...NOTHING, view: { ...VIEW, positionM: [1, 2, 3], targetM: [0, 0, 0] }, switched: ["grid"] });
+  const remembered = decoded("1~p1_2_3~t0_0_0~u0_0_0~m<b>~f999~a<i>~l?_grid_grid~c1~znew");
+  assert.deepEqual(remembered, {
+    ...NOTHING,
+    view: { position: [1, 2, 3], target: [0, 0, 0], up: [0, 0, 1], mode: "orbit" },
+    switched: ["grid"],
+  });
 });
 
 test("a cut text is another view at most in its last part", () => {

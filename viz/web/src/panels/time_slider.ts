@@ -8,9 +8,6 @@ import type { KeyframesTopic } from "../topics/keyframes";
 import type { NumberedKeyframe } from "../connection/protocol";
 import type { OrbitView } from "../view/orbit_view";
 
-/** Shows the photograph of a keyframe in a figure, or nothing if there is none. */
-export type ShowPhotograph = (keyframe: NumberedKeyframe | null) => void;
-
 export class TimeSlider {
   private readonly panel = element("history");
   private readonly slider = element("history-time", HTMLInputElement);
@@ -25,7 +22,6 @@ export class TimeSlider {
   constructor(
     private readonly keyframes: KeyframesTopic,
     private readonly view: OrbitView,
-    private readonly showPhotograph: ShowPhotograph,
   ) {
     keyframes.onChange = () => this.listChanged();
     this.slider.addEventListener("input", () => this.choose(this.slider.valueAsNumber));
@@ -50,14 +46,22 @@ export class TimeSlider {
     this.view.overlays.showsKeyframes = this.isOpen || isKeyframeLayerOn();
     this.view.changed();
     if (this.isOpen) this.showSlider();
-    else this.showPhotograph(null);
   }
 
   private listChanged(): void {
+    const before = new Set(this.ordered.map((keyframe) => keyframe.stamp_nanos));
     this.ordered = byTime(this.keyframes.list.keyframes);
+    if (!this.ordered.some((keyframe) => before.has(keyframe.stamp_nanos))) this.forget();
     this.firstNanos = Math.min(this.firstNanos, this.ordered[0]?.stamp_nanos ?? Infinity);
     element("toggle-history").hidden = this.ordered.length < 2;
     if (this.isOpen) this.showSlider();
+  }
+
+  /** Returns to the present: these are the first keyframes, or those of another run. */
+  private forget(): void {
+    this.firstNanos = Infinity;
+    if (this.chosenNanos !== null) this.keyframes.showUntil(null);
+    this.chosenNanos = null;
   }
 
   /** Chooses a keyframe. The last one stands for the present, so that new keyframes are shown again. */
@@ -83,7 +87,6 @@ export class TimeSlider {
     element("history-before", HTMLButtonElement).disabled = ix <= 0;
     element("history-after", HTMLButtonElement).disabled = chosenNanos === null;
     element("history-look", HTMLButtonElement).disabled = !chosen;
-    this.showPhotograph(chosen ?? null);
   }
 
   private textOf(chosen: NumberedKeyframe, ix: number): string {

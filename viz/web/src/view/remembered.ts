@@ -5,29 +5,19 @@
 // and that chat programs keep when they recognize a link: letters, digits, `-`, `.`, `_` and `~`.
 
 import type { Crop } from "./crop_box";
+import { isViewMode, type ViewMode, type ViewState } from "./view_state";
 
-export type Point = [number, number, number];
+type Point = [number, number, number];
 
-/** A camera that looks at a point, in world. */
-export interface RememberedView {
-  positionM: Point;
-  targetM: Point;
-  up: Point;
-  /** Vertical field of view. */
-  fovDegrees: number;
-  /** How the view moves, such as `orbit`. */
-  mode: string;
-}
-
-/** A view of the camera path. */
+/** A view of the camera path: eye and target in world, meters. */
 export interface RememberedPathView {
-  positionM: Point;
-  targetM: Point;
+  position: Point;
+  target: Point;
   fovDegrees: number;
 }
 
 export interface Remembered {
-  view: RememberedView | null;
+  view: ViewState | null;
   /** Names of the switches, such as layers, that are not in their initial state. */
   switched: string[];
   /** The crop box, if the user has changed it. */
@@ -57,18 +47,26 @@ const VIEW_DECIMALS = 6;
 const PATH_DECIMALS = 4;
 
 const NUMBER = /^-?\d{1,6}(\.\d{1,6})?$/;
+/** Names of switches, which are ids of buttons. */
 const NAME = /^[a-z0-9-]{1,32}$/;
 const METHOD = /^[a-z0-9_-]{1,32}$/;
+/** Names of links and cameras with other characters are left out. */
+const FRAME = /^[\w.-]{1,64}$/;
+const UPRIGHT: Point = [0, 0, 1];
+/** Most views orbit, so their texts do not say it. */
+const DEFAULT_MODE: ViewMode = "orbit";
 
 /** Text for [`decoded`]. */
 export function encoded({ view, switched, crop, method, path }: Remembered): string {
   const parts = [VERSION];
   if (view) {
-    parts.push(`p${numbers(view.positionM, VIEW_DECIMALS)}`, `t${numbers(view.targetM, VIEW_DECIMALS)}`);
-    // Most views are upright, and orbit.
+    parts.push(`p${numbers(view.position, VIEW_DECIMALS)}`, `t${numbers(view.target, VIEW_DECIMALS)}`);
     if (view.up.join() !== UPRIGHT.join()) parts.push(`u${numbers(view.up, VIEW_DECIMALS)}`);
-    if (view.mode !== DEFAULT_MODE) parts.push(`m${view.mode}`);
-    parts.push(`f${numbers([view.fovDegrees], 2)}`);
+    const { mode, attachedTo, fovDegrees } = view;
+    const isNamed = attachedTo !== undefined && FRAME.test(attachedTo);
+    if (mode !== DEFAULT_MODE) parts.push(`m${mode}`);
+    if (isNamed) parts.push(`a${attachedTo}`);
+    if (fovDegrees !== undefined) parts.push(`f${numbers([fovDegrees], 2)}`);
   }
   if (switched.length > 0) parts.push(`l${switched.join("_")}`);
   if (crop) parts.push(`c${numbers([...crop.min_m, ...crop.max_m], PATH_DECIMALS)}`);
@@ -77,9 +75,6 @@ export function encoded({ view, switched, crop, method, path }: Remembered): str
   if (views.length > 0) parts.push(`k${views.length}_${numbers(views.flatMap(pathNumbers), PATH_DECIMALS)}`);
   return parts.join("~");
 }
-
-const UPRIGHT: Point = [0, 0, 1];
-const DEFAULT_MODE = "orbit";
 
 /** Reads the text of [`encoded`]; null if it is not of this version or remembers nothing. */
 export function decoded(text: string): Remembered | null {
@@ -120,18 +115,21 @@ export function linkTo({ origin, pathname }: { origin: string; pathname: string 
   return origin + pathname + fragmentWith(text);
 }
 
-function viewOf(part: (letter: string) => string): RememberedView | null {
-  const positionM = pointOf(part("p"));
-  const targetM = pointOf(part("t"));
-  if (!positionM || !targetM || !isLookingAt(positionM, targetM)) return null;
+function viewOf(part: (letter: string) => string): ViewState | null {
+  const position = pointOf(part("p"));
+  const target = pointOf(part("t"));
+  if (!position || !target || !isLookingAt(position, target)) return null;
   const up = pointOf(part("u"));
+  const mode = part("m");
   const fov = numbersOf(part("f"), 1)?.[0];
+  const attachedTo = part("a");
   return {
-    positionM,
-    targetM,
+    position,
+    target,
     up: up && Math.hypot(...up) > 0.5 && Math.hypot(...up) < 2 ? up : UPRIGHT,
-    fovDegrees: fov !== undefined && isFov(fov) ? fov : 50,
-    mode: NAME.test(part("m")) ? part("m") : DEFAULT_MODE,
+    mode: isViewMode(mode) ? mode : DEFAULT_MODE,
+    ...(fov !== undefined && isFov(fov) ? { fovDegrees: fov } : {}),
+    ...(FRAME.test(attachedTo) ? { attachedTo } : {}),
   };
 }
 
@@ -142,8 +140,8 @@ function cropOf(text: string): Crop | null {
   return min_m.every((min, axis) => min < max_m[axis]!) ? { min_m, max_m } : null;
 }
 
-function pathNumbers({ positionM, targetM, fovDegrees }: RememberedPathView): number[] {
-  return [...positionM, ...targetM, fovDegrees];
+function pathNumbers({ position, target, fovDegrees }: RememberedPathView): number[] {
+  return [...position, ...target, fovDegrees];
 }
 
 /** The views of a path; none if any of them is missing or invalid, because the rest would be another path. */
@@ -155,9 +153,9 @@ function pathOf(text: string): RememberedPathView[] {
   if (!values) return [];
   const views = Array.from({ length: nViews }, (_, ix) => {
     const own = values.slice(7 * ix, 7 * (ix + 1));
-    return { positionM: own.slice(0, 3) as Point, targetM: own.slice(3, 6) as Point, fovDegrees: own[6]! };
+    return { position: own.slice(0, 3) as Point, target: own.slice(3, 6) as Point, fovDegrees: own[6]! };
   });
-  const isValid = views.every((view) => isLookingAt(view.positionM, view.targetM) && isFov(view.fovDegrees));
+  const isValid = views.every((view) => isLookingAt(view.position, view.target) && isFov(view.fovDegrees));
   return isValid ? views : [];
 }
 

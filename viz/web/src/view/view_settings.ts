@@ -58,10 +58,10 @@ export class ViewSettings {
     return this.path.all;
   }
 
-  /** Replaces the camera path, for example by that of a link. */
+  /** Replaces the camera path by that of a link, if it has one. Shows the field of view of the link. */
   restorePath(views: readonly PathView[]): void {
     this.edit(() => {
-      this.path.clear();
+      if (views.length > 0) this.path.clear();
       for (const view of views) this.path.add(view);
     });
   }
