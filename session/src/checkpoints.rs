@@ -6,8 +6,8 @@ use anyhow::Context;
 use background::Task;
 use keyframe::Keyframe;
 use messages::{BadInput, Setting};
-use model_files::Edits;
 use model_files::checkpoint::Checkpoint;
+use model_files::{Edits, RunHistory};
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -121,6 +121,8 @@ pub struct Checkpoints {
     writer: Option<WriterThread>,
     /// Whether this run has written a checkpoint.
     has_any: bool,
+    /// Number of images that did not become keyframes so far, by reason.
+    rejected: BTreeMap<String, u64>,
 }
 
 /// A writer thread.
@@ -138,6 +140,8 @@ pub struct Snapshot<'a> {
     pub keyframes: &'a [Arc<Keyframe>],
     /// Erased space.
     pub edits: &'a Edits,
+    /// Training time in seconds and mean PSNR of the test images in dB, in order.
+    pub psnr_history: &'a [(f64, f64)],
     /// Training time, seconds.
     pub seconds: f64,
     /// Whether training has reached its limit.
@@ -158,6 +162,7 @@ impl Checkpoints {
             last_keyframes: Instant::now(),
             writer: None,
             has_any: false,
+            rejected: BTreeMap::new(),
         })
     }
 
@@ -218,6 +223,11 @@ impl Checkpoints {
         Ok(false)
     }
 
+    /// Sets how many images did not become keyframes so far, by reason, for the next checkpoint.
+    pub fn set_rejected(&mut self, rejected: &BTreeMap<String, u64>) {
+        self.rejected.clone_from(rejected);
+    }
+
     /// Makes the next checkpoint due now.
     pub fn request(&mut self) {
         self.due_after = Duration::ZERO;
@@ -244,6 +254,7 @@ impl Checkpoints {
             seconds: now.seconds,
             is_finished: now.is_finished,
             edits: now.edits.clone(),
+            history: RunHistory::new(now.psnr_history, self.rejected.clone()),
             run_flags: self.run_flags.clone(),
             path: self.path.clone(),
             keyframes: self
@@ -324,6 +335,7 @@ pub struct CheckpointWrite {
     seconds: f64,
     is_finished: bool,
     edits: Edits,
+    history: RunHistory,
     run_flags: RunFlags,
     path: PathBuf,
     keyframes: Option<(StoredKeyframes, Vec<Arc<Keyframe>>)>,
@@ -344,6 +356,7 @@ impl CheckpointWrite {
             seconds: self.seconds,
             is_finished: self.is_finished,
             edits: self.edits,
+            history: self.history,
             depth_from,
             flags,
             ..self.pending.finish()?
@@ -405,6 +418,7 @@ mod tests {
             flags: BTreeMap::new(),
             is_finished: false,
             edits: edits_of(1),
+            history: RunHistory::default(),
             state: serde_json::Value::Null,
             arrays: Vec::new(),
         };

@@ -78,6 +78,7 @@ impl Session {
             stop,
             clock,
             previous_secs,
+            previous_psnr,
             initial_points,
             edits,
             scores_stepwise,
@@ -94,7 +95,8 @@ impl Session {
                 kind.name()
             );
         }
-        let mut scoreboard = Scoreboard::new(evaluators, scores_stepwise);
+        let mut scoreboard =
+            Scoreboard::new(evaluators, scores_stepwise).with_history(previous_psnr);
         if let Some(previous_secs) = previous_secs {
             scoreboard.skip_until(previous_secs);
         }
@@ -314,6 +316,7 @@ impl Session {
             method: &mut self.method,
             keyframes: &self.keyframes,
             edits: &self.edits,
+            psnr_history: self.scoreboard.psnr_history(),
             seconds,
             is_finished: false,
         })

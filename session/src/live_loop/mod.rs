@@ -19,6 +19,7 @@ use keyframes::AcceptedKeyframes;
 use models::Models;
 use publishing::Publishing;
 use requests::Requests;
+use std::collections::BTreeMap;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 use trainer::AlignTiming;
@@ -67,6 +68,8 @@ pub struct LiveLoop {
     requests: Requests,
     publishing: Publishing,
     keyframe_warning: KeyframeWarning,
+    /// Number of images that did not become keyframes in earlier parts of the run, by reason.
+    earlier_rejected: BTreeMap<String, u64>,
 }
 
 /// Changes a keyframe before the models receive it.
@@ -92,6 +95,7 @@ impl LiveLoop {
             keyframe_change: None,
             requests: Requests::default(),
             keyframe_warning: KeyframeWarning::start(),
+            earlier_rejected: options.earlier_rejected,
         }
     }
 
@@ -321,6 +325,8 @@ pub struct LiveOptions {
     pub pace: Pace,
     /// Number of keyframes with which training starts.
     pub start_keyframes: usize,
+    /// Number of images that did not become keyframes in earlier parts of the run, by reason.
+    pub earlier_rejected: BTreeMap<String, u64>,
     /// Notes shown on the page.
     pub notes: Vec<String>,
     /// Notes about the devices, which are added during the run and shown, too.

@@ -19,6 +19,7 @@ use drivers::Source;
 use gpu::Gpu;
 use keyframe::Keyframe;
 use kinematics::Stamp;
+use std::collections::BTreeMap;
 use std::path::Path;
 use std::sync::Arc;
 use trainer::{ModelKind, Resumed};
@@ -185,6 +186,9 @@ impl OpenedRun<'_> {
             start_keyframes: rig
                 .join
                 .start_keyframes_or_default(pace == Pace::RealTime, has_depth),
+            earlier_rejected: previous.as_ref().map_or(BTreeMap::new(), |previous| {
+                previous.run.checkpoint.history.rejected().clone()
+            }),
             notes: gpu_notes(&gpu),
             device_notes,
             open_gpu: services.open_gpu,

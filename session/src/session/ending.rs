@@ -243,6 +243,7 @@ impl<P> EndingSession<P> {
             method: &mut session.method,
             keyframes: &session.keyframes,
             edits: &session.edits,
+            psnr_history: session.scoreboard.psnr_history(),
             seconds,
             is_finished,
         });
