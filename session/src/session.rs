@@ -1,6 +1,7 @@
 //! A training session: one model in training, with scheduled evaluations and checkpoints.
 
 mod ending;
+mod growth_log;
 mod options;
 mod outcome;
 mod persistence;
@@ -26,6 +27,7 @@ use crate::training_clock::Clock;
 use calibration::{Alignment, CalibratedCamera, CameraCorrection};
 use capture::Stop;
 use gpu::Gpu;
+use growth_log::GrowthLog;
 use keyframe::Keyframe;
 use kinematics::Stamp;
 use model_files::{Edits, InitialPoints};
@@ -61,6 +63,7 @@ pub struct Session {
     stop: Stop,
     /// Erased space, which is not drawn for viewers. Training and scores ignore it.
     edits: Arc<Edits>,
+    growth_log: GrowthLog,
 }
 
 impl Session {
@@ -112,6 +115,7 @@ impl Session {
             reporter: Reporter::new(kind, observer, data, profiles),
             stop,
             edits: Arc::new(edits),
+            growth_log: GrowthLog::default(),
         }
     }
 
@@ -244,10 +248,8 @@ impl Session {
                 step_millis,
                 ..
             } = self.progress();
-            let change = if is_paused { "is paused" } else { "continues" };
-            log::info!(
-                "growth {change} at {primitives} splats: a step takes {step_millis:.0} ms, limit {MAX_LIVE_STEP_MILLIS} ms"
-            );
+            self.growth_log
+                .changed(is_paused, primitives, step_millis, Instant::now());
             self.persistence
                 .log_growth_pause(&mut self.method, is_paused)?;
         }

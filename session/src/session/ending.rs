@@ -12,6 +12,7 @@ use model_files::Edits;
 use serde::Serialize;
 use std::path::PathBuf;
 use std::sync::Arc;
+use std::time::Instant;
 use trainer::{AlignedModel, ModelKind};
 use viz::Hub;
 
@@ -189,6 +190,9 @@ fn stop_training(session: &mut Session) -> anyhow::Result<f64> {
     session.gpu.wait()?;
     let seconds = session.time.end_secs();
     session.reporter.report_training_ended();
+    if let Some(summary) = session.growth_log.summary(Instant::now()) {
+        log::info!("{summary}");
+    }
     Ok(seconds)
 }
 
