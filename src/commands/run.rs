@@ -99,6 +99,11 @@ pub(super) struct Running {
 /// Runs until a limit, the end of the devices, or Ctrl-C; saves the model, its keyframes and the
 /// effective rig file.
 pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
+    // What follows can take many seconds.
+    log::info!(
+        "reading {}",
+        args.resume.as_ref().unwrap_or(&args.rig_file).display()
+    );
     // The previous run is read before anything else, because its flags decide what this run does.
     let plan = args.plan();
     let previous = plan.previous()?;

@@ -766,7 +766,10 @@ fn printed_commands_work_and_report_page_is_written() {
                 .into_rgb8()
         })
         .collect();
-    // Image, render, error and depth of both test images.
+    // The whole model; then image, render, error and depth of both test images.
+    let (overview, pictures) = pictures.split_first().expect("pictures");
+    assert!(overview.width() > overview.height(), "an overview");
+    assert!(page.contains("<svg class=\"coverage\""), "a map");
     assert_eq!(pictures.len(), 8);
     assert!(
         pictures

@@ -173,6 +173,8 @@ impl LiveLoop {
         // Requests of operators come first, so that the pictures and the status of this cycle
         // already show their effect.
         self.requests.apply_controls(&self.hub, &mut self.models);
+        self.ledger
+            .set_paused(self.requests.is_paused, Instant::now());
         self.record_shown_pictures();
         self.requests.apply_edits(&self.hub, &mut self.models);
         // After a GPU failure, the remaining stages are skipped: each of them would fail, too.

@@ -89,12 +89,20 @@ impl<'a> PreparedRun<'a> {
             training.log_unestimated(available_data(&self.rig), self.parts.gpu.is_software());
         }
         // Compile kernels before the first image, so that keyframes do not wait.
+        log::info!("compiling kernels for {}", self.parts.gpu.describe());
         self.parts
             .models
             .iter_mut()
             .try_for_each(|model| model.method.model_mut().prepare())?;
         // Only now the devices, because their data is used from the first sample on.
         let device_notes = Notes::default();
+        log::info!(
+            "opening the {}",
+            self.parts
+                .plan
+                .recording()
+                .map_or("devices", |_| "recording")
+        );
         let opened = self.parts.plan.open(self.rig)?;
         Ok(OpenedRun {
             opened: opened.with_tag_check(&device_notes)?,

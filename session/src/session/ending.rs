@@ -324,16 +324,18 @@ impl<P: Serialize> SavedSession<P> {
         let outcome = score_at_end(&mut session, seconds, hub)?;
         let method = &mut session.method;
         // Rendered before profiling, because profiling trains the model further.
-        let comparisons =
-            session
-                .reporter
-                .compare(method, session.scoreboard.tests(), &outcome.per_image);
+        let pictures = session.reporter.draw_pictures(
+            method,
+            &session.keyframes,
+            session.scoreboard.tests(),
+            &outcome.per_image,
+        );
         let passes = session.reporter.profile(method.model_mut())?;
         session.reporter.report_end(ScoredModel {
             out: &out,
             checkpoint_sha256: &sha256,
             outcome: &outcome,
-            comparisons,
+            pictures,
             passes,
             cameras: method.model_mut().camera_corrections()?,
             alignment: method.alignment(),
