@@ -1,6 +1,7 @@
 //! Shows saved models to viewers: their cameras, scores and initial view.
 
-use crate::{camera_list, methods, scene_hint, viewers};
+use crate::model_source::report;
+use crate::{camera_list, methods, model_source, scene_hint, served_files, viewers};
 use gpu::Gpu;
 use kinematics::Transform;
 use nalgebra::Point3;
@@ -35,6 +36,7 @@ pub fn publish_saved(
         statuses.push(model_status(path, model));
     }
     let report = paths.first().map_or(Value::Null, |path| report(path));
+    let kinds: Vec<ModelKind> = models.iter().map(|model| model.kind).collect();
     let mut statuses = statuses.into_iter();
     let status = Status {
         state: "viewing".to_owned(),
@@ -42,6 +44,7 @@ pub fn publish_saved(
         keyframes: cameras.len() as u64,
         model: statuses.next().unwrap_or_default(),
         others: statuses.collect(),
+        source: Some(model_source::of_saved(paths, &kinds, model_from_page)),
         notes,
         ..Status::default()
     };
@@ -51,6 +54,10 @@ pub fn publish_saved(
     }
     hub.set_keyframes(cameras);
     hub.set_status(status);
+    viz::publish_files(
+        hub,
+        served_files::of_models(kinds.iter().copied().zip(paths)),
+    );
     Ok(())
 }
 
@@ -102,21 +109,14 @@ fn first_view(
         .map(|camera| camera.world_from_camera)
         .collect();
     scene_hint::from_cameras(poses).or_else(|| {
-        let Bounds { center_m, radius_m } = bounds?;
+        let bounds = bounds?;
         // The frame of the page may differ from that of the model.
-        let center = model_from_page.inverse() * Point3::from(center_m);
+        let center = model_from_page.inverse() * Point3::from(bounds.center_m);
         Some(scene_hint::from_bounds(&Bounds {
             center_m: center.coords.into(),
-            radius_m,
+            ..bounds
         }))
     })
-}
-
-/// The report in a model's folder; `Null` if there is none.
-fn report(model: &Path) -> Value {
-    // Splat files of other programs have no report.
-    let text = files::read_text(&model.join("report.json")).unwrap_or_default();
-    serde_json::from_str(&text).unwrap_or_default()
 }
 
 /// Size and scores of a model at the end of its training.

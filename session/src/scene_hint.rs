@@ -17,9 +17,10 @@ const PRIOR_DISTANCE_M: f64 = 0.5;
 /// meet; a smaller one leaves it undefined for nearly parallel axes.
 const PRIOR_WEIGHT: f64 = 0.01;
 
-/// Distance of an outside view, in radii of the model. Most of the model fits into a field of view
-/// of 50 degrees.
-const DISTANCE_RADII: f64 = 2.0;
+/// Distance of an outside view, in outer radii of the model. The whole sphere is then visible in a
+/// field of view of 50 degrees (`1 / sin(25 degrees)` is 2.4), also on an upright phone whose view is
+/// a quarter narrower than high.
+const DISTANCE_RADII: f64 = 3.0;
 /// Direction from the model to an outside view: from the front right, 30 degrees above the horizon.
 const VIEW_DIRECTION: [f64; 3] = [0.5, -0.707, 0.5];
 
@@ -59,10 +60,10 @@ pub fn from_bounds(bounds: &Bounds) -> SceneHint {
     let axes = Matrix3::from_columns(&[right, forward.cross(&right), forward]);
     let rotation = UnitQuaternion::from_rotation_matrix(&Rotation3::from_matrix_unchecked(axes));
     let position_m =
-        Vector3::from(bounds.center_m) + DISTANCE_RADII * bounds.radius_m * view_direction;
+        Vector3::from(bounds.center_m) + DISTANCE_RADII * bounds.outer_radius_m * view_direction;
     SceneHint {
         center_m: bounds.center_m,
-        radius_m: bounds.radius_m,
+        radius_m: bounds.outer_radius_m,
         world_from_camera: Transform::from_parts(Translation3::from(position_m), rotation),
     }
 }
@@ -131,13 +132,17 @@ mod tests {
         let bounds = Bounds {
             center_m: [1.0, 2.0, 3.0],
             radius_m: 0.5,
+            outer_radius_m: 0.8,
         };
         let pose = from_bounds(&bounds).world_from_camera;
         let center_in_camera = pose.inverse() * Point3::from(bounds.center_m);
         assert!(
-            (center_in_camera - Point3::new(0.0, 0.0, 1.0)).norm() < TOLERANCE_M,
+            (center_in_camera - Point3::new(0.0, 0.0, 2.4)).norm() < TOLERANCE_M,
             "{center_in_camera}"
         );
+        // The edge of the field of view is 25 degrees from the axis.
+        let angle = (bounds.outer_radius_m / center_in_camera.z).asin();
+        assert!(angle < 25_f64.to_radians(), "{angle} rad");
         let right = pose.rotation * Vector3::x();
         let down = pose.rotation * Vector3::y();
         assert!(

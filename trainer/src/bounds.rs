@@ -6,6 +6,12 @@ use numbers::quantile::{Rank, quantile};
 /// With a larger fraction, the initial view shows the background instead of the object; with a
 /// smaller one, it starts inside the scene.
 const INSIDE_FRAC: f64 = 0.8;
+/// Fraction of the points inside the outer radius. It includes thin parts far from the center, such
+/// as the neck of a guitar, but not the strays around a model.
+const OUTER_FRAC: f64 = 0.99;
+/// Maximum outer radius, in radii. If points are farther away, they are the background of a scene
+/// rather than parts of an object, whose farthest parts are rarely beyond twice its radius.
+const MAX_OUTER_RADII: f64 = 2.5;
 /// Minimum radius, meters. A model of a single point needs one, too.
 pub(crate) const MIN_RADIUS_M: f64 = 0.01;
 
@@ -16,6 +22,9 @@ pub struct Bounds {
     pub center_m: [f64; 3],
     /// Meters.
     pub radius_m: f64,
+    /// Radius of a sphere with the same center that contains the whole object, meters. It equals
+    /// `radius_m` if the model has a distant background.
+    pub outer_radius_m: f64,
 }
 
 impl Bounds {
@@ -28,14 +37,17 @@ impl Bounds {
         let middle =
             |axis: usize| quantile(points_m.iter().map(|point| point[axis]).collect(), 0.5);
         let center_m = [middle(0)?, middle(1)?, middle(2)?];
-        let distances_m = points_m
+        let distances_m: Vec<f64> = points_m
             .iter()
             .map(|point_m| distance_m(point_m, center_m))
             .collect();
-        let radius_m = quantile(distances_m, INSIDE_FRAC)?;
+        let radius_m = quantile(distances_m.clone(), INSIDE_FRAC)?.max(MIN_RADIUS_M);
+        let outer_radius_m = quantile(distances_m, OUTER_FRAC)?.max(radius_m);
+        let is_object = outer_radius_m <= MAX_OUTER_RADII * radius_m;
         Some(Self {
             center_m,
-            radius_m: radius_m.max(MIN_RADIUS_M),
+            radius_m,
+            outer_radius_m: if is_object { outer_radius_m } else { radius_m },
         })
     }
 }
@@ -47,4 +59,33 @@ fn distance_m(point_m: &[f64; 3], center_m: [f64; 3]) -> f64 {
         .zip(center_m)
         .map(|(coordinate, center)| (coordinate - center).powi(2));
     squared.sum::<f64>().sqrt()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// A disk of 900 points with radius 1, and 100 points evenly along a line from its edge to
+    /// `reach_m`.
+    fn disk_with_neck(reach_m: f64) -> Vec<[f64; 3]> {
+        let disk = (0..900).map(|ix| {
+            // Filled evenly along a golden-angle spiral.
+            let radius = (f64::from(ix) / 900.0).sqrt();
+            let angle = 2.399_963 * f64::from(ix);
+            [radius * angle.cos(), radius * angle.sin(), 0.0]
+        });
+        let neck = (0..100).map(|ix| [1.0 + (reach_m - 1.0) * f64::from(ix) / 99.0, 0.0, 0.0]);
+        disk.chain(neck).collect()
+    }
+
+    #[test]
+    fn outer_radius_contains_thin_parts_but_no_background() {
+        let guitar = Bounds::of_points(&disk_with_neck(2.0)).expect("points");
+        assert!(
+            guitar.radius_m < 1.1 && guitar.outer_radius_m > 1.8,
+            "{guitar:?}"
+        );
+        let scene = Bounds::of_points(&disk_with_neck(50.0)).expect("points");
+        assert_eq!(scene.outer_radius_m, scene.radius_m, "{scene:?}");
+    }
 }

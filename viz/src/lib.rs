@@ -38,11 +38,13 @@ pub use pictures::picture_requests::{PendingRender, PictureRequests};
 pub use pictures::picture_times::{NewestKeyframe, ShownPicture, TrainedKeyframes};
 pub use server::access::{Role, Token, Tokens};
 pub use server::certificate::Certificate;
+pub use server::downloads::{OpenFile, ServedFile, publish_files};
 pub use server::{Server, ServerConfig, Sharing};
 pub use topics::model_chunks::PublishedChunks;
 pub use topics::observations::{ObservationMap, ObservedCell};
 pub use topics::published_data::{
-    Guidance, KeyframePose, ModelStatus, RunResult, SceneHint, Status,
+    FileLink, Grade, Guidance, KeyframePose, ModelSource, ModelStatus, RunResult, SceneHint,
+    SourceKind, Status, Verdict,
 };
 pub use topics::robot_description::{MeshFormat, RobotDescription, RobotMesh};
 

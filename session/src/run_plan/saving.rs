@@ -8,8 +8,9 @@ use crate::live_loop::LiveLoop;
 use crate::next_commands::DataSource;
 use crate::run_folder::{self, CreatedFolders};
 use crate::session::{self, EndingSession, FinishedModel, Session};
+use crate::verdict::{Findings, ModelScore};
 use crate::viewer::ServedModel;
-use crate::{corrected_rig, recovery};
+use crate::{corrected_rig, recovery, served_files, verdict};
 use capture::config::Rig;
 use capture::{Counts, InputResult, SampleUse, StationReport};
 use keyframe::{Keyframe, Split};
@@ -19,7 +20,7 @@ use std::collections::BTreeMap;
 use std::path::PathBuf;
 use std::sync::{Arc, OnceLock};
 use std::time::Duration;
-use viz::{Hub, RunResult};
+use viz::{Hub, RunResult, Verdict};
 
 /// Name of the rig file with the corrections of a run.
 const CORRECTED_RIG: &str = "corrected-rig.toml";
@@ -33,6 +34,9 @@ pub struct SavedRun {
     pub models: Vec<FinishedModel>,
     hub: Hub,
     data_losses: Vec<String>,
+    /// Number of images that were received, and of those that were dropped before.
+    n_received: u64,
+    n_lost: u64,
     /// Whether the keyframe lists were written.
     listed: anyhow::Result<()>,
     /// The rig files of the models whose cameras were corrected.
@@ -60,7 +64,7 @@ impl SavedRun {
     /// run. Removes the folders of a run that is rejected.
     pub fn end(mut self) -> anyhow::Result<EndedRun> {
         // The page shows the result before errors are returned, because viewers have waited for it.
-        publish_end(&self.hub, &self.models);
+        publish_end(&self.hub, &self);
         let created = std::mem::take(&mut self.created);
         let has_keyframes = self.has_keyframes;
         let failure = self.failure.take();
@@ -78,6 +82,35 @@ impl SavedRun {
         let is_useless = |error: &anyhow::Error| !has_keyframes || is_rejection(error);
         created.keep_unless(ended.as_ref().is_err_and(is_useless));
         ended
+    }
+
+    /// How good the models are, in one sentence.
+    pub fn verdict(&self) -> Verdict {
+        let score = |model: &FinishedModel| {
+            let (method, psnr_db) = (model.kind.name(), model.scores.psnr);
+            (model.n_tests(), ModelScore { method, psnr_db })
+        };
+        let (n_tests, models): (Vec<usize>, Vec<ModelScore<'_>>) =
+            self.models.iter().map(score).unzip();
+        verdict::verdict(&Findings {
+            models,
+            n_tests: n_tests.into_iter().max().unwrap_or_default(),
+            n_received: self.n_received,
+            n_lost: self.n_lost,
+        })
+    }
+
+    /// Errors that ended the run, and descriptions of lost data.
+    fn problems(&self) -> Vec<String> {
+        let failure = self.failure.as_ref().map(|error| format!("{error:#}"));
+        let input_error = self.input_error.as_ref().map(ToString::to_string);
+        let mut problems: Vec<String> = failure
+            .into_iter()
+            .chain(input_error)
+            .chain(self.no_model_reason.clone())
+            .collect();
+        problems.extend(self.data_losses.iter().cloned());
+        problems
     }
 
     /// Writes corrected rig files, and returns the first error of the lists, the files and the
@@ -200,12 +233,14 @@ pub(super) fn save(
         let finished = session::finish(endings, Some(&hub));
         models = finished.map_err(|error| recovery::with_recoverable(error, &recoverable))?;
     }
-    let no_model_reason =
-        (n_train == 0).then(|| no_model_reason(n_keyframes, input_result.join.counts(), rig));
+    let counts = input_result.join.counts();
+    let no_model_reason = (n_train == 0).then(|| no_model_reason(n_keyframes, counts, rig));
     Ok(SavedRun {
         models,
         hub,
         data_losses,
+        n_received: counts.images,
+        n_lost: counts.device_skipped,
         listed,
         corrected_rigs,
         input_error: input_result.input_error,
@@ -362,7 +397,8 @@ fn position_error_m(keyframe: &Arc<Keyframe>) -> Option<f64> {
 }
 
 /// Publishes the result of a run to its page.
-fn publish_end(hub: &Hub, models: &[FinishedModel]) {
+fn publish_end(hub: &Hub, saved: &SavedRun) {
+    let models = &saved.models;
     let name = |model: &FinishedModel| match models.len() {
         1 => model.scores.to_string(),
         _ => format!("{} {}", model.kind.name(), model.scores),
@@ -372,12 +408,66 @@ fn publish_end(hub: &Hub, models: &[FinishedModel]) {
         1 => model.folder.as_path(),
         _ => model.folder.parent().unwrap_or(&model.folder),
     });
+    let final_scores = models
+        .iter()
+        .filter_map(|model| Some((model.kind.name(), model.seconds, model.scores.psnr?)));
+    publish_final_scores(hub, final_scores);
+    viz::publish_files(
+        hub,
+        served_files::of_models(models.iter().map(|model| (model.kind, &model.folder))),
+    );
     hub.set_run_result(RunResult {
         folder: folder.map(|folder| folder.display().to_string()),
         scores: models.iter().map(name).collect::<Vec<_>>().join("; "),
         seconds: models.iter().map(|model| model.seconds).fold(0.0, f64::max),
+        verdict: Some(saved.verdict()),
+        problems: saved.problems(),
     });
     if hub.n_clients() > 0 {
         std::thread::sleep(FINAL_STATUS_TIME); // Clients keep showing the result after the server has stopped.
+    }
+}
+
+/// Replaces the last scores of the training by those of the saved models, so that the page shows
+/// the PSNR of the verdict.
+///
+/// * `scores`: name of the method, training time in seconds, and PSNR of each scored model.
+fn publish_final_scores<'a>(hub: &Hub, scores: impl Iterator<Item = (&'a str, f64, f64)> + Clone) {
+    hub.change_status(|status| {
+        for shown in std::iter::once(&mut status.model).chain(&mut status.others) {
+            let of_model = scores.clone().find(|(name, ..)| *name == shown.method);
+            if let Some((_, seconds, psnr)) = of_model {
+                shown.psnr = Some(psnr);
+                shown.psnr_history.push((seconds, psnr));
+            }
+        }
+    });
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use viz::{ModelStatus, Status};
+
+    #[test]
+    fn page_shows_the_final_scores() {
+        let hub = Hub::new();
+        let model = |method: &str, psnr| ModelStatus {
+            method: method.to_owned(),
+            psnr: Some(psnr),
+            psnr_history: vec![(8.0, psnr)],
+            ..ModelStatus::default()
+        };
+        hub.set_status(Status {
+            model: model("splat", 25.2),
+            others: vec![model("tsdf", 18.0)],
+            ..Status::default()
+        });
+        publish_final_scores(&hub, [("splat", 10.0, 24.85)].into_iter());
+        hub.change_status(|status| {
+            assert_eq!(status.model.psnr, Some(24.85));
+            assert_eq!(status.model.psnr_history, [(8.0, 25.2), (10.0, 24.85)]);
+            assert_eq!(status.others, [model("tsdf", 18.0)], "it was not scored");
+        });
     }
 }

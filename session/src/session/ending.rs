@@ -45,6 +45,11 @@ impl FinishedModel {
             n_tests: self.n_tests,
         }
     }
+
+    /// Number of test images.
+    pub(crate) fn n_tests(&self) -> usize {
+        self.n_tests
+    }
 }
 
 /// A session to finish, with its output folder and the command-specific entries of its report.

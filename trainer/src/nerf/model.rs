@@ -439,6 +439,7 @@ impl Method for NerfModel {
         Ok(self.extent().map(|extent| Bounds {
             center_m: extent.center_m,
             radius_m: extent.radius_m,
+            outer_radius_m: extent.radius_m,
         }))
     }
 

@@ -76,7 +76,8 @@ mod tests {
             one,
             Bounds {
                 center_m: [1.0, 2.0, 3.0],
-                radius_m: MIN_RADIUS_M
+                radius_m: MIN_RADIUS_M,
+                outer_radius_m: MIN_RADIUS_M
             }
         );
     }

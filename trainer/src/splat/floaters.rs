@@ -29,7 +29,9 @@ const MAX_TOTAL_SAMPLES: f64 = 5e7;
 
 /// The small parts of a splat model; `None` if there are none.
 pub(super) fn floaters(splats: &SplatArrays) -> Option<Floaters> {
-    let Bounds { center_m, radius_m } = bounds(splats)?;
+    let Bounds {
+        center_m, radius_m, ..
+    } = bounds(splats)?;
     let grid = CellGrid {
         center_m,
         radius_m,

@@ -4,6 +4,7 @@ pub(crate) mod access;
 pub(crate) mod admission;
 pub(crate) mod certificate;
 pub(crate) mod client_log;
+pub(crate) mod downloads;
 mod guarded_stream;
 mod page;
 pub(crate) mod server_context;
@@ -15,6 +16,7 @@ use crate::server::access::{Access, Role, Tokens};
 use crate::server::admission::{Admission, Connection, Limits};
 use crate::server::certificate::Certificate;
 use crate::server::client_log::ClientLog;
+use crate::server::downloads::FileServer;
 use crate::server::guarded_stream::GuardedStream;
 use crate::server::page::{FILES, has_version};
 use crate::server::server_context::ServerContext;
@@ -224,6 +226,7 @@ async fn serve(
         server_context,
         admission: Arc::clone(&admission),
         access: Arc::new(access),
+        files: FileServer::new(hub.clone()),
     }));
     tokio::select! {
         () = accept(&listener, &admission, tls.as_ref(), &app) => {}
@@ -358,12 +361,14 @@ struct AppState {
     server_context: ServerContext,
     admission: Arc<Admission>,
     access: Arc<Access>,
+    files: FileServer,
 }
 
 fn router(app_state: AppState) -> Router {
     let mut router = Router::new()
         .route("/status", get(status))
         .route("/robot/{mesh}", get(robot_mesh))
+        .route("/files/{name}", get(file))
         .route("/ws", get(connect))
         .route_layer(from_fn_with_state(app_state.clone(), require_token));
     // The files of the page contain no data, and the page needs them before it can send the token:
@@ -447,6 +452,11 @@ async fn robot_mesh(
         .into_response()
 }
 
+/// A published file.
+async fn file(Path(name): Path<String>, State(app_state): State<AppState>) -> Response {
+    app_state.files.respond(&name).await
+}
+
 /// A checksum that only this program needs to reproduce.
 fn etag(bytes: &[u8]) -> String {
     let mut hasher = DefaultHasher::new();
@@ -481,8 +491,11 @@ async fn connect(
 async fn add_security_headers(request: Request, next: Next) -> Response {
     let mut response = next.run(request).await;
     let headers = response.headers_mut();
-    let policies: [(HeaderName, &'static str); 4] = [
-        (header::CONTENT_SECURITY_POLICY, CONTENT_SECURITY_POLICY),
+    // Reports have a policy of their own.
+    headers
+        .entry(header::CONTENT_SECURITY_POLICY)
+        .or_insert(HeaderValue::from_static(CONTENT_SECURITY_POLICY));
+    let policies: [(HeaderName, &'static str); 3] = [
         (header::X_CONTENT_TYPE_OPTIONS, "nosniff"),
         (header::REFERRER_POLICY, "no-referrer"),
         (

@@ -37,6 +37,12 @@ pub struct Status {
     pub notes: Vec<String>,
     /// The result, once the run has ended and its model is saved.
     pub result: Option<RunResult>,
+    /// The saved model or file that is viewed; `None` in a run.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub source: Option<ModelSource>,
+    /// Files that clients can download; set by [`publish_files`](crate::publish_files).
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    pub files: Vec<FileLink>,
     /// What the operator should do, for commands that take images without training.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub guidance: Option<Guidance>,
@@ -61,6 +67,83 @@ pub struct RunResult {
     pub scores: String,
     /// Wall time of the whole run, seconds.
     pub seconds: f64,
+    /// How good the result is.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub verdict: Option<Verdict>,
+    /// Errors that ended the run, and descriptions of lost data, one sentence each.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    pub problems: Vec<String>,
+}
+
+/// How good a result is.
+#[derive(Clone, Debug, Default, PartialEq, Eq, Serialize)]
+pub struct Verdict {
+    /// The grade, for colors.
+    pub grade: Grade,
+    /// One sentence without a period, such as `Good: 31.2 dB on 12 test images`.
+    pub text: String,
+}
+
+/// Grade of a result.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Grade {
+    /// Pictures of the model can hardly be distinguished from photos.
+    Good,
+    /// Shapes are right, details are not.
+    Fair,
+    /// The model differs visibly from the scene.
+    Poor,
+    /// The model was not scored.
+    #[default]
+    Unknown,
+}
+
+/// What `view` shows: a saved model of a run, or a file.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize)]
+pub struct ModelSource {
+    /// Whether it is a model folder or a file.
+    pub kind: SourceKind,
+    /// Name of the file or folder, without its parents.
+    pub name: String,
+    /// The path, as given.
+    pub path: String,
+    /// Format of a file, such as `PLY`; `None` for a folder.
+    pub format: Option<String>,
+    /// Size of the model's files, bytes; of several models, the sum.
+    pub bytes: u64,
+    /// When the model was saved, seconds since 1970 in UTC; `None` if it is not known.
+    pub modified_unix_secs: Option<u64>,
+    /// Dataset or recording that the model was trained on; `None` for live runs and if it is not
+    /// known.
+    pub data: Option<String>,
+    /// GPU on which it was trained; `None` if it is not known.
+    pub adapter: Option<String>,
+    /// How good the model is; `None` without a report.
+    pub verdict: Option<Verdict>,
+    /// Axis of the model that points up on the page: `x`, `y`, `z`, `-x`, `-y` or `-z`.
+    pub up_axis: &'static str,
+}
+
+/// Kind of a [`ModelSource`].
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "snake_case")]
+pub enum SourceKind {
+    /// Folder of a saved model, or of several.
+    Saved,
+    /// A single file, which may come from another program.
+    File,
+}
+
+/// A file that the server offers to its clients.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize)]
+pub struct FileLink {
+    /// Path of the URL, without a slash at its beginning.
+    pub path: String,
+    /// What the file contains, for display.
+    pub label: String,
+    /// Whether browsers show the file instead of saving it.
+    pub is_page: bool,
 }
 
 /// Status of a model.

@@ -426,6 +426,7 @@ fn run_result_arrives_before_goodbye() {
         folder,
         scores: "PSNR 26.50 dB".to_owned(),
         seconds: 98.0,
+        ..RunResult::default()
     });
     drop(server);
     let ended = client.text_of("status");

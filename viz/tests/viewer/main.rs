@@ -4,6 +4,8 @@
 mod admission;
 mod analytic_scene;
 mod client;
+mod downloads;
+mod ending_page;
 mod eye_page;
 #[cfg(feature = "foxglove")]
 mod foxglove;

@@ -211,6 +211,7 @@ fn robot_silhouette_is_exact_in_front_and_behind() {
         folder: None,
         scores: String::new(),
         seconds: 1.0,
+        ..RunResult::default()
     });
     wait_for(&mut browser, "no warning after the run", |browser| {
         browser.evaluate("document.getElementById('robot-age').hidden") == true

@@ -173,7 +173,7 @@ fn data_requires_a_token_and_the_page_does_not() {
     let shared = Shared::start();
     let bearer = |token: &str| format!("Authorization: Bearer {token}\r\n");
     let cookie = format!("Cookie: __Host-fieldrig-7007={}\r\n", shared.viewer);
-    for path in ["/status", "/robot/0.stl", "/ws"] {
+    for path in ["/status", "/robot/0.stl", "/files/splat.ply", "/ws"] {
         for (headers, named) in [
             (String::new(), "requires a token"),
             (bearer("0123"), "invalid token"),

@@ -9,6 +9,7 @@ import { showGuidance } from "./panels/guidance";
 import { setUpHelp, showKeysInTitles } from "./panels/help";
 import { LinkReadout } from "./connection/link_readout";
 import { LiveImages } from "./panels/live_images";
+import { ModelSourceCard } from "./panels/model_source";
 import { ModelSwitch } from "./panels/model_switch";
 import { BACKGROUND, OrbitView } from "./view/orbit_view";
 import { NamedViews } from "./panels/named_views";
@@ -18,6 +19,7 @@ import { Readouts } from "./panels/readouts";
 import { RenderScheduler } from "./connection/render_scheduler";
 import { RobotAge } from "./panels/robot_age";
 import { RunControls } from "./panels/run_controls";
+import { RunEnd } from "./panels/run_end";
 import { ShownLatency } from "./connection/shown_latency";
 import { SideView } from "./layers/side_view";
 import { Surroundings } from "./layers/surroundings";
@@ -49,18 +51,20 @@ window.addEventListener("hashchange", () => {
 });
 // A page that becomes visible subscribes again, and receives all chunks again.
 document.addEventListener("visibilitychange", () => {
-  if (!document.hidden) view.local.clear();
+  if (!document.hidden && connection.isOpen) view.local.clear();
 });
 const connection: Connection = new Connection(`${location.protocol === "https:" ? "wss" : "ws"}://${location.host}/ws`, {
   state(state, text) {
     const shown = element("connection");
     const before = shown.dataset.state;
     const wasOpen = before === "open" || before === "silent";
-    const hasEnded = state === "lost" && banner.isFinished;
+    const hasEnded = state === "lost" && connection.hasStopped && banner.isFinished;
     shown.dataset.state = hasEnded ? "ended" : state;
     shown.textContent = hasEnded ? "the server has stopped" : text;
     // Operators who control the robot by the picture must see that it is frozen.
-    banner.setConnection(state, text);
+    banner.setConnection(state, text, hasEnded);
+    runEnd.setEnded(hasEnded);
+    modelSource.setEnded(hasEnded);
     view.overlays.setLive(state === "open");
     if (state === "open" && !wasOpen) {
       view.picture.forget();
@@ -96,6 +100,8 @@ const topics = new Topics(connection, [
   chunks,
 ]);
 const runControls = new RunControls(connection);
+const runEnd = new RunEnd();
+const modelSource = new ModelSourceCard((up) => view.turnUp(up));
 new LinkReadout(connection);
 const shownLatency = new ShownLatency(connection);
 const models = new ModelSwitch(() => {
@@ -142,7 +148,9 @@ function receiveStatus(status: Status): void {
   models.list(status);
   showStatus(status);
   runControls.show(status);
-  banner.setRunResult(status.result);
+  banner.setStatus(status);
+  runEnd.show(status);
+  modelSource.show(status);
   showGuidance(status.guidance, banner, liveImages);
   robotAge.hasEnded = banner.isFinished;
   namedViews.runIs(status);
@@ -244,9 +252,8 @@ function action(id: string, key: string, act: () => void): void {
   element(id).addEventListener("click", act);
   window.addEventListener("keydown", (event) => {
     const isPlain = !event.ctrlKey && !event.metaKey && !event.altKey && !event.repeat;
-    if (element(id).hidden || event.target instanceof HTMLInputElement || event.target instanceof HTMLSelectElement) {
-      return;
-    }
+    const isUnavailable = element(id).hidden || element(id).matches(":disabled");
+    if (isUnavailable || event.target instanceof HTMLInputElement || event.target instanceof HTMLSelectElement) return;
     if (isPlain && event.key.toLowerCase() === key) act();
   });
 }

@@ -21,7 +21,9 @@ pub(in crate::tsdf) fn floaters(mesh: &Mesh, voxel_m: f64) -> Option<Floaters> {
         .iter()
         .map(|offset_m| std::array::from_fn(|axis| mesh.origin_m[axis] + f64::from(offset_m[axis])))
         .collect();
-    let Bounds { center_m, radius_m } = Bounds::of_points(&positions_m)?;
+    let Bounds {
+        center_m, radius_m, ..
+    } = Bounds::of_points(&positions_m)?;
     // The contracted cube is 4 radii wide.
     let n_cells =
         (4.0 * radius_m / (CELL_VOXELS * voxel_m)).clamp(N_CELLS_RANGE[0], N_CELLS_RANGE[1]);

@@ -34,9 +34,20 @@ export async function refusalReason(): Promise<string> {
 export function showRole(role: Role | undefined): void {
   const isViewer = role === "viewer";
   element("role").textContent = isViewer ? "viewer" : "";
-  for (const control of document.querySelectorAll<HTMLButtonElement>("[data-operator]")) {
+  disable("[data-server]", "");
+  disable("[data-operator]", isViewer ? VIEWER_REASON : "");
+}
+
+/** Disables everything that needs a server, until one says hello. */
+export function disableServerControls(reason: string): void {
+  disable("[data-server], [data-operator]", reason);
+}
+
+/** Disables controls and shows why, or enables them if there is no reason. */
+function disable(selector: string, reason: string): void {
+  for (const control of document.querySelectorAll<HTMLButtonElement>(selector)) {
     control.dataset.title ??= control.title;
-    control.disabled = isViewer;
-    control.title = isViewer ? VIEWER_REASON : control.dataset.title;
+    control.disabled = reason !== "";
+    control.title = reason || control.dataset.title;
   }
 }

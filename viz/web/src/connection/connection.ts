@@ -36,9 +36,12 @@ export class Connection {
   /** Time from the last ping to its answer; null before the first answer of a connection. */
   roundTripMillis: number | null = null;
   private readonly parts = new PartJoiner();
+  /** Those of the last server until the next one says hello, so that the page still offers what needs no server. */
   private capabilities: ReadonlySet<string> = new Set();
   private socket: WebSocket | null = null;
   private goodbye = "";
+  /** Whether the server has said that it stops, and no server has answered since. */
+  hasStopped = false;
   /** Whether the current socket has received a hello. */
   private hasHello = false;
   private refusal = "";
@@ -97,7 +100,6 @@ export class Connection {
     this.socket = socket;
     this.hasHello = false;
     this.parts.forget();
-    this.capabilities = new Set();
     this.receivedAt = performance.now();
     this.clock.forget();
     this.roundTripMillis = null;
@@ -186,6 +188,7 @@ export class Connection {
     switch (message.type) {
       case "hello": {
         this.goodbye = "";
+        this.hasStopped = false;
         this.refusal = "";
         this.hasHello = true;
         const agreement = agree(message, this.topicCapabilities());
@@ -210,6 +213,7 @@ export class Connection {
         break;
       case "goodbye":
         this.goodbye = message.reason;
+        this.hasStopped = true;
         break;
     }
     this.events.text(message);

@@ -80,6 +80,10 @@ export interface Status extends ModelStatus {
   notes: string[];
   result: RunResult | null;
   guidance?: Guidance;
+  /** The saved model or file that is viewed; missing in a run, and on older servers. */
+  source?: ModelSource;
+  /** Files that can be downloaded. */
+  files?: FileLink[];
 }
 
 /** What the operator should do, while images are taken for a calibration. */
@@ -93,6 +97,43 @@ export interface RunResult {
   folder: string | null;
   scores: string;
   seconds: number;
+  /** Missing on older servers. */
+  verdict?: Verdict;
+  /** Errors that ended the run, and lost data, one sentence each. */
+  problems?: string[];
+}
+
+/** How good a result is. */
+export interface Verdict {
+  grade: "good" | "fair" | "poor" | "unknown";
+  /** One sentence without a period. */
+  text: string;
+}
+
+/** An axis of a model. */
+export type Axis = "x" | "y" | "z" | "-x" | "-y" | "-z";
+
+/** The saved model or file that is viewed. */
+export interface ModelSource {
+  kind: "saved" | "file";
+  name: string;
+  path: string;
+  format: string | null;
+  bytes: number;
+  modified_unix_secs: number | null;
+  data: string | null;
+  adapter: string | null;
+  verdict: Verdict | null;
+  /** Axis of the model that points up on the page. */
+  up_axis: Axis;
+}
+
+/** A file that the server offers. */
+export interface FileLink {
+  path: string;
+  label: string;
+  /** Whether browsers show it instead of saving it. */
+  is_page: boolean;
 }
 
 export interface Scene {

@@ -24,6 +24,8 @@ const TITLES: Record<Quantity, string> = {
 };
 /** Maps with a smaller fraction of the keyframes are incomplete. */
 const MIN_MAPPED_FRAC = 0.9;
+/** Opacity of the colors of an incomplete map, whose ages and uncertainties are too large. */
+const FAINT_OPACITY = 0.35;
 const SCALE = COLORS.map(
   (color) => new THREE.Vector3(...[1, 3, 5].map((ix) => parseInt(color.slice(ix, ix + 2), 16) / 255)),
 );
@@ -40,6 +42,7 @@ export const TINT = /* glsl */ `
   uniform vec3 observationCodes;          // numbers of code 1, and logarithm of the ratio of two codes
   uniform vec2 observationRange;          // logarithms of the best and the worst number
   uniform float observationAge;           // seconds since the newest view
+  uniform float observationOpacity;       // of the tint
 
   vec3 tinted(vec3 rgb, vec3 pointInWorld) {
     if (observedQuantity == 0) return rgb;
@@ -48,7 +51,7 @@ export const TINT = /* glsl */ `
     bool isInside = all(greaterThanEqual(at, vec3(0.0))) && all(lessThan(at, vec3(1.0)));
     vec2 codes = isInside ? round(textureLod(observations, at, 0.0).rg * 255.0) : vec2(0.0);
     float code = observedQuantity == 1 ? codes.r : codes.g;
-    if (code == 0.0) return vec3(0.3 * gray); // not observed
+    if (code == 0.0) return mix(rgb, vec3(0.3 * gray), observationOpacity); // not observed
     float number = (observedQuantity == 1 ? observationCodes.x : observationCodes.y)
       * exp(observationCodes.z * (code - 1.0));
     if (observedQuantity == 1) number += observationAge;
@@ -56,7 +59,7 @@ export const TINT = /* glsl */ `
       : clamp((log(number) - observationRange.x) / (observationRange.y - observationRange.x), 0.0, 1.0);
     vec3 color = ${glsl(SCALE[0]!)};
 ${MIX}
-    return color * (0.5 + 0.6 * gray);
+    return mix(rgb, color * (0.5 + 0.6 * gray), observationOpacity);
   }`;
 
 export class ObservationLayer {
@@ -69,6 +72,7 @@ export class ObservationLayer {
     observationCodes: { value: new THREE.Vector3() },
     observationRange: { value: new THREE.Vector2() },
     observationAge: { value: 0 },
+    observationOpacity: { value: 1 },
   };
   private quantity: Quantity | null = null;
   private newestMillis: number | null = null;
@@ -133,8 +137,12 @@ export class ObservationLayer {
   }
 
   /** Without the depth of some keyframes, which is still being rendered, ages and uncertainties are too large. */
+  private get isComplete(): boolean {
+    return this.nMapped >= MIN_MAPPED_FRAC * this.nAll;
+  }
+
   private progress(): string {
-    return this.nMapped < MIN_MAPPED_FRAC * this.nAll ? ` (${this.nMapped} of ${this.nAll} keyframes so far)` : "";
+    return this.isComplete ? "" : `. Faint, because only ${this.nMapped} of ${this.nAll} keyframes are processed so far`;
   }
 
   private update(): void {
@@ -145,10 +153,13 @@ export class ObservationLayer {
       uniforms.observationRange.value.fromArray(RANGES[quantity].map(Math.log));
       const age = this.newestMillis === null ? null : this.clock().age(this.newestMillis);
       uniforms.observationAge.value = Math.max(0, (age ?? 0) / 1000);
+      uniforms.observationOpacity.value = this.isComplete ? 1 : FAINT_OPACITY;
       const isSaved = quantity === "age" && this.newestMillis === null;
       element("legend-title").textContent = this.hasMap
         ? TITLES[quantity] + (isSaved ? ", relative to the newest keyframe" : "") + this.progress()
-        : "waiting for the map of observations";
+        : this.nAll > 0
+          ? `Computing: 0 of ${this.nAll} keyframes are processed`
+          : "There are no keyframes, from which this is computed";
       element("legend-labels").replaceChildren(...LABELS[quantity].map(label));
     }
     this.changed();

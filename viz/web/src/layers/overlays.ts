@@ -2,6 +2,7 @@
 
 import * as THREE from "three";
 import { worldFromCamera } from "../view/convention";
+import { uprightRotation } from "../view/up_axis";
 import { type Occlusion, ON_SURFACE } from "./occlusion";
 import type { NumberedKeyframe, PosedCamera, Scene } from "../connection/protocol";
 
@@ -32,6 +33,7 @@ export class Overlays {
   private readonly keyframes: THREE.LineSegments;
   private readonly live = new Map<string, LiveCamera>();
   private isLive = true;
+  private readonly worldFromUpright = new THREE.Quaternion();
   private frustumDepth = 0.06;
   private posed: (PosedCamera | NumberedKeyframe)[] = [];
 
@@ -58,6 +60,12 @@ export class Overlays {
     this.drawKeyframes();
   }
 
+  /** Makes the grid perpendicular to another direction of up. */
+  setUp(up: THREE.Vector3, scene: Scene | null): void {
+    this.worldFromUpright.copy(uprightRotation(up));
+    if (scene) this.setScene(scene);
+  }
+
   /** Creates grid and axes for a scene of this size. */
   setScene(scene: Scene): void {
     this.frustumDepth = 0.12 * scene.radius_m;
@@ -68,8 +76,10 @@ export class Overlays {
     this.ground.clear();
     const grid = new THREE.GridHelper(nCells * cell, nCells, 0x9fb0c3, 0x9fb0c3);
     grid.rotateX(Math.PI / 2);
-    const middle = [scene.center_m[0], scene.center_m[1]].map((value) => Math.round(value / cell) * cell);
-    grid.position.set(middle[0]!, middle[1]!, 0);
+    const center = new THREE.Vector3(...scene.center_m).applyQuaternion(this.worldFromUpright.clone().invert());
+    const middle = [center.x, center.y].map((value) => Math.round(value / cell) * cell);
+    grid.position.set(middle[0]!, middle[1]!, 0).applyQuaternion(this.worldFromUpright);
+    grid.quaternion.premultiply(this.worldFromUpright);
     Object.assign(grid.material, { transparent: true, opacity: 0.22, depthWrite: false });
     const axesHelper = axes(2 * cell);
     for (const drawn of [grid, axesHelper]) this.occlusion.apply(drawn.material as THREE.Material, ON_SURFACE);

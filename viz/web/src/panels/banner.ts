@@ -1,14 +1,15 @@
-// One line across the view: why the picture is not live, what to do, or how the run ended.
+// One line across the view: why the picture is not live, or what to do.
 
-import { timeText } from "./chart";
 import type { ConnectionState } from "../connection/connection";
 import { element } from "./element";
-import type { Guidance, RunResult } from "../connection/protocol";
+import type { Guidance, Status } from "../connection/protocol";
 
 export class Banner {
   private connection: ConnectionState = "connecting";
   private connectionText = "";
-  private result: RunResult | null = null;
+  private isResultShown = false;
+  private isSavedModel = false;
+  private hasEnded = false;
   private guidance: Guidance | null = null;
   private graphics = "";
 
@@ -18,19 +19,23 @@ export class Banner {
     this.show();
   }
 
-  setConnection(state: ConnectionState, text: string): void {
+  /** `hasEnded`: whether the connection was lost because the program has ended, as expected. */
+  setConnection(state: ConnectionState, text: string, hasEnded: boolean): void {
     this.connection = state;
     this.connectionText = text;
+    this.hasEnded = hasEnded;
     this.show();
   }
 
-  /** Whether the run has ended, so that the server may stop. */
+  /** Whether nothing more is expected from the server, so that it may stop. */
   get isFinished(): boolean {
-    return this.result !== null || this.guidance?.is_finished === true;
+    return this.isResultShown || this.isSavedModel || this.guidance?.is_finished === true;
   }
 
-  setRunResult(result: RunResult | null): void {
-    this.result = result;
+  /** Adopts whether the run has ended. Its result has a panel of its own. */
+  setStatus(status: Status): void {
+    this.isResultShown = status.result !== null;
+    this.isSavedModel = status.source !== undefined;
     this.show();
   }
 
@@ -40,25 +45,25 @@ export class Banner {
   }
 
   private show(): void {
-    const isBroken = ["silent", "lost", "refused"].includes(this.connection);
-    // Once a run has ended, a stopped server is expected.
-    const { result, guidance, isFinished } = this;
-    const hasProblem = isBroken && !isFinished;
-    const text = result
-      ? runResultText(result)
-      : capitalized(hasProblem ? this.connectionText : (guidance?.text ?? this.graphics));
+    const { guidance, hasEnded } = this;
+    const hasProblem = ["silent", "lost", "refused"].includes(this.connection) && !hasEnded;
+    const isUnexplained = hasEnded && !this.isResultShown && guidance === null;
+    const text = hasProblem
+      ? capitalized(this.connectionText)
+      : isUnexplained
+        ? "The program has ended. The page shows what it received last."
+        : (guidance?.text ?? this.graphics);
     const banner = element("banner");
     if (banner.textContent !== text) banner.textContent = text; // Otherwise screen readers would repeat it.
-    const withoutProblem = guidance ? "guidance" : this.graphics ? "graphics" : this.connection;
-    banner.dataset.kind = isFinished ? "finished" : hasProblem ? this.connection : withoutProblem;
+    banner.dataset.kind = hasProblem ? this.connection : text === "" ? "open" : this.kindOfNotice(isUnexplained);
     element("view").classList.toggle("stale", hasProblem);
   }
-}
 
-function runResultText(result: RunResult): string {
-  const saved = result.folder === null ? "no model was saved" : `model saved in ${result.folder}`;
-  const scores = result.scores === "" ? "" : `, ${result.scores}`;
-  return `Finished after ${timeText(result.seconds)}: ${saved}${scores}`;
+  private kindOfNotice(isEnd: boolean): string {
+    if (isEnd) return "ended";
+    if (this.guidance === null) return "graphics";
+    return this.guidance.is_finished ? "finished" : "guidance";
+  }
 }
 
 function capitalized(text: string): string {

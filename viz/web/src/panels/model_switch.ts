@@ -45,6 +45,7 @@ export class ModelSwitch {
     const button = document.createElement("button");
     button.textContent = method;
     button.dataset.method = method;
+    button.dataset.server = "";
     button.title = `Show the model of the method ${method}`;
     button.addEventListener("click", () => this.choose(method));
     return button;

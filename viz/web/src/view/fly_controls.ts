@@ -2,6 +2,7 @@
 
 import * as THREE from "three";
 import { element } from "../panels/element";
+import { uprightRotation } from "./up_axis";
 
 /** Directions of keys by their position on the keyboard: right, up, forward. */
 const KEYS: Record<string, [number, number, number]> = {
@@ -117,12 +118,13 @@ export class FlyControls {
   /** Turns the view by a motion on the screen, pixels. */
   private look(x: number, y: number): void {
     const perPixel = (LOOK_SCALE * this.camera.fov * Math.PI) / 180 / this.canvas.clientHeight;
-    const forward = this.target.clone().sub(this.camera.position);
+    const worldFromUpright = uprightRotation(this.camera.up);
+    const forward = this.target.clone().sub(this.camera.position).applyQuaternion(worldFromUpright.clone().invert());
     const distance = forward.length();
     const yaw = Math.atan2(forward.y, forward.x) + x * perPixel;
     const pitch = Math.asin(THREE.MathUtils.clamp(forward.z / distance, -1, 1)) + y * perPixel;
     const [cosine, sine] = [Math.cos, Math.sin].map((f) => f(THREE.MathUtils.clamp(pitch, -MAX_PITCH, MAX_PITCH)));
-    forward.set(cosine! * Math.cos(yaw), cosine! * Math.sin(yaw), sine!);
+    forward.set(cosine! * Math.cos(yaw), cosine! * Math.sin(yaw), sine!).applyQuaternion(worldFromUpright);
     this.target.copy(this.camera.position).addScaledVector(forward, distance);
     this.camera.lookAt(this.target);
     this.moved();

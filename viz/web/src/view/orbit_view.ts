@@ -23,6 +23,7 @@ import { ScanLayer } from "../layers/scan_layer";
 import type { ServerClock } from "../connection/server_clock";
 import { surfacePoint } from "./surface_picker";
 import type { ViewState } from "./view_state";
+import { outsideView, turnControls, uprightRotation } from "./up_axis";
 
 const VERTICAL_FOV_DEGREES = 50;
 /** Duration of the motion back to the front of a surface. */
@@ -72,6 +73,8 @@ export class OrbitView {
   private hasUserMoved = false;
   private isStale = true;
   private isModelShown = true;
+  /** Whether another direction than the server's points up. */
+  private isTurned = false;
 
   constructor(
     private readonly canvas: HTMLCanvasElement,
@@ -144,7 +147,19 @@ export class OrbitView {
 
   /** Returns to the scene's initial view. */
   reset(): void {
-    if (this.scene) this.lookFrom(this.scene.world_from_camera);
+    if (!this.scene) return;
+    // The server's view is upright only for its own direction of up.
+    if (this.isTurned) this.jump(outsideView(this.scene, this.camera));
+    else this.lookFrom(this.scene.world_from_camera);
+  }
+
+  /** Turns the view so that this direction of the world points up, and looks at the scene from outside. */
+  turnUp(up: THREE.Vector3): void {
+    turnControls(this.controls, up);
+    this.isTurned = true;
+    this.overlays.setUp(up, this.scene);
+    this.hasUserMoved = true;
+    this.reset();
   }
 
   /** Looks along a camera's axis, upright, and orbits the point on it that is closest to the scene's center. */
@@ -165,6 +180,7 @@ export class OrbitView {
     const distance = (1.15 * this.scene.radius_m) / Math.tan(halfAngle) / Math.min(1, this.camera.aspect);
     // Almost from above: exactly from above, the direction of "up" would be undefined.
     const from = direction === "top" ? new THREE.Vector3(0, -1e-3, 1) : new THREE.Vector3(0, -1, 0);
+    from.applyQuaternion(uprightRotation(this.camera.up));
     this.hasUserMoved = true;
     this.jump({ eye: center.clone().addScaledVector(from, distance), target: center });
   }

@@ -1,0 +1,110 @@
+// The end of a run: a panel with the verdict, the folder and the files. It can be closed, and opened again from the header.
+
+import { disableServerControls } from "../connection/access";
+import type { RunResult, Status } from "../connection/protocol";
+import { timeText } from "./chart";
+import { element } from "./element";
+import { fileLinks } from "./file_links";
+import { child, descriptions } from "./html";
+
+const ENDED = "The program has ended, so this is no longer possible";
+/** Only the verdict is open at first in windows like those of phones; see app.css. */
+const SMALL_WINDOW = "(max-width: 820px), (max-height: 500px)";
+
+export class RunEnd {
+  private readonly panel = element("run-end");
+  private readonly opener = element("show-result", HTMLButtonElement);
+  private status: Status | null = null;
+  private hasEnded = false;
+  /** What the panel shows, so that it is only rebuilt if something has changed. */
+  private shown = "";
+
+  constructor() {
+    this.opener.addEventListener("click", () => this.setOpen(this.panel.hidden !== false));
+    this.panel.addEventListener("keydown", (event) => {
+      if (event.key === "Escape") this.close();
+    });
+  }
+
+  show(status: Status): void {
+    const hadResult = this.status !== null && this.status.result !== null;
+    const hasResult = status.result !== null;
+    this.status = status;
+    this.opener.hidden = !hasResult;
+    if (hasResult !== hadResult) this.setOpen(hasResult);
+    this.update();
+  }
+
+  /** Sets whether the program has ended. The page keeps what it has received, and disables what needs the program. */
+  setEnded(hasEnded: boolean): void {
+    if (hasEnded === this.hasEnded) return;
+    this.hasEnded = hasEnded;
+    if (hasEnded) disableServerControls(ENDED); // The next hello enables them.
+    this.update();
+  }
+
+  private setOpen(isOpen: boolean): void {
+    this.panel.hidden = !isOpen;
+    this.opener.setAttribute("aria-expanded", String(isOpen));
+  }
+
+  private close(): void {
+    this.setOpen(false);
+    this.opener.focus();
+  }
+
+  private update(): void {
+    const result = this.status?.result;
+    if (!this.status || !result) return;
+    const files = this.status.files ?? [];
+    const shown = JSON.stringify([result, files, this.hasEnded]);
+    if (shown === this.shown) return;
+    const isFirst = this.shown === "";
+    this.shown = shown;
+    const wasOpen = this.panel.querySelector("details")?.open ?? true;
+    const details = document.createElement("details");
+    details.open = isFirst ? !window.matchMedia(SMALL_WINDOW).matches : wasOpen;
+    const summary = child("summary", verdictText(result));
+    summary.id = "run-verdict";
+    const links = child("p");
+    links.className = "files";
+    links.append(...fileLinks(files, this.hasEnded ? ENDED : ""));
+    const problems = child("ul");
+    problems.className = "problems";
+    problems.append(...(result.problems ?? []).map((problem) => child("li", problem)));
+    const state = child("p", stateText(this.hasEnded));
+    state.id = "run-end-state";
+    details.append(summary, problems, descriptions(rows(result)), links, state);
+    this.panel.dataset.grade = result.verdict?.grade ?? "unknown";
+    this.panel.replaceChildren(details, this.closeButton());
+  }
+
+  private closeButton(): HTMLButtonElement {
+    const button = document.createElement("button");
+    button.id = "close-result";
+    button.textContent = "×";
+    button.title = "Close. The button Result in the header opens this again";
+    button.setAttribute("aria-label", "Close the result");
+    button.addEventListener("click", () => this.close());
+    return button;
+  }
+}
+
+/** The verdict. Servers without one send only scores. */
+export function verdictText(result: RunResult): string {
+  if (result.verdict) return result.verdict.text;
+  return result.scores === "" ? "The run has ended" : `The run has ended: ${result.scores}`;
+}
+
+function rows(result: RunResult): [string, string][] {
+  return [
+    ["Saved in", result.folder ?? "nothing was saved"],
+    ["Training time", timeText(result.seconds)],
+  ];
+}
+
+function stateText(hasEnded: boolean): string {
+  return hasEnded
+    ? "The program has ended. The page keeps the last picture, and the parts of the model that it has received."
+    : "You can still look at the model, until the program is stopped in its terminal.";
+}

@@ -1,0 +1,56 @@
+// Which direction points up: models of other programs often have another one than the page, whose world is z up.
+
+import * as THREE from "three";
+import type { OrbitControls } from "three/examples/jsm/controls/OrbitControls.js";
+import type { Axis, Scene } from "../connection/protocol";
+
+export const AXES: readonly Axis[] = ["z", "-z", "y", "-y", "x", "-x"];
+
+/** Direction from the scene to a view of all of it, with z up: from the front right, 30 degrees above the horizon. */
+const OUTSIDE = new THREE.Vector3(0.5, -0.707, 0.5).normalize();
+/** Distance of that view relative to the one at which the sphere around the scene touches the edges of the view. */
+const OUTSIDE_MARGIN = 1.25;
+
+/** Rotation that maps z to this direction; for -z, a half turn about x, as `--up` does. */
+export function uprightRotation(up: THREE.Vector3): THREE.Quaternion {
+  if (up.z < -1 + 1e-9) return new THREE.Quaternion(1, 0, 0, 0);
+  return new THREE.Quaternion().setFromUnitVectors(new THREE.Vector3(0, 0, 1), up);
+}
+
+/** Direction of an axis of the model in the world of the page, on which the axis `served` of the model points up. */
+export function upInWorld(served: Axis, axis: Axis): THREE.Vector3 {
+  const modelFromWorld = uprightRotation(vector(served));
+  return vector(axis).applyQuaternion(modelFromWorld.invert());
+}
+
+/** Makes the controls orbit around another direction of up. */
+export function turnControls(controls: OrbitControls, up: THREE.Vector3): void {
+  controls.object.up.copy(up);
+  // The controls of three.js compute this rotation only when they are created.
+  const { _quat, _quatInverse } = controls as unknown as Record<"_quat" | "_quatInverse", THREE.Quaternion>;
+  _quat.setFromUnitVectors(up, new THREE.Vector3(0, 1, 0));
+  _quatInverse.copy(_quat).invert();
+}
+
+/** A view of the whole scene from outside, with the camera's direction of up. */
+export function outsideView(scene: Scene, camera: THREE.PerspectiveCamera): { eye: THREE.Vector3; target: THREE.Vector3 } {
+  const target = new THREE.Vector3(...scene.center_m);
+  const vertical = (camera.fov * Math.PI) / 360;
+  const horizontal = Math.atan(Math.tan(vertical) * camera.aspect);
+  const distance = (OUTSIDE_MARGIN * scene.radius_m) / Math.sin(Math.min(vertical, horizontal));
+  const from = OUTSIDE.clone().applyQuaternion(uprightRotation(camera.up));
+  return { eye: target.clone().addScaledVector(from, distance), target };
+}
+
+/** Arguments of `fieldrig view` that show a file with this axis up. */
+export function upCommand(path: string, axis: Axis): string {
+  const isPlain = /^[A-Za-z0-9_./:=@%+,][A-Za-z0-9_./:=@%+,-]*$/.test(path);
+  const quoted = isPlain ? path : `'${path.replaceAll("'", "'\\''")}'`;
+  return `fieldrig view ${quoted} --up ${axis}`;
+}
+
+function vector(axis: Axis): THREE.Vector3 {
+  const sign = axis.startsWith("-") ? -1 : 1;
+  const letter = axis.slice(-1);
+  return new THREE.Vector3(Number(letter === "x"), Number(letter === "y"), Number(letter === "z")).multiplyScalar(sign);
+}
