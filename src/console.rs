@@ -7,8 +7,10 @@ use messages::counted;
 use parking_lot::Mutex;
 use serde::Serialize;
 use session::next_commands::{self, SavedModel};
+use session::verdict::{self, Findings, ModelScore};
 use session::{FinishedModel, FinishedRun, Limits, Observer, ReadProgress, SessionEvent};
 use std::time::{Duration, Instant};
+use viz::Verdict;
 
 /// What is printed about a session.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -157,12 +159,32 @@ pub(crate) fn print_json(value: &impl Serialize) {
     }
 }
 
-/// Prints commands to run next on these models.
-pub(crate) fn print_next_commands(models: &[FinishedModel]) {
-    let models: Vec<SavedModel<'_>> = models.iter().map(FinishedModel::saved).collect();
-    for line in next_commands::lines(&next_commands::for_models(&models)) {
-        print::report(line);
+/// Prints commands to run next on these models, and in the last line how good they are, with the
+/// first of the commands.
+pub(crate) fn print_end(models: &[FinishedModel], verdict: &Verdict) {
+    let saved: Vec<SavedModel<'_>> = models.iter().map(FinishedModel::saved).collect();
+    let commands = next_commands::for_models(&saved);
+    next_commands::lines(&commands)
+        .iter()
+        .for_each(print::report);
+    if let Some(first) = commands.first() {
+        print::report(format_args!("{}. Next: {}", verdict.text, first.command));
     }
+}
+
+/// How good models are whose images come from a dataset, which loses none.
+pub(crate) fn verdict_of(models: &[FinishedModel]) -> Verdict {
+    let n_tests = models.iter().map(|model| model.saved().n_tests).max();
+    let score = |model: &'_ FinishedModel| ModelScore {
+        method: model.kind.name(),
+        psnr_db: model.scores.psnr,
+    };
+    verdict::verdict(&Findings {
+        models: models.iter().map(score).collect(),
+        n_tests: n_tests.unwrap_or_default(),
+        n_received: 0,
+        n_lost: 0,
+    })
 }
 
 /// Prints that a run which was to be continued has reached its limits.

@@ -1,7 +1,7 @@
 //! `fieldrig run`: opens devices, joins their samples, trains, and serves the page.
 
 use crate::checkpoint_args::CheckpointArgs;
-use crate::console::{Console, OutputMode, print_finished_run, print_next_commands};
+use crate::console::{Console, OutputMode, print_end, print_finished_run};
 use crate::exit::{self, Exit};
 use crate::number_args::number_in_range;
 use crate::open_gpu::open_gpu;
@@ -117,7 +117,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     let hub = run.live.hub();
     let saved = run.run_to_end()?;
     if !args.json {
-        print_next_commands(&saved.models);
+        print_end(&saved.models, &saved.verdict());
     }
     let EndedRun {
         models,

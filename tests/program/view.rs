@@ -667,8 +667,15 @@ fn printed_commands_work_and_report_page_is_written() {
         "my runs/first one",
     ];
     let printed = train(folder, &args);
+    let verdict = printed.lines().last().expect("a line");
+    assert!(
+        verdict.contains(" dB on 2 test images. Next: ")
+            && verdict.contains(" view 'my runs/first one'"),
+        "{verdict}"
+    );
     let commands: Vec<&str> = printed
         .lines()
+        .filter(|line| *line != verdict)
         .skip_while(|line| !line.starts_with("saved in "))
         .skip(1)
         .map(|line| {

@@ -16,7 +16,7 @@ pub(crate) use scene_pictures::ScenePictures;
 pub(crate) use wording::image_name;
 
 use crate::next_commands::NextCommand;
-use crate::{evaluation_schedule, run_folder};
+use crate::{evaluation_schedule, run_folder, verdict};
 use report::Table;
 use report::chart::drawing::escaped;
 use report::chart::{Axis, Chart, Line, Point, Scale};
@@ -68,6 +68,7 @@ impl Page<'_> {
             report::STYLE,
             escaped(&self.subtitle())
         );
+        page.push_str(&verdict_line(report));
         page.push_str(&figures(done, self.primitive));
         page.push_str(&data_losses(report));
         page.push_str(&self.scene.html());
@@ -152,6 +153,13 @@ impl Page<'_> {
         }
         html
     }
+}
+
+/// How good the model is, in one sentence.
+fn verdict_line(report: &Value) -> String {
+    verdict::of_report(report).map_or(String::new(), |verdict| {
+        format!("<p class=\"verdict\">{}.</p>\n", escaped(&verdict.text))
+    })
 }
 
 /// The main scores and sizes.
