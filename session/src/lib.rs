@@ -50,6 +50,7 @@ pub mod next_commands;
 mod observations;
 mod observer;
 mod pending_evaluation;
+mod photographs;
 mod previous_run;
 mod read_progress;
 pub mod recoveries;

@@ -1,4 +1,5 @@
-//! Stores the keyframes of a live run on disk, next to its checkpoint, for `run --resume`.
+//! Stores the keyframes of a live run on disk, next to its checkpoint, for `run --resume`. The page
+//! shows the photographs of a saved run from these files.
 //!
 //! Each keyframe is a separate file in the layout of a checkpoint (`docs/reference/files.md`), with
 //! its color and depth as PNG. Ground truth from a simulator is left out.
@@ -14,7 +15,7 @@ use model_files::checkpoint::{Array, Checkpoint};
 use nalgebra::Vector3;
 use serde::{Deserialize, Serialize};
 use std::collections::{BTreeMap, BTreeSet};
-use std::ffi::OsString;
+use std::ffi::{OsStr, OsString};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
@@ -130,6 +131,32 @@ impl StoredKeyframes {
         Ok(keyframes)
     }
 
+    /// Whether the folder exists.
+    pub fn exist(&self) -> bool {
+        self.folder.is_dir()
+    }
+
+    /// Reads the keyframe with this camera and stamp; `None` if it is not stored.
+    ///
+    /// # Errors
+    ///
+    /// Fails if its file cannot be read.
+    pub fn read_one(&self, camera: &str, stamp: Stamp) -> anyhow::Result<Option<Keyframe>> {
+        let name = file_name(camera, stamp);
+        // The names of the cameras of a saved model come from a file, which may be from elsewhere.
+        if Path::new(&name).file_name() != Some(OsStr::new(&name)) {
+            return Ok(None);
+        }
+        let path = self.folder.join(name);
+        if !path.is_file() {
+            return Ok(None);
+        }
+        let read = || keyframe_of(&Checkpoint::read(&path)?);
+        let keyframe =
+            read().with_context(|| format!("cannot read the keyframe {}", path.display()))?;
+        Ok(Some(keyframe))
+    }
+
     fn names(&self) -> anyhow::Result<BTreeSet<String>> {
         let names = file_names(&self.folder)
             .with_context(|| format!("cannot list {}", self.folder.display()))?;
@@ -152,10 +179,15 @@ fn file_names(folder: &Path) -> std::io::Result<Vec<OsString>> {
         .collect()
 }
 
-/// File name of a keyframe. The stamp is padded with zeros to 20 digits, so that the names of a
-/// camera are in the order of its stamps.
+/// File name of a keyframe.
 fn name_of(keyframe: &Keyframe) -> String {
-    format!("{}_{:020}.{EXTENSION}", keyframe.camera, keyframe.stamp.0)
+    file_name(&keyframe.camera, keyframe.stamp)
+}
+
+/// File name of the keyframe with this camera and stamp. The stamp is padded with zeros to 20
+/// digits, so that the names of a camera are in the order of its stamps.
+fn file_name(camera: &str, stamp: Stamp) -> String {
+    format!("{camera}_{:020}.{EXTENSION}", stamp.0)
 }
 
 fn to_checkpoint(keyframe: &Keyframe) -> anyhow::Result<Checkpoint> {
@@ -366,6 +398,27 @@ mod tests {
         }
         stored.keep_only(&all[1..]).expect("they are there");
         assert_eq!(stored.read().expect("complete files").len(), 2);
+    }
+
+    #[test]
+    fn single_keyframes_are_read_from_the_folder_only() {
+        let run = tempfile::tempdir().expect("a folder");
+        let stored = StoredKeyframes::of_run(run.path());
+        assert!(!stored.exist());
+        stored.add(&[keyframe(7, true)]).expect("disk space");
+        assert!(stored.exist());
+        let read = |camera: &str, stamp| stored.read_one(camera, Stamp(stamp));
+        let found = read("wrist", 7).expect("a complete file").expect("stored");
+        assert_eq!(
+            keyframe::fingerprint(&found),
+            keyframe::fingerprint(&keyframe(7, true))
+        );
+        assert!(read("wrist", 8).expect("no error").is_none());
+        // A file beside the folder that has the right name.
+        let name = file_name("wrist", Stamp(7));
+        let inside = run.path().join(KEYFRAMES).join(&name);
+        std::fs::copy(inside, run.path().join(&name)).expect("disk space");
+        assert!(read("../wrist", 7).expect("no error").is_none());
     }
 
     #[test]

@@ -4,6 +4,7 @@ use crate::chunk_publisher::ChunkPublisher;
 use crate::editing::{self, Editor};
 use crate::methods;
 use crate::observations::{ModelState, ObservationPublisher, PosedKeyframe};
+use crate::photographs;
 use capture::Stop;
 use kinematics::Transform;
 use model_files::{Aabb, Edits};
@@ -89,6 +90,8 @@ impl ModelViewer {
 
     /// Draws requested pictures until a signal requests a stop.
     pub fn serve(&mut self, stop: &Stop) {
+        let paths = self.models.iter().map(|model| &*model.path);
+        photographs::serve_stored(&self.hub, paths, &self.model_from_page);
         while !stop.signaled() {
             self.apply_edits();
             if self.hub.pictures().wait_for_request(POLL_PERIOD)

@@ -26,6 +26,7 @@ mod pose;
 mod server;
 mod topics;
 
+pub use client::keyframe_image::ReadKeyframe;
 pub use client::protocol::{BASE_PROTOCOL_VERSION, Control, PROTOCOL_VERSION};
 pub use edit::{EditAction, EditRequest};
 pub use error::Error;

@@ -1,10 +1,11 @@
 //! Checks the messages of viewers: every accepted request must be safe to render, and every
 //! accepted subscription must keep its limits. The fuzz target `page` calls it.
 
+use crate::client::keyframe_image::{KeyframeImageRequest, MAX_PHOTOGRAPH_PX};
 use crate::client::negotiation::{capabilities, negotiate};
 use crate::client::protocol::{
-    BASE_PROTOCOL_VERSION, ClientHello, ClientMessage, EditMessage, MAX_RATE_HZ, PROTOCOL_VERSION,
-    RenderMessage, ShownMessage, SubscribeMessage,
+    BASE_PROTOCOL_VERSION, ClientHello, ClientMessage, EditMessage, KeyframeImageMessage,
+    MAX_RATE_HZ, PROTOCOL_VERSION, RenderMessage, ShownMessage, SubscribeMessage,
 };
 use crate::clock::ServerClock;
 use crate::edit::{EditAction, EditRequest};
@@ -25,6 +26,7 @@ pub(crate) fn check_messages(messages: &str) {
                 check_subscription(&mut subscriptions, message)
             }
             Ok(ClientMessage::Shown(message)) => check_shown(&message),
+            Ok(ClientMessage::KeyframeImage(message)) => check_keyframe_image(&message),
             Ok(ClientMessage::Edit(message)) => check_edit(&message),
             Ok(ClientMessage::Control(_) | ClientMessage::Ping(_) | ClientMessage::Goodbye(_))
             | Err(_) => {}
@@ -86,6 +88,16 @@ fn check_shown(message: &ShownMessage) {
             "{} ms became {shown_at:?}",
             message.shown_millis
         );
+    }
+}
+
+fn check_keyframe_image(message: &KeyframeImageMessage) {
+    let Ok(request) = KeyframeImageRequest::check(message) else {
+        return;
+    };
+    for size_px in [[640, 480], [1, 4000], [4096, 1]] {
+        let fitted = fitted(size_px, request.max_px);
+        assert!((0..2).all(|axis| (1..=MAX_PHOTOGRAPH_PX).contains(&fitted[axis])));
     }
 }
 

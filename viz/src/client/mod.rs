@@ -1,6 +1,7 @@
 //! Serves one connected client, from hello to goodbye: a reader and a writer that never wait for
 //! each other.
 
+pub(crate) mod keyframe_image;
 pub(crate) mod link_rate;
 #[cfg(any(test, fuzzing))]
 pub(crate) mod message_checks;
@@ -10,6 +11,7 @@ pub(crate) mod server_message;
 mod writer;
 
 use crate::Hub;
+use crate::client::keyframe_image::KeyframeImageRequest;
 use crate::client::link_rate::LinkRate;
 use crate::client::negotiation::{Negotiated, negotiate};
 use crate::client::protocol::{
@@ -88,6 +90,7 @@ pub(crate) async fn serve(
         negotiated: Negotiated::default(),
         link,
         part_sent: Instant::now(),
+        photograph: None,
     };
     // Both run in one task, and neither waits for the other: a client can request another view
     // while a picture is being sent.
@@ -201,6 +204,10 @@ impl Reader<'_> {
                 self.hub.operator_requests().control(action);
             }
             ClientMessage::Shown(message) => self.shown(&message)?,
+            ClientMessage::KeyframeImage(message) => {
+                let request = KeyframeImageRequest::check(&message)?;
+                return Ok(Some(Reply::KeyframeImage(request)));
+            }
             ClientMessage::Edit(message) => self.edit(&message)?,
             ClientMessage::Ping(ping) => return Ok(Some(Reply::Pong { t: ping.t })),
             ClientMessage::Goodbye(_) => {

@@ -4,7 +4,7 @@ use crate::client::protocol::{BASE_PROTOCOL_VERSION, ClientHello, PROTOCOL_VERSI
 use crate::topics::TOPICS;
 
 /// Names of the capabilities of this server, except those of topics.
-const CAPABILITIES: [&str; 9] = [
+const CAPABILITIES: [&str; 10] = [
     "views",
     "subscribe",
     "compact_depth",
@@ -14,6 +14,7 @@ const CAPABILITIES: [&str; 9] = [
     "control",
     "edit",
     "shown",
+    "keyframe_images",
 ];
 const KEYFRAME_CHANGES: &str = "keyframe_changes";
 const PARTS: &str = "parts";

@@ -36,6 +36,8 @@ pub(crate) enum ClientMessage {
     Control(ControlMessage),
     /// Reports when a picture was shown.
     Shown(ShownMessage),
+    /// Requests the photograph of a keyframe.
+    KeyframeImage(KeyframeImageMessage),
     /// Edits a model.
     Edit(EditMessage),
     /// Requests the server's time.
@@ -54,6 +56,7 @@ impl ClientMessage {
             | Self::Render(_)
             | Self::Subscribe(_)
             | Self::Shown(_)
+            | Self::KeyframeImage(_)
             | Self::Ping(_)
             | Self::Goodbye(_) => Role::Viewer,
             Self::Control(_) | Self::Edit(_) => Role::Operator,
@@ -121,6 +124,18 @@ pub(crate) struct ShownMessage {
     pub(crate) view: Option<String>,
     /// When its last stage was shown, on the server's clock.
     pub(crate) shown_millis: f64,
+}
+
+/// Fields of `keyframe_image`.
+#[derive(Debug, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(crate) struct KeyframeImageMessage {
+    /// Number chosen by the client and repeated in the reply.
+    pub(crate) id: u64,
+    /// Number of the keyframe in `keyframe_changes`.
+    pub(crate) keyframe: u64,
+    /// Maximum size; larger photographs are downscaled.
+    pub(crate) size_px: Option<[u32; 2]>,
 }
 
 /// Fields of `edit`.

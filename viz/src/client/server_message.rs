@@ -65,6 +65,8 @@ pub(crate) enum ServerMessage<'a> {
         id: Option<u64>,
         #[serde(skip_serializing_if = "Option::is_none")]
         view: Option<&'a str>,
+        #[serde(skip_serializing_if = "Option::is_none")]
+        keyframe: Option<u64>,
         message: &'a str,
     },
     /// Sent at a fixed rate, so that silence indicates a broken connection.
@@ -137,6 +139,8 @@ pub(crate) enum BinaryHeader<'a> {
     LiveImage(&'a LiveHeader<'a>),
     /// Points of a keyframe.
     KeyframePoints(PointsHeader),
+    /// The photograph of a keyframe.
+    KeyframeImage(KeyframeImageHeader<'a>),
     /// A scan of a range scanner.
     RangeScan(RangeScanHeader<'a>),
     /// When and how precisely each part of the scene was observed.
@@ -153,6 +157,36 @@ pub(crate) struct PointsHeader {
     pub(crate) id: u64,
     pub(crate) n_points: usize,
     pub(crate) meters_per_count: f64,
+}
+
+/// Header of `keyframe_image`.
+#[derive(Clone, Debug, Serialize)]
+pub(crate) struct KeyframeImageHeader<'a> {
+    pub(crate) id: u64,
+    pub(crate) keyframe: u64,
+    pub(crate) camera: &'a str,
+    pub(crate) stamp_nanos: i64,
+    pub(crate) size_px: [u32; 2],
+    pub(crate) full_size_px: [u32; 2],
+    /// Name of the split.
+    pub(crate) split: &'static str,
+    pub(crate) has_depth: bool,
+    /// Row-major pose before the corrections that the model has estimated.
+    pub(crate) reported_world_from_camera: [f64; 16],
+    /// Speed of the camera at the stamp; `None` if unknown.
+    pub(crate) speed_m_s: Option<f64>,
+    pub(crate) turn_rad_s: Option<f64>,
+    pub(crate) readout_secs: f64,
+    pub(crate) color: ColorPart,
+    /// `None` if all pixels are valid.
+    pub(crate) mask: Option<MaskPart>,
+}
+
+/// Position of the valid pixels of a photograph in the payload.
+#[derive(Clone, Copy, Debug, Serialize)]
+pub(crate) struct MaskPart {
+    pub(crate) offset: usize,
+    pub(crate) bytes: usize,
 }
 
 /// Header of `range_scan`.
@@ -233,7 +267,7 @@ pub(crate) struct NewestKeyframeMessage {
 }
 
 /// Position of the color in the payload.
-#[derive(Debug, Serialize)]
+#[derive(Clone, Debug, Serialize)]
 pub(crate) struct ColorPart {
     pub(crate) format: &'static str,
     pub(crate) offset: usize,

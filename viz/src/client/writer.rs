@@ -4,6 +4,7 @@
 //! most one part. The parts and the kernel's buffer are so small that their transfer takes less
 //! than 100 ms. Everything else waits here, where newer data replaces older data.
 
+use crate::client::keyframe_image::{KeyframeImageError, KeyframeImageRequest, encode_photograph};
 use crate::client::link_rate::LinkRate;
 use crate::client::negotiation::{Agreement, Negotiated, capabilities};
 use crate::client::protocol::{BASE_PROTOCOL_VERSION, PROTOCOL_VERSION};
@@ -51,9 +52,18 @@ const MAX_SILENCE: Duration = Duration::from_secs(2);
 /// A message that the reader asks the writer to send.
 pub(crate) enum Reply {
     Welcome(Agreement),
-    Error { id: Option<u64>, message: String },
-    Pong { t: f64 },
-    Goodbye { reason: String },
+    Error {
+        id: Option<u64>,
+        message: String,
+    },
+    Pong {
+        t: f64,
+    },
+    /// Not sent itself: the photograph follows when it is encoded.
+    KeyframeImage(KeyframeImageRequest),
+    Goodbye {
+        reason: String,
+    },
 }
 
 /// Whether to serve the client further: continue or end.
@@ -70,6 +80,8 @@ pub(crate) struct Writer<'a> {
     pub(crate) link: LinkRate,
     /// When the last part was sent.
     pub(crate) part_sent: Instant,
+    /// The photograph that is being encoded, or waits until it can be sent.
+    pub(crate) photograph: Option<PhotographTask>,
 }
 
 /// A picture being encoded.
@@ -77,6 +89,12 @@ struct EncodingTask {
     id: u64,
     view: Arc<str>,
     task: JoinHandle<Result<PackedPicture, PackError>>,
+}
+
+/// A photograph of a keyframe that is being encoded: at most one per client.
+pub(crate) struct PhotographTask {
+    request: KeyframeImageRequest,
+    task: JoinHandle<Result<Vec<u8>, KeyframeImageError>>,
 }
 
 /// A binary message that is being sent in parts.
@@ -254,6 +272,20 @@ impl Writer<'_> {
                         None => {}
                     }
                 }
+                // Before pictures, which follow each other without a pause: the client waits for it.
+                encoded = encoded_photograph(&mut self.photograph), if !is_sending && is_heard => {
+                    let Some(PhotographTask { request, .. }) = self.photograph.take() else {
+                        continue;
+                    };
+                    match encoded {
+                        Ok(Ok(bytes)) => transfers.start(bytes.into(), false),
+                        Ok(Err(error)) => {
+                            self.send_image_error(request, &error.to_string()).await?;
+                        }
+                        // The task panicked. The client must not wait forever.
+                        Err(error) => self.send_image_error(request, &error.to_string()).await?,
+                    }
+                }
                 // The encoded picture waits in its task until the last message is complete.
                 encoded = finished(&mut encoding), if !is_sending => {
                     let Some(EncodingTask { id, view, .. }) = encoding.take() else { continue };
@@ -365,8 +397,35 @@ impl Writer<'_> {
                 self.send_message(&ServerMessage::Pong { t, clock_millis })
                     .await
             }
+            Reply::KeyframeImage(request) if self.photograph.is_some() => {
+                let reason = KeyframeImageError::Busy.to_string();
+                self.send_image_error(request, &reason).await
+            }
+            Reply::KeyframeImage(request) => {
+                let context = self.server_context;
+                let photographs = Arc::clone(&context.photographs);
+                let task =
+                    tokio::spawn(encode_photograph(photographs, context.hub.clone(), request));
+                self.photograph = Some(PhotographTask { request, task });
+                ControlFlow::Continue(())
+            }
             Reply::Goodbye { reason } => self.send_goodbye(&reason).await,
         }
+    }
+
+    /// Sends the reason why there is no photograph.
+    async fn send_image_error(
+        &mut self,
+        request: KeyframeImageRequest,
+        reason: &str,
+    ) -> ClientFlow {
+        self.send_message(&ServerMessage::Error {
+            id: Some(request.id),
+            view: None,
+            keyframe: Some(request.keyframe),
+            message: reason,
+        })
+        .await
     }
 
     /// Sends the next part, or the whole message if the client cannot join parts.
@@ -418,8 +477,13 @@ impl Writer<'_> {
 
     async fn send_error(&mut self, id: Option<u64>, view: &str, message: &str) -> ClientFlow {
         let view = (!view.is_empty()).then_some(view);
-        self.send_message(&ServerMessage::Error { id, view, message })
-            .await
+        self.send_message(&ServerMessage::Error {
+            id,
+            view,
+            keyframe: None,
+            message,
+        })
+        .await
     }
 
     async fn send_goodbye(&mut self, reason: &str) -> ClientFlow {
@@ -459,6 +523,16 @@ fn encode(drawn: Box<DrawnPicture>, effort: Option<Effort>) -> EncodingTask {
 async fn finished(encoding: &mut Option<EncodingTask>) -> EncodingResult {
     match encoding {
         Some(encoding) => (&mut encoding.task).await,
+        None => std::future::pending().await,
+    }
+}
+
+/// Waits until the photograph is encoded. Without one, waits forever.
+async fn encoded_photograph(
+    photograph: &mut Option<PhotographTask>,
+) -> Result<Result<Vec<u8>, KeyframeImageError>, JoinError> {
+    match photograph {
+        Some(photograph) => (&mut photograph.task).await,
         None => std::future::pending().await,
     }
 }

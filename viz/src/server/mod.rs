@@ -40,7 +40,7 @@ use std::sync::Arc;
 use std::thread::JoinHandle;
 use std::time::Duration;
 use tokio::io::{AsyncRead, AsyncWrite};
-use tokio::sync::watch;
+use tokio::sync::{Semaphore, watch};
 use tokio_rustls::TlsAcceptor;
 
 /// Maximum time that a stopping server waits until its clients have received the goodbye. A client
@@ -60,6 +60,9 @@ const SEND_BUFFER_BYTES: usize = 64 * 1024;
 /// Maximum number of connections waiting to be accepted.
 #[cfg(unix)]
 const BACKLOG: i32 = 1024;
+/// Maximum number of photographs of keyframes that are encoded at the same time, for all clients.
+/// Each one takes a processor away from training for some milliseconds.
+const MAX_PHOTOGRAPHS: usize = 2;
 /// Sources that the page may load, and sites that may embed it.
 const CONTENT_SECURITY_POLICY: &str = "default-src 'self'; img-src 'self' data: blob:; object-src 'none'; base-uri 'none'; \
      form-action 'none'; frame-ancestors 'none'";
@@ -219,6 +222,7 @@ async fn serve(
         clock,
         topics,
         publisher,
+        photographs: Arc::new(Semaphore::new(MAX_PHOTOGRAPHS)),
         log,
         stopped: stopped.clone(),
     };

@@ -5,7 +5,7 @@ use crate::clock::ServerClock;
 use crate::server::client_log::ClientLog;
 use crate::topics::{Publisher, Topic};
 use std::sync::Arc;
-use tokio::sync::watch;
+use tokio::sync::{Semaphore, watch};
 
 /// Shared by the tasks of all clients.
 #[derive(Clone)]
@@ -18,6 +18,8 @@ pub(crate) struct ServerContext {
     pub(crate) topics: Arc<[Arc<dyn Topic>]>,
     /// Notices new messages of the topics.
     pub(crate) publisher: Publisher,
+    /// Limits the work on photographs of keyframes.
+    pub(crate) photographs: Arc<Semaphore>,
     /// Log of client activity.
     pub(crate) log: Arc<ClientLog>,
     /// Becomes true when the server stops.

@@ -92,6 +92,11 @@ impl KeyframeLog {
         self.keyframes.contains_key(&number)
     }
 
+    /// The keyframe with this number.
+    pub(crate) fn get(&self, number: u64) -> Option<&KeyframePose> {
+        self.keyframes.get(&number).map(|entry| &entry.keyframe)
+    }
+
     /// Number, camera and stamp of all keyframes, the newest first.
     pub(crate) fn newest_first(&self) -> impl Iterator<Item = (u64, &KeyframePose)> {
         self.keyframes

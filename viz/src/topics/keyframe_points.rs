@@ -215,7 +215,7 @@ impl Hub {
     }
 
     /// The keyframe with this camera and stamp, if the run still has it.
-    fn keyframe_source(&self, camera: &Arc<str>, stamp: Stamp) -> Option<Arc<Keyframe>> {
+    pub(crate) fn keyframe_source(&self, camera: &Arc<str>, stamp: Stamp) -> Option<Arc<Keyframe>> {
         self.latest::<KeyframeSources>()
             .borrow()
             .get(&(Arc::clone(camera), stamp.0))?

@@ -171,6 +171,7 @@ fn live_message(image: &LiveImage, max_px: [u32; 2], clock: ServerClock) -> Mess
             ServerMessage::Error {
                 id: None,
                 view: None,
+                keyframe: None,
                 message: &message,
             }
             .to_message()

@@ -9,6 +9,8 @@ mod ending_page;
 mod eye_page;
 #[cfg(feature = "foxglove")]
 mod foxglove;
+mod keyframe_browser_page;
+mod keyframe_images;
 mod local_page;
 mod model_chunks;
 mod models;

@@ -2,11 +2,13 @@
 
 import { keepToken, showRole } from "./connection/access";
 import { Banner } from "./panels/banner";
+import { CoverageHint } from "./panels/coverage_hint";
 import { Connection } from "./connection/connection";
 import { EditControls } from "./panels/edit_controls";
 import { element } from "./panels/element";
 import { showGuidance } from "./panels/guidance";
 import { setUpHelp, showKeysInTitles } from "./panels/help";
+import { KeyframeBrowser } from "./panels/keyframe_browser";
 import { LinkReadout } from "./connection/link_readout";
 import { LiveImages } from "./panels/live_images";
 import { ModelSourceCard } from "./panels/model_source";
@@ -33,14 +35,17 @@ import { RangeScansTopic } from "./topics/range_scans";
 import { robotTopic } from "./topics/robot_state";
 import { statusTopic } from "./topics/status";
 import { Topics } from "./topics/topic";
+import { TimePhoto } from "./panels/time_photo";
 import { TimeSlider } from "./panels/time_slider";
 import { ViewMemory } from "./view/view_memory";
+import { setUpSavePicture } from "./view/save_picture";
 import { ViewSettings } from "./view/view_settings";
 
 let stages = [0.1, 0.5, 1];
 let latestStatus: Status | null = null;
 let latestStep = -1;
 let showsModel = true;
+let sceneRadiusM = 1;
 
 const readouts = new Readouts();
 const banner = new Banner();
@@ -72,6 +77,8 @@ const connection: Connection = new Connection(`${location.protocol === "https:" 
       shownLatency.forget();
       forgetSurfaces();
       for (const side of sides) side.restart();
+      browser.restart();
+      coverage.restart();
       topics.restart();
     }
     if (shown.dataset.state !== before) view.changed();
@@ -108,6 +115,7 @@ const models = new ModelSwitch(() => {
   shownLatency.forget();
   scheduler.restart();
   forgetSurfaces();
+  browser.modelChanged(true);
   if (latestStatus) showStatus(latestStatus);
 });
 let isDrawnLocally = false;
@@ -121,6 +129,16 @@ const surroundings = new Surroundings(
   () => view.forgetSurfaces(),
 );
 const settings = new ViewSettings(view, scheduler, sides[1]);
+setUpSavePicture(view);
+const browser = new KeyframeBrowser({
+  connection,
+  view,
+  topic: keyframes,
+  common: () => scheduler.picture({ ...view.view(), crop: undefined }),
+  live: () => liveImages.latest,
+  radiusM: () => sceneRadiusM,
+});
+const coverage = new CoverageHint({ view, topic: observations, live: () => liveImages.latest });
 
 function openView(): OrbitView {
   if (!document.createElement("canvas").getContext("webgl2")) {
@@ -166,10 +184,12 @@ function receiveText(message: TextMessage): void {
       break;
     case "scene":
       view.setScene(message);
+      coverage.setScene(message);
+      sceneRadiusM = message.radius_m;
       break;
     case "error":
       if (edits.failed(message)) break;
-      if (sides.some((side) => side.fail(message))) break;
+      if (sides.some((side) => side.fail(message)) || browser.fail(message)) break;
       scheduler.failed(message.id);
       element("notice").textContent = message.message;
       break;
@@ -183,6 +203,7 @@ function showStatus(status: Status): void {
   const isEdited = edits.show(status, model);
   const isChanged = model.step !== latestStep;
   if (isChanged || isEdited) scheduler.modelChanged();
+  if (isChanged || isEdited) browser.modelChanged(isEdited);
   if (isEdited) forgetSurfaces();
   else if (isChanged) surroundings.modelChanged();
   latestStep = model.step;
@@ -205,6 +226,7 @@ function updateLocalModel(model: ModelStatus): void {
 }
 
 function receiveBinary(header: BinaryHeader, payload: Uint8Array<ArrayBuffer>): void {
+  if (browser.receive(header, payload)) return;
   if (header.type !== "picture") topics.receive(header, payload);
   else if (!sides.some((side) => side.receive(header, payload))) void showPicture(header, payload);
 }
@@ -270,7 +292,7 @@ action("full-screen", "u", () => {
 setUpHelp();
 action("look-top", "t", () => view.lookAlong("top"));
 action("look-front", "f", () => view.lookAlong("front"));
-action("look-nearest", "n", () => view.lookFromNearest(keyframes.list.keyframes));
+action("look-nearest", "n", () => browser.toggle());
 action("look-live", "c", () => {
   const pose = liveImages.latest?.world_from_camera;
   if (pose) view.lookFrom(pose);
@@ -321,6 +343,7 @@ for (const { id, key, quantity } of TINTS) {
     observations.tint = isOn ? quantity : null;
   });
 }
+toggle("toggle-coverage", "4", (isOn) => (coverage.enabled = isOn));
 toggle("toggle-robot", "b", (isOn) => (view.robot.enabled = isOn));
 toggle("toggle-frames", "h", (isOn) => (view.frames.enabled = isOn));
 toggle("toggle-occlude", "o", (isOn) => (view.occlusion.enabled = isOn));
@@ -328,7 +351,7 @@ toggle("toggle-occlude", "o", (isOn) => (view.occlusion.enabled = isOn));
 // After all toggles have their listeners, because restoring a view presses them.
 const memory = new ViewMemory(view, settings, models);
 const namedViews = new NamedViews(memory);
-new TimeSlider(keyframes, view);
+new TimeSlider(keyframes, view, new TimePhoto(browser.photos));
 
 function frame(): void {
   shownLatency.frameBegins();

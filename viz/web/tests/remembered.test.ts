@@ -25,7 +25,7 @@ const PATH = [
   { position: [-1, 2, 3], target: [0, 0, 0.5], fovDegrees: 60 },
 ] satisfies Remembered["path"];
 const ALL: Remembered = {
-  view: { ...VIEW, up: [0, -1, 0], mode: "chase", attachedTo: "tool0", fovDegrees: 71.25 },
+  view: { ...VIEW, up: [0, -1, 0], mode: "ride", attachedTo: "tool0", fovDegrees: 71.25 },
   switched: ["grid", "keyframes"],
   crop: { min_m: [-1, -2, -3], max_m: [1, 2, 3.5] },
   method: "mean_color",
@@ -42,6 +42,11 @@ test("the text needs no escapes in an address, and a usual one is short", () => 
   assert.match(encoded(ALL), /^[A-Za-z0-9._~-]+$/);
   assert.ok(encoded({ ...NOTHING, view: VIEW }).length < 60, encoded({ ...NOTHING, view: VIEW }));
   assert.equal(textInFragment(fragmentWith(encoded(ALL))), encoded(ALL));
+});
+
+test("only a ride can be tilted, so that other views have no direction of up", () => {
+  const view: ViewState = { ...VIEW, up: [0.1, 0.2, 0.9], mode: "chase", attachedTo: "base" };
+  assert.deepEqual(decoded(encoded({ ...NOTHING, view }))?.view, { ...view, up: [0, 0, 1] });
 });
 
 test("frames whose names need escapes are left out", () => {

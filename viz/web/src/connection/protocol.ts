@@ -15,6 +15,7 @@ export const CAPABILITIES = [
   "control",
   "edit",
   "shown",
+  "keyframe_images",
 ] as const;
 export type Capability = (typeof CAPABILITIES)[number];
 
@@ -221,6 +222,8 @@ export interface ErrorMessage {
   type: "error";
   id: number | null;
   view?: string;
+  /** Number of the keyframe, in replies to `keyframe_image`. */
+  keyframe?: number;
   message: string;
 }
 
@@ -295,6 +298,31 @@ export interface KeyframePointsHeader {
   id: number;
   n_points: number;
   meters_per_count: number;
+}
+
+/** The photograph of a keyframe: the undistorted image that the model is trained on. */
+export interface KeyframeImageHeader {
+  type: "keyframe_image";
+  /** Number of the request. */
+  id: number;
+  /** Number of the keyframe. */
+  keyframe: number;
+  camera: string;
+  stamp_nanos: number;
+  size_px: [number, number];
+  full_size_px: [number, number];
+  split: "train" | "validation" | "test";
+  has_depth: boolean;
+  /** Pose before the corrections that the model has estimated, row major. */
+  reported_world_from_camera: number[];
+  /** Speed of the camera at mid-exposure; null if unknown. */
+  speed_m_s: number | null;
+  turn_rad_s: number | null;
+  /** Time from the first row's exposure to the last row's. */
+  readout_secs: number;
+  color: { format: "jpeg"; offset: number; bytes: number };
+  /** A zlib stream of a byte per pixel, 0 where the photograph is not used; null if all pixels are. */
+  mask: { offset: number; bytes: number } | null;
 }
 
 interface ChunkHeader {
@@ -394,6 +422,7 @@ export type BinaryHeader =
   | PictureHeader
   | LiveImageHeader
   | KeyframePointsHeader
+  | KeyframeImageHeader
   | RangeScanHeader
   | ObservationsHeader
   | ModelChunkHeader;
@@ -451,6 +480,16 @@ export interface ShownMessage {
   shown_millis: number;
 }
 
+/** Requests the photograph of a keyframe. */
+export interface KeyframeImageMessage {
+  type: "keyframe_image";
+  id: number;
+  /** Number of the keyframe. */
+  keyframe: number;
+  /** Maximum size. */
+  size_px: [number, number];
+}
+
 export interface PingMessage {
   type: "ping";
   t: number;
@@ -463,6 +502,7 @@ export type ClientMessage =
   | ControlMessage
   | ShownMessage
   | EditMessage
+  | KeyframeImageMessage
   | PingMessage;
 
 /** Header and payload of a binary message: u32 little-endian header length, JSON header, payload. */

@@ -74,6 +74,8 @@ export class ObservationLayer {
     observationAge: { value: 0 },
     observationOpacity: { value: 1 },
   };
+  /** Called with each new map: its header, and the codes of ages, then of standard deviations. */
+  onMap: ((header: ObservationsHeader, codes: Uint8Array) => void) | null = null;
   private quantity: Quantity | null = null;
   private newestMillis: number | null = null;
   private hasMap = false;
@@ -112,6 +114,7 @@ export class ObservationLayer {
     const codes = await inflated(payload, 2 * nCells);
     if (codes.length !== 2 * nCells) throw new Error(`a map has ${codes.length} bytes, not ${2 * nCells}`);
     if (number !== this.nReceived) return;
+    this.onMap?.(header, codes);
     const interleaved = new Uint8Array(2 * nCells);
     for (let ix = 0; ix < nCells; ix++) {
       interleaved[2 * ix] = codes[ix]!;

@@ -12,6 +12,7 @@ const OLD_COLOR = new THREE.Color(0x9aa4b2);
 /** The color of a keyframe of this age is halfway between both. */
 const AGE_SECS = 10;
 const LIVE_COLOR = 0x4cc2a6;
+const SELECTED_COLOR = 0xe3b341;
 
 /** A pose in the world. */
 export interface PosedFrame {
@@ -35,13 +36,16 @@ export class Overlays {
   private isLive = true;
   private readonly worldFromUpright = new THREE.Quaternion();
   private frustumDepth = 0.06;
+  /** The frustum of the keyframe that the operator looks at. */
+  private readonly selected: THREE.LineSegments;
   private posed: (PosedCamera | NumberedKeyframe)[] = [];
 
   constructor(private readonly occlusion: Occlusion) {
     this.keyframes = this.lines(0xffffff, 0.45);
     (this.keyframes.material as THREE.LineBasicMaterial).vertexColors = true;
     this.keyframes.visible = false; // Hundreds of them would hide the scene.
-    this.root.add(this.ground, this.cameras, this.keyframes);
+    this.selected = this.lines(SELECTED_COLOR, 1);
+    this.root.add(this.ground, this.cameras, this.keyframes, this.selected);
   }
 
   /** Grid, axes and live cameras. */
@@ -90,6 +94,16 @@ export class Overlays {
   setKeyframes(keyframes: (PosedCamera | NumberedKeyframe)[]): void {
     this.posed = keyframes;
     this.drawKeyframes();
+  }
+
+  /** The keyframes whose frustums are drawn, and how deep these are, meters. */
+  get drawnKeyframes(): { keyframes: (PosedCamera | NumberedKeyframe)[]; depthM: number } {
+    return { keyframes: this.keyframes.visible ? this.posed : [], depthM: this.frustumDepth };
+  }
+
+  /** Draws the frustum of this keyframe larger and in another color, even if the others are hidden. */
+  select(keyframe: PosedCamera | null): void {
+    setLines(this.selected, keyframe ? frustum(keyframe, 1.3 * this.frustumDepth) : []);
   }
 
   /** Builds the frustums if they are visible: the list changes several times per second. */
@@ -165,7 +179,7 @@ export function axes(length: number): THREE.LineSegments {
 }
 
 /** Ends of the edges of a frustum and of a small roof on its upper side, in world. */
-function frustum(camera: PosedCamera, depth: number): THREE.Vector3[] {
+export function frustum(camera: PosedCamera, depth: number): THREE.Vector3[] {
   const pose = worldFromCamera(camera.world_from_camera);
   const [width, height] = camera.size_px;
   const at = (u: number, v: number): THREE.Vector3 =>

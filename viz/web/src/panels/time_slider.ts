@@ -1,4 +1,5 @@
-// Goes back in time: shows only the keyframes, and their points, up to a moment of the run.
+// Goes back in time: shows only the keyframes, and their points, up to a moment of the run, and the photograph of that
+// moment.
 //
 // The slider moves from keyframe to keyframe and not along the clock, because the times of a resumed run have a gap.
 
@@ -7,6 +8,7 @@ import { byTime, nearestInTime, stopwatchText } from "./keyframe_times";
 import type { KeyframesTopic } from "../topics/keyframes";
 import type { NumberedKeyframe } from "../connection/protocol";
 import type { OrbitView } from "../view/orbit_view";
+import type { TimePhoto } from "./time_photo";
 
 export class TimeSlider {
   private readonly panel = element("history");
@@ -22,8 +24,9 @@ export class TimeSlider {
   constructor(
     private readonly keyframes: KeyframesTopic,
     private readonly view: OrbitView,
+    private readonly photo: TimePhoto,
   ) {
-    keyframes.onChange = () => this.listChanged();
+    keyframes.onChange.push(() => this.listChanged());
     this.slider.addEventListener("input", () => this.choose(this.slider.valueAsNumber));
     element("history-before").addEventListener("click", () => this.choose(this.slider.valueAsNumber - 1));
     element("history-after").addEventListener("click", () => this.choose(this.slider.valueAsNumber + 1));
@@ -46,6 +49,7 @@ export class TimeSlider {
     this.view.overlays.showsKeyframes = this.isOpen || isKeyframeLayerOn();
     this.view.changed();
     if (this.isOpen) this.showSlider();
+    else this.photo.show(null);
   }
 
   private listChanged(): void {
@@ -87,6 +91,7 @@ export class TimeSlider {
     element("history-before", HTMLButtonElement).disabled = ix <= 0;
     element("history-after", HTMLButtonElement).disabled = chosenNanos === null;
     element("history-look", HTMLButtonElement).disabled = !chosen;
+    this.photo.show(chosen ?? null);
   }
 
   private textOf(chosen: NumberedKeyframe, ix: number): string {

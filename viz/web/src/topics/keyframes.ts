@@ -10,6 +10,8 @@ const HZ = 2;
 export class KeyframesTopic implements Topic {
   readonly name = "keyframes";
   readonly list = new KeyframeList();
+  /** Called after changes of the list. */
+  readonly onChange: (() => void)[] = [];
   readonly receivers = [
     on<Keyframes>("keyframes", (message) => {
       this.view.overlays.setKeyframes(message.keyframes);
@@ -19,11 +21,9 @@ export class KeyframesTopic implements Topic {
       this.list.apply(message);
       this.view.points.setKeyframes(this.list.keyframes);
       this.show();
-      this.onChange();
+      for (const changed of this.onChange) changed();
     }),
   ];
-  /** Called after each change of the list. */
-  onChange = (): void => {};
   private untilNanos: number | null = null;
 
   constructor(private readonly view: OrbitView) {}

@@ -24,6 +24,7 @@ export class ObservationsTopic implements Topic {
     }),
   ];
   private isShown = false;
+  private isSearched = false;
 
   constructor(private readonly view: OrbitView, private readonly changed: () => void) {}
 
@@ -34,12 +35,19 @@ export class ObservationsTopic implements Topic {
     this.changed();
   }
 
+  /** Whether the place that is seen worst is searched for. */
+  set searched(isSearched: boolean) {
+    this.isSearched = isSearched;
+    this.changed();
+  }
+
   subscriptions(isHidden: boolean): Subscription[] {
-    return [{ rate_hz: this.isShown && !isHidden ? HZ : 0 }];
+    return [{ rate_hz: (this.isShown || this.isSearched) && !isHidden ? HZ : 0 }];
   }
 
   restart(isSupported: boolean): void {
     this.view.observations.clear();
     for (const { id } of TINTS) element(id).hidden = !isSupported;
+    element("toggle-coverage").hidden = !isSupported;
   }
 }

@@ -185,19 +185,16 @@ export class OrbitView {
     this.jump({ eye: center.clone().addScaledVector(from, distance), target: center });
   }
 
-  /** Looks from the keyframe closest to the current view. */
-  lookFromNearest(keyframes: PosedCamera[]): void {
-    const forward = this.camera.getWorldDirection(new THREE.Vector3());
-    const radius = this.scene?.radius_m ?? 1;
-    const distance = (keyframe: PosedCamera): number => {
-      const pose = worldFromCamera(keyframe.world_from_camera);
-      const away = new THREE.Vector3().setFromMatrixPosition(pose).distanceTo(this.camera.position) / radius;
-      return away + forward.angleTo(new THREE.Vector3().setFromMatrixColumn(pose, 2));
-    };
-    const [nearest] = [...keyframes].sort((a, b) => distance(a) - distance(b));
-    if (!nearest) return;
+  /** Looks from a keyframe. */
+  lookFromKeyframe({ world_from_camera }: PosedCamera): void {
     this.hasUserMoved = true;
-    this.lookFrom(nearest.world_from_camera);
+    this.lookFrom(world_from_camera);
+  }
+
+  /** Turns toward a point in world, which becomes the center of the orbit. */
+  turnTo(point: THREE.Vector3): void {
+    this.hasUserMoved = true;
+    this.jump({ eye: this.camera.position.clone(), target: point });
   }
 
   /** Shows a view of the camera path. */

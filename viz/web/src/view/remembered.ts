@@ -61,8 +61,9 @@ export function encoded({ view, switched, crop, method, path }: Remembered): str
   const parts = [VERSION];
   if (view) {
     parts.push(`p${numbers(view.position, VIEW_DECIMALS)}`, `t${numbers(view.target, VIEW_DECIMALS)}`);
-    if (view.up.join() !== UPRIGHT.join()) parts.push(`u${numbers(view.up, VIEW_DECIMALS)}`);
     const { mode, attachedTo, fovDegrees } = view;
+    // All other views are upright.
+    if (mode === "ride") parts.push(`u${numbers(view.up, VIEW_DECIMALS)}`);
     const isNamed = attachedTo !== undefined && FRAME.test(attachedTo);
     if (mode !== DEFAULT_MODE) parts.push(`m${mode}`);
     if (isNamed) parts.push(`a${attachedTo}`);

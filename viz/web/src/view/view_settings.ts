@@ -123,7 +123,8 @@ export class ViewSettings {
   }
 }
 
-function download(file: Blob, name: string): void {
+/** Lets the browser save a file. */
+export function download(file: Blob, name: string): void {
   const link = document.createElement("a");
   link.href = URL.createObjectURL(file);
   link.download = name;

@@ -1,0 +1,154 @@
+// Gets the photograph of a keyframe and the model's picture of the same view, and compares them.
+
+import type { KeyframePhotos, Photo } from "../connection/keyframe_photos";
+import type { KeyframeImageHeader, NumberedKeyframe } from "../connection/protocol";
+import type { PictureRequest, SidePicture, SideView } from "../layers/side_view";
+import { decodeDepth } from "../layers/depth_part";
+import { inflated } from "../layers/zlib";
+import { compareKeyframe, type KeyframeErrors } from "./keyframe_error";
+import { keyframeKey } from "./keyframe_order";
+
+/** A photograph with its mask: by pixel, 0 where it is not used; null if all pixels are. */
+export interface DecodedPhoto {
+  header: KeyframeImageHeader;
+  image: ImageData;
+  mask: Uint8Array | null;
+}
+
+export interface Comparison {
+  keyframe: NumberedKeyframe;
+  /** The photograph, or the reason why there is none. */
+  photo: DecodedPhoto | string;
+  /** The model's picture, or the reason why there is none. */
+  render: ImageData | string;
+  /** Null if one of the two is missing. */
+  errors: KeyframeErrors | null;
+}
+
+/** What requests for pictures of the model have in common: the model, the clipping distances and the background. */
+export type CommonRequest = Omit<PictureRequest, "world_from_camera" | "size_px" | "projection" | "crop" | "outputs">;
+
+/** Waiting longer than this for a picture is not useful: the server is busy, for example with saving. */
+const TIMEOUT_MILLIS = 30_000;
+
+export class KeyframeComparer {
+  /** The photograph that was requested last. */
+  private last: { key: string; photo: DecodedPhoto } | null = null;
+
+  constructor(
+    private readonly photos: KeyframePhotos,
+    private readonly side: SideView,
+    private readonly common: () => CommonRequest,
+    private readonly maxPx: [number, number],
+    private readonly isUrgent: boolean,
+  ) {}
+
+  /** Forgets the photograph: a new server may have another one under the same name. */
+  restart(): void {
+    this.last = null;
+  }
+
+  /** Compares a keyframe. `onPhoto` is called with its photograph, which usually arrives before the model's picture. */
+  async compare(keyframe: NumberedKeyframe, onPhoto?: (photo: DecodedPhoto | string) => void): Promise<Comparison> {
+    const sizePx = fitted(keyframe.size_px, this.maxPx);
+    const [photo, render] = await Promise.all([
+      this.photo(keyframe).then((photo) => {
+        onPhoto?.(photo);
+        return photo;
+      }),
+      this.render(keyframe, sizePx),
+    ]);
+    const isComplete = typeof photo !== "string" && typeof render !== "string";
+    return {
+      keyframe,
+      photo,
+      render: typeof render === "string" ? render : render.image,
+      errors: isComplete ? compareKeyframe(photo.image, render.image, { mask: photo.mask, surface: render.surface }) : null,
+    };
+  }
+
+  private async photo(keyframe: NumberedKeyframe): Promise<DecodedPhoto | string> {
+    const key = keyframeKey(keyframe);
+    if (this.last?.key === key) return this.last.photo;
+    if (!this.photos.isPossible) return "this server sends no photographs";
+    try {
+      const photo = await decodePhoto(await this.photos.request(keyframe, this.maxPx, this.isUrgent));
+      this.last = { key, photo };
+      return photo;
+    } catch (error) {
+      return reason(error);
+    }
+  }
+
+  private async render(
+    keyframe: NumberedKeyframe,
+    [width, height]: [number, number],
+  ): Promise<{ image: ImageData; surface: Uint8Array | null } | string> {
+    if (!this.side.isPossible) return "the server draws no other views";
+    const [scaleX, scaleY] = [width / keyframe.size_px[0], height / keyframe.size_px[1]];
+    const request: PictureRequest = {
+      ...this.common(),
+      world_from_camera: keyframe.world_from_camera,
+      size_px: [width, height],
+      projection: {
+        kind: "pinhole",
+        focal_px: [keyframe.focal_px[0] * scaleX, keyframe.focal_px[1] * scaleY],
+        principal_px: [keyframe.principal_px[0] * scaleX, keyframe.principal_px[1] * scaleY],
+      },
+      outputs: ["color", "depth"],
+    };
+    const timer = window.setTimeout(() => this.side.abandon("the server has not drawn this view yet"), TIMEOUT_MILLIS);
+    try {
+      return await decodeRender(await this.side.request(request));
+    } catch (error) {
+      return reason(error);
+    } finally {
+      window.clearTimeout(timer);
+    }
+  }
+}
+
+async function decodePhoto({ header, payload }: Photo): Promise<DecodedPhoto> {
+  const { color, mask } = header;
+  const image = await decodeJpeg(payload.subarray(color.offset, color.offset + color.bytes));
+  const nPx = image.width * image.height;
+  return {
+    header,
+    image,
+    mask: mask ? await inflated(payload.slice(mask.offset, mask.offset + mask.bytes), nPx) : null,
+  };
+}
+
+async function decodeRender({ header, payload }: SidePicture): Promise<{ image: ImageData; surface: Uint8Array | null }> {
+  if (!header.color) throw new Error("the model's picture has no colors");
+  const image = await decodeJpeg(payload.subarray(header.color.offset, header.color.offset + header.color.bytes));
+  if (!header.depth) return { image, surface: null };
+  const { depth, sizePx } = await decodeDepth(header.depth, payload);
+  const surface = new Uint8Array(image.width * image.height);
+  for (let y = 0; y < image.height; y++) {
+    const row = Math.floor((y * sizePx[1]) / image.height) * sizePx[0];
+    for (let x = 0; x < image.width; x++) {
+      surface[y * image.width + x] = depth[row + Math.floor((x * sizePx[0]) / image.width)]! > 0 ? 1 : 0;
+    }
+  }
+  return { image, surface };
+}
+
+async function decodeJpeg(jpeg: Uint8Array<ArrayBuffer>): Promise<ImageData> {
+  const bitmap = await createImageBitmap(new Blob([jpeg], { type: "image/jpeg" }));
+  const context = new OffscreenCanvas(bitmap.width, bitmap.height).getContext("2d", { willReadFrequently: true });
+  if (!context) throw new Error("this browser cannot read pixels of images");
+  context.drawImage(bitmap, 0, 0);
+  bitmap.close();
+  return context.getImageData(0, 0, context.canvas.width, context.canvas.height);
+}
+
+/** The size of an image that is downscaled to a maximum size, as the server rounds it. */
+function fitted([width, height]: [number, number], [maxWidth, maxHeight]: [number, number]): [number, number] {
+  const scale = Math.min(1, maxWidth / width, maxHeight / height);
+  return [Math.max(1, Math.round(width * scale)), Math.max(1, Math.round(height * scale))];
+}
+
+function reason(error: unknown): string {
+  return error instanceof Error ? error.message : String(error);
+}
