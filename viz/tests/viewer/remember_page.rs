@@ -5,6 +5,7 @@
 
 use crate::analytic_scene::{draw, looking_along_y};
 use crate::request_thread::RequestThread;
+use keyframe::{Keyframe, Split};
 use kinematics::{Stamp, Transform};
 use nalgebra::Translation3;
 use serde_json::{Value, json};
@@ -19,6 +20,10 @@ const WINDOW_PX: [u32; 2] = [1280, 760];
 const MAX_ERROR: f64 = 1e-4;
 /// Times of the keyframes, seconds.
 const KEYFRAME_SECS: [i64; 3] = [1000, 1065, 1130];
+const KEYFRAME_PX: [u32; 2] = [64, 48];
+/// Gray levels of their photographs, and how much JPEG may change them.
+const GRAY_LEVELS: [u8; 3] = [40, 120, 200];
+const MAX_GRAY_ERROR: u64 = 6;
 /// Addresses that somebody may have written by hand: none of them changes the view.
 const HOSTILE: [&str; 4] = [
     "#view=1~pNaN_0_0~t0_0_0",
@@ -40,7 +45,9 @@ fn page_finds_its_view_again() {
         radius_m: 0.8,
         world_from_camera: Translation3::new(0.0, 0.0, 0.3) * looking_along_y(),
     });
-    hub.set_keyframes(keyframes());
+    let keyframes = keyframes();
+    hub.set_keyframe_sources(&keyframes);
+    hub.set_keyframes(keyframes.iter().map(listed).collect());
     let config = ServerConfig {
         listen: ([127, 0, 0, 1], 0).into(),
     };
@@ -84,18 +91,55 @@ fn page_finds_its_view_again() {
     std::fs::remove_dir_all(&profile).expect("the browser has left its profile");
 }
 
-/// Keyframes of one camera that moves along x.
-fn keyframes() -> Vec<KeyframePose> {
-    let at = |(ix, secs): (usize, i64)| KeyframePose {
-        camera: "wrist".into(),
-        stamp: Stamp(secs * 1_000_000_000),
-        world_from_camera: Transform::translation(0.3 * ix as f64 - 0.3, 0.4, 0.3)
-            * looking_along_y(),
-        size_px: [640, 480],
-        focal_px: [560.0, 560.0],
-        principal_px: [320.0, 240.0],
+/// Keyframes of one camera that moves along x. Each photograph has one gray level.
+fn keyframes() -> Vec<Arc<Keyframe>> {
+    let at = |(ix, secs): (usize, i64)| {
+        let gray = GRAY_LEVELS[ix];
+        let n_pixels = (KEYFRAME_PX[0] * KEYFRAME_PX[1]) as usize;
+        Arc::new(Keyframe {
+            camera: "wrist".into(),
+            stamp: Stamp(secs * 1_000_000_000),
+            size_px: KEYFRAME_PX,
+            focal_px: [56.0; 2],
+            principal_px: [32.0, 24.0],
+            rgba_srgb: [gray, gray, gray, 255].repeat(n_pixels).into(),
+            depth: None,
+            world_from_camera: Transform::translation(0.3 * ix as f64 - 0.3, 0.4, 0.3)
+                * looking_along_y(),
+            twist: None,
+            readout_secs: 0.0,
+            joint_twists: [].into(),
+            base: None,
+            split: Split::Train,
+            truth: None,
+        })
     };
-    (KEYFRAME_SECS.into_iter().enumerate().map(at)).collect()
+    KEYFRAME_SECS.into_iter().enumerate().map(at).collect()
+}
+
+fn listed(keyframe: &Arc<Keyframe>) -> KeyframePose {
+    KeyframePose {
+        camera: Arc::clone(&keyframe.camera),
+        stamp: keyframe.stamp,
+        world_from_camera: keyframe.world_from_camera,
+        size_px: keyframe.size_px,
+        focal_px: keyframe.focal_px,
+        principal_px: keyframe.principal_px,
+    }
+}
+
+/// Waits for the photograph with this gray level beside the slider.
+fn wait_for_photograph(browser: &mut Browser, gray: u8) {
+    let shown = "(() => { const photo = document.getElementById('history-photo'); return !photo || photo.hidden ? null : \
+         photo.getContext('2d').getImageData(0, 0, 1, 1).data[0]; })()";
+    wait_for(
+        browser,
+        &format!("the photograph of gray {gray}"),
+        |browser| {
+            let level = browser.evaluate(shown).as_u64();
+            level.is_some_and(|level| level.abs_diff(u64::from(gray)) <= MAX_GRAY_ERROR)
+        },
+    );
 }
 
 /// Layers, camera path, field of view and camera return after a reload. Returns the view.
@@ -188,7 +232,12 @@ fn check_time(browser: &mut Browser, requests: &Requests) {
     wait_for(browser, "the button", |browser| {
         browser.evaluate("document.getElementById('toggle-history')?.hidden") == json!(false)
     });
-    for button in ["toggle-model", "toggle-grid", "toggle-history"] {
+    for button in [
+        "reset-view",
+        "toggle-model",
+        "toggle-grid",
+        "toggle-history",
+    ] {
         browser.click(button);
     }
     // Texts over the view change all the time. Only the frustums are compared.
@@ -212,6 +261,7 @@ fn check_time(browser: &mut Browser, requests: &Requests) {
         "the time",
         text("1:05 of 2:10, keyframe 2 of 3, camera wrist"),
     );
+    wait_for_photograph(browser, GRAY_LEVELS[1]);
     wait_for(browser, "fewer frustums", |browser| {
         canvas_shot(browser) != all
     });
@@ -221,6 +271,7 @@ fn check_time(browser: &mut Browser, requests: &Requests) {
         "the first keyframe",
         text("0:00 of 2:10, keyframe 1 of 3, camera wrist"),
     );
+    wait_for_photograph(browser, GRAY_LEVELS[0]);
     browser.click("history-now");
     wait_for(browser, "all frustums", |browser| {
         canvas_shot(browser) == all
@@ -233,7 +284,7 @@ fn check_time(browser: &mut Browser, requests: &Requests) {
     });
     browser.click("reset-view");
     browser.click("history-now");
-    wait_for(browser, "all frustums from the first view", |browser| {
+    wait_for(browser, "all frustums from the same view", |browser| {
         canvas_shot(browser) == all
     });
     // A closed panel shows the layers as before.
