@@ -621,6 +621,26 @@ mod tests {
     }
 
     #[test]
+    fn short_scores_name_few_cameras() {
+        let scores = |cameras: &[&str]| {
+            let images: Vec<_> = cameras
+                .iter()
+                .zip([18.04, 20.0, 22.0, 24.0])
+                .map(|(camera, psnr)| image(camera, psnr, None))
+                .collect();
+            Scores::mean(&images).short()
+        };
+        assert_eq!(scores(&[]), "no test image yet");
+        assert_eq!(scores(&["wrist"]), "PSNR 18.04 dB");
+        assert_eq!(
+            scores(&["front", "rear"]),
+            "PSNR 19.02 dB (front 18.0, rear 20.0)"
+        );
+        let long = ["front_left_camera", "front_right_camera", "rear_camera"];
+        assert_eq!(scores(&long), "PSNR 20.01 dB");
+    }
+
+    #[test]
     fn pixels_count_as_covered_from_half_alpha() {
         let rgba_srgb = [0, MIN_ALPHA - 1, MIN_ALPHA, 255]
             .into_iter()
