@@ -7,8 +7,10 @@ use messages::counted;
 use parking_lot::Mutex;
 use serde::Serialize;
 use session::next_commands::{self, SavedModel};
+use session::verdict::{self, Findings, ModelScore};
 use session::{FinishedModel, FinishedRun, Limits, Observer, ReadProgress, SessionEvent};
 use std::time::{Duration, Instant};
+use viz::Verdict;
 
 /// What is printed about a session.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -36,6 +38,8 @@ pub(crate) struct Console {
     limits: Limits,
     is_hidden: bool,
     bar: ProgressBar,
+    /// Lines about the scoring in progress.
+    scoring: Option<ProgressLines>,
 }
 
 impl Console {
@@ -55,6 +59,17 @@ impl Console {
             limits,
             is_hidden,
             bar: print::bar(length, template, is_hidden),
+            scoring: None,
+        }
+    }
+
+    /// Prints how many test images are scored, if no bar shows it.
+    fn print_scoring(&mut self, n_scored: usize, n_all: usize) {
+        let is_shown = self.output == OutputMode::Lines && self.bar.is_hidden();
+        let now = Instant::now();
+        let lines = (self.scoring).get_or_insert_with(|| ProgressLines::new(is_shown, now));
+        if lines.is_due(n_scored, n_all, now) {
+            print::notice(format_args!("scored {n_scored} of {n_all} test images"));
         }
     }
 }
@@ -87,8 +102,10 @@ impl Observer for Console {
                     self.bar = print::bar(Some(*n_all as u64), template, self.is_hidden);
                 }
                 self.bar.set_position(*n_scored as u64);
+                self.print_scoring(*n_scored, *n_all);
                 if n_scored == n_all {
                     self.bar.finish_and_clear();
+                    self.scoring = None;
                 }
             }
             (SessionEvent::Evaluated(evaluation), OutputMode::Json) => print_json(evaluation),
@@ -99,7 +116,7 @@ impl Observer for Console {
                     evaluation.step,
                     counted(evaluation.primitives, evaluation.primitive),
                     evaluation.step_millis.unwrap_or_default(),
-                    evaluation.scores
+                    evaluation.scores.short()
                 ))
             }
             (SessionEvent::Finished(finished), OutputMode::Json) => {
@@ -111,14 +128,15 @@ impl Observer for Console {
                     print::report(format_args!("{millis:9.3} ms  {name}"));
                 }
                 let done = finished.done;
-                print::report(format_args!(
+                let result = format!(
                     "{:.1} s, {}, {}, {:.1} MB: {}",
                     done.seconds,
                     counted(done.steps, "step"),
                     counted(done.primitives, finished.primitive),
                     done.bytes as f64 / 1e6,
                     done.scores
-                ));
+                );
+                wrapped(&result).iter().for_each(print::report);
                 let with_page = if finished.has_page {
                     ", with pictures and scores in report.html"
                 } else {
@@ -141,12 +159,32 @@ pub(crate) fn print_json(value: &impl Serialize) {
     }
 }
 
-/// Prints commands to run next on these models.
-pub(crate) fn print_next_commands(models: &[FinishedModel]) {
-    let models: Vec<SavedModel<'_>> = models.iter().map(FinishedModel::saved).collect();
-    for line in next_commands::lines(&next_commands::for_models(&models)) {
-        print::report(line);
+/// Prints commands to run next on these models, and in the last line how good they are, with the
+/// first of the commands.
+pub(crate) fn print_end(models: &[FinishedModel], verdict: &Verdict) {
+    let saved: Vec<SavedModel<'_>> = models.iter().map(FinishedModel::saved).collect();
+    let commands = next_commands::for_models(&saved);
+    next_commands::lines(&commands)
+        .iter()
+        .for_each(print::report);
+    if let Some(first) = commands.first() {
+        print::report(format_args!("{}. Next: {}", verdict.text, first.command));
     }
+}
+
+/// How good models are whose images come from a dataset, which loses none.
+pub(crate) fn verdict_of(models: &[FinishedModel]) -> Verdict {
+    let n_tests = models.iter().map(|model| model.saved().n_tests).max();
+    let score = |model: &'_ FinishedModel| ModelScore {
+        method: model.kind.name(),
+        psnr_db: model.scores.psnr,
+    };
+    verdict::verdict(&Findings {
+        models: models.iter().map(score).collect(),
+        n_tests: n_tests.unwrap_or_default(),
+        n_received: 0,
+        n_lost: 0,
+    })
 }
 
 /// Prints that a run which was to be continued has reached its limits.
@@ -198,8 +236,10 @@ pub(crate) struct ProgressLines {
 }
 
 impl ProgressLines {
-    /// At most 360 lines per hour.
-    const PERIOD: Duration = Duration::from_secs(10);
+    /// If less than a tenth is done in this time, there is a line nevertheless.
+    const MAX_PERIOD: Duration = Duration::from_secs(10);
+    /// Work that is done sooner needs no lines.
+    const MIN_PERIOD: Duration = Duration::from_secs(1);
 
     /// Lines for work that begins at `now`, in place of a hidden bar.
     pub(crate) fn new(is_shown: bool, now: Instant) -> Self {
@@ -210,19 +250,48 @@ impl ProgressLines {
         }
     }
 
-    /// Whether a line is due at `now`: a period has passed since the last line, more is done than
-    /// then, and something remains.
+    /// Whether a line is due at `now`: something remains, and since the last line, a tenth of the
+    /// whole was done, or a period has passed and anything was done.
     pub(crate) fn is_due(&mut self, n_done: usize, n_all: usize, now: Instant) -> bool {
-        let is_due = self.is_shown
-            && n_done > self.n_last
-            && n_done < n_all
-            && now.duration_since(self.last_at) >= Self::PERIOD;
+        let elapsed = now.duration_since(self.last_at);
+        let is_tenth = 10 * n_done.saturating_sub(self.n_last) >= n_all;
+        let min_period = if is_tenth {
+            Self::MIN_PERIOD
+        } else {
+            Self::MAX_PERIOD
+        };
+        let is_due =
+            self.is_shown && n_done > self.n_last && n_done < n_all && elapsed >= min_period;
         if is_due {
             self.n_last = n_done;
             self.last_at = now;
         }
         is_due
     }
+}
+
+/// Maximum length of the lines of [`wrapped`].
+const MAX_LINE_CHARS: usize = 100;
+
+/// A list, broken after commas into lines of at most [`MAX_LINE_CHARS`] characters if possible. All
+/// lines but the first are indented.
+fn wrapped(list: &str) -> Vec<String> {
+    let mut lines: Vec<String> = Vec::new();
+    for word in list.split_inclusive(", ") {
+        match lines.last_mut() {
+            Some(line)
+                if line.chars().count() + word.trim_end().chars().count() <= MAX_LINE_CHARS =>
+            {
+                line.push_str(word)
+            }
+            Some(_) => lines.push(format!("  {word}")),
+            None => lines.push(word.to_owned()),
+        }
+    }
+    lines
+        .iter()
+        .map(|line| line.trim_end().to_owned())
+        .collect()
 }
 
 /// A progress bar for reading images; cleared when it is dropped.
@@ -288,29 +357,44 @@ mod tests {
     use super::*;
 
     #[test]
-    fn progress_lines_are_due_every_ten_seconds_when_something_is_done() {
+    fn progress_lines_are_due_every_tenth_or_ten_seconds() {
         let start = Instant::now();
-        let at = |secs: u64| start + Duration::from_secs(secs);
+        let at = |millis: u64| start + Duration::from_millis(millis);
         let mut lines = ProgressLines::new(true, start);
-        for (n_done, secs, expected) in [
-            (1, 9, false),
-            (1, 10, true),
-            (2, 12, false),
-            // There was no progress since the last line.
-            (1, 25, false),
-            (3, 31, true),
-            (4, 40, false),
-            (4, 41, true),
+        for (n_done, millis, expected) in [
+            // Fast work needs no lines.
+            (10, 900, false),
+            (10, 1000, true),
+            (19, 9000, false),
+            (20, 9500, true),
+            // Slow work has a line if anything was done.
+            (20, 40_000, false),
+            (21, 40_100, true),
+            (22, 50_000, false),
+            (22, 50_100, true),
+            (99, 60_000, true),
             // The result follows.
-            (5, 99, false),
+            (100, 99_000, false),
         ] {
             assert_eq!(
-                lines.is_due(n_done, 5, at(secs)),
+                lines.is_due(n_done, 100, at(millis)),
                 expected,
-                "{n_done} after {secs} s"
+                "{n_done} after {millis} ms"
             );
         }
         let mut hidden = ProgressLines::new(false, start);
-        assert!(!hidden.is_due(1, 5, at(60)));
+        assert!(!hidden.is_due(10, 100, at(60_000)));
+    }
+
+    #[test]
+    fn long_lists_are_wrapped_after_commas() {
+        let words: Vec<String> = (0..30).map(|n| format!("score{n} 12.34 dB")).collect();
+        let list = words.join(", ");
+        let lines = wrapped(&list);
+        assert!(lines.len() > 1 && lines.iter().all(|line| line.len() <= MAX_LINE_CHARS));
+        assert!(lines[1..].iter().all(|line| line.starts_with("  score")));
+        let joined: Vec<&str> = lines.iter().map(|line| line.trim()).collect();
+        assert_eq!(joined.join(" "), list);
+        assert_eq!(wrapped("one"), ["one"]);
     }
 }

@@ -6,8 +6,8 @@ use anyhow::Context;
 use background::Task;
 use keyframe::Keyframe;
 use messages::{BadInput, Setting};
-use model_files::Edits;
 use model_files::checkpoint::Checkpoint;
+use model_files::{Edits, RunHistory};
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -123,6 +123,8 @@ pub struct Checkpoints {
     has_any: bool,
     /// What has become of the last checkpoint that was requested.
     requested: Option<CheckpointProgress>,
+    /// Number of images that did not become keyframes so far, by reason.
+    rejected: BTreeMap<String, u64>,
 }
 
 /// What has become of a checkpoint that was requested.
@@ -153,6 +155,8 @@ pub struct Snapshot<'a> {
     pub keyframes: &'a [Arc<Keyframe>],
     /// Erased space.
     pub edits: &'a Edits,
+    /// Training time in seconds and mean PSNR of the test images in dB, in order.
+    pub psnr_history: &'a [(f64, f64)],
     /// Training time, seconds.
     pub seconds: f64,
     /// Whether training has reached its limit.
@@ -174,6 +178,7 @@ impl Checkpoints {
             writer: None,
             has_any: false,
             requested: None,
+            rejected: BTreeMap::new(),
         })
     }
 
@@ -234,6 +239,11 @@ impl Checkpoints {
         Ok(false)
     }
 
+    /// Sets how many images did not become keyframes so far, by reason, for the next checkpoint.
+    pub fn set_rejected(&mut self, rejected: &BTreeMap<String, u64>) {
+        self.rejected.clone_from(rejected);
+    }
+
     /// Makes the next checkpoint due now.
     pub fn request(&mut self) {
         self.due_after = Duration::ZERO;
@@ -274,6 +284,7 @@ impl Checkpoints {
             seconds: now.seconds,
             is_finished: now.is_finished,
             edits: now.edits.clone(),
+            history: RunHistory::new(now.psnr_history, self.rejected.clone()),
             run_flags: self.run_flags.clone(),
             path: self.path.clone(),
             keyframes: self
@@ -370,6 +381,7 @@ pub struct CheckpointWrite {
     seconds: f64,
     is_finished: bool,
     edits: Edits,
+    history: RunHistory,
     run_flags: RunFlags,
     path: PathBuf,
     keyframes: Option<(StoredKeyframes, Vec<Arc<Keyframe>>)>,
@@ -390,6 +402,7 @@ impl CheckpointWrite {
             seconds: self.seconds,
             is_finished: self.is_finished,
             edits: self.edits,
+            history: self.history,
             depth_from,
             flags,
             ..self.pending.finish()?
@@ -451,6 +464,7 @@ mod tests {
             flags: BTreeMap::new(),
             is_finished: false,
             edits: edits_of(1),
+            history: RunHistory::default(),
             state: serde_json::Value::Null,
             arrays: Vec::new(),
         };

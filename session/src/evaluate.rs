@@ -29,6 +29,9 @@ const FAR_M: f64 = 1000.0;
 /// draws pictures for viewers. A longer wait would delay these pictures.
 const MEANWHILE_PERIOD: Duration = Duration::from_millis(5);
 
+/// Maximum length of the list of cameras in [`Scores::short`]. Lines with it fit into 110 columns.
+const MAX_CAMERAS_CHARS: usize = 32;
+
 /// Minimum alpha of a pixel that counts as covered by the model: half of the range. Below it, the
 /// background contributes more to the color than the model.
 pub const MIN_ALPHA: u8 = 128;
@@ -368,6 +371,28 @@ impl Scores {
     }
 }
 
+impl Scores {
+    /// The PSNR in a few words, with that of each camera if there are few, for lines during
+    /// training.
+    #[must_use]
+    pub fn short(&self) -> String {
+        let Some(psnr) = self.psnr else {
+            return "no test image yet".to_owned();
+        };
+        let cameras: Vec<String> = self
+            .psnr_per_camera
+            .iter()
+            .map(|(camera, psnr)| format!("{camera} {psnr:.1}"))
+            .collect();
+        let cameras = cameras.join(", ");
+        if cameras.is_empty() || cameras.len() > MAX_CAMERAS_CHARS {
+            format!("PSNR {psnr:.2} dB")
+        } else {
+            format!("PSNR {psnr:.2} dB ({cameras})")
+        }
+    }
+}
+
 impl Display for Scores {
     fn fmt(&self, f: &mut Formatter<'_>) -> std::fmt::Result {
         let decibels =
@@ -379,7 +404,7 @@ impl Display for Scores {
                 .filter_map(|(camera, psnr)| decibels(camera, Some(*psnr))),
         );
         words.extend(decibels("against truth", self.psnr_truth));
-        words.extend(decibels("ceiling", self.psnr_ceiling));
+        words.extend(decibels("noise limit", self.psnr_ceiling));
         words.extend(self.ssim.map(|ssim| format!("SSIM {ssim:.4}")));
         words.extend(self.lpips.map(|lpips| format!("LPIPS {lpips:.4}")));
         words.extend(
@@ -593,6 +618,26 @@ mod tests {
             psnr_ceiling: None,
             covered_frac: Some(1.0),
         }
+    }
+
+    #[test]
+    fn short_scores_name_few_cameras() {
+        let scores = |cameras: &[&str]| {
+            let images: Vec<_> = cameras
+                .iter()
+                .zip([18.04, 20.0, 22.0, 24.0])
+                .map(|(camera, psnr)| image(camera, psnr, None))
+                .collect();
+            Scores::mean(&images).short()
+        };
+        assert_eq!(scores(&[]), "no test image yet");
+        assert_eq!(scores(&["wrist"]), "PSNR 18.04 dB");
+        assert_eq!(
+            scores(&["front", "rear"]),
+            "PSNR 19.02 dB (front 18.0, rear 20.0)"
+        );
+        let long = ["front_left_camera", "front_right_camera", "rear_camera"];
+        assert_eq!(scores(&long), "PSNR 20.01 dB");
     }
 
     #[test]

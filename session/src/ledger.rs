@@ -52,6 +52,8 @@ pub struct Ledger {
     keyframes: Vec<KeyframeTimes>,
     /// Number of keyframes, from the first, of which [`KeyframeTimes::trained`] is known.
     n_trained: usize,
+    /// Pauses of the training; the end is `None` while one is in progress.
+    pauses: Vec<(Instant, Option<Instant>)>,
 }
 
 impl Ledger {
@@ -76,10 +78,21 @@ impl Ledger {
         }
     }
 
-    /// Durations from mid-exposure by stage, in order.
+    /// Durations from mid-exposure by stage, in order. Those during which an operator had paused
+    /// the training are left out: they would only show how long the pause was.
     #[must_use]
     pub fn latencies(&self) -> Vec<(String, Latency)> {
-        latencies(&self.keyframes)
+        stages(&self.keyframes, &self.pauses)
+    }
+
+    /// Records at `now` whether training is paused.
+    pub(crate) fn set_paused(&mut self, is_paused: bool, now: Instant) {
+        match self.pauses.last_mut() {
+            Some((_, end @ None)) if !is_paused => *end = Some(now),
+            Some((_, None)) => {}
+            _ if is_paused => self.pauses.push((now, None)),
+            _ => {}
+        }
     }
 
     /// Number of keyframes, from the first, that were available in at least one of the first `step`
@@ -129,8 +142,16 @@ impl Ledger {
 /// Durations from mid-exposure to each stage, over these keyframes. Without stamps on the clock of
 /// this process, from the arrival of the image.
 pub fn latencies(keyframes: &[KeyframeTimes]) -> Vec<(String, Latency)> {
+    stages(keyframes, &[])
+}
+
+/// [`latencies`] without the durations that overlap a pause.
+fn stages(
+    keyframes: &[KeyframeTimes],
+    pauses: &[(Instant, Option<Instant>)],
+) -> Vec<(String, Latency)> {
     let until = |name: &str, at: fn(&KeyframeTimes) -> Option<Instant>| {
-        Some((name.to_owned(), latency_until(keyframes, at)?))
+        Some((name.to_owned(), latency_until(keyframes, at, pauses)?))
     };
     let stages = [
         // Without the time of capture, the arrival would be compared with itself.
@@ -152,10 +173,15 @@ pub fn latencies(keyframes: &[KeyframeTimes]) -> Vec<(String, Latency)> {
 fn latency_until(
     keyframes: &[KeyframeTimes],
     at: fn(&KeyframeTimes) -> Option<Instant>,
+    pauses: &[(Instant, Option<Instant>)],
 ) -> Option<Latency> {
-    let millis = keyframes
-        .iter()
-        .filter_map(|keyframe| keyframe.millis_until(at(keyframe)?));
+    let millis = keyframes.iter().filter_map(|keyframe| {
+        let end = at(keyframe)?;
+        let is_paused = pauses
+            .iter()
+            .any(|(from, to)| *from < end && to.is_none_or(|to| keyframe.captured_at() < to));
+        keyframe.millis_until(end).filter(|_| !is_paused)
+    });
     Latency::of(millis)
 }
 
@@ -256,6 +282,49 @@ mod tests {
         assert_eq!(
             times, expected,
             "the first was already known when the client connected"
+        );
+    }
+
+    #[test]
+    fn durations_during_a_pause_are_left_out() {
+        let mut ledger = Ledger::default();
+        let began = Instant::now();
+        let at = |millis| began + Duration::from_millis(millis);
+        // Before, during and after the pause from 100 to 900 ms.
+        for captured in [10, 200, 1000] {
+            ledger.push(KeyframeTimes {
+                input: InputTimes {
+                    captured: Some(at(captured)),
+                    arrived: at(captured + 5),
+                    queued: at(captured + 6),
+                },
+                pushed: at(captured + 7),
+                trained: Some(at(captured.max(893) + 7)),
+                ..keyframe(0)
+            });
+        }
+        let n_of = |ledger: &Ledger, name: &str| {
+            let latencies = ledger.latencies();
+            let found = latencies.iter().find(|(stage, _)| stage == name);
+            found.map(|(_, latency)| latency.n)
+        };
+        assert_eq!(n_of(&ledger, "shutter to first step"), Some(3));
+        for (is_paused, millis) in [
+            (false, 50),
+            (true, 100),
+            (true, 300),
+            (false, 900),
+            (false, 950),
+        ] {
+            ledger.set_paused(is_paused, at(millis));
+        }
+        assert_eq!(n_of(&ledger, "shutter to first step"), Some(1));
+        assert_eq!(n_of(&ledger, "shutter to model"), Some(2));
+        ledger.set_paused(true, at(1001));
+        assert_eq!(
+            n_of(&ledger, "shutter to model"),
+            Some(1),
+            "the pause has not ended"
         );
     }
 

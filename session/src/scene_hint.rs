@@ -185,7 +185,7 @@ fn outside(bounds: &Bounds) -> Transform {
 
 /// The point with the least squared distances to all optical axes, with a weak prior on the
 /// distance from each camera.
-fn nearest_to_axes(world_from_cameras: &[Transform]) -> Option<Point3<f64>> {
+pub(crate) fn nearest_to_axes(world_from_cameras: &[Transform]) -> Option<Point3<f64>> {
     let mut normal = Matrix3::zeros();
     let mut right = Vector3::zeros();
     for pose in world_from_cameras {

@@ -2,6 +2,7 @@
 
 mod end_viewers;
 mod ending;
+mod growth_log;
 mod options;
 mod outcome;
 mod persistence;
@@ -28,6 +29,7 @@ use crate::training_clock::Clock;
 use calibration::{Alignment, CalibratedCamera, CameraCorrection};
 use capture::Stop;
 use gpu::Gpu;
+use growth_log::GrowthLog;
 use keyframe::Keyframe;
 use kinematics::Stamp;
 use model_files::{Edits, InitialPoints};
@@ -63,6 +65,7 @@ pub struct Session {
     stop: Stop,
     /// Erased space, which is not drawn for viewers. Training and scores ignore it.
     edits: Arc<Edits>,
+    growth_log: GrowthLog,
 }
 
 impl Session {
@@ -80,6 +83,7 @@ impl Session {
             stop,
             clock,
             previous_secs,
+            previous_psnr,
             initial_points,
             edits,
             scores_stepwise,
@@ -96,7 +100,8 @@ impl Session {
                 kind.name()
             );
         }
-        let mut scoreboard = Scoreboard::new(evaluators, scores_stepwise);
+        let mut scoreboard =
+            Scoreboard::new(evaluators, scores_stepwise).with_history(previous_psnr);
         if let Some(previous_secs) = previous_secs {
             scoreboard.skip_until(previous_secs);
         }
@@ -112,6 +117,7 @@ impl Session {
             reporter: Reporter::new(kind, observer, data, profiles),
             stop,
             edits: Arc::new(edits),
+            growth_log: GrowthLog::default(),
         }
     }
 
@@ -244,10 +250,8 @@ impl Session {
                 step_millis,
                 ..
             } = self.progress();
-            let change = if is_paused { "is paused" } else { "continues" };
-            log::info!(
-                "growth {change} at {primitives} splats: a step takes {step_millis:.0} ms, limit {MAX_LIVE_STEP_MILLIS} ms"
-            );
+            self.growth_log
+                .changed(is_paused, primitives, step_millis, Instant::now());
             self.persistence
                 .log_growth_pause(&mut self.method, is_paused)?;
         }
@@ -316,6 +320,7 @@ impl Session {
             method: &mut self.method,
             keyframes: &self.keyframes,
             edits: &self.edits,
+            psnr_history: self.scoreboard.psnr_history(),
             seconds,
             is_finished: false,
         })

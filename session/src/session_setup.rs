@@ -117,6 +117,9 @@ impl SessionSetup<'_> {
                 clock: self.clock.clone(),
                 // Limits count from the start of the first run.
                 previous_secs: self.previous.map(|previous| previous.checkpoint.seconds),
+                previous_psnr: self.previous.map_or(Vec::new(), |previous| {
+                    previous.checkpoint.history.psnr().to_vec()
+                }),
                 initial_points: self.initial_points.clone(),
                 edits,
                 scores_stepwise: self.is_live,

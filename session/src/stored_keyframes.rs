@@ -236,6 +236,7 @@ fn to_checkpoint(keyframe: &Keyframe) -> anyhow::Result<Checkpoint> {
         flags: BTreeMap::new(),
         is_finished: false,
         edits: model_files::Edits::default(),
+        history: model_files::RunHistory::default(),
         state: serde_json::to_value(description)?,
         arrays,
     })

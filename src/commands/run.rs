@@ -1,7 +1,7 @@
 //! `fieldrig run`: opens devices, joins their samples, trains, and serves the page.
 
 use crate::checkpoint_args::CheckpointArgs;
-use crate::console::{Console, OutputMode, print_finished_run, print_next_commands};
+use crate::console::{Console, OutputMode, print_end, print_finished_run};
 use crate::exit::{self, Exit};
 use crate::number_args::number_in_range;
 use crate::open_gpu::open_gpu;
@@ -99,6 +99,11 @@ pub(super) struct Running {
 /// Runs until a limit, the end of the devices, or Ctrl-C; saves the model, its keyframes and the
 /// effective rig file.
 pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
+    // What follows can take many seconds.
+    log::info!(
+        "reading {}",
+        args.resume.as_ref().unwrap_or(&args.rig_file).display()
+    );
     // The previous run is read before anything else, because its flags decide what this run does.
     let plan = args.plan();
     let previous = plan.previous()?;
@@ -112,7 +117,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     let hub = run.live.hub();
     let saved = run.run_to_end()?;
     if !args.json {
-        print_next_commands(&saved.models);
+        print_end(&saved.models, &saved.verdict());
     }
     let EndedRun {
         models,

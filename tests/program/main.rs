@@ -33,6 +33,8 @@ mod robot_silhouette;
 mod run_folder;
 #[cfg(feature = "sim")]
 mod small_rig;
+#[cfg(feature = "sim")]
+mod terminal;
 mod together;
 mod view;
 mod wall;

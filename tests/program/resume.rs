@@ -4,6 +4,8 @@
 use crate::photos::dataset;
 #[cfg(feature = "sim")]
 use crate::small_rig;
+#[cfg(feature = "sim")]
+use model_files::RunHistory;
 use model_files::checkpoint::Checkpoint;
 use serde_json::{Value, json};
 use std::path::Path;
@@ -426,6 +428,14 @@ fn killed_live_run_resumes_keyframes_and_clock() {
         "{list}"
     );
 
+    let history = |run: &str| {
+        Checkpoint::read(&folder.join(run).join("training.ckpt"))
+            .unwrap()
+            .history
+    };
+    let resumed = history("out");
+    expect_continued(&checkpoint.history, &resumed);
+
     // The run is finished. With a longer time limit, it continues in a new folder.
     let finished = run(&["--resume", "out"]).output().unwrap();
     assert!(finished.status.success());
@@ -439,6 +449,8 @@ fn killed_live_run_resumes_keyframes_and_clock() {
         String::from_utf8_lossy(&more.stderr)
     );
     assert!(folder.join("more/splats.ply").exists());
+    assert!(!resumed.psnr().is_empty() && !resumed.rejected().is_empty());
+    expect_continued(&resumed, &history("more"));
     let assert_fails = |args: &[&str], words: &str| {
         let output = run(args).output().unwrap();
         let stderr_text = String::from_utf8_lossy(&output.stderr).into_owned();
@@ -453,4 +465,19 @@ fn killed_live_run_resumes_keyframes_and_clock() {
         &["--resume", "out", "--seconds", "30", "--out", "x"],
         "has no usable keyframes",
     );
+}
+
+/// Fails unless the curve and the numbers of rejected images begin with those of the first part.
+#[cfg(feature = "sim")]
+fn expect_continued(first: &RunHistory, both: &RunHistory) {
+    assert!(
+        both.psnr().starts_with(first.psnr()),
+        "{first:?}, then {both:?}"
+    );
+    for (reason, n) in first.rejected() {
+        assert!(
+            both.rejected().get(reason) >= Some(n),
+            "{first:?}, then {both:?}"
+        );
+    }
 }

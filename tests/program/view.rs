@@ -667,8 +667,15 @@ fn printed_commands_work_and_report_page_is_written() {
         "my runs/first one",
     ];
     let printed = train(folder, &args);
+    let verdict = printed.lines().last().expect("a line");
+    assert!(
+        verdict.contains(" dB on 2 test images. Next: ")
+            && verdict.contains(" view 'my runs/first one'"),
+        "{verdict}"
+    );
     let commands: Vec<&str> = printed
         .lines()
+        .filter(|line| *line != verdict)
         .skip_while(|line| !line.starts_with("saved in "))
         .skip(1)
         .map(|line| {
@@ -766,7 +773,10 @@ fn printed_commands_work_and_report_page_is_written() {
                 .into_rgb8()
         })
         .collect();
-    // Image, render, error and depth of both test images.
+    // The whole model; then image, render, error and depth of both test images.
+    let (overview, pictures) = pictures.split_first().expect("pictures");
+    assert!(overview.width() > overview.height(), "an overview");
+    assert!(page.contains("<svg class=\"coverage\""), "a map");
     assert_eq!(pictures.len(), 8);
     assert!(
         pictures

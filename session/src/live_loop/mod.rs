@@ -23,6 +23,7 @@ use keyframes::AcceptedKeyframes;
 use models::Models;
 use publishing::Publishing;
 use requests::Requests;
+use std::collections::BTreeMap;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 use trainer::AlignTiming;
@@ -72,6 +73,8 @@ pub struct LiveLoop {
     requests: Requests,
     publishing: Publishing,
     keyframe_warning: KeyframeWarning,
+    /// Number of images that did not become keyframes in earlier parts of the run, by reason.
+    earlier_rejected: BTreeMap<String, u64>,
 }
 
 /// Changes a keyframe before the models receive it.
@@ -103,6 +106,7 @@ impl LiveLoop {
             keyframe_change: None,
             requests: Requests::default(),
             keyframe_warning: KeyframeWarning::start(),
+            earlier_rejected: options.earlier_rejected,
         }
     }
 
@@ -178,6 +182,8 @@ impl LiveLoop {
         // Requests of operators come first, so that the pictures and the status of this cycle
         // already show their effect.
         self.requests.apply_controls(&self.hub, &mut self.models);
+        self.ledger
+            .set_paused(self.requests.is_paused, Instant::now());
         self.record_shown_pictures();
         self.requests.apply_edits(&self.hub, &mut self.models);
         // After a GPU failure, the remaining stages are skipped: each of them would fail, too.
@@ -403,6 +409,8 @@ pub struct LiveOptions {
     pub start_keyframes: usize,
     /// Which robot and run the page shows.
     pub identity: Identity,
+    /// Number of images that did not become keyframes in earlier parts of the run, by reason.
+    pub earlier_rejected: BTreeMap<String, u64>,
     /// Notes shown on the page.
     pub notes: Vec<String>,
     /// Notes about the devices, which are added during the run and shown, too.

@@ -11,6 +11,7 @@ use calibration::CalibratedCamera;
 use capture::Notes;
 use keyframe::Keyframe;
 use kinematics::Transform;
+use std::collections::BTreeMap;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 use trainer::RenderRequest;
@@ -184,8 +185,22 @@ impl LiveLoop {
             self.publishing
                 .publish_moved_keyframes(&self.accepted.list, &self.models.sessions[0]);
         }
+        let rejected = self.rejected();
+        for session in &mut self.models.sessions {
+            session.persistence().set_rejected(&rejected);
+        }
         self.publish_status();
         Ok(())
+    }
+
+    /// Number of images that did not become keyframes since the start of the first part of the run,
+    /// by reason.
+    fn rejected(&self) -> BTreeMap<String, u64> {
+        let mut rejected = self.earlier_rejected.clone();
+        for (reason, n) in self.feed.rejected() {
+            *rejected.entry(reason).or_default() += n;
+        }
+        rejected
     }
 
     pub(super) fn publish_status(&mut self) {
@@ -201,7 +216,7 @@ impl LiveLoop {
             progress: self.state_progress(),
             seconds: sessions[0].time().secs(),
             keyframes: self.accepted.list.len() as u64,
-            rejected: self.feed.rejected(),
+            rejected: self.rejected(),
             model: models.next().unwrap_or_default(),
             others: models.collect(),
             edit_revision: self.requests.edit_revision,

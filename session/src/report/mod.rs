@@ -4,12 +4,19 @@
 //! The page combines the content of `report.json`, renders of test images, and suggested next
 //! commands.
 
+mod coverage;
+mod overview;
 mod pictures;
+mod scene_pictures;
+mod seen_places;
+mod wording;
 
 pub(crate) use pictures::{Comparison, Scored, compare};
+pub(crate) use scene_pictures::ScenePictures;
+pub(crate) use wording::image_name;
 
 use crate::next_commands::NextCommand;
-use crate::{evaluation_schedule, run_folder};
+use crate::{evaluation_schedule, run_folder, verdict};
 use report::Table;
 use report::chart::drawing::escaped;
 use report::chart::{Axis, Chart, Line, Point, Scale};
@@ -17,6 +24,7 @@ use report::table::html_row;
 use serde_json::{Map, Value};
 use std::fmt::Write;
 use std::path::Path;
+use wording::{dropped_images, duration, is_omitted, label, value_text};
 
 /// Name of the page in the folder of a run.
 pub(crate) const FILE: &str = "report.html";
@@ -32,11 +40,14 @@ pub(crate) struct Page<'a> {
     /// Singular name of the model's primitive, such as `splat`.
     pub primitive: &'a str,
     pub comparisons: &'a [Comparison],
+    pub scene: &'a ScenePictures,
     pub next: &'a [NextCommand],
     /// Settings of the model from the decision log; `Null` if there is no log.
     pub settings: Value,
     /// The command line of the training.
     pub command: String,
+    /// Date and time of day in UTC.
+    pub date: String,
 }
 
 impl Page<'_> {
@@ -49,8 +60,7 @@ impl Page<'_> {
         let report = self.report;
         let done = &report["done"];
         let method = done["method"].as_str().unwrap_or("model");
-        let name = self.folder.display().to_string();
-        let title = escaped(&format!("{name}: {method}"));
+        let title = escaped(&format!("{}, {}: {method}", self.name(), self.date));
         let mut page = format!(
             "<!doctype html>\n<html lang=\"en\"><head><meta charset=\"utf-8\">\n\
              <meta name=\"viewport\" content=\"width=device-width, initial-scale=1\">\n\
@@ -58,8 +68,10 @@ impl Page<'_> {
             report::STYLE,
             escaped(&self.subtitle())
         );
+        page.push_str(&verdict_line(report));
         page.push_str(&figures(done, self.primitive));
-        page.push_str(&data_losses(&report["data_losses"]));
+        page.push_str(&data_losses(report));
+        page.push_str(&self.scene.html());
         page.push_str(&commands(self.next));
         page.push_str(&comparison_section(
             self.comparisons,
@@ -81,10 +93,22 @@ impl Page<'_> {
         page
     }
 
-    /// Program version, data and device in one line.
+    /// The rig or the data, or else the folder.
+    fn name(&self) -> String {
+        let text = |key: &str| self.report[key].as_str().map(str::to_owned);
+        let data = text("data").map(|data| {
+            let name = Path::new(&data).file_name();
+            name.map_or(data.clone(), |name| name.to_string_lossy().into_owned())
+        });
+        let folder = || self.folder.display().to_string();
+        text("rig").or(data).unwrap_or_else(folder)
+    }
+
+    /// Folder, program version, data and device in one line.
     fn subtitle(&self) -> String {
         let text = |key: &str| self.report[key].as_str().map(str::to_owned);
         let words = [
+            Some(self.folder.display().to_string()),
             Some(format!("fieldrig {}", env!("CARGO_PKG_VERSION"))),
             text("data"),
             text("adapter"),
@@ -101,6 +125,7 @@ impl Page<'_> {
             "trials",
             "passes",
             "per_image",
+            "rig",
         ];
         let extra = self.report.as_object().into_iter().flatten();
         let extra = extra.filter(|(key, _)| !excluded_keys.contains(&key.as_str()));
@@ -130,6 +155,13 @@ impl Page<'_> {
     }
 }
 
+/// How good the model is, in one sentence.
+fn verdict_line(report: &Value) -> String {
+    verdict::of_report(report).map_or(String::new(), |verdict| {
+        format!("<p class=\"verdict\">{}.</p>\n", escaped(&verdict.text))
+    })
+}
+
 /// The main scores and sizes.
 fn figures(done: &Value, primitive: &str) -> String {
     let number = |key: &str| done[key].as_f64();
@@ -153,7 +185,7 @@ fn figures(done: &Value, primitive: &str) -> String {
             "%",
         ),
         ("PSNR against truth", scaled("psnr_truth", 1.0, 2), "dB"),
-        ("training time", scaled("seconds", 1.0, 1), "s"),
+        ("training time", number("seconds").map(duration), ""),
         ("steps", number("steps").map(grouped), ""),
         (primitives.as_str(), number("primitives").map(grouped), ""),
         ("GPU memory", scaled("bytes", 1e-6, 1), "MB"),
@@ -186,11 +218,13 @@ fn figures(done: &Value, primitive: &str) -> String {
     html
 }
 
-fn data_losses(data_losses: &Value) -> String {
-    let items: String = array(data_losses)
-        .iter()
-        .filter_map(Value::as_str)
-        .map(|loss| format!("<li>{}</li>", escaped(loss)))
+/// The losses of data, the images that devices dropped first.
+fn data_losses(report: &Value) -> String {
+    let losses = array(&report["data_losses"]);
+    let items: String = dropped_images(report)
+        .into_iter()
+        .chain(losses.iter().filter_map(Value::as_str).map(str::to_owned))
+        .map(|loss| format!("<li>{}</li>", escaped(&loss)))
         .collect();
     if items.is_empty() {
         return String::new();
@@ -232,8 +266,9 @@ fn comparison_section(comparisons: &[Comparison], n_tests: usize) -> String {
         )
     };
     let mut html = format!(
-        "<h2>Test images</h2>\n<p class=\"legend\">{count_note}Left to right: the camera image and the model's render from \
-         the same pose. None of these images was used for training.</p>\n<div class=\"comparisons\">\n"
+        "<h2>Test images</h2>\n<p class=\"legend\">{count_note}Left to right: the camera image, the model's render from the \
+         same pose, and, in one column, their difference and the depth of the render. None of these images was used for \
+         training.</p>\n<div class=\"comparisons\">\n"
     );
     let by_psnr = |a: &&Comparison, b: &&Comparison| a.psnr.total_cmp(&b.psnr);
     let worst = comparisons.iter().min_by(by_psnr);
@@ -445,7 +480,7 @@ fn latencies(latencies: &Value) -> Table {
         .map(str::to_owned)
         .to_vec();
     Table {
-        title: "Latency".into(),
+        title: "Latency, without pauses of the training".into(),
         head,
         rows: array(latencies).iter().filter_map(latency_row).collect(),
     }
@@ -522,13 +557,13 @@ fn settings_table(title: &str, rows: Vec<Vec<String>>, is_collapsed: bool) -> St
 
 /// Table rows for a value: one row per key for objects, none for empty values.
 fn rows_of(key: &str, value: &Value) -> Vec<Vec<String>> {
-    let key = match key {
-        "n_train" => "training images".to_owned(),
-        "n_validation" => "validation images".to_owned(),
-        "n_test" => "test images".to_owned(),
-        "startup_secs" => "seconds before training".to_owned(),
-        other => other.replace('_', " "),
-    };
+    if is_omitted(key, value) {
+        return Vec::new();
+    }
+    if let Some(text) = value_text(key, value) {
+        return vec![vec![label(key), text]];
+    }
+    let key = label(key);
     match value {
         Value::Null => Vec::new(),
         Value::Array(items) if items.is_empty() => Vec::new(),
@@ -639,9 +674,11 @@ mod tests {
             report,
             primitive: "splat",
             comparisons: &[],
+            scene: &ScenePictures::default(),
             next: &[next],
             settings: json!({ "options": { "seed": 7, "caps": null } }),
             command: "fieldrig train data".into(),
+            date: "2026-11-29 10:57 UTC".into(),
         };
         page.html()
     }
@@ -649,9 +686,10 @@ mod tests {
     #[test]
     fn page_shows_scores_commands_and_settings_escaped() {
         let html = page(&json!({
-            "done": { "method": "splat", "psnr": 23.456, "ssim": 0.9, "seconds": 8.0, "steps": 12345, "primitives": 4000000,
+            "done": { "method": "splat", "psnr": 23.456, "ssim": 0.9, "seconds": 750.0, "steps": 12345, "primitives": 4000000,
                       "bytes": 8000000, "psnr_per_camera": { "wrist": 22.0 } },
-            "data": "my data", "adapter": "a GPU",
+            "rig": "arm <1>", "data": "my data", "adapter": "a GPU", "keyframes": 7, "evicted": 0, "device_skipped": 90,
+            "max_position_error_m": 6.262e-16,
             "data_losses": ["1 image <broken>"],
             "evaluations": [{ "seconds": 0.5, "psnr": 20.0, "step": 10, "step_millis": 1.5 }, { "seconds": 4.0, "psnr": 22.0 }],
             "per_image": [{ "name": "images/1.jpg", "psnr": 23.456, "ssim": null }],
@@ -660,7 +698,12 @@ mod tests {
             "latencies": [["shutter to shown", { "p50": 181.7, "p99": 640.2, "n": 95 }]],
         }));
         for words in [
-            "<title>runs/a &lt;b&gt;: splat</title>",
+            "<title>arm &lt;1&gt;, 2026-11-29 10:57 UTC: splat</title>",
+            "runs/a &lt;b&gt; · fieldrig ",
+            "<dd>12 min 30 s</dd><dt>training time</dt>",
+            "90 % of the images were dropped by the devices: 90 of 100 never",
+            "<td>images dropped by devices</td><td>90</td>",
+            "<td>largest error of a camera position (simulation)</td><td>0.00 mm</td>",
             "23.46<small>dB</small>",
             "12\u{202f}345",
             "4\u{202f}000\u{202f}000",
@@ -671,13 +714,14 @@ mod tests {
             "images/1.jpg",
             "+0.50 ± 0.10",
             "<td>shutter to shown</td><td>182</td><td>640</td><td>95</td>",
-            "<td>rejected: blurred</td><td>3</td>",
+            "<td>images that became no keyframe: blurred</td><td>3</td>",
             "<td>options: seed</td><td>7</td>",
             "prefers-color-scheme: dark",
         ] {
             assert!(html.contains(words), "{words} is missing: {html}");
         }
         assert!(!html.contains("<b>") && !html.contains("alignment") && !html.contains("NaN"));
+        assert!(!html.contains("evicted") && !html.contains("because the store was full"));
         assert!(
             !html.contains("http://")
                 || html.matches("http://").count() == html.matches("http://www.w3.org").count()

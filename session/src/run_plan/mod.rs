@@ -7,6 +7,7 @@
 
 mod in_progress;
 mod no_model;
+mod opening;
 mod prepared;
 mod previous;
 mod saving;
@@ -131,12 +132,14 @@ impl RunPlan {
         let mut overrides = plan.overrides();
         overrides.extend(previous.iter().flat_map(PreviousLiveRun::overrides));
         let rig = Rig::load(&plan.rig_file, &overrides)?;
+        log::info!("{}", opening::describe(&plan.rig_name(), &rig, &plan.input));
         let kinds = methods_of(&rig)?;
         let available = available_data(&rig);
         plan.check_training(&kinds, available)?;
         let pace = plan.pace(&rig)?;
         // The GPU is opened before the devices: their queues fill while the GPU starts, and images
         // would be lost.
+        log::info!("opening the GPU");
         let gpu = (services.open_gpu)()?;
         let models = match &previous {
             Some(previous) => vec![previous.resume(&gpu)?],
@@ -272,6 +275,14 @@ impl RunPlan {
         let [rig, folder] =
             [&*self.rig_file, folder].map(|path| next_commands::quoted(&path.to_string_lossy()));
         format!("fieldrig run {rig} {} {folder}", Setting::Resume)
+    }
+
+    /// Name of the rig file without its extension.
+    fn rig_name(&self) -> String {
+        let name = self.rig_file.file_stem();
+        name.unwrap_or(self.rig_file.as_os_str())
+            .to_string_lossy()
+            .into_owned()
     }
 
     /// The folder of the results, if it is not a new one in `runs`.

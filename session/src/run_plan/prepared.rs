@@ -19,6 +19,7 @@ use drivers::Source;
 use gpu::Gpu;
 use keyframe::Keyframe;
 use kinematics::Stamp;
+use std::collections::BTreeMap;
 use std::ffi::OsStr;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -87,6 +88,7 @@ impl<'a> PreparedRun<'a> {
             training.log_unestimated(available_data(&self.rig), self.parts.gpu.is_software());
         }
         // Compile kernels before the first image, so that keyframes do not wait.
+        log::info!("compiling kernels for {}", self.parts.gpu.describe());
         for (model, kind) in self.parts.models.iter_mut().zip(&self.parts.kinds) {
             let text = format!("for the model {}", kind.name());
             startup::show(&self.hub, "compiling kernels", text);
@@ -95,6 +97,13 @@ impl<'a> PreparedRun<'a> {
         // Only now the devices, because their data is used from the first sample on.
         startup::show(&self.hub, "opening devices", startup::devices(&self.rig));
         let device_notes = Notes::default();
+        log::info!(
+            "opening the {}",
+            self.parts
+                .plan
+                .recording()
+                .map_or("devices", |_| "recording")
+        );
         let opened = self.parts.plan.open(self.rig)?;
         Ok(OpenedRun {
             opened: opened.with_tag_check(&device_notes)?,
@@ -194,6 +203,9 @@ impl OpenedRun<'_> {
                 .join
                 .start_keyframes_or_default(pace == Pace::RealTime, has_depth),
             identity,
+            earlier_rejected: previous.as_ref().map_or(BTreeMap::new(), |previous| {
+                previous.run.checkpoint.history.rejected().clone()
+            }),
             notes: gpu_notes(&gpu),
             device_notes,
             open_gpu: services.open_gpu,

@@ -213,6 +213,7 @@ pub(super) fn save(
     // Estimated before the models are saved, because saving consumes the sessions.
     let corrected_rigs = corrected_rigs(rig, &mut sessions, &folders);
     let mut details = DetailsOfRun {
+        rig: plan.rig_name(),
         seed: rig.train.seed,
         input_result: &input_result,
         data_losses: &data_losses,
@@ -296,6 +297,8 @@ fn data_losses(
 /// The entries of the report besides scores.
 #[derive(Debug, Serialize)]
 struct RunDetails {
+    /// Name of the rig file without its extension.
+    rig: String,
     method: &'static str,
     seed: u64,
     keyframes: usize,
@@ -319,6 +322,7 @@ struct RunDetails {
 
 /// The entries of all reports of a run.
 struct DetailsOfRun<'a> {
+    rig: String,
     seed: u64,
     input_result: &'a InputResult,
     data_losses: &'a [String],
@@ -337,6 +341,7 @@ impl DetailsOfRun<'_> {
             ..
         } = join.counts();
         RunDetails {
+            rig: self.rig.clone(),
             method: session.kind().name(),
             seed: self.seed,
             keyframes: session.keyframes().len(),

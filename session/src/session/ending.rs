@@ -18,6 +18,7 @@ use model_files::Edits;
 use serde::Serialize;
 use std::path::PathBuf;
 use std::sync::Arc;
+use std::time::Instant;
 use trainer::{AlignedModel, ModelKind};
 use viz::StateProgress;
 
@@ -273,12 +274,16 @@ fn stop_training(session: &mut Session) -> anyhow::Result<f64> {
     session.gpu.wait()?;
     let seconds = session.time.end_secs();
     session.reporter.report_training_ended();
+    if let Some(summary) = session.growth_log.summary(Instant::now()) {
+        log::info!("{summary}");
+    }
     Ok(seconds)
 }
 
 /// A session while its model is scored, and the viewers of all models.
 struct ScoredSession<'a> {
     method: &'a mut AlignedModel,
+    keyframes: &'a [Arc<Keyframe>],
     scoreboard: &'a Scoreboard,
     reporter: &'a mut Reporter,
     viewing: Viewing<'a>,
@@ -357,6 +362,7 @@ impl<'a> ScoredSession<'a> {
         let kind = session.kind();
         Self {
             method: &mut session.method,
+            keyframes: &session.keyframes,
             scoreboard: &session.scoreboard,
             reporter: &mut session.reporter,
             viewing: Viewing {
@@ -379,6 +385,7 @@ fn score_at_end(session: &mut ScoredSession<'_>, seconds: f64) -> anyhow::Result
         scoreboard,
         reporter,
         viewing,
+        ..
     } = session;
     viewing.gpu.wait()?;
     viewing.persistence.log_render();
@@ -424,21 +431,26 @@ fn report_end(
     let outcome = score_at_end(&mut session, seconds)?;
     let ScoredSession {
         method,
+        keyframes,
         scoreboard,
         reporter,
         mut viewing,
     } = session;
     viewing.show_reporting();
     // Rendered before profiling, because profiling trains the model further.
-    let comparisons = reporter.compare(method, scoreboard.tests(), &outcome.per_image, |method| {
-        viewing.serve(method)
-    });
+    let pictures = reporter.draw_pictures(
+        method,
+        keyframes,
+        scoreboard.tests(),
+        &outcome.per_image,
+        |method| viewing.serve(method),
+    );
     let passes = reporter.profile(method.model_mut())?;
     reporter.report_end(ScoredModel {
         out: &ending.out,
         checkpoint_sha256: &saved.sha256,
         outcome: &outcome,
-        comparisons,
+        pictures,
         passes,
         cameras: method.model_mut().camera_corrections()?,
         alignment: method.alignment(),
@@ -484,6 +496,7 @@ impl<P> EndingSession<P> {
             method: &mut session.method,
             keyframes: &session.keyframes,
             edits: &session.edits,
+            psnr_history: session.scoreboard.psnr_history(),
             seconds,
             is_finished,
         });

@@ -27,6 +27,8 @@ pub struct SessionOptions {
     /// Training time of earlier runs, seconds. If present, the session continues from it with its
     /// own clock, and does not repeat their evaluations.
     pub previous_secs: Option<f64>,
+    /// Scores of earlier runs, with which the PSNR curve begins: training seconds and dB.
+    pub previous_psnr: Vec<(f64, f64)>,
     /// Points from which the model starts if no keyframe has depth.
     pub initial_points: Option<Arc<InitialPoints>>,
     /// Erased space, such as that of an earlier run.
@@ -59,6 +61,7 @@ impl SessionOptions {
             stop: Stop::default(),
             clock: Clock::default(),
             previous_secs: None,
+            previous_psnr: Vec::new(),
             initial_points: None,
             edits: Edits::default(),
             scores_stepwise: false,

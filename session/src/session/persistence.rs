@@ -11,6 +11,7 @@ use keyframe::{DepthMap, Keyframe};
 use kinematics::Stamp;
 use messages::Setting;
 use model_files::checkpoint::Checkpoint;
+use std::collections::BTreeMap;
 use std::path::Path;
 use std::sync::Arc;
 use trainer::{AlignedModel, Resumed};
@@ -131,6 +132,13 @@ impl Persistence {
         // Without pixels, because evicting keyframes is what bounds the memory of a long run.
         if self.recovery.is_some() {
             self.evicted.push(Arc::new(without_pixels(keyframe)));
+        }
+    }
+
+    /// Sets how many images did not become keyframes so far, by reason, for the next checkpoint.
+    pub(crate) fn set_rejected(&mut self, rejected: &BTreeMap<String, u64>) {
+        if let Some(checkpoints) = &mut self.checkpoints {
+            checkpoints.set_rejected(rejected);
         }
     }
 

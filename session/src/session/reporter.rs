@@ -12,6 +12,7 @@ use anyhow::Context;
 use calibration::{Alignment, CameraCorrection, TrialReport};
 use keyframe::Keyframe;
 use serde::Serialize;
+use serde_json::Value;
 use std::collections::BTreeMap;
 use std::path::Path;
 use std::sync::Arc;
@@ -50,8 +51,9 @@ pub(super) struct ScoredModel<'a, T: Serialize> {
     pub out: &'a Path,
     pub checkpoint_sha256: &'a str,
     pub outcome: &'a TrainingOutcome,
-    /// Test images next to renders. If this is an error, the page is not written.
-    pub comparisons: anyhow::Result<Vec<report::Comparison>>,
+    /// Test images next to renders, and pictures of the scene. If this is an error, the page is not
+    /// written.
+    pub pictures: anyhow::Result<ReportPictures>,
     /// GPU time of each kernel in a step in milliseconds, if profiling was requested.
     pub passes: Option<Vec<(&'static str, f64)>>,
     pub alignment: Option<&'a Alignment>,
@@ -63,6 +65,14 @@ pub(super) struct ScoredModel<'a, T: Serialize> {
     pub adapter: String,
     /// Command-specific entries of the report.
     pub details: &'a T,
+}
+
+/// The pictures of the report page.
+pub(super) struct ReportPictures {
+    comparisons: Vec<report::Comparison>,
+    scene: report::ScenePictures,
+    /// Stamp of the first keyframe, nanoseconds.
+    first_nanos: i64,
 }
 
 /// Reports on one model.
@@ -165,22 +175,36 @@ impl Reporter {
         self.observer.on_event(&SessionEvent::TrainingEnded);
     }
 
-    /// Renders test images for the report. `scores` has one entry per test image, in the same
-    /// order. `meanwhile` is called between two images.
-    pub(super) fn compare<'a>(
+    /// Renders the pictures of the report.
+    ///
+    /// * `keyframes`: all keyframes in the store.
+    /// * `tests`: the test keyframes.
+    /// * `scores`: one entry per test keyframe, in the same order.
+    /// * `meanwhile`: called between two renders.
+    pub(super) fn draw_pictures<'a>(
         &self,
         method: &mut AlignedModel,
+        keyframes: &[Arc<Keyframe>],
         tests: impl Iterator<Item = &'a Arc<Keyframe>>,
         scores: &[ImageScores],
-        meanwhile: impl FnMut(&mut AlignedModel),
-    ) -> anyhow::Result<Vec<report::Comparison>> {
+        mut meanwhile: impl FnMut(&mut AlignedModel),
+    ) -> anyhow::Result<ReportPictures> {
+        let stamps = keyframes.iter().map(|keyframe| keyframe.stamp.0);
+        let first_nanos = stamps.min().unwrap_or_default();
         let scored = tests.zip(scores).map(|(keyframe, scores)| report::Scored {
             keyframe,
-            name: self.image_name(scores),
+            name: self.readable_name(&scores.camera, scores.stamp_nanos, first_nanos),
             psnr: scores.psnr,
             ssim: scores.ssim,
         });
-        report::compare(method, &scored.collect::<Vec<_>>(), meanwhile)
+        let comparisons = report::compare(method, &scored.collect::<Vec<_>>(), &mut meanwhile)?;
+        let scene = report::ScenePictures::draw(method, keyframes)?;
+        meanwhile(method);
+        Ok(ReportPictures {
+            comparisons,
+            scene,
+            first_nanos,
+        })
     }
 
     /// GPU time of each kernel in a step in milliseconds, if profiling was requested.
@@ -229,8 +253,8 @@ impl Reporter {
         let written = run_folder::write_json(&out.join("report.json"), &report);
         // The page is an addition, so its error is only logged.
         let page = model
-            .comparisons
-            .and_then(|comparisons| self.write_page(out, &report, &comparisons));
+            .pictures
+            .and_then(|pictures| self.write_page(out, &report, &pictures));
         if let Err(error) = &page {
             log::warn!("{} was not written: {error:#}", report::FILE);
         }
@@ -261,7 +285,7 @@ impl Reporter {
         &self,
         out: &Path,
         report: &Report<'_, impl Serialize>,
-        comparisons: &[report::Comparison],
+        pictures: &ReportPictures,
     ) -> anyhow::Result<()> {
         let n_tests = report.per_image.len();
         let model = SavedModel {
@@ -270,16 +294,38 @@ impl Reporter {
             data: &self.data,
             n_tests,
         };
+        let mut content = serde_json::to_value(report)?;
+        self.name_images(&mut content["per_image"], pictures.first_nanos);
         let page = report::Page {
             folder: out,
-            report: &serde_json::to_value(report)?,
+            report: &content,
             primitive: self.kind.entry().primitive,
-            comparisons,
+            comparisons: &pictures.comparisons,
+            scene: &pictures.scene,
             next: &next_commands::for_models(&[model]),
             settings: report::settings_in(out),
             command: next_commands::this_command(),
+            date: run_folder::utc_now(),
         };
         page.write()
+    }
+
+    /// Replaces the names of images without a file by readable ones.
+    fn name_images(&self, per_image: &mut Value, first_nanos: i64) {
+        for image in per_image.as_array_mut().into_iter().flatten() {
+            let named = image["camera"].as_str().zip(image["stamp_nanos"].as_i64());
+            if let Some((camera, stamp_nanos)) = named {
+                image["name"] = self.readable_name(camera, stamp_nanos, first_nanos).into();
+            }
+        }
+    }
+
+    /// The file name of an image, or its camera and the time after the first keyframe.
+    fn readable_name(&self, camera: &str, stamp_nanos: i64, first_nanos: i64) -> String {
+        let known = (self.data.image_names).get(&(camera.to_owned(), stamp_nanos));
+        known
+            .cloned()
+            .unwrap_or_else(|| report::image_name(camera, stamp_nanos, first_nanos))
     }
 
     fn named<'a>(&self, images: &'a [ImageScores]) -> Vec<NamedScores<'a>> {

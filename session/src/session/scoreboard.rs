@@ -65,6 +65,11 @@ impl Scoreboard {
         }
     }
 
+    /// Begins the curve with the scores of earlier runs.
+    pub(super) fn with_history(self, history: Vec<(f64, f64)>) -> Self {
+        Self { history, ..self }
+    }
+
     /// Whether the caller scores an evaluation image by image.
     pub(super) fn is_stepwise(&self) -> bool {
         self.is_stepwise

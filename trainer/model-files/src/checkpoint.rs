@@ -2,8 +2,8 @@
 //!
 //! `docs/reference/files.md` describes the layout.
 
-use crate::Error;
 use crate::edits::Edits;
+use crate::{Error, RunHistory};
 use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
 use std::collections::BTreeMap;
@@ -34,6 +34,8 @@ pub struct Checkpoint {
     pub is_finished: bool,
     /// Erased space.
     pub edits: Edits,
+    /// Scores and rejected images so far, for the page.
+    pub history: RunHistory,
     /// The method's state without its arrays.
     pub state: serde_json::Value,
     /// Large arrays, little endian.
@@ -63,6 +65,8 @@ struct Header {
     is_finished: bool,
     #[serde(default, skip_serializing_if = "Edits::is_empty")]
     edits: Edits,
+    #[serde(default, skip_serializing_if = "RunHistory::is_empty")]
+    history: RunHistory,
     state: serde_json::Value,
     arrays: Vec<ArrayHeader>,
 }
@@ -83,6 +87,7 @@ impl Checkpoint {
             flags: BTreeMap::new(),
             is_finished: false,
             edits: Edits::default(),
+            history: RunHistory::default(),
             state,
             arrays,
         }
@@ -140,6 +145,7 @@ impl Checkpoint {
             flags: self.flags.clone(),
             is_finished: self.is_finished,
             edits: self.edits.clone(),
+            history: self.history.clone(),
             state: self.state.clone(),
             arrays: lengths.collect(),
         })?;
@@ -204,6 +210,7 @@ impl Checkpoint {
             flags,
             is_finished,
             edits,
+            history,
             state,
             ..
         } = header;
@@ -214,6 +221,7 @@ impl Checkpoint {
             flags,
             is_finished,
             edits,
+            history,
             state,
             arrays,
         })
@@ -293,6 +301,11 @@ mod tests {
             flags: BTreeMap::from([("scale".into(), "0.5".into())]),
             is_finished: true,
             edits: edits(),
+            // A perfect picture has an infinite PSNR, which JSON cannot express.
+            history: RunHistory::new(
+                &[(0.5, 20.25), (1.0, f64::INFINITY), (2.0, 1.0 / 3.0)],
+                BTreeMap::from([("blurred".into(), 3)]),
+            ),
             state: serde_json::json!({ "step": u64::MAX, "size_m": 1.0 / 3.0 }),
             arrays: arrays
                 .map(|(name, bytes)| Array {

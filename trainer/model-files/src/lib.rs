@@ -21,6 +21,7 @@ pub mod edits;
 mod error;
 mod initial_points;
 pub mod mesh;
+mod run_history;
 pub mod spherical_harmonics;
 pub mod splat;
 
@@ -28,3 +29,4 @@ pub use aabb::Aabb;
 pub use edits::Edits;
 pub use error::Error;
 pub use initial_points::InitialPoints;
+pub use run_history::RunHistory;

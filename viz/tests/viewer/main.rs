@@ -24,6 +24,7 @@ mod page_latency;
 mod page_tasks;
 mod protocol;
 mod proxy;
+mod remember_page;
 mod request_thread;
 mod robot;
 mod robot_page;

@@ -163,6 +163,14 @@ fn page_uses_its_token_and_shows_its_role() {
     std::fs::write(scratch.join("shared-edit.png"), browser.screenshot()).expect("written");
     browser.resize(PHONE_PX);
     std::fs::write(scratch.join("shared-edit-phone.png"), browser.screenshot()).expect("written");
+    // A link may contain a view besides the token. Only the token is removed.
+    browser.load_by(&format!(
+        "location.hash = '#token={operator}&view=1~p1_2_3~t0_0_0~f50'"
+    ));
+    wait_for(&mut browser, "an address without token", |browser| {
+        browser.evaluate("location.hash") == json!("#view=1~p1_2_3~t0_0_0~f50")
+    });
+    wait_for(&mut browser, "a connection", connected);
     drop(browser);
     std::fs::remove_dir_all(&profile).expect("the browser has left its profile");
 }

@@ -20,6 +20,7 @@ import { ModelSourceCard } from "./panels/model_source";
 import { ModelSwitch } from "./panels/model_switch";
 import { BACKGROUND, OrbitView } from "./view/orbit_view";
 import { OverlayAges } from "./panels/overlay_ages";
+import { NamedViews } from "./panels/named_views";
 import { panels } from "./panels/panels";
 import { PictureInfo } from "./panels/picture_info";
 import type { BinaryHeader, ModelStatus, PictureHeader, Status, TextMessage } from "./connection/protocol";
@@ -46,6 +47,9 @@ import { Topics } from "./topics/topic";
 import { setUpToolbar } from "./panels/toolbar";
 import { Tooltip } from "./panels/tooltip";
 import { TrainingPanel } from "./panels/training_panel";
+import { TimePhoto } from "./panels/time_photo";
+import { TimeSlider } from "./panels/time_slider";
+import { ViewMemory } from "./view/view_memory";
 import { setUpSavePicture } from "./view/save_picture";
 import { ViewControls } from "./view/view_controls";
 import { ViewSettings } from "./view/view_settings";
@@ -204,6 +208,7 @@ function receiveStatus(status: Status): void {
   showGuidance(status.guidance, banner, liveImages);
   robotAge.hasEnded = banner.isFinished;
   overlayAges.hasEnded = banner.isFinished;
+  namedViews.runIs(status);
 }
 
 function receiveText(message: TextMessage): void {
@@ -329,7 +334,13 @@ toggle("toggle-measure", "d", (isOn) => (view.measure.enabled = isOn));
 endsWithEscape("toggle-fly", "toggle-measure");
 closesWithEscape("mode", () => images.isEnlarged, () => images.reduce());
 toggle("toggle-images", "i", (isOn) => (liveImages.shown = isOn));
-const switchPanel = panels({ "toggle-layers": "layers", "toggle-settings": "settings", "toggle-edit": "edit" });
+const switchPanel = panels({
+  "toggle-layers": "layers",
+  "toggle-settings": "settings",
+  "toggle-edit": "edit",
+  "toggle-views": "views",
+  "toggle-history": "history",
+});
 const togglePanel = (button: string): void => {
   switchPanel(button);
   edits.opened();
@@ -340,6 +351,7 @@ action("toggle-edit", "q", () => {
   const button = element("toggle-edit", HTMLButtonElement);
   if (!button.hidden && !button.disabled) togglePanel("toggle-edit");
 });
+for (const id of ["toggle-views", "toggle-history"]) element(id).addEventListener("click", () => togglePanel(id));
 action("undo-edit", "z", () => edits.undoLast());
 toggle("toggle-cut", "3", (isOn) => (view.isCut = isOn));
 toggle("toggle-follow", "l", (isOn) => (view.follows = isOn));
@@ -356,6 +368,11 @@ toggle("toggle-coverage", "4", (isOn) => (coverage.enabled = isOn));
 toggle("toggle-robot", "b", (isOn) => (view.robot.enabled = isOn));
 toggle("toggle-frames", "h", (isOn) => (view.frames.enabled = isOn));
 toggle("toggle-occlude", "o", (isOn) => (view.occlusion.enabled = isOn));
+
+// After all toggles have their listeners, because restoring a view presses them.
+const memory = new ViewMemory(view, settings, models);
+const namedViews = new NamedViews(memory);
+new TimeSlider(keyframes, view, new TimePhoto(browser.photos));
 
 function frame(): void {
   shownLatency.frameBegins();

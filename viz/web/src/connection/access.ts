@@ -2,6 +2,7 @@
 
 import { element } from "../panels/element";
 import type { Role } from "./protocol";
+import { onlyView } from "../view/remembered";
 
 const VIEWER_REASON = "Only operators can do this; you are connected as viewer";
 
@@ -15,7 +16,7 @@ export function keepToken(): boolean {
   const name = `__Host-fieldrig-${location.port || "443"}`;
   // biome-ignore lint/suspicious/noDocumentCookie: not all browsers that can show this page have the Cookie Store API.
   document.cookie = `${name}=${encodeURIComponent(token)}; Path=/; Secure; SameSite=Strict`;
-  history.replaceState(null, "", location.pathname + location.search);
+  history.replaceState(null, "", location.pathname + location.search + onlyView(location.hash));
   return true;
 }
 

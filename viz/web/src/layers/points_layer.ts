@@ -12,6 +12,7 @@ export class PointsLayer {
   private readonly material: THREE.PointsMaterial;
   private readonly byKeyframe = new Map<number, THREE.Points>();
   private poses = new Map<number, number[]>();
+  private shownIds: ReadonlySet<number> | null = null;
   private isEnabled = false;
 
   constructor(occlusion: Occlusion) {
@@ -49,6 +50,7 @@ export class PointsLayer {
     points.frustumCulled = false;
     points.matrixAutoUpdate = false;
     points.userData.scale = header.meters_per_count;
+    points.visible = this.shownIds?.has(header.id) ?? true;
     this.place(points, pose);
     this.byKeyframe.set(header.id, points);
     this.root.add(points);
@@ -62,6 +64,12 @@ export class PointsLayer {
       if (pose) this.place(points, pose);
       else this.remove(id);
     }
+  }
+
+  /** Draws only the points of these keyframes; of all if null. */
+  showOnly(ids: ReadonlySet<number> | null): void {
+    this.shownIds = ids;
+    for (const [id, points] of this.byKeyframe) points.visible = ids?.has(id) ?? true;
   }
 
   clear(): void {

@@ -138,7 +138,8 @@ export class SplatLayer {
     const hasChanged = this.clip.set(crop, erased);
     // Without boxes, the shaders do not even contain the code for them.
     for (const material of [this.mesh.material, this.depth.material]) {
-      const defines = (material.defines ??= {});
+      material.defines ??= {};
+      const { defines } = material;
       if (this.clip.isUsed === "CLIPS" in defines) continue;
       if (this.clip.isUsed) defines.CLIPS = 1;
       else delete defines.CLIPS;

@@ -22,8 +22,8 @@ export class BoxPanel {
   private show(): void {
     this.panel.hidden = !this.box.isVisible;
     const { center, size, yaw } = this.box.pose;
-    CENTERS.forEach((id, axis) => setNumber(id, center.getComponent(axis), 3));
-    SIZES.forEach((id, axis) => setNumber(id, size.getComponent(axis), 3));
+    for (const [axis, id] of CENTERS.entries()) setNumber(id, center.getComponent(axis), 3);
+    for (const [axis, id] of SIZES.entries()) setNumber(id, size.getComponent(axis), 3);
     const degrees = (yaw * 180) / Math.PI;
     setNumber(YAW, degrees - 360 * Math.round(degrees / 360), 1);
   }

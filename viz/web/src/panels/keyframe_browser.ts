@@ -36,7 +36,7 @@ export interface BrowserSources {
 }
 
 export class KeyframeBrowser {
-  private readonly photos: KeyframePhotos;
+  readonly photos: KeyframePhotos;
   private readonly sides: readonly [SideView, SideView];
   private readonly comparer: KeyframeComparer;
   private readonly survey: KeyframeSurvey;
@@ -66,7 +66,7 @@ export class KeyframeBrowser {
       order: (order) => this.sort(order),
       close: () => this.close(),
     });
-    topic.onChange = () => this.listChanged();
+    topic.onChange.push(() => this.listChanged());
     window.addEventListener("keydown", (event) => this.pressed(event));
     this.pickFrustums(element("canvas"));
     window.setInterval(() => this.refresh(), REFRESH_MILLIS / 4);

@@ -15,6 +15,16 @@ export class ModelSwitch {
     return this.chosen;
   }
 
+  /** The model that the user has chosen; null if it is the server's first. */
+  get preferred(): string | null {
+    return this.chosen ?? null;
+  }
+
+  /** Chooses a model before the list of models is known. A model that is not in the list is then dropped. */
+  prefer(method: string | null): void {
+    if (method !== this.preferred) this.choose(method ?? undefined);
+  }
+
   /** The selected model. */
   shown(status: Status): ModelStatus {
     return status.others.find((model) => model.method === this.chosen) ?? status;

@@ -26,7 +26,7 @@ export function setUpToolbar(): void {
 /** Moves the focus to the next or the previous button of the toolbar, as arrow keys do in toolbars. */
 function moveFocus(toolbar: HTMLElement, step: number): boolean {
   const buttons = [...toolbar.querySelectorAll("button")].filter((button) => button.checkVisibility() && !button.disabled);
-  const ix = buttons.findIndex((button) => button === document.activeElement);
+  const ix = buttons.indexOf(document.activeElement as HTMLButtonElement);
   if (step === 0 || ix < 0) return false;
   buttons[(ix + step + buttons.length) % buttons.length]!.focus();
   return true;

@@ -11,7 +11,7 @@ export class KeyframesTopic implements Topic {
   readonly name = "keyframes";
   readonly list = new KeyframeList();
   /** Called after changes of the list. */
-  onChange: () => void = () => undefined;
+  readonly onChange: (() => void)[] = [];
   readonly receivers = [
     on<Keyframes>("keyframes", (message) => {
       this.view.overlays.setKeyframes(message.keyframes);
@@ -20,13 +20,28 @@ export class KeyframesTopic implements Topic {
     on<KeyframeChanges>("keyframe_changes", (message) => {
       this.list.apply(message);
       this.view.points.setKeyframes(this.list.keyframes);
-      this.view.overlays.setKeyframes(this.list.keyframes);
-      this.view.changed();
-      this.onChange();
+      this.show();
+      for (const changed of this.onChange) changed();
     }),
   ];
+  private untilNanos: number | null = null;
 
   constructor(private readonly view: OrbitView) {}
+
+  /** Draws only the keyframes up to this time on the clock of the rig; all of them if null. */
+  showUntil(nanos: number | null): void {
+    this.untilNanos = nanos;
+    this.show();
+  }
+
+  private show(): void {
+    const { untilNanos } = this;
+    const all = this.list.keyframes;
+    const shown = untilNanos === null ? all : all.filter((keyframe) => keyframe.stamp_nanos <= untilNanos);
+    this.view.points.showOnly(untilNanos === null ? null : new Set(shown.map((keyframe) => keyframe.id)));
+    this.view.overlays.setKeyframes(shown);
+    this.view.changed();
+  }
 
   subscriptions(isHidden: boolean): { rate_hz: number }[] {
     return [{ rate_hz: isHidden ? 0 : HZ }];

@@ -24,6 +24,11 @@ export class CameraPath {
     return this.startedAt !== null;
   }
 
+  /** The views of the path, in order. */
+  get all(): readonly PathView[] {
+    return this.views;
+  }
+
   add(view: PathView): void {
     this.views.push({ ...view, position: view.position.clone(), target: view.target.clone() });
   }

@@ -3,6 +3,7 @@
 import * as THREE from "three";
 import type { Scene } from "../connection/protocol";
 import { type Anchor, type HandlePlace, placeHandles, type Rect } from "./handle_places";
+import type { RememberedBox } from "./remembered";
 import { type Crop, OrientedBox, type Side } from "./oriented_box";
 
 export type { Crop } from "./oriented_box";
@@ -135,6 +136,17 @@ export class CropBox {
     this.notify();
   }
 
+  /** The box if the user has changed it; null if it still follows the scene. */
+  get changedBox(): RememberedBox | null {
+    const { center, size, yaw } = this.box;
+    return this.hasUserChanged ? { center: center.toArray(), size: size.toArray(), yaw } : null;
+  }
+
+  /** Restores a box that the user has changed earlier. */
+  restore({ center, size, yaw }: RememberedBox): void {
+    this.setPose(new THREE.Vector3(...center), new THREE.Vector3(...size), yaw);
+  }
+
   /** Sets the relevant part of the scene. */
   setScene(scene: Scene): void {
     this.radius = scene.radius_m;
@@ -161,7 +173,7 @@ export class CropBox {
     const anchors = this.handles.map(({ action }) => this.anchor(this.positionOf(action), width, height));
     const view = { left: 0, top: 0, right: width, bottom: height };
     const places = placeHandles(anchors, view, obstacles(this.canvas));
-    this.handles.forEach((handle, ix) => this.draw(handle, places[ix]!));
+    for (const [ix, handle] of this.handles.entries()) this.draw(handle, places[ix]!);
   }
 
   /** Draws a handle at its place on the screen, as far away as its place on the box. */

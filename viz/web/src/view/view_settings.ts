@@ -1,6 +1,6 @@
 // The panel with settings of the view: field of view, resolution, opacity, refresh, camera path.
 
-import { CameraPath } from "./camera_path";
+import { CameraPath, type PathView } from "./camera_path";
 import { element } from "../panels/element";
 import type { OrbitView } from "./orbit_view";
 import { PathVideo, whyNoVideo } from "./path_video";
@@ -51,6 +51,19 @@ export class ViewSettings {
   /** Whether the view moves along the camera path. */
   get isPlaying(): boolean {
     return this.path.isPlaying;
+  }
+
+  /** The views of the camera path. */
+  get pathViews(): readonly PathView[] {
+    return this.path.all;
+  }
+
+  /** Replaces the camera path by that of a link, if it has one. Shows the field of view of the link. */
+  restorePath(views: readonly PathView[]): void {
+    this.edit(() => {
+      if (views.length > 0) this.path.clear();
+      for (const view of views) this.path.add(view);
+    });
   }
 
   /** Called for every display refresh. */

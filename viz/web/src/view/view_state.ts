@@ -23,6 +23,11 @@ export interface ViewState {
 
 const MODES: readonly unknown[] = ["overview", "orbit", "fly", "chase", "ride"] satisfies ViewMode[];
 
+/** Whether a text is the name of a mode. */
+export function isViewMode(text: string): text is ViewMode {
+  return MODES.includes(text);
+}
+
 /** Whether a value, for example from an address or from the browser's storage, is a view that can be restored. */
 export function isViewState(value: unknown): value is ViewState {
   if (typeof value !== "object" || value === null) return false;

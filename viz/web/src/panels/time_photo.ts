@@ -1,0 +1,65 @@
+// The photograph of the keyframe at the time of the slider.
+
+import type { KeyframePhotos } from "../connection/keyframe_photos";
+import type { NumberedKeyframe } from "../connection/protocol";
+import { element } from "./element";
+
+/** Maximum size: twice the width of the panel, for dense screens. */
+const SIZE_PX: [number, number] = [560, 560];
+
+export class TimePhoto {
+  private readonly canvas = element("history-photo", HTMLCanvasElement);
+  private wanted: NumberedKeyframe | null = null;
+  private shownKey = "";
+  private isBusy = false;
+
+  constructor(private readonly photos: KeyframePhotos) {}
+
+  /** Shows the photograph of a keyframe, or nothing. */
+  show(keyframe: NumberedKeyframe | null): void {
+    this.wanted = keyframe;
+    if (!keyframe || !this.photos.isPossible) this.hide();
+    else if (!this.isBusy && keyOf(keyframe) !== this.shownKey) void this.request();
+  }
+
+  private hide(): void {
+    this.canvas.hidden = true;
+    this.shownKey = "";
+  }
+
+  /** Requests photographs until the wanted one is shown: while the slider moves, most keyframes are passed by. */
+  private async request(): Promise<void> {
+    this.isBusy = true;
+    for (let next = this.wanted; next && keyOf(next) !== this.shownKey; next = this.pending(next)) {
+      try {
+        await this.draw(next);
+        this.shownKey = keyOf(next);
+      } catch {
+        // The run has dropped the keyframe, or the connection was lost.
+        this.hide();
+        if (next === this.wanted) break;
+      }
+    }
+    this.isBusy = false;
+  }
+
+  /** The wanted keyframe, if it is another one than this. */
+  private pending(shown: NumberedKeyframe): NumberedKeyframe | null {
+    return this.wanted && keyOf(this.wanted) !== keyOf(shown) ? this.wanted : null;
+  }
+
+  private async draw(keyframe: NumberedKeyframe): Promise<void> {
+    const { header, payload } = await this.photos.request(keyframe, SIZE_PX, true);
+    const { offset, bytes } = header.color;
+    const bitmap = await createImageBitmap(new Blob([payload.slice(offset, offset + bytes)], { type: "image/jpeg" }));
+    const { canvas } = this;
+    [canvas.width, canvas.height] = [bitmap.width, bitmap.height];
+    canvas.getContext("2d")?.drawImage(bitmap, 0, 0);
+    bitmap.close();
+    canvas.hidden = this.wanted === null;
+  }
+}
+
+function keyOf({ camera, stamp_nanos }: NumberedKeyframe): string {
+  return `${camera} ${stamp_nanos}`;
+}

@@ -1,0 +1,145 @@
+// Keeps the view over a reload of the page, in the address, and for links: the camera, what is drawn, the crop box, the
+// chosen model and the camera path.
+
+import * as THREE from "three";
+import type { ModelSwitch } from "../panels/model_switch";
+import type { OrbitView } from "./orbit_view";
+import { decoded, encoded, fragmentWith, linkTo, type Remembered, textInFragment } from "./remembered";
+import type { ViewSettings } from "./view_settings";
+
+const STORED_KEY = "view";
+/** Safari allows 100 changes of the address in 30 s. */
+const WRITE_MILLIS = 1000;
+/** The switches that are remembered: what is drawn, and not tools such as the measurement. */
+const SWITCHES = ".layers [id^=toggle-][aria-pressed], #toggle-crop";
+const TOGGLE = "toggle-";
+
+export class ViewMemory {
+  /** The switches that are pressed initially. */
+  private readonly initiallyOn = new Set(switches().filter(isOn).map((button) => button.id));
+  /** Without an action of the user, the address stays as it is. */
+  private hasUserActed = false;
+  private written: string | null = null;
+
+  constructor(
+    private readonly view: OrbitView,
+    private readonly settings: ViewSettings,
+    private readonly models: ModelSwitch,
+  ) {
+    for (const kind of ["pointerdown", "wheel", "keydown", "click"] as const) {
+      window.addEventListener(kind, () => (this.hasUserActed = true), { capture: true, passive: true });
+    }
+    window.setInterval(() => this.write(), WRITE_MILLIS);
+    window.addEventListener("pagehide", () => this.write());
+    window.addEventListener("hashchange", () => this.show(textInFragment(location.hash)));
+    this.show(textAtStart());
+  }
+
+  /** The present view, without the camera path, as text for [`show`]. */
+  get viewText(): string {
+    return encoded({ ...this.present, path: [] });
+  }
+
+  /** A link to the present view, which contains no token. */
+  get link(): string {
+    const { present } = this;
+    const { view } = present;
+    // An overview would follow the bounds of the model, and show another part of it later.
+    return linkTo(location, encoded(view?.mode === "overview" ? { ...present, view: { ...view, mode: "orbit" } } : present));
+  }
+
+  /** Shows the view of an earlier text; does nothing if the text is not valid. */
+  show(text: string | null): void {
+    const remembered = decoded(text ?? "");
+    if (!remembered) return;
+    // Pressing buttons here is no action of the user.
+    const { hasUserActed } = this;
+    this.restore(remembered);
+    this.hasUserActed = hasUserActed;
+    this.written = encoded(this.present);
+    // The page may be about to be loaded again, with a token that came with the link.
+    store(this.written);
+  }
+
+  private get present(): Remembered {
+    return {
+      view: this.view.state(),
+      switched: switches()
+        .filter((button) => isOn(button) !== this.initiallyOn.has(button.id))
+        .map((button) => button.id.slice(TOGGLE.length)),
+      crop: this.view.crop.changedBox,
+      method: this.models.preferred,
+      path: this.settings.pathViews.map(({ position, target, fovDegrees }) => ({
+        position: position.toArray(),
+        target: target.toArray(),
+        fovDegrees,
+      })),
+    };
+  }
+
+  private restore({ view, switched, crop, method, path }: Remembered): void {
+    this.models.prefer(method);
+    if (crop) this.view.crop.restore(crop);
+    for (const button of switches()) {
+      const isSwitched = switched.includes(button.id.slice(TOGGLE.length));
+      press(button, this.initiallyOn.has(button.id) !== isSwitched);
+    }
+    if (view) {
+      // Flying changes the target, so it begins before the view is restored.
+      press(document.getElementById(`${TOGGLE}fly`), view.mode === "fly");
+      this.view.restore(view);
+    }
+    this.settings.restorePath(
+      path.map(({ position, target, fovDegrees }) => ({
+        position: new THREE.Vector3(...position),
+        target: new THREE.Vector3(...target),
+        fovDegrees,
+      })),
+    );
+  }
+
+  /** Writes the view to the address and to the storage of the tab, if it has changed. */
+  private write(): void {
+    const text = encoded(this.present);
+    if (!this.hasUserActed || text === this.written || this.settings.isPlaying) return;
+    this.written = text;
+    history.replaceState(history.state, "", location.pathname + location.search + fragmentWith(text));
+    store(text);
+  }
+}
+
+/** After a reload, the stored view, which may be newer than the address; otherwise, the view of the address. */
+function textAtStart(): string | null {
+  const [navigation] = performance.getEntriesByType("navigation") as PerformanceNavigationTiming[];
+  const inAddress = textInFragment(location.hash);
+  // An address that was typed again may lead to another run.
+  return navigation?.type === "navigate" ? inAddress : (storedText() ?? inAddress);
+}
+
+function storedText(): string | null {
+  try {
+    return sessionStorage.getItem(STORED_KEY);
+  } catch {
+    return null; // The browser stores nothing for this page.
+  }
+}
+
+function store(text: string): void {
+  try {
+    sessionStorage.setItem(STORED_KEY, text);
+  } catch {
+    // The address still contains the view.
+  }
+}
+
+function switches(): HTMLElement[] {
+  return [...document.querySelectorAll<HTMLElement>(SWITCHES)];
+}
+
+function isOn(button: HTMLElement): boolean {
+  return button.getAttribute("aria-pressed") === "true";
+}
+
+function press(button: HTMLElement | null, on: boolean): void {
+  if (button && isOn(button) !== on) button.click();
+}
