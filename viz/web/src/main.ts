@@ -42,7 +42,7 @@ let latestStep = -1;
 let showsModel = true;
 
 const readouts = new Readouts();
-const header = new Header();
+const operatorHeader = new Header();
 const trainingPanel = new TrainingPanel();
 const banner = new Banner();
 const view = openView();
@@ -155,7 +155,7 @@ function receiveStatus(status: Status): void {
   models.list(status);
   showStatus(status);
   runControls.show(status);
-  header.show(status);
+  operatorHeader.show(status);
   trainingPanel.show(status);
   banner.setRunResult(status.result);
   showGuidance(status.guidance, banner, liveImages);
@@ -168,7 +168,7 @@ function receiveText(message: TextMessage): void {
   switch (message.type) {
     case "hello":
       stages = message.default_stages;
-      header.client = message.client;
+      operatorHeader.client = message.client;
       showRole(message.role);
       showKeysInTitles(!isPressed("toggle-fly"));
       break;
