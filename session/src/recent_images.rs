@@ -24,11 +24,8 @@ impl RecentImages {
             self.totals.push_back((now, ImageFlow::default()));
         }
         // The first one kept is just outside of the window, so that the window is covered.
-        let is_second_old = |totals: &VecDeque<(Instant, ImageFlow)>| {
-            let second = totals.get(1);
-            second.is_some_and(|(at, _)| now.saturating_duration_since(*at) >= WINDOW)
-        };
-        while is_second_old(&self.totals) {
+        let is_old = |(at, _): &(Instant, ImageFlow)| now.saturating_duration_since(*at) >= WINDOW;
+        while self.totals.get(1).is_some_and(is_old) {
             self.totals.pop_front();
         }
         let recent = match self.totals.front() {

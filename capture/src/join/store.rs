@@ -184,6 +184,8 @@ impl KeyframeStore {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use kinematics::Transform;
+    use nalgebra::Vector3;
 
     #[test]
     fn a_store_is_full_if_the_next_keyframe_exceeds_a_limit() {
@@ -198,8 +200,6 @@ mod tests {
         assert!(used(3, 76).is_full(), "in bytes");
         assert!(!used(3, 75).is_full());
     }
-    use kinematics::Transform;
-    use nalgebra::Vector3;
 
     fn keyframe(ix: usize, camera: &str, x_m: f64) -> Arc<Keyframe> {
         Arc::new(Keyframe {

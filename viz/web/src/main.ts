@@ -61,7 +61,7 @@ let showsModel = true;
 let sceneRadiusM = 1;
 
 const readouts = new Readouts();
-const header = new Header();
+const operatorHeader = new Header();
 const trainingPanel = new TrainingPanel();
 const banner = new Banner();
 const view = openView();
@@ -200,7 +200,7 @@ function receiveStatus(status: Status): void {
   models.list(status);
   showStatus(status);
   runControls.show(status);
-  header.show(status);
+  operatorHeader.show(status);
   trainingPanel.show(status);
   banner.setStatus(status);
   runEnd.show(status);
@@ -216,7 +216,7 @@ function receiveText(message: TextMessage): void {
   switch (message.type) {
     case "hello":
       stages = message.default_stages;
-      header.client = message.client;
+      operatorHeader.client = message.client;
       showRole(message.role);
       edits.client = message.client;
       break;
