@@ -475,8 +475,8 @@ struct ModelOutcome {
 }
 
 impl<P> EndingSession<P> {
-    /// Saves the model. If `out` cannot be written, a temporary folder becomes `out`, and the reason
-    /// is returned.
+    /// Saves the model. If `out` cannot be written, a temporary folder becomes `out`, and the
+    /// reason is returned.
     ///
     /// * `seconds`: training time.
     fn save(&mut self, seconds: f64) -> anyhow::Result<Option<anyhow::Error>> {

@@ -36,7 +36,7 @@ export class ChunkArrival {
     for (const id of ids) this.received.delete(id);
   }
 
-  /** Whether each chunk was there at some time, at least coarsely. Chunks that split later are replaced without holes. */
+  /** Whether each chunk was there at some time, at least coarsely. Later ones replace others without holes. */
   get hasAll(): boolean {
     return this.hasEverything;
   }
