@@ -161,7 +161,7 @@ export class CropBox {
     const anchors = this.handles.map(({ action }) => this.anchor(this.positionOf(action), width, height));
     const view = { left: 0, top: 0, right: width, bottom: height };
     const places = placeHandles(anchors, view, obstacles(this.canvas));
-    this.handles.forEach((handle, ix) => this.draw(handle, places[ix]!));
+    for (const [ix, handle] of this.handles.entries()) this.draw(handle, places[ix]!);
   }
 
   /** Draws a handle at its place on the screen, as far away as its place on the box. */
