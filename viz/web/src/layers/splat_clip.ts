@@ -94,31 +94,38 @@ export class SplatClip {
   };
   private crop: Crop | undefined;
   private erased: Crop[] = [];
-  private shown = "";
 
   /** Whether any box can cut a splat. Only then, materials need the define CLIPS. */
   get isUsed(): boolean {
     return this.crop !== undefined || this.erased.length > 0;
   }
 
-  /** The crop box, and the erased ones. */
-  get boxes(): [Crop | undefined, Crop[]] {
-    return [this.crop, this.erased];
+  /** Sets the box to which splats are limited. */
+  setCrop(crop: Crop | undefined): void {
+    if (isSame(crop, this.crop)) return;
+    this.crop = crop;
+    this.uniforms.isCropped.value = crop !== undefined;
+    this.upload();
   }
 
-  /** Sets the boxes. Returns whether they have changed. */
-  set(crop: Crop | undefined, erased: Crop[]): boolean {
-    const shown = JSON.stringify([crop ?? null, erased]);
-    if (shown === this.shown) return false;
-    this.shown = shown;
-    this.crop = crop;
-    this.erased = erased.slice(0, MAX_BOXES);
-    this.uniforms.isCropped.value = crop !== undefined;
-    this.uniforms.nErased.value = this.erased.length;
-    this.uniforms.boxes.value.dispose();
-    this.uniforms.boxes.value = boxTexture([crop ?? EMPTY, ...this.erased]);
+  /** Sets the boxes that are cut out of splats. Returns whether they have changed. */
+  setErased(boxes: Crop[]): boolean {
+    const erased = boxes.slice(0, MAX_BOXES);
+    if (isSame(erased, this.erased)) return false;
+    this.erased = erased;
+    this.uniforms.nErased.value = erased.length;
+    this.upload();
     return true;
   }
+
+  private upload(): void {
+    this.uniforms.boxes.value.dispose();
+    this.uniforms.boxes.value = boxTexture([this.crop ?? EMPTY, ...this.erased]);
+  }
+}
+
+function isSame(a: Crop | Crop[] | undefined, b: Crop | Crop[] | undefined): boolean {
+  return JSON.stringify(a) === JSON.stringify(b);
 }
 
 function boxTexture(boxes: Crop[]): THREE.DataTexture {

@@ -126,17 +126,19 @@ export class SplatLayer {
 
   /** Draws only the part of the splats in a box. */
   set crop(crop: Crop | undefined) {
-    this.setBoxes(crop, this.clip.boxes[1]);
+    this.clip.setCrop(crop);
+    this.selectShaders();
   }
 
   /** Cuts boxes out of the splats. Returns whether they have changed. */
-  setErased(erased: Crop[]): boolean {
-    return this.setBoxes(this.clip.boxes[0], erased);
+  setErased(boxes: Crop[]): boolean {
+    const hasChanged = this.clip.setErased(boxes);
+    this.selectShaders();
+    return hasChanged;
   }
 
-  private setBoxes(crop: Crop | undefined, erased: Crop[]): boolean {
-    const hasChanged = this.clip.set(crop, erased);
-    // Without boxes, the shaders do not even contain the code for them.
+  /** Without boxes, the shaders do not even contain the code for them. */
+  private selectShaders(): void {
     for (const material of [this.mesh.material, this.depth.material]) {
       material.defines ??= {};
       const { defines } = material;
@@ -145,7 +147,6 @@ export class SplatLayer {
       else delete defines.CLIPS;
       material.needsUpdate = true;
     }
-    return hasChanged;
   }
 
   /** Prepares to draw from a camera. `worldFromCamera` is in fieldrig's convention. */

@@ -18,12 +18,14 @@ export class BoxPanel {
     this.show();
   }
 
-  /** Shows the numbers of the box, except in the field that is being edited. */
+  /** Shows the numbers of the box. */
   private show(): void {
     this.panel.hidden = !this.box.isVisible;
     const { center, size, yaw } = this.box.pose;
-    for (const [axis, id] of CENTERS.entries()) setNumber(id, center.getComponent(axis), 3);
-    for (const [axis, id] of SIZES.entries()) setNumber(id, size.getComponent(axis), 3);
+    for (const axis of [0, 1, 2] as const) {
+      setNumber(CENTERS[axis], center.getComponent(axis), 3);
+      setNumber(SIZES[axis], size.getComponent(axis), 3);
+    }
     const degrees = (yaw * 180) / Math.PI;
     setNumber(YAW, degrees - 360 * Math.round(degrees / 360), 1);
   }
