@@ -65,7 +65,11 @@ impl SceneView {
             let ahead: Vec<_> = cameras.iter().map(|pose| ahead(pose, &center)).collect();
             return Self::of_points(cameras, &ahead);
         };
-        let around = |side: f64| model.center_m.map(|along| along + side * model.outer_radius_m);
+        let around = |side: f64| {
+            model
+                .center_m
+                .map(|along| along + side * model.outer_radius_m)
+        };
         let bounds = SceneBounds {
             min_m: around(-1.0),
             max_m: around(1.0),

@@ -27,9 +27,7 @@ impl Requests {
     pub(super) fn infos(&self) -> impl Iterator<Item = String> {
         let checkpoint = self.checkpoint_note(|state| state != CheckpointState::Failed);
         let edit = self.last_edit.as_ref().map(|edit| edit.text.clone());
-        [checkpoint, edit, self.editor.note()]
-            .into_iter()
-            .flatten()
+        [checkpoint, edit, self.editor.note()].into_iter().flatten()
     }
 
     /// Notes on checkpoints that could not be written.

@@ -14,6 +14,7 @@ use crate::next_commands::{DataSource, SavedModel};
 use crate::{camera_list, run_folder};
 use background::Task;
 use gpu::Gpu;
+use keyframe::Keyframe;
 use model_files::Edits;
 use serde::Serialize;
 use std::path::PathBuf;

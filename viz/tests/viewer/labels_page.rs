@@ -464,7 +464,10 @@ fn check_pause(page: &mut Page) {
     }
     assert_ne!(color(browser), training);
     assert_eq!(browser.text("pause"), "Continue");
-    assert_eq!(browser.text("checkpoint-note"), "checkpoint written after 98 s");
+    assert_eq!(
+        browser.text("checkpoint-note"),
+        "checkpoint written after 98 s"
+    );
     let notes = browser.text("notes");
     assert!(!notes.contains("checkpoint"), "it is shown once: {notes}");
 }
@@ -477,6 +480,7 @@ fn check_end(page: &mut Page) {
         folder: Some("runs/2026-11-28-kitchen".to_owned()),
         scores: "PSNR 26.60 dB".to_owned(),
         seconds: 98.4,
+        ..RunResult::default()
     });
     wait_for(browser, "the end of the run", |browser| {
         browser.text("state") == "finished" && browser.text("advice").is_empty()

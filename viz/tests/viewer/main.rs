@@ -6,15 +6,15 @@ mod analytic_scene;
 mod black_page;
 mod client;
 mod downloads;
-mod ending_page;
 mod edits_page;
+mod ending_page;
 mod eye_page;
 #[cfg(feature = "foxglove")]
 mod foxglove;
 mod hands_page;
-mod labels_page;
 mod keyframe_browser_page;
 mod keyframe_images;
+mod labels_page;
 mod local_page;
 mod model_chunks;
 mod models;

@@ -21,8 +21,7 @@ use viz::{
     Advice, CheckpointState, Control, ControlRequest, EditAction, Error, Hub, Identity,
     ImageCounts, KeyframePose, KeyframeStore, LiveImage, LivePixels, ModelStatus, ObservationMap,
     ObservedCell, OperatorStatus, PendingRender, RangeScan, RequestedCheckpoint, SceneBounds,
-    SceneHint, Server,
-    ServerConfig, Status,
+    SceneHint, Server, ServerConfig, Status,
 };
 
 fn start() -> (Hub, Server) {
