@@ -13,6 +13,7 @@ use std::collections::BTreeSet;
 use std::net::{SocketAddr, TcpStream};
 use std::path::Path;
 use std::rc::Rc;
+use std::sync::{Condvar, Mutex};
 use std::thread::JoinHandle;
 use std::time::Duration;
 use trainer::{CorrectedKeyframe, Error, Method, PendingCheckpoint, Picture, RenderRequest};
@@ -29,13 +30,17 @@ const TIMEOUT: Duration = Duration::from_secs(120);
 const METHODS: [&str; 2] = ["splat", "tsdf"];
 
 /// A gray model. While it is viewed, it draws a test image only after a client has requested a
-/// picture, so that requests are pending between all images.
+/// picture, so that requests are pending between all images; and all but the first only after the
+/// client has received the progress of scoring.
 struct Gray {
     name: &'static str,
     level: u8,
-    viewed: Option<Hub>,
+    viewed: Option<(Hub, Received)>,
     drawn: DrawnSizes,
 }
+
+/// The methods of the pictures and the states that the client has received.
+type Received = Arc<(Mutex<BTreeSet<String>>, Condvar)>;
 
 /// The method and the size of each picture, in the order of drawing.
 type DrawnSizes = Rc<RefCell<Vec<(&'static str, [u32; 2])>>>;
@@ -62,10 +67,16 @@ impl Method for Gray {
     }
 
     fn render(&mut self, request: &RenderRequest) -> Result<Picture, Error> {
-        if let Some(hub) = &self.viewed
+        if let Some((hub, received)) = &self.viewed
             && request.size_px == TEST_PX
         {
             assert!(hub.pictures().wait_for_request(TIMEOUT), "no request");
+            let is_first = !self
+                .drawn
+                .borrow()
+                .iter()
+                .any(|(_, size_px)| *size_px == TEST_PX);
+            assert!(is_first || waits_for_scoring(received), "no progress");
         }
         self.drawn.borrow_mut().push((self.name, request.size_px));
         let n = request.size_px[0] as usize * request.size_px[1] as usize;
@@ -123,7 +134,11 @@ fn test_keyframe(ix: u8) -> Arc<Keyframe> {
 }
 
 /// A trained session of each method, to be saved in folders of their own.
-fn endings(folder: &Path, viewed: Option<&Hub>, drawn: &DrawnSizes) -> Vec<EndingSession<Value>> {
+fn endings(
+    folder: &Path,
+    viewed: Option<&(Hub, Received)>,
+    drawn: &DrawnSizes,
+) -> Vec<EndingSession<Value>> {
     let gpu = Gpu::open(&GpuOptions::default()).expect("an adapter");
     let kind = |name: &str| {
         let mut all = ModelKind::ALL.iter();
@@ -162,11 +177,13 @@ fn endings(folder: &Path, viewed: Option<&Hub>, drawn: &DrawnSizes) -> Vec<Endin
 }
 
 /// A client that requests pictures of both methods in turn until the server stops. After each
-/// picture, it connects anew, as a page does that is loaded again. Returns the methods of the
-/// pictures and the states that it has received.
-fn client(address: SocketAddr) -> JoinHandle<BTreeSet<String>> {
+/// picture, it connects anew, as a page does that is loaded again.
+fn client(address: SocketAddr, received: Received) -> JoinHandle<()> {
     std::thread::spawn(move || {
-        let mut received = BTreeSet::new();
+        let add = |text: Option<String>| {
+            received.0.lock().expect("no panic").extend(text);
+            received.1.notify_all();
+        };
         for method in METHODS.into_iter().cycle() {
             let Ok(stream) = TcpStream::connect(address) else {
                 break;
@@ -189,20 +206,33 @@ fn client(address: SocketAddr) -> JoinHandle<BTreeSet<String>> {
             {
                 match message {
                     Message::Binary(bytes) if contains(&bytes, br#""type":"picture""#) => {
-                        received.insert(method.to_owned());
+                        add(Some(method.to_owned()));
                         has_picture = true;
                     }
                     Message::Text(text) => {
                         let state = state_in(&text);
                         has_state |= state.is_some();
-                        received.extend(state);
+                        add(state);
                     }
                     _ => {}
                 }
             }
         }
-        received
     })
+}
+
+/// Waits until the client has received how many test images are scored.
+fn waits_for_scoring((received, changed): &(Mutex<BTreeSet<String>>, Condvar)) -> bool {
+    let guard = received.lock().expect("no panic");
+    let is_missing = |received: &mut BTreeSet<String>| !received.iter().any(is_scoring);
+    let (_guard, waited) = changed
+        .wait_timeout_while(guard, TIMEOUT, is_missing)
+        .expect("no panic");
+    !waited.timed_out()
+}
+
+fn is_scoring(state: &String) -> bool {
+    state.starts_with("scoring, ") && state.contains(" of 4 ")
 }
 
 /// The state in a message, if it is a status.
@@ -235,16 +265,22 @@ fn viewers_get_pictures_of_all_models_while_each_is_scored() {
         hub.clone(),
     )
     .expect("a free port");
-    let client = client(server.address());
+    let received = Received::default();
+    let client = client(server.address(), Arc::clone(&received));
     let chunks = ChunkPublisher::new(hub.clone());
     let mut viewers = EndViewers::new(hub.clone(), RenderBudget::new(true), chunks);
     let watched = finish(
-        endings(&folder.path().join("watched"), Some(&hub), &drawn),
+        endings(
+            &folder.path().join("watched"),
+            Some(&(hub.clone(), Arc::clone(&received))),
+            &drawn,
+        ),
         Some(&mut viewers),
     )
     .expect("scored");
     drop(server);
-    let received = client.join().expect("no panic");
+    client.join().expect("no panic");
+    let received = received.0.lock().expect("no panic");
 
     let results = |models: &[FinishedModel]| -> Vec<_> {
         let result = |model: &FinishedModel| {
@@ -272,9 +308,8 @@ fn viewers_get_pictures_of_all_models_while_each_is_scored() {
         METHODS.into(),
         "pictures of both models are drawn between the scored images"
     );
-    let is_scoring = |state: &String| state.starts_with("scoring, ") && state.contains(" of 4 ");
     assert!(
-        METHODS.iter().all(|method| received.contains(*method)) && received.iter().any(is_scoring),
+        METHODS.iter().all(|method| received.contains(*method)),
         "{received:?}"
     );
 }

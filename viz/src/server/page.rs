@@ -204,6 +204,8 @@ mod tests {
             let actions = [
                 format!("toggle(\"{id}\", \"{lower}\""),
                 format!("action(\"{id}\", \"{lower}\""),
+                // Buttons can have further keys.
+                format!("action(\"{id}\", \"{lower} "),
                 format!("{{ id: \"{id}\", key: \"{lower}\""),
             ];
             let is_help = *key == "?" && help.contains("event.key === \"?\"");
