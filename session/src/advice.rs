@@ -99,9 +99,8 @@ pub fn advise(situation: &Situation) -> Advice {
                 "{state}. None has come so far: check the cameras with fieldrig doctor"
             ));
         }
-        RunState::Collecting | RunState::Training => !situation.has_input_ended,
-        // Keyframes are still accepted, so losses matter.
-        RunState::Paused => true,
+        // While training is paused, keyframes are still accepted, so losses matter.
+        RunState::Collecting | RunState::Training | RunState::Paused => !situation.has_input_ended,
         RunState::Waiting | RunState::Finished => false,
     };
     if !is_scanning {
@@ -128,10 +127,17 @@ fn state_text(situation: &Situation) -> String {
             "Training on the data so far, because the input has ended".to_owned()
         }
         RunState::Training => "Scanning".to_owned(),
-        RunState::Paused => match situation.paused_by {
-            Some(client) => format!("Paused by client {client}, keyframes are still taken"),
-            None => "Paused, keyframes are still taken".to_owned(),
-        },
+        RunState::Paused => {
+            let by = situation
+                .paused_by
+                .map_or(String::new(), |client| format!(" by client {client}"));
+            let keyframes = if situation.has_input_ended {
+                "the input has ended"
+            } else {
+                "keyframes are still taken"
+            };
+            format!("Paused{by}, {keyframes}")
+        }
         RunState::Finished => {
             "All data are in the model: end the run in the terminal to save it".to_owned()
         }
@@ -307,6 +313,11 @@ mod tests {
             advise(&paused).text,
             "Paused by client 3, keyframes are still taken"
         );
+        let paused_at_end = Situation {
+            has_input_ended: true,
+            ..situation(RunState::Paused, lossy.clone())
+        };
+        assert_eq!(advise(&paused_at_end).text, "Paused, the input has ended");
         let ended = Situation {
             has_input_ended: true,
             ..situation(RunState::Training, lossy)
