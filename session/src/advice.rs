@@ -51,39 +51,39 @@ const REMEDIES: [(&[Rejection], &str); 7] = [
 
 /// What happened to the color images of some time.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
-pub struct ImageFlow {
+pub(crate) struct ImageFlow {
     /// Images that arrived.
-    pub received: u64,
+    pub(crate) received: u64,
     /// Images dropped before they arrived.
-    pub dropped: u64,
+    pub(crate) dropped: u64,
     /// Images that became keyframes.
-    pub accepted: u64,
+    pub(crate) accepted: u64,
     /// Images that did not, by [`Rejection::name`].
-    pub rejected: BTreeMap<String, u64>,
+    pub(crate) rejected: BTreeMap<String, u64>,
 }
 
 /// What the advice depends on.
 #[derive(Clone, Debug)]
-pub struct Situation {
+pub(crate) struct Situation {
     /// What the run does.
-    pub state: RunState,
+    pub(crate) state: RunState,
     /// Whether the devices will send nothing more.
-    pub has_input_ended: bool,
+    pub(crate) has_input_ended: bool,
     /// Time since the start of the run, seconds.
-    pub run_secs: f64,
+    pub(crate) run_secs: f64,
     /// What happened to the images of the last seconds.
-    pub recent: ImageFlow,
+    pub(crate) recent: ImageFlow,
     /// The store of keyframes.
-    pub store: StoreUse,
+    pub(crate) store: StoreUse,
     /// Number of keyframes with which training starts.
-    pub start_keyframes: usize,
+    pub(crate) start_keyframes: usize,
     /// Number of the client that has paused training.
-    pub paused_by: Option<u64>,
+    pub(crate) paused_by: Option<u64>,
 }
 
 /// The advice for a situation. Problems come first, in the order of what they cost.
 #[must_use]
-pub fn advise(situation: &Situation) -> Advice {
+pub(crate) fn advise(situation: &Situation) -> Advice {
     let state = state_text(situation);
     let warning = |text: String| Advice {
         text,
