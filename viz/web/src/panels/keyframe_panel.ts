@@ -26,7 +26,7 @@ const COLORS = [
 const MASKED_COLOR = [58, 66, 78] as const;
 
 export class KeyframePanel {
-  readonly root = make("section", { id: "keyframe-browser", className: "panel keyframe-browser", tabIndex: -1, hidden: true });
+  readonly root = make("section", { id: "keyframe-browser", className: "panel keyframe-browser", ariaLabel: "Keyframe", tabIndex: -1, hidden: true });
   private readonly title = make("h2", { id: "keyframe-title", ariaLive: "polite" });
   private readonly order = make("select", { id: "keyframe-order", title: "Order of the keyframes" });
   private readonly photo = make("canvas", { id: "keyframe-photo", role: "img", ariaLabel: "Photograph" });
