@@ -6,6 +6,7 @@
 use crate::client::TIMEOUT;
 use crate::models;
 use crate::models::{ModelThread, splat_model, tsdf_model, wall};
+use crate::page::Camera;
 use kinematics::{Stamp, Transform};
 use nalgebra::{Point3, UnitQuaternion, Vector3};
 use std::path::PathBuf;
@@ -378,7 +379,8 @@ fn local_splats_hide_what_lies_behind_them() {
     wait_for(&mut browser, "all parts of the model", has_all_parts);
     browser.click("look-front");
     for (y, name) in [(0.4, "hidden"), (-0.4, "in-front")] {
-        hub.set_live_image(live_image(y));
+        // The frustum of a camera that sends nothing fades.
+        let camera = Camera::sending(hub.clone(), move || live_image(y));
         wait_for(&mut browser, "the live camera", |browser| {
             browser.evaluate("document.querySelectorAll('#live canvas').length") == 1
         });
@@ -387,6 +389,7 @@ fn local_splats_hide_what_lies_behind_them() {
         browser.click("toggle-occlude");
         let n_all = n_accent_pixels(&mut browser, &format!("{name}-without-occlusion"));
         browser.click("toggle-occlude");
+        camera.stop();
         eprintln!("{name}: {n_shown} of {n_all} pixels");
         assert!(n_all > 60, "{name}: the camera covers {n_all} pixels");
         let is_right = if y > 0.0 {

@@ -80,8 +80,9 @@ const FRAGMENT = /* glsl */ `${TINT}${DEPTH}
     if (isMoved && abs(pointInPicture.z - depth) > tolerance(uv, depth)) discard;
     vec3 pointInWorld = (worldFromPicture * vec4(pointInPicture * (depth / pointInPicture.z), 1.0)).xyz;
     vec3 color = texture2D(colorMap, uv).rgb;
-    color = mix(vec3(dot(color, vec3(0.299, 0.587, 0.114))), color, saturation);
-    gl_FragColor = vec4(rendered > 0.0 ? tinted(color, pointInWorld) : color, opacity);
+    // The background keeps its color, so that the edges of the picture do not show.
+    vec3 faded = mix(vec3(dot(color, vec3(0.299, 0.587, 0.114))), color, saturation);
+    gl_FragColor = vec4(rendered > 0.0 ? tinted(faded, pointInWorld) : color, opacity);
   }`;
 
 /** A picture that has been received, and what becomes of it: whether it is shown. */
