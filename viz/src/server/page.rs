@@ -52,6 +52,12 @@ pub(crate) const FILES: &[PageFile] = &[
         "video_worker.js"
     ),
     page_file!(
+        "/mesh_loaders.js",
+        "text/javascript; charset=utf-8",
+        "../../web/dist/",
+        "mesh_loaders.js"
+    ),
+    page_file!(
         "/app.css",
         "text/css; charset=utf-8",
         "../../web/dist/",
