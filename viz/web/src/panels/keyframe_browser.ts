@@ -9,10 +9,11 @@ import type { KeyframesTopic } from "../topics/keyframes";
 import type { OrbitView } from "../view/orbit_view";
 import { element } from "./element";
 import { type CommonRequest, type Comparison, type DecodedPhoto, KeyframeComparer } from "./keyframe_comparison";
-import { correctionText, durationText, keyframeFaults, type PoseDifference, poseDifference } from "./keyframe_faults";
+import { correctionText, keyframeFaults, type PoseDifference, poseDifference } from "./keyframe_faults";
 import { type KeyframeOrder, keyframeKey, nearestKeyframe, neighborKeyframe, orderedKeyframes } from "./keyframe_order";
 import { KeyframePanel } from "./keyframe_panel";
 import { KeyframeSurvey } from "./keyframe_survey";
+import { durationText } from "./quantities";
 
 /** Maximum size of the photograph that is shown, and of those that are only measured. */
 const SHOWN_PX: [number, number] = [640, 640];

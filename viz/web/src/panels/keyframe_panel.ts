@@ -1,5 +1,6 @@
 // The elements of the keyframe browser: photograph and model behind a wiper, map of the error, facts and faults.
 
+import { make, setText } from "./html";
 import type { DecodedPhoto } from "./keyframe_comparison";
 import type { KeyframeErrors } from "./keyframe_error";
 import type { KeyframeOrder } from "./keyframe_order";
@@ -71,7 +72,7 @@ export class KeyframePanel {
   }
 
   showTitle(title: string, progress: string): void {
-    if (this.title.textContent !== title) this.title.textContent = title;
+    setText(this.title, title);
     this.progress.textContent = progress;
   }
 
@@ -226,11 +227,4 @@ function errorImage(map: Float32Array, width: number, height: number): ImageData
     image.data[4 * ix + 3] = 255;
   }
   return image;
-}
-
-function make<K extends keyof HTMLElementTagNameMap>(
-  tag: K,
-  properties: Partial<HTMLElementTagNameMap[K]> = {},
-): HTMLElementTagNameMap[K] {
-  return Object.assign(document.createElement(tag), properties);
 }

@@ -3,11 +3,10 @@
 import type { Vector3 } from "three";
 import type { Axis, ModelSource, ModelStatus, Status } from "../connection/protocol";
 import { AXES, upCommand, upInWorld } from "../view/up_axis";
-import { timeText } from "./chart";
 import { element } from "./element";
 import { fileLinks } from "./file_links";
-import { child, descriptions } from "./html";
-import { bytesText } from "./quantities";
+import { child, descriptions, make } from "./html";
+import { bytesText, countText, timeText } from "./quantities";
 
 const ENDED = "The program has ended";
 
@@ -85,10 +84,9 @@ export class ModelSourceCard {
   private upChooser(source: ModelSource): HTMLElement {
     const row = child("p");
     row.className = "up-axis";
-    const label = child("label", "Up axis ") as HTMLLabelElement;
+    const label = child("label", "Up axis ");
     label.htmlFor = "up-axis";
-    const choice = document.createElement("select");
-    choice.id = "up-axis";
+    const choice = make("select", { id: "up-axis" });
     choice.append(...AXES.map((axis) => new Option(axis, axis)));
     choice.value = this.chosenUp ?? source.up_axis;
     const hint = child("small");
@@ -123,11 +121,11 @@ export function factsOf(source: ModelSource, status: Status): [string, string][]
     [source.kind === "file" ? "File" : "Folder", source.path],
     ["Format", source.format],
     ["Method", models.map((model) => model.method).join(", ")],
-    ...models.map((model): [string, string] => [model.primitives_label, model.primitives.toLocaleString("en-US")]),
+    ...models.map((model): [string, string] => [model.primitives_label, countText(model.primitives)]),
     ["Size", bytesText(source.bytes)],
     ["Saved", source.modified_unix_secs === null ? null : dateText(source.modified_unix_secs)],
     ["Trained for", status.seconds > 0 ? timeText(status.seconds) : null],
-    ["Steps", steps.length > 0 ? steps.map((model) => model.step.toLocaleString("en-US")).join(", ") : null],
+    ["Steps", steps.length > 0 ? steps.map((model) => countText(model.step)).join(", ") : null],
     ["Data", source.data],
     ["Trained on", source.adapter],
   ];

@@ -2,10 +2,10 @@
 
 import { disableServerControls } from "../connection/access";
 import type { RunResult, Status } from "../connection/protocol";
-import { timeText } from "./chart";
 import { element } from "./element";
 import { fileLinks } from "./file_links";
-import { child, descriptions } from "./html";
+import { child, descriptions, make } from "./html";
+import { timeText } from "./quantities";
 
 const ENDED = "The program has ended, so this is no longer possible";
 /** Only the verdict is open at first in windows like those of phones; see app.css. */
@@ -62,7 +62,7 @@ export class RunEnd {
     const isFirst = this.shown === "";
     this.shown = shown;
     const wasOpen = this.panel.querySelector("details")?.open ?? true;
-    const details = document.createElement("details");
+    const details = make("details");
     details.open = isFirst ? !window.matchMedia(SMALL_WINDOW).matches : wasOpen;
     const summary = child("summary", verdictText(result));
     summary.id = "run-verdict";
@@ -80,11 +80,8 @@ export class RunEnd {
   }
 
   private closeButton(): HTMLButtonElement {
-    const button = document.createElement("button");
-    button.id = "close-result";
-    button.textContent = "×";
-    button.title = "Close. The button Result in the header opens this again";
-    button.setAttribute("aria-label", "Close the result");
+    const title = "Close. The button Result in the header opens this again";
+    const button = make("button", { id: "close-result", textContent: "×", title, ariaLabel: "Close the result" });
     button.addEventListener("click", () => this.close());
     return button;
   }

@@ -5,6 +5,7 @@
 
 import type { ConnectionState } from "../connection/connection";
 import type { Status } from "../connection/protocol";
+import { setText } from "./html";
 import { isNothingShown, type Knowledge, type Shown, skeletonText } from "./skeleton_text";
 
 export class Skeleton {
@@ -81,9 +82,8 @@ export class Skeleton {
     this.view.classList.toggle("awaiting", this.isAwaiting);
     if (this.root.hidden) return;
     const { title, detail, doneFrac } = skeletonText(this.known);
-    // Otherwise, screen readers would repeat it.
-    if (this.title.textContent !== title) this.title.textContent = title;
-    if (this.detail.textContent !== detail) this.detail.textContent = detail;
+    setText(this.title, title);
+    setText(this.detail, detail);
     this.bar.hidden = doneFrac === null;
     if (doneFrac !== null) this.bar.value = doneFrac;
   }

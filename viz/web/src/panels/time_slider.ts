@@ -4,7 +4,8 @@
 // The slider moves from keyframe to keyframe and not along the clock, because the times of a resumed run have a gap.
 
 import { element } from "./element";
-import { byTime, nearestInTime, stopwatchText } from "./keyframe_times";
+import { byTime, nearestInTime } from "./keyframe_times";
+import { stopwatchText } from "./quantities";
 import type { KeyframesTopic } from "../topics/keyframes";
 import type { NumberedKeyframe } from "../connection/protocol";
 import type { OrbitView } from "../view/orbit_view";

@@ -1,10 +1,12 @@
 // The panel with settings of the view: field of view, resolution, opacity, refresh, camera path.
 
 import { CameraPath, type PathView } from "./camera_path";
+import { download } from "../panels/download";
 import { element } from "../panels/element";
 import type { OrbitView } from "./orbit_view";
 import { PathVideo, whyNoVideo } from "./path_video";
 import type { RenderScheduler } from "../connection/render_scheduler";
+import { reasonOf } from "../panels/sentence";
 import type { SideView } from "../layers/side_view";
 
 export class ViewSettings {
@@ -117,17 +119,8 @@ export class ViewSettings {
       const file = await recording;
       if (file) download(file, "camera_path.mp4");
     } catch (error) {
-      note.textContent = `Cannot record a video: ${error instanceof Error ? error.message : String(error)}`;
+      note.textContent = `Cannot record a video: ${reasonOf(error)}`;
     }
     this.edit(() => undefined);
   }
-}
-
-/** Lets the browser save a file. */
-export function download(file: Blob, name: string): void {
-  const link = document.createElement("a");
-  link.href = URL.createObjectURL(file);
-  link.download = name;
-  link.click();
-  URL.revokeObjectURL(link.href);
 }
