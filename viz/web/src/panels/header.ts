@@ -1,7 +1,9 @@
 // The operator's header: which robot this is, what it does, what to do, and who else is connected.
 
 import type { Status } from "../connection/protocol";
+import { closesWithEscape } from "../keys";
 import { element } from "./element";
+import { closePanel } from "./focus";
 import { child, setText } from "./html";
 import { colorOf, detailsOf, iconOf, letterOf, nameOf } from "./identity";
 import { bytesText, countText } from "./quantities";
@@ -14,6 +16,12 @@ export class Header {
   /** Number of this client; null before the server's hello. */
   client: number | null = null;
   private icon = "";
+
+  constructor() {
+    const clients = element("clients", HTMLDetailsElement);
+    const close = (): void => closePanel(clients, element("n-clients"), () => (clients.open = false));
+    closesWithEscape("panel", () => clients.open, close, clients);
+  }
 
   show(status: Status): void {
     this.showIdentity(status);

@@ -36,7 +36,7 @@ const CLOSE_KEYS: Group = {
 export function setUpHelp(): void {
   const dialog = element("help", HTMLDialogElement);
   const filter = element("help-filter", HTMLInputElement);
-  action("show-help", "?", () => {
+  action("show-help", () => {
     if (dialog.open) {
       dialog.close();
       return;

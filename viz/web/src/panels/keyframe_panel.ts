@@ -50,7 +50,6 @@ export class KeyframePanel {
     this.wiper.addEventListener("input", () => this.wipe());
     this.faults.ariaLabel = "What is wrong with this keyframe";
     this.root.append(this.head(), this.figures(), this.facts, this.faults, this.buttons());
-    this.root.addEventListener("keydown", (event) => this.pressed(event));
     parent.append(this.root);
     this.wipe();
   }
@@ -186,13 +185,6 @@ export class KeyframePanel {
     if (text.length < 2) button.ariaLabel = title;
     button.addEventListener("click", act);
     return button;
-  }
-
-  private pressed(event: KeyboardEvent): void {
-    if (event.key === "Escape") {
-      event.stopPropagation();
-      this.events.close();
-    }
   }
 
   private wipe(): void {

@@ -39,14 +39,9 @@ export class ModelSourceCard {
     this.card.hidden = source === undefined;
     if (!this.status) return;
     if (!source) {
-      this.restoreTraining();
+      this.restoreRun();
       return;
     }
-    showTraining({
-      psnr: [this.status, ...this.status.others].some((model) => model.psnr !== null),
-      seconds: false,
-      keyframes: this.status.keyframes > 0,
-    });
     const files = this.status.files ?? [];
     const facts = factsOf(source, this.status);
     const shown = JSON.stringify([source, files, facts, this.hasEnded]);
@@ -72,11 +67,10 @@ export class ModelSourceCard {
   }
 
   /** Undoes the changes for a source, because the page has reconnected to a run. */
-  private restoreTraining(): void {
+  private restoreRun(): void {
     if (this.shown === "") return;
     this.shown = "";
     this.training?.append(element("controls"));
-    showTraining({ psnr: true, seconds: true, keyframes: true });
     if (this.chosenUp) this.turnUp(upInWorld("z", "z"));
     this.chosenUp = null;
   }
@@ -102,14 +96,6 @@ export class ModelSourceCard {
     });
     row.append(label, choice, hint);
     return row;
-  }
-}
-
-/** Shows or hides the cards of values that only a run has, each named by one of its elements. */
-function showTraining(shown: Record<"psnr" | "seconds" | "keyframes", boolean>): void {
-  for (const [id, isShown] of Object.entries(shown)) {
-    const card = element(id).closest<HTMLElement>(".card");
-    if (card) card.hidden = !isShown;
   }
 }
 

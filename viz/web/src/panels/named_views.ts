@@ -102,7 +102,9 @@ export class NamedViews {
     const input = make("input", { value: view.name, maxLength, ariaLabel: `New name of “${view.name}”` });
     input.addEventListener("keydown", (event) => {
       if (event.key === "Escape") input.value = view.name;
-      if (event.key === "Escape" || event.key === "Enter") input.blur();
+      if (event.key !== "Escape" && event.key !== "Enter") return;
+      event.preventDefault(); // Escape does not close the panel, too.
+      input.blur();
     });
     input.addEventListener("blur", () => {
       const views = renamed(this.views, view.name, input.value);

@@ -2,7 +2,9 @@
 
 import { disableServerControls } from "../connection/access";
 import type { RunResult, Status } from "../connection/protocol";
+import { closesWithEscape } from "../keys";
 import { element } from "./element";
+import { closePanel } from "./focus";
 import { fileLinks } from "./file_links";
 import { child, descriptions, make } from "./html";
 import { timeText } from "./quantities";
@@ -21,9 +23,7 @@ export class RunEnd {
 
   constructor() {
     this.opener.addEventListener("click", () => this.setOpen(this.panel.hidden !== false));
-    this.panel.addEventListener("keydown", (event) => {
-      if (event.key === "Escape") this.close();
-    });
+    closesWithEscape("card", () => !this.panel.hidden, () => this.close(), this.panel);
   }
 
   show(status: Status): void {
@@ -49,8 +49,7 @@ export class RunEnd {
   }
 
   private close(): void {
-    this.setOpen(false);
-    this.opener.focus();
+    closePanel(this.panel, this.opener, () => this.setOpen(false));
   }
 
   private update(): void {

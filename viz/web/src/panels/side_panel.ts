@@ -2,6 +2,7 @@
 
 import { action, closesWithEscape } from "../keys";
 import { element } from "./element";
+import { closePanel } from "./focus";
 
 /** The windows that styles/phone.css regards as phones. */
 const phones = matchMedia("(max-width: 599px), (max-height: 500px)");
@@ -12,8 +13,9 @@ export function setUpSidePanel(): void {
     panel.hidden = !isOpen;
     element("toggle-run").setAttribute("aria-expanded", String(isOpen));
   };
-  action("toggle-run", "5", () => show(panel.hidden === true));
-  closesWithEscape("panel", () => phones.matches && !panel.hidden, () => show(false));
+  action("toggle-run", () => show(panel.hidden === true));
+  const close = (): void => closePanel(panel, element("toggle-run"), () => show(false));
+  closesWithEscape("panel", () => phones.matches && !panel.hidden, close, panel);
   // On phones, it would cover other panels, or they would cover it.
   element("toolbar").addEventListener("click", (event) => {
     if (!phones.matches || !(event.target instanceof Element)) return;

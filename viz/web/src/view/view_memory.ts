@@ -11,8 +11,8 @@ import type { ViewSettings } from "./view_settings";
 const STORED_KEY = "view";
 /** Safari allows 100 changes of the address in 30 s. */
 const WRITE_MILLIS = 1000;
-/** The switches that are remembered: what is drawn, and not tools such as the measurement. */
-const SWITCHES = ".layers [id^=toggle-][aria-pressed], #toggle-crop";
+/** The switches that are remembered: what is drawn, and not tools such as the measurement. A cut ends with its view. */
+const SWITCHES = ".layers [id^=toggle-][aria-pressed]:not(#toggle-cut), #toggle-crop";
 const TOGGLE = "toggle-";
 
 export class ViewMemory {
