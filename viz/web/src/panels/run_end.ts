@@ -8,10 +8,9 @@ import { closePanel } from "./focus";
 import { fileLinks } from "./file_links";
 import { child, descriptions, make } from "./html";
 import { timeText } from "./quantities";
+import { SMALL_WINDOW } from "./windows";
 
 const ENDED = "The program has ended, so this is no longer possible";
-/** Only the verdict is open at first in windows like those of phones; see app.css. */
-const SMALL_WINDOW = "(max-width: 820px), (max-height: 500px)";
 
 export class RunEnd {
   private readonly panel = element("run-end");

@@ -3,9 +3,9 @@
 import { action, closesWithEscape } from "../keys";
 import { element } from "./element";
 import { closePanel } from "./focus";
+import { PHONE } from "./windows";
 
-/** The windows that styles/phone.css regards as phones. */
-const phones = matchMedia("(max-width: 599px), (max-height: 500px)");
+const phones = matchMedia(PHONE);
 
 export function setUpSidePanel(): void {
   const panel = element("run");
