@@ -65,7 +65,10 @@ export class PictureLabel {
     if (header === this.drawn) return;
     this.drawn = header;
     this.drawnAt = now;
-    if (!header) return;
+    if (!header) {
+      this.firstRequestAt = null; // The page waits for the next request from now on.
+      return;
+    }
     // Earlier requests cannot be drawn any more.
     for (const id of this.outdatedAt.keys()) if (id < header.id) this.outdatedAt.delete(id);
   }

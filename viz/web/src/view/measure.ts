@@ -3,6 +3,7 @@
 import * as THREE from "three";
 import { isKeptByFocus, isPageCovered } from "../keys";
 import { element } from "../panels/element";
+import { child, make } from "../panels/html";
 import { placeLabel } from "./label_places";
 
 const COLOR = 0xe3b341;
@@ -130,16 +131,15 @@ export class MeasureTool {
     const root = new THREE.Group();
     root.add(line, from, to);
     this.root.add(root);
-    const measurement: Measurement = { root, ends: [from, to], label: document.createElement("div") };
-    const text = document.createElement("span");
-    text.textContent = distanceText(from.position, to.position);
-    const remove = document.createElement("button");
-    remove.textContent = "×";
-    remove.title = "Remove this measurement";
-    remove.setAttribute("aria-label", `Remove the measurement ${text.textContent}`);
+    const measurement: Measurement = { root, ends: [from, to], label: make("div", { className: "distance" }) };
+    const text = distanceText(from.position, to.position);
+    const remove = make("button", {
+      textContent: "×",
+      title: "Remove this measurement",
+      ariaLabel: `Remove the measurement ${text}`,
+    });
     remove.addEventListener("click", () => this.remove(measurement));
-    measurement.label.className = "distance";
-    measurement.label.append(text, remove);
+    measurement.label.append(child("span", text), remove);
     this.labels.append(measurement.label);
     this.measurements.push(measurement);
   }

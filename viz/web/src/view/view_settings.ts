@@ -94,7 +94,7 @@ export class ViewSettings {
     element("path-video").textContent = this.video.isRecording ? "Cancel" : "Video";
     element("path-video", HTMLButtonElement).disabled = nViews < 2 && !this.video.isRecording;
     element("path-clear", HTMLButtonElement).disabled = nViews === 0;
-    const fov = Math.round(this.view.pathView().fovDegrees);
+    const fov = Math.round(this.view.attachment.fovDegrees); // Without the lens of a camera that the view rides on.
     if (this.fov.valueAsNumber !== fov) {
       this.fov.value = String(fov);
       element("fov-value").textContent = `${fov}°`;
