@@ -16,13 +16,14 @@ export function setUpSidePanel(): void {
   action("toggle-run", () => show(panel.hidden === true));
   const close = (): void => closePanel(panel, element("toggle-run"), () => show(false));
   closesWithEscape("panel", () => phones.matches && !panel.hidden, close, panel);
-  // On phones, it would cover other panels, or they would cover it.
+  // On phones, there is space for one panel.
   element("toolbar").addEventListener("click", (event) => {
     if (!phones.matches || !(event.target instanceof Element)) return;
     const opener = event.target.closest("[aria-controls]");
     if (!opener || opener.id === "show-more") return;
     const isRunOpen = opener.id === "toggle-run" && !panel.hidden;
-    if (isRunOpen) for (const other of openPanels()) other.click();
+    const isOpened = opener.getAttribute("aria-expanded") === "true";
+    for (const other of openPanels()) if (isOpened && other !== opener) other.click();
     show(isRunOpen);
   });
   phones.addEventListener("change", () => show(!phones.matches));
