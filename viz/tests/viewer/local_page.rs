@@ -384,14 +384,25 @@ fn local_splats_hide_what_lies_behind_them() {
         wait_for(&mut browser, "the live camera", |browser| {
             browser.evaluate("document.querySelectorAll('#live canvas').length") == 1
         });
-        std::thread::sleep(Duration::from_millis(700));
-        let n_shown = n_accent_pixels(&mut browser, name);
+        // On a busy computer, images are late, and the frustum is drawn faintly for a while.
+        let mut n_bright = |browser: &mut Browser, name: &str| {
+            let mut n = 0;
+            wait_for(browser, name, |browser| {
+                n = n_accent_pixels(browser, name);
+                n > 60
+            });
+            n
+        };
         browser.click("toggle-occlude");
-        let n_all = n_accent_pixels(&mut browser, &format!("{name}-without-occlusion"));
+        let n_all = n_bright(&mut browser, &format!("{name}-without-occlusion"));
         browser.click("toggle-occlude");
+        let n_shown = if y > 0.0 {
+            n_accent_pixels(&mut browser, name)
+        } else {
+            n_bright(&mut browser, name)
+        };
         camera.stop();
         eprintln!("{name}: {n_shown} of {n_all} pixels");
-        assert!(n_all > 60, "{name}: the camera covers {n_all} pixels");
         let is_right = if y > 0.0 {
             n_shown * 20 < n_all
         } else {

@@ -643,7 +643,7 @@ fn every_wire_field_is_documented_and_typed() {
                 "{kind}.{name} is not in docs/reference/protocol.md"
             );
             assert!(
-                page.contains(&format!("{name}:")),
+                page.contains(&format!("{name}:")) || page.contains(&format!("{name}?:")),
                 "{kind}.{name} is not in web/src/connection/protocol.ts"
             );
         }
