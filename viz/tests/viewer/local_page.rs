@@ -385,7 +385,7 @@ fn local_splats_hide_what_lies_behind_them() {
             browser.evaluate("document.querySelectorAll('#live canvas').length") == 1
         });
         // On a busy computer, images are late, and the frustum is drawn faintly for a while.
-        let mut n_bright = |browser: &mut Browser, name: &str| {
+        let n_bright = |browser: &mut Browser, name: &str| {
             let mut n = 0;
             wait_for(browser, name, |browser| {
                 n = n_accent_pixels(browser, name);
