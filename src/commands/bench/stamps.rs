@@ -23,7 +23,7 @@ pub(crate) struct Args {
     /// Maximum random latency added to each image
     #[arg(long, value_name = "MS", default_value_t = 75.0)]
     jitter_millis: f64,
-    /// How much faster this computer's clock runs than the camera's, parts per million
+    /// How much faster this computer's clock runs than the camera's clock, parts per million
     #[arg(
         long,
         value_name = "PPM",
