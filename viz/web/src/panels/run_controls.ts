@@ -36,7 +36,7 @@ export class RunControls {
     element("pause").hidden = !isRunning;
     const save = element("save", HTMLButtonElement);
     save.textContent = isRunning ? "Save checkpoint" : "Save edits";
-    save.dataset.title = isRunning ? "Write a checkpoint now" : "Save the edits in the folder of the model, or an edited copy of a single file beside it";
+    save.dataset.title = isRunning ? "Write a checkpoint now" : "Save the edits in the folder of the model. If the model is a single file, save an edited copy beside it";
     if (!save.disabled) save.title = save.dataset.title; // Otherwise, the title says why.
   }
 }
