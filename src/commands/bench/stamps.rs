@@ -34,7 +34,7 @@ pub(crate) struct Args {
     /// Length of a run in seconds
     #[arg(long, value_name = "S", default_value_t = 120.0)]
     seconds: f64,
-    /// Seconds at the start of a run that are not counted
+    /// Seconds at the start of each run for which errors are not counted
     #[arg(long, value_name = "S", default_value_t = 10.0)]
     settle_seconds: f64,
     /// Runs per rate
