@@ -7,11 +7,12 @@ use std::io::Write;
 use std::path::{Path, PathBuf};
 
 /// Files written by `scripts/build-web.sh`.
-const BUNDLE: [&str; 5] = [
+const BUNDLE: [&str; 6] = [
     "web/dist/index.html",
     "web/dist/app.js",
     "web/dist/splat_worker.js",
     "web/dist/video_worker.js",
+    "web/dist/mesh_loaders.js",
     "web/dist/app.css",
 ];
 /// The page of binaries built without Node.js.

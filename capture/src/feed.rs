@@ -258,8 +258,6 @@ impl Pump {
             let newest = sample.stamp();
             let events = self.input.join.push(sample);
             let newest = self.input.join.shifted(newest);
-            // Before the keyframes, because sending them waits while the trainer is busy.
-            *self.shared.counts.lock() = InputCounts::of(&self.input.join);
             if self
                 .forward(events)
                 .and_then(|()| self.advance_to(newest))
@@ -325,6 +323,8 @@ impl Pump {
     }
 
     fn forward(&mut self, events: Vec<JoinEvent>) -> Result<(), TrainerGone> {
+        // Before the keyframes, because sending them waits while the trainer is busy.
+        *self.shared.counts.lock() = InputCounts::of(&self.input.join);
         for event in events {
             match event {
                 JoinEvent::Accepted(keyframe) => self.apply(Change::Accepted(keyframe))?,

@@ -7,7 +7,7 @@ use crate::join::{Join, StoreUse};
 pub struct InputCounts {
     /// Color images that arrived.
     pub images: u64,
-    /// Images dropped by devices or queues. They did not arrive.
+    /// Color images dropped by devices or queues. They did not arrive.
     pub dropped: u64,
     /// Images that became keyframes.
     pub accepted: u64,
@@ -22,7 +22,7 @@ impl InputCounts {
         let counts = join.counts();
         Self {
             images: counts.images,
-            dropped: counts.device_skipped,
+            dropped: counts.color_skipped,
             accepted: counts.accepted,
             evicted: counts.evicted,
             store: join.store_use(),

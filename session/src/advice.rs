@@ -51,39 +51,39 @@ const REMEDIES: [(&[Rejection], &str); 7] = [
 
 /// What happened to the color images of some time.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
-pub struct ImageFlow {
+pub(crate) struct ImageFlow {
     /// Images that arrived.
-    pub received: u64,
+    pub(crate) received: u64,
     /// Images dropped before they arrived.
-    pub dropped: u64,
+    pub(crate) dropped: u64,
     /// Images that became keyframes.
-    pub accepted: u64,
+    pub(crate) accepted: u64,
     /// Images that did not, by [`Rejection::name`].
-    pub rejected: BTreeMap<String, u64>,
+    pub(crate) rejected: BTreeMap<String, u64>,
 }
 
 /// What the advice depends on.
 #[derive(Clone, Debug)]
-pub struct Situation {
+pub(crate) struct Situation {
     /// What the run does.
-    pub state: RunState,
+    pub(crate) state: RunState,
     /// Whether the devices will send nothing more.
-    pub has_input_ended: bool,
+    pub(crate) has_input_ended: bool,
     /// Time since the start of the run, seconds.
-    pub run_secs: f64,
+    pub(crate) run_secs: f64,
     /// What happened to the images of the last seconds.
-    pub recent: ImageFlow,
+    pub(crate) recent: ImageFlow,
     /// The store of keyframes.
-    pub store: StoreUse,
+    pub(crate) store: StoreUse,
     /// Number of keyframes with which training starts.
-    pub start_keyframes: usize,
+    pub(crate) start_keyframes: usize,
     /// Number of the client that has paused training.
-    pub paused_by: Option<u64>,
+    pub(crate) paused_by: Option<u64>,
 }
 
 /// The advice for a situation. Problems come first, in the order of what they cost.
 #[must_use]
-pub fn advise(situation: &Situation) -> Advice {
+pub(crate) fn advise(situation: &Situation) -> Advice {
     let state = state_text(situation);
     let warning = |text: String| Advice {
         text,
@@ -99,9 +99,8 @@ pub fn advise(situation: &Situation) -> Advice {
                 "{state}. None has come so far: check the cameras with fieldrig doctor"
             ));
         }
-        RunState::Collecting | RunState::Training => !situation.has_input_ended,
-        // Keyframes are still accepted, so losses matter.
-        RunState::Paused => true,
+        // While training is paused, keyframes are still accepted, so losses matter.
+        RunState::Collecting | RunState::Training | RunState::Paused => !situation.has_input_ended,
         RunState::Waiting | RunState::Finished => false,
     };
     if !is_scanning {
@@ -128,10 +127,17 @@ fn state_text(situation: &Situation) -> String {
             "Training on the data so far, because the input has ended".to_owned()
         }
         RunState::Training => "Scanning".to_owned(),
-        RunState::Paused => match situation.paused_by {
-            Some(client) => format!("Paused by client {client}, keyframes are still taken"),
-            None => "Paused, keyframes are still taken".to_owned(),
-        },
+        RunState::Paused => {
+            let by = situation
+                .paused_by
+                .map_or(String::new(), |client| format!(" by client {client}"));
+            let keyframes = if situation.has_input_ended {
+                "the input has ended"
+            } else {
+                "keyframes are still taken"
+            };
+            format!("Paused{by}, {keyframes}")
+        }
         RunState::Finished => {
             "All data are in the model: end the run in the terminal to save it".to_owned()
         }
@@ -307,6 +313,11 @@ mod tests {
             advise(&paused).text,
             "Paused by client 3, keyframes are still taken"
         );
+        let paused_at_end = Situation {
+            has_input_ended: true,
+            ..situation(RunState::Paused, lossy.clone())
+        };
+        assert_eq!(advise(&paused_at_end).text, "Paused, the input has ended");
         let ended = Situation {
             has_input_ended: true,
             ..situation(RunState::Training, lossy)

@@ -81,7 +81,6 @@ pub mod verdict;
 mod viewer;
 mod viewers;
 
-pub use advice::{ImageFlow, Situation, advise};
 pub use checkpoints::{CheckpointOptions, Checkpoints, RunFlags, parse_period};
 pub use data::{Data, DataOptions, Purpose, expect, points_sha256};
 pub use dataset_export::{RecordingExport, Written, write_nerfstudio};
@@ -106,7 +105,6 @@ pub use run_plan::{
     DiscardedRun, EndedRun, OpenedRun, PreparedRun, PreviousLiveRun, RunInProgress, RunInput,
     RunPlan, SavedRun,
 };
-pub use run_state::RunState;
 pub use saved_view::{publish_loading, publish_saved};
 pub use scene_calibration::{RelativePose, SCENE_PARAMS, SceneCalibration, calibrate_scene};
 pub use session::{

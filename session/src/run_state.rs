@@ -2,7 +2,7 @@
 
 /// The state of a live run until it is saved.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum RunState {
+pub(crate) enum RunState {
     /// No image has arrived.
     Waiting,
     /// There are too few keyframes to train on.
@@ -18,7 +18,7 @@ pub enum RunState {
 impl RunState {
     /// The state in `status` messages.
     #[must_use]
-    pub fn name(self) -> &'static str {
+    pub(crate) fn name(self) -> &'static str {
         match self {
             Self::Waiting => "waiting for images",
             Self::Collecting => "collecting keyframes",

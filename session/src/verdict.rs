@@ -11,7 +11,7 @@ const GOOD_DB: f64 = 30.0;
 /// Minimum PSNR of a fair model, dB. The differences are twice as large, 16 gray levels: shapes are
 /// in place, but details are blurred. Below this, poses or lens are often wrong.
 const FAIR_DB: f64 = 24.0;
-/// Minimum fraction of lost images that the verdict mentions. Cameras drop single images now and
+/// Minimum fraction of lost images that verdicts and reports mention. Cameras drop single images now and
 /// then, which the next image replaces.
 const MIN_LOST_FRAC: f64 = 0.05;
 
@@ -51,13 +51,7 @@ pub fn verdict(findings: &Findings<'_>) -> Verdict {
 #[must_use]
 pub fn of_report(report: &Value) -> Option<Verdict> {
     let done = report["done"].as_object()?;
-    let count = |key: &str| report[key].as_u64().unwrap_or_default();
-    let rejected = report["rejected"].as_object();
-    let n_rejected: u64 = rejected
-        .into_iter()
-        .flat_map(|reasons| reasons.values())
-        .filter_map(Value::as_u64)
-        .sum();
+    let loss = ImageLoss::of_report(report);
     let method = done.get("method").and_then(Value::as_str);
     Some(verdict(&Findings {
         models: vec![ModelScore {
@@ -65,9 +59,48 @@ pub fn of_report(report: &Value) -> Option<Verdict> {
             psnr_db: done.get("psnr").and_then(Value::as_f64),
         }],
         n_tests: report["per_image"].as_array().map_or(0, Vec::len),
-        n_received: count("keyframes") + count("evicted") + n_rejected,
-        n_lost: count("device_skipped"),
+        n_received: loss.n_received,
+        n_lost: loss.n_lost,
     }))
+}
+
+/// How many color images of a run were received, and how many were dropped before.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub(crate) struct ImageLoss {
+    pub(crate) n_received: u64,
+    pub(crate) n_lost: u64,
+}
+
+impl ImageLoss {
+    /// The images according to `report.json`.
+    pub(crate) fn of_report(report: &Value) -> Self {
+        let count = |key: &str| report[key].as_u64();
+        let rejected = report["rejected"].as_object();
+        let n_rejected: u64 = rejected
+            .into_iter()
+            .flat_map(|reasons| reasons.values())
+            .filter_map(Value::as_u64)
+            .sum();
+        let accepted = ["keyframes", "evicted"].into_iter().filter_map(count);
+        // Older reports have no count of the color images alone.
+        let n_lost = count("color_skipped").or_else(|| count("device_skipped"));
+        Self {
+            n_received: accepted.sum::<u64>() + n_rejected,
+            n_lost: n_lost.unwrap_or_default(),
+        }
+    }
+
+    /// Number of images that the cameras have taken.
+    pub(crate) fn n_sent(self) -> u64 {
+        self.n_received + self.n_lost
+    }
+
+    /// Fraction of the images that were lost; `None` if they are too few to mention.
+    pub(crate) fn noticeable_frac(self) -> Option<f64> {
+        let lost_frac = self.n_lost as f64 / self.n_sent() as f64;
+        // Without images, the fraction is NaN, which is not enough either.
+        (lost_frac >= MIN_LOST_FRAC).then_some(lost_frac)
+    }
 }
 
 fn judge_scores(findings: &Findings<'_>) -> (Grade, String) {
@@ -111,11 +144,12 @@ fn judge_scores(findings: &Findings<'_>) -> (Grade, String) {
 }
 
 fn describe_lost(findings: &Findings<'_>) -> Option<String> {
-    let n_sent = findings.n_received + findings.n_lost;
-    let lost_frac = findings.n_lost as f64 / n_sent as f64;
-    // Without images, the fraction is NaN, which is not enough either.
-    (lost_frac >= MIN_LOST_FRAC)
-        .then(|| format!("{:.0} % of the images were lost", 100.0 * lost_frac))
+    let loss = ImageLoss {
+        n_received: findings.n_received,
+        n_lost: findings.n_lost,
+    };
+    loss.noticeable_frac()
+        .map(|lost_frac| format!("{:.0} % of the images were lost", 100.0 * lost_frac))
 }
 
 #[cfg(test)]

@@ -34,6 +34,13 @@ pub struct ServedModel {
     pub path: PathBuf,
 }
 
+/// A note on an edit or save.
+struct Note {
+    text: String,
+    /// Whether it only informs, so that nobody has to act.
+    is_info: bool,
+}
+
 /// Trained models and the hub of the clients that view them.
 pub struct ModelViewer {
     /// The first model is drawn for requests that name no method.
@@ -51,7 +58,7 @@ pub struct ModelViewer {
     /// Number of requests to save them.
     n_saves: u64,
     /// What the last edit or save did.
-    note: Option<String>,
+    note: Option<Note>,
     published_notes: Vec<String>,
 }
 
@@ -195,7 +202,10 @@ impl ModelViewer {
         };
         self.hub
             .change_status(|status| status.saved_edits = Some(saved_edits));
-        self.note = Some(text);
+        self.note = Some(Note {
+            text,
+            is_info: !has_failed,
+        });
         self.publish_notes();
     }
 
@@ -222,10 +232,14 @@ impl ModelViewer {
                     text: note.clone(),
                 });
                 let is_unsaved = self.has_unsaved_edits();
-                self.note = Some(if is_unsaved {
+                let text = if is_unsaved {
                     format!("{note}; not saved yet")
                 } else {
                     note
+                };
+                self.note = Some(Note {
+                    text,
+                    is_info: !is_unsaved,
                 });
             }
             Err(reason) => self.hub.reject_edit(request, &reason),
@@ -262,18 +276,31 @@ impl ModelViewer {
 
     /// Publishes the notes on edits in place of the previous ones.
     fn publish_notes(&mut self) {
-        let current: Vec<String> = self
-            .note
-            .iter()
-            .cloned()
-            .chain(self.editor.note())
+        let search = self.editor.note();
+        let of_edit = self.note.as_ref();
+        let infos: Vec<String> = of_edit
+            .filter(|note| note.is_info)
+            .map(|note| note.text.clone())
+            .into_iter()
+            .chain(search.clone())
+            .collect();
+        let current: Vec<String> = of_edit
+            .map(|note| note.text.clone())
+            .into_iter()
+            .chain(search)
             .collect();
         let previous = std::mem::replace(&mut self.published_notes, current.clone());
         // The status also has notes of other code, which remain.
-        self.hub.change_status(|Status { notes, .. }| {
-            notes.retain(|shown| !previous.contains(shown));
-            notes.extend(current);
-        });
+        self.hub.change_status(
+            |Status {
+                 notes, operator, ..
+             }| {
+                for (shown, new) in [(notes, current), (&mut operator.infos, infos)] {
+                    shown.retain(|note| !previous.contains(note));
+                    shown.extend(new);
+                }
+            },
+        );
     }
 
     fn answer(&mut self, pending: PendingRender) {

@@ -1,25 +1,52 @@
-// Bundles the page into dist/: one HTML, one script, two workers, one stylesheet, nothing loaded from elsewhere.
+// Bundles the page into dist/: one HTML, one stylesheet, one script at the start, and scripts and workers for what only some
+// runs need. Nothing is loaded from elsewhere.
 
 import { build } from "esbuild";
 import { copyFileSync, mkdirSync, utimesSync } from "node:fs";
-import { dirname, join } from "node:path";
+import { basename, dirname, join } from "node:path";
 import { fileURLToPath } from "node:url";
 
 const here = dirname(fileURLToPath(import.meta.url));
 mkdirSync(join(here, "dist"), { recursive: true });
+const options = {
+  outdir: join(here, "dist"),
+  bundle: true,
+  minify: true,
+  target: "es2022",
+  legalComments: "eof",
+  logLevel: "info",
+};
+/** `import()` loads a script of its own, which has the name of the module. */
+const ownScripts = {
+  name: "own scripts",
+  setup({ onResolve }) {
+    onResolve({ filter: /^\./ }, ({ kind, path }) =>
+      kind === "dynamic-import" ? { path: `./${basename(path)}.js`, external: true } : undefined,
+    );
+  },
+};
+/** The part of three.js that draws nothing. */
+const withoutRenderer = {
+  name: "without renderer",
+  setup({ onResolve }) {
+    onResolve({ filter: /^three$/ }, () => ({ path: join(here, "node_modules/three/build/three.core.js") }));
+  },
+};
 await build({
+  ...options,
   entryPoints: {
     app: join(here, "src/main.ts"),
     splat_worker: join(here, "src/layers/splat_worker.ts"),
     video_worker: join(here, "src/view/video_worker.ts"),
   },
-  outdir: join(here, "dist"),
-  bundle: true,
-  minify: true,
   format: "iife",
-  target: "es2022",
-  legalComments: "eof",
-  logLevel: "info",
+  plugins: [ownScripts],
+});
+await build({
+  ...options,
+  entryPoints: [join(here, "src/layers/mesh_loaders.ts")],
+  format: "esm",
+  plugins: [withoutRenderer],
 });
 await build({ entryPoints: [join(here, "src/app.css")], outfile: join(here, "dist/app.css"), bundle: true, minify: true });
 copyFileSync(join(here, "src/index.html"), join(here, "dist/index.html"));

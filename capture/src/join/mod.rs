@@ -318,7 +318,10 @@ impl Join {
 
     fn push_image(&mut self, image: Image, events: &mut Vec<JoinEvent>) {
         self.counts.device_skipped += image.n_skipped;
-        self.counts.images += u64::from(!image.is_depth());
+        if !image.is_depth() {
+            self.counts.images += 1;
+            self.counts.color_skipped += image.n_skipped;
+        }
         let Some(camera) = self
             .cameras
             .iter_mut()

@@ -82,6 +82,8 @@ pub struct Counts {
     pub without_depth: u64,
     /// Images dropped by devices or queues before the join.
     pub device_skipped: u64,
+    /// Those of them that were color images. Cameras with depth lose images of both kinds.
+    pub color_skipped: u64,
     /// Joint readings that were out of order or not finite, or had the wrong number of joints.
     pub joints_rejected: u64,
     /// Joint readings that differ from the previous ones by more than the joints can move.

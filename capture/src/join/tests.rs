@@ -1,7 +1,7 @@
 //! Generated samples in, keyframes out: poses at the shutter time, every rejection, the bounds, and
 //! bit-exact replay.
 
-use super::{Join, JoinEvent, Rejection, SampleUse};
+use super::{Counts, Join, JoinEvent, Rejection, SampleUse};
 use crate::config::{Override, Rig};
 use crate::open;
 use drivers::{BasePose, Image, PixelFormat, Sample, TruthImage};
@@ -369,6 +369,21 @@ fn replay_reproduces_keyframes_bit_for_bit() {
     let mut other = live.keyframes.clone();
     other[3] = Arc::new(changed);
     assert_eq!(differences(&live.keyframes, &other).len(), 1);
+}
+
+#[test]
+fn images_that_devices_dropped_are_counted_by_kind() {
+    let mut join = join(&rig(&[]));
+    for (image, n_skipped) in [(color("wrist", 0), 3), (depth(5_000_000), 4)] {
+        join.push(Sample::Image(Image { n_skipped, ..image }));
+    }
+    let Counts {
+        images,
+        device_skipped,
+        color_skipped,
+        ..
+    } = *join.counts();
+    assert_eq!((images, color_skipped, device_skipped), (1, 3, 7));
 }
 
 #[test]

@@ -30,6 +30,12 @@ impl AcceptedKeyframes {
             .any(|keyframe| keyframe.split == Split::Train)
     }
 
+    /// Number of keyframes accepted, and of those evicted. In a full store, each new keyframe
+    /// replaces another one, so that the length of the list stays the same.
+    fn n_changes(&self) -> (u64, u64) {
+        (self.list.len() as u64 + self.n_evicted, self.n_evicted)
+    }
+
     fn evict(&mut self, camera: &Arc<str>, stamp: Stamp) {
         self.n_evicted += 1;
         self.list
@@ -60,16 +66,16 @@ impl LiveLoop {
                 .iter()
                 .for_each(|session| session.time().start(first_image));
         }
-        let n_before = self.accepted.list.len();
+        let before = self.accepted.n_changes();
         match self.pace {
             Pace::RealTime => self.take_waiting_keyframes()?,
             Pace::Lockstep { steps_per_keyframe } => self.take_due_keyframes(steps_per_keyframe)?,
         }
-        let accepted = &self.accepted.list;
-        if accepted.len() != n_before {
+        let accepted = &self.accepted;
+        if accepted.n_changes() != before {
             self.publishing
-                .publish_keyframes(accepted, &self.models.sessions[0]);
-            self.scene.publish(accepted, &self.hub);
+                .publish_keyframes(&accepted.list, &self.models.sessions[0]);
+            self.scene.publish(&accepted.list, &self.hub);
         }
         Ok(())
     }
@@ -169,5 +175,41 @@ impl LiveLoop {
             });
         }
         pushed
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use kinematics::Transform;
+
+    fn keyframe(nanos: i64) -> Arc<Keyframe> {
+        Arc::new(Keyframe {
+            camera: "wrist".into(),
+            stamp: Stamp(nanos),
+            size_px: [1, 1],
+            focal_px: [1.0; 2],
+            principal_px: [0.5; 2],
+            rgba_srgb: [0; 4].into(),
+            depth: None,
+            world_from_camera: Transform::identity(),
+            twist: None,
+            readout_secs: 0.0,
+            joint_twists: [].into(),
+            base: None,
+            split: Split::Train,
+            truth: None,
+        })
+    }
+
+    #[test]
+    fn replacing_a_keyframe_of_a_full_store_is_a_change() {
+        let mut accepted = AcceptedKeyframes::default();
+        accepted.list.push(keyframe(1));
+        let before = accepted.n_changes();
+        accepted.evict(&"wrist".into(), Stamp(1));
+        accepted.list.push(keyframe(2));
+        assert_eq!(accepted.list.len(), 1);
+        assert_ne!(accepted.n_changes(), before);
     }
 }

@@ -6,6 +6,7 @@ use crate::chunk_publisher::ChunkPublisher;
 use crate::ledger::Ledger;
 use crate::observations::{ModelState, ObservationPublisher, PosedKeyframe};
 use crate::recent_images::RecentImages;
+use crate::run_state::RunState;
 use crate::session::Session;
 use calibration::CalibratedCamera;
 use capture::Notes;
@@ -242,14 +243,17 @@ impl LiveLoop {
             accepted: counts.accepted,
             rejected: self.feed.rejected(),
         };
+        let state = self.state();
+        // After the end of the input, a run can be finished although training is still paused.
+        let paused_by = (self.requests.paused_by).filter(|_| state == RunState::Paused);
         let situation = Situation {
-            state: self.state(),
+            state,
             has_input_ended: self.feed.ended(),
             run_secs: self.publishing.started.elapsed().as_secs_f64(),
             recent: self.publishing.recent_images.push(Instant::now(), total),
             store,
             start_keyframes: self.start_keyframes,
-            paused_by: self.requests.paused_by,
+            paused_by,
         };
         OperatorStatus {
             identity: Some(self.publishing.identity.clone()),
@@ -267,7 +271,7 @@ impl LiveLoop {
                 max_bytes: store.max_bytes,
                 is_full: store.is_full(),
             }),
-            paused_by: self.requests.paused_by,
+            paused_by,
             checkpoint: self.requests.checkpoint(),
             infos: self.requests.infos().collect(),
             ..OperatorStatus::default()

@@ -1,10 +1,7 @@
 //! The words of the report page: durations, names of images, losses, and counters.
 
-use serde_json::{Map, Value};
-
-/// Minimum fraction of dropped images that the page mentions. Cameras drop single images now and
-/// then, which the next image replaces.
-const MIN_DROPPED_FRAC: f64 = 0.05;
+use crate::verdict::ImageLoss;
+use serde_json::Value;
 
 /// A duration, such as `45.2 s`, `12 min 30 s` or `1 h 5 min`.
 #[must_use]
@@ -46,18 +43,9 @@ pub(crate) fn image_name(camera: &str, stamp_nanos: i64, first_nanos: i64) -> St
 /// * `report`: the content of `report.json`.
 #[must_use]
 pub(super) fn dropped_images(report: &Value) -> Option<String> {
-    let count = |key: &str| report[key].as_u64().unwrap_or_default();
-    let rejected = report["rejected"].as_object();
-    let n_rejected: u64 = rejected
-        .into_iter()
-        .flat_map(Map::values)
-        .filter_map(Value::as_u64)
-        .sum();
-    let n_dropped = count("device_skipped");
-    let n_all = n_dropped + count("keyframes") + count("evicted") + n_rejected;
-    let dropped_frac = n_dropped as f64 / n_all as f64;
-    // Without images, the fraction is NaN, which is not enough either.
-    (dropped_frac >= MIN_DROPPED_FRAC).then(|| {
+    let loss = ImageLoss::of_report(report);
+    let (n_dropped, n_all) = (loss.n_lost, loss.n_sent());
+    loss.noticeable_frac().map(|dropped_frac| {
         format!(
             "{:.0} % of the images were dropped by the devices: {n_dropped} of {n_all} never reached fieldrig, because this \
              computer or the connection was too slow. Lower rate_hz or the size of the images, or use a faster computer",
@@ -78,6 +66,7 @@ pub(super) fn label(key: &str) -> String {
         "evicted" => "keyframes removed because the store was full",
         "rejected" => "images that became no keyframe",
         "device_skipped" => "images dropped by devices",
+        "color_skipped" => "color images dropped by devices",
         "range_scans" => "range scans used",
         "range_points" => "points of the range scans",
         "max_position_error_m" => "largest error of a camera position (simulation)",
@@ -103,7 +92,7 @@ pub(super) fn value_text(key: &str, value: &Value) -> Option<String> {
 pub(super) fn is_omitted(key: &str, value: &Value) -> bool {
     matches!(
         key,
-        "range_scans" | "range_points" | "evicted" | "device_skipped"
+        "range_scans" | "range_points" | "evicted" | "device_skipped" | "color_skipped"
     ) && value.as_u64() == Some(0)
 }
 

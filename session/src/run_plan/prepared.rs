@@ -159,15 +159,8 @@ impl OpenedRun<'_> {
             .as_ref()
             .map_or(&[][..], |previous| &previous.keyframes);
         let (input, evicted) = input(&plan, &rig, (source, stamp_clock), held)?;
-        let robot = robot_meshes::description(&rig, &plan.rig_file)?;
-        let identity = identity(
-            &plan,
-            &folders,
-            robot.as_ref().map(|robot| robot.robot.name()),
-        );
-        if let Some(robot) = robot {
-            hub.set_robot(robot);
-        }
+        let robot = publish_robot(&hub, &rig, &plan)?;
+        let identity = identity(&plan, &folders, robot);
         let stop = services.stop.clone();
         let feed = Feed::start(input, Box::new(Viewers(hub.clone())), stop.clone())?;
         let setup = SessionSetup {
@@ -226,8 +219,18 @@ impl OpenedRun<'_> {
     }
 }
 
+/// Publishes the robot, and returns its name; `None` if there is no robot.
+fn publish_robot(hub: &Hub, rig: &Rig, plan: &RunPlan) -> anyhow::Result<Option<String>> {
+    let Some(robot) = robot_meshes::description(rig, &plan.rig_file)? else {
+        return Ok(None);
+    };
+    let name = robot.robot.name().to_owned();
+    hub.set_robot(robot);
+    Ok(Some(name))
+}
+
 /// Which robot and run this is. Several models have a folder each in that of the run.
-fn identity(plan: &RunPlan, folders: &[PathBuf], robot: Option<&str>) -> Identity {
+fn identity(plan: &RunPlan, folders: &[PathBuf], robot: Option<String>) -> Identity {
     let name = |name: Option<&OsStr>| name.map(|name| name.to_string_lossy().into_owned());
     let first = folders.first().map(PathBuf::as_path);
     let run = match folders.len() {
@@ -236,7 +239,7 @@ fn identity(plan: &RunPlan, folders: &[PathBuf], robot: Option<&str>) -> Identit
     };
     Identity {
         rig: name(plan.rig_file.file_stem()),
-        robot: robot.map(str::to_owned),
+        robot,
         run: name(run.and_then(Path::file_name)),
     }
 }

@@ -20,7 +20,7 @@ use std::collections::BTreeMap;
 use std::path::PathBuf;
 use std::sync::{Arc, OnceLock};
 use std::time::Duration;
-use viz::{Grade, Hub, RunResult, Verdict};
+use viz::{CheckpointState, Grade, Hub, RequestedCheckpoint, RunResult, Status, Verdict};
 
 /// Name of the rig file with the corrections of a run.
 const CORRECTED_RIG: &str = "corrected-rig.toml";
@@ -34,7 +34,7 @@ pub struct SavedRun {
     pub models: Vec<FinishedModel>,
     hub: Hub,
     data_losses: Vec<String>,
-    /// Number of images that were received, and of those that were dropped before.
+    /// Number of color images that were received, and of those that were dropped before.
     n_received: u64,
     n_lost: u64,
     /// Whether the keyframe lists were written.
@@ -244,7 +244,7 @@ pub(super) fn save(
         hub,
         data_losses,
         n_received: counts.images,
-        n_lost: counts.device_skipped,
+        n_lost: counts.color_skipped,
         listed,
         corrected_rigs,
         input_error: input_result.input_error,
@@ -305,6 +305,7 @@ struct RunDetails {
     evicted: u64,
     rejected: BTreeMap<&'static str, u64>,
     device_skipped: u64,
+    color_skipped: u64,
     /// Number of range scans, which are stored in addition to the keyframes, and number of their
     /// points.
     range_scans: usize,
@@ -338,6 +339,7 @@ impl DetailsOfRun<'_> {
             evicted,
             rejected,
             device_skipped,
+            color_skipped,
             ..
         } = join.counts();
         RunDetails {
@@ -348,6 +350,7 @@ impl DetailsOfRun<'_> {
             evicted: *evicted,
             rejected: rejected.iter().map(|(why, n)| (why.name(), *n)).collect(),
             device_skipped: *device_skipped,
+            color_skipped: *color_skipped,
             range_scans: join.range_scans().count(),
             range_points: join
                 .range_scans()
@@ -420,34 +423,47 @@ fn publish_end(hub: &Hub, saved: &SavedRun) {
         hub,
         served_files::of_models(models.iter().map(|model| (model.kind, &model.folder))),
     );
-    hub.set_run_result(RunResult {
+    let result = RunResult {
         folder: folder.map(|folder| folder.display().to_string()),
         scores: models.iter().map(name).collect::<Vec<_>>().join("; "),
         seconds: models.iter().map(|model| model.seconds).fold(0.0, f64::max),
         verdict: Some(saved.verdict()),
         problems: saved.problems(),
-    });
-    wait_for_clients(hub);
+    };
+    publish_result(hub, result);
 }
 
 /// Publishes why a run has ended without a result. The error says what was saved.
 pub(super) fn publish_failure(hub: &Hub, error: &anyhow::Error) {
-    hub.set_run_result(RunResult {
+    let result = RunResult {
         verdict: Some(Verdict {
             grade: Grade::Unknown,
             text: "The run ended with an error".to_owned(),
         }),
         problems: vec![format!("{error:#}")],
         ..RunResult::default()
-    });
-    wait_for_clients(hub);
+    };
+    publish_result(hub, result);
 }
 
-/// Waits until connected clients have received the last status, which they keep showing after the
-/// server has stopped.
-fn wait_for_clients(hub: &Hub) {
+/// Publishes a result, and waits until connected clients have received it. They keep showing it
+/// after the server has stopped.
+fn publish_result(hub: &Hub, result: RunResult) {
+    hub.change_status(remove_pending_checkpoint);
+    hub.set_run_result(result);
     if hub.n_clients() > 0 {
         std::thread::sleep(FINAL_STATUS_TIME);
+    }
+}
+
+/// Removes that a checkpoint was requested. At the end of a run, the last one is written instead, so
+/// that the state of the requested one would never change.
+fn remove_pending_checkpoint(status: &mut Status) {
+    let is_pending =
+        |checkpoint: &mut RequestedCheckpoint| checkpoint.state == CheckpointState::Requested;
+    if let Some(RequestedCheckpoint { text, .. }) = status.operator.checkpoint.take_if(is_pending) {
+        status.notes.retain(|note| *note != text);
+        status.operator.infos.retain(|note| *note != text);
     }
 }
 
@@ -470,7 +486,7 @@ fn publish_final_scores<'a>(hub: &Hub, scores: impl Iterator<Item = (&'a str, f6
 #[cfg(test)]
 mod tests {
     use super::*;
-    use viz::{ModelStatus, Status};
+    use viz::{ModelStatus, OperatorStatus};
 
     #[test]
     fn page_shows_the_final_scores() {
@@ -492,5 +508,28 @@ mod tests {
             assert_eq!(status.model.psnr_history, [(8.0, 25.2), (10.0, 24.85)]);
             assert_eq!(status.others, [model("tsdf", 18.0)], "it was not scored");
         });
+    }
+
+    #[test]
+    fn a_requested_checkpoint_does_not_stay_pending_after_the_run() {
+        for (state, is_kept) in [
+            (CheckpointState::Requested, false),
+            (CheckpointState::Failed, true),
+        ] {
+            let text = "checkpoint".to_owned();
+            let mut status = Status {
+                notes: vec![text.clone(), "no GPU".to_owned()],
+                operator: OperatorStatus {
+                    infos: vec![text.clone()],
+                    checkpoint: Some(RequestedCheckpoint { state, text }),
+                    ..OperatorStatus::default()
+                },
+                ..Status::default()
+            };
+            remove_pending_checkpoint(&mut status);
+            assert_eq!(status.operator.checkpoint.is_some(), is_kept);
+            assert_eq!(status.operator.infos.is_empty(), !is_kept);
+            assert_eq!(status.notes.len(), if is_kept { 2 } else { 1 });
+        }
     }
 }

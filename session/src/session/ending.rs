@@ -185,19 +185,33 @@ fn save<P>(
     seconds: f64,
     viewers: Option<&mut EndViewers>,
 ) -> anyhow::Result<Saved> {
-    let ending = &mut endings[ix];
-    let failed = ending.save(seconds)?;
-    ending.write_cameras();
-    let folder = ending.out.clone();
+    let mut failed = endings[ix].save(seconds)?;
+    let sha256 = match checksum(endings, ix, viewers) {
+        // The folder may have been removed, or the disk may have failed, since the model was saved.
+        Err(error) if failed.is_none() && is_io(&error) => {
+            failed = Some(endings[ix].save_elsewhere(error)?);
+            run_folder::checkpoint_sha256(&endings[ix].out)?
+        }
+        sha256 => sha256?,
+    };
+    endings[ix].write_cameras();
+    Ok(Saved { sha256, failed })
+}
+
+/// Checksum of one of the models on disk. Viewers get pictures while it is computed.
+fn checksum<P>(
+    endings: &mut [EndingSession<P>],
+    ix: usize,
+    viewers: Option<&mut EndViewers>,
+) -> anyhow::Result<String> {
+    let folder = endings[ix].out.clone();
     let checksum = Task::start("checksum", move || run_folder::checkpoint_sha256(&folder));
     if let Some(viewers) = viewers {
         serve_while(viewers, endings, |_| !checksum.is_finished());
     }
-    let sha256 = match checksum.join() {
-        Ok(sha256) => sha256?,
-        Err(panic) => std::panic::resume_unwind(panic),
-    };
-    Ok(Saved { sha256, failed })
+    checksum
+        .join()
+        .unwrap_or_else(|panic| std::panic::resume_unwind(panic))
 }
 
 /// Waits until the last checkpoint of each saved model is on disk.

@@ -342,7 +342,8 @@ pub fn wait_for(browser: &mut Browser, what: &str, mut is_there: impl FnMut(&mut
 
 /// Left, top, width and height of the view in the window, pixels.
 pub fn canvas_bounds(browser: &mut Browser) -> [u32; 4] {
-    let bounds = browser.evaluate("(() => { const b = document.getElementById('canvas').getBoundingClientRect(); return [b.x, b.y, b.width, b.height].map(Math.round) })()");
+    // While the page reloads, it has no elements.
+    let bounds = browser.evaluate("(() => { const b = document.getElementById('canvas')?.getBoundingClientRect(); return b ? [b.x, b.y, b.width, b.height].map(Math.round) : [0, 0, 0, 0] })()");
     [0, 1, 2, 3].map(|ix| {
         bounds[ix]
             .as_u64()

@@ -97,6 +97,14 @@ pub(crate) struct PhotographTask {
     task: JoinHandle<Result<Vec<u8>, KeyframeImageError>>,
 }
 
+impl Drop for PhotographTask {
+    /// Removes the request of a client that has disconnected from the queue. Otherwise, a client
+    /// that connects again and again could fill it.
+    fn drop(&mut self) {
+        self.task.abort();
+    }
+}
+
 /// A binary message that is being sent in parts.
 struct Transfer {
     number: u64,
@@ -125,6 +133,9 @@ impl Transfers {
         });
     }
 }
+
+/// The binary message with a photograph, or the reason why there is none.
+type PhotographResult = Result<Result<Vec<u8>, KeyframeImageError>, JoinError>;
 
 /// An encoded picture, or the reason why there is none.
 type EncodingResult = Result<Result<PackedPicture, PackError>, JoinError>;
@@ -274,17 +285,7 @@ impl Writer<'_> {
                 }
                 // Before pictures, which follow each other without a pause: the client waits for it.
                 encoded = encoded_photograph(&mut self.photograph), if !is_sending && is_heard => {
-                    let Some(PhotographTask { request, .. }) = self.photograph.take() else {
-                        continue;
-                    };
-                    match encoded {
-                        Ok(Ok(bytes)) => transfers.start(bytes.into(), false),
-                        Ok(Err(error)) => {
-                            self.send_image_error(request, &error.to_string()).await?;
-                        }
-                        // The task panicked. The client must not wait forever.
-                        Err(error) => self.send_image_error(request, &error.to_string()).await?,
-                    }
+                    self.send_photograph(encoded, &mut transfers).await?;
                 }
                 // The encoded picture waits in its task until the last message is complete.
                 encoded = finished(&mut encoding), if !is_sending => {
@@ -413,6 +414,27 @@ impl Writer<'_> {
         }
     }
 
+    /// Begins to send a photograph, or sends the reason why there is none.
+    async fn send_photograph(
+        &mut self,
+        encoded: PhotographResult,
+        transfers: &mut Transfers,
+    ) -> ClientFlow {
+        let Some(request) = self.photograph.take().map(|photograph| photograph.request) else {
+            return ControlFlow::Continue(());
+        };
+        let reason = match encoded {
+            Ok(Ok(bytes)) => {
+                transfers.start(bytes.into(), false);
+                return ControlFlow::Continue(());
+            }
+            Ok(Err(error)) => error.to_string(),
+            // The task panicked. The client must not wait forever.
+            Err(error) => error.to_string(),
+        };
+        self.send_image_error(request, &reason).await
+    }
+
     /// Sends the reason why there is no photograph.
     async fn send_image_error(
         &mut self,
@@ -528,9 +550,7 @@ async fn finished(encoding: &mut Option<EncodingTask>) -> EncodingResult {
 }
 
 /// Waits until the photograph is encoded. Without one, waits forever.
-async fn encoded_photograph(
-    photograph: &mut Option<PhotographTask>,
-) -> Result<Result<Vec<u8>, KeyframeImageError>, JoinError> {
+async fn encoded_photograph(photograph: &mut Option<PhotographTask>) -> PhotographResult {
     match photograph {
         Some(photograph) => (&mut photograph.task).await,
         None => std::future::pending().await,

@@ -14,7 +14,7 @@ use std::fmt::{Debug, Formatter, Write};
 use std::fs::File;
 use std::io::Read;
 use std::sync::Arc;
-use tokio::sync::Semaphore;
+use tokio::sync::{OwnedSemaphorePermit, Semaphore};
 use tokio::task::spawn_blocking;
 
 /// Folder of the files in URLs.
@@ -24,6 +24,9 @@ const PIECE_BYTES: u64 = 256 * 1024;
 /// Maximum number of files that are opened or converted at once. A conversion holds a whole model in
 /// memory and keeps a processor busy, which pictures need as well.
 const MAX_CONVERSIONS: usize = 1;
+/// Maximum number of files that wait, are converted or are sent at once. A converted file takes disk
+/// space until it is sent, which a slow client can delay.
+const MAX_DOWNLOADS: usize = 8;
 /// What a report may do: show its own styles and embedded pictures. Scripts and requests are not
 /// allowed, whatever a file contains.
 const REPORT_POLICY: &str = "default-src 'none'; img-src data:; style-src 'unsafe-inline'; base-uri 'none'; form-action 'none'; \
@@ -78,6 +81,7 @@ pub fn publish_files(hub: &Hub, files: Vec<ServedFile>) {
 pub(crate) struct FileServer {
     hub: Hub,
     conversions: Arc<Semaphore>,
+    downloads: Arc<Semaphore>,
 }
 
 impl FileServer {
@@ -86,6 +90,7 @@ impl FileServer {
         Self {
             hub,
             conversions: Arc::new(Semaphore::new(MAX_CONVERSIONS)),
+            downloads: Arc::new(Semaphore::new(MAX_DOWNLOADS)),
         }
     }
 
@@ -97,8 +102,21 @@ impl FileServer {
             let reason = "the server offers no file with this name";
             return (StatusCode::NOT_FOUND, reason).into_response();
         };
+        let Ok(permit) = Arc::clone(&self.downloads).try_acquire_owned() else {
+            let reason = format!(
+                "{MAX_DOWNLOADS} files are being downloaded already; try again when one is complete"
+            );
+            return (StatusCode::SERVICE_UNAVAILABLE, reason).into_response();
+        };
         match self.open(file).await {
-            Ok((opened, n_bytes)) => response(file, opened, n_bytes),
+            Ok((opened, n_bytes)) => response(
+                file,
+                Opened {
+                    file: opened,
+                    n_bytes,
+                    _permit: permit,
+                },
+            ),
             Err(reason) => (StatusCode::INTERNAL_SERVER_ERROR, reason).into_response(),
         }
     }
@@ -121,9 +139,18 @@ impl FileServer {
     }
 }
 
-fn response(file: &ServedFile, opened: File, n_bytes: u64) -> Response {
+/// A file that is ready to be sent.
+struct Opened {
+    file: File,
+    /// Number of bytes that have not been sent.
+    n_bytes: u64,
+    /// One of the downloads, until the file is sent or the client has disconnected.
+    _permit: OwnedSemaphorePermit,
+}
+
+fn response(file: &ServedFile, opened: Opened) -> Response {
     let shared = [
-        (header::CONTENT_LENGTH, n_bytes.to_string()),
+        (header::CONTENT_LENGTH, opened.n_bytes.to_string()),
         // Edits change the files, so browsers must not keep them.
         (header::CACHE_CONTROL, "no-store".to_owned()),
     ];
@@ -137,22 +164,23 @@ fn response(file: &ServedFile, opened: File, n_bytes: u64) -> Response {
             (header::CONTENT_SECURITY_POLICY, REPORT_POLICY.to_owned()),
         ],
     };
-    (shared, special, Body::from_stream(pieces(opened, n_bytes))).into_response()
+    (shared, special, Body::from_stream(pieces(opened))).into_response()
 }
 
 /// The content of a file. If the file becomes shorter meanwhile, the stream ends with an error, so
 /// that the client does not take a part for the whole.
-fn pieces(file: File, n_bytes: u64) -> impl Stream<Item = std::io::Result<Bytes>> + Send {
-    stream::try_unfold((file, n_bytes), |(mut file, n_left)| async move {
-        if n_left == 0 {
+fn pieces(opened: Opened) -> impl Stream<Item = std::io::Result<Bytes>> + Send {
+    stream::try_unfold(opened, |mut opened| async move {
+        if opened.n_bytes == 0 {
             return Ok(None);
         }
         let piece = spawn_blocking(move || {
-            let length = usize::try_from(n_left.min(PIECE_BYTES)).expect("a piece fits in memory");
+            let n_piece = opened.n_bytes.min(PIECE_BYTES);
+            let length = usize::try_from(n_piece).expect("a piece fits in memory");
             let mut piece = vec![0; length];
-            file.read_exact(&mut piece)?;
-            let n_left = n_left - piece.len() as u64;
-            Ok::<_, std::io::Error>(Some((Bytes::from(piece), (file, n_left))))
+            opened.file.read_exact(&mut piece)?;
+            opened.n_bytes -= n_piece;
+            Ok::<_, std::io::Error>(Some((Bytes::from(piece), opened)))
         });
         piece.await.map_err(std::io::Error::other)?
     })

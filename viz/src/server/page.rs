@@ -52,6 +52,12 @@ pub(crate) const FILES: &[PageFile] = &[
         "video_worker.js"
     ),
     page_file!(
+        "/mesh_loaders.js",
+        "text/javascript; charset=utf-8",
+        "../../web/dist/",
+        "mesh_loaders.js"
+    ),
+    page_file!(
         "/app.css",
         "text/css; charset=utf-8",
         "../../web/dist/",
@@ -159,61 +165,6 @@ mod tests {
             assert_eq!(accepts_gzip(&headers), expected, "{value}");
         }
         assert!(!accepts_gzip(&HeaderMap::new()));
-    }
-
-    /// Id and title of each button of the page.
-    fn buttons() -> Vec<(&'static str, &'static str)> {
-        let tags = include_str!("../../web/src/index.html")
-            .split("<button ")
-            .skip(1);
-        let attribute =
-            |tag: &'static str, name: &str| Some(tag.split_once(name)?.1.split_once('"')?.0);
-        tags.filter_map(|tag| {
-            let tag = tag.split_once('>')?.0;
-            Some((attribute(tag, "id=\"")?, attribute(tag, "title=\"")?))
-        })
-        .collect()
-    }
-
-    /// The key in a title, such as X in `Crop (X)`.
-    fn key_of(title: &'static str) -> Option<&'static str> {
-        title
-            .split('(')
-            .skip(1)
-            .filter_map(|rest| rest.split_once(')'))
-            .map(|(key, _)| key)
-            .find(|key| key.len() == 1)
-    }
-
-    #[test]
-    fn keys_in_titles_are_unique_and_have_actions() {
-        let main = concat!(
-            include_str!("../../web/src/main.ts"),
-            include_str!("../../web/src/topics/observations.ts")
-        );
-        let help = include_str!("../../web/src/panels/help.ts");
-        let keys: Vec<_> = buttons()
-            .into_iter()
-            .filter_map(|(id, title)| Some((id, key_of(title)?)))
-            .collect();
-        assert!(keys.len() > 20, "{keys:?}");
-        for (ix, (id, key)) in keys.iter().enumerate() {
-            let other = keys[..ix].iter().find(|(_, earlier)| earlier == key);
-            assert_eq!(other, None, "{id} has the same key {key}");
-            let lower = key.to_lowercase();
-            let actions = [
-                format!("toggle(\"{id}\", \"{lower}\""),
-                format!("action(\"{id}\", \"{lower}\""),
-                // Buttons can have further keys.
-                format!("action(\"{id}\", \"{lower} "),
-                format!("{{ id: \"{id}\", key: \"{lower}\""),
-            ];
-            let is_help = *key == "?" && help.contains("event.key === \"?\"");
-            assert!(
-                is_help || actions.iter().any(|action| main.contains(action)),
-                "{id}: {key} has no action"
-            );
-        }
     }
 
     #[test]

@@ -8,6 +8,7 @@ use std::net::{SocketAddr, TcpStream};
 use std::path::{Path, PathBuf};
 use std::sync::mpsc::{Receiver, sync_channel};
 use std::sync::{Arc, Mutex};
+use std::time::{Duration, Instant};
 use viz::{Hub, ServedFile, Server, ServerConfig, publish_files};
 
 /// Many pieces, and more than the buffers of a connection hold.
@@ -179,5 +180,53 @@ fn clients_are_served_while_a_file_is_converted() {
         let (head, body) = response(stream);
         assert!(head.starts_with("http/1.1 200"), "{head}");
         assert_eq!(body, b"converted");
+    }
+}
+
+/// Waits until one of the requests is answered, and removes it.
+fn first_answered(requests: &mut Vec<TcpStream>) -> TcpStream {
+    let started = Instant::now();
+    loop {
+        for ix in 0..requests.len() {
+            let stream = &requests[ix];
+            stream.set_nonblocking(true).expect("a socket");
+            let is_answered = stream.peek(&mut [0]).is_ok_and(|n| n > 0);
+            stream.set_nonblocking(false).expect("a socket");
+            if is_answered {
+                return requests.swap_remove(ix);
+            }
+        }
+        assert!(started.elapsed() < TIMEOUT, "no answer");
+        std::thread::sleep(Duration::from_millis(5));
+    }
+}
+
+#[test]
+fn downloads_beyond_the_limit_are_refused_until_another_one_is_complete() {
+    const LIMIT: usize = 8;
+    let folder = tempfile::tempdir().expect("a folder");
+    let (hub, server) = start();
+    let (make_ready, ready) = sync_channel(LIMIT + 1);
+    publish_files(&hub, vec![slow_file(folder.path(), ready)]);
+    let mut waiting: Vec<TcpStream> = (0..=LIMIT)
+        .map(|_| request(server.address(), "/files/slow.spz"))
+        .collect();
+    let (head, body) = response(first_answered(&mut waiting));
+    assert!(head.starts_with("http/1.1 503"), "{head}");
+    let reason = String::from_utf8_lossy(&body).into_owned();
+    assert!(reason.contains("8 files are being downloaded"), "{reason}");
+    for _ in 0..=LIMIT {
+        make_ready.send(()).expect("the server waits");
+    }
+    for stream in waiting {
+        assert_eq!(response(stream).1, b"converted");
+    }
+    // A place becomes free when the client has disconnected, which the server may notice later.
+    let started = Instant::now();
+    while !get(server.address(), "/files/slow.spz")
+        .0
+        .starts_with("http/1.1 200")
+    {
+        assert!(started.elapsed() < TIMEOUT, "no place became free");
     }
 }

@@ -542,7 +542,7 @@ fn is_shown(id: &str) -> String {
 fn check_file(browser: &mut Browser) {
     wait_for(browser, "the facts", |browser| {
         let text = browser.text("source-card");
-        ["guitar.compressed.ply", "PLY", "84,512", "11.0 MiB"]
+        ["guitar.compressed.ply", "PLY", "84,512", "11.5 MB"]
             .iter()
             .all(|fact| text.contains(fact))
     });

@@ -102,6 +102,18 @@ fn inflated(bytes: &[u8]) -> Vec<u8> {
     inflated
 }
 
+/// The header of a photograph.
+pub(crate) fn header_of_photograph() -> Value {
+    let (hub, server) = start();
+    let keyframe = Arc::new(photographed(7));
+    hub.set_keyframe_sources([&keyframe]);
+    hub.set_keyframes(vec![listed(&keyframe)]);
+    let (mut client, keyframes) = connect(&server);
+    let number = &keyframes[0]["id"];
+    client.send_json(&json!({"type": "keyframe_image", "id": 5, "keyframe": number}));
+    client.binary_of("keyframe_image").0
+}
+
 #[test]
 fn clients_get_the_photograph_of_a_keyframe_with_its_mask_and_facts() {
     let (hub, server) = start();

@@ -6,6 +6,7 @@
 use crate::client::TIMEOUT;
 use crate::models;
 use crate::models::{ModelThread, splat_model, tsdf_model, wall};
+use crate::page::Camera;
 use kinematics::{Stamp, Transform};
 use nalgebra::{Point3, UnitQuaternion, Vector3};
 use std::path::PathBuf;
@@ -378,17 +379,30 @@ fn local_splats_hide_what_lies_behind_them() {
     wait_for(&mut browser, "all parts of the model", has_all_parts);
     browser.click("look-front");
     for (y, name) in [(0.4, "hidden"), (-0.4, "in-front")] {
-        hub.set_live_image(live_image(y));
+        // The frustum of a camera that sends nothing fades.
+        let camera = Camera::sending(hub.clone(), move || live_image(y));
         wait_for(&mut browser, "the live camera", |browser| {
             browser.evaluate("document.querySelectorAll('#live canvas').length") == 1
         });
-        std::thread::sleep(Duration::from_millis(700));
-        let n_shown = n_accent_pixels(&mut browser, name);
+        // On a busy computer, images are late, and the frustum is drawn faintly for a while.
+        let mut n_bright = |browser: &mut Browser, name: &str| {
+            let mut n = 0;
+            wait_for(browser, name, |browser| {
+                n = n_accent_pixels(browser, name);
+                n > 60
+            });
+            n
+        };
         browser.click("toggle-occlude");
-        let n_all = n_accent_pixels(&mut browser, &format!("{name}-without-occlusion"));
+        let n_all = n_bright(&mut browser, &format!("{name}-without-occlusion"));
         browser.click("toggle-occlude");
+        let n_shown = if y > 0.0 {
+            n_accent_pixels(&mut browser, name)
+        } else {
+            n_bright(&mut browser, name)
+        };
+        camera.stop();
         eprintln!("{name}: {n_shown} of {n_all} pixels");
-        assert!(n_all > 60, "{name}: the camera covers {n_all} pixels");
         let is_right = if y > 0.0 {
             n_shown * 20 < n_all
         } else {

@@ -885,26 +885,31 @@ fn save_screenshot(browser: &mut Browser, name: &str) {
 }
 
 /// Sends live images ten times a second.
-struct Camera {
+pub(crate) struct Camera {
     stop: Arc<AtomicBool>,
     thread: std::thread::JoinHandle<()>,
 }
 
 impl Camera {
     fn start(hub: Hub) -> Self {
+        let gray: Arc<[u8]> = vec![120; 640 * 480 * 4].into();
+        Self::sending(hub, move || live_image(Arc::clone(&gray)))
+    }
+
+    /// A camera that sends these images.
+    pub(crate) fn sending(hub: Hub, image: impl Fn() -> LiveImage + Send + 'static) -> Self {
         let stop: Arc<AtomicBool> = Arc::default();
         let stopped = Arc::clone(&stop);
-        let gray: Arc<[u8]> = vec![120; 640 * 480 * 4].into();
         let thread = std::thread::spawn(move || {
             while !stopped.load(Ordering::Relaxed) {
-                hub.set_live_image(live_image(Arc::clone(&gray)));
+                hub.set_live_image(image());
                 std::thread::sleep(Duration::from_millis(100));
             }
         });
         Self { stop, thread }
     }
 
-    fn stop(self) {
+    pub(crate) fn stop(self) {
         self.stop.store(true, Ordering::Relaxed);
         self.thread.join().expect("no panic");
     }

@@ -6,6 +6,7 @@ use crate::analytic_scene::draw;
 use crate::client;
 use crate::client::TIMEOUT;
 use crate::client::{Client, Received};
+use crate::keyframe_images::header_of_photograph;
 use crate::robot;
 use keyframe::RangePoints;
 use kinematics::{Stamp, Transform};
@@ -642,7 +643,7 @@ fn every_wire_field_is_documented_and_typed() {
                 "{kind}.{name} is not in docs/reference/protocol.md"
             );
             assert!(
-                page.contains(&format!("{name}:")),
+                page.contains(&format!("{name}:")) || page.contains(&format!("{name}?:")),
                 "{kind}.{name} is not in web/src/connection/protocol.ts"
             );
         }
@@ -742,6 +743,7 @@ fn one_of_each() -> Vec<Value> {
     messages.push(client.text_of("error"));
     drop(server);
     messages.push(client.text_of("goodbye"));
+    messages.push(header_of_photograph());
     messages
 }
 

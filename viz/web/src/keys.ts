@@ -1,8 +1,10 @@
-// The table of all keys. Buttons, help and titles are made from it, and one listener finds the binding of a key.
+// What keys do. Titles and the help show the keys of buttons, and one listener finds the binding of a key.
 
 import { announce } from "./panels/announcer";
 import { element } from "./panels/element";
 import { type Chord, type Focus, chordLabel, isPressed as isChordPressed, keepsKey, keyOf, parseChords } from "./key_chord";
+import { KEYS } from "./key_table";
+import { setTitle, titleOf } from "./panels/title";
 import { isMovementKey } from "./view/movement_keys";
 
 /** A button, its keys, and what they do. */
@@ -22,11 +24,13 @@ export interface KeyBinding {
 interface Closable {
   isOpen: () => boolean;
   close: () => void;
+  /** If it has the focus, Escape closes it before the others. */
+  root?: HTMLElement | undefined;
 }
 
 const bindings: KeyBinding[] = [];
-/** Kinds of things that Escape closes, the topmost first. */
-const closables = { panel: [] as Closable[], mode: [] as Closable[] };
+/** Kinds of things that Escape closes, in this order; of one kind, the last registered one first. Cards hide little. */
+const closables: Record<"panel" | "mode" | "card", Closable[]> = { panel: [], mode: [], card: [] };
 let onToggle = (): void => undefined;
 let isFlying = false;
 
@@ -36,26 +40,27 @@ export function setUpKeys(changed: () => void): void {
   window.addEventListener("keydown", press);
 }
 
-/** All bindings in the order of their registration. */
+/** All bindings, in the order of the table. */
 export function keyBindings(): readonly KeyBinding[] {
-  return bindings;
+  const order = Object.keys(KEYS);
+  return [...bindings].sort((a, b) => order.indexOf(a.button.id) - order.indexOf(b.button.id));
 }
 
-/** Makes a button run a function, also by these keys (see `parseChords`), unless `when` is false or the button is disabled. */
-export function action(id: string, keys: string, act: () => void, when: () => boolean = () => true): void {
+/** Makes a button run a function, also by its keys in key_table.ts, unless `when` is false or the button is disabled. */
+export function action(id: string, act: () => void, when: () => boolean = () => true): void {
   const button = element(id);
+  const keys = KEYS[id] ?? "";
   button.addEventListener("click", act);
   const binding: KeyBinding = { button, chords: parseChords(keys), when, act, group: groupOf(button), help: "" };
-  binding.help = withoutKeys(button.dataset.title ?? button.title, binding);
+  binding.help = titleOf(button);
   button.ariaKeyShortcuts = keys.replaceAll("Ctrl", "Control");
   bindings.push(binding);
-  button.title = titleOf(binding);
-  button.dataset.title = button.title;
+  setTitle(button, titleWithKeys(binding));
 }
 
 /** Makes a button switch something on and off. */
-export function toggle(id: string, keys: string, apply: (isOn: boolean) => void): void {
-  action(id, keys, () => {
+export function toggle(id: string, apply: (isOn: boolean) => void): void {
+  action(id, () => {
     const isOn = !isPressed(id);
     element(id).setAttribute("aria-pressed", String(isOn));
     apply(isOn);
@@ -68,9 +73,14 @@ export function isPressed(id: string): boolean {
   return element(id).getAttribute("aria-pressed") === "true";
 }
 
-/** Makes Escape close something: open panels first, the last registered one first, and then modes. */
-export function closesWithEscape(kind: keyof typeof closables, isOpen: () => boolean, close: () => void): void {
-  closables[kind].unshift({ isOpen, close });
+/** Makes Escape close something. */
+export function closesWithEscape(
+  kind: keyof typeof closables,
+  isOpen: () => boolean,
+  close: () => void,
+  root?: HTMLElement,
+): void {
+  closables[kind].unshift({ isOpen, close, root });
 }
 
 /** Makes Escape switch these toggles off. */
@@ -82,9 +92,7 @@ export function endsWithEscape(...ids: string[]): void {
 export function setFlying(flies: boolean): void {
   isFlying = flies;
   for (const binding of bindings.filter(({ chords }) => chords.some(({ key }) => isMovementKey(key)))) {
-    const { button } = binding;
-    button.dataset.title = titleOf(binding);
-    if (isUsable(button) || button.hidden) button.title = button.dataset.title; // Otherwise, the title says why it is disabled.
+    setTitle(binding.button, titleWithKeys(binding));
   }
 }
 
@@ -98,11 +106,16 @@ export function isKeptByFocus(event: KeyboardEvent): boolean {
   return keepsKey(focusOf(event.target), keyOf(event));
 }
 
+/** Whether a modal dialog covers the page: keys have no effect on what it covers. */
+export function isPageCovered(): boolean {
+  return document.querySelector("dialog:modal") !== null;
+}
+
 function press(event: KeyboardEvent): void {
   if (event.defaultPrevented || event.repeat || isKeptByFocus(event)) return;
   const key = keyOf(event);
-  // The browser closes modal dialogs, and keys have no effect on what they cover.
-  const isCovered = document.querySelector("dialog:modal") !== null;
+  const isCovered = isPageCovered();
+  // The browser closes modal dialogs.
   const isDone = key === "escape" ? !isCovered && closeTopmost() : pressBound(event, isCovered);
   if (isDone) event.preventDefault();
 }
@@ -119,9 +132,10 @@ function pressBound(event: KeyboardEvent, isCovered: boolean): boolean {
 }
 
 function closeTopmost(): boolean {
-  const open = [...closables.panel, ...closables.mode].find(({ isOpen }) => isOpen());
-  open?.close();
-  return open !== undefined;
+  const open = [...closables.panel, ...closables.mode, ...closables.card].filter(({ isOpen }) => isOpen());
+  const closed = open.find(({ root }) => root?.contains(document.activeElement)) ?? open[0];
+  closed?.close();
+  return closed !== undefined;
 }
 
 function isUsable(button: HTMLElement): boolean {
@@ -144,12 +158,8 @@ function focusOf(target: EventTarget | null): Focus {
 }
 
 /** The title of a button, with the keys that have a meaning now. */
-function titleOf(binding: KeyBinding): string {
+function titleWithKeys(binding: KeyBinding): string {
   const { chords, help } = binding;
   const isShown = chords.length > 0 && !(isFlying && chords.some(({ key }) => isMovementKey(key)));
   return isShown ? `${help} (${keysLabel(binding)})`.trim() : help;
-}
-
-function withoutKeys(title: string, binding: KeyBinding): string {
-  return title.replace(` (${keysLabel(binding)})`, "");
 }

@@ -1,6 +1,6 @@
 import assert from "node:assert/strict";
 import { test } from "node:test";
-import { timeText } from "../src/panels/chart";
+import { timeText } from "../src/panels/quantities";
 
 test("durations are short texts", () => {
   const texts: [number, string][] = [

@@ -1,7 +1,8 @@
 import assert from "node:assert/strict";
 import { test } from "node:test";
 import type { KeyframeErrors } from "../src/panels/keyframe_error";
-import { durationText, keyframeFaults, type KeyframeFacts, poseDifference } from "../src/panels/keyframe_faults";
+import { keyframeFaults, type KeyframeFacts, poseDifference } from "../src/panels/keyframe_faults";
+import { durationText } from "../src/panels/quantities";
 import { assertClose } from "./close";
 
 const GOOD: KeyframeErrors = {

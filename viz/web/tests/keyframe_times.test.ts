@@ -1,7 +1,8 @@
 import assert from "node:assert/strict";
 import { test } from "node:test";
 import type { NumberedKeyframe } from "../src/connection/protocol";
-import { byTime, nearestInTime, stopwatchText } from "../src/panels/keyframe_times";
+import { byTime, nearestInTime } from "../src/panels/keyframe_times";
+import { stopwatchText } from "../src/panels/quantities";
 
 function keyframe(id: number, secs: number): NumberedKeyframe {
   return { id, stamp_nanos: secs * 1e9, camera: "wrist", world_from_camera: [], size_px: [4, 3], focal_px: [1, 1], principal_px: [2, 1.5] };

@@ -20,6 +20,7 @@ beforeEach(() => {
     window: { addEventListener: () => undefined, innerHeight: 600 },
     devicePixelRatio: 1,
     HTMLElement: Object,
+    HTMLButtonElement: Object,
   });
 });
 

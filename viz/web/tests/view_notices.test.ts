@@ -7,7 +7,6 @@ import { hiddenDistanceM } from "../src/view/hidden_robot";
 import { LinkLook, nearOpacity } from "../src/layers/link_look";
 import type { Occlusion } from "../src/layers/occlusion";
 import { arrowPlace } from "../src/view/robot_arrow";
-import { isViewState, type ViewState } from "../src/view/view_state";
 import { assertClose } from "./close";
 
 const FORWARD = new Vector3(0, 1, 0);
@@ -104,21 +103,4 @@ test("a link fades close to the eye, and disappears around it", () => {
   assert.equal(depthOnly.visible, false, "what lies behind a fading link is visible");
   assertClose([opacityAt(0.45)], [0.35], 1e-9);
   assert.equal(depthOnly.visible, true);
-});
-
-test("only complete views are restored", () => {
-  const state: ViewState = { position: [1, 2, 3], target: [0, 0, 0], up: [0, 0, 1], mode: "chase", attachedTo: "@base" };
-  assert.ok(isViewState(state));
-  assert.ok(isViewState(JSON.parse(JSON.stringify({ ...state, fovDegrees: 40 }))));
-  const wrong: unknown[] = [
-    null,
-    3,
-    {},
-    { ...state, position: [1, 2] },
-    { ...state, target: [1, 2, null] },
-    { ...state, mode: "walk" },
-    { ...state, fovDegrees: 180 },
-    { ...state, attachedTo: 4 },
-  ];
-  for (const value of wrong) assert.ok(!isViewState(value), JSON.stringify(value));
 });

@@ -1,9 +1,9 @@
 //! Plain CPU version of splatting in f64. Tests compare every kernel of `splat` with it.
 //!
 //! `project` projects each splat onto the image plane, and `rasterize` composites the splats pixel
-//! by pixel; each has a backward function. `clip` limits splats to a box in pictures. Discrete decisions (visibility, depth order,
-//! contributors of each pixel) are made once, in [`decide`], and kept fixed while gradients are
-//! computed.
+//! by pixel; each has a backward function. `clip` limits splats to boxes, or cuts boxes out of them,
+//! in pictures. Discrete decisions (visibility, depth order, contributors of each pixel) are made
+//! once, in [`decide`], and kept fixed while gradients are computed.
 //!
 //! Source: Kerbl et al. 2023 (3D Gaussian splatting) and Ye et al. 2024 (gsplat, appendix on
 //! gradients). We add a rolling shutter and a depth output, which is composited like a color.

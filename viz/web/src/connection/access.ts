@@ -1,6 +1,7 @@
 // Access to a shared server: the token, and the role that the server assigns.
 
 import { element } from "../panels/element";
+import { disable } from "../panels/title";
 import type { Role } from "./protocol";
 import { onlyView } from "../view/remembered";
 
@@ -34,20 +35,15 @@ export async function refusalReason(): Promise<string> {
 export function showRole(role: Role | undefined): void {
   const isViewer = role === "viewer";
   element("role").textContent = isViewer ? "viewer" : "";
-  disable("[data-server]", "");
-  disable("[data-operator]", isViewer ? VIEWER_REASON : "");
+  disableAll("[data-server]", "");
+  disableAll("[data-operator]", isViewer ? VIEWER_REASON : "");
 }
 
 /** Disables everything that needs a server, until one says hello. */
 export function disableServerControls(reason: string): void {
-  disable("[data-server], [data-operator]", reason);
+  disableAll("[data-server], [data-operator]", reason);
 }
 
-/** Disables controls and shows why, or enables them if there is no reason. */
-function disable(selector: string, reason: string): void {
-  for (const control of document.querySelectorAll<HTMLButtonElement>(selector)) {
-    control.dataset.title ??= control.title;
-    control.disabled = reason !== "";
-    control.title = reason || control.dataset.title;
-  }
+function disableAll(selector: string, reason: string): void {
+  for (const control of document.querySelectorAll<HTMLButtonElement>(selector)) disable(control, reason);
 }

@@ -2,6 +2,7 @@
 
 import type { Connection } from "./connection";
 import { element } from "../panels/element";
+import { bytesText } from "../panels/quantities";
 
 const PERIOD_MILLIS = 1000;
 
@@ -15,15 +16,11 @@ export class LinkReadout {
 
   private show(): void {
     const now = performance.now();
-    const kilobytesPerSec = (this.connection.nReceived - this.nBytes) / (now - this.at);
+    const bytesPerSec = (1000 * (this.connection.nReceived - this.nBytes)) / (now - this.at);
     this.nBytes = this.connection.nReceived;
     this.at = now;
     const { roundTripMillis } = this.connection;
     const latency = roundTripMillis === null ? "–" : `${Math.max(1, Math.round(roundTripMillis))} ms`;
-    element("link-text").textContent = this.connection.isOpen ? `${latency} · ${rateText(kilobytesPerSec)}` : "";
+    element("link-text").textContent = this.connection.isOpen ? `${latency} · ${bytesText(bytesPerSec)}/s` : "";
   }
-}
-
-function rateText(kilobytesPerSec: number): string {
-  return kilobytesPerSec < 1000 ? `${kilobytesPerSec.toFixed(0)} kB/s` : `${(kilobytesPerSec / 1000).toFixed(1)} MB/s`;
 }

@@ -2,6 +2,7 @@
 
 import * as THREE from "three";
 import { element } from "../panels/element";
+import { child } from "../panels/html";
 import type { ObservationsHeader } from "../connection/protocol";
 import type { ServerClock } from "../connection/server_clock";
 import { inflated } from "./zlib";
@@ -163,7 +164,7 @@ export class ObservationLayer {
         : this.nAll > 0
           ? `Computing: 0 of ${this.nAll} keyframes are processed`
           : "This map is computed from keyframes, but there are none";
-      element("legend-labels").replaceChildren(...LABELS[quantity].map(label));
+      element("legend-labels").replaceChildren(...LABELS[quantity].map((label) => child("span", label)));
     }
     this.changed();
   }
@@ -174,12 +175,6 @@ function texture(codes: Uint8Array<ArrayBuffer>, [width, height, depth]: [number
   made.format = THREE.RGFormat;
   made.unpackAlignment = 1;
   made.needsUpdate = true;
-  return made;
-}
-
-function label(text: string): HTMLElement {
-  const made = document.createElement("span");
-  made.textContent = text;
   return made;
 }
 

@@ -7,6 +7,7 @@
 import * as THREE from "three";
 import { worldFromCamera } from "../view/convention";
 import { decodeDepth } from "./depth_part";
+import { decodeJpeg } from "./jpeg";
 import { type ObservationLayer, TINT } from "./observation_layer";
 import type { Occlusion } from "./occlusion";
 import type { DepthPart, PictureHeader } from "../connection/protocol";
@@ -80,8 +81,9 @@ const FRAGMENT = /* glsl */ `${TINT}${DEPTH}
     if (isMoved && abs(pointInPicture.z - depth) > tolerance(uv, depth)) discard;
     vec3 pointInWorld = (worldFromPicture * vec4(pointInPicture * (depth / pointInPicture.z), 1.0)).xyz;
     vec3 color = texture2D(colorMap, uv).rgb;
-    color = mix(vec3(dot(color, vec3(0.299, 0.587, 0.114))), color, saturation);
-    gl_FragColor = vec4(rendered > 0.0 ? tinted(color, pointInWorld) : color, opacity);
+    // The background keeps its color, so that the edges of the picture do not show.
+    vec3 faded = mix(vec3(dot(color, vec3(0.299, 0.587, 0.114))), color, saturation);
+    gl_FragColor = vec4(rendered > 0.0 ? tinted(faded, pointInWorld) : color, opacity);
   }`;
 
 /** A picture that has been received, and what becomes of it: whether it is shown. */
@@ -204,7 +206,7 @@ export class PictureLayer {
     if (header.projection.kind !== "pinhole") return false;
     const server = this.nServers;
     const [bitmap, depth] = await Promise.all([
-      header.color ? unpackColor(header.color, payload) : null,
+      header.color ? decodeJpeg(payload, header.color, { colorSpaceConversion: "none" }) : null,
       unpackDepth(header.depth, payload),
     ]);
     const isOlder =
@@ -255,14 +257,6 @@ function gridGeometry(): THREE.BufferGeometry {
   const geometry = new THREE.PlaneGeometry(1, 1, N_COLUMNS, N_ROWS);
   geometry.translate(0.5, 0.5, 0);
   return geometry;
-}
-
-function unpackColor(
-  { offset, bytes }: { offset: number; bytes: number },
-  payload: Uint8Array<ArrayBuffer>,
-): Promise<ImageBitmap> {
-  const jpeg = new Blob([payload.subarray(offset, offset + bytes)], { type: "image/jpeg" });
-  return createImageBitmap(jpeg, { colorSpaceConversion: "none" });
 }
 
 function colorTexture(bitmap: ImageBitmap): THREE.Texture {

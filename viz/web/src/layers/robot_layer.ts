@@ -1,11 +1,9 @@
 // The robot: links of a URDF, moved by the joint positions that the server sends.
 
 import * as THREE from "three";
-import { ColladaLoader } from "three/examples/jsm/loaders/ColladaLoader.js";
-import { OBJLoader } from "three/examples/jsm/loaders/OBJLoader.js";
-import { STLLoader } from "three/examples/jsm/loaders/STLLoader.js";
 import { worldFromCamera as matrixOf } from "../view/convention";
 import { LinkLook } from "./link_look";
+import type { MeshPart } from "./mesh_loaders";
 import type { Occlusion } from "./occlusion";
 import type { PosedFrame } from "./overlays";
 import type { Robot, RobotJoint, RobotShape, RobotState } from "../connection/protocol";
@@ -188,21 +186,8 @@ export class RobotLayer {
     material: THREE.MeshLambertMaterial,
   ): Promise<void> {
     try {
-      if (format === "stl") {
-        addMesh(pose, look, await new STLLoader().loadAsync(url), material);
-      } else if (format === "obj") {
-        addObject(pose, look, await new OBJLoader().loadAsync(url), () => material);
-      } else {
-        const collada = await new ColladaLoader().loadAsync(url);
-        if (!collada) throw new Error("not a COLLADA file");
-        // The loader turns z-up files to y-up; URDF uses the file's axes.
-        collada.scene.rotation.set(0, 0, 0);
-        const own = (old: THREE.Material): THREE.Material => {
-          const color = (old as THREE.MeshPhongMaterial).color;
-          return color ? look.material([color.r, color.g, color.b, 1]) : material;
-        };
-        addObject(pose, look, collada.scene, own);
-      }
+      const { loadMeshes } = await import("./mesh_loaders");
+      for (const part of await loadMeshes(url, format)) addPart(pose, look, part, material);
     } catch (error) {
       console.warn(`cannot draw the mesh ${url}: ${String(error)}`);
     }
@@ -216,23 +201,19 @@ function addMesh(parent: THREE.Object3D, look: LinkLook, geometry: THREE.BufferG
   parent.add(mesh, look.add(mesh));
 }
 
-/** Adds the meshes of a loaded file with materials that hide occluded fragments. */
-function addObject(
-  parent: THREE.Object3D,
-  look: LinkLook,
-  object: THREE.Object3D,
-  replace: (old: THREE.Material) => THREE.Material,
-): void {
-  const meshes: THREE.Mesh[] = [];
-  object.traverse((part) => {
-    if (part instanceof THREE.Mesh) meshes.push(part);
-  });
-  for (const mesh of meshes) {
-    const old = mesh.material as THREE.Material | THREE.Material[];
-    mesh.material = Array.isArray(old) ? old.map(replace) : replace(old);
-    mesh.add(look.add(mesh));
-  }
-  parent.add(object);
+/** Adds a mesh of a file, in its own colors if it has some. */
+function addPart(parent: THREE.Object3D, look: LinkLook, part: MeshPart, material: THREE.Material): void {
+  const geometry = new THREE.BufferGeometry();
+  geometry.setAttribute("position", new THREE.BufferAttribute(part.positions, 3));
+  if (part.normals) geometry.setAttribute("normal", new THREE.BufferAttribute(part.normals, 3));
+  if (part.indices) geometry.setIndex(new THREE.BufferAttribute(part.indices, 1));
+  for (const { start, count, colorIx } of part.groups) geometry.addGroup(start, count, colorIx);
+  const materials = part.colors.map((color) => (color ? look.material([...color, 1]) : material));
+  const mesh = new THREE.Mesh(geometry, part.groups.length > 0 ? materials : materials[0]);
+  mesh.matrixAutoUpdate = false;
+  mesh.matrix.fromArray(part.fileFromPart);
+  mesh.add(look.add(mesh));
+  parent.add(mesh);
 }
 
 /** Position of a joint, following the joints that it mimics. */

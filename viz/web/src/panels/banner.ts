@@ -2,6 +2,8 @@
 
 import type { ConnectionState } from "../connection/connection";
 import { element } from "./element";
+import { setText } from "./html";
+import { capitalized } from "./sentence";
 import type { Guidance, Status } from "../connection/protocol";
 
 export class Banner {
@@ -54,7 +56,7 @@ export class Banner {
         ? "The program has ended. The page shows what it received last."
         : (guidance?.text ?? this.graphics);
     const banner = element("banner");
-    if (banner.textContent !== text) banner.textContent = text; // Otherwise screen readers would repeat it.
+    setText(banner, text);
     banner.dataset.kind = hasProblem ? this.connection : text === "" ? "open" : this.kindOfNotice(isUnexplained);
     element("view").classList.toggle("stale", hasProblem);
   }
@@ -64,8 +66,4 @@ export class Banner {
     if (this.guidance === null) return "graphics";
     return this.guidance.is_finished ? "finished" : "guidance";
   }
-}
-
-function capitalized(text: string): string {
-  return text.charAt(0).toUpperCase() + text.slice(1);
 }

@@ -1,5 +1,7 @@
 // Accuracy of all models over time on a canvas; the selected model is highlighted.
 
+import { timeText } from "./quantities";
+
 /** Minimum distance between time labels. */
 const MIN_TICK_PX = 50;
 const MARGIN = { left: 30, right: 8, top: 8, bottom: 18 };
@@ -151,14 +153,4 @@ function ticks(min: number, max: number, n: number): number[] {
 function timeTicks(max: number, n: number): number[] {
   if (max < 150) return ticks(0, max, n);
   return ticks(0, max / 60, n).filter(Number.isInteger).map((minutes) => 60 * minutes);
-}
-
-/** Duration as readable text. */
-export function timeText(seconds: number): string {
-  if (seconds < 120) return `${Number(seconds.toFixed(seconds < 10 ? 1 : 0))} s`;
-  const whole = Math.round(seconds);
-  const minutes = Math.floor(whole / 60);
-  const rest = whole - 60 * minutes;
-  if (minutes < 60) return rest ? `${minutes} min ${rest} s` : `${minutes} min`;
-  return `${Math.floor(minutes / 60)} h ${minutes % 60} min`;
 }

@@ -7,6 +7,7 @@ import type { ObservationsTopic } from "../topics/observations";
 import type { OrbitView } from "../view/orbit_view";
 import { directionText, directionTo, reasonText, type WorstPlace, worstPlace } from "./coverage";
 import { element } from "./element";
+import { make, setText } from "./html";
 
 /** The live camera moves: its direction to the place is updated this often. */
 const UPDATE_MILLIS = 250;
@@ -21,9 +22,9 @@ export interface CoverageSources {
 
 export class CoverageHint {
   private readonly marker = new CoverageMarker();
-  private readonly root = document.createElement("div");
-  private readonly text = document.createElement("span");
-  private readonly look = document.createElement("button");
+  private readonly root = make("div", { id: "coverage", className: "coverage", hidden: true });
+  private readonly text = make("span", { id: "coverage-text" });
+  private readonly look = make("button", { id: "coverage-look", textContent: "Look", title: "Turn the view toward this place" });
   private scene: Scene | null = null;
   private map: { header: ObservationsHeader; codes: Uint8Array } | null = null;
   private place: WorstPlace | null = null;
@@ -36,13 +37,6 @@ export class CoverageHint {
       this.map = { header, codes };
       this.update();
     };
-    this.root.id = "coverage";
-    this.root.className = "coverage";
-    this.root.hidden = true;
-    this.text.id = "coverage-text";
-    this.look.id = "coverage-look";
-    this.look.textContent = "Look";
-    this.look.title = "Turn the view toward this place";
     this.look.addEventListener("click", () => {
       if (this.place) view.turnTo(new Vector3(...this.place.pointM));
     });
@@ -81,8 +75,7 @@ export class CoverageHint {
   }
 
   private showText(): void {
-    const text = this.hint();
-    if (this.text.textContent !== text) this.text.textContent = text;
+    setText(this.text, this.hint());
     this.look.hidden = this.place === null;
   }
 

@@ -3,6 +3,7 @@
 import type { Connection } from "../connection/connection";
 import type { CropBox } from "../view/crop_box";
 import { type EditState, editNews } from "./edit_news";
+import { action } from "../keys";
 import { element } from "./element";
 import type { EditMessage, ErrorMessage, ModelStatus, Status } from "../connection/protocol";
 import { showToast } from "./toast";
@@ -26,53 +27,21 @@ export class EditControls {
     private readonly box: CropBox,
     private readonly method: () => string | undefined,
   ) {
-    element("erase-box").addEventListener("click", () => this.eraseBox());
-    element("remove-floaters").addEventListener("click", () => this.removeFloaters());
-    this.redo.addEventListener("click", () => this.redoLast());
-    window.addEventListener("keydown", (event) => this.keyDown(event));
+    const isOpen = (): boolean => !element("edit").hidden;
+    action("erase-box", () => this.send({ action: "erase", box: box.corners }, ""), isOpen);
+    action("remove-floaters", () => this.send({ action: "remove_floaters" }, "looking for floaters …"), isOpen);
+    action("undo-edit", () => this.send({ action: "undo" }, ""), isOpen);
+    action("redo-edit", () => this.send({ action: "redo" }, ""), isOpen);
   }
 
-  /** Whether the panel is open. */
-  get isOpen(): boolean {
-    return !element("edit").hidden;
+  /** Shows or hides the box that is erased. */
+  set isOpen(isOpen: boolean) {
+    this.box.isEditing = isOpen;
   }
 
-  /** Shows or hides the box. */
-  opened(): void {
-    this.box.isEditing = this.isOpen;
-  }
-
-  /** Erases the box. */
-  private eraseBox(): void {
-    this.send({ action: "erase", box: this.box.corners }, "");
-  }
-
-  /** Erases small unconnected parts. */
-  private removeFloaters(): void {
-    this.send({ action: "remove_floaters" }, "looking for floaters …");
-  }
-
-  /** Undoes the last edit. */
-  undoLast(): void {
-    if (!this.undo.disabled) this.send({ action: "undo" }, "");
-  }
-
-  /** Makes the last undone edit again. */
-  private redoLast(): void {
-    if (!this.redo.disabled) this.send({ action: "redo" }, "");
-  }
-
-  /** Delete erases the box that is shown; Ctrl+Z and Ctrl+Shift+Z undo and redo. */
-  private keyDown(event: KeyboardEvent): void {
-    const { target, key } = event;
-    const isTyping = target instanceof HTMLInputElement || target instanceof HTMLSelectElement;
-    if (!this.isOpen || isTyping || event.defaultPrevented || event.altKey) return;
-    const hasControl = event.ctrlKey || event.metaKey;
-    if (key === "Delete" && !hasControl && !event.repeat && this.box.isVisible) this.eraseBox();
-    else if (key.toLowerCase() === "z" && hasControl && event.shiftKey) this.redoLast();
-    else if (key.toLowerCase() === "z" && hasControl) this.undoLast();
-    else return;
-    event.preventDefault();
+  /** Forgets what a server has said: the edits of another one are no news. */
+  restart(): void {
+    this.before = null;
   }
 
   /** Shows the edits of the model on the page. Returns whether the edits of any model have changed. */
@@ -107,7 +76,7 @@ export class EditControls {
   }
 
   /** Shows why an edit failed. Returns false if the message is about something else. */
-  failed(message: ErrorMessage): boolean {
+  fail(message: ErrorMessage): boolean {
     if (message.id === null || message.id < FIRST_ID) return false;
     this.setNote(message.message, true);
     return true;
@@ -127,8 +96,6 @@ export class EditControls {
   }
 
   private send(edit: Pick<EditMessage, "action" | "box">, note: string): void {
-    // Keys reach this function even if the buttons are disabled.
-    if (!this.isOpen || this.opener.disabled) return;
     this.nSent += 1;
     this.setNote(note, false);
     this.connection.send({ type: "edit", id: FIRST_ID + this.nSent, method: this.method(), ...edit });

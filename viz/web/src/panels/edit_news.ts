@@ -1,6 +1,7 @@
 // What to say about edits that have changed since the last status.
 
 import type { LastEdit, SavedEdits } from "../connection/protocol";
+import { capitalized } from "./sentence";
 
 /** The part of a status that is about edits of any model. */
 export interface EditState {
@@ -24,17 +25,13 @@ export function editNews(before: EditState | null, now: EditState, client: numbe
   if (now.edit_revision !== before.edit_revision) {
     const edit = now.last_edit;
     const isOwn = edit?.client === client;
-    news.note = edit && isOwn ? sentence(edit.text) : "";
+    news.note = edit && isOwn ? capitalized(edit.text) : "";
     if (edit && !isOwn) news.toast = `client ${edit.client} ${edit.text}`;
   }
   const saved = now.saved_edits;
   if (saved && saved.revision !== before.saved_edits?.revision) {
-    news.note = sentence(saved.text);
+    news.note = capitalized(saved.text);
     news.hasFailed = saved.has_failed;
   }
   return news;
-}
-
-function sentence(text: string): string {
-  return text.charAt(0).toUpperCase() + text.slice(1);
 }

@@ -3,6 +3,8 @@
 import { devices } from "./devices";
 import { element } from "./element";
 import { basicGestures } from "./gestures";
+import { child } from "./html";
+import { store, stored } from "./storage";
 
 /** Key under which the browser stores that the hint was shown. */
 const SEEN_KEY = "gestures-seen";
@@ -13,7 +15,7 @@ const FADE_MILLIS = 1500;
 
 /** Shows the hint unless this browser has shown it before. */
 export function showGestureHint(): void {
-  if (wasSeen()) return;
+  if (stored(SEEN_KEY) !== null) return;
   const hint = element("gesture-hint");
   const kinds = devices().filter((device) => device !== "keyboard");
   const gestures = basicGestures(kinds.includes("touch") && !kinds.includes("mouse") ? "touch" : "mouse");
@@ -30,26 +32,13 @@ export function showGestureHint(): void {
 }
 
 function phrase([how, what]: [string, string]): HTMLElement {
-  const [made, name] = [document.createElement("span"), document.createElement("b")];
-  name.textContent = what;
-  made.append(`${how}: `, name);
+  const made = child("span", `${how}: `);
+  made.append(child("b", what));
   return made;
 }
 
 function fade(hint: HTMLElement): void {
   hint.classList.add("is-fading");
   window.setTimeout(() => (hint.hidden = true), FADE_MILLIS);
-  try {
-    localStorage.setItem(SEEN_KEY, "1");
-  } catch {
-    // The next visit shows it again.
-  }
-}
-
-function wasSeen(): boolean {
-  try {
-    return localStorage.getItem(SEEN_KEY) !== null;
-  } catch {
-    return false; // The browser stores nothing for this page.
-  }
+  store(SEEN_KEY, "1"); // Otherwise, the next visit shows it again.
 }

@@ -1,9 +1,13 @@
 // The operator's header: which robot this is, what it does, what to do, and who else is connected.
 
 import type { Status } from "../connection/protocol";
+import { closesWithEscape } from "../keys";
 import { element } from "./element";
+import { closePanel } from "./focus";
+import { child, setText } from "./html";
 import { colorOf, detailsOf, iconOf, letterOf, nameOf } from "./identity";
 import { bytesText, countText } from "./quantities";
+import { setTitle } from "./title";
 
 /** States in which data are lost, or nothing is learned, until the operator acts. */
 const HELD_STATES = ["paused"];
@@ -12,6 +16,12 @@ export class Header {
   /** Number of this client; null before the server's hello. */
   client: number | null = null;
   private icon = "";
+
+  constructor() {
+    const clients = element("clients", HTMLDetailsElement);
+    const close = (): void => closePanel(clients, element("n-clients"), () => (clients.open = false));
+    closesWithEscape("panel", () => clients.open, close, clients);
+  }
 
   show(status: Status): void {
     this.showIdentity(status);
@@ -43,7 +53,7 @@ export class Header {
     const sentence = advice?.text ?? "";
     const byThis = pausedBy !== undefined && pausedBy === this.client;
     text("advice", byThis ? sentence.replace(`by client ${pausedBy}`, "by you") : sentence);
-    line.title = line.textContent ?? "";
+    setTitle(line, line.textContent);
     line.dataset.kind = advice?.is_warning === true ? "warning" : "info";
   }
 
@@ -54,7 +64,7 @@ export class Header {
       { id: "store", text: store?.is_full ? "store full" : "" },
     ];
     for (const chip of chips) text(chip.id, chip.text);
-    if (store) element("store").title = `${storeText(store)} of keyframes; new ones replace similar ones`;
+    if (store) setTitle(element("store"), `${storeText(store)} of keyframes; new ones replace similar ones`);
   }
 
   private showClients({ clients }: Status): void {
@@ -64,13 +74,7 @@ export class Header {
     text("n-clients", clients.length === 1 ? "1 client" : `${clients.length} clients`);
     const names = clients.map(({ id, role }) => `client ${id}, ${role}${id === this.client ? " (you)" : ""}`);
     if (element("client-list").textContent === names.join("")) return; // Keeps a selection of the text.
-    element("client-list").replaceChildren(
-      ...names.map((name) => {
-        const item = document.createElement("li");
-        item.textContent = name;
-        return item;
-      }),
-    );
+    element("client-list").replaceChildren(...names.map((name) => child("li", name)));
   }
 }
 
@@ -80,6 +84,5 @@ export function storeText({ keyframes, max_keyframes: max, bytes }: NonNullable<
 }
 
 function text(id: string, value: string): void {
-  const shown = element(id);
-  if (shown.textContent !== value) shown.textContent = value;
+  setText(element(id), value);
 }

@@ -4,6 +4,7 @@ import { action, keyBindings, keysLabel } from "../keys";
 import { devices } from "./devices";
 import { element } from "./element";
 import { GESTURES } from "./gestures";
+import { child, make } from "./html";
 
 interface Group {
   title: string;
@@ -35,7 +36,7 @@ const CLOSE_KEYS: Group = {
 export function setUpHelp(): void {
   const dialog = element("help", HTMLDialogElement);
   const filter = element("help-filter", HTMLInputElement);
-  action("show-help", "?", () => {
+  action("show-help", () => {
     if (dialog.open) {
       dialog.close();
       return;
@@ -85,22 +86,16 @@ function isPartOfHidden(button: HTMLElement): boolean {
 }
 
 function section({ title, rows }: Group): HTMLElement {
-  const made = document.createElement("section");
-  const list = document.createElement("dl");
+  const made = make("section");
+  const list = make("dl");
   list.append(...rows.map(row));
-  made.append(withText("h3", title), list);
+  made.append(child("h3", title), list);
   return made;
 }
 
 function row([how, what]: [string, string]): HTMLElement {
-  const made = document.createElement("div");
-  made.append(withText("dt", how), withText("dd", what));
-  return made;
-}
-
-function withText(tag: string, text: string): HTMLElement {
-  const made = document.createElement(tag);
-  made.textContent = text;
+  const made = make("div");
+  made.append(child("dt", how), child("dd", what));
   return made;
 }
 

@@ -1,15 +1,26 @@
 // Small elements of panels.
 
+/** An element with these properties. */
+export function make<K extends keyof HTMLElementTagNameMap>(
+  tag: K,
+  properties: Partial<HTMLElementTagNameMap[K]> = {},
+): HTMLElementTagNameMap[K] {
+  return Object.assign(document.createElement(tag), properties);
+}
+
 /** An element with a text. */
-export function child(tag: string, text = ""): HTMLElement {
-  const made = document.createElement(tag);
-  made.textContent = text;
-  return made;
+export function child<K extends keyof HTMLElementTagNameMap>(tag: K, textContent = ""): HTMLElementTagNameMap[K] {
+  return Object.assign(document.createElement(tag), { textContent });
 }
 
 /** A list of names and values. */
 export function descriptions(rows: readonly [string, string][]): HTMLElement {
-  const list = document.createElement("dl");
+  const list = make("dl");
   list.append(...rows.flatMap(([name, value]) => [child("dt", name), child("dd", value)]));
   return list;
+}
+
+/** Shows a text. An unchanged one stays: screen readers would repeat it, and a selection would be lost. */
+export function setText(target: Element, text: string): void {
+  if (target.textContent !== text) target.textContent = text;
 }

@@ -7,12 +7,15 @@ import { pickFrustum } from "../layers/frustum_picker";
 import { SideView } from "../layers/side_view";
 import type { KeyframesTopic } from "../topics/keyframes";
 import type { OrbitView } from "../view/orbit_view";
+import { closesWithEscape, isPageCovered, isPressed } from "../keys";
 import { element } from "./element";
+import { closePanel } from "./focus";
 import { type CommonRequest, type Comparison, type DecodedPhoto, KeyframeComparer } from "./keyframe_comparison";
-import { correctionText, durationText, keyframeFaults, type PoseDifference, poseDifference } from "./keyframe_faults";
+import { correctionText, keyframeFaults, type PoseDifference, poseDifference } from "./keyframe_faults";
 import { type KeyframeOrder, keyframeKey, nearestKeyframe, neighborKeyframe, orderedKeyframes } from "./keyframe_order";
 import { KeyframePanel } from "./keyframe_panel";
 import { KeyframeSurvey } from "./keyframe_survey";
+import { durationText } from "./quantities";
 
 /** Maximum size of the photograph that is shown, and of those that are only measured. */
 const SHOWN_PX: [number, number] = [640, 640];
@@ -66,6 +69,7 @@ export class KeyframeBrowser {
       order: (order) => this.sort(order),
       close: () => this.close(),
     });
+    closesWithEscape("panel", () => this.panel.isOpen, () => this.close(), this.panel.root);
     topic.onChange.push(() => this.listChanged());
     window.addEventListener("keydown", (event) => this.pressed(event));
     this.pickFrustums(element("canvas"));
@@ -94,7 +98,7 @@ export class KeyframeBrowser {
     this.photos.restart();
     for (const side of this.sides) side.restart();
     this.comparer.restart();
-    this.isOutdated = true;
+    this.modelChanged(true);
   }
 
   /** To be called when the model has changed. `isOther`: it is another model, so that nothing measured is valid. */
@@ -113,11 +117,10 @@ export class KeyframeBrowser {
   }
 
   private close(): void {
-    this.setOpen(false);
+    closePanel(this.panel.root, this.opener, () => this.setOpen(false));
     this.shown = null;
     this.sources.view.overlays.select(null);
     this.sources.view.changed();
-    this.opener.focus({ preventScroll: true });
   }
 
   private setOpen(isOpen: boolean): void {
@@ -290,8 +293,7 @@ export class KeyframeBrowser {
     const { target } = event;
     const isOurs = target === document.body || (target instanceof Node && this.panel.root.contains(target));
     const isField = target instanceof HTMLInputElement || target instanceof HTMLSelectElement;
-    const flies = element("toggle-fly").getAttribute("aria-pressed") === "true";
-    if (step === 0 || !this.panel.isOpen || !isOurs || isField || flies) return;
+    if (step === 0 || !this.panel.isOpen || !isOurs || isField || isPageCovered()) return;
     event.preventDefault();
     this.step(step);
   }
@@ -302,8 +304,7 @@ export class KeyframeBrowser {
     canvas.addEventListener("pointerdown", (event) => (pressedAt = [event.clientX, event.clientY]));
     canvas.addEventListener("click", (event) => {
       const moved = Math.hypot(event.clientX - pressedAt[0], event.clientY - pressedAt[1]);
-      const isMeasuring = element("toggle-measure").getAttribute("aria-pressed") === "true";
-      if (moved > MAX_CLICK_PX || isMeasuring) return;
+      if (moved > MAX_CLICK_PX || isPressed("toggle-measure")) return;
       const { view } = this.sources;
       const { keyframes, depthM } = view.overlays.drawnKeyframes;
       const numbered = keyframes.filter((keyframe): keyframe is NumberedKeyframe => "id" in keyframe);

@@ -4,9 +4,11 @@ import type { KeyframePhotos, Photo } from "../connection/keyframe_photos";
 import type { KeyframeImageHeader, NumberedKeyframe } from "../connection/protocol";
 import type { PictureRequest, SidePicture, SideView } from "../layers/side_view";
 import { decodeDepth } from "../layers/depth_part";
+import { decodeJpeg } from "../layers/jpeg";
 import { inflated } from "../layers/zlib";
 import { compareKeyframe, type KeyframeErrors } from "./keyframe_error";
 import { keyframeKey } from "./keyframe_order";
+import { reasonOf } from "./sentence";
 
 /** A photograph with its mask: by pixel, 0 where it is not used; null if all pixels are. */
 export interface DecodedPhoto {
@@ -76,7 +78,7 @@ export class KeyframeComparer {
       this.last = { key, photo };
       return photo;
     } catch (error) {
-      return reason(error);
+      return reasonOf(error);
     }
   }
 
@@ -101,7 +103,7 @@ export class KeyframeComparer {
     try {
       return await decodeRender(await this.side.request(request));
     } catch (error) {
-      return reason(error);
+      return reasonOf(error);
     } finally {
       window.clearTimeout(timer);
     }
@@ -110,7 +112,7 @@ export class KeyframeComparer {
 
 async function decodePhoto({ header, payload }: Photo): Promise<DecodedPhoto> {
   const { color, mask } = header;
-  const image = await decodeJpeg(payload.subarray(color.offset, color.offset + color.bytes));
+  const image = await pixelsOf(payload, color);
   const nPx = image.width * image.height;
   return {
     header,
@@ -121,7 +123,7 @@ async function decodePhoto({ header, payload }: Photo): Promise<DecodedPhoto> {
 
 async function decodeRender({ header, payload }: SidePicture): Promise<{ image: ImageData; surface: Uint8Array | null }> {
   if (!header.color) throw new Error("the model's picture has no colors");
-  const image = await decodeJpeg(payload.subarray(header.color.offset, header.color.offset + header.color.bytes));
+  const image = await pixelsOf(payload, header.color);
   if (!header.depth) return { image, surface: null };
   const { depth, sizePx } = await decodeDepth(header.depth, payload);
   const surface = new Uint8Array(image.width * image.height);
@@ -134,8 +136,8 @@ async function decodeRender({ header, payload }: SidePicture): Promise<{ image: 
   return { image, surface };
 }
 
-async function decodeJpeg(jpeg: Uint8Array<ArrayBuffer>): Promise<ImageData> {
-  const bitmap = await createImageBitmap(new Blob([jpeg], { type: "image/jpeg" }));
+async function pixelsOf(payload: Uint8Array<ArrayBuffer>, part: { offset: number; bytes: number }): Promise<ImageData> {
+  const bitmap = await decodeJpeg(payload, part);
   const context = new OffscreenCanvas(bitmap.width, bitmap.height).getContext("2d", { willReadFrequently: true });
   if (!context) throw new Error("this browser cannot read pixels of images");
   context.drawImage(bitmap, 0, 0);
@@ -147,8 +149,4 @@ async function decodeJpeg(jpeg: Uint8Array<ArrayBuffer>): Promise<ImageData> {
 function fitted([width, height]: [number, number], [maxWidth, maxHeight]: [number, number]): [number, number] {
   const scale = Math.min(1, maxWidth / width, maxHeight / height);
   return [Math.max(1, Math.round(width * scale)), Math.max(1, Math.round(height * scale))];
-}
-
-function reason(error: unknown): string {
-  return error instanceof Error ? error.message : String(error);
 }

@@ -1,6 +1,7 @@
 // Says in words what is wrong with a keyframe.
 
 import type { KeyframeErrors } from "./keyframe_error";
+import { durationText } from "./quantities";
 
 /** What is known about a keyframe besides its pixels. */
 export interface KeyframeFacts {
@@ -83,12 +84,6 @@ export function poseDifference(one: number[], other: number[]): PoseDifference {
 
 export function correctionText({ meters, radians }: PoseDifference): string {
   return `${(1000 * meters).toFixed(1)} mm and ${degrees(radians).toFixed(2)} degrees`;
-}
-
-/** Such as "40 s", "4 min" or "2.5 h". */
-export function durationText(secs: number): string {
-  if (secs < 100) return `${secs.toFixed(secs < 10 ? 1 : 0)} s`;
-  return secs < 6000 ? `${Math.round(secs / 60)} min` : `${(secs / 3600).toFixed(1)} h`;
 }
 
 /** Such as "4 px to the right and 2 px up". */

@@ -1,6 +1,7 @@
 // Orders of the keyframes: by time, by error, and by distance to a view.
 
 import type { NumberedKeyframe } from "../connection/protocol";
+import { byTime } from "./keyframe_times";
 
 export type KeyframeOrder = "time" | "error";
 
@@ -15,11 +16,11 @@ export function orderedKeyframes(
   order: KeyframeOrder,
   psnrOf: ReadonlyMap<string, number>,
 ): NumberedKeyframe[] {
-  const byTime = [...keyframes].sort((a, b) => a.stamp_nanos - b.stamp_nanos || a.id - b.id);
-  if (order === "time") return byTime;
+  const ordered = byTime(keyframes);
+  if (order === "time") return ordered;
   const psnr = (keyframe: NumberedKeyframe): number => psnrOf.get(keyframeKey(keyframe)) ?? Infinity;
   const isBefore = (a: number, b: number): number => (a === b ? 0 : a < b ? -1 : 1);
-  return byTime.sort((a, b) => isBefore(psnr(a), psnr(b)));
+  return ordered.sort((a, b) => isBefore(psnr(a), psnr(b)));
 }
 
 /**

@@ -1,5 +1,6 @@
 // The elements of the keyframe browser: photograph and model behind a wiper, map of the error, facts and faults.
 
+import { make, setText } from "./html";
 import type { DecodedPhoto } from "./keyframe_comparison";
 import type { KeyframeErrors } from "./keyframe_error";
 import type { KeyframeOrder } from "./keyframe_order";
@@ -26,7 +27,7 @@ const COLORS = [
 const MASKED_COLOR = [58, 66, 78] as const;
 
 export class KeyframePanel {
-  readonly root = make("section", { id: "keyframe-browser", className: "panel keyframe-browser", tabIndex: -1, hidden: true });
+  readonly root = make("section", { id: "keyframe-browser", className: "panel keyframe-browser", ariaLabel: "Keyframe", tabIndex: -1, hidden: true });
   private readonly title = make("h2", { id: "keyframe-title", ariaLive: "polite" });
   private readonly order = make("select", { id: "keyframe-order", title: "Order of the keyframes" });
   private readonly photo = make("canvas", { id: "keyframe-photo", role: "img", ariaLabel: "Photograph" });
@@ -49,7 +50,6 @@ export class KeyframePanel {
     this.wiper.addEventListener("input", () => this.wipe());
     this.faults.ariaLabel = "What is wrong with this keyframe";
     this.root.append(this.head(), this.figures(), this.facts, this.faults, this.buttons());
-    this.root.addEventListener("keydown", (event) => this.pressed(event));
     parent.append(this.root);
     this.wipe();
   }
@@ -71,7 +71,7 @@ export class KeyframePanel {
   }
 
   showTitle(title: string, progress: string): void {
-    if (this.title.textContent !== title) this.title.textContent = title;
+    setText(this.title, title);
     this.progress.textContent = progress;
   }
 
@@ -187,13 +187,6 @@ export class KeyframePanel {
     return button;
   }
 
-  private pressed(event: KeyboardEvent): void {
-    if (event.key === "Escape") {
-      event.stopPropagation();
-      this.events.close();
-    }
-  }
-
   private wipe(): void {
     this.views.style.setProperty("--wiper", `${this.wiper.value}%`);
   }
@@ -226,11 +219,4 @@ function errorImage(map: Float32Array, width: number, height: number): ImageData
     image.data[4 * ix + 3] = 255;
   }
   return image;
-}
-
-function make<K extends keyof HTMLElementTagNameMap>(
-  tag: K,
-  properties: Partial<HTMLElementTagNameMap[K]> = {},
-): HTMLElementTagNameMap[K] {
-  return Object.assign(document.createElement(tag), properties);
 }

@@ -1,9 +1,13 @@
 // The current camera images, as thumbnails in the corner or docked in the side panel. A click on a thumbnail enlarges it.
 
+import { decodeJpeg, drawBitmap } from "../layers/jpeg";
 import { element } from "./element";
+import { child, make, setText } from "./html";
+import { ageText } from "./quantities";
 import type { LiveImageHeader } from "../connection/protocol";
 import { markRidden, rideButton } from "./ride_button";
 import type { ServerClock } from "../connection/server_clock";
+import { store, stored } from "./storage";
 
 /** Older images are not labeled live. */
 const LIVE_MILLIS = 500;
@@ -54,12 +58,8 @@ export class LiveImages {
     for (let next = slot.waiting; next; next = slot.waiting) {
       slot.waiting = null;
       try {
-        const bitmap = await createImageBitmap(new Blob([next.jpeg], { type: "image/jpeg" }));
+        drawBitmap(slot.canvas, await decodeJpeg(next.jpeg));
         slot.capturedMillis = next.header.captured_millis;
-        slot.canvas.width = bitmap.width;
-        slot.canvas.height = bitmap.height;
-        slot.canvas.getContext("2d")?.drawImage(bitmap, 0, 0);
-        bitmap.close();
       } catch {
         // The caption shows that the image is outdated.
       }
@@ -126,14 +126,12 @@ export class LiveImages {
   }
 
   private add(camera: string): Slot {
-    const figure = document.createElement("figure");
-    const canvas = document.createElement("canvas");
-    const caption = document.createElement("figcaption");
-    const name = document.createElement("b");
-    const age = document.createElement("span");
-    name.textContent = camera;
-    const dock = document.createElement("button");
-    caption.append(name, age, dock, rideButton(camera, this.ridden === camera, () => this.ride(camera)));
+    const figure = make("figure");
+    const canvas = make("canvas");
+    const caption = make("figcaption");
+    const age = make("span");
+    const dock = make("button");
+    caption.append(child("b", camera), age, dock, rideButton(camera, this.ridden === camera, () => this.ride(camera)));
     figure.append(canvas, caption);
     figure.dataset.camera = camera;
     figure.addEventListener("click", () => {
@@ -142,7 +140,7 @@ export class LiveImages {
     dock.addEventListener("click", (event) => {
       event.stopPropagation(); // It is not a click on the image.
       if (!this.docked.delete(camera)) this.docked.add(camera);
-      storeCameras(this.docked);
+      store(DOCKED_KEY, JSON.stringify([...this.docked])); // Otherwise, it is docked until the page is reloaded.
       this.place(slot);
     });
     makeButton(canvas, `Enlarge the image of ${camera}`);
@@ -171,7 +169,7 @@ export class LiveImages {
       const millis = this.clock().age(capturedMillis) ?? Infinity;
       caption.classList.toggle("stale", millis > LIVE_MILLIS);
       figure.classList.toggle("dimmed", millis > DIM_MILLIS);
-      age.textContent = millis > LIVE_MILLIS ? ageText(millis) : "live";
+      setText(age, millis > LIVE_MILLIS ? ageText(millis) : "live");
     }
   }
 }
@@ -190,23 +188,9 @@ function makeButton(target: HTMLElement, name: string): void {
 
 function storedCameras(): Set<string> {
   try {
-    const stored: unknown = JSON.parse(localStorage.getItem(DOCKED_KEY) ?? "[]");
-    return new Set(Array.isArray(stored) ? stored.filter((camera) => typeof camera === "string") : []);
+    const cameras: unknown = JSON.parse(stored(DOCKED_KEY) ?? "[]");
+    return new Set(Array.isArray(cameras) ? cameras.filter((camera) => typeof camera === "string") : []);
   } catch {
-    return new Set(); // The browser stores nothing for this page.
+    return new Set(); // It is no JSON.
   }
-}
-
-function storeCameras(cameras: Set<string>): void {
-  try {
-    localStorage.setItem(DOCKED_KEY, JSON.stringify([...cameras]));
-  } catch {
-    // The images are in the side panel until the page is reloaded.
-  }
-}
-
-function ageText(millis: number): string {
-  if (!Number.isFinite(millis)) return "not live";
-  const seconds = millis / 1000;
-  return seconds < 120 ? `${seconds.toFixed(seconds < 10 ? 1 : 0)} s old` : `${Math.round(seconds / 60)} min old`;
 }

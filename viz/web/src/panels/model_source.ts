@@ -3,11 +3,10 @@
 import type { Vector3 } from "three";
 import type { Axis, ModelSource, ModelStatus, Status } from "../connection/protocol";
 import { AXES, upCommand, upInWorld } from "../view/up_axis";
-import { timeText } from "./chart";
 import { element } from "./element";
 import { fileLinks } from "./file_links";
-import { child, descriptions } from "./html";
-import { bytesText } from "./quantities";
+import { child, descriptions, make } from "./html";
+import { bytesText, countText, timeText } from "./quantities";
 
 const ENDED = "The program has ended";
 
@@ -40,14 +39,9 @@ export class ModelSourceCard {
     this.card.hidden = source === undefined;
     if (!this.status) return;
     if (!source) {
-      this.restoreTraining();
+      this.restoreRun();
       return;
     }
-    showTraining({
-      psnr: [this.status, ...this.status.others].some((model) => model.psnr !== null),
-      seconds: false,
-      keyframes: this.status.keyframes > 0,
-    });
     const files = this.status.files ?? [];
     const facts = factsOf(source, this.status);
     const shown = JSON.stringify([source, files, facts, this.hasEnded]);
@@ -73,11 +67,10 @@ export class ModelSourceCard {
   }
 
   /** Undoes the changes for a source, because the page has reconnected to a run. */
-  private restoreTraining(): void {
+  private restoreRun(): void {
     if (this.shown === "") return;
     this.shown = "";
     this.training?.append(element("controls"));
-    showTraining({ psnr: true, seconds: true, keyframes: true });
     if (this.chosenUp) this.turnUp(upInWorld("z", "z"));
     this.chosenUp = null;
   }
@@ -85,10 +78,9 @@ export class ModelSourceCard {
   private upChooser(source: ModelSource): HTMLElement {
     const row = child("p");
     row.className = "up-axis";
-    const label = child("label", "Up axis ") as HTMLLabelElement;
+    const label = child("label", "Up axis ");
     label.htmlFor = "up-axis";
-    const choice = document.createElement("select");
-    choice.id = "up-axis";
+    const choice = make("select", { id: "up-axis" });
     choice.append(...AXES.map((axis) => new Option(axis, axis)));
     choice.value = this.chosenUp ?? source.up_axis;
     const hint = child("small");
@@ -107,14 +99,6 @@ export class ModelSourceCard {
   }
 }
 
-/** Shows or hides the cards of values that only a run has, each named by one of its elements. */
-function showTraining(shown: Record<"psnr" | "seconds" | "keyframes", boolean>): void {
-  for (const [id, isShown] of Object.entries(shown)) {
-    const card = element(id).closest<HTMLElement>(".card");
-    if (card) card.hidden = !isShown;
-  }
-}
-
 /** Names and values of the facts about a source and its models. */
 export function factsOf(source: ModelSource, status: Status): [string, string][] {
   const models: ModelStatus[] = [status, ...status.others];
@@ -123,11 +107,11 @@ export function factsOf(source: ModelSource, status: Status): [string, string][]
     [source.kind === "file" ? "File" : "Folder", source.path],
     ["Format", source.format],
     ["Method", models.map((model) => model.method).join(", ")],
-    ...models.map((model): [string, string] => [model.primitives_label, model.primitives.toLocaleString("en-US")]),
+    ...models.map((model): [string, string] => [model.primitives_label, countText(model.primitives)]),
     ["Size", bytesText(source.bytes)],
     ["Saved", source.modified_unix_secs === null ? null : dateText(source.modified_unix_secs)],
     ["Trained for", status.seconds > 0 ? timeText(status.seconds) : null],
-    ["Steps", steps.length > 0 ? steps.map((model) => model.step.toLocaleString("en-US")).join(", ") : null],
+    ["Steps", steps.length > 0 ? steps.map((model) => countText(model.step)).join(", ") : null],
     ["Data", source.data],
     ["Trained on", source.adapter],
   ];

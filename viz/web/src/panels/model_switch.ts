@@ -1,6 +1,7 @@
 // The switch between models trained in parallel; hidden if there is only one.
 
 import { element } from "./element";
+import { make } from "./html";
 import type { ModelStatus, Status } from "../connection/protocol";
 
 export class ModelSwitch {
@@ -42,11 +43,8 @@ export class ModelSwitch {
   }
 
   private button(method: string): HTMLButtonElement {
-    const button = document.createElement("button");
-    button.textContent = method;
-    button.dataset.method = method;
-    button.dataset.server = "";
-    button.title = `Show the model of the method ${method}`;
+    const button = make("button", { textContent: method, title: `Show the model of the method ${method}` });
+    Object.assign(button.dataset, { method, server: "" });
     button.addEventListener("click", () => this.choose(method));
     return button;
   }

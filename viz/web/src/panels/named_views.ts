@@ -1,6 +1,8 @@
 // The panel with saved views, and links to views.
 
 import { element } from "./element";
+import { make } from "./html";
+import { store, stored } from "./storage";
 import { freeName, MAX_NAMED_VIEWS, type NamedView, namedViewsIn, renamed, withView } from "../view/named_view_list";
 import type { Status } from "../connection/protocol";
 import type { ViewMemory } from "../view/view_memory";
@@ -83,7 +85,7 @@ export class NamedViews {
   }
 
   private row(view: NamedView): HTMLLIElement {
-    const row = document.createElement("li");
+    const row = make("li");
     const show = button(view.name, "Show this view", () => this.memory.show(view.text));
     show.className = "name";
     const rename = button("✎", `Rename “${view.name}”`, () => row.replaceChildren(this.nameEditor(view)));
@@ -96,13 +98,13 @@ export class NamedViews {
 
   /** An input in place of a row: Enter or leaving it renames the view, Escape does not. */
   private nameEditor(view: NamedView): HTMLInputElement {
-    const input = document.createElement("input");
-    input.value = view.name;
-    input.maxLength = this.input.maxLength;
-    input.setAttribute("aria-label", `New name of “${view.name}”`);
+    const { maxLength } = this.input;
+    const input = make("input", { value: view.name, maxLength, ariaLabel: `New name of “${view.name}”` });
     input.addEventListener("keydown", (event) => {
       if (event.key === "Escape") input.value = view.name;
-      if (event.key === "Escape" || event.key === "Enter") input.blur();
+      if (event.key !== "Escape" && event.key !== "Enter") return;
+      event.preventDefault(); // Escape does not close the panel, too.
+      input.blur();
     });
     input.addEventListener("blur", () => {
       const views = renamed(this.views, view.name, input.value);
@@ -115,10 +117,8 @@ export class NamedViews {
 }
 
 function button(text: string, title: string, act: () => void): HTMLButtonElement {
-  const made = document.createElement("button");
-  made.textContent = text;
-  made.title = title;
-  if (text.length === 1) made.setAttribute("aria-label", title);
+  const made = make("button", { textContent: text, title });
+  if (text.length === 1) made.ariaLabel = title;
   made.addEventListener("click", act);
   return made;
 }
@@ -127,23 +127,6 @@ function button(text: string, title: string, act: () => void): HTMLButtonElement
 async function copied(text: string): Promise<boolean> {
   try {
     await navigator.clipboard.writeText(text);
-    return true;
-  } catch {
-    return false;
-  }
-}
-
-function stored(key: string): string | null {
-  try {
-    return localStorage.getItem(key);
-  } catch {
-    return null;
-  }
-}
-
-function store(key: string, text: string): boolean {
-  try {
-    localStorage.setItem(key, text);
     return true;
   } catch {
     return false;

@@ -4,6 +4,7 @@ import type { ServerClock } from "../connection/server_clock";
 import { FRESH_MILLIS } from "../layers/freshness";
 import type { OrbitView } from "../view/orbit_view";
 import { element } from "./element";
+import { ageText } from "./quantities";
 
 const PERIOD_MILLIS = 100;
 
@@ -28,8 +29,4 @@ export class OverlayAges {
     label.hidden = oldest === null || oldest.ageMillis <= FRESH_MILLIS || this.hasEnded;
     if (oldest && !label.hidden) label.textContent = `${oldest.scanner} ${ageText(oldest.ageMillis)}`;
   }
-}
-
-function ageText(millis: number): string {
-  return Number.isFinite(millis) ? `${(millis / 1000).toFixed(1)} s old` : "not live";
 }

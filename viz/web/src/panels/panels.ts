@@ -1,24 +1,33 @@
 // Panels below the toolbar; at most one is open.
 
-import { closesWithEscape } from "../keys";
+import { action, closesWithEscape } from "../keys";
 import { element } from "./element";
+import { closePanel } from "./focus";
 
-/** Opens and closes panels with their buttons: ids of the buttons, and of the panels. Returns the function for a press of a button. */
-export function panels(ids: Record<string, string>): (button: string) => void {
-  const press = (pressed: string): void => {
-    for (const [button, id] of Object.entries(ids)) {
-      const panel = element(id);
-      const isOpen = button === pressed && panel.hidden;
+/** A panel and its button. */
+export interface PanelEntry {
+  button: string;
+  panel: string;
+  /** Called when the panel is opened or closed. */
+  onToggle?: (isOpen: boolean) => void;
+}
+
+/** Opens and closes panels with their buttons. */
+export function setUpPanels(entries: readonly PanelEntry[]): void {
+  const showOnly = (shown: PanelEntry | null): void => {
+    for (const entry of entries) {
+      const panel = element(entry.panel);
+      const isOpen = entry === shown;
+      if (panel.hidden === !isOpen) continue;
       panel.hidden = !isOpen;
-      element(button).setAttribute("aria-expanded", String(isOpen));
+      element(entry.button).setAttribute("aria-expanded", String(isOpen));
+      entry.onToggle?.(isOpen);
     }
   };
-  for (const [button, id] of Object.entries(ids)) {
-    closesWithEscape("panel", () => !element(id).hidden, () => {
-      const hadFocus = element(id).contains(document.activeElement);
-      element(button).click();
-      if (hadFocus) element(button).focus();
-    });
+  for (const entry of entries) {
+    const [panel, button] = [element(entry.panel), element(entry.button)];
+    action(entry.button, () => showOnly(panel.hidden ? entry : null));
+    // Also if the button was disabled or hidden in the meantime.
+    closesWithEscape("panel", () => !panel.hidden, () => closePanel(panel, button, () => showOnly(null)), panel);
   }
-  return press;
 }

@@ -2,7 +2,9 @@
 
 import type { ServerClock } from "../connection/server_clock";
 import type { OrbitView } from "../view/orbit_view";
+import type { ChunkArrival } from "../layers/chunk_arrival";
 import { element } from "./element";
+import { setText } from "./html";
 import { type DrawnHeader, labelText, PictureLabel, type PictureStatus } from "./picture_label";
 
 export class PictureInfo {
@@ -10,6 +12,7 @@ export class PictureInfo {
   private answerMillis = 0;
   private readonly info = element("picture-info");
   private readonly text = element("picture-text");
+  private readonly localText = element("local-text");
   private readonly marks = [...this.info.querySelectorAll(".stages i")];
 
   /**
@@ -55,6 +58,8 @@ export class PictureInfo {
     this.label.show(this.view.picture.header, now);
     const status = this.label.status(now);
     if (this.view.picture.setFaded(status.state === "old")) this.view.changed();
+    const { loading } = this.view.local;
+    setText(this.localText, loading ? `loading ${loading.method}: ${partsText(loading.arrival)}` : "");
     if (this.view.local.root.visible && this.view.local.isShown) {
       this.showLocal(status);
       return;
@@ -68,13 +73,14 @@ export class PictureInfo {
       shownRequest: numberText(header?.id),
     });
     const text = labelText(header, status, this.answerMillis, header && this.ageMillis(header, status));
-    if (this.text.textContent !== text) this.text.textContent = text;
+    setText(this.text, text);
     this.showStages(status.isOfView ? (header?.scale ?? 0) : 0);
   }
 
   /** The page draws the model itself, and shows how many of its chunks have arrived. */
   private showLocal(status: PictureStatus): void {
     const { drawn, loading } = this.view.local;
+    if (drawn) setText(this.text, `drawn here: ${partsText(drawn.arrival)}`);
     const isComplete = drawn !== null && loading === null && drawn.arrival.completesView;
     this.set({
       state: isComplete ? "current" : "waiting",
@@ -105,6 +111,10 @@ export class PictureInfo {
       mark.classList.toggle("done", scale >= (this.stages()[ix] ?? 1) - 1e-9);
     });
   }
+}
+
+function partsText({ nChunks, nIncomplete }: ChunkArrival): string {
+  return nIncomplete > 0 ? `${nChunks - nIncomplete} of ${nChunks} parts` : `${nChunks} parts`;
 }
 
 function numberText(value: number | null | undefined): string {

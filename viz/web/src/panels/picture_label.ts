@@ -5,6 +5,7 @@
 // that was drawn, so that a label can be late, but never describes another picture.
 
 import type { PictureHeader } from "../connection/protocol";
+import { ageText, durationText } from "./quantities";
 
 /** A drawn picture is noticeably outdated after this time. */
 const OLD_MILLIS = 1000;
@@ -64,7 +65,10 @@ export class PictureLabel {
     if (header === this.drawn) return;
     this.drawn = header;
     this.drawnAt = now;
-    if (!header) return;
+    if (!header) {
+      this.firstRequestAt = null; // The page waits for the next request from now on.
+      return;
+    }
     // Earlier requests cannot be drawn any more.
     for (const id of this.outdatedAt.keys()) if (id < header.id) this.outdatedAt.delete(id);
   }
@@ -99,7 +103,7 @@ export function labelText(
   ageMillis: number | null,
 ): string {
   if (!header) return `no picture yet${waitingText(waitingMillis)}`;
-  const age = ageMillis !== null && ageMillis > OLD_MILLIS ? `${secondsText(ageMillis)} old` : "";
+  const age = ageMillis !== null && ageMillis > OLD_MILLIS ? ageText(ageMillis) : "";
   const what = [header.method ?? "", age].filter((part) => part !== "").join(", ");
   const [width, height] = header.size_px;
   const size = `${width} × ${height} (${Math.round(100 * header.scale)} %)`;
@@ -112,10 +116,5 @@ export function labelText(
 function waitingText(millis: number | null): string {
   if (millis === null) return "";
   // Fast pictures of a moving view would otherwise show changing numbers that mean nothing.
-  return millis < 300 ? " · waiting" : ` · waiting ${secondsText(millis)}`;
-}
-
-function secondsText(millis: number): string {
-  const seconds = millis / 1000;
-  return seconds < 120 ? `${seconds.toFixed(seconds < 10 ? 1 : 0)} s` : `${Math.round(seconds / 60)} min`;
+  return millis < 300 ? " · waiting" : ` · waiting ${durationText(millis / 1000)}`;
 }

@@ -19,3 +19,33 @@ export function stepTimeText(millis: number | null): string {
   if (millis >= 1000) return `${(millis / 1000).toFixed(1)} s`;
   return `${millis >= 100 ? millis.toFixed(0) : millis.toPrecision(3)} ms`;
 }
+
+/** How long something has taken, to the second. */
+export function timeText(seconds: number): string {
+  if (seconds < 120) return `${Number(seconds.toFixed(seconds < 10 ? 1 : 0))} s`;
+  const whole = Math.round(seconds);
+  const minutes = Math.floor(whole / 60);
+  const rest = whole - 60 * minutes;
+  if (minutes < 60) return rest ? `${minutes} min ${rest} s` : `${minutes} min`;
+  return `${Math.floor(minutes / 60)} h ${minutes % 60} min`;
+}
+
+/** About how long something lasts, such as "40 s", "4 min" or "2.5 h". */
+export function durationText(secs: number): string {
+  if (secs < 100) return `${secs.toFixed(secs < 10 ? 1 : 0)} s`;
+  return secs < 6000 ? `${Math.round(secs / 60)} min` : `${(secs / 3600).toFixed(1)} h`;
+}
+
+/** How old something is that should be live. An infinite age stands for an unknown one. */
+export function ageText(millis: number): string {
+  return Number.isFinite(millis) ? `${durationText(millis / 1000)} old` : "not live";
+}
+
+/** A duration as on a stopwatch: minutes and seconds, and hours if there are any. */
+export function stopwatchText(secs: number): string {
+  const whole = Math.max(0, Math.floor(secs));
+  const twoDigits = (value: number): string => String(value).padStart(2, "0");
+  const minutes = Math.floor(whole / 60);
+  const end = twoDigits(whole % 60);
+  return minutes < 60 ? `${minutes}:${end}` : `${Math.floor(minutes / 60)}:${twoDigits(minutes % 60)}:${end}`;
+}

@@ -1,9 +1,10 @@
 // Text readouts of the run's values.
 
-import { Chart, timeText } from "./chart";
+import { Chart } from "./chart";
 import { element } from "./element";
+import { child, setText } from "./html";
 import { storeText } from "./header";
-import { bytesText, countText, stepTimeText } from "./quantities";
+import { bytesText, countText, stepTimeText, timeText } from "./quantities";
 import type { ModelStatus, Status } from "../connection/protocol";
 
 export class Readouts {
@@ -66,11 +67,5 @@ function showNotes({ notes, infos, checkpoint }: Status): void {
 }
 
 function text(id: string, value: string): void {
-  element(id).textContent = value;
-}
-
-function child(tag: string, value: string): HTMLElement {
-  const made = document.createElement(tag);
-  made.textContent = value;
-  return made;
+  setText(element(id), value);
 }

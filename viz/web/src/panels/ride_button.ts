@@ -1,13 +1,16 @@
 // The button below a camera image that attaches the view to the camera.
 
+import { make } from "./html";
+
 /** A button for this camera. Clicks on it are not clicks on the image. */
 export function rideButton(camera: string, isRidden: boolean, ride: () => void): HTMLButtonElement {
-  const button = document.createElement("button");
-  button.className = "ride";
-  button.textContent = "◎";
-  button.title = "View from this camera, and move with it";
-  button.ariaLabel = `View from the camera ${camera}, and move with it`;
-  button.ariaPressed = String(isRidden);
+  const button = make("button", {
+    className: "ride",
+    textContent: "◎",
+    title: "View from this camera, and move with it",
+    ariaLabel: `View from the camera ${camera}, and move with it`,
+    ariaPressed: String(isRidden),
+  });
   button.addEventListener("click", (event) => {
     event.stopPropagation();
     ride();

@@ -1,6 +1,7 @@
 // Shows how old the drawn pose of the robot is, as soon as it is not live.
 
 import { element } from "./element";
+import { ageText } from "./quantities";
 import type { RobotState } from "../connection/protocol";
 import type { RobotLayer } from "../layers/robot_layer";
 import type { ServerClock } from "../connection/server_clock";
@@ -33,6 +34,6 @@ export class RobotAge {
     const isLive = age <= LIVE_MILLIS;
     this.robot.setOutdated(!isLive);
     label.hidden = isLive || this.hasEnded;
-    if (!isLive) label.textContent = Number.isFinite(age) ? `robot ${(age / 1000).toFixed(1)} s old` : "robot not live";
+    if (!isLive) label.textContent = `robot ${ageText(age)}`;
   }
 }

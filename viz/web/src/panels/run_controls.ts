@@ -3,6 +3,7 @@
 import type { Connection } from "../connection/connection";
 import { element } from "./element";
 import type { Status } from "../connection/protocol";
+import { setTitle, titleOf } from "./title";
 
 /** States in which a run can be controlled. */
 const CONTROLLABLE = ["waiting for images", "collecting keyframes", "training", "paused"];
@@ -36,7 +37,6 @@ export class RunControls {
     element("pause").hidden = !isRunning;
     const save = element("save", HTMLButtonElement);
     save.textContent = isRunning ? "Save checkpoint" : "Save edits";
-    save.dataset.title = isRunning ? "Write a checkpoint now" : "Save the edits in the folder of the model. If the model is a single file, save an edited copy beside it";
-    if (!save.disabled) save.title = save.dataset.title; // Otherwise, the title says why.
+    setTitle(save, isRunning ? "Write a checkpoint now" : titleOf(element("save-edits")));
   }
 }

@@ -2,14 +2,15 @@
 
 import { disableServerControls } from "../connection/access";
 import type { RunResult, Status } from "../connection/protocol";
-import { timeText } from "./chart";
+import { closesWithEscape } from "../keys";
 import { element } from "./element";
+import { closePanel } from "./focus";
 import { fileLinks } from "./file_links";
-import { child, descriptions } from "./html";
+import { child, descriptions, make } from "./html";
+import { timeText } from "./quantities";
+import { SMALL_WINDOW } from "./windows";
 
 const ENDED = "The program has ended, so this is no longer possible";
-/** Only the verdict is open at first in windows like those of phones; see app.css. */
-const SMALL_WINDOW = "(max-width: 820px), (max-height: 500px)";
 
 export class RunEnd {
   private readonly panel = element("run-end");
@@ -21,9 +22,7 @@ export class RunEnd {
 
   constructor() {
     this.opener.addEventListener("click", () => this.setOpen(this.panel.hidden !== false));
-    this.panel.addEventListener("keydown", (event) => {
-      if (event.key === "Escape") this.close();
-    });
+    closesWithEscape("card", () => !this.panel.hidden, () => this.close(), this.panel);
   }
 
   show(status: Status): void {
@@ -49,8 +48,7 @@ export class RunEnd {
   }
 
   private close(): void {
-    this.setOpen(false);
-    this.opener.focus();
+    closePanel(this.panel, this.opener, () => this.setOpen(false));
   }
 
   private update(): void {
@@ -62,7 +60,7 @@ export class RunEnd {
     const isFirst = this.shown === "";
     this.shown = shown;
     const wasOpen = this.panel.querySelector("details")?.open ?? true;
-    const details = document.createElement("details");
+    const details = make("details");
     details.open = isFirst ? !window.matchMedia(SMALL_WINDOW).matches : wasOpen;
     const summary = child("summary", verdictText(result));
     summary.id = "run-verdict";
@@ -80,11 +78,8 @@ export class RunEnd {
   }
 
   private closeButton(): HTMLButtonElement {
-    const button = document.createElement("button");
-    button.id = "close-result";
-    button.textContent = "×";
-    button.title = "Close. The button Result in the header opens this again";
-    button.setAttribute("aria-label", "Close the result");
+    const title = "Close. The button Result in the header opens this again";
+    const button = make("button", { id: "close-result", textContent: "×", title, ariaLabel: "Close the result" });
     button.addEventListener("click", () => this.close());
     return button;
   }

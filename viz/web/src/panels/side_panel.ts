@@ -2,9 +2,10 @@
 
 import { action, closesWithEscape } from "../keys";
 import { element } from "./element";
+import { closePanel } from "./focus";
+import { PHONE } from "./windows";
 
-/** The windows that styles/phone.css regards as phones. */
-const phones = matchMedia("(max-width: 599px), (max-height: 500px)");
+const phones = matchMedia(PHONE);
 
 export function setUpSidePanel(): void {
   const panel = element("run");
@@ -12,15 +13,17 @@ export function setUpSidePanel(): void {
     panel.hidden = !isOpen;
     element("toggle-run").setAttribute("aria-expanded", String(isOpen));
   };
-  action("toggle-run", "5", () => show(panel.hidden === true));
-  closesWithEscape("panel", () => phones.matches && !panel.hidden, () => show(false));
-  // On phones, it would cover other panels, or they would cover it.
+  action("toggle-run", () => show(panel.hidden === true));
+  const close = (): void => closePanel(panel, element("toggle-run"), () => show(false));
+  closesWithEscape("panel", () => phones.matches && !panel.hidden, close, panel);
+  // On phones, there is space for one panel.
   element("toolbar").addEventListener("click", (event) => {
     if (!phones.matches || !(event.target instanceof Element)) return;
     const opener = event.target.closest("[aria-controls]");
     if (!opener || opener.id === "show-more") return;
     const isRunOpen = opener.id === "toggle-run" && !panel.hidden;
-    if (isRunOpen) for (const other of openPanels()) other.click();
+    const isOpened = opener.getAttribute("aria-expanded") === "true";
+    for (const other of openPanels()) if (isOpened && other !== opener) other.click();
     show(isRunOpen);
   });
   phones.addEventListener("change", () => show(!phones.matches));

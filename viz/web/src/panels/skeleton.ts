@@ -5,13 +5,14 @@
 
 import type { ConnectionState } from "../connection/connection";
 import type { Status } from "../connection/protocol";
+import { make, setText } from "./html";
 import { isNothingShown, type Knowledge, type Shown, skeletonText } from "./skeleton_text";
 
 export class Skeleton {
-  private readonly root = document.createElement("div");
-  private readonly title = document.createElement("strong");
-  private readonly detail = document.createElement("span");
-  private readonly bar = document.createElement("progress");
+  private readonly root = make("div", { id: "skeleton", className: "skeleton" });
+  private readonly title = make("strong");
+  private readonly detail = make("span");
+  private readonly bar = make("progress", { ariaLabel: "Progress" });
   private readonly known: Knowledge = { connection: "connecting", status: null, isContextLost: false };
   private readonly shown: Shown = { hasPicture: false, hasContent: false, isStartup: false, isContextLost: false };
   private isAwaiting = false;
@@ -22,12 +23,8 @@ export class Skeleton {
     private readonly view: HTMLElement,
     canvas: HTMLElement,
   ) {
-    this.root.id = "skeleton";
-    this.root.className = "skeleton";
-    const text = document.createElement("p");
-    text.setAttribute("role", "status");
+    const text = make("p", { role: "status" });
     text.append(this.title, this.detail);
-    this.bar.setAttribute("aria-label", "Progress");
     this.root.append(text, this.bar);
     canvas.after(this.root);
     this.show();
@@ -81,9 +78,8 @@ export class Skeleton {
     this.view.classList.toggle("awaiting", this.isAwaiting);
     if (this.root.hidden) return;
     const { title, detail, doneFrac } = skeletonText(this.known);
-    // Otherwise, screen readers would repeat it.
-    if (this.title.textContent !== title) this.title.textContent = title;
-    if (this.detail.textContent !== detail) this.detail.textContent = detail;
+    setText(this.title, title);
+    setText(this.detail, detail);
     this.bar.hidden = doneFrac === null;
     if (doneFrac !== null) this.bar.value = doneFrac;
   }

@@ -2,6 +2,7 @@
 
 import type { ConnectionState } from "../connection/connection";
 import type { Status } from "../connection/protocol";
+import { capitalized } from "./sentence";
 
 /** What the page knows about the run before the first picture. */
 export interface Knowledge {
@@ -27,7 +28,7 @@ export function skeletonText({ connection, status, isContextLost }: Knowledge): 
   if (connection === "connecting") return plain("Connecting to the server");
   if (connection === "lost" || connection === "refused") return plain("No connection to the server");
   if (!status || status.state === "") return plain("Connected", "waiting for the state of the run");
-  const title = status.state.charAt(0).toUpperCase() + status.state.slice(1);
+  const title = capitalized(status.state);
   if (status.progress) return { title, detail: status.progress.text, doneFrac: status.progress.done_frac };
   return plain(title, DRAWS_AT_ONCE.includes(status.state) ? "drawing the first picture" : "a picture follows");
 }

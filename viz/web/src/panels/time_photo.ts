@@ -2,7 +2,9 @@
 
 import type { KeyframePhotos } from "../connection/keyframe_photos";
 import type { NumberedKeyframe } from "../connection/protocol";
+import { decodeJpeg, drawBitmap } from "../layers/jpeg";
 import { element } from "./element";
+import { keyframeKey } from "./keyframe_order";
 
 /** Maximum size: twice the width of the panel, for dense screens. */
 const SIZE_PX: [number, number] = [560, 560];
@@ -19,7 +21,7 @@ export class TimePhoto {
   show(keyframe: NumberedKeyframe | null): void {
     this.wanted = keyframe;
     if (!keyframe || !this.photos.isPossible) this.hide();
-    else if (!this.isBusy && keyOf(keyframe) !== this.shownKey) void this.request();
+    else if (!this.isBusy && keyframeKey(keyframe) !== this.shownKey) void this.request();
   }
 
   private hide(): void {
@@ -30,10 +32,10 @@ export class TimePhoto {
   /** Requests photographs until the wanted one is shown: while the slider moves, most keyframes are passed by. */
   private async request(): Promise<void> {
     this.isBusy = true;
-    for (let next = this.wanted; next && keyOf(next) !== this.shownKey; next = this.pending(next)) {
+    for (let next = this.wanted; next && keyframeKey(next) !== this.shownKey; next = this.pending(next)) {
       try {
         await this.draw(next);
-        this.shownKey = keyOf(next);
+        this.shownKey = keyframeKey(next);
       } catch {
         // The run has dropped the keyframe, or the connection was lost.
         this.hide();
@@ -45,21 +47,12 @@ export class TimePhoto {
 
   /** The wanted keyframe, if it is another one than this. */
   private pending(shown: NumberedKeyframe): NumberedKeyframe | null {
-    return this.wanted && keyOf(this.wanted) !== keyOf(shown) ? this.wanted : null;
+    return this.wanted && keyframeKey(this.wanted) !== keyframeKey(shown) ? this.wanted : null;
   }
 
   private async draw(keyframe: NumberedKeyframe): Promise<void> {
     const { header, payload } = await this.photos.request(keyframe, SIZE_PX, true);
-    const { offset, bytes } = header.color;
-    const bitmap = await createImageBitmap(new Blob([payload.slice(offset, offset + bytes)], { type: "image/jpeg" }));
-    const { canvas } = this;
-    [canvas.width, canvas.height] = [bitmap.width, bitmap.height];
-    canvas.getContext("2d")?.drawImage(bitmap, 0, 0);
-    bitmap.close();
-    canvas.hidden = this.wanted === null;
+    drawBitmap(this.canvas, await decodeJpeg(payload, header.color));
+    this.canvas.hidden = this.wanted === null;
   }
-}
-
-function keyOf({ camera, stamp_nanos }: NumberedKeyframe): string {
-  return `${camera} ${stamp_nanos}`;
 }

@@ -4,7 +4,8 @@
 // The slider moves from keyframe to keyframe and not along the clock, because the times of a resumed run have a gap.
 
 import { element } from "./element";
-import { byTime, nearestInTime, stopwatchText } from "./keyframe_times";
+import { byTime, nearestInTime } from "./keyframe_times";
+import { stopwatchText } from "./quantities";
 import type { KeyframesTopic } from "../topics/keyframes";
 import type { NumberedKeyframe } from "../connection/protocol";
 import type { OrbitView } from "../view/orbit_view";
@@ -23,7 +24,7 @@ export class TimeSlider {
 
   constructor(
     private readonly keyframes: KeyframesTopic,
-    private readonly view: OrbitView,
+    view: OrbitView,
     private readonly photo: TimePhoto,
   ) {
     keyframes.onChange.push(() => this.listChanged());
@@ -33,22 +34,20 @@ export class TimeSlider {
     element("history-now").addEventListener("click", () => this.choose(this.ordered.length - 1));
     element("history-look").addEventListener("click", () => {
       const chosen = this.ordered[this.slider.valueAsNumber];
-      if (chosen) view.lookFrom(chosen.world_from_camera);
+      if (chosen) view.lookFromKeyframe(chosen);
     });
-    // A closed panel shows the present. Otherwise, old keyframes would look like all there are.
-    new MutationObserver(() => this.opened()).observe(this.panel, { attributeFilter: ["hidden"] });
   }
 
   private get isOpen(): boolean {
     return !this.panel.hidden;
   }
 
-  private opened(): void {
+  /** The panel was opened or closed. Both show the present: old keyframes would look like all there are. */
+  opened(isOpen: boolean): void {
     this.chosenNanos = null;
+    this.keyframes.isBrowsed = isOpen;
     this.keyframes.showUntil(null);
-    this.view.overlays.showsKeyframes = this.isOpen || isKeyframeLayerOn();
-    this.view.changed();
-    if (this.isOpen) this.showSlider();
+    if (isOpen) this.showSlider();
     else this.photo.show(null);
   }
 
@@ -99,8 +98,4 @@ export class TimeSlider {
     const [at, end] = [chosen.stamp_nanos, newestNanos].map((nanos) => stopwatchText((nanos - this.firstNanos) * 1e-9));
     return `${at} of ${end}, keyframe ${ix + 1} of ${this.ordered.length}, camera ${chosen.camera}`;
   }
-}
-
-function isKeyframeLayerOn(): boolean {
-  return element("toggle-keyframes").getAttribute("aria-pressed") === "true";
 }

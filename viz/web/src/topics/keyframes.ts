@@ -25,8 +25,27 @@ export class KeyframesTopic implements Topic {
     }),
   ];
   private untilNanos: number | null = null;
+  private isOn = false;
+  private isInHistory = false;
 
   constructor(private readonly view: OrbitView) {}
+
+  /** Whether the layer of keyframes is on. */
+  set isLayerOn(isOn: boolean) {
+    this.isOn = isOn;
+    this.showFrustums();
+  }
+
+  /** Whether the user goes back in time, for which keyframes are drawn, too. */
+  set isBrowsed(isBrowsed: boolean) {
+    this.isInHistory = isBrowsed;
+    this.showFrustums();
+  }
+
+  private showFrustums(): void {
+    this.view.overlays.showsKeyframes = this.isOn || this.isInHistory;
+    this.view.changed();
+  }
 
   /** Draws only the keyframes up to this time on the clock of the rig; all of them if null. */
   showUntil(nanos: number | null): void {

@@ -10,7 +10,7 @@ import { on, type Subscription, type Topic } from "./topic";
 const HZ = 4;
 /** The view moves with the poses of the camera that it rides on. */
 const RIDDEN_HZ = 12;
-/** Limits of the height of camera images, in CSS pixels: see `.live canvas` in app.css. */
+/** Limits of the height of camera images, in CSS pixels: see `.live canvas` in styles/page.css. */
 const IMAGE_HEIGHT = { min: 90, max: 190, ofWindow: 0.22 };
 const MAX_IMAGE_WIDTH_PX = 640;
 /** Maximum size of images that are enlarged or fill the view. */
@@ -72,6 +72,8 @@ export class LiveImagesTopic implements Topic {
   }
 
   restart(): void {
+    this.latest = null;
+    element("look-live", HTMLButtonElement).disabled = true;
     this.images.forget();
     this.view.overlays.forgetLive();
     this.view.attachment.forgetCameras();

@@ -1,7 +1,5 @@
 // Chunks of the model that the page draws itself.
 
-import type { ChunkArrival } from "../layers/chunk_arrival";
-import { element } from "../panels/element";
 import type { OrbitView } from "../view/orbit_view";
 import type { ModelChunkHeader, ModelChunksRemoved } from "../connection/protocol";
 import { on, type Subscription, type Topic } from "./topic";
@@ -18,7 +16,12 @@ export class ModelChunksTopic implements Topic {
   ];
   private drawn: string | null = null;
 
-  constructor(private readonly view: OrbitView, private readonly changed: () => void) {}
+  constructor(private readonly view: OrbitView, private readonly changed: () => void) {
+    // A page that becomes visible subscribes again, and receives all chunks again.
+    document.addEventListener("visibilitychange", () => {
+      if (!document.hidden) view.local.renew();
+    });
+  }
 
   /** The model that the page draws; null if the server draws it. */
   set method(method: string | null) {
@@ -34,20 +37,4 @@ export class ModelChunksTopic implements Topic {
   restart(): void {
     this.view.local.renew();
   }
-
-  /** Shows what is drawn here and what is being loaded. To be called for every display refresh. */
-  showProgress(): void {
-    const { drawn, loading } = this.view.local;
-    if (drawn) setText("picture-text", `drawn here: ${partsText(drawn.arrival)}`);
-    setText("local-text", loading ? `loading ${loading.method}: ${partsText(loading.arrival)}` : "");
-  }
-}
-
-function partsText({ nChunks, nIncomplete }: ChunkArrival): string {
-  return nIncomplete > 0 ? `${nChunks - nIncomplete} of ${nChunks} parts` : `${nChunks} parts`;
-}
-
-function setText(id: string, text: string): void {
-  const shown = element(id);
-  if (shown.textContent !== text) shown.textContent = text;
 }

@@ -8,10 +8,10 @@ import { on, type Subscription, type Topic } from "./topic";
 
 /** Maps have about 30 kB each. */
 const HZ = 0.5;
-/** Buttons that tint the model, their keys, and what the tint shows. */
-export const TINTS: readonly { id: string; key: string; quantity: Quantity }[] = [
-  { id: "toggle-age", key: "1", quantity: "age" },
-  { id: "toggle-uncertainty", key: "2", quantity: "uncertainty" },
+/** Buttons that tint the model, and what the tint shows. */
+export const TINTS: readonly { id: string; quantity: Quantity }[] = [
+  { id: "toggle-age", quantity: "age" },
+  { id: "toggle-uncertainty", quantity: "uncertainty" },
 ];
 
 export class ObservationsTopic implements Topic {

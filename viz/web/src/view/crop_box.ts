@@ -312,7 +312,7 @@ function actions(): Action[] {
 /** The toolbar and the panels over the canvas, in its pixels. */
 function obstacles(canvas: HTMLCanvasElement): Rect[] {
   const origin = canvas.getBoundingClientRect();
-  const shown = [...(canvas.parentElement?.querySelectorAll(".toolbar, .panel, .bottom > *") ?? [])];
+  const shown = [...(canvas.parentElement?.querySelectorAll(".toolbar, .panel, .bottom > :not(.view-chips), .view-chip") ?? [])];
   return shown
     .map((shape) => shape.getBoundingClientRect())
     .filter(({ width, height }) => width > 0 && height > 0)

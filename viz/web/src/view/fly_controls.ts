@@ -1,7 +1,7 @@
 // Flies: keys move the eye, dragging turns the view. On touch screens, the left thumb moves and the right one turns.
 
 import * as THREE from "three";
-import { isKeptByFocus } from "../keys";
+import { isKeptByFocus, isPageCovered } from "../keys";
 import { element } from "../panels/element";
 import { MOVEMENTS } from "./movement_keys";
 import { uprightRotation } from "./up_axis";
@@ -120,7 +120,7 @@ export class FlyControls {
   }
 
   private press(event: KeyboardEvent): void {
-    if (!this.isOn || isKeptByFocus(event) || event.ctrlKey || event.metaKey || event.altKey) return;
+    if (!this.isOn || isKeptByFocus(event) || isPageCovered() || event.ctrlKey || event.metaKey || event.altKey) return;
     this.keys.add(event.code);
     if (!(event.code in MOVEMENTS)) return;
     event.preventDefault();

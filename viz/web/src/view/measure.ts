@@ -1,7 +1,9 @@
 // Measures distances between points of the model's surface that the user clicks on.
 
 import * as THREE from "three";
+import { isKeptByFocus, isPageCovered } from "../keys";
 import { element } from "../panels/element";
+import { child, make } from "../panels/html";
 import { placeLabel } from "./label_places";
 
 const COLOR = 0xe3b341;
@@ -46,7 +48,7 @@ export class MeasureTool {
       this.pressed = event.isPrimary && event.button === 0 ? [event.offsetX, event.offsetY] : null;
     });
     canvas.addEventListener("pointerup", (event) => this.release(event));
-    // Before other listeners, so that Delete and Esc have only one effect.
+    // Before other listeners, so that Delete has only one effect.
     window.addEventListener("keydown", (event) => this.keyDown(event), { capture: true });
   }
 
@@ -129,16 +131,15 @@ export class MeasureTool {
     const root = new THREE.Group();
     root.add(line, from, to);
     this.root.add(root);
-    const measurement: Measurement = { root, ends: [from, to], label: document.createElement("div") };
-    const text = document.createElement("span");
-    text.textContent = distanceText(from.position, to.position);
-    const remove = document.createElement("button");
-    remove.textContent = "×";
-    remove.title = "Remove this measurement";
-    remove.setAttribute("aria-label", `Remove the measurement ${text.textContent}`);
+    const measurement: Measurement = { root, ends: [from, to], label: make("div", { className: "distance" }) };
+    const text = distanceText(from.position, to.position);
+    const remove = make("button", {
+      textContent: "×",
+      title: "Remove this measurement",
+      ariaLabel: `Remove the measurement ${text}`,
+    });
     remove.addEventListener("click", () => this.remove(measurement));
-    measurement.label.className = "distance";
-    measurement.label.append(text, remove);
+    measurement.label.append(child("span", text), remove);
     this.labels.append(measurement.label);
     this.measurements.push(measurement);
   }
@@ -154,8 +155,13 @@ export class MeasureTool {
     this.changed();
   }
 
+  /** Whether the first point of a measurement is set, but not the second one. */
+  get hasBegun(): boolean {
+    return this.begun !== null;
+  }
+
   /** Removes the first point of the next measurement. */
-  private cancel(): void {
+  cancel(): void {
     if (this.begun) this.root.remove(this.begun);
     this.begun = null;
     this.showHint();
@@ -163,11 +169,10 @@ export class MeasureTool {
   }
 
   private keyDown(event: KeyboardEvent): void {
-    const isTyping = event.target instanceof HTMLInputElement || event.target instanceof HTMLSelectElement;
-    if (!this.root.visible || isTyping || event.ctrlKey || event.metaKey || event.altKey) return;
+    if (!this.root.visible || event.key !== "Delete" || isKeptByFocus(event) || isPageCovered()) return;
     const last = this.measurements.at(-1);
-    if (this.begun && (event.key === "Escape" || event.key === "Delete")) this.cancel();
-    else if (last && event.key === "Delete") this.remove(last);
+    if (this.begun) this.cancel();
+    else if (last) this.remove(last);
     else return;
     event.preventDefault();
     event.stopImmediatePropagation();

@@ -190,7 +190,7 @@ export class OrbitView {
   /** Turns the view so that this direction of the world points up, and shows everything. */
   turnUp(up: THREE.Vector3): void {
     turnControls(this.controls, up);
-    this.isTurned = true;
+    this.isTurned = up.distanceTo(new THREE.Vector3(0, 0, 1)) > 1e-6;
     this.overlays.setUp(up, this.scene);
     this.showOverview();
   }

@@ -1,9 +1,10 @@
 // Views of everything: from where the bounds of the scene, the robot and its path fill the picture.
 
-import { Box3, type Matrix4, Quaternion, Vector3 } from "three";
+import { Box3, type Matrix4, Vector3 } from "three";
 import type { Scene } from "../connection/protocol";
 import { worldFromCamera } from "./convention";
 import type { Viewpoint } from "./eye_guard";
+import { uprightRotation } from "./up_axis";
 
 /** The overview looks down by this angle, and past the right side of the robot, which would hide the scene. */
 const DOWN_RAD = (35 * Math.PI) / 180;
@@ -69,8 +70,7 @@ export function frontDirection(robotHeadingRad: number | null): Vector3 {
  * another direction points up, it turns with it. The target is amid the points.
  */
 export function viewOf(points: Vector3[], direction: Vector3, { fovDegrees, aspect, up: upInWorld }: Lens): Viewpoint {
-  const upright = new Quaternion().setFromUnitVectors(new Vector3(0, 0, 1), upInWorld);
-  const forward = direction.clone().normalize().applyQuaternion(upright);
+  const forward = direction.clone().normalize().applyQuaternion(uprightRotation(upInWorld));
   const right = forward.clone().cross(upInWorld).normalize();
   const up = right.clone().cross(forward);
   const tangent = Math.tan((fovDegrees * Math.PI) / 360) * FILLED_FRAC;

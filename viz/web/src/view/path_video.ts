@@ -1,6 +1,7 @@
 // Records a video along a camera path: requests each picture in full, and encodes it in a worker.
 
 import { FRAMES_PER_SEC, type PathView } from "./camera_path";
+import { decodeJpeg } from "../layers/jpeg";
 import type { PictureRequest, SidePicture, SideView } from "../layers/side_view";
 
 /** What the worker gets; it answers each message before the next one is sent. */
@@ -98,5 +99,5 @@ export class PathVideo {
 
 function bitmapOf({ header: { color }, payload }: SidePicture): Promise<ImageBitmap> {
   if (!color) throw new Error("received a picture without color");
-  return createImageBitmap(new Blob([payload.subarray(color.offset, color.offset + color.bytes)], { type: "image/jpeg" }));
+  return decodeJpeg(payload, color);
 }

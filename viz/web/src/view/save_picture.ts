@@ -1,8 +1,8 @@
 // Saves what the view shows as a PNG file.
 
+import { download } from "../panels/download";
 import { element } from "../panels/element";
 import type { OrbitView } from "./orbit_view";
-import { download } from "./view_settings";
 
 /** Connects the button that saves the view. */
 export function setUpSavePicture(view: OrbitView): void {

@@ -2,14 +2,9 @@
 
 import * as THREE from "three";
 import type { OrbitControls } from "three/examples/jsm/controls/OrbitControls.js";
-import type { Axis, Scene } from "../connection/protocol";
+import type { Axis } from "../connection/protocol";
 
 export const AXES: readonly Axis[] = ["z", "-z", "y", "-y", "x", "-x"];
-
-/** Direction from the scene to a view of all of it, with z up: from the front right, 30 degrees above the horizon. */
-const OUTSIDE = new THREE.Vector3(0.5, -0.707, 0.5).normalize();
-/** Distance of that view relative to the one at which the sphere around the scene touches the edges of the view. */
-const OUTSIDE_MARGIN = 1.25;
 
 /** Rotation that maps z to this direction; for -z, a half turn about x, as `--up` does. */
 export function uprightRotation(up: THREE.Vector3): THREE.Quaternion {
@@ -30,16 +25,6 @@ export function turnControls(controls: OrbitControls, up: THREE.Vector3): void {
   const { _quat, _quatInverse } = controls as unknown as Record<"_quat" | "_quatInverse", THREE.Quaternion>;
   _quat.setFromUnitVectors(up, new THREE.Vector3(0, 1, 0));
   _quatInverse.copy(_quat).invert();
-}
-
-/** A view of the whole scene from outside, with the camera's direction of up. */
-export function outsideView(scene: Scene, camera: THREE.PerspectiveCamera): { eye: THREE.Vector3; target: THREE.Vector3 } {
-  const target = new THREE.Vector3(...scene.center_m);
-  const vertical = (camera.fov * Math.PI) / 360;
-  const horizontal = Math.atan(Math.tan(vertical) * camera.aspect);
-  const distance = (OUTSIDE_MARGIN * scene.radius_m) / Math.sin(Math.min(vertical, horizontal));
-  const from = OUTSIDE.clone().applyQuaternion(uprightRotation(camera.up));
-  return { eye: target.clone().addScaledVector(from, distance), target };
 }
 
 /** Arguments of `fieldrig view` that show a file with this axis up. */

@@ -3,10 +3,11 @@
 import { blockText, canBeCut } from "./block";
 import { element } from "../panels/element";
 import { FrameChooser } from "./frame_chooser";
+import { setText } from "../panels/html";
 import type { LiveImages } from "../panels/live_images";
 import type { OrbitView } from "./orbit_view";
 import { RobotArrow } from "./robot_arrow";
-import { setFlying } from "../keys";
+import { isPressed, setFlying } from "../keys";
 import { nextCamera } from "./ride";
 
 /** For how long the reason is shown after the eye was stopped. */
@@ -72,7 +73,7 @@ export class ViewControls {
   }
 
   private showFlying(isFlying: boolean): void {
-    if (isFlying === (element("toggle-fly").getAttribute("aria-pressed") === "true")) return;
+    if (isFlying === isPressed("toggle-fly")) return;
     press("toggle-fly", isFlying);
     setFlying(isFlying);
   }
@@ -90,13 +91,13 @@ export class ViewControls {
     const isShown = hasWaited && now - this.lastStop < BLOCKED_MILLIS && !this.view.isCut;
     if (isShown) {
       const text = blockText(block.what);
-      if (element("blocked-text").textContent !== text) element("blocked-text").textContent = text;
+      setText(element("blocked-text"), text);
       element("cut-away").hidden = !canBeCut(block.what);
     }
     if (this.blocked.hidden === isShown) this.blocked.hidden = !isShown;
   }
 }
 
-function press(id: string, isPressed: boolean): void {
-  element(id).setAttribute("aria-pressed", String(isPressed));
+function press(id: string, isOn: boolean): void {
+  element(id).setAttribute("aria-pressed", String(isOn));
 }

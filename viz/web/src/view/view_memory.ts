@@ -5,13 +5,14 @@ import * as THREE from "three";
 import type { ModelSwitch } from "../panels/model_switch";
 import type { OrbitView } from "./orbit_view";
 import { decoded, encoded, fragmentWith, linkTo, type Remembered, textInFragment } from "./remembered";
+import { store, stored } from "../panels/storage";
 import type { ViewSettings } from "./view_settings";
 
 const STORED_KEY = "view";
 /** Safari allows 100 changes of the address in 30 s. */
 const WRITE_MILLIS = 1000;
-/** The switches that are remembered: what is drawn, and not tools such as the measurement. */
-const SWITCHES = ".layers [id^=toggle-][aria-pressed], #toggle-crop";
+/** The switches that are remembered: what is drawn, and not tools such as the measurement. A cut ends with its view. */
+const SWITCHES = ".layers [id^=toggle-][aria-pressed]:not(#toggle-cut), #toggle-crop";
 const TOGGLE = "toggle-";
 
 export class ViewMemory {
@@ -58,7 +59,7 @@ export class ViewMemory {
     this.hasUserActed = hasUserActed;
     this.written = encoded(this.present);
     // The page may be about to be loaded again, with a token that came with the link.
-    store(this.written);
+    store(STORED_KEY, this.written, "sessionStorage");
   }
 
   private get present(): Remembered {
@@ -104,7 +105,7 @@ export class ViewMemory {
     if (!this.hasUserActed || text === this.written || this.settings.isPlaying) return;
     this.written = text;
     history.replaceState(history.state, "", location.pathname + location.search + fragmentWith(text));
-    store(text);
+    store(STORED_KEY, text, "sessionStorage");
   }
 }
 
@@ -113,23 +114,7 @@ function textAtStart(): string | null {
   const [navigation] = performance.getEntriesByType("navigation") as PerformanceNavigationTiming[];
   const inAddress = textInFragment(location.hash);
   // An address that was typed again may lead to another run.
-  return navigation?.type === "navigate" ? inAddress : (storedText() ?? inAddress);
-}
-
-function storedText(): string | null {
-  try {
-    return sessionStorage.getItem(STORED_KEY);
-  } catch {
-    return null; // The browser stores nothing for this page.
-  }
-}
-
-function store(text: string): void {
-  try {
-    sessionStorage.setItem(STORED_KEY, text);
-  } catch {
-    // The address still contains the view.
-  }
+  return navigation?.type === "navigate" ? inAddress : (stored(STORED_KEY, "sessionStorage") ?? inAddress);
 }
 
 function switches(): HTMLElement[] {

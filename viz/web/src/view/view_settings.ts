@@ -1,10 +1,12 @@
 // The panel with settings of the view: field of view, resolution, opacity, refresh, camera path.
 
 import { CameraPath, type PathView } from "./camera_path";
+import { download } from "../panels/download";
 import { element } from "../panels/element";
 import type { OrbitView } from "./orbit_view";
 import { PathVideo, whyNoVideo } from "./path_video";
 import type { RenderScheduler } from "../connection/render_scheduler";
+import { reasonOf } from "../panels/sentence";
 import type { SideView } from "../layers/side_view";
 
 export class ViewSettings {
@@ -92,7 +94,7 @@ export class ViewSettings {
     element("path-video").textContent = this.video.isRecording ? "Cancel" : "Video";
     element("path-video", HTMLButtonElement).disabled = nViews < 2 && !this.video.isRecording;
     element("path-clear", HTMLButtonElement).disabled = nViews === 0;
-    const fov = Math.round(this.view.pathView().fovDegrees);
+    const fov = Math.round(this.view.attachment.fovDegrees); // Without the lens of a camera that the view rides on.
     if (this.fov.valueAsNumber !== fov) {
       this.fov.value = String(fov);
       element("fov-value").textContent = `${fov}°`;
@@ -117,17 +119,8 @@ export class ViewSettings {
       const file = await recording;
       if (file) download(file, "camera_path.mp4");
     } catch (error) {
-      note.textContent = `Cannot record a video: ${error instanceof Error ? error.message : String(error)}`;
+      note.textContent = `Cannot record a video: ${reasonOf(error)}`;
     }
     this.edit(() => undefined);
   }
-}
-
-/** Lets the browser save a file. */
-export function download(file: Blob, name: string): void {
-  const link = document.createElement("a");
-  link.href = URL.createObjectURL(file);
-  link.download = name;
-  link.click();
-  URL.revokeObjectURL(link.href);
 }

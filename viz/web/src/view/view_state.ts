@@ -27,21 +27,3 @@ const MODES: readonly unknown[] = ["overview", "orbit", "fly", "chase", "ride"] 
 export function isViewMode(text: string): text is ViewMode {
   return MODES.includes(text);
 }
-
-/** Whether a value, for example from an address or from the browser's storage, is a view that can be restored. */
-export function isViewState(value: unknown): value is ViewState {
-  if (typeof value !== "object" || value === null) return false;
-  const { position, target, up, mode, fovDegrees, attachedTo } = value as Record<string, unknown>;
-  const isOptional = (field: unknown, type: string): boolean => field === undefined || typeof field === type;
-  return (
-    [position, target, up].every(isPoint) &&
-    MODES.includes(mode) &&
-    isOptional(attachedTo, "string") &&
-    isOptional(fovDegrees, "number") &&
-    !(Number(fovDegrees) <= 0 || Number(fovDegrees) >= 180)
-  );
-}
-
-function isPoint(value: unknown): value is Point {
-  return Array.isArray(value) && value.length === 3 && value.every((coordinate) => Number.isFinite(coordinate));
-}

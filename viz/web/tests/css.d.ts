@@ -1,5 +1,0 @@
-// Tests import the styles as text.
-declare module "*.css" {
-  const text: string;
-  export default text;
-}
