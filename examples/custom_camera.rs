@@ -1,8 +1,9 @@
-//! Adds a camera of your own: implements `drivers::Camera`, and reads it as a source of samples.
+//! Adds your own camera: implements `drivers::Camera`, and reads this camera as a source of
+//! samples.
 //!
-//! The camera computes its images. A real one would wait for its hardware in `next_image`, and
+//! The camera computes its images. A real camera would wait for its hardware in `next_image`, and
 //! stamp each image at mid-exposure with the clock of `drivers::clock`. `LiveDevices` reads each
-//! device on a thread of its own, and returns the samples of all devices in the order of their
+//! device on a separate thread, and returns the samples of all devices in the order of their
 //! stamps.
 //!
 //! ```text

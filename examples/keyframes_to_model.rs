@@ -1,8 +1,8 @@
 //! Trains splats on keyframes, and saves the model.
 //!
 //! Without an argument, the keyframes show a ball on a floor, rendered with exact poses and depth.
-//! With an argument, they are read from a dataset folder (nerfstudio or TUM RGB-D). The saved model
-//! can be opened with the example `model_to_picture`, or with `fieldrig view`.
+//! With an argument, the keyframes are read from a dataset folder (nerfstudio or TUM RGB-D). The
+//! saved model can be opened with the example `model_to_picture`, or with `fieldrig view`.
 //!
 //! ```text
 //! cargo run --release --example keyframes_to_model
@@ -18,7 +18,7 @@ use std::sync::Arc;
 use trainer::splat::SplatOptions;
 use trainer::{ModelOptions, ModelSpec};
 
-/// Enough for a recognizable scene.
+/// This number of steps is enough for a recognizable scene.
 const N_STEPS: u64 = 500;
 const MODEL_FOLDER: &str = "target/example-model";
 

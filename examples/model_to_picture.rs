@@ -1,8 +1,8 @@
 //! Loads a saved model of any method, and renders it to a PNG file.
 //!
-//! The virtual camera looks at the center of the model from outside. The model is the one that the
-//! example `keyframes_to_model` saves, or the first argument: a folder of a saved model, or a file
-//! of splats.
+//! The virtual camera looks at the center of the model from outside. Without an argument, the model
+//! is the model that the example `keyframes_to_model` saves. With an argument, it is a folder of a
+//! saved model, or a file of splats.
 //!
 //! ```text
 //! cargo run --release --example model_to_picture

@@ -1,9 +1,9 @@
 //! Computes the pose of a camera on an arm at the middle of an exposure, and makes a keyframe.
 //!
-//! The inputs are those of a real robot: the URDF of the arm, stamped joint states, the pose of the
-//! camera on the flange (hand-eye), the intrinsics of the camera, and an image with the time of its
-//! exposure. `capture::Join` does the same for all cameras of a rig, and decides which images to
-//! accept.
+//! The inputs are the inputs that a real robot provides: the URDF of the arm, stamped joint states,
+//! the pose of the camera on the flange (hand-eye), the intrinsics of the camera, and an image with
+//! the time of its exposure. `capture::Join` does the same for all cameras of a rig, and decides
+//! which images to accept.
 //!
 //! ```text
 //! cargo run --example pose_to_keyframe
@@ -27,11 +27,11 @@ const URDF: &str = r#"<robot name="two-joints">
     <limit lower="-2" upper="2" effort="50" velocity="2"/>
   </joint>
 </robot>"#;
-/// Joint states that are further apart are not interpolated.
+/// Joint states that are farther apart in time than this are not interpolated.
 const MAX_GAP: Duration = Duration::from_millis(50);
 const EXPOSURE_START: Stamp = Stamp(43_000_000);
 const EXPOSURE_SECS: f64 = 0.008;
-/// Time from the exposure of the first row to that of the last row (rolling shutter).
+/// Time from the exposure of the first row to the exposure of the last row (rolling shutter).
 const READOUT_SECS: f64 = 0.012;
 
 fn main() -> anyhow::Result<()> {
@@ -50,7 +50,7 @@ fn main() -> anyhow::Result<()> {
     let world_from_camera = world_from_base * base_from_flange * flange_from_camera;
     let flange_twist = chain.tip_twist(&state.position, &state.velocity)?;
 
-    // A keyframe holds the undistorted image, and the pinhole camera that it belongs to.
+    // A keyframe holds the undistorted image, and the pinhole camera of this image.
     let intrinsics = intrinsics();
     let pinhole = intrinsics.undistorted();
     let rgba_srgb = Undistortion::new(&intrinsics).apply_rgb(&image_rgb(intrinsics.size_px))?;

@@ -1,16 +1,16 @@
 //! Settings of the C library's allocator.
 //!
 //! glibc serves large blocks from separate memory mappings, which return to the system when the
-//! blocks are freed. However, each such free raises the size above which glibc maps blocks, up to
-//! 32 MiB. Images are then allocated on the heaps, together with small blocks. In a long run, the
-//! heaps fragment and grow although memory use is constant, because small blocks remain between
-//! freed keyframes. A fixed threshold keeps images out of the heaps.
+//! blocks are freed. However, whenever such a block is freed, glibc raises the size above which it
+//! maps blocks, up to 32 MiB. Images are then allocated on the heaps, together with small blocks.
+//! In a long run, the heaps fragment and grow although memory use is constant, because small blocks
+//! remain between freed keyframes. A fixed threshold keeps images out of the heaps.
 //!
-//! The cost: the kernel clears a mapped block page by page when it is first written. Pictures for
-//! viewers are such blocks. On a GPU that draws a picture in a millisecond, clearing takes most of
-//! the time (H200, 1024x1024 with depth, 8 clients: 105 ms from request to picture instead of 45).
-//! The setting is therefore used only with software adapters, where drawing takes far longer and
-//! host memory holds images twice.
+//! A fixed threshold has a cost: the kernel clears a mapped block page by page when the block is
+//! first written. Pictures for viewers are such blocks. On a GPU that draws a picture in a
+//! millisecond, clearing takes most of the time (H200, 1024x1024 with depth, 8 clients: 105 ms from
+//! request to picture instead of 45). The setting is therefore used only with software adapters,
+//! where drawing takes far longer and host memory holds images twice.
 
 /// Blocks of at least this size get a separate mapping. An image of 640x480 takes 1.2 MB.
 const MMAP_THRESHOLD_BYTES: i32 = 1 << 20;

@@ -6,7 +6,8 @@ use std::time::Duration;
 /// How often checkpoints are written.
 #[derive(Clone, Copy, Debug, clap::Args)]
 pub(crate) struct CheckpointArgs {
-    /// Write a checkpoint for `--resume` every S seconds and at the end; 0: never [default: 60]
+    /// Write a checkpoint for `--resume` every S seconds and at the end; 0 disables checkpoints
+    /// [default: 60]
     #[arg(long, value_name = "S", value_parser = parse_period)]
     checkpoint_secs: Option<Duration>,
 }

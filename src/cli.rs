@@ -65,8 +65,8 @@ pub(crate) enum Command {
 }
 
 impl Command {
-    /// Whether only the owner may read the results. They show where the robot was, so this is the
-    /// default.
+    /// Whether only the owner may read the results. This is the default, because the results show
+    /// where the robot was.
     pub(crate) fn is_private(&self) -> bool {
         let permissions = match self {
             Self::Run(args) => args.permissions,

@@ -43,8 +43,8 @@ pub(crate) struct Console {
 }
 
 impl Console {
-    /// A console for a session with these limits. Several sessions at once have no progress bar,
-    /// because their bars would overwrite each other.
+    /// A console for a session with these limits. If several sessions run at once, there is no
+    /// progress bar, because their bars would overwrite each other.
     pub(crate) fn new(output: OutputMode, limits: Limits, n_sessions: usize) -> Self {
         // `on_event` sets the position in the same unit: steps if both limits are given.
         let length = limits.steps.or(limits.seconds.map(whole_secs));
@@ -159,8 +159,8 @@ pub(crate) fn print_json(value: &impl Serialize) {
     }
 }
 
-/// Prints commands to run next on these models, and in the last line how good they are, with the
-/// first of the commands.
+/// Prints commands to run next on these models. The last line is the verdict on the models, with
+/// the first of these commands.
 pub(crate) fn print_end(models: &[FinishedModel], verdict: &Verdict) {
     let saved: Vec<SavedModel<'_>> = models.iter().map(FinishedModel::saved).collect();
     let commands = next_commands::for_models(&saved);
@@ -172,7 +172,7 @@ pub(crate) fn print_end(models: &[FinishedModel], verdict: &Verdict) {
     }
 }
 
-/// How good models are whose images come from a dataset, which loses none.
+/// The verdict on models whose images come from a dataset, which loses no images.
 pub(crate) fn verdict_of(models: &[FinishedModel]) -> Verdict {
     let n_tests = models.iter().map(|model| model.saved().n_tests).max();
     let score = |model: &'_ FinishedModel| ModelScore {
@@ -187,7 +187,7 @@ pub(crate) fn verdict_of(models: &[FinishedModel]) -> Verdict {
     })
 }
 
-/// Prints that a run which was to be continued has reached its limits.
+/// Prints that the run to be continued has already reached its limits.
 pub(crate) fn print_finished_run(run: &FinishedRun, json: bool) -> anyhow::Result<Exit> {
     let FinishedRun {
         folder,
@@ -228,7 +228,8 @@ fn whole_secs(secs: f64) -> u64 {
     secs as u64
 }
 
-/// Lines about progress, for outputs that show no progress bar because they are not a terminal.
+/// Lines about progress, for outputs without a progress bar, that is, outputs that are not a
+/// terminal.
 pub(crate) struct ProgressLines {
     is_shown: bool,
     n_last: usize,
@@ -236,12 +237,12 @@ pub(crate) struct ProgressLines {
 }
 
 impl ProgressLines {
-    /// If less than a tenth is done in this time, there is a line nevertheless.
+    /// After this time, a line is printed even if less than a tenth was done.
     const MAX_PERIOD: Duration = Duration::from_secs(10);
-    /// Work that is done sooner needs no lines.
+    /// Work that takes less time than this needs no lines.
     const MIN_PERIOD: Duration = Duration::from_secs(1);
 
-    /// Lines for work that begins at `now`, in place of a hidden bar.
+    /// Lines for work that begins at `now`. They replace a hidden progress bar.
     pub(crate) fn new(is_shown: bool, now: Instant) -> Self {
         Self {
             is_shown,
@@ -250,8 +251,8 @@ impl ProgressLines {
         }
     }
 
-    /// Whether a line is due at `now`: something remains, and since the last line, a tenth of the
-    /// whole was done, or a period has passed and anything was done.
+    /// Whether a line is due at `now`. A line is due if some work remains, and if since the last
+    /// line a tenth of the whole was done, or a period has passed in which anything was done.
     pub(crate) fn is_due(&mut self, n_done: usize, n_all: usize, now: Instant) -> bool {
         let elapsed = now.duration_since(self.last_at);
         let is_tenth = 10 * n_done.saturating_sub(self.n_last) >= n_all;
@@ -273,8 +274,8 @@ impl ProgressLines {
 /// Maximum length of the lines of [`wrapped`].
 const MAX_LINE_CHARS: usize = 100;
 
-/// A list, broken after commas into lines of at most [`MAX_LINE_CHARS`] characters if possible. All
-/// lines but the first are indented.
+/// A list that is broken after commas, if possible into lines of at most [`MAX_LINE_CHARS`]
+/// characters. All lines except the first are indented.
 fn wrapped(list: &str) -> Vec<String> {
     let mut lines: Vec<String> = Vec::new();
     for word in list.split_inclusive(", ") {
@@ -294,15 +295,15 @@ fn wrapped(list: &str) -> Vec<String> {
         .collect()
 }
 
-/// A progress bar for reading images; cleared when it is dropped.
+/// A progress bar for reading images. It is cleared when the value is dropped.
 pub(crate) struct ReadBar {
     is_hidden: bool,
-    /// Name of the counted items, and the bar.
+    /// The name of the counted items, and the bar.
     bar: Mutex<Option<(&'static str, ProgressBar)>>,
 }
 
 impl ReadBar {
-    /// A bar that appears with the first progress, unless it is hidden.
+    /// A bar that appears when there is progress for the first time, unless it is hidden.
     pub(crate) fn new(is_hidden: bool) -> Self {
         Self {
             is_hidden,
@@ -334,7 +335,7 @@ impl ReadBar {
         }
     }
 
-    /// Removes the bar until further progress.
+    /// Removes the bar until there is further progress.
     pub(crate) fn end(&self) {
         clear(&mut self.bar.lock());
     }

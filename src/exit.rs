@@ -22,7 +22,7 @@ pub(crate) enum Exit {
 }
 
 impl Exit {
-    /// Turns success into a loss if some of the output could not be printed.
+    /// Turns success into a loss if a part of the output could not be printed.
     pub(crate) fn or_output_loss(self) -> Self {
         if self == Self::Done && print::has_lost_output() {
             Self::Loss
@@ -59,8 +59,8 @@ pub(crate) fn from_losses(data_losses: &[String]) -> Exit {
     }
 }
 
-/// Whether the reader of stdout closed the pipe, as `head` does. This ends a command whose result
-/// is its output.
+/// Whether the reader of stdout closed the pipe, as `head` does. A command whose result is its
+/// output then ends.
 pub(crate) fn is_broken_pipe(error: &anyhow::Error) -> bool {
     // Other pipes, such as those of cameras, do not end a command in order.
     let is_pipe = |io: &std::io::Error| io.kind() == ErrorKind::BrokenPipe;

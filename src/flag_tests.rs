@@ -11,8 +11,9 @@ use syn::buffer::{Cursor, TokenBuffer};
 use syn::visit::Visit;
 use syn::{Attribute, Item, LitStr, Macro, Meta};
 
-/// Source files or folders, and the commands that print their messages. All these commands must
-/// accept a flag or setting in a message, unless the message names a command that accepts it.
+/// Source files or folders, and the commands that print their messages. If a message contains a
+/// flag or setting, all these commands must accept it. The exception is a message that names a
+/// command that accepts the flag.
 const PRINTED_BY: [(&str, &[&str]); 34] = [
     ("bench/src", &["bench"]),
     (
@@ -85,7 +86,7 @@ const PRINTED_BY: [(&str, &[&str]); 34] = [
     ("src/commands/bench/run_flags.rs", &["run"]),
 ];
 
-/// Settings in messages of libraries that name a command which accepts them.
+/// Settings in messages of libraries, where the message names a command that accepts the setting.
 const NAMED_WITH_COMMAND: [(&str, Setting, &str); 11] = [
     ("capture/src/dataset.rs", Setting::Scale, "train"),
     ("capture/src/found_devices.rs", Setting::Sim, "run"),
@@ -129,7 +130,7 @@ fn is_in(file: &str, place: &str) -> bool {
 
 /// The flags of each command that prints the messages of a file.
 fn accepted_in(file: &str) -> Vec<BTreeSet<String>> {
-    // The longest place is the most specific one.
+    // If several paths match, the longest path is the most specific.
     let places = PRINTED_BY.iter().filter(|(place, _)| is_in(file, place));
     if let Some((_, commands)) = places.max_by_key(|(place, _)| place.len()) {
         return commands.iter().map(|command| flags_of(command)).collect();
@@ -347,7 +348,7 @@ fn read(path: PathBuf) -> (String, String) {
 #[test]
 fn messages_name_only_flags_of_their_command() {
     let (mut n_flags, mut wrong) = (0, Vec::new());
-    // The flags of settings are checked where libraries name the settings.
+    // Flags of settings are not checked here, but in the libraries, which name the settings.
     let files = source_files(vec![root().join("src")]);
     for (file, source) in files.iter().filter(|(file, _)| file != "src/flag_names.rs") {
         let texts = texts_of(file, source);

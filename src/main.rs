@@ -58,8 +58,8 @@ fn start_threads() -> anyhow::Result<()> {
     })
 }
 
-/// Suppresses an irrelevant error on machines without a desktop: software Vulkan connects to
-/// Wayland, and libwayland prints an error if `XDG_RUNTIME_DIR` is not set, unless
+/// Suppresses an irrelevant error on machines without a desktop. Software Vulkan connects to
+/// Wayland, and libwayland prints an error if `XDG_RUNTIME_DIR` is not set. It prints no error if
 /// `WAYLAND_DISPLAY` is an absolute path.
 #[expect(
     unsafe_code,

@@ -6,8 +6,8 @@ use messages::BadInput;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Once};
 
-/// Opens the GPU. `FIELDRIG_GPU` selects one of several; `FIELDRIG_GPU_FEATURES=none` disables all
-/// optional features, and `no-matrices` only cooperative matrices.
+/// Opens the GPU. `FIELDRIG_GPU` selects one of several GPUs. `FIELDRIG_GPU_FEATURES=none` disables
+/// all optional features, and `no-matrices` disables only cooperative matrices.
 pub(crate) fn open_gpu() -> anyhow::Result<Arc<Gpu>> {
     let features = std::env::var_os("FIELDRIG_GPU_FEATURES");
     let [optional_features, matrices] =
@@ -19,7 +19,8 @@ pub(crate) fn open_gpu() -> anyhow::Result<Arc<Gpu>> {
             })?),
             Err(_) => None,
         };
-    // Installed before the GPU is used, because a lost device is detected at any time after that.
+    // The hook is installed before the GPU is used, because a lost device can be detected at any
+    // time after that.
     hide_caught_panics();
     check_open_for_tests()?;
     // For tests: loses the GPU once, when a model reaches this step.
@@ -46,8 +47,8 @@ pub(crate) fn open_gpu() -> anyhow::Result<Arc<Gpu>> {
     Ok(gpu)
 }
 
-/// Hides the message of a panic that is caught: wgpu panics if it detects a lost device while
-/// waiting.
+/// Hides the message of one panic: wgpu panics if it detects a lost device while waiting, and
+/// fieldrig catches this panic.
 fn hide_caught_panics() {
     static IS_SET: Once = Once::new();
     IS_SET.call_once(|| {

@@ -12,17 +12,17 @@ use viz::{Certificate, Hub, Server, ServerConfig, Sharing, Tokens};
 #[derive(Clone, Debug, clap::Args)]
 pub(crate) struct PageArgs {
     /// Address of the page: numeric IP address and port [default: 127.0.0.1:7007, with --share
-    /// 0.0.0.0:7007; `view` and `calibrate` take a free port if that one is in use]
+    /// 0.0.0.0:7007; `view` and `calibrate` take a free port if this port is in use]
     #[arg(long, value_name = "ADDRESS", value_parser = address)]
     listen: Option<SocketAddr>,
-    /// Serve the page to other machines over TLS; the printed addresses contain the required token
+    /// Serve the page to other machines over TLS. The printed addresses contain the required token
     #[arg(long)]
     share: bool,
     /// TLS certificate for --share, with its chain (PEM) [default: self-signed, kept for later
     /// runs]
     #[arg(long, value_name = "FILE", requires = "share")]
     certificate: Option<PathBuf>,
-    /// Private key of --certificate (PEM) [default: it is in the same file]
+    /// Private key of --certificate (PEM) [default: the file of --certificate]
     #[arg(long, value_name = "FILE", requires = "certificate")]
     certificate_key: Option<PathBuf>,
     /// Also serve images, joint states, frames, keyframes and metrics to Foxglove at this loopback

@@ -2,13 +2,13 @@
 //!
 //! A command whose result is its output (`devices`, `metrics`) prints with [`line()`] and [`json`],
 //! which fail if stdout fails. A command whose result is a file (`train`, `run`, `record`) prints
-//! with [`report()`] and [`report_json`], which never fail: a closed terminal or a full disk loses
-//! lines, not the model. A thread per stream writes the lines, so that a terminal or a program that
-//! accepts no output blocks neither this program nor the other stream. [`has_lost_output`] returns
-//! whether any lines of stdout were lost.
+//! with [`report()`] and [`report_json`], which never fail: if the terminal is closed or the disk
+//! is full, lines are lost, but the model is not. Each stream has a thread that writes its lines. A
+//! terminal or a program that accepts no output therefore blocks neither this program nor the other
+//! stream. [`has_lost_output`] returns whether any lines of stdout were lost.
 //!
-//! Text may come from files and other programs, so control characters, which a terminal may
-//! interpret, are escaped in it.
+//! Text may come from files and other programs. A terminal may interpret control characters in this
+//! text, so they are escaped.
 
 use anyhow::Context;
 use console::Term;
@@ -37,7 +37,7 @@ static LOST_OUTPUT: AtomicBool = AtomicBool::new(false);
 /// no output, for example after a broken connection, does not block the program.
 const MAX_WAITING: usize = 4096;
 /// At exit, the program waits at most this long for its output to be written. A slow connection
-/// needs seconds for a full queue; one that is broken never accepts it.
+/// needs seconds for a full queue. A broken connection never accepts the output.
 const MAX_FLUSH: Duration = Duration::from_secs(5);
 
 /// A command waits at most this long for the log before it prints a line of its result. Lines of
@@ -47,7 +47,7 @@ const MAX_ORDERING: Duration = Duration::from_millis(200);
 /// A part of the output of one stream.
 enum OutputChunk {
     Bytes(Vec<u8>),
-    /// Acknowledged once everything before it has been written.
+    /// A request that is acknowledged once all earlier chunks have been written.
     Flush(SyncSender<()>),
 }
 
@@ -90,8 +90,8 @@ fn write_chunks(chunks: Receiver<OutputChunk>, write: fn(&[u8])) {
     }
 }
 
-/// Queues text for a stream; returns false if the queue is full. The progress bars are hidden
-/// meanwhile.
+/// Queues text for a stream, and returns false if the queue is full. The progress bars are hidden
+/// during this call.
 fn send(stream: &SyncSender<OutputChunk>, text: String) -> bool {
     BARS.suspend(|| {
         stream
@@ -133,8 +133,8 @@ pub(crate) fn flush() {
     flush_for(MAX_FLUSH);
 }
 
-/// Waits until stdout is written, at most [`MAX_FLUSH`], and until stderr is written, at most
-/// `max_stderr` from the call.
+/// Waits until stdout is written, for at most [`MAX_FLUSH`]. Also waits until stderr is written,
+/// for at most `max_stderr` after the call.
 fn flush_for(max_stderr: Duration) {
     let began = Instant::now();
     // Both streams get the request before either is waited for, so that they are written in
@@ -154,7 +154,7 @@ fn flush_for(max_stderr: Duration) {
     }
 }
 
-/// Where progress bars are drawn: stderr, if that is a terminal.
+/// The place where progress bars are drawn: stderr, if it is a terminal.
 fn target() -> ProgressDrawTarget {
     let term = Term::stderr();
     if term.is_term() {
@@ -170,8 +170,8 @@ fn target() -> ProgressDrawTarget {
 /// A terminal that may disappear or stop accepting output at any time: output goes through the
 /// writer thread.
 ///
-/// indicatif's own target blocks on the terminal, and panics if drawing fails
-/// (`MultiProgress::suspend`), as it does with EIO after a terminal is closed.
+/// The target of indicatif blocks on the terminal. It also panics if drawing fails
+/// (`MultiProgress::suspend`), for example with EIO after a terminal is closed.
 #[derive(Debug)]
 struct BarTerm {
     term: Term,
@@ -259,7 +259,7 @@ pub(crate) fn report(text: impl Display) {
     report_styled(printable(&text.to_string()));
 }
 
-/// Prints text of this program as [`report()`] does, with its colors.
+/// Prints text of this program as [`report()`] does, but keeps the colors of the text.
 pub(crate) fn report_styled(text: impl Display) {
     if !send(&STDOUT, format!("{text}\n")) {
         log_lost("it accepts no more output");
@@ -305,7 +305,7 @@ fn json_text(value: &impl Serialize) -> anyhow::Result<String> {
     serde_json::to_string(value).context("cannot write the result as JSON")
 }
 
-/// Returns a progress bar on stderr; it is not drawn if `hidden` is set or stderr is not a
+/// Returns a progress bar on stderr. The bar is not drawn if `hidden` is set or if stderr is not a
 /// terminal.
 ///
 /// `template` is an indicatif template.

@@ -12,13 +12,13 @@ use viz::{Server, Tokens};
 /// A page that is being served.
 pub(crate) struct ServedPage {
     pub(crate) server: Server,
-    /// What clients on other machines need to know, if they may open the page.
+    /// The data that clients on other machines need, if they may open the page.
     pub(crate) shared: Option<Shared>,
     #[cfg(feature = "foxglove")]
     pub(crate) foxglove: Option<viz::FoxgloveServer>,
 }
 
-/// What clients of a shared page need to know.
+/// The data that clients of a shared page need.
 pub(crate) struct Shared {
     operator_url: String,
     viewer_url: String,
@@ -71,7 +71,8 @@ impl ServedPage {
         None
     }
 
-    /// Prints the addresses of the page; if `is_json`, as an event that also has these fields.
+    /// Prints the addresses of the page. If `is_json` is set, prints them as an event that also has
+    /// these fields.
     pub(crate) fn print(&self, is_json: bool, fields: Value) -> anyhow::Result<()> {
         if is_json {
             self.print_event(fields)
@@ -104,8 +105,8 @@ impl ServedPage {
         Ok(())
     }
 
-    /// The addresses of the page, and what else clients need to know. They contain the tokens, so
-    /// they must not be logged.
+    /// The addresses of the page, and other data that clients need. The addresses contain the
+    /// tokens, so they must not be logged.
     pub(crate) fn lines(&self) -> Vec<String> {
         let mut lines = vec![format!("open {} in a browser", self.url())];
         lines.extend(
@@ -140,7 +141,8 @@ impl ServedPage {
     }
 }
 
-/// The addresses under which other machines may reach a server, the likeliest first; at least one.
+/// The addresses at which other machines may reach a server, most likely first. There is at least
+/// one address.
 fn reachable_addresses(listen: IpAddr) -> Vec<IpAddr> {
     if !listen.is_unspecified() {
         return vec![listen];
@@ -179,7 +181,7 @@ fn default_route_address() -> Option<IpAddr> {
     socket.local_addr().ok().map(|address| address.ip())
 }
 
-/// A QR code for terminals, dark on light whatever the terminal's colors.
+/// A QR code for terminals. It is dark on light, independent of the terminal's colors.
 fn qr_code(text: &str) -> anyhow::Result<String> {
     let code = QrCode::new(text).context("cannot create a QR code")?;
     let lines = code.render::<Dense1x2>().build();

@@ -1,11 +1,12 @@
 //! Signals that end a command: it stops, saves, and exits.
 //!
 //! SIGINT (Ctrl-C), SIGTERM, SIGHUP (the terminal was closed) and SIGXCPU (the limit of processor
-//! time was reached) request an orderly stop. A second Ctrl-C ends the process at once, and so does
-//! SIGQUIT; arms with CAN motors get their fail-safe command before that. SIGHUP never ends the
-//! process at once, because closing a terminal sends it more than once: from the kernel to the
-//! foreground group, and from the shell to its jobs. The kernel repeats SIGXCPU every second. If
-//! SIGHUP or SIGXCPU is ignored, as SIGHUP is under `nohup`, it stays ignored.
+//! time was reached) request an orderly stop. A second Ctrl-C ends the process at once. SIGQUIT
+//! also ends it at once. In both cases, arms with CAN motors first get their fail-safe command.
+//! SIGHUP never ends the process at once, because closing a terminal sends it more than once: the
+//! kernel sends it to the foreground group, and the shell sends it to its jobs. The kernel repeats
+//! SIGXCPU every second. If the process was started with SIGHUP or SIGXCPU ignored, as `nohup` does
+//! for SIGHUP, the signal stays ignored.
 //!
 //! SIGXFSZ (a file reached the limit of its size) does not end a command: the write fails instead.
 
@@ -24,8 +25,8 @@ use std::time::{Duration, Instant};
 
 /// Shells report this plus the signal number as the exit code of a process that a signal ended.
 const SIGNAL_EXIT_BASE: i32 = 128;
-/// A second Ctrl-C within this time counts as the same one: some programs signal both a process and
-/// its group.
+/// A second Ctrl-C within this time does not count, because some programs send the signal both to a
+/// process and to its group.
 const MIN_BETWEEN: Duration = Duration::from_millis(500);
 
 /// Lets a write beyond the limit of the file size (`ulimit -f`) fail with an error, as on a full
@@ -37,13 +38,13 @@ pub(crate) fn fail_writes_at_size_limit() -> anyhow::Result<()> {
     Ok(())
 }
 
-/// Handles SIGINT, SIGTERM, SIGHUP and SIGXCPU of a command that saves its results; at most once
-/// per process.
+/// Handles SIGINT, SIGTERM, SIGHUP and SIGXCPU of a command that saves its results. Call this at
+/// most once per process.
 pub(crate) fn stop_on_signals() -> anyhow::Result<Stop> {
     stop_on_signals_logging("stopping and saving; Ctrl-C again exits at once")
 }
 
-/// As [`stop_on_signals`], for a command that saves nothing.
+/// The same as [`stop_on_signals`], but for a command that saves nothing.
 pub(crate) fn stop_on_signals_logging(message: &'static str) -> anyhow::Result<Stop> {
     let (stop, [signaled, interrupted]) = Stop::with_signal_flags(message);
     let signals = Signals::new(termination_signals().chain([SIGQUIT]))
@@ -55,8 +56,8 @@ pub(crate) fn stop_on_signals_logging(message: &'static str) -> anyhow::Result<S
     Ok(stop)
 }
 
-/// Handles signals until the process ends. They arrive on this thread, where the fail-safe command
-/// of arms may block; a signal handler may not.
+/// Handles signals until the process ends. The signals arrive on this thread, because the fail-safe
+/// command of arms may block, which is not allowed in a signal handler.
 fn handle_signals(mut signals: Signals, signaled: &AtomicBool, interrupted: &AtomicBool) {
     let mut interrupted_at = Instant::now();
     for signal in signals.forever() {
@@ -78,8 +79,8 @@ fn handle_signals(mut signals: Signals, signaled: &AtomicBool, interrupted: &Ato
 }
 
 /// Requests a stop when stdout or stderr is closed, for example because a terminal closed without
-/// sending SIGHUP, or the reader of a pipe ended. Nobody then supervises the motion. At most once
-/// per process.
+/// sending SIGHUP, or the reader of a pipe ended. In this case, nobody supervises the motion. Call
+/// this at most once per process.
 pub(crate) fn stop_when_output_closes(stop: &Stop) -> anyhow::Result<()> {
     let stop = stop.clone();
     std::thread::Builder::new()
@@ -104,7 +105,8 @@ fn wait_until_output_closes() {
 
 /// Removes partial files before a signal ends the process.
 ///
-/// For commands that have nothing to save when they are cancelled; others use [`stop_on_signals`].
+/// This is for commands that have nothing to save when they are canceled. Other commands use
+/// [`stop_on_signals`].
 pub(crate) fn remove_partial_files_on_signals() -> anyhow::Result<()> {
     let mut signals =
         Signals::new(termination_signals()).context("cannot install signal handlers")?;
@@ -121,7 +123,8 @@ pub(crate) fn remove_partial_files_on_signals() -> anyhow::Result<()> {
     Ok(())
 }
 
-/// The signals that request a stop; without SIGHUP and SIGXCPU if they are ignored.
+/// The signals that request a stop. The list does not contain SIGHUP and SIGXCPU if they are
+/// ignored.
 fn termination_signals() -> impl Iterator<Item = i32> {
     let unless_ignored = [SIGHUP, SIGXCPU]
         .into_iter()
@@ -129,7 +132,7 @@ fn termination_signals() -> impl Iterator<Item = i32> {
     [SIGINT, SIGTERM].into_iter().chain(unless_ignored)
 }
 
-/// Whether this process was started with the signal ignored, which Linux reports in `/proc`.
+/// Whether this process was started with the signal ignored. Linux reports this in `/proc`.
 fn is_ignored(signal: i32) -> bool {
     let Ok(status) = std::fs::read_to_string("/proc/self/status") else {
         return false;

@@ -22,8 +22,8 @@ static METHOD_HELP: LazyLock<String> = LazyLock::new(|| {
     )
 });
 
-/// Ids of all flags of [`TrainingArgs`], which flags such as `--resume` exclude. With the id of
-/// their group instead, clap would list all of them in its message.
+/// Ids of all flags of [`TrainingArgs`]. Flags such as `--resume` exclude these flags. If they
+/// excluded the id of the group instead, clap would list all flags in its message.
 pub(crate) const TRAINING_ARGS: [&str; 6] = [
     "method",
     "seed",
@@ -39,29 +39,29 @@ pub(crate) struct TrainingArgs {
     #[arg(long, value_name = "METHOD", value_parser = methods, help = METHOD_HELP.as_str())]
     pub(crate) method: Option<Methods>,
     /// Random seed, 0 to 2^63 - 1. With the same number of steps, the same seed gives the same
-    /// result [default: the rig file's, else 1]
+    /// result [default: value of the rig file, else 1]
     #[arg(long, value_name = "N", value_parser = value_parser!(u64).range(SEED_RANGE))]
     pub(crate) seed: Option<u64>,
     /// Maximum GPU memory of each model in bytes, at least 1000000 and enough for the smallest
-    /// model of the method [default: the rig file's, else no limit]
+    /// model of the method [default: value of the rig file, else no limit]
     #[arg(long, value_name = "BYTES", value_parser = max_bytes)]
     pub(crate) max_bytes: Option<u64>,
-    /// Maximum number of splats, 1 to 100000000 [default: the rig file's, else 400000]
+    /// Maximum number of splats, 1 to 100000000 [default: value of the rig file, else 400000]
     #[arg(long, value_name = "N", value_parser = value_parser!(u64).range(MAX_SPLATS_RANGE))]
     pub(crate) max_splats: Option<u64>,
-    /// Calibration parameters to estimate: auto (those that improve validation images), none, or a
-    /// list of base, extrinsics, time-offset, joints, depth-pose, lens, depth-scale, readout,
-    /// image-poses and image-gains, separated by commas. Images with depth are registered while
-    /// training runs; without depth, extrinsics, time-offset and (if listed) lens are estimated
-    /// from matched features, and all parameters are optimized with the scene. base estimates the
-    /// pose of a mobile base at every station [default: base; on a GPU: auto, but without trials in
-    /// live runs]
+    /// Calibration parameters to estimate: auto (the parameters that improve the prediction of
+    /// validation images), none, or a list of base, extrinsics, time-offset, joints, depth-pose,
+    /// lens, depth-scale, readout, image-poses and image-gains, separated by commas. Images with
+    /// depth are registered while training runs. Without depth, extrinsics, time-offset and (if
+    /// listed) lens are estimated from matched features, and all parameters are optimized with the
+    /// scene. base estimates the pose of a mobile base at every station [default: base; on a GPU:
+    /// auto, but without trials in live runs]
     #[arg(long, value_name = "PARAMS", value_delimiter = ',', hide_possible_values = true, value_parser = refine())]
     pub(crate) refine: Vec<Refine>,
-    /// How the number of splats is chosen: to-cap (grow to --max-splats), or tested (grow to
-    /// --max-splats, or to 8000 splats per image if there are fewer than 40 images; then halve as
-    /// long as that costs less than 0.1 dB on validation images) [default: to-cap; for data on disk
-    /// with a GPU: tested]
+    /// How the number of splats is chosen. to-cap: grow to --max-splats. tested: grow to
+    /// --max-splats, or to 8000 splats per image if there are fewer than 40 images; then halve the
+    /// number as long as this costs less than 0.1 dB on validation images [default: to-cap; for
+    /// data on disk with a GPU: tested]
     #[arg(long, value_name = "HOW", hide_possible_values = true)]
     pub(crate) count: Option<CountArg>,
 }

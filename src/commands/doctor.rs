@@ -17,7 +17,7 @@ const DEFAULT_ADDRESS: &str = "127.0.0.1:7007";
 /// Flags of `doctor`.
 #[derive(Debug, clap::Args)]
 pub(crate) struct Args {
-    /// Rig file; its devices are checked, too
+    /// Rig file whose devices are also checked
     rig: Option<PathBuf>,
     /// After the checks, read all devices for S seconds and print rates, latencies and losses;
     /// nothing is moved
@@ -30,7 +30,8 @@ pub(crate) struct Args {
 
 /// Runs all checks; the exit code is 1 if one fails.
 pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
-    // An invalid rig file is an error, not a finding: its devices would be unknown.
+    // An invalid rig file is an error of the command and not a failed check, because its devices
+    // are unknown.
     let rig = args
         .rig
         .as_ref()
@@ -40,7 +41,8 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     findings.push(simulation());
     findings.push(page_address::page_address(DEFAULT_ADDRESS));
     findings.extend(doctor::check(rig.as_ref()));
-    // Printed before listening, which takes as long as the user asks for.
+    // The checks are printed before listening, because listening takes as long as the user asks
+    // for.
     print_findings(&findings, args.json)?;
     if let (Some(rig), Some(secs)) = (&rig, args.listen) {
         let result = doctor::listen(rig, secs, &signals::stop_on_signals()?)?;
@@ -54,7 +56,8 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
         print_findings(&result.findings, args.json)?;
         findings.extend(result.findings);
     }
-    // Warnings do not fail: a script can use the exit code to decide whether a run can start.
+    // Warnings do not change the exit code, so that a script can use it to decide whether a run can
+    // start.
     let failed = findings
         .iter()
         .any(|finding| finding.verdict == Verdict::Fail);

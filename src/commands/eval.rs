@@ -15,7 +15,8 @@ use std::time::Instant;
 pub(crate) struct Args {
     /// Folder of a saved model, or a splat file (.ply, .spz, .splat)
     model: PathBuf,
-    /// The data it was trained on, or other data of the same scene in the same world frame
+    /// The data on which the model was trained, or other data of the same scene in the same world
+    /// frame
     data: PathBuf,
     #[command(flatten)]
     images: DataArgs,
@@ -73,6 +74,6 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
             outcome.scores
         ))?;
     }
-    // Scores of incomplete data are printed, but the exit code says so.
+    // Scores of incomplete data are printed, but the exit code reports the loss.
     Ok(exit::from_losses(&outcome.data_losses))
 }

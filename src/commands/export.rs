@@ -32,7 +32,7 @@ pub(crate) struct Args {
     /// run would accept]
     #[arg(long, value_name = "FILE")]
     keyframes: Option<PathBuf>,
-    /// Use this rig file instead of the recording's
+    /// Use this rig file instead of the rig file in the recording
     #[arg(long, value_name = "RIG.toml")]
     rig: Option<PathBuf>,
     #[command(flatten)]
@@ -89,11 +89,11 @@ enum Contents {
 pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     let contents = contents(&args.from)?;
     let has_cells = |kind: ModelKind| kind.entry().exports.iter().any(|export| export.has_cells);
-    // A flag without an effect is probably a mistake.
+    // A flag without an effect is probably a mistake of the user, so it is an error.
     if args.cell_m.is_some() && !matches!(contents, Contents::Model(kind) if has_cells(kind)) {
         return Err(BadInput(format!("--cell-m: {} has no mesh", args.from.display())).into());
     }
-    // Before the model is loaded, which may take long.
+    // This is checked before the model is loaded, because loading may take long.
     check_file(args)?;
     signals::remove_partial_files_on_signals()?;
     match (contents, &*args.to) {
@@ -211,7 +211,7 @@ fn write_export(export: &Export, args: &Args, out: &Path) -> anyhow::Result<Expo
         ExportWriter::Gpu(write) => write(open_gpu()?, &request),
     };
     exported.map_err(|error| match error {
-        // The cell width is an argument, so another one is a remedy.
+        // The cell width is an argument, so the user can try another width.
         trainer::Error::EmptyMesh { cell_m } => anyhow::Error::new(BadInput(format!(
             "--cell-m {cell_m}: no triangles are left at this cell width; use a smaller one"
         ))),

@@ -20,9 +20,9 @@ pub(crate) struct Args {
     base: Option<String>,
     /// Joint values as JSON, `{"joint_names": ["j1", ...], "configurations": [[0.1, ...], ...]}`
     ///
-    /// Radians for revolute joints, meters for prismatic ones. The names may be in any order.
-    /// Joints that do not move the tip and joints that mimic others may be included; they have no
-    /// effect.
+    /// Values are in radians for revolute joints, and in meters for prismatic joints. The names may
+    /// be in any order. Joints that do not move the tip, and joints that mimic others, may be
+    /// included, but have no effect.
     #[arg(long, value_name = "FILE.json")]
     joints: PathBuf,
 }
@@ -92,7 +92,8 @@ fn poses(robot: &Robot, chain: &Chain, joints: &str) -> anyhow::Result<Vec<[f64;
             Ok(transform::to_rows(&base_from_tip))
         })
         .collect::<anyhow::Result<_>>()?;
-    // An error makes the warning pointless, so it comes after all poses.
+    // If there is an error, the warning is not needed. The warning therefore comes after all poses
+    // are computed.
     warn_outside_limits(robot, &joints);
     Ok(poses)
 }
@@ -119,7 +120,7 @@ fn warn_outside_limits(robot: &Robot, joints: &JointsFile) {
 
 fn check_names(robot: &Robot, names: &[String]) -> anyhow::Result<()> {
     for (at, name) in names.iter().enumerate() {
-        // Only one of the two values could be used.
+        // The name occurs twice, but only one of the two values could be used.
         ensure!(
             !names[..at].contains(name),
             "joint {name:?} is listed twice in joint_names"

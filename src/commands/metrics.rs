@@ -35,7 +35,7 @@ fn positive(text: &str) -> Result<f64, String> {
     let number = text
         .parse::<f64>()
         .ok()
-        // With 0, all depths and their error would be 0.
+        // With a value of 0, all depths and their error would be 0.
         .filter(|number| number.is_finite() && *number > 0.0);
     number.ok_or_else(|| "must be a number above 0".to_owned())
 }

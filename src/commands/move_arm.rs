@@ -35,7 +35,7 @@ pub(crate) struct Args {
     /// joints
     #[arg(long, value_name = "JOINT=DELTA", value_parser = delta)]
     by: Vec<(String, f64)>,
-    /// Recover an arm that has stopped, before any motion; inspect the arm first
+    /// Recover an arm that has stopped, before any motion. Inspect the arm first
     #[arg(long)]
     recover: bool,
     /// Confirm the motion: nobody is within reach of the arm, and a hand is on the emergency stop
@@ -64,7 +64,7 @@ fn delta(text: &str) -> Result<(String, f64), String> {
 struct ArrivedEvent<'a> {
     event: &'static str,
     joints: &'a [String],
-    /// Target, and the position that the joints report, rad or m.
+    /// The target, and the position that the joints report, rad or m.
     target: &'a [f64],
     position: &'a [f64],
     /// Largest absolute difference between the two.
@@ -84,7 +84,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     check(args, &rig)?;
     let mut arm = SupervisedArm::new(open::movable_arm(&rig)?, &rig);
     let bar = print::bar(None, "{spinner} {elapsed} {msg}", args.json);
-    // An arm with an error accepts no target, so it recovers first.
+    // An arm with an error accepts no target, so it is recovered first.
     if args.recover {
         arm.recover()?;
         log::info!("the arm has recovered");
@@ -119,7 +119,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
         })?;
         report_arrival(args, &rig.arm.joints, &target, &last, began)?;
     }
-    // Otherwise, the motors would release the arm when this program ends.
+    // The arm is held, because the motors would otherwise release it when this program ends.
     if motion.on_loss != OnLoss::Hold && !args.exit_on_arrival {
         log::info!("{HOLDING}");
         arm.hold(&stop, |state| {
@@ -140,7 +140,7 @@ fn check(args: &Args, rig: &Rig) -> Result<(), BadInput> {
             joints.len()
         )));
     }
-    // Both the sum and the last of two values may be meant.
+    // Two values for a joint are ambiguous: the user may mean their sum, or the last value.
     if let Some(joint) = joints
         .iter()
         .find(|joint| args.by.iter().filter(|(by, _)| by == *joint).count() > 1)

@@ -30,21 +30,21 @@ pub(crate) struct Args {
     /// Camera path in nerfstudio's format (JSON)
     #[arg(long, value_name = "FILE", group = "where")]
     camera_path: Option<PathBuf>,
-    /// `world_from_camera`: 16 numbers, row major, separated by spaces or commas; camera: x right,
-    /// y down, z forward
+    /// Pose of the camera, `world_from_camera`: 16 numbers, row major, separated by spaces or
+    /// commas. The camera frame is x right, y down, z forward
     #[arg(long, value_name = "NUMBERS", group = "where", allow_hyphen_values = true, value_parser = numbers::<16>)]
     pose: Option<Numbers<16>>,
-    /// Size of the images [default: the camera path's, else 1280x720]
+    /// Size of the images [default: size in the camera path, else 1280x720]
     #[arg(long, value_name = "WIDTHxHEIGHT", value_parser = size)]
     size: Option<[u32; 2]>,
-    /// Vertical field of view, degrees [default: the camera path's, else 60]
+    /// Vertical field of view, degrees [default: value in the camera path, else 60]
     #[arg(long, value_name = "DEGREES")]
     fov: Option<f64>,
     /// Render a 360-degree equirectangular image instead of a pinhole view
     #[arg(long, conflicts_with = "fov")]
     equirect: bool,
-    /// Render only the part of the scene in this box: x y z of the lower corner, then of the upper
-    /// corner, world frame, meters
+    /// Render only the part of the scene in this box: x y z of the lower corner, then x y z of the
+    /// upper corner, in the world frame, meters
     #[arg(long, value_name = "NUMBERS", allow_hyphen_values = true, value_parser = corners)]
     crop: Option<Numbers<6>>,
     /// Also write depth as .npy: meters along the camera's z axis (distance with --equirect)
@@ -147,7 +147,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
         edits,
         ..
     } = loaded;
-    // Shared by all requests, because a model may have many edits.
+    // All requests share the edits, because a model may have many of them.
     let edits = Arc::new(edits);
     std::fs::create_dir_all(&args.out)
         .with_context(|| format!("cannot create the folder {}", args.out.display()))?;
@@ -158,7 +158,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     );
     let mut covered_fracs = Vec::new();
     for (ix, request) in requests.iter().enumerate() {
-        // The request is timed alone: encoding and writing files are not part of drawing.
+        // Only the request is timed, because encoding and writing files are not part of drawing.
         let since = Instant::now();
         let picture = model.model_mut().render(&RenderRequest {
             edits: Arc::clone(&edits),
@@ -179,7 +179,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
         }
     }
     bar.finish_and_clear();
-    // An empty model has a note of its own.
+    // An empty model has a separate note.
     if !is_empty {
         warn_if_hardly_covered(&covered_fracs);
     }

@@ -48,11 +48,11 @@ pub(crate) struct Args {
     /// and with its flags. New keyframes are added; --record and --listen are not restored
     #[arg(long, value_name = "FOLDER", conflicts_with = "from", conflicts_with_all = TRAINING_ARGS)]
     resume: Option<PathBuf>,
-    /// Stop S seconds after the first image; time before --resume counts [default: run until
+    /// Stop S seconds after the first image. Time before --resume counts [default: run until
     /// Ctrl-C]
     #[arg(long, value_name = "S", allow_negative_numbers = true, value_parser = number_in_range(0.0..=1e9))]
     seconds: Option<f64>,
-    /// Stop after N optimizer steps, or when the devices have ended and all data is fused; steps
+    /// Stop after N optimizer steps, or when the devices have ended and all data is fused. Steps
     /// before --resume count. With --lockstep, the result then depends only on the seed
     #[arg(long, value_name = "N")]
     steps: Option<u64>,
@@ -63,8 +63,8 @@ pub(crate) struct Args {
     training: TrainingArgs,
     #[command(flatten)]
     page: PageArgs,
-    /// Folder for the results and the effective rig file; several methods get a subfolder each. A
-    /// folder that contains a model is refused [default: a new folder in runs]
+    /// Folder for the results and the effective rig file. With several methods, each method gets a
+    /// subfolder. A folder that contains a model is refused [default: a new folder in runs]
     #[arg(long, value_name = "FOLDER")]
     out: Option<PathBuf>,
     #[command(flatten)]
@@ -99,7 +99,7 @@ pub(super) struct Running {
 /// Runs until a limit, the end of the devices, or Ctrl-C; saves the model, its keyframes and the
 /// effective rig file.
 pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
-    // What follows can take many seconds.
+    // The start of a run can take many seconds.
     log::info!(
         "reading {}",
         args.resume.as_ref().unwrap_or(&args.rig_file).display()
@@ -124,7 +124,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
         data_losses,
     } = saved.end()?;
     let exit = exit::from_losses(&data_losses);
-    // After a signal, the user expects the program to end.
+    // The page is not kept after a signal, because the user then expects the program to end.
     if args.keeps_serving() && !models.is_empty() && !stop.signaled() {
         print::report(format_args!(
             "serving the page at {} until Ctrl-C",
@@ -138,8 +138,8 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
 /// Opens the devices, the GPU and the page; continues the `previous` run if there is one.
 pub(super) fn start(args: &Args, previous: Option<PreviousLiveRun>) -> anyhow::Result<Running> {
     args.page.check()?;
-    // Signals are handled before the rig is read, so that Ctrl-C during a long start is an orderly
-    // end, too.
+    // Signals are handled before the rig is read, so that Ctrl-C during a long start also ends the
+    // run in an orderly way.
     let stop = signals::stop_on_signals()?;
     let services = Services {
         open_gpu,
@@ -150,8 +150,8 @@ pub(super) fn start(args: &Args, previous: Option<PreviousLiveRun>) -> anyhow::R
         },
     };
     let prepared = args.plan().prepare(previous, services)?;
-    // The page is served before kernels are compiled, so that its address in use is reported at
-    // once, and viewers can connect meanwhile.
+    // The page is served before kernels are compiled. If its address is in use, this is reported at
+    // once, and viewers can connect while kernels are compiled.
     let page = args.page.serve(prepared.hub())?;
     let opened = prepared.open_devices()?;
     page.print(args.json, serde_json::json!({}))?;

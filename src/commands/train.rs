@@ -18,20 +18,20 @@ pub(crate) struct Args {
     data: PathBuf,
     #[command(flatten)]
     training: TrainingArgs,
-    /// Continue from the checkpoint in this folder, on the same data and with its flags; no other
-    /// flag is needed. A larger --steps or --seconds continues a finished run; model settings
-    /// cannot be changed
+    /// Continue from the checkpoint in this folder, on the same data and with the flags of the
+    /// first command. No other flag is needed. A larger --steps or --seconds continues a finished
+    /// run. Model settings cannot be changed
     #[arg(long, value_name = "FOLDER", conflicts_with_all = TRAINING_ARGS, conflicts_with = "plan_steps")]
     resume: Option<PathBuf>,
     /// Repeat the timing-dependent decisions in this decisions.jsonl of an earlier run. With the
     /// same data, this gives the same model
     #[arg(long, value_name = "FILE", conflicts_with_all = TRAINING_ARGS, conflicts_with_all = ["plan_steps", "seconds", "steps", "holdout", "keyframes", "scale"])]
     replay_decisions: Option<PathBuf>,
-    /// Stop after S seconds of training; loading and scoring do not count, time before --resume
+    /// Stop after S seconds of training. Loading and scoring do not count, but time before --resume
     /// does [default: 120, unless --steps is given]
     #[arg(long, value_name = "S", allow_negative_numbers = true)]
     seconds: Option<f64>,
-    /// Stop after N optimizer steps; steps before --resume count. Without --seconds, no decision
+    /// Stop after N optimizer steps. Steps before --resume count. Without --seconds, no decision
     /// depends on timing, and the result depends only on the seed
     #[arg(long, value_name = "N")]
     steps: Option<u64>,
@@ -41,21 +41,21 @@ pub(crate) struct Args {
     #[command(flatten)]
     images: DataArgs,
     /// Render depth from this model (a folder or a splat file) for images that have depth on less
-    /// than half of their pixels. All methods treat rendered depth as measured. The model must be
-    /// of the same scene, in the same world frame. --refine then estimates parameters jointly with
-    /// the scene
+    /// than half of their pixels. All methods treat rendered depth as measured depth. The model
+    /// must be of the same scene, in the same world frame. --refine then estimates parameters
+    /// jointly with the scene
     #[arg(long, value_name = "MODEL")]
     depth_from: Option<PathBuf>,
     /// `SqueezeNet` weights for LPIPS (safetensors) [default: `FIELDRIG_LPIPS_WEIGHTS`, else no
     /// LPIPS]
     #[arg(long, value_name = "FILE")]
     lpips_weights: Option<PathBuf>,
-    /// Folder for the results; several methods get a subfolder each. A folder that contains a model
-    /// is refused [default: the folder of --resume if it contains no model, else a new folder in
-    /// runs]
+    /// Folder for the results. With several methods, each method gets a subfolder. A folder that
+    /// contains a model is refused [default: the folder of --resume if it contains no model, else a
+    /// new folder in runs]
     #[arg(long, value_name = "FOLDER")]
     out: Option<PathBuf>,
-    /// Write the recording's rig file here with the estimated calibration, and the robot
+    /// Write the recording's rig file with the estimated calibration to this path, and the robot
     /// description (robot.urdf) next to it
     #[arg(long, value_name = "FILE")]
     write_rig: Option<PathBuf>,

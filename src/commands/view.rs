@@ -51,7 +51,7 @@ impl Up {
     /// Rotation from the page, which is z up, to the model.
     fn model_from_page(self) -> Transform {
         let rotation = UnitQuaternion::rotation_between(&Vector3::z(), &self.0);
-        // If the two are opposite, rotate by 180 degrees about a horizontal axis.
+        // If the two directions are opposite, rotate by 180 degrees about a horizontal axis.
         let rotation =
             rotation.unwrap_or_else(|| UnitQuaternion::new(std::f64::consts::PI * Vector3::x()));
         Transform::from_parts(Translation3::identity(), rotation)
@@ -66,7 +66,8 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     let stop = signals::stop_on_signals_logging("stopping; Ctrl-C again exits at once")?;
     let gpu = open_gpu()?;
     let hub = Hub::new();
-    // Before the models are loaded, so that an address in use is reported at once.
+    // The server starts before the models are loaded, so that an address in use is reported at
+    // once.
     let page = args.page.serve_or_free_port(&hub)?;
 
     let model_from_page = args.up.model_from_page();

@@ -1,5 +1,5 @@
-//! `fieldrig bench budget`: accuracy over the number of splats, and the number that the trainer
-//! chooses.
+//! `fieldrig bench budget`: measures accuracy over the number of splats, and the number of splats
+//! that the trainer chooses.
 
 use super::runs_args::RunsArgs;
 use crate::exit::Exit;

@@ -44,10 +44,10 @@ impl From<PartArg> for Part {
 /// Flags of `bench calibration`.
 #[derive(Clone, Debug, clap::Args)]
 pub(crate) struct Args {
-    /// What to measure; rigs need --rig
+    /// What to measure. The part `rigs` needs --rig
     #[arg(long, value_name = "PART", value_delimiter = ',', value_enum, default_values_t = ALL_PARTS)]
     parts: Vec<PartArg>,
-    /// Calibrations per kind, for the coverage of the reported uncertainty
+    /// With coverage: number of calibrations of each kind
     #[arg(long, value_name = "N", default_value_t = 200, value_parser = clap::value_parser!(u64).range(1..=100_000))]
     runs: u64,
     /// With coverage: images or robot poses per calibration
@@ -59,16 +59,17 @@ pub(crate) struct Args {
     /// With coverage: seed of the first scene
     #[arg(long, value_name = "N", default_value_t = 0, value_parser = clap::value_parser!(u64).range(0..=1_000_000))]
     first_seed: u64,
-    /// Scenes per number of poses and per combination of conditions
+    /// Number of scenes for each number of poses and for each combination of conditions
     #[arg(long, value_name = "N", default_value_t = 4, value_parser = clap::value_parser!(u64).range(1..=1000))]
     seeds: u64,
-    /// Also calibrate simulated rigs without a target: this rig file with wrong camera poses
+    /// Also calibrate simulated rigs without a target. The rigs are this rig file with wrong camera
+    /// poses
     #[arg(long, value_name = "RIG_FILE")]
     rig: Option<PathBuf>,
-    /// With --rig: number of rigs, each with another seed and direction of the error
+    /// With --rig: number of rigs. Each rig has another seed and another direction of the error
     #[arg(long, value_name = "N", default_value_t = 10, requires = "rig", value_parser = clap::value_parser!(u64).range(1..=1000))]
     rigs: u64,
-    /// With --rig: number of the first rig
+    /// With --rig: index of the first rig, counted from 1
     #[arg(long, value_name = "N", default_value_t = 1, requires = "rig", value_parser = clap::value_parser!(u64).range(1..=1000))]
     first_rig: u64,
     /// With --rig: length of each scan in seconds

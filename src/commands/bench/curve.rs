@@ -8,7 +8,8 @@ use std::path::PathBuf;
 /// Flags of `bench curve`.
 #[derive(Debug, clap::Args)]
 pub(crate) struct Args {
-    /// Nerfstudio or TUM RGB-D folders, or recordings (.mcap); each gives one line per method
+    /// Nerfstudio or TUM RGB-D folders, or recordings (.mcap). The chart has one line per input and
+    /// method
     #[arg(required = true)]
     data: Vec<PathBuf>,
     /// Training time of each run in seconds; loading and scoring do not count

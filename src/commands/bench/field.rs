@@ -10,8 +10,8 @@ pub(crate) struct Args {
     /// Rays per step, 1 to 65536
     #[arg(long, value_name = "N", default_value_t = 4096, value_parser = clap::value_parser!(u32).range(1..=65_536))]
     rays: u32,
-    /// Samples per step, separated by commas; rounded down to a multiple of the rays, with at least
-    /// one per ray [default: 131072,262144; without a GPU 16384]
+    /// Numbers of samples per step, separated by commas. Each is rounded down to a multiple of the
+    /// rays, with at least one sample per ray [default: 131072,262144; without a GPU 16384]
     #[arg(long, value_name = "N,...", value_delimiter = ',', value_parser = clap::value_parser!(u32).range(1..=1 << 24))]
     samples: Vec<u32>,
     /// Number of timed steps, 1 to 10000; the median is reported [default: 100; without a GPU 3]

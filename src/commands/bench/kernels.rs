@@ -30,9 +30,9 @@ pub(crate) struct Args {
     /// Put the camera in the middle of the cloud, where only some of the splats are visible
     #[arg(long)]
     inside: bool,
-    /// Measure a step that resembles those of a scan with depth: unevenly distributed splats, and a
-    /// loss with D-SSIM and depth [default: 640x480 and 400000 splats; without a GPU 160x120 and
-    /// 25000]
+    /// Measure a step that resembles the steps of a scan with depth: unevenly distributed splats,
+    /// and a loss with D-SSIM and depth [default: 640x480 and 400000 splats; without a GPU 160x120
+    /// and 25000]
     #[arg(long, conflicts_with_all = ["cloud", "inside"])]
     scan: bool,
     /// Print the GPU time of each pass of a step

@@ -22,7 +22,7 @@ use std::time::Duration;
 pub(crate) struct Args {
     /// Recording of `fieldrig record` or `fieldrig run --record`
     recording: PathBuf,
-    /// Rig file [default: the one stored in the recording]
+    /// Rig file [default: the rig file stored in the recording]
     #[arg(long, value_name = "FILE")]
     rig: Option<PathBuf>,
     /// Length of each run in seconds, counted from the first image. After the end of the recording,
@@ -42,8 +42,7 @@ pub(crate) struct Args {
     /// Request panoramas (equirectangular) instead of pinhole views
     #[arg(long)]
     panorama: bool,
-    /// Pictures that each viewer requests per second, if they arrive that fast [default: back to
-    /// back]
+    /// Maximum number of pictures that each viewer requests per second [default: back to back]
     #[arg(long, value_name = "HZ", value_parser = number_in_range(0.1..=1000.0))]
     picture_rate: Option<f64>,
     /// Repeat the run with one viewer and a wrong hand-eye calibration: degrees and millimeters in
@@ -54,7 +53,7 @@ pub(crate) struct Args {
     #[arg(long, value_name = "N", default_value_t = 1, requires = "hand_eye_error", value_parser = clap::value_parser!(u64).range(1..=100))]
     directions: u64,
     /// Repeat the run with one viewer and each of these disturbances: `pose-noise` in mm,
-    /// `clock-offset` in ms, or `exposure`, a step in EV in the middle of the run
+    /// `clock-offset` in ms, or `exposure` in EV (a sudden change in the middle of the run)
     #[arg(long, value_name = "WHAT:SIZE,...", value_delimiter = ',', value_parser = disturbance)]
     disturb: Vec<LiveDisturbance>,
     /// Folder for charts and numbers
@@ -139,7 +138,7 @@ pub(super) fn run(args: &Args) -> anyhow::Result<Exit> {
         }
         runs.push(run);
     }
-    // Charts without a run would only look like a result.
+    // Without a run, no charts are written, because they would only look like a result.
     if runs.is_empty() {
         anyhow::bail!("interrupted before the first run ended");
     }
@@ -193,7 +192,7 @@ fn describe(run: &LiveRun) -> String {
 
 impl Args {
     fn conditions(&self) -> Vec<Conditions> {
-        // Errors and disturbances are compared with one viewer each, so that the load is the same.
+        // Runs with errors and disturbances have one viewer each, so that their load is the same.
         let with_one = Conditions {
             n_viewers: 1,
             hand_eye_error: None,
@@ -233,8 +232,8 @@ impl Args {
         rig: &Rig,
         conditions: Conditions,
     ) -> anyhow::Result<Option<(LiveRun, Vec<String>)>> {
-        // Named by the process, so that two benchmarks with the same output do not remove each
-        // other's folder.
+        // The folder is named after the process, so that two benchmarks with the same output do not
+        // remove each other's folder.
         let folder = self.out.join(format!("run-{}", std::process::id()));
         std::fs::create_dir_all(&folder)
             .with_context(|| format!("cannot create {}", folder.display()))?;
@@ -300,7 +299,8 @@ impl Args {
         while run.run_time_slice()? {
             timeline.sample(&run.live, &run.gpu, &viewers);
         }
-        // Measured before the viewers disconnect, because their latencies are part of it.
+        // The run is measured before the viewers disconnect, because their latencies are part of
+        // the measurement.
         let measured = LiveRun::of(conditions, &run.live, &viewers, &timeline);
         drop(viewers);
         let DiscardedRun {

@@ -55,8 +55,8 @@ pub(super) fn run(args: &Args) -> anyhow::Result<Exit> {
     args.check()?;
     std::fs::create_dir_all(&args.out)
         .with_context(|| format!("cannot create {}", args.out.display()))?;
-    // Checkpoints are part of a run, so they are written here, too. Their folder is removed
-    // afterwards.
+    // Checkpoints are part of a run, so this bench also writes them. Their folder is removed at the
+    // end.
     let run_folder = args.out.join(format!("run-{}", std::process::id()));
     let measured = args
         .run_flags(&run_folder)
@@ -108,8 +108,8 @@ fn measure(args: &Args, flags: &run::Args) -> anyhow::Result<(MemoryRun, Option<
         if now < due {
             continue;
         }
-        // From now on and not from the last due time, so that a long step is not followed by
-        // several samples at once.
+        // The period starts now and not at the last due time, so that a long step is not followed
+        // by several samples at once.
         due = now + every;
         let sample = measured.add_sample(&run.live, &run.gpu, &viewers)?;
         if args.json {
@@ -120,8 +120,8 @@ fn measure(args: &Args, flags: &run::Args) -> anyhow::Result<(MemoryRun, Option<
             print::report(describe(&sample));
             last_printed = Some(now);
         }
-        // The results so far survive if the run is killed after hours, for example for lack of
-        // memory.
+        // The results are written during the run, so that they survive if the run is killed after
+        // hours, for example for lack of memory.
         if written.elapsed() >= WRITE_PERIOD {
             measured.findings()?.write(&args.out)?;
             written = Instant::now();

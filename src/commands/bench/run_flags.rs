@@ -27,7 +27,7 @@ pub(super) fn parse(
     let mut line: Vec<OsString> = vec!["run".into(), rig_file.into()];
     line.extend(flags);
     line.extend(["--seconds".into(), seconds.to_string().into()]);
-    // Port 0 is any free one: a bench must not collide with a run that serves its page.
+    // Port 0 means any free port, so that a bench does not collide with a run that serves its page.
     line.extend([
         "--out".into(),
         out.into(),
@@ -40,7 +40,8 @@ pub(super) fn parse(
     line.extend(given.iter().cloned());
     let parsed = RunFlags::try_parse_from(line).map_err(|error| {
         let message = error.to_string();
-        // The rest of the message is the usage of this parser, which the user did not call.
+        // The rest of the message is the usage of this parser. It is left out, because the user did
+        // not call this parser.
         let first = message.lines().next().unwrap_or_default();
         BadInput(format!(
             "flags of run: {}",

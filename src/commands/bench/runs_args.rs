@@ -17,7 +17,7 @@ pub(crate) struct RunsArgs {
     training: TrainingArgs,
     #[command(flatten)]
     images: DataArgs,
-    /// Folder for runs, charts and the page; finished runs of an earlier bench in this folder are
+    /// Folder for runs, charts and the page. Finished runs of an earlier bench in this folder are
     /// not repeated [default: a new folder in runs]
     #[arg(long, value_name = "FOLDER")]
     out: Option<PathBuf>,
@@ -79,8 +79,8 @@ impl BenchObserver for Printer {
     }
 
     fn training(&self, limits: Limits) -> Box<dyn Observer> {
-        // The bar is for the single run; `on_run` reports its result in a line that fits the
-        // others.
+        // The console prints only the progress bar. `on_run` prints the result of the run, in the
+        // same format for all runs.
         let output = if self.json {
             OutputMode::Nothing
         } else {

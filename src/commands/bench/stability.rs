@@ -19,11 +19,11 @@ pub(crate) struct Args {
         default_value = "all"
     )]
     disturb: Vec<DisturbanceArg>,
-    /// Sizes of the disturbance instead of the default ones (mm, ms, EV or keyframes), separated by
-    /// commas; needs a single disturbance
+    /// Sizes of the disturbance instead of the default sizes (mm, ms, EV or keyframes), separated
+    /// by commas. Needs a single disturbance
     #[arg(long, value_name = "N,...", value_delimiter = ',')]
     levels: Vec<f64>,
-    /// Image rate of a folder without time stamps, Hz; required there for clock-offset
+    /// Image rate of a folder without time stamps, Hz. `clock-offset` requires it for such a folder
     #[arg(long, value_name = "HZ")]
     rate_hz: Option<f64>,
     /// Training time of each run in seconds; loading and scoring do not count [default: 30, unless
@@ -46,7 +46,7 @@ enum DisturbanceArg {
     PoseNoise,
     /// Poses from 0 to 200 ms after the image stamps
     ClockOffset,
-    /// Exposure step of 0 to 1 EV in the middle of the capture
+    /// A sudden change of the exposure by 0 to 1 EV in the middle of the capture
     Exposure,
     /// 3 to 300 training keyframes
     Keyframes,

@@ -23,7 +23,7 @@ pub(crate) struct Args {
     /// Maximum random latency added to each image
     #[arg(long, value_name = "MS", default_value_t = 75.0)]
     jitter_millis: f64,
-    /// How much faster this computer's clock runs than the camera's, parts per million
+    /// How much faster this computer's clock runs than the camera's clock, parts per million
     #[arg(
         long,
         value_name = "PPM",
@@ -34,7 +34,7 @@ pub(crate) struct Args {
     /// Length of a run in seconds
     #[arg(long, value_name = "S", default_value_t = 120.0)]
     seconds: f64,
-    /// Seconds at the start of a run that are not counted
+    /// Seconds at the start of each run for which errors are not counted
     #[arg(long, value_name = "S", default_value_t = 10.0)]
     settle_seconds: f64,
     /// Runs per rate

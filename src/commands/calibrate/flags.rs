@@ -10,11 +10,11 @@ use std::path::PathBuf;
 /// Flags of commands that calibrate one camera, from files, a recording or the devices of a rig.
 #[derive(Debug, clap::Args)]
 pub(super) struct RigFlags {
-    /// The camera to calibrate, with a recording or rig file as input; the camera in the rig file,
-    /// with --write-rig [default: the only one]
+    /// With a recording or rig file as input: the camera to calibrate. With --write-rig: the camera
+    /// in the rig file [default: the only camera]
     #[arg(long, value_name = "NAME")]
     camera: Option<String>,
-    /// With a recording: read it with this rig file instead of the one stored in it. With image
+    /// With a recording: read it with this rig file instead of the stored rig file. With image
     /// files: the rig file to write the result into
     #[arg(long, value_name = "RIG.toml")]
     rig: Option<PathBuf>,
@@ -27,7 +27,7 @@ pub(super) struct RigFlags {
     /// With a rig file: read the devices for S seconds [default: 30]
     #[arg(long, value_name = "S", value_parser = number_in_range(1.0..=3600.0))]
     seconds: Option<f64>,
-    /// With a rig file: the page with the camera images and what to do next.
+    /// With a rig file: the page that shows the camera images and the next instruction.
     #[command(flatten)]
     pub(super) page: PageArgs,
 }
@@ -50,8 +50,8 @@ impl RigFlags {
 /// The flag of commands that write a report.
 #[derive(Debug, clap::Args)]
 pub(super) struct ReportFlag {
-    /// Write a report with the result, its uncertainty and the errors of all samples as an HTML
-    /// page; also if the calibration is refused
+    /// Write a report as an HTML page, with the result, its uncertainty and the errors of all
+    /// samples. The report is also written if the calibration is refused
     #[arg(long, value_name = "FILE.html")]
     report: Option<PathBuf>,
 }

@@ -19,8 +19,8 @@ const TARGET_HELP: &str = "The target, such as chessboard:9x6:25mm, charuco:5x7:
 /// Flags of `calibrate intrinsics`.
 #[derive(Debug, clap::Args)]
 pub(crate) struct Args {
-    /// Folder of images (.jpg, .png) of the target, all of one camera and one size; or a recording
-    /// (.mcap) or rig file (.toml) whose camera sees the target
+    /// Folder of images (.jpg, .png) of the target, all from one camera and of one size. Or a
+    /// recording (.mcap) or rig file (.toml) whose camera sees the target
     #[arg(value_name = "IMAGES|RECORDING|RIG")]
     input: PathBuf,
     #[arg(long, value_name = "SPEC", value_parser = target_argument, help = TARGET_HELP)]
@@ -67,8 +67,8 @@ struct Printed<'a> {
     images: Vec<PrintedImage<'a>>,
     /// Number of corners in each part of the image.
     coverage: PrintedGrid<usize>,
-    /// Standard deviation of the projection of a distant point in each part of the image; null
-    /// beyond the lens model.
+    /// Standard deviation of the projection of a distant point, for each part of the image. It is
+    /// null where the lens model does not apply.
     projection_sigma_px: PrintedGrid<Option<f64>>,
     trials: Vec<PrintedTrial<'a>>,
     next_view: Option<&'a str>,
@@ -163,8 +163,8 @@ fn printed<'a>(calibration: &'a IntrinsicsCalibration, unused: &[Unused]) -> Pri
             is_unreadable: false,
         });
     let rejected = unused.chain(rejected).collect();
-    // The first parameters are the focal lengths and the principal point, which have fields of
-    // their own.
+    // The first parameters are the focal lengths and the principal point, which have separate
+    // fields.
     const N_PINHOLE_PARAMS: usize = 4;
     let names = calibration.params.iter().map(|param| param.name);
     Printed {

@@ -1,5 +1,5 @@
-//! The web page while images of a target are taken: the camera image, the corners found so far, and
-//! what to do next.
+//! The web page while images of a target are taken. It shows the camera image, the corners found so
+//! far, and the next instruction.
 
 use crate::page_args::PageArgs;
 use crate::print;
@@ -16,7 +16,7 @@ use viz::{Guidance, Hub, LiveImage, LivePixels, Status};
 const INTERVAL: Duration = Duration::from_millis(200);
 /// Time for which an image with new corners is shown.
 const DETECTED_FOR: Duration = Duration::from_millis(1200);
-/// Colors of the corners of earlier images and of the newest one.
+/// Colors of the corners of earlier images and of the newest image.
 const EARLIER_SRGB: [u8; 3] = [227, 179, 65];
 const NEWEST_SRGB: [u8; 3] = [76, 255, 140];
 
@@ -40,9 +40,9 @@ impl GuidancePage {
     /// Serves the page for a camera.
     pub(super) fn start(args: &PageArgs, camera: &Camera) -> anyhow::Result<Self> {
         let hub = Hub::new();
-        // The page only helps, so a used port must not prevent the calibration.
+        // The page is only an aid, so a port that is in use must not prevent the calibration.
         let page = args.serve_or_free_port(&hub)?;
-        // On stderr, because stdout has the result.
+        // The address is printed to stderr, because stdout contains only the result.
         print::notice("the page shows camera images and what to do next:");
         page.lines().iter().for_each(print::notice);
         let began = Instant::now();
@@ -59,7 +59,7 @@ impl GuidancePage {
         })
     }
 
-    /// Shows what to do.
+    /// Shows the next instruction.
     pub(super) fn guide(&self, text: &str) {
         self.set_status(
             "calibrating",
@@ -98,7 +98,7 @@ impl GuidancePage {
     /// Shows an image of the camera with the corners of earlier images, unless no client shows
     /// images.
     pub(super) fn show_live(&mut self, image: &Image) {
-        // Checked before decoding, because most images are not shown.
+        // This is checked before decoding, because most images are not shown.
         let now = Instant::now();
         if image.camera != self.camera
             || image.is_depth()
@@ -128,24 +128,25 @@ impl GuidancePage {
             .collect();
         // The target is searched in gray images, so the same images are shown.
         let rgb = gray.iter().flat_map(|value| [*value; 3]).collect();
-        // The stamp only has to differ from that of the previous image.
+        // The stamp only has to differ from the stamp of the previous image.
         let stamp = Stamp::from_secs(self.began.elapsed().as_secs_f64());
         self.publish(stamp, size_px, rgb, &newest);
         if view.is_some() {
             self.n_views += 1;
-            // Otherwise, the next live image would replace the new corners before anyone has seen
-            // them.
+            // Without this pause, the next live image would replace the new corners before anyone
+            // has seen them.
             self.next_live = Instant::now() + DETECTED_FOR;
         }
-        // Only after the image was published, in which these corners are the newest.
+        // The corners are added only after the image was published, because in this image they are
+        // the newest.
         self.corners_px.extend(newest);
     }
 
     fn publish(&self, stamp: Stamp, size_px: [u32; 2], mut rgb: Vec<u8>, newest_px: &[[f64; 2]]) {
-        // Visible if the page shows the image in the width of a phone.
+        // This size is visible even if the page shows the image in the width of a phone.
         const WIDTH_PER_DOT: u32 = 320;
         let radius = size_px[0].div_ceil(2 * WIDTH_PER_DOT);
-        // The newest corners last, so that dots of earlier ones do not hide them.
+        // The newest corners are drawn last, so that dots of earlier corners do not hide them.
         for (corners_px, color, radius) in [
             (&self.corners_px[..], EARLIER_SRGB, radius),
             (newest_px, NEWEST_SRGB, 3 * radius),

@@ -24,7 +24,7 @@ pub(crate) struct Args {
     /// Use exactly the keyframes listed by an earlier run (keyframes.txt)
     #[arg(long, value_name = "FILE")]
     keyframes: Option<PathBuf>,
-    /// Read a recording with this rig file instead of the one stored in it
+    /// Read a recording with this rig file instead of the rig file stored in the recording
     #[arg(long, value_name = "FILE")]
     rig: Option<PathBuf>,
     /// What to estimate: auto (the parameters that improve the prediction of validation images), or
@@ -53,11 +53,12 @@ pub(crate) struct Args {
 #[derive(Debug, Serialize)]
 struct Printed<'a> {
     n_images: usize,
-    /// Calibration after the accepted corrections, by name of the camera; without a rig file,
-    /// empty.
+    /// Calibration after the accepted corrections, by name of the camera. Without a rig file, this
+    /// is empty.
     cameras: BTreeMap<&'a str, PrintedCamera>,
     /// For data without a rig file, the pose of each corrected camera in the frame of the given
-    /// one: multiply each given `world_from_camera` by it from the right.
+    /// camera. To correct the poses, multiply each given `world_from_camera` by this pose from the
+    /// right.
     #[serde(skip_serializing_if = "BTreeMap::is_empty")]
     given_from_corrected: BTreeMap<&'a str, [[f64; 4]; 4]>,
     estimates: &'a [Estimate],
@@ -72,7 +73,7 @@ struct Printed<'a> {
 struct PrintedCamera {
     /// Number of images used.
     n_images: usize,
-    /// Why its extrinsics are those of the rig file.
+    /// Why the extrinsics from the rig file were kept.
     refused: Option<String>,
     parent_from_camera: [[f64; 4]; 4],
     /// Standard deviations along and about the axes of the camera; null if its extrinsics were not
@@ -87,7 +88,7 @@ struct PrintedCamera {
     stamp_to_mid_exposure_millis: Option<f64>,
 }
 
-/// Pose of a camera in the frame of another one.
+/// Pose of a camera in the frame of another camera.
 #[derive(Debug, Serialize)]
 struct PrintedRelative {
     camera: String,
@@ -182,7 +183,7 @@ fn printed(outcome: &SceneOutcome) -> Printed<'_> {
     Printed {
         n_images: data.keyframes.len(),
         cameras: cameras.collect(),
-        // With a rig file, the poses of its cameras say the same.
+        // With a rig file, the poses of its cameras contain the same information.
         given_from_corrected: match calibration.rig {
             Some(_) => BTreeMap::new(),
             None => alignment
@@ -231,7 +232,7 @@ fn given_from_corrected<'a>(
         correction.rotation_rad.into(),
         correction.translation_m.into(),
     );
-    // The estimate leads from given to corrected frames. Poses of cameras need the opposite.
+    // The estimate maps given frames to corrected frames. Poses of cameras need the inverse.
     (camera, matrix_of(&corrected_from_given.inverse()))
 }
 

@@ -8,7 +8,7 @@ use messages::BadInput;
 use std::path::PathBuf;
 use targets::{Paper, TargetSpec};
 
-/// Fits on A4 and letter paper, and can be identified if parts of it are hidden.
+/// This target fits on A4 and letter paper, and can be identified if parts of it are hidden.
 const DEFAULT_TARGET: &str = "charuco:5x7:34mm:26mm:5X5_100";
 
 const TARGET_HELP: &str = "Target to draw: chessboard:9x6:25mm (inner corners, square), charuco:5x7:34mm:26mm:5X5_100 \
@@ -45,7 +45,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
     if args.out.exists() {
         return Err(BadInput(format!("{} exists", args.out.display())).into());
     }
-    // Only a warning: the target still serves for the lens.
+    // This is only a warning, because the target can still be used to calibrate a lens.
     if let Some(warning) = symmetry_warning(&args.target) {
         log::warn!("{warning}");
     }

@@ -15,7 +15,7 @@ use session::ReadProgress;
 
 /// The terminal in which a calibration runs.
 pub(super) struct Terminal<'a> {
-    /// How the page is served; `None` for a calibration without a target, which has no page.
+    /// How the page is served. `None` for a calibration without a target, because it has no page.
     page: Option<&'a PageArgs>,
     /// Whether nothing but the result is printed.
     is_json: bool,
@@ -84,7 +84,7 @@ struct TerminalView {
 
 impl CameraView for TerminalView {
     fn show_live(&mut self, image: &Image) {
-        // Only moves the spinner.
+        // This only moves the spinner.
         self.bar.inc(1);
         self.page.show_live(image);
     }
@@ -95,7 +95,8 @@ impl CameraView for TerminalView {
 
     fn advise(&mut self, text: &str) {
         self.page.guide(text);
-        // A hidden bar swallows messages, for example if stderr is a file.
+        // A hidden bar does not print its messages. The bar is hidden, for example, if stderr is a
+        // file.
         if self.bar.is_hidden() {
             log::info!("{text}");
         } else {

@@ -15,8 +15,8 @@ use std::path::PathBuf;
 /// Flags of `calibrate time-offset`.
 #[derive(Debug, clap::Args)]
 pub(crate) struct Args {
-    /// Poses of the first body as rows t,x,y,z,qx,qy,qz,qw (seconds, meters); other lines that are
-    /// not numbers are skipped
+    /// Poses of the first body as rows t,x,y,z,qx,qy,qz,qw (seconds, meters). Lines that do not
+    /// contain numbers are skipped
     #[arg(value_name = "A.csv")]
     a: PathBuf,
     /// Poses of the second body, which is rigidly attached to the first, in any other fixed frame
@@ -40,13 +40,13 @@ pub(crate) struct Args {
 /// The printed result.
 #[derive(Debug, Default, Serialize)]
 struct Printed {
-    /// Seconds to add to the clock of B to get that of A.
+    /// Seconds to add to the clock of B to get the clock of A.
     offset_secs: Option<f64>,
     sigma_secs: Option<f64>,
     /// RMS difference of the orientations after alignment, degrees.
     residual_deg: Option<f64>,
-    /// Rate of the clock of A relative to that of B, minus 1, in parts per million; null if it is
-    /// not significant.
+    /// Rate of the clock of A relative to the clock of B, minus 1, in parts per million; null if it
+    /// is not significant.
     drift_ppm: Option<f64>,
     drift_sigma_ppm: Option<f64>,
     /// Time on the clock of B at which `offset_secs` holds, if there is a drift.
@@ -64,8 +64,8 @@ struct Printed {
     refused: Option<String>,
 }
 
-/// Estimates and prints the offset. Exit code 4 if the motion does not determine it, or a requested
-/// transform.
+/// Estimates and prints the offset. The exit code is 4 if the motion does not determine the offset,
+/// or does not determine a requested transform.
 pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     let TimeOffsetOutcome { result, written } = args.task().run()?;
     let printed = match result {
@@ -90,7 +90,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     written?;
     match refused {
         None => Ok(Exit::Done),
-        // The reason is part of the JSON output already.
+        // The reason is already part of the JSON output.
         Some(_) if args.json => Ok(Exit::InsufficientData),
         Some(reason) => Err(InsufficientData(reason).into()),
     }

@@ -23,7 +23,7 @@ pub(super) fn gpu() -> Vec<Finding> {
             return vec![Finding::fail("gpu", error.to_string(), remedy)];
         }
     };
-    // Everything works on a software adapter, so it is no failure.
+    // Everything works on a software adapter, so a software adapter is not a failure.
     let adapter = if gpu.is_software() {
         let remedy = "training is slow on a software adapter: install the Vulkan driver of the GPU, if there is one";
         Finding::warn("gpu", gpu.describe(), remedy)

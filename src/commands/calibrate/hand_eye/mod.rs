@@ -41,7 +41,7 @@ pub(crate) struct Args {
     input: PathBuf,
     #[arg(long, value_name = "SPEC", value_parser = target_argument, help = TARGET_HELP)]
     target: Option<TargetSpec>,
-    /// Also estimate the intrinsics, starting from those in the file; needs images
+    /// Also estimate the intrinsics, starting from the intrinsics in the file; needs images
     #[arg(long)]
     with_intrinsics: bool,
     /// Also estimate the offsets of all joints except the first and the last. With samples in JSON:
@@ -69,29 +69,30 @@ pub(crate) struct Args {
 #[derive(Debug, clap::Args)]
 struct MoveFlags {
     /// With a rig file: move the arm to poses that show the target, until the result is accurate.
-    /// The target must be visible at the start; the arm returns there at the end. It does not avoid
-    /// obstacles, and does not check for collisions of the arm with itself, its base or cables
+    /// The target must be visible at the start. The arm returns to the start at the end. The
+    /// command does not avoid obstacles, and does not check for collisions of the arm with itself,
+    /// its base or cables
     #[arg(long = "move")]
     is_requested: bool,
-    /// With --move: confirm the motion: nobody is within reach of the arm, and a hand is on the
+    /// With --move: confirm that nobody is within reach of the arm, and that a hand is on the
     /// emergency stop. Not needed with --sim
     #[arg(long, requires = "is_requested")]
     enable_motion: bool,
     /// With --move: maximum number of poses
     #[arg(long, value_name = "N", default_value_t = 20, requires = "is_requested", value_parser = clap::value_parser!(u16).range(10..=200))]
     max_poses: u16,
-    /// With --move: end when the standard deviations of the position are this small, millimeters
+    /// With --move: end when the standard deviations of the position are at most this, millimeters
     #[arg(long, value_name = "MM", default_value_t = 0.2, requires = "is_requested", value_parser = number_in_range(1e-3..=100.0))]
     goal_mm: f64,
     /// With --move: maximum distance of the flange from its position at the start, millimeters;
-    /// tool, camera, target and elbow can reach farther. Default: 300; with a camera on the flange,
-    /// at most half its distance to the target
+    /// tool, camera, target and elbow can reach farther. Default: 300; if the camera is on the
+    /// flange, at most half its distance to the target
     #[arg(long, value_name = "MM", requires = "is_requested", value_parser = number_in_range(10.0..=5000.0))]
     max_distance_mm: Option<f64>,
 }
 
-/// Reads or takes the samples, calibrates and prints the result. Exit code 4 if the samples do not
-/// determine it.
+/// Reads or takes the samples, calibrates and prints the result. The exit code is 4 if the samples
+/// do not determine the result.
 pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     let task = args.task()?;
     let host = Terminal::new(Some(&args.rig.page), args.json);
@@ -120,7 +121,8 @@ fn calibrate_and_print(
                 .collect(),
             ..printed::printed(&calibrated.calibration)
         },
-        // JSON output contains a refusal like a result, for programs that evaluate it.
+        // In JSON output, a refusal has the same form as a result, so that programs can evaluate
+        // it.
         Err(error) if exit::of(error) == Exit::InsufficientData && is_json => {
             Printed::refused(outcome.setup(), format!("{error:#}"))
         }
@@ -139,7 +141,7 @@ fn calibrate_and_print(
         printed::describe(&printed, rig_pose.as_ref())?
     }
     match outcome.finish() {
-        // The reason is part of the JSON output already.
+        // The reason is already part of the JSON output.
         Err(_) if printed.refused.is_some() => Ok(Exit::InsufficientData),
         finished => finished.map(|()| Exit::Done),
     }

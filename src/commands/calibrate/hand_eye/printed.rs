@@ -10,8 +10,8 @@ use serde::Serialize;
 
 type Matrix = [[f64; 4]; 4];
 
-/// The printed result. Matrices are row by row; standard deviations along and about the axes of the
-/// camera.
+/// The printed result. Matrices are row by row. Standard deviations are along and about the axes of
+/// the camera.
 #[derive(Debug, Default, Serialize)]
 pub(super) struct Printed {
     #[serde(skip_serializing_if = "Option::is_none")]
@@ -48,7 +48,7 @@ pub(super) struct PrintedPose {
     #[serde(skip_serializing_if = "Option::is_none")]
     pub(super) joints: Option<Vec<f64>>,
     pub(super) motion: String,
-    /// Standard deviations with this pose, relative to those without.
+    /// Standard deviations with this pose, relative to the standard deviations without it.
     pub(super) sigma_frac: f64,
 }
 
@@ -96,7 +96,8 @@ impl PrintedPose {
 pub(super) fn printed(calibration: &HandEyeCalibration) -> Printed {
     let camera = Some(matrix_of(&calibration.parent_from_camera));
     let board = Some(matrix_of(&calibration.parent_from_board));
-    // The outer `Option` is whether the setup has this matrix, the inner one whether it is known.
+    // The outer `Option` says whether the setup has this matrix. The inner `Option` says whether
+    // the matrix is known.
     let of_setup =
         |setup: Setup, matrix: Option<Matrix>| (calibration.setup == setup).then_some(matrix);
     let held_out = calibration.held_out_scatter;
@@ -169,9 +170,9 @@ impl PrintedSample {
 }
 
 impl Printed {
-    /// Without a result.
+    /// A printed result for the case that there is no result.
     pub(super) fn refused(setup: Setup, reason: String) -> Self {
-        // The keys are those of a result, with null instead of a matrix.
+        // The keys are the same as in a result, but matrices are null.
         let of_setup = |other: Setup| (setup == other).then_some(None);
         Self {
             flange_from_camera: of_setup(Setup::EyeInHand),

@@ -104,7 +104,7 @@ export class ShownLatency {
     const total = (sample: Sample): number => sample.total;
     label.textContent = `camera to screen ${millis(total)}`;
     label.title = [
-      `From mid-exposure of a keyframe to the first picture with it on this screen, last minute (${this.samples.length}):`,
+      `Time from mid-exposure of a keyframe to its first picture on this screen, in the last minute (${this.samples.length}):`,
       `median ${millis(total)}, 99 % below ${millis(total, 0.99)}.`,
       "Medians of the parts:",
       `camera to model ${millis((sample) => sample.toModel)}`,

@@ -163,7 +163,7 @@ export class ObservationLayer {
         ? TITLES[quantity] + (isSaved ? ", relative to the newest keyframe" : "") + this.progress()
         : this.nAll > 0
           ? `Computing: 0 of ${this.nAll} keyframes are processed`
-          : "There are no keyframes, from which this is computed";
+          : "This map is computed from keyframes, but there are none";
       element("legend-labels").replaceChildren(...LABELS[quantity].map((label) => child("span", label)));
     }
     this.changed();

@@ -16,7 +16,7 @@ export const GESTURES: Record<"mouse" | "touch", Gesture[]> = {
     { how: "Scroll", what: "Zoom", isBasic: true },
     { how: "Double click", what: "Orbit around this point of the model" },
     { how: "Click on an image", what: "Enlarge the image of a camera" },
-    { how: "Rest on a button", what: "Explain it" },
+    { how: "Rest on a button", what: "Show what it does" },
   ],
   touch: [
     { how: "Drag with one finger", what: "Orbit", isBasic: true },
@@ -24,7 +24,7 @@ export const GESTURES: Record<"mouse" | "touch", Gesture[]> = {
     { how: "Pinch", what: "Zoom", isBasic: true },
     { how: "Double tap", what: "Orbit around this point of the model" },
     { how: "Tap on an image", what: "Enlarge the image of a camera" },
-    { how: "Touch and hold a button", what: "Explain it" },
+    { how: "Touch and hold a button", what: "Show what it does" },
   ],
 };
 

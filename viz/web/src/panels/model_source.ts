@@ -86,7 +86,7 @@ export class ModelSourceCard {
     const hint = child("small");
     hint.id = "up-hint";
     const showHint = (axis: Axis): void => {
-      hint.textContent = axis === source.up_axis ? "" : `Only in this window. Permanent: ${upCommand(source.path, axis)}`;
+      hint.textContent = axis === source.up_axis ? "" : `This applies only to this window. To keep it: ${upCommand(source.path, axis)}`;
     };
     showHint(choice.value as Axis);
     choice.addEventListener("change", () => {

@@ -61,8 +61,8 @@ export class NamedViews {
     shown.value = link;
     if (!isCopied) shown.select();
     const where = LOCAL_HOSTS.includes(location.hostname)
-      ? "It works on this computer only, because the page is not shared"
-      : "Others need access to this server to open it";
+      ? "The link works only on this computer, because the page is not shared"
+      : "To open the link, others need access to this server";
     this.note.textContent = `${isCopied ? "Copied." : "Copy the link above."} ${where}`;
   }
 

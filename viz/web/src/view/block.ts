@@ -32,7 +32,7 @@ export function blockText(block: Block): string {
     case "surface":
       return `A ${block.direction === "ahead" ? "surface" : "wall"} is ${PLACES[block.direction]}`;
     case "unknown space":
-      return `What is ${PLACES[block.direction]} is hidden and not known yet`;
+      return `The space ${PLACES[block.direction]} is hidden and not known yet`;
     case "near end":
       return "The view is at the point that it orbits: double-click on another point, or fly (Y)";
     case "far end":

@@ -14,7 +14,7 @@ const MAX_CLICK_PX = 4;
 
 const FIRST_POINT = "Click on two points of the model to measure their distance.";
 const SECOND_POINT = "Click on the second point. Esc cancels.";
-const NEXT_POINT = "Click on two points for the next distance. Delete removes the last one.";
+const NEXT_POINT = "Click on two points for the next distance. Delete removes the last distance.";
 const NO_SURFACE = "No surface there. Click on the model.";
 
 /** Two points and their distance. */
