@@ -417,7 +417,8 @@ fn tum_folder() -> tempfile::TempDir {
         list(&["1.015000", "1.110000"], "depth"),
     )
     .unwrap();
-    // Along x at 1 m/s, every 10 ms from just before the first photo until just after the third.
+    // The camera moves along x at 1 m/s. There is a pose every 10 ms, from just before the first
+    // photo until just after the third.
     let poses = (0..=25).map(|ix| {
         format!(
             "{:.4} {} 2 3 0 0 0 1\n",
@@ -815,7 +816,7 @@ fn mask_in_the_alpha_channel_is_named() {
     );
 }
 
-/// Feeds each key of the tables in docs/reference/datasets.md alone.
+/// Tests each key of the tables in docs/reference/datasets.md in its own file.
 #[test]
 fn keys_of_transforms_json_are_used_refused_or_named_as_documented() {
     let documented = include_str!("../../../docs/reference/datasets.md");
@@ -918,7 +919,7 @@ fn keys_of_transforms_json_are_used_refused_or_named_as_documented() {
     }
 }
 
-/// The points are in the frame of the poses, and their path follows the same rules as those of
+/// The points are in the frame of the poses. Their path follows the same rules as the paths of
 /// images.
 #[test]
 fn path_of_points_is_returned() {

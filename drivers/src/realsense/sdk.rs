@@ -106,7 +106,7 @@ impl Context {
             path: path.to_owned(),
             reason,
         };
-        // Opened here first, because the error of the operating system names the cause.
+        // The file is opened here first, because the error of the operating system names the cause.
         if let Err(error) = std::fs::File::open(path) {
             return Err(file_problem(error.to_string()));
         }

@@ -222,7 +222,7 @@ fn first_of_format<'a>(modes: &[&'a Mode], format: V4l2Format) -> Option<&'a Mod
     modes.iter().find(|mode| mode.format == format).copied()
 }
 
-/// Index of a format in order of preference. Depth comes last because it is only selected
+/// Rank of a format in the order of preference. Depth comes last because it is only selected
 /// explicitly.
 pub(super) fn rank(format: V4l2Format) -> usize {
     V4l2Format::COLOR_FORMATS
