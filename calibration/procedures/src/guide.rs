@@ -66,7 +66,8 @@ impl<'a> Guide<'a> {
         for image in &images[self.detected.len()..] {
             let detected = images::detect_in_image(image, self.target);
             let view = detected.board.as_ref().ok().map(|board| &board.view);
-            // Images without the target are shown, too: they often show why it was not found.
+            // Images without the target are shown, too, because they often show why the target was
+            // not found.
             self.shown.show_searched(image.size_px, &image.gray, view);
             let text = match &detected.board {
                 Ok(board) => {
@@ -109,7 +110,8 @@ impl<'a> Guide<'a> {
             }
             Purpose::HandEye => {
                 let is_on_flange = self.camera.parent == Parent::Flange;
-                // The moving body, whose rotations count: it carries the camera or the target.
+                // The moving body carries the camera or the target. Its rotations determine the
+                // result.
                 let (setup, body) = if is_on_flange {
                     (Setup::EyeInHand, "camera")
                 } else {

@@ -63,7 +63,7 @@ impl IntrinsicsTask {
         self.report.as_ref().map_or(Ok(()), ReportOptions::check)?;
         let mut rig = self.rig.open(&self.input)?;
         let detected = self.detect(host, rig.as_mut())?;
-        // Before the calibration, because its result could not be written.
+        // The size is checked before the calibration, because its result could not be written.
         if let (Some(rig), Some(size_px)) = (&rig, detected.sizes_px.first()) {
             rig.expect_size(*size_px)?;
         }
@@ -227,7 +227,8 @@ impl IntrinsicsOutcome {
             )?;
             rig.write()?;
         }
-        // The report comes last: the rig file is written even if the report could not be.
+        // The error of the report is returned last, so that the rig file is written even if the
+        // report could not be written.
         self.written
     }
 }
