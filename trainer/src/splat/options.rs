@@ -23,8 +23,8 @@ pub struct SplatOptions {
     /// Weight of the depth loss, per meter.
     pub depth_per_m: f64,
     /// Maximum brightness of the background. It is random in every step, which keeps dark objects
-    /// opaque. A value of 1 costs 1 dB in the first few hundred steps, while large parts of the
-    /// image are uncovered.
+    /// opaque. With a value of 1, scores are 1 dB lower in the first few hundred steps, while large
+    /// parts of the image are uncovered.
     pub random_background: f64,
     /// Determines the costs of opacity and size: `(cost_images / n_images)^2`, relative to the
     /// color loss. The fewer images there are, the more each splat must reduce the color loss to

@@ -23,7 +23,7 @@
 @compute @workgroup_size(32)
 fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u, @builtin(local_invocation_index) lane: u32) {
     let at = folded(wg, n_wgs);
-    if at >= min(status[N_BLOCKS], field.n_block_slots) || lane >= 27u { return; } // Allowed here: no barrier below.
+    if at >= min(status[N_BLOCKS], field.n_block_slots) || lane >= 27u { return; } // No barrier follows this return.
     if changed[at] == 0u { return; }
     let slot = find_slot(coords[at].xyz + around(lane));
     if slot == 0u { return; }

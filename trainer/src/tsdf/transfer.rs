@@ -11,8 +11,8 @@ use crate::Error;
 use gpu::{Gpu, Passes};
 use std::collections::BTreeSet;
 
-/// Blocks gathered at once: 12.6 MB. Larger batches need more GPU memory beside the field; smaller
-/// ones wait for the GPU more often.
+/// Blocks gathered at once: 12.6 MB. Larger batches need more GPU memory in addition to the field.
+/// Smaller batches wait for the GPU more often.
 const GATHER_BATCH: usize = 2048;
 
 impl FieldBuffers {
@@ -168,7 +168,7 @@ impl FieldBuffers {
         let moved_slots: Vec<u32> = (end.min(n_before)..n_before)
             .filter(|slot| !gone.contains(slot))
             .collect();
-        // Read before anything is written, because holes are filled in place.
+        // The blocks are read before anything is written, because holes are filled in place.
         let moved = self.read(gpu, pipelines, &moved_slots)?;
         let moved = moved_slots
             .iter()

@@ -91,8 +91,9 @@ impl March {
     }
 
     /// All segments of a ray that are within a range of distances and in occupied cells. The first
-    /// step starts `jitter` steps after `range[0]`. Also returns a margin: the smallest distance of
-    /// a segment's middle to a cell's side, in cells, or of the number of steps to an integer.
+    /// step starts `jitter` steps after `range[0]`. Also returns a margin. It is the smallest of
+    /// the distances from the middle of a segment to a side of its cell, in cells, and of the
+    /// distances from a number of steps to an integer.
     ///
     /// Steps have constant length inside the inner cube. Outside, the step at a distance u from the
     /// cube is longer by (1 + u)^2, so that each step changes 1 / (1 + u) by the same amount.
@@ -128,7 +129,8 @@ impl March {
     }
 
     fn path(&self, (origin, direction): ([f64; 3], [f64; 3]), [begin, end]: [f64; 2]) -> Path {
-        // Intersection with the inner cube (slab method), and not before the beginning of the ray.
+        // Intersection with the inner cube (slab method), limited to the part after the beginning
+        // of the ray.
         let [mut enter, mut leave] = [begin, f64::INFINITY];
         for axis in 0..3 {
             let along = if direction[axis].abs() < MIN_DIRECTION {
@@ -182,7 +184,7 @@ impl March {
             reason = "a fraction of the stride"
         )]
         let phase = ((jitter * stride as f64) as usize).min(stride - 1);
-        // A random phase, so that all segments are sampled in the course of several steps.
+        // The phase is random, so that all segments are sampled in the course of several steps.
         segments
             .iter()
             .skip(phase)
