@@ -4,13 +4,13 @@
 use kinematics::{Stamp, Transform};
 use std::collections::VecDeque;
 
-/// Time for which the base must stay near one pose to count as stationary. A shorter time would
-/// take the moment at which a base reverses for a station; a longer one would lose the first
-/// keyframes of a station.
+/// Time for which the base must stay near one pose to count as stationary. With a shorter time, the
+/// moment at which a base reverses would count as a station. With a longer time, the first
+/// keyframes of a station would be lost.
 const STATIONARY_SECS: f64 = 0.5;
-/// Maximum distance from that pose, meters and (next constant) radians. Larger values would merge
-/// slow motion into a station; smaller ones would split a station of a base that sways while its
-/// arm moves.
+/// Maximum distance from that pose, meters and (next constant) radians. With larger values, slow
+/// motion would become part of a station. With smaller values, a station would be split if the base
+/// sways while its arm moves.
 const STATIONARY_M: f64 = 0.005;
 const STATIONARY_RAD: f64 = 0.005;
 /// Maximum number of stations kept, far more than any image waits for.

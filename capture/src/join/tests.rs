@@ -105,8 +105,8 @@ fn truth(nanos: i64) -> Sample {
     })
 }
 
-/// Joints at 200 Hz, color at 10 Hz with other phases, depth 5 ms after color. Each image comes
-/// after the readings around it.
+/// Joints at 200 Hz, color at 10 Hz with a different phase, and depth 5 ms after color. Each image
+/// comes after the readings around it.
 fn samples(secs: i64) -> Vec<Sample> {
     let mut samples = Vec::new();
     for tick in 0..secs * 200 {
@@ -780,7 +780,8 @@ fn one_hour_run_keeps_only_the_store_in_memory() {
     for tick in 0..3600 * 20_i64 {
         let mut samples = vec![reading(tick * 50_000_000)];
         if tick % 4 == 2 {
-            // Not in phase with the motion, so that every image has a slightly different pose.
+            // The images are not in phase with the motion, so that every image has a slightly
+            // different pose.
             let stamp = Stamp(tick * 50_000_000 - 21_000_000 - tick % 977 * 10_000);
             n_images += 1;
             samples.extend([&color, &depth].map(|image| {
