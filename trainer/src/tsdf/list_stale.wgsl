@@ -1,5 +1,6 @@
-// list_stale: lists the blocks whose triangles may have changed: changed blocks and all their neighbors, whose cubes
-// and normals read the changed voxels. The order depends on thread timing; blocks are processed independently.
+// list_stale: lists the blocks whose triangles may have changed. These are the changed blocks and all their neighbors,
+// whose cubes and normals read the changed voxels. The order depends on thread timing, but results do not, because
+// blocks are processed independently.
 //
 // groups    one per block of the pool; 32 threads, 27 of which handle the block and its neighbors
 // reads     field, status, coords, changed, keys, entries
