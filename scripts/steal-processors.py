@@ -34,7 +34,7 @@ def steal(processor, share, longest_secs, seed, start):
     bursts = random.Random(seed)
     at = start
     while True:
-        # Most bursts are short, some are long; the mean is a quarter of the longest.
+        # Most bursts are short, and some are long. Their mean is a quarter of the longest burst.
         burst_secs = longest_secs * bursts.random() ** 3
         pause_secs = longest_secs / 4 * (1 / share - 1) * 2 * bursts.random()
         at += pause_secs
