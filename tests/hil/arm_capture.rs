@@ -1,7 +1,7 @@
-//! An arm with emulated CAN motors is moved to poses and photographed at rest, inside the virtual
-//! kernel: the path of `fieldrig calibrate hand-eye --move` below the detection of the target.
-//! Drivers, bus and camera device are those of a real rig; the motors are emulated, and the images
-//! are the test pattern of vivid.
+//! An arm with emulated CAN motors is moved to poses, and a camera takes images of it at rest,
+//! inside the virtual kernel. This tests all of `fieldrig calibrate hand-eye --move` except for the
+//! detection of the target and the estimation. The drivers, the bus and the camera device are the
+//! same as in a real rig. The motors are emulated, and the images are the test pattern of vivid.
 
 use crate::can::Wire;
 use crate::can_motion::Motors;
@@ -56,7 +56,8 @@ fn can_arm_visits_poses_holds_and_stops() {
         );
         assert_eq!(image.gray.len(), 640 * 360);
     }
-    // Before the arm has been at rest for long enough, so that no image ends the wait.
+    // The stop comes before the arm has been at rest for long enough, so that no image ends the
+    // wait.
     assert!(
         capture
             .move_to(&[-0.2, 0.2], &Stop::default())
