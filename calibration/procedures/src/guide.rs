@@ -71,7 +71,7 @@ impl<'a> Guide<'a> {
             self.shown.show_searched(image.size_px, &image.gray, view);
             let text = match &detected.board {
                 Ok(board) => {
-                    // A copy, because the detection itself is kept for the estimate.
+                    // The view is copied, because the detection itself is kept for the estimate.
                     self.views.push(board.view.clone());
                     self.base_from_flange
                         .extend(image.arm.as_ref().map(|arm| arm.base_from_flange));
@@ -85,9 +85,9 @@ impl<'a> Guide<'a> {
         }
     }
 
-    /// The target in each of all images.
+    /// Returns the detected target of every image.
     pub(crate) fn finish(mut self, images: &[CalibrationImage]) -> Vec<DetectedImage> {
-        // Images that arrived after the last update.
+        // Some images may have arrived after the last update.
         self.detect(images);
         self.shown.finish();
         self.detected

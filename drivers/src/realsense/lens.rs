@@ -69,7 +69,7 @@ pub(super) fn intrinsics(
 }
 
 /// Converts our intrinsics to those of the library. The library has no rational model. The closest
-/// polynomial replaces it, or no distortion if no polynomial is close.
+/// polynomial replaces this model. If no polynomial is close, the result has no distortion.
 #[cfg(feature = "emulation")]
 pub(super) fn raw(intrinsics: &Intrinsics) -> sys::rs2_intrinsics {
     let lens = if intrinsics.is_pinhole() {

@@ -79,7 +79,7 @@ impl Topic {
         }
     }
 
-    /// The key in the metadata of a channel that is used.
+    /// The only key that is read from the metadata of the channel; `None` if no key is read.
     pub(super) fn metadata_key(&self) -> Option<&'static str> {
         match self {
             Self::Joints => Some(JOINT_NAMES),

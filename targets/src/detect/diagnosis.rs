@@ -10,7 +10,8 @@ use crate::marker::{Exact, Marker, read_exactly};
 use crate::quad::Quad;
 use crate::spec::{Millimeters, Pattern, TargetSpec};
 
-/// Fewer different markers without an error may occur by chance.
+/// Minimum number of different markers that were read without an error. Fewer such markers may
+/// occur by chance.
 const MIN_MARKERS: usize = 3;
 /// With at least this many cells per side, a single marker without an error does not occur by
 /// chance. Random cells match one of 1000 markers, in any of four rotations, with a probability of
@@ -35,8 +36,8 @@ pub(super) fn marker_size(
     const MIN_PAIRS: usize = 4;
     /// Minimum fraction of pairs that measure the same size if the markers are in the right places.
     const MIN_SAME_FRAC: f64 = 0.8;
-    /// Largest relative difference between sizes that are the same. Lens and perspective change the
-    /// scale from a marker to its neighbor.
+    /// Largest relative difference between sizes that count as the same. Lens and perspective
+    /// change the scale from a marker to its neighbor.
     const SAME: f64 = 0.1;
     let Pattern::Charuco {
         square_m, marker_m, ..
@@ -97,7 +98,8 @@ pub(super) fn other_counts(
     };
     let n_ids = markers.iter().map(|marker| marker.id + 1).max()?;
     // The number of columns alone determines where a marker is. The number of rows is the smallest
-    // that contains all ids, or that of the target with its sides swapped.
+    // number with which the board contains all ids. If the counts can be those of the target with
+    // its sides swapped, the swapped counts are used.
     let counts = (2..=MAX_COLUMNS)
         .filter(|columns| *columns != expected[0])
         .map(|columns| {
@@ -123,8 +125,8 @@ pub(super) fn other_counts(
     })
 }
 
-/// A pattern with other counts of columns and rows. Patterns without counts of markers are the
-/// same.
+/// The pattern with other counts of columns and rows. Patterns without counts of markers are
+/// returned unchanged.
 fn with_counts(pattern: &Pattern, counts: [u32; 2]) -> Pattern {
     match pattern.clone() {
         Pattern::Charuco {

@@ -46,8 +46,9 @@ const MIN_IMAGES_PER_CAMERA: usize = 10;
 /// Minimum gain in cross-validation, dB. Errors of single poses cause smaller gains, too.
 const MIN_GAIN_DB: f64 = 0.1;
 
-/// Minimum gain with the matches of the baseline for a trial with others. It is lower than
-/// [`MIN_GAIN_DB`], because the matches of the baseline favor the baseline.
+/// Minimum gain that a variant must reach with the matches of the baseline before it is tried with
+/// new matches. It is lower than [`MIN_GAIN_DB`], because the matches of the baseline favor the
+/// baseline.
 const MIN_QUICK_GAIN_DB: f64 = 0.03;
 
 /// One round of matching.
@@ -118,8 +119,8 @@ const ANNEALING: f64 = 0.75;
 const MAX_ITERATIONS: usize = 40;
 /// A step smaller than this number of standard deviations ends a round.
 const CONVERGED_STEP_SIGMAS: f64 = 0.05;
-/// Minimum fraction of the last round's matches within this fraction of the band around the
-/// epipolar line. Random matches are spread evenly over the band.
+/// Minimum fraction of the last round's matches that are near the epipolar line. A match is near if
+/// it is within the same fraction of the band. Random matches are spread evenly over the band.
 const MIN_INNER_MATCHES: f64 = 0.5;
 const MAX_INNER_FRAC: f64 = 0.25;
 

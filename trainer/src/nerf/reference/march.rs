@@ -33,7 +33,8 @@ impl RaySegment {
         })
     }
 
-    /// Span of `stride` times the length around the middle.
+    /// Begin and end of a span around the middle of the segment. The span is `stride` times as long
+    /// as the segment.
     fn widened(&self, stride: usize) -> [f64; 2] {
         let middle = self.begin + 0.5 * self.length;
         let reach = 0.5 * self.length * stride as f64;
@@ -91,9 +92,10 @@ impl March {
     }
 
     /// All segments of a ray that are within a range of distances and in occupied cells. The first
-    /// step starts `jitter` steps after `range[0]`. Also returns a margin. It is the smallest of
-    /// the distances from the middle of a segment to a side of its cell, in cells, and of the
-    /// distances from a number of steps to an integer.
+    /// step starts `jitter` steps after `range[0]`. Also returns a margin, which is the smallest of
+    /// two kinds of distances. The first is the distance from the middle of a segment to a side of
+    /// its cell, in cells. The second is the distance from a number of steps to the nearest
+    /// integer.
     ///
     /// Steps have constant length inside the inner cube. Outside, the step at a distance u from the
     /// cube is longer by (1 + u)^2, so that each step changes 1 / (1 + u) by the same amount.
