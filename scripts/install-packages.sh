@@ -221,7 +221,7 @@ check() {
         [ "${npm_major:-0}" -ge 7 ] || need npm "downloads the libraries of the web page (npm 7 or newer)"
         ;;
     nokhwa)
-        # Needed only on Linux, where every build generates nokhwa's V4L2 bindings.
+        # This check is needed only on Linux, where every build generates nokhwa's V4L2 bindings.
         check_libclang
         ;;
     realsense)

@@ -22,7 +22,7 @@ import subprocess
 import sys
 import time
 
-# Higher than any priority that the tests use.
+# This priority is higher than any priority that the tests use.
 PRIORITY = 97
 RT_LIMIT = pathlib.Path("/proc/sys/kernel/sched_rt_runtime_us")
 

@@ -128,7 +128,7 @@ mod tests {
     use crate::scripted::{self, Scripted, joints};
 
     fn millis(millis: i64) -> Stamp {
-        // Stamps of another computer.
+        // These are stamps of another computer.
         Stamp(7_000_000_000_000 + millis * 1_000_000)
     }
 

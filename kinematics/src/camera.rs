@@ -314,7 +314,7 @@ fn check(
 mod tests {
     use super::*;
 
-    const ROUND_TRIP: f64 = 1e-12; // On the plane z = 1.
+    const ROUND_TRIP: f64 = 1e-12; // This is a distance on the plane z = 1.
 
     fn camera(lens: Lens) -> Intrinsics {
         Intrinsics {

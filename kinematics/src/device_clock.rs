@@ -274,8 +274,9 @@ impl ClockMap {
             }
             hull.push(bucket);
         }
-        // Of all lines below the points, this edge minimizes the sum of the distances to them,
-        // because that sum depends only on the height at the mean time.
+        // Of all lines below the points, this edge minimizes the sum of the distances to the
+        // points. The reason is that this sum depends only on the height of the line at the mean
+        // time.
         let edge = hull
             .windows(2)
             .find(|edge| edge[1].device_secs >= mean_secs);

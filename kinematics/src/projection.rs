@@ -71,8 +71,10 @@ impl Intrinsics {
         let distorted = lens.distort(plane)?;
         let pixel = self.pixel_at(distorted.value)?;
         let plane_by_point = Matrix2x3::new(1.0, 0.0, -plane.x, 0.0, 1.0, -plane.y) / z;
-        // The chain rule multiplies the derivatives of the pixel by the distorted point, of that by
-        // the point of the plane `z = 1`, and of that by the point in space.
+        // The chain rule multiplies three derivatives. The first is the derivative of the pixel by
+        // the distorted point. The second is the derivative of the distorted point by the point of
+        // the plane `z = 1`. The third is the derivative of the point of the plane by the point in
+        // space.
         let mut by_point = distorted.jacobian * plane_by_point;
         let mut by_intrinsics = SMatrix::<f64, 2, MAX_INTRINSICS_PARAMS>::zeros();
         // First, compute the derivatives of the distorted point, which do not depend on focal

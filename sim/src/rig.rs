@@ -49,7 +49,7 @@ pub fn open(config: &Config) -> Result<Rig, Error> {
     // This check comes before anything reaches MuJoCo, which aborts the process on invalid numbers.
     config.check()?;
     let cameras = Cameras::new(config)?;
-    // One model for dynamics, rendering and ray casting, each with its own data.
+    // Dynamics, rendering and ray casting share one model, but each has its own data.
     let model = Arc::new(scene::build(config, cameras.largest_view_px())?);
     let renderer = Renderer::start(Arc::clone(&model), scene::near_far_m(config.scene))?;
     let motion = BaseMotion::of(config.scene, config.speed);

@@ -26,7 +26,7 @@ pub struct PinholeView {
 /// Draws a scene and a robot that has no cameras on its flange. The drawing happens on the thread
 /// that has opened this value.
 pub struct RobotMasks {
-    // Dropped before the context.
+    // This field is dropped before the context.
     canvas: Canvas,
     _context: HeadlessContext,
 }

@@ -141,7 +141,7 @@ impl Lattice {
     fn pixel_by_step(&self, cell: Cell, pixel: [f64; 2], step: Cell) -> Option<[f64; 2]> {
         match (self.at(cell, step, -1), self.at(cell, step, 1)) {
             (Some(before), Some(after)) => Some(combine(&[(0.5, after), (-0.5, before)])),
-            // At the border of the board, or next to a missing corner.
+            // The corner is at the border of the board, or next to a missing corner.
             _ => self
                 .one_sided(cell, pixel, step, 1)
                 .or_else(|| self.one_sided(cell, pixel, step, -1)),

@@ -77,7 +77,7 @@ fn can_arm_visits_poses_holds_and_stops() {
         max_difference(&motors.positions(), &held) < 1e-3
             && max_difference(&held, &[-0.2, 0.2]) < CLOSE_RAD
     );
-    // During a motion.
+    // Now the stop comes during a motion.
     let is_complete = capture.move_to(&[0.6, 0.2], &requested_after(Duration::from_millis(400)));
     assert!(!is_complete.expect("the arm stops"));
     let rest = motors.positions();

@@ -171,7 +171,7 @@ fn kernel(script: &str) -> PathBuf {
 /// Creates a root folder with busybox, this program, `fieldrig`, additional programs, and all
 /// required libraries.
 fn install_root(root: &Path, init_script: &str, extra_files: &[(PathBuf, &str)]) {
-    let _ = fs::remove_dir_all(root); // Missing at the first run.
+    let _ = fs::remove_dir_all(root); // The folder is missing at the first run.
     for folder in ["bin", "dev", "lib", "proc", "rigs", "sys", "tmp"] {
         fs::create_dir_all(root.join(folder)).expect("creating a folder");
     }

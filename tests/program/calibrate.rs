@@ -146,7 +146,7 @@ fn lens_and_hand_eye_are_found_from_images() {
         "an unreadable image is named"
     );
 
-    // Samples in another order than that of the file names.
+    // The samples are in another order than the file names.
     let robot_poses = robot_poses();
     let sample = |ix: usize| json!({"base_from_flange": rows(&robot_poses[ix]), "image": format!("images/{ix}.png")});
     let samples: Vec<Value> = (0..robot_poses.len()).rev().map(sample).collect();
@@ -586,7 +586,7 @@ fn weak_excitation_and_mistakes_are_refused() {
         "{result}"
     );
 
-    // All rotations about the flange's z axis.
+    // All rotations are about the flange's z axis.
     let first = robot_poses()[0];
     let base_from_board = first * flange_from_camera() * board_poses()[0];
     let about_z = (0..8).map(|ix| {

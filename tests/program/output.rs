@@ -313,7 +313,7 @@ fn training_survives_a_closed_pipe_and_full_stdout() {
         "{printed}"
     );
     expect_model(folder, "full");
-    // The same without stderr.
+    // The test is repeated without stderr.
     assert_eq!(
         train("mute")
             .stdout(full())

@@ -69,7 +69,7 @@ mod tests {
     /// `reach_m`.
     fn disk_with_neck(reach_m: f64) -> Vec<[f64; 3]> {
         let disk = (0..900).map(|ix| {
-            // Filled evenly along a golden-angle spiral.
+            // The disk is filled evenly along a golden-angle spiral.
             let radius = (f64::from(ix) / 900.0).sqrt();
             let angle = 2.399_963 * f64::from(ix);
             [radius * angle.cos(), radius * angle.sin(), 0.0]

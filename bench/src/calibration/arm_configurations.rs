@@ -126,7 +126,7 @@ impl Arm<'_> {
     /// [`N_POSES`] if such positions are rare.
     fn samples(&self, lens: &Intrinsics, random: &mut Random) -> Vec<HandEyeSample> {
         const MAX_ATTEMPTS: usize = 20_000;
-        // In front of the camera at the mean arm configuration.
+        // The board is in front of the camera at the mean arm configuration.
         let base_from_board = self.forward(&self.home)
             * self.flange_from_camera
             * Transform::new(Vector3::new(-0.1, -0.06, 0.5), Vector3::new(0.2, 0.1, 0.0));

@@ -280,7 +280,7 @@ fn intrinsics_run(seed: u64, scenes: CoverageScenes, lens: Lens, model: LensMode
 pub(super) fn chi_squared_cdf(x: f64, degrees_of_freedom: usize) -> f64 {
     /// Larger values have a probability of 1 in f64.
     const MAX: f64 = 300.0;
-    let is_small = x < MAX; // False for NaN.
+    let is_small = x < MAX; // This comparison is false for NaN.
     if !is_small {
         return 1.0;
     }

@@ -248,7 +248,7 @@ fn warnings(calibration: &IntrinsicsCalibration) -> Vec<String> {
 fn aspect_warning([fx, fy]: [f64; 2]) -> Option<String> {
     const MAX_RATIO: f64 = 1.05;
     let ratio = fy / fx;
-    // False for NaN.
+    // This comparison is false for NaN.
     let is_square = (1.0 / MAX_RATIO..=MAX_RATIO).contains(&ratio);
     (!is_square).then(|| {
         format!(

@@ -171,7 +171,7 @@ impl<'a> JsonObject<'a> {
         let Some(numbers) = self.numbers(key)? else {
             return Ok(None);
         };
-        // Kept for the message, because the conversion consumes the list.
+        // The length is kept for the message, because the conversion consumes the list.
         let n = numbers.len();
         numbers
             .try_into()

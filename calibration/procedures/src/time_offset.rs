@@ -114,7 +114,7 @@ fn read(path: &Path) -> anyhow::Result<Vec<PoseSample>> {
         let norm = quaternion.norm();
         // Quaternions are normalized afterwards. A larger deviation indicates a different order of
         // the columns.
-        let is_unit = (norm - 1.0).abs() < MAX_NORM_ERROR; // False for NaN.
+        let is_unit = (norm - 1.0).abs() < MAX_NORM_ERROR; // This comparison is false for NaN.
         if !is_unit {
             return Err(BadInput(format!(
                 "{}: |qx,qy,qz,qw| is {norm:.3}, expected 1",

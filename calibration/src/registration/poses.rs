@@ -343,7 +343,7 @@ impl NormalEquations {
     fn solve(&self) -> Vec<Vector6<f64>> {
         // An inexact step is corrected by the next Gauss-Newton step.
         const MAX_CG_ITERATIONS: usize = 60;
-        // Of the squared residual.
+        // The tolerance applies to the squared residual.
         const TOLERANCE: f64 = 1e-8;
         let inverses: Vec<Matrix6<f64>> = self
             .diagonal

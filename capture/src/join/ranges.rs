@@ -199,7 +199,7 @@ impl RangeScans {
             }
             let in_scanner = Point3::from(point.position_m).cast::<f64>();
             let range_m = in_scanner.coords.norm();
-            // False for a NaN range.
+            // This comparison is false for a NaN range.
             if range_m >= scanner.min_m && range_m <= scanner.max_m {
                 points.push((column.1 * in_scanner).cast::<f32>().coords.into());
             }

@@ -82,7 +82,7 @@ impl StationDetector {
 }
 
 fn is_near(pose: &Transform, other: &Transform) -> bool {
-    // False for a pose with NaN.
+    // This comparison is false for a pose with NaN.
     (pose.translation.vector - other.translation.vector).norm() <= STATIONARY_M
         && pose.rotation.angle_to(&other.rotation) <= STATIONARY_RAD
 }
@@ -94,7 +94,8 @@ mod tests {
 
     #[test]
     fn station_begins_after_rest_and_ends_with_motion() {
-        // Rests 2 s, moves 1 m within 2 s, rests and turns on the spot, rests.
+        // The base rests for 2 s and moves 1 m within 2 s. Then it rests, turns on the spot, and
+        // rests again.
         let pose = |secs: f64| {
             let x = (0.5 * (secs - 2.0)).clamp(0.0, 1.0);
             let yaw_rad = (0.3 * (secs - 6.0)).clamp(0.0, 0.3);

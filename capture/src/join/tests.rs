@@ -374,7 +374,7 @@ fn replay_reproduces_keyframes_bit_for_bit() {
 #[test]
 fn images_without_joint_readings_are_dropped_and_counted() {
     let rig = rig(&[]);
-    // No joint readings from 2 s to 4 s and after 6 s.
+    // There are no joint readings from 2 s to 4 s and after 6 s.
     let in_gap =
         |nanos: i64| (2_000_000_000..4_000_000_000).contains(&nanos) || nanos > 6_000_000_000;
     let kept = samples(8)

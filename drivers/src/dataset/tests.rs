@@ -451,7 +451,8 @@ fn tum_photos_interpolate_pose_and_use_nearest_depth() {
     );
     let second = &dataset.images[1];
     assert_eq!(second.stamp, Stamp(1_100_000_000));
-    // Halfway between two poses. The depth image was taken 10 ms later and 1 cm further.
+    // The image is halfway between two poses. The depth image was taken 10 ms later and 1 cm
+    // further.
     assert!(
         (second.world_from_camera.translation.vector - Vector3::new(0.105, 2.0, 3.0)).norm()
             < EXACT_M
@@ -1006,7 +1007,7 @@ fn sparse_tum_poses_are_interpolated_but_not_over_gaps() {
     let folder = tum_folder();
     let write = |name: &str, text: String| std::fs::write(folder.path().join(name), text).unwrap();
     let photo = |secs: f64| format!("{secs} rgb/1.000000.png\n");
-    // Poses at 20 Hz without those from 1.2 s to 1.3 s.
+    // The poses have 20 Hz, but the poses from 1.2 s to 1.3 s are missing.
     let poses = (0..20)
         .filter(|ix| !(5..6).contains(ix))
         .map(|ix| f64::from(ix) * 0.05);

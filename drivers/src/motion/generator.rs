@@ -77,7 +77,7 @@ impl TrajectoryGenerator {
                     ix + 1
                 ));
             }
-            // Written so that NaN fails.
+            // The comparison is written so that NaN fails.
             if [joint.velocity, joint.acceleration, joint.jerk]
                 .iter()
                 .any(|limit| !limit.is_finite() || *limit <= 0.0)

@@ -70,7 +70,8 @@ impl Context {
     pub(super) fn new() -> Result<Self, Problem> {
         const WHAT: &str = "start";
         // The library rejects programs compiled for another minor version, although its interface
-        // has only grown. So we pass its own version. SAFETY: only numbers are passed.
+        // has only grown. We therefore pass the library's own version. SAFETY: only numbers are
+        // passed.
         let context = unsafe {
             let version = call(WHAT, |error| sys::rs2_get_api_version(error))?;
             call(WHAT, |error| sys::rs2_create_context(version, error))?

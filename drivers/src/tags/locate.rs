@@ -309,9 +309,10 @@ fn equations(
         d_point_d_pose
             .fixed_view_mut::<3, 3>(0, 3)
             .copy_from(&-point.cross_matrix());
-        // The chain rule multiplies three derivatives: of the pixel by the point at the time of its
-        // row, of that point by the point at mid-exposure, and of the latter by the pose. The
-        // motion during the exposure is known, so its derivative is its rotation.
+        // The chain rule multiplies three derivatives. The first is the derivative of the pixel by
+        // the point at the time of its row. The second is the derivative of this point by the point
+        // at mid-exposure. The third is the derivative of the point at mid-exposure by the pose.
+        // The motion during the exposure is known, so its derivative is its rotation.
         let jacobian = d_pixel_d_point
             * row_from_mid_exposure.rotation.to_rotation_matrix().matrix()
             * d_point_d_pose;

@@ -268,7 +268,7 @@ fn excess(mode: &Mode, bytes_per_sec: f64) -> Option<String> {
         .copied()
         .filter(|hz| required_bytes_per_sec(*hz) > Some(bytes_per_sec))
         .fold(f64::INFINITY, f64::min);
-    // Infinite if no rate exceeds the bandwidth.
+    // The value is infinite if no rate exceeds the bandwidth.
     let megabytes = required_bytes_per_sec(slowest)
         .filter(|required_bytes_per_sec| required_bytes_per_sec.is_finite())?
         * 1e-6;

@@ -528,7 +528,7 @@ fn echo_positions(wire: &WireScan) -> Result<Vec<Option<[f32; 3]>>, Malformed> {
                     numbers.len()
                 )));
             }
-            // False for NaN, too.
+            // This comparison is false for NaN, too.
             let is_near = points
                 .iter()
                 .flatten()

@@ -61,7 +61,7 @@ impl Face {
             world_from_camera: request.world_from_camera
                 * Transform::from_parts(Translation3::identity(), rotation),
             size_px: [edge_px; 2],
-            // A field of view of 90 degrees, so that the six faces cover all directions.
+            // The field of view is 90 degrees, so that the six faces cover all directions.
             focal_px: [f64::from(edge_px) / 2.0; 2],
             principal_px: [f64::from(edge_px) / 2.0; 2],
             shutter: None,

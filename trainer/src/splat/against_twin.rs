@@ -391,7 +391,7 @@ fn long_lists(n: usize, log_scale: f64, opacity_logit: f64) -> (View, Vec<Splat>
     let world_from_camera = view.camera_from_world.inverse();
     let mut splats = scene::small_scene(5, n);
     for (ix, splat) in splats.iter_mut().enumerate() {
-        // Depths that differ, in an order unlike that of the indices.
+        // The depths differ, and their order is unlike the order of the indices.
         let z = 1.5 + 0.0025 * (ix * 149 % n) as f64;
         splat.mean = (world_from_camera * nalgebra::Point3::new(splat.mean[0], splat.mean[1], z))
             .coords

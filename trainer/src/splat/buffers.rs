@@ -538,12 +538,12 @@ impl ImageBuffers {
         Ok(Self {
             n_pixels,
             n_tiles,
-            // Composited in f32, for the gradients: color with transmittance, depth, and the last
-            // splat that contributes.
+            // These buffers are composited in f32, for the gradients. They contain color with
+            // transmittance, depth, and the last splat that contributes.
             image: each("splat.image", 16)?,
             depth: each("splat.depth", 4)?,
             last: each("splat.last", 4)?,
-            // Packed for display and scores.
+            // These buffers are packed for display and scores.
             pixels: each("splat.pixels", 4)?,
             depths: each("splat.depths", 4)?,
             // Four u32 per color and workgroup of 256 pixels.

@@ -59,12 +59,12 @@ impl Default for SplatOptions {
         Self {
             max_splats: 400_000,
             count: CountPolicy::default(),
-            // As in Kerbl et al. 2023, like the weight of D-SSIM.
+            // This value and the weight of D-SSIM are those of Kerbl et al. 2023.
             sh_degree: 3,
             dssim_frac: 0.2,
             depth_per_m: 0.1,
             random_background: 0.25,
-            // Chosen from 0, 6, 13 and 20 by the scores of three data sets
+            // The value was chosen from 0, 6, 13 and 20 by the scores of three data sets
             // (docs/benchmarks/2026-11-23-splats.md, section "Ablation").
             cost_images: 13.0,
             // Twice the fraction of 3DGS-MCMC.

@@ -300,8 +300,8 @@ impl ViewPasses<'_> {
             bin_counts,
         ];
         passes.dispatch(gpu, &pipelines.count_bins, n_blocks * n_windows, &counted);
-        // Turns the counts into offsets: within groups of blocks, then over all groups of a bin,
-        // then over all bins.
+        // These passes turn the counts into offsets, first within groups of blocks, then over all
+        // groups of a bin, and then over all bins.
         let n_groups = n_blocks.div_ceil(u64::from(GROUP));
         passes.dispatch(
             gpu,

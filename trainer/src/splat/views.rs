@@ -128,8 +128,8 @@ pub(crate) fn drop_levels(views: &mut [TrainView], keep: Keep<'_>) -> Vec<Level>
         let coarsest = view.clamped(keep.coarsest);
         for level_ix in 0..view.levels.len() {
             let is_needed = keep.needed.contains(&(view_ix, level_ix));
-            // Training never returns to a coarser resolution. Finer images stay: trials, gains and
-            // contributions use full resolution.
+            // Training never returns to a coarser resolution. Finer images are kept, because
+            // trials, gains and contributions use full resolution.
             if level_ix > coarsest && !is_needed {
                 dropped.extend(view.levels[level_ix].take());
             } else if let Some(level) = &view.levels[level_ix] {

@@ -387,8 +387,8 @@ impl Method for TsdfModel {
             .passes
             .submit_reading(&self.gpu, &[(&field.status, 4 * status::LEN)]);
 
-        // Waits for the previous submit while this one runs. If the previous one overflowed, the
-        // new one had no effect, and its counters need not be read.
+        // This waits for the previous submit while the new one runs. If the previous one
+        // overflowed, the new one had no effect, and its counters need not be read.
         let failed = self.finish_in_flight()?;
         if !failed {
             self.fusion

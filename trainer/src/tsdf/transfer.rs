@@ -163,7 +163,7 @@ impl FieldBuffers {
         let block_coords = self.block_coords(gpu)?;
         let n_after = n_before as usize - evicted.len() + added.len();
         let gone: BTreeSet<u32> = evicted.iter().copied().collect();
-        // Blocks past the new end move into the holes; added blocks fill the rest.
+        // Blocks past the new end move into the holes. Added blocks fill the other holes.
         let end = u32::try_from(n_after).unwrap_or(u32::MAX);
         let moved_slots: Vec<u32> = (end.min(n_before)..n_before)
             .filter(|slot| !gone.contains(slot))

@@ -217,7 +217,7 @@ impl SamplesFile {
                 EntryBoard::Image(_) => {
                     let DetectedImage { name, board, .. } =
                         detected.next().expect("one result per image");
-                    // Listed in `unused` above.
+                    // This key is listed in `unused` above.
                     let Ok(board) = board else { continue };
                     // One lens model applies to all images, and it depends on their size.
                     samples.expect_size(&name, board.size_px)?;

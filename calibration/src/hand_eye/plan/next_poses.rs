@@ -338,7 +338,7 @@ impl Scene<'_> {
             return Some((turned, None));
         }
         // For an arm, the distance and the position of the board in the image are also changed. A
-        // person changes them in any case.
+        // person changes the rotations in any case.
         let distance_m = (solution.camera_from_board(&geometry::a_of(self.input.setup, &turned)))
             .translation
             .vector
@@ -358,7 +358,7 @@ impl Scene<'_> {
         // The margin for an arm is larger, because it moves before anyone can check whether the
         // board is in view.
         const ARM_MARGIN_FRAC: f64 = 0.05;
-        // Without intrinsics: the field of view of a narrow camera.
+        // Without intrinsics, the field of view of a narrow camera is assumed.
         const HALF_VIEW_RAD: f64 = 0.35;
         let center = (camera_from_board * Point3::from(self.options.center_in_board)).coords;
         let normal = camera_from_board.rotation * Vector3::z();

@@ -175,8 +175,8 @@ impl CornerProblem<'_> {
         let n_intrinsics = self.n_intrinsics;
         let n_shared = self.n_shared();
         let corner_px = self.noise.corner_px.unwrap_or(1.0);
-        // Shared parameters first (solution, intrinsics, joint offsets), then the error of the
-        // pose.
+        // The shared parameters come first (solution, intrinsics, joint offsets), then the error of
+        // the pose.
         let mut rows = [vec![0.0; n_shared + 6], vec![0.0; n_shared + 6]];
         for point in &view.points {
             let at = chain.at(&point.point_in_board);
@@ -240,7 +240,7 @@ impl least_squares::Problem for CornerProblem<'_> {
         for view in &self.stops[block_ix] {
             self.evaluate_view(state, view, error, sums)?;
         }
-        // The prior of the pose error. All images at a stop share it, so it is added once.
+        // This is the prior of the pose error. All images at a stop share it, so it is added once.
         for (first, sigma) in [(0, self.noise.rotation_rad), (3, self.noise.translation_m)] {
             for ix in first..first + 3 {
                 let mut row = vec![0.0; n_shared + 6];
@@ -362,7 +362,7 @@ impl PointChain {
                 let camera_from_flange = self.camera_from_x * self.base_from_flange;
                 let rotation = matrix(camera_from_flange.rotation);
                 let by_flange = joined(-rotation * point.cross_matrix(), rotation);
-                // The left Jacobian, likewise.
+                // This is the left Jacobian, also up to first order.
                 let left = Matrix3::identity() + cross * 0.5;
                 let by_error = joined(-rotation * rotated.cross_matrix() * left, rotation);
                 (

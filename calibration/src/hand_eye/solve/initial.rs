@@ -88,7 +88,7 @@ pub(crate) fn consensus(samples: &[Sample]) -> Option<Consensus> {
     /// If each sample has only one pose, this number is sufficient.
     const TRIALS_WITHOUT_CHOICE: usize = 200;
     let metric = Metric::of(samples);
-    // A fixed seed, so that the same samples give the same result.
+    // The seed is fixed, so that the same samples give the same result.
     let mut random = Random::new(1);
     let mut best: Option<(f64, Solution)> = None;
     let has_choice = samples.iter().any(|sample| sample.candidates.len() > 1);

@@ -397,7 +397,7 @@ impl Level {
             .map(|sample| sample * sample)
             .sum::<f32>()
             .sqrt();
-        // Also false for NaN.
+        // This comparison is also false for NaN.
         let has_contrast = norm > MIN_CONTRAST * (DESCRIPTOR_LEN as f32).sqrt();
         has_contrast.then(|| samples.map(|sample| sample / norm))
     }

@@ -79,7 +79,7 @@ pub(super) fn matches(
                 best_of_to[other_ix] = (correlation, ix);
             }
         }
-        // Of equal ones, the first.
+        // If several are equal, the first one is taken.
         let Some(best) = candidates
             .iter()
             .copied()

@@ -111,8 +111,8 @@ impl EmulatedMotor {
     /// Advances the simulation of shaft and watchdog to `now`, and returns the unsolicited frames.
     pub fn report(&mut self, now: Stamp) -> Result<Vec<Frame>, CanError> {
         self.drive.advance(now);
-        // The shaft moves up to `now` under the last command before the watchdog is checked. Called
-        // once per millisecond, this delays the reaction by a millisecond at most.
+        // The shaft moves up to `now` under the last command before the watchdog is checked. This
+        // is called once per millisecond, so the reaction is delayed by a millisecond at most.
         if self.has_timed_out(now) {
             self.time_out(now);
         }

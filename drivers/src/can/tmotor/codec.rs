@@ -146,7 +146,8 @@ pub fn decode_feedback(
             id: frame.id().value(),
         });
     }
-    // Six bytes from older firmware, eight from newer. Any other length is another message.
+    // Older firmware sends six bytes, and newer firmware sends eight. Any other length is another
+    // message.
     let (motor, motion, rest) = match *frame.data() {
         [motor, a, b, c, d, e, ref rest @ ..] if rest.is_empty() || rest.len() == 2 => {
             (motor, [a, b, c, d, e], rest)

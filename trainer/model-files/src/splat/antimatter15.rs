@@ -55,7 +55,7 @@ fn floats(row: &[u8; SPLAT_BYTES], start: usize) -> [f32; 3] {
 
 /// Logarithm of a standard deviation; NaN for invalid ones.
 fn log_scale(scale: f32) -> f32 {
-    // False for NaN and negative numbers. The caller leaves out splats with NaN.
+    // This comparison is false for NaN and negative numbers. The caller leaves out splats with NaN.
     if scale >= 0.0 {
         scale.max(MIN_SCALE).ln()
     } else {

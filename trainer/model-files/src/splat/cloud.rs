@@ -129,7 +129,7 @@ pub fn scan_cloud(n_splats: usize, seed: u64) -> SplatArrays {
         splats
             .log_scales
             .push(flatness.map(|along| (log_size + along) as f32));
-        // Roughly parallel to the wall.
+        // The splats are roughly parallel to the wall.
         splats
             .rotations_wxyz
             .push([1.0, 0.2, 0.2, 1.0].map(|deviation| (deviation * random.normal()) as f32));

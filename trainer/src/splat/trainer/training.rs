@@ -163,7 +163,7 @@ impl Training {
         }
         let counters = self.optimizer.submit(&mut self.recorder);
         self.schedule.step += n_steps;
-        // Waits for the previous submit while this one runs, so that the GPU never idles.
+        // This waits for the previous submit while the new one runs, so that the GPU never idles.
         let failed = self.finish_in_flight()?;
         // After a failure, the failure flag turns this submit into a no-op, too. Its steps are
         // repeated, so its counters are not needed.
