@@ -309,8 +309,8 @@ fn follow_mimics<'a>(
         followers.push((current, mimic));
         current = source;
     };
-    // Back down: substitute each rule into the one of its follower, and remember it. With `source =
-    // a x + b`, the follower is `m (a x + b) + c = (m a) x + (m b + c)`.
+    // Back down: substitute each rule into the rule of the joint that follows, and remember the
+    // result. With `source = a x + b`, the follower is `m (a x + b) + c = (m a) x + (m b + c)`.
     while let Some((follower, mimic)) = followers.pop() {
         let MimicRule {
             source,

@@ -39,7 +39,8 @@ struct JointCommands {
     commands: Commands,
     /// Joint index of each value of a reading.
     joint_ixs: Vec<usize>,
-    /// Added to reported positions to get the true ones; empty if there are none.
+    /// Offsets that are added to reported positions to get the true positions; empty if there are
+    /// none.
     joint_offsets: Vec<f64>,
     position_rad: Joints,
     velocity_rad_s: Joints,

@@ -24,7 +24,7 @@ type Graph = BTreeMap<Module, BTreeSet<Module>>;
 struct File {
     /// Paths as written: relative ones start with `self`, `super`, or the name of a submodule.
     paths: Vec<Module>,
-    /// Names of `use` items and the paths that they refer to. Private ones count, because
+    /// Names of `use` items and the paths that they refer to. Private names count, because
     /// submodules can use them, too.
     names: BTreeMap<String, Module>,
     /// Submodules in separate files that are compiled only for tests.
@@ -115,8 +115,8 @@ impl<'ast> Visit<'ast> for File {
     }
 }
 
-/// Appends the paths of several segments in tokens that are not parsed, such as arguments of
-/// macros.
+/// Appends all paths with several segments that occur in tokens. This is for tokens that are not
+/// parsed, such as arguments of macros.
 fn find_paths(mut tokens: Cursor<'_>, found: &mut Vec<Module>) {
     loop {
         if let Some((path, rest)) = path_at(tokens) {

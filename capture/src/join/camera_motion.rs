@@ -14,7 +14,8 @@ use std::f64::consts::TAU;
 use std::sync::Arc;
 use std::time::Duration;
 
-/// Maximum number of readings kept: those of 20 s at 1 kHz, longer than any image waits.
+/// Maximum number of readings kept. At 1 kHz, they cover 20 s, which is longer than any image
+/// waits.
 const MAX_READINGS: usize = 20_000;
 /// Tolerance for joint positions beyond the limits, radians or meters. Calibration errors and soft
 /// stops stay within it.

@@ -135,7 +135,7 @@ const MAX_POSITION_M: f64 = 1e4;
 #[derive(Debug, Default)]
 struct SkippedImages {
     missing: Vec<String>,
-    /// Names of unusable images with the reason; also in `broken`.
+    /// Names of unusable images, each with the reason. The list `broken` has the same form.
     unusable: Vec<(String, String)>,
     broken: Vec<(String, String)>,
     /// Messages about other parts of the dataset that cannot be used.

@@ -27,7 +27,7 @@ pub(super) fn scene() -> SplatArrays {
     const N_DISCS: usize = 400;
     let mut arrays = synthetic_cloud(N_DISCS, 3);
     for ix in 0..N_DISCS {
-        // The cameras are evenly distributed (Vogel 1979) and face the center.
+        // The discs are evenly distributed on a sphere (Vogel 1979) and face its center.
         let height = 1.0 - (2 * ix + 1) as f64 / N_DISCS as f64;
         let (angle, radius) = (ix as f64 * 2.399_963, (1.0 - height * height).sqrt());
         let out = Vector3::new(radius * angle.cos(), height, radius * angle.sin());

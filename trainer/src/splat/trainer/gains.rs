@@ -30,7 +30,7 @@ pub(super) fn try_gains(training: &mut Training, trials: &mut SplatTrials) -> Re
         .map(|(keyframe, _)| training.views.neighbors(keyframe))
         .collect();
     // Gains of the validation keyframe itself would be fitted to the image on which they are
-    // scored. Gains of neighbors predict these gains only if the exposure really changes.
+    // scored. Gains of its neighbors predict its gains only if the exposure really changes.
     let mut known = LogGains::new();
     let neighbor_ixs = neighbors.iter().flatten().copied().collect();
     add_gains(training, &comparer, &mut known, neighbor_ixs)?;
