@@ -32,7 +32,8 @@ const PRIOR_ROTATION_RAD: f64 = 0.0175;
 /// Maximum number of steps at each level. Weights that depend on the residuals make convergence
 /// slower than plain Gauss-Newton.
 const MAX_ITERATIONS: usize = 20;
-/// A step smaller than this number of standard deviations ends a level, the finest first.
+/// A step smaller than this number of standard deviations ends a level. The value of the finest
+/// level comes first.
 const CONVERGED_STEP_SIGMAS: [f64; 4] = [0.1, 0.3, 0.3, 0.3];
 /// Factor on the brightness noise. Near occlusions and reflections, the brightness errors are the
 /// same in all pairs of two stations. Depth errors are not.
@@ -113,8 +114,8 @@ impl StationCorrection {
     /// identity unless the correction is accepted. `world_from_base` is the reported pose of the
     /// base.
     ///
-    /// * `share`: fraction of the path to the station, 0 to 1, because the error grows along the
-    ///   path.
+    /// * `share`: fraction of the path to the station, 0 to 1. It scales the correction, because
+    ///   the error grows along the path.
     pub fn map_from_odom(&self, world_from_base: &Transform, share: f64) -> Transform {
         if !self.kept {
             return Transform::identity();
@@ -411,7 +412,7 @@ mod tests {
         .inverse()
     }
 
-    /// Images of two stations, those of the second one with a wrong base pose.
+    /// Images of two stations. The images of the second station have a wrong base pose.
     fn keyframes_of_two_stations(
         odom_from_true: &Transform,
         noise: f64,

@@ -192,12 +192,12 @@ pub enum Reports {
     WhenPolled,
     /// Periodically, without being polled.
     Unasked {
-        /// What to check if it does not.
+        /// What to check if the motor does not report.
         if_silent: &'static str,
     },
     /// In reply to each command.
     WhenCommanded {
-        /// What to check if it does not.
+        /// What to check if the motor does not report.
         if_silent: &'static str,
     },
 }
