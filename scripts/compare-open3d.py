@@ -38,8 +38,8 @@ from scipy.sparse.csgraph import connected_components
 CPU = o3c.Device("CPU:0")
 # fieldrig's truncation for exact depth, in voxels.
 TRUNCATION_VOXELS = 4.0
-# fieldrig's vertices are f32 coordinates of a few meters. Coincident vertices of neighboring blocks differ by less
-# than this.
+# fieldrig's vertices have f32 coordinates of a few meters. Vertices of neighboring blocks at the
+# same position differ by less than this.
 WELD_M = 1e-5
 N_SAMPLES = 400_000
 OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])

@@ -1,10 +1,11 @@
 #!/bin/sh
 # Installs a pinned librealsense2 into .deps/realsense, for the tests and for machines without the RealSense SDK.
 #
-# Debian has no package for it. The extension module in the wheel pyrealsense2 on the Python package index contains
-# the whole library and exports its C functions. The script renames the module and adds a stub library that defines
-# Python's C functions, none of which is ever called. Programs then link with it like with the SDK's library. Does
-# nothing if the right version is already there.
+# Debian has no package for it. The extension module in the wheel pyrealsense2 on the Python package
+# index contains the whole library and exports its C functions. The script renames the module and
+# adds a stub library that defines Python's C functions. None of these functions is ever called.
+# Programs then link with the module as with the SDK's library. The script does nothing if the right
+# version is already there.
 set -eu
 
 version=2.56.5
@@ -18,7 +19,7 @@ fi
 cd "$(dirname "$0")/.."
 folder=.deps/realsense
 library=librealsense2.so.2.56
-# Written last. Identifies all inputs, including this script.
+# This stamp is written last. It identifies all inputs, including this script.
 stamp="$sha256 $(sha256sum scripts/fetch-realsense.sh | cut -d ' ' -f 1)"
 
 if [ "$(cat "$folder/made-of" 2>/dev/null)" = "$stamp" ]; then
@@ -60,7 +61,8 @@ PYTHON
 # Symbols of Python's C interface are resolved when the library is loaded, so each needs a definition.
 nm -D --undefined-only "$download/$library" | awk '$2 ~ /^_?Py/ { print "char " $2 "[64];" }' >"$download/no-python.c"
 cc -shared -nostdlib -Wl,-soname,librealsense2-no-python.so -o "$download/librealsense2-no-python.so" "$download/no-python.c"
-# Two separate calls: with both options in one call, patchelf 0.14 applies only one.
+# Two separate calls are needed, because patchelf 0.14 applies only one of the two options in a
+# single call.
 patchelf --set-soname "$library" "$download/$library"
 patchelf --add-needed librealsense2-no-python.so "$download/$library"
 # shellcheck disable=SC2016

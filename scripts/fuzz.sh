@@ -23,8 +23,9 @@ for target in "${@:-${all[@]}}"; do
         [ ! -d "$folder" ] || seeds+=("$folder")
     done
     echo "== $target"
-    # Dead code of a dependency (pulp) does not compile with a sanitizer, so it is left out.
-    # A target that does not exist or does not build is not a finding: the script stops here.
+    # Dead code of a dependency (pulp) does not compile with a sanitizer, so it is left out. If a
+    # target does not exist or does not build, the script stops here, because this is not a finding
+    # of fuzzing.
     "${cargo[@]}" fuzz build --strip-dead-code "$target"
     mkdir -p "fuzz/corpus/$target"
     "${cargo[@]}" fuzz run --strip-dead-code "$target" "fuzz/corpus/$target" "${seeds[@]}" -- \

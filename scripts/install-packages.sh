@@ -54,7 +54,8 @@ elf_machine() {
     od -An -tx1 -j18 -N2 "$1"
 }
 
-# is_native FILE: whether programs of this system can load a library. Often, a 32-bit library is also installed.
+# is_native FILE: whether programs of this system can load a library. This check is needed because
+# 32-bit libraries are often installed, too.
 is_native() {
     [ -r "$1" ] && [ "$(elf_machine "$1")" = "$(elf_machine /bin/sh)" ]
 }
@@ -174,8 +175,9 @@ qemu_libraries() {
         libspice-server1 libtinfo6 libudev1 liburing2 libusb-1.0-0 libusbredirparser1 libvdeplug2 libzstd1 zlib1g
 }
 
-# check_qemu: a newer qemu-utils, such as that of backports, conflicts with the QEMU of Debian 12. It is not removed: then only QEMU's libraries
-# are installed, and scripts/fetch-qemu.sh unpacks QEMU into .deps/qemu.
+# check_qemu: checks for QEMU. A newer qemu-utils, such as that of backports, conflicts with the
+# QEMU of Debian 12. The newer package is not removed. Instead, only QEMU's libraries are installed,
+# and scripts/fetch-qemu.sh unpacks QEMU into .deps/qemu.
 check_qemu() {
     installed=$(dpkg-query -W -f '${Version}' qemu-utils 2>/dev/null || true)
     if [ -x /usr/bin/qemu-system-x86_64 ] || [ -z "$installed" ] || dpkg --compare-versions "$installed" lt 1:8.0; then
@@ -219,7 +221,7 @@ check() {
         [ "${npm_major:-0}" -ge 7 ] || need npm "downloads the libraries of the web page (npm 7 or newer)"
         ;;
     nokhwa)
-        # Needed only on Linux, where every build generates nokhwa's V4L2 bindings.
+        # This check is needed only on Linux, where every build generates nokhwa's V4L2 bindings.
         check_libclang
         ;;
     realsense)
@@ -304,10 +306,10 @@ if ! command -v apt-get >/dev/null 2>&1; then
     echo "apt-get not found: install the equivalents of these Debian packages with the package manager of this system" >&2
     give_up
 fi
-# If another apt holds the lock, wait for it.
-# It never removes a package of this computer.
+# If another apt holds the lock, this command waits for it. The command never removes a package of
+# this computer.
 install="apt-get install -y -q --no-install-recommends --no-remove -o DPkg::Lock::Timeout=300"
-# After `;`, the installation continues even if a repository is unreachable.
+# Because of the `;`, the installation continues even if a repository is unreachable.
 line="apt-get update -q; $install$missing"
 # An interrupted installation must be finished first, together with its dependencies.
 if [ -n "$(dpkg --audit 2>/dev/null)" ]; then

@@ -17,7 +17,8 @@ if ! node -e 'process.exit(parseInt(process.versions.node) < 18 ? 1 : 0)' >/dev/
         "npm $(npm --version 2>/dev/null || echo missing); run: scripts/install-packages.sh web" >&2
     exit 1
 fi
-# Packages are installed again only when the lock file has changed. Those for checks include those for the build.
+# Packages are installed again only when the lock file has changed. The packages for checks include
+# the packages for the build.
 for installed in check "$1"; do
     if cmp -s package-lock.json "node_modules/.installed-$installed"; then
         exit 0

@@ -150,7 +150,8 @@ class Trial:
 
     def disk(self):
         subprocess.run(["mount", "-t", "tmpfs", "-o", "size=6m", "tmpfs", self.out], check=True)
-        # Fill a random part of the disk, so that writing fails at a different file in each trial.
+        # This fills a random part of the disk, so that writing fails at a different file in each
+        # trial.
         (self.out / "filler").write_bytes(bytes(self.random.randrange(6 << 20)))
         command = self.command(10)
         process = self.start(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT)
@@ -175,7 +176,8 @@ class Trial:
 
     def kill_train(self):
         steps = ["--steps", str(self.args.steps), "--method", self.args.method, "--checkpoint-secs", "1"]
-        # Few, small test images: without a GPU, evaluation takes most of the time.
+        # The test images are few and small, because evaluation takes most of the time without a
+        # GPU.
         more = ["--scale", "0.25", "--holdout", "30", *(SMALL if self.args.method == "splat" else [])]
         command = [self.exe, "train", self.data, *steps, *more, "--json", "--out"]
         uninterrupted = self.data.parent / f"whole-{self.args.method}"

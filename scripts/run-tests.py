@@ -33,15 +33,17 @@ BESIDE = ("fieldrig hil",)
 # Tests that need other settings than the rest of their program: program, part of the names of the tests, environment. Mesa's
 # software Vulkan has subgroups of 16 lanes with this width, so that the kernels for GPUs run, too.
 SEPARATE = tuple((name, "needs_large_subgroups", {"LP_NATIVE_VECTOR_WIDTH": "512"}) for name in ("gpu unit", "trainer unit"))
-# Programs that only compute. They run one after another beside all others, with a lower priority, and use the time in which the
-# others wait for clocks, devices and browsers.
+# Programs that only compute. They run one after another beside all other programs, with a lower
+# priority. They use the time in which the other programs wait for clocks, devices and browsers.
 COMPUTING = (
     "trainer unit", "trainer unit needs_large_subgroups", "gpu unit", "gpu unit needs_large_subgroups", "calibration unit",
     "sim rigs", "sim unit", "targets accuracy", "targets photos", "examples in documentation",
 )
-# Steps by which a priority differs. A program with a priority that is lower by 10 gets a tenth of a busy processor.
+# Steps by which a priority differs. A program whose priority is lower by 10 gets a tenth of a busy
+# processor.
 NICE = 10
-# Programs that start first, because they take longest. The others follow in the order of their names.
+# Programs that start first, because they take longest. The other programs follow in the order of
+# their names.
 FIRST = ("fieldrig program", "trainer unit")
 # With --quick: only programs with unit tests, without these modules, whose tests need a GPU. No GPU is visible to the programs,
 # so a test that needs one fails unless its module is listed here.
@@ -93,13 +95,15 @@ class Program:
         # Mesa's software Vulkan runs kernels on the calling thread, which takes a third less computing time than handing parts
         # of them to other threads: tests run in parallel anyway.
         environment = dict(os.environ, LP_NUM_THREADS="0", **self.environment)
-        # With a single thread, the harness prints a line in two parts, and the output of the test comes between them.
+        # With a single thread, the test harness prints a line in two parts, and the output of the
+        # test comes between them.
         environment["RUST_TEST_THREADS"] = str(max(2, os.cpu_count()))
         with tempfile.TemporaryDirectory() as folder, open(pathlib.Path(folder, "output"), "w+b") as output:
             self.output_path = pathlib.Path(folder, "output")
             skipped = pathlib.Path(folder, "skipped")
             environment["FIELDRIG_SKIPPED_TESTS"] = str(skipped)
-            # A process group of its own, so that `stop` ends the programs that it starts.
+            # The program gets its own process group, so that `stop` also ends the programs that it
+            # starts.
             self.process = subprocess.Popen(
                 self.command,
                 cwd=self.folder,
@@ -171,7 +175,8 @@ def build(cargo_arguments):
             if is_unit and target["kind"] == ["bin"]:
                 name += " (program)"
             arguments = ["-Z", "unstable-options", "--report-time"]
-            # The option for times is unstable; this variable allows it. Not for cargo, which would compile dependencies again.
+            # The option for times is unstable, and this variable allows it. The variable is not set
+            # for cargo, which would compile dependencies again.
             programs.append(Program(name, [message["executable"], *arguments], folder, {"RUSTC_BOOTSTRAP": "1"}))
     if cargo.returncode != 0:
         sys.exit(cargo.returncode)

@@ -22,7 +22,7 @@ import subprocess
 import sys
 import time
 
-# Higher than any priority that the tests use.
+# This priority is higher than any priority that the tests use.
 PRIORITY = 97
 RT_LIMIT = pathlib.Path("/proc/sys/kernel/sched_rt_runtime_us")
 
@@ -34,7 +34,7 @@ def steal(processor, share, longest_secs, seed, start):
     bursts = random.Random(seed)
     at = start
     while True:
-        # Most bursts are short, some are long; the mean is a quarter of the longest.
+        # Most bursts are short, and some are long. Their mean is a quarter of the longest burst.
         burst_secs = longest_secs * bursts.random() ** 3
         pause_secs = longest_secs / 4 * (1 / share - 1) * 2 * bursts.random()
         at += pause_secs

@@ -78,7 +78,7 @@ make_root() {
     cp /etc/resolv.conf "$root/etc/resolv.conf"
     [ -z "${FILES-}" ] || cp -a "$FILES/." "$root/"
     mkdir -p "$root/src" "$root/var/cache/apt/archives"
-    # Packages do not need to be synced to the disk, because the chroot is temporary.
+    # dpkg does not need to sync packages to the disk, because the chroot is temporary.
     echo force-unsafe-io >"$root/etc/dpkg/dpkg.cfg.d/unsafe-io"
     git ls-files -z -co --exclude-standard | tar --create --null --ignore-failed-read --files-from=- 2>/dev/null |
         tar --extract --directory "$root/src" --no-same-owner

@@ -29,8 +29,8 @@ impl<T: Send + 'static> Task<T> {
     }
 
     fn start_on(builder: Builder, work: impl FnOnce() -> T + Send + 'static) -> Self {
-        // A failed start drops its closure, so the work is kept here. The mutex is never contended:
-        // either the thread or, after a failure, the caller takes the work.
+        // A failed start drops its closure, so the work is kept here. The mutex is never contended,
+        // because only one side takes the work. This is the thread or, after a failure, the caller.
         let kept = Arc::new(Mutex::new(Some(work)));
         // A panic cannot happen while the lock is held, so a poisoned lock holds valid work.
         let take =
@@ -75,8 +75,9 @@ pub fn start_threads() -> Result<(), Box<dyn std::error::Error + Send + Sync>> {
     Ok(rayon::ThreadPoolBuilder::new().build_global()?)
 }
 
-/// Runs `work` in a separate thread pool, on three quarters of the processors. In the global pool,
-/// training, which downscales images on all processors, would wait for it.
+/// Runs `work` in a separate thread pool, on three quarters of the processors. Training downscales
+/// images in the global pool on all processors. If `work` ran in the global pool, training would
+/// wait for it.
 pub fn run_in_background_pool<T: Send>(work: impl FnOnce() -> T + Send) -> T {
     // One thread in four stays free for training and for the drivers, whose queues drop samples if
     // they wait for a processor.
@@ -95,7 +96,7 @@ pub fn run_in_background_pool<T: Send>(work: impl FnOnce() -> T + Send) -> T {
 
 fn warn_once(error: &dyn std::error::Error) {
     static HAS_WARNED: AtomicBool = AtomicBool::new(false);
-    // A limit affects every later task, too, and repeated warnings would hide other messages.
+    // A limit affects every later task, too. Repeated warnings would hide other messages.
     if !HAS_WARNED.swap(true, Ordering::Relaxed) {
         log::warn!(
             "cannot start a thread: {error}; the calling thread does the work, which slows the run down; raise the limits on \

@@ -17,8 +17,8 @@ use trainer::{MethodOptions, ModelOptions, ModelSpec};
 /// Training time of a run if no flag limits it. The twelve variants with several seeds then take
 /// minutes. Longer runs are closer to the final quality of a model.
 const DEFAULT_SECONDS: f64 = 16.0;
-/// Times at which the table lists the PSNR, seconds. Some parts only speed up the beginning, and
-/// gain nothing at the end.
+/// Times at which the table lists the PSNR, seconds. Some parts of the method only speed up the
+/// beginning, and gain nothing at the end.
 const TABLE_SECS: [f64; 2] = [1.0, 4.0];
 
 /// The unchanged method, to which all variants are compared.
@@ -163,7 +163,8 @@ pub fn run(options: &AblationOptions, host: &Host<'_>) -> Result<BenchResult> {
             baseline = finished.clone();
         }
         rows.extend(VariantResult::of(change.name, &baseline, finished));
-        // Written after every variant, so that an interrupted bench leaves results.
+        // The findings are written after every variant, so that an interrupted bench leaves
+        // results.
         page = Some(findings(options, &runs, &data, &rows)?);
     }
     BenchResult::of(page, data.data.data_losses)
@@ -179,8 +180,8 @@ impl VariantResult {
         let median_of = |of: &dyn Fn(&Run) -> Option<f64>| {
             median(&runs.iter().filter_map(of).collect::<Vec<_>>())
         };
-        // Runs with the same seed are compared. The seed affects both in a similar way, so their
-        // difference varies less than the difference of the medians.
+        // Runs with the same seed are compared. The seed affects both runs in a similar way, so the
+        // difference of a pair varies less than the difference of the medians.
         let gain: Vec<f64> = baseline
             .iter()
             .zip(&runs)
@@ -237,8 +238,8 @@ impl VariantResult {
 
 /// PSNR of a run at a time of the evaluation schedule, dB.
 fn psnr_near(run: &Run, secs: f64) -> Option<f64> {
-    // An evaluation begins after the step during which it became due, so it is somewhat late. The
-    // next one is twice as late.
+    // An evaluation begins after the step during which it became due, so its time is slightly above
+    // the scheduled time. The next evaluation is at twice the scheduled time.
     run.curve()
         .into_iter()
         .find(|(time, _)| (time / secs - 1.0).abs() < 0.1)

@@ -16,9 +16,9 @@ use trainer::{MethodOptions, ModelSpec};
 
 /// Training time of a run if no flag limits it.
 const DEFAULT_SECONDS: f64 = 60.0;
-/// Gain below which doubling the splats is not worthwhile, dB: the same value with which the
-/// trainer chooses their number, see the text of the page. Doubling the splats doubles the memory
-/// of the model.
+/// Gain below which doubling the splats is not worthwhile, dB. The trainer uses the same value to
+/// choose their number, as the text of the page explains. Doubling the splats doubles the memory of
+/// the model.
 const MIN_GAIN_DB: f64 = 0.1;
 
 /// Options of [`run`].
@@ -94,7 +94,8 @@ pub fn run(options: &BudgetOptions, host: &Host<'_>) -> Result<BenchResult> {
         for seed in first_seed..first_seed.saturating_add(options.seeds) {
             let capped_options = base_options.clone().with(|model| {
                 model.common.seed = seed;
-                // With a cap, the number of splats is the size to measure. Tests would reduce it.
+                // With a cap, the number of splats is the size to measure. The trainer's tests of
+                // this number would reduce it.
                 model.specific.count = if cap.is_some() {
                     CountPolicy::ToCap
                 } else {
@@ -197,7 +198,7 @@ fn accuracy_chart(subtitle: &str, by_cap: &[&Capped], chosen: Option<&Capped>) -
         ),
         line_ix: 1,
     });
-    // A larger cap may give fewer splats, if neither is reached.
+    // If neither of two caps is reached, the larger one may give fewer splats.
     let mut points: Vec<Point> = by_cap.iter().map(|capped| capped.point()).collect();
     points.sort_by(|a, b| a.x.total_cmp(&b.x));
     Chart {

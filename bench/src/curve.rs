@@ -124,13 +124,13 @@ pub fn run(options: &CurveOptions, host: &Host<'_>) -> Result<BenchResult> {
     for (path, n_left) in options.data.iter().zip((1..=options.data.len()).rev()) {
         let data = runs.load(path, &mut names)?;
         data_losses.extend(data.data.data_losses.iter().cloned());
-        // The methods of later data sets are not known yet. The estimate assumes the same number,
-        // and is corrected with each data set.
+        // The methods of later data sets are not known yet. The estimate of the number of runs
+        // assumes as many methods as for this data set, and is corrected with each data set.
         let model_specs = bench.applicable(&data);
         runs.expect((n_left * model_specs.len()) as u64 * options.seeds);
         for model_spec in model_specs {
             let mut finished = Vec::new();
-            // An empty result, which the first run replaces.
+            // This result is empty until the first run replaces it.
             bench
                 .results
                 .push(CurveResult::of_runs(&data, model_spec.kind, Vec::new()));
@@ -229,7 +229,7 @@ impl CurveResult {
         }
     }
 
-    /// The final PSNR over the size of the model; without a point if either is unknown.
+    /// The final PSNR over the size of the model. The line has no point if either value is unknown.
     fn size_line(&self) -> Line {
         let Summary { psnr, bytes, .. } = self.summary;
         let megabytes = bytes
@@ -252,8 +252,8 @@ impl CurveResult {
 /// Median and range at each scheduled evaluation that at least half of the runs reached, ordered by
 /// time.
 fn median_curve(curves: &[Vec<(f64, f64)>]) -> Vec<CurvePoint> {
-    // Keyed by the bits of the scheduled time, which sort like the time. The flag marks a final
-    // evaluation between two scheduled times, which gets a separate group.
+    // The key contains the bits of the scheduled time, which sort like the time itself. The flag
+    // marks a final evaluation between two scheduled times, which gets a separate group.
     let mut groups: BTreeMap<(u64, bool), Vec<(f64, f64)>> = BTreeMap::new();
     for curve in curves {
         let mut taken = HashSet::new();

@@ -1,8 +1,8 @@
 //! Disturbs keyframes, for example with pose noise or a clock offset of a given size.
 //!
-//! A clock offset and an exposure step affect all images including test images, as they would on a
-//! robot. Pose noise does not affect test images: they keep their true poses, so that the scores
-//! measure the model.
+//! A clock offset and an exposure step affect all images, including test images, because this is
+//! also what happens on a robot. Pose noise does not affect test images: they keep their true
+//! poses, so that the scores measure the model.
 //!
 //! A disturbance is a pure function of its size, a seed and the keyframes. Its effect on a keyframe
 //! does not depend on the order of the keyframes. With one seed, all sizes use the same random
@@ -29,8 +29,8 @@ pub enum Disturbance {
     Keyframes,
 }
 
-/// Rotation noise per translation noise, degrees per millimeter: 5 degrees at 50 mm. At a distance
-/// of 0.57 m, both move a point by the same length.
+/// Rotation noise per translation noise, degrees per millimeter. At 50 mm, the rotation noise is 5
+/// degrees. Rotation and translation move a point at a distance of 0.57 m by the same length.
 const DEGREES_PER_MM: f64 = 0.1;
 
 impl Disturbance {
@@ -160,7 +160,7 @@ fn pose_noise(keyframes: &[Arc<Keyframe>], sigma_mm: f64, seed: u64) -> Vec<Arc<
 /// Source: Box and Muller 1958, applied to uniform numbers from a hash.
 fn six_normals(seed: u64, camera: &str, stamp: Stamp) -> [f64; 6] {
     let mut normals = [0.0; 6];
-    // A hash has no state: the noise of a keyframe does not depend on the other keyframes.
+    // A hash has no state, so the noise of a keyframe does not depend on the other keyframes.
     for (ix, pair) in (0_u8..).zip(normals.chunks_exact_mut(2)) {
         let mut hash = Sha256::new();
         hash.update(seed.to_le_bytes());
@@ -230,8 +230,8 @@ fn at(trajectory: &Trajectory, nanos: f64) -> Option<(Transform, Option<Twist>)>
 /// Darkens the first half of the capture and brightens the second, by half of `step_ev` each to
 /// preserve the mean.
 fn exposure_step(keyframes: &[Arc<Keyframe>], step_ev: f64) -> Vec<Arc<Keyframe>> {
-    // The median of the stamps of training images, so that both exposures have the same number of
-    // them.
+    // The exposure changes at the median stamp of the training images, so that both exposures have
+    // the same number of training images.
     let mut stamps: Vec<Stamp> = keyframes
         .iter()
         .filter(|keyframe| keyframe.split != Split::Test)
@@ -406,7 +406,8 @@ pub(crate) mod tests {
 
     #[test]
     fn pose_noise_has_the_requested_std() {
-        /// Four standard errors of the standard deviation over three axes of 3500 keyframes.
+        /// The tolerance is four standard errors of the standard deviation over three axes of 3500
+        /// keyframes.
         const REL_TOLERANCE: f64 = 0.03;
         let capture = capture(4000);
         let noisy = pose_noise(&capture, 20.0, 7);
@@ -479,8 +480,8 @@ pub(crate) mod tests {
                 );
             }
         }
-        // If stamps count images, the image rate defines a second: at 1 image per second, 100 ms is
-        // 0.1 images.
+        // If stamps count images, the image rate defines the length of a second. At 1 image per
+        // second, 100 ms is 0.1 images.
         let counted = Disturbance::ClockOffset.apply(&capture, 100.0, 1, 1e8);
         assert!((counted[1].world_from_camera.translation.x - 0.11).abs() < TOLERANCE);
         let alone = clock_offset(&capture[1..2], 1e8);
@@ -499,7 +500,8 @@ pub(crate) mod tests {
                 .all(|(byte, after)| byte == *after as usize)
         );
         let doubled = exposure_table(2.0);
-        // 128 is 0.2159 in linear light; twice that is 175.6. 188 is just above 0.5.
+        // The byte 128 is 0.2159 in linear light, and twice this light is the byte 175.6. The byte
+        // 188 is just above 0.5 in linear light.
         assert_eq!(
             (doubled[0], doubled[128], doubled[188], doubled[255]),
             (0, 176, 255, 255)

@@ -21,7 +21,7 @@ pub struct FieldOptions {
     /// Rays per step.
     pub n_rays: u32,
     /// Samples per step, one row for each value; the defaults if empty. Each value is rounded down
-    /// to a multiple of the rays, but at least one sample per ray.
+    /// to a multiple of the number of rays. At least one sample per ray is used.
     pub n_samples: Vec<u32>,
     /// Number of timed steps, of which the median is reported. If `None`: 100, or 3 on the CPU.
     pub n_repeats: Option<u32>,

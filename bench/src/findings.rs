@@ -56,7 +56,8 @@ impl Findings {
     ///
     /// If a file cannot be written.
     pub fn write(&self, folder: &Path) -> Result<PathBuf> {
-        // The numbers first: they are the only part that cannot be made again from another one.
+        // The numbers are written first, because they are the only part that cannot be recreated
+        // from another part.
         let path_with = |suffix: &str| folder.join(format!("{}{suffix}", self.name));
         run_folder::write_json(&path_with(".json"), &self.numbers)?;
         let mut page = self.page_head();

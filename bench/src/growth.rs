@@ -11,8 +11,9 @@ const SETTLE_SECS: f64 = 60.0;
 /// Minimum time over which a rate is measured. Over a shorter time, a rate per hour is mostly noise
 /// of the allocator.
 const MIN_SPAN_SECS: f64 = 60.0;
-/// Maximum number of samples for a rate. More samples are reduced to medians of at most this many
-/// groups, because the number of pairs grows with the square: 400 groups are 80 thousand pairs.
+/// Maximum number of samples for a rate. If there are more samples, they are reduced to the medians
+/// of at most this many groups. The reason is that the number of pairs grows with the square. For
+/// example, 400 groups are 80 thousand pairs.
 const MAX_GROUPS: usize = 400;
 const SECS_PER_HOUR: f64 = 3600.0;
 
@@ -65,7 +66,7 @@ impl Excluded {
             Self::Model => sample.model_bytes,
             Self::Training => sample.gpu_bytes.saturating_sub(sample.gpu_image_bytes),
         };
-        // The viewers of a bench run in the same process, and store the times of every picture.
+        // The viewers of a bench run in the measured process, and store the times of every picture.
         let times_bytes = sample.pictures * size_of::<ReceivedPicture>() as u64;
         sample.resident_bytes as f64 - (excluded_bytes + times_bytes) as f64
     }
@@ -247,7 +248,7 @@ mod tests {
     #[test]
     fn resident_memory_is_read() {
         let (before, _) = resident_bytes().expect("Linux");
-        // Far more than concurrent tests free at the same time.
+        // This is far more memory than concurrent tests free at the same time.
         let held = vec![1u8; 512 << 20];
         let (now, peak) = resident_bytes().expect("Linux");
         assert!(

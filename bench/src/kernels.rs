@@ -58,9 +58,9 @@ pub struct KernelsOptions {
     pub n_repeats: Option<u32>,
     /// Whether the camera is inside the cloud, so that only some of the splats are visible.
     pub inside: bool,
-    /// Whether to measure a step like those of a scan with depth: its splats are distributed
-    /// unevenly, and the loss includes D-SSIM and depth. Cannot be combined with `cloud` or
-    /// `inside`.
+    /// Whether to measure a step as in training on a scan with depth. In such a step, the splats
+    /// are distributed unevenly, and the loss includes D-SSIM and depth. Cannot be combined with
+    /// `cloud` or `inside`.
     pub scan: bool,
     /// Whether to report the GPU time of each pass.
     pub profile: bool,

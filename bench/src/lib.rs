@@ -1,11 +1,12 @@
-//! The experiments of `fieldrig bench`: they train many models, or measure a part of the program,
+//! The experiments of `fieldrig bench`. They train many models, or measure a part of the program,
 //! and draw charts.
 //!
 //! [`curve`], [`budget`], [`ablation`] and [`stability`] train models. They save each finished run
 //! to a file, so that a bench restarted in the same folder does not repeat it. [`kernels`] and
-//! [`field`] measure training speed, [`stamps`] the errors of image stamps, [`calibration`] the
-//! accuracy of calibration, [`live`] a live run with viewers, and [`memory`] the memory of a long
-//! run. The results are [`Findings`]: JSON with every number, charts, and a page.
+//! [`field`] measure training speed. [`stamps`] measures the errors of image stamps, and
+//! [`calibration`] measures the accuracy of calibration. [`live`] measures a live run with viewers,
+//! and [`memory`] measures the memory of a long run. The results are [`Findings`], which contain
+//! JSON with every number, charts, and a page.
 //!
 //! The caller opens the GPU, requests stops and receives reports ([`Host`], [`BenchObserver`]).
 //!

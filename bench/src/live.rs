@@ -151,7 +151,7 @@ impl LiveRun {
         viewers: &[Viewer],
         timeline: &Timeline,
     ) -> Self {
-        // Only the first model is measured; it is the one that viewers see.
+        // Only the first model is measured, because it is the one that viewers see.
         let session = &live.sessions()[0];
         let progress = session.progress();
         let seconds = session.time().secs();
@@ -221,7 +221,7 @@ fn latencies(
     let named = named
         .into_iter()
         .filter_map(|(name, latency)| Some((name.to_owned(), latency?)));
-    // In the order in which they occur: a picture is received before it is shown.
+    // The latencies are in the order in which they occur. A picture is received before it is shown.
     let mut since_shutter = session::latencies(keyframes);
     let shown_at = since_shutter
         .iter()
@@ -423,8 +423,8 @@ pub fn findings(input: &str, runs: &[LiveRun]) -> Findings {
         });
     }
     let mut charts = vec![("", accuracy_chart(input, runs))];
-    // The first run with viewers; without viewers, there is no latency. `max_by_key` returns the
-    // last of several equal runs, hence the reversed order.
+    // The chart shows the first run with viewers, because a run without viewers has no latency. The
+    // order is reversed because `max_by_key` returns the last of several equal runs.
     let charted = runs
         .iter()
         .rev()

@@ -55,8 +55,8 @@ impl LiveDisturbance {
                     [-0.5, 0.5].map(|fraction| exposure_table(2.0_f64.powf(fraction * self.level)));
                 let mut step_at: Option<Stamp> = None;
                 Some(Box::new(move |keyframe| {
-                    // Relative to the first keyframe, because stamps of a recording are not times
-                    // of this run.
+                    // The time of the step is relative to the first keyframe, because stamps of a
+                    // recording are not times of this run.
                     let step_at = *step_at.get_or_insert(keyframe.stamp.plus_secs(step_after_secs));
                     let mut changed = keyframe.as_ref().clone();
                     expose(

@@ -97,7 +97,7 @@ impl MemoryRun {
             .iter()
             .map(|(label, bytes)| (label, *bytes))
             .collect();
-        // The largest ones are the candidates for savings.
+        // The largest buffers are the candidates for savings.
         gpu_buffers.sort_by_key(|(_, bytes)| std::cmp::Reverse(*bytes));
         let gpu_rows = gpu_buffers
             .iter()
@@ -144,10 +144,10 @@ impl MemoryRun {
         })
     }
 
-    /// The growth rates of this run, with the memory that they are about.
+    /// The growth rates of this run, each with the name of the memory that it describes.
     fn growths(&self) -> Vec<(&'static str, Growth)> {
-        // On a CPU, buffers of the GPU are in the memory of the process. They grow with the model,
-        // which would hide a leak.
+        // On a CPU, the GPU buffers are in the memory of the process. They grow with the model, and
+        // this growth would hide a leak.
         let kinds = if self.is_software {
             vec![
                 ("without the model", Excluded::Model),

@@ -17,9 +17,9 @@ const SAMPLE_PERIOD: Duration = Duration::from_secs(1);
 /// Maximum number of time buckets. A run of an hour then has one per minute, whose medians are not
 /// affected by single slow pictures.
 const MAX_BUCKETS: usize = 60;
-/// Minimum duration for trends: nearly two minutes, measured at the last sample. In a shorter run,
-/// the second half is too short for a rate per hour. The last sample of a run of two minutes is a
-/// little earlier than its end.
+/// Minimum duration of a run for trends, measured at its last sample. In a shorter run, the second
+/// half is too short for a rate per hour. The limit is slightly below two minutes, because the last
+/// sample of a run of two minutes is a little earlier than its end.
 const MIN_SECS: f64 = 115.0;
 const SECS_PER_HOUR: f64 = 3600.0;
 const BYTES_PER_MB: f64 = 1e6;
@@ -75,8 +75,8 @@ impl Timeline {
     ///
     /// * `pictures`: the pictures of each viewer.
     pub(crate) fn over_time(&self, pictures: &[Vec<ReceivedPicture>]) -> OverTime {
-        // The pictures of all viewers in one list, ordered by time, so that those of a bucket are a
-        // range of it.
+        // The pictures of all viewers are in one list, ordered by time. The pictures of a bucket
+        // are therefore a range of this list.
         let mut received: Vec<(Instant, f64)> = pictures
             .iter()
             .flatten()
@@ -90,7 +90,8 @@ impl Timeline {
         received.sort_by_key(|(complete, _)| *complete);
         let last_ix = self.moments.len().saturating_sub(1);
         let n_each = last_ix.div_ceil(MAX_BUCKETS).max(1);
-        // Neighboring buckets share the moment between them: rates need both ends.
+        // Neighboring buckets share the moment between them, because rates need both ends of a
+        // bucket.
         let buckets: Vec<Bucket> = (0..last_ix)
             .step_by(n_each)
             .map(|from_ix| {

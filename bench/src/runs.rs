@@ -175,7 +175,8 @@ pub struct Run {
 }
 
 impl Run {
-    /// Final test PSNR, dB; 99 if it is infinite, because renders and images are identical.
+    /// Final test PSNR, dB. It is infinite if renders and images are identical; 99 is returned
+    /// then.
     #[must_use]
     pub fn psnr(&self) -> f64 {
         const WITHOUT_ERROR_DB: f64 = 99.0;
@@ -185,8 +186,9 @@ impl Run {
     /// Points `(seconds, dB)` at the evaluations and at the end.
     #[must_use]
     pub fn curve(&self) -> Vec<(f64, f64)> {
-        /// Minimum ratio of the end to the last evaluation for the end to be a separate point. At
-        /// smaller ratios, both score almost the same model, and noise would look like a step.
+        /// Minimum ratio of the final time to the time of the last evaluation for the end to be a
+        /// separate point. At smaller ratios, both evaluations score almost the same model, and
+        /// noise would look like a step.
         const MIN_SECONDS_RATIO: f64 = 1.02;
         let is_new = self
             .evaluations
@@ -508,7 +510,7 @@ fn path_of(out: &Path, name: &str) -> PathBuf {
 ///
 /// # Errors
 ///
-/// If its settings differ, because it must not appear among the results of the others.
+/// If its settings differ. Such a run must not appear among the results of the other runs.
 fn saved_run(out: &Path, name: &str, settings: &RunSettings) -> Result<Option<Run>> {
     let path = path_of(out, name);
     if !path.exists() {
@@ -539,14 +541,14 @@ fn read(path: &Path) -> Result<Run> {
 
 /// Description of the first setting that differs.
 fn difference(cached: &RunSettings, requested: &RunSettings) -> Result<Option<String>> {
-    // Compared as JSON, which has the names of the settings for the message.
+    // The settings are compared as JSON, which contains their names for the message.
     let fields =
         |settings: &RunSettings| serde_json::to_value(settings).context("settings are plain data");
     Ok(first_difference(&fields(cached)?, &fields(requested)?))
 }
 
-/// Description of the first value of an object that differs. For values that are objects, it names
-/// the first of their values that differs.
+/// Description of the first value of an object that differs. If that value is itself an object, the
+/// description names the first value inside it that differs.
 fn first_difference(cached: &Value, requested: &Value) -> Option<String> {
     let (key, value) = requested
         .as_object()?

@@ -335,8 +335,8 @@ impl StabilityOptions {
                 disturbance,
                 levels: levels(disturbance, requested, n_train(data)),
                 nanos_per_sec,
-                // Stored with each run. Other disturbances do not depend on the rate, so their runs
-                // stay valid if it changes.
+                // The rate is stored with each run of a clock offset. Other disturbances do not
+                // depend on the rate, so their runs stay valid if it changes.
                 rate_hz: rate_hz.filter(|_| disturbance == Disturbance::ClockOffset),
             });
         }
@@ -347,7 +347,7 @@ impl StabilityOptions {
 /// The sizes to measure, from none to the largest.
 fn levels(disturbance: Disturbance, requested: &[f64], n_train: usize) -> Vec<f64> {
     let mut levels = requested.to_vec();
-    // Undisturbed data come first, whether they are requested or not: the other results are
+    // Undisturbed data come first even if they are not requested, because the other results are
     // compared with them.
     if disturbance == Disturbance::Keyframes {
         levels.iter_mut().for_each(|level| *level = level.round());
@@ -410,8 +410,8 @@ impl DisturbanceResult {
     fn chart(&self, subtitle: &str, of_one: &str) -> Chart {
         let (scale, ticks) = match self.disturbance.interpolation() {
             Interpolation::Log => (Scale::Log, self.levels()),
-            // Evenly spaced levels: the small ones would be on top of each other on a linear scale,
-            // and a logarithmic one has no 0.
+            // The levels are evenly spaced. On a linear scale, small levels would be on top of each
+            // other, and a logarithmic scale has no 0.
             Interpolation::Linear => (Scale::Levels(self.levels()), Vec::new()),
         };
         let curves = self.variants.iter().enumerate();

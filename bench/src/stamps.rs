@@ -13,17 +13,17 @@ use serde::Serialize;
 use std::path::PathBuf;
 use std::time::Duration;
 
-/// Width of a histogram bin, milliseconds: a tenth of the error up to which a stamp counts as
+/// Width of a histogram bin, milliseconds. It is a tenth of the error up to which a stamp counts as
 /// correct.
 const BIN_MILLIS: f64 = 0.1;
 /// Range of the histogram to either side, milliseconds. Larger errors are counted in the outermost
-/// bins. An unknown fixed latency of a few milliseconds is inside.
+/// bins. The range is large enough for an unknown fixed latency of a few milliseconds.
 const HISTOGRAM_RANGE_MILLIS: f64 = 8.0;
 /// Joint states per second.
 const JOINT_RATE_HZ: u32 = 1000;
 /// Speed of the joint, rad/s. The joint angle encodes the time.
 const SPEED_RAD_S: f64 = 1.0;
-/// Error up to which a stamp counts as correct. At 1 rad/s, it is an error of the pose of 1 mrad.
+/// Error up to which a stamp counts as correct. At 1 rad/s, it causes a pose error of 1 mrad.
 const MAX_ERROR_MILLIS: f64 = 1.0;
 
 /// Options of [`run`] and [`measure`].
@@ -153,8 +153,8 @@ fn check(options: &StampsOptions) -> Result<()> {
     }
 }
 
-/// The stamp error of each image after the settling time: time of the joint state at its stamp,
-/// minus time of its shutter. Includes the fixed latency.
+/// The stamp error of each image after the settling time. It is the time of the joint state at the
+/// stamp of the image, minus the time of its shutter. The error includes the fixed latency.
 #[expect(
     clippy::cast_possible_truncation,
     reason = "times of an hour at most, in nanoseconds"
@@ -162,7 +162,8 @@ fn check(options: &StampsOptions) -> Result<()> {
 fn errors_millis(options: &StampsOptions, rate_hz: f64, seed: u64) -> Vec<f64> {
     let mut random = Random::new(seed);
     let mut clock = ClockMap::new();
-    // Joint states until after the last image could arrive: a stamp may be as late as its arrival.
+    // The joint states continue until the last image has certainly arrived, because a stamp may be
+    // as late as the arrival of its image.
     let n_readings =
         (options.seconds + options.fixed_millis * 1e-3 + options.jitter_millis * 1e-3 + 1.0)
             * f64::from(JOINT_RATE_HZ);
@@ -183,11 +184,12 @@ fn errors_millis(options: &StampsOptions, rate_hz: f64, seed: u64) -> Vec<f64> {
     let mut errors = Vec::new();
     for ix in 0..(options.seconds * rate_hz) as i64 {
         let shutter_secs = ix as f64 / rate_hz;
-        // The clock of the camera is slower by the drift.
+        // The camera's clock is slower than the computer's clock by the drift.
         let device_nanos = (shutter_secs / (1.0 + options.drift_ppm * 1e-6) * 1e9) as i64;
         let latency_millis = options.fixed_millis + options.jitter_millis * random.unit();
         let arrival = Stamp(((shutter_secs + latency_millis * 1e-3) * 1e9) as i64);
-        // Also during the settling time, in which the map learns offset and drift.
+        // Images are also stamped during the settling time, in which the clock map learns offset
+        // and drift.
         let stamp = clock.stamp(device_nanos, arrival);
         if shutter_secs < options.settle_seconds {
             continue;

@@ -34,8 +34,8 @@ pub(crate) fn sample_std(values: &[f64]) -> Option<f64> {
 pub(crate) fn secs_to(curve: &[(f64, f64)], target_db: f64) -> Option<f64> {
     let at = curve.iter().position(|(_, psnr)| *psnr >= target_db)?;
     let (secs, psnr) = curve[at];
-    // Over the logarithm of time, curves are nearly straight between two evaluations, because the
-    // gain per doubling of the time changes slowly.
+    // The gain per doubling of the time changes slowly. Over the logarithm of time, curves are
+    // therefore nearly straight between two evaluations.
     let Some((previous_secs, earlier_psnr)) = at.checked_sub(1).map(|before| curve[before]) else {
         return Some(secs);
     };
@@ -79,7 +79,7 @@ pub(crate) fn break_point(
     let at = curve.iter().position(|(_, psnr)| *psnr <= floor)?;
     let (before, psnr_before) = curve[at.checked_sub(1)?];
     let (level, psnr) = curve[at];
-    // The point before is above the floor, so the divisor is above 0.
+    // The previous point is above the floor, so the divisor is above 0.
     let frac = (psnr_before - floor) / (psnr_before - psnr);
     Some(match interpolation {
         Interpolation::Linear => before + frac * (level - before),

@@ -3,7 +3,8 @@
 use calibration::CameraRefinement;
 use trainer::ModelOptions;
 
-/// A named change of training options: of one method with options `S`, or of any method by default.
+/// A named change of training options. It applies to one method with options `S`, or by default to
+/// any method.
 pub(crate) struct Variant<S = serde_json::Value> {
     pub(crate) name: &'static str,
     pub(crate) change: fn(&mut ModelOptions<S>),

@@ -1,8 +1,8 @@
 //! A viewer for benches: a WebSocket client that requests images back to back and discards them.
 //!
-//! It uses the capabilities that the web page uses for pictures. It runs in the measured process.
-//! To affect the measurement little, it decodes only the first picture with a new keyframe, and
-//! reports that it has shown it.
+//! The viewer uses the capabilities that the web page uses for pictures, and runs in the measured
+//! process. To affect the measurement little, it decodes only the first picture with each new
+//! keyframe. It then reports that it has shown this picture.
 
 use anyhow::{Context, Result, anyhow, ensure};
 use kinematics::Transform;
@@ -99,8 +99,8 @@ impl Viewer {
         stream
             .set_read_timeout(Some(MAX_SILENCE))
             .context("cannot set a timeout")?;
-        // As in browsers: otherwise, a request after a report would wait up to 40 ms for an
-        // acknowledgment.
+        // Browsers also disable the delay of small packets. With the delay, a request after a
+        // report would wait up to 40 ms for an acknowledgment.
         stream
             .set_nodelay(true)
             .context("cannot set an option of a connection")?;
@@ -178,7 +178,8 @@ struct Client {
     radius_m: f64,
     /// The parts received so far of a message that the server sends in parts.
     parts: Vec<u8>,
-    /// Estimated time at which the server's clock started; at most the delay of a message late.
+    /// Estimated time at which the server's clock started. The estimate is too late by at most the
+    /// delay of one message.
     server_started: Option<Instant>,
     /// Largest number of keyframes in a picture so far.
     n_keyframes: u64,
@@ -247,7 +248,8 @@ impl Client {
             .as_f64()
             .and_then(|n| Duration::try_from_secs_f64(n * 1e-3).ok())
         {
-            // Each message is late by its own delay. The earliest estimate has the smallest one.
+            // The delay of a message makes its estimate too late. The earliest estimate therefore
+            // has the smallest error.
             let started = Instant::now().checked_sub(clock);
             self.server_started = self.server_started.into_iter().chain(started).min();
         }
@@ -267,7 +269,7 @@ impl Client {
                 if !self.pictures.lock().is_empty() || self.started.elapsed() > MAX_START {
                     log::warn!("a viewer received no picture: {message}");
                 }
-                // A request at once would get the same answer.
+                // An immediate request would get the same answer.
                 std::thread::sleep(Duration::from_millis(200));
                 self.request_picture()?;
             }
@@ -324,8 +326,8 @@ impl Client {
                 encode_millis: millis("encode_millis"),
                 n_keyframes,
             });
-            // Only the first picture with a new keyframe, so that decoding takes little time from
-            // the measured run.
+            // Only the first picture with a new keyframe is decoded, so that decoding takes little
+            // time from the measured run.
             if n_keyframes > self.n_keyframes {
                 self.n_keyframes = n_keyframes;
                 self.show(header, payload)?;
@@ -392,8 +394,8 @@ impl Client {
             is_final,
             "the server sent a fragmented message, expected one frame per message"
         );
-        // RFC 6455, section 5.2: lengths from 126 on are in the next 2 or 8 bytes. The highest bit
-        // marks a mask, which only clients use.
+        // According to RFC 6455, section 5.2, lengths from 126 on are in the next 2 or 8 bytes. The
+        // highest bit of this byte marks a mask, which only clients use.
         let n_bytes = match head[1] {
             126 => {
                 let mut bytes = [0; 2];

@@ -10,8 +10,9 @@ use std::sync::Arc;
 
 /// Step at which training waits for the result and applies it.
 ///
-/// A later step leaves more time for alignment, so that training waits less, but trains longer with
-/// wrong poses. It is smaller on software adapters, where a step takes as long as alignment.
+/// With a later step, alignment has more time and training waits less, but it trains longer with
+/// wrong poses. The step is smaller on software adapters, where one step takes as long as the whole
+/// alignment.
 const ALIGNMENT_STEP: u64 = 400;
 const SOFTWARE_ALIGNMENT_STEP: u64 = 50;
 
@@ -93,8 +94,8 @@ impl AlignmentTask {
 
     /// Starts alignment of uncorrected keyframes on its own thread.
     pub fn begin(&mut self, keyframes: &[Arc<Keyframe>], choice: &CameraRefinement) {
-        // Movements of cameras are not estimated by alignment. Images before and after one would
-        // contradict each other without it.
+        // Alignment does not estimate movements of cameras, but it must apply known ones.
+        // Otherwise, images before and after a movement would contradict each other.
         let choice = choice.clone();
         let with_movements = |keyframe: &Arc<Keyframe>| match &self.result {
             Some(result) => result.with_movements(keyframe),
@@ -174,9 +175,9 @@ impl AlignmentTask {
 const COLOR_ACCURACY_RAD: f64 = 1.75e-3;
 const COLOR_ACCURACY_M: f64 = 3e-3;
 
-/// Whether the latest corrections are as good as newer ones. Without depth, they are if both agree
-/// within their accuracy, or if the newer estimate was rejected; cameras would move back and forth
-/// otherwise.
+/// Whether the latest corrections are as good as newer ones. Without depth, this is the case if
+/// both agree within their accuracy, or if the newer estimate was rejected. Otherwise, cameras
+/// would move back and forth.
 fn is_as_good(latest: &Alignment, newer: &Alignment, keyframes: &[Arc<Keyframe>]) -> bool {
     if !latest.has_corrections() || keyframes.iter().any(|keyframe| keyframe.depth.is_some()) {
         return false;
@@ -223,7 +224,7 @@ enum Worker {
     Done,
 }
 
-/// Tests keyframes until a movement is found. Later ones are compared with new references.
+/// Tests keyframes until a movement is found. Later keyframes are compared with new references.
 fn tested(
     mut detector: MovementDetector,
     keyframes: &[Arc<Keyframe>],

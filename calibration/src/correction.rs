@@ -89,8 +89,8 @@ pub struct CalibratedCamera {
     pub gains: [f64; 3],
 }
 
-/// Maximum relative difference between two focal lengths that is negligible: 0.6 px at the border
-/// of an image of 1280 px.
+/// Relative differences of focal lengths up to this are negligible. At the border of an image of
+/// 1280 px, it corresponds to 0.6 px.
 const NOTICEABLE_FOCAL: f64 = 1e-3;
 
 impl CalibratedCamera {
@@ -151,12 +151,13 @@ impl CameraCorrection {
             Vector3::new(rotation_x, rotation_y, rotation_z),
             Vector3::new(x, y, z),
         );
-        // From right to left, in the order of causes: the time of the exposure, the joints, the
-        // pose of this image, and the mount of the camera.
+        // The factors from right to left follow the order of the causes: the time of the exposure,
+        // the joints, the pose of this image, and the extrinsics of the camera.
         let world_from_camera =
             (extrinsics * drift * joints * time_offset * lens.world_from_camera.inverse())
                 .inverse();
-        // Velocities are given at the raw camera, and differ at the corrected one by its lever arm.
+        // Velocities are given at the raw camera. At the corrected camera, they differ because of
+        // the lever arm between the two.
         let raw_from_corrected = lens.world_from_camera.inverse() * world_from_camera;
         let shutter = |shutter: Shutter| Shutter {
             twist: shutter.twist.of_attached(&raw_from_corrected),

@@ -17,7 +17,7 @@ pub enum Error {
         /// Index of the block of residuals.
         block_ix: usize,
     },
-    /// There are not more residuals than parameters.
+    /// The number of residuals does not exceed the number of parameters.
     #[error(
         "least squares: {n_residuals} residuals cannot determine {n_params} parameters; more measurements are needed"
     )]
@@ -196,7 +196,8 @@ impl Refusal {
         }
     }
 
-    /// Adds warnings, which may be the cause: wrong samples enlarge the uncertainty, for example.
+    /// Adds warnings, because they may describe the cause. For example, wrong samples enlarge the
+    /// uncertainty.
     ///
     /// * `except`: a warning that is reported in another way.
     pub(crate) fn with_warnings(self, warnings: &[String], except: Option<&str>) -> Self {

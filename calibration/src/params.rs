@@ -64,8 +64,8 @@ impl std::fmt::Display for ParamSet {
     }
 }
 
-/// Serializes the set as a map from the names of all parameters, in lower case, to booleans:
-/// whether the set contains them.
+/// Serializes the set as a map. The keys are the names of all parameters in lower case. The values
+/// are booleans that indicate whether the set contains the parameter.
 impl Serialize for ParamSet {
     fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
         let all = Self::all();

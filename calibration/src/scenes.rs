@@ -60,7 +60,7 @@ pub fn joints_at(secs: f64, azimuth_only: bool) -> Joints {
     if azimuth_only {
         [wave(0.5, 0.11, 0.2), 0.15, 0.2, 0.1]
     } else {
-        // Frequencies without a common period, so that no configuration repeats.
+        // The frequencies have no common period, so that no configuration repeats.
         [
             wave(0.4, 0.11, 0.2),
             0.15 + wave(0.25, 0.23, 1.0),
@@ -99,7 +99,8 @@ fn cast(from: Point3<f64>, ray: Vector3<f64>) -> (f64, f64) {
             nearest = nearest.min(distance);
         }
     }
-    // A sum of waves in space: a texture with gradients in all directions, at several scales.
+    // The texture is a sum of waves in space. It has gradients in all directions and at several
+    // scales.
     let p = from + ray * nearest;
     let wave = |size: f64, x: f64, y: f64, z: f64, phase: f64| {
         size * (x * p.x + y * p.y + z * p.z + phase).sin()
@@ -169,7 +170,7 @@ fn noise(key: u64) -> f64 {
 /// brightness there.
 fn cast_pixel(pose: &Transform, x: usize, y: usize) -> (f64, f64) {
     let at = [x as f64 + 0.5, y as f64 + 0.5];
-    // With a z of 1, distances along the ray are depths.
+    // The z coordinate of the ray is 1, so distances along the ray are depths.
     let ray = Vector3::new(
         (at[0] - PRINCIPAL_PX[0]) / FOCAL_PX[0],
         (at[1] - PRINCIPAL_PX[1]) / FOCAL_PX[1],
@@ -186,7 +187,7 @@ pub fn capture(miscalibration: &Miscalibration) -> Vec<Arc<Keyframe>> {
             let shot = Shot {
                 miscalibration,
                 ix,
-                // Irregular times: images do not fall on the same phases of the joints.
+                // Irregular times ensure that images do not fall on the same phases of the joints.
                 secs: 0.3 * ix as f64 + 0.05 * (ix as f64 * 1.7).sin(),
             };
             Arc::new(shot.keyframe())
@@ -263,7 +264,7 @@ impl Shot<'_> {
         let miscalibration = self.miscalibration;
         let depth_from_true = Transform::new(Vector3::new(0.02, 0.0, 0.0), Vector3::zeros());
         let depth_m = self.depth_m(&(camera_at(self.joints(self.secs)) * depth_from_true));
-        // Everything that is reported contains the errors, while the images show the truth.
+        // All reported values contain the errors, whereas the images show the truth.
         let reported_secs = self.secs - miscalibration.time_offset_secs;
         let moved = self.joints(reported_secs);
         let reported_joints =
@@ -314,7 +315,8 @@ pub fn wrong_extrinsics() -> Transform {
     )
 }
 
-/// Rotation and translation that remain of an extrinsics error, degrees and millimeters.
+/// Rotation and translation of the extrinsics error that remains after a correction, degrees and
+/// millimeters.
 pub fn remaining(correction: &CameraCorrection, miscalibration: &Transform) -> (f64, f64) {
     let estimated = rigid_transform(
         correction.rotation_rad.into(),

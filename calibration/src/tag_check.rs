@@ -1,27 +1,28 @@
-//! Whether tags at known poses contradict the calibrated pose of a camera while a robot works.
+//! Checks whether tags at known poses contradict the calibrated pose of a camera while a robot
+//! works.
 //!
 //! Each image with a tag gives the pose of the camera relative to the world. If the camera has
-//! moved relative to its mount, this pose differs from the calibrated one by the same motion in the
-//! frame of the camera, wherever the robot is. If the tag has moved, it differs by the same motion
-//! in the world.
+//! moved relative to its mount, this pose differs from the calibrated pose by a motion that is the
+//! same in the frame of the camera for all robot poses. If the tag has moved, the motion is the
+//! same in the world.
 
 use crate::least_squares::sigma_of;
 use kinematics::{Stamp, Transform, Twist, transform};
 use nalgebra::{Matrix6, Vector6};
 use std::collections::{BTreeSet, VecDeque};
 
-/// Number of images at different poses before a contradiction is reported. Fewer could share an
-/// error, such as a blurred tag.
+/// Number of images at different poses before a contradiction is reported. Fewer images could have
+/// the same error, for example due to a blurred tag.
 const MIN_IMAGES: usize = 8;
-/// Number of latest images that are compared. More would average images from before and after a
-/// movement for longer.
+/// Number of latest images that are compared. With more images, images from before and after a
+/// movement would be averaged for a longer time.
 const MAX_IMAGES: usize = 24;
 /// Smaller differences are not reported: measured tags and robots are rarely more accurate.
 const MIN_TRANSLATION_M: f64 = 0.005;
 const MIN_ROTATION_RAD: f64 = 0.0087;
-/// A difference is significant from this multiple of its standard deviation. The check is repeated
-/// with every image for hours, and the errors of images are not normal, so it is larger than in a
-/// single test.
+/// A difference is significant if it is at least this multiple of its standard deviation. The
+/// multiple is larger than in a single test, because the check is repeated with every image for
+/// hours and the errors of images are not normally distributed.
 const MIN_SIGMAS: f64 = 5.0;
 /// Images of a camera that moves less than this show the same errors and count once, unless this
 /// time has passed.
@@ -33,7 +34,7 @@ const ARM_M: f64 = 0.4;
 /// One explanation is better than the other if its residuals are smaller by this factor.
 const CLEARER: f64 = 2.0;
 
-/// What one image says about the pose of its camera.
+/// Observation of the pose of a camera in one image.
 #[derive(Clone, Debug, PartialEq)]
 pub struct TagObservation {
     /// Stamp of the image.
@@ -146,8 +147,8 @@ impl TagCheck {
         } else {
             ContradictionCause::Unknown
         };
-        // The scatter about the better explanation, and the stated noise, which is larger if the
-        // robot stands still.
+        // The variance is the larger of two values: the scatter about the better explanation, and
+        // the stated noise, which is larger if the robot stands still.
         let residuals = if squares_of_camera <= squares_of_world {
             &of_camera
         } else {
@@ -164,8 +165,8 @@ impl TagCheck {
             .map(|residual| residual * residual.transpose())
             .sum::<Matrix6<f64>>()
             / (n - 1) as f64;
-        // A tag that has moved shows in other camera axes at each pose: those of the latest image
-        // are used.
+        // If a tag has moved, its motion is expressed in different camera axes at each pose. The
+        // axes of the latest image are used.
         let latest = self.observations.back()?.calibrated;
         let difference = if squares_of_camera <= squares_of_world {
             twist(&mean_in_camera)
@@ -388,8 +389,8 @@ mod tests {
         assert_eq!(found.cause, ContradictionCause::Unknown, "{found}");
     }
 
-    /// In camera axes, the motion of the tag has another direction at each pose, so that its mean
-    /// is far too small.
+    /// In camera axes, the motion of the tag has a different direction at each pose, so its mean
+    /// would be far too small.
     #[test]
     fn moved_tag_is_measured_in_the_world_while_the_wrist_rotates() {
         for moved in [
@@ -399,7 +400,8 @@ mod tests {
             let mut check = TagCheck::new("wrist");
             let angles = [-90.0_f64, 90.0].into_iter().cycle().map(f64::to_radians);
             let found = angles.take(40).enumerate().find_map(|(ix, angle)| {
-                // Around the viewing direction, straight above the origin of the world.
+                // The camera rotates about its viewing direction, straight above the origin of the
+                // world.
                 let down = Transform::new(
                     Vector3::new(0.0, 0.0, 0.4),
                     Vector3::x() * std::f64::consts::PI,
@@ -419,8 +421,8 @@ mod tests {
                 (found.rotation_rad[0] - moved.rotation.angle()).abs() < 1e-3,
                 "{found:?}"
             );
-            // The rotation about the origin of the world also shifts the camera, but not from above
-            // it.
+            // A rotation about the origin of the world usually also moves the camera. It does not
+            // if the camera is straight above the origin.
             assert!((found.translation_m[0] - 0.04).abs() < 1e-3, "{found:?}");
         }
     }

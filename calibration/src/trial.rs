@@ -5,7 +5,8 @@ use crate::ParamSet;
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 
-/// Minimum number of validation images for a trial. The standard error of fewer is too uncertain.
+/// Minimum number of validation images for a trial. With fewer images, the standard error is too
+/// uncertain.
 pub const MIN_VALIDATION_IMAGES: usize = 4;
 /// Minimum gain of camera parameters and of a color degree, dB. Smaller gains are not visible.
 const MIN_GAIN_DB: f64 = 0.05;

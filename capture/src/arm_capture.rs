@@ -16,14 +16,15 @@ use std::time::{Duration, Instant};
 /// checked, so this also bounds how far the arm pushes against an obstacle. Smaller steps are safer
 /// and slower.
 const MAX_STEP: f64 = 0.25;
-/// Time before an image during which the arm must stand still: longer than stamps are wrong and
-/// mounts vibrate.
+/// Time before an image during which the arm must stand still. It is longer than the errors of
+/// stamps and the vibration of camera mounts.
 const SETTLE_SECS: f64 = 0.3;
-/// Largest drift of a joint during that time, radians or meters: the difference between the means
-/// of both halves, which averages the noise of encoders.
+/// Largest drift of a joint during that time, radians or meters. The drift is the difference
+/// between the means of both halves of the time, which averages the noise of encoders.
 ///
-/// With a smaller value, arms that sway or have coarse encoders never count as resting. A larger
-/// one lets images of a moving camera through: 3e-4 rad at an arm's length of 1 m is 0.3 mm.
+/// With a smaller value, arms that sway or have coarse encoders never count as resting. With a
+/// larger value, images of a moving camera are accepted. At an arm's length of 1 m, 3e-4 rad is 0.3
+/// mm.
 const MAX_DRIFT: f64 = 3e-4;
 /// Maximum time until the arm stands still and an image arrives.
 const MAX_WAIT_SECS: f64 = 15.0;
@@ -72,7 +73,7 @@ pub struct ArmCapture {
     /// Index in the joint states of each joint of the chain.
     order: Vec<usize>,
     arm: SupervisedArm,
-    /// The last accepted target; before the first, the first state.
+    /// The last accepted target. Before the first target, it is the first state.
     accepted: Option<Vec<f64>>,
     /// Pose of the flange from which it may move at most this far, meters.
     limit: Option<(Transform, f64)>,
@@ -178,10 +179,10 @@ impl ArmCapture {
 
     fn step_to(&mut self, joints: &[f64], stop: &Stop) -> anyhow::Result<bool> {
         let free = self.read()?.position;
-        // A command to stay here: the previous target, unless someone has moved the arm since then.
-        // The sag of the last step is the best prediction for the next one, because the load
-        // changes little within a step. Commanding target plus sag brings the joint to the target
-        // itself.
+        // This command makes the arm stay here. It is the previous target, unless someone has moved
+        // the arm since then. The sag of the last step is the best prediction for the next one,
+        // because the load changes little within a step. Commanding target plus sag brings the
+        // joint to the target itself.
         let accepted = self.accepted.get_or_insert_with(|| free.clone());
         let sag = accepted
             .iter()
@@ -221,7 +222,7 @@ impl ArmCapture {
             position: position.to_vec(),
         })?;
         self.accepted = Some(accepted.position);
-        // A borrow of this field alone, because the arm is borrowed at the same time.
+        // Only this field is borrowed, because the arm is borrowed at the same time.
         let recent = &mut self.recent;
         let end = self.arm.follow(stop, |state| remember(recent, state))?;
         if !end.has_arrived {
@@ -257,7 +258,7 @@ impl ArmCapture {
         }))
     }
 
-    /// Ends the push against an obstacle: returns to the previous step, which was free, or holds
+    /// Stops pushing against an obstacle: returns to the previous step, which was free, or holds
     /// the arm where it is.
     ///
     /// * `stay`: the command of the previous step.
@@ -274,8 +275,8 @@ impl ArmCapture {
         {
             return Ok("the arm has returned to the previous step");
         }
-        // Back at the current position, the motors no longer push. A stop request must not prevent
-        // that.
+        // If the current position is the target, the motors no longer push. A stop request must not
+        // prevent this.
         let here = self.read()?.position;
         self.go(&here, &Stop::default())?;
         Ok("the arm did not return to the previous step, and holds where it is")
@@ -301,7 +302,7 @@ impl ArmCapture {
             if stop.requested() {
                 return Ok(None);
             }
-            // Notices faults, and ends the wait if no image is usable.
+            // This call detects faults, and ends the wait if no image is usable.
             self.read_queued()?;
             let now = self.read()?.stamp;
             self.check_wait(&wait, now, &seen)?;
@@ -440,8 +441,8 @@ impl ArmCapture {
         let mid = camera.mid_exposure(image.stamp);
         let configured = camera.exposure_micros.map(|micros| 1e-6 * micros);
         let exposure_secs = image.exposure_secs.or(configured).unwrap_or(0.0);
-        // The first row starts half an exposure before its middle, and the last row ends half an
-        // exposure after its own.
+        // The exposure of the first row starts half an exposure time before its middle. The
+        // exposure of the last row ends half an exposure time after its middle.
         let half_secs = 0.5 * (1e-6 * camera.readout_micros.unwrap_or(0.0) + exposure_secs);
         [mid.plus_secs(-half_secs), mid.plus_secs(half_secs)]
     }

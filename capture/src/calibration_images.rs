@@ -220,7 +220,8 @@ impl<'a> Reader<'a> {
             }
             _ => return,
         }
-        // In order: while the oldest image waits for readings, later ones do, too.
+        // Images are processed in order. While the oldest image waits for readings, later images
+        // wait as well.
         while let Some(image) = self.waiting.pop_front() {
             match self.arm_during(&image) {
                 Err(HistoryError::NotYet { .. }) => {
@@ -261,7 +262,7 @@ impl<'a> Reader<'a> {
         let secs = self
             .first
             .map_or(0.0, |first| image.stamp.secs_since(first));
-        // From cheap to expensive: the pose is compared before the image is decoded.
+        // Cheap tests come first, so the pose is compared before the image is decoded.
         if self.found.images.len() >= MAX_IMAGES || !self.is_different(secs, arm.as_ref()) {
             return;
         }
@@ -294,7 +295,7 @@ impl<'a> Reader<'a> {
                 .last()
                 .is_none_or(|last| secs - last.secs >= INTERVAL_SECS);
         };
-        // Compared with all images, not only with the last one: a robot often returns to a pose.
+        // The pose is compared with those of all images, because a robot often returns to a pose.
         !self
             .found
             .images
@@ -319,7 +320,7 @@ impl<'a> Reader<'a> {
             .exposure_secs
             .or(self.camera.exposure_micros.map(|micros| 1e-6 * micros));
         let (motion, secs) = match (&self.arm, readout_secs > 0.0) {
-            // Without a readout time, the motion since a short time before.
+            // If there is no readout time, the motion during a short time before the image is used.
             (Some(history), false) => {
                 let earlier = self
                     .camera
@@ -339,7 +340,8 @@ impl<'a> Reader<'a> {
             _ => (first.inverse() * last, readout_secs),
         };
         // A rotation moves every pixel by about the focal length times its angle. A translation
-        // acts like a rotation by translation over distance. The sum is an upper bound for both.
+        // acts like a rotation by the translation divided by the distance. The sum is an upper
+        // bound for both.
         let focal_px = self.camera.intrinsics.focal_px[0];
         let angle = motion.rotation.angle()
             + motion.translation.vector.norm() / self.rig.join.default_depth_m;
@@ -361,7 +363,7 @@ impl Arm {
         })
     }
 
-    /// Adds a reading in the order of the device. Invalid readings are ignored: images at their
+    /// Adds a reading in the order of the device. Invalid readings are ignored, and images at their
     /// stamps are not used.
     fn push(&mut self, state: &JointState, offsets: &[f64]) {
         let position = self.order.iter().map(|ix| {

@@ -15,8 +15,8 @@ pub struct CameraInfo {
     pub size_px: Option<[u32; 2]>,
     /// Focal lengths along x and y, pixels.
     pub focal_px: [f64; 2],
-    /// Principal point, pixels. Half a pixel is added to that of ROS, which counts from the center
-    /// of the first pixel.
+    /// Principal point, pixels. Half a pixel is added to the value of ROS, which is measured from
+    /// the center of the first pixel.
     pub principal_px: [f64; 2],
     /// Distortion.
     pub lens: Lens,
@@ -122,12 +122,12 @@ pub fn convert(intrinsics: &mut Value) -> Result<Vec<String>, String> {
 /// # Errors
 /// If the text is neither; the message gives line and column.
 pub fn parse_value(text: &str) -> Result<Value, String> {
-    // Checked first: OpenCV's header is no valid YAML directive, and the message of the parser
-    // would not name the cause.
+    // This is checked first. OpenCV's header is not a valid YAML directive, and the message of the
+    // parser would not name the cause.
     if text.starts_with("%YAML:") {
         return Err("it is YAML of OpenCV, expected a camera_info file of ROS".to_owned());
     }
-    // JSON first: most of it is valid YAML, too, but its own parser is the stricter one.
+    // JSON is tried first. Most JSON is also valid YAML, but the JSON parser is stricter.
     if let Ok(value) = serde_json::from_str(text) {
         return Ok(value);
     }
@@ -150,7 +150,8 @@ pub fn is_yaml(text: &str) -> bool {
         .is_some_and(|(key, _)| is_key(key.trim_start_matches("- ")))
 }
 
-/// Whether a word can be a key, so that other formats with colons are not taken for YAML.
+/// Whether a word can be a key. With this test, other formats with colons are not mistaken for
+/// YAML.
 fn is_key(word: &str) -> bool {
     !word.is_empty()
         && word
@@ -166,7 +167,7 @@ fn find(
     let mut found = names
         .iter()
         .filter_map(|name| Some((*name, object.get(*name).filter(|value| !value.is_null())?)));
-    // Two names of a key in one file would leave open which of them counts.
+    // If a file contains two names of a key, it is unclear which of them counts.
     match (found.next(), found.next()) {
         (Some((name, _)), Some((other, _))) => Err(format!(
             "{name} and {other} mean the same: keep one of them"
@@ -321,7 +322,7 @@ fn lens(object: &Map<String, Value>) -> Result<Lens, String> {
     }
 }
 
-/// The error for `n` coefficients that are not 0, where the model has at most `max`.
+/// The error for a list with `n` nonzero coefficients if the model has at most `max`.
 fn too_many(n: usize, model: &str, max: usize) -> Result<Lens, String> {
     Err(format!(
         "{n} distortion coefficients that are not 0; {model} has at most {max}"
@@ -603,7 +604,7 @@ projection_matrix:
         );
     }
 
-    /// Feeds each name of the table in docs/reference/camera-info.md alone.
+    /// Tests each name of the table in docs/reference/camera-info.md in its own file.
     #[test]
     fn keys_are_used_refused_or_named_as_documented() {
         let page = include_str!("../../docs/reference/camera-info.md");

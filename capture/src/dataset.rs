@@ -77,7 +77,8 @@ fn load_few_at_once(
     collect(dataset, results)
 }
 
-/// The split of each photo: from `holdout`, else as listed in the dataset, else the default.
+/// The split of each photo. It comes from `holdout`, or else from the lists of the dataset, or else
+/// from the default.
 fn splits_of(
     dataset: &Dataset,
     holdout: Option<&Holdout>,
@@ -138,8 +139,8 @@ fn decode_all(
     results
 }
 
-/// Collects the results. One photo that does not decode must not cost the others, so its error
-/// becomes a message.
+/// Collects the results. If a single photo does not decode, its error becomes a message, so that
+/// the other photos can still be used.
 fn collect(
     dataset: &Dataset,
     results: Vec<(String, anyhow::Result<Converted>)>,
@@ -223,7 +224,7 @@ fn check_memory(dataset: &Dataset, scale_frac: f64, available_bytes: u64) -> any
     }
     // Memory is proportional to the square of the scale.
     let fitting = scale_frac * (available_bytes as f64 / n_bytes as f64).sqrt();
-    // Rounded down, so that the suggested scale fits.
+    // The scale is rounded down, so that the suggested scale fits.
     let remedy = match (100.0 * fitting).floor() / 100.0 {
         scale if scale >= downscale::MIN_SCALE => {
             format!(
@@ -307,7 +308,8 @@ impl LensMaps {
         let cached = self
             .depth
             .get_or_init(|| Undistortion::new(&depth.intrinsics));
-        // Another size than that of the first depth image is rare, so its map is not kept.
+        // Depth images rarely have a different size than the first one, so maps for other sizes are
+        // not kept.
         if cached.size_px() == size_px {
             cached.apply_depth(&depth.depth_m)
         } else {

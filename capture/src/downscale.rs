@@ -153,7 +153,8 @@ fn covered_by(ix: u32, ratio: f64, from: u32) -> Vec<(usize, f32)> {
     let source_pixels = start as usize..(end.ceil() as usize).min(from as usize);
     source_pixels
         .map(|source_ix| (source_ix, overlap(source_ix) as f32))
-        // A pixel that only rounding includes would mask the new pixel if it were masked itself.
+        // A pixel that is included only because of rounding must be left out. If it were masked, it
+        // would mask the new pixel.
         .filter(|(_, share)| *share > 1e-6)
         .collect()
 }

@@ -21,12 +21,12 @@ use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
 /// Maximum number of keyframes that wait for the trainer. If the queue is full, the input thread
-/// waits, and live devices drop and count images. A longer queue would hold more memory, and the
-/// trainer would see keyframes later; a shorter one would stop the input at each long step.
+/// waits, and live devices drop and count images. With a longer queue, more memory is used and the
+/// trainer receives keyframes later. With a shorter queue, the input would stop at each long step.
 const MAX_WAITING: usize = 8;
 
-/// Number of images whose arrival is remembered until they become keyframes: more than a station
-/// holds back.
+/// Number of images whose arrival times are kept until they become keyframes. It is larger than the
+/// number of images that a station holds back.
 const MAX_ARRIVALS: usize = 512;
 
 /// When a keyframe passed the stages of the input.
@@ -233,21 +233,22 @@ impl Pump {
                 Ok(Some(sample)) => sample,
                 Ok(None) => break,
                 Err(error) => {
-                    // Reported at once, because the keyframes that are still queued may take long
-                    // to train.
+                    // The failure is reported at once, because training on the queued keyframes may
+                    // take long.
                     self.shared.source_failed.store(true, Ordering::Relaxed);
                     input_error = Some(error);
                     break;
                 }
             };
-            // Before the first sample of the new round is joined, images of the old round must be
-            // decided with the motion of the old round.
+            // Images of the old round must be decided with the motion of that round, before the
+            // first sample of the new round is joined.
             let is_restarted = self.input.source.n_restarts() > n_restarts;
             n_restarts = self.input.source.n_restarts();
             if is_restarted && self.restart().is_err() {
                 break;
             }
-            // Before the join, so that a replay gets exactly the samples that the join got.
+            // The sample is recorded before the join, so that a replay gets exactly the samples
+            // that the join received.
             self.record(&sample, &mut recording_error);
             self.remember_arrival(&sample);
             // Viewers get the readings at once; the join may hold images back for up to its longest
@@ -266,8 +267,8 @@ impl Pump {
                 break;
             }
         }
-        // The input has ended. Images that wait get a decision now, and a station is registered
-        // with the keyframes that it has.
+        // The input has ended. Images that are still waiting get a decision now, and a station is
+        // registered with the keyframes received so far.
         let events = self.input.join.finish();
         // If the trainer has ended, it needs no more keyframes.
         let _ = self.forward(events).and_then(|()| self.release_held());
@@ -372,7 +373,7 @@ impl Pump {
     fn send(&self, changes: Vec<Change>) -> Result<(), TrainerGone> {
         changes.into_iter().try_for_each(|change| {
             let times = self.times(&change);
-            // Blocks while the queue is full. This is the back pressure of the trainer on the
+            // This blocks while the queue is full, which gives the trainer back pressure on the
             // input.
             self.sender
                 .send(FeedItem { change, times })
@@ -380,8 +381,8 @@ impl Pump {
         })
     }
 
-    /// Times of an accepted keyframe. Its stamp differs from its image's by the offsets in the rig
-    /// file, so its image is the one closest in time.
+    /// Times of an accepted keyframe. The stamp of the keyframe differs from that of its image by
+    /// the offsets in the rig file. The image that is closest in time is therefore used.
     fn times(&self, change: &Change) -> Option<InputTimes> {
         let Change::Accepted(keyframe) = change else {
             return None;

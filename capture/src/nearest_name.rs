@@ -1,8 +1,8 @@
 //! Suggestions for misspelled names.
 
-/// Less similar names are not misspellings of each other. With a lower limit, unrelated names are
-/// suggested; with a higher one, real misspellings get no suggestion. Jaro-Winkler similarity also
-/// rewards a common prefix, so that `focal` suggests `focal_px`.
+/// Less similar names are not misspellings of each other. With a lower limit, unrelated names would
+/// be suggested. With a higher limit, real misspellings would get no suggestion. Jaro-Winkler
+/// similarity also rewards a common prefix, so that `focal` suggests `focal_px`.
 const MIN_SIMILARITY: f64 = 0.75;
 
 /// The known name that is most similar to an unknown one; `None` if none is similar.

@@ -91,7 +91,7 @@ impl RecordPlan {
             overrides.push(Override::new("sim.lockstep", true));
         }
         let rig = Rig::load(&self.rig_file, &overrides)?;
-        // Before the devices are opened, as they may take long to start.
+        // The end is checked before the devices are opened, because they may take long to start.
         self.check_end(&rig)?;
         if self.out.exists() {
             let path = self.out.clone();
@@ -138,7 +138,7 @@ impl RecordPlan {
             );
             return Err(anyhow::Error::new(error).context(finished));
         }
-        // An empty file would only look like a recording.
+        // An empty file would wrongly look like a recording.
         if n_written == Some(0) {
             return Err(InsufficientData(format!(
                 "no device sent any data, so {} was not written",
@@ -233,7 +233,7 @@ impl Recorded {
             Sample::Base(_) => self.base_poses += 1,
             Sample::Range(_) => self.range_scans += 1,
             Sample::Truth(_) => self.truths += 1,
-            // Not counted, because one arrives with every base pose.
+            // These samples are not counted, because one arrives with every base pose.
             Sample::BaseTruth(_) => {}
         }
     }

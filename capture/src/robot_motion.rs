@@ -35,9 +35,9 @@ impl RobotMotion {
     }
 
     /// Takes a sample; returns the state of the robot if the sample moves it and the pose of its
-    /// base is known. The stamp is the older one of joint positions and base pose, so that neither
-    /// is older than the stamp. The base pose does not include the correction of its station; the
-    /// joint positions include the joint offsets.
+    /// base is known. The stamp of the state is the older of the stamps of joint positions and base
+    /// pose, so that neither is older than this stamp. The base pose does not include the
+    /// correction of its station. The joint positions include the joint offsets.
     pub fn push(&mut self, sample: &Sample, clock: &StampClock) -> Option<RobotState> {
         match sample {
             Sample::Joints(state) => {

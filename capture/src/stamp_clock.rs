@@ -5,14 +5,15 @@ use kinematics::Stamp;
 use std::time::{Duration, Instant};
 
 /// A live image that appears to be older than this was stamped by another clock. No device or queue
-/// holds an image for a minute, while clocks that start at another time usually differ by more.
+/// holds an image for a minute. In contrast, clocks that start at another time usually differ by
+/// more than a minute.
 const MAX_LIVE_AGE_SECS: f64 = 60.0;
 
 /// Relates stamps to the clock of this process.
 #[derive(Clone, Debug)]
 pub enum StampClock {
-    /// Devices are read in real time, and their stamps are on this computer's clock. Older ones are
-    /// from another clock.
+    /// Devices are read in real time, and their stamps are on this computer's clock. Stamps that
+    /// seem too old are from another clock.
     Computer,
     /// All devices are simulated, and their stamps are on the simulation's clock.
     Simulation,

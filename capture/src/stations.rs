@@ -21,8 +21,9 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 /// Number of keyframes with depth, excluding test keyframes, with which a station is registered. A
-/// scan of a few seconds gives so many. With more, keyframes reach the trainer later; with fewer,
-/// the correction has fewer pairs of images and is less certain.
+/// scan of a few seconds gives this many keyframes. With a larger number, keyframes reach the
+/// trainer later. With a smaller number, the correction has fewer pairs of images and is less
+/// certain.
 const MIN_KEYFRAMES: usize = 14;
 /// Maximum time to wait for that many keyframes, seconds. Without a limit, a short visit or a
 /// camera without texture in view would hold its keyframes until the base leaves.
@@ -33,8 +34,8 @@ const MAX_SCAN_SECS: f64 = 10.0;
 const MAX_TRAVEL_SECS: f64 = 30.0;
 const MAX_HELD: usize = 128;
 /// Maximum number of reference keyframes from earlier stations. It bounds memory and the time of a
-/// registration, which compares new keyframes with these. When it is reached, every other one is
-/// removed, so that those that remain still cover all stations.
+/// registration, which compares new keyframes with these. When the maximum is reached, every other
+/// keyframe is removed, so that the remaining ones still cover all stations.
 const MAX_REFERENCE_KEYFRAMES: usize = 160;
 
 /// Corrects keyframes for errors of the reported base poses, at each station.
@@ -86,7 +87,7 @@ impl CorrectionChange<'_> {
         }
         let from = distance(&self.left, &at.world_from_base);
         let to = distance(&at.world_from_base, &self.arrived);
-        // A base that has not moved yet has not drifted; this also avoids 0 / 0.
+        // A base that has not moved yet has not drifted. This condition also avoids 0 / 0.
         let fraction = if from > 0.0 { from / (from + to) } else { 0.0 };
         self.at(&at.world_from_base, fraction)
     }
@@ -291,9 +292,9 @@ impl Stations {
     }
 
     fn take(&mut self, change: Change, released: &mut Vec<Change>) {
-        // A keyframe that shows that the scan is over starts the registration without it. It is put
-        // back and belongs to the next group. `advance_to` does the same with time alone, for a
-        // base that sends no more keyframes.
+        // If a keyframe shows that the scan is over, registration starts without this keyframe. It
+        // is put back and belongs to the next group. `advance_to` does the same with time alone,
+        // for a base that sends no more keyframes.
         let ends_group = match &change {
             Change::Accepted(keyframe) => {
                 self.is_overdue(keyframe.stamp) || self.leaves_station(keyframe)
@@ -306,8 +307,8 @@ impl Stations {
             return;
         }
         match change {
-            // With nothing held, keyframes of the current station pass at once, so that an arm that
-            // scans from one place trains without delay.
+            // If no keyframes are held, keyframes of the current station pass at once. An arm that
+            // scans from one place is thus trained without delay.
             Change::Accepted(keyframe)
                 if self.held.is_empty() && self.is_at_current_station(&keyframe) =>
             {
@@ -346,8 +347,8 @@ impl Stations {
     /// Whether the queued keyframes have waited too long at the time `now`.
     fn is_overdue(&self, now: Stamp) -> bool {
         let waited_secs = |first: Option<&Keyframe>| first.map(|first| now.secs_since(first.stamp));
-        // A scan has begun as soon as one held keyframe is at a station. From then on its shorter
-        // limit applies, counted from that keyframe.
+        // A scan has begun as soon as one held keyframe is at a station. From then on, the shorter
+        // limit of a scan applies, counted from that keyframe.
         match (
             waited_secs(self.group().next()),
             waited_secs(self.held_keyframes().next()),
@@ -385,7 +386,7 @@ impl Stations {
             }
             return;
         };
-        // The keyframes are registered from the best known guess: the drift since the last station
+        // Registration starts from the current correction, because the drift since the last station
         // is much smaller than the drift since the start.
         let new: Vec<Arc<Keyframe>> = self
             .group()
@@ -472,7 +473,7 @@ impl Stations {
         }
         self.reference_keyframes.push(Arc::clone(keyframe));
         if self.reference_keyframes.len() > MAX_REFERENCE_KEYFRAMES {
-            // Sorted by split first, so that thinning keeps keyframes of both splits.
+            // Keyframes are sorted by split first, so that thinning keeps keyframes of both splits.
             self.reference_keyframes
                 .sort_by_key(|keyframe| (keyframe.split == Split::Validation, keyframe.stamp));
             let mut ixs = 0..;

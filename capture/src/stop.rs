@@ -36,7 +36,7 @@ impl Stop {
     /// and the next Ctrl-C does not end the process at once.
     pub fn rearm(&mut self, message: &'static str) {
         self.message = message;
-        // A signal that arrives in between still requests a stop, because its handler sets
+        // A signal that arrives during this loop still requests a stop, because its handler sets
         // `interrupted` first.
         for flag in [
             &self.signaled,

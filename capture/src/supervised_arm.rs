@@ -11,8 +11,8 @@ use std::time::Duration;
 
 /// Duration of one wait for a joint state. It bounds the time until a request to stop is noticed.
 const POLL: Duration = Duration::from_millis(50);
-/// A movable arm that reports nothing for this long counts as lost. It is longer than pauses of a
-/// busy computer, because an error here stops a motion.
+/// A movable arm that reports nothing for this long counts as lost. The time is longer than pauses
+/// of a busy computer, because an error here stops a motion.
 const MAX_SILENCE: Duration = Duration::from_secs(2);
 
 /// Instruction for the user while an arm is held that its motors would release.
@@ -74,8 +74,8 @@ impl SupervisedArm {
     /// Reads the next joint state. `None` if none arrives in time.
     fn read_within(&mut self, timeout: Duration) -> anyhow::Result<Option<JointState>> {
         let state = self.arm.read(timeout);
-        // Checked after every read, also one that timed out: an arm that has stopped because of a
-        // fault may report nothing any more.
+        // This is checked after every read, even after a timeout, because an arm that has stopped
+        // because of a fault may no longer report anything.
         if let Motion::Stopped { reason } = self.arm.motion() {
             bail!(
                 "the arm stopped: {reason}. Inspect it, then recover it with `fieldrig move {}`",
@@ -150,7 +150,7 @@ impl SupervisedArm {
     ) -> anyhow::Result<MotionEnd> {
         let end = self.follow_while_read(stop, on_state);
         // If the program can no longer read the arm, it must not leave it moving unsupervised. An
-        // arm that has stopped by itself stays as it is.
+        // arm that has already stopped is not commanded again.
         if end.is_err()
             && !matches!(self.arm.motion(), Motion::Stopped { .. })
             && let Err(error) = self.arm.stop()
@@ -170,8 +170,8 @@ impl SupervisedArm {
         loop {
             let state = self.read()?;
             on_state(&state);
-            // Arrival counts more than a stop that was requested at the same time: the arm is at
-            // rest already.
+            // Arrival has priority over a stop that was requested at the same time, because the arm
+            // is already at rest.
             if self.arm.motion() == Motion::Holding {
                 return Ok(MotionEnd {
                     state,

@@ -231,8 +231,8 @@ mod emulated_controller {
     const BUSY: &str = "communication_constraints_violation";
     const MAX_ATTEMPTS: usize = 3;
 
-    /// An arm that requests a stop once its joint has moved by this much. A time would depend on
-    /// the load of the computer.
+    /// An arm that requests a stop once its joint has moved by this much. The stop depends on the
+    /// position, because a time would depend on the load of the computer.
     struct StoppedOnTheWay {
         arm: Box<dyn MovableArm>,
         after_rad: f64,

@@ -112,7 +112,7 @@ fn camera([width, height]: [u32; 2], focal_px: f64, lens: Lens) -> Intrinsics {
 }
 
 fn alignment(criterion: &mut Criterion) {
-    // As on a D435: the color camera is 15 mm to the side of the depth camera and slightly rotated.
+    // As on a D435, the color camera is 15 mm to the side of the depth camera and slightly rotated.
     let color_from_depth = Transform::from_parts(
         Translation3::new(0.0148, 0.0002, 0.0003),
         UnitQuaternion::from_euler_angles(0.003, -0.006, 0.002),

@@ -139,7 +139,8 @@ impl Image {
         }
     }
 
-    /// The size of a compressed image, and the decoded image if it has the size of this one.
+    /// Returns the size of a compressed image. Also returns the decoded image if its size is as
+    /// expected.
     fn decode_of_size(
         &self,
         format: ImageFormat,
@@ -348,8 +349,8 @@ mod tests {
                         tight,
                         "{format:?} {size_px:?} {padding}"
                     );
-                    // Devices may omit the padding of the last row, and may send more bytes than
-                    // they fill.
+                    // Devices may omit the padding of the last row. They may also send more bytes
+                    // than they have filled.
                     assert_eq!(
                         &*pack(&padded[..padded.len() - padding])
                             .expect("no last padding")

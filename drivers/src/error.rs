@@ -284,7 +284,7 @@ pub enum Error {
         /// Error of the operating system.
         source: std::io::Error,
     },
-    /// A topic of a recording has other contents than its name requires.
+    /// The contents of a topic of a recording do not match its name.
     #[error("the recording {path:?}: topic {topic:?}: {reason}")]
     BrokenTopic {
         /// The file.

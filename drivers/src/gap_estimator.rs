@@ -3,12 +3,13 @@
 use kinematics::Stamp;
 
 /// If an image is late by more than this many periods, images were dropped before it. Smaller
-/// delays are jitter. A smaller value counts jitter as lost images, a larger one misses losses.
+/// delays are jitter. With a smaller value, jitter would count as lost images; with a larger value,
+/// losses would be missed.
 const LATE_PERIODS: f64 = 0.75;
-/// Fraction of the delay of an image by which the next due time is shifted. Without this correction,
-/// due times would drift away from the images, because the actual frame rate differs from the
-/// nominal rate. With a larger value, a single late image shifts the due time more; 0.05 averages
-/// over about 20 images.
+/// Fraction of the delay of an image by which the next due time is shifted. Without this
+/// correction, due times would drift away from the images, because the actual frame rate differs
+/// from the nominal rate. The value 0.05 averages over about 20 images. With a larger value, a
+/// single late image would shift the due time more.
 const DRIFT_GAIN: f64 = 0.05;
 
 /// Estimates when the images of a camera are due. Images may be late, but never early.
@@ -35,8 +36,8 @@ impl GapEstimator {
         let late_periods = stamp.secs_since(due) / self.period_secs;
         let lost_periods = (late_periods - LATE_PERIODS).ceil().max(0.0);
         let delayed_secs = (late_periods - lost_periods) * self.period_secs;
-        // Images are never early. So an image before its due time means that all earlier images
-        // were delayed, and the whole difference is corrected.
+        // Images are never early. If an image arrives before its due time, all earlier images were
+        // delayed, so the whole difference is corrected.
         let correction_secs = if delayed_secs < 0.0 {
             delayed_secs
         } else {
@@ -70,7 +71,7 @@ mod tests {
     fn gaps_are_counted_but_jitter_is_not() {
         assert_eq!(n_lost(25.0, [0.0, 40.0, 80.0, 160.0, 200.0]), 1);
         assert_eq!(n_lost(25.0, [0.0, 40.0, 1080.0, 1120.0]), 25);
-        // Images delayed one after another, then on time again.
+        // Images are delayed one after another, and then arrive on time again.
         assert_eq!(n_lost(25.0, [0.0, 65.0, 105.0, 122.0, 160.0]), 0);
         let jitter = |ix: u32| f64::from(ix) * 40.0 + f64::from(ix * ix % 27);
         assert_eq!(n_lost(25.0, (0..1000).map(jitter)), 0);

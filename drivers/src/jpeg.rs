@@ -104,15 +104,15 @@ fn scan_markers(buffer: &[u8], start: usize) -> Result<ImageExtent, (JpegError, 
     let mut has_tables = false;
     let mut is_sequential = false;
     loop {
-        // Instead of a marker right here, the next one is sought. This skips stray bytes between
-        // segments. It also skips coded data, in which a 0 follows each 0xff, so that no marker
-        // appears in it.
+        // The next marker is searched for instead of being expected here. This skips stray bytes
+        // between segments. It also skips coded data, which contain no markers because a 0 follows
+        // each 0xff.
         let (marker_at, marker) =
             next_marker(buffer, position).ok_or((JpegError::Truncated, buffer.len()))?;
         position = marker_at + 2;
         match (marker, first_scan) {
-            // A start outside of a segment is another image. One inside, such as that of a
-            // thumbnail, has been skipped with its segment.
+            // A start marker outside of a segment begins another image. A start marker inside a
+            // segment, such as that of a thumbnail, has been skipped with its segment.
             (START_OF_IMAGE, _) => return Err((JpegError::Truncated, marker_at)),
             (END_OF_IMAGE, None) => return Err((JpegError::NoScanData, position)),
             (END_OF_IMAGE, Some(first_scan)) => {
@@ -132,7 +132,8 @@ fn scan_markers(buffer: &[u8], start: usize) -> Result<ImageExtent, (JpegError, 
         let &[high, low, ..] = &buffer[position..] else {
             return Err((JpegError::Truncated, buffer.len()));
         };
-        // A length below 2 is invalid; taking 2 still moves forward, so the loop ends.
+        // A length below 2 is invalid. Using 2 instead still advances the position, so the loop
+        // ends.
         position += usize::from(u16::from_be_bytes([high, low])).max(2);
         if position > buffer.len() {
             return Err((JpegError::Truncated, buffer.len()));
@@ -291,7 +292,8 @@ mod tests {
             first_image(&[&first[..], &second].concat()).as_deref(),
             Ok(&first[..])
         );
-        // Cuts inside a segment are not tested: its length would reach into the second image.
+        // Cuts inside a segment are not tested, because the length of the segment would reach into
+        // the second image.
         for n_bytes in [2, 20, first.len() / 2, first.len() - 2] {
             let buffer = [&first[..n_bytes], &second].concat();
             assert_eq!(

@@ -9,15 +9,16 @@ use std::thread::JoinHandle;
 use std::time::Duration;
 
 /// Queue capacity of a camera, in images. If it is full, the oldest image is dropped. Eight images
-/// are a quarter of a second at 30 Hz, which bridges pauses of the caller; more would hold stale
-/// images in memory, of up to several megabytes each.
+/// are a quarter of a second at 30 Hz, which bridges pauses of the caller. A longer queue would
+/// keep stale images in memory, of up to several megabytes each.
 const MAX_IMAGES: usize = 8;
 /// Queue capacity for joint states and base poses: one second at 1 kHz.
 const MAX_JOINTS: usize = 1000;
 /// Queue capacity of a range scanner, in scans: two seconds at 10 Hz, the usual rate.
 const MAX_SCANS: usize = 20;
-/// A device that delivers no samples for this long causes an error. Devices that need a few seconds
-/// to start must not fail, and an operator should not wait long for the message.
+/// A device that delivers no samples for this long causes an error. The limit must be longer than
+/// the few seconds that some devices need to start. It should be short, so that an operator does
+/// not wait long for the message.
 const MAX_SILENCE: Duration = Duration::from_secs(5);
 /// Duration of one wait on a device. It bounds the time until its thread notices that it has to
 /// stop.
@@ -135,7 +136,7 @@ impl LiveDevices {
             match camera.next_image(POLL) {
                 Err(Error::Ended { .. }) => Ok(ReadOutcome::End),
                 Err(Error::NoImage { .. }) => Ok(ReadOutcome::NoSample),
-                // The driver has its own time limit for reconnecting, and a file its own clock.
+                // The driver has its own time limit for reconnecting, and a file has its own clock.
                 Err(Error::Reconnecting { .. } | Error::NotDue { .. }) => Ok(ReadOutcome::Pending),
                 image => image.map(Sample::Image).map(ReadOutcome::Sample),
             }
@@ -207,8 +208,8 @@ impl LiveDevices {
             .name(device.clone())
             .spawn(move || {
                 read(&shared);
-                // Also after an error or at the end of a file, so that the caller does not wait for
-                // a device that will not deliver any more.
+                // This is also done after an error or at the end of a file, so that the caller does
+                // not wait for a device that no longer delivers samples.
                 shared.state.lock().n_running -= 1;
                 shared.arrived.notify_all();
             });
@@ -266,7 +267,8 @@ fn read_until_stopped(
         let error = match sample {
             Ok(ReadOutcome::Sample(sample)) => {
                 waited = Duration::ZERO;
-                // A file that is read as fast as possible would otherwise drop most of its images.
+                // Without this wait, most images of a file that is read as fast as possible would
+                // be dropped.
                 while policy.blocks_device
                     && state.queues[device_ix].len() >= policy.capacity
                     && !state.stop
@@ -279,8 +281,8 @@ fn read_until_stopped(
             }
             Ok(ReadOutcome::End) => {
                 state.n_cameras -= 1;
-                // Arm and base never end. Without images, nothing more can be done with their
-                // samples.
+                // The samples of arm and base never end. They are useless once there are no more
+                // images.
                 state.stop |= state.n_cameras == 0;
                 return;
             }
@@ -295,8 +297,8 @@ fn read_until_stopped(
             Ok(ReadOutcome::NoSample) => timeout_error(waited + POLL),
             Err(error) => error,
         };
-        // Only the first error is reported: later ones are often its consequence, such as two
-        // devices on one unplugged hub.
+        // Only the first error is reported, because later ones often have the same cause. For
+        // example, two devices may be connected to the same unplugged hub.
         if !state.failed {
             state.failed = true;
             state.error = Some(error);
@@ -325,8 +327,8 @@ impl State {
     /// kind.
     fn report_dropped(&mut self, device_ix: usize, dropped_image: &Image, newest: &mut Sample) {
         let same_kind = |sample: &&mut Sample| matches!(sample, Sample::Image(image) if image.is_depth() == dropped_image.is_depth());
-        // The count is carried by the next image of the same kind that is still delivered, so that
-        // it appears where the gap is, and drops of color and depth are not mixed.
+        // The next image of the same kind that is still delivered contains the count. The count
+        // thus appears at the gap, and dropped color and depth images are counted separately.
         let pending = &mut self.dropped[device_ix][usize::from(dropped_image.is_depth())];
         *pending += dropped_image.n_skipped + 1;
         if let Some(Sample::Image(next)) = self.queues[device_ix]
@@ -340,8 +342,8 @@ impl State {
 
     /// Removes the oldest queued sample of all devices.
     fn take(&mut self) -> Option<Sample> {
-        // Queues are in stamp order, so the oldest sample of all is at the head of one. Equal
-        // stamps are decided by the index, and thus always alike.
+        // Each queue is in stamp order, so the oldest sample of all is at the head of a queue. If
+        // stamps are equal, the index decides, so that the result is always the same.
         let heads = self
             .queues
             .iter()
@@ -356,8 +358,8 @@ impl Source for LiveDevices {
     fn next_sample(&mut self) -> Result<Option<Sample>, Error> {
         let mut state = self.shared.state.lock();
         loop {
-            // The error comes before queued samples: they are of no use without the device, and
-            // waiting would delay the message.
+            // The error is returned before queued samples. The samples are useless without the
+            // device, and waiting would delay the message.
             if let Some(error) = state.error.take() {
                 return Err(error);
             }
@@ -489,7 +491,7 @@ mod tests {
         while live.shared.state.lock().n_running > 0 {
             std::thread::yield_now();
         }
-        // Errors come first: samples that a failed device sent earlier are not worth waiting for.
+        // Errors are returned first, before samples that the failed device has sent earlier.
         assert!(
             live.next_sample()
                 .expect_err("the cable")

@@ -21,14 +21,15 @@ impl Outage {
             n_tries: 0,
             last_try: now,
         });
-        // A camera that was opened but sent nothing starts a new pause here. It would otherwise be
-        // reopened at once, again and again.
+        // A camera that was opened but sent nothing starts a new pause here. Without the pause, it
+        // would be reopened at once, again and again.
         outage.last_try = now;
         *outage
     }
 
     /// Waits until the next attempt is due, one pause after the last attempt, and counts the
-    /// attempt. If it is due after the deadline, waits until the deadline and returns false.
+    /// attempt. If the attempt is due after the deadline, waits until the deadline and returns
+    /// false.
     pub(crate) fn wait_for_retry(&mut self, pause: Duration, deadline: Instant) -> bool {
         let next_try = self.last_try + pause;
         std::thread::sleep(

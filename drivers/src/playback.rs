@@ -13,10 +13,10 @@ const MAX_DELAY: Duration = Duration::from_millis(270);
 
 /// A source whose samples are returned when they are due, by their stamps and their order.
 ///
-/// A sample is due as long after the first one as its stamp is, but not before the samples in front
-/// of it: an image that was recorded after the joint states of the following 30 ms is returned 30
-/// ms after its stamp, which keeps the latency of its camera. If the caller is too slow, images are
-/// dropped and counted, as with devices.
+/// The time from the first sample until a sample is due is the difference of their stamps. A sample
+/// is never due before the samples in front of it, which keeps the latency of cameras. For example,
+/// an image that was recorded after the joint states of the following 30 ms is returned 30 ms after
+/// its stamp. If the caller is too slow, images are dropped and counted, as with devices.
 pub struct Playback {
     source: Box<dyn Source>,
     clock: PlaybackClock,
@@ -34,8 +34,8 @@ pub struct PlaybackClock {
 }
 
 impl PlaybackClock {
-    /// When a measurement with this stamp takes place in the playback; `None` before the first
-    /// sample, and for earlier stamps that this process's clock cannot represent.
+    /// Time at which a measurement with this stamp takes place in the playback. `None` before the
+    /// first sample, and for stamps that are too early for this process's clock.
     #[must_use]
     pub fn instant_of(&self, stamp: Stamp) -> Option<Instant> {
         let (first, began) = self.start.get()?;
@@ -73,8 +73,8 @@ impl Playback {
         let due = self
             .clock
             .instant_of(stamp)
-            // A sample is never due before one in front of it. Unrepresentable times are taken as
-            // now.
+            // A sample is never due before the samples in front of it. Times that the clock cannot
+            // represent are replaced by the current time.
             .max(self.last_due)
             .unwrap_or_else(Instant::now);
         self.last_due = Some(due);
@@ -128,7 +128,7 @@ mod tests {
     use crate::scripted::{self, Scripted, joints};
 
     fn millis(millis: i64) -> Stamp {
-        // Stamps of another computer.
+        // These are stamps of another computer.
         Stamp(7_000_000_000_000 + millis * 1_000_000)
     }
 

@@ -26,8 +26,9 @@ pub(crate) trait ReopenableCamera: Debug {
     fn open(&mut self) -> Result<Self::Stream, Failure<Self::Problem>>;
 
     /// Description of device, mode and settings for the log; `None` while the camera is still being
-    /// opened. If opening proves nothing, as for a camera that only sends datagrams, it is `None`
-    /// until the first image. A camera counts as reconnected once it has a description.
+    /// opened. For a camera that only sends datagrams, opening does not prove that the camera
+    /// exists. It then returns `None` until the first image. A camera counts as reconnected once it
+    /// has a description.
     fn describe(&self, stream: &Self::Stream) -> Option<String>;
 
     /// Waits for the next image. Returns `None` if no image arrived; the caller may call again if
@@ -53,8 +54,8 @@ pub(crate) trait ReopenableCamera: Debug {
 pub(crate) enum Failure<P> {
     /// The camera is disconnected, or has a problem that may disappear if it is reopened.
     Lost(P),
-    /// An error that another attempt cannot remove, because the camera answered and refuses the rig
-    /// file's settings. It is returned without another attempt.
+    /// An error that would occur again, because the camera answered and refuses the rig file's
+    /// settings. It is returned without another attempt.
     #[cfg_attr(
         not(any(target_os = "linux", feature = "realsense", test)),
         expect(dead_code, reason = "the nokhwa driver has no such errors")
@@ -163,8 +164,8 @@ impl<C: ReopenableCamera> Reconnecting<C> {
             if let Some(image) = self.poll_image(deadline)? {
                 return Ok(image);
             }
-            // While the camera is still being opened, this is the outage that is known already, not
-            // a new silence.
+            // While the camera is still being opened, a missing image is part of the known outage,
+            // not a new silence.
             if self.stream.is_some() && Instant::now() >= deadline {
                 return Err(match self.outage {
                     Some(outage) if !self.is_streaming => self.reconnecting(outage),
@@ -196,9 +197,10 @@ impl<C: ReopenableCamera> Reconnecting<C> {
     fn count(&mut self, mut image: Image) -> Image {
         let kind = usize::from(image.is_depth());
         let last = self.last[kind].replace(image.stamp);
-        // Sequence numbers start again when a camera is opened, so the driver cannot count across
-        // an outage. The stamps can. The larger number wins, because the driver may have counted
-        // images that were dropped after opening.
+        // Sequence numbers start again when a camera is opened, so the driver cannot count images
+        // that were lost during an outage. The number is estimated from the stamps instead. The
+        // larger number is used, because the driver may have counted images that were dropped after
+        // opening.
         let is_first_since_open = !std::mem::replace(&mut self.has_image[kind], true);
         if let (true, Some(last)) = (is_first_since_open, last) {
             image.n_skipped =
@@ -206,8 +208,8 @@ impl<C: ReopenableCamera> Reconnecting<C> {
                     .n_skipped
                     .max(n_between(last, image.stamp, self.policy.rate_hz));
         }
-        // The outage ends with an image, not with the opening: a camera may be opened and send
-        // nothing.
+        // The outage ends with an image and not with the opening, because a camera may be open but
+        // send nothing.
         self.outage = None;
         self.counts.n_images += 1;
         self.counts.n_skipped += image.n_skipped;
@@ -218,10 +220,11 @@ impl<C: ReopenableCamera> Reconnecting<C> {
     /// returns.
     fn disconnect(&mut self, problem: C::Problem) -> Result<(), Error> {
         let outage = Outage::of(&mut self.outage);
-        // Dropped before the warning and any wait: the device node is free from here on.
+        // The stream is dropped before the warning and any wait, so that the device node is free
+        // from here on.
         self.stream = None;
-        // The first problem is a warning. Later ones are details until the time is over, because
-        // the log would otherwise repeat them at every attempt.
+        // The first problem is a warning. Later problems are logged as details until the time
+        // limit, because the log would otherwise repeat them at every attempt.
         if outage.n_tries > 0 {
             return self.fail_if_overdue(outage, problem);
         }

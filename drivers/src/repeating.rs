@@ -56,8 +56,8 @@ impl<Reopen: FnMut() -> Result<Box<dyn Source>, Error> + Send> Source for Repeat
                 return Ok(None);
             };
             self.has_image = false;
-            // Opened before the offset changes: after an error, this source still has consistent
-            // stamps.
+            // The source is reopened before the offset changes. If reopening fails, this source
+            // thus still has consistent stamps.
             self.source = (self.reopen)()?;
             let round_nanos = latest.nanos_since(earliest).saturating_add(PAUSE_NANOS);
             self.offset_nanos = self.offset_nanos.saturating_add(round_nanos);

@@ -73,7 +73,7 @@ impl YuvColors {
         const DCI_P3: u32 = 12;
         let colorspace = match (reported.colorspace, reported.is_hdtv) {
             (0, true) => REC709,
-            // Same matrix and range as standard definition (SMPTE 170M).
+            // The matrix and range are those of standard definition (SMPTE 170M).
             (0, false) => SRGB,
             (colorspace, _) => colorspace,
         };
@@ -115,7 +115,7 @@ impl YuvColors {
             YuvRange::Full => (0.0, 1.0, 1.0),
         };
         // BT.601-7, section 2.5: V is `(R - Y) / (2 (1 - red))`, U is `(B - Y) / (2 (1 - blue))`.
-        // Solved for R and B. G follows from `Y = red R + green G + blue B`.
+        // The equations are solved for R and B. G follows from `Y = red R + green G + blue B`.
         let v_in_red = 2.0 * (1.0 - red) * chroma;
         let u_in_blue = 2.0 * (1.0 - blue) * chroma;
         (

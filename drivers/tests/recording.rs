@@ -286,7 +286,7 @@ fn an_unfinished_recording_is_readable() {
     for sample in &sent {
         recorder.write(sample).expect("writing a sample");
     }
-    std::mem::forget(recorder); // As if the program were killed.
+    std::mem::forget(recorder); // The recording ends as if the program had been killed.
     let (read, recording) = replay(&path);
     assert!(read[..] == sent[..read.len()]);
     let last = read.last().expect("some").stamp();

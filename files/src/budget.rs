@@ -69,7 +69,8 @@ impl Budget {
     pub const SPLATS: Self = Self {
         max_bytes: u64::MAX,
         max_elements: 100_000_000,
-        // Far above the factor of real files, far below that of a file made to fill the memory.
+        // This is far above the factor of real files, and far below the factor of a file made to
+        // fill the memory.
         max_expansion: 50,
     };
     /// Point clouds from which training starts.

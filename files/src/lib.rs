@@ -5,12 +5,12 @@
 //! - Whole files and folders are written under a [temporary name](partial::path_of), which no user
 //!   has chosen, and then renamed, so that they are complete or absent. [`begin`] is the exception:
 //!   it starts a growing log under its final name.
-//! - Symbolic links are followed when reading, but neither the temporary nor the final name of an
-//!   output is followed.
+//! - Symbolic links are followed when reading. When writing, a link under the temporary or the
+//!   final name of an output is not followed.
 //! - A file or folder that stays in use for a whole run can be [`Kept`] open. [`Kept::place`] then
 //!   reports whether it was removed or renamed, and [`Kept::restore`] restores a removed file.
-//! - Of two programs that write the same file at the same time, the second gets an error, if the
-//!   file system supports locks.
+//! - If two programs write the same file at the same time, the second program gets an error. This
+//!   requires a file system that supports locks.
 
 mod budget;
 mod kept;

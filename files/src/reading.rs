@@ -11,11 +11,11 @@ use std::path::Path;
 /// # Errors
 /// If the file cannot be opened, or is a folder, a pipe, a socket or a device.
 pub fn open(path: &Path) -> std::io::Result<File> {
-    // Opening a pipe waits for its writer, and opening a device may start it, so the type is
-    // checked before, too.
+    // Opening a pipe waits for its writer, and opening a device may start the device. The type is
+    // therefore also checked before opening.
     check_type(&std::fs::metadata(path)?.file_type())?;
-    // Between the check and the opening, another program may replace the file. Without waiting, a
-    // pipe is opened at once, and refused by the second check.
+    // Another program may replace the file between this check and the opening. With `NONBLOCK`, a
+    // pipe that replaces it is opened at once, and the second check refuses it.
     let flags = rustix::fs::OFlags::NONBLOCK.bits().cast_signed();
     let file = OpenOptions::new()
         .read(true)
@@ -70,7 +70,8 @@ pub fn read(path: &Path, budget: Budget) -> std::io::Result<Vec<u8>> {
 /// As [`read`], and if the file is not UTF-8.
 pub fn read_text(path: &Path) -> std::io::Result<String> {
     let bytes = read(path, Budget::TEXT)?;
-    // Windows editors offer UTF-16 as "Unicode". The byte order mark distinguishes it.
+    // Windows editors offer UTF-16 under the name "Unicode". Its byte order mark shows that a text
+    // is in UTF-16.
     let is_utf_16 = [[0xFF, 0xFE], [0xFE, 0xFF]]
         .iter()
         .any(|mark| bytes.starts_with(mark));
@@ -82,7 +83,8 @@ pub fn read_text(path: &Path) -> std::io::Result<String> {
         };
         Error::new(ErrorKind::InvalidData, found)
     })?;
-    // The parsers of TOML, JSON and lists would take the mark for a part of the first word.
+    // The parsers of TOML, JSON and lists would treat the byte order mark as a part of the first
+    // word.
     if text.starts_with('\u{FEFF}') {
         text.drain(..'\u{FEFF}'.len_utf8());
     }

@@ -64,7 +64,7 @@ pub fn create_from<T, E: From<Error>>(
     write: impl FnOnce(&Path) -> Result<T, E>,
 ) -> Result<T, E> {
     if path.symlink_metadata().is_ok() {
-        // Checked before the work, which may take minutes. `publish` checks again.
+        // The name is checked before the work, which may take minutes. `publish` checks it again.
         return Err(exists().into());
     }
     let unfinished = Unfinished::folder(path)?;
@@ -78,8 +78,8 @@ pub fn create_from<T, E: From<Error>>(
 
 /// Calls `write` with a path in a temporary folder. `write` creates a folder there, which is then
 /// moved to `path`. If `path` is a folder already, those `entries` that `write` created are moved
-/// into it, in this order. A killed program may have moved only the first entries, so the last one
-/// should be the one by which readers recognize the folder.
+/// into it in the given order. If the program is killed, it may have moved only the first entries.
+/// The last entry should therefore be the one by which readers recognize the folder.
 ///
 /// # Errors
 /// The errors of `write`, and those of [`create`]. Entries that have already been moved are removed
@@ -100,8 +100,8 @@ pub fn create_folder<T, E: From<Error>>(
     let mut moved = Vec::new();
     for entry in entries.iter().filter(|entry| inside.join(entry).exists()) {
         publish(&inside.join(entry), &path.join(entry))?;
-        // Until all are moved, a failure or signal removes those that have been moved, too: half an
-        // export looks like a complete one.
+        // Until all entries are moved, a failure or signal also removes the entries that have been
+        // moved, because half an export looks like a complete one.
         moved.push(Registered::new(&path.join(entry)));
     }
     sync_parent(&contents)?;
@@ -120,8 +120,8 @@ fn write_and_publish(
 ) -> std::io::Result<()> {
     let mut unfinished = Unfinished::file(path)?;
     contents(&mut unfinished.file)?;
-    // The contents must be on the disk before the name is: after a power failure, the name would
-    // otherwise lead to an empty file.
+    // The contents must be on the disk before the name is. Otherwise, the name could lead to an
+    // empty file after a power failure.
     unfinished.file.sync_all()?;
     publish(&unfinished.path)?;
     // From here on, the temporary name may belong to another program.
@@ -168,8 +168,8 @@ fn sync_parent(path: &Path) -> std::io::Result<()> {
 /// there.
 struct Unfinished {
     path: PathBuf,
-    /// Declared before `file`: fields drop in order, so the path is removed while it is still
-    /// locked.
+    /// This field is declared before `file`. Fields drop in order, so the path is removed while it
+    /// is still locked.
     registered: Registered,
     /// The file, or the folder opened for the lock.
     file: File,
@@ -190,15 +190,15 @@ impl Unfinished {
         })
     }
 
-    /// Makes and locks the temporary file. One that is left over from a program that was killed is
-    /// removed first. Until it is locked, another program may mistake it for a leftover and remove
-    /// it; then `make` returns `None`.
+    /// Makes and locks the temporary file. A leftover file of a program that was killed is removed
+    /// first. Until the new file is locked, another program may mistake it for a leftover and
+    /// remove it; then `make` returns `None`.
     fn new(
         path: &Path,
         make: impl Fn(&Path) -> std::io::Result<Option<File>>,
     ) -> std::io::Result<Self> {
-        // Each attempt fails only if another program acts between two calls of this one. A hundred
-        // times in a row means that it keeps doing so.
+        // Each attempt fails only if another program acts between two calls of this program. If
+        // this happens a hundred times in a row, the other program will not stop.
         const MAX_ATTEMPTS: usize = 100;
         let busy = || Error::new(ErrorKind::ResourceBusy, "another program is writing it");
         let unfinished = partial::path_of(path);
@@ -207,9 +207,9 @@ impl Unfinished {
             match make(&unfinished) {
                 Ok(None) => {}
                 Ok(Some(file)) => {
-                    // Between creation and lock, another program may have taken the file for a
-                    // leftover and removed it. Then the lock is that of a file without a name, and
-                    // the next attempt makes a new one.
+                    // Between creation and lock, another program may have mistaken the file for a
+                    // leftover and removed it. This program then holds the lock of a file without a
+                    // name, and the next attempt makes a new file.
                     if try_lock(&file)? && is_at(&file, &unfinished) {
                         let registered = Registered::new(&unfinished);
                         return Ok(Self {
@@ -223,18 +223,19 @@ impl Unfinished {
                     let flags =
                         OFlags::RDONLY | OFlags::NOFOLLOW | OFlags::NONBLOCK | OFlags::CLOEXEC;
                     match rustix::fs::open(&unfinished, flags, Mode::empty()).map(File::from) {
-                        // The lock distinguishes a leftover from a file that is being written: the
-                        // kernel releases it when its program ends, however that happens.
+                        // The lock distinguishes a leftover from a file that is being written. The
+                        // kernel releases the lock when its program ends, even if the program was
+                        // killed.
                         Ok(leftover) if !try_lock(&leftover)? => return Err(busy()),
                         // Holding the lock keeps other programs from removing a new file at this
                         // path in the meantime.
                         Ok(leftover) if is_at(&leftover, &unfinished) => {
                             partial::remove_leftover(&unfinished, &[name])?;
                         }
-                        // Its program has just published or removed it.
+                        // The program that made the file has just published or removed it.
                         Ok(_) | Err(rustix::io::Errno::NOENT) => {}
-                        // A symbolic link and a socket cannot be opened, and no program is writing
-                        // them.
+                        // A symbolic link or a socket cannot be opened, and no program is writing
+                        // it.
                         Err(_) => partial::remove_leftover(&unfinished, &[name])?,
                     }
                 }
@@ -257,7 +258,7 @@ fn try_lock(file: &File) -> std::io::Result<bool> {
 }
 
 fn is_at(file: &File, path: &Path) -> bool {
-    // Device and inode: paths may be renamed.
+    // The file is identified by device and inode, because paths may be renamed.
     let id = |metadata: std::fs::Metadata| (metadata.dev(), metadata.ino());
     file.metadata().is_ok_and(|open| {
         path.symlink_metadata()
@@ -393,7 +394,8 @@ mod tests {
         let path = folder.path().join("scene.ply");
         std::fs::write(partial::path_of(&path), "of a program that was killed").expect("written");
         replace(&path, |file| {
-            // As another program would; locks of one process conflict in the same way.
+            // The test takes the lock as another program would. Locks of one process conflict in
+            // the same way as locks of two.
             let refused = replace(&path, text("other")).expect_err("it is being written");
             assert_eq!(refused.to_string(), "another program is writing it");
             assert_eq!(
@@ -439,7 +441,7 @@ mod tests {
             for _ in 0..200 {
                 until_written(&|| replace(&path, text("scene")));
                 until_written(&|| create_from(&created, |inside| std::fs::write(inside, "scene")));
-                // Only its creator removes it.
+                // Only the creator of the file removes it.
                 std::fs::remove_file(&created).expect("it was created");
             }
         };

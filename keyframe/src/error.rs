@@ -44,7 +44,7 @@ pub enum Error {
     List {
         /// The file.
         path: PathBuf,
-        /// Description of the problem, with the line.
+        /// Description of the problem, including the invalid line.
         reason: String,
     },
     /// A list of keyframes has no keyframe in common with the data.

@@ -46,9 +46,9 @@ impl Default for Hash {
 
 impl Hash {
     fn word(&mut self, word: u64) {
-        // The rotation brings the upper bits, into which a multiplication carries everything, back
-        // to where they affect all others. An odd factor keeps the map one to one, so that two
-        // different words cannot have the same result.
+        // A multiplication carries information only into the upper bits. The rotation moves the
+        // upper bits down, where they affect all other bits. An odd factor keeps the map one to
+        // one, so that two different words cannot have the same result.
         self.0 = (self.0.rotate_left(29) ^ word).wrapping_mul(0xd134_2543_de82_ef95);
         self.0 ^= self.0 >> 32;
     }
@@ -59,8 +59,8 @@ impl Hash {
             .iter()
             .for_each(|word| self.word(u64::from_le_bytes(*word)));
         rest.iter().for_each(|byte| self.word((*byte).into()));
-        // Without the length, trailing zeros would not change the hash: each remaining byte is a
-        // word of its own.
+        // The length is part of the hash, because each remaining byte is a word of its own. Without
+        // the length, trailing zeros would not change the hash.
         self.word(bytes.len() as u64);
     }
 

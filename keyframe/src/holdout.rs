@@ -48,8 +48,9 @@ impl Holdout {
 
     /// The split of each photo, in the order of `names`.
     ///
-    /// Validation photos lie halfway between test photos; with named test photos, they are every
-    /// 8th of the others, from the 5th. Names match with or without folder and extension.
+    /// Validation photos lie halfway between test photos. If the test photos are named, every 8th
+    /// of the other photos, starting with the 5th, is for validation. Names match with or without
+    /// folder and extension.
     ///
     /// # Errors
     ///
@@ -65,8 +66,8 @@ impl Holdout {
 fn every_nth(ix: usize, every: usize) -> Split {
     match ix % every {
         0 => Split::Test,
-        // With two photos or fewer between test photos, at least half of them would be lost to
-        // training.
+        // With two or fewer photos between test photos, validation would take at least half of them
+        // from training.
         offset if every >= 4 && offset == every / 2 => Split::Validation,
         _ => Split::Train,
     }
@@ -89,8 +90,8 @@ fn splits_by_name(test_names: &[String], names: &[&str]) -> Result<Vec<Split>, E
             }
         }
         n_remaining += usize::from(!is_test);
-        // Validation photos are counted among the others, so that they are spread evenly wherever
-        // the test photos are.
+        // Validation photos are counted among the photos that are not for testing. They are
+        // therefore spread evenly wherever the test photos are.
         splits.push(if is_test {
             Split::Test
         } else if n_remaining % 8 == 5 {
@@ -99,8 +100,8 @@ fn splits_by_name(test_names: &[String], names: &[&str]) -> Result<Vec<Split>, E
             Split::Train
         });
     }
-    // A name without a photo is probably a typing error. Scores on the rest would look like those
-    // of the whole list.
+    // A name without a photo is probably a typing error. Scores on the other listed photos would
+    // look like scores on the whole list.
     match test_names.iter().find(|name| !requested[name.as_str()]) {
         Some(name) => Err(Error::Holdout {
             request: format!("{name:?}"),

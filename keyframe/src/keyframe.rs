@@ -10,7 +10,7 @@ use std::sync::Arc;
 pub enum Split {
     /// Used for training.
     Train,
-    /// Used to decide hyperparameters and trials, and afterwards for training.
+    /// Used to choose hyperparameters and to decide trials, and afterwards for training.
     Validation,
     /// Used only for reported scores.
     Test,
@@ -64,8 +64,8 @@ pub struct Keyframe {
 }
 
 impl Keyframe {
-    /// Whether most of the image has no depth: the keyframe has no depth, or its depth comes from a
-    /// range scanner, which covers only a band.
+    /// Whether most of the image has no depth. This is so if the keyframe has no depth, or if its
+    /// depth comes from a range scanner, which covers only a band.
     pub fn lacks_dense_depth(&self) -> bool {
         self.depth.as_ref().is_none_or(|depth| {
             // NaN compares false, so it counts as unknown.
@@ -214,8 +214,8 @@ impl DepthMap {
     #[must_use]
     pub fn subsampled(&self, stride: u32) -> Self {
         let [width, height] = self.size_px.map(|size| size / stride);
-        // The center pixel keeps its ray: its position divided by the stride is the center of the
-        // small pixel, so intrinsics only have to be scaled.
+        // The ray of the center pixel does not change, because its position divided by the stride
+        // is the center of the small pixel. The intrinsics therefore only have to be scaled.
         let at = |x: u32, y: u32| {
             ((y * stride + stride / 2) * self.size_px[0] + x * stride + stride / 2) as usize
         };

@@ -10,7 +10,8 @@ pub struct RangePoints {
     pub scanner: Arc<str>,
     /// Begin of the revolution.
     pub stamp: Stamp,
-    /// Pose of the scanner at `stamp`; it is close to where each point was observed from.
+    /// Pose of the scanner at `stamp`. It is close to the poses from which the points were
+    /// observed.
     pub world_from_scanner: Transform,
     /// The points in world, meters.
     pub points_in_world_m: Arc<[[f32; 3]]>,

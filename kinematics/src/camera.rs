@@ -120,7 +120,7 @@ impl Intrinsics {
         Some((self.pixel_at(distorted.value)?, pixel_by_point))
     }
 
-    /// Back-projects a pixel to the point on its ray with `z = 1`. The inverse of
+    /// Back-projects a pixel to the point on its ray with `z = 1`. This is the inverse of
     /// [`Intrinsics::project`], accurate to 1e-12.
     ///
     /// Returns `None` if the pixel is not finite or if no direction in front of the camera projects
@@ -170,7 +170,7 @@ impl Intrinsics {
         // Pincushion distortion of real lenses stays below 1.2. Barrel distortion has no such
         // limit: wide lenses compress the edge of the image.
         const MAX_STRETCH: f64 = 1.5;
-        // Almost 90 degrees from the axis.
+        // Position of a point at almost 90 degrees from the axis.
         const SIDEWAYS: Vector2<f64> = Vector2::new(1e9, 0.0);
         let lens = self.lens_in_use();
         let is_fisheye = matches!(lens, Lens::KannalaBrandt(_));
@@ -203,8 +203,8 @@ impl Intrinsics {
 
     /// Returns the intrinsics for the image resized to `size_px`.
     pub fn resized(&self, size_px: [u32; 2]) -> Self {
-        // Pixel edges are at integers, so scaling maps them to each other without the shift by half
-        // a pixel that conventions with integer pixel centers need.
+        // Pixel edges are at integers, so scaling maps edges to edges. Conventions with integer
+        // pixel centers need an additional offset of half a pixel.
         let ratio = |axis: usize| f64::from(size_px[axis]) / f64::from(self.size_px[axis]);
         Self {
             size_px,
@@ -268,7 +268,8 @@ impl Intrinsics {
                 "a finite number of pixels",
             )?;
         }
-        // Coefficients of a rectified image are checked, too: a file that contains NaN is damaged.
+        // Coefficients of a rectified image are also checked, because a file that contains NaN is
+        // damaged.
         for &k in self.lens.coefficients() {
             let what = "a distortion coefficient";
             check(what, k, k.is_finite(), "a finite number")?;
@@ -313,7 +314,7 @@ fn check(
 mod tests {
     use super::*;
 
-    const ROUND_TRIP: f64 = 1e-12; // On the plane z = 1.
+    const ROUND_TRIP: f64 = 1e-12; // This is a distance on the plane z = 1.
 
     fn camera(lens: Lens) -> Intrinsics {
         Intrinsics {

@@ -79,9 +79,9 @@ impl Chain {
                     });
                 }
             };
-            // Rotates the frame so that the joint's axis is z, where a joint motion has a closed
-            // form that is cheaper than a product. The rotation is undone after the joint, so that
-            // later frames are those of the URDF.
+            // Rotates the frame so that the joint's axis is z. A motion along or about z has a
+            // closed form that is cheaper than a product. The rotation is undone after the joint,
+            // so that later frames are those of the URDF.
             let joint_from_aligned = rotation_from_z_to(&joint.axis);
             let rule = follow_mimics(robot, joint, &mut rules)?;
             // Two mimic joints may follow the same joint, which has one value in a configuration.
@@ -196,7 +196,8 @@ impl Chain {
                 column[axis] += segment.multiplier * linear[axis];
                 column[3 + axis] += segment.multiplier * angular[axis];
             }
-            // The axis above is the one before the joint moves: the motion itself leaves it fixed.
+            // The axis was computed before the joint motion, which is correct because the motion
+            // does not change it.
             pose.move_joint(segment, q);
         }
         Ok(jacobian)
@@ -217,8 +218,7 @@ impl Chain {
     /// For each joint, the velocity of the tip relative to the base, in the tip frame, when only
     /// that joint moves from `q` at unit speed (1 rad/s or 1 m/s).
     pub fn tip_twists_by_joint(&self, q: &[f64]) -> Result<Vec<Twist>, Error> {
-        // A velocity of the tip's origin only changes its axes: the two frames have the same
-        // origin.
+        // The two frames have the same origin, so only the axes of the velocity change.
         let tip_from_base = self.forward(q)?.rotation.inverse();
         let jacobian = self.jacobian(q)?;
         let columns = jacobian.column_iter();
@@ -242,8 +242,8 @@ impl Chain {
                 joints: self.joint_names.clone(),
             });
         }
-        // One NaN of a device would make the whole pose NaN, and later errors could not name the
-        // joint.
+        // A single NaN from a device would make the whole pose NaN, and later errors could not name
+        // the joint.
         match values.iter().position(|value| !value.is_finite()) {
             None => Ok(()),
             Some(at) => Err(Error::JointNotFinite {
@@ -269,7 +269,7 @@ struct MimicRule<'a> {
     offset: f64,
 }
 
-/// The known rules, by joint: chains of mimic joints are followed once.
+/// The known rules, by joint. They ensure that chains of mimic joints are followed only once.
 type MimicRules<'a> = HashMap<&'a str, MimicRule<'a>>;
 
 /// The rule that expresses `joint` by an independent joint, through any number of mimic joints.
@@ -278,7 +278,7 @@ fn follow_mimics<'a>(
     joint: &'a Joint,
     rules: &mut MimicRules<'a>,
 ) -> Result<MimicRule<'a>, Error> {
-    // Upwards: walk from the joint to one that is independent, or whose rule is known.
+    // Upwards: walk from the joint to a joint that is independent or whose rule is known.
     let mut followers = Vec::new();
     let mut current = joint;
     let mut rule = loop {
@@ -309,8 +309,8 @@ fn follow_mimics<'a>(
         followers.push((current, mimic));
         current = source;
     };
-    // Back down: substitute each rule into the one of its follower, and remember it. With `source =
-    // a x + b`, the follower is `m (a x + b) + c = (m a) x + (m b + c)`.
+    // Back down: substitute each rule into the rule of the joint that follows, and remember the
+    // result. With `source = a x + b`, the follower is `m (a x + b) + c = (m a) x + (m b + c)`.
     while let Some((follower, mimic)) = followers.pop() {
         let MimicRule {
             source,
@@ -336,10 +336,10 @@ fn mimic_error(joint: &Joint, mimic: &Mimic, why: &'static str) -> Error {
     }
 }
 
-/// A rotation that turns the z axis to `axis`. The angle about `axis` is arbitrary.
+/// A rotation that maps the z axis to `axis`. The angle about `axis` is arbitrary.
 fn rotation_from_z_to(axis: &Unit<Vector3<f64>>) -> UnitQuaternion<f64> {
-    // Opposite directions leave the rotation axis undetermined: a half turn about any axis
-    // perpendicular to z works.
+    // For opposite directions, the rotation axis is not determined. A half turn about any axis
+    // perpendicular to z is correct.
     UnitQuaternion::rotation_between_axis(&Vector3::z_axis(), axis)
         .unwrap_or_else(|| UnitQuaternion::from_quaternion(Quaternion::new(0.0, 1.0, 0.0, 0.0)))
 }

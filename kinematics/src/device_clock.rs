@@ -7,7 +7,7 @@ use std::collections::VecDeque;
 ///
 /// Every message arrives at `device * (1 + drift) + offset + latency`, where the latency has a
 /// fixed minimum and is often much larger. All arrivals therefore lie above a line. The map is the
-/// highest such line: the edge of the lower convex hull across the mean device time (Moon, Skelly
+/// highest such line. It is the edge of the lower convex hull at the mean device time (Moon, Skelly
 /// and Towsley 1999, section 4). Late arrivals do not move the line. The minimum latency cannot be
 /// observed and remains in the result; calibration estimates it.
 #[derive(Clone, Debug)]
@@ -46,23 +46,24 @@ struct Line {
 }
 
 /// Each bucket keeps one arrival. Longer buckets take less memory and time, but have fewer points
-/// near the line; shorter ones hold more late arrivals that never touch the line.
+/// near the line. Shorter buckets keep more late arrivals, which never touch the line.
 const BUCKET_NANOS: i64 = 250_000_000;
 /// Arrivals older than this are discarded, so that the map follows a drift that changes with
-/// temperature. A longer window averages more latency, a shorter one follows temperature faster.
+/// temperature. A longer window averages more latency. A shorter window follows temperature faster.
 /// With [`BUCKET_NANOS`], the window has at most 481 buckets.
 const WINDOW_SECS: f64 = 120.0;
-/// Maximum drift. It exceeds the drift of any common crystal; steeper slopes are caused by latency.
+/// Maximum drift. It exceeds the drift of all common crystals. Steeper slopes are caused by
+/// latency.
 const MAX_DRIFT: f64 = 200e-6;
-/// Observed time span from which on the estimated drift is applied in full. It is applied in
-/// proportion to shorter spans, because latency looks like drift over short spans.
+/// Observed time span at which the estimated drift is applied in full. For shorter spans, a
+/// proportional part is applied, because latency looks like drift over short spans.
 const FULL_DRIFT_SECS: f64 = 80.0;
 /// If a device stamp is earlier than the newest one by more than this, the clock has restarted.
 /// Smaller steps back come from reordered messages.
 const MAX_DISORDER_NANOS: i64 = 500_000_000;
 /// If a message arrives earlier than the line by more than this, in seconds, the device clock has
-/// jumped ahead. Smaller differences need no restart: the line follows early arrivals at once. They
-/// also occur when the latency of a connection falls.
+/// jumped ahead. Smaller differences need no restart, because the line follows early arrivals at
+/// once. They also occur when the latency of a connection decreases.
 const MAX_EARLY_SECS: f64 = 0.25;
 /// If all arrivals within [`MAX_LATE_NANOS`] are late by more than this, in seconds, the device
 /// clock has jumped back a little or was paused. A congested network also delays messages, but
@@ -98,7 +99,7 @@ impl ClockMap {
         let Some(origin) = self.origin else {
             return self.start(device_nanos, arrival);
         };
-        // A device that restarts counts from zero again. Its old line says nothing about the new
+        // A device that restarts counts from zero again. Its old line does not apply to the new
         // clock.
         if device_nanos < self.newest_nanos.saturating_sub(MAX_DISORDER_NANOS) {
             return self.restart(device_nanos, arrival);
@@ -119,8 +120,8 @@ impl ClockMap {
         if has_line && lateness_secs < -MAX_EARLY_SECS {
             return self.restart(device_nanos, arrival);
         }
-        // The line follows early arrivals at once, but never late ones. So a clock that jumped back
-        // would make all stamps early until its old arrivals have left the window.
+        // The line follows early arrivals at once, but never late ones. If the clock jumped back,
+        // all stamps would therefore be too early until the old arrivals have left the window.
         if self.late_for_too_long(lateness_secs, arrival) {
             return self.restart(device_nanos, arrival);
         }
@@ -218,8 +219,8 @@ impl ClockMap {
             Some(known) if known.index == new.index && new.delay_secs < known.delay_secs => {
                 *known = new
             }
-            // Neither a slower message nor one of an earlier, empty bucket is stored. The second
-            // kind comes from reordering, and would have to be inserted in the middle.
+            // Slower messages are not stored. Messages of an earlier, empty bucket are not stored
+            // either. They come from reordering and would have to be inserted in the middle.
             Some(_) => return false,
         }
         let oldest_secs = new.device_secs - WINDOW_SECS;
@@ -242,8 +243,8 @@ impl ClockMap {
         // full span, it amounts to 12.5 ppm.
         let max_drift = MAX_DRIFT * (span_secs / FULL_DRIFT_SECS).min(1.0);
         let drift = self.hull_slope().clamp(-max_drift, max_drift);
-        // The slope may have been limited, so the offset is not that of the hull's edge. The line
-        // has to touch the arrivals from below in any case.
+        // The slope may have been limited, so the offset may differ from that of the hull's edge.
+        // The line must always touch the arrivals from below.
         let offset_secs = self
             .buckets
             .iter()
@@ -264,8 +265,8 @@ impl ClockMap {
             / self.buckets.len() as f64;
         let mut hull: Vec<&Bucket> = Vec::with_capacity(self.buckets.len());
         for bucket in &self.buckets {
-            // Andrew's monotone chain: a point above the line from its predecessor to the new point
-            // is not part of the lower hull.
+            // This is Andrew's monotone chain. A point above the line from its predecessor to the
+            // new point is not part of the lower hull.
             while let [.., a, b] = hull[..]
                 && slope(a, bucket) <= slope(a, b)
             {
@@ -273,8 +274,9 @@ impl ClockMap {
             }
             hull.push(bucket);
         }
-        // Of all lines below the points, this edge minimizes the sum of the distances to them: the
-        // height at the mean time decides that sum.
+        // Of all lines below the points, this edge minimizes the sum of the distances to the
+        // points. The reason is that this sum depends only on the height of the line at the mean
+        // time.
         let edge = hull
             .windows(2)
             .find(|edge| edge[1].device_secs >= mean_secs);

@@ -72,9 +72,9 @@ struct Readings<T> {
     n_rejected: u64,
 }
 
-/// Two neighboring readings and the position of the stamp between them, 0 to 1. At 0 or 1 the stamp
-/// coincides with a reading; if that reading has no neighbor within `max_gap`, both entries are
-/// that reading.
+/// Two neighboring readings and the position of the stamp between them, 0 to 1. At 0 or 1, the
+/// stamp coincides with a reading. If that reading has no neighbor within `max_gap`, both entries
+/// are that reading.
 struct Bracket<'a, T> {
     before: (Stamp, &'a T),
     after: (Stamp, &'a T),
@@ -164,10 +164,10 @@ impl<T> Readings<T> {
         })
     }
 
-    /// The bracket of a stamp that is the stamp of a reading. It exists even if both neighbors are
-    /// too far away, because nothing has to be interpolated. A neighbor is included if possible,
-    /// because callers derive velocities from it. The earlier one is preferred: with it, the result
-    /// does not depend on whether the next reading has arrived yet.
+    /// The bracket of a stamp that is equal to the stamp of a reading. It exists even if both
+    /// neighbors are too far away, because nothing has to be interpolated. A neighbor is included
+    /// if possible, because callers derive velocities from it. The earlier neighbor is preferred,
+    /// because the result then does not depend on whether the next reading has arrived yet.
     ///
     /// * `before`: the reading before `reading`, if any.
     fn around_reading<'a>(
@@ -256,8 +256,8 @@ impl JointHistory {
         if !numbers.all(|number| number.is_finite()) {
             return self.readings.reject(HistoryError::NotFinite);
         }
-        // A different number of joints comes from another device or a faulty message. Interpolation
-        // pairs joints by index.
+        // A different number of joints comes from another device or a faulty message. It must be
+        // rejected, because interpolation pairs joints by index.
         if let Some((_, last)) = self.readings.buffer.back()
             && last.position.len() != state.position.len()
         {
@@ -298,8 +298,8 @@ impl JointHistory {
             }
             return Ok(at_reading);
         }
-        // With velocities, the cubic is more accurate when the arm accelerates between readings. A
-        // device that reports velocities in some readings only gets the line.
+        // With velocities, the cubic is more accurate when the arm accelerates between readings. If
+        // a device reports velocities only in some readings, the line is used.
         let is_cubic = has_velocities(a) && has_velocities(b);
         let (position, velocity) = (0..n_joints)
             .map(|joint| {
@@ -415,12 +415,12 @@ impl PoseHistory {
         } = self.readings.around(stamp)?;
         let pose = self.at(stamp)?;
         let span_secs = after.secs_since(before);
-        // Both entries are the same reading: without a neighbor there is no velocity.
+        // Both entries are the same reading. Without a neighbor, there is no velocity.
         if span_secs <= 0.0 {
             return Ok((pose, Twist::zero()));
         }
-        // Divides the same motion that `transform::interpolate` spreads over the span: a line for
-        // the position, a constant rate for the rotation.
+        // The velocity is that of the motion that `transform::interpolate` uses: a line for the
+        // position, and a constant rate for the rotation.
         let velocity_m_s = (b.translation.vector - a.translation.vector) / span_secs;
         let angular_rad_s = (a.rotation.inverse() * b.rotation).scaled_axis() / span_secs;
         Ok((
@@ -557,7 +557,7 @@ mod tests {
             ask(1.03).unwrap_err().to_string(),
             "readings are missing for 30.0 ms around the requested stamp (at most 20.0 ms)"
         );
-        // At the edges of a gap and of the history, there are values.
+        // There are values at the edges of a gap and of the history.
         for secs in [1.01, 1.015, 1.02, 1.05] {
             assert!(ask(secs).is_ok(), "{secs}");
         }

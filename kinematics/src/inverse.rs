@@ -10,8 +10,8 @@ const MAX_STEPS: usize = 100;
 /// any arm, and far above the rounding errors of forward kinematics.
 const TOLERANCE: f64 = 1e-7;
 /// Damping that remains when the error is zero; it bounds the steps near singular configurations. A
-/// larger value would slow down the last steps, a smaller one would let rounding errors decide the
-/// direction in which the damped matrix is nearly singular.
+/// larger value would slow down the last steps. With a smaller value, rounding errors would
+/// determine the step in directions in which the matrix is nearly singular.
 const MIN_DAMPING: f64 = 1e-9;
 /// Largest step of one joint, radians or meters. The Jacobian is only valid near a configuration.
 const MAX_STEP: f64 = 0.3;
@@ -23,8 +23,8 @@ impl Chain {
     ///
     /// * `bounds`: lower and upper bound of each joint.
     ///
-    /// Levenberg-Marquardt steps whose damping is the squared error of the pose; joints that would
-    /// leave their bounds stay there for the rest of the step.
+    /// Uses Levenberg-Marquardt steps whose damping is the squared error of the pose. Joints that
+    /// would leave their bounds stay at them for the rest of the step.
     ///
     /// Source: Sugihara 2011, "Solvability-unconcerned inverse kinematics by the
     /// Levenberg-Marquardt method", section III.
@@ -62,16 +62,16 @@ impl Chain {
             if error.norm() < TOLERANCE {
                 return Ok(Some(q));
             }
-            // Sugihara's damping falls with the squared error: far away, where the linear model is
-            // wrong, steps are short and safe; close to the target, they are Newton's and converge
-            // quickly.
+            // Sugihara's damping decreases with the squared error. Far from the target, where the
+            // linear model is wrong, steps are short and safe. Close to the target, they are Newton
+            // steps and converge quickly.
             let damping = extra_damping * 0.5 * error.norm_squared() + MIN_DAMPING;
             let next = self.step(&q, &error, damping, bounds)?;
             let next_error = pose_error(base_from_tip, &self.forward(&next)?);
-            // The factor on the damping is the addition of Levenberg and Marquardt: a step that
-            // makes the error worse is discarded and tried again with more damping. The bounds keep
-            // the factor from becoming so small that it no longer reacts, and end the search where
-            // no step improves the pose.
+            // The factor on the damping comes from Levenberg and Marquardt: a step that increases
+            // the error is discarded and tried again with more damping. The lower bound keeps the
+            // factor large enough to react. The upper bound ends the search if no step improves the
+            // pose.
             if next_error.norm() < error.norm() {
                 (q, error) = (next, next_error);
                 extra_damping = f64::max(0.2 * extra_damping, 1e-6);
@@ -98,7 +98,8 @@ impl Chain {
             let longest = change
                 .iter()
                 .fold(0.0f64, |longest, value| longest.max(value.abs()));
-            // All joints are scaled alike, so that the direction of the step stays the same.
+            // All joints are scaled by the same factor, so that the direction of the step stays the
+            // same.
             let scale = if longest > MAX_STEP {
                 MAX_STEP / longest
             } else {
@@ -123,7 +124,7 @@ impl Chain {
                     .zip(bounds)
                     .map(|(value, [lower, upper])| value.max(*lower).min(*upper));
                 // A joint may still cross a bound that it was not at. It then ends at the bound,
-                // and the next step does without it if necessary.
+                // and the next step leaves it out if necessary.
                 return Ok(clamped.collect());
             }
             stuck
@@ -135,8 +136,8 @@ impl Chain {
 
 fn damped_change(jacobian: &Matrix6xX<f64>, error: &Vector6<f64>, damping: f64) -> Vec<f64> {
     let square: Matrix6<f64> = jacobian * jacobian.transpose() + Matrix6::identity() * damping;
-    // `J^T (J J^T + d 1)^-1 e`: the 6 x 6 form of the damped least-squares step, for any number of
-    // joints.
+    // `J^T (J J^T + d 1)^-1 e` is the 6 x 6 form of the damped least-squares step, for any number
+    // of joints.
     match square.cholesky() {
         Some(factor) => (jacobian.transpose() * factor.solve(error))
             .iter()

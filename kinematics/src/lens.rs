@@ -67,12 +67,12 @@ impl Radial for RationalRadial {
         let mut rise = [0.0; 7];
         for (i, n) in self.numerator.iter().enumerate() {
             for (j, d) in self.denominator.iter().enumerate() {
-                // `r2^i` times `r2^j`: with `N' = i n r2^(i - 1)`, the three products have the same
-                // power.
+                // These are the products of `r2^i` and `r2^j`. With `N' = i n r2^(i - 1)`, the
+                // three products have the same power.
                 rise[i + j] += n * d * (1.0 + 2.0 * (i as f64 - j as f64));
             }
         }
-        // A zero of the denominator is a pole: the quotient jumps from one infinity to the other
+        // A zero of the denominator is a pole. The quotient jumps from one infinity to the other
         // there, and may rise on both sides of it.
         positive_on(&self.denominator, r2) && positive_on(&rise, r2)
     }
@@ -156,15 +156,15 @@ fn undistort(
     tangential: [f64; 2],
     distorted: Vector2<f64>,
 ) -> Option<Vector2<f64>> {
-    // Newton's method converges in a few steps from the radial solution; the rest is a bound for
-    // points near the edge of the invertible region.
+    // Newton's method converges in a few steps from the radial solution. More steps are needed only
+    // for points near the edge of the invertible region.
     const MAX_STEPS: usize = 50;
     let length = distorted.norm();
     if length == 0.0 && tangential == [0.0; 2] {
         return Some(distorted);
     }
-    // Without the tangential part, solving for the radius suffices. With it, that solution is the
-    // initial value of Newton's method in the plane.
+    // Without a tangential part, it is sufficient to solve for the radius. With a tangential part,
+    // that solution is the initial value of Newton's method in the plane.
     let is_rising_to = |radius: f64| radial.is_rising_to(radius * radius);
     let radius = solve_rising(
         |radius| distorted_radius(radial, radius),
@@ -181,7 +181,7 @@ fn undistort(
     };
     for _ in 0..MAX_STEPS {
         let guess = distort_unchecked(radial, tangential, plane);
-        // The radial solution is close already, because tangential coefficients are small. A
+        // The radial solution is already close, because tangential coefficients are small. A
         // singular Jacobian means that the point is on the edge of the invertible region.
         let step = guess.jacobian.try_inverse()? * (guess.value - distorted);
         plane -= step;
@@ -293,8 +293,8 @@ pub(crate) fn undistort_kannala_brandt(
     }
     let series = [1.0, k[0], k[1], k[2], k[3]];
     let derivative = angle_derivative(k);
-    // The model is a polynomial in the angle from the axis, so the angle is solved for, and the
-    // direction is kept.
+    // The model is a polynomial in the angle from the axis. The equation is solved for this angle,
+    // and the direction is kept.
     let is_rising_to = |angle: f64| positive_on(&derivative, angle * angle);
     let angle = solve_rising(
         |angle| {

@@ -17,18 +17,18 @@ pub(crate) fn solve_rising(
     target: f64,
     limit: f64,
 ) -> Option<f64> {
-    // Bisection alone needs about 60 steps: each gains one of the 53 bits of an f64. More steps
-    // are only a guard against a bracket that stops shrinking.
+    // Bisection alone needs about 60 steps, because each step gains one of the 53 bits of an f64.
+    // The higher limit only guards against a bracket that stops shrinking.
     const MAX_STEPS: usize = 200;
     let value = |x: f64| function(x).0 - target;
-    // Find a bracket: from `low`, where the value is below the target, to `high`, where it is above
-    // or the derivative has changed sign. Doubling reaches any magnitude in a few steps, so callers
-    // need not know how strongly their lens distorts.
+    // Find a bracket. At `low`, the value is below the target. At `high`, the value is above the
+    // target, or the derivative has changed sign. Doubling reaches any magnitude in a few steps, so
+    // callers need not know how strongly their lens distorts.
     let mut low = 0.0;
     let mut high = target.min(limit);
     while is_rising_to(high) && value(high) < 0.0 {
-        // The functions of callers compute squares of `high`, which would overflow after the next
-        // doubling.
+        // The functions of callers compute squares of `high`. These squares would overflow after
+        // the next doubling.
         if high >= limit || high > f64::MAX.sqrt() * 0.25 {
             return None;
         }
@@ -81,9 +81,9 @@ pub(crate) fn evaluate<const N: usize>(p: &[f64; N], s: f64) -> f64 {
 /// conclusive, the interval is halved (Lane and Riesenfeld 1981). For a point well inside the range
 /// of the lens, the first test is conclusive.
 pub(crate) fn positive_on<const N: usize>(p: &[f64; N], end: f64) -> bool {
-    // Each halving divides the distance between the coefficients and the polynomial by four, so
-    // only a polynomial that nearly touches zero needs many. It is then rejected, which is the safe
-    // answer. The bound also ends the recursion for NaN.
+    // Each halving divides the distance between the coefficients and the polynomial by four. Only a
+    // polynomial that nearly touches zero therefore needs many halvings. It is then rejected, which
+    // is the safe answer. The bound also ends the recursion for NaN.
     const MAX_HALVINGS: u32 = 30;
     let mut power = *p;
     let mut scale = 1.0;
@@ -135,8 +135,8 @@ fn all_positive<const N: usize>(bernstein: &[f64; N], halvings_left: u32) -> boo
     }
     let mut left = [0.0; N];
     let mut right = *bernstein;
-    // De Casteljau's algorithm at the middle: the first value of each level is a coefficient of the
-    // left half.
+    // This is De Casteljau's algorithm at the middle. The first value of each level is a
+    // coefficient of the left half.
     for (level, first) in left.iter_mut().enumerate() {
         *first = right[0];
         for at in 0..N - 1 - level {

@@ -71,12 +71,14 @@ impl Intrinsics {
         let distorted = lens.distort(plane)?;
         let pixel = self.pixel_at(distorted.value)?;
         let plane_by_point = Matrix2x3::new(1.0, 0.0, -plane.x, 0.0, 1.0, -plane.y) / z;
-        // The chain rule: pixel by distorted point, by point of the plane `z = 1`, by point in
+        // The chain rule multiplies three derivatives. The first is the derivative of the pixel by
+        // the distorted point. The second is the derivative of the distorted point by the point of
+        // the plane `z = 1`. The third is the derivative of the point of the plane by the point in
         // space.
         let mut by_point = distorted.jacobian * plane_by_point;
         let mut by_intrinsics = SMatrix::<f64, 2, MAX_INTRINSICS_PARAMS>::zeros();
-        // First the derivatives of the distorted point, which do not depend on focal lengths and
-        // principal point.
+        // First, compute the derivatives of the distorted point, which do not depend on focal
+        // lengths and principal point.
         match &lens {
             Lens::Pinhole => (),
             Lens::BrownConrady(_) => set_coefficients(
@@ -92,7 +94,8 @@ impl Intrinsics {
                 &lens::rational_by_coefficients(k, plane),
             ),
         }
-        // Then those of `pixel = focal_px * distorted + principal_px`, by the chain rule.
+        // Then compute the derivatives of `pixel = focal_px * distorted + principal_px` by the
+        // chain rule.
         for axis in 0..2 {
             by_point.row_mut(axis).scale_mut(self.focal_px[axis]);
             by_intrinsics.row_mut(axis).scale_mut(self.focal_px[axis]);

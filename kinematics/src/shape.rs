@@ -61,18 +61,20 @@ pub(crate) struct LinkShapes {
 /// Reads the shapes of all links that have any. Invalid shapes and colors are noted and left out.
 pub(crate) fn read_all(robot: Element<'_>, notes: &mut Notes) -> HashMap<String, LinkShapes> {
     let mut materials = Materials::new();
-    // Materials of the robot come first, so that they win over those of links with the same name.
+    // Materials of the robot are read first, so that they take precedence over materials of links
+    // with the same name.
     for material in robot.all("material") {
         read_material(material, "the robot", &mut materials, notes);
     }
     let mut by_link = HashMap::<String, LinkShapes>::new();
-    // Visual shapes wait until all links have been read: a material that a link defines may be used
-    // by all others, also by earlier ones.
+    // Visual shapes are added after all links have been read. A material that a link defines may be
+    // used by all other links, including earlier ones.
     let mut visuals = Vec::new();
     let mut seen = HashSet::new();
     for link in robot.all("link") {
         let name = link.attribute("name").unwrap_or_default();
-        // Of several links with one name, the robot uses the first, and has noted the others.
+        // If several links have the same name, the robot uses the first one. The others have
+        // already been noted.
         if !seen.insert(name) {
             continue;
         }
@@ -146,7 +148,7 @@ fn add_visuals<'a>(
 
 type Materials<'a> = HashMap<&'a str, [f64; 4]>;
 
-/// The value, or `None` and a note.
+/// Returns the value, or `None` after adding a note.
 fn noted<T>(read: Result<T, Problem>, what: &str, notes: &mut Notes) -> Option<T> {
     read.map_err(|Problem { line, why }| notes.add(line, &format!("{what} is not used: {why}")))
         .ok()
@@ -162,7 +164,7 @@ fn read_material<'a>(
     material.note_unknown(&["name"], &["color", "texture"], notes);
     let color = noted(own_color(material), &format!("a color of {owner}"), notes).flatten();
     if let (Some(name), Some(color)) = (material.attribute("name"), color) {
-        // The first definition wins, as for links. A material without a color is a reference, and
+        // The first definition is used, as for links. A material without a color is a reference and
         // defines nothing.
         materials.entry(name).or_insert(color);
     }
@@ -227,7 +229,8 @@ fn shape(element: Element<'_>, notes: &mut Notes) -> Result<Shape, Problem> {
         notes,
     );
     let geometry = required_child(element, "geometry")?;
-    // Only notes attributes; a problem of the element is reported when the pose is read below.
+    // This only notes unknown attributes. Problems of the element are reported when the pose is
+    // read below.
     if let Ok(Some(origin)) = element.only("origin") {
         origin.note_unknown(&ORIGIN_ATTRIBUTES, &[], notes);
     }
@@ -299,7 +302,7 @@ fn read_geometry(form: Element<'_>) -> Result<Geometry, Problem> {
         _ => {
             let scale = form.numbers("scale")?.unwrap_or([1.0; 3]);
             // A scale of zero flattens the mesh, and its normals cannot be computed. Negative
-            // values are allowed: they mirror it.
+            // values are allowed, because they mirror the mesh.
             if scale.contains(&0.0) {
                 return Err(form.problem(format!(
                     "its scale is {scale:?}, expected numbers other than 0"

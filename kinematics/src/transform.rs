@@ -19,7 +19,7 @@ pub struct Twist {
 }
 
 /// Largest element of `|RᵀR - 1|` that is accepted as a rounding error in a file. Quaternions with
-/// three decimals stay below it; a scale error of 0.1 % exceeds it.
+/// three decimals deviate by less than this. A scale error of 0.1 % exceeds it.
 pub const RIGID_TOLERANCE: f64 = 1e-3;
 /// As [`RIGID_TOLERANCE`], for matrices with three decimals, which deviate by up to `2 * sqrt(3) *
 /// 0.0005`.
@@ -79,8 +79,8 @@ fn from_rows_within(rows: &[f64; 16], tolerance: f64) -> Result<Transform, Error
         .abs()
         .max();
     let determinant = given.determinant();
-    // A mirrored matrix is orthogonal, too: only its determinant differs. It comes from a file with
-    // left-handed axes.
+    // A mirrored matrix is also orthogonal, and differs only in its determinant. It comes from a
+    // file with left-handed axes.
     if off > tolerance || determinant < 0.0 {
         return Err(Error::NotRigid {
             off,
@@ -98,8 +98,8 @@ fn from_rows_within(rows: &[f64; 16], tolerance: f64) -> Result<Transform, Error
 /// The orthogonal polar factor, by Newton's iteration (Higham 1986), which converges quadratically
 /// for matrices that are close to a rotation.
 fn nearest_rotation(mut matrix: Matrix3<f64>) -> Rotation3<f64> {
-    // Errors go from 1e-3 to 1e-6 and 1e-12, then below rounding. One extra step is cheap, and a
-    // fixed number of steps gives the same bits for the same file.
+    // Errors decrease from 1e-3 to 1e-6 and 1e-12, and then below rounding. One extra step takes
+    // little time, and a fixed number of steps gives the same bits for the same file.
     const STEPS: usize = 4;
     for _ in 0..STEPS {
         let inverse_transpose = matrix
@@ -136,8 +136,8 @@ pub fn from_xyz_xyzw([x, y, z, i, j, k, w]: [f64; 7]) -> Transform {
     )
 }
 
-/// Smaller motions of a camera are noticeable neither in a picture nor in a map of the scene: at a
-/// focal length of 600 pixels, both bounds move a point at a distance of 1 m by 0.3 pixels.
+/// Smaller motions of a camera are not noticeable, neither in a picture nor in a map of the scene.
+/// At a focal length of 600 pixels, both bounds move a point at a distance of 1 m by 0.3 pixels.
 const NOTICEABLE_M: f64 = 5e-4;
 const NOTICEABLE_RAD: f64 = 5e-4;
 
@@ -196,8 +196,8 @@ pub fn exp(twist: &Twist, secs: f64) -> Transform {
         let half = (0.5 * angle).sin() / angle;
         (2.0 * half * half, (angle - angle.sin()) / angle.powi(3))
     };
-    // `v + first (w x v) + second (w x (w x v))`: the series of powers of the cross product, summed
-    // up by Rodrigues.
+    // `v + first (w x v) + second (w x (w x v))` is the sum of the series of powers of the cross
+    // product (Rodrigues).
     let first_cross = rotation_vector.cross(&translation_part);
     let translation =
         translation_part + first_cross * first + rotation_vector.cross(&first_cross) * second;

@@ -188,7 +188,7 @@ impl Undistortion {
     }
 }
 
-/// The channels of a pixel and of the one at its right, weighted with `ONE - right` and `right`.
+/// The channels of a pixel and of its right neighbor, weighted with `ONE - right` and `right`.
 ///
 /// * `source`: from the first channel of the pixel on.
 fn mix_pair<const CHANNELS: usize>(
@@ -237,7 +237,8 @@ fn tap_at(source: [f64; 2], size_px: [u32; 2]) -> Tap {
 )]
 fn tap_along(source_px: f64, size_px: u32) -> (u32, u16) {
     let last = f64::from(size_px - 1);
-    // From pixel edges at integers to pixel centers at integers, which are the samples to mix.
+    // The position is converted from integer pixel edges to integer pixel centers, because the
+    // samples are at pixel centers.
     let position = (source_px - 0.5).clamp(0.0, last);
     // The last pixel is read as the right neighbor of the one before it, so that no read goes past
     // the end.
@@ -386,7 +387,7 @@ mod tests {
         let rgba = noise(33 * 21 * 4);
         let whole = map.apply_rgba(&rgba).unwrap();
         let write_row = map.rgba_rows(&rgba).unwrap();
-        let mut row = vec![7; 33 * 4]; // Also pixels outside the source must be written.
+        let mut row = vec![7; 33 * 4]; // Pixels outside the source must also be written.
         for (ix, expected) in whole.chunks(33 * 4).enumerate().rev() {
             write_row(ix, &mut row);
             assert_eq!(row, expected, "row {ix}");

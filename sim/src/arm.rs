@@ -13,9 +13,9 @@ use std::sync::Arc;
 pub(crate) const STEP_NANOS: i64 = 1_000_000;
 const STEP_SECS: f64 = 1e-3;
 /// Stiffness, newton meters per radian, and damping, newton meter seconds per radian, of each
-/// joint's controller. The arm is stiff enough to follow the tour closely; joints near the flange
-/// move less mass, and get less of both. With much higher values, the joints could oscillate,
-/// because torques change only once per millisecond.
+/// joint's controller. The arm is stiff enough to follow the tour closely. Joints near the flange
+/// move less mass, so their stiffness and damping are lower. With much higher values, the joints
+/// could oscillate, because torques change only once per millisecond.
 const STIFFNESS: [f64; N_JOINTS] = [2000.0, 2000.0, 1600.0, 1600.0, 600.0, 600.0, 300.0];
 const DAMPING: [f64; N_JOINTS] = [120.0, 120.0, 90.0, 90.0, 35.0, 35.0, 18.0];
 
@@ -39,7 +39,8 @@ struct JointCommands {
     commands: Commands,
     /// Joint index of each value of a reading.
     joint_ixs: Vec<usize>,
-    /// Added to reported positions to get the true ones; empty if there are none.
+    /// Offsets that are added to reported positions to get the true positions; empty if there are
+    /// none.
     joint_offsets: Vec<f64>,
     position_rad: Joints,
     velocity_rad_s: Joints,
@@ -91,7 +92,8 @@ impl Arm {
         history_duration_nanos: i64,
     ) -> Result<Self, Error> {
         let mut data = MjData::new(model);
-        // A scene with other movable joints would mix up their positions.
+        // If the scene had other movable joints, their positions would be confused with those of
+        // the arm.
         if data.qpos().len() != N_JOINTS {
             return Err(Error::NJoints {
                 got: data.qpos().len(),
@@ -137,8 +139,8 @@ impl Arm {
     pub(crate) fn step(&mut self) -> JointReading {
         let position_rad = self.position_rad();
         let velocity_rad_s = Joints::from_column_slice(self.data.qvel());
-        // The reading, the torque and the step belong to the same instant: the reading holds the
-        // state before the step and the torque that is applied during it.
+        // The reading, the torque and the step belong to the same instant. The reading contains the
+        // state before the step and the torque that is applied during the step.
         let torque_nm = self.control(&position_rad, &velocity_rad_s);
         let reading = JointReading {
             nanos: self.n_steps * STEP_NANOS,
@@ -172,8 +174,8 @@ impl Arm {
     fn control(&self, position_rad: &Joints, velocity_rad_s: &Joints) -> Joints {
         let position_error = self.reference.position_rad() - position_rad;
         let velocity_error = self.reference.velocity_rad_s() - velocity_rad_s;
-        // Torques that gravity and velocities cause. Added to the command, they leave only the
-        // inertia to the controller.
+        // These are the torques that gravity and velocities cause. They are added to the command,
+        // so that the controller only has to overcome the inertia.
         let bias = self.data.qfrc_bias();
         Joints::from_fn(|ix, _| {
             let torque = bias[ix]

@@ -139,7 +139,7 @@ fn lap_secs(secs: f64, speed: f64) -> f64 {
 
 fn lap_pose(at: f64, gait_secs: f64) -> Transform {
     let around = at / LAP_SECS * TAU + std::f64::consts::PI;
-    // Periods without a common multiple, so that no lap repeats the views of another.
+    // The periods have no common multiple, so that no lap repeats the views of another lap.
     let radius_m = oscillate([2.25, 0.38, 23.0, 0.1], at);
     // The heading varies between facing the pedestal and facing past it.
     let heading_offset_rad = oscillate([0.25, 0.55, 15.7, 0.0], at);
@@ -182,10 +182,10 @@ pub(crate) struct Drift {
 }
 
 /// Steps of the random walk over the whole walk. With more steps, the drift changes more often and
-/// by less each time; the error at the end stays the same.
+/// by less each time. The error at the end stays the same.
 const N_STEPS: f64 = 64.0;
-/// Errors of height, roll and pitch relative to the other axes: gravity and the floor constrain
-/// them.
+/// Errors of height, roll and pitch relative to those of the other axes. They are smaller, because
+/// gravity and the floor constrain them.
 const CONSTRAINED_AXIS_FRAC: f64 = 0.3;
 /// Identifies the random number stream.
 const DRIFT: u64 = 0xd41f;
@@ -221,8 +221,8 @@ impl Drift {
         let mut translation_error = Vector3::zeros();
         let mut rotation_vector = Vector3::zeros();
         let mut step = 0_u64;
-        // Summing all steps each time needs no state, and even a long run has only a few hundred
-        // steps.
+        // All steps are summed each time, which needs no state. Even a long run has only a few
+        // hundred steps.
         while (step as f64) < steps {
             // The last step is blended in, so that the reported pose does not jump.
             let share = smooth(steps - step as f64);

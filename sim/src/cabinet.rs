@@ -59,7 +59,7 @@ fn equip(furniture: &mut Furniture) {
     let [x, y, z] = SCREEN_M;
     let box_pose = upright([x + BOX_HALF_M[0], y, z], 180.0);
     furniture.add_item(&box_pose, BOX_HALF_M, 12, 12);
-    // Slightly in front of the box, to avoid z-fighting.
+    // The screen is slightly in front of the box, to avoid z-fighting.
     let mut screen = Mesh::default();
     let at = Point3::new(x - 0.002, y, z);
     screen.rectangle(
@@ -285,7 +285,7 @@ pub(crate) fn objects() -> Vec<Object> {
 
 /// The textures by name, with baked lighting.
 pub(crate) fn textures() -> Vec<(&'static str, Texture)> {
-    /// Distance up to which objects darken a surface, meters: about the size of the cabinet's
+    /// Distance up to which objects darken a surface, meters. It is about the size of the cabinet's
     /// parts.
     const AMBIENT_REACH_M: f64 = 0.3;
     let mut occluders = Occluders::new(AMBIENT_REACH_M);
@@ -301,7 +301,7 @@ pub(crate) fn textures() -> Vec<(&'static str, Texture)> {
     let [near, far] = ROOM_X_M;
     let mut tiles = lab_texture::floor_tiles([far - near, 2.0 * ROOM_HALF_Y_M], 1.1);
     tiles.shade(WHOLE, 100, |u, v, name| {
-        // v runs down in a texture, but y up on the floor.
+        // In a texture, v points down, but on the floor, y points up.
         let point = Point3::new(
             near + (far - near) * u,
             (1.0 - 2.0 * v) * ROOM_HALF_Y_M,

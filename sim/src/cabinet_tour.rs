@@ -39,8 +39,8 @@ impl CabinetTour {
     /// Target pose of the camera in the arm's base frame.
     pub(crate) fn arm_from_camera(&self, secs: f64) -> Transform {
         let [departure_secs, arrival_secs] = self.walk_secs;
-        // The tour is defined in the world, so that the camera stays on target although the base
-        // stands at another place and angle at each station.
+        // The tour is defined in the world, so that the camera views the target although the base
+        // has a different position and heading at each station.
         match self.motion.station_at(secs) {
             Some((station, at)) => self.at_station(station, at),
             None => {
@@ -83,7 +83,7 @@ fn far(at: f64) -> (Vector3<f64>, Vector3<f64>, f64) {
 /// Eye, look-at point and roll at the second station: before the opening, then repeatedly in and
 /// out.
 fn near(at: f64) -> (Vector3<f64>, Vector3<f64>, f64) {
-    // A cosine, so that the camera starts and turns around at rest.
+    // The cycle is a cosine, so that the camera is at rest when it starts and when it turns around.
     let cycle = ((at - OUTSIDE_SECS).max(0.0) / IN_AND_OUT_SECS * std::f64::consts::TAU).cos();
     let inside = 0.5 - 0.5 * cycle;
     // Position and look-at point move from outside to inside together.

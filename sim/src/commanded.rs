@@ -100,7 +100,7 @@ impl Simulation {
             .nanos
             .saturating_add(i64::try_from(timeout.as_nanos()).unwrap_or(i64::MAX));
         loop {
-            // First, because a sample may have arrived while another device was read.
+            // This is done first, because a sample may have arrived while another device was read.
             if let Some(taken) = take(self) {
                 return Ok(Some(taken));
             }

@@ -531,7 +531,7 @@ impl ScannerConfig {
         check(of, "n_rings", self.n_rings.into(), 1.0, 256.0)?;
         check(of, "n_columns", self.n_columns.into(), 4.0, 4096.0)?;
         check(of, "lowest elevation", self.elevation_rad[0], -1.57, 1.57)?;
-        // The lowest elevation is the limit, so that the range is not empty.
+        // The lower limit is the lowest elevation, so that the range is not empty.
         check(
             of,
             "highest elevation",
@@ -661,7 +661,7 @@ fn check_pose(of: &str, key: &'static str, pose: &Transform) -> Result<(), Error
 
 /// Rejects numbers outside `lower..=upper`, and NaN.
 fn check(of: &str, key: &'static str, got: f64, lower: f64, upper: f64) -> Result<(), Error> {
-    // False for NaN, which is therefore refused.
+    // The condition is false for NaN, so NaN is rejected.
     if got >= lower && got <= upper {
         return Ok(());
     }

@@ -12,7 +12,8 @@ type Egl = egl::DynamicInstance<egl::EGL1_5>;
 const PLATFORM_DEVICE: egl::Enum = 0x313f;
 const PLATFORM_SURFACELESS_MESA: egl::Enum = 0x31dd;
 const EXTENSIONS: i32 = 0x3055;
-/// More devices than any computer has; further ones are not tried.
+/// Maximum number of devices that are tried. It is larger than the number of devices of any
+/// computer.
 const MAX_DEVICES: usize = 32;
 
 /// A context without a surface. Dropping it releases the thread and destroys the context.

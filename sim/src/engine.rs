@@ -90,8 +90,9 @@ struct Exposure {
     depth_picture: Option<Pending>,
 }
 
-/// First exposure of the first camera, and additional delay of each further camera. The arm needs
-/// readings before the first exposure; cameras of a real rig are not synchronized either.
+/// First exposure of the first camera, and additional delay of each further camera. The first
+/// exposure is delayed, because the arm needs readings before it. The cameras have different
+/// delays, because cameras of a real rig are not synchronized either.
 const FIRST_NANOS: i64 = 50_000_000;
 const STAGGER_NANOS: i64 = 3_700_000;
 
@@ -404,8 +405,8 @@ impl Engine {
             self.has_ended = true;
             return Ok(());
         }
-        // Slots keep the order of the arrivals: readings first, then base poses and scans, then
-        // images whose readout has ended by now.
+        // Slots keep the order of the arrivals. Readings come first, then base poses and scans,
+        // then images whose readout has ended by now.
         self.slots.extend(reading.map(Slot::Joints));
         self.queue_base_and_scans(nanos);
         for camera_ix in 0..self.cameras.len() {
@@ -420,7 +421,7 @@ impl Engine {
         Ok(())
     }
 
-    /// Queues the poses of a moving base and the scanner revolutions that end by now.
+    /// Queues the poses of a moving base and the scanner revolutions that have ended by now.
     fn queue_base_and_scans(&mut self, nanos: i64) {
         let due = |n_done: u64, rate_hz: f64| nanos_from_secs(n_done as f64 / rate_hz);
         while self.config.scene.has_moving_base()
@@ -459,7 +460,8 @@ impl Engine {
                 world_from_base: reported,
             }),
         ));
-        // Ground truth follows its sample, so that a reader that waits for it finds it next.
+        // Ground truth follows its sample. A reader that waits for it thus finds it as the next
+        // sample.
         if self.config.truth {
             self.ready.push_back((
                 nanos,
@@ -518,8 +520,8 @@ impl Engine {
         let world_from_camera = camera.world_from_camera(&robot);
         let camera_from_world = world_from_camera.inverse();
         let mut row_motions = Vec::new();
-        // The scene is rendered once, at the stamp. The poses of the rows are needed to move its
-        // pixels to where each row sees them.
+        // The scene is rendered once, at the stamp. The poses of the rows are needed to move the
+        // pixels to the positions at which each row sees them.
         for offset in camera.row_offsets_nanos() {
             let world_from_row = camera.world_from_camera(&robot_at(stamp_nanos + offset)?);
             row_motions.push(RowMotion::new(&(camera_from_world * world_from_row)));
@@ -598,8 +600,9 @@ impl Engine {
             exposure_secs: Some(1e-6 * camera.sensor.exposure_micros),
             n_skipped: exposure.n_skipped,
         };
-        // Color comes first. The image without motion is also the ground truth; both are only
-        // computed if they are needed, because they take most of the time on the processor.
+        // Color comes first. The image without motion is also the ground truth. The images with and
+        // without motion are computed only if they are needed, because they take most of the
+        // processor time.
         let is_moving = !exposure.row_motions.is_empty();
         let motion_free = if self.config.truth || !is_moving {
             camera.optics.motion_free(&picture)
@@ -635,8 +638,8 @@ impl Engine {
             exposure.arrival_nanos,
             Sample::Image(image(PixelFormat::Rgb8, data)),
         ));
-        // Then depth: from the view of a separate sensor if there is one, otherwise from the color
-        // view.
+        // Then comes depth. It is taken from the view of a separate sensor if there is one,
+        // otherwise from the color view.
         let sensor_depth_m = match (&camera.depth_optics, exposure.depth_picture) {
             (Some(optics), Some(picture)) => Some(optics.depth_m(&picture.wait()?)),
             _ => None,

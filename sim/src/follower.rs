@@ -38,17 +38,17 @@ pub(crate) struct Follower {
     acceleration_rad_s2: Joints,
 }
 
-/// Preferred posture: far from the joint limits, elbow up.
+/// Preferred posture, which is far from the joint limits and has the elbow up.
 const REST_POSTURE_RAD: [f64; N_JOINTS] =
     [0.0, -0.3, 0.0, -2.2, 0.0, 2.2, std::f64::consts::FRAC_PI_4];
 /// Margin to the joint limits, radians. The controller overshoots its reference slightly, and must
 /// not reach the limits.
 const LIMIT_MARGIN_RAD: f64 = 0.05;
-/// Fraction of the maximum joint speeds that the scan uses. The rest is left for the controller,
-/// which catches up with errors.
+/// Fraction of the maximum joint speeds that the scan uses. The rest is a reserve for the
+/// controller, which corrects errors.
 const SPEED_LIMIT_FRAC: f64 = 0.5;
 /// Damping of the least squares, in meters and radians. Near singular postures, it bounds the joint
-/// velocities at the price of a pose error; a larger value tracks less precisely everywhere.
+/// velocities but causes a pose error. With a larger value, tracking is less accurate everywhere.
 const DAMPING: f64 = 0.03;
 /// Rate at which pose errors and posture errors decay, per second. The posture has the lower rate,
 /// because it must not disturb the tracking of the pose.
@@ -65,8 +65,8 @@ const DYNAMICS_LIMIT_FRAC: f64 = 0.6;
 impl Follower {
     /// Starts at rest, at the scan's first pose.
     pub(crate) fn new(scan: Tour, flange_from_camera: Transform) -> Result<Self, Error> {
-        // Meters and radians together: the first pose must be reached closely, or the scan would
-        // begin with a jump.
+        // Tolerance of the norm of meters and radians. The first pose must be reached closely,
+        // because the scan would otherwise begin with a jump.
         const TOLERANCE: f64 = 0.02;
         let mut follower = Self {
             scan,
@@ -76,8 +76,8 @@ impl Follower {
             acceleration_rad_s2: Joints::zeros(),
         };
         let target_pose = scan.arm_from_camera(0.0);
-        // Inverse kinematics by the same least squares as during the scan, so that both find the
-        // same posture: 30 s of motion in steps of 10 ms.
+        // Inverse kinematics uses the same least squares as the scan, so that both find the same
+        // posture. The loop corresponds to 30 s of motion in steps of 10 ms.
         for _ in 0..3000 {
             let step = follower.desired_velocity(&target_pose, &Vector6::zeros()) * 0.01;
             follower.position_rad = clamp_to_limits(follower.position_rad + step);
@@ -86,7 +86,7 @@ impl Follower {
         if pose_error(&target_pose, &base_from_camera).norm() > TOLERANCE {
             return Err(Error::Unreachable { at_secs: 0.0 });
         }
-        // On a copy, because the check moves the arm.
+        // The check is done on a copy, because it moves the arm.
         follower.clone().warn_if_tour_is_unreachable();
         Ok(follower)
     }
@@ -127,8 +127,8 @@ impl Follower {
     pub(crate) fn advance(&mut self, secs: f64, step_secs: f64) {
         let target_pose = self.scan.arm_from_camera(secs);
         let before = self.scan.arm_from_camera(secs - step_secs);
-        // Feedforward: without it, the camera would lag behind the tour by its velocity divided by
-        // the gain.
+        // This is the feedforward. Without it, the camera would lag behind the tour by its velocity
+        // divided by the gain.
         let target_twist = pose_error(&target_pose, &before) / step_secs;
         let desired_velocity = self.desired_velocity(&target_pose, &target_twist);
         for ix in 0..N_JOINTS {
@@ -136,8 +136,8 @@ impl Follower {
             let velocity_error =
                 desired_velocity[ix].clamp(allowed[0], allowed[1]) - self.velocity_rad_s[ix];
             let acceleration = self.acceleration_rad_s2[ix];
-            // A critically damped spring from the current to the desired velocity, whose frequency
-            // is `SMOOTHING_RAD_S`: jerk = w^2 * error - 2 * w * acceleration.
+            // The velocity follows the desired velocity like a critically damped spring of the
+            // frequency w = `SMOOTHING_RAD_S`: jerk = w^2 * error - 2 * w * acceleration.
             let jerk = (velocity_error * SMOOTHING_RAD_S - 2.0 * acceleration) * SMOOTHING_RAD_S;
             let max_jerk = panda::MAX_JERK_RAD_S3[ix];
             let max_acceleration = panda::MAX_ACCELERATION_RAD_S2[ix];
@@ -175,8 +175,8 @@ impl Follower {
         let rest_posture_velocity =
             (Joints::from(REST_POSTURE_RAD) - self.position_rad) * REST_POSTURE_GAIN_HZ;
         let inverse = damped_inverse(&jacobian);
-        // The posture velocity is applied in full, and the least squares correct what it does to
-        // the camera. Its projection to the null space remains.
+        // The posture velocity is applied in full, and the least squares correct its effect on the
+        // camera. As a result, only its projection to the null space remains.
         rest_posture_velocity + inverse * (twist - jacobian * rest_posture_velocity)
     }
 }

@@ -176,8 +176,7 @@ impl Furniture {
             }
             let mut y = -half_length + 0.03;
             loop {
-                // The random numbers are drawn in this order, so another order would change the
-                // scene.
+                // The random numbers are drawn in this order. Another order would change the scene.
                 let half = [
                     self.draw_uniform(0.10, 0.19),
                     self.draw_uniform(0.08, 0.26),
@@ -206,7 +205,7 @@ impl Furniture {
             ];
             let x = self.draw_uniform(-0.06, 0.06);
             let y = self.draw_uniform(-0.06, 0.06);
-            // A little crooked, like boxes that were stacked by hand.
+            // The boxes are slightly rotated, like boxes that were stacked by hand.
             let yaw = self.draw_uniform(-20.0, 20.0);
             let front = self.draw_picture(&[0, 1, 2, 3, 10, 11]);
             let pose = world_from_boxes * upright([x, y, z + half[2]], yaw);
@@ -218,8 +217,8 @@ impl Furniture {
     /// Adds all larger boxes as occluders. Shadows of small items on shelves would not be visible
     /// on the floor.
     pub(crate) fn add_occluders(&self, occluders: &mut Occluders) {
-        /// Half the side from which a box counts as large, meters. More boxes make the shadows
-        /// slower to compute.
+        /// Boxes count as large if half their side is at least this, meters. With more boxes,
+        /// computing the shadows takes longer.
         const MIN_HALF_M: f64 = 0.22;
         let large = |half_m: &[f64; 3]| half_m.iter().any(|half_m| *half_m >= MIN_HALF_M);
         for (world_from_box, half_m) in self.solids.iter().filter(|(_, half_m)| large(half_m)) {

@@ -160,7 +160,7 @@ fn bowl() -> Mesh {
         [0.001, 0.022],
     ];
     let mut mesh = Mesh::default();
-    // Two surfaces, because normals must not be smoothed across the rim.
+    // The bowl has two surfaces, because normals must not be smoothed across the rim.
     for part in [&outer[..], &inner[..]] {
         mesh.append(
             Mesh::lathe(part, 48, WHOLE, true),
@@ -236,7 +236,7 @@ fn ceiling() -> Mesh {
         Vector3::y() * -ROOM_HALF_M[1],
         WHOLE,
     );
-    // Beams, so that the ceiling is not a single color.
+    // The beams ensure that the ceiling is not of a single color.
     for x in [-5.0, -2.5, 0.0, 2.5, 5.0] {
         mesh.append(
             Mesh::cuboid([0.08, ROOM_HALF_M[1], 0.1], &[WHOLE; 6]),

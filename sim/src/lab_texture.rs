@@ -14,7 +14,7 @@ const N_ACROSS: usize = 4;
 
 /// Rectangle of a picture on a sheet. Indices past the last picture wrap around.
 pub(crate) fn picture(ix: usize) -> TextureRect {
-    /// Keeps mip levels from mixing neighboring pictures.
+    /// The inset keeps mip levels from mixing neighboring pictures.
     const INSET: f64 = 0.004;
     let side = 1.0 / N_ACROSS as f64;
     let x = (ix % N_ACROSS) as f64 * side;
@@ -129,7 +129,7 @@ fn curves(own: f64, u: f64, v: f64) -> Color {
             0.5 - 0.36 * (-(2.0 + k) * u).exp() * ((9.0 + 4.0 * k) * (u + own)).cos() - 0.05 * k;
         ((v - y).abs(), hue(0.27 * k + own, 0.05, 0.85))
     });
-    // Of curves that overlap, the first one is on top.
+    // If curves overlap, the first one is on top.
     near.filter(|(distance, _)| *distance < 0.013)
         .map(|(_, color)| color)
         .next()
@@ -158,7 +158,7 @@ fn letters(each: RandomStream, u: f64, v: f64) -> Color {
 
 fn spots(each: RandomStream, ix: u64, u: f64, v: f64) -> Color {
     let ground = hue(each.unit(50 + ix), 0.25, 0.8);
-    // From the last spot to the first, so that later spots cover earlier ones.
+    // The spots are searched from the last to the first, so that later spots cover earlier ones.
     let top = (0..14).rev().find(|spot| {
         let at = |counter: u64| each.unit(ix * 100 + spot * 4 + counter);
         (u - at(0)).hypot(v - at(1)) < 0.04 + 0.13 * at(2)
@@ -241,7 +241,7 @@ fn slats(noise: &Noise, ix: usize, u: f64, v: f64) -> Color {
 fn books(each: RandomStream, ix: u64, u: f64, v: f64) -> Color {
     let mut left = 0.0;
     for book in 0..24 {
-        // Widths are random, so those of the books to the left have to be added up.
+        // Widths are random, so the widths of the books to the left have to be added up.
         let at = |counter: u64| each.unit(ix * 1000 + book * 8 + counter);
         let width = 0.035 + 0.055 * at(0);
         if u < left + width {
@@ -364,7 +364,7 @@ pub(crate) fn floor_tiles(size_m: [f64; 2], lane_m: f64) -> Texture {
     let blotch = Noise::new(122);
     let each = RandomStream::new(0x7e37, &[123]);
     Texture::paint(2 * SIDE_PX, |u, v| {
-        // In meters, so that tiles are square in a room of any shape.
+        // Coordinates are in meters, so that tiles are square in a room of any shape.
         let x = (u - 0.5) * size_m[0];
         let y = (v - 0.5) * size_m[1];
         let column = (x * 2.0).floor();
@@ -461,7 +461,7 @@ pub(crate) fn mounting_plate() -> Texture {
     let spangle = Noise::new(151);
     let rough = Noise::new(152);
     Texture::paint(SIDE_PX, |u, v| {
-        // Few levels, because the crystals of a zinc coating have sharp borders.
+        // There are few levels, because the crystals of a zinc coating have sharp borders.
         let crystals = (spangle.rough(u * 26.0, v * 26.0, 2) * 9.0).floor() / 9.0;
         let plate = scale(
             mix([0.42, 0.45, 0.49], [0.80, 0.82, 0.84], crystals),

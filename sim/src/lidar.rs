@@ -1,4 +1,4 @@
-//! A rotating range scanner: each ray is cast from the scanner's pose at the ray's instant.
+//! A rotating range scanner. Each ray is cast from the scanner's pose at the time of the ray.
 #![expect(
     clippy::cast_possible_truncation,
     reason = "points are in f32, and times within a revolution fit a u32"
@@ -84,9 +84,8 @@ pub(crate) fn scan_revolution(
     let mut points = Vec::new();
     for column in 0..scanner.n_columns {
         let share = f64::from(column) / f64::from(scanner.n_columns);
-        // Rounded before the pose is computed, so that a receiver that uses the offset gets exactly
-        // this pose.
-        // The time offset of a point is stored in whole microseconds.
+        // The time offset of a point is stored in whole microseconds. It is rounded before the pose
+        // is computed, so that a receiver that uses the offset gets exactly this pose.
         let offset_micros = (share * period_nanos * 1e-3) as u32;
         let world_from_scanner =
             world_from_base(i64::from(offset_micros) * 1000) * scanner.base_from_scanner;
@@ -107,8 +106,8 @@ pub(crate) fn scan_revolution(
             scanner.max_m,
         )?;
         for (ring, (direction, distance_m)) in directions.iter().zip(distances).enumerate() {
-            // Two counters per ray, one for the loss and one for the noise, so that the settings of
-            // one do not change the other.
+            // Each ray has two random counters, one for its loss and one for its noise. The
+            // settings of the loss therefore do not change the noise, and the reverse.
             let counter = u64::from(column) * u64::from(scanner.n_rings) + ring as u64;
             let Some(true_m) = distance_m else { continue };
             let is_dropped = !ideal && random.unit(2 * counter) < scanner.dropped_frac;

@@ -42,13 +42,13 @@ const AMBIENT: [f64; 3] = [0.37, 0.37, 0.39];
 /// Tangent of half the angle that the key lamp covers. A larger lamp gives softer shadows, which
 /// need more rays.
 const KEY_SIZE: f64 = 0.06;
-/// Number of rays to the key lamp and of ambient rays. Fewer rays give visible noise, which
-/// [`Texture::shade`](crate::texture::Texture::shade) blurs; more take longer when a scene is
-/// built.
+/// Number of rays to the key lamp and of ambient rays. With fewer rays, there is visible noise,
+/// which [`Texture::shade`](crate::texture::Texture::shade) blurs. With more rays, building a scene
+/// takes longer.
 const N_KEY_RAYS: u64 = 12;
 const N_AMBIENT_RAYS: u64 = 20;
 
-/// The golden angle, radians: points at its multiples on a spiral never line up.
+/// The golden angle, radians. On a spiral, points at its multiples never line up.
 const GOLDEN_ANGLE_RAD: f64 = 2.399_963;
 
 impl Lamp {
@@ -187,7 +187,7 @@ impl Occluders {
             0.0
         };
         let other_frac = self.ambient_frac(&from, normal, random);
-        // OpenGL draws the unoccluded light, so the texture gets the ratio of the light that
+        // OpenGL draws the unoccluded light, so the texture contains the fraction of the light that
         // arrives.
         (key * key_frac + others * other_frac) / (key + others)
     }
@@ -197,7 +197,7 @@ impl Occluders {
         let side = to_lamp.cross(&Vector3::x()).normalize();
         let across = to_lamp.cross(&side);
         let n_free = (0..N_KEY_RAYS).filter(|ray| {
-            // Spread evenly over the lamp's disc, with a random rotation (Vogel 1979).
+            // The rays are spread evenly over the lamp's disc, with a random rotation (Vogel 1979).
             let radius = KEY_SIZE * ((*ray as f64 + 0.5) / N_KEY_RAYS as f64).sqrt();
             let (sin, cos) = (*ray as f64 * GOLDEN_ANGLE_RAD
                 + random.between(0, 0.0, std::f64::consts::TAU))
@@ -209,7 +209,7 @@ impl Occluders {
     }
 
     fn ambient_frac(&self, from: &Point3<f64>, normal: &Vector3<f64>, random: RandomStream) -> f64 {
-        // An axis that is not parallel to the normal, or the cross product would vanish.
+        // The axis must not be parallel to the normal, because the cross product would vanish.
         let side = if normal.x.abs() < 0.7 {
             normal.cross(&Vector3::x())
         } else {
@@ -218,9 +218,9 @@ impl Occluders {
         .normalize();
         let across = normal.cross(&side);
         let n_free = (0..N_AMBIENT_RAYS).filter(|ray| {
-            // Malley's method: points spread evenly over a disc, projected up to the hemisphere.
-            // Each ray then carries the same light.
-            // Cosine-weighted directions around the normal.
+            // Cosine-weighted directions around the normal, by Malley's method: points are spread
+            // evenly over a disc and projected up to the hemisphere. Each ray then carries the same
+            // light.
             let square = (*ray as f64 + random.unit(2 + ray)) / N_AMBIENT_RAYS as f64;
             let (sin, cos) = (*ray as f64 * GOLDEN_ANGLE_RAD
                 + random.between(1, 0.0, std::f64::consts::TAU))
@@ -255,8 +255,8 @@ fn hits_box(
     half_m: &Vector3<f64>,
     reach: f64,
 ) -> bool {
-    // Slabs (Kay and Kajiya 1986): the ray is in the box while it is between all three pairs of
-    // planes. A component of 0 gives infinities, which `min` and `max` handle.
+    // This is the slab method (Kay and Kajiya 1986). The ray is in the box while it is between all
+    // three pairs of planes. A component of 0 gives infinities, which `min` and `max` handle.
     let mut enter = 0.0_f64;
     let mut leave = reach;
     for axis in 0..3 {

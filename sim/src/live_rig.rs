@@ -21,8 +21,9 @@ const MAX_READINGS: usize = 1000;
 const MAX_SCANS: usize = 20;
 /// Queue length for the ground-truth images of a camera, which are large.
 const MAX_TRUTH_IMAGES: usize = 8;
-/// Delay beyond which the simulation skips images. A smaller value skips images after short pauses
-/// of the computer; with a larger one, samples arrive later than those of a real device.
+/// Delay beyond which the simulation skips images. With a smaller value, images are skipped after
+/// short pauses of the computer. With a larger value, samples arrive later than those of a real
+/// device.
 const MAX_LATE: Duration = Duration::from_millis(50);
 
 /// Simulated devices that deliver in real time.
@@ -194,7 +195,7 @@ fn run_simulation(mut engine: Engine, shared: &SharedQueues, names: &DeviceNames
             Err(error) => break error.to_string(),
         }
     };
-    // Set under the lock, so that a device that is about to wait cannot miss it.
+    // The end is set under the lock, so that a device that is about to wait cannot miss it.
     shared.state.lock().end = Some(end);
     shared.arrived.notify_all();
 }
@@ -237,7 +238,7 @@ impl SharedQueues {
             ),
             pose @ Sample::BaseTruth(_) => push_bounded(&mut state.truth_poses, MAX_READINGS, pose),
         }
-        // The lock is released before waiting devices are woken; they would otherwise block on it
+        // The lock is released before waiting devices are woken. Otherwise, they would block on it
         // at once.
         let is_running = !state.stop;
         drop(state);

@@ -10,8 +10,8 @@ use std::time::Duration;
 const MAX_GAP: Duration = Duration::from_secs(1);
 /// Number of states kept: those of ten seconds at 1 kHz.
 const MAX_STATES: usize = 10_000;
-/// Maximum time to wait for a state. After it, the motors count as stopped. A state comes every
-/// millisecond, so only a stopped emulator is silent for so long.
+/// Maximum time to wait for a state. After this time, the motors count as stopped. A state comes
+/// every millisecond, so only a stopped emulator is silent for this long.
 const MAX_WAIT: Duration = Duration::from_secs(2);
 
 /// Recent positions of emulated motors, in the order of the joint readings. Clones share them.
@@ -37,15 +37,15 @@ impl Default for MotorHistory {
 impl MotorHistory {
     /// Adds the state of the motors. States that are not later than those before are ignored.
     pub fn record(&self, state: JointState) {
-        let _ = self.0.history.lock().push(state); // Rejected states are counted by the history.
+        let _ = self.0.history.lock().push(state); // The history counts rejected states.
         self.0.arrived.notify_all();
     }
 
     /// Waits until the positions at a stamp are known. Returns false if the motors have stopped.
     fn wait_until(&self, stamp: Stamp) -> bool {
         let mut history = self.0.history.lock();
-        // The time limit starts again with each state, so motors that lag behind are waited for,
-        // and only motors that send nothing count as stopped.
+        // The time limit starts again with each state. Motors that lag behind are therefore waited
+        // for, and only motors that send nothing count as stopped.
         while history.newest().is_none_or(|newest| newest < stamp) {
             if self.0.arrived.wait_for(&mut history, MAX_WAIT).timed_out() {
                 return false;

@@ -26,10 +26,10 @@ pub(crate) fn add_color_noise(
     sensor: &SensorConfig,
     random: RandomStream,
 ) -> Vec<u8> {
-    /// Pixels that one task processes: few enough for many tasks, and many enough that starting one
-    /// costs little.
+    /// Number of pixels that one task processes. It is small enough for many tasks, and large
+    /// enough for a low overhead per task.
     const PIXELS_A_CHUNK: usize = 640;
-    // A table of 256 square roots instead of one square root per channel.
+    // A table of 256 square roots replaces one square root per channel.
     let sigma: [f32; 256] = std::array::from_fn(|level| noise_sigma(sensor, level as f64) as f32);
     let mut bytes = vec![0; colors.len()];
     bytes
@@ -58,8 +58,8 @@ pub(crate) fn add_color_noise(
 pub(crate) fn noise_sigma(sensor: &SensorConfig, level: f64) -> f64 {
     const MID_GRAY: f64 = 128.0;
     sensor.noise_sigma
-        // The variance of shot noise is proportional to the brightness; that of read noise is
-        // constant.
+        // The variance of shot noise is proportional to the brightness. The variance of read noise
+        // is constant.
         * (1.0 - sensor.shot_frac + sensor.shot_frac * level / MID_GRAY)
             .max(0.0)
             .sqrt()
@@ -69,7 +69,7 @@ pub(crate) fn noise_sigma(sensor: &SensorConfig, level: f64) -> f64 {
 pub(crate) fn psnr(bytes: &[u8], colors: &[f32]) -> f64 {
     // A chunk's sum of squares fits u32: 4096 * 255^2 < 2^32.
     const SAMPLES_A_CHUNK: usize = 4096;
-    // Chunks, so that the innermost loop runs over slices.
+    // The data is processed in chunks, so that the innermost loop runs over slices.
     let squares = bytes
         .par_chunks(SAMPLES_A_CHUNK)
         .zip(colors.par_chunks(SAMPLES_A_CHUNK))
@@ -125,8 +125,8 @@ pub(crate) fn depth_counts(
     counts
 }
 
-/// Pixels at which a stereo camera finds no match: next to depth edges first, then in small
-/// clusters.
+/// Pixels at which a stereo camera finds no match. They are next to depth edges first, and then in
+/// small clusters.
 struct Holes {
     is_edge: Vec<bool>,
     width: usize,
@@ -183,8 +183,8 @@ impl Holes {
 /// only one of the two imagers.
 fn mark_edges(is_edge: &mut [bool], depth_m: &[f32]) {
     const EDGE_RADIUS_PX: usize = 2;
-    /// Depth difference that counts as an edge, as a fraction of the depth. Moderately slanted
-    /// surfaces stay below it.
+    /// Depth difference that counts as an edge, as a fraction of the depth. On moderately slanted
+    /// surfaces, differences are smaller.
     const JUMP_FRAC: f32 = 0.03;
     // Pixels near the ends of a row have no complete window and stay unmarked.
     for (column, window) in depth_m.windows(2 * EDGE_RADIUS_PX + 1).enumerate() {

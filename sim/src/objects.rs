@@ -215,7 +215,7 @@ pub(crate) fn shade_box(
 
 fn occluders() -> Occluders {
     const WALL_HALF_THICKNESS_M: f64 = 0.005;
-    /// Similar to the size of the objects.
+    /// The distance is similar to the size of the objects.
     const AMBIENT_REACH_M: f64 = 0.25;
     let mut occluders = Occluders::new(AMBIENT_REACH_M);
     occluders.add_box(world_from_cube(), [CUBE_HALF_M; 3]);
@@ -275,7 +275,7 @@ fn floor() -> Mesh {
         Point3::new(0.5, 0.0, -0.75),
         Vector3::x() * 3.0,
         Vector3::y() * 3.0,
-        // The texture repeats, because it would be coarse if it were stretched over the floor.
+        // The texture is repeated, because it would be coarse if it were stretched over the floor.
         [0.0, 0.0, 4.0, 4.0],
     );
     mesh
@@ -296,7 +296,7 @@ fn frame() -> Mesh {
         ],
         &[WHOLE; 6],
     );
-    // Slightly below the top, to avoid z-fighting.
+    // The frame is slightly below the table top, to avoid z-fighting.
     mesh.append(
         slab,
         table_center().coords - Vector3::new(0.0, 0.0, TABLE_HALF_THICKNESS_M + 1e-4),

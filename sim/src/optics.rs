@@ -48,8 +48,8 @@ impl RowMotion {
     }
 }
 
-/// Maximum number of iterations that correct the pixel position until its depth matches the ray. At
-/// most surfaces, one is enough; at depth edges, the search may never settle.
+/// Maximum number of iterations that correct the pixel position until its depth matches the ray. On
+/// most surfaces, one iteration is enough. At depth edges, the search may never converge.
 const MAX_CORRECTIONS: usize = 3;
 /// Relative depth tolerance. At the speeds of the arm, it moves a point by less than 0.02 pixels.
 const SAME_DEPTH_FRAC: f32 = 0.005;
@@ -85,8 +85,8 @@ impl Optics {
                 rays.push([point.x as f32, point.y as f32]);
             }
         }
-        // Rolling shutter and blur show content from outside the image: a few pixels at the speeds
-        // of the arm.
+        // Rolling shutter and blur show content from outside the image. At the speeds of the arm,
+        // this is a few pixels.
         let margin_px = if is_motion_free { 0 } else { 4 + height / 60 };
         let mut optics = Self {
             view_size_px: [0; 2],
@@ -178,7 +178,7 @@ impl Optics {
         let area = (side * side) as f32;
         let top = (margin + row * side) * stride + 3 * margin;
         for (column, color) in colors.iter_mut().enumerate() {
-            // At most 16 samples of 255, which fit u16.
+            // There are at most 16 samples of 255, so the sum fits u16.
             let mut sum = [0u16; 3];
             for y in 0..side {
                 let start = top + y * stride + 3 * column * side;
@@ -196,8 +196,8 @@ impl Optics {
     ///
     /// `row_motions` holds all motions of the first row, then of the second, and so on. Each
     /// pixel's ray is traced into the rendered image with the rendered depth, so surfaces have the
-    /// correct positions. The exception is a strip next to each depth edge, as wide as the parallax
-    /// during the readout, which repeats the adjacent content.
+    /// correct positions. There is one exception: a strip next to each depth edge repeats the
+    /// adjacent content. The strip is as wide as the parallax during the readout.
     pub(crate) fn motion_blurred(&self, picture: &Picture, row_motions: &[RowMotion]) -> Vec<f32> {
         let n_samples = row_motions.len() / self.intrinsics.size_px[1] as usize;
         let share = 1.0 / n_samples as f32;
@@ -297,15 +297,15 @@ impl Optics {
         }
         let [width, height] = picture.size_px.map(|side| side as usize);
         let start = |axis: usize, size: usize| {
-            // Clamped, so that the square stays inside the picture and its first and last columns
-            // exist.
+            // The position is clamped, so that the square stays inside the picture and its first
+            // and last columns exist.
             let first = (at[axis] - 0.5 * side as f32).clamp(0.0, (size - side) as f32 - 1e-3);
             (first as usize, first.fract())
         };
         let (column, share_x) = start(0, width);
         let (row, share_y) = start(1, height);
-        // The square covers `side` pixels, but starts at a fraction, so the outer ones count
-        // partly.
+        // The square covers `side` pixels, but starts at a fraction of a pixel, so the outer pixels
+        // count partly.
         let weight = |ix: usize, share: f32| match ix {
             0 => 1.0 - share,
             ix if ix == side => share,

@@ -14,7 +14,7 @@ pub(crate) type Joints = SVector<f64, N_JOINTS>;
 /// velocity.
 pub(crate) type Jacobian = SMatrix<f64, 6, N_JOINTS>;
 
-/// Craig's parameters of a joint: distance a along and angle alpha about the previous x axis,
+/// Craig's parameters of a joint: distance a along the previous x axis, angle alpha about it, and
 /// offset d along the joint axis.
 struct Link {
     a_m: f64,
@@ -119,8 +119,8 @@ pub(crate) fn jacobian(
     let base_from_tip = base_from_flange * flange_from_tip;
     let mut jacobian = Matrix6xX::zeros(N_JOINTS);
     for (ix, frame) in frames.iter().enumerate() {
-        // Each joint rotates the tip about its z axis: the angular velocity is the axis, the linear
-        // velocity its cross product with the lever.
+        // Each joint rotates the tip about the joint's z axis. The angular velocity is the axis,
+        // and the linear velocity is the cross product of the axis and the lever arm.
         let axis = frame.rotation * Vector3::z();
         let arm = base_from_tip.translation.vector - frame.translation.vector;
         jacobian
@@ -273,8 +273,8 @@ pub(crate) fn mjcf(on_flange: &str) -> String {
     write_parts(&mut xml, BASE);
     for (ix, link) in LINKS.iter().enumerate() {
         let pose = pose_attributes(&link.parent_from_joint());
-        // A solid of this mass and about the size of a link. The exact inertia does not matter,
-        // because the controller is stiff.
+        // The inertia is that of a solid of this mass and about the size of a link. Its exact value
+        // does not matter, because the controller is stiff.
         let [number, inertia, mass] = [ix as f64 + 1.0, 0.012 * MASS_KG[ix], MASS_KG[ix]];
         let lower = LOWER_RAD[ix];
         let upper = UPPER_RAD[ix];

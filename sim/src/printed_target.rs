@@ -8,7 +8,7 @@ use image::{ExtendedColorType, ImageEncoder};
 use nalgebra::{Point3, Vector3};
 use targets::Raster;
 
-/// Side of the square texture, pixels. A power of two, so that no mipmap level is shifted.
+/// Side of the square texture, pixels. It is a power of two, so that no mipmap level is shifted.
 const SIDE_PX: u32 = 2048;
 /// Thickness of the plate, and gap between print and plate to avoid z-fighting, meters.
 const PLATE_M: f64 = 0.003;
@@ -32,8 +32,7 @@ pub(crate) fn print(config: &TargetConfig) -> Result<Printed, Error> {
         source,
     };
     // The size of the raster in pixels depends on the target's shape, which only the rasterizer
-    // knows.
-    // First rasterize at 1 px per mm to get the size.
+    // knows. The target is therefore first rasterized at 1 px per mm to get the size.
     let coarse = target.raster(1000.0).map_err(failed)?;
     let longest_px = coarse.size_px.into_iter().max().unwrap_or(1);
     let picture = target
@@ -104,7 +103,7 @@ mod tests {
         let target: TargetSpec = spec.parse().expect("a target");
         let [low, high] = target.bounds_m();
         let center = Vector3::new(0.5 * (low[0] + high[0]), 0.5 * (low[1] + high[1]), 0.0);
-        // In front of the objects on the table, facing the middle of the scan.
+        // The target is in front of the objects on the table and faces the middle of the scan.
         let (sin, cos) = 40f64.to_radians().sin_cos();
         let forward = Vector3::new(cos, 0.0, -sin);
         let down = Vector3::new(-sin, 0.0, -cos);
@@ -171,7 +170,7 @@ mod tests {
 
     #[test]
     fn corners_are_where_the_specification_says() {
-        /// Measured: below 0.003 px and 0.023 px.
+        /// The measured values are below 0.003 px and 0.023 px.
         const MAX_BIAS_PX: f64 = 0.005;
         const MAX_RMS_PX: f64 = 0.03;
         for (spec, min_corners) in [

@@ -39,8 +39,8 @@ impl RandomStream {
     pub(crate) fn normals(self, counter: u64) -> [f32; 4] {
         let bits = self.bits(counter);
         let table = &*QUANTILES;
-        // Four separate groups of 12 bits. A table lookup is much faster than the Box-Muller
-        // transform, and images need millions of normal numbers.
+        // Four separate groups of 12 bits are used. A table lookup is much faster than the
+        // Box-Muller transform, and images need millions of normal numbers.
         [0, 12, 24, 36].map(|shift| table[(bits >> shift & 0xfff) as usize])
     }
 }

@@ -92,7 +92,7 @@ fn render_thread_stopped() -> Error {
 impl Renderer {
     /// Starts the thread and its context.
     pub(crate) fn start(model: Arc<MjModel>, near_far_m: [f64; 2]) -> Result<Self, Error> {
-        // A bounded queue, so that the simulation cannot run far ahead of the rendering.
+        // The queue is bounded, so that the simulation cannot run far ahead of the rendering.
         let (job_sender, queue) = bounded::<Job>(4);
         let (ready, started) = bounded(1);
         let thread = std::thread::Builder::new()
@@ -193,8 +193,8 @@ impl Canvas {
         self.draw_with(view, &options)
     }
 
-    /// The pixels at which MuJoCo's segmentation shows the robot; with nothing else in the scene if
-    /// `is_alone`.
+    /// The pixels at which MuJoCo's segmentation shows the robot. If `is_alone` is set, the scene
+    /// contains nothing else.
     pub(crate) fn robot_mask(&mut self, view: &View, is_alone: bool) -> Vec<bool> {
         let mut options = MjvOption::default();
         if is_alone {
@@ -270,8 +270,8 @@ impl Canvas {
         let in_f32 = |vector: Vector3<f64>| [vector.x as f32, vector.y as f32, vector.z as f32];
         let [width, height] = view.size_px.map(f64::from);
         let at_near = |pixels: f64, axis: usize| pixels * near / view.focal_px[axis];
-        // An off-center frustum gives the principal point of the camera. OpenGL has y up, the image
-        // y down, so top and bottom change places.
+        // An off-center frustum gives the principal point of the camera. In OpenGL, y points up,
+        // but in the image, y points down, so top and bottom are swapped.
         let [left, right] = [
             at_near(-view.principal_px[0], 0),
             at_near(width - view.principal_px[0], 0),

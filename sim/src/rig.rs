@@ -20,13 +20,13 @@ use drivers::motion::MotionLimits;
 use kinematics::{Stamp, Transform};
 use std::sync::Arc;
 
-/// The simulated arm as a URDF: same kinematics and limits, base `panda_link0`, flange
-/// `panda_link8`.
+/// The simulated arm as a URDF, with the same kinematics and limits. The base is `panda_link0`, and
+/// the flange is `panda_link8`.
 pub const PANDA_URDF: &str = include_str!("../../rigs/robots/panda.urdf");
 
-/// The mobile arm as a URDF: root `base`, arm as above.
+/// The mobile arm as a URDF. Its root is `base`, and its arm is the one above.
 const MOBILE_ARM_URDF: &str = include_str!("../../rigs/robots/mobile-arm.urdf");
-/// The quadruped as a URDF: root `base`, `top_plate` on its back.
+/// The quadruped as a URDF. Its root is `base`, and `top_plate` is on its back.
 const QUADRUPED_URDF: &str = include_str!("../../rigs/robots/quadruped.urdf");
 
 /// URDF of a scene's robot.
@@ -46,10 +46,10 @@ pub struct Rig {
 
 /// Builds the scene and starts its render thread. Takes one to two seconds.
 pub fn open(config: &Config) -> Result<Rig, Error> {
-    // Before anything reaches MuJoCo, which aborts the process on invalid numbers.
+    // This check comes before anything reaches MuJoCo, which aborts the process on invalid numbers.
     config.check()?;
     let cameras = Cameras::new(config)?;
-    // One model for dynamics, rendering and ray casting, each with its own data.
+    // Dynamics, rendering and ray casting share one model, but each has its own data.
     let model = Arc::new(scene::build(config, cameras.largest_view_px())?);
     let renderer = Renderer::start(Arc::clone(&model), scene::near_far_m(config.scene))?;
     let motion = BaseMotion::of(config.scene, config.speed);
@@ -96,8 +96,8 @@ pub fn open(config: &Config) -> Result<Rig, Error> {
     Ok(Rig { engine, info })
 }
 
-/// `flange_from_camera` of the camera that follows the tour: the first one on the flange, or a
-/// default if there is none.
+/// `flange_from_camera` of the camera that follows the tour. This is the first camera on the
+/// flange. Without such a camera, a default pose is returned.
 fn scanning_camera(config: &Config) -> Transform {
     let on_flange = config
         .cameras
@@ -131,12 +131,12 @@ impl Rig {
         &self.info
     }
 
-    /// Runs as fast as samples are taken. Simulated time zero has the stamp 0.
+    /// Lets the rig run as fast as its samples are taken. Simulated time zero has the stamp 0.
     pub fn into_lockstep(self) -> Lockstep {
         Lockstep::new(self.engine, self.info)
     }
 
-    /// Runs as fast as its devices are read, with an arm that moves by commands within the given
+    /// Lets the rig run as fast as its devices are read. Its arm moves by commands within the given
     /// limits, which are in the order of the joint readings. Simulated time zero has the stamp 0.
     pub fn into_commanded(self, limits: &[MotionLimits]) -> Result<CommandedRig, Error> {
         CommandedRig::new(self.engine, self.info, limits)
@@ -147,8 +147,8 @@ impl Rig {
         self.engine.reported_joints()
     }
 
-    /// The cameras, in real time, on an arm that emulated motors move. Simulated time zero is now,
-    /// which is `start` on the clock of the motors.
+    /// Returns the cameras, which run in real time on an arm that emulated motors move. Simulated
+    /// time zero is the time of this call, which is `start` on the clock of the motors.
     pub fn into_motorized(
         mut self,
         motors: MotorHistory,
@@ -160,7 +160,8 @@ impl Rig {
             .cameras)
     }
 
-    /// Runs in real time. Simulated time zero is now, which is `start` on the caller's clock.
+    /// Lets the rig run in real time. Simulated time zero is the time of this call, which is
+    /// `start` on the caller's clock.
     pub fn into_live(self, start: Stamp) -> Result<LiveRig, Error> {
         LiveRig::start(self.engine, self.info, start)
     }

@@ -72,8 +72,8 @@ impl Robot {
     }
 
     /// Advances by one step. Returns the time before the step, nanoseconds, and the joint reading
-    /// at that time. Emulated motors report their joints themselves; the step then waits for them,
-    /// and fails if they have stopped.
+    /// at that time. Emulated motors report their joints themselves. In this case, the step waits
+    /// for their reports, and fails if the motors have stopped.
     pub(crate) fn step(&mut self) -> Result<(i64, Option<JointReading>), Error> {
         let nanos = self.n_steps * STEP_NANOS;
         self.n_steps += 1;
@@ -88,7 +88,8 @@ impl Robot {
         Ok((nanos, reading))
     }
 
-    /// The robot at a time in its recent past; `None` if the positions of the arm do not cover it.
+    /// The robot at a time in its recent past; `None` if the stored positions of the arm do not
+    /// cover that time.
     pub(crate) fn at(&self, nanos: i64) -> Option<RobotPose> {
         let joints_rad = match &self.arm {
             Some(ArmMotion::Simulated(arm)) => Some(arm.position_at(nanos)?),

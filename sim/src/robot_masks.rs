@@ -12,7 +12,8 @@ use std::sync::Arc;
 /// A pinhole view of a scene.
 #[derive(Clone, Debug, PartialEq)]
 pub struct PinholeView {
-    /// Width and height, pixels; at most those with which [`RobotMasks::open`] was called.
+    /// Width and height, pixels. Both are at most as large as the size with which
+    /// [`RobotMasks::open`] was called.
     pub size_px: [u32; 2],
     /// Focal length, pixels.
     pub focal_px: [f64; 2],
@@ -22,10 +23,10 @@ pub struct PinholeView {
     pub world_from_camera: Transform,
 }
 
-/// Draws a scene with a robot without cameras on its flange. It draws on the thread that has opened
-/// it.
+/// Draws a scene and a robot that has no cameras on its flange. The drawing happens on the thread
+/// that has opened this value.
 pub struct RobotMasks {
-    // Dropped before the context.
+    // This field is dropped before the context.
     canvas: Canvas,
     _context: HeadlessContext,
 }
@@ -51,8 +52,8 @@ impl RobotMasks {
         })
     }
 
-    /// The pixels at which MuJoCo's segmentation shows the robot, row by row; with nothing else in
-    /// the scene if `is_alone`.
+    /// The pixels at which MuJoCo's segmentation shows the robot, row by row. If `is_alone`, the
+    /// scene contains nothing else.
     ///
     /// * `joints_rad`: positions of the arm's joints from base to flange.
     ///
@@ -80,8 +81,8 @@ impl RobotMasks {
         Ok(self.canvas.robot_mask(&drawn(view, Some(robot)), is_alone))
     }
 
-    /// Depth of the scene without the robot, row by row, meters along z; the far plane where there
-    /// is nothing.
+    /// Depth of the scene without the robot, row by row, meters along z. Pixels that show nothing
+    /// have the depth of the far plane.
     pub fn depth_without_robot_m(&mut self, view: &PinholeView) -> Vec<f32> {
         self.canvas.draw(&drawn(view, None)).depth_m
     }

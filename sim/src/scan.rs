@@ -1,4 +1,4 @@
-//! The camera tour of the static arm: around the target area on the table.
+//! The camera tour of the static arm, which leads around the target area on the table.
 
 use crate::objects::{TABLE_Z_M, TARGET_XY_M};
 use kinematics::Transform;
@@ -61,13 +61,13 @@ impl Scan {
     /// Progress along the tour, in seconds at constant speed; starts at rest.
     fn progress(&self, secs: f64) -> f64 {
         let (share, period_secs) = SPEED_OSCILLATION;
-        // The integral of a smooth ramp from 0 to 1.
+        // This is the integral of a smooth ramp from 0 to 1.
         let ramp = (secs / START_SECS).clamp(0.0, 1.0);
         let started =
             START_SECS * (ramp.powi(3) - 0.5 * ramp.powi(4)) + (secs - START_SECS).max(0.0);
         let uniform_secs = started * self.speed;
-        // The integral of a speed that oscillates about 1. The cosine starts with zero slope, so
-        // the motion starts smoothly.
+        // This is the integral of a speed that oscillates about 1. The cosine starts with zero
+        // slope, so the motion starts smoothly.
         uniform_secs + share * period_secs / TAU * (1.0 - (uniform_secs * TAU / period_secs).cos())
     }
 

@@ -43,7 +43,8 @@ pub(crate) fn build(config: &Config, largest_px: [u32; 2]) -> Result<MjModel, Er
     let mut assets = format!("{MATERIALS}{}", extra_materials(config.scene));
     let mut bodies = String::new();
     let scene_assets = SceneAssets::get(config.scene)?;
-    // The scene first: textures, each with a material of the same name, then meshes.
+    // The scene comes first. It consists of textures, each with a material of the same name, and
+    // then meshes.
     for (name, png) in &scene_assets.textures_png {
         add_file(&mut files, &format!("{name}.png"), png)?;
         let specular = if *name == "metal" { 0.25 } else { 0.03 };
@@ -72,7 +73,7 @@ pub(crate) fn build(config: &Config, largest_px: [u32; 2]) -> Result<MjModel, Er
             "<geom type=\"mesh\" mesh=\"{name}\" material=\"{material}\" group=\"{group}\" {pose}/>"
         );
     }
-    // Then printed targets. Those on the flange become part of the arm's last body.
+    // Then come the printed targets. Targets on the flange become part of the arm's last body.
     let mut on_flange = String::new();
     for (ix, target) in config.targets.iter().enumerate() {
         let printed_target::Printed { png, mesh, plate } = printed_target::print(target)?;
@@ -92,14 +93,15 @@ pub(crate) fn build(config: &Config, largest_px: [u32; 2]) -> Result<MjModel, Er
             TargetParent::World => &mut bodies,
             TargetParent::Flange => &mut on_flange,
         };
-        // Visible even if the arm is hidden, and without mass.
+        // The target is visible even if the arm is hidden, and it has no mass.
         let _ = writeln!(
             parent,
             "<geom type=\"mesh\" mesh=\"{name}\" material=\"{name}\" group=\"0\" mass=\"0\" {pose}/>\n\
              <geom type=\"mesh\" mesh=\"{name}_plate\" material=\"frame\" group=\"0\" mass=\"0\" {pose}/>"
         );
     }
-    // Contacts and shadows are off: nothing touches, and shadows are baked into the textures.
+    // Contacts are off because nothing touches. Shadows are off because they are baked into the
+    // textures.
     let [near, far] = near_far_m(config.scene);
     let [width, height] = largest_px;
     let (lamps, ambient) = light::mjcf(brightness(config.scene));

@@ -48,13 +48,14 @@ impl Texture {
         share_at: impl Fn(f64, f64, u64) -> f64 + Sync,
     ) {
         let step = 1.0 / (n - 1) as f64;
-        // Exactly on the edge, a point may lie inside the adjacent object.
+        // A point exactly on the edge may lie inside the adjacent object.
         let inside = |at: usize| (at as f64 * step).clamp(EDGE, 1.0 - EDGE);
         let shares: Vec<f64> = (0..n * n)
             .into_par_iter()
             .map(|ix| share_at(inside(ix % n), inside(ix / n), ix as u64))
             .collect();
-        // Few rays per sample give noise, which the mean of neighbors reduces.
+        // The light samples are noisy because each uses few rays. The mean of neighbors reduces
+        // this noise.
         let shares = blurred(&shares, n);
         let side_px = self.side_px;
         let [left, top, right, bottom] = rectangle;
@@ -100,7 +101,7 @@ fn blurred(grid: &[f64], side: usize) -> Vec<f64> {
         .collect()
 }
 
-/// Mean of a point of a square grid and its neighbors; fewer at the border.
+/// Mean of a point of a square grid and its neighbors. A point at the border has fewer neighbors.
 fn mean_around(grid: &[f64], side: usize, ix: usize) -> f64 {
     let around = |at: usize| at.saturating_sub(1)..(at + 2).min(side);
     let rows = around(ix / side);
@@ -430,7 +431,8 @@ impl Grain {
     }
 }
 
-/// Fur colors, brighter to the right. Each band runs from tip (top) to root. Bands: [`FurBand`].
+/// Fur colors, which are brighter to the right. Each band runs from the tip of the hair (top) to
+/// its root. [`FurBand`] lists the bands.
 pub(crate) fn fur() -> Texture {
     let skin = Noise::new(52);
     Texture::paint(SIDE_PX / 2, |x, y| {
@@ -478,7 +480,8 @@ impl FurBand {
 pub(crate) fn tags() -> Texture {
     let cells: Vec<_> = (0..tag::CODES.len()).map(tag::cells).collect();
     let paper = Noise::new(61);
-    // Larger than the other textures, so that edges between cells stay sharp at close range.
+    // This texture is larger than the others, so that edges between cells stay sharp at close
+    // range.
     Texture::paint(3 * SIDE_PX / 2, |x, y| {
         let across = x * 3.0;
         let down = y * 3.0;

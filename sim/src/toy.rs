@@ -61,8 +61,8 @@ impl Part {
     }
 }
 
-/// Twice the factor on the hair counts below. More hairs make a denser coat, and a larger mesh that
-/// takes longer to draw.
+/// Twice the factor by which the hair counts below are multiplied. More hairs make the coat denser,
+/// but the mesh then takes longer to draw.
 const DENSITY: u64 = 3;
 
 /// The toy stands on z = 0, looks along x, and is 0.15 m high.
@@ -292,7 +292,8 @@ pub(crate) fn fur(light: Light<'_>) -> Mesh {
         let random = RandomStream::new(0xf0_44, &[ix as u64]);
         let half_axes = part.half_axes();
         for hair in 0..DENSITY * part.n_hairs / 2 {
-            // Evenly distributed over a sphere: the cosine of the polar angle is uniform.
+            // The directions are evenly distributed over a sphere, because the cosine of the polar
+            // angle is uniform.
             let down = (1.0 - 2.0 * random.unit(8 * hair)).acos() / std::f64::consts::PI;
             let direction = sphere_direction(down, random.unit(8 * hair + 1));
             let root = part.center()

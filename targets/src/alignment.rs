@@ -55,7 +55,8 @@ impl Printed<'_> {
         cell: Cell,
         pixel: [f64; 2],
     ) -> Option<[f64; 2]> {
-        // Scale, shear and bend come from the neighbors only, so that any lens is supported.
+        // Scale, shear and bend are computed only from the neighbors, so that any lens is
+        // supported.
         let neighborhood = Neighborhood {
             point_m: self.point_m(cell),
             pixel,

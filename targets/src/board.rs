@@ -97,8 +97,9 @@ impl TargetSpec {
     ///
     /// A pose of such a board is ambiguous: `camera_from_board * rotation` fits the image equally
     /// well for every rotation of this list. A chessboard whose numbers of inner corners are both
-    /// even or both odd looks the same rotated by 180 degrees; if they are also equal and even, by
-    /// 90 degrees. All other targets are unambiguous.
+    /// even or both odd looks the same after a rotation by 180 degrees. If the numbers are also
+    /// equal and even, it looks the same after a rotation by 90 degrees. All other targets are
+    /// unambiguous.
     pub fn symmetry(&self) -> Vec<Transform> {
         let Pattern::Chessboard {
             inner: [columns, rows],
@@ -107,9 +108,9 @@ impl TargetSpec {
         else {
             return vec![Transform::identity()];
         };
-        // The numbers of squares are one larger. Opposite squares at the corners of the board have
-        // the same color if both numbers are even or both are odd; all four have it if both are
-        // odd.
+        // The numbers of squares are larger by one. Opposite squares at the corners of the board
+        // have the same color if both numbers are even or both are odd. All four squares have the
+        // same color if both numbers are odd.
         let quarters: &[f64] = if columns == rows && columns % 2 == 0 {
             &[0.0, 1.0, 2.0, 3.0]
         } else if (columns + rows) % 2 == 0 {

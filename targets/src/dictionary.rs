@@ -40,9 +40,9 @@ const ARUCO: [&str; 16] = [
     "4X4_50", "4X4_100", "4X4_250", "4X4_1000", "5X5_50", "5X5_100", "5X5_250", "5X5_1000",
     "6X6_50", "6X6_100", "6X6_250", "6X6_1000", "7X7_50", "7X7_100", "7X7_250", "7X7_1000",
 ];
-/// Largest number of wrong cells that are corrected in 4X4 markers, whose codes are similar, and in
-/// larger ones. More corrections find more markers in bad images, and more markers where there are
-/// none.
+/// Maximum number of wrong cells that are corrected: first in 4X4 markers, whose codes are similar,
+/// then in larger ones. With more corrections, more markers are found in bad images, but also more
+/// false markers.
 const CORRECTED: [u32; 2] = [0, 2];
 
 impl Dictionary {
@@ -131,7 +131,8 @@ impl Dictionary {
                 code | u64::from(cell(quarter_turns, at / n, at % n)) << at
             });
             for (id, code) in (0..).zip(self.codes) {
-                // The Hamming distance. Of equals, the first id and rotation are kept.
+                // This is the Hamming distance. If several are equal, the first id and rotation are
+                // kept.
                 let n_wrong = (seen ^ code).count_ones();
                 if n_wrong <= n_corrected && best.is_none_or(|best| n_wrong < best.n_wrong) {
                     best = Some(Match {
@@ -194,7 +195,8 @@ mod tests {
     fn rotated_and_damaged_markers_are_decoded() {
         let dictionary = Dictionary::aruco("6X6_250").unwrap();
         let n = dictionary.n_bits();
-        // The marker, rotated clockwise by one quarter: its left column is the top row.
+        // The marker is rotated clockwise by a quarter turn, so its left column becomes the top
+        // row.
         let mut cells: Vec<bool> = (0..n * n)
             .map(|at| dictionary.is_black(42, n - 1 - at % n, at / n))
             .collect();

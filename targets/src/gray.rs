@@ -91,9 +91,9 @@ impl Plane {
 
     /// Smooths with the binomial kernel (1 4 6 4 1) / 16 along both axes, a Gaussian of 1 px.
     pub(crate) fn smoothed(&self) -> Self {
-        // The kernel is separable: two passes with 5 values each, instead of one with 25. Two
-        // pixels at each border are not smoothed, because the kernel would reach outside;
-        // detection keeps away from them.
+        // The kernel is separable, so two passes with 5 values each replace one pass with 25. Two
+        // pixels at each border are not smoothed, because the kernel would reach outside. Detection
+        // does not use them.
         let mut across = self.values.clone();
         for (out, row) in across
             .chunks_exact_mut(self.width)

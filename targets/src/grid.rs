@@ -1,10 +1,10 @@
 //! Links saddles along the edges between them into lattices.
 //!
-//! Every saddle looks for the nearest saddle along each of its four edges; links that both ends
-//! agree on are kept if the image is black on one side and white on the other all along. The links
-//! are then walked, which gives every saddle a column and a row. All decisions are local, so the
-//! lens may bend the board. Similar to Geiger et al. 2012, "Automatic camera and range sensor
-//! calibration using a single shot", section III.
+//! For every saddle, the nearest saddle along each of its four edges is found. A link is kept if
+//! both ends agree on it, and if the image is black on one side and white on the other along the
+//! whole link. The links are then followed, which gives every saddle a column and a row. All
+//! decisions are local, so the lens may bend the board. The method is similar to Geiger et al.
+//! 2012, "Automatic camera and range sensor calibration using a single shot", section III.
 
 use crate::gray::Plane;
 use crate::lattice::{Cell, Lattice, STEPS, distance};
@@ -15,14 +15,14 @@ use std::f64::consts::PI;
 /// Largest angle between an edge and the line to the neighbor, radians.
 ///
 /// The edge's direction is measured on a ring of a few pixels, and fisheye lenses bend the line
-/// between two corners. The next direction of a lattice, the diagonal, is 0.79 rad away under
-/// frontal view, so half of that separates the two.
+/// between two corners. In a frontal view, the next direction of a lattice is the diagonal, which
+/// is 0.79 rad away. Half of that separates the two directions.
 const MAX_ANGLE_RAD: f64 = 0.4;
 /// Largest length of neighboring links relative to each other.
 ///
 /// Foreshortening makes the two axes of a board differ by `1 / cos(tilt)`, which is 2.5 at 66
-/// degrees. Smaller values reject tilted boards; larger ones accept links across a missing corner
-/// more often.
+/// degrees. With a smaller value, tilted boards are rejected. With a larger value, links across a
+/// missing corner are accepted more often.
 const MAX_RATIO: f64 = 2.5;
 
 /// Links saddles. Returns the lattices with at least `min` corners, the largest first.
@@ -67,7 +67,8 @@ fn links(plane: &Plane, saddles: &[Saddle]) -> Vec<[Link; 4]> {
             });
         }
     }
-    // The check of the image is not symmetric in rounding, so links are compared once more.
+    // Because of rounding, the check of the image is not exactly symmetric, so links are compared
+    // once more.
     let checked = links.clone();
     for (from, edges) in links.iter_mut().enumerate() {
         for (edge, link) in edges.iter_mut().enumerate() {
@@ -99,8 +100,8 @@ fn edge_back(origin: &Saddle, edge: usize, saddle: &Saddle) -> Option<usize> {
         return None;
     }
     let back_rad = |back: usize| angle_between(toward_rad + PI, saddle.edges_rad[back]).abs();
-    // An edge with black after it, in ascending angles, is seen from its other end with black
-    // before it. Only two of the four edges are therefore possible.
+    // If an edge has black after it, in ascending angles, it has black before it when seen from its
+    // other end. Only two of the four edges are therefore possible.
     let back = [1 - edge % 2, 3 - edge % 2]
         .into_iter()
         .min_by(|&a, &b| back_rad(a).total_cmp(&back_rad(b)))?;
@@ -109,7 +110,8 @@ fn edge_back(origin: &Saddle, edge: usize, saddle: &Saddle) -> Option<usize> {
 
 /// Whether the image is black on one side of the line between two saddles and white on the other.
 fn is_edge(plane: &Plane, from: &Saddle, edge: usize, to: &Saddle) -> bool {
-    // Puzzleboards have a dot in the middle third of every edge, so its outer thirds are examined.
+    // Puzzleboards have a dot in the middle third of every edge, so only the outer thirds are
+    // examined.
     const ALONG: [f64; 4] = [0.2, 0.3, 0.7, 0.8];
     // Distance of the samples from the line, relative to its length. It must exceed the deviation
     // of a bent line, and stay inside the square.
@@ -140,8 +142,8 @@ fn beside(point: [f64; 2], sign: f64, across_px: f64, [dx, dy]: [f64; 2]) -> [f6
     ]
 }
 
-/// Removes links that are much longer than the other links of a saddle: they skip a missing corner
-/// or leave the board.
+/// Removes links that are much longer than the other links of a saddle, because they skip a missing
+/// corner or leave the board.
 fn drop_odd_lengths(saddles: &[Saddle], links: &mut [[Link; 4]]) {
     // All lengths are compared with those before any link is removed, so that the result does not
     // depend on the order of the saddles.
@@ -179,8 +181,9 @@ fn walk(saddles: &[Saddle], links: &[[Link; 4]], seed: usize, is_used: &mut [boo
     let mut queue = VecDeque::from([(seed, [0, 0], 0_usize)]);
     is_used[seed] = true;
     lattice.corners.insert([0, 0], saddles[seed].pixel);
-    // Breadth first: near the seed, cells are certain. If a wrong link leads to a cell that is
-    // already taken, the earlier assignment, which needed fewer links, is kept.
+    // The search is breadth first, because cells near the seed are certain. If a wrong link leads
+    // to a cell that is already taken, the earlier assignment is kept, because it needed fewer
+    // links.
     while let Some((from, cell, first_step)) = queue.pop_front() {
         for (edge, link) in links[from].iter().enumerate() {
             let Some((to, back)) = *link else { continue };
@@ -191,8 +194,9 @@ fn walk(saddles: &[Saddle], links: &[[Link; 4]], seed: usize, is_used: &mut [boo
             }
             is_used[to] = true;
             lattice.corners.insert(neighbor, saddles[to].pixel);
-            // Edge `back` of the neighbor points opposite to `step`, that is to `step + 2`. Its
-            // edge 0 is `back` quarter turns before that; 4 keeps the difference positive.
+            // Edge `back` of the neighbor points in the direction opposite to `step`, which is
+            // `step + 2`. Edge 0 of the neighbor is `back` quarter turns before that. The 4 keeps
+            // the difference positive.
             queue.push_back((to, neighbor, (step + 2 + 4 - back) % 4));
         }
     }

@@ -7,11 +7,12 @@ use nalgebra::{Matrix2, Matrix3, SMatrix, SVector, Vector3};
 pub(crate) struct Homography(Matrix3<f64>);
 
 impl Homography {
-    /// The map that takes four points to four others. `None` if three of either lie on a line.
+    /// The map that takes four points to four others. `None` if three points of one of these sets
+    /// lie on a line.
     ///
-    /// Source: Hartley and Zisserman 2004, section 4.1, with the last element fixed to 1: the image
-    /// of the first plane's origin must be finite, so points of the first plane should be near its
-    /// origin.
+    /// Source: Hartley and Zisserman 2004, section 4.1, with the last element fixed to 1. The image
+    /// of the first plane's origin must therefore be finite, so points of the first plane should be
+    /// near its origin.
     pub(crate) fn from_corners(from: &[[f64; 2]; 4], to: &[[f64; 2]; 4]) -> Option<Self> {
         let mut matrix = SMatrix::<f64, 8, 8>::zeros();
         let mut right = SVector::<f64, 8>::zeros();
@@ -75,7 +76,7 @@ mod tests {
                 .map(|sign| homography.map([0.3 + sign * nudge[0], 0.8 + sign * nudge[1]]));
             for row in 0..2 {
                 let numeric = (ahead[row] - behind[row]) / (2.0 * NUDGE);
-                // Derivatives are near 100; differences lose ten digits.
+                // The derivatives are near 100, and the differences lose ten digits.
                 assert!(
                     (jacobian[(row, axis)] - numeric).abs() < 1e-6,
                     "{row} {axis}"

@@ -18,9 +18,9 @@ pub(crate) struct Lattice {
 
 /// Largest deviation from a prediction, relative to the distance between neighbors.
 ///
-/// The nearest wrong saddles belong to dots or to markers, about a third of a square away. Larger
-/// values let them in. Smaller values lose corners where a lens bends the board strongly, because
-/// extrapolation is inaccurate there.
+/// The nearest wrong saddles belong to dots or to markers, about a third of a square away. With
+/// larger values, they would be accepted. With smaller values, corners would be lost where a lens
+/// bends the board strongly, because extrapolation is inaccurate there.
 const MAX_DEVIATION: f64 = 0.22;
 /// Radius of the ring that verifies a corner, relative to the distance between neighbors. At less
 /// than half, it crosses no edges of neighboring corners, even in foreshortened squares.
@@ -28,16 +28,16 @@ const RING_FRAC: f64 = 0.27;
 /// Half the refinement window, relative to the distance between neighbors, and its limits in
 /// pixels.
 ///
-/// A larger window averages more noise. It must not contain the edges of neighboring corners, and
-/// beyond 9 pixels, the bending of lines by the lens outweighs the gain.
+/// A larger window averages more noise, but it must not contain the edges of neighboring corners.
+/// Beyond 9 pixels, the bending of lines by the lens outweighs the gain.
 const WINDOW_FRAC: f64 = 0.38;
 const WINDOW_PX: [f64; 2] = [2.0, 9.0];
 
 /// How corners are refined and verified.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Refinement {
-    /// Part of the distance between corners around each corner that shows nothing but the four
-    /// edges, 0 to 0.5.
+    /// Fraction of the distance between corners, around each corner, in which only the four edges
+    /// are visible, 0 to 0.5.
     pub(crate) clear_frac: f64,
 }
 
@@ -60,12 +60,14 @@ impl Lattice {
     /// Predicts a corner from its neighbors, without using the corner itself. Also returns the
     /// distance between neighbors there.
     ///
-    /// The mean of all predictions of the most accurate kind is used: between two neighbors;
-    /// extrapolation of a parabola; completion of a square; linear extrapolation.
+    /// The mean of all predictions of the most accurate available kind is used. The kinds are:
+    /// between two neighbors, extrapolation of a parabola, completion of a square, and linear
+    /// extrapolation.
     pub(crate) fn predict(&self, cell: Cell) -> Option<Prediction> {
-        // With a second difference `c` of the corners (lenses, perspective) and a noise `s` of each
-        // corner, the errors are about: between, c / 2 and 0.7 s; parabola, the third difference
-        // and 4.4 s; square, the mixed second difference and 1.7 s; line, c and 2.2 s.
+        // Let `c` be the second difference of the corners (due to lenses and perspective), and `s`
+        // the noise of each corner. The approximate errors are c / 2 and 0.7 s between neighbors,
+        // the third difference and 4.4 s for the parabola, the mixed second difference and 1.7 s
+        // for the square, and c and 2.2 s for the line.
         mean(
             STEPS[..2]
                 .iter()
@@ -139,15 +141,15 @@ impl Lattice {
     fn pixel_by_step(&self, cell: Cell, pixel: [f64; 2], step: Cell) -> Option<[f64; 2]> {
         match (self.at(cell, step, -1), self.at(cell, step, 1)) {
             (Some(before), Some(after)) => Some(combine(&[(0.5, after), (-0.5, before)])),
-            // At the border of the board, or next to a missing corner.
+            // The corner is at the border of the board, or next to a missing corner.
             _ => self
                 .one_sided(cell, pixel, step, 1)
                 .or_else(|| self.one_sided(cell, pixel, step, -1)),
         }
     }
 
-    /// Like [`Self::pixel_by_step`], from the corners on one side. It is of second order if there
-    /// are two: the derivative of the parabola through three corners.
+    /// Like [`Self::pixel_by_step`], from the corners on one side. If there are two such corners,
+    /// it is of second order: the derivative of the parabola through three corners.
     fn one_sided(&self, cell: Cell, pixel: [f64; 2], step: Cell, sign: i32) -> Option<[f64; 2]> {
         let near = self.at(cell, step, sign)?;
         let ahead = match self.at(cell, step, 2 * sign) {
@@ -240,8 +242,8 @@ impl Lattice {
     /// Removes corners that deviate from the predictions of their neighbors, the worst first.
     pub(crate) fn remove_outliers(&mut self) {
         loop {
-            // One at a time: a wrong corner also spoils the predictions of its neighbors, which
-            // are right once it is gone.
+            // Corners are removed one at a time. A wrong corner also spoils the predictions of its
+            // neighbors, which become correct after its removal.
             let worst = self
                 .corners
                 .iter()
@@ -291,8 +293,8 @@ impl Prediction {
         let radius_px = refinement.ring_px(self.spacing_px);
         let saddle = saddle::find_near(plane, self.pixel, reach_px, radius_px)?;
         let pixel = refinement.refine(plane, saddle.pixel, self.spacing_px)?;
-        // The search covers whole pixels within the reach, and refinement moves on from there by a
-        // part of a pixel.
+        // The search covers whole pixels within the reach. Refinement then moves the position by a
+        // fraction of a pixel.
         (distance(pixel, self.pixel) <= reach_px + 0.5).then_some(pixel)
     }
 }

@@ -1,4 +1,5 @@
-//! Places of markers on a board, and which of several arrangements fits the markers in an image.
+//! Positions of markers on a board, and the choice of the arrangement that fits the markers in an
+//! image.
 
 use crate::board::tag_origin;
 use crate::homography::Homography;
@@ -17,8 +18,9 @@ pub(crate) struct Layout {
     pub(crate) is_legacy: bool,
 }
 
-/// Largest deviation of a marker from where its neighbor predicts it, relative to its side. Lenses
-/// and blur cause a part of this; in another arrangement, markers are a whole square away.
+/// Largest deviation of a marker from the position that its neighbor predicts, relative to its
+/// side. Lenses and blur cause a part of this; in another arrangement, markers are a whole square
+/// away.
 const MAX_DEVIATION: f64 = 0.35;
 
 /// The arrangements in which a board may be printed, the standard one first.
@@ -43,7 +45,7 @@ pub(crate) fn layouts(pattern: &Pattern) -> Vec<Layout> {
             tag_m,
             spacing_frac,
         } => {
-            // Programs disagree on the rotation of the tags; their places are the same.
+            // Programs differ in the rotation of the tags, but not in their positions.
             let upright: Vec<Quad> = (0..tags[0] * tags[1])
                 .map(|id| square_at(tag_origin(tags, tag_m, spacing_frac, id), tag_m))
                 .collect();
@@ -111,7 +113,8 @@ pub(crate) fn fit(layouts: Vec<Layout>, markers: &[Marker]) -> Option<Fit> {
             n_confirmed,
         }
     });
-    // Of equals, the first is kept: the standard arrangement.
+    // If several arrangements are equally good, the first one is kept, which is the standard
+    // arrangement.
     let best = fits.reduce(|best, next| {
         if next.n_confirmed > best.n_confirmed {
             next
@@ -132,14 +135,15 @@ fn confirmed(layout: &Layout, markers: &[Marker]) -> (Vec<Marker>, usize) {
     let center_m = |marker: &Marker| center(&layout.corners_m[marker.id as usize]);
     let mut votes: Vec<(i32, &Marker)> = Vec::new();
     for marker in &known {
-        // The nearest markers on the board: near enough for a prediction through any lens.
+        // Only the nearest markers on the board are used, because they are near enough for a
+        // prediction through any lens.
         let mut others: Vec<(f64, &Marker)> = known
             .iter()
             .filter(|other| other.id != marker.id)
             .map(|other| (distance(center_m(marker), center_m(other)), *other))
             .collect();
         others.sort_by(|a, b| a.0.total_cmp(&b.0));
-        // As many as a marker inside the board has at the same distance.
+        // The number of neighbors that a marker inside the board has at the same distance.
         const N_NEIGHBORS: usize = 4;
         let nearest = others.first().map_or(0.0, |other| other.0);
         let close = others
@@ -151,7 +155,7 @@ fn confirmed(layout: &Layout, markers: &[Marker]) -> (Vec<Marker>, usize) {
     }
     let n_confirmed = votes.iter().filter(|(votes, _)| *votes > 0).count();
     // A single marker has no neighbor to confirm it. Several markers that do not confirm each other
-    // are misreadings, or on another board.
+    // are misread or belong to another board.
     let is_kept = |(votes, _): &&(i32, &Marker)| {
         *votes > 0 || (*votes == 0 && n_confirmed == 0 && known.len() == 1)
     };
@@ -160,7 +164,7 @@ fn confirmed(layout: &Layout, markers: &[Marker]) -> (Vec<Marker>, usize) {
         .filter(is_kept)
         .map(|(_, marker)| **marker)
         .collect();
-    // An id at several places is not trusted anywhere.
+    // If an id occurs at several positions, none of them is trusted.
     let ids: Vec<u32> = kept.iter().map(|marker| marker.id).collect();
     kept.retain(|marker| ids.iter().filter(|id| **id == marker.id).count() == 1);
     (kept, n_confirmed)

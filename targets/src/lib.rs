@@ -30,7 +30,7 @@
 //!   between them (`grid`).
 //! - ChArUco boards, AprilGrids and tags: dark quadrilaterals (`quad`) are decoded (`marker`), and
 //!   arrangements that contradict the target are rejected (`layout`).
-//! - In the end, every corner is aligned with the printed pattern around it (`template`).
+//! - Finally, every corner is aligned with the printed pattern around it (`template`).
 //!
 //! Only neighboring corners are compared, so the lens may distort the board, and parts of it may be
 //! hidden. Markers are decoded through a homography, so strong fisheye distortion reduces the

@@ -6,11 +6,11 @@ use crate::homography::Homography;
 use crate::lattice::distance;
 use crate::quad::{Quad, shortest_side};
 
-/// Smallest difference in gray value between black and white cells. Lower values read cells from
-/// noise; higher ones lose dark images.
+/// Smallest difference in gray value between black and white cells. With a lower value, cells are
+/// read from noise. With a higher value, markers in dark images are lost.
 const MIN_CONTRAST: f32 = 14.0;
-/// Part of the border cells that may be read wrong: 2 of the 20 of a 4X4 marker. Fingers and
-/// highlights cover single cells; texture without a border has about half of them wrong.
+/// Fraction of the border cells that may be read wrong: 2 of the 20 of a 4X4 marker. Fingers and
+/// highlights cover single cells. In texture without a border, about half of the cells are wrong.
 const MAX_BORDER_ERRORS: f64 = 0.1;
 
 /// A square of side 1 with its corners in the order of a [`Quad`].
@@ -123,7 +123,8 @@ fn read_cells(plane: &Plane, quad: &Quad, n_bits: usize, border: usize) -> Optio
     let pixel_from_unit = Homography::from_corners(&UNIT_SQUARE, quad)?;
     let mut values = Vec::with_capacity(n * n);
     for at in 0..n * n {
-        // Positions in the cell: away from its sides, where neighbors blur into it.
+        // Positions of the samples in a cell. They are away from its sides, because neighboring
+        // cells blur into it there.
         const OFFSETS: [[f64; 2]; 5] = [[0.5, 0.5], [0.3, 0.3], [0.7, 0.3], [0.3, 0.7], [0.7, 0.7]];
         let cell = [at % n, at / n].map(|count| count as f64);
         let samples = OFFSETS.map(|[x, y]| {
@@ -132,13 +133,13 @@ fn read_cells(plane: &Plane, quad: &Quad, n_bits: usize, border: usize) -> Optio
         });
         values.push(samples.iter().sum::<f32>() / OFFSETS.len() as f32);
     }
-    // One threshold per marker follows the light across the image.
+    // Each marker has its own threshold, so that it adapts to the lighting in the image.
     let threshold = threshold(&values)?;
     let is_black: Vec<bool> = values.iter().map(|&value| value < threshold).collect();
     let is_inside = |at: usize| {
         (border..n - border).contains(&(at % n)) && (border..n - border).contains(&(at / n))
     };
-    // The border is checked first: most dark quadrilaterals are no markers.
+    // The border is checked first, because most dark quadrilaterals are not markers.
     let n_border = n * n - n_bits * n_bits;
     let n_wrong = (0..n * n)
         .filter(|&at| !is_inside(at) && !is_black[at])
@@ -167,7 +168,7 @@ fn threshold(values: &[f32]) -> Option<f32> {
         let n_low = at as f32;
         let n_high = (sorted.len() - at) as f32;
         let difference = (total - sum) / n_high - sum / n_low;
-        // Between the two classes, times a constant.
+        // This is the variance between the two classes, times a constant.
         let variance = n_low * n_high * difference * difference;
         if variance > best.0 {
             best = (variance, difference, (sorted[at - 1] + sorted[at]) / 2.0);

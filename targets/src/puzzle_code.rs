@@ -54,11 +54,11 @@ pub(crate) struct Position {
 }
 
 /// Finds the offset at which most observed dots (edge, whether the dot is white) agree with the
-/// master pattern, among those that are possible. `None` if none is.
+/// master pattern. Only possible offsets are considered. `None` if no offset is possible.
 ///
 /// The horizontal and the vertical edges each depend on the offset modulo 3 along one axis and
-/// modulo 167 along the other, so their agreement is counted separately and summed for every
-/// offset.
+/// modulo 167 along the other. Their agreement is therefore counted separately and then summed for
+/// every offset.
 pub(crate) fn locate(
     dots: &[(Edge, bool)],
     is_possible: impl Fn([u32; 2]) -> bool,

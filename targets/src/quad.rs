@@ -1,4 +1,4 @@
-//! Finds dark convex quadrilaterals: outlines of dark regions after adaptive thresholding,
+//! Finds dark convex quadrilaterals. They are outlines of dark regions after adaptive thresholding,
 //! approximated by polygons.
 
 use crate::gray::Plane;
@@ -11,7 +11,7 @@ use crate::lattice::distance;
 /// larger windows.
 const WINDOWS_PX: [usize; 3] = [9, 23, 61];
 /// A pixel is dark if it is darker than the local mean by this much. It exceeds the noise of common
-/// images, so that even areas are not full of dark dots.
+/// images, so that areas of constant brightness do not contain many dark dots.
 const DARKER_BY: f32 = 5.0;
 /// Shortest side of a quadrilateral, pixels. The smallest markers have 6 x 6 cells with the border,
 /// which cannot be read with less than a pixel per cell.
@@ -33,11 +33,12 @@ pub(crate) fn find(plane: &Plane, do_touch: bool) -> Vec<Quad> {
     let mut quads = Vec::new();
     for window_px in WINDOWS_PX {
         let mut is_dark = threshold(plane, &sums, window_px);
-        // The pixels decide which regions are dark; the corners are then located in the gray image.
+        // Dark regions are determined from pixels. The corners are then located in the gray image.
         let mut add =
             |outline: &[[i32; 2]]| quads.extend(quad(outline).map(|quad| refine(plane, quad)));
         Mask::new(&is_dark, plane.size()).outlines(&mut add);
-        // Both are searched: erosion separates touching regions, and removes small markers.
+        // Both masks are searched, because erosion separates touching regions but also removes
+        // small markers.
         if do_touch {
             erode(&mut is_dark, plane.size());
             Mask::new(&is_dark, plane.size()).outlines(&mut add);
@@ -145,8 +146,9 @@ impl<'a> Mask<'a> {
         else {
             return;
         };
-        // Upper borders of dark pixels that an outline has passed. Every outline has at least one,
-        // so looking for one that was not passed finds every region once.
+        // Upper borders of dark pixels that an outline has passed. Every outline has at least one
+        // such border. Searching for borders that were not passed therefore finds every region
+        // exactly once.
         let mut is_visited = vec![false; self.width * self.height];
         let mut outline = Vec::new();
         for y in 0..n_rows {
@@ -194,8 +196,9 @@ impl<'a> Mask<'a> {
                 _ => ([-1, -1], [0, -1]),
             };
             let is_dark_at = |[dx, dy]: [i32; 2]| self.at([point[0] + dx, point[1] + dy]);
-            // Dark stays on the right: turn right where it ends, left where it blocks the way. Of
-            // two dark pixels that touch at a corner, the left one is another region.
+            // The dark region stays on the right. Turn right where it ends, and left where it
+            // blocks the way. If two dark pixels touch at a corner, the left one belongs to another
+            // region.
             step = match (is_dark_at(left), is_dark_at(right)) {
                 (_, false) => (step + 1) % 4,
                 (true, true) => (step + 3) % 4,
@@ -208,7 +211,7 @@ impl<'a> Mask<'a> {
     }
 }
 
-/// Approximates an outline by four corners, clockwise. `None` if its shape is another one.
+/// Approximates an outline by four corners, clockwise. `None` if it has a different shape.
 fn quad(outline: &[[i32; 2]]) -> Option<Quad> {
     let points: Vec<[f64; 2]> = outline.iter().map(|point| point.map(f64::from)).collect();
     let area = area(&points);
@@ -246,7 +249,7 @@ fn split(points: &[[f64; 2]], from: usize, to: usize, tolerance_px: f64, corners
     let n = points.len();
     let a = points[from % n];
     let b = points[to % n];
-    // Both are the same point if the outline is cut only once.
+    // If the outline is cut only once, both are the same point.
     let length = distance(a, b).max(1e-9);
     let away = |at: usize| cross(a, b, points[at % n]).abs() / length;
     let Some(at) = (from + 1..to).max_by(|&a, &b| away(a).total_cmp(&away(b))) else {
@@ -357,7 +360,7 @@ fn fit_side(plane: &Plane, from: [f64; 2], to: [f64; 2]) -> Option<Line> {
             f64::from(plane.sample([0, 1].map(|axis| center[axis] + away * outward[axis])))
         };
         // The mean of all positions across the side, weighted by the squared rise from dark to
-        // bright. Falling edges are those of cells and do not count.
+        // bright. Falling edges belong to cells and do not count.
         let mut weight_sum = 0.0;
         let mut sum = 0.0;
         let mut away = -REACH_PX;
@@ -376,8 +379,9 @@ fn fit_side(plane: &Plane, from: [f64; 2], to: [f64; 2]) -> Option<Line> {
     if points.len() < 3 {
         return None;
     }
-    // Where something touches the side, points are off. They are dropped by their distance from a
-    // first line, relative to the median distance; a perfect line must not drop its own noise.
+    // If something touches the side, points there are wrong. Points are dropped according to their
+    // distance from a first line, relative to the median distance. A lower limit ensures that a
+    // perfect line does not drop its own noise.
     let line = fit_line(&points)?;
     let off = |point: &[f64; 2]| line.distance(*point);
     let mut offs: Vec<f64> = points.iter().map(off).collect();
@@ -395,7 +399,8 @@ fn central_moment(points: &[[f64; 2]], mean: [f64; 2], [a, b]: [usize; 2]) -> f6
         .sum::<f64>()
 }
 
-/// Fits a line by total least squares: distances count across the line, whatever its direction.
+/// Fits a line by total least squares. Distances are measured perpendicular to the line, whatever
+/// its direction.
 fn fit_line(points: &[[f64; 2]]) -> Option<Line> {
     if points.len() < 2 {
         return None;

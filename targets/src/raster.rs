@@ -24,7 +24,7 @@ impl TargetSpec {
     /// White margin that pictures have around the pattern, meters.
     fn margin_m(&self) -> f64 {
         let [low, high] = self.bounds_m();
-        // A single tag has no squares around its corners; they are detected by the margin.
+        // A single tag has no squares around its corners, so the margin is needed to detect them.
         let frac = if matches!(self.pattern, Pattern::Tag { .. }) {
             0.2
         } else {
@@ -43,7 +43,7 @@ impl TargetSpec {
         let margin_m = self.margin_m();
         let side_px =
             [0, 1].map(|axis| ((high[axis] - low[axis] + 2.0 * margin_m) * px_per_m).ceil());
-        // Comparisons with NaN are false, so that it is refused, too.
+        // Comparisons with NaN are false, so NaN is also rejected.
         let is_valid = px_per_m > 0.0
             && side_px
                 .iter()

@@ -1,23 +1,24 @@
 //! Saddle points of gray images: places where two black and two white sectors meet, such as
 //! chessboard corners.
 //!
-//! Candidates are maxima of minus the determinant of the Hessian; a ring of samples around each
-//! shows whether it has two black and two white sectors, and the directions of the four edges
-//! between them. Positions are then refined to the point that all gradients around it are
-//! perpendicular to (Förstner and Gülch 1987).
+//! Candidates are maxima of minus the determinant of the Hessian. A ring of samples around each
+//! candidate shows whether it has two black and two white sectors, and the directions of the four
+//! edges between them. Positions are then refined to the point for which all gradients around it
+//! are perpendicular to the direction from this point (Förstner and Gülch 1987).
 
 use crate::gray::Plane;
 use std::f64::consts::{PI, TAU};
 
-/// Smallest difference in gray value between black and white sectors. Larger values lose boards in
-/// the dark; smaller ones find saddles in noise. This and the other thresholds of detection were
-/// tuned on the photographs of docs/benchmarks/2026-11-26-calibration.md.
+/// Smallest difference in gray value between black and white sectors. With a larger value, dark
+/// boards are lost. With a smaller value, saddles are found in noise. This and the other thresholds
+/// of detection were tuned on the photographs of docs/benchmarks/2026-11-26-calibration.md.
 const MIN_CONTRAST: f32 = 12.0;
 /// Largest deviation of opposite edges from a straight line, radians. Perspective keeps lines
-/// straight; the rest is for blur, noise and fisheye lenses.
+/// straight, so the tolerance is for blur, noise and fisheye lenses.
 const MAX_BEND_RAD: f64 = 0.55;
-/// Smallest angle of a sector, radians: about two samples of the ring, because a sector without a
-/// sample inside cannot be seen. Such sharp sectors occur only on boards that are tilted strongly.
+/// Smallest angle of a sector, radians. It corresponds to about two samples of the ring, because a
+/// sector without a sample inside cannot be detected. Such sharp sectors occur only on strongly
+/// tilted boards.
 const MIN_SECTOR_RAD: f64 = 0.35;
 /// Radius of the ring around candidates, pixels. The ring must be outside the blur of the corner,
 /// and smaller than the squares around it.
@@ -39,7 +40,7 @@ pub(crate) struct Saddle {
 /// Finds saddle points. `plane` is slightly smoothed.
 pub(crate) fn find(plane: &Plane) -> Vec<Saddle> {
     let [width, height] = plane.size();
-    // The ring and the Hessian stay inside.
+    // With this margin, the ring and the Hessian stay inside the image.
     let margin = 6;
     if width <= 2 * margin + 2 || height <= 2 * margin + 2 {
         return Vec::new();
@@ -84,7 +85,8 @@ fn response_at([above, here, below]: [&[f32]; 3], x: usize) -> f32 {
     xy * xy - xx * yy
 }
 
-/// Whether a response is the largest within two pixels; of equal ones, the first.
+/// Whether a response is the largest within two pixels. If responses are equal, the first one
+/// counts as larger.
 fn is_maximum(response: &[f32], width: usize, x: usize, y: usize) -> bool {
     let value = response[y * width + x];
     (y - 2..=y + 2).all(|near_y| {
@@ -133,8 +135,9 @@ pub(crate) fn ring(plane: &Plane, center: [f64; 2], radius_px: f64) -> Option<Sa
     let samples: [f32; N_RING] = std::array::from_fn(sample);
     let mut sorted = samples;
     sorted.sort_by(f32::total_cmp);
-    // Means of the darkest and the brightest quarter: about half of the samples are black, so these
-    // quarters lie inside the sectors, and single noisy samples do not decide.
+    // The means of the darkest and the brightest quarter are used. About half of the samples are
+    // black, so these quarters lie inside the sectors, and single noisy samples have little
+    // influence.
     let quarter_mean = |quarter: &[f32]| quarter.iter().sum::<f32>() / quarter.len() as f32;
     let black = quarter_mean(&sorted[..N_RING / 4]);
     let white = quarter_mean(&sorted[N_RING * 3 / 4..]);
@@ -165,7 +168,8 @@ pub(crate) fn ring(plane: &Plane, center: [f64; 2], radius_px: f64) -> Option<Sa
     // Start with the edge that a black sector follows.
     let first = usize::from(!edges[0].1);
     let edges_rad: [f64; 4] = std::array::from_fn(|at| {
-        // Angles stay ascending when the first edge is put last.
+        // If the first edge is moved to the end, a full turn is added, so that angles stay
+        // ascending.
         let turns = if first + at >= 4 { TAU } else { 0.0 };
         edges[(first + at) % 4].0 + turns
     });
@@ -205,9 +209,10 @@ pub(crate) fn angle_between(a_rad: f64, b_rad: f64) -> f64 {
     reason = "pixel indices are bounded by the image"
 )]
 pub(crate) fn refine(plane: &Plane, start: [f64; 2], half_window_px: f64) -> Option<[f64; 2]> {
-    // Most corners converge in a few steps. Points that still move after that many are kept.
+    // Most corners converge in a few steps. Points that still move after this number of steps are
+    // kept.
     const MAX_STEPS: usize = 12;
-    // A fiftieth of the smallest error of corners in renders, 0.011 pixels
+    // A fiftieth of the smallest error of corners in renders, which is 0.011 pixels
     // (docs/benchmarks/2026-11-26-calibration.md).
     const CONVERGED_PX: f64 = 2e-4;
     let reach = half_window_px.ceil() + 1.0;
@@ -241,8 +246,8 @@ pub(crate) fn refine(plane: &Plane, start: [f64; 2], half_window_px: f64) -> Opt
             }
         }
         let determinant = xx * yy - xy * xy;
-        // The smaller eigenvalue is determinant / trace at least; near zero, only one direction is
-        // known.
+        // The smaller eigenvalue is at least determinant / trace. If it is near zero, the position
+        // is known in only one direction.
         const MIN_RATIO: f64 = 0.02;
         let is_corner = determinant > MIN_RATIO * (xx + yy) * (xx + yy);
         if !is_corner {
@@ -254,7 +259,7 @@ pub(crate) fn refine(plane: &Plane, start: [f64; 2], half_window_px: f64) -> Opt
         ];
         center = [center[0] + step[0], center[1] + step[1]];
         let moved = (center[0] - start[0]).hypot(center[1] - start[1]);
-        // Written so that a NaN is not near.
+        // The comparison is written so that NaN does not count as near.
         let is_near = moved <= half_window_px;
         if !is_near {
             return None;

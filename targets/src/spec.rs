@@ -152,7 +152,8 @@ pub(crate) struct Millimeters(pub(crate) f64);
 
 impl fmt::Display for Millimeters {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        // A picometer: far above the rounding of the conversion, far below any length in use.
+        // The resolution is a picometer. This is far above the rounding errors of the conversion,
+        // and far below any length in use.
         const DIGITS: f64 = 1e9;
         write!(f, "{}mm", (self.0 * 1e3 * DIGITS).round() / DIGITS)
     }
@@ -201,7 +202,8 @@ impl Reader<'_> {
             expected: "4X4_50, 4X4_100, 4X4_250, 4X4_1000, or the same with 5X5, 6X6 or 7X7"
                 .to_owned(),
         })?;
-        // Every second square has a marker. Of an odd number of squares, black has one more.
+        // Every second square has a marker. If the number of squares is odd, there is one more
+        // black square.
         let needed = squares[0] * squares[1] / 2;
         if needed > dictionary.n_markers() {
             return Err(self.too_small(
@@ -343,7 +345,7 @@ impl Reader<'_> {
         let with_unit = |unit: &str, per_meter: f64| {
             Some((lower.strip_suffix(unit)?.trim().to_owned(), per_meter))
         };
-        // Meters last: the other units end with "m", too.
+        // Meters are tried last, because the other units also end with "m".
         let split = with_unit("mm", 1000.0)
             .or_else(|| with_unit("cm", 100.0))
             .or_else(|| with_unit("m", 1.0));

@@ -1,5 +1,5 @@
-//! What is printed where: the color of every point of a target, and the black shapes it consists
-//! of.
+//! The printed pattern: the color of every point of a target, and the black shapes of which it
+//! consists.
 
 use crate::dictionary::Dictionary;
 use crate::layout::is_black_square;
@@ -192,7 +192,7 @@ fn is_black_on_aprilgrid(tags: [u32; 2], spacing_frac: f64, in_tags: [f64; 2]) -
     // and above the first tag, each period begins with the gap.
     let pitch = 1.0 + spacing_frac;
     let position = in_tags.map(|value| (value + spacing_frac) / pitch);
-    // One more column and row: the last consists of small squares only.
+    // There is one more column and row, because the last one consists of small squares only.
     let Some([column, row]) = square(position, tags.map(|count| count + 1)) else {
         return false;
     };
@@ -262,7 +262,7 @@ fn aprilgrid_shapes(tags: [u32; 2], tag_m: f64, spacing_frac: f64, shapes: &mut 
 fn dots(squares: [u32; 2], square_m: f64, origin: [u32; 2], shapes: &mut Vec<Shape>) {
     for [column, row] in cells(squares) {
         for is_vertical in [true, false] {
-            // The outermost edges have a square on one side only, and no dot.
+            // The outermost edges have a square on only one side, and no dot.
             let is_last = if is_vertical {
                 column + 1 == squares[0]
             } else {
@@ -301,14 +301,14 @@ pub(crate) fn pixel_mean(color: impl Fn(f64, f64) -> f64) -> f64 {
         [0.5, 1.0],
         [1.0, 1.0],
     ];
-    // Most pixels have one color, which their corners and sides show. Only shapes smaller than half
-    // a pixel could be missed.
+    // Most pixels have a single color, so samples at their corners and sides are sufficient. Only
+    // shapes smaller than half a pixel could be missed.
     let first = color(0.5, 0.5);
     if BORDER.into_iter().all(|[x, y]| color(x, y) == first) {
         return first;
     }
-    // A lattice in which no two samples share a row or a column, so that edges along them are
-    // smooth, too.
+    // In this lattice, no two samples share a row or a column, so that edges along rows and columns
+    // are also smooth.
     let half = 0.5 / N_SAMPLES as f64;
     let samples = (0..N_SAMPLES).map(|n| {
         let x = n as f64 / N_SAMPLES as f64 + half;
@@ -370,7 +370,8 @@ fn marker(
     add([0, n], [n - border, n]);
     add([0, border], [border, n - border]);
     add([n - border, n], [border, n - border]);
-    // One rectangle per run of black cells: fewer shapes, and no seams between cells of a row.
+    // There is one rectangle per run of black cells, which gives fewer shapes and no seams between
+    // cells of a row.
     for row in 0..n_bits {
         let mut column = 0;
         while column < n_bits {
@@ -398,7 +399,7 @@ fn edge([column, row]: [u32; 2], is_vertical: bool, origin: [u32; 2]) -> Edge {
     }
 }
 
-/// The color of the dot that covers a position in a square of a puzzleboard: whether it is black.
+/// Whether the dot that covers a position in a square of a puzzleboard is black.
 fn dot_near(
     position: [f64; 2],
     cell: [u32; 2],

@@ -56,7 +56,7 @@ impl Sheet<'_> {
     /// Mean gray value of a pixel, from the board positions of its corners: upper left, upper
     /// right, lower left, lower right.
     fn pixel(&self, corners: [Option<[f64; 2]>; 4]) -> f64 {
-        // A ray of a corner that does not meet the board, as at the horizon.
+        // The ray of a corner may not meet the board, for example at the horizon.
         let [Some(a), Some(b), Some(c), Some(d)] = corners else {
             return BACKGROUND;
         };
@@ -111,7 +111,8 @@ pub fn render(target: &TargetSpec, view: &View) -> Vec<u8> {
         .into_iter()
         .enumerate()
         .map(|(at, value)| {
-            // A quarter darker at the right border: detection must not rely on even light.
+            // The image is a quarter darker at the right border, because detection must not rely on
+            // uniform lighting.
             let fall_off = 1.0 - 0.25 * (at % width) as f64 / width as f64;
             quantized(value * fall_off + view.noise * random.normal())
         })
@@ -130,7 +131,7 @@ pub fn truth(target: &TargetSpec, view: &View) -> Vec<(u32, [f64; 2])> {
         .collect()
 }
 
-/// Where the ray of a pixel position meets the board.
+/// The point at which the ray of a pixel position meets the board.
 fn point_on_board(view: &View, pixel: [f64; 2]) -> Option<[f64; 2]> {
     let ray_in_camera = view.intrinsics.unproject(pixel)?;
     let board_from_camera = view.camera_from_board.inverse();
@@ -164,7 +165,7 @@ fn blur(values: &[f64], [width, height]: [usize; 2], stride: usize, sigma_px: f6
         // Position along the axis of the blur, and the start of its row or column.
         let here = if stride == 1 { at % width } else { at / width };
         let start = at - here * stride;
-        // Beyond the border, the outermost value continues.
+        // Values beyond the border are equal to the outermost value.
         let neighbor = |offset: usize| {
             values[start + (here + offset).saturating_sub(reach).min(n - 1) * stride]
         };

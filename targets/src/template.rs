@@ -1,19 +1,20 @@
 //! Refines corners by comparing the image with the printed pattern around them.
 //!
-//! Where other edges are close to a corner, such as those of a marker with a narrow margin, the
-//! pattern around the corner is known but is no plain saddle. The pattern is rendered with the
-//! local scale, rotation and shear, and shifted until it matches the image best (Lucas and Kanade
-//! 1981, inverse compositional as in Baker and Matthews 2004, with gain and offset of the gray
-//! values).
+//! If other edges are close to a corner, such as those of a marker with a narrow margin, the
+//! pattern around the corner is not a plain saddle. Since the pattern is known, it is rendered with
+//! the local scale, rotation and shear, and shifted until it matches the image best (Lucas and
+//! Kanade 1981, inverse compositional as in Baker and Matthews 2004, with gain and offset of the
+//! gray values).
 
 use crate::gray::Plane;
 use crate::surface::Surface;
 use nalgebra::{Matrix2, Matrix4, Vector2, Vector4};
 
-/// Smallest correlation between image and pattern. Larger values lose corners that are blurred or
-/// partly covered by a highlight; smaller ones accept other patterns.
+/// Smallest correlation between image and pattern. With a larger value, corners that are blurred or
+/// partly covered by a highlight are lost. With a smaller value, other patterns are accepted.
 const MIN_CORRELATION: f64 = 0.75;
-/// Smallest standard deviation of the gray values. In an even area, noise alone could correlate.
+/// Smallest standard deviation of the gray values. In an area of constant brightness, noise alone
+/// could correlate.
 const MIN_DEVIATION: f64 = 6.0;
 
 /// The surroundings of a corner.
@@ -36,11 +37,13 @@ pub(crate) struct Neighborhood {
 }
 
 /// Half the side of the window, relative to the image of `side_m`, and its limits in pixels. Larger
-/// windows average more noise, but contain more bending and take longer (with the square).
+/// windows average more noise, but contain more bending. Their time grows with the square of the
+/// size.
 pub(crate) const WINDOW_FRAC: f64 = 0.35;
 const HALF_WINDOW_PX: [f64; 2] = [3.0, 9.0];
 /// Largest distance from a prediction, relative to the image of `side_m`, and its limits in pixels.
-/// It must stay below the distance to the next edge, or the pattern may lock to that.
+/// It must stay below the distance to the next edge. Otherwise, the pattern may be aligned with
+/// that edge.
 const REACH_FRAC: f64 = 0.12;
 const REACH_PX: [f64; 2] = [1.5, 8.0];
 /// Numbers of times the pattern is blurred by the kernel (1 2 1) / 4, from images in focus to
@@ -62,7 +65,7 @@ pub(crate) fn find(
         side_m,
         ..
     } = *neighborhood;
-    // The shorter side of the foreshortened square, so that the window does not reach into
+    // The shorter side of the foreshortened square is used, so that the window does not reach into
     // neighboring squares.
     let side_px = pixel_by_point
         .column(0)
@@ -193,7 +196,8 @@ impl Template {
         n_blurs: usize,
     ) -> Option<Self> {
         let point_by_pixel = neighborhood.pixel_by_point.try_inverse()?;
-        // More pixels on each side: each blur takes one, and the derivatives one more.
+        // The patch has more pixels on each side, because each blur takes one pixel and the
+        // derivatives take another one.
         let padding = i32::try_from(n_blurs).ok()? + 1;
         let padded = half_px + padding;
         let side = 2 * padded + 1;
@@ -240,8 +244,8 @@ impl Template {
 
     /// Finds the shift of the pattern, and the correlation there.
     fn find(&self, plane: &Plane, pixel: [f64; 2], reach_px: f64) -> Option<(f64, [f64; 2])> {
-        // The best whole-pixel shift first: the alignment converges from about half an edge's
-        // width.
+        // The best whole-pixel shift is searched first, because the alignment converges only from
+        // about half of an edge's width.
         #[expect(clippy::cast_possible_truncation, reason = "a few pixels")]
         let steps = reach_px.floor() as i32;
         let shifts = (-steps..=steps)
@@ -274,8 +278,8 @@ impl Template {
             products += sample * value;
         }
         let n = self.values.len() as f64;
-        // Rounding can make the variance of an even area negative. The products need no mean,
-        // because the values of the pattern add up to zero.
+        // Because of rounding, the variance of an area of constant brightness can be negative. The
+        // products need no mean, because the values of the pattern add up to zero.
         let deviation = (squares - sum * sum / n).max(0.0).sqrt();
         if deviation < MIN_DEVIATION * n.sqrt() {
             0.0
@@ -286,8 +290,8 @@ impl Template {
 
     /// Shifts the pattern to the position of least squares.
     fn align(&self, plane: &Plane, start: [f64; 2]) -> Option<[f64; 2]> {
-        // Enough for any shift within the limits below. Oscillating steps end here, too; the
-        // correlation then decides.
+        // This number is sufficient for any shift within the limits below. It also ends oscillating
+        // steps; the correlation then decides.
         const MAX_STEPS: usize = 20;
         const CONVERGED_PX: f64 = 1e-3;
         let mut center = start;
@@ -301,7 +305,7 @@ impl Template {
             // The image is gain * pattern(shifted) + offset; its derivative with respect to the
             // shift is gain * gradient.
             let gain = solution[2];
-            // Black and white are swapped: this is another place of the pattern.
+            // Black and white are swapped, so this is another part of the pattern.
             if gain <= 0.0 {
                 return None;
             }
@@ -310,7 +314,7 @@ impl Template {
             let limited = step.map(|value| value.clamp(-0.7, 0.7));
             center = [center[0] - limited[0], center[1] - limited[1]];
             // The start is the best whole pixel, so the solution is within a pixel of it, with some
-            // reserve. Written so that a NaN is not near.
+            // reserve. The comparison is written so that NaN does not count as near.
             let is_near = (center[0] - start[0]).hypot(center[1] - start[1]) < 2.0;
             if !is_near {
                 return None;

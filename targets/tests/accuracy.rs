@@ -5,7 +5,7 @@ use nalgebra::{Translation3, UnitQuaternion, Vector3};
 use targets::synthetic::{View, render, truth};
 use targets::{Detection, GrayImage, NotDetected, TargetSpec};
 
-/// Moderate perspective, two rotations about the viewing axis.
+/// Moderate perspective, with two rotations about the viewing axis.
 const TILTED: [[f64; 3]; 2] = [[0.5, -0.4, 0.3], [-0.4, 0.5, 2.0]];
 
 fn camera() -> Intrinsics {
@@ -120,7 +120,7 @@ const CASES: [Case; 12] = [
     case("aprilgrid:5x4:40mm:0.3", 1.5, 5.0, [0.08, 0.2, 0.8]),
     case("puzzleboard:12x9:20mm", 0.7, 2.0, [0.04, 0.12, 0.95]),
     case("puzzleboard:12x9:20mm:101x250", 1.0, 5.0, [0.06, 0.2, 0.95]),
-    // Corners of single tags are no saddles: blur moves them, and only one edge per side locates
+    // Corners of single tags are not saddles. Blur moves them, and only one edge per side locates
     // them.
     case("tag:36h11:7:100mm", 0.7, 2.0, [0.25, 0.4, 0.75]),
     case("tag:36h11:586:100mm", 1.5, 5.0, [0.35, 0.6, 0.75]),

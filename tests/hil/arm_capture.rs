@@ -1,7 +1,7 @@
-//! An arm with emulated CAN motors is moved to poses and photographed at rest, inside the virtual
-//! kernel: the path of `fieldrig calibrate hand-eye --move` below the detection of the target.
-//! Drivers, bus and camera device are those of a real rig; the motors are emulated, and the images
-//! are the test pattern of vivid.
+//! An arm with emulated CAN motors is moved to poses, and a camera takes images of it at rest,
+//! inside the virtual kernel. This tests all of `fieldrig calibrate hand-eye --move` except for the
+//! detection of the target and the estimation. The drivers, the bus and the camera device are the
+//! same as in a real rig. The motors are emulated, and the images are the test pattern of vivid.
 
 use crate::can::Wire;
 use crate::can_motion::Motors;
@@ -56,7 +56,8 @@ fn can_arm_visits_poses_holds_and_stops() {
         );
         assert_eq!(image.gray.len(), 640 * 360);
     }
-    // Before the arm has been at rest for long enough, so that no image ends the wait.
+    // The stop comes before the arm has been at rest for long enough, so that no image ends the
+    // wait.
     assert!(
         capture
             .move_to(&[-0.2, 0.2], &Stop::default())
@@ -76,7 +77,7 @@ fn can_arm_visits_poses_holds_and_stops() {
         max_difference(&motors.positions(), &held) < 1e-3
             && max_difference(&held, &[-0.2, 0.2]) < CLOSE_RAD
     );
-    // During a motion.
+    // Now the stop comes during a motion.
     let is_complete = capture.move_to(&[0.6, 0.2], &requested_after(Duration::from_millis(400)));
     assert!(!is_complete.expect("the arm stops"));
     let rest = motors.positions();

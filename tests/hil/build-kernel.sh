@@ -1,11 +1,13 @@
 #!/bin/sh
-# Builds a User-Mode Linux kernel for the tests, once: it runs as an ordinary process, with cameras and virtual CAN buses. Prints its path
-# as the only line on stdout.
+# Builds a User-Mode Linux kernel for the tests, once. This kernel runs as an ordinary process, with
+# cameras and virtual CAN buses. The script prints the path of the kernel as the only line on
+# stdout.
 #
 # usage: build-kernel.sh
 #
-# The kernel is kept in the user's cache folder ($XDG_CACHE_HOME/fieldrig/kernels), so that every checkout uses it. Its name contains a hash
-# of everything that it is built from. Remove it to rebuild it.
+# The kernel is kept in the user's cache folder ($XDG_CACHE_HOME/fieldrig/kernels), so that every
+# checkout uses it. Its name contains a hash of everything that it is built from. To rebuild the
+# kernel, remove it.
 #
 # The source is Debian's package linux-source-6.1, verified by apt. sources.sha256 contains the tested version. Other versions are
 # used with a warning; different bytes of the tested version are rejected.
@@ -32,7 +34,7 @@ fi
 
 folder=${XDG_CACHE_HOME:-$HOME/.cache}/fieldrig/kernels
 mkdir -p "$folder"
-# Two runs of the tests at the same time build a kernel only once.
+# With this lock, two runs of the tests at the same time build a kernel only once.
 exec 9>"$folder/lock"
 flock 9
 
@@ -52,8 +54,9 @@ mkdir "$source"
 tar --extract --file "$archive" --directory "$source" --strip-components=1
 (
     cd "$source"
-    # The kernel saves the floating-point state of a process in 2696 bytes. Processors with AMX have 11 KB of it, and their kernels reject a
-    # smaller buffer (EFAULT: "ptrace set fp regs failed"). A larger buffer is accepted.
+    # User-Mode Linux saves the floating-point state of a process in 2696 bytes. On processors with
+    # AMX, this state takes 11 KB, and the kernel of the host rejects a smaller buffer (EFAULT:
+    # "ptrace set fp regs failed"). It accepts a larger buffer.
     sed -i 's/DEFINE_LONGS(HOST_FP_SIZE, 2696)/DEFINE_LONGS(HOST_FP_SIZE, 12288)/' arch/x86/um/user-offsets.c
     grep -q 'HOST_FP_SIZE, 12288' arch/x86/um/user-offsets.c || exit 1
     make ARCH=um tinyconfig
@@ -65,7 +68,8 @@ tar --extract --file "$archive" --directory "$source" --strip-components=1
         esac
     done
     make ARCH=um olddefconfig
-    # An option that its dependencies have changed again would only show up much later, as a missing device or a slow build.
+    # The dependencies of an option may change it back. Without this check, the change would show up
+    # much later, as a missing device or a slow build.
     grep -v '^#' "$here/kernel.config" | while IFS== read -r option value; do
         if [ "$(sed -n "s/^CONFIG_$option=//p" .config)" != "${value#n}" ]; then
             echo "the kernel configuration rejects CONFIG_$option=$value"

@@ -14,12 +14,12 @@ use std::time::{Duration, Instant};
 
 pub(crate) const WEBCAM: &str = "platform:vivid-000";
 const GRABBER: &str = "platform:vivid-001";
-/// Fault injection controls of vivid (`vivid-ctrls.c`): drop a percentage of the images;
-/// disconnect.
+/// Fault injection controls of vivid (`vivid-ctrls.c`): one drops a percentage of the images, the
+/// other disconnects the device.
 pub(crate) const DROP_PERCENT: u32 = 0x00f0_f040;
 const DISCONNECT: u32 = 0x00f0_f041;
-/// More fault injection controls: damage the next image; reject the next stream; break the running
-/// stream.
+/// These fault injection controls damage the next image, reject the next stream, or break the
+/// running stream.
 const DAMAGE: u32 = 0x00f0_f042;
 const REFUSE_STREAM: u32 = 0x00f0_f045;
 const BREAK_STREAM: u32 = 0x00f0_f046;
@@ -131,7 +131,7 @@ impl CapturedImages {
 #[test]
 #[ignore = "runs in the virtual kernel"]
 fn every_lost_image_is_counted() {
-    // vivid is slow at 1080p as a webcam, but not as a grabber.
+    // At 1080p, vivid is slow as a webcam, but not as a grabber.
     for (device, size_px) in [(WEBCAM, [640, 360]), (GRABBER, [1920, 1080])] {
         let rate_hz = 25.0;
         let mut camera = V4l2Camera::open(config(device, size_px, rate_hz)).expect("vivid opens");
@@ -166,7 +166,7 @@ fn injected_drops_are_counted_exactly() {
         CapturedImages::capture(&mut camera, 12.0).report("30 % dropped", rate_hz);
     v4l2::set_control(&node(WEBCAM), DROP_PERCENT, 0).expect("vivid injects faults");
     let share = n_lost as f64 / (delivered + n_lost) as f64;
-    // 300 Bernoulli trials at 30 %: four standard deviations.
+    // The limits are four standard deviations of 300 Bernoulli trials at 30 %.
     assert!(
         (0.19..0.41).contains(&share),
         "lost a fraction of {share:.2}"
@@ -233,7 +233,7 @@ fn unplugged_camera_reconnects_with_all_settings() {
 
     for n_before in 0..3 {
         v4l2::set_control(&node(WEBCAM), DISCONNECT, 1).expect("vivid injects faults");
-        // Images captured before may still arrive.
+        // Images captured before the fault may still arrive.
         let start_time = Instant::now();
         let image = loop {
             let image = recovered_image(&mut camera, start_time);
@@ -271,7 +271,7 @@ fn unplugged_camera_reconnects_with_all_settings() {
     let bound_at = Instant::now();
     let image = recovered_image(&mut camera, bound_at);
     time_to_recover("connected again", bound_at);
-    // At least one second without a camera, plus the time to bind it.
+    // The camera is missing for at least one second, plus the time to bind it.
     let max_lost = unplugged_at.elapsed().as_secs_f64() * rate_hz + 10.0;
     let lost_range = 20.0..=max_lost;
     assert!(

@@ -304,7 +304,7 @@ fn joints_are_read_from_motors_of_all_families() {
             .map(|motor| motor.joint.clone())
             .collect::<Vec<_>>()
     );
-    // Half a count of velocity, times a few milliseconds of extrapolation.
+    // The tolerance is half a count of velocity, times a few milliseconds of extrapolation.
     const EXTRAPOLATED_RAD: f64 = 1e-4;
     let half_counts = [
         12.5 / 65_535.0,

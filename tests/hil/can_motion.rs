@@ -27,7 +27,7 @@ use std::time::Duration;
 const CHILD: &str = "FIELDRIG_HIL_CHILD";
 const RATE_HZ: f64 = 200.0;
 const TIMEOUT: Duration = Duration::from_millis(250);
-/// Period of the emulated motors, which is also their delay.
+/// Period of the emulated motors, which is also the delay of their answers.
 const MOTOR_PERIOD: Duration = Duration::from_millis(1);
 /// Motors that report automatically do so every 10 ms.
 const REPORT_PERIOD: Duration = Duration::from_millis(10);
@@ -342,12 +342,13 @@ fn motors_of_all_families_reach_targets() {
     let mut arm = MovableCanArm::open(&config).expect("all motors are enabled");
     assert_eq!(motors.states(), [State::Enabled; 6]);
     assert_eq!(arm.motion(), Motion::Holding);
-    // The motors start at 0, which is another joint position for some. Enabling them must not cause
-    // motion.
+    // All motors start at 0. Because of offsets, this is a joint position other than 0 for some of
+    // them. Enabling the motors must not cause motion.
     let initial: Vec<f64> = configs.iter().map(|config| config.offset_rad).collect();
-    // Resolution: half a count in the command and half a count in the feedback; drives and ODrives
-    // are more precise. In MIT mode, no count represents zero velocity. The offset of half a count,
-    // times damping over stiffness, displaces the motor.
+    // The resolution causes an error of half a count in the command and half a count in the
+    // feedback. Drives and ODrives are more precise. In MIT mode, no count represents zero
+    // velocity. The resulting velocity of half a count displaces the motor by this velocity times
+    // damping over stiffness.
     let push_offset = |limit_rad_s: f64, counts: f64| {
         limit_rad_s / counts * GAINS.damping_nm_s_rad / GAINS.stiffness_nm_rad
     };
@@ -377,7 +378,8 @@ fn motors_of_all_families_reach_targets() {
         let target = JointTarget { position: target };
         assert_eq!(arm.command(&target).expect("within the limits"), target);
         wait_until_holding(&mut arm);
-        // Error of half a count of velocity, extrapolated until the other motors have reported.
+        // The tolerance is half a count of velocity, extrapolated until the other motors have
+        // reported.
         const EXTRAPOLATED_RAD: f64 = 1e-4;
         let mut reported = [f64::INFINITY; 6];
         for _ in 0..50 {
@@ -501,8 +503,8 @@ fn commands_respect_limits_and_joints_arrive_together() {
             .rposition(|rad| (rad - last).abs() > 2e-3)
             .expect("the joint moved")
     });
-    // The second joint alone would arrive hundreds of cycles earlier. The last counts of a short
-    // path take many cycles.
+    // The second joint alone would arrive hundreds of cycles earlier. The tolerance is needed
+    // because the last counts of a short path take many cycles.
     assert!(
         last_change[0].abs_diff(last_change[1]) < 40,
         "{last_change:?}"
@@ -665,7 +667,7 @@ fn faults_stop_the_arm_until_recovery() {
                 "the bus is off" => inject_bus_off("vcan10"),
                 _ => motors.fails_next.store(true, Ordering::Relaxed),
             }
-            // Measure from here, because taking the link down takes some time.
+            // The time is measured from here, because taking the link down takes some time.
             let faulted_at = clock::now();
             let reason = wait_until_stopped(&arm);
             let reported_after = clock::now().duration_since(start_time);
@@ -673,8 +675,8 @@ fn faults_stop_the_arm_until_recovery() {
                 reported_after < TIMEOUT + REPORT_PERIOD,
                 "{fault}: {reported_after:?}"
             );
-            // Without a connection, the watchdogs stop the motors. Otherwise, they received a
-            // command to stop.
+            // Without a connection, the watchdogs stop the motors. With a connection, the motors
+            // received a command to stop.
             let is_isolated = ["the cable is disconnected", "the link is down"].contains(&fault);
             let after_millis = if is_isolated {
                 motors.wait_until_timed_out(faulted_at, state)
@@ -955,7 +957,7 @@ fn killed_or_suspended_program_triggers_watchdogs() {
                 "the held motor moved"
             );
         }
-        // Recovery happens only on request, and starts from the current positions.
+        // The arm recovers only on request, and starts from the current positions.
         child
             .stdin
             .as_mut()

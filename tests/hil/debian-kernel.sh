@@ -1,5 +1,6 @@
 #!/bin/sh
-# Fetches Debian's own kernel for the tests in QEMU, and makes its first root folder, once. Prints their folder as the only line on stdout:
+# Fetches Debian's own kernel for the tests in QEMU, and makes its first root folder, once. Prints
+# the folder of both as the only line on stdout:
 #   vmlinuz    the kernel
 #   initrd     loads the modules, then mounts the root folder of the tests from the host (9p) and starts its /init
 #
@@ -21,7 +22,7 @@ if [ -z "$package" ]; then
 fi
 cache=${XDG_CACHE_HOME:-$HOME/.cache}/fieldrig/kernels
 mkdir -p "$cache"
-# Two runs of the tests at the same time fetch the kernel only once.
+# With this lock, two runs of the tests at the same time fetch the kernel only once.
 exec 9>"$cache/lock"
 flock 9
 
@@ -37,7 +38,7 @@ trap 'exit 130' HUP INT TERM
 echo "fetching the kernel for the tests in QEMU ($package), once" >&2
 chmod 755 "$work"
 if ! (cd "$work" && apt-get download -q "$package" >"$work/log" 2>&1); then
-    # The list of packages is older than the newest security update.
+    # The download fails if the list of packages is older than the newest security update.
     echo "debian-kernel: apt cannot download $package; run: apt-get update" >&2
     tail -n 3 "$work/log" >&2
     exit 1

@@ -187,7 +187,7 @@ fn follow_for_ten_thousand_cycles(name: &str, open: impl Fn() -> MovableFrankaAr
             };
             match arm.command(&target) {
                 Ok(commanded) => assert_eq!(commanded, target),
-                // Holding a position takes answers, too.
+                // Holding a position also requires answers.
                 Err(error) => {
                     recover(&mut arm, &error.to_string());
                     continue;
@@ -269,7 +269,7 @@ impl FrankaSim {
             .expect("a free port")
             .port();
         let log = fs::File::create(folder().join("franka-sim.log")).expect("creating the log file");
-        // The model of franka-sim is a separate download, so this uses our model of primitive
+        // The model of franka-sim is a separate download, so this test uses our model of primitive
         // shapes.
         let (root, model) = (
             Path::new(env!("CARGO_MANIFEST_DIR")).join(".."),
@@ -403,7 +403,7 @@ fn make_environment() -> Result<(), String> {
     run(Path::new("python3"), &["-c", is_python_3_11]).map_err(|_| {
         "the Python packages of the Franka tests require Python 3.11 (Debian 12)".to_owned()
     })?;
-    // Leftovers of an interrupted run.
+    // The folder may contain leftovers of an interrupted run.
     let _ = fs::remove_dir_all(&folder);
     let [at, requirements] =
         [&folder, &folder.join("requirements.txt")].map(|path| path.display().to_string());

@@ -143,7 +143,7 @@ fn second_program_cannot_move_the_arm() {
     );
     moving.kill().expect("our own child");
     moving.wait().expect("our own child");
-    // The kernel has released the lock. An arm that is only read needs none.
+    // The kernel has released the lock. An arm that is only read needs no lock.
     let config = movable(
         wire.config(false),
         &Rig::load(&rig, &[]).expect("a rig file").arm.motors,
@@ -202,11 +202,11 @@ fn second_ctrl_c_applies_the_fail_safe() {
     for trial in 0..n_trials() {
         let (motors, mut moving) = moving_arm(&wire, &rig);
         wait_for_trial(trial);
-        // The first one brings the arm to rest, which takes seconds at the acceleration of this
+        // The first Ctrl-C brings the arm to rest, which takes seconds at the acceleration of this
         // rig.
         interrupt(&moving);
         std::thread::sleep(Duration::from_millis(100));
-        interrupt(&moving); // The same key press, sent twice.
+        interrupt(&moving); // This signal belongs to the same key press, which was sent twice.
         std::thread::sleep(Duration::from_millis(500));
         assert!(
             motors.observed()[0].velocity_rad_s.abs() > 0.02 && !is_damped(&motors.observed()),

@@ -64,8 +64,8 @@ impl Card {
         }
         let card = Self { interface, device };
         // For fault injection, the chip is identified by the interface name in its acceptance
-        // registers. They are writable only while the interface is down. All frames are still
-        // accepted.
+        // registers. These registers are writable only while the interface is down. The chip still
+        // accepts all frames.
         for (value, register) in [interface.as_bytes(), &qemu::ACCEPT_ALL]
             .concat()
             .iter()
@@ -194,9 +194,9 @@ fn errors_until(bus: &Bus, condition: impl Fn(&WireErrors) -> bool) -> WireError
     errors
 }
 
-/// Accumulates error frames while `act` runs, until the bus has restarted. Nothing else reads the
-/// bus meanwhile: on a busy host, frames of the motors would fill its buffer, and the kernel would
-/// drop the error frame.
+/// Accumulates error frames while `act` runs, until the bus has restarted. While `act` runs,
+/// nothing else reads the bus. On a busy host, frames of the motors would otherwise fill the
+/// buffer, and the kernel would drop the error frame.
 fn errors_until_restart<R>(bus: &Bus, act: impl FnOnce() -> R) -> (WireErrors, R) {
     std::thread::scope(|scope| {
         let errors = scope.spawn(|| errors_until(bus, |errors| errors.n_restarts > 0));
@@ -356,7 +356,7 @@ fn bus_off_stops_moving_arm_until_recovery() {
     let configs = [damiao(1), damiao(2)];
     let motors = Motors::new(cards[1].config(), configs.to_vec(), false);
     let mut config = movable(cards[0].config(), &configs, OnLoss::Release);
-    // Longer than the stalls of this machine on a busy host.
+    // This timeout is longer than the stalls of this machine on a busy host.
     config.motion.timeout = Duration::from_secs(2);
     let mut arm = MovableCanArm::open(&config).expect("the motors are enabled");
     let monitor = cards[0].bus();
@@ -459,8 +459,8 @@ fn controller_state_changes_are_reported() {
             .any(|complaint| complaint.problem.starts_with("it is bus-off")),
         "{problems:?}"
     );
-    // The kernel needs up to a second to detect that nothing is transmitted. After that, it accepts
-    // frames and drops them.
+    // The kernel needs up to a second to detect that nothing is transmitted. From then on, it
+    // accepts frames and drops them.
     let frame = Frame::classic(Id::standard(0x100).expect("11 bits"), &[]).expect("no bytes");
     std::thread::sleep(Duration::from_millis(1200));
     let n_accepted = (0..50)
@@ -518,8 +518,8 @@ fn unacknowledged_frames_are_distinguished_from_silence() {
         .expect_err("no motor is connected")
         .to_string();
     assert!(printed.contains("no answer to 4 requests"), "{printed}");
-    // The chip reports error-passive with the first request. This is the only sign, because its
-    // driver cannot report missing acknowledgments.
+    // The chip reports the state error-passive with the first request. This is the only sign of the
+    // problem, because the driver of the chip cannot report missing acknowledgments.
     card.inject(HAS_ERRORS, PASSIVE_CHANGED);
     let printed = CanArm::open(&config)
         .expect_err("no motor is connected")

@@ -7,8 +7,8 @@
 //! which are ignored on the host: `kvaser.rs` in QEMU, the others in User-Mode Linux.
 //!
 //! User-Mode Linux uses a simulated clock (`time-travel=inf-cpu`): it advances only while all
-//! processes sleep, and then jumps to the next timer. Simulated time therefore does not depend on
-//! the host. QEMU runs in real time.
+//! processes sleep, and then jumps to the next timer. Simulated time is therefore independent of
+//! the speed of the host. QEMU runs in real time.
 
 #![expect(
     clippy::print_stdout,
@@ -116,7 +116,7 @@ fn run_inside(extra_files: &[&str], boot: impl FnOnce() -> String) {
     }
     let _alone = ONE_AT_A_TIME.lock();
     let console = boot();
-    // Bypasses the test harness, so that the report is also visible if all tests pass.
+    // This output bypasses the test harness, so that the report is also visible if all tests pass.
     std::io::stderr()
         .write_all(console.as_bytes())
         .expect("stderr is open");
@@ -154,7 +154,8 @@ fn root_folder() -> PathBuf {
     folder
 }
 
-/// Path that a script prints; the script builds or downloads the kernel first if necessary.
+/// Path of a kernel, which a script prints. The script builds or downloads the kernel first if
+/// necessary.
 fn kernel(script: &str) -> PathBuf {
     let path = Path::new(env!("CARGO_MANIFEST_DIR"))
         .join("tests/hil")
@@ -170,7 +171,7 @@ fn kernel(script: &str) -> PathBuf {
 /// Creates a root folder with busybox, this program, `fieldrig`, additional programs, and all
 /// required libraries.
 fn install_root(root: &Path, init_script: &str, extra_files: &[(PathBuf, &str)]) {
-    let _ = fs::remove_dir_all(root); // Missing at the first run.
+    let _ = fs::remove_dir_all(root); // The folder is missing at the first run.
     for folder in ["bin", "dev", "lib", "proc", "rigs", "sys", "tmp"] {
         fs::create_dir_all(root.join(folder)).expect("creating a folder");
     }
@@ -234,7 +235,7 @@ fn libraries_of(program: &Path) -> BTreeSet<PathBuf> {
 
 /// Calls `run` on one processor, on which all programs that it starts also run. User-Mode Linux is
 /// faster on one processor, because it traces its processes and only one of them runs at a time. On
-/// two, each system call wakes an idle processor.
+/// two processors, each system call would wake an idle processor.
 fn on_one_processor<T>(run: impl FnOnce() -> T) -> T {
     let allowed = sched_getaffinity(None).expect("the processors of this thread");
     let last = (0..CpuSet::MAX_CPU)

@@ -31,7 +31,7 @@ fn config() -> Config {
 }
 
 /// Opens a camera after setting a format that nokhwa supports. nokhwa cannot open a camera that is
-/// set to another format, as it may be after the V4L2 tests.
+/// set to another format. After the V4L2 tests, the camera may be set to such a format.
 fn open(config: Config) -> NokhwaCamera {
     let known_format = v4l2::Config {
         format: Some(V4l2Format::Yuyv),
@@ -166,7 +166,8 @@ fn nokhwa_camera_survives_unplugging() {
         "nokhwa: disconnected, detected after {detected_after:.2?}, recovered after {elapsed:.2?}, about {} images lost",
         image.n_skipped
     );
-    // At least one second without a camera, plus the times to bind it and to open it again.
+    // The camera is missing for at least one second, plus the times to bind it and to open it
+    // again.
     let lost_range = 20.0..=unplugged_at.elapsed().as_secs_f64() * RATE_HZ + 10.0;
     assert!(
         lost_range.contains(&(image.n_skipped as f64)),

@@ -2,8 +2,8 @@
 //! into their chips.
 //!
 //! QEMU's chip (SJA1000, `hw/net/can/can_sja1000.c`) produces no errors: it never sets the status
-//! bits for errors and bus-off or their interrupts, and its error counters always read 0.
-//! Therefore, these bits are set from outside in the memory of QEMU, as by a debugger. Everything
+//! bits for errors and bus-off or their interrupts, and its error counters always read 0. The tests
+//! therefore set these bits from outside in the memory of QEMU, as a debugger would. Everything
 //! else runs in the kernel's driver for real chips and the layers above it.
 
 use super::{run, write_script};
@@ -13,7 +13,8 @@ use std::os::unix::fs::FileExt;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
 
-/// QEMU if its package is installed, and where `scripts/fetch-qemu.sh` unpacks it otherwise.
+/// Paths of QEMU: the path of its installed package, and the path to which `scripts/fetch-qemu.sh`
+/// unpacks QEMU otherwise.
 const PROGRAMS: [&str; 2] = [
     "/usr/bin/qemu-system-x86_64",
     concat!(
@@ -24,7 +25,8 @@ const PROGRAMS: [&str; 2] = [
 /// The `ip` of busybox does not support bit rates.
 pub(crate) const IP: &str = "/usr/sbin/ip";
 
-/// First process in the root folder. It ends QEMU by a restart (`-no-reboot`).
+/// First process in the root folder. It ends QEMU by restarting the machine, because of the option
+/// `-no-reboot`.
 const INIT: &str = r#"#!/bin/busybox sh
 bb=/bin/busybox
 $bb mount -t proc proc /proc

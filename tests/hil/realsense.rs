@@ -208,7 +208,7 @@ fn file_plays_in_real_time_and_fast_file_loses_nothing() {
 
 #[test]
 fn file_on_the_clock_starts_at_its_stamps() {
-    const LATER_SECS: f64 = 6.0; // Longer than the silence limit of a device.
+    const LATER_SECS: f64 = 6.0; // This delay is longer than the silence limit of a device.
     let folder = tempfile::tempdir().unwrap();
     let camera = d435i([640, 480], Lens::Pinhole);
     let path = folder.path().join("camera.bag");

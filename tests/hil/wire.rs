@@ -48,7 +48,7 @@ fn mobile_arm_is_read_and_moved_through_drivers() {
         .spawn()
         .expect("fieldrig is installed");
     let mut line = String::new();
-    // Keep the pipe open, so that the program does not lose output.
+    // The pipe is kept open, so that the program does not lose output.
     let mut stdout = BufReader::new(playing.stdout.take().expect("piped"));
     stdout.read_line(&mut line).expect("fieldrig prints a line");
     assert!(
@@ -93,6 +93,6 @@ fn mobile_arm_is_read_and_moved_through_drivers() {
     let (code, printed) = fieldrig(&arguments);
     assert_eq!(code, Some(0), "{printed}");
     assert!(wire_difference::error_of_move(&printed) < 0.01, "{printed}");
-    let _ = playing.kill(); // It runs until it is stopped.
+    let _ = playing.kill(); // The program runs until it is stopped.
     let _ = playing.wait();
 }

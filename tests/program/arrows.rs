@@ -39,7 +39,7 @@ const ALLOWED: &str = "
 /// Crates that only `fieldrig` may use, because only it prints and parses command lines.
 const BINARY_ONLY: [&str; 4] = ["clap", "ctrlc", "env_logger", "indicatif"];
 
-/// Crates that may carry context with `anyhow`. Those below them have typed errors.
+/// Crates that may add context to errors with `anyhow`. The crates below them have typed errors.
 const WITH_ANYHOW: [&str; 6] = [
     "bench",
     "calibrate",
@@ -171,8 +171,8 @@ fn forbidden_dependency_is_detected() {
     assert_eq!(violations(&dependencies), expected);
 }
 
-/// Dependencies are compiled without checks of overflow and without debug assertions, the crates of
-/// this workspace with them.
+/// The crates of this workspace are compiled with overflow checks and debug assertions. Their
+/// dependencies are compiled without both.
 #[test]
 fn every_crate_is_checked_in_development() {
     const CHECKS: [&str; 2] = ["debug-assertions", "overflow-checks"];

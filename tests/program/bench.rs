@@ -138,8 +138,8 @@ fn kernel_bench_reports_every_variant() {
     assert!(row["step_visible_millis"].as_f64() > Some(0.0), "{row}");
 }
 
-/// Checks the counts that `--scan` imitates (docs/benchmarks/README.md), with as many splats per
-/// pixel as a scan.
+/// Checks that `--scan` reproduces the counts of a scan (docs/benchmarks/README.md), with as many
+/// splats per pixel as in a scan.
 #[test]
 fn kernel_bench_of_a_scan_has_uneven_lists() {
     let folder = tempfile::tempdir().expect("a folder");

@@ -146,7 +146,7 @@ fn lens_and_hand_eye_are_found_from_images() {
         "an unreadable image is named"
     );
 
-    // Samples in another order than that of the file names.
+    // The samples are in another order than the file names.
     let robot_poses = robot_poses();
     let sample = |ix: usize| json!({"base_from_flange": rows(&robot_poses[ix]), "image": format!("images/{ix}.png")});
     let samples: Vec<Value> = (0..robot_poses.len()).rev().map(sample).collect();
@@ -262,14 +262,14 @@ fn lens_and_hand_eye_are_found_from_images() {
     );
 }
 
-/// A report. It must not load anything.
+/// Returns a report, and checks that it does not load anything.
 fn report(folder: &Path, name: &str) -> String {
     let page = std::fs::read_to_string(folder.join(name)).expect("a report");
     assert!(page.starts_with("<!doctype html>") && page.trim_end().ends_with("</html>"));
     for source in ["<script", "<link", "src=\"http", "href=\"http", "url("] {
         assert!(!page.contains(source), "{name} contains {source}");
     }
-    // Encoded pictures may contain any letters.
+    // Encoded pictures may contain any letters, so they are removed before the search.
     let without_picture = |part: &str| {
         part.split_once('"')
             .map_or(String::new(), |(_, rest)| rest.to_owned())
@@ -357,7 +357,7 @@ fn results_are_written_into_a_rig_file() {
     );
     assert!(folder.path().join("new.toml.old").exists());
 
-    // Two programs write the same file at once: no result disappears.
+    // If two programs write the same file at once, no result disappears.
     let both = [
         "--rig",
         "new.toml",
@@ -586,7 +586,7 @@ fn weak_excitation_and_mistakes_are_refused() {
         "{result}"
     );
 
-    // All rotations about the flange's z axis.
+    // All rotations are about the flange's z axis.
     let first = robot_poses()[0];
     let base_from_board = first * flange_from_camera() * board_poses()[0];
     let about_z = (0..8).map(|ix| {
@@ -770,7 +770,7 @@ fn targets_are_printed_once() {
 fn rig_is_calibrated_from_a_simulated_scan() {
     let folder = tempfile::tempdir().expect("a folder");
     let rigs = Path::new(env!("CARGO_MANIFEST_DIR")).join("rigs");
-    // A quarter of the resolution.
+    // The rig file has a quarter of the resolution.
     let text = std::fs::read_to_string(rigs.join("uncalibrated.toml")).expect("a rig file");
     let small = text
         .replace("[640, 480]", "[160, 120]")
@@ -822,7 +822,7 @@ fn rig_is_calibrated_from_a_simulated_scan() {
     );
 }
 
-/// The disk is full, here a limit of the file size.
+/// A limit of the file size simulates a full disk.
 #[cfg(unix)]
 #[test]
 fn result_is_printed_if_the_report_cannot_be_written() {

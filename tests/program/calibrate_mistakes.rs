@@ -138,7 +138,7 @@ fn symmetric_boards_are_named() {
 #[test]
 fn refused_lens_has_a_report_with_coverage() {
     let folder = tempfile::tempdir().expect("a folder");
-    // Facing the camera only.
+    // The board only faces the camera.
     write_images(
         &folder.path().join("images"),
         BOARD,

@@ -129,7 +129,7 @@ fn images_and_instructions_of_a_scan_reach_a_client() {
         received.texts
     );
     assert!(!received.images_px.is_empty(), "{log}");
-    // The same text as in the terminal.
+    // The page shows the same text as the terminal.
     let shown = received
         .texts
         .iter()

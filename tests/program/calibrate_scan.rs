@@ -10,8 +10,8 @@ use std::path::Path;
 
 const TARGET: &str = "charuco:5x7:24mm:18mm:5X5_100";
 
-/// Limit of the rotation error, degrees; also with a lens from the same few images, whose principal
-/// point is less certain.
+/// Limit of the rotation error, degrees. It also holds with a lens from the same few images, whose
+/// principal point is less certain.
 const MAX_DEG: f64 = 0.03;
 const MAX_DEG_WITH_LENS: f64 = 0.06;
 
@@ -88,7 +88,8 @@ fn lens_and_hand_eye_of_a_moving_arm_are_found_from_a_printed_target() {
         );
     }
 
-    // From the recording and from the simulated devices; the result of the latter is written.
+    // The test calibrates from the recording and from the simulated devices. Only the second result
+    // is written.
     let files = ["--report", "hand-eye.html", "--write-rig", "result.toml"];
     for input in [
         &["scan.mcap", "--rig", "calibrated.toml"][..],
@@ -105,7 +106,7 @@ fn lens_and_hand_eye_of_a_moving_arm_are_found_from_a_printed_target() {
         assert!(output.status.success(), "{input:?}: {}", stderr(&output));
         assert!(is_report_with_photo(folder, "hand-eye.html"), "{input:?}");
         check_pose(&json_of(&output), MAX_DEG);
-        // Devices, but not recordings, are accompanied by guidance.
+        // The program prints guidance for devices, but not for recordings.
         let log = stderr(&output);
         let is_guided = log.contains("0 poses with the target")
             && log.contains("more poses, rotated by 20 degrees");
@@ -192,7 +193,7 @@ fn arm_moves_around_a_target_until_its_camera_is_calibrated() {
         "{log}"
     );
     assert!(log.contains("returning to the start"), "{log}");
-    // Half the distance to the target, before the first motion.
+    // The limit is half the distance to the target, as it was before the first motion.
     let [distance, motion] = [
         "; the flange moves at most 0.",
         "moving to pose 2: orbit the target by 15 degrees",
@@ -245,7 +246,7 @@ fn joint_offsets_are_estimated_and_written() {
     let output = fieldrig(folder, &[&args[..], &goals].concat());
     assert!(output.status.success(), "{}", stderr(&output));
     let result = json_of(&output);
-    // Not only until the camera is accurate.
+    // The motion continues even after the camera is accurate.
     assert!(
         result["samples"].as_array().map_or(0, Vec::len) > 20,
         "{}",
@@ -338,8 +339,8 @@ mod emulated_controller {
     #[test]
     fn ctrl_c_while_the_arm_waits_for_an_image_ends_the_motion() {
         let folder = tempfile::tempdir().expect("a folder");
-        // The motion to a pose takes three seconds, and its image comes eight seconds after that of
-        // the pose before.
+        // The motion to a pose takes three seconds. The image of a pose comes eight seconds after
+        // the image of the previous pose.
         write_emulated_rig(folder.path(), 0.125);
         let mut child = Command::new(env!("CARGO_BIN_EXE_fieldrig"))
             .current_dir(folder.path())

@@ -451,7 +451,7 @@ fn paths_of_windows() {
     }
 }
 
-/// The answer names the size, and memory stays small.
+/// The error message names the size, and memory use stays small.
 #[test]
 fn huge_depth() {
     let Some(hostile) = test_support::data_folder("hostile/depth-16384") else {
@@ -498,13 +498,13 @@ fn calibrations_of_ros() {
         code == Some(2) && printed.contains("this is YAML, expected JSON"),
         "{printed}"
     );
-    // The case has no images: reading goes on beyond the intrinsics.
+    // The case has no images, so the error shows that reading goes on after the intrinsics.
     let (code, printed) = case.run(&["calibrate", "hand-eye", "samples_with_camera_info.json"]);
     assert!(
         code == Some(2) && printed.contains("00.png") && !printed.contains("camera_matrix"),
         "{printed}"
     );
-    // The same parameters in a file of their own.
+    // The same parameters are also tested in a separate file.
     let samples = std::fs::read_to_string(case.at("samples_with_camera_info.json")).unwrap();
     let mut samples: Value = serde_json::from_str(&samples).unwrap();
     samples["intrinsics"] = "ost.yaml".into();
@@ -549,7 +549,7 @@ fn sides_of_a_board_swapped() {
     assert_eq!(code, Some(0), "{printed}");
 }
 
-/// Joint states as ROS publishes them; the clock of the sender is that of this computer.
+/// Joint states as ROS publishes them. The sender uses the clock of this computer.
 #[cfg(feature = "sim")]
 #[test]
 fn joint_states_of_ros() {

@@ -253,7 +253,7 @@ fn invalid_arguments_exit_with_2() {
         assert_fails_with(&["train", "absent", flag, value], 2, &[flag]);
         assert_fails_with(&["run", "absent.toml", flag, value], 2, &[flag]);
     }
-    // Rejected before data is read: this folder does not exist.
+    // The options are rejected before data are read, because this folder does not exist.
     let refine = |words| ["train", "absent", "--method", "tsdf", "--refine", words];
     assert_fails_with(
         &refine("extrinsics,image-gains"),

@@ -19,15 +19,15 @@ use tungstenite::{Message, WebSocket};
 /// Maximum time until an expected message. Much longer than two busy cores need for a small
 /// picture.
 const TIMEOUT: Duration = Duration::from_secs(120);
-/// Exit codes of a run that has saved its model: success, and dropped images, as on a busy
-/// computer.
+/// Exit codes of a run that has saved its model: success, and dropped images. A busy computer drops
+/// images.
 const EXIT_CODES: [i32; 2] = [0, 3];
 const SIZE_PX: [u32; 2] = [96, 72];
 /// Upper bound on the difference caused by JPEG compression, as in `tests/program/view.rs`.
 const MAX_JPEG_DIFFERENCE: f64 = 3.0;
 
-/// Upper bound on the brightness in the middle of erased space: faint surfaces behind it may be
-/// visible. It is above 50 before.
+/// Upper bound on the brightness in the middle of erased space. It is above 0 because faint
+/// surfaces behind the erased space may be visible. Before the edit, the brightness is above 50.
 const MAX_ERASED_BRIGHTNESS: f64 = 20.0;
 
 /// A command that serves the page.
@@ -155,7 +155,8 @@ impl Operator {
         })
     }
 
-    /// Removes floaters from a model with so many edits, and undoes this if there were any.
+    /// Removes floaters from a model that has this number of edits. If any floaters were removed,
+    /// undoes the removal.
     fn search_floaters(&mut self, method: &str, n_edits: u64) {
         match self.edit(method, json!({"action": "remove_floaters"}), n_edits + 1) {
             Ok(_) => {
@@ -302,7 +303,8 @@ fn edits_of_saved_models_are_drawn_saved_exported_and_undone() {
         (message["type"] == "scene").then(|| message["world_from_camera"].clone())
     });
     let [x, y] = [3, 7].map(|at| pose[at].as_f64().expect("a number"));
-    // The center of the view: the camera is at z = 1 m and looks down at the wall at z = 0.
+    // The edit is at the center of the view. The camera is at z = 1 m and looks down at the wall at
+    // z = 0.
     let erase = json!({"action": "erase", "box": {"min_m": [x - 0.15, y - 0.15, -0.5], "max_m": [x + 0.15, y + 0.15, 0.5]}});
     for (method, n_whole) in ["splat", "tsdf"].iter().zip(n_whole) {
         let model = format!("all/{method}");
@@ -370,7 +372,7 @@ fn edits_of_saved_models_are_drawn_saved_exported_and_undone() {
         reason,
         "no model with the method \"nerf\"; use splat or tsdf"
     );
-    // The number of edits is the same after an undo and another edit, but not the revision.
+    // After an undo and another edit, the number of edits is the same, but the revision differs.
     let revision = operator.edit("splat", erase.clone(), 1).expect("erased");
     operator
         .edit("splat", json!({"action": "undo"}), 0)

@@ -15,8 +15,8 @@ use std::process::{Command, Output, Stdio};
 const N_IMAGES: i64 = 40;
 /// Steps of every run in this file.
 const N_STEPS: &str = "300";
-/// Measured 22.1 dB after these few steps, most of them at coarse resolution; the initial splats of
-/// the first keyframe score 16.4 dB.
+/// The measured PSNR is 22.1 dB after these few steps, most of which are at coarse resolution. The
+/// initial splats of the first keyframe score 16.4 dB.
 const MIN_PSNR: f64 = 21.0;
 /// Tolerance for forward kinematics, interpolation and camera extrinsics together.
 const MAX_POSITION_ERROR_M: f64 = 1e-4;
@@ -187,7 +187,7 @@ fn memory_bench_measures_a_run_with_a_viewer() {
         number(last, "keyframes") <= 8.0 && number(last, "evicted") > 0.0,
         "{last}"
     );
-    // Color, depth and ground truth of this many images of 160x120.
+    // The file holds color, depth and ground truth of this many images of 160x120.
     assert_eq!(
         number(last, "keyframe_bytes"),
         number(last, "keyframes") * 160.0 * 120.0 * 12.0
@@ -298,7 +298,7 @@ fn live_bench_repeats_a_recording() {
 
 /// Number of keyframes to fuse.
 const N_FUSED: &str = "10";
-/// Measured 18 dB: regions not observed yet have no surface.
+/// The measured PSNR is 18 dB, because regions that are not observed yet have no surface.
 const MIN_PSNR_OF_MESH: f64 = 15.0;
 
 #[test]
@@ -366,7 +366,8 @@ fn tsdf_runs_live_replays_and_resumes() {
     check_saved_model_renders(folder);
 
     let train = ["train", "scan.mcap", "--keyframes", "live/keyframes.txt"];
-    // Without registration: `run` did none, and corrections would be part of the model.
+    // This run has no registration, because `run` did none and corrections would be part of the
+    // model.
     let half = [
         "--method", "tsdf", "--refine", "none", "--json", "--steps", "4", "--out", "half",
     ];
@@ -384,13 +385,14 @@ fn tsdf_runs_live_replays_and_resumes() {
     );
 }
 
-/// Steps that train a NeRF: few on a software adapter, where each is slow. On a GPU the model is
-/// larger and needs more.
+/// Number of steps that train a NeRF. A software adapter gets few steps, because each is slow. On a
+/// GPU, the model is larger and needs more steps.
 fn n_nerf_steps() -> &'static str {
     let gpu = Gpu::open(&GpuOptions::default()).expect("an adapter");
     if gpu.is_software() { "120" } else { "300" }
 }
-/// Measured 16.5 dB on a software adapter, 22.6 dB on an H100: keyframes arrive during training.
+/// The measured PSNR is 16.5 dB on a software adapter and 22.6 dB on an H100. It is low because
+/// keyframes arrive during training.
 const MIN_NERF_PSNR: f64 = 14.0;
 
 #[test]
@@ -1030,7 +1032,7 @@ fn decision_log_reproduces_a_real_time_run() {
     let rig = std::fs::read_to_string(folder.join("rig.toml")).expect("a rig file");
     let live = rig.replace("lockstep = true", "lockstep = false");
     assert_ne!(live, rig);
-    // Small enough that keyframes are evicted.
+    // This limit is small enough that keyframes are evicted.
     std::fs::write(
         folder.join("rig.toml"),
         live + "[join]\nmax_keyframes = 10\n",
@@ -1126,7 +1128,7 @@ fn decision_log_reproduces_a_real_time_run() {
         "the replay made different decisions"
     );
 
-    // Truncated in the middle of a line: complete lines are replayed.
+    // The log is truncated in the middle of a line. Complete lines are replayed.
     std::fs::write(folder.join("cut.jsonl"), &log[..log.len() / 2]).expect("the disk has space");
     let cut = replay("cut.jsonl", "cut", &[3]);
     assert!(cut["steps"].as_u64() <= live["steps"].as_u64());
@@ -1396,7 +1398,7 @@ fn without_depth_the_hand_eye_calibration_is_estimated_from_color() {
 
 #[test]
 fn wrong_hand_eye_calibration_is_corrected() {
-    /// Half the scan; measured 0.003 degrees and 0.04 mm.
+    /// This is half of the scan. The measured errors are 0.003 degrees and 0.04 mm.
     const N_IMAGES: i64 = 90;
     const MAX_REMAINING_DEGREES: f64 = 0.1;
     const MAX_REMAINING_MM: f64 = 0.5;
@@ -1428,8 +1430,8 @@ fn wrong_hand_eye_calibration_is_corrected() {
         "{degrees:.4} degrees, {mm:.3} mm left"
     );
 
-    // In real time, while the keyframes arrive. The decision log reproduces the moment of the
-    // correction.
+    // The correction happens in real time, while the keyframes arrive. The decision log reproduces
+    // its moment.
     let args = [
         "run",
         "wrong.toml",
@@ -1489,7 +1491,7 @@ fn wrong_hand_eye_calibration_is_corrected() {
     assert!((number(&found[0], "rotation_rad").to_degrees() - 1.0).abs() < MAX_REMAINING_DEGREES);
     assert!(number(&found[0], "translation_sigma_m") < 5e-4);
 
-    // With the corrected rig file, no correction is needed.
+    // A run with the corrected rig file needs no correction.
     let args = [
         "train",
         "scan.mcap",

@@ -1,11 +1,11 @@
 //! Checks that the source files of each crate do not import each other in cycles.
 //!
 //! The graph is read from the source: `use` items and paths such as `crate::join::Join`, also in
-//! arguments of macros and attributes. Every name is followed through `use` items, also through
-//! re-exports of other files, to the file that defines it. Glob imports are not followed; the lint
-//! `wildcard_imports` rejects them. A module may import from its parents, and a parent may re-export
-//! its children, so imports of a module's own submodules do not count. Test code does not count
-//! either.
+//! arguments of macros and attributes. Every name is followed to the file that defines it, through
+//! `use` items and through re-exports of other files. Glob imports are not followed; the lint
+//! `wildcard_imports` rejects them. A module may import from its parents, and a parent may
+//! re-export its children, so imports of a module's own submodules do not count. Test code does not
+//! count either.
 #![expect(clippy::unwrap_used, reason = "a test that cannot continue may panic")]
 
 use std::collections::{BTreeMap, BTreeSet};
@@ -24,7 +24,7 @@ type Graph = BTreeMap<Module, BTreeSet<Module>>;
 struct File {
     /// Paths as written: relative ones start with `self`, `super`, or the name of a submodule.
     paths: Vec<Module>,
-    /// Names of `use` items and the paths that they refer to. Private ones count, because
+    /// Names of `use` items and the paths that they refer to. Private names count, because
     /// submodules can use them, too.
     names: BTreeMap<String, Module>,
     /// Submodules in separate files that are compiled only for tests.
@@ -115,8 +115,8 @@ impl<'ast> Visit<'ast> for File {
     }
 }
 
-/// Appends the paths of several segments in tokens that are not parsed, such as arguments of
-/// macros.
+/// Appends all paths with several segments that occur in tokens. This is for tokens that are not
+/// parsed, such as arguments of macros.
 fn find_paths(mut tokens: Cursor<'_>, found: &mut Vec<Module>) {
     loop {
         if let Some((path, rest)) = path_at(tokens) {
@@ -244,7 +244,7 @@ fn absolute(
             if !files.contains_key(&base) {
                 let imported = files.get(module)?.names.get(first)?;
                 let full: Module = imported.iter().chain(rest).cloned().collect();
-                // The name of another crate refers to itself, as in `use serde;`.
+                // In `use serde;`, the name of another crate refers to itself.
                 let is_resolvable = depth < MAX_DEPTH && imported[0] != first;
                 return is_resolvable
                     .then(|| absolute(files, module, &full, depth + 1))

@@ -67,7 +67,8 @@ fn largest_difference(a: &[f64], b: &[f64]) -> f64 {
 
 #[test]
 fn stretched_panda_matches_published_pose() {
-    // All joints zero: 0.333 + 0.316 + 0.384 - 0.107 up, 0.088 out, the flange pointing down.
+    // With all joints at zero, the flange is 0.333 + 0.316 + 0.384 - 0.107 up and 0.088 out, and
+    // points down.
     let stretched = [
         1.0, 0.0, 0.0, 0.088, 0.0, -1.0, 0.0, 0.0, 0.0, 0.0, -1.0, 0.926, 0.0, 0.0, 0.0, 1.0,
     ];

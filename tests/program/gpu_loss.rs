@@ -158,7 +158,7 @@ fn out_of_gpu_memory_stops_growth() {
         )
     };
     let free = done(&train("free", &[]));
-    // Enough memory to train and render the first 50 000 splats, but not 75 000.
+    // This is enough memory to train and render the first 50 000 splats, but not 75 000.
     let full = train("full", &[("FIELDRIG_TEST_GPU_BYTES", "48000000")]);
     let text = stderr(&full);
     assert_eq!(
@@ -173,7 +173,7 @@ fn out_of_gpu_memory_stops_growth() {
         "{full} {free}"
     );
 
-    // Not enough memory to start: one error message, and no panic.
+    // There is not enough memory to start. The program prints one error message and does not panic.
     let none = train("none", &[("FIELDRIG_TEST_GPU_BYTES", "3000000")]);
     assert_eq!(none.status.code(), Some(1));
     assert!(
@@ -238,7 +238,7 @@ fn live_run_survives_gpu_loss_or_keeps_its_recording() {
     );
     let listed = std::fs::read_to_string(folder.join("gone/keyframes.txt")).unwrap();
     assert!(listed.lines().count() >= 12, "{listed}");
-    // The recording is complete: it can be trained on.
+    // The recording is complete, so it can be used for training.
     let args = [
         "train",
         "gone.mcap",

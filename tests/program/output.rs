@@ -15,7 +15,7 @@ use std::process::{Child, Command, ExitStatus, Stdio};
 use std::time::{Duration, Instant};
 
 const EXE: &str = env!("CARGO_BIN_EXE_fieldrig");
-/// Longer than any of these commands takes on a busy machine.
+/// This is longer than any of these commands takes on a busy machine.
 const TIMEOUT: Duration = Duration::from_secs(240);
 /// Exit code for losses, which include lost lines of output.
 const LOSS: i32 = 3;
@@ -196,7 +196,7 @@ fn training_saves_at_the_limit_of_processor_time() {
     ];
     let mut run = OnTerminal::start(folder, &args, false);
     run.wait_for("step");
-    // The kernel sends it every second after the soft limit.
+    // The kernel sends this signal every second after the soft limit.
     for _ in 0..2 {
         let limit = Command::new("kill")
             .args(["-XCPU", &run.child.id().to_string()])
@@ -213,7 +213,7 @@ fn writes_beyond_the_limit_of_the_file_size_fail_as_on_a_full_disk() {
     let folder = tempfile::tempdir().unwrap();
     let folder = folder.path();
     wall::write(&folder.join("data"), true, 0.0);
-    // At most 100 kB: enough for the lists, but not for the model.
+    // A file can have at most 100 kB, which is enough for the lists, but not for the model.
     let limited = "ulimit -f 100; exec \"$0\" \"$@\"";
     let mut train = Command::new("sh");
     train.args(["-c", limited, EXE]).args([
@@ -246,7 +246,8 @@ fn training_is_not_blocked_by_a_full_terminal() {
     let folder = tempfile::tempdir().unwrap();
     let folder = folder.path();
     wall::write(&folder.join("data"), true, 0.0);
-    // As after a broken connection, the terminal exists, but nothing reads it. 8 kB fill it.
+    // The terminal exists, but nothing reads it, as after a broken connection. 8 kB fill the
+    // terminal.
     let args = [
         "train",
         "data",
@@ -312,7 +313,7 @@ fn training_survives_a_closed_pipe_and_full_stdout() {
         "{printed}"
     );
     expect_model(folder, "full");
-    // The same without stderr.
+    // The test is repeated without stderr.
     assert_eq!(
         train("mute")
             .stdout(full())
@@ -374,8 +375,8 @@ fn runs_and_recordings_survive_a_closed_terminal() {
     }
 }
 
-/// Kills exports while they write. The folder is complete or absent, and the next export replaces
-/// what is left.
+/// The test kills exports while they write. The folder is then complete or absent, and the next
+/// export replaces the leftovers.
 #[cfg(feature = "sim")]
 #[test]
 fn killed_export_is_complete_or_absent() {
@@ -525,7 +526,7 @@ fn full_disk_keeps_recording_readable_and_saves_model_elsewhere() {
         "{n_samples}: {export_stderr}"
     );
 
-    // Enough space for the lists, but not for the model.
+    // The disk has enough space for the lists, but not for the model.
     std::fs::remove_file(disk.join("run.mcap")).unwrap();
     std::fs::write(disk.join("filler"), vec![1; 900 << 10]).unwrap();
     wall::write(&folder.join("data"), true, 0.0);

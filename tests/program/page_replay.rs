@@ -21,15 +21,16 @@ use test_support::browser::{Browser, NO_DRAWING, Task, browser_for_page, wait_fo
 const WINDOW_PX: [u32; 2] = [1280, 720];
 /// How long the run is recorded after its first picture.
 const RECORDED: Duration = Duration::from_secs(15);
-/// Length of the run if it is not interrupted: longer than Chromium takes to start on a busy
-/// computer, and the recording.
+/// Length of the run if it is not interrupted. It is longer than the start of Chromium on a busy
+/// computer and the recording take together.
 const MAX_SECONDS: &str = "90";
 /// Limit of the 99th percentile of the CPU time of tasks. CPU time does not depend on the tests
 /// that run beside this one.
 const MAX_P99_MILLIS: f64 = 4.0;
 /// Additional time for decoding an image on a slow computer.
 const SLOW_DECODING_MILLIS: u32 = 400;
-/// Added to the page: counts decoded images, and the decoders that run at the same time.
+/// This script is added to the page. It counts decoded images, and the decoders that run at the
+/// same time.
 const COUNT_DECODERS: &str = r"
 window.decoders = { n: 0, nActive: 0, maxActive: 0, sizes: [], delay: 0 };
 const decode = window.createImageBitmap;
@@ -174,7 +175,7 @@ fn a_recorded_session_keeps_the_main_thread_free_and_outdated_images_are_dropped
     check_dropping(&program, &session, [pictures, images]);
 }
 
-/// The run knows when its pictures were shown.
+/// The report of the run states when its pictures were shown.
 fn check_report(report: &Value) {
     let latency = |name: &str| {
         let latencies = report["latencies"].as_array().expect("a list");
@@ -191,7 +192,8 @@ fn check_report(report: &Value) {
         model["p50"].as_f64().is_some_and(|millis| millis > 0.0),
         "{model}"
     );
-    // The same keyframes. More of them were added to the model than shown.
+    // Both latencies are about the same keyframes. More keyframes were added to the model than
+    // shown.
     assert_eq!(sent["n"], shown["n"]);
     assert!(
         sent["p50"].as_f64() < shown["p50"].as_f64()

@@ -6,7 +6,7 @@ use std::sync::Arc;
 use test_support::browser::bundle;
 use tungstenite::WebSocket;
 
-/// Its threads end with the process or their connections.
+/// A server whose threads end with the process or with their connections.
 pub(crate) struct PageServer {
     address: SocketAddr,
 }

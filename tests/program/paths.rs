@@ -15,7 +15,7 @@ fn source_files(folder: &Path) -> Vec<PathBuf> {
             let path = entry.path();
             let name = entry.file_name();
             let name = name.to_string_lossy();
-            // Links are not followed: they may lead out of the project.
+            // Links are not followed, because they may lead out of the project.
             let is_folder = entry.file_type().expect("a type").is_dir();
             if is_folder && !name.starts_with('.') && name != "target" && name != "node_modules" {
                 folders.push(path);
@@ -30,7 +30,7 @@ fn source_files(folder: &Path) -> Vec<PathBuf> {
 
 /// Lines that set the path of a module.
 fn lines_with_path(text: &str) -> impl Iterator<Item = &str> {
-    // In two parts, so that this file has no such line.
+    // The text is in two parts, so that this file has no such line.
     let attribute = concat!("#[", "path");
     text.lines().filter(move |line| line.contains(attribute))
 }

@@ -146,7 +146,7 @@ fn links_in_a_received_run_are_not_followed() {
     }
 }
 
-/// Downloads and editors use such names, too.
+/// Browsers and editors use such names for their own files, too.
 #[test]
 fn files_of_users_that_end_in_part_are_kept() {
     let received = received();
@@ -164,7 +164,7 @@ fn files_of_users_that_end_in_part_are_kept() {
         std::fs::create_dir_all(path.parent().unwrap()).unwrap();
         std::fs::write(path, "of the user").unwrap();
     }
-    // What killed programs leave behind is removed.
+    // Files that killed programs have left behind are removed.
     let leftovers = [
         "run/.model.fieldrig.part/splats.ply",
         ".scene.spz.fieldrig.part/scene.spz",
@@ -289,7 +289,7 @@ fn one_of_two_exports_to_one_path_wins() {
     assert_eq!(parts.count(), 0);
 }
 
-/// Reading them would wait forever, or until the memory is full.
+/// Reading a pipe or device could wait forever, or until the memory is full.
 #[test]
 fn pipes_and_devices_are_refused_as_inputs() {
     let folder = tempfile::tempdir().unwrap();
@@ -418,7 +418,7 @@ fn results_are_private_unless_requested_otherwise() {
         ("public", &["--public-files"][..], 0o044),
     ] {
         let run_with_flags = |args: &[&str]| {
-            // The usual umask, whatever that of the tests is.
+            // The program gets the usual umask, whatever the umask of the tests is.
             let mut command = Command::new("sh");
             command.args([
                 "-c",

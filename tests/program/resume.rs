@@ -319,7 +319,7 @@ fn repeatedly_killed_training_is_identical() {
             );
             std::thread::sleep(Duration::from_millis(1));
         }
-        // Each kill is at a different point in the cycle of steps and checkpoints.
+        // Each kill happens at a different point in the cycle of steps and checkpoints.
         std::thread::sleep(Duration::from_micros(
             u64::from(kill * 23 % 37) * 8000 + 137 * u64::from(kill),
         ));

@@ -373,7 +373,7 @@ fn silhouette_of_a_simulated_robot_matches_the_simulator() {
             browser.click("toggle-occlude");
         }
     }
-    // The cases differ, so that a wrong case would have been detected.
+    // The cases differ. If the page had drawn a wrong case, this test would have detected it.
     let size_px = stage.view().size_px;
     for (a, b) in [(0, 1), (0, 2), (1, 3), (2, 3)] {
         let similarity = iou(size_px, &exact[a], &exact[b]);

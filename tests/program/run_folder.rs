@@ -1,4 +1,5 @@
-//! Tests runs whose files disappear: while the run continues, and before it is resumed.
+//! Tests runs whose files disappear. They disappear while the run continues, or before it is
+//! resumed.
 
 use crate::small_rig::{self, Pace};
 use std::fs;
@@ -107,7 +108,7 @@ fn run_outlives_its_folder_and_its_recording() {
     check_resume_without_keyframes(folder, &run);
 }
 
-/// Damages a keyframe and deletes another one: the run continues with the others.
+/// Damages a keyframe and deletes another one. The run must continue with the other keyframes.
 fn check_resume_without_keyframes(folder: &Path, run: &Path) {
     let stored = stored_keyframes(run);
     let mut bytes = fs::read(&stored[0]).expect("a keyframe");

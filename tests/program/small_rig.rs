@@ -22,7 +22,7 @@ pub(crate) fn write(folder: &Path, pace: Pace) {
     });
 }
 
-/// Same as [`write`], but changes the table `[sim]` first.
+/// Does the same as [`write`], but changes the table `[sim]` first.
 pub(crate) fn write_with(folder: &Path, change: impl FnOnce(&mut toml::Table)) {
     let rigs = Path::new(env!("CARGO_MANIFEST_DIR")).join("rigs");
     let text = std::fs::read_to_string(rigs.join("static-arm.toml")).expect("a shipped rig file");

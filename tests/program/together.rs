@@ -87,7 +87,7 @@ fn several_methods_equal_single_trainings() {
             assert_eq!(done[key], alone[key], "{method}: {key}");
         }
         assert_eq!(done["out"], json!(format!("all/{method}")));
-        // The logs differ only in their first line: it contains the caps, which only splats have.
+        // The logs differ only in their first line, which contains the caps. Only splats have caps.
         let [log, log_alone] = ["all/", ""].map(|run| {
             let log =
                 std::fs::read_to_string(folder.join(run).join(method).join("decisions.jsonl"))
@@ -168,7 +168,8 @@ fn check_resume_of_one_method(folder: &Path, splat: &Value) {
     assert_eq!(evaluated["psnr"], splat["psnr"]);
 }
 
-/// Checks that distance fields export their mesh, whole or simplified, and other models have none.
+/// Checks that distance fields export their mesh, whole or simplified, and that other models have
+/// no mesh.
 fn check_mesh_export(folder: &Path) {
     let export = |to: &str, more: &[&str], out: &str| {
         let output = fieldrig(
@@ -233,8 +234,8 @@ fn check_mesh_export(folder: &Path) {
 
 #[test]
 fn several_methods_share_time_and_one_clock() {
-    /// Methods share the time equally, but steps of splats become longer, and on a slow machine the
-    /// last time slice is a large part of the time.
+    /// Methods share the time equally, but steps of splats become longer. On a slow machine, the
+    /// last time slice is also a large part of the time.
     const MAX_TIME_RATIO: f64 = 3.0;
     let folder = tempfile::tempdir().expect("a folder");
     let folder = folder.path();

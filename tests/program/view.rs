@@ -299,8 +299,8 @@ fn brightness(picture: &image::RgbImage) -> f64 {
         / picture.as_raw().len() as f64
 }
 
-/// Upper bound on the difference caused by JPEG compression at quality 92 in these pictures:
-/// measured 1.0.
+/// Upper bound on the difference caused by JPEG compression at quality 92 in these pictures. The
+/// measured difference is 1.0.
 const MAX_JPEG_DIFFERENCE: f64 = 3.0;
 
 #[test]
@@ -421,7 +421,7 @@ fn check_view_without_cameras(folder: &Path) {
             "only a folder has a report: {status}"
         );
         let start = pose_of(&scene);
-        // Upright: the camera's x axis is level, its y axis points down.
+        // The camera is upright, so its x axis is level and its y axis points down.
         assert!(start[8].abs() < 1e-9 && start[9] < -0.1, "{start:?}");
         let received = client.request_picture(&start, None).expect("a picture");
         assert!(
@@ -429,8 +429,8 @@ fn check_view_without_cameras(folder: &Path) {
             "{model}, {up} up: nothing is visible from {start:?}"
         );
         if up == "-y" {
-            // Up on the page is -y in the model: the page's world rotated by a quarter turn about
-            // x.
+            // Up on the page is -y in the model, because the page's world is rotated by a quarter
+            // turn about x.
             let [x, y, z] = [
                 [1.0, 0.0, 0.0, 0.0],
                 [0.0, 0.0, -1.0, 0.0],
@@ -773,7 +773,8 @@ fn printed_commands_work_and_report_page_is_written() {
                 .into_rgb8()
         })
         .collect();
-    // The whole model; then image, render, error and depth of both test images.
+    // The first picture shows the whole model. The others are the image, render, error and depth of
+    // both test images.
     let (overview, pictures) = pictures.split_first().expect("pictures");
     assert!(overview.width() > overview.height(), "an overview");
     assert!(page.contains("<svg class=\"coverage\""), "a map");

@@ -89,8 +89,8 @@ fn emulated_franka_rig_is_recorded_and_moved() {
         folder.path().join("script.mcap"),
         folder.path().join("wire.mcap"),
     );
-    // The end of a file ends the recording and is not a loss. A busy machine may drop images, which
-    // is a loss.
+    // The recording ends at the end of the file, which does not count as a loss. A busy machine may
+    // drop images, which counts as a loss.
     let (code, printed) = fieldrig(
         &["record", "--out", &wire.to_string_lossy(), "--json"],
         &rig,
@@ -139,7 +139,7 @@ fn emulated_franka_rig_is_recorded_and_moved() {
     drop(emulated_rig);
 }
 
-/// After each, the state is as in the table of docs/guide/moving-arms.md.
+/// After each kind of loss, the state is as in the table of docs/guide/moving-arms.md.
 #[test]
 fn lost_terminal_stops_franka_motion_and_kill_is_a_reflex() {
     let folder = tempfile::tempdir().expect("a folder");

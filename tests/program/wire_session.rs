@@ -216,7 +216,8 @@ impl Session {
     }
 }
 
-/// Whether a recorded message is replaced when a session is played, or would end the connection.
+/// Whether a recorded message must not be played, because it is replaced or would end the
+/// connection.
 fn is_own_answer(text: &str) -> bool {
     let message: Value = serde_json::from_str(text).expect("JSON");
     ["pong", "goodbye"]

@@ -1,7 +1,7 @@
-//! Benchmarks of the signed distance field: fusing a keyframe of 640x480 with color, rendering, and
-//! meshing, with voxels of 1 cm. Times for fusing, rendering, and meshing the changes of one
-//! keyframe are GPU times if the adapter has timestamps. The times of all passes of one keyframe
-//! are printed first. passes of one keyframe are printed before.
+//! Benchmarks of the signed distance field with voxels of 1 cm. They measure fusing a keyframe of
+//! 640x480 with color, rendering, and meshing. Times for fusing, rendering, and meshing the changes
+//! of one keyframe are GPU times if the adapter has timestamps. The times of all passes of one
+//! keyframe are printed first.
 
 use criterion::{Criterion, criterion_group, criterion_main};
 use gpu::{Gpu, GpuOptions, PassTiming};

@@ -1,11 +1,12 @@
 //! A scene model, and the alignment of its cameras while it trains.
 //!
 //! Alignment runs in parallel with training, once or repeatedly as keyframes arrive. Its result is
-//! applied a fixed number of steps after it began, so that a seed gives one result. In real time,
-//! it is applied when the caller asks for it ([`AlignedModel::poll_alignment`]), so that training
-//! never waits. A single alignment from features, without depth, takes only seconds and precedes
-//! the first step. A result that changes the corrections replaces the keyframes; the model moves
-//! along with them or restarts, see [`Method::recalibrate`].
+//! applied a fixed number of steps after alignment began, so that the same seed gives the same
+//! model. In real time, the result is applied when the caller polls for it
+//! ([`AlignedModel::poll_alignment`]), so that training never waits. A single alignment from
+//! features, without depth, takes only seconds and precedes the first step. A result that changes
+//! the corrections replaces the keyframes; the model moves along with them or restarts, see
+//! [`Method::recalibrate`].
 
 use crate::corrected_keyframe::{CorrectedKeyframe, id_of};
 use crate::model_metadata::{METADATA_FILE, read_metadata};
@@ -31,7 +32,7 @@ const METADATA_KEY: &str = "alignment";
 
 /// Number of keyframes at which a live run is aligned for the first time. About four of them are
 /// validation images, which is the smallest number with which alignment accepts a parameter. With
-/// fewer keyframes, alignment would compute without effect; with more, the model would be trained
+/// fewer keyframes, alignment would have no effect. With more keyframes, the model would be trained
 /// longer on wrong cameras.
 const FIRST_LIVE_ALIGNMENT: usize = 25;
 /// Factor by which the number of keyframes grows between two alignments of a live run. Because it
@@ -80,8 +81,7 @@ struct AlignedState {
     n_references: Option<usize>,
     /// Number of original keyframes when alignment began; `None` before that.
     n_begun: Option<usize>,
-    /// Whether the alignment task is done. This and the next two fields are set only in
-    /// checkpoints.
+    /// Whether the alignment task is done. This field and the next two are set only in checkpoints.
     is_aligned: bool,
     /// Result of the alignment task.
     alignment: Option<Alignment>,
@@ -90,8 +90,8 @@ struct AlignedState {
 }
 
 impl AlignedModel {
-    /// An untrained model, with the alignment that the options request. If it runs once, its result
-    /// is applied early in the planned steps.
+    /// An untrained model, with the alignment that the options request. If alignment runs only
+    /// once, its result is applied early in the planned steps.
     pub fn new(model: Box<dyn Method>, common: &CommonOptions, is_software: bool) -> Self {
         let is_live = common.align_timing != AlignTiming::Once;
         Self {
@@ -141,8 +141,8 @@ impl AlignedModel {
     /// Resumes from a checkpoint. `resume` receives the corrected keyframes, and returns the model
     /// and the keyframes that it was not trained on.
     ///
-    /// * `placeholders`: keyframes without pixels, with corrected poses, in place of missing
-    ///   keyframes. The caller must remove them from the resumed model.
+    /// * `placeholders`: keyframes without pixels that replace missing keyframes. Their poses are
+    ///   corrected. The caller must remove them from the resumed model.
     pub fn resume(
         checkpoint: &Checkpoint,
         keyframes: &[Arc<Keyframe>],
@@ -176,8 +176,9 @@ impl AlignedModel {
         let corrected: Vec<_> = corrected.chain(placeholders.iter().cloned()).collect();
         let (model, untrained) = resume(&own_checkpoint, &corrected)?;
 
-        // Alignment needs the originals in the order in which they arrived, and the same numbers of
-        // them as before: alignment uses a prefix, and so do the references of movements.
+        // Alignment needs the originals in the order in which they arrived. Their numbers must also
+        // be the same as before, because alignment and the references of movements each use a
+        // prefix of the list.
         let originals: BTreeMap<_, _> = keyframes
             .iter()
             .map(|keyframe| (id_of(keyframe), keyframe))
@@ -194,7 +195,7 @@ impl AlignedModel {
         state.n_references = state.n_references.map(n_with_pixels);
         let original_keyframes: Vec<_> = ids.iter().filter_map(with_pixels).collect();
 
-        // Uncorrected, because `push` corrects them.
+        // These keyframes are not corrected here, because `push` corrects them.
         let untrained = untrained
             .iter()
             .filter_map(|keyframe| original(id_of(keyframe)))
@@ -225,8 +226,8 @@ impl AlignedModel {
 
     /// Adds a keyframe; see [`Method::push`]. It may begin or end an alignment.
     pub fn push(&mut self, keyframe: Arc<Keyframe>) -> Result<(), Error> {
-        // Test keyframes must not influence the cameras. A single alignment that is done needs no
-        // more keyframes. In live runs, the task is always requested again.
+        // Test keyframes must not influence the cameras. If alignment runs only once and is done,
+        // it needs no more keyframes. In live runs, the task is always requested again.
         let is_used =
             !self.alignment_task.is_done() && keyframe.split != Split::Test && keyframe.is_finite();
         // Validation keyframes are pushed again after resuming.
@@ -235,8 +236,8 @@ impl AlignedModel {
                 .original_keyframes
                 .iter()
                 .any(|known| id_of(known) == id_of(&keyframe));
-        // In lockstep, the test of the previous keyframe must end before this one is corrected:
-        // otherwise its correction would depend on the speed of the test.
+        // In lockstep, the test of the previous keyframe must end before this keyframe is
+        // corrected. Otherwise, its correction would depend on the speed of the test.
         if is_new && self.state.timing == AlignTiming::Lockstep {
             self.poll_movement(true)?;
         }
@@ -260,7 +261,7 @@ impl AlignedModel {
             .position(|keyframe| id_of(keyframe) == (camera, stamp.0))
         {
             self.original_keyframes.remove(ix);
-            // Both numbers count a prefix of the list, which just became shorter.
+            // Both numbers are lengths of a prefix of the list, which has just become shorter.
             for n in [&mut self.state.n_begun, &mut self.state.n_references] {
                 *n = n.map(|n| n - usize::from(ix < n));
             }
@@ -279,7 +280,7 @@ impl AlignedModel {
         self.finish_alignment_when_due()?;
         let n_steps = self.model.step(n.min(self.steps_to_alignment()))?;
         if n_steps > 0 {
-            // After the first step, which itself needs much CPU time.
+            // Alignment begins after the first step, because that step needs much CPU time itself.
             self.begin_alignment();
             if let (Some(task), None) = (&mut self.movement_task, self.state.n_begun) {
                 task.begin();
@@ -290,8 +291,9 @@ impl AlignedModel {
 
     /// Whether further steps have no effect until a keyframe arrives.
     pub fn is_idle(&self) -> bool {
-        // While alignment is awaited, the caller must go on calling `step`, which applies the
-        // result. Before the first step, there is nothing to train on, so waiting would not end.
+        // While alignment is awaited, the model is not idle, because the caller must continue to
+        // call `step`, which applies the result. Before the first step, there are no keyframes to
+        // train on, so waiting would never end.
         self.model.is_idle() && (!self.is_awaited() || self.model.progress().step == 0)
     }
 
@@ -438,7 +440,8 @@ impl AlignedModel {
 
     /// Waits for the result of alignment and applies it.
     fn finish_alignment(&mut self) -> Result<(), Error> {
-        // `finish` replaces the result, but the model holds keyframes with the previous one.
+        // `finish` replaces the result, but the keyframes of the model are corrected with the
+        // previous result.
         let previous = AlignmentTask::done(self.alignment_task.result().cloned());
         let is_changed = self.alignment_task.finish(&self.original_keyframes)?;
         let n_begun = self.state.n_begun.take();
@@ -454,8 +457,8 @@ impl AlignedModel {
         }
         if self.state.detects_movements && self.alignment_task.result().is_some() {
             match (self.state.n_references, n_begun) {
-                // The first alignment is trusted: movements are measured relative to the keyframes
-                // that it used.
+                // The first alignment counts as correct. Movements are measured relative to the
+                // keyframes that it used.
                 (None, Some(n_begun)) => self.detect_movements(n_begun),
                 (Some(n_references), _) if is_changed => {
                     // The latest keyframes are tested again with the new corrections.
@@ -487,7 +490,7 @@ impl AlignedModel {
             })
             .collect();
         // A model that cannot move with its keyframes starts again from step 0. Its earlier steps
-        // stay part of the total, which limits and schedules of the session count.
+        // remain part of the total number of steps, which limits and schedules of the session use.
         let n_steps = self.model.n_total_steps()?;
         self.model.recalibrate(&keyframes, alignment)?;
         let n_forgotten = n_steps.wrapping_sub(self.model.n_total_steps()?);
@@ -515,8 +518,8 @@ impl AlignedModel {
     /// Applies a movement if one was found. With `wait`, tests all keyframes first. Returns whether
     /// a movement was applied. During an alignment, no keyframes are tested.
     fn poll_movement(&mut self, wait: bool) -> Result<bool, Error> {
-        // A running alignment may change the corrections with which the task's keyframes were
-        // corrected. Detection starts again after it.
+        // A running alignment may change the corrections of the task's keyframes. Detection starts
+        // again after the alignment.
         let (Some(task), None) = (&mut self.movement_task, self.state.n_begun) else {
             return Ok(false);
         };
@@ -535,7 +538,7 @@ impl AlignedModel {
             log::warn!("{movement}");
         }
         self.recalibrate(&previous)?;
-        // The next alignment begins now: it uses the images since the movement, too.
+        // The next alignment begins now, because it also uses the images since the movement.
         let n_keyframes = self.original_keyframes.len();
         self.state.begins_at = n_keyframes;
         // All keyframes are corrected now, so all of them can be references for the next movement.
@@ -554,8 +557,9 @@ impl AlignedModel {
 
     /// Whether alignment must end before the first step.
     fn precedes_training(&self) -> bool {
-        // Alignment from features takes seconds, and wrong cameras would cost the model more.
-        // Registration with depth takes longer and runs beside training.
+        // Alignment from features precedes training, because it takes only seconds and training on
+        // wrong cameras would take longer to correct. Registration with depth takes longer and runs
+        // in parallel with training.
         self.state.timing == AlignTiming::Once
             && self.model.progress().step == 0
             && self.alignment_task.is_requested()
@@ -583,8 +587,8 @@ fn invalid_state(error: serde_json::Error) -> Error {
 
 /// Index of the first keyframe that is among the last `n` of its camera.
 fn first_recent(keyframes: &[Arc<Keyframe>], n: usize) -> usize {
-    // Counted from the newest keyframe on, because cameras have different rates: the last keyframes
-    // of a slow camera may be far from the end of the list.
+    // Keyframes of each camera are counted from the newest one backwards. Cameras have different
+    // rates, so the last keyframes of a slow camera may be far from the end of the list.
     let mut n_later = BTreeMap::<&str, usize>::new();
     let mut first = keyframes.len();
     for (ix, keyframe) in keyframes.iter().enumerate().rev() {
@@ -597,7 +601,8 @@ fn first_recent(keyframes: &[Arc<Keyframe>], n: usize) -> usize {
     first
 }
 
-/// Number of keyframes at which the next alignment of a live run begins after one with `n`.
+/// Number of keyframes at which the next alignment of a live run begins, if the previous one used
+/// `n` keyframes.
 #[expect(
     clippy::cast_possible_truncation,
     clippy::cast_sign_loss,

@@ -3,16 +3,16 @@
 use numbers::quantile::{Rank, quantile};
 
 /// Fraction of the points inside the radius. Stray points and distant backgrounds stay outside.
-/// With a larger fraction, the initial view shows the background instead of the object; with a
-/// smaller one, it starts inside the scene.
+/// With a larger fraction, the initial view would show the background instead of the object. With a
+/// smaller fraction, it would be inside the scene.
 const INSIDE_FRAC: f64 = 0.8;
 /// Fraction of the points inside the outer radius. It includes thin parts far from the center, such
-/// as the neck of a guitar, but not the strays around a model.
+/// as the neck of a guitar, but not stray points around a model.
 const OUTER_FRAC: f64 = 0.99;
 /// Maximum outer radius, in radii. If points are farther away, they are the background of a scene
 /// rather than parts of an object, whose farthest parts are rarely beyond twice its radius.
 const MAX_OUTER_RADII: f64 = 2.5;
-/// Minimum radius, meters. A model of a single point needs one, too.
+/// Minimum radius, meters. It is needed for a model of a single point.
 pub(crate) const MIN_RADIUS_M: f64 = 0.01;
 
 /// A sphere that contains most of a model.
@@ -28,11 +28,11 @@ pub struct Bounds {
 }
 
 impl Bounds {
-    /// Centered at the median along each axis, with a radius that contains most points; `None`
-    /// without points.
+    /// The sphere is centered at the median along each axis, and its radius contains most points.
+    /// `None` without points.
     pub(crate) fn of_points(points_m: &[[f64; 3]]) -> Option<Self> {
-        // Medians and a quantile instead of mean and maximum: a few stray points far away would
-        // move the center and enlarge the radius without bound.
+        // Medians and a quantile are used instead of mean and maximum, because a few distant stray
+        // points would move the center and enlarge the radius without bound.
         let quantile = |mut values: Vec<f64>, frac| quantile(&mut values, frac, Rank::Nearest);
         let middle =
             |axis: usize| quantile(points_m.iter().map(|point| point[axis]).collect(), 0.5);
@@ -69,7 +69,7 @@ mod tests {
     /// `reach_m`.
     fn disk_with_neck(reach_m: f64) -> Vec<[f64; 3]> {
         let disk = (0..900).map(|ix| {
-            // Filled evenly along a golden-angle spiral.
+            // The disk is filled evenly along a golden-angle spiral.
             let radius = (f64::from(ix) / 900.0).sqrt();
             let angle = 2.399_963 * f64::from(ix);
             [radius * angle.cos(), radius * angle.sin(), 0.0]

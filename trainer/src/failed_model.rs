@@ -27,7 +27,8 @@ impl Method for FailedModel {
     }
 
     fn is_idle(&self) -> bool {
-        // Nothing would change with further steps, so a loop that trains until idle ends.
+        // Further steps would change nothing. The model counts as idle, so that a loop that trains
+        // until idle ends.
         true
     }
 

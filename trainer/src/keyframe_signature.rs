@@ -71,8 +71,9 @@ impl KeyframeSignature {
     /// Describes a difference between `keyframe` and the recorded one; `None` if they match.
     fn difference(&self, keyframe: &Keyframe) -> Option<String> {
         let other = Self::of(keyframe);
-        // Values are compared bit by bit: a pose that was estimated again, however similar, is
-        // other data, and continuing with it would not give the model of an uninterrupted run.
+        // Values are compared bit by bit. A pose that was estimated again is different data,
+        // however similar it is, and training would not give the same model as an uninterrupted
+        // run.
         let [[width, height], [other_width, other_height]] = [self.size_px, other.size_px];
         let problem = if self.size_px != other.size_px {
             format!("has {other_width}x{other_height} pixels, had {width}x{height}")
@@ -101,8 +102,8 @@ pub(crate) fn match_keyframes(
     expected: &[KeyframeSignature],
     keyframes: &[Arc<Keyframe>],
 ) -> Result<MatchedAndOthers, Error> {
-    // A model is not trained on test keyframes. Without this filter, a keyframe that has become a
-    // test keyframe since, with another split, would be trained on.
+    // A model is not trained on test keyframes. With another split, a training keyframe may have
+    // become a test keyframe. Without this filter, the model would be trained on it.
     let by_name: HashMap<_, _> = keyframes
         .iter()
         .filter(|keyframe| keyframe.split != Split::Test)
@@ -127,8 +128,8 @@ pub(crate) fn match_keyframes(
             placeholders: missing,
         });
     }
-    // By address, not by name: the others include test keyframes, and a second keyframe with the
-    // same camera and stamp must not disappear.
+    // Keyframes are compared by address and not by name. The other keyframes include test
+    // keyframes, and a second keyframe with the same camera and stamp must not be lost.
     let is_matched =
         |keyframe: &Arc<Keyframe>| found.iter().any(|matched| Arc::ptr_eq(matched, keyframe));
     let others = keyframes

@@ -129,8 +129,8 @@ pub trait Method {
     fn background_srgb(&self) -> [f32; 3] {
         [0.0; 3]
     }
-    /// Pixel stride along both axes for depth images that are compared with measured ones. Odd;
-    /// above 1 if rays are expensive.
+    /// Pixel stride along both axes for depth images that are compared with measured ones. It is
+    /// odd, and above 1 if rays are expensive.
     fn depth_stride(&self) -> u32 {
         1
     }
@@ -139,8 +139,8 @@ pub trait Method {
     fn bounds(&mut self) -> Result<Option<Bounds>, Error> {
         Ok(None)
     }
-    /// Corrections of cameras that were optimized with the scene, by name. They are applied after
-    /// the corrections of alignment. Waits for queued work.
+    /// Corrections of cameras that were optimized with the scene, by camera name. They are applied
+    /// after the corrections of alignment. Waits for queued work.
     fn camera_corrections(&mut self) -> Result<BTreeMap<String, CameraCorrection>, Error> {
         Ok(BTreeMap::new())
     }

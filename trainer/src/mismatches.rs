@@ -25,7 +25,7 @@ impl Mismatches {
         let ratio = (got - expected).abs() / (abs + rel * got.abs().max(expected.abs()));
         self.n_checked += 1;
         self.max_ratio = self.max_ratio.max(ratio);
-        let passes = ratio <= 1.0; // False for NaN.
+        let passes = ratio <= 1.0; // This comparison is false for NaN.
         if !passes {
             self.mismatches.push(format!(
                 "{name}: got {got:.9e}, expected {expected:.9e} ({ratio:.1} x tolerance)"

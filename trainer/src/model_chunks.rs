@@ -66,7 +66,7 @@ pub enum ChunkLayout {
         max_m: [f32; 3],
         /// Smallest and largest logarithm of a standard deviation in meters.
         log_scale_range: [f32; 2],
-        /// Factor for all standard deviations: above 1 if few splats stand for many.
+        /// Factor for all standard deviations. It is above 1 if few splats represent many.
         scale_factor: f32,
         /// Degree of the spherical harmonics, 0 to 2.
         sh_degree: u32,

@@ -139,8 +139,8 @@ pub fn resume_without_missing(
     checkpoint: &Checkpoint,
     keyframes: &[Arc<Keyframe>],
 ) -> Result<(Resumed, Vec<KeyframeId>), Error> {
-    // Only an attempt finds out which keyframes the model needs. The second one uses placeholders
-    // for the missing ones, because a model may store parameters of keyframes in their order.
+    // A first attempt shows which keyframes the model needs. The second attempt uses placeholders
+    // for the missing ones, because a model may store parameters in the order of the keyframes.
     let placeholders = match resume_with(gpu.clone(), checkpoint, keyframes, &[]) {
         Ok(resumed) => return Ok((resumed, Vec::new())),
         Err(Error::MissingKeyframes { placeholders }) => placeholders,

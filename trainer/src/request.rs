@@ -98,7 +98,7 @@ impl Picture {
         )]
         let [red, green, blue] =
             background_srgb.map(|part| (part.clamp(0.0, 1.0) * 255.0 + 0.5).floor() as u8);
-        // Alpha is coverage, so it is 0.
+        // Alpha is coverage, which is 0 here.
         Self {
             size_px,
             rgba_srgb: [red, green, blue, 0].repeat(n),

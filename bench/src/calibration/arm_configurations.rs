@@ -24,11 +24,11 @@ const ANGLES_DEG: [f64; 6] = [0.0, 2.0, 5.0, 15.0, 45.0, 90.0];
 /// Standard deviation of joint 6 around the arm configuration, radians. It is small, so that the
 /// whole run stays near the tested distance from the singularity.
 const WRIST_SPREAD_RAD: f64 = 0.01;
-/// Standard deviation of the other joints, radians: enough rotation for a calibration, but most
-/// poses still show the whole board.
+/// Standard deviation of the other joints, radians. The rotation is large enough for a calibration,
+/// but most poses still show the whole board.
 const SPREAD_RAD: f64 = 0.2;
-/// Standard deviation of the joint offsets, radians: 3 mm at a distance of 0.8 m, far above the
-/// noise of the corners.
+/// Standard deviation of the joint offsets, radians. It corresponds to 3 mm at a distance of 0.8 m,
+/// which is far above the noise of the corners.
 const OFFSET_RAD: f64 = 0.004;
 const N_POSES: usize = 25;
 const CORNER_PX: f64 = 0.1;
@@ -47,7 +47,7 @@ pub(super) struct ArmConfiguration {
     /// Fraction of the offsets of all joints except the first and the last that are reported as
     /// observable.
     pub(super) observable_frac: Option<f64>,
-    /// Fraction of these within three standard deviations.
+    /// Fraction of the observable offsets whose error is within three standard deviations.
     pub(super) within_3_sigma_frac: Option<f64>,
 }
 
@@ -126,7 +126,7 @@ impl Arm<'_> {
     /// [`N_POSES`] if such positions are rare.
     fn samples(&self, lens: &Intrinsics, random: &mut Random) -> Vec<HandEyeSample> {
         const MAX_ATTEMPTS: usize = 20_000;
-        // In front of the camera at the mean arm configuration.
+        // The board is in front of the camera at the mean arm configuration.
         let base_from_board = self.forward(&self.home)
             * self.flange_from_camera
             * Transform::new(Vector3::new(-0.1, -0.06, 0.5), Vector3::new(0.2, 0.1, 0.0));
@@ -138,8 +138,8 @@ impl Arm<'_> {
                 .enumerate()
                 .map(|(ix, joint)| joint + spread_rad(ix) * random.normal())
                 .collect();
-            // The camera is where the true positions move it. The calibration gets the reported
-            // ones.
+            // The pose of the camera results from the true joint positions. The calibration gets
+            // the reported positions.
             let moved: Vec<f64> = joints
                 .iter()
                 .zip(&self.offsets)

@@ -86,8 +86,8 @@ pub(super) fn measure(scenes: CoverageScenes) -> Vec<Coverage> {
         estimate_intrinsics: true,
         ..default
     };
-    // Each kind has another source of uncertainty: corners, robot poses, the given lens, or a lens
-    // that is estimated, too.
+    // The kinds of calibration differ in the source of uncertainty. It is the corners, the robot
+    // poses, the given lens, or a lens that is estimated, too.
     let hand_eye = |name, noise, given, options| hand_eye(scenes, name, noise, given, options);
     let lens = |name, lens, model| intrinsics_coverage(scenes, name, lens, model);
     vec![
@@ -280,7 +280,7 @@ fn intrinsics_run(seed: u64, scenes: CoverageScenes, lens: Lens, model: LensMode
 pub(super) fn chi_squared_cdf(x: f64, degrees_of_freedom: usize) -> f64 {
     /// Larger values have a probability of 1 in f64.
     const MAX: f64 = 300.0;
-    let is_small = x < MAX; // False for NaN.
+    let is_small = x < MAX; // This comparison is false for NaN.
     if !is_small {
         return 1.0;
     }
@@ -288,7 +288,7 @@ pub(super) fn chi_squared_cdf(x: f64, degrees_of_freedom: usize) -> f64 {
     // `h^a e^-h / Gamma(a + 1) * (1 + h / (a + 1) + h^2 / ((a + 1) (a + 2)) + ...)`.
     let a = 0.5 * degrees_of_freedom as f64;
     let half = 0.5 * x.max(0.0);
-    // Gamma(a + 1) from Gamma(1) or Gamma(1/2).
+    // Gamma(a + 1) is computed from Gamma(1) or Gamma(1/2).
     let (mut gamma, mut at) = if degrees_of_freedom.is_multiple_of(2) {
         (1.0, 1.0)
     } else {

@@ -81,7 +81,8 @@ fn pair(sample: &HandEyeSample) -> Option<(Transform, Transform)> {
 
 /// Squared Mahalanobis distance of the error; below 12.59 in 95 % of correct calibrations.
 pub(super) fn squared_error(found: &HandEyeCalibration, truth: &Transform) -> f64 {
-    // In the axes of the camera, translation first, as the covariance is reported.
+    // The error is in the axes of the camera, with the translation first, like the reported
+    // covariance.
     let error = found.parent_from_camera.inverse() * truth;
     let t = error.translation.vector;
     let r = error.rotation.scaled_axis();

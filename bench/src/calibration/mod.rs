@@ -62,7 +62,7 @@ pub struct CalibrationOptions {
     pub seeds: u64,
     /// Rig file for [`Part::Rigs`]; skipped if `None`.
     pub rig: Option<PathBuf>,
-    /// Number of rigs: the first camera of the rig file with different errors.
+    /// Number of rigs. Each is the first camera of the rig file with different errors.
     pub rigs: u64,
     /// Number of the first of these rigs, from 1.
     pub first_rig: u64,
@@ -101,7 +101,7 @@ impl CalibrationOptions {
 pub fn run(options: &CalibrationOptions) -> Result<BenchResult> {
     std::fs::create_dir_all(&options.out)
         .with_context(|| format!("cannot create {}", options.out.display()))?;
-    // Speed before the other measurements, which use all processors.
+    // Speed is measured before the other parts, which use all processors.
     let mut results = Results {
         speed: options.measured(Part::Speed, || speed::measure(options.seeds)),
         coverage: options.measured(Part::Coverage, || coverage::measure(options.coverage)),
@@ -121,7 +121,7 @@ pub fn run(options: &CalibrationOptions) -> Result<BenchResult> {
             .rigs
             .push(rigs::measure(rig, seed, options.scan_secs)?);
         log::info!("rig {seed}: {:?}", results.rigs.last());
-        // An interrupted bench leaves results.
+        // Results are written after each rig, so that an interrupted bench leaves them.
         write(options, &results)?;
     }
     write(options, &results)

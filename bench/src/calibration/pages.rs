@@ -124,7 +124,8 @@ fn coverage_line(coverage: &Coverage) -> Line {
 
 fn coverage_chart(results: &[Coverage]) -> Chart {
     // With the right covariance, the ellipsoid of a level contains the truth in that fraction of
-    // the results. A line below is overconfident, one above too cautious.
+    // the results. A line below this one shows an overconfident covariance, and a line above shows
+    // a covariance that is too cautious.
     let ideal = Line {
         label: "ideal".into(),
         points: LEVELS.map(|level| point(level, level)).into(),

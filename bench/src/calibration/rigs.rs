@@ -1,5 +1,5 @@
-//! Calibration of a rig without a target: simulated rigs whose camera pose is wrong in a random
-//! direction.
+//! Calibration of a rig without a target. The simulated rigs have a camera pose that is wrong in a
+//! random direction.
 
 use super::method::Errors;
 use anyhow::Result;
@@ -61,7 +61,7 @@ pub(super) fn measure(rig_file: &Path, seed: u64, scan_secs: f64) -> Result<RigR
         },
         &ignore_progress,
     )?;
-    // Only the estimation is timed: the scan takes as long as the robot moves.
+    // Only the estimation is timed, because the scan takes as long as the robot moves.
     let started = Instant::now();
     let found = match calibrate_scene(&data, &[Refine::Auto], Some(&given)) {
         Ok(found) => found,

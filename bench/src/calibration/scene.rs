@@ -1,4 +1,5 @@
-//! Simulated measurements of a chessboard with a known camera pose: corners without rendering.
+//! Simulated measurements of a chessboard with a known camera pose. The corners are computed
+//! without rendering.
 
 use calibration::hand_eye::{BoardObservation, HandEyeInput, HandEyeOptions, HandEyeSample, Setup};
 use calibration::{BoardPoint, BoardView, board_pose};
@@ -55,7 +56,8 @@ fn normal_vector(random: &mut Random, scale: f64) -> Vector3<f64> {
     Vector3::new(random.normal(), random.normal(), random.normal()) * scale
 }
 
-/// A pose from which the whole board is visible: rotated about a random axis by a normal angle.
+/// A pose from which the whole board is visible. It is rotated about a random axis by a normally
+/// distributed angle.
 pub(super) fn camera_from_board(
     intrinsics: &Intrinsics,
     spread_rad: f64,
@@ -93,7 +95,7 @@ pub(super) fn view(
         let Some(pixel) = intrinsics.project(&point_in_camera.coords) else {
             continue;
         };
-        // Without noise, no random numbers are drawn: the search for a pose must not affect the
+        // Without noise, no random numbers are drawn. The search for a pose must not affect the
         // noise of the scene.
         let pixel = if noise_px > 0.0 {
             pixel.map(|value| value + noise_px * random.normal())
@@ -137,7 +139,8 @@ impl Scene {
 
     /// Measured robot poses and corners.
     pub(super) fn samples(&self, noise: Noise, seed: u64) -> Vec<HandEyeSample> {
-        // Not the seed of the scene, whose random numbers would otherwise repeat as noise.
+        // This seed differs from the seed of the scene. Otherwise, the random numbers of the scene
+        // would repeat as noise.
         let mut random = Random::new(seed ^ 0x5eed_0000);
         let lens = intrinsics(brown_conrady());
         let mut samples = Vec::new();

@@ -40,7 +40,7 @@ pub(super) fn measure(n_seeds: u64) -> Vec<Speed> {
                 let samples = scene.samples(NOISE, seed);
                 let started = Instant::now();
                 let outcome = method.calibrate(&samples, &scene.flange_from_camera);
-                // A refusal takes time, too, but has no error.
+                // A refused calibration takes time, too, but has no error.
                 millis.push(started.elapsed().as_secs_f64() * 1e3);
                 if let Some(errors) = outcome.errors() {
                     mm.push(errors.mm);

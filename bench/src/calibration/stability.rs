@@ -123,7 +123,8 @@ impl Condition {
                         continue;
                     };
                     let n = n_outliers(view.points.len());
-                    // Otherwise, the outliers of all images would be in the same part of the board.
+                    // Without shuffling, the outliers of all images would be in the same part of
+                    // the board.
                     random.shuffle(&mut view.points);
                     for point in &mut view.points[..n] {
                         let offset = [0, 1].map(|_| random.uniform(-MAX_OFFSET_PX, MAX_OFFSET_PX));

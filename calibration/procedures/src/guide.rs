@@ -66,11 +66,12 @@ impl<'a> Guide<'a> {
         for image in &images[self.detected.len()..] {
             let detected = images::detect_in_image(image, self.target);
             let view = detected.board.as_ref().ok().map(|board| &board.view);
-            // Images without the target are shown, too: they often show why it was not found.
+            // Images without the target are shown, too, because they often show why the target was
+            // not found.
             self.shown.show_searched(image.size_px, &image.gray, view);
             let text = match &detected.board {
                 Ok(board) => {
-                    // A copy, because the detection itself is kept for the estimate.
+                    // The view is copied, because the detection itself is kept for the estimate.
                     self.views.push(board.view.clone());
                     self.base_from_flange
                         .extend(image.arm.as_ref().map(|arm| arm.base_from_flange));
@@ -84,9 +85,9 @@ impl<'a> Guide<'a> {
         }
     }
 
-    /// The target in each of all images.
+    /// Returns the detected target of every image.
     pub(crate) fn finish(mut self, images: &[CalibrationImage]) -> Vec<DetectedImage> {
-        // Images that arrived after the last update.
+        // Some images may have arrived after the last update.
         self.detect(images);
         self.shown.finish();
         self.detected
@@ -109,7 +110,8 @@ impl<'a> Guide<'a> {
             }
             Purpose::HandEye => {
                 let is_on_flange = self.camera.parent == Parent::Flange;
-                // The moving body, whose rotations count: it carries the camera or the target.
+                // The moving body carries the camera or the target. Its rotations determine the
+                // result.
                 let (setup, body) = if is_on_flange {
                     (Setup::EyeInHand, "camera")
                 } else {

@@ -63,7 +63,8 @@ const EXTENSIONS: [&str; 3] = ["jpg", "jpeg", "png"];
 
 /// The image files in a folder, in order of their names.
 pub(crate) fn files(folder: &Path) -> Result<Vec<ImageFile>, BadInput> {
-    // A single image is a likely mistake. Without this check, the error would be about a folder.
+    // Users may pass a single image by mistake. Without this check, the error would describe a
+    // problem with a folder.
     if folder.is_file() {
         return Err(BadInput(format!(
             "{} is a file, expected a folder of images",
@@ -214,7 +215,8 @@ pub(crate) fn other_size<'a>(
             Err(_) => (),
         }
     }
-    // The most frequent other size: a wrong count of one image may give any size.
+    // The most frequent other size is used, because a wrong detection in a single image may give
+    // any size.
     let (found, n) = found_sizes
         .into_iter()
         .max_by_key(|(_, n)| *n)
@@ -244,7 +246,7 @@ fn detect_in_file(path: &Path, name: &str, target: &TargetSpec) -> Result<Board,
     let unreadable = |error: image::ImageError| NoBoard::Unreadable(error.to_string());
     let reader = files::open(path)
         .map(BufReader::new)
-        // The contents decide on the format, because the extension may be wrong.
+        // The format is determined from the contents, because the extension may be wrong.
         .and_then(|file| ImageReader::new(file).with_guessed_format());
     let gray = reader
         .map_err(|error| unreadable(error.into()))?

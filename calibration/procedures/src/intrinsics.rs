@@ -63,7 +63,7 @@ impl IntrinsicsTask {
         self.report.as_ref().map_or(Ok(()), ReportOptions::check)?;
         let mut rig = self.rig.open(&self.input)?;
         let detected = self.detect(host, rig.as_mut())?;
-        // Before the calibration, because its result could not be written.
+        // The size is checked before the calibration, because its result could not be written.
         if let (Some(rig), Some(size_px)) = (&rig, detected.sizes_px.first()) {
             rig.expect_size(*size_px)?;
         }
@@ -227,7 +227,8 @@ impl IntrinsicsOutcome {
             )?;
             rig.write()?;
         }
-        // The report comes last: the rig file is written even if the report could not be.
+        // The error of the report is returned last, so that the rig file is written even if the
+        // report could not be written.
         self.written
     }
 }
@@ -247,7 +248,7 @@ fn warnings(calibration: &IntrinsicsCalibration) -> Vec<String> {
 fn aspect_warning([fx, fy]: [f64; 2]) -> Option<String> {
     const MAX_RATIO: f64 = 1.05;
     let ratio = fy / fx;
-    // False for NaN.
+    // This comparison is false for NaN.
     let is_square = (1.0 / MAX_RATIO..=MAX_RATIO).contains(&ratio);
     (!is_square).then(|| {
         format!(

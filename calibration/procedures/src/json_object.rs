@@ -6,8 +6,8 @@ use serde::de::{Deserialize, Deserializer, Error as _, MapAccess, SeqAccess, Vis
 use serde_json::{Map, Value};
 use std::fmt::Formatter;
 
-/// Parses JSON. A key that occurs twice in one object is an error: otherwise, only its last value
-/// would be used.
+/// Parses JSON. A key that occurs twice in one object is an error, because only its last value
+/// would be used otherwise.
 pub(crate) fn parse(text: &str) -> serde_json::Result<Value> {
     serde_json::from_str(text).map(|Unique(value)| value)
 }
@@ -171,7 +171,7 @@ impl<'a> JsonObject<'a> {
         let Some(numbers) = self.numbers(key)? else {
             return Ok(None);
         };
-        // Kept for the message, because the conversion consumes the list.
+        // The length is kept for the message, because the conversion consumes the list.
         let n = numbers.len();
         numbers
             .try_into()
@@ -215,14 +215,16 @@ fn transform_of(value: &Value) -> Result<Transform, String> {
     let rows = value.as_array().map_or(0, Vec::len);
     let row_of = |row: &Value| row.as_array().filter(|row| row.len() == 4).cloned();
     let given = value.as_array().cloned().unwrap_or_default();
-    // Four rows of four, or else the numbers themselves. Other shapes fail at the conversion below.
+    // The list has four rows of four numbers, or it contains the numbers directly. Other shapes
+    // fail in the conversion below.
     let flat = match given.iter().map(row_of).collect::<Option<Vec<_>>>() {
         Some(rows) => rows.concat(),
         None => given,
     };
     let numbers: Option<Vec<f64>> = flat.iter().map(Value::as_f64).collect();
     let numbers: Option<[f64; 16]> = numbers.and_then(|numbers| numbers.try_into().ok());
-    // One to three rows are likely a forgotten last row, which is worth a hint.
+    // If there are one to three rows, the last row was probably forgotten, so the error includes a
+    // hint.
     let numbers = numbers.ok_or_else(|| match rows {
         1..=3 => format!("must be a matrix of 4 x 4 numbers, row by row; found {rows} rows"),
         _ => "must be a matrix of 4 x 4 numbers, row by row".to_owned(),

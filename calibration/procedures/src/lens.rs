@@ -10,7 +10,7 @@ use serde::Serialize;
 #[derive(Clone, Debug, Serialize)]
 pub struct LensFile {
     /// `pinhole`, `brown_conrady` (five or eight coefficients) or `kannala_brandt`, as in rig
-    /// files; by default, pinhole without distortion coefficients, and `brown_conrady` with them.
+    /// files. The default is `brown_conrady` with distortion coefficients, and pinhole without.
     #[serde(skip_serializing_if = "Option::is_none")]
     model: Option<String>,
     #[serde(skip_serializing_if = "Option::is_none")]
@@ -106,7 +106,7 @@ impl LensFile {
     /// The intrinsics with the covariance of their parameters.
     #[must_use]
     pub fn with_covariance(self, covariance: &DMatrix<f64>) -> Self {
-        // Symmetric, so the order of rows and columns does not matter.
+        // The matrix is symmetric, so the order of rows and columns does not matter.
         Self {
             covariance: covariance.as_slice().to_vec(),
             ..self
@@ -121,7 +121,7 @@ impl LensFile {
     ) -> Result<Option<DMatrix<f64>>, BadInput> {
         let n = intrinsics.params().len();
         let name = |ix: usize| param_names(self.model.as_deref())[ix];
-        // A standard deviation of a coefficient that the lens lacks is probably that of another
+        // A standard deviation of a coefficient that the lens lacks probably belongs to another
         // lens.
         if let Some((ix, _)) = self.sigmas.iter().find(|(ix, _)| *ix >= n) {
             let params = param_names(self.model.as_deref())[..n].join(", ");

@@ -1,5 +1,5 @@
-//! The procedures of `fieldrig calibrate`: they read or take images, estimate, and write a report and
-//! a rig file.
+//! The procedures of `fieldrig calibrate`. They read or take images, estimate parameters, and write
+//! a report and a rig file.
 //!
 //! A task holds the options of one procedure: [`IntrinsicsTask`] for the lens of a camera,
 //! [`HandEyeTask`] for its pose on a robot, [`SceneTask`] for the cameras of a rig without a
@@ -7,9 +7,9 @@
 //! outcome, which contains the estimates and can write the rig file. If requested, the arm moves to
 //! the poses that determine the result best ([`MotionOptions`]).
 //!
-//! The estimation itself is in the crate `calibration`, the detection of targets in `targets`. The
-//! program that runs a procedure implements [`Host`]: it passes on stop requests and shows the
-//! progress.
+//! The estimation itself is in the crate `calibration`, and the detection of targets is in
+//! `targets`. The program that runs a procedure implements [`Host`], which passes on stop requests
+//! and shows the progress.
 
 mod guide;
 mod hand_eye;

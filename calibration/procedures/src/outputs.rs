@@ -16,8 +16,8 @@ pub struct RigOptions {
     /// Name of the camera to calibrate in a recording or rig file, or of the camera to change in
     /// the rig file for `write_rig`. `None`: the only camera.
     pub camera: Option<String>,
-    /// With a recording: the rig file to read it with, instead of the one stored in it. With image
-    /// files: the rig file to write the result into.
+    /// With a recording, the rig file that replaces the one stored in it. With image files, the rig
+    /// file into which the result is written.
     pub rig: Option<PathBuf>,
     /// The rig file to write, with the result.
     pub write_rig: Option<PathBuf>,
@@ -103,8 +103,8 @@ impl RigOptions {
         Err(BadInput(problem))
     }
 
-    /// Reads the rig file to write the result into: the input, that of a recording, or `--rig`.
-    /// `None` without `--write-rig`.
+    /// Reads the rig file into which the result will be written. This is the input itself, the rig
+    /// file of a recording, or `--rig`. Returns `None` without `--write-rig`.
     pub(crate) fn open(&self, input: &Path) -> anyhow::Result<Option<RigOutput>> {
         self.check(input)?;
         let Some(file) = &self.write_rig else {
@@ -134,7 +134,7 @@ impl RigOptions {
             (InputKind::Rig | InputKind::Files, _) => Rig::load(input, &[])?,
         };
         let camera = self.camera_of(&rig)?.name.to_string();
-        // Before images are taken, because the result could not be written.
+        // This is checked before images are taken, because the result could not be written.
         corrected_rig::check_target_file(&rig, file)?;
         Ok(Some(RigOutput {
             rig,
@@ -216,7 +216,7 @@ impl RigOutput {
 
     /// Rejects a setup in which the camera is attached to another frame than in the rig file.
     pub(crate) fn expect_setup(&self, setup: Setup) -> anyhow::Result<()> {
-        // The result is dropped: only the error counts.
+        // The result is dropped, because only the error is needed.
         corrected_rig::with_extrinsics(
             &self.rig,
             &self.camera,
@@ -347,7 +347,7 @@ fn is_other_file(file: &Path) -> bool {
 }
 
 /// Writes the report, if one is requested, on a result or on the reason why there is none. Returns
-/// the result, and whether the report was written: the result is printed even if it was not.
+/// the result, and whether the report was written. The result is printed in both cases.
 pub(crate) fn reported<T>(
     result: anyhow::Result<T>,
     report: Option<&ReportOptions>,

@@ -29,7 +29,7 @@ use targets::TargetSpec;
 const DEFAULT_SECS: f64 = 30.0;
 /// Maximum predicted image motion over readout, exposure and stamp uncertainty, pixels. Corners are
 /// corrected for the motion during the readout, but only as well as the velocity is known. A
-/// smaller value rejects images of slow motions; a larger one lets blurred corners through.
+/// smaller value rejects images of slow motions. A larger value accepts blurred corners.
 const MAX_SHIFT_PX: f64 = 3.0;
 
 /// Images of one camera in which a target was searched.
@@ -153,7 +153,8 @@ impl RigOptions {
         )
     }
 
-    /// Reads images. From devices, the target is detected at once, to tell what to do next.
+    /// Reads images. If they come from devices, the target is detected at once, so that advice can
+    /// be shown.
     fn images(
         &self,
         opened: Opened,
@@ -186,7 +187,7 @@ impl RigOptions {
                     n_all: None,
                 }),
             }
-            // Counted by stamps, because a simulation does not run in real time.
+            // The time is measured by stamps, because a simulation does not run in real time.
             let since_first = sample
                 .stamp()
                 .secs_since(*first.get_or_insert(sample.stamp()));
@@ -351,7 +352,7 @@ impl Scan {
 
     /// The images, with corners corrected for a rolling shutter.
     pub(crate) fn detected(&mut self) -> Vec<DetectedImage> {
-        // Moved out, because the correction needs the rest of `self`.
+        // The images are moved out of `self`, because the correction needs the rest of `self`.
         let images = std::mem::take(&mut self.images);
         images
             .into_iter()
@@ -376,7 +377,7 @@ impl Scan {
             let name = image.name.clone();
             match (&image.board, arm) {
                 (Ok(board), Some(arm)) => {
-                    // The correction for a rolling shutter depends on it.
+                    // The correction for a rolling shutter depends on the pose of the camera.
                     let camera_pose = parent_from_camera.unwrap_or(&self.parent_from_camera);
                     let view = self.at_mid_exposure(&board.view, arm, camera_pose);
                     samples.push(HandEyeSample {

@@ -184,7 +184,7 @@ impl SceneTask {
             host.on_progress_end();
             return data;
         }
-        // Both flags are about data that were recorded before.
+        // Both flags apply only to data that were recorded before.
         if self.keyframes.is_some() || self.rig.is_some() {
             return Err(BadInput(format!(
                 "{} and {} need a recording as input",
@@ -214,7 +214,7 @@ impl SceneTask {
         let data = Data::from_devices(
             opened,
             |sample| {
-                // Counted by stamps, because a simulation does not run in real time.
+                // The time is measured by stamps, because a simulation does not run in real time.
                 let since_first = sample
                     .stamp()
                     .secs_since(*first.get_or_insert(sample.stamp()));
@@ -238,7 +238,7 @@ impl SceneOutcome {
             outputs::log_failure(self.written);
             return Err(InsufficientData(reason).into());
         }
-        // A file without a correction would only look like a result.
+        // A file without corrections would wrongly look like a result.
         if let (Some(file), Some(before), Some(after)) =
             (&self.write_rig, &self.before, &self.calibration.rig)
         {
@@ -252,7 +252,8 @@ impl SceneOutcome {
                 log::info!("rig file written to {}", file.display());
             }
         }
-        // The report comes last: the rig file is written even if the report could not be.
+        // The error of the report is returned last, so that the rig file is written even if the
+        // report could not be written.
         self.written
     }
 }

@@ -63,7 +63,7 @@ impl SceneReport<'_> {
             alignment.estimates.len().to_string(),
             "",
         ));
-        // Each trial is measured against the result of the ones before it, so the gains add up.
+        // Each trial is compared with the result of all earlier trials, so the gains can be added.
         let gains_db: Vec<f64> = alignment
             .trials
             .iter()

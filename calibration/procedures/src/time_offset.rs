@@ -87,7 +87,7 @@ fn read(path: &Path) -> anyhow::Result<Vec<PoseSample>> {
     let mut samples = Vec::new();
     for (ix, line) in text.lines().enumerate() {
         let parsed = line
-            // Any usual separator, because such files come from many programs.
+            // All usual separators are accepted, because such files come from many programs.
             .split([',', ' ', ';', '\t'])
             .filter(|field| !field.is_empty())
             .map(str::parse::<f64>);
@@ -112,8 +112,9 @@ fn read(path: &Path) -> anyhow::Result<Vec<PoseSample>> {
             return Err(BadInput(format!("{}: t, x, y and z must be finite", place())).into());
         }
         let norm = quaternion.norm();
-        // Normalized afterwards. A larger deviation shows another order of the columns.
-        let is_unit = (norm - 1.0).abs() < MAX_NORM_ERROR; // False for NaN.
+        // Quaternions are normalized afterwards. A larger deviation indicates a different order of
+        // the columns.
+        let is_unit = (norm - 1.0).abs() < MAX_NORM_ERROR; // This comparison is false for NaN.
         if !is_unit {
             return Err(BadInput(format!(
                 "{}: |qx,qy,qz,qw| is {norm:.3}, expected 1",

@@ -101,8 +101,8 @@ pub(crate) fn residual_by_flange(
     solution: &Solution,
     predicted: &Transform,
 ) -> Matrix6<f64> {
-    // For the eye in hand, points at rest move against the flange; for the eye to hand, the board
-    // moves with it.
+    // With the eye in hand, points at rest move in the opposite direction relative to the flange.
+    // With the eye to hand, the board moves with the flange.
     let (rotation, board_in_flange, sign) = match setup {
         Setup::EyeInHand => (
             solution.x.rotation.inverse(),
@@ -129,7 +129,7 @@ pub(crate) fn residual_by_flange(
 fn inverse_left_jacobian(rotation_vector: &Vector3<f64>) -> Matrix3<f64> {
     const SMALL_RAD: f64 = 1e-4;
     let angle = rotation_vector.norm();
-    // The series: the quotient below loses all digits near zero.
+    // The series is used near zero, where the quotient below loses all digits.
     let second = if angle < SMALL_RAD {
         1.0 / 12.0 + angle * angle / 720.0
     } else {
@@ -142,7 +142,7 @@ fn inverse_left_jacobian(rotation_vector: &Vector3<f64>) -> Matrix3<f64> {
 /// The rotation `r` that maximizes the trace of `r' correlation` (Kabsch 1976). `None` if it is not
 /// unique.
 pub(crate) fn nearest_rotation(correlation: &Matrix3<f64>) -> Option<UnitQuaternion<f64>> {
-    // Of the second to the first singular value; parallel axes have 0.
+    // Minimum ratio of the second to the first singular value. For parallel axes, the ratio is 0.
     const MIN_RATIO: f64 = 1e-9;
     if !correlation.iter().all(|value| value.is_finite()) {
         return None;
@@ -154,7 +154,7 @@ pub(crate) fn nearest_rotation(correlation: &Matrix3<f64>) -> Option<UnitQuatern
     let u = svd.u?;
     let v_t = svd.v_t?;
     // If the product of the two orthogonal matrices is a reflection, the direction with the
-    // smallest singular value is flipped, which costs the least.
+    // smallest singular value is flipped, because this reduces the trace least.
     let mirror = Matrix3::from_diagonal(&Vector3::new(1.0, 1.0, (u * v_t).determinant().signum()));
     Some(UnitQuaternion::from_rotation_matrix(
         &Rotation3::from_matrix_unchecked(u * mirror * v_t),
@@ -187,7 +187,7 @@ pub(crate) fn median_distance_m<'a>(
     numbers::quantile::median(&distances)
 }
 
-/// How much the poses of the board that the samples imply differ.
+/// Differences between the poses of the board that follow from the samples.
 ///
 /// For each sample, `board_i = base_from_flange_i * flange_from_camera * camera_from_board_i` (eye
 /// in hand), or `flange_from_base_i * base_from_camera * camera_from_board_i` (eye to hand). The
@@ -259,8 +259,8 @@ mod tests {
                     "{setup:?}, parameter {ix}"
                 );
             }
-            // Derivatives by the flange are used as weights only; they are exact for small
-            // residuals.
+            // Derivatives with respect to the flange are used only as weights, and are exact only
+            // for small residuals.
             let by_flange = residual_by_flange(setup, &solution, &predicted);
             for ix in 0..6 {
                 let numeric = central_difference(|nudge| {

@@ -2,10 +2,11 @@
 //!
 //! [`calibrate_hand_eye`] takes robot poses and, for each, the pose of a board in the camera or its
 //! corners in the image. Closed-form solutions of sample triples give an initial solution that most
-//! samples agree with. It is refined from board poses by generalized least squares, with noise
-//! variances estimated by restricted maximum likelihood, or from corners by minimizing the
-//! reprojection error, with a small unknown error of each robot pose. The result has an uncertainty
-//! and the errors of held-out samples. Input that does not determine the result is refused.
+//! samples agree with. The solution is then refined. With board poses, generalized least squares is
+//! used, with noise variances estimated by restricted maximum likelihood. With corners, the
+//! reprojection error is minimized, with a small unknown error of each robot pose. The result has
+//! an uncertainty and the errors of held-out samples. Input that does not determine the result is
+//! refused.
 
 mod checks;
 mod geometry;
@@ -72,8 +73,8 @@ pub struct HandEyeInput<'a> {
     pub samples: Vec<HandEyeSample>,
     /// Lens parameters. Needed for corners; initial values if they are estimated.
     pub intrinsics: Option<Intrinsics>,
-    /// Covariance of the given intrinsics in the order of [`Intrinsics::params`], which enlarges
-    /// that of the result. `None`: the intrinsics are taken as exact. Not used if they are
+    /// Covariance of the given intrinsics in the order of [`Intrinsics::params`]. It enlarges the
+    /// covariance of the result. `None`: the intrinsics are taken as exact. Not used if they are
     /// estimated.
     pub intrinsics_covariance: Option<DMatrix<f64>>,
     /// Rotations of the board after which it looks the same, `board_from_equivalent_board`: for

@@ -27,11 +27,12 @@ pub struct HandEyeCalibration {
     pub sigma_mm: [f64; 3],
     /// Standard deviations of the rotation around the camera's axes, degrees.
     pub sigma_deg: [f64; 3],
-    /// Scatter of the board over the used samples, with the result of all of them.
+    /// Scatter of the board over the used samples, with the result that was estimated from all of
+    /// them.
     pub scatter: Scatter,
-    /// The same for held-out samples: each sample is evaluated with a calibration from others.
-    /// Leave-one-out, or with more than [`MAX_FOLDS`](super::MAX_FOLDS) samples, cross-validation
-    /// with as many folds.
+    /// The same for held-out samples: each sample is evaluated with a calibration from other
+    /// samples. One sample is left out at a time. With more than [`MAX_FOLDS`](super::MAX_FOLDS)
+    /// samples, cross-validation with that number of folds is used.
     pub held_out_scatter: Option<Scatter>,
     /// RMS length of the reprojection error of the used corners, pixels. The robot poses are taken
     /// as exact.
@@ -69,7 +70,7 @@ pub struct JointOffset {
 pub enum SampleStatus {
     /// Used.
     Used,
-    /// Excluded: it disagrees with the other samples.
+    /// The sample was excluded because it disagrees with the other samples.
     Outlier,
     /// The corners do not determine a pose of the board.
     NoBoard,
@@ -100,8 +101,8 @@ pub struct SampleReport {
     pub points: Vec<PointFit>,
 }
 
-/// Largest standard deviation of a joint offset that counts as observable, radians or meters: 1
-/// degree. A larger value would report offsets that the data hardly determine.
+/// A joint offset counts as observable up to this standard deviation, radians or meters; 1 degree.
+/// With a larger value, offsets that the data hardly determine would be reported.
 const MAX_JOINT_SIGMA: f64 = 0.0175;
 
 /// Evaluates a refined solution.
@@ -131,7 +132,7 @@ pub(super) fn report(
     }
     let rms_px = rms_px(input, refined, |_| Some(refined.solution));
     let mut warnings = problems(input, refined, &samples);
-    // Contradicting intrinsics are the more precise explanation.
+    // If the intrinsics contradict the corners, that is the more precise explanation.
     if refined.intrinsics_doubt.is_none() {
         warnings.extend(large_errors(&refined.noise, scatter, rms_px));
     }
@@ -312,7 +313,8 @@ fn problems(input: &HandEyeInput<'_>, refined: &Refined, reports: &[SampleReport
             "{n_used} samples were taken at {n_stops} different robot poses: samples at the same pose share its error and count as one"
         ));
     }
-    // Twelve unknowns: with three to five poses, one that is wrong hardly contradicts the others.
+    // There are twelve unknowns. With three to five poses, a wrong pose hardly contradicts the
+    // others.
     if n_stops < 6 {
         warnings
             .push(format!("only {n_stops} robot poses were used: with fewer than 6, wrong samples may go unnoticed"));
@@ -321,8 +323,8 @@ fn problems(input: &HandEyeInput<'_>, refined: &Refined, reports: &[SampleReport
 }
 
 /// Names of the samples that show the board from the other side than most samples, so that its
-/// corners are mirrored. In a few samples, this means that the detection swapped corners. If most
-/// samples show the back, the board is described that way.
+/// corners are mirrored. If only a few samples do so, the detection swapped corners. If most
+/// samples show the back, the points of the board are defined that way.
 fn mirrored<'a>(input: &'a HandEyeInput<'_>, refined: &Refined) -> Vec<&'a str> {
     // The board's z axis points away from a viewer of the printed side.
     let is_front = |sample: &Sample| {
@@ -339,18 +341,18 @@ fn mirrored<'a>(input: &'a HandEyeInput<'_>, refined: &Refined) -> Vec<&'a str> 
         .collect()
 }
 
-/// Errors that industrial arms, boards and calibrated cameras stay below. Lower limits would warn
-/// of inexpensive arms, whose errors are no mistake.
+/// The errors of industrial arms, boards and calibrated cameras are below these limits. Lower
+/// limits would cause warnings for inexpensive arms, whose larger errors are not mistakes.
 const MAX_RMS_PX: f64 = 3.0;
 const MAX_SCATTER: Scatter = Scatter { mm: 5.0, deg: 0.5 };
-/// Residual of sharp corners after a separate fit of each image, pixels. A right lens leaves a few
-/// tenths of a pixel at most.
+/// Maximum residual of sharp corners after a separate fit of each image, pixels. With a correct
+/// lens, the residual is at most a few tenths of a pixel.
 const MAX_RESIDUAL_PX: f64 = 0.7;
 
 /// A sentence on the likely cause if the errors are larger than those of usual arms and cameras.
 ///
-/// If each image on its own fits the board, lens and board are right, and the robot poses are not
-/// those of the images.
+/// If each single image fits the board, the lens and the board are right. In that case, the robot
+/// poses do not belong to the images.
 fn large_errors(noise: &HandEyeNoise, scatter: Scatter, rms_px: Option<f64>) -> Option<String> {
     let has_large_error = rms_px.is_some_and(|rms_px| rms_px > MAX_RMS_PX)
         || scatter.mm > MAX_SCATTER.mm

@@ -257,8 +257,8 @@ fn small(random: &mut Random, rad: f64, m: f64) -> Transform {
     Transform::new(vector(m), vector(rad))
 }
 
-/// Distance of a calibration from the truth in its own uncertainty: 95 % of the results stay below
-/// 12.59.
+/// Squared distance of a calibration from the truth, relative to its own uncertainty. It is below
+/// 12.59 for 95 % of the results.
 fn squared_error(calibration: &HandEyeCalibration, truth: &Transform) -> f64 {
     let difference = calibration.parent_from_camera.inverse() * truth;
     let translation = difference.translation.vector;
@@ -371,7 +371,7 @@ fn stated_ellipsoid_covers_the_truth_with_exact_robot_and_with_inexact_robot() {
     let inexact = n_covered(N_RUNS, |scene, seed| scene.views(&robot, seed));
     let poses = Errors::boards(2e-3);
     let given = n_covered(N_RUNS, |scene, seed| scene.poses(&poses, seed));
-    // One in 300 correct tests has fewer.
+    // By chance, one in 300 correct tests has fewer.
     for (name, n) in [
         ("exact robot", exact),
         ("inexact robot", inexact),
@@ -552,7 +552,7 @@ fn lists_that_are_off_by_one_are_named() {
         let text = refusal(&scene.input(samples)).to_string();
         assert!(text.contains("off by one") && text.contains(word), "{text}");
     }
-    // Poses in random order are not explained by a shift, nor by the size of the squares.
+    // Neither a shift nor the size of the squares explains poses in random order.
     let mut samples = scene.poses(&errors, 3);
     let poses = robot_poses(&samples);
     for (ix, sample) in samples.iter_mut().enumerate() {
@@ -853,7 +853,8 @@ fn several_images_at_one_stop_do_not_count_as_independent() {
         let mut random = Random::new(*seed);
         let mut samples = Vec::new();
         for stop in &stops {
-            // The robot's error is that of the stop; each image has its own noise.
+            // The robot's error is the same for all images of the stop. Each image has its own
+            // noise.
             for ix in 0..5 {
                 let mut sample = HandEyeSample {
                     name: format!("{} {ix}", stop.name),

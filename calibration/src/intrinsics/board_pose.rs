@@ -16,9 +16,9 @@ pub struct BoardPose {
 
 /// Estimates the pose of a flat target by minimizing the reprojection error.
 ///
-/// The initial value is the pose of a homography. A flat target far away or seen at a small angle
-/// looks almost the same with its normal mirrored at the line of sight, so the minimum that starts
-/// there is found too, and the better one is returned.
+/// The initial value is the pose of a homography. If the normal of a flat target is mirrored at the
+/// line of sight, the target looks almost the same from far away or at a small angle. The
+/// minimization therefore also starts from the mirrored pose, and the better minimum is returned.
 ///
 /// * `points`: at least four points that are not on a line, with the same z coordinate in the frame
 ///   of the target.
@@ -43,7 +43,7 @@ pub fn board_pose(intrinsics: &Intrinsics, points: &[BoardPoint]) -> Option<Boar
 pub(super) fn initial_pose(intrinsics: &Intrinsics, points: &[BoardPoint]) -> Option<Transform> {
     /// 68 degrees from the optical axis.
     const MAX_RADIUS: f64 = 2.5;
-    /// Twice the minimum of a homography, so that the initial pose is not spoiled by a few points.
+    /// Twice the minimum of a homography, so that a few wrong points do not spoil the initial pose.
     const MIN_ACCURATE: usize = 8;
     // Points beyond the lens model are left out.
     let mut pairs = Vec::with_capacity(points.len());
@@ -52,7 +52,7 @@ pub(super) fn initial_pose(intrinsics: &Intrinsics, points: &[BoardPoint]) -> Op
             pairs.push((point.point_in_board.xy(), ray));
         }
     }
-    // Errors of directions close to 90 degrees are large on the plane `z = 1`.
+    // On the plane `z = 1`, errors of directions close to 90 degrees are large.
     let is_accurate = |pair: &(Vector2<f64>, Vector2<f64>)| pair.1.norm() < MAX_RADIUS;
     if pairs.iter().filter(|pair| is_accurate(pair)).count() >= MIN_ACCURATE {
         pairs.retain(is_accurate);

@@ -9,7 +9,7 @@ use kinematics::{Intrinsics, MAX_INTRINSICS_PARAMS, Transform};
 use least_squares::{Fit, Loss, Options};
 use nalgebra::{DVector, Point3, Vector2, Vector6};
 
-/// Noise of corner detectors that is never undercut, pixels.
+/// Minimum noise of corner detectors, pixels.
 pub(super) const MIN_NOISE_PX: f64 = 0.005;
 
 /// Models with nearly redundant coefficients take the most steps.
@@ -106,7 +106,7 @@ impl Problem for Reprojection<'_> {
             let projection = bundle.intrinsics.project_with_derivatives(&in_camera)?;
             let by_rotation =
                 projection.by_point * board_pose::by_rotation(pose, &point.point_in_board);
-            // Arrays on the stack, because this runs for every corner in every step.
+            // The arrays are on the stack, because this code runs for every corner in every step.
             let mut rows = [[0.0; MAX_INTRINSICS_PARAMS + 6]; 2];
             for (axis, row) in rows.iter_mut().enumerate() {
                 for (derivative, param) in row.iter_mut().zip(&self.params) {

@@ -10,8 +10,8 @@ use numbers::quantile::median;
 
 /// Minimum number of images: each gives two constraints on focal lengths and principal point.
 pub(super) const MIN_IMAGES: usize = 3;
-/// Images whose corners differ by less, pixels, are repetitions. Counting them as independent would
-/// hide the uncertainty.
+/// Images whose corners differ by less than this, in pixels, are repetitions. If they counted as
+/// independent, the uncertainty would be underestimated.
 const MIN_DISTANCE_PX: f64 = 1.0;
 
 /// Returns the indices of the images with enough points that do not repeat an earlier image, and
@@ -64,7 +64,8 @@ fn check_views(views: &[BoardView], sizes_px: &[[u32; 2]]) -> Result<(), Error> 
         });
     }
     for (view, size_px) in views.iter().zip(sizes_px) {
-        // One lens has one size: intrinsics of cropped or scaled images differ.
+        // All images must have the same size, because cropped or scaled images have different
+        // intrinsics.
         if *size_px != sizes_px[0] {
             return Err(Error::MixedImageSizes {
                 first: views[0].name.clone(),
@@ -128,7 +129,7 @@ pub(super) fn check_n_images(n_images: usize) -> Result<(), Error> {
 
 /// Rejects targets of an implausible size, and targets that are not flat.
 fn check_target<'a>(points: impl Iterator<Item = &'a BoardPoint> + Clone) -> Result<(), Error> {
-    /// Outside, the points are probably in other units.
+    /// If the size is outside this range, the points are probably in other units.
     const SIZES_M: std::ops::RangeInclusive<f64> = 0.002..=10.0;
     /// Allowed deviation from a plane, relative to the size of the target.
     const MAX_BEND: f64 = 0.02;
@@ -166,7 +167,8 @@ pub(super) fn check_observable(fit: &Fit<Bundle>) -> Result<(), Error> {
     const FOCAL_FRACS: std::ops::Range<f64> = 0.05..100.0;
     let intrinsics = &fit.state.intrinsics;
     let side_px = f64::from(intrinsics.size_px[0].max(intrinsics.size_px[1]));
-    // For messages: without tilts, focal length and distance cannot be distinguished.
+    // Messages contain the largest tilt, because focal length and distance cannot be distinguished
+    // without tilts.
     let max_tilt_deg = fit.state.poses.iter().map(|pose| {
         let normal = pose.rotation * Vector3::z();
         normal.z.abs().min(1.0).acos().to_degrees()

@@ -105,7 +105,7 @@ impl Coefficients {
     /// Intrinsics with this lens model. Coefficients of the given intrinsics are kept if they exist
     /// in this model and are estimated.
     pub(super) fn applied_to(self, intrinsics: &Intrinsics) -> Intrinsics {
-        // Coefficients of the two families have the same names, but other meanings.
+        // Coefficients of the two families have the same names but different meanings.
         let is_fisheye = |lens: &Lens| matches!(lens, Lens::KannalaBrandt(_));
         let mut k = [0.0; 8];
         if is_fisheye(&intrinsics.lens) == (self.family == Family::KannalaBrandt) {

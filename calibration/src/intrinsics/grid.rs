@@ -76,8 +76,8 @@ fn sigma_px(derivatives: &DMatrix<f64>, covariance: &DMatrix<f64>) -> f64 {
 /// of the cells.
 ///
 /// A change of the intrinsics and a rotation of the camera frame have similar effects, and the
-/// poses of the target absorb such a rotation. So each change is compensated by the rotation that
-/// minimizes the sum of the squared displacements over the grid.
+/// poses of the target absorb such a rotation. Each change is therefore compensated by the rotation
+/// that minimizes the sum of the squared displacements over the grid.
 #[derive(Clone, Debug)]
 pub(super) struct ProjectionDerivatives {
     /// One matrix per cell, `[2, n_params]`, pixels. `None` where the lens model ends.
@@ -109,7 +109,8 @@ impl ProjectionDerivatives {
             normal_matrix += by_rotation.tr_mul(by_rotation);
             rhs += by_rotation.transpose() * by_params;
         }
-        // Without an inverse there is nothing to rotate: the lens images no cell.
+        // The inverse does not exist if the lens images no cell. In that case, no rotation is
+        // needed.
         let inverse = normal_matrix.try_inverse().unwrap_or_else(Matrix3::zeros);
         let rotation_by_params = -(inverse * rhs);
         let mut cells = Vec::with_capacity(uncompensated.len());
@@ -232,7 +233,8 @@ pub(super) fn information(
         cross.gemm_tr(1.0, &by_pose, &by_params, 1.0);
         local += by_pose.tr_mul(&by_pose);
     }
-    // The Schur complement: what the image says about the intrinsics after its pose is estimated.
+    // The Schur complement is the information about the intrinsics that remains after the pose of
+    // the image is estimated.
     let eliminated = local.cholesky()?.solve(&cross);
     Some(shared - cross.transpose() * eliminated)
 }

@@ -1,7 +1,8 @@
 //! What images of a target cover so far, and which ones to take next, without a calibration.
 //!
-//! A lens needs corners in all parts of the image, and tilts in all directions: without tilts, a
-//! longer focal length cannot be distinguished from a larger distance (Zhang 2000, section 3.3).
+//! Calibrating a lens requires corners in all parts of the image and tilts in all directions.
+//! Without tilts, a longer focal length cannot be distinguished from a larger distance (Zhang 2000,
+//! section 3.3).
 
 use super::board_pose::board_pose;
 use super::grid::ImageGrid;
@@ -12,11 +13,11 @@ use std::fmt;
 
 /// Number of images after which no more are needed, if they cover everything.
 pub const RECOMMENDED_IMAGES: usize = 15;
-/// A part of the image is covered if this fraction of its cells has corners. A target rarely
-/// reaches the outermost cells, so all of them would ask too much.
+/// A part of the image is covered if this fraction of its cells has corners. Not all cells are
+/// required, because a target rarely reaches the outermost ones.
 const MIN_COVERED_FRAC: f64 = 0.5;
-/// A tilt in a direction counts from this angle between the normal of the target and the line of
-/// sight. It is below the 20 degrees that are asked for, because people tilt by eye.
+/// A tilt counts if the angle between the normal of the target and the line of sight is at least
+/// this. It is below the requested 20 degrees, because people estimate tilts by eye.
 const MIN_TILT_DEG: f64 = 15.0;
 /// Number of images with each tilt.
 const MIN_TILTED: usize = 2;
@@ -113,7 +114,8 @@ fn advice(
         .iter()
         .filter_map(|view| tilt_deg(view, intrinsics))
         .collect();
-    // Tilts first: they determine the focal length, without which coverage is of little use.
+    // Tilts come first, because they determine the focal length, and coverage is of little use
+    // without it.
     let n_tilted = |side: Side| tilts.iter().filter(|tilt| is_tilted(side, **tilt)).count();
     let missing_tilt = [Side::Left, Side::Right, Side::Upper, Side::Lower]
         .into_iter()

@@ -12,7 +12,7 @@ pub(super) const MIN_POINTS: usize = 4;
 /// collinear or not finite.
 ///
 /// Source: Hartley and Zisserman 2004, algorithm 4.2 (normalized DLT), with the inhomogeneous
-/// solution: after the normalization, the element of the last row and column is the depth of the
+/// solution. After the normalization, the element of the last row and column is the depth of the
 /// centroid, which is not zero for a target in front of the camera.
 pub(crate) fn homography(pairs: &[(Vector2<f64>, Vector2<f64>)]) -> Option<Matrix3<f64>> {
     if pairs.len() < MIN_POINTS {

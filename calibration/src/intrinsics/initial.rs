@@ -99,8 +99,8 @@ pub(super) fn pinhole(images: &[&[BoardPoint]], size_px: [u32; 2]) -> Option<Sta
 
 /// Initial values for fisheye lenses: the best of a set of equidistant lenses.
 pub(super) fn fisheye(images: &[&[BoardPoint]], size_px: [u32; 2]) -> Option<Start> {
-    /// Number of candidates whose poses are refined, because those of homographies are inaccurate
-    /// for wide angles.
+    /// Number of candidates whose poses are refined. Poses of homographies are inaccurate for wide
+    /// angles.
     const N_REFINED: usize = 3;
     let lens = Lens::KannalaBrandt([0.0; 4]);
     let starts = FISHEYE_FOCAL_FRACS.into_iter().filter_map(|frac| {
@@ -174,7 +174,8 @@ type Plane = ([f64; 2], [f64; 2]);
 /// Converts to pixels. `None` if the focal lengths are implausible or the principal point is
 /// outside the image.
 fn denormalized((focal, principal): Plane, size_px: [u32; 2], lens: Lens) -> Option<Intrinsics> {
-    // Closed forms of nearly degenerate images give arbitrary numbers.
+    // Range of plausible focal lengths. For nearly degenerate images, closed forms give arbitrary
+    // numbers.
     const FOCAL_FRACS: std::ops::Range<f64> = 0.05..100.0;
     const MAX_ASPECT: f64 = 2.0;
     let (center, side) = frame(size_px);
@@ -209,7 +210,7 @@ fn zhang(homographies: &[Matrix3<f64>]) -> Option<Plane> {
             normal_matrix += row * row.transpose();
         }
     }
-    // No skew: one more row per image that sets the second element to zero.
+    // One more row per image sets the second element to zero, which excludes skew.
     normal_matrix[(1, 1)] += homographies.len() as f64;
     let eigen = normal_matrix.symmetric_eigen();
     let b = eigen.eigenvectors.column(eigen.eigenvalues.imin());
@@ -262,8 +263,8 @@ fn single_focal(homographies: &[Matrix3<f64>]) -> Option<Plane> {
     focal.is_finite().then_some(([focal; 2], [0.0; 2]))
 }
 
-/// Product of two columns of a homography: of the first two rows, which are divided by the squared
-/// focal length, and minus that of the last row.
+/// Products of two columns of a homography: the product over the first two rows, which is divided
+/// by the squared focal length, and minus the product in the last row.
 fn products(homography: &Matrix3<f64>, i: usize, j: usize) -> Vector2<f64> {
     let a = homography.column(i);
     let b = homography.column(j);

@@ -36,8 +36,8 @@ use robust::RobustFit;
 /// Detected points and the lens model to estimate.
 #[derive(Clone, Copy, Debug)]
 pub struct IntrinsicsInput<'a> {
-    /// The target in each image. Any consistent numbering of its points is fine, also a mirrored or
-    /// rotated one.
+    /// The target in each image. The numbering of its points must be consistent. It may be mirrored
+    /// or rotated.
     pub views: &'a [BoardView],
     /// Width and height of each image, pixels; all equal.
     pub sizes_px: &'a [[u32; 2]],
@@ -72,7 +72,7 @@ pub enum LensModel {
 /// If the input is malformed, if too few images are usable, if no lens model fits, or if the images
 /// do not determine the focal length or the principal point. The message contains the remedy.
 pub fn calibrate_intrinsics(input: &IntrinsicsInput<'_>) -> Result<IntrinsicsCalibration, Error> {
-    // Each phase rejects what would mislead the next one: malformed input, gross errors of single
+    // Each phase rejects what would affect the next one: malformed input, gross errors of single
     // corners, images that contradict the others, and results that are not determined.
     let (usable, mut rejected) = check::usable_images(input.views, input.sizes_px)?;
     let images: Vec<&[BoardPoint]> = usable
@@ -125,10 +125,11 @@ fn select(
     near_pinhole: Option<RobustFit>,
     fisheye: Option<RobustFit>,
 ) -> Result<(Option<RobustFit>, Vec<LensTrial>), Error> {
-    // Relative to the better of both typical errors. A wrong lens model has errors far above it.
+    // Maximum error relative to the smaller of both typical errors. The errors of a wrong lens
+    // model are far above it.
     const MAX_ERROR_RATIO: f64 = 3.0;
-    // A fit that rejects images is not better than one that explains them, and one with large
-    // errors explains none.
+    // A fit that rejects images is not better than a fit that explains them. A fit with large
+    // errors explains no images.
     let fits = || {
         [near_pinhole.as_ref(), fisheye.as_ref()]
             .into_iter()
@@ -162,8 +163,8 @@ fn select(
 
 /// Refuses a fit with errors that no corner detector has.
 fn check_match(fit: &RobustFit, size_px: [u32; 2]) -> Result<(), Error> {
-    // Of the longer side of the image: 38 px of 1280. Errors of this size come from a wrong layout
-    // of the target.
+    // Maximum error as a fraction of the longer side of the image: 38 px of 1280. Errors of this
+    // size come from a wrong layout of the target.
     const MAX_ERROR_FRAC: f64 = 0.03;
     let side_px = f64::from(size_px[0].max(size_px[1]));
     if fit.typical_px < MAX_ERROR_FRAC * side_px {

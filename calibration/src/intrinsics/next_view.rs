@@ -32,7 +32,8 @@ const REGIONS: [([f64; 2], &str); 9] = [
     ([1.0, 1.0], "at the lower right of the image"),
 ];
 
-/// Large enough to determine the focal length, small enough for corners to be detected well.
+/// The tilt is large enough to determine the focal length, and small enough for corners to be
+/// detected well.
 const TILT_DEG: f64 = 35.0;
 /// Rotation axes of the tilts in the camera frame, and the side of the target that is farther away.
 const TILTS: [([f64; 2], Option<&str>); 9] = [
@@ -77,8 +78,8 @@ pub(super) fn suggest(
         let covariance = information.cholesky()?.inverse() * known.variance;
         Some(mean_square.dot(&covariance).max(0.0).sqrt())
     };
-    // 162 poses. Each adds the information of one image with all points of the target, as if none
-    // were missed.
+    // 162 poses are evaluated. Each adds the information of one image in which all points of the
+    // target are detected.
     let current_px = sigma_px(known.information.clone())?;
     let mut best: Option<NextView> = None;
     for (region, region_words) in REGIONS {
@@ -146,7 +147,7 @@ impl Board {
             .flat_map(|points| *points)
             .map(|p| p.point_in_board)
             .collect();
-        // Sorted, so that equal points are neighbors.
+        // The points are sorted, so that equal points are neighbors.
         let key = |point: &Vector3<f64>| [point.x, point.y, point.z];
         points.sort_by(|a, b| {
             key(a)
@@ -181,7 +182,7 @@ impl Board {
         let distance_m = f64::max(distance_for(0), distance_for(1));
         let pixel = [0, 1].map(|axis| {
             let half_extent_px = 0.5 * intrinsics.focal_px[axis] * self.extent[axis] / distance_m;
-            // Slightly more than the target at this distance, because tilted targets look larger on
+            // The margin makes the distance slightly larger, because tilted targets look larger on
             // one side.
             const MARGIN: f64 = 1.15;
             let reach_px = (0.5 * size_px[axis] - MARGIN * half_extent_px).max(0.0);

@@ -43,10 +43,11 @@ pub struct IntrinsicsCalibration {
     /// Standard deviation of the projection of a distant point in each part of the image, in the
     /// worst direction, pixels. `None` beyond the range of the lens model.
     ///
-    /// The uncertainty of the intrinsics is propagated to the pixel after the rotation of the
-    /// camera frame that absorbs most of each change, because such a rotation does not matter for
-    /// images of unknown pose. mrcal 2.4 ("projection uncertainty") derives this rotation from the
-    /// poses of the target; here it minimizes the squared displacements over the whole image.
+    /// The uncertainty of the intrinsics is propagated to the pixel. A rotation of the camera frame
+    /// absorbs most of each change of the intrinsics. It is removed, because such a rotation does
+    /// not matter for images of unknown pose. mrcal 2.4 ("projection uncertainty") derives this
+    /// rotation from the poses of the target; here it minimizes the squared displacements over the
+    /// whole image.
     pub uncertainty_px: ImageGrid<Option<f64>>,
     /// The pose of the target that would lower the projection uncertainty the most.
     pub next_view: Option<NextView>,
@@ -208,7 +209,7 @@ fn rejection(image_ix: usize, view: &BoardView, fit: &RobustFit) -> Option<Rejec
         .image_ixs
         .iter()
         .position(|kept_ix| *kept_ix == image_ix);
-    // A rejected image has no pose in the fit, so its best pose is searched.
+    // A rejected image has no pose in the fit, so its best pose is computed here.
     let pose = match position {
         Some(position) => Some(fit.fit.state.poses[position]),
         None => board_pose(intrinsics, &view.points).map(|pose| pose.camera_from_board),
@@ -227,7 +228,8 @@ fn rejection(image_ix: usize, view: &BoardView, fit: &RobustFit) -> Option<Rejec
             typical_px,
         });
     };
-    // Corners are rejected from the largest error on, so the largest of all is one of them.
+    // Corners with the largest errors are rejected first, so the largest error of all belongs to a
+    // rejected corner.
     let n_corners = view.points.len() - kept.points[position].len();
     let max_px = errors_px.iter().copied().fold(0.0, f64::max);
     (n_corners > 0).then_some(RejectionReason::Corners {

@@ -12,23 +12,23 @@ use nalgebra::{Matrix3, Vector2};
 use numbers::quantile::median;
 use numbers::random::Random;
 
-/// Minimum number of corners that an image keeps; with fewer, its pose has no redundancy worth
-/// using.
+/// Minimum number of corners that an image keeps. With fewer corners, its pose has too little
+/// redundancy.
 pub(super) const MIN_POINTS: usize = 6;
 /// A corner is rejected if its error exceeds this multiple of the standard deviation of the others.
 /// Normal errors do not (1 in 10^8), but errors of real corners have longer tails.
 const MAX_SIGMAS: f64 = 6.0;
-/// An image is rejected if its median error exceeds this multiple of that of the others. Blurred
-/// images have larger errors, but still contribute.
+/// An image is rejected if its median error exceeds this multiple of the median error of the
+/// others. Blurred images have larger errors, but still contribute.
 const MAX_MEDIAN_RATIO: f64 = 6.0;
-/// An image is rejected if more than this fraction of its corners are. Then the minority may be
-/// right.
+/// An image is rejected if more than this fraction of its corners are rejected. In that case, the
+/// minority of the corners may be right.
 const MAX_OUTLIER_FRAC: f64 = 0.5;
 /// Ratio between the median and the standard deviation per axis of the norm of a normal error
 /// (Rayleigh distribution).
 const MEDIAN_PER_SIGMA: f64 = 1.177_410_022_515_474_7;
-/// Tolerances of fits between which outliers are searched, a tenth of a standard deviation of the
-/// parameters, and of the last one.
+/// Tolerances of the fits between which outliers are searched (a tenth of a standard deviation of
+/// the parameters), and of the last fit.
 const ROUGH: f64 = 1e-5;
 const EXACT: f64 = 1e-12;
 
@@ -91,8 +91,8 @@ pub(super) fn fit(
     /// first fit.
     const MAX_START_RATIO: f64 = 8.0;
     let max_error_px = MAX_START_RATIO * start.median_error_px();
-    // A wrong pose in the first fit would bend the lens. Images that are left out here are checked
-    // again later.
+    // A wrong pose in the first fit would distort the lens parameters. Images that are left out
+    // here are checked again later.
     let image_ixs: Vec<usize> = (0..images.len())
         .filter(|ix| start.errors_px[*ix] <= max_error_px)
         .collect();
@@ -138,7 +138,8 @@ fn consistent_points(points: &[BoardPoint]) -> Vec<BoardPoint> {
     /// Samples of four points. With 45 % wrong points, one of them is free of errors with a
     /// probability of 99.9 %.
     const N_SAMPLES: usize = 75;
-    /// Points are kept up to this multiple of the median error; distortion bends the plane by less.
+    /// Points are kept up to this multiple of the median error. Deviations due to distortion are
+    /// smaller.
     const MAX_MEDIAN_RATIO: f64 = 8.0;
     let pairs: Vec<_> = points
         .iter()
@@ -224,8 +225,8 @@ pub(super) fn refit(
         };
     }
     let mut fit = squared(&kept, bundle, coefficients, EXACT)?;
-    // Errors of the corners of one image are correlated: blur, a bent target, a lens that no model
-    // describes.
+    // Errors of the corners of one image are correlated, for example because of blur, a bent
+    // target, or a lens that no model describes.
     fit.covariance *= fit.dispersion.max(1.0);
     Some(RobustFit {
         fit,
@@ -237,7 +238,7 @@ pub(super) fn refit(
 
 /// A fit that limits the influence of remaining outliers.
 fn huber(kept: &Kept, bundle: Bundle, coefficients: Coefficients) -> Option<Bundle> {
-    // The norm of normal errors exceeds it in 4 % of the corners: exp(-2.5² / 2).
+    // For normal errors, the norm exceeds this in 4 % of the corners: exp(-2.5² / 2).
     const THRESHOLD_SIGMAS: f64 = 2.5;
     let errors: Vec<f64> = (0..kept.points.len())
         .flat_map(|ix| bundle.errors_px(ix, &kept.points[ix]))
@@ -287,7 +288,8 @@ fn median_px(image: &Option<(Transform, Vec<f64>)>) -> Option<f64> {
 /// Selects the images and corners that agree with the intrinsics, and returns the poses of these
 /// images and the typical error.
 fn judge(images: &[&[BoardPoint]], kept: &Kept, bundle: &Bundle) -> Option<(Kept, Bundle, f64)> {
-    // The poses of all images, also of those that are not in use, so that they can return.
+    // The poses of all images are estimated, including images that are not in use, so that these
+    // can be used again.
     let poses: Vec<_> = (0..images.len())
         .map(|image_ix| {
             let position = kept
@@ -307,7 +309,8 @@ fn judge(images: &[&[BoardPoint]], kept: &Kept, bundle: &Bundle) -> Option<(Kept
     let mut located_images: Vec<Option<(Transform, Vec<f64>)>> = (0..images.len())
         .map(|ix| Some(located(ix, poses[ix]?)))
         .collect();
-    // The typical error: a median of medians, which neither wrong corners nor wrong images change.
+    // The typical error is a median of medians, which neither wrong corners nor wrong images
+    // change.
     let medians: Vec<f64> = kept
         .image_ixs
         .iter()

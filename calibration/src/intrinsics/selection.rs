@@ -44,10 +44,11 @@ struct Scored {
 /// Adds coefficients one group at a time, and keeps those that lower the error on held-out corners
 /// significantly. Returns the selected model with its parameters, and all comparisons.
 ///
-/// Brown-Conrady grows from a pinhole by k1, k2, p1 and p2, k3, and, unless k3 was not needed, the
-/// rational terms. If k1 alone is not significant, k1 and k2 are tried together. At last, the
-/// result is compared with Kannala-Brandt, which replaces a rational model also if both are equally
-/// good, because it has fewer coefficients.
+/// Brown-Conrady starts as a pinhole. The groups k1, k2, p1 and p2, and k3 are added in this order;
+/// the rational terms follow unless k3 was not needed. If k1 alone is not significant, k1 and k2
+/// are tried together. Finally, the result is compared with Kannala-Brandt. Since Kannala-Brandt
+/// has fewer coefficients than a rational model, it replaces that model even if both are equally
+/// good.
 pub(super) fn select(
     kept: &Kept,
     near_pinhole: Option<&RobustFit>,
@@ -147,7 +148,8 @@ fn start_of(kept: &Kept, fit: &RobustFit) -> Option<Bundle> {
 
 /// Compares two models by their held-out errors.
 fn compare(baseline: &Scored, variant: &Scored) -> LensTrial {
-    // Paired by image: images differ in blur and distance much more than models do.
+    // The errors are compared image by image, because images differ in blur and distance much more
+    // than models differ.
     let gain_db = |(baseline, variant): (&f64, &f64)| 20.0 * (baseline / variant).log10();
     let gains_db: Vec<f64> = baseline
         .errors_px
@@ -172,9 +174,9 @@ fn compare(baseline: &Scored, variant: &Scored) -> LensTrial {
 /// The intrinsics are fitted to the other folds. The pose of the held-out image is fitted to every
 /// second corner and evaluated on the others, and the other way around.
 fn score(kept: &Kept, start: &Bundle, coefficients: Coefficients) -> Option<Scored> {
-    // Each fold is a fit. With five, a fit uses 80 % of the images.
+    // Each fold requires a fit. With five folds, a fit uses 80 % of the images.
     const MAX_FOLDS: usize = 5;
-    // Differences of models are far larger than the error that this leaves.
+    // Models differ by far more than the error that remains with this tolerance.
     const TOLERANCE: f64 = 1e-7;
     let images = kept.images();
     let start = Bundle {

@@ -319,7 +319,7 @@ fn simplest_sufficient_model_is_selected() {
 fn wrong_images_and_corners_are_rejected_and_named() {
     let camera = brown_conrady_camera();
     let mut views = observed_images(&camera, &poses(12, 7), 0.1, 8);
-    // Columns and rows exchanged: the positions of another layout.
+    // If columns and rows are exchanged, the positions are those of another layout.
     let transposed: Vec<_> = (0..9)
         .flat_map(|row| (0..6).map(move |column| [column, row]))
         .collect();

@@ -16,9 +16,9 @@ pub struct Fit<S> {
     pub n_params: usize,
     /// Variance of a scalar residual, estimated from the residuals.
     pub variance: f64,
-    /// How much larger the scatter of the blocks' gradients is than independent residuals explain.
-    /// Above 1, residuals of a block share errors, and the covariance times this factor is more
-    /// honest.
+    /// Ratio of the scatter of the blocks' gradients to the scatter that independent residuals
+    /// would cause. If it is above 1, residuals of a block share errors, and the covariance times
+    /// this factor is more realistic.
     pub dispersion: f64,
     /// Information about the shared parameters with free local parameters, for residuals of unit
     /// variance.
@@ -87,8 +87,8 @@ pub(super) fn fit<S>(
     } else {
         SymmetricEigen::new(scaled)
     };
-    // Unobservable directions have eigenvalues of zero or below, by rounding. The floor keeps their
-    // variance finite.
+    // Because of rounding, unobservable directions have eigenvalues of zero or below. The floor
+    // keeps their variance finite.
     let floor = (ROUNDING * eigen.eigenvalues.iter().copied().fold(0.0, f64::max))
         .max(f64::MIN_POSITIVE / ROUNDING);
     let mut directions: Vec<Direction> = eigen

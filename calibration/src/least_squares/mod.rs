@@ -64,8 +64,8 @@ pub struct Options {
     /// fraction.
     pub tolerance: f64,
     /// Lower limit of the residuals' standard deviation, in units of the residuals. It limits the
-    /// stated accuracy where the residuals are smaller than any measurement could be, and decides
-    /// when steps are too small to matter.
+    /// stated accuracy if the residuals are smaller than the errors of any real measurement. It
+    /// also determines which steps are negligible.
     pub min_noise: f64,
 }
 
@@ -90,12 +90,12 @@ pub fn minimize<P: Problem>(
     initial: P::State,
     options: &Options,
 ) -> Result<Fit<P::State>, Error> {
-    // Relative to the diagonal. Initial states are close to the solution, so the first step is
-    // almost a Gauss-Newton step.
+    // Damping of the first step, relative to the diagonal. Initial states are close to the
+    // solution, so the first step is almost a Gauss-Newton step.
     const INITIAL_DAMPING: f64 = 1e-4;
     // Below the rounding of the diagonal, damping has no effect.
     const MIN_DAMPING: f64 = 1e-15;
-    // Steps are then too short to change the parameters: there is no descent.
+    // With more damping, steps are too short to change the parameters, so there is no descent.
     const MAX_DAMPING: f64 = 1e12;
     let scales = problem.scales();
     let n_shared = scales.len();
@@ -123,7 +123,7 @@ pub fn minimize<P: Problem>(
             (trial.totals.loss < at.totals.loss).then_some((trial, gain))
         });
         match trial {
-            // The better the model has predicted the decrease, the less damping the next step gets.
+            // The next step gets less damping if the model has predicted the decrease well.
             Some((trial, gain)) => {
                 at = trial;
                 damping =

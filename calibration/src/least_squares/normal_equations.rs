@@ -21,7 +21,7 @@ pub struct BlockSums {
     pub(super) totals: Totals,
 }
 
-/// Sums over residuals that do not depend on the parameters' number.
+/// Sums over residuals whose size does not depend on the number of parameters.
 #[derive(Clone, Copy, Debug, Default)]
 pub(super) struct Totals {
     /// Sum of the loss.
@@ -88,8 +88,8 @@ impl BlockSums {
             self.weighted_derivatives
                 .extend(row.iter().map(|derivative| root_weight * derivative));
         }
-        // A change along the residual changes the weight, too; the other `D - 1` directions only
-        // rotate it.
+        // A change along the residual also changes the weight. Changes in the other `D - 1`
+        // directions only rotate the residual.
         let dims = D as f64;
         self.totals.add(&Totals {
             loss: loss.value,
@@ -134,7 +134,7 @@ impl BlockSums {
     }
 }
 
-/// Adds Marquardt's damping to the diagonal: a fraction of it.
+/// Adds Marquardt's damping, which is a fraction of the diagonal, to the diagonal.
 fn damp(matrix: &mut DMatrix<f64>, damping: f64) {
     for ix in 0..matrix.nrows() {
         matrix[(ix, ix)] *= 1.0 + damping;
@@ -193,8 +193,8 @@ pub(super) fn step(blocks: &[BlockSums], n_shared: usize, damping: f64) -> Optio
 /// Information about the shared parameters when the local ones are free: the Schur complement.
 /// Symmetric. Directions of local parameters without information are left out.
 pub(super) fn information(blocks: &[BlockSums], n_shared: usize) -> DMatrix<f64> {
-    // A tiny damping keeps blocks whose local parameters are not determined from removing other
-    // blocks' information.
+    // Blocks may not determine their local parameters. Because of the tiny damping, such blocks do
+    // not remove the information of other blocks.
     const DAMPING: f64 = 1e-12;
     match Reduced::new(blocks, n_shared, DAMPING) {
         Some(reduced) => {
@@ -271,7 +271,7 @@ impl Reduced {
             matrix += block.products.view((0, 0), (n_shared, n_shared));
             gradient += block.gradient.rows(0, n_shared);
         }
-        // Damping before elimination, as for a system that is solved as a whole.
+        // The damping is added before elimination, as for a system that is solved as a whole.
         damp(&mut matrix, damping);
         for block in blocks {
             if block.n_local == 0 {

@@ -4,8 +4,9 @@ use super::{BlockSums, Loss, Options, Problem, minimize};
 use nalgebra::{DMatrix, DVector, Vector2};
 use numbers::random::Random;
 
-/// Circles of one common radius: the radius is shared, the centers are local. Residuals are vectors
-/// from the nearest point of the circle at a known angle.
+/// Circles of one common radius. The radius is a shared parameter, and the centers are local
+/// parameters. Each residual is the vector to a measured point from the point of the circle at a
+/// known angle.
 struct Circles {
     points: Vec<Vec<(f64, Vector2<f64>)>>,
 }
@@ -147,7 +148,7 @@ fn robust_losses_resist_outliers() {
     );
 }
 
-/// Linear residuals of two shared parameters without local ones; the second parameter has no
+/// Linear residuals of two shared parameters, without local parameters. The second parameter has no
 /// influence.
 struct Line;
 

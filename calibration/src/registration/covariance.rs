@@ -60,8 +60,9 @@ impl ExtrinsicsCovariance {
             params.iter().enumerate().filter_map(first).unzip();
         (!cameras.is_empty()).then_some(())?;
         let ixs: Vec<usize> = begins.iter().flat_map(|begin| *begin..begin + 6).collect();
-        // The solution returns variances of weighted sums. Covariances follow from those of the
-        // sums of two parameters. The variance of a doubled parameter is four times its own.
+        // The solution returns variances of weighted sums. Covariances are computed from the
+        // variances of sums of two parameters. The sum of a parameter and itself has four times the
+        // variance of the parameter.
         let own: Vec<f64> = ixs
             .iter()
             .map(|ix| variance_of_sum(solution, params.len(), [*ix, *ix]) / 4.0)

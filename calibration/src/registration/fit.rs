@@ -17,8 +17,8 @@ pub(super) const OCCLUSION_FRAC: [f64; 4] = [0.04, 0.05, 0.07, 0.1];
 /// A step smaller than this number of standard deviations ends a level, the finest first. Further
 /// steps would be smaller than the error of the result.
 const CONVERGED_STEP_SIGMAS: [f64; 4] = [0.2, 2.0, 2.0, 2.0];
-/// Noise for the first residuals. It is replaced by an estimate after them, so it only must not
-/// reject many of them.
+/// Noise for the first residuals. It is then replaced by an estimate, so it must only be large
+/// enough not to reject many of these residuals.
 pub(super) const INITIAL_NOISE: Noise = Noise {
     photo: 20.0,
     depth: 0.005,
@@ -35,12 +35,13 @@ pub(super) struct Fit {
 
 impl Fit {
     /// Adds the discretization error to the covariance: the change of the estimate between the
-    /// finest level and the next one. All pairs share this error, so that their scatter does not
-    /// contain it. At half the pixel size, an error of first or higher order in the pixel size is
-    /// at most as large as this change. Its direction may be another one, because the error is the
-    /// sum of many, some of which do not depend on the pixel size in the same way.
+    /// finest level and the next one. All pairs share this error, so their scatter does not contain
+    /// it. At half the pixel size, an error of first or higher order in the pixel size is at most
+    /// as large as this change. Its direction may be different, because the error is a sum of
+    /// several errors, some of which depend on the pixel size in another way.
     pub(super) fn add_discretization_error(&mut self, images: &[PreparedImage], pairs: &[Pair]) {
-        // Converged at level 1 from the result of level 0: the difference of both results.
+        // The estimate converges at level 1, starting from the result of level 0. The change is the
+        // difference of both results.
         const LEVEL: usize = 1;
         if images.iter().all(|image| image.levels.len() <= LEVEL) {
             return;
@@ -123,8 +124,8 @@ pub(super) fn fit(
                 &subset,
                 &options,
             );
-            // The noise decreases as the images get aligned, and with it the residuals that count
-            // as outliers.
+            // As the images become aligned, the noise decreases, and so does the limit above which
+            // residuals count as outliers.
             options.noise = sums::noise_of(&sums)?;
             let solution = step(&layout, &corrections, &subset, &sums);
             corrections.apply_step(&layout, &solution.step);

@@ -53,7 +53,7 @@ const MAX_IMAGES: usize = 100;
 const PARTNERS_PER_IMAGE: usize = 4;
 /// Maximum number of validation images.
 const MAX_VALIDATION_IMAGES: usize = 32;
-/// Covariances follow from the scatter between pairs, which fewer do not determine.
+/// Covariances are computed from the scatter between pairs. Fewer pairs do not determine it.
 const MIN_PAIRS: usize = 4;
 /// Corrections smaller than this number of standard deviations are not significant.
 const MIN_SIGNIFICANT_SIGMAS: f64 = 3.0;
@@ -112,7 +112,8 @@ pub fn align(keyframes: &[Arc<Keyframe>], choice: &CameraRefinement) -> Option<A
             scene.select_params(candidates, uncorrected, &mut trials, &mut unobservable)
         }
         CameraRefinement::AlwaysAndTry(set, candidates) => {
-            // Registration has no first step, so it tries every set.
+            // Registration has no training steps. A set that would be optimized from the first step
+            // on is therefore tried like the others.
             let all = [&[*set], &candidates[..]].concat();
             scene.select_params(&all, uncorrected, &mut trials, &mut unobservable)
         }
@@ -247,7 +248,8 @@ impl AlignmentScene {
             .par_iter()
             .filter_map(|ix| Some((*ix, self.drift_of(*ix, &model.corrections, &views, &train)?)))
             .collect();
-        // Added after all of them are estimated: an entry changes the interpolated drift of others.
+        // The poses are added after all of them are estimated, because an entry changes the
+        // interpolated drift of other images.
         for (ix, drift) in found {
             let image = &self.images[ix];
             model.corrections.by_camera[image.camera]
@@ -300,7 +302,8 @@ impl AlignmentScene {
         trials: &mut Vec<Trial>,
         unobservable: &mut Vec<Unobservable>,
     ) -> CalibrationModel {
-        // Forward: the candidates in order of likelihood, each together with those kept so far.
+        // Forward selection: the candidates are tested in order of likelihood, each together with
+        // those kept so far.
         let mut kept = uncorrected;
         let mut kept_sets: Vec<ParamSet> = Vec::new();
         for candidate in candidates {
@@ -327,8 +330,8 @@ impl AlignmentScene {
             }
             trials.push(trial);
         }
-        // Backward: a later parameter may explain what an earlier one was kept for. The last one
-        // was tested with all others.
+        // Backward elimination: a later parameter may explain the same errors as an earlier one,
+        // which is then no longer needed. The last parameter was already tested with all others.
         for kept_set in kept_sets.clone().into_iter().rev().skip(1) {
             let other_params = kept_sets
                 .iter()
@@ -403,7 +406,7 @@ impl CalibrationModel {
     fn has_significant(&self, params: &Layout) -> bool {
         let Some(fit) = &self.fit else { return false };
         fit.layout.params.iter().enumerate().any(|(ix, param)| {
-            // A mostly unobservable parameter has a value only by its prior.
+            // The value of a mostly unobservable parameter comes only from its prior.
             params.params.contains(param)
                 && self.corrections.value(*param).abs()
                     > MIN_SIGNIFICANT_SIGMAS * fit.solution.sigma(ix)

@@ -38,10 +38,11 @@ const MAX_REFERENCES: usize = 48;
 /// Maximum and minimum number of reference images with which an image is compared.
 const MAX_PARTNERS: usize = 6;
 const MIN_PARTNERS: usize = 2;
-/// Sum of stakes at which a movement is reported: at most 1 % false alarms in 1000 images.
+/// Sum of stakes at which a movement is reported. The probability of a false alarm in 1000 images
+/// is then at most 1 %.
 const ALARM: f64 = 1e5;
-/// Fraction of the stake that is bet on each image. A larger bet detects movements with fewer
-/// images, but one bad image costs most of the stake.
+/// Fraction of the stake that is bet on each image. With a larger bet, movements are detected with
+/// fewer images, but one bad image loses most of the stake.
 const BET_FRAC: f64 = 0.8;
 /// Prediction gain that is ignored, dB: other calibration errors may improve neighboring images by
 /// this much.
@@ -110,8 +111,8 @@ struct ImageState {
     stake: f64,
 }
 
-/// Detects movements of cameras in a sequence of keyframes. A pure function of the keyframes and
-/// their order.
+/// Detects movements of cameras in a sequence of keyframes. The result depends only on the
+/// keyframes and their order.
 #[derive(Debug)]
 pub struct MovementDetector {
     images: Vec<PreparedImage>,
@@ -164,7 +165,8 @@ impl MovementDetector {
             },
         );
         let ix = self.images.len() - 1;
-        // Only references are partners: recent images may be on the other side of the movement.
+        // Only reference images are partners, because recent images may have been taken after the
+        // movement.
         let pairs = pairs::choose(
             &self.images,
             &self.views,
@@ -188,7 +190,7 @@ impl MovementDetector {
             // A rejected movement would be found again with the next image.
             recent.iter().for_each(|ix| self.states[*ix].stake = 1.0);
         }
-        // The window moves on: without a movement, its oldest image becomes a reference.
+        // If there is no movement, the window moves on and its oldest image becomes a reference.
         if recent.len() > MOVEMENT_WINDOW {
             self.states[recent[0]] = ImageState {
                 is_reference: true,
@@ -341,7 +343,7 @@ impl MovementDetector {
             .iter()
             .map(|pairs| gain(pairs).unwrap_or(0.0))
             .collect();
-        // Clamped, so that one image with a large gain does not decide alone.
+        // Gains are clamped, so that one image with a large gain does not decide alone.
         let clamped: Vec<f64> = gains.iter().map(|gain| gain.clamp(-1.0, 1.0)).collect();
         let since = |position: &usize| clamped[*position..].iter().sum::<f64>();
         let start = (0..recent.len()).max_by(|one, other| since(one).total_cmp(&since(other)))?;
@@ -372,8 +374,8 @@ impl MovementDetector {
         (is_large && explained_frac > MIN_EXPLAINED_FRAC).then_some(movement)
     }
 
-    /// Registers all moved images together against the references, starting with a motion. They
-    /// count as those of a second camera, whose extrinsics are estimated.
+    /// Registers all moved images together against the references, starting with a motion. The
+    /// moved images are treated as images of a second camera, whose extrinsics are estimated.
     fn register_moved(
         &mut self,
         moved: &[usize],
@@ -386,7 +388,7 @@ impl MovementDetector {
         let mut initial = Corrections::none(2);
         initial.by_camera[1] = correction_of(motion);
         let found = fit::fit(&self.images, pairs, Layout::extrinsics_of(1), &initial);
-        // If the movement is rejected, they become references.
+        // If the movement is rejected, these images become references.
         for ix in moved {
             self.images[*ix].camera = 0;
         }
@@ -421,7 +423,8 @@ fn is_used(keyframe: &Keyframe) -> bool {
     keyframe.split != Split::Test && keyframe.depth.is_some()
 }
 
-/// Residuals of all pixels at the finest level: new images are already aligned approximately.
+/// Options for residuals of all pixels at the finest level. Coarser levels are not needed, because
+/// new images are already aligned approximately.
 fn finest(noise: Noise) -> ResidualOptions {
     ResidualOptions {
         level: 0,

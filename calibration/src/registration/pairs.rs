@@ -5,7 +5,7 @@ use super::view::CorrectedView;
 use rayon::prelude::*;
 
 /// Minimum fraction of an image's samples that its partner must show. With less overlap, a pair
-/// takes as long, but has fewer residuals and more of them at occlusions.
+/// takes the same time but has fewer residuals, and more of them are at occlusions.
 const MIN_OVERLAP: f64 = 0.3;
 /// Number of samples that are tested for the overlap, which gives it a standard deviation of about
 /// 7 %. All pairs of images are tested, so this determines the time of the selection.

@@ -1,5 +1,5 @@
-//! Estimates pose corrections of individual images. There are many unknowns, but each pair
-//! constrains only two images.
+//! Estimates pose corrections of individual images. There are many unknowns, but the equations are
+//! sparse, because each pair constrains only two images.
 
 use super::corrections::{Corrections, rotation_and_translation, twist};
 use super::fit::{INITIAL_NOISE, OCCLUSION_FRAC};
@@ -39,7 +39,7 @@ pub(super) fn fit(
     let layout = Layout::default();
     let mut corrections = from.clone();
     let slot_of_image = slots(pairs);
-    // Motion of each image so far, meters and radians, towards which the prior is relative.
+    // Motion of each image so far, meters and radians. The prior applies to this total motion.
     let mut total = vec![Vector6::zeros(); slot_of_image.len()];
     let mut pose_error = MAX_POSE_ERROR;
     let n_levels = images.iter().map(|image| image.levels.len()).max()?;
@@ -252,8 +252,8 @@ fn remove_mean(
 
 /// Moves the camera of an image in its own axes: meters, then radians.
 fn apply_step(correction: &mut CameraCorrection, image: &PreparedImage, step: &Vector6<f64>) {
-    // Drift is applied before the extrinsics correction, so the motion is converted to the axes
-    // before that correction.
+    // Drift is applied before the extrinsics correction, so the motion is converted to the axes of
+    // the camera before that correction.
     let extrinsics = rigid_transform(
         correction.rotation_rad.into(),
         correction.translation_m.into(),
@@ -343,7 +343,7 @@ impl NormalEquations {
     fn solve(&self) -> Vec<Vector6<f64>> {
         // An inexact step is corrected by the next Gauss-Newton step.
         const MAX_CG_ITERATIONS: usize = 60;
-        // Of the squared residual.
+        // The tolerance applies to the squared residual.
         const TOLERANCE: f64 = 1e-8;
         let inverses: Vec<Matrix6<f64>> = self
             .diagonal

@@ -122,7 +122,8 @@ fn select_samples(
     depth: &DepthMap,
     gradient_norm: impl Fn(&DepthSample) -> Option<f64>,
 ) -> (Vec<DepthSample>, Vec<DepthSample>) {
-    // Per cell. Testing all pixels would take most of the time of the preparation.
+    // Number of tested pixels along each side of a cell. Testing all pixels would take most of the
+    // preparation time.
     const CANDIDATES_PER_SIDE: usize = 6;
     let [width, height] = depth.size_px.map(|side| side as usize);
     let mut strongest = Vec::new();
@@ -222,7 +223,7 @@ pub(super) fn depth_at(depth: &DepthMap, pixel: [f64; 2]) -> Option<SampledValue
     let (min, max) = corners.iter().fold((f64::MAX, 0.0f64), |(min, max), z| {
         (min.min(*z), max.max(*z))
     });
-    // Holes are zeros. Written so that a NaN is a hole, too.
+    // Holes are zeros. The comparison is written so that NaN also counts as a hole.
     if !(min > 0.0 && max - min <= SMOOTH_FRAC * min) {
         return None;
     }
@@ -298,14 +299,15 @@ fn levels(keyframe: &Keyframe) -> Vec<GrayImage> {
 }
 
 /// Blurs with a binomial filter, five pixels wide. Interpolated values have less noise than values
-/// at pixel centers; without the blur, this would bias estimates towards half-pixel offsets.
+/// at pixel centers. Without the blur, this difference would bias estimates towards half-pixel
+/// offsets.
 fn blurred([width, height]: [usize; 2], values_in: &[f32]) -> Vec<f32> {
     let rows = blurred_along(values_in, [width, 1], |ix| ix % width);
     blurred_along(&rows, [height, width], |ix| ix / width)
 }
 
-/// Blurs along one axis with `n` values that are `stride` apart. Outside, the outermost value
-/// continues.
+/// Blurs along one axis with `n` values that are `stride` apart. Values beyond the ends are equal
+/// to the outermost value.
 ///
 /// * `coordinate`: position along the axis of the value at an index.
 fn blurred_along(

@@ -211,8 +211,8 @@ fn estimate(
     };
     Some(match param {
         CalibrationParam::Extrinsics(camera, 0) => {
-            // The correction maps to the corrected camera; the report names the motion of the
-            // camera.
+            // The correction maps to the corrected camera, whereas the report contains the motion
+            // of the camera.
             let wrong_extrinsics = rigid_transform(
                 correction(camera).rotation_rad.into(),
                 correction(camera).translation_m.into(),
@@ -272,7 +272,8 @@ fn pose_estimate(
     solution: &Solution,
     begin: usize,
 ) -> PoseEstimate {
-    // Standard deviations along the estimated motion, which say whether its size is significant.
+    // The standard deviations are along the estimated motion, so that they show whether its size is
+    // significant.
     let rotation_axis = unit_or_zero(rotation);
     let translation_axis = unit_or_zero(translation);
     PoseEstimate {
@@ -300,8 +301,8 @@ fn sigma_along(solution: &Solution, axis: Vector3<f64>, begin: usize) -> f64 {
 
 /// Unobservable directions of a fit.
 pub(super) fn unobservable(scene: &AlignmentScene, fit: &Fit) -> Vec<Unobservable> {
-    // Directions that are pure translations first: they are the most common ones, and the easiest
-    // to understand.
+    // Pure translations come first, because they are the most common directions and the easiest to
+    // understand.
     let directions = fit
         .solution
         .unobservable(|ix| !is_translation(fit.layout.params[ix]));
@@ -412,7 +413,7 @@ impl Alignment {
         !self.corrections.is_empty()
     }
 
-    /// Whether another alignment places the camera of a keyframe noticeably differently.
+    /// Whether another alignment gives the camera of a keyframe a noticeably different pose.
     pub(crate) fn differs(&self, other: &Self, keyframe: &Keyframe) -> bool {
         self.camera(keyframe, None)
             .differs_noticeably(&other.camera(keyframe, None))
@@ -430,7 +431,8 @@ impl Alignment {
             Some(correction) => correction.color_from_depth(keyframe, depth),
             None => keyframe.world_from_camera.inverse() * depth.world_from_camera,
         });
-        // Without the depth map, so that it is not scaled pixel by pixel for a pose.
+        // The depth map is left out, because only the pose is needed and scaling all pixels would
+        // take time.
         let aligned = self.corrected(&Arc::new(Keyframe {
             depth: None,
             ..keyframe.clone()

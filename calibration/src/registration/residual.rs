@@ -1,9 +1,10 @@
 //! Photometric and depth residuals of a sample of one image in another image, and their Jacobians.
 //!
-//! A depth reading becomes a point in the world. Its brightness in image `i` is compared with that
-//! in image `j`, and its distance along the z axis of `j`'s depth camera with the reading there.
-//! Source: Kerbl, Sturm and Cremers 2013 (the two residuals), Schoeps et al. 2019 (both cameras
-//! move). The separate pose of the depth camera and the rolling shutter are our additions.
+//! A depth reading becomes a point in the world. The point's brightness in image `i` is compared
+//! with its brightness in image `j`. Its distance along the z axis of `j`'s depth camera is
+//! compared with the depth reading of `j`. Source: Kerbl, Sturm and Cremers 2013 (the two
+//! residuals), Schoeps et al. 2019 (both cameras move). The separate pose of the depth camera and
+//! the rolling shutter are our additions.
 
 use super::prepared_image::{DepthSample, GrayImage, PreparedImage, depth_at, point};
 use super::view::{CorrectedView, unit_twist};
@@ -97,8 +98,8 @@ impl Correspondence {
             depth_pixel,
             reading_m,
             reading_gradient,
-            // Projects the difference along z onto the normal; depth noise grows with the square of
-            // the depth.
+            // The weight projects the difference along z onto the normal. It also accounts for
+            // depth noise, which grows with the square of the depth.
             depth_weight: 1.0
                 / ((1.0 + tilt[0] * tilt[0] + tilt[1] * tilt[1]).sqrt() * reading_m * reading_m),
         })
@@ -141,9 +142,9 @@ impl Correspondence {
         );
         let gradient_j = mid_exposure_gradient(j.view, &self.j, &read_j);
         let gradient_i = mid_exposure_gradient(i.view, &self.i, &read_i);
-        // With respect to the point in the axes of camera i. The point is fixed in camera i, so a
-        // motion of that camera carries the point along and changes only its place in j; a motion
-        // of j moves the point against it.
+        // Gradient with respect to the point in the axes of camera i. The point is fixed in camera
+        // i, so a motion of camera i carries the point along and changes only its position in j. A
+        // motion of camera j moves the point in the opposite direction relative to j.
         let gradient_through_poses = i
             .view
             .world_from_camera
@@ -178,7 +179,8 @@ impl Correspondence {
         let [fx, fy] = j.view.depth_focal_px;
         let q = &self.in_depth;
         let [sx, sy] = self.reading_gradient;
-        // Two terms: the reading changes with the pixel, and the depth of the point changes.
+        // There are two terms, because both the reading at the pixel and the depth of the point
+        // change.
         let along_z = -(sx * fx * q.x + sy * fy * q.y) / (q.z * q.z) - 1.0;
         let in_depth = Vector3::new(sx * fx / q.z, sy * fy / q.z, along_z) * weight;
         let gradient_j = j.view.color_from_depth.rotation * in_depth;
@@ -209,8 +211,9 @@ impl Correspondence {
     }
 }
 
-/// Pyramid levels at which both images have about the same resolution on the surface, neither finer
-/// than `level`. A near view has detail that a distant view lacks.
+/// Pyramid levels at which both images have about the same resolution on the surface. Neither is
+/// finer than `level`. Different levels are needed because a near view has detail that a distant
+/// view lacks.
 fn levels([i, j]: [Side<'_>; 2], [z_i, z_j]: [f64; 2], level: usize) -> [usize; 2] {
     let texel_m =
         |side: Side<'_>, z_m: f64| z_m * side.image.level(level).texel_px() / side.view.focal_px[0];
@@ -306,15 +309,15 @@ fn gradient_by_point(view: &CorrectedView, observed: &ObservedPoint, factor: f64
     )
 }
 
-/// Gradient with respect to a displacement of the point at its readout time. Includes the effect
-/// that a displacement changes the row, and thus the readout time.
+/// Gradient with respect to a displacement of the point at its readout time. A displacement also
+/// changes the row and thus the readout time. This effect is included.
 fn row_held_gradient(
     view: &CorrectedView,
     observed: &ObservedPoint,
     gradient: &Vector3<f64>,
 ) -> Vector3<f64> {
-    // Implicit differentiation of the row: position = displaced point - drift * share(row), and the
-    // row follows from the position.
+    // The row is differentiated implicitly: position = displaced point - drift * share(row), and
+    // the row depends on the position.
     let drift = -view.readout_secs * view.twist.apparent_velocity(&observed.still);
     let z = observed.read.z;
     let row = Vector3::new(

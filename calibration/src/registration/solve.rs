@@ -39,7 +39,8 @@ impl Solution {
         sums: &[PairSums],
     ) -> Self {
         let n = scales.len();
-        // In units of the scales, so that eigenvalues of meters and radians are comparable.
+        // The information is in units of the scales, so that eigenvalues of meters and radians are
+        // comparable.
         let mut information = DMatrix::zeros(n, n);
         let mut gradient = DVector::zeros(n);
         for pair in sums {
@@ -61,10 +62,10 @@ impl Solution {
         let mut step = DVector::zeros(n);
         for (ix, observable) in is_observable.iter().enumerate() {
             let direction = eigen.eigenvectors.column(ix);
-            // A prior at zero with a standard deviation of one scale. Its information is multiplied
-            // by `INFLATION`, because that of the residuals is too large by this factor. Components
-            // that the residuals do not determine return to zero: an earlier step may have moved
-            // them, when the directions were others.
+            // The prior is at zero with a standard deviation of one scale. Its information is
+            // multiplied by `INFLATION`, because the information of the residuals is too large by
+            // this factor. Components that the residuals do not determine return to zero. Earlier
+            // steps may have moved them, because the directions were different then.
             let length = if *observable {
                 (direction.dot(&gradient) - INFLATION * direction.dot(&values))
                     / (eigen.eigenvalues[ix] + INFLATION)
@@ -121,9 +122,9 @@ impl Solution {
         &inverse * meat * &inverse * (n_active / (n_active - 1.0).max(1.0))
     }
 
-    /// Adds an error of the parameters that the scatter of the pairs does not contain to the
-    /// covariance. Its size, in units of the scales, is known better than its direction: half of
-    /// its variance is along `error`, and half is spread evenly over all observable directions.
+    /// Adds an error to the covariance that the scatter of the pairs does not contain. The size of
+    /// the error, in units of the scales, is known better than its direction. Half of its variance
+    /// is therefore along `error`, and half is spread evenly over all observable directions.
     pub(super) fn add_error(&mut self, error: &DVector<f64>) {
         let scaled = error.component_div(&self.scales);
         self.covariance.ger(0.5, &scaled, &scaled, 1.0);
@@ -204,8 +205,8 @@ impl Solution {
                 0.0
             }
         });
-        // Any basis of the unobservable space is as good. This one has vectors that do not change
-        // the selected parameters, if there are any, which are easier to describe.
+        // Any basis of the unobservable space is equally valid. In this one, some vectors do not
+        // change the selected parameters, if there are such vectors. They are easier to describe.
         let rotated = SymmetricEigen::new(masked_basis.tr_mul(&masked_basis));
         let mut order: Vec<usize> = (0..columns.len()).collect();
         order.sort_by(|a, b| rotated.eigenvalues[*a].total_cmp(&rotated.eigenvalues[*b]));

@@ -32,10 +32,11 @@ const PRIOR_ROTATION_RAD: f64 = 0.0175;
 /// Maximum number of steps at each level. Weights that depend on the residuals make convergence
 /// slower than plain Gauss-Newton.
 const MAX_ITERATIONS: usize = 20;
-/// A step smaller than this number of standard deviations ends a level, the finest first.
+/// A step smaller than this number of standard deviations ends a level. The value of the finest
+/// level comes first.
 const CONVERGED_STEP_SIGMAS: [f64; 4] = [0.1, 0.3, 0.3, 0.3];
-/// Factor on the brightness noise. Near occlusions and reflections, brightness has the same errors
-/// in all pairs of two stations; depth does not.
+/// Factor on the brightness noise. Near occlusions and reflections, the brightness errors are the
+/// same in all pairs of two stations. Depth errors are not.
 const BRIGHTNESS_NOISE_INFLATION: f64 = 4.0;
 
 /// Correction of the reported pose of a base at a station. Each sigma is a standard deviation.
@@ -79,7 +80,8 @@ pub fn register_station(
     world_from_base: &Transform,
 ) -> Option<StationCorrection> {
     // A base has one pose per station, so its six parameters are always estimated together. The
-    // decision is the same as for cameras: significant, and better on validation images.
+    // criteria are the same as for cameras: the correction must be significant, and improve the
+    // prediction of validation images.
     let scene = StationScene::new(reference, new, world_from_base)?;
     let (estimate, solution, noise) = scene.fit()?;
     let trial = scene.evaluate(&estimate, noise);
@@ -112,8 +114,8 @@ impl StationCorrection {
     /// identity unless the correction is accepted. `world_from_base` is the reported pose of the
     /// base.
     ///
-    /// * `share`: fraction of the path to the station, 0 to 1, because the error grows along the
-    ///   path.
+    /// * `share`: fraction of the path to the station, 0 to 1. It scales the correction, because
+    ///   the error grows along the path.
     pub fn map_from_odom(&self, world_from_base: &Transform, share: f64) -> Transform {
         if !self.kept {
             return Transform::identity();
@@ -157,7 +159,7 @@ fn base_motion(
 
 /// Describes an unobservable direction.
 fn describe(direction: &DVector<f64>) -> String {
-    // A part that is much smaller than the other one, in units of the scales, is omitted.
+    // If one part is much smaller than the other in units of the scales, it is omitted.
     const MIN_SHARE: f64 = 0.1;
     let vector = |begin: usize| Vector3::from_fn(|row, _| direction[begin + row]);
     let translation = vector(0);
@@ -410,7 +412,7 @@ mod tests {
         .inverse()
     }
 
-    /// Images of two stations, those of the second one with a wrong base pose.
+    /// Images of two stations. The images of the second station have a wrong base pose.
     fn keyframes_of_two_stations(
         odom_from_true: &Transform,
         noise: f64,

@@ -11,13 +11,13 @@ use rayon::prelude::*;
 /// Number of standard deviations at which residuals get half the full weight (Cauchy weights, 95 %
 /// as efficient as least squares for normal noise).
 const CAUCHY_SCALE: f64 = 2.385;
-/// Standard deviation of the prior on the gain, around 1. The next constant is that of the offset,
-/// around 0. They are wide, because exposures differ. Without a prior, a pair of even images would
-/// not determine them.
+/// Standard deviation of the prior on the gain, around 1. The next constant is the same for the
+/// offset, around 0. The priors are wide, because exposures differ. Without a prior, a pair of
+/// images of constant brightness would not determine gain and offset.
 const PRIOR_GAIN_DEVIATION: f64 = 0.2;
 const PRIOR_OFFSET: f64 = 30.0;
-/// Minimum number of samples of a pair. With fewer, gain and offset of the pair would absorb most
-/// of what the samples say.
+/// Minimum number of samples of a pair. With fewer samples, gain and offset of the pair would
+/// absorb most of their information.
 const MIN_SAMPLES: usize = 12;
 
 /// Scatter of the residuals: brightness on a scale of 0 to 255, depth in meters at 1 m.
@@ -51,8 +51,8 @@ pub(super) enum PixelSubset {
 
 impl PixelSubset {
     fn includes(self, pixel: [f64; 2]) -> bool {
-        // Larger than the correlation of textures and of the blur, so that the two halves are
-        // independent; small enough for several blocks in each image.
+        // Blocks are larger than the correlation lengths of textures and of the blur, so that the
+        // two halves are independent. They are small enough for several blocks in each image.
         const BLOCK_PX: f64 = 64.0;
         match self {
             Self::All => true,
@@ -279,7 +279,7 @@ impl ToneSums {
         let oo = self.at(n + 1, n + 1) + prior_information[1];
         let determinant = gg * oo - go * go;
         for row in 0..n {
-            // How gain and offset follow a change of the parameter.
+            // Change of gain and offset per change of the parameter.
             let rhs = [self.at(n, row), self.at(n + 1, row)];
             let of_tone = [
                 (oo * rhs[0] - go * rhs[1]) / determinant,
@@ -358,7 +358,7 @@ pub(super) fn noise_of(sums: &[PairSums]) -> Option<Noise> {
 
 /// Standard deviation of normal residuals with the same median of their absolute values.
 fn scatter(sums: &[PairSums], residuals_of: fn(&PairSums) -> &[f64]) -> Option<f64> {
-    /// Of a normal distribution: 1 divided by its 75 % quantile.
+    /// For a normal distribution, this is 1 divided by its 75 % quantile.
     const SIGMA_PER_MEDIAN: f64 = 1.4826;
     let mut all: Vec<f64> = sums
         .iter()

@@ -281,7 +281,7 @@ fn reported_sigmas_match_actual_errors() {
     assert!((0.25..4.0).contains(&mean), "{mean} of {squares:.1?}");
 }
 
-/// Of the reported uncertainty, which contains the error that all pairs have in common.
+/// The reported uncertainty contains the error that all pairs have in common.
 #[test]
 fn truth_is_within_the_stated_extrinsics() {
     const MAX_SIGMAS: f64 = 3.0;
@@ -373,8 +373,8 @@ fn max_jacobian_errors(has_rolling_shutter: bool) -> Vec<(layout::CalibrationPar
     let all: ParamSet = candidates().into_iter().collect();
     let layout = scene.layout(all);
     let mut here = Corrections::none(1);
-    // Joint offsets are zero: their columns are those at the measured joint positions, to first
-    // order.
+    // Joint offsets are zero. To first order, their columns are those at the measured joint
+    // positions.
     let displaced = layout
         .params
         .iter()
@@ -534,8 +534,8 @@ fn drifting_image_poses_are_corrected() {
     );
 }
 
-/// Seed of the pose errors of the first image. Errors of 10 mm are at the limit: with two of six
-/// seeds, single images converge to wrong poses.
+/// Seed of the pose errors of the first image. Errors of 10 mm are at the limit of convergence:
+/// with two of six seeds, single images converge to wrong poses.
 const NOISE_SEED: u64 = 1000;
 
 /// The capture with random errors in every pose except those of test images: `mm` millimeters along

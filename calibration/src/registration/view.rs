@@ -95,7 +95,7 @@ impl CorrectedView {
                 columns.push((joints + joint, twist.linear_m_s, twist.angular_rad_s));
             }
         }
-        // Depth that was registered to the color image has the errors of its lens, too.
+        // Depth that was registered to the color image also has the errors of the color lens.
         let mut depth_focal_px = depth.focal_px;
         let mut depth_principal_px = depth.principal_px;
         if image.shares_lens {
@@ -128,8 +128,8 @@ impl CorrectedView {
         })
     }
 
-    /// The view with another camera pose, on a camera that moves rigidly with a frame. Parameters 0
-    /// to 5 are the motion of the frame in its own axes: meters, then radians.
+    /// The view with another camera pose, for a camera that moves rigidly with a frame. Parameters
+    /// 0 to 5 are the motion of the frame in its own axes: meters, then radians.
     pub(super) fn moved_with_frame(
         &self,
         world_from_camera: &Transform,
@@ -169,8 +169,8 @@ impl CorrectedView {
         if self.readout_secs == 0.0 {
             return (*still, 0.0);
         }
-        // The row depends on the position, and the position on the time of the row. Two iterations
-        // suffice, because points move by a few rows at most during the readout.
+        // The row depends on the position, and the position depends on the time of the row. Two
+        // iterations are sufficient, because points move by a few rows at most during the readout.
         let drift = -self.readout_secs * self.twist.apparent_velocity(still);
         let mut at = *still;
         let mut share = 0.0;

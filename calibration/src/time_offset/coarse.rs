@@ -72,7 +72,8 @@ pub(super) fn correlate(
             ),
         });
     };
-    // No correlation. A wrong rate of one clock destroys it, too, and has another remedy.
+    // There is no correlation. A wrong rate of one clock is also a possible cause, with another
+    // remedy.
     if best.value < MIN_CORRELATION {
         if let Some(refusal) = clock_rate_mistake(a, b) {
             return Err(refusal);
@@ -105,7 +106,7 @@ pub(super) fn correlate(
 
 /// Explanation by stamps that advance too fast or too slowly by a factor of two.
 pub(super) fn clock_rate_mistake(a: &Stream, b: &Stream) -> Option<Refusal> {
-    /// Unrelated motions of usual length do not reach it.
+    /// The correlation of unrelated motions of usual length is below this.
     const MIN_CORRELATION: f64 = 0.7;
     let words = [(0.5, "twice"), (2.0, "half")]
         .into_iter()
@@ -148,7 +149,8 @@ impl Grid {
         let durations = [a, b].map(|stream| stream.end_secs() - stream.start_secs());
         let finest = a.step_secs().max(b.step_secs());
         let step_secs = finest.max(durations[0].max(durations[1]) / MAX_POINTS);
-        // Windows of two steps: shorter ones amplify noise, longer ones blur the motion.
+        // The windows are two steps long. Shorter windows amplify noise, and longer windows blur
+        // the motion.
         let rates = [a, b].map(|stream| Rates::new(stream, step_secs, 2.0 * step_secs));
         Self {
             rates,
@@ -160,7 +162,8 @@ impl Grid {
     /// Correlations at all lags with enough overlap. Without a limit, clocks with different zeros
     /// are allowed.
     pub(super) fn correlations(&self, max_offset_secs: Option<f64>) -> Vec<Correlation> {
-        // Of the shorter stream. With less overlap, correlations by chance are high.
+        // Minimum overlap as a fraction of the shorter stream. With less overlap, correlations are
+        // often high by chance.
         const MIN_OVERLAP: f64 = 0.25;
         let [n_a, n_b] = self
             .rates
@@ -215,7 +218,7 @@ impl Rates {
     /// # Errors
     /// If the rate hardly changes.
     fn check_excitation(&self, name: &str) -> Result<(), Refusal> {
-        /// A tenth of what a hand-held or slowly moving camera does; below, noise of tracking
+        /// A tenth of the value for a hand-held or slowly moving camera. Below it, tracking noise
         /// dominates.
         const MIN_DEVIATION_RAD_S: f64 = 0.02;
         let rates: Vec<f64> = self.values.iter().flatten().copied().collect();
@@ -246,7 +249,7 @@ impl Rates {
 pub(super) struct Correlation {
     pub(super) lag: i64,
     pub(super) value: f64,
-    /// Value of the t statistic, which weighs long overlaps.
+    /// Value of the t statistic, which gives long overlaps more weight.
     significance: f64,
 }
 
@@ -284,7 +287,8 @@ impl Correlation {
     }
 }
 
-/// Whether a correlation is larger than both neighbors; of equal ones, the last counts.
+/// Whether a correlation is larger than both neighbors. If correlations are equal, the last one
+/// counts as larger.
 fn is_maximum(correlations: &[Correlation], ix: usize) -> bool {
     let value = correlations[ix].value;
     ix > 0

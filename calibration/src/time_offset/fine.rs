@@ -38,8 +38,8 @@ pub(super) struct Fine {
 /// If the streams do not overlap.
 pub(super) fn refine(a: &Stream, b: &Stream, offset_secs: f64) -> Result<Fine, Error> {
     const MIN_SIGMAS: f64 = 3.0;
-    // Twice: without a drift, then with one. An insignificant drift would only add to the
-    // uncertainty of the offset.
+    // The fit is done twice, first without a drift and then with one. An insignificant drift would
+    // only increase the uncertainty of the offset.
     let problem = Orientations::new(a, b, offset_secs)?;
     let initial = problem.initial_state(offset_secs)?;
     let without = problem.fit(initial)?;
@@ -144,8 +144,8 @@ impl<'a> Orientations<'a> {
 
     /// Rotations from the correlation of rotation vectors over about half a second (Kabsch 1976).
     fn initial_state(&self, offset_secs: f64) -> Result<State, Error> {
-        // Long enough for rotations above the noise of the poses, short enough for rotation vectors
-        // of less than half a turn.
+        // The time is long enough for rotations above the noise of the poses, and short enough for
+        // rotations of less than half a turn.
         const SPAN_SECS: f64 = 0.5;
         let mut correlation = Matrix3::zeros();
         let mut later_ix = 0;
@@ -164,8 +164,8 @@ impl<'a> Orientations<'a> {
             let in_a = (start.rotation.inverse() * end.rotation).scaled_axis();
             correlation += in_a * (rotation.inverse() * later).scaled_axis().transpose();
         }
-        // Rotations about one axis determine the rotation up to that axis: any completion is a
-        // start.
+        // If all rotations are about one axis, the rotation about that axis is not determined. Any
+        // value can then be used as a start.
         let smallest = 1e-6 * correlation.norm().max(f64::MIN_POSITIVE);
         let undetermined = || Error::TimeOffsetInput {
             why: "the rotations of the streams have no mean".to_owned(),
@@ -194,11 +194,12 @@ impl<'a> Orientations<'a> {
     /// Robust fit; the scale of the residuals is estimated in three rounds.
     fn fit(&self, initial: State) -> Result<Fit<State>, Error> {
         const ROUNDS: usize = 4;
-        // Exact poses of a simulation have no residuals.
+        // Lower limit of the scale, because exact poses of a simulation have no residuals.
         const MIN_SCALE_RAD: f64 = 1e-7;
         let options = least_squares::Options {
-            // In standard deviations. Not convex, but the start is close, and tracking systems
-            // report wrong poses that the Huber loss would follow.
+            // The threshold is in standard deviations. The Cauchy loss is not convex, but the start
+            // is close. Tracking systems report wrong poses, which have too much influence with the
+            // Huber loss.
             loss: Loss::Cauchy { threshold: 2.5 },
             max_steps: 40,
             ..least_squares::Options::default()

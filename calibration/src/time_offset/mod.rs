@@ -72,7 +72,7 @@ pub struct TimeOffset {
     pub rms_deg: f64,
     /// Differences of the orientations after alignment over time: seconds on B's clock, degrees.
     pub residuals: Vec<[f64; 2]>,
-    /// The transform between the bodies, or why it is refused. `None` if it was not asked for.
+    /// The transform between the bodies, or why it is refused. `None` if it was not requested.
     pub hand_eye: Option<Result<BodyTransform, Refusal>>,
 }
 
@@ -120,7 +120,8 @@ pub fn estimate_time_offset(
     b: &[PoseSample],
     options: &TimeOffsetOptions,
 ) -> Result<TimeOffset, Error> {
-    // Checked in any case: streams with wrong quaternions may give an offset with large residuals.
+    // The orientations are always checked, because streams with wrong quaternions may give an
+    // offset with large residuals.
     let found = estimate(a, b, options);
     match quaternion_order::mistake(a, b, options, found.as_ref()) {
         Some(refusal) => Err(Error::Refused(Box::new(refusal))),
@@ -149,8 +150,8 @@ fn estimate(
             _ => error,
         })?;
     let offset_secs = sign * fine.offset_secs;
-    // Rotation rates are the same for a stream and its inverse, but orientations are not: the fit
-    // then drifts away from its start.
+    // Rotation rates are the same for a stream and its inverse, but orientations are not. If one
+    // stream is inverted, the fit therefore moves away from its start.
     if (offset_secs - coarse.offset_secs).abs() > 10.0 * coarse.step_secs {
         return Err(refused(Refusal::new(
             format!(
@@ -160,7 +161,7 @@ fn estimate(
             "check that both streams are poses of the bodies (reference_from_body), not their inverses",
         )));
     }
-    // An offset at the limit may exceed it by its error.
+    // An offset near the limit may exceed the limit because of its error.
     const MAX_SIGMAS: f64 = 3.0;
     let is_beyond = |most: &f64| offset_secs.abs() > most + MAX_SIGMAS * fine.sigma_secs;
     if let Some(most) = options.max_offset_secs.filter(is_beyond) {
@@ -219,7 +220,7 @@ fn estimate(
     })
 }
 
-/// The refined offset with the smallest residuals, and where it started.
+/// The refined offset with the smallest residuals, and the offset from which it started.
 ///
 /// # Errors
 /// If another offset fits as well, or none.
@@ -231,7 +232,7 @@ fn refine_best(
 ) -> Result<(coarse::Coarse, fine::Fine), Error> {
     /// Residuals of a wrong offset exceed the noise by a large factor.
     const SIMILAR: f64 = 1.5;
-    /// Differences that no tracking system resolves.
+    /// Smaller differences are below the resolution of all tracking systems.
     const EXACT_RAD: f64 = 1e-4;
     /// Largest residual relative to the motion. Unrelated motions have about 1.
     const MAX_RESIDUAL_FRAC: f64 = 0.25;
@@ -286,7 +287,7 @@ fn body_transform(
     b: &Stream,
     secs_a: impl Fn(f64) -> f64,
 ) -> Result<Result<BodyTransform, Refusal>, Error> {
-    /// More poses of a stream are not independent of each other, and would only take longer.
+    /// More poses would not be independent of each other, and would only take longer.
     const MAX_SAMPLES: usize = 50;
     let pairs: Vec<(f64, Transform, Transform)> = b
         .samples

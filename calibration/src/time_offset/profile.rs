@@ -8,15 +8,15 @@ use crate::Error;
 /// Rotation rates of both streams, and their correlation at each offset.
 #[derive(Clone, Debug, PartialEq)]
 pub struct MotionProfile {
-    /// Rotation rates of A and B, without gaps: seconds on the clock of the stream, radians per
-    /// second. The highest 5 % of the rates are clipped.
+    /// Rotation rates of A and B, without gaps. Each entry contains seconds on the clock of the
+    /// stream, and radians per second. The highest 5 % of the rates are clipped.
     pub rates: [Vec<[f64; 2]>; 2],
     /// Offset in seconds, and correlation of the rates at this offset.
     pub correlation: Vec<[f64; 2]>,
 }
 
-/// The rotation rates that [`super::estimate_time_offset`] compares. Available also if the estimate
-/// is refused.
+/// The rotation rates that [`super::estimate_time_offset`] compares. They are available even if the
+/// estimate is refused.
 ///
 /// # Errors
 /// [`Error::TimeOffsetInput`] if a stream is invalid.

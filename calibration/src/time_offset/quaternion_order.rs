@@ -15,11 +15,12 @@ pub(super) fn mistake(
     options: &TimeOffsetOptions,
     found: Result<&TimeOffset, &Error>,
 ) -> Option<Refusal> {
-    /// Smaller residuals are errors of a tracking system.
+    /// Smaller residuals are normal errors of a tracking system.
     const MAX_GOOD_DEG: f64 = 2.0;
     /// Residual with the right order.
     const MAX_EXPLAINED_DEG: f64 = 6.0;
-    /// Factor by which the other order must fit better. A smaller one would blame noisy streams.
+    /// Factor by which the other order must fit better. With a smaller factor, noisy streams would
+    /// be reported, too.
     const BETTER: f64 = 3.0;
     let found_deg = match found {
         Ok(offset) => median_deg(offset),

@@ -29,8 +29,8 @@ impl Stream {
     /// # Errors
     /// If a value is not finite, or if there are too few poses.
     pub(super) fn new(name: &str, samples: &[PoseSample]) -> Result<Self, Error> {
-        /// Neighbors whose distance exceeds the median by this factor are not interpolated: up to
-        /// two poses in a row may be missing.
+        /// Neighbors whose distance exceeds the median by this factor are not interpolated. Up to
+        /// two consecutive poses may thus be missing.
         const GAP: f64 = 3.5;
         let invalid = |why: String| Err(Error::TimeOffsetInput { why });
         if let Some(ix) = samples.iter().position(|sample| !is_valid(sample)) {

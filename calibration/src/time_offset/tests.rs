@@ -315,7 +315,7 @@ fn stamps_that_advance_at_another_rate_or_repeat_are_named() {
         text.contains("stream B") && text.contains("whole seconds"),
         "{text}"
     );
-    // Rows that are repeated exactly do no harm.
+    // Exact repetitions of rows do not affect the result.
     let repeated: Vec<PoseSample> = b.iter().flat_map(|sample| [*sample, *sample]).collect();
     let found = estimate_time_offset(&a, &repeated, &TimeOffsetOptions::default()).unwrap();
     assert!(
@@ -369,7 +369,7 @@ fn offsets_beyond_the_limit_are_refused() {
         };
         estimate_time_offset(&a, &b, &options)
     };
-    // Half of the time between two poses beyond the limit.
+    // The limit is exceeded by half of the time between two poses.
     let refused = refusal(within(TRUE_OFFSET_SECS - 0.005));
     assert!(
         refused

@@ -121,7 +121,7 @@ fn rows_have_the_poses_of_their_exposures() {
     };
     let found = calibration_images(opened, "wrist", 1e3, |_, _| ControlFlow::Continue(())).unwrap();
     let arm = found.images[0].arm.as_ref().unwrap();
-    // 1 rad/s over the readout time of 10 ms.
+    // The joint rotates at 1 rad/s over the readout time of 10 ms.
     let angles = [0.0, 0.5, 1.0].map(|row_frac| arm.base_from_flange_at(row_frac).rotation.angle());
     for (angle, expected) in angles.into_iter().zip([0.445, 0.45, 0.455]) {
         assert!((angle - expected).abs() < 1e-6, "{angles:?}");
@@ -132,7 +132,7 @@ fn rows_have_the_poses_of_their_exposures() {
 fn images_without_readings_or_pixels_are_unusable() {
     let mut broken = image(0.5);
     broken.data = [7; 3].into();
-    // Before the first reading, broken, and after the last one.
+    // The images are before the first reading, broken, and after the last reading.
     let found = read(
         arm_rig(),
         with_readings([image(-0.5), broken, image(1.8), image(2.5)]),

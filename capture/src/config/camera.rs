@@ -26,8 +26,8 @@ keys! {
         pub device: String = String::new();
         /// Frame rate, Hz.
         pub rate_hz: f64, in 0.01..=1000.0, required "images per second";
-        /// Exposure time, microseconds, at most one frame period. `None`: automatic; the exposure
-        /// time of each image is then known only if the camera reports it.
+        /// Exposure time, microseconds, at most one frame period. `None` means automatic exposure.
+        /// The exposure time of each image is then known only if the camera reports it.
         pub exposure_micros: Option<f64>, in 0.0..=period_micros(rate_hz);
         /// Time from the first to the last row, microseconds, at most one frame period; `None` if
         /// unknown, 0 for a global shutter.

@@ -27,7 +27,7 @@ pub(super) fn insert_contents(
         };
         let files = Files { folder, context };
         files.insert(&format!("camera.{name}"), camera, &Table::new())?;
-        // Depth inherits the size of the color images if it has none of its own.
+        // Depth inherits the size of the color images if it has no size of its own.
         let color = camera.clone();
         if let Some(Value::Table(depth)) = camera.get_mut("depth") {
             files.insert(&format!("camera.{name}.depth"), depth, &color)?;
@@ -67,8 +67,8 @@ impl Files<'_> {
         })?;
         let info = CameraInfo::parse(&text).map_err(&rejected)?;
         let setting = |name: &str| table.get(name).or_else(|| defaults.get(name));
-        // With `rectified = true`, distortion would be ignored, and the camera matrix would be that
-        // of other images.
+        // With `rectified = true`, distortion would be ignored, and the camera matrix would belong
+        // to other images.
         if setting("rectified") == Some(&Value::Boolean(true)) {
             return Err(rejected(
                 "these are the lens parameters of raw images, but rectified = true; remove that key, or use the numbers of \
@@ -78,8 +78,8 @@ impl Files<'_> {
         }
         let sides = setting("size_px").and_then(Value::as_array);
         let sides = sides.and_then(|sides| sides.iter().map(number).collect::<Option<Vec<f64>>>());
-        // The parameters are not scaled to another size: cameras may crop instead of scaling, which
-        // the file does not show.
+        // The parameters are not scaled to another size. Cameras may crop instead of scaling, and
+        // the file does not show which of the two they do.
         if let (Some([width, height]), Some(sides)) = (info.size_px, sides)
             && sides != [f64::from(width), f64::from(height)]
         {

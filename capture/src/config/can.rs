@@ -154,7 +154,7 @@ fn motor(joint: String, mut keys: Section<'_>, buses: &[BusConfig]) -> Option<Mo
     };
     let protocol = protocol(&mut keys, family, id);
     keys.end();
-    // Only now, so that all problems of the motor have been reported.
+    // This returns only now, so that all problems of the motor have been reported.
     let bus_ix = bus_ix?;
     let protocol = protocol?;
     Some(MotorConfig {

@@ -6,8 +6,8 @@ use super::section::Section;
 use kinematics::{Intrinsics, Lens};
 use toml::Value;
 
-/// Placeholder until the camera reports its intrinsics, and in a rig with missing keys, which is
-/// never returned.
+/// Placeholder until the camera reports its intrinsics. It is also used in a rig with missing keys,
+/// which is never returned.
 pub(super) const PLACEHOLDER_INTRINSICS: Intrinsics = Intrinsics {
     size_px: [1, 1],
     focal_px: [1.0; 2],

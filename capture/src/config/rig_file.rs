@@ -51,8 +51,8 @@ pub(super) fn keys(
         message: e.message().to_owned(),
     };
     let mut table: Table = toml::from_str(text).map_err(syntax)?;
-    // Flags are applied to the text of the file, before anything is checked. Their values then have
-    // the same ranges and defaults as keys.
+    // Flags are applied to the text of the file, before anything is checked. The values of flags
+    // therefore have the same ranges and defaults as keys.
     for flag in overrides {
         set(&mut table, flag.key, flag.value.clone());
     }

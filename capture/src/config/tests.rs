@@ -404,7 +404,7 @@ const KEYS: &[(&str, &str, &str)] = &[
         "[0, 1, 0, 0]",
         "[0, 0, 0, 0]",
     ),
-    // The same settings as whole tables: a flag may also replace a table.
+    // These are the same settings as whole tables, because a flag may also replace a table.
     ("base.world_from_base", "{ xyz_m = [1, 2, 3] }", "3"),
     (
         "range.lidar.base_from_scanner",

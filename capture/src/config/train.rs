@@ -45,8 +45,8 @@ pub struct Methods {
 
 impl PartialEq for Methods {
     fn eq(&self, other: &Self) -> bool {
-        // The place in a file is no part of the value: a rig read from its effective rig file must
-        // equal the original.
+        // The location in the file is not compared, because a rig that was read from its effective
+        // rig file must equal the original.
         self.names == other.names
     }
 }

@@ -1,5 +1,5 @@
-//! Checks for camera values in the rig file that are valid but implausible: in another unit, or
-//! left at the default.
+//! Checks for camera values in the rig file that are valid but implausible. Such values are in
+//! another unit, or were left at the default.
 
 use super::Finding;
 use crate::config::{Camera, Parent, Rig};
@@ -54,7 +54,8 @@ fn problems(camera: &Camera) -> Vec<(String, String)> {
             * (0.5 * size_px[0] / intrinsics.focal_px[0])
                 .atan()
                 .to_degrees();
-        // The formula above holds for a pinhole; a fisheye may see more than half of the space.
+        // The formula above holds for a pinhole. A fisheye lens may see more than half of the
+        // space.
         let has_wide_lens =
             matches!(intrinsics.lens, Lens::KannalaBrandt(_)) && !intrinsics.rectified;
         if !FIELD_OF_VIEW_DEG.contains(&field_of_view_deg) && !has_wide_lens {

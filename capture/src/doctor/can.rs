@@ -5,8 +5,8 @@ use crate::config::Rig;
 use drivers::can::{BusConfig, Link, interfaces};
 use std::path::Path;
 
-/// Checks the settings of CAN interfaces. Interfaces in the rig file must match it; for the others,
-/// general settings are checked.
+/// Checks the settings of CAN interfaces. Interfaces in the rig file must match it. For the other
+/// interfaces, general settings are checked.
 pub(super) fn can(rig: Option<&Rig>) -> Vec<Finding> {
     let named = rig.map_or(&[][..], |rig| &rig.arm.buses);
     let others = interfaces(Path::new("/sys"))

@@ -68,8 +68,8 @@ fn output_of(program: &str, arguments: &[&str]) -> Option<String> {
     Some(String::from_utf8_lossy(&output.stdout).into_owned())
 }
 
-/// Checks that the controller accepts clients, by opening a connection and closing it without
-/// sending anything, which does not occupy the robot.
+/// Checks that the controller accepts clients. It opens a connection and closes it without sending
+/// anything, so the robot is not occupied.
 fn port(address: &str) -> Finding {
     let has_no_port = host_of(address) == address;
     let found = if has_no_port {

@@ -298,8 +298,8 @@ fn remedy(error: &Error, monitors: &[DatagramMonitor]) -> &'static str {
     }
 }
 
-/// A finding for each device that sent nothing. Devices whose datagrams cannot be used have another
-/// finding.
+/// A finding for each device that sent nothing. Devices whose datagrams cannot be used get a
+/// different finding.
 fn missing(
     rig: &Rig,
     expected: &BTreeMap<String, Option<f64>>,
@@ -432,7 +432,7 @@ mod tests {
         };
         for ix in 0..n {
             let stamp = Stamp(ix * period_millis * 1_000_000);
-            // One in a hundred arrives late.
+            // One sample in a hundred arrives late.
             track.note(
                 stamp,
                 stamp.plus_secs(if ix % 100 == 50 { 0.5 } else { 0.01 }),

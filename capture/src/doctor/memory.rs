@@ -3,8 +3,9 @@
 use super::{Finding, field};
 use std::path::Path;
 
-/// Enough for a model of a million splats with its keyframes and the optimizer state. With less, a
-/// run may have to swap, or fails when its store of keyframes is full.
+/// This memory is enough for a model of a million splats with its keyframes and the optimizer
+/// state. With less memory, a run may have to swap, or may fail when its store of keyframes is
+/// full.
 const SUFFICIENT_MEMORY_KIB: u64 = 4 << 20;
 
 /// Checks that the memory is sufficient for a run.

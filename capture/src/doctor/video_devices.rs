@@ -22,8 +22,8 @@ pub(super) fn permissions(dev: &Path) -> Finding {
     let denied: Vec<String> = nodes
         .iter()
         .filter(|node| {
-            // Opened for reading and writing, as the drivers do. Any other error, such as a busy
-            // device, is no problem of permissions.
+            // The device is opened for reading and writing, as the drivers do. Any other error,
+            // such as a busy device, is not a permission problem.
             let opened = std::fs::File::options().read(true).write(true).open(node);
             opened.is_err_and(|error| error.kind() == std::io::ErrorKind::PermissionDenied)
         })

@@ -25,7 +25,8 @@ struct CameraFile {
 impl CameraFiles {
     /// Creates an entry for each RealSense camera of the rig.
     pub(super) fn new(rig: &Rig, folder: &Path) -> anyhow::Result<Self> {
-        // Absolute, because the rig file that names these files may be read from another folder.
+        // The path is absolute, because the rig file that names these files may be read from
+        // another folder.
         let folder =
             std::path::absolute(folder).context("cannot resolve the folder of the camera files")?;
         let camera_file = |camera: &Camera| CameraFile {
@@ -63,7 +64,7 @@ impl CameraFiles {
     pub(super) fn finish(self, rig: &mut Rig) -> anyhow::Result<Vec<String>> {
         let mut descriptions = Vec::new();
         for camera_file in self.camera_files {
-            // Copies, because finishing consumes the entry.
+            // These values are copied, because finishing consumes the entry.
             let name = Arc::clone(&camera_file.camera.name);
             let path = camera_file.path.clone();
             camera_file.finish()?;
@@ -121,7 +122,8 @@ impl CameraFile {
                 camera_from_depth: depth.camera_from_depth,
                 meters_per_count,
             }),
-            // The rig file promises depth images, and their unit is in the first one: keep waiting.
+            // Keep waiting, because the rig file has depth, and the first depth image contains the
+            // unit.
             (Some(_), None) => return Ok(()),
             (None, _) => None,
         };
@@ -134,7 +136,8 @@ impl CameraFile {
             clippy::cast_sign_loss,
             reason = "rates are small numbers above 0"
         )]
-        // The file stores whole rates. At least 1, because a slower camera would get a rate of 0.
+        // The file stores rates as integers. The rate is at least 1, because a slower camera would
+        // otherwise get a rate of 0.
         let rate_hz = rate_hz.round().max(1.0) as u16;
         let emulated = EmulatedCamera {
             name: "fieldrig simulated camera".to_owned(),

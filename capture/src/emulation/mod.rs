@@ -92,7 +92,7 @@ impl EmulationPlan {
         let (name, mut rig) = load(&self.rig_or_scene)?;
         check(&rig)?;
         if rig.arm.driver == ArmDriver::Franka {
-            // Checked before simulating for a minute.
+            // The address is checked before the simulation, which takes a minute.
             let address = fci_address(&rig.arm.address)?;
             TcpListener::bind(address)
                 .with_context(|| format!("cannot emulate the controller at {address}"))?;
@@ -103,8 +103,8 @@ impl EmulationPlan {
             .unwrap_or_else(|| PathBuf::from(format!("sim-{name}")));
         std::fs::create_dir_all(&folder)
             .with_context(|| format!("cannot create the folder {}", folder.display()))?;
-        // All samples are prepared before the playback: simulating and encoding would not keep up
-        // with real time.
+        // All samples are prepared before the playback, because simulating and encoding are slower
+        // than real time.
         let recording = match &self.recording {
             Some(path) => path.clone(),
             None => match self.simulate(&rig, &folder, stop, on_progress)? {
@@ -134,7 +134,7 @@ impl EmulationPlan {
                 .saturating_sub(playback_clock.scripted.0);
         }
         let rig_file = write_rig(&folder, &rig)?;
-        // Last, because the playback time is running.
+        // The devices are started last, because the playback time is already running.
         let devices = EmulatedDevices::start(&rig, &script, playback_clock, self)?;
         descriptions.extend(devices.descriptions.iter().cloned());
         Ok(Some(Emulation {
@@ -160,7 +160,7 @@ impl EmulationPlan {
             rig, mut source, ..
         } = open::rig(simulated, Devices::Sim)?;
         let path = folder.join(SIMULATION_FILE);
-        // A leftover of an earlier or interrupted simulation.
+        // The file may remain from an earlier or interrupted simulation.
         match std::fs::remove_file(&path) {
             Err(error) if error.kind() != std::io::ErrorKind::NotFound => {
                 return Err(error).with_context(|| format!("cannot replace {}", path.display()));

@@ -16,8 +16,8 @@ pub(super) struct Acceptance {
     is_fixed: bool,
     readout_secs: f64,
     /// All poses accepted so far, including those of evicted keyframes. Otherwise, a full store
-    /// would accept the same views again and again. Their number is bounded by the spacing and the
-    /// space that the camera can reach.
+    /// would accept the same views again and again. Their number is limited, because the camera can
+    /// reach only a limited space and poses have a minimum spacing.
     accepted: Vec<Transform>,
     last: Option<Stamp>,
     sharpness: SharpnessHistory,
@@ -57,8 +57,8 @@ impl Acceptance {
             });
             waited && self.accepted.len() < self.config.fixed_keyframes
         } else {
-            // The distance to every accepted pose counts, not only to the last one: an arm that
-            // repeats its path would otherwise add the same views in each round.
+            // The distance to every accepted pose counts, not only the distance to the last one.
+            // Otherwise, an arm that repeats its path would add the same views in each round.
             self.accepted
                 .iter()
                 .all(|accepted| self.spacing.between(accepted, pose) >= 1.0)
@@ -81,8 +81,8 @@ impl Acceptance {
     ) -> Result<(), Rejection> {
         let Some(twist) = &camera_pose.twist else {
             // Shear is proportional to the readout time, so a global shutter needs no velocity.
-            // Blur cannot be predicted without a velocity either; strong blur is found by the test
-            // of sharpness.
+            // Blur cannot be predicted without a velocity either, but the sharpness test detects
+            // strong blur.
             return if self.readout_secs > 0.0 {
                 Err(Rejection::ShearUnknown)
             } else {
@@ -94,7 +94,7 @@ impl Acceptance {
         // images are found by their sharpness.
         let blur_px = speed_px_s * exposure_secs.unwrap_or(0.0);
         let shear_px = speed_px_s * self.readout_secs;
-        // Written so that a NaN speed is rejected too.
+        // The comparison is written so that a NaN speed is also rejected.
         match (
             blur_px <= self.config.max_blur_px,
             shear_px <= self.config.max_shear_px,
@@ -113,8 +113,8 @@ impl Acceptance {
         if !is_well_exposed || statistics.clipped_frac > self.config.max_clipped_frac {
             return Err(Rejection::Exposure);
         }
-        // The history is updated before the test, also with images that are rejected. Otherwise, a
-        // camera that turns to a blurry scene would be rejected forever.
+        // The history is updated before the test, also with images that are rejected. Otherwise,
+        // all later images of a camera that rotates toward a blurry scene would be rejected.
         let relative = self.sharpness.relative(statistics.sharpness);
         if relative >= self.config.min_sharpness_frac {
             Ok(())

@@ -14,25 +14,27 @@ use std::f64::consts::TAU;
 use std::sync::Arc;
 use std::time::Duration;
 
-/// Maximum number of readings kept: those of 20 s at 1 kHz, longer than any image waits.
+/// Maximum number of readings kept. At 1 kHz, they cover 20 s, which is longer than any image
+/// waits.
 const MAX_READINGS: usize = 20_000;
 /// Tolerance for joint positions beyond the limits, radians or meters. Calibration errors and soft
 /// stops stay within it.
 const MAX_LIMIT_EXCESS: f64 = 0.2;
 /// Joint states that imply more than this multiple of a joint's speed limit are ignored as states
 /// of another arm. The margin allows for an arm that is pushed, and for a URDF with reduced limits.
-/// A smaller value would ignore the states of such arms; a larger one would let states of a second
-/// arm through that happen to be close.
+/// With a smaller value, the states of such arms would be ignored. With a larger value, states of a
+/// second arm would be accepted if they happen to be close.
 const MAX_SPEED_FACTOR: f64 = 3.0;
 /// Added to the time between two readings, because their stamps may be inaccurate. At 1 kHz, two
 /// readings whose stamps are too close would otherwise seem to move at many times their speed.
 const MAX_STAMP_ERROR_SECS: f64 = 0.02;
-/// So many ignored states in a row that agree with each other are accepted. Fewer would accept
-/// states of another arm that arrive between ours; more would lose longer parts of the motion after
-/// a real jump, for example after a pause of the sender.
+/// If this many consecutive ignored states agree with each other, they are accepted. With a smaller
+/// number, states of another arm that arrive between ours would be accepted. With a larger number,
+/// longer parts of the motion would be lost after a real jump, for example after a pause of the
+/// sender.
 const MIN_CONSISTENT: u32 = 5;
-/// Maximum gap for interpolating base poses from tags, in image periods. It lets one image in
-/// between lack a pose.
+/// Maximum gap for interpolating base poses from tags, in image periods. With this value, one image
+/// in between may lack a pose.
 const MAX_IMAGE_INTERVALS: f64 = 2.5;
 
 /// The recent motion of the robot.
@@ -55,8 +57,8 @@ fn distance(from: f64, to: f64, limits: &JointLimits) -> f64 {
     let n_turns = if limits.lower.is_finite() {
         0.0
     } else {
-        // A continuous joint may report an angle modulo a full turn. The nearest number of full
-        // turns is taken out.
+        // A continuous joint may report its angle modulo a full turn. The nearest number of full
+        // turns is therefore subtracted.
         (moved / TAU).round()
     };
     (moved - n_turns * TAU).abs()
@@ -251,8 +253,8 @@ impl Motion {
         let joints = self.chain.joint_names().iter().zip(self.chain.limits());
         let mut joints = joints.zip(before.position.iter().zip(&state.position));
         let ((name, limits), (from, to)) = joints.find(|((_, limits), (from, to))| {
-            // A URDF without a speed limit, or with the limit 0, says nothing about speeds, so its
-            // joints are never ignored.
+            // If the URDF has no speed limit or a limit of 0, the maximum speed is unknown, so
+            // states are never ignored because of this joint.
             let max_speed = MAX_SPEED_FACTOR * limits.velocity;
             max_speed > 0.0
                 && distance(**from, **to, limits) > max_speed * (secs + MAX_STAMP_ERROR_SECS)
@@ -275,8 +277,8 @@ impl Motion {
                     .push(pose.stamp, pose.world_from_base)
                     .is_ok();
                 if is_valid {
-                    // A pose that the history has rejected is out of order or not finite, and must
-                    // not end a station.
+                    // A pose that the history has rejected must not end a station, because it is
+                    // out of order or not finite.
                     reported
                         .station_detector
                         .push(pose.stamp, &pose.world_from_base);
@@ -320,8 +322,8 @@ impl Motion {
         stamp: Stamp,
     ) -> Result<CameraPose, HistoryError> {
         // The state of the base is stored with each keyframe, so that a later correction of the
-        // base pose can be applied to it. A camera in the room is not carried by the base and needs
-        // none.
+        // base pose can be applied to it. A camera that is fixed in the room does not need it,
+        // because the base does not carry it.
         let (world_from_base, base_twist, base) = match &self.base {
             BaseMotion::Fixed(pose) => (*pose, Twist::zero(), None),
             BaseMotion::ReportedPoses(reported) if camera.parent != Parent::World => {
@@ -354,8 +356,9 @@ impl Motion {
                 let Ok(base_from_flange) = self.chain.forward(&joints.position) else {
                     return Err(HistoryError::NotFinite);
                 };
-                // Both twists are those of the flange in flange axes: the base carries it, and the
-                // joints move it. Velocities of a point add up in the same axes.
+                // Both twists are twists of the flange in flange axes: one from the motion of the
+                // base, and one from the joints. They can be added, because they are expressed in
+                // the same axes.
                 let by_base = base_twist.of_attached(&base_from_flange);
                 let by_arm = self
                     .chain
@@ -391,7 +394,7 @@ impl Motion {
 /// the centers of its quadrants.
 pub(super) fn image_speed_px_s(twist: &Twist, intrinsics: &Intrinsics, depth_m: f64) -> f64 {
     // Rotation about the optical axis moves only the outer points, and translation along it moves
-    // no point at the center. Five points see both.
+    // no point at the center. With five points, both motions are measured.
     let sample_points = [
         [0.5, 0.5],
         [0.25, 0.25],

@@ -226,7 +226,7 @@ impl Join {
                 }
             }
         }
-        // Any sample may complete a waiting image: a joint reading gives it a pose, and a sample of
+        // Any sample may complete a waiting image. A joint reading gives it a pose, and a sample of
         // another device may end its wait.
         self.process_ready(false, &mut events);
         events
@@ -294,8 +294,8 @@ impl Join {
     /// Adds a joint state. The first state of each kind of problem is logged, all of them are
     /// counted.
     fn push_joints(&mut self, state: JointState) {
-        // States that are ignored below are checked, too: readings in degrees also imply impossible
-        // speeds, but this warning names the cause.
+        // States that are ignored below are also checked here. Readings in degrees imply impossible
+        // speeds as well, but this warning names the cause.
         if !self.warned_joint_limits
             && let Some(joint_limit_warning) = self.motion.joint_limit_warning(&state)
         {
@@ -428,8 +428,8 @@ impl Join {
             Partner::Available(truth) => Some(truth.clone()),
             Partner::NotYet | Partner::Never => None,
         };
-        // A recording of a simulator may have no ground truth. Without this, every image of such a
-        // recording would wait until it is overdue.
+        // A recording of a simulator may have no ground truth. If it were still expected, every
+        // image of such a recording would wait until it is overdue.
         if truth.is_none() && overdue && camera_pose.is_ok() {
             camera.waiting.stop_waiting_for_truth();
         }
@@ -470,12 +470,12 @@ impl Join {
             Ok(keyframe) => keyframe,
             Err(why) => return self.reject(&name, stamp, why, events),
         };
-        // Only accepted images count for the split, so that each camera has the same share of test
-        // keyframes, however many of its images are rejected.
+        // Only accepted images count for the split. Each camera thus has the same share of test
+        // keyframes, regardless of how many of its images are rejected.
         camera.n_accepted += 1;
         self.counts.accepted += 1;
         // A depth camera measures every pixel at the time of the image. Scans are older and sparse,
-        // so they are used only without such a camera.
+        // so they are used only if there is no depth camera.
         let depth_from_ranges = if camera.config.depth.is_none() {
             self.ranges.depth_of(&keyframe)
         } else {

@@ -5,9 +5,9 @@ use numbers::quantile::{Rank, quantile};
 /// Approximate width of the reduced image. A common width makes sharpness comparable between
 /// cameras and averages out noise.
 const REDUCED_WIDTH: usize = 320;
-/// Number of images whose median sharpness is the reference. They are so few that they show similar
-/// content. More would compare images of different parts of the scene; fewer would let two blurred
-/// images in a row become the reference.
+/// Number of images whose median sharpness is the reference. The number is small enough for the
+/// images to show similar content. With more images, different parts of the scene would be
+/// compared. With fewer, two consecutive blurred images could become the reference.
 const SHARPNESS_WINDOW: usize = 9;
 /// Brightness limits (0 to 255). Pixels at or beyond them count as clipped. One level of margin at
 /// both ends allows for the rounding of JPEG and YUV conversions.
@@ -75,8 +75,8 @@ impl Reduced {
                 for pixel in pixels.as_chunks::<3>().0 {
                     let luma = luma(*pixel);
                     *sum += luma;
-                    // A saturated color, such as a red lamp, has one channel at the limit. Only if
-                    // all channels are at it, the exposure is wrong.
+                    // A saturated color, such as a red lamp, has one channel at the limit. The
+                    // exposure is wrong only if all channels are at the limit.
                     let clipped = pixel.iter().all(|c| *c <= CLIPPED[0])
                         || pixel.iter().all(|c| *c >= CLIPPED[1]);
                     reduced.n_clipped += u64::from(clipped);

@@ -19,8 +19,8 @@ const CELL_PX: u32 = 8;
 /// Maximum time between an image and the scans used for its depth. Older and newer scans were taken
 /// from elsewhere, with other occlusions.
 const MAX_TIME_DIFFERENCE_SECS: f64 = 1.0;
-/// Minimum number of filled cells for a depth map. Fewer points say little about the image, and a
-/// map with them would count as depth in registration.
+/// Minimum number of filled cells for a depth map. Fewer points contain little information about
+/// the image, but a map with them would count as depth in registration.
 const MIN_CELLS: usize = 16;
 
 /// The scans that wait for base poses, and the newest transformed ones.
@@ -151,8 +151,8 @@ impl RangeScans {
         max_wait_secs: f64,
     ) -> PlacementCounts {
         let mut counts_placed = PlacementCounts::default();
-        // In order: a scan whose poses are not known yet holds back later ones, whose poses are not
-        // known either.
+        // Scans are processed in order. If the poses of a scan are not known yet, those of later
+        // scans are not known either.
         while let Some(scan) = self.waiting.front() {
             match self.in_world(scan, motion) {
                 Ok(in_world) => {
@@ -199,7 +199,7 @@ impl RangeScans {
             }
             let in_scanner = Point3::from(point.position_m).cast::<f64>();
             let range_m = in_scanner.coords.norm();
-            // False for a NaN range.
+            // This comparison is false for a NaN range.
             if range_m >= scanner.min_m && range_m <= scanner.max_m {
                 points.push((column.1 * in_scanner).cast::<f32>().coords.into());
             }

@@ -117,7 +117,8 @@ impl Counts {
     #[must_use]
     pub fn data_losses(&self, sample_use: SampleUse) -> Vec<String> {
         let mut data_losses = Vec::new();
-        // Images without a recording are only candidates: a dropped one is replaced by the next.
+        // If there is no recording, images are only candidates, and a dropped image is replaced by
+        // the next one.
         if sample_use == SampleUse::Recorded && self.device_skipped > 0 {
             data_losses.push(dropped_by_devices(self.device_skipped));
         }

@@ -14,8 +14,8 @@ impl Spacing {
     /// least 1.
     pub(super) fn between(&self, a: &Transform, b: &Transform) -> f64 {
         let translation_m = (a.translation.vector - b.translation.vector).norm();
-        // The maximum and not the sum: either kind of motion alone must be large enough to show
-        // something new.
+        // The maximum is used instead of the sum, because one of the two kinds of motion alone must
+        // be large enough to show something new.
         (translation_m / self.translation_m)
             .max(a.rotation.angle_to(&b.rotation) / self.rotation_rad)
     }

@@ -4,13 +4,13 @@
 use kinematics::{Stamp, Transform};
 use std::collections::VecDeque;
 
-/// Time for which the base must stay near one pose to count as stationary. A shorter time would
-/// take the moment at which a base reverses for a station; a longer one would lose the first
-/// keyframes of a station.
+/// Time for which the base must stay near one pose to count as stationary. With a shorter time, the
+/// moment at which a base reverses would count as a station. With a longer time, the first
+/// keyframes of a station would be lost.
 const STATIONARY_SECS: f64 = 0.5;
-/// Maximum distance from that pose, meters and (next constant) radians. Larger values would merge
-/// slow motion into a station; smaller ones would split a station of a base that sways while its
-/// arm moves.
+/// Maximum distance from that pose, meters and (next constant) radians. With larger values, slow
+/// motion would become part of a station. With smaller values, a station would be split if the base
+/// sways while its arm moves.
 const STATIONARY_M: f64 = 0.005;
 const STATIONARY_RAD: f64 = 0.005;
 /// Maximum number of stations kept, far more than any image waits for.
@@ -82,7 +82,7 @@ impl StationDetector {
 }
 
 fn is_near(pose: &Transform, other: &Transform) -> bool {
-    // False for a pose with NaN.
+    // This comparison is false for a pose with NaN.
     (pose.translation.vector - other.translation.vector).norm() <= STATIONARY_M
         && pose.rotation.angle_to(&other.rotation) <= STATIONARY_RAD
 }
@@ -94,7 +94,8 @@ mod tests {
 
     #[test]
     fn station_begins_after_rest_and_ends_with_motion() {
-        // Rests 2 s, moves 1 m within 2 s, rests and turns on the spot, rests.
+        // The base rests for 2 s and moves 1 m within 2 s. Then it rests, turns on the spot, and
+        // rests again.
         let pose = |secs: f64| {
             let x = (0.5 * (secs - 2.0)).clamp(0.0, 1.0);
             let yaw_rad = (0.3 * (secs - 6.0)).clamp(0.0, 0.3);

@@ -1,9 +1,9 @@
 //! The keyframe store, bounded in count and bytes. The most redundant keyframe is evicted first.
 //!
-//! A keyframe is evicted from the split (train, validation, test) that exceeds its share most, so
-//! that the splits keep their proportions in a long run: if test keyframes were spared, they would
-//! eventually fill the store. Within that split, the keyframe nearest to another one of its camera
-//! is evicted, and of two equally near ones the older.
+//! A keyframe is evicted from the split (train, validation, test) that exceeds its share most. The
+//! splits thus keep their proportions in a long run. If test keyframes were never evicted, they
+//! would eventually fill the store. Within that split, the keyframe nearest to another one of its
+//! camera is evicted. If two are equally near, the older one is evicted.
 
 use super::spacing::Spacing;
 use keyframe::{Keyframe, Split};

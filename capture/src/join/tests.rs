@@ -105,8 +105,8 @@ fn truth(nanos: i64) -> Sample {
     })
 }
 
-/// Joints at 200 Hz, color at 10 Hz with other phases, depth 5 ms after color. Each image comes
-/// after the readings around it.
+/// Joints at 200 Hz, color at 10 Hz with a different phase, and depth 5 ms after color. Each image
+/// comes after the readings around it.
 fn samples(secs: i64) -> Vec<Sample> {
     let mut samples = Vec::new();
     for tick in 0..secs * 200 {
@@ -389,7 +389,7 @@ fn images_that_devices_dropped_are_counted_by_kind() {
 #[test]
 fn images_without_joint_readings_are_dropped_and_counted() {
     let rig = rig(&[]);
-    // No joint readings from 2 s to 4 s and after 6 s.
+    // There are no joint readings from 2 s to 4 s and after 6 s.
     let in_gap =
         |nanos: i64| (2_000_000_000..4_000_000_000).contains(&nanos) || nanos > 6_000_000_000;
     let kept = samples(8)
@@ -795,7 +795,8 @@ fn one_hour_run_keeps_only_the_store_in_memory() {
     for tick in 0..3600 * 20_i64 {
         let mut samples = vec![reading(tick * 50_000_000)];
         if tick % 4 == 2 {
-            // Not in phase with the motion, so that every image has a slightly different pose.
+            // The images are not in phase with the motion, so that every image has a slightly
+            // different pose.
             let stamp = Stamp(tick * 50_000_000 - 21_000_000 - tick % 977 * 10_000);
             n_images += 1;
             samples.extend([&color, &depth].map(|image| {

@@ -15,8 +15,8 @@ use sim::wire::{JointTrack, emulate_fci};
 use std::net::{Ipv4Addr, SocketAddr};
 use std::time::Duration;
 
-/// How long the controller waits for each answer of the driver. Both are in this process, and the
-/// motion must not depend on the load of the computer.
+/// How long the controller waits for each answer of the driver. The wait is long because both are
+/// in this process, and because the motion must not depend on the load of the computer.
 const ANSWER_WAIT: Duration = Duration::from_millis(15);
 
 /// Opens the camera, and the arm for motion. The address of the arm becomes that of the controller.
@@ -29,15 +29,16 @@ pub(super) fn open(rig: &mut Rig) -> anyhow::Result<(Box<dyn MovableArm>, Box<dy
     let mut simulated = sim::open(&unlimited(rig)?)?;
     let motors = MotorHistory::default();
     let config = RobotConfig {
-        // Port 0: the system chooses a free port, so that several runs do not collide.
+        // With port 0, the system chooses a free port, so that several runs do not collide.
         address: SocketAddr::from((Ipv4Addr::LOCALHOST, 0)),
-        // That of the Panda in the simulated scenes.
+        // This is the version of the Panda in the simulated scenes.
         version: FciVersion::V5,
         chain: real::franka_chain(rig)?,
         flange_from_tool: Transform::identity(),
         limits: Limits::panda(),
     };
-    // The arm starts where the simulated arm is, or it would jump at the first image.
+    // The arm starts at the position of the simulated arm. Otherwise, it would jump at the first
+    // image.
     let track = JointTrack::at_rest(simulated.start_position()?)?;
     let controller = emulate_fci(track, config, ANSWER_WAIT, Some(motors.clone()))?;
     rig.arm.address = controller.address().to_string();
@@ -61,7 +62,7 @@ pub(super) fn open(rig: &mut Rig) -> anyhow::Result<(Box<dyn MovableArm>, Box<dy
 
 /// A driver with the emulated controller that it is connected to.
 struct EmulatedArm {
-    /// Dropped first, while the controller still answers.
+    /// This field is dropped first, while the controller still answers.
     arm: Box<dyn MovableArm>,
     _controller: EmulatedRobot,
 }

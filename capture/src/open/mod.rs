@@ -94,7 +94,7 @@ impl Opened {
     pub fn repeated(self, path: &Path) -> Self {
         let path = path.to_owned();
         let damage = Arc::clone(&self.damage);
-        // Opened again for each round: a source cannot be rewound.
+        // The recording is opened again for each round, because a source cannot be rewound.
         let reopen = move || open_recording(&path, &damage);
         Self {
             source: Box::new(Repeating::new(self.source, reopen)),
@@ -151,7 +151,8 @@ pub(crate) fn rig_with_monitors(
     } else {
         (Box::new(LiveDevices::new(real)?), StampClock::Computer)
     };
-    // Behind all devices, because the tags are searched in the images of any camera on the robot.
+    // This source comes after all devices, because tags are searched in the images of all cameras
+    // on the robot.
     let source = match rig.base.driver {
         BaseDriver::Tags => Box::new(TagBaseSource::new(&rig, source)?),
         _ => source,
@@ -208,7 +209,7 @@ pub fn recording(path: &Path, rig: Option<Rig>, overrides: &[Override]) -> anyho
         [rig.arm.joint_offsets, rig.arm.sim.true_joint_offsets] = offsets;
         rig.arm.joints = recorded.to_vec();
     }
-    // The cameras cannot be asked any more.
+    // The cameras are no longer available, so the intrinsics must be known.
     check_intrinsics(&rig)?;
     without_readout_if_ideal(&mut rig);
     let damage = Arc::default();
@@ -297,8 +298,8 @@ fn stored_text<'a>(path: &Path, recording: &'a Recording, name: &str) -> anyhow:
         .with_context(|| format!("the recording {path:?}: {name} is not text"))
 }
 
-/// Sets the readout time of simulated cameras without imperfections to 0: they expose all rows at
-/// once.
+/// Sets the readout time of simulated cameras without imperfections to 0, because they expose all
+/// rows at once.
 fn without_readout_if_ideal(rig: &mut Rig) {
     let is_ideal = rig.sim.ideal;
     for camera in rig

@@ -33,8 +33,8 @@ pub fn movable(rig: &Rig, devices: Devices, camera: &str) -> anyhow::Result<Mova
     let Some(driver) = rig.cameras.first().map(|camera| camera.driver) else {
         bail!("the rig has no camera {camera:?}");
     };
-    // Remembered, because `use_simulated_devices` overwrites it, and an emulated controller needs
-    // the driver of the real arm.
+    // The driver is stored, because `use_simulated_devices` overwrites it, and an emulated
+    // controller needs the driver of the real arm.
     let arm_driver = rig.arm.driver;
     if devices == Devices::Sim {
         use_simulated_devices(&mut rig);
@@ -58,8 +58,8 @@ pub fn movable(rig: &Rig, devices: Devices, camera: &str) -> anyhow::Result<Mova
         }
         return simulated(rig);
     }
-    // The camera first: the arm is enabled only if everything else works. It is opened for motion,
-    // not for reading.
+    // The camera is opened first, so that the arm is enabled only if everything else works. The arm
+    // is opened for motion, not for reading.
     let driver = std::mem::replace(&mut rig.arm.driver, ArmDriver::None);
     let opened = real::open(&mut rig);
     rig.arm.driver = driver;

@@ -32,8 +32,8 @@ const READ_ONLY: &str = "arms with this driver can only be read; to move the arm
 pub(super) fn open(rig: &mut Rig) -> anyhow::Result<(Devices, Vec<DatagramMonitor>)> {
     let mut devices = Devices::default();
     let mut monitors = Vec::new();
-    // Cameras first: some of them store intrinsics, which are copied to the rig before anything
-    // uses it.
+    // Cameras are opened first. Some of them store intrinsics, which are copied to the rig before
+    // anything uses them.
     for camera in &mut rig.cameras {
         match camera.driver {
             CameraDriver::V4l2 => devices.cameras.extend(v4l2_cameras(camera)?),
@@ -144,8 +144,8 @@ pub(super) fn motion_limits(
         let joint = joint_ix
             .map(|joint_ix| chain.limits()[joint_ix])
             .context("a joint of the rig is not in its URDF")?;
-        // Invalid limits do not disturb reading. A motion needs them, because they are what keeps
-        // the arm from its stops.
+        // Invalid limits do not matter for reading. A motion needs valid limits, because they keep
+        // the arm away from its mechanical stops.
         if !joint.is_range_valid {
             bail!(
                 "arm.motion: the <limit> of joint {name:?} in the URDF is invalid; give finite numbers, lower at most upper"

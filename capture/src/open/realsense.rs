@@ -20,8 +20,9 @@ mod with_sdk {
     use kinematics::{Intrinsics, Lens};
     use std::time::Duration;
 
-    /// Maximum difference between the intrinsics in the rig file and those stored in the camera,
-    /// pixels. Above it, one of them probably belongs to another camera.
+    /// Maximum difference between the intrinsics in the rig file and the intrinsics stored in the
+    /// camera, pixels. If the difference is larger, one of the two probably belongs to another
+    /// camera.
     ///
     /// A recalibration of the same camera changes its projections by less, and another camera of
     /// the same type usually by more.
@@ -36,8 +37,8 @@ mod with_sdk {
             intrinsics,
             depth_intrinsics,
             camera_from_depth,
-            // Taken, so that nothing counts as unknown any more and the rig can be stored in a
-            // recording.
+            // The marks are reset, so that nothing counts as unknown any more and the rig can be
+            // stored in a recording.
         } = std::mem::take(&mut camera.realsense.unknown);
         apply_known(
             "intrinsics",

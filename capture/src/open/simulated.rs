@@ -35,8 +35,8 @@ pub(super) fn open(rig: &Rig, real: Devices) -> anyhow::Result<(Box<dyn Source>,
     } else {
         (Stamp::default(), StampClock::Simulation)
     };
-    // In real time the limits are checked here, because devices that end would look like devices
-    // that fail.
+    // In real time, the limits are checked here, because devices that end would look like devices
+    // that have failed.
     config.duration_secs = None;
     config.n_images = None;
     let sim::LiveRig {
@@ -83,7 +83,8 @@ struct RealTime {
 
 impl Source for RealTime {
     fn next_sample(&mut self) -> Result<Option<Sample>, Error> {
-        // Before the next sample, because an image waits for its ground truth in the join.
+        // Ground truth is returned before the next sample, because an image in the join waits for
+        // it.
         if let Some(truth) = self.truth.take() {
             return Ok(Some(truth));
         }
@@ -262,7 +263,8 @@ fn depth_sensor(camera: &Camera, depth: &Depth, color: &Intrinsics) -> Option<si
         .truth
         .camera_from_depth
         .unwrap_or(depth.camera_from_depth);
-    // Depth that was resized from the color image's lens has its true lens, too.
+    // If the lens of depth was derived from that of the color image, its true lens is derived from
+    // the true color lens.
     let size_px = depth.intrinsics.size_px;
     let shares_lens = depth.intrinsics == camera.intrinsics.resized(size_px);
     let intrinsics = if shares_lens {

@@ -700,7 +700,7 @@ fn tag_corners_match_the_simulator() {
             _ => {}
         }
     }
-    // Medians, because corners of sides at grazing angles are unreliable.
+    // Medians are used, because corners of sides at grazing angles are unreliable.
     let median = |numbers: Vec<f64>| median(&numbers).expect("corners");
     let along = |axis: usize| median(off_px.iter().map(|error_of| error_of[axis]).collect());
     let spread = median(off_px.iter().map(|[x, y]| x.hypot(*y)).collect());

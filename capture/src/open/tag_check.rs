@@ -37,8 +37,8 @@ struct CheckedCamera {
 }
 
 impl TagCheckSource {
-    /// Checks the images of a source. The source is returned as it is if the rig has no tags, or if
-    /// they locate its base.
+    /// Checks the images of a source. The source is returned unchanged if the rig has no tags, or
+    /// if the tags locate its base.
     ///
     /// * `notes`: gets the warnings.
     pub(super) fn check(

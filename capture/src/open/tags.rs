@@ -141,7 +141,7 @@ impl TagBaseSource {
         let Some(camera) = self.camera(&detection.camera) else {
             return;
         };
-        // Tags that the rig file does not place say nothing about the base.
+        // Tags whose pose is not in the rig file cannot locate the base.
         let known = detection
             .tags
             .iter()
@@ -242,8 +242,8 @@ pub(super) fn rolling_shutter_camera<'a>(
 
 impl Source for TagBaseSource {
     fn next_sample(&mut self) -> Result<Option<Sample>, Error> {
-        // Before the next sample is read, because a base pose belongs before the images that wait
-        // for it.
+        // Detections are processed before the next sample is read, because a base pose must precede
+        // the images that wait for it.
         let new_detections = self.detector.new_detections();
         self.enqueue(new_detections);
         self.process_ready();

@@ -6,7 +6,7 @@
 
 use std::ops::Range;
 
-/// Value of a pixel that no square covers: larger than any count minus one.
+/// Value of a pixel that no square covers. It is larger than every stored value (count minus one).
 pub(super) const NO_DEPTH: u16 = u16::MAX;
 /// Maximum square width, in columns, with its own strip. Wider squares are rare and are written
 /// column by column. More strips would take more time to merge in every run.
@@ -23,8 +23,8 @@ const WIDE: u16 = u16::MAX;
 /// Largest image width, in columns. Columns beyond it get no depth because they have no cell in a
 /// strip.
 pub(super) const MAX_COLUMNS: usize = N_STRIP_CELLS - 1 - N_DISCARD_CELLS - PAD - 1;
-/// Number of pixels tested at once: a few vector registers. A longer block computes more beyond the
-/// first match, a shorter one tests for an exit more often.
+/// Number of pixels tested at once: a few vector registers. A longer block computes more values
+/// beyond the first match. A shorter block tests for an exit more often.
 const BLOCK: usize = 32;
 
 /// First and last column and row that each pixel of one row of depth covers, clipped to the image.
@@ -120,8 +120,8 @@ impl NearestDepth {
         }
         for (ix, (cell, count_minus_one)) in run.zip(strip_cells.iter().zip(count_minus_one)) {
             let columns = match *cell {
-                // The columns of the first strip, which stands for squares of one column, so that a
-                // wide square is a row of them.
+                // The first strip contains squares of one column. A wide square is written there as
+                // a row of such squares.
                 WIDE => {
                     usize::from(bounds.first[0][ix]) + PAD
                         ..usize::from(bounds.last[0][ix]) + PAD + 1
@@ -156,8 +156,8 @@ impl NearestDepth {
         let n_strips = self.n_strips as u16;
         let discard = n_strips * stride;
         for ix in 0..n {
-            // No branches and no short circuits: pixels with and without depth alternate
-            // irregularly at the edges of objects, where branches would be mispredicted.
+            // This loop has no branches and no short circuits. At the edges of objects, pixels with
+            // and without depth alternate irregularly, so branches would be mispredicted.
             let is_visible = (row[ix] != 0) & (left[ix] <= right[ix]) & (top[ix] <= bottom[ix]);
             // The results for pixels that cover nothing may wrap around. They are replaced below.
             let n_more = right[ix].wrapping_sub(left[ix]);
@@ -206,8 +206,8 @@ impl NearestDepth {
         }
         let n = usize::from(to - from) + 1;
         let from = usize::from(from);
-        // From the widest squares to single columns: each strip is spread into the next narrower
-        // one. This takes one pass per width instead of one per square.
+        // Each strip is spread into the next narrower one, from the widest squares to single
+        // columns. This takes one pass per width instead of one pass per square.
         for n_more in (1..self.n_strips).rev() {
             // A square of this many columns is the union of two squares that are one column
             // narrower.
@@ -221,8 +221,8 @@ impl NearestDepth {
             strip[PAD + from..][..n].fill(NO_DEPTH);
         }
         let columns = &mut self.strips[PAD + from..][..n];
-        // The squares of the run cover all these lines alike, so the merged row is the same for
-        // each.
+        // Every square of the run covers all these lines, so the merged row is the same for each
+        // line.
         for line in lines >> 16..=lines & 0xFFFF {
             let line = &mut self.nearest[(line as usize - 1) * self.width + from - 1..][..n];
             line.iter_mut()
@@ -237,7 +237,7 @@ impl NearestDepth {
 /// compiler can vectorize.
 #[inline(always)]
 fn find_blockwise(numbers: &[u32], predicate: impl Fn(u32) -> bool) -> Option<usize> {
-    // A fold without early exit, unlike `any`: it tests all numbers of a block at once.
+    // Unlike `any`, a fold has no early exit, so it tests all numbers of a block at once.
     let (block_ix, block) = numbers.chunks(BLOCK).enumerate().find(|(_, block)| {
         block
             .iter()

@@ -4,8 +4,9 @@
 //! square. Two opposite corners are projected to the color image at the depth of the pixel, and
 //! each color pixel keeps the nearest square that covers it. We clip squares at the edge of the
 //! image, whereas librealsense drops them. The SSE path of librealsense
-//! (`src/proc/sse/sse-align.cpp`) rounds half a pixel further to the right and down, and uses only
-//! the upper left corner if color has fewer pixels per angle than depth. We follow its scalar path.
+//! (`src/proc/sse/sse-align.cpp`) rounds half a pixel further to the right and down. It uses only
+//! the upper left corner if the color image has fewer pixels per angle than the depth image. We
+//! follow the scalar path of librealsense.
 
 mod cover;
 
@@ -96,8 +97,8 @@ impl pulp::NullaryFnOnce for Task<'_> {
         let mut data: Arc<[u8]> = std::iter::repeat_n(0, 2 * aligned.len()).collect();
         let bytes = Arc::get_mut(&mut data).expect("the buffer was just created and is not shared");
         for (bytes, count_minus_one) in bytes.as_chunks_mut::<2>().0.iter_mut().zip(aligned) {
-            // The images store counts minus one, so that no depth is the largest number and loses
-            // every comparison.
+            // The images store counts minus one. The count 0 ("no depth") thus becomes the largest
+            // number, which loses every comparison.
             let count = count_minus_one.wrapping_add(1);
             // The largest count is invalid, too.
             *bytes = if count == u16::MAX {
@@ -264,8 +265,8 @@ impl DepthAlignment {
 }
 
 /// Projects rays to columns and rows of the color image. `distort` maps a point of the plane `z` =
-/// 1 to its distorted position and returns whether the lens model is valid there. Branch-free, with
-/// each slice as its own argument, so that the compiler vectorizes it.
+/// 1 to its distorted position and returns whether the lens model is valid there. The function has
+/// no branches and takes each slice as its own argument, so that the compiler vectorizes it.
 #[inline(always)]
 fn project_by(
     columns: &mut [f32],
@@ -292,7 +293,8 @@ fn project_by(
         // The ray was rotated in advance, so a point in the color camera is only a scaled ray plus
         // the offset between the cameras.
         let z = counts[ix] * zs[ix] + tz;
-        // One division instead of two: a division takes several times as long as a multiplication.
+        // One division replaces two, because a division takes several times as long as a
+        // multiplication.
         let inverse = 1.0 / z;
         let x = (counts[ix] * xs[ix] + tx) * inverse;
         let y = (counts[ix] * ys[ix] + ty) * inverse;
@@ -327,13 +329,13 @@ fn number(numbers: &mut [u16], positions_px: &[f32], side: u32, corner: Corner) 
     let numbers = &mut numbers[..n];
     let positions_px = &positions_px[..n];
     for ix in 0..n {
-        // These comparisons compile to vector instructions; `max` and `min` do not because of their
-        // NaN handling.
+        // These comparisons compile to vector instructions. `max` and `min` do not, because they
+        // must handle NaN.
         let one_based = positions_px[ix] + 1.0;
         let one_based = if one_based > min { one_based } else { min };
         let one_based = if one_based < max { one_based } else { max };
-        // Adding and subtracting rounds to the nearest integer. Where this rounded up, one is
-        // subtracted to obtain the integer below.
+        // Adding and subtracting the constant rounds to the nearest integer. If this rounded up,
+        // one is subtracted to obtain the integer below.
         let nearest = (one_based + INTEGER_FLOAT) - INTEGER_FLOAT;
         let below = nearest - if nearest > one_based { 1.0 } else { 0.0 };
         numbers[ix] = (below + INTEGER_FLOAT).to_bits() as u16;
@@ -369,8 +371,8 @@ impl ColorCamera {
 /// outside.
 fn max_radius(camera: &Intrinsics) -> f64 {
     // Squares at the edge of the image have corners outside, which must still be projected. A
-    // larger margin would reach the radii where distortion polynomials turn back, and draw depth
-    // from far outside the field of view into the image.
+    // larger margin would reach the radii at which distortion polynomials stop increasing. Depth
+    // from far outside the field of view would then be drawn into the image.
     const MARGIN: f64 = 1.02;
     let [width, height] = camera.size_px;
     // The largest radius of a lens is not necessarily in a corner, because the principal point may
@@ -542,7 +544,7 @@ mod tests {
         aligned
     }
 
-    /// As on a D435: the color camera is 15 mm to the side of the depth camera and slightly
+    /// As on a D435, the color camera is 15 mm to the side of the depth camera and slightly
     /// rotated.
     fn color_from_depth_like_d435() -> Transform {
         Transform::from_parts(
@@ -558,7 +560,8 @@ mod tests {
 
     #[test]
     fn aligned_depth_matches_twin() {
-        // With f32, about one corner in ten thousand falls on the other side of a pixel edge.
+        // Because of rounding to f32, about one corner in ten thousand falls on the other side of a
+        // pixel edge.
         const EQUAL_FRAC: f64 = 0.999;
         let size_px = [320, 240];
         let scene = scene(size_px);

@@ -24,9 +24,9 @@ pub(super) const MAX_WAITING: usize = 7000;
 /// If a loop iteration of a bus thread takes this much longer than its waits, the thread was not
 /// scheduled.
 const MAX_LOOP_DELAY: Duration = Duration::from_millis(20);
-/// A motor that sends nothing for this long causes an error. A lower value would report motors
-/// behind a bus that restarts after a bus-off; with a higher one, the caller learns later that a
-/// joint is gone.
+/// A motor that sends nothing for this long causes an error. With a lower value, motors would be
+/// reported while their bus restarts after a bus-off. With a higher value, the caller learns later
+/// that a joint is missing.
 const MAX_SILENCE: Duration = Duration::from_secs(1);
 
 /// A read-only arm, which cannot be moved. Dropping it stops the polling but does not affect the
@@ -51,7 +51,7 @@ impl CanArm {
         let stop = Arc::new(AtomicBool::new(false));
         let mut buses = Vec::new();
         // All motors are found before the first thread starts. A missing motor is then an error of
-        // this call, and its queries cannot lose answers to a thread that reads the same bus.
+        // this call. Also, no thread that reads the same bus can take the answers to these queries.
         for (bus_ix, bus) in config.buses.iter().enumerate() {
             let bus = Bus::open(bus)?;
             let motors_of_bus = config
@@ -159,8 +159,8 @@ impl Cycle {
         {
             poll_frames.push(canopen::encode_sync());
         }
-        // The load of the bus includes the answers. Motors with their own rate load the bus
-        // whatever our rate is, so they are counted apart.
+        // The load of the bus includes the answers. The load of motors that report at their own
+        // rate does not depend on our rate, so it is counted separately.
         let mut cycle_frames = poll_frames.clone();
         let mut unsolicited = Vec::new();
         for (answer, own_rate_hz) in motors
@@ -185,7 +185,7 @@ impl Cycle {
     }
 }
 
-/// What the thread of a bus has heard and lost so far.
+/// Frames that the thread of a bus has received and lost so far.
 struct Progress {
     /// Time at which each motor was last heard.
     last_heard: Vec<Stamp>,
@@ -197,8 +197,8 @@ struct Progress {
 }
 
 impl Progress {
-    /// Excludes a stall of this computer from the silence of the motors, because no frames were
-    /// read in this time.
+    /// Excludes a stall of this computer from the measured silence of the motors, because no frames
+    /// were read during the stall.
     fn excuse_silence(&mut self, stall: Duration) {
         for last_heard in &mut self.last_heard {
             *last_heard = last_heard.plus_secs(stall.as_secs_f64());
@@ -227,8 +227,9 @@ impl BusReader {
         let start = clock::now();
         let mut next_cycle = start;
         let mut previous = start;
-        // An iteration waits up to `POLL` for a frame, and for each poll that finds the queue of
-        // the interface full. On a blocked bus, that is no stall: the silence of its motors counts.
+        // An iteration waits up to `POLL` for a frame. It also waits for each poll that finds the
+        // queue of the interface full. On a blocked bus, these waits are not a stall, so the
+        // silence of its motors counts.
         let n_polls = u32::try_from(self.cycle.poll_frames.len()).unwrap_or(u32::MAX);
         let max_iteration = POLL + MAX_SENDING.saturating_mul(n_polls) + MAX_LOOP_DELAY;
         let mut progress = Progress {
@@ -288,7 +289,8 @@ impl BusReader {
             let Some(reading) = motor.read(frame) else {
                 continue;
             };
-            // Uses the time of reading, not the stamp: a late reader does not make a motor silent.
+            // The time of reading is used instead of the stamp, because a motor is not silent if
+            // only the reader is late.
             progress.last_heard[ix] = now;
             let reading_of_joint = JointReading {
                 joint_ix: *joint_ix,
@@ -414,7 +416,8 @@ mod tests {
                 )
             })
             .collect();
-        // Seven motors with two frames each, at most 135 bits per frame: 1.89 ms per cycle.
+        // Seven motors with two frames each need 1.89 ms per cycle, at no more than 135 bits per
+        // frame.
         let cycle = Cycle::new(&bus, &motors, 500.0);
         let rate_hz = 1.0 / cycle.period.as_secs_f64();
         assert!((rate_hz - 0.7 / (14.0 * 135e-6)).abs() < 0.1, "{rate_hz}");

@@ -47,12 +47,12 @@ const MAX_QUEUED: Duration = Duration::from_micros(800);
 /// Maximum wait for space in the queue when sending a fail-safe command. If the queue stays full,
 /// nobody is receiving.
 const MAX_FAIL_SAFE_WAIT: Duration = Duration::from_millis(5);
-/// Interval at which an idle thread checks for requests. It also bounds how late a thread with a
-/// long cycle notices that it must shut down.
+/// Interval at which an idle thread checks for requests. It also limits the delay with which a
+/// thread with a long cycle notices that it must shut down.
 const POLL: Duration = Duration::from_millis(20);
 /// Additional time, beyond the time that its limits require, in which an arm must come to rest on
-/// shutdown. It covers late cycles and a target that was set just before; without a bound, an arm
-/// that never comes to rest would block the end of the program.
+/// shutdown. It covers late cycles and a target that was set just before the shutdown. Without a
+/// limit, an arm that never comes to rest would keep the program from ending.
 const STOP_MARGIN: Duration = Duration::from_secs(1);
 
 type Reply<T> = SyncSender<Result<T, Error>>;
@@ -153,8 +153,8 @@ impl ArmLoop {
         })
     }
 
-    /// Runs until the owner drops the arm, or [`apply_fail_safe`](crate::motion::apply_fail_safe)
-    /// is called.
+    /// Runs until the owner drops the arm or calls
+    /// [`apply_fail_safe`](crate::motion::apply_fail_safe).
     pub(super) fn run(mut self) {
         let mut next_cycle = clock::now();
         let mut shutdown_deadline = None;
@@ -221,8 +221,8 @@ impl ArmLoop {
             }
             // The arm is not moving, so it is already at rest.
             (Request::Stop(answer), _) => drop(answer.try_send(Ok(()))),
-            // Everything is prepared anew: while the arm was stopped, an interface may have been
-            // set up again, and motors may have been reset or replaced.
+            // All buses and motors are prepared again. While the arm was stopped, an interface may
+            // have been set up again, and motors may have been reset or replaced.
             (
                 Request::Recover(answer),
                 ArmState::Stopped {
@@ -233,8 +233,8 @@ impl ArmLoop {
                 match self.prepare() {
                     Ok(prepared) => {
                         self.prepared = Some(prepared);
-                        // Preparing takes longer than a watchdog timeout, which is no stall of this
-                        // thread.
+                        // Preparing takes longer than a watchdog timeout. This time is not a stall
+                        // of this thread.
                         self.last_cycle = clock::now_including_suspend();
                         self.arm_state = ArmState::Measuring {
                             since: clock::now(),
@@ -317,7 +317,7 @@ impl ArmLoop {
     }
 
     /// Returns an error if this thread stalled for so long that the motors have stopped or are
-    /// about to. A setpoint from before the stall must then not be sent any more.
+    /// about to. In that case, setpoints from before the stall must not be sent.
     fn check_stall(&self, stall: Duration) -> Result<(), Error> {
         if stall <= self.max_silence() {
             return Ok(());
@@ -396,12 +396,12 @@ impl ArmLoop {
         else {
             return Ok(());
         };
-        // Motors get their target before they are enabled, so that none moves to an old one. Drives
-        // are enabled by these commands, one state per cycle.
+        // Motors get their target before they are enabled, so that none moves to an old target. For
+        // drives, these commands also enable them, one state per cycle.
         prepared.command(generator)?;
         if !*is_ordered {
-            // The order is sent once. Repeating it would enable a motor again that has stopped
-            // because of a fault.
+            // The order to enable is sent only once. If it were repeated, it would enable a motor
+            // that has stopped because of a fault.
             *is_ordered = true;
             prepared.enable()?;
             // A motor that ignores commands while it is disabled gets its target now.
@@ -435,8 +435,8 @@ impl ArmLoop {
         else {
             return Ok(());
         };
-        // The checks come first: after a fault of one motor, the others must not get another
-        // setpoint.
+        // The checks come first, because after a fault of one motor, the others must not get
+        // another setpoint.
         prepared.check(now, max_silence_allowed)?;
         prepared.command(generator)?;
         // The SYNC follows the targets of all drives, so that they accept them at the same instant.
@@ -508,7 +508,7 @@ impl ArmLoop {
         }
         let fail_safe = self.fail_safe_command();
         if let Some(prepared) = &self.prepared {
-            // Motors with a watchdog get the command, too: all joints then stop together, and not
+            // Motors with a watchdog get the command, too. All joints then stop together instead of
             // each at the end of its own timeout.
             prepared.shutdown(fail_safe, |_| true);
         }
@@ -534,8 +534,8 @@ impl ArmLoop {
             reason: reason.to_owned(),
             pending_fail_safe,
         };
-        // Whoever waits for the arm to be enabled gets the reason. Otherwise, the request would end
-        // with a timeout that names no cause.
+        // A caller that waits for the arm to be enabled receives the reason. Otherwise, its request
+        // would end with a timeout that names no cause.
         let before = std::mem::replace(&mut self.arm_state, stopped);
         *self.motion.lock() = Motion::Stopped {
             reason: reason.to_owned(),
@@ -558,9 +558,9 @@ impl ArmLoop {
 
     /// Maximum time for the arm to come to rest.
     fn max_stop_duration(&self) -> Duration {
-        // Worst case: a joint at full velocity that still has its full acceleration in the
-        // direction of motion. Removing that acceleration takes `a / j`. Then the joint decelerates
-        // from `v` in `v / a`, plus `a / j` for the two ramps of the deceleration.
+        // In the worst case, a joint at full velocity still has its full acceleration in the
+        // direction of motion. Reducing that acceleration to zero takes `a / j`. Then the joint
+        // decelerates from `v` in `v / a`, plus `a / j` for the two ramps of the deceleration.
         let secs = |joint: &MotionLimits| {
             joint.velocity / joint.acceleration + 2.0 * joint.acceleration / joint.jerk
         };
@@ -612,8 +612,8 @@ impl ArmLoop {
 
     /// Resends the fail-safe command once per cycle to motors without a watchdog, because a motor
     /// that misses it would execute its last command forever. Continues until each of these motors
-    /// has sent a frame after the watchdog timeout, when the watchdogs of the other motors have
-    /// expired, but for at most [`STARTUP_TIMEOUT`] after that timeout.
+    /// has sent a frame after the watchdog timeout, at which the watchdogs of the other motors have
+    /// expired. Ends at most [`STARTUP_TIMEOUT`] after that timeout.
     fn resend_fail_safe(&mut self, now: Stamp) {
         let ArmState::Stopped {
             since,
@@ -704,8 +704,8 @@ impl PreparedMotors {
             if movable_motor.config().bus_ix != bus_ix {
                 continue;
             }
-            // A frame without a reading, such as a statusword, still updates the health. It does
-            // not count as heard, because the following error needs positions.
+            // A frame without a reading, such as a statusword, still updates the health. The motor
+            // does not count as heard, because the following error is computed from positions.
             if let Some(reading) = movable_motor.process_frame(frame) {
                 self.last_heard[joint_ix] = (stamp, self.cycle_ix);
                 self.latest[joint_ix] = Some(reading);
@@ -723,8 +723,8 @@ impl PreparedMotors {
     fn positions(&self, since: Stamp) -> Option<Vec<f64>> {
         let mut positions_rad = Vec::with_capacity(self.latest.len());
         for (latest, (heard, _)) in self.latest.iter().zip(&self.last_heard) {
-            // Frames that queued up during the preparation are older. Since then, the joint may
-            // have sagged.
+            // Frames that queued up during the preparation are too old, because the joint may have
+            // sagged since then.
             if *heard < since {
                 return None;
             }
@@ -760,7 +760,7 @@ impl PreparedMotors {
     }
 
     /// Polls the positions of motors that are executing `on_loss`, as a read-only arm does. Sends
-    /// no SYNC, because on a SYNC, drives would accept the last target that they received.
+    /// no SYNC, because a SYNC makes drives accept the last target that they received.
     fn poll_stopped(&self) -> Result<(), Error> {
         self.poll(|movable_motor| movable_motor.motor().protocol().poll_frame())
     }
@@ -856,8 +856,8 @@ impl PreparedMotors {
                 continue;
             };
             let following = &movable_motor.config().following;
-            // A loaded or fast joint lags its command, too, so the configured limit must exceed the
-            // error of normal motions.
+            // A joint that is loaded or fast also lags its command. The configured limit must
+            // therefore exceed the following error of normal motions.
             if let Some(violation) = following.violation(*sent_rad, position_rad, effort_nm) {
                 return Err(self.fault(movable_motor, violation));
             }
@@ -868,7 +868,8 @@ impl PreparedMotors {
                 Some(Health::Fault(reason)) => {
                     return Err(self.fault(movable_motor, reason.clone()));
                 }
-                // We have not disabled it: another program did, or it was reset by a loss of power.
+                // This program has not disabled the motor. Either another program did, or a loss of
+                // power reset the motor.
                 Some(Health::Off) | None => {
                     return Err(
                         self.fault(movable_motor, "the motor was disabled by something else")
@@ -950,7 +951,7 @@ fn motion(reason: String) -> Error {
     Error::Motion { reason }
 }
 
-/// Reason of the error, without the prefix that the arm is not moved.
+/// Reason of the error, without the prefix "the arm is not moved".
 fn reason_of(error: &Error) -> String {
     match error {
         Error::Motion { reason } => reason.clone(),

@@ -44,10 +44,10 @@ impl Bus {
         // the socket exists.
         Link::read(&config.interface)?.check(config)?;
         let open = CanFdSocket::open(&config.interface).and_then(|socket| {
-            // Error frames are off by default. They distinguish an unpowered motor from a bus that
-            // is cut.
+            // Error frames are off by default. They distinguish an unpowered motor from an
+            // interrupted bus.
             socket.set_error_filter_accept_all()?;
-            // A stamp of the kernel does not depend on when this thread is scheduled.
+            // The kernel's stamps do not depend on when this thread is scheduled.
             socket.set_recv_timestamp(true)?;
             // All waits use `poll`, which has a better resolution and can wait for several buses.
             socket.set_nonblocking(true)?;
@@ -98,8 +98,8 @@ impl Bus {
                         return Ok(false);
                     }
                     // A classic frame takes up to 135 us at 1 Mbit/s, so one or two slots become
-                    // free in this time. The kernel does not report when: a CAN socket counts as
-                    // writable while the queue is full.
+                    // free in this time. The kernel does not report when a slot becomes free,
+                    // because a CAN socket counts as writable even while the queue is full.
                     std::thread::sleep(Duration::from_micros(200));
                 }
                 Err(source) => return Err(self.bus_error(source)),
@@ -175,7 +175,7 @@ impl Bus {
     fn count(&self, frame: &Frame) {
         let busy = Duration::from_secs_f64(frame.bits(Stuffing::None).seconds(self.config.rates()));
         let nanos = u64::try_from(busy.as_nanos()).unwrap_or(u64::MAX);
-        // Nothing else is ordered by this counter.
+        // No other memory access depends on the order of this counter's updates.
         self.busy_nanos.fetch_add(nanos, Ordering::Relaxed);
     }
 

@@ -6,12 +6,12 @@ use crate::wire::can::frame::{Stuffing, load_frac};
 
 /// Maximum fraction of the bus for polls, commands and answers. Errors cause retransmissions, and
 /// other nodes may send, too. With a larger fraction, frames with high identifiers wait longer,
-/// because lower identifiers have priority; with a smaller one, the rate of the cycle drops in
+/// because lower identifiers have priority. With a smaller fraction, the rate of cycles drops in
 /// proportion.
 const MAX_LOAD_FRAC: f64 = 0.7;
 
-/// Rate of cycles, Hz: the requested rate, or the highest rate that keeps the bus load within its
-/// limit.
+/// Rate of cycles, Hz. It is the requested rate, or the highest rate that keeps the bus load within
+/// its limit.
 ///
 /// `cycle_frames`: all frames of a cycle, sent and received. `unsolicited`: other frames, with
 /// their rate in Hz.
@@ -34,8 +34,8 @@ pub(super) fn max_cycle_rate_hz(
         cycle_frames.iter().map(|frame| (bits(frame), 1.0)),
         bus.rates(),
     );
-    // Unsolicited reports cannot be slowed down, so the cycle gets what they leave. If they leave
-    // nothing, 1 Hz keeps the period finite.
+    // Unsolicited reports cannot be slowed down, so the cycle gets the part of the limit that they
+    // leave. If they leave nothing, a rate of 1 Hz keeps the period finite.
     let rate_hz = requested_hz.min(((MAX_LOAD_FRAC - unsolicited) / per_cycle).max(1.0));
     let load_percent = 100.0 * (unsolicited + per_cycle * rate_hz);
     let interface = &bus.interface;

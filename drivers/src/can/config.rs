@@ -152,8 +152,7 @@ impl FollowingLimits {
                 self.max_error_rad
             ));
         }
-        // If the motor reports no effort, or the rig file sets no limit, there is nothing to
-        // exceed.
+        // Without a reported effort or a configured limit, no limit can be exceeded.
         let effort_nm = effort_nm?.abs();
         let max_effort_nm = self.max_effort_nm?;
         (effort_nm > max_effort_nm).then(|| {

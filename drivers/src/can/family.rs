@@ -21,7 +21,7 @@ pub(super) const MAX_REPORT: Duration = Duration::from_secs(1);
 pub(super) const MAX_CHANGE: Duration = Duration::from_secs(1);
 /// Fault of a motor whose watchdog has expired.
 pub(super) const COMMUNICATION_LOST: &str = "it received no command for longer than its timeout";
-/// Ranges for motors whose values need no scaling. Their gains, if they have any, have the usual
+/// Ranges for motors whose values need no scaling. If such motors have gains, these have the usual
 /// ranges.
 pub(super) const UNLIMITED: Limits = Limits::of(f64::INFINITY, f64::INFINITY, f64::INFINITY);
 
@@ -40,7 +40,7 @@ pub trait MotorFamily: Debug + Sync {
     /// Whether each command includes stiffness and damping (MIT mode). Other motors keep the gains
     /// stored in them.
     fn has_gains(&self) -> bool;
-    /// The motor with these settings; `None` if a required setting is missing.
+    /// Creates the motor with these settings. Returns `None` if a required setting is missing.
     fn motor(&self, settings: &MotorSettings) -> Option<Arc<dyn MotorProtocol>>;
     /// Data for fuzzing and its tests.
     #[cfg(any(test, fuzzing))]
@@ -57,8 +57,8 @@ pub trait MotorProtocol: Debug + Send + Sync {
     fn settings(&self) -> MotorSettings;
     /// IDs that no other motor of the family may use on the same bus.
     fn addresses(&self) -> Vec<u32>;
-    /// Ranges of its raw values, infinite where there are none; `None` if [`MotorProtocol::set_up`]
-    /// reads them from the motor.
+    /// Ranges of the motor's raw values. A range is infinite if the value is not limited. `None` if
+    /// [`MotorProtocol::set_up`] reads the ranges from the motor.
     fn ranges(&self) -> Option<Limits>;
     /// Node ID, if the motor is a CANopen node. Such a motor reports and accepts targets on each
     /// SYNC, and monitors our heartbeat.
@@ -78,8 +78,8 @@ pub trait MotorProtocol: Debug + Send + Sync {
     fn poll_frame(&self) -> Option<Frame> {
         None
     }
-    /// A frame of the same size as its position reports, and the rate of the reports in Hz if the
-    /// motor determines it.
+    /// A frame of the same size as the motor's position reports. If the motor determines the rate
+    /// of the reports, also returns that rate in Hz.
     fn typical_answer(&self) -> (Frame, Option<f64>);
     /// The reading in a frame; `None` if the frame is from another motor or has other content.
     fn read(&self, frame: &Frame, limits: &Limits) -> Option<MotorReading>;
@@ -192,12 +192,12 @@ pub enum Reports {
     WhenPolled,
     /// Periodically, without being polled.
     Unasked {
-        /// What to check if it does not.
+        /// What to check if the motor does not report.
         if_silent: &'static str,
     },
     /// In reply to each command.
     WhenCommanded {
-        /// What to check if it does not.
+        /// What to check if the motor does not report.
         if_silent: &'static str,
     },
 }

@@ -38,8 +38,8 @@ pub struct WireErrors {
     pub n_warnings: u64,
     /// Number of times the controller became error-passive, at a counter of 128.
     pub n_passive: u64,
-    /// Number of frames that no node acknowledged: there is no other node, or none at this bit
-    /// rate.
+    /// Number of frames that no node acknowledged. The bus then has no other node, or none with
+    /// this bit rate.
     pub n_unacknowledged: u64,
     /// Number of times a buffer of the controller or the kernel was full, so that frames were
     /// dropped.

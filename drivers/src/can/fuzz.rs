@@ -103,7 +103,7 @@ pub fn frames(bytes: &[u8]) {
             // Every motor gets every frame, because on a real bus, any node may send any
             // identifier.
             check(&listeners[ix], &frame);
-            // A command out of range has no answer, as on a real motor.
+            // As on a real motor, a command out of range gets no answer.
             let answers = emulated.take(&frame).unwrap_or_default();
             for sent in answers
                 .into_iter()

@@ -33,8 +33,8 @@ impl Joints {
 
     /// Adds a reading. Once every joint has a new reading, returns a state and starts over.
     pub(super) fn take(&mut self, joint_reading: &JointReading) -> Option<JointState> {
-        // A second reading of a joint replaces the first, so a fast motor does not hold back newer
-        // data.
+        // A second reading of a joint replaces the first, so that a state contains the newest data
+        // of fast motors.
         self.newest[joint_reading.joint_ix] = Some((joint_reading.stamp, joint_reading.reading));
         let all = self.newest.iter().copied().collect::<Option<Vec<_>>>()?;
         // Every state consists of new readings only. Otherwise, a silent motor would keep its last

@@ -8,10 +8,10 @@ use socketcan::nl::{CanState, InterfaceDetails, Mtu};
 use std::io;
 use std::path::Path;
 
-/// Time from a bus-off to the automatic restart in the commands that we print, milliseconds. A
-/// shorter time would let a node with a permanent fault disturb the bus more often; a longer one
-/// lengthens the gap in the joint states, which must stay below the second after which a motor
-/// counts as silent.
+/// Time from a bus-off to the automatic restart in the commands that we print, milliseconds. With a
+/// shorter time, a node with a permanent fault would disturb the bus more often. A longer time
+/// lengthens the gap in the joint states, which must stay below one second: after that time, a
+/// motor counts as silent.
 const RESTART_MILLIS: u32 = 100;
 
 /// State of a controller according to its error counters.
@@ -92,7 +92,7 @@ impl Link {
             bitrate_hz: bit_rate_hz(can.bit_timing),
             data_bitrate_hz: bit_rate_hz(can.data_bit_timing),
             restart_millis: can.restart_ms,
-            // The driver of a virtual interface reports no controller, and so no state.
+            // A virtual interface has no controller, so its driver reports no state.
             state: can.state.map(|state| match state {
                 CanState::ErrorActive => State::Active,
                 CanState::ErrorWarning => State::Warning,

@@ -32,8 +32,8 @@ impl Motor {
     /// Makes the motor report its position, and waits for the first report.
     pub(super) fn set_up(bus: &dyn FrameIo, config: &MotorConfig) -> Result<Self, Error> {
         let motor = Self::set_up_for_motion(bus, config)?;
-        // Such a motor is silent until another master commands it. Reading it makes no sense before
-        // that, so the error names this cause.
+        // Such a motor is silent until another master commands it, and cannot be read before that.
+        // The error therefore names this cause.
         if let Reports::WhenCommanded { if_silent } = config.protocol.reports() {
             motor.wait_for_reading(&MotorQuery::new(bus, &config.joint), if_silent)?;
         }
@@ -50,8 +50,8 @@ impl Motor {
         // The ranges come first: without them, the raw values of a report have no meaning.
         let limits = config.protocol.set_up(&query)?;
         let motor = Self::with_limits(config.clone(), limits);
-        // A motor that is polled has answered the queries of its set-up. One that reports without
-        // being asked may not have been heard yet.
+        // A motor that is polled has already answered the queries of its set-up. A motor that sends
+        // unsolicited reports may not have sent a frame yet.
         if let Reports::Unasked { if_silent } = config.protocol.reports() {
             motor.wait_for_reading(&query, if_silent)?;
         }

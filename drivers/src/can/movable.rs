@@ -1,7 +1,7 @@
 //! An arm of motors on CAN buses that may be moved.
 //!
-//! One thread serves all buses of the arm, so that its joints start and arrive together. In each
-//! cycle it sends every motor its setpoint, which also resets the motors' watchdogs.
+//! One thread serves all buses of the arm, so that all joints start and arrive at the same time. In
+//! each cycle it sends every motor its setpoint, which also resets the motors' watchdogs.
 
 use super::arm::MAX_WAITING;
 use super::arm_loop::{ArmLoop, Request};
@@ -38,7 +38,7 @@ pub struct MovableCanArm {
     motion: Arc<Mutex<Motion>>,
     is_shutting_down: Arc<AtomicBool>,
     thread: Option<JoinHandle<()>>,
-    /// Of all its buses, until the thread has ended.
+    /// Locks of all buses of the arm. They are held until the thread has ended.
     _locks: Vec<MotionLock>,
 }
 
@@ -78,8 +78,8 @@ impl MovableCanArm {
             Arc::clone(&motion),
             Arc::clone(&is_shutting_down),
         )?;
-        // The lock comes before the thread, and thus before any frame. Two programs that command
-        // the same motors would alternate between two targets.
+        // The lock is taken before the thread starts, and thus before any frame is sent. If two
+        // programs commanded the same motors, the motors would alternate between two targets.
         let locks = config
             .arm
             .buses
@@ -151,8 +151,8 @@ impl Arm for MovableCanArm {
                         return Ok(state);
                     }
                 }
-                // A stopped arm reports no state, but that is no error: the reason is in `motion`,
-                // and the arm may be recovered.
+                // A stopped arm reports no state. That is not an error, because `motion` contains
+                // the reason and the arm may be recovered.
                 Err(RecvTimeoutError::Timeout | RecvTimeoutError::Disconnected) => {
                     return Err(Error::NoJoints { waited: timeout });
                 }

@@ -37,8 +37,8 @@ impl MovableMotor {
         let movable_motor = Self::new(Motor::set_up_for_motion(bus, config)?);
         let query = MotorQuery::new(bus, &config.joint);
         // The order matters. Gains are checked before anything is changed. The motor is disabled
-        // before its mode changes, because in another mode its last command would have another
-        // meaning. A motor whose watchdog does not read back as set stays disabled.
+        // before its mode changes, because its last command would have a different meaning in
+        // another mode. A motor stays disabled if its watchdog reads back differently.
         movable_motor.check_gains(&query)?;
         movable_motor.motion.switch_off(&query)?;
         movable_motor.motion.set_watchdog(&query, plan)?;
@@ -125,21 +125,21 @@ impl MovableMotor {
         let per_turn = self.motor.per_turn();
         let [kp_nm_rad, kd_nm_s_rad] = self.gains().unwrap_or([0.0; 2]);
         Command {
-            // The inverse of `Motor::read`, so that a motor that is sent its own reading stays
-            // where it is.
+            // This is the inverse of `Motor::read`. A motor that receives its own reading as a
+            // command thus stays where it is.
             position_rad: (position_rad - self.motor.config().offset_rad) / per_turn,
             velocity_rad_s: velocity_rad_s / per_turn,
             kp_nm_rad,
             kd_nm_s_rad,
-            // There is no dynamic model of the arm, so gravity is left to the stiffness.
+            // There is no dynamic model of the arm, so only the stiffness counteracts gravity.
             torque_nm: 0.0,
         }
     }
 
-    /// The fail-safe command, after which the motor does what `on_loss` specifies without further
+    /// The fail-safe command. After it, the motor does what `on_loss` specifies, without further
     /// commands. `position_rad` is the last commanded position of the joint.
     pub(super) fn shutdown(&self, on_loss: OnLoss, position_rad: f64) -> Result<Frame, CanError> {
-        // Velocity 0, so that a moving joint comes to rest at this position, or is damped.
+        // The velocity is 0, so that a moving joint comes to rest at this position or is damped.
         let command = self.motor_command(position_rad, 0.0);
         match on_loss {
             OnLoss::Release => self.motion.release(),
@@ -236,8 +236,8 @@ mod tests {
     fn commands_are_in_motor_coordinates() {
         let sent = damiao().command(1.0, 0.25).expect("numbers");
         let got = mit::decode(sent.data().try_into().expect("eight bytes"), &LIMITS);
-        // Tolerances: half a quantization step of the 16-bit position and of the 12-bit velocity
-        // and gains.
+        // The tolerances are half a quantization step: 16 bits for the position, 12 bits for
+        // velocity and gains.
         assert!(
             (got.position_rad + 2.0).abs() < 2e-4 && (got.velocity_rad_s + 1.0).abs() < 8e-3,
             "{got:?}"

@@ -7,9 +7,9 @@ use crate::Error;
 use crate::wire::can::canopen::{self, NodeState};
 use std::time::Duration;
 
-/// Minimum watchdog timeout, in cycles. The arm is stopped after 80 % of the timeout. Four cycles
-/// are the smallest number for which this is more than the three cycles for which a motor may
-/// always be silent.
+/// Minimum watchdog timeout, in cycles. The arm is stopped after 80 % of the timeout. A motor may
+/// always be silent for three cycles. Four is the smallest number of cycles for which 80 % are more
+/// than that.
 const MIN_CYCLES: u32 = 4;
 
 /// Makes all checks that are possible before any frame is sent, and returns the watchdog
@@ -99,10 +99,10 @@ fn motor_error(config: &MotorConfig, interface: &str, reason: String) -> Error {
     }
 }
 
-/// An unused CANopen node number for this computer.
+/// Returns an unused CANopen node number for this computer.
 fn unused_node(config: &MovableArmConfig) -> Result<canopen::Node, Error> {
-    // From the top, because drives are usually numbered from 1. A drive that the rig file does not
-    // list would otherwise be likely to share our number.
+    // The search starts at the highest number, because drives are usually numbered from 1. A low
+    // number could belong to a drive that the rig file does not list.
     let mut numbers = (1..=127)
         .rev()
         .filter_map(|number| canopen::Node::new(number).ok());
@@ -224,7 +224,7 @@ mod tests {
             period(&config(vec![damiao(1), damiao(2)]), host),
             Duration::from_millis(1)
         );
-        // Seven motors with two frames each, at most 135 bits per frame.
+        // Seven motors have two frames each, of at most 135 bits per frame.
         let seven = period(&config((1..8).map(damiao).collect()), host).as_secs_f64();
         assert!((seven - 14.0 * 135e-6 / 0.7).abs() < 1e-6, "{seven}");
     }
@@ -244,7 +244,8 @@ mod tests {
         };
         let arm = config(vec![drive(127), drive(126), drive(1)]);
         assert_eq!(unused_node(&arm).expect("125 are free"), node(125));
-        // 9 x 135 bits, a SYNC of 55 and a heartbeat of 65 take 1.34 ms of 70 %: 1.91 ms.
+        // 9 x 135 bits, a SYNC of 55 bits and a heartbeat of 65 bits take 1.34 ms. At a load of 70
+        // %, the period is 1.91 ms.
         assert_eq!(period(&arm, node(125)), Duration::from_millis(2));
     }
 

@@ -117,8 +117,8 @@ impl<'a> MotorQuery<'a> {
         mut matches: impl FnMut(&Frame) -> Option<T>,
     ) -> Result<T, Error> {
         for _ in 0..MAX_ATTEMPTS {
-            // A full queue is no error here. If the frame was not sent, no answer arrives, and the
-            // next attempt repeats it.
+            // A full queue is not an error here. If the frame was not sent, no answer arrives, and
+            // the next attempt sends it again.
             self.bus.send(poll_frame)?;
             if let Some(answer) = self.wait(MAX_ANSWER, &mut matches)? {
                 return Ok(answer);

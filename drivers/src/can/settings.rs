@@ -79,7 +79,8 @@ impl MotorSettings {
         }
     }
 
-    /// The choice of a word from a table of names; `None` if absent.
+    /// The choice that a word stands for, according to a table of names; `None` if the setting is
+    /// absent.
     pub fn choice<T: Copy>(&self, name: &str, choices: &[(&str, T)]) -> Option<T> {
         match self.values.get(name)? {
             // The rig file was checked against the allowed words, so the search fails only if the

@@ -109,8 +109,8 @@ impl Receiver {
     /// Returns the oldest queued datagram, or `None` if none came until `until`.
     pub(crate) fn next(&self, until: Instant) -> Result<Option<ReceivedDatagram>, Error> {
         let mut state = self.shared.state.lock();
-        // Otherwise, the first read would return a burst of old values, and the clock map would
-        // start with their delays.
+        // Old datagrams are discarded. Otherwise, the first read would return a burst of old
+        // values, and the clock map would start with their delays.
         if !std::mem::replace(&mut state.has_reader, true) {
             state.discard_before(clock::now() - MAX_BUFFERED_AGE);
         }
@@ -145,7 +145,8 @@ impl Shared {
         let mut buffer = vec![0; MAX_DATAGRAM_BYTES];
         loop {
             let received = socket.recv_from(&mut buffer);
-            // Before the lock, so that a reader that holds it does not delay stamps.
+            // The time is taken before the lock, so that a reader that holds the lock does not
+            // delay the stamp.
             let at = clock::now();
             let mut state = self.state.lock();
             if state.stop {

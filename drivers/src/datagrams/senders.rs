@@ -7,18 +7,19 @@ use std::net::SocketAddr;
 use std::time::Duration;
 
 /// Another sender may replace the current one after this time without a datagram from it. A
-/// restarted sender usually has a new address. A shorter time would let two programs alternate when
-/// one of them pauses; a longer one delays the data of a restarted sender.
+/// restarted sender usually has a new address. With a shorter time, two programs would alternate
+/// when one of them pauses. A longer time delays the data of a restarted sender.
 const MAX_SENDER_SILENCE: Duration = Duration::from_secs(2);
 
 /// If this many datagrams come from different ports of one host, one program has opened a socket
-/// for each of them. Up to four programs that keep their sockets would have used a port again.
+/// for each of them. If the datagrams came from up to four programs that keep their sockets, a port
+/// would have occurred twice.
 const MIN_NEW_PORTS: usize = 5;
 /// Number of recent ports of such a program that are stored. It is small, because the system
 /// chooses ports at random and may soon choose one again.
 const MAX_RECENT_PORTS: usize = 8;
 
-/// The current sender: one at a time, so that the data of two programs cannot mix.
+/// The current sender. There is only one at a time, so that the data of two programs cannot mix.
 #[derive(Debug, Default)]
 pub(crate) struct Senders {
     current: Option<(SocketAddr, Stamp)>,
@@ -45,8 +46,8 @@ impl Senders {
         match self.current {
             Some((current, last)) if !self.is_current(current, from) => {
                 let is_silent = at.duration_since(last) >= MAX_SENDER_SILENCE;
-                // Asked first, because such a sender is never silent: each datagram would otherwise
-                // be ignored as that of another program.
+                // This is checked first, because such a sender is never silent. Otherwise, each of
+                // its datagrams would be ignored as a datagram of another program.
                 if self.finds_new_ports(current, from) {
                     log::warn!(
                         "{device}: every datagram comes from another port of {}, so its sender opens a socket for each of \
@@ -59,7 +60,7 @@ impl Senders {
                         "now receiving from {from}; {current} was silent for more than {MAX_SENDER_SILENCE:?}"
                     );
                     count_and_warn(device, &mut self.n_changes, 1, what);
-                    // The ports seen so far are those of another program.
+                    // The ports seen so far belong to another program.
                     if self.has_new_ports || current.ip() != from.ip() {
                         self.has_new_ports = false;
                         self.recent_ports = VecDeque::new();
@@ -74,13 +75,13 @@ impl Senders {
                         "ignored a datagram from {from}, because {current}{ports} is also sending; stop one of them"
                     );
                     count_and_warn(device, n_foreign, 1, what);
-                    // Nothing of the current sender changes: ignored datagrams must not keep it
-                    // alive.
+                    // The state of the current sender does not change, because ignored datagrams
+                    // must not keep it alive.
                     return false;
                 }
                 self.keeps_port = false;
             }
-            // A second datagram from one port: this sender keeps its socket.
+            // A second datagram from the same port shows that this sender keeps its socket.
             Some(_) if !self.has_new_ports => {
                 self.keeps_port = true;
                 self.recent_ports.clear();
@@ -110,8 +111,8 @@ impl Senders {
     /// Notes a datagram from another address than the current one. Returns whether it shows that
     /// the sender uses a new port for each datagram.
     fn finds_new_ports(&mut self, current: SocketAddr, from: SocketAddr) -> bool {
-        // A sender that keeps its port is known to be one program; another port of its host is
-        // another program.
+        // If a sender keeps its port, datagrams from another port of its host come from another
+        // program.
         if self.has_new_ports || self.keeps_port || current.ip() != from.ip() {
             return false;
         }

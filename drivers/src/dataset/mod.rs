@@ -75,9 +75,11 @@ pub fn read(path: &Path) -> Result<Dataset, Error> {
 /// Describes a focal length or principal point that no camera has, such as the result of a division
 /// by almost zero, or lens coefficients that no lens has.
 fn implausible(intrinsics: &Intrinsics) -> Option<String> {
-    /// Relative to the longer side: fields of view from 0.06 to 176 degrees.
+    /// Range of focal lengths relative to the longer side of the image. It corresponds to fields of
+    /// view from 0.06 to 176 degrees.
     const FOCAL: std::ops::RangeInclusive<f64> = 0.02..=1000.0;
-    /// Relative to the size: images may be cut out of larger ones.
+    /// Range of principal points relative to the image size. It is wide because images may be cut
+    /// out of larger ones.
     const CENTER: std::ops::RangeInclusive<f64> = -1.0..=2.0;
     let [width, height] = intrinsics.size_px.map(f64::from);
     let longer = width.max(height);
@@ -133,7 +135,7 @@ const MAX_POSITION_M: f64 = 1e4;
 #[derive(Debug, Default)]
 struct SkippedImages {
     missing: Vec<String>,
-    /// Names of unusable images with the reason; also in `broken`.
+    /// Names of unusable images, each with the reason. The list `broken` has the same form.
     unusable: Vec<(String, String)>,
     broken: Vec<(String, String)>,
     /// Messages about other parts of the dataset that cannot be used.

@@ -28,7 +28,7 @@ pub(super) const OTHER_FILE: &str =
 const MAX_FOCAL_DIFFERENCE: f64 = 0.01;
 /// Depth counts are millimeters unless the file specifies another unit.
 const DEFAULT_METERS_PER_COUNT: f64 = 0.001;
-/// With 65535 counts, depth of up to 6.5 cm and up to 65 km.
+/// Range of accepted units. With 65535 counts, the maximum depth is between 6.5 cm and 65 km.
 const METERS_PER_COUNT: std::ops::RangeInclusive<f64> = 1e-6..=1.0;
 /// Extensions tried when a path has none, in lower and upper case.
 const EXTENSIONS: [&str; 7] = ["png", "jpg", "jpeg", "webp", "bmp", "tif", "tiff"];
@@ -192,8 +192,8 @@ impl Reading<'_> {
             name: name.clone(),
             intrinsics,
             world_from_camera: poses.world_from_camera,
-            // The index in the list, so that the stamps of the others stay the same if an image
-            // is removed from the folder.
+            // The stamp is computed from the index in the list. The stamps of the other images thus
+            // stay the same if an image is removed from the folder.
             stamp: Stamp(
                 i64::try_from(ix)
                     .unwrap_or(i64::MAX)
@@ -201,8 +201,8 @@ impl Reading<'_> {
             ),
             image_path,
             depth,
-            // A mask that is named but missing is an error when the image is loaded: training on
-            // the pixels that it should exclude would go unnoticed.
+            // A mask that is named but missing causes an error when the image is loaded. Otherwise,
+            // nobody would notice that the pixels that it should exclude are used for training.
             mask_path: entry.mask_path.as_ref().map(|name| {
                 find_image(self.folder, name).unwrap_or_else(|| self.folder.join(name))
             }),
@@ -242,8 +242,8 @@ impl Reading<'_> {
         Some(poses)
     }
 
-    /// Notes that images have another size than the file says. Once, because the images of a
-    /// downscaled dataset have one size.
+    /// Notes that images have another size than the file says. The note is written only once,
+    /// because all images of a downscaled dataset have the same size.
     fn note_other_size(&mut self, [width, height]: [u32; 2]) {
         if !std::mem::replace(&mut self.has_other_size, true) {
             self.notes.push(format!(
@@ -403,8 +403,8 @@ struct Document {
 
 impl Document {
     /// The split of each listed image; empty if the file has no lists. The keys are [`normalized`].
-    /// Without test images, the validation images are the test images, as they are scored in
-    /// nerfstudio.
+    /// If the file lists no test images, its validation images become the test images, because
+    /// nerfstudio also scores them.
     fn splits(&self) -> Result<HashMap<String, ListedSplit>, String> {
         let validation = if self.test_filenames.is_empty() {
             ListedSplit::Test
@@ -484,7 +484,8 @@ fn unknown_keys(keys: &BTreeMap<String, Value>) -> Vec<String> {
         .collect()
 }
 
-/// A path in the form in which paths are compared: with slashes, and without `./` at its start.
+/// Converts a path to the form in which paths are compared: with slashes, and without `./` at its
+/// start.
 fn normalized(path: &str) -> String {
     let path = path.replace('\\', "/");
     path.strip_prefix("./").unwrap_or(&path).to_owned()
@@ -651,7 +652,7 @@ impl CameraEntry {
 
     /// Lens parameters for images of the given size.
     fn intrinsics(&self, image_px: [u32; 2]) -> Result<Intrinsics, String> {
-        // Without a size, the parameters are those of the images as they are.
+        // Without a size in the file, the parameters refer to the actual size of the images.
         let size_px = self.size_px().unwrap_or(image_px);
         let [width, height] = size_px.map(f64::from);
         let focal_x = focal_px(
@@ -719,8 +720,8 @@ impl CameraEntry {
     }
 }
 
-/// The focal length along one axis, pixels, from a focal length, a field of view, or both; `None`
-/// without either. Each has the name of its key.
+/// Returns the focal length along one axis in pixels. It is computed from a focal length, a field
+/// of view, or both; `None` if neither is given. Each argument includes the name of its key.
 fn focal_px(
     given: (&str, Option<f64>),
     angle: (&str, Option<f64>),

@@ -7,7 +7,7 @@ use std::path::Path;
 struct OtherFormat {
     /// Name with its article.
     name: &'static str,
-    /// Files and folders; one of them identifies a folder of this format.
+    /// Names of files and folders. A folder that contains one of them has this format.
     members: &'static [&'static str],
     /// Extensions, in lower case, of a file of this format, or of a file in a folder.
     extensions: &'static [&'static str],
@@ -15,8 +15,8 @@ struct OtherFormat {
     remedy: &'static str,
 }
 
-/// The formats. The first match is reported. Some formats also contain files of another format, so
-/// they come before it.
+/// The formats. The first match is reported. A format that also contains files of another format
+/// comes before the other format.
 static OTHER_FORMATS: [OtherFormat; 7] = [
     OtherFormat {
         name: "a raw export of Polycam",
@@ -68,7 +68,8 @@ static OTHER_FORMATS: [OtherFormat; 7] = [
     },
 ];
 
-/// The format of a file or folder and what to do, if it is known: the end of an error message.
+/// The end of an error message, which names the format of a file or folder and what to do. `None`
+/// if the format is unknown.
 pub(super) fn hint(path: &Path) -> Option<String> {
     let format = OTHER_FORMATS.iter().find(|format| format.matches(path))?;
     Some(format!(

@@ -82,7 +82,7 @@ impl DatasetImage {
         let mut rgba = into_rgba(decode_file(&self.image_path, Budget::COLOR_IMAGE)?);
         self.require_size(&self.image_path, [rgba.width(), rgba.height()])?;
         for pixel in rgba.pixels_mut() {
-            // Half transparent pixels are used: only fully transparent ones were cut out on
+            // Semi-transparent pixels are used. Only fully transparent pixels were cut out on
             // purpose.
             pixel.0[3] = if pixel.0[3] == 0 { 0 } else { 255 };
         }
@@ -100,8 +100,8 @@ impl DatasetImage {
                 pixel.0[3] = if mask_pixel.0[0] == 0 { 0 } else { pixel.0[3] };
             }
         }
-        // Depth helps training but is not necessary, so a broken depth image does not cost the
-        // photo.
+        // Depth helps training but is not necessary, so the photo is used even if its depth image
+        // is broken.
         let (depth, depth_error) = match self.depth.as_ref().map(|file| self.load_depth(file)) {
             Some(Err(error)) => (None, Some(error.to_string())),
             Some(Ok(depth)) => (Some(depth), None),
@@ -116,7 +116,7 @@ impl DatasetImage {
     }
 
     fn load_depth(&self, file: &DepthFile) -> Result<DepthImage, Error> {
-        // 8-bit depth would be a picture for people, with unknown scaling.
+        // An 8-bit depth image would be a visualization with unknown scaling.
         let DynamicImage::ImageLuma16(counts) = decode_file(&file.path, Budget::DEPTH_IMAGE)?
         else {
             return Err(Error::NotDepth {
@@ -168,13 +168,15 @@ fn into_rgba(image: DynamicImage) -> RgbaImage {
     }
 }
 
-/// Whether a mask is black, but not equally transparent: it was made as transparency.
+/// Whether a mask is black and its transparency varies. The alpha channel of such a mask contains
+/// the mask.
 fn is_in_alpha(mask: &DynamicImage) -> bool {
     if !mask.color().has_alpha() {
         return false;
     }
     let mask = mask.to_luma_alpha8();
-    // Such a mask was drawn as transparency. As a gray image, it would exclude everything.
+    // The alpha channel of such a mask contains the mask. Interpreted as a gray image, it would
+    // exclude all pixels.
     let alpha = mask.pixels().next().map(|pixel| pixel.0[1]);
     mask.pixels().all(|pixel| pixel.0[0] == 0)
         && mask.pixels().any(|pixel| Some(pixel.0[1]) != alpha)

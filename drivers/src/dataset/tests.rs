@@ -417,7 +417,8 @@ fn tum_folder() -> tempfile::TempDir {
         list(&["1.015000", "1.110000"], "depth"),
     )
     .unwrap();
-    // Along x at 1 m/s, every 10 ms from just before the first photo until just after the third.
+    // The camera moves along x at 1 m/s. There is a pose every 10 ms, from just before the first
+    // photo until just after the third.
     let poses = (0..=25).map(|ix| {
         format!(
             "{:.4} {} 2 3 0 0 0 1\n",
@@ -450,7 +451,8 @@ fn tum_photos_interpolate_pose_and_use_nearest_depth() {
     );
     let second = &dataset.images[1];
     assert_eq!(second.stamp, Stamp(1_100_000_000));
-    // Halfway between two poses. The depth image was taken 10 ms later and 1 cm further.
+    // The image is halfway between two poses. The depth image was taken 10 ms later and 1 cm
+    // further.
     assert!(
         (second.world_from_camera.translation.vector - Vector3::new(0.105, 2.0, 3.0)).norm()
             < EXACT_M
@@ -815,7 +817,7 @@ fn mask_in_the_alpha_channel_is_named() {
     );
 }
 
-/// Feeds each key of the tables in docs/reference/datasets.md alone.
+/// Tests each key of the tables in docs/reference/datasets.md in its own file.
 #[test]
 fn keys_of_transforms_json_are_used_refused_or_named_as_documented() {
     let documented = include_str!("../../../docs/reference/datasets.md");
@@ -918,7 +920,7 @@ fn keys_of_transforms_json_are_used_refused_or_named_as_documented() {
     }
 }
 
-/// The points are in the frame of the poses, and their path follows the same rules as those of
+/// The points are in the frame of the poses. Their path follows the same rules as the paths of
 /// images.
 #[test]
 fn path_of_points_is_returned() {
@@ -1005,7 +1007,7 @@ fn sparse_tum_poses_are_interpolated_but_not_over_gaps() {
     let folder = tum_folder();
     let write = |name: &str, text: String| std::fs::write(folder.path().join(name), text).unwrap();
     let photo = |secs: f64| format!("{secs} rgb/1.000000.png\n");
-    // Poses at 20 Hz without those from 1.2 s to 1.3 s.
+    // The poses have 20 Hz, but the poses from 1.2 s to 1.3 s are missing.
     let poses = (0..20)
         .filter(|ix| !(5..6).contains(ix))
         .map(|ix| f64::from(ix) * 0.05);

@@ -22,8 +22,8 @@ const POSE_LIST: &str = "groundtruth.txt";
 /// pixel centers at integers as in OpenCV.
 const CAMERA_FILE: &str = "calibration.txt";
 /// Maximum time between an image and its depth image or pose. The `associate.py` of the benchmark
-/// has the same default. At 30 Hz, it is a little more than half of the interval between images, so
-/// that every image finds the closest one of the other kind.
+/// has the same default. At 30 Hz, this is slightly more than half of the interval between images,
+/// so every color image finds the closest depth image.
 const MAX_GAP_NANOS: i64 = 20_000_000;
 /// Upper limit of the time between two poses that are interpolated, whatever their median interval.
 const MAX_POSE_INTERVAL_NANOS: i64 = 110_000_000;
@@ -59,11 +59,11 @@ const CAMERAS: [(&str, [f64; 9]); 3] = [
 
 /// Reads a folder.
 ///
-/// Each photo gets the depth image closest in time, within 20 ms, and the pose interpolated at its
-/// stamp between two poses that are at most 40 ms apart, or 1.5 times the usual interval of the
-/// poses, up to 110 ms. Photos without a pose, photos of another size and invalid lines are skipped
-/// and counted. Lens parameters come from `calibration.txt`, else from the folder name. The details
-/// are in docs/reference/datasets.md.
+/// Each photo gets the depth image closest in time, within 20 ms. Its pose is interpolated at its
+/// stamp between two poses. These may be at most 40 ms apart, or 1.5 times the usual interval of
+/// the poses, up to 110 ms. Photos without a pose, photos of another size and invalid lines are
+/// skipped and counted. Lens parameters come from `calibration.txt`, else from the folder name. The
+/// details are in docs/reference/datasets.md.
 pub fn read(folder: &Path) -> Result<Dataset, Error> {
     let (camera, lens_px) = camera_of(folder)?;
     let mut skipped = SkippedImages::default();
@@ -237,8 +237,8 @@ impl Reading<'_> {
     }
 }
 
-/// Whether anything has this name, including a broken link. An optional file is skipped only if
-/// nothing has its name; otherwise, errors in reading it are reported.
+/// Whether a file, folder or link has this name, even if the link is broken. An optional file is
+/// skipped only if this is not the case. Otherwise, errors in reading it are reported.
 fn exists(path: &Path) -> bool {
     !matches!(path.symlink_metadata(), Err(error) if error.kind() == ErrorKind::NotFound)
 }
@@ -394,8 +394,8 @@ fn stamped_lines(
             }),
         }
     }
-    // A list without any valid line is of another format, which is worth an error; a few bad lines
-    // are not.
+    // A list without any valid line has another format, which is an error. A few invalid lines are
+    // not an error.
     if let (true, Some(first)) = (lines.is_empty(), invalid.first()) {
         return Err(Error::DatasetFile {
             path,
@@ -404,7 +404,7 @@ fn stamped_lines(
     }
     skipped.lines(list, &invalid);
     // Lists that were merged or edited may be out of order, and stamps are searched by bisection.
-    // The sort is stable, so that of two lines with one time, the first one counts.
+    // The sort is stable, so that if two lines have the same time, the first one is used.
     lines.sort_by_key(|line| line.stamp);
     Ok(lines)
 }
@@ -562,8 +562,8 @@ fn max_interval_nanos(poses: &[(Stamp, Transform)]) -> i64 {
         .unwrap_or_default();
     #[expect(clippy::cast_possible_truncation, reason = "the cast saturates")]
     let max = (MAX_USUAL_INTERVALS * usual as f64) as i64;
-    // At the lower bound, no pose is further than the maximum gap from the closest reading. The
-    // upper bound keeps a sparse trajectory from inventing motion.
+    // At the lower bound, no stamp is farther than the maximum gap from the closest pose. The upper
+    // bound prevents interpolation of unknown motion in a sparse trajectory.
     max.clamp(2 * MAX_GAP_NANOS, MAX_POSE_INTERVAL_NANOS)
 }
 
@@ -572,8 +572,8 @@ fn pose_of(columns: &str) -> Result<Transform, &'static str> {
     let Some([x, y, z, qx, qy, qz, qw]) = numbers.as_deref() else {
         return Err("expected seven numbers tx ty tz qx qy qz qw after the time");
     };
-    // Files round quaternions to four decimals, which changes the length by less than 0.001. A
-    // length that differs by more than 0.01 belongs to other columns.
+    // Files round quaternions to four decimals, which changes the length by less than 0.001. If the
+    // length differs by more than 0.01, the columns are not a quaternion.
     let rotation = Quaternion::new(*qw, *qx, *qy, *qz);
     // The comparisons are written so that NaN fails them.
     let is_near = [x, y, z].iter().all(|along| along.abs() <= MAX_POSITION_M);

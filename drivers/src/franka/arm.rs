@@ -22,8 +22,8 @@ use std::time::{Duration, Instant};
 /// Capacity of the queue of states for a slow caller: one second. When it is full, the oldest state
 /// is dropped.
 const MAX_WAITING: usize = 1000;
-/// A robot that sends nothing for this long counts as lost. At a thousand states per second, this
-/// is no matter of lost datagrams, but of a cable, the power or a closed connection.
+/// A robot that sends nothing for this long counts as lost. At a thousand states per second, lost
+/// datagrams cannot cause such a silence. The cause is a cable, the power or a closed connection.
 const MAX_SILENCE: Duration = Duration::from_secs(1);
 /// Maximum difference between our forward kinematics and the robot's own. Beyond it, the
 /// description belongs to another robot. Poses of FCI 10 are rounded by less than a micrometer, and
@@ -32,8 +32,8 @@ const MAX_POSE_ERROR_M: f64 = 2e-3;
 const MAX_POSE_ERROR_RAD: f64 = 0.5 / 180.0 * std::f64::consts::PI;
 const NANOS_PER_STATE: i64 = 1_000_000;
 /// A robot that received no answer for this long has stopped waiting. States that arrived in the
-/// meantime are not answered. The time is that of 20 missed commands, after which a robot ends its
-/// motion.
+/// meantime are not answered. The time corresponds to 20 missed commands, after which a robot ends
+/// its motion.
 const MAX_RESPONSE_GAP: Duration = Duration::from_millis(20);
 
 /// Configuration of an arm from the rig file.
@@ -190,8 +190,8 @@ fn first_state(address: &str, connection: &Connection) -> Result<(SocketAddr, Ro
             Some((sender, first)) => return Ok((sender, first.state)),
             None if clock::now() < deadline => {}
             None => {
-                // Requests work, so TCP is not blocked. States come over UDP, to a port that a
-                // firewall may not know.
+                // TCP is not blocked, because requests are answered. A firewall may block the UDP
+                // port to which the states are sent.
                 return Err(fault(
                     address,
                     format!(
@@ -217,15 +217,15 @@ fn check_kinematics(config: &ArmConfig, state: &RobotState) -> Result<(), String
     };
     let base_from_tool = matrix("O_T_EE", &state.O_T_EE)?;
     let flange_from_tool = matrix("F_T_EE", &state.F_T_EE)?;
-    // The robot reports its tool, whose pose depends on settings in Desk. Removing it leaves the
-    // flange, which depends on the joints only.
+    // The robot reports its tool, whose pose depends on settings in Desk. Without the tool's pose,
+    // the result is the pose of the flange, which depends only on the joints.
     let reported = base_from_tool * flange_from_tool.inverse();
     let (error_m, error_rad) = difference(&ours, &reported);
     if error_m <= MAX_POSE_ERROR_M && error_rad <= MAX_POSE_ERROR_RAD {
         return Ok(());
     }
-    // If the rig file agrees with the tool instead, its author has named the hand as the flange.
-    // This mistake is distinguishable from the others.
+    // If the rig file agrees with the pose of the tool instead, it names the hand as the flange.
+    // The error reports this mistake separately.
     let (tool_error_m, tool_error_rad) = difference(&ours, &base_from_tool);
     let tip = chain.tip_link();
     let likely_cause = if tool_error_m <= MAX_POSE_ERROR_M && tool_error_rad <= MAX_POSE_ERROR_RAD {
@@ -294,7 +294,8 @@ impl StateReader {
     fn run(mut self, connection: &Connection, sender: SocketAddr, shared: &Shared) {
         realtime::request_realtime(&format!("arm at {}", self.address));
         if let Err(reason) = self.read(connection, sender, shared) {
-            // The caller of a motion learns that it has ended even if nobody reads joint states.
+            // A caller that moves the arm must learn that the connection has ended, even if nobody
+            // reads joint states.
             if let Some(motion_loop) = &mut self.motion_loop {
                 motion_loop.handle_disconnect(&reason);
             }
@@ -322,11 +323,11 @@ impl StateReader {
         loop {
             let mut received = network.udp.blocking_receive(&mut buffer).ok();
             let mut at = clock::now();
-            // Measured when the first waiting state is read. After a stall of this thread, the
-            // robot no longer waits for an answer to any of them.
+            // The time is measured when the first waiting state is read. After a stall of this
+            // thread, the robot no longer waits for an answer to any of the waiting states.
             let is_fresh = at.duration_since(last_received) <= MAX_RESPONSE_GAP;
             // All waiting states are read, so that each gets a stamp. Only the newest one is
-            // answered: for the earlier ones, an answer would come too late.
+            // answered, because answers to the earlier ones would be too late.
             let mut newest = None;
             while let Some(n) = received {
                 // A controller sends all states of a connection from one port. Datagrams from other
@@ -338,13 +339,14 @@ impl StateReader {
                     return Ok(());
                 }
                 received = network.udp.try_receive(&mut buffer).unwrap_or(None);
-                // Every state gets its own arrival time. With that of an earlier state, it could
-                // seem to have arrived before it was sent, which would shift the stamps of all
-                // later states.
+                // Every state gets its own arrival time. With the arrival time of an earlier state,
+                // a state could seem to have arrived before it was sent. That would shift the
+                // stamps of all later states.
                 at = clock::now();
             }
             if let Some((from, numbered, stamp)) = newest {
-                // Late and duplicate states do not count: a robot that only repeats itself is lost.
+                // Late and duplicate states do not count. A robot that only repeats old states
+                // counts as lost.
                 last_received = at;
                 shared.arrived.notify_all();
                 self.log_mode(&numbered.state);
@@ -412,7 +414,7 @@ impl StateReader {
                 return None;
             }
         }
-        // The robot numbers its states by its own clock, one per millisecond.
+        // The robot increments the number of its states once per millisecond of its own clock.
         let stamp_nanos = i64::try_from(*number)
             .unwrap_or(i64::MAX)
             .saturating_mul(NANOS_PER_STATE);

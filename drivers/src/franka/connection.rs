@@ -49,8 +49,8 @@ impl Connection {
             ConnectResponse::OtherVersion(server_version) => server_version,
         };
         if server_version == number(FciVersion::V5) {
-            // The controller accepts one client, and may still be serving the connection that asked
-            // for FCI 10.
+            // The controller accepts only one client. It may still be serving the connection that
+            // requested FCI 10.
             let deadline = clock::now() + MAX_ANSWER;
             loop {
                 match connect(FciVersion::V5) {

@@ -11,8 +11,8 @@ use franka::rate_limiting::{self, fer, limit_rate_joint_positions};
 /// setpoints make up for the difference. A larger fraction makes motions faster, and reflexes more
 /// likely.
 const LIMIT_FRAC: f64 = 0.5;
-/// Fraction of the robot's maximum jerk that we use. If a command is lost and we do not notice, the
-/// next command appears to the robot with four times its jerk.
+/// Fraction of the robot's maximum jerk that we use. If a command is lost unnoticed, the robot sees
+/// the next command with four times its jerk.
 ///
 /// The factor follows from the differences of positions. With the jerk `j` and the step `T`, the
 /// lost command leaves the robot `j T³` behind the trajectory, and the next one brings it back.
@@ -20,9 +20,9 @@ const LIMIT_FRAC: f64 = 0.5;
 /// which is added to the `j T³` of the trajectory. A factor of a quarter thus keeps this jerk
 /// within the same fraction as the velocity.
 const JERK_LIMIT_FRAC: f64 = 0.25 * LIMIT_FRAC;
-/// Distance of targets from the ends of a joint's range. The robot stops with an error beyond the
-/// end, so a joint that overshoots by rounding, or by a missed command at the end of a motion, must
-/// still be inside. It costs 0.3 degrees of range.
+/// Distance of targets from the ends of a joint's range. Beyond the end, the robot stops with an
+/// error. A joint must therefore stay inside even if it overshoots because of rounding or a missed
+/// command at the end of a motion. The margin reduces the range by 0.3 degrees.
 const MARGIN_RAD: f64 = 5e-3;
 /// Margin subtracted from the velocity near the end of a range, in addition to the robot's own. It
 /// covers the tolerance of libfranka's limiter, 0.001 rad/s, and the difference between continuous
@@ -173,8 +173,8 @@ impl RobotLimits {
             &reference.acceleration_rad_s2,
         );
         let limited = limited.map_err(|error| error.to_string())?;
-        // The limiter computes the position from rates, so it differs by rounding even if nothing
-        // was limited. Only a real change displaces the generator and is counted.
+        // The limiter computes the position from rates, so rounding changes the position even if
+        // nothing was limited. Only larger changes are counted and passed on to the generator.
         let is_same = limited
             .iter()
             .zip(requested_rad)

@@ -81,8 +81,8 @@ impl MotionMailbox {
     ) -> Option<MutexGuard<'_, MailboxState>> {
         let deadline = Instant::now() + timeout;
         let mut mailbox_state = self.lock();
-        // The condition is checked in a loop: a condition variable may wake up without a change, or
-        // for a change of another field.
+        // The condition is checked in a loop, because a condition variable may wake up without a
+        // change, or for a change of another field.
         while !condition(&mailbox_state) {
             let remaining = deadline.saturating_duration_since(Instant::now());
             if remaining.is_zero() {

@@ -18,8 +18,8 @@ use std::time::Duration;
 
 const STEP: Duration = Duration::from_millis(1);
 /// Number of states at rest after which a motion ends, so that a person may guide the arm by hand.
-/// Starting a motion takes a request and its answer, so a caller that sends several targets in a
-/// row should not have to start one for each.
+/// Starting a motion takes a request and its answer. A caller that sends several targets in a row
+/// should not have to start a motion for each target.
 const MAX_AT_REST: u32 = 1000;
 /// Number of states within which a motion must start. Source: FCI documentation.
 const MAX_STATES_UNTIL_START: u32 = 1000;
@@ -53,7 +53,7 @@ pub(super) struct StampedState<'a> {
 #[derive(Debug)]
 enum MotionState {
     Idle,
-    /// The robot accepted a motion, but no state reports it yet.
+    /// The robot has accepted a motion, but no state reports the motion yet.
     Beginning {
         id: u32,
         n_waited: u32,
@@ -159,8 +159,8 @@ impl MotionLoop {
         self.mode = mode;
         self.mailbox
             .update(|mailbox_state| mailbox_state.mode = mode);
-        // Between motions, nobody waits for an answer, so a user stop would go unnoticed until the
-        // next target.
+        // Between motions, no reply is pending. Without this check, a user stop would go unnoticed
+        // until the next target.
         if let (MotionState::Idle, RobotMode::Reflex | RobotMode::UserStopped, Some(reason)) =
             (&self.motion_state, mode, cause(state))
         {
@@ -190,7 +190,7 @@ impl MotionLoop {
             };
         }
         // The trajectory starts at the position that the robot commands, not at the measured one.
-        // The two differ by the sag under load, which would be a jump.
+        // The two differ by the sag under load, so the measured position would cause a jump.
         let reference = Reference::at_rest(&numbered.state);
         let generator = match TrajectoryGenerator::new(&self.limits, &reference.position_rad, STEP)
         {
@@ -216,8 +216,8 @@ impl MotionLoop {
     fn run(&mut self, mut active: Box<ActiveMotion>, stamped: &StampedState<'_>) -> MotionState {
         let NumberedState { number, state } = stamped.numbered;
         let n_states = number.saturating_sub(active.number);
-        // First it is determined what the robot did with the last command. The next one must
-        // continue from there, or it looks like a jump.
+        // The first step determines what the robot did with the last command. The next command must
+        // continue from there. Otherwise, the robot would see a jump.
         let fate = match n_states {
             0 => CommandFate::Followed,
             n => active.tracker.advance(active.sent, n, state),
@@ -229,7 +229,7 @@ impl MotionLoop {
             Ok(position_rad) => position_rad,
             Err(why) => return self.halt(active.id, why),
         };
-        // The motion advances even if nothing is sent: the next state shows that the robot has
+        // The motion advances even if nothing is sent. The next state then shows that the robot has
         // extrapolated.
         if stamped.is_fresh {
             self.send(&mut active, stamped, position_rad);
@@ -257,7 +257,7 @@ impl MotionLoop {
         mailbox_state.statistics.n_lost += n_states.saturating_sub(1);
         mailbox_state.statistics.n_stale += u64::from(!stamped.is_fresh);
         mailbox_state.statistics.n_missed += fate.n_missed();
-        // Until then, the window of the success rate is not full.
+        // The window of the success rate is full only after this number of cycles.
         if active.n_cycles > N_SUCCESS_WINDOW {
             mailbox_state
                 .statistics
@@ -269,8 +269,8 @@ impl MotionLoop {
         let is_at_rest = active.generator.is_at_rest() && command.is_none();
         active.n_at_rest = if is_at_rest { active.n_at_rest + 1 } else { 0 };
         if is_at_rest && (active.n_at_rest > MAX_AT_REST || mailbox_state.is_shutting_down) {
-            // Under the same lock as the command above, so that no command can come in between and
-            // be accepted by a motion that ends.
+            // This is set under the same lock under which the command was taken above. No command
+            // can thus arrive in between and be accepted by a motion that ends.
             active.is_ending = true;
             mailbox_state.accepts_commands = false;
         }
@@ -310,11 +310,11 @@ impl MotionLoop {
             .try_into()
             .map_err(|_| "the setpoint has the wrong number of joints".to_owned())?;
         // The generator respects its limits, but a missed command or a displaced reference adds to
-        // them. What is sent must be within the limits of the robot in any case.
+        // them. The position that is sent must always be within the limits of the robot.
         let (position_rad, is_limited) = self.robot.limited(desired, reference)?;
         if is_limited {
-            // The generator must know that its setpoint was not sent. Its next one would otherwise
-            // be limited, too.
+            // The generator must know that its setpoint was not sent. Otherwise, its next setpoint
+            // would have to be limited, too.
             generator.resume(&reference.sent(position_rad).setpoint())?;
             self.mailbox.lock().statistics.n_limited += 1;
         }
@@ -359,8 +359,8 @@ impl MotionLoop {
 
     /// Makes the robot brake.
     fn halt(&self, id: u32, reason: String) -> MotionState {
-        // Ceasing to send would also stop the robot, after 20 ms and with a reflex that a person
-        // must clear.
+        // The motion is ended by a request. If commands simply ceased, the robot would stop only
+        // after 20 ms, with a reflex that a person must clear.
         let reason = match request::halt(&self.connection) {
             Ok(()) => reason,
             Err(why) => format!("{reason}; {why}"),
@@ -393,8 +393,8 @@ impl MotionLoop {
                 };
             }
             Ok(Some(MotionResponse::Finished)) => reason,
-            // The states name the cause in more detail, such as the reflex. The answer is added for
-            // what the states do not contain.
+            // The states describe the cause, such as the reflex, in more detail. The answer is
+            // added because it may contain information that the states lack.
             Ok(Some(MotionResponse::Rejected(why))) => {
                 Some(reason.map_or(why.clone(), |reason| format!("{reason} ({why})")))
             }
@@ -443,8 +443,8 @@ impl MotionLoop {
 fn cause(state: &RobotState) -> Option<String> {
     match state.robot_mode {
         RobotMode::Reflex => {
-            // The current errors may already be cleared when the state is sent. Those of the last
-            // motion then still name the cause.
+            // The current errors may already be cleared when the state is sent. In that case, the
+            // errors of the last motion still name the cause.
             let errors = state.current_errors.names();
             let last = state.last_motion_errors.names();
             let names = if errors.is_empty() { last } else { errors };

@@ -18,8 +18,8 @@ use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 
-/// How long a robot waits for our driver, which answers no state if the one before it arrived more
-/// than 20 ms earlier.
+/// How long a robot waits for our driver. The driver does not answer a state if the previous state
+/// arrived more than 20 ms earlier.
 const ANSWER_WAIT: Duration = Duration::from_millis(15);
 /// Number of states without an answer after which a robot stops; two commands may still be on their
 /// way.
@@ -457,7 +457,7 @@ impl Relay {
                 let is_dropped = relay_faults.is_disconnected.load(Ordering::Relaxed)
                     || (is_dropped_randomly && relay_faults.drops_some.load(Ordering::Relaxed));
                 let (to, datagram) = match is_command || is_dropped {
-                    // Without an answer, an empty datagram ends the robot's wait for it.
+                    // If the answer is lost, an empty datagram ends the robot's wait.
                     true => (robot_states, &buffer[..if is_dropped { 0 } else { n }]),
                     false => (Some(client_states), &buffer[..n]),
                 };
@@ -485,7 +485,7 @@ fn lossy_network_is_reported_and_motions_complete() {
     }
     let statistics = arm.motion_statistics();
     eprintln!("5 % loss in each direction: {statistics}");
-    // 0.95 for our rate and 0.95 squared for the robot's.
+    // The expected rates are 0.95 for ours and 0.95 squared for the robot's.
     let [mean, least] = statistics.robot_success_frac().unwrap();
     assert!(
         (0.88..0.97).contains(&statistics.success_frac()),
@@ -619,8 +619,8 @@ fn suspended_program_triggers_reflex_and_sends_nothing_stale() {
         n_without_answer <= MAX_WITHOUT_ANSWER,
         "the robot stopped after {n_without_answer} states"
     );
-    // The relay forwards the last commands after the program was stopped, late if this process is
-    // stalled, too.
+    // After the program was stopped, the relay still forwards the last commands. They are late if
+    // this process is stalled, too.
     let mut counts = vec![0];
     while counts
         .iter()

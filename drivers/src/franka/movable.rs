@@ -21,7 +21,7 @@ use std::time::Duration;
 const ROBOT_TIMEOUT: Duration = Duration::from_millis(20);
 /// Maximum time for an arm to come to rest and end its motion.
 const STOP_TIMEOUT: Duration = Duration::from_secs(5);
-/// Maximum time until the states agree with the robot's reply. They come over another connection,
+/// Maximum time until the states agree with the robot's reply. States come over another connection,
 /// so states from before the reply may still arrive.
 const SETTLE_TIMEOUT: Duration = Duration::from_secs(2);
 
@@ -61,8 +61,8 @@ impl MovableFrankaArm {
         Ok(())
     }
 
-    /// Connects like [`FrankaArm::open`], and prepares to move. Nothing moves, and no setting of
-    /// the robot changes, before the first target.
+    /// Connects like [`FrankaArm::open`], and prepares to move. Before the first target, nothing
+    /// moves and no setting of the robot changes.
     ///
     /// `motion.limits` are in the order of the joints. They are reduced to at most half of the
     /// robot's limits (an eighth for the jerk), and to slightly less than its joint ranges. A
@@ -88,7 +88,7 @@ impl MovableFrankaArm {
         )?;
         let mailbox = Arc::new(MotionMailbox::default());
         // The limits depend on the robot, which is known only after the connection. The closure
-        // stores what this value needs of them.
+        // stores the limits that this value needs.
         let connected = OnceLock::new();
         let arm = FrankaArm::open_with(config, |connection, first| {
             // A Panda serves no description, so its limits are built in.
@@ -178,9 +178,9 @@ impl MovableFrankaArm {
             mailbox_state.accepts_commands = true;
             mailbox_state.is_idle = false;
             mailbox_state.command = Some(MotionCommand::SetTarget(target.clone()));
-            // Set here and not by the thread: a caller may wait for the end of the motion as soon
-            // as this returns.
-            // If the robot has stopped since the request was sent, the reason must not be lost.
+            // The motion is set here and not by the thread, because a caller may wait for its end
+            // as soon as this function returns. If the robot has stopped since the request was
+            // sent, the reason must be kept.
             if !matches!(mailbox_state.motion, Motion::Stopped { .. }) {
                 mailbox_state.motion = Motion::Moving;
             }
@@ -282,8 +282,8 @@ impl Drop for MovableFrankaArm {
     fn drop(&mut self) {
         self.mailbox.update(|mailbox_state| {
             mailbox_state.is_shutting_down = true;
-            // A pending target is replaced. Without a motion, a stop has nothing to do, and would
-            // wait in the mailbox for the next one.
+            // The stop replaces a pending target. Without a motion, the stop has no effect, and
+            // would otherwise wait in the mailbox until the next motion.
             mailbox_state.command = mailbox_state
                 .accepts_commands
                 .then_some(MotionCommand::Stop);

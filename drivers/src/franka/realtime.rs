@@ -3,14 +3,14 @@
 use franka::realtime::set_current_thread_scheduler_priority;
 use rustix::mm::{MlockAllFlags, mlockall};
 
-/// Real-time priority: above all ordinary threads and interrupt threads (50), below the kernel's
-/// watchdogs (99).
+/// Real-time priority. It is above all ordinary threads and interrupt threads (50), and below the
+/// kernel's watchdogs (99).
 const PRIORITY: i32 = 80;
 
 /// Gives the calling thread a real-time priority, and locks the memory that the program currently
 /// uses.
 ///
-/// Memory allocated later is not locked: images and models are large, and nothing at 1 kHz waits
+/// Memory allocated later is not locked. Images and models are large, and nothing at 1 kHz waits
 /// for them. A denied request is logged, and the thread continues without it.
 pub(super) fn request_realtime(device: &str) {
     let mut denied = Vec::new();

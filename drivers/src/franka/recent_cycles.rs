@@ -23,8 +23,8 @@ struct Cycle {
 impl Cycle {
     /// Joint with the largest commanded acceleration, and that acceleration in rad/s².
     fn largest_acceleration(&self) -> Option<(usize, f64)> {
-        // Computed as the robot does, from differences of positions. A violated limit shows here,
-        // even if the trajectory itself was smooth.
+        // Like the robot, this computes the acceleration from differences of positions. A violated
+        // limit is thus visible even if the trajectory itself was smooth.
         let sent = self.assumed.sent(self.sent_rad?);
         let accelerations = sent
             .acceleration_rad_s2
@@ -41,7 +41,7 @@ pub(super) struct RecentCycles(VecDeque<Cycle>);
 
 impl RecentCycles {
     /// A robot gives up after 20 missed commands, and reports the reflex some states later. This
-    /// covers both, and what came before.
+    /// number covers both, and some cycles before them.
     const MAX: usize = 60;
 
     pub(super) fn new() -> Self {
@@ -149,7 +149,7 @@ mod tests {
                 sent_rad,
             );
         };
-        // In a millisecond, 3 micrometers are 3 rad/s².
+        // A jump of 3 microradians within a millisecond is an acceleration of 3 rad/s².
         let mut jump = [0.0; N_JOINTS];
         jump[4] = 3e-6;
         push(100, CommandFate::Followed, Some([0.0; N_JOINTS]));

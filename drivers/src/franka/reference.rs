@@ -9,25 +9,26 @@ use franka::{RobotState, rate_limiting};
 const STEP_SECS: f64 = rate_limiting::DELTA_T;
 /// Maximum position difference between our reference and the robot's, in rad. Smaller differences
 /// come from the rounding of FCI 10, for positions up to 8 rad: its floats are 4.8e-7 apart there,
-/// so rounding changes them by at most 2.4e-7. A larger tolerance would hide missed commands; a
-/// smaller one would take rounding for a displaced reference.
+/// so rounding changes them by at most 2.4e-7. A larger tolerance would hide missed commands. With
+/// a smaller tolerance, rounding would look like a displaced reference.
 const POSITION_TOLERANCE_RAD: f64 = 4e-7;
 /// Maximum velocity difference between our reference and the robot's, for velocities up to 8 rad/s.
-/// Rounding takes a quarter of it. A missed command with a jerk of 10 rad/s³ changes the velocity
-/// by 1e-5 rad/s, ten times this tolerance.
+/// Rounding accounts for a quarter of this tolerance. A missed command with a jerk of 10 rad/s³
+/// changes the velocity by 1e-5 rad/s, ten times this tolerance.
 const VELOCITY_TOLERANCE_RAD_S: f64 = 1e-6;
-/// Maximum number of steps by which a reported reference may be behind: `franka-sim` reports what
-/// its joint thread has processed. A larger value would accept a reference that is really
-/// elsewhere, at 1 rad/s by a milliradian per step.
+/// Maximum number of steps by which a reported reference may be behind. `franka-sim` needs this,
+/// because it reports what its joint thread has processed. A larger value would accept wrong
+/// references: at 1 rad/s, each step is a milliradian.
 const MAX_BEHIND: f64 = 3.0;
 /// Number of consecutive missing commands after which the robot stops. Source: FCI documentation,
 /// "Real-time control commands".
 const MAX_MISSED: u64 = 20;
 /// Number of most recent commands over which the robot computes its success rate.
 pub(super) const N_SUCCESS_WINDOW: u64 = 100;
-/// Number of missed commands that a success rate may not contain yet. The rate and the reference
-/// may come from different cycles of the robot. With a larger number, a mistake lasts longer; with
-/// a smaller one, commands that were really missed could count as received.
+/// Number of missed commands that the success rate may not include yet, because the rate and the
+/// reference may come from different cycles of the robot. With a larger number, a mistake is
+/// corrected later. With a smaller number, commands that were really missed could count as
+/// received.
 const MAX_UNREPORTED: f64 = 3.0;
 
 /// Commanded joint positions, rad, with velocities and accelerations as differences per
@@ -46,7 +47,7 @@ pub(super) enum CommandFate {
     Followed,
     /// The robot extrapolated over this many missing commands.
     Missed(u64),
-    /// The robot's reference is elsewhere.
+    /// The robot's reference matches neither case.
     Unknown,
 }
 
@@ -65,7 +66,7 @@ pub(super) struct ReferenceTracker {
     reference: Reference,
     /// The reference if the robot received all commands that were sent since it last followed one.
     if_all_received: Reference,
-    /// Number of those commands. The robot seems to have missed them.
+    /// Number of commands since then that the robot seems to have missed.
     n_doubtful: u64,
 }
 
@@ -99,14 +100,14 @@ impl ReferenceTracker {
         let (reference, fate) = self.reference.advance(sent, n_states, state);
         self.reference = reference;
         if fate != CommandFate::Missed(n_states) {
-            // The robot has followed a command, or its reference is elsewhere. Either way, all
-            // earlier doubts are settled.
+            // The robot has followed a command, or its reference matches no prediction. In both
+            // cases, earlier commands are no longer in doubt.
             self.if_all_received = reference;
             self.n_doubtful = 0;
             return fate;
         }
-        // Two explanations are tracked side by side: that all commands since the last certain one
-        // were missed, and that all were received.
+        // Two explanations are tracked in parallel: all commands since the last certain one were
+        // missed, or all were received.
         self.if_all_received = self.if_all_received.after(sent, n_states);
         // A state that was not answered is a missed command for certain, so it raises no doubt.
         self.n_doubtful += u64::from(sent.is_some());
@@ -227,8 +228,8 @@ impl Reference {
             // The position does not match the prediction with the command, or there was no command.
             None => match if_sent_received {
                 _ if if_missed.is_near(state) => (if_missed, CommandFate::Missed(n_states)),
-                // A robot that reports late seems to be behind. Our own reference stays, because
-                // the robot will get there.
+                // A robot that reports late seems to be behind. Our own reference is kept, because
+                // the robot will reach it.
                 Some(if_received) if n_after == 0 && if_received.is_shortly_after(&reported) => {
                     (if_received, CommandFate::Followed)
                 }
@@ -392,7 +393,7 @@ mod tests {
         })
         .take(60)
         .collect();
-        // Three are reported as missed, and three may not be reported yet.
+        // The success rate reports three missed commands, and may not include three more yet.
         let n_displaced = fates
             .iter()
             .take_while(|fate| **fate != CommandFate::Followed)

@@ -13,8 +13,8 @@ use zerocopy::little_endian::U64;
 const MAX_ANSWER: Duration = Duration::from_secs(2);
 /// Maximum time for a recovery, which releases brakes.
 const MAX_RECOVERY: Duration = Duration::from_secs(10);
-/// Maximum deviation of a motion from the command: m, rad, and rad of the elbow. As in libfranka,
-/// these values allow any deviation.
+/// Maximum deviation of a motion from the command, in meters, in radians, and in radians of the
+/// elbow. As in libfranka, these values allow any deviation.
 const ANY_DEVIATION: (f64, f64, f64) = (10.0, 3.12, std::f64::consts::TAU);
 
 /// Collision thresholds and stiffness of a robot.
@@ -76,7 +76,8 @@ pub(super) fn set(connection: &Connection, contact: &ContactConfig) -> Result<()
     let [about_x, about_y, about_z] = contact.moment_nm;
     let torque = &contact.torque_nm;
     let force = &[x, y, z, about_x, about_y, about_z];
-    // Lower thresholds are only reported. The same thresholds apply with and without acceleration.
+    // If a lower threshold is exceeded, the robot only reports this. The same thresholds apply with
+    // and without acceleration.
     let collision = v10::SetCollisionBehaviorRequest::new(
         torque, torque, torque, torque, force, force, force, force,
     );
@@ -157,7 +158,7 @@ pub(super) fn start_motion(connection: &Connection) -> Result<u32, String> {
         }
     };
     // The number of this command and of `StopMove` is the same in both versions. A motion has two
-    // answers with one ID: this one, and another when it ends.
+    // answers with the same ID: one when it is accepted, and one when it ends.
     let id = send(connection, v10::Command::Move.to_u32(), &request)?;
     match decode_response(connection.version, &wait(connection, id, MAX_ANSWER)?) {
         MotionResponse::Started => Ok(id),
@@ -211,8 +212,8 @@ pub(super) fn command(
     position_rad: &[f64; N_JOINTS],
     is_last: bool,
 ) -> Vec<u8> {
-    // The number of the state that is answered. From it, the robot computes which millisecond the
-    // positions are for.
+    // This is the number of the state that is answered. The robot computes from it for which
+    // millisecond the positions are.
     let message_id = U64::new(number);
     let q_c = f64s_to_wire(position_rad);
     let motion_generation_finished = u8::from(is_last);

@@ -221,8 +221,8 @@ impl Delays {
     fn count(&mut self, delay: Duration) {
         self.n += 1;
         self.max_delay = self.max_delay.max(delay);
-        // A histogram needs constant memory, for runs of any length. The maximum is kept exactly,
-        // because one long delay is what stops a robot.
+        // The memory of a histogram does not depend on the length of the run. The maximum is kept
+        // exactly, because one long delay is what stops a robot.
         let bin = usize::try_from(delay.as_micros() / BIN_WIDTH.as_micros()).unwrap_or(usize::MAX);
         self.bins[bin.min(N_BINS - 1)] += 1;
     }
@@ -237,7 +237,8 @@ impl Delays {
             n_left -= *n as f64;
             n_left <= 0.0
         });
-        // The upper edge of the bin: a delay is never reported as shorter than it was.
+        // The upper edge of the bin is returned, so that no delay is reported as shorter than it
+        // was.
         let ix =
             u32::try_from(bin.unwrap_or(N_BINS - 1)).expect("the number of bins fits in 32 bits");
         (BIN_WIDTH * (ix + 1)).min(self.max_delay)

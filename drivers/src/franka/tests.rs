@@ -463,7 +463,7 @@ fn malformed_bytes_stop_neither_robot_nor_client() {
 
 #[test]
 fn states_from_another_port_of_the_controller_are_rejected() {
-    // Few enough for the receive buffer of a socket.
+    // The number is small enough for the receive buffer of a socket.
     const N_FOREIGN: u32 = 20;
     let emulated = robot(
         FciVersion::V10,
@@ -477,7 +477,8 @@ fn states_from_another_port_of_the_controller_are_rejected() {
     .unwrap();
     let earlier = arm.read(TEST_TIMEOUT).unwrap().stamp;
     let n_rejected = arm.statistics().n_rejected;
-    // The same address as that of the emulated robot, and valid states with other numbers.
+    // These datagrams have the address of the emulated robot, and contain valid states with other
+    // numbers.
     let foreign = UdpSocket::bind(FREE_PORT).unwrap();
     for state in state_datagrams(FciVersion::V10, N_FOREIGN) {
         foreign.send_to(&state, ("127.0.0.1", state_port)).unwrap();

@@ -18,8 +18,8 @@ pub fn nerfstudio(bytes: &[u8]) {
     });
 }
 
-/// Reads the lists of a TUM folder, separated by lines of three equals signs: photos, depth images,
-/// poses, lens.
+/// Reads the lists of a TUM folder: photos, depth images, poses, lens. Lines of three equals signs
+/// separate the lists.
 pub fn tum(bytes: &[u8]) {
     let text = String::from_utf8_lossy(bytes);
     let mut lists = text.splitn(4, "===\n");

@@ -63,7 +63,7 @@ fn corrupt(bytes: &mut Vec<u8>, random: &mut Random) {
 
 #[test]
 fn corrupted_seeds_never_panic() {
-    /// Each is corrupted a few times. File readers take 50 us per input.
+    /// Each seed is corrupted a few times. File readers take 50 us per input.
     const N_CORRUPTED: usize = 400;
     for (name, read) in READERS {
         let mut random = Random::new(5);

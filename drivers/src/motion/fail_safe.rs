@@ -13,15 +13,15 @@ const MAX_WAIT: Duration = Duration::from_secs(5);
 
 /// Sends the fail-safe command to all arms with CAN motors that this process moves, without
 /// bringing them to rest first. Waits until their threads have ended, for at most 5 s. These arms
-/// accept no further commands. For use before the process ends without an orderly stop.
+/// accept no further commands. Call this function before the process ends without an orderly stop.
 ///
 /// Franka arms brake when the connection ends.
 pub fn apply_fail_safe() {
-    // It is never reset, so an arm that is opened later sends nothing either. The program is about
-    // to end.
+    // The flag is never reset, because the program is about to end. An arm that is opened later
+    // therefore sends nothing either.
     IS_DUE.store(true, Ordering::Relaxed);
     let deadline = Instant::now() + MAX_WAIT;
-    // Polling needs no locks, so this also works while another thread has panicked or holds one.
+    // Polling needs no locks, so this also works if another thread has panicked or holds a lock.
     while N_COMMANDED.load(Ordering::Relaxed) > 0 && Instant::now() < deadline {
         std::thread::sleep(Duration::from_millis(2));
     }

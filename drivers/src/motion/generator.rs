@@ -19,8 +19,8 @@ use std::time::Duration;
 const MAX_OVERSHOOT: f64 = 0.02;
 
 /// Fractions by which the jerk is reduced if no trajectory is found with the full jerk. The
-/// smallest reduction comes first, because it changes the motion least. It need only exceed the
-/// rounding errors that make the case degenerate.
+/// smallest reduction comes first, because it changes the motion least. The reduction must only
+/// exceed the rounding errors that cause the degenerate case.
 const JERK_REDUCTIONS: [f64; 3] = [1e-6, 1e-4, 1e-2];
 
 /// Setpoint of all joints at an instant, in their order; radians or meters, and seconds.
@@ -77,7 +77,7 @@ impl TrajectoryGenerator {
                     ix + 1
                 ));
             }
-            // Written so that NaN fails.
+            // The comparison is written so that NaN fails.
             if [joint.velocity, joint.acceleration, joint.jerk]
                 .iter()
                 .any(|limit| !limit.is_finite() || *limit <= 0.0)
@@ -122,7 +122,7 @@ impl TrajectoryGenerator {
             .zip(&self.limits)
             .map(clamp_to_range)
             .collect();
-        // A stop before this target may have changed both.
+        // An earlier stop may have changed the control interface and the synchronization.
         self.input.control_interface = ControlInterface::Position;
         self.input.synchronization = Synchronization::Time;
         self.input.target_position = data_array(position.iter().copied());
@@ -214,7 +214,7 @@ impl TrajectoryGenerator {
         let is_stop = self.input.control_interface == ControlInterface::Velocity;
         match result {
             Ok(result) if is_within_tolerance || is_stop => Some(result),
-            // The bounds come back, so that the next target is planned with them.
+            // The bounds are restored, so that the next target is planned with them.
             _ => {
                 (self.input.min_position, self.input.max_position) = position_bounds;
                 None
@@ -268,7 +268,8 @@ impl TrajectoryGenerator {
             self.output.pass_to_input(&mut self.input);
             if result == RuckigResult::Finished {
                 self.is_at_rest = true;
-                // The end is reached up to a rounding error, so the remaining motion is removed.
+                // The end is reached except for a rounding error, so the remaining motion is set to
+                // zero.
                 self.input.current_velocity = data_array(self.limits.iter().map(|_| 0.0));
                 self.input.current_acceleration = data_array(self.limits.iter().map(|_| 0.0));
             }
@@ -541,7 +542,7 @@ mod tests {
                             && now.acceleration[0].abs() <= acceleration * 1.0001
                     );
                 }
-                // Four times the time to reach full acceleration.
+                // The limit is four times the time to reach full acceleration.
                 assert!(
                     (trajectory.len() as f64 - 400.0).abs() < 3.0,
                     "{}",

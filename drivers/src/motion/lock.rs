@@ -8,8 +8,8 @@ use std::os::unix::net::{SocketAddr, UnixListener, UnixStream};
 /// The right to move the arms on a bus or controller. The kernel takes it back when the program
 /// ends in any way.
 ///
-/// It is a Unix socket with an abstract name: unlike a file, it needs no folder that all users may
-/// write to, and it belongs to the same network namespace as a CAN interface.
+/// The lock is a Unix socket with an abstract name. Unlike a file, it needs no folder that all
+/// users may write to. It also belongs to the same network namespace as a CAN interface.
 #[derive(Debug)]
 pub(crate) struct MotionLock {
     _listener: UnixListener,
@@ -24,8 +24,8 @@ impl MotionLock {
         let fail = |error: std::io::Error| Error::Motion {
             reason: format!("cannot lock {name}: {error}"),
         };
-        // The prefix keeps the name apart from those of other programs: all programs of a network
-        // namespace share the abstract names.
+        // All programs of a network namespace share the abstract names. The prefix distinguishes
+        // this name from the names of other programs.
         let address =
             SocketAddr::from_abstract_name(format!("fieldrig-move/{name}")).map_err(fail)?;
         match UnixListener::bind_addr(&address) {
@@ -33,8 +33,8 @@ impl MotionLock {
                 _listener: listener,
             }),
             Err(error) if error.kind() == std::io::ErrorKind::AddrInUse => {
-                // Connecting shows who holds the lock: the kernel reports the process that listens.
-                // It may end just now, so its number is optional.
+                // Connecting shows who holds the lock, because the kernel reports the process that
+                // listens. This process may end at the same time, so its number is optional.
                 let owner = UnixStream::connect_addr(&address)
                     .ok()
                     .and_then(|stream| socket_peercred(stream).ok());

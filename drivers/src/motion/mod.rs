@@ -122,8 +122,8 @@ impl MotionLimits {
         jerk_secs: f64,
     ) -> Self {
         let velocity = joint.velocity.min(max_speed);
-        // The limits follow from times, because a time suits joints of any size. An acceleration
-        // would have to be chosen for each joint.
+        // The limits are computed from times, because the same times suit joints of any size. An
+        // acceleration would have to be chosen for each joint.
         let acceleration = velocity / acceleration_secs;
         Self {
             position: [joint.lower, joint.upper],

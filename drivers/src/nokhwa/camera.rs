@@ -10,16 +10,17 @@ use kinematics::Intrinsics;
 use std::sync::{Arc, Weak};
 use std::time::{Duration, Instant};
 
-/// If no image arrives for this long, or for the periods of this many images (next constant), the
-/// call is abandoned.
+/// A call is abandoned if no image arrives for this time. The next constant is the same limit in
+/// periods of images; the longer of the two applies.
 const MAX_SILENCE: Duration = Duration::from_millis(1500);
 const MAX_SILENT_IMAGES: f64 = 5.0;
-/// Opening takes longer: cameras adjust the exposure first.
+/// Maximum time to open a camera. It is longer because cameras adjust the exposure first.
 const MAX_OPENING: Duration = Duration::from_secs(8);
 /// Pause between two attempts to reconnect.
 const RETRY_PAUSE: Duration = Duration::from_millis(200);
-/// Maximum number of threads that hang in a call and cannot be ended. After that, no new thread is
-/// started: each holds memory and perhaps the camera, and more attempts have hardly a chance.
+/// Maximum number of threads that hang in a call and cannot be ended. Beyond this number, no new
+/// thread is started. Each thread holds memory and perhaps the camera, and further attempts are
+/// unlikely to succeed.
 const MAX_ABANDONED: usize = 8;
 /// Maximum time to wait until a streaming thread stops.
 const SHUTDOWN_TIMEOUT: Duration = Duration::from_secs(1);
@@ -28,8 +29,8 @@ const SHUTDOWN_TIMEOUT: Duration = Duration::from_secs(1);
 ///
 /// If the camera is disconnected or a call hangs, it is reopened for at most
 /// [`Config::reconnect_for`]. During that time, [`Camera::next_image`] returns
-/// [`Error::Reconnecting`], afterwards the cause. Images are stamped on arrival. The number of
-/// dropped images is estimated from the stamps.
+/// [`Error::Reconnecting`]. Afterwards, it returns the cause. Images are stamped on arrival. The
+/// number of dropped images is estimated from the stamps.
 #[derive(Debug)]
 pub struct NokhwaCamera(Reconnecting<NokhwaDevice>);
 
@@ -140,7 +141,7 @@ impl ReopenableCamera for NokhwaDevice {
 
     /// Starts a thread that opens the camera, and does not wait for it.
     fn open(&mut self) -> Result<NokhwaStream, Failure<Problem>> {
-        // A call that returned late has ended its thread, and no longer counts.
+        // If a call has returned late, its thread has ended and no longer counts.
         self.abandoned.retain(|alive| alive.strong_count() > 0);
         if self.abandoned.len() >= MAX_ABANDONED {
             return Err(Problem::TooManyAbandoned {

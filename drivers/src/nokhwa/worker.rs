@@ -98,8 +98,8 @@ impl Worker {
         let thread = std::thread::Builder::new()
             .name(format!("nokhwa {}", config.name))
             .spawn(move || {
-                // Dropped when the thread ends, which the camera observes through its weak
-                // reference. A join handle would block if a call hangs.
+                // This value is dropped when the thread ends, which the camera detects through its
+                // weak reference. Joining the thread would block if a call hangs.
                 let _alive = alive;
                 if let Err(problem) = stream(&config, &sender) {
                     sender.send(WorkerEvent::Failed(problem));
@@ -137,8 +137,8 @@ impl Worker {
 
 impl Shared {
     /// Queues an event and returns whether the caller is still listening. If the queue is full, the
-    /// oldest image is dropped; the gap is detected from the stamps. Other events are kept: without
-    /// them, the caller would never learn that the camera is open.
+    /// oldest image is dropped; the gap is detected from the stamps. Other events are kept, because
+    /// the caller would otherwise never learn that the camera is open.
     fn send(&self, event: WorkerEvent) -> bool {
         let mut state = self.state.lock();
         if state.queue.len() >= MAX_WAITING
@@ -170,7 +170,8 @@ fn stream(config: &Config, shared: &Shared) -> Result<(), Problem> {
     )));
     while is_receiving {
         let buffer = camera.frame().map_err(unplugged)?;
-        // Before the copy, whose time must not count as latency.
+        // The arrival is taken before the copy, so that the time of copying does not count as
+        // latency.
         let arrival = clock::now();
         let bytes = trim(buffer.buffer(), format, config.intrinsics.size_px);
         is_receiving = shared.send(WorkerEvent::Frame(Frame {
@@ -236,7 +237,7 @@ fn open(config: &Config, index: CameraIndex) -> Result<(Camera, V4l2Format), Pro
         reason = "compared with the original below"
     )]
     let whole_hz = rate_hz.round() as u32;
-    // nokhwa supports only integer rates. A rounded one would make the estimated gaps wrong.
+    // nokhwa supports only integer rates. With a rounded rate, the estimated gaps would be wrong.
     if f64::from(whole_hz) != rate_hz {
         return Err(Problem::Rate { rate_hz });
     }

@@ -12,8 +12,8 @@ use std::time::{Duration, Instant};
 /// Pause before every attempt to reconnect. After a reset, a camera is unavailable for a few
 /// seconds.
 const RETRY_PAUSE: Duration = Duration::from_millis(500);
-/// A stream without images for this long, or for the periods of this many images (next constant),
-/// is restarted, because cameras may hang.
+/// A stream is restarted if no image arrives for this time, because cameras may hang. The next
+/// constant is the same limit in periods of images; the longer of the two applies.
 const MAX_SILENCE: Duration = Duration::from_secs(2);
 const MAX_SILENT_IMAGES: f64 = 10.0;
 /// Number of failed attempts after which a camera that is connected but does not stream is reset.
@@ -24,8 +24,8 @@ const TRIES_BEFORE_RESET: u32 = 3;
 ///
 /// A camera that is disconnected or hangs is reopened with the same settings for at most
 /// [`Config::reconnect_for`], and reset if that does not help. During that time,
-/// [`Camera::next_image`] returns [`Error::Reconnecting`], afterwards the cause. Dropping this
-/// value stops the streams.
+/// [`Camera::next_image`] returns [`Error::Reconnecting`]. Afterwards, it returns the cause.
+/// Dropping this value stops the streams.
 #[derive(Debug)]
 pub struct RealsenseCamera {
     camera: Reconnecting<RealsenseDevice>,
@@ -35,7 +35,7 @@ pub struct RealsenseCamera {
 #[derive(Debug)]
 struct RealsenseDevice {
     config: Config,
-    /// Number of resets in the current outage. The next field counts the resets before it.
+    /// Number of resets in the current outage. The next field counts the resets of earlier outages.
     n_resets: u32,
     n_earlier_resets: u32,
 }

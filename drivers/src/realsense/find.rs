@@ -39,7 +39,8 @@ impl FoundCamera {
 
     /// Whether its firmware is older than the version that the library recommends.
     pub fn has_old_firmware(&self) -> bool {
-        // Compared part by part as numbers: as text, 5.9 would be newer than 5.16.
+        // The versions are compared part by part as numbers. Compared as text, 5.9 would be newer
+        // than 5.16.
         self.recommended_firmware
             .as_deref()
             .is_some_and(|requested| version_numbers(&self.firmware) < version_numbers(requested))

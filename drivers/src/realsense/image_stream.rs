@@ -45,9 +45,9 @@ pub(super) struct ImageStream {
     description: String,
     started: ActiveStreams,
     device: Device,
-    /// Declared, and so dropped, after the device whose streams write to it.
+    /// This field is declared, and thus dropped, after the device whose streams write to the queue.
     queue: Queue,
-    /// Declared, and so dropped, after the devices that it listed.
+    /// This field is declared, and thus dropped, after the devices that the context listed.
     _context: Context,
 }
 
@@ -192,7 +192,7 @@ impl ImageStream {
 
     /// Copies a frame to an image. Returns `None` for duplicates.
     fn image(&mut self, frame: Frame) -> Result<Option<Image>, Problem> {
-        // First, so that filters and copies do not delay the stamp.
+        // The arrival is taken first, so that filters and copies do not delay the stamp.
         let arrival = clock::now();
         let is_depth = frame.stream_profile().kind() == Rs2StreamKind::Depth;
         let counter = &mut self.counter[usize::from(is_depth)];
@@ -200,7 +200,8 @@ impl ImageStream {
         match counter.last_number.replace(number) {
             // The library sometimes returns the last image of a stream again.
             Some(last) if last == number => return Ok(None),
-            // Numbers that decrease come from a restart of the stream, which loses nothing.
+            // If a number is lower than the last one, the stream was restarted. A restart loses no
+            // images.
             Some(last) if number > last => counter.n_unreported += number - last - 1,
             _ => {}
         }
@@ -231,7 +232,8 @@ impl ImageStream {
             exposure_secs,
             n_skipped: std::mem::take(&mut counter.n_unreported),
         };
-        // Before the filters: they take most of the time, and the file has to catch up.
+        // This check comes before the filters. They take most of the time, and the file has to
+        // catch up.
         if self.stamps.is_before_open(image.stamp) {
             self.n_before_open += 1;
             return Ok(None);

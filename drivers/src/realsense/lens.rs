@@ -13,7 +13,8 @@ use realsense_sys as sys;
 /// is 0.04.
 const MAX_FIT_ERROR_PX: f64 = 0.5;
 /// Number of fit points along each side of the image. Five coefficients of smooth polynomials need
-/// far fewer; the density lets the maximum error between the points be close to that at the points.
+/// far fewer points. With this density, the maximum error between the points is close to the
+/// maximum error at the points.
 const N_FIT_POINTS: u32 = 24;
 
 /// Converts intrinsics of the library to ours.
@@ -42,7 +43,8 @@ pub(super) fn intrinsics(
         sys::rs2_distortion_RS2_DISTORTION_KANNALA_BRANDT4 => {
             Lens::KannalaBrandt([k[0], k[1], k[2], k[3]])
         }
-        // After Kannala-Brandt, which is not a pinhole even with zero coefficients.
+        // This case comes after Kannala-Brandt, because that model is not a pinhole model even with
+        // zero coefficients.
         _ if k == [0.0; 5] => Lens::Pinhole,
         sys::rs2_distortion_RS2_DISTORTION_NONE => Lens::Pinhole,
         sys::rs2_distortion_RS2_DISTORTION_BROWN_CONRADY => Lens::BrownConrady(k),
@@ -66,8 +68,8 @@ pub(super) fn intrinsics(
     Ok(intrinsics)
 }
 
-/// Converts our intrinsics to those of the library. It has no rational model: the closest
-/// polynomial replaces it, or no distortion if none is close.
+/// Converts our intrinsics to those of the library. The library has no rational model. The closest
+/// polynomial replaces this model. If no polynomial is close, the result has no distortion.
 #[cfg(feature = "emulation")]
 pub(super) fn raw(intrinsics: &Intrinsics) -> sys::rs2_intrinsics {
     let lens = if intrinsics.is_pinhole() {
@@ -187,8 +189,8 @@ fn fit_brown_conrady(
             let side = |axis: usize, step: u32| {
                 f64::from(pinhole.size_px[axis] * step) / f64::from(N_FIT_POINTS)
             };
-            // Points on the borders, too: distortion is strongest in the corners, and a polynomial
-            // must not extrapolate there.
+            // The borders are included, because distortion is strongest in the corners and the
+            // polynomial must not be extrapolated there.
             let ray_at = pinhole.unproject([side(0, column), side(1, row)])?;
             pairs.push(pair([ray_at.x, ray_at.y]));
         }

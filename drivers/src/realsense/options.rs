@@ -160,7 +160,8 @@ fn white_balance(
 
 fn laser(sensor: &mut Sensor, power: f64) -> Result<(), Problem> {
     const KEY: &str = "realsense.laser_power";
-    // The range of the power may not include 0; the emitter has a switch of its own.
+    // The range of the power may not include 0, so the emitter is switched off with a separate
+    // option.
     if power == 0.0 && is_supported(sensor, Rs2Option::EmitterEnabled) {
         return set(sensor, KEY, Rs2Option::EmitterEnabled, 0.0, 0.0);
     }

@@ -70,7 +70,8 @@ impl Context {
     pub(super) fn new() -> Result<Self, Problem> {
         const WHAT: &str = "start";
         // The library rejects programs compiled for another minor version, although its interface
-        // has only grown. So we pass its own version. SAFETY: only numbers are passed.
+        // has only grown. We therefore pass the library's own version. SAFETY: only numbers are
+        // passed.
         let context = unsafe {
             let version = call(WHAT, |error| sys::rs2_get_api_version(error))?;
             call(WHAT, |error| sys::rs2_create_context(version, error))?
@@ -106,7 +107,7 @@ impl Context {
             path: path.to_owned(),
             reason,
         };
-        // Opened here first, because the error of the operating system names the cause.
+        // The file is opened here first, because the error of the operating system names the cause.
         if let Err(error) = std::fs::File::open(path) {
             return Err(file_problem(error.to_string()));
         }

@@ -97,13 +97,13 @@ impl Stamps {
         self.pace == Some(Pace::Clock) && stamp < self.opened
     }
 
-    /// Camera clock in nanoseconds, or `None` if the camera does not report it, which is logged
+    /// Camera clock in nanoseconds. If the camera does not report it, returns `None` and logs this
     /// once.
     fn device_nanos(&mut self, frame_time: &FrameTime) -> Option<i64> {
         if let Some(micros) = frame_time.mid_exposure_micros {
-            // Emulated cameras use 64-bit counts, which do not wrap.
-            // A count that fits into 32 bits is unwrapped even if it has 64 bits: it cannot have
-            // wrapped then, and both give the same result.
+            // Emulated cameras use 64-bit counts, which do not wrap. A count that fits into 32 bits
+            // is always unwrapped. If it is a 64-bit count, it has not wrapped, so unwrapping does
+            // not change it.
             let is_64_bit = micros > i64::from(u32::MAX);
             return Some(if is_64_bit {
                 micros.saturating_mul(1000)
@@ -191,7 +191,7 @@ mod tests {
             let late_nanos = 5_000_000 + (image % 7) * 3_000_000;
             let arrival = Stamp(since_micros * 1000 + late_nanos);
             let error_nanos = stamps.stamp(&frame_time(micros), arrival).0 - since_micros * 1000;
-            // The minimum latency is not observable, but jitter must be removed.
+            // The minimum latency cannot be observed, but jitter must be removed.
             assert!(
                 (error_nanos - 5_000_000).abs() < 200_000,
                 "image {image}: {error_nanos}"

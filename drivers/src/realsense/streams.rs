@@ -95,7 +95,7 @@ impl StreamRequest {
     }
 
     /// Whether a mode belongs to this stream. If there are two infrared cameras, only the left one
-    /// matches, because depth is in its frame.
+    /// matches, because depth is in the frame of that camera.
     fn is_of_stream(&self, mode: &Mode) -> bool {
         let is_infrared = mode.stream == sys::rs2_stream_RS2_STREAM_INFRARED;
         mode.stream == self.stream && (!is_infrared || mode.index <= LEFT)
@@ -122,7 +122,8 @@ impl StreamRequest {
 
     /// The problem that no mode fits, with the modes that the camera offers for this stream.
     fn no_mode(&self, modes: &[Modes], rate_hz: Option<f64>) -> Problem {
-        // A set: several sensors or formats of the library may describe the same mode.
+        // A set removes duplicates, because several sensors or formats of the library may describe
+        // the same mode.
         let offered: BTreeSet<String> = modes
             .iter()
             .flat_map(|modes| &modes.modes)
@@ -190,8 +191,8 @@ pub(super) fn start(
     });
     let depth = depth.transpose()?;
     let mode_at = |(sensor, mode): (usize, usize)| &modes[sensor].modes[mode];
-    // The calibration is read before the streams start: it depends on the mode, and a problem with
-    // it then needs no cleaning up.
+    // The calibration depends on the mode. It is read before the streams start, so that nothing has
+    // to be stopped if reading fails.
     let calibration = Calibration {
         intrinsics: lens::intrinsics(&mode_at(image).intrinsics()?, name)?,
         depth: depth
@@ -216,8 +217,8 @@ pub(super) fn start(
         description: description.join(" and "),
         _modes: Vec::new(),
     };
-    // All modes of a sensor must be opened in one call: depth and infrared share a sensor, and a
-    // second call fails.
+    // All modes of a sensor must be opened in one call, because depth and infrared share a sensor,
+    // and a second call fails.
     for sensor in &started.sensors {
         let sensor_modes: Vec<_> = chosen
             .iter()

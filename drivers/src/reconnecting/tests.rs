@@ -8,7 +8,7 @@ use std::sync::Arc;
 const RETRY_PAUSE: Duration = Duration::from_millis(20);
 /// A wait that is shorter than [`RETRY_PAUSE`], so it ends before the next attempt.
 const BRIEFLY: Duration = Duration::from_millis(10);
-/// Limit of an outage that is never reached. The next one is reached at the first failed attempt.
+/// Limit of an outage that is never reached. The next limit is reached at the first failed attempt.
 const UNLIMITED: Duration = Duration::from_secs(3600);
 const ONE_ATTEMPT: Duration = Duration::ZERO;
 
@@ -249,7 +249,7 @@ fn caller_learns_that_the_camera_reconnects() {
         !is_connected(BRIEFLY),
         "unplugged, and the first attempt fails"
     );
-    // The pause before the second attempt ends, the camera opens, but does not stream yet.
+    // The pause before the second attempt ends. The camera opens but does not stream yet.
     assert!(!is_connected(2 * RETRY_PAUSE), "opening");
     assert!(is_connected(BRIEFLY), "streaming, but without images");
     assert_eq!(camera.counts().n_reconnections, 1);
@@ -379,7 +379,7 @@ fn final_error_while_reopening_is_returned_at_once() {
         .expect_err("another attempt cannot help")
         .to_string();
     assert!(error.contains("unsupported colors"), "{error}");
-    // A caller that insists gets another attempt.
+    // A caller that calls again gets another attempt.
     assert_eq!(read_all(&mut camera).0, [(0, 0)]);
 }
 

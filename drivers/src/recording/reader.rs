@@ -318,8 +318,8 @@ impl Recording {
                 Ok(())
             };
         };
-        // A topic with one of our names but other messages is an error: leaving it out would
-        // silently lose a camera or the joints.
+        // A topic with one of our names but other messages is an error. If it were skipped, a
+        // camera or the joints would be missing silently.
         let (readable, readable_encoding) = topic.readable();
         // Calibrations are not read.
         let is_read = !matches!(topic, Topic::Calibration(_));
@@ -330,7 +330,7 @@ impl Recording {
             ));
         }
         let used_key = topic.metadata_key();
-        // Other keys are reported, because their authors expected an effect.
+        // Other keys are reported, because whoever wrote them expected an effect.
         let value = used_key
             .and_then(|key| metadata.get(key))
             .map(|value| (*value).to_owned());
@@ -458,7 +458,8 @@ impl Recording {
         let (stamp, world_from_camera, psnr_ceiling) = foxglove::decode_true_pose(data)?;
         let depth_m = self.true_depth_m.take().unwrap_or_else(|| Arc::from([]));
         let color = self.true_color.take();
-        // The images of another camera or time would give scores against the wrong truth.
+        // With images of another camera or time, scores would be computed against the wrong ground
+        // truth.
         let image = color
             .filter(|image| *image.camera == *camera && image.stamp == stamp)
             .ok_or(Malformed::Missing {
@@ -509,7 +510,7 @@ fn other_channel(id: u16) -> String {
 struct Notes(BTreeMap<(String, &'static str), String>);
 
 impl Notes {
-    /// Logs a difference in a topic; only the first one about each subject.
+    /// Logs a difference in a topic. For each subject, logs only the first one.
     fn add(&mut self, topic: &str, subject: &'static str, difference: impl FnOnce() -> String) {
         self.add_at(format!("topic {topic:?}"), subject, difference);
     }
@@ -553,8 +554,8 @@ impl Notes {
             return Ok(());
         }
         let [expected_parent, expected_child] = expected;
-        // The inverse of a pose is a pose, too, so nothing later would notice. The robot would move
-        // backwards.
+        // The inverse of a pose is also a valid pose, so later code could not detect the mistake.
+        // The robot would move backwards.
         if [child, parent] == expected {
             let expected = format!("{expected_parent:?}: the pose is inverted");
             return Err(Malformed::Unsupported {

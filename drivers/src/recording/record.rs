@@ -102,7 +102,8 @@ impl<'a> Record<'a> {
                 // 0 means that the writer computed no checksum.
                 if stored_crc != 0 && stored_crc != crc32fast::hash(checksummed) {
                     return Err(RecordError::Checksum {
-                        // The name comes from a damaged record, and may be megabytes of garbage.
+                        // The name may come from a damaged record, and may then be megabytes of
+                        // garbage.
                         name: name.chars().take(100).collect(),
                     });
                 }

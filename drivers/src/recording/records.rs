@@ -10,8 +10,8 @@ use lz4_flex::frame::FrameDecoder;
 use ruzstd::decoding::StreamingDecoder;
 use std::io::{Cursor, Read, Seek, SeekFrom};
 
-/// Maximum allocation before any byte of a record was read. Most records are smaller, and take one
-/// allocation; a damaged length costs no more than this.
+/// Maximum allocation before any byte of a record was read. Most records are smaller and need one
+/// allocation. A damaged length causes no larger allocation than this.
 const MAX_PREALLOCATED_BYTES: u64 = 1 << 20;
 /// Length of a record's header: opcode and length.
 const HEAD_BYTES: usize = 1 + 8;
@@ -93,8 +93,8 @@ impl<R: Read> Records<R> {
 
     fn read(&mut self) -> Result<Option<RawRecord>, ReadError> {
         loop {
-            // Checked after the last record of the chunk has been returned: the records before
-            // damage are worth having, and the error then ends the recording.
+            // The checksum is checked after the last record of the chunk has been returned. The
+            // records before the damage are thus usable, and the error then ends the recording.
             if let Some(chunk) = self.chunk.take_if(|chunk| chunk.n_remaining == 0) {
                 let computed = chunk.hasher.finalize();
                 if chunk.checksum != 0 && chunk.checksum != computed {
@@ -131,8 +131,8 @@ impl<R: Read> Records<R> {
                 Some(records) => records,
                 None => &mut self.input,
             };
-            // Compared before reading, because a record must not take bytes of what follows the
-            // chunk.
+            // The length is compared before reading, because a record must not contain bytes from
+            // after the chunk.
             if *n_remaining < HEAD_BYTES as u64 {
                 return Err(ReadError::ExceedsChunk);
             }
@@ -241,7 +241,8 @@ fn bytes_of(input: &mut (impl Read + ?Sized), n_bytes: u64) -> Result<Vec<u8>, R
     if Budget::RECORD.check_bytes(n_bytes).is_err() {
         return Err(ReadError::TooLong { n_bytes });
     }
-    // `n_bytes` is what the file declares. Only as much memory is taken as bytes arrive.
+    // `n_bytes` is the length that the file declares. Memory is allocated only for bytes that are
+    // actually read.
     let n_preallocated =
         usize::try_from(n_bytes.min(MAX_PREALLOCATED_BYTES)).expect("at most one megabyte");
     let mut bytes = Vec::with_capacity(n_preallocated);

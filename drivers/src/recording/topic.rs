@@ -79,7 +79,7 @@ impl Topic {
         }
     }
 
-    /// The key in the metadata of a channel that is used.
+    /// The only key that is read from the metadata of the channel; `None` if no key is read.
     pub(super) fn metadata_key(&self) -> Option<&'static str> {
         match self {
             Self::Joints => Some(JOINT_NAMES),
@@ -102,8 +102,8 @@ impl Topic {
         {
             return Some(Self::Range(scanner.to_owned()));
         }
-        // Names of cameras contain no slash, so the first one ends the name, although kinds such as
-        // `truth/color` contain one, too.
+        // Names of cameras contain no slash, so the first slash ends the name. Kinds such as
+        // `truth/color` may contain further slashes.
         let (camera, kind) = name.strip_prefix("/camera/")?.split_once('/')?;
         let camera = camera.to_owned();
         Some(match kind {

@@ -15,10 +15,11 @@ use std::fs::File;
 use std::io::{BufWriter, ErrorKind, Seek, Write};
 use std::path::{Path, PathBuf};
 
-/// Size from which on a chunk is closed. Viewers read whole chunks, and their index has one entry
-/// per chunk: smaller chunks make the index longer, larger ones make seeking slower.
+/// Size at which a chunk is closed. Viewers read whole chunks, and the index has one entry per
+/// chunk. Smaller chunks make the index longer, and larger chunks make seeking slower.
 const CHUNK_BYTES: u64 = 4 << 20;
-/// Longest time of samples in an open chunk, which a crash loses. Shorter times write more often.
+/// Maximum time span of the samples in an open chunk, which are lost in a crash. With a shorter
+/// time, the file is written more often.
 const FLUSH_NANOS: i64 = 1_000_000_000;
 
 /// Description of the rig, written before the first sample.
@@ -40,7 +41,7 @@ pub struct Recorder {
     /// The file, which somebody may remove or rename while it is written; `None` if it cannot be
     /// watched.
     kept: Option<Kept>,
-    /// Where the file was at the last check.
+    /// Location of the file at the last check.
     place: Place,
     /// `None` after a failure.
     mcap: Option<mcap::Writer<Box<dyn Sink>>>,
@@ -225,7 +226,7 @@ impl Recorder {
     /// Closes the open chunk, which writes all samples to the file.
     fn close_chunk(&mut self) -> mcap::McapResult<()> {
         self.mcap()?.flush()?;
-        // Each flush is a good time to notice a removal: the file system has just been accessed
+        // A removed file is detected at each flush, because the file system has just been accessed
         // anyway.
         self.check_place();
         self.recorded = RecordedSpan {
@@ -242,7 +243,8 @@ impl Recorder {
         self.write_sample(sample)?;
         self.n_samples += 1;
         self.stamps = Some(with_stamp(self.stamps, stamp));
-        // Sample time instead of a clock: the same samples give the same file, byte for byte.
+        // The times of the samples are used instead of a clock, so that the same samples give the
+        // same file, byte for byte.
         let open_since = *self.open_since.get_or_insert(stamp);
         if self.open_bytes >= CHUNK_BYTES || stamp.0.saturating_sub(open_since.0) >= FLUSH_NANOS {
             self.close_chunk()?;
@@ -319,8 +321,8 @@ impl Recorder {
     fn write_truth(&mut self, truth: &TruthImage) -> mcap::McapResult<()> {
         let camera = || truth.image.camera.to_string();
         let stamp = truth.image.stamp;
-        // The pose comes last: it completes the sample for the reader, which drops incomplete ones
-        // at the end of a truncated file.
+        // The pose is written last. It completes the sample for the reader, which drops an
+        // incomplete sample at the end of a truncated file.
         self.write_image(Topic::TrueColor(camera()), &truth.image)?;
         if !truth.depth_m.is_empty() {
             let message =
@@ -568,7 +570,8 @@ mod tests {
             assert_eq!(sample, reading(n_samples));
             n_samples += 1;
         }
-        // Samples of the truncated chunk count, too: the error reports what can be read.
+        // Samples of the truncated chunk count, too, because the error reports how many samples can
+        // be read.
         assert!(
             recorded.n_samples > 1000 && n_samples.unsigned_abs() == recorded.n_samples,
             "{n_samples} of {recorded:?}"

@@ -11,8 +11,8 @@ use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
 /// detected as a tag (Olson 2011, section V.B).
 const CORRECTED_BITS: usize = 1;
 /// Minimum mean difference in gray value between the cells of a tag and the decision threshold. The
-/// authors of AprilTag consider values below 10 noise; the corners of a barely visible tag are not
-/// accurate enough to use.
+/// authors of AprilTag consider values below 10 noise. The limit is higher, because the corners of
+/// a barely visible tag are not accurate enough.
 const MIN_MARGIN: f32 = 20.0;
 /// Images with at least this many pixels are searched for quads at half resolution. Corners are
 /// always refined at full resolution.
@@ -186,7 +186,7 @@ fn detect(detector: &mut Detector, image: &Image) -> Result<TagDetections, Error
         let parts = 77 * u32::from(*red) + 150 * u32::from(*green) + 29 * u32::from(*blue);
         *gray = parts.to_le_bytes()[1];
     }
-    // Half the resolution takes a quarter of the time in the search, and the tags of a large image
+    // At half the resolution, the search takes a quarter of the time. The tags of a large image
     // still have enough pixels.
     detector.set_decimation(if width * height < DECIMATE_ABOVE_PX {
         1.0

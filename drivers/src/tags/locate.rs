@@ -19,14 +19,15 @@ const CORNER_SIGMA_PX: f64 = 0.2;
 /// tags viewed at a grazing angle are unreliable.
 const HUBER_PX: f64 = 3.0 * CORNER_SIGMA_PX;
 /// Maximum root mean square error, pixels. If it is larger, the corners do not match the tags of
-/// the rig file. The bound lets through poses from measured tags and inaccurate intrinsics, whose
-/// errors are several times the noise of corners.
+/// the rig file. The limit is several times the noise of corners. It accepts poses from inaccurate
+/// intrinsics or inaccurately measured tags, which cause errors of this size.
 const MAX_RMS_ERROR_PX: f64 = 3.0;
 /// Minimum ratio of the cost of the second-best pose to the best cost. Below it, the pose is
-/// ambiguous. A larger value rejects more correct poses of small or distant tags, a smaller one
+/// ambiguous. A larger value rejects more correct poses of small or distant tags. A smaller value
 /// accepts more poses with the wrong tilt.
 const MIN_AMBIGUITY_RATIO: f64 = 3.0;
-/// Far more than needed from either start. It only bounds the time for corners that no pose fits.
+/// Maximum number of iterations. Both starting poses need far fewer. The limit only bounds the time
+/// for corners that no pose fits.
 const MAX_ITERATIONS: usize = 50;
 
 /// A tag with a known pose.
@@ -133,8 +134,8 @@ pub fn locate(
     if rms_error_px > MAX_RMS_ERROR_PX {
         return Err(LocateError::LargeReprojectionError { rms_error_px });
     }
-    // Contribution of noise to the cost. With it on both sides, the ratio of two nearly perfect
-    // fits is about 1, and their tiny costs do not decide which tilt is right.
+    // Contribution of noise to the cost. It is added to both costs. The ratio of two nearly perfect
+    // fits is then about 1, so that their tiny costs do not decide which tilt is right.
     let floor = corners.len() as f64 * CORNER_SIGMA_PX * CORNER_SIGMA_PX;
     // Solutions from several tags usually converge to one pose. 0.05 rad (3 degrees) separates
     // rounding differences of one minimum from two minima, which are mirror images of each other.
@@ -197,7 +198,7 @@ fn initial_poses(
     let Some(first) = pose_from_homography(tag.size_m, [a, b, c, d]) else {
         return Vec::new();
     };
-    // The second candidate: the normal of the tag is mirrored about the viewing direction.
+    // For the second candidate, the normal of the tag is mirrored about the viewing direction.
     let view_direction = first.translation.vector.normalize();
     let normal = first.rotation * Vector3::z();
     let mirrored = view_direction * (2.0 * view_direction.dot(&normal)) - normal;
@@ -252,7 +253,8 @@ fn refine(
     let (mut cost, mut normal_matrix, mut rhs) = equations(intrinsics, corners, &pose)?;
     let mut damping = 1e-4;
     for _ in 0..MAX_ITERATIONS {
-        // Marquardt's scaling by the diagonal: meters and radians have different magnitudes.
+        // The damping is scaled by the diagonal (Marquardt), because meters and radians have
+        // different magnitudes.
         let damped = normal_matrix + Matrix6::from_diagonal(&(normal_matrix.diagonal() * damping));
         let step = damped.cholesky()?.solve(&rhs);
         let twist = Twist {
@@ -307,8 +309,10 @@ fn equations(
         d_point_d_pose
             .fixed_view_mut::<3, 3>(0, 3)
             .copy_from(&-point.cross_matrix());
-        // The chain rule: pixel by the point at its row, by the point at mid-exposure, by the pose.
-        // The motion during the exposure is known, so it adds only its rotation.
+        // The chain rule multiplies three derivatives. The first is the derivative of the pixel by
+        // the point at the time of its row. The second is the derivative of this point by the point
+        // at mid-exposure. The third is the derivative of the point at mid-exposure by the pose.
+        // The motion during the exposure is known, so its derivative is its rotation.
         let jacobian = d_pixel_d_point
             * row_from_mid_exposure.rotation.to_rotation_matrix().matrix()
             * d_point_d_pose;

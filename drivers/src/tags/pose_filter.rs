@@ -14,7 +14,7 @@ const FORGETTING_FACTOR: f64 = 0.97;
 /// Running average of a pose.
 #[derive(Clone, Debug, Default)]
 pub struct StationaryPoseFilter {
-    /// The pose and its covariance in its own axes: meters first, then radians.
+    /// The average pose, and its covariance in the pose's own axes: meters first, then radians.
     average: Option<(Transform, Matrix6<f64>)>,
 }
 
@@ -36,7 +36,7 @@ impl StationaryPoseFilter {
         covariance: &Matrix6<f64>,
     ) -> Option<(Transform, Matrix6<f64>)> {
         let (average, average_covariance) = self.average.as_ref()?;
-        // A larger covariance makes the average give way to new poses.
+        // The covariance of the average is increased, so that new poses have more weight.
         let average_covariance = average_covariance / FORGETTING_FACTOR;
         let residual = transform::log(&(average.inverse() * pose), 1.0);
         let residual = Vector6::from_iterator(
@@ -46,8 +46,8 @@ impl StationaryPoseFilter {
                 .chain(&residual.angular_rad_s)
                 .copied(),
         );
-        // The Kalman filter of a constant: the distance between average and pose has the sum of
-        // both covariances.
+        // This is the Kalman filter of a constant. The covariance of the distance between average
+        // and pose is the sum of both covariances.
         let innovation_inverse = (average_covariance + covariance).try_inverse()?;
         if (residual.transpose() * innovation_inverse * residual).x > MAX_CHI_SQUARED {
             return None;

@@ -63,7 +63,7 @@ impl DatagramReader {
     }
 
     /// Returns the next value that `decode` accepts with its stamp on our clock, or `None` if none
-    /// came in time. A datagram without a value, such as the state of a gripper, only counts in the
+    /// came in time. A datagram without a value, such as the state of a gripper, only advances the
     /// sequence.
     pub(super) fn next<T>(
         &mut self,
@@ -77,7 +77,7 @@ impl DatagramReader {
             if reading.is_some() {
                 return Ok(reading);
             }
-            // Even if invalid datagrams keep arriving.
+            // The time limit also applies if invalid datagrams keep arriving.
             if Instant::now() >= until {
                 break;
             }
@@ -106,8 +106,8 @@ impl DatagramReader {
                 return None;
             }
         };
-        // Only valid datagrams identify the sender: whatever else reaches the port, such as a
-        // port scan, must not take the place of the current sender.
+        // Only valid datagrams identify the sender. Other traffic on the port, such as a port scan,
+        // must not replace the current sender.
         let device = self.receiver.device();
         let n_foreign = &mut self.counts.n_foreign;
         if !self
@@ -119,7 +119,8 @@ impl DatagramReader {
         if !self.is_new(&header, datagram.at) {
             return None;
         }
-        // Checked after the sequence number, so that states of other joints do not count as lost.
+        // The value is checked after the sequence number, so that states of other joints do not
+        // count as lost.
         let Some(reading) = reading else {
             self.count_other();
             return None;
@@ -158,8 +159,8 @@ impl DatagramReader {
         true
     }
 
-    /// Counts a state that names none of the joints, and explains the first one: a gripper on the
-    /// same port sends such states, but so does an arm whose joints are named wrongly.
+    /// Counts a state that names none of the joints, and explains the first one in the log. Such
+    /// states come from a gripper on the same port, or from an arm whose joints are named wrongly.
     fn count_other(&mut self) {
         if self.counts.n_other == 0 {
             let device = self.receiver.device();

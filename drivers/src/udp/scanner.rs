@@ -135,8 +135,8 @@ impl UdpScanner {
     fn begin(&mut self, part: ScanPart, arrival: Stamp) {
         self.finish_scan();
         let n_before = self.sequence.n_clock_restarts();
-        // The stamp comes from the first part that arrives: it has the smallest delay, and all
-        // parts carry the same stamp.
+        // All parts contain the same stamp. The first part that arrives has the smallest delay, so
+        // it is used to map the stamp.
         let stamp = self.sequence.stamp(&part.header, arrival);
         let n_new_restarts = self.sequence.n_clock_restarts() - n_before;
         count_and_warn(
@@ -238,7 +238,7 @@ impl RangeScanner for UdpScanner {
             };
             self.take(&datagram);
             self.monitor.set_counts(self.counts);
-            // Even if invalid datagrams keep arriving.
+            // The time limit also applies if invalid datagrams keep arriving.
             if self.completed.is_empty() && Instant::now() >= until {
                 break;
             }

@@ -5,7 +5,8 @@ use kinematics::{ClockMap, Stamp};
 use std::time::Duration;
 
 /// Maximum gap in the sequence numbers. A larger difference means that the sender restarted. A gap
-/// of 1000 is a second of joint states at 1 kHz; larger gaps would count a restart as lost values.
+/// of 1000 is a second of joint states at 1 kHz. With a larger limit, a restart could count as lost
+/// values.
 const MAX_SEQUENCE_GAP: u64 = 1000;
 /// Maximum delay of a reordered datagram. If the newest datagram is older than this, a lower
 /// sequence number means that the sender restarted.
@@ -76,8 +77,8 @@ impl SequenceTracker {
             Clock::Device => self.clock.stamp(header.stamp_nanos, arrival),
         };
         let is_recent = stamp >= arrival - MAX_AGE && stamp <= arrival + MAX_AHEAD;
-        // Histories and the merging of devices need increasing stamps. The clock map may also move
-        // a stamp slightly back.
+        // Histories and the merging of devices need increasing stamps, but the clock map may move a
+        // stamp slightly back.
         let is_after = self.newest_stamp.is_none_or(|newest| stamp > newest);
         if !(is_recent && is_after) {
             return None;
@@ -89,7 +90,7 @@ impl SequenceTracker {
     }
 }
 
-/// Why a stamp is invalid, with a possible cause.
+/// Returns why a stamp is invalid, with a possible cause.
 pub(crate) fn rejection(header: &DatagramHeader, arrival: Stamp) -> String {
     let stamp_nanos = header.stamp_nanos;
     let hint = hint(header, arrival);

@@ -191,7 +191,7 @@ pub(super) struct QueryControl {
     pub(super) reserved: [u32; 2],
 }
 
-/// `struct v4l2_querymenu`. It is packed, but its size is a multiple of 4 anyway.
+/// `struct v4l2_querymenu`. It is packed, but its size is still a multiple of 4.
 #[repr(C)]
 #[derive(Clone, Copy, Default)]
 pub(super) struct QueryMenu {

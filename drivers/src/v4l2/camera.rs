@@ -7,11 +7,11 @@ use crate::{Camera, Error, Image};
 use kinematics::Intrinsics;
 use std::time::{Duration, Instant};
 
-/// Pause between two attempts to reconnect. Opening a missing node fails at once, so attempts cost
-/// little, and a shorter outage loses fewer images.
+/// Pause between two attempts to reconnect. The pause is short, because opening a missing node
+/// fails at once and a shorter outage loses fewer images.
 const RETRY_PAUSE: Duration = Duration::from_millis(100);
-/// A stream without images for this long, or for the periods of this many images (next constant),
-/// is restarted, because cameras may hang.
+/// A stream is restarted if no image arrives for this time, because cameras may hang. The next
+/// constant is the same limit in periods of images; the longer of the two applies.
 const MAX_SILENCE: Duration = Duration::from_secs(2);
 const MAX_SILENT_IMAGES: f64 = 5.0;
 
@@ -19,8 +19,8 @@ const MAX_SILENT_IMAGES: f64 = 5.0;
 ///
 /// A camera that is disconnected or hangs is reopened with the same settings for at most
 /// [`Config::reconnect_for`]. During that time, [`Camera::next_image`] returns
-/// [`Error::Reconnecting`], afterwards the cause. Images missed in the meantime count as skipped.
-/// Dropping this value stops the stream.
+/// [`Error::Reconnecting`]. Afterwards, it returns the cause. Images missed in the meantime count
+/// as skipped. Dropping this value stops the stream.
 #[derive(Debug)]
 pub struct V4l2Camera(Reconnecting<V4l2Device>);
 
@@ -105,8 +105,8 @@ impl ReopenableCamera for V4l2Device {
         stream: &mut V4l2Stream,
         deadline: Instant,
     ) -> Result<Option<Image>, Failure<Problem>> {
-        // Between opening and the first request, other devices may take seconds to open. The images
-        // in the queue are from before that.
+        // Between opening and the first request, other devices may take seconds to open. By then,
+        // the images in the queue are outdated.
         if !std::mem::replace(&mut self.was_read, true) {
             stream.discard_queued()?;
         }

@@ -1,8 +1,8 @@
 //! Sets exposure, gain, white balance and brightness from the rig file in the right order, and
 //! reads them back.
 //!
-//! Source: Linux `v4l2-controls.h` and its documentation of user and camera controls. Ids are those
-//! of the kernel.
+//! Source: Linux `v4l2-controls.h` and its documentation of user and camera controls. The ids are
+//! defined by the kernel.
 
 use super::Problem;
 use super::abi::{self, QueryControl};
@@ -117,8 +117,8 @@ pub(super) fn apply(
     let steps = plan(settings, camera)?;
     for step in &steps {
         match camera.set(step.id, step.value) {
-            // A missing device is a disconnection, even if the control is optional: the driver then
-            // reconnects.
+            // A missing device counts as disconnected even if the control is optional, so that the
+            // driver reconnects.
             Err(error) if step.is_required || error == Errno::NODEV => {
                 return Err(refused(step.control, error));
             }
@@ -266,7 +266,8 @@ fn fixed(
     let known = camera.find(id).ok_or(Problem::NoControl { control })?;
     let step = known.step.max(1);
     let is_known = (known.minimum..=known.maximum).contains(&value)
-        // In 64 bits, because the difference of two 32-bit numbers may overflow.
+        // The difference is computed in 64 bits, because the difference of two 32-bit numbers may
+        // overflow.
         && (i64::from(value) - i64::from(known.minimum)) % i64::from(step) == 0;
     if !is_known {
         return Err(Problem::ControlRange {
@@ -331,8 +332,8 @@ fn exposure(
 
 /// A fixed exposure time, rounded to the steps of its control.
 fn exposure_time(micros: f64, known: &QueryControl) -> Result<Step, Problem> {
-    // The kernel would round silently; the nearest step of the control is chosen here, so that the
-    // value read back can be compared.
+    // The kernel would round silently. The nearest step of the control is therefore chosen here, so
+    // that the value read back can be compared.
     let step = f64::from(known.step.max(1));
     let nearest = ((micros / MICROS_PER_COUNT - f64::from(known.minimum)) / step).round() * step
         + f64::from(known.minimum);

@@ -75,9 +75,9 @@ unsafe impl<T: Plain> Ioctl for Exchange<'_, T> {
 impl Device {
     /// Opens a node in nonblocking mode.
     pub(super) fn open(path: &Path) -> rustix::io::Result<Self> {
-        // Nonblocking, so that a device that stops sending cannot block the thread: `wait` has a
-        // timeout, `DQBUF` has none. Closed in child processes, which would otherwise keep the
-        // device busy.
+        // The node is opened in nonblocking mode, so that a device that stops sending cannot block
+        // the thread: `wait` has a timeout, but `DQBUF` has none. The descriptor is closed in child
+        // processes, which would otherwise keep the device busy.
         let flags = OFlags::RDWR | OFlags::NONBLOCK | OFlags::CLOEXEC;
         Ok(Self {
             fd: rustix::fs::open(path, flags, Mode::empty())?,
@@ -105,7 +105,7 @@ impl Device {
     /// Enumerates entries with increasing indices until the device has no more. The list is empty
     /// if the device lacks the request.
     fn list<T: Plain>(&self, request: &Request<T>, mut request_at: impl FnMut(u32) -> T) -> Vec<T> {
-        // Terminates even if a driver never ends its list.
+        // This limit ends the loop even if a driver never ends its list.
         const MAX_ENTRIES: u32 = 1000;
         let entry = |index| {
             let mut entry = request_at(index);
@@ -328,7 +328,7 @@ impl Stream {
             // The caller compares its deadline and waits again.
             Err(Errno::INTR) => Ok(false),
             Err(error) => Err(error),
-            // Includes errors: taking the image returns the error.
+            // This is also `true` after an error, because taking the image then returns the error.
             Ok(_) => Ok(!poll_fds[0].revents().is_empty()),
         }
     }

@@ -169,7 +169,7 @@ fn nodes(root: &Path) -> Vec<Node> {
         .filter_map(|entry| entry.ok()?.file_name().into_string().ok())
         .filter_map(|name| Some((number(&name)?, name)))
         .collect();
-    // By number: sorted as text, video10 would come before video2.
+    // The nodes are sorted by number. Sorted as text, video10 would come before video2.
     names.sort_unstable();
     names
         .into_iter()

@@ -222,7 +222,7 @@ fn first_of_format<'a>(modes: &[&'a Mode], format: V4l2Format) -> Option<&'a Mod
     modes.iter().find(|mode| mode.format == format).copied()
 }
 
-/// Index of a format in order of preference. Depth comes last because it is only selected
+/// Rank of a format in the order of preference. Depth comes last because it is only selected
 /// explicitly.
 pub(super) fn rank(format: V4l2Format) -> usize {
     V4l2Format::COLOR_FORMATS
@@ -268,7 +268,7 @@ fn excess(mode: &Mode, bytes_per_sec: f64) -> Option<String> {
         .copied()
         .filter(|hz| required_bytes_per_sec(*hz) > Some(bytes_per_sec))
         .fold(f64::INFINITY, f64::min);
-    // Infinite if no rate exceeds the bandwidth.
+    // The value is infinite if no rate exceeds the bandwidth.
     let megabytes = required_bytes_per_sec(slowest)
         .filter(|required_bytes_per_sec| required_bytes_per_sec.is_finite())?
         * 1e-6;

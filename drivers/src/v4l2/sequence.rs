@@ -17,7 +17,8 @@ impl Sequence {
             .last
             .replace(number)
             .map_or(1, |last| number.wrapping_sub(last));
-        // The difference wraps like the numbers. More than half the range ahead means behind.
+        // The difference wraps like the numbers. A number that seems to be ahead by more than half
+        // of the range is actually behind.
         if ahead > u32::MAX / 2 {
             0
         } else {

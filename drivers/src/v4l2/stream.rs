@@ -14,8 +14,8 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-/// Number of image buffers: a quarter of a second at 30 Hz. With fewer, images are lost when the
-/// caller pauses; more take more memory of the kernel.
+/// Number of image buffers: a quarter of a second at 30 Hz. With fewer buffers, images are lost
+/// when the caller pauses. More buffers take more kernel memory.
 const N_BUFFERS: u32 = 8;
 /// A stamp that is earlier than the start of the stream or later than now by more than this comes
 /// from another clock, regardless of its flag.
@@ -77,7 +77,8 @@ impl V4l2Stream {
             .map_err(Failure::Final)?;
         controls::apply(&config.settings, &device)?;
         let requested = requested(config, Some(mode.format));
-        // Before the start of the stream, so that no stamp of it can be earlier.
+        // The time is taken before the stream starts, so that no stamp of the stream can be
+        // earlier.
         let started_at = clock::now();
         let stream = device.stream(N_BUFFERS).map_err(|refused| {
             let bytes_per_sec = mode
@@ -85,7 +86,7 @@ impl V4l2Stream {
                 .bytes_per_sec(config.intrinsics.size_px, config.rate_hz);
             stream_problem(refused, path, requested.clone(), bytes_per_sec)
         })?;
-        // Only now are settings final: some cameras reset them when the stream starts.
+        // The settings are confirmed here, because some cameras reset them when the stream starts.
         let applied = controls::confirm(&config.settings, stream.device())?;
         Ok(Self {
             stream,
@@ -161,8 +162,8 @@ impl V4l2Stream {
             self.n_unreported += self.sequence.n_skipped_before(filled.sequence);
             let image =
                 // The image is copied before its buffer goes back to the device. Copying takes a
-                // fraction of the time between images; holding buffers would leave the device
-                // without any.
+                // fraction of the time between images. If buffers were held instead, the device
+                // would run out of buffers.
                 (!filled.is_damaged).then(|| self.image_of(&filled, config.intrinsics.size_px));
             self.stream.requeue(filled).map_err(lost)?;
             match image {
@@ -198,8 +199,9 @@ impl V4l2Stream {
         loop {
             match self.stream.take().map_err(lost)? {
                 Some(newer) => {
-                    // For `Newest`: continue until the queue is empty, and give back what is not
-                    // the newest. The skipped ones are counted in order of their sequence numbers.
+                    // For `Newest`, continue until the queue is empty, and requeue all buffers
+                    // except the newest. The skipped images are counted in the order of their
+                    // sequence numbers.
                     if let Some(older) = taken.replace(newer) {
                         self.n_unreported += self.sequence.n_skipped_before(older.sequence) + 1;
                         self.stream.requeue(older).map_err(lost)?;
@@ -330,7 +332,8 @@ fn open(config: &Config, path: &Path) -> Result<Device, Problem> {
     }
 }
 
-/// How preferred the format is that a node would send; nodes without a suitable mode come last.
+/// Rank of the format that a node would send, in the order of preference. Nodes without a suitable
+/// mode come last.
 fn rank(config: &Config, path: &Path) -> usize {
     let modes = open(config, path)
         .map(|device| find::modes(&device))

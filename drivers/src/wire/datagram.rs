@@ -268,7 +268,7 @@ pub fn decode_scan(bytes: &[u8]) -> Result<ScanPart, Malformed> {
         wire.offsets_micros.as_ref().map(Vec::len),
         n,
     )?;
-    // Directions without an echo have rings and offsets, too, so they are left out only here.
+    // Directions without an echo are left out only here, because they also have rings and offsets.
     let points = echo_positions
         .into_iter()
         .enumerate()
@@ -323,7 +323,7 @@ pub fn decode_pose(bytes: &[u8]) -> Result<PoseDatagram, Malformed> {
         )));
     }
     let quaternion = Quaternion::new(w, i, j, k);
-    // Written so that NaN is not a unit norm.
+    // The comparison is written so that NaN fails it.
     let is_unit = (quaternion.norm() - 1.0).abs() <= UNIT_NORM_TOLERANCE;
     if !is_unit {
         return Err(invalid("quat_xyzw is not a unit quaternion".to_owned()));
@@ -358,8 +358,8 @@ fn covariance(numbers: Vec<f64>) -> Result<Box<[f64; 36]>, Malformed> {
     }
     for (row, column) in (0..6).flat_map(|row| (0..row).map(move |column| (row, column))) {
         let [lower, upper] = [covariance[6 * row + column], covariance[6 * column + row]];
-        // The Cauchy-Schwarz inequality: a covariance is at most the product of both standard
-        // deviations.
+        // According to the Cauchy-Schwarz inequality, a covariance is at most the product of both
+        // standard deviations.
         let max_covariance = (covariance[7 * row] * covariance[7 * column]).sqrt();
         if (lower - upper).abs() > SYMMETRY_TOLERANCE * max_covariance
             || lower.abs() > (1.0 + SYMMETRY_TOLERANCE) * max_covariance
@@ -427,13 +427,13 @@ pub fn decode_joints(
     ))
 }
 
-/// Where the lists of a datagram have the numbers of our joints.
+/// Positions of our joints in the lists of a datagram.
 struct JointLayout {
     /// Index of each of our joints in the lists.
     order: Vec<usize>,
     /// Length of the lists.
     n: usize,
-    /// What the lists have one number for, in messages.
+    /// The items for which the lists have one number each, as named in messages.
     per: &'static str,
 }
 
@@ -477,8 +477,8 @@ fn order_of(joints: &[String], reported: &[String]) -> Result<Option<Vec<usize>>
         .iter()
         .map(|joint| only_index_of(joint, reported))
         .collect::<Result<Vec<_>, _>>()?;
-    // Several devices may send to one port. A datagram with some of the joints, though, is a
-    // mistake in the names.
+    // Several devices may send to one port, so a datagram may contain none of the joints. If it
+    // contains only some of them, the names are wrong.
     if found.iter().all(Option::is_none) && !joints.is_empty() {
         return Ok(None);
     }
@@ -528,7 +528,7 @@ fn echo_positions(wire: &WireScan) -> Result<Vec<Option<[f32; 3]>>, Malformed> {
                     numbers.len()
                 )));
             }
-            // False for NaN, too.
+            // This comparison is false for NaN, too.
             let is_near = points
                 .iter()
                 .flatten()
@@ -566,7 +566,8 @@ fn positions_from_ranges(
                 "ranges_m has a number outside 0 to {MAX_ABS_VALUE} m"
             )));
         }
-        // Multiplied instead of added up, so that rounding errors do not accumulate.
+        // The step is multiplied by the index instead of added repeatedly, so that rounding errors
+        // do not accumulate.
         let azimuth_rad = first_rad + ix as f64 * step_rad;
         positions.push(Some(position_from_polar(
             range_m,
@@ -577,7 +578,7 @@ fn positions_from_ranges(
     Ok(positions)
 }
 
-/// A required angle. A value in degrees is usually above the maximum.
+/// A required angle, rad. A value in degrees is usually above the maximum and thus rejected.
 fn angle(name: &str, angle_rad: Option<f64>) -> Result<f64, Malformed> {
     match angle_rad {
         Some(angle_rad) if angle_rad.abs() <= MAX_ANGLE_RAD => Ok(angle_rad),
@@ -618,7 +619,8 @@ fn check_kind(bytes: &[u8], expected: &'static str) -> Result<(), Malformed> {
 fn parse_json<T: DeserializeOwned>(bytes: &[u8]) -> Result<T, Malformed> {
     let parse =
         |bytes: &[u8]| serde_json::from_slice(bytes).map_err(|error| invalid(reported(&error)));
-    // Replacing costs a copy of the text, so it is done only if the plain text is not JSON.
+    // Replacing them requires a copy of the text, so it is done only if the original text is not
+    // valid JSON.
     parse(bytes).or_else(|error| match std::str::from_utf8(bytes) {
         Ok(text) if text.contains("NaN") || text.contains("Infinity") => {
             parse(json::nan_as_null(text).as_bytes())

@@ -190,7 +190,7 @@ pub fn decode_image(schema: &str, bytes: &[u8]) -> Result<Image, Malformed> {
         });
     }
     image.size_px = size_px;
-    // Fields may be in any order, so the format is put together after all have been read.
+    // Fields may be in any order, so the format is determined after all fields have been read.
     image.format = if compressed {
         compressed_format(format)?
     } else {
@@ -404,12 +404,12 @@ pub fn decode_transform(bytes: &[u8]) -> Result<(Stamp, Transform), Malformed> {
 }
 
 /// Normalizes a quaternion. A quaternion whose length is 1 up to rounding is returned unchanged,
-/// because normalizing would change its last bits. So is one that is not finite; users of the pose
-/// reject it.
+/// because normalizing would change its last bits. A quaternion that is not finite is also returned
+/// unchanged, because users of the pose reject it.
 fn unit_quaternion(quaternion: [f64; 4]) -> Result<[f64; 4], Malformed> {
-    /// Products of many rotations, and quaternions in f32, stay below it.
+    /// Products of many rotations and quaternions in f32 deviate by less than this.
     const EXACT: f64 = 1e-6;
-    /// Quaternions with two decimals stay below it.
+    /// Quaternions with two decimals deviate by less than this.
     const ROUNDED: f64 = 0.01;
     let length = quaternion
         .iter()
@@ -478,7 +478,7 @@ pub(super) fn numbers<const N: usize>(field: &Field<'_>) -> Result<[f64; N], Mal
     let mut numbers = [0.0; N];
     for inner in fields(field.bytes()?) {
         let inner = inner?;
-        // Numbers of fields come from the file, and may be anything.
+        // Field numbers come from the file and may have any value.
         let slot = (inner.number as usize)
             .checked_sub(1)
             .and_then(|ix| numbers.get_mut(ix));
@@ -491,7 +491,8 @@ pub(super) fn numbers<const N: usize>(field: &Field<'_>) -> Result<[f64; N], Mal
 
 pub(super) fn timestamp(stamp: Stamp) -> Message {
     let mut message = Message::default();
-    // Euclidean division: nanoseconds of a `Timestamp` are not negative, even before zero.
+    // Euclidean division is used because the nanoseconds of a `Timestamp` are never negative, even
+    // for times before zero.
     message.varint(1, stamp.0.div_euclid(NANOS_PER_SEC).cast_unsigned());
     message.varint(2, stamp.0.rem_euclid(NANOS_PER_SEC).cast_unsigned());
     message

@@ -1,5 +1,5 @@
-//! Joint states as JSON with our own schema, because Foxglove has none that every version of its
-//! viewer opens.
+//! Joint states as JSON with our own schema. Foxglove has no schema for joint states that every
+//! version of its viewer opens.
 
 use super::Malformed;
 use kinematics::{JointState, Stamp};
@@ -62,7 +62,7 @@ pub fn encode(state: &JointState) -> Vec<u8> {
     serde_json::to_vec(&wire).expect("numbers and lists always serialize")
 }
 
-/// The numbers; `None` for those that are not finite, which JSON does not have.
+/// The numbers. Numbers that are not finite become `None`, because JSON cannot express them.
 fn finite(numbers: &[f64]) -> Vec<Option<f64>> {
     numbers
         .iter()
@@ -76,7 +76,7 @@ pub fn decode(bytes: &[u8]) -> Result<JointState, Malformed> {
         reason: e.to_string(),
     })?;
     let Timestamp { sec, nsec } = wire.timestamp;
-    // Checked arithmetic: the numbers come from a file.
+    // The arithmetic is checked, because the numbers come from a file.
     let nanos = Some(i64::from(nsec)).filter(|nanos| *nanos < NANOS_PER_SEC);
     let stamp = sec
         .checked_mul(NANOS_PER_SEC)

@@ -111,7 +111,7 @@ pub fn decode(bytes: &[u8]) -> Result<RangeScan, Malformed> {
     })
 }
 
-/// Rejects points in another frame than that of the scanner.
+/// Rejects points that are not in the frame of the scanner.
 fn expect_identity(pose: &Field<'_>) -> Result<(), Malformed> {
     let mut position = [0.0; 3];
     let mut orientation = [0.0, 0.0, 0.0, 1.0];

@@ -20,7 +20,7 @@ impl Message {
         Self(Vec::with_capacity(bytes))
     }
 
-    /// Appends an integer; negative numbers of `int32` and `int64` as their 64-bit two's
+    /// Appends an integer. Negative numbers of `int32` and `int64` are encoded as 64-bit two's
     /// complement.
     pub fn varint(&mut self, field: u32, value: u64) -> &mut Self {
         self.key(field, VARINT);
@@ -210,8 +210,8 @@ impl<'a> Fields<'a> {
 
     fn varint(&mut self) -> Result<u64, Malformed> {
         let mut value = 0;
-        // Ten groups of seven bits hold 64 bits. The format allows no more, so that bytes with the
-        // high bit set cannot keep the loop going.
+        // Ten groups of seven bits hold 64 bits. The format allows no more. The loop therefore ends
+        // even if all bytes have the high bit set.
         for shift in (0..64).step_by(7) {
             let [byte] = self.array()?;
             value |= u64::from(byte & 0x7f) << shift;

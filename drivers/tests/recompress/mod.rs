@@ -17,7 +17,7 @@ pub(crate) fn recompress(recording: &[u8], compression: Compression, chunk_bytes
             .write(&message.expect("a complete recording"))
             .expect("memory");
     }
-    // Newer versions of the `mcap` program write them last.
+    // Newer versions of the `mcap` program write attachments last.
     for index in &summary.attachment_indexes {
         let attachment: Attachment<'_> =
             mcap::read::attachment(recording, index).expect("a complete recording");

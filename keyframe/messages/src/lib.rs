@@ -1,4 +1,5 @@
-//! Parts of messages that all crates share: classes of errors, counts and lists, names of settings.
+//! Parts of messages that all crates share: classes of errors, counts and lists, and names of
+//! settings.
 //!
 //! ```
 //! use messages::{BadInput, ErrorClass, counted, listed};

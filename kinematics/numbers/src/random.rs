@@ -54,8 +54,8 @@ impl Random {
     /// # Panics
     /// If `bound` is 0.
     pub fn below(&mut self, bound: usize) -> usize {
-        // The bias of the modulo is accepted: rejecting values would make the number of draws, and
-        // thus all later numbers, depend on the values.
+        // The bias of the modulo is accepted. If values were rejected, the number of draws, and
+        // thus all later numbers, would depend on the values.
         usize::try_from(self.bits() % bound as u64).expect("less than a usize")
     }
 
@@ -93,7 +93,7 @@ impl Random {
 /// The bits at index `n` of the sequence of a seed, computed without the preceding ones.
 pub fn nth_bits(seed: u64, n: u64) -> u64 {
     // The state after `n` steps is known without taking them, so any element can be computed in
-    // parallel. `n + 1`, because the generator advances before it mixes.
+    // parallel. The factor is `n + 1`, because the generator advances before it mixes.
     let state = seed.wrapping_add(n.wrapping_add(1).wrapping_mul(GOLDEN_GAMMA));
     let mixed = (state ^ (state >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
     let mixed = (mixed ^ (mixed >> 27)).wrapping_mul(0x94d0_49bb_1331_11eb);

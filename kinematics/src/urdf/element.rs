@@ -5,8 +5,8 @@ use roxmltree::{Document, Node, ParsingOptions};
 use std::borrow::Cow;
 use std::collections::{BTreeMap, BTreeSet};
 
-/// Maximum size of a robot description. It is far above that of any robot, whose meshes are in
-/// other files, and keeps a wrong file from filling the memory.
+/// Maximum size of a robot description. It is far above the size of any real description, because
+/// meshes are in other files. It prevents a wrong file from filling the memory.
 pub const MAX_BYTES: usize = 16 << 20;
 /// The parser's memory grows with the number of nodes.
 const MAX_NODES: u32 = 1 << 20;
@@ -14,7 +14,8 @@ const MAX_NODES: u32 = 1 << 20;
 /// namespaces.
 const MAX_ATTRIBUTES: usize = 2000;
 const MAX_NAMESPACES: usize = 100;
-/// Notes are printed; more of them would hide the first ones, which often cause the others.
+/// Maximum number of notes. Notes are printed, and a longer list would hide the first ones, whose
+/// problems often cause the others.
 const MAX_NOTES: usize = 100;
 
 /// Repairs what the parsers of other programs accept: white space before the XML declaration, and
@@ -74,8 +75,9 @@ fn prefixes(xml: &str) -> BTreeSet<&str> {
     found
 }
 
-/// Whether text can be declared as a prefix: a name of ASCII characters. Others may be anything
-/// before a colon, such as a part of a path, and declaring them could make the file invalid.
+/// Whether text can be declared as a prefix, that is, whether it is a name of ASCII characters.
+/// Other text before a colon may be anything, such as a part of a path. Declaring it could make the
+/// file invalid.
 fn is_plain_name(text: &str) -> bool {
     text.starts_with(|first: char| first.is_ascii_alphabetic() || first == '_')
         && text
@@ -88,8 +90,8 @@ pub(super) fn parse(xml: &str) -> Result<Document<'_>, Error> {
     // All limits are checked before the parser runs, because its time depends on them.
     limited("bytes", xml.len(), MAX_BYTES)?;
     limited("namespaces", xml.matches("xmlns").count(), MAX_NAMESPACES)?;
-    // Counted in the text before parsing, because parsing is what takes the time. The count may be
-    // too high, as values and comments contain `=`, too.
+    // Attributes are counted in the text before parsing, because parsing takes most of the time.
+    // The count may be too high, because values and comments also contain `=`.
     let n_attributes = |element: &str| element.bytes().filter(|byte| *byte == b'=').count();
     limited(
         "attributes in one element",
@@ -218,7 +220,7 @@ impl<'a> Element<'a> {
 
     pub(crate) fn children(self) -> impl Iterator<Item = Element<'a>> {
         let namespace = self.0.document().root_element().tag_name().namespace();
-        // An element of another namespace, such as that of xacro, means something else.
+        // An element of another namespace, such as that of xacro, has a different meaning.
         self.0
             .children()
             .filter(move |node| node.is_element() && node.tag_name().namespace() == namespace)
@@ -320,7 +322,8 @@ impl<'a> Element<'a> {
 
     /// Counts an unknown name at a position of the text.
     fn add_unknown(self, what: String, at: usize, notes: &mut Notes) {
-        // Finding a line takes time that grows with the file, so it is done only for the first one.
+        // The time to find a line grows with the size of the file, so the line is found only for
+        // the first occurrence.
         let first = || (self.0.document().text_pos_at(at).row, 1);
         notes
             .unknown

@@ -6,7 +6,7 @@ use crate::{Error, Transform};
 use nalgebra::{Quaternion, Translation3, Unit, UnitQuaternion, Vector3};
 
 const ATTRIBUTES: [&str; 2] = ["name", "type"];
-/// The last three do not affect kinematics.
+/// Known children of a joint. The last three do not affect kinematics.
 const CHILDREN: [&str; 9] = [
     "parent",
     "child",
@@ -18,7 +18,7 @@ const CHILDREN: [&str; 9] = [
     "calibration",
     "hardwareInterface",
 ];
-/// The last three are not used.
+/// Known attributes of a limit. The last three are not used.
 const LIMIT_ATTRIBUTES: [&str; 7] = [
     "lower",
     "upper",
@@ -28,8 +28,8 @@ const LIMIT_ATTRIBUTES: [&str; 7] = [
     "deceleration",
     "jerk",
 ];
-/// Shortest quaternion that is normalized instead of refused. Rounding in a file changes a unit
-/// quaternion by far less than its length; a quaternion as short as this is a mistake, and its
+/// Shortest quaternion that is normalized instead of refused. Rounding in a file changes the length
+/// of a unit quaternion only slightly. A quaternion as short as this is a mistake, and its
 /// direction is noise.
 const MIN_QUATERNION_NORM: f64 = 1e-6;
 
@@ -133,7 +133,7 @@ impl Motion {
                 "unknown type {other:?}, expected fixed, revolute, continuous, prismatic, floating, planar or spherical"
             ))),
         };
-        // Axis, limits and mimic rule of a fixed joint mean nothing, so they are not read, and
+        // Axis, limits and mimic rule of a fixed joint have no meaning. They are not read, so
         // errors in them do not matter.
         let parent_from_joint = origin(element)?;
         let is_movable = matches!(kind, JointKind::Revolute | JointKind::Prismatic);
@@ -150,8 +150,8 @@ impl Motion {
             Err(Problem { line, why }) => {
                 notes.add(line, &format!("{what}: {why}"));
                 JointLimits {
-                    // The joint is still part of the kinematics, but must not be moved: its real
-                    // range is unknown.
+                    // The joint is still part of the kinematics, but it must not be moved, because
+                    // its real range is unknown.
                     is_range_valid: false,
                     ..JointLimits::NONE
                 }
@@ -246,13 +246,14 @@ fn read_limits(
         effort,
         ..JointLimits::NONE
     };
-    // Two zeros are not a range but missing values: a joint without motion would be fixed.
+    // Two zeros are missing values and not a range, because a joint without motion would be a fixed
+    // joint.
     if is_continuous || (lower.unwrap_or(0.0), upper.unwrap_or(0.0)) == (0.0, 0.0) {
         return unlimited;
     }
     let lower = lower.unwrap_or(0.0);
     let upper = upper.unwrap_or(0.0);
-    // False for NaN, which stands for a number that could not be read.
+    // The comparison is false for NaN, which represents a number that could not be read.
     if lower <= upper {
         return JointLimits {
             lower,

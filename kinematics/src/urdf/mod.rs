@@ -65,7 +65,7 @@ impl Robot {
             .map(|joint| joint::read(joint, &mut notes))
             .collect::<Result<Vec<_>, _>>()?;
         mark_undefined_links(root, &links, &mut joints, &mut notes);
-        // These problems concern the tree as a whole: no chain of such a file can be trusted.
+        // These problems affect the whole tree, so no chain of such a file can be trusted.
         let joints_by_name = indices_by_name("joint", root.all("joint"))?;
         let joint_above = joints_above(&links, &joints)?;
         reject_cycles(&links, &joints, &joint_above)?;
@@ -177,7 +177,8 @@ impl Robot {
 /// The names of all links, in file order. A link that is defined again is noted and left out.
 fn read_links(root: Element<'_>, notes: &mut Notes) -> Result<Vec<String>, Error> {
     let mut links = Vec::new();
-    // Elements instead of lines: finding a line takes time, so it is done only for notes.
+    // Elements are stored instead of lines. Finding a line takes time, so it is done only for
+    // notes.
     let mut element_of: HashMap<String, Element<'_>> = HashMap::new();
     for element in root.all("link") {
         let link = element
@@ -236,8 +237,8 @@ fn indices_by_name<'a>(
     let mut indices = HashMap::new();
     let mut lines = Vec::new();
     for (ix, element) in elements.enumerate() {
-        // The element instead of its line: finding a line takes time, and is needed only for the
-        // error.
+        // The element is stored instead of its line. Finding a line takes time and is needed only
+        // for the error.
         lines.push(element);
         let name = element.attribute("name").unwrap_or_default();
         if let Some(first_ix) = indices.insert(name.to_owned(), ix) {
@@ -260,8 +261,8 @@ fn joints_above(
     let mut above: HashMap<String, Option<usize>> =
         links.iter().map(|link| (link.clone(), None)).collect();
     for (joint_ix, joint) in joints.iter().enumerate() {
-        // The joint has a problem already. Its child must stay without a parent, or be that of a
-        // valid joint.
+        // The joint already has a problem. Its child must have no parent, or a valid joint as its
+        // parent.
         if !above.contains_key(&joint.parent) || !above.contains_key(&joint.child) {
             continue;
         }
@@ -284,8 +285,8 @@ fn reject_cycles(
     // Links from which a root was reached.
     let mut sound: HashSet<&str> = HashSet::new();
     for start in links {
-        // Each walk ends at a root, at a link of an earlier walk, or where it meets itself. So each
-        // link is walked once in total, and the time is linear even in deep trees.
+        // Each walk ends at a root, at a link of an earlier walk, or at one of its own links. Each
+        // link is thus visited only once, and the time is linear even in deep trees.
         let mut walked: HashSet<&str> = HashSet::new();
         let mut link: &str = start;
         while !sound.contains(link) {
@@ -327,8 +328,7 @@ fn drop_below_problems(
         .filter(|link| !is_placed(link))
         .collect();
     let mut seen: HashSet<&str> = dropped.iter().copied().collect();
-    // The search visits each link once: a shape below an invalid joint has no known pose, wherever
-    // it is.
+    // The search visits each link once. No shape below an invalid joint has a known pose.
     while let Some(link) = dropped.pop() {
         shapes.remove(link);
         dropped.extend(
@@ -654,7 +654,7 @@ mod tests {
             (0..=N).map(link).collect::<String>(),
             (1..=N).map(joint).collect::<String>()
         );
-        // Quadratic time would be minutes, also on a fast computer.
+        // With quadratic time, this would take minutes, even on a fast computer.
         let robot = Robot::parse(&chain).unwrap();
         let chain = crate::Chain::new(&robot, robot.root().unwrap(), &format!("l{N}")).unwrap();
         assert_eq!(chain.joint_names(), ["j1"]);

@@ -43,8 +43,8 @@ impl EmulatedMotors {
             threads: Vec::new(),
         };
         for (bus_ix, bus) in arm.buses.iter().enumerate() {
-            // One thread per bus, like the driver. Motors on one bus answer in the order of the
-            // messages.
+            // Like the driver, the emulation uses one thread per bus. Motors on one bus answer in
+            // the order of the messages.
             let joints_of_bus = arm
                 .motors
                 .iter()
@@ -101,8 +101,8 @@ impl EmulatedJoint {
             offset_rad,
             ..
         } = self.config;
-        // The inverse of the conversion in the driver: position and velocity scale with the gear
-        // ratio, torque with its inverse.
+        // This is the inverse of the conversion in the driver. Position and velocity scale with the
+        // gear ratio, and torque scales with the inverse of the ratio.
         let motor_per_joint = gear_ratio * if is_reversed { -1.0 } else { 1.0 };
         let of = |numbers: &[f64]| numbers.get(self.joint_ix).copied().unwrap_or(0.0);
         self.motor.set_motion(Motion {
@@ -122,8 +122,9 @@ fn run_bus(
     while !flags.stop.load(Ordering::Relaxed) {
         let arrived = bus.receive(RECEIVE_TIMEOUT)?;
         let now = clock::now();
-        // The script counts until a client takes over any motor. Then all motors stay where they
-        // are, because a script that moves some joints would fight the client.
+        // The script moves the motors until a client takes over any of them. From then on, all
+        // motors stay where they are, because a script that moves some joints would fight the
+        // client.
         let joints = (!flags.is_client_controlled.load(Ordering::Relaxed)).then(|| track.at(now));
         for emulated_joint in &mut joints_on_bus {
             if let Some(joints) = &joints {

@@ -43,7 +43,7 @@ impl ScriptedArm {
         if client_target.is_moving && !std::mem::replace(&mut self.is_client_controlled, true) {
             log::info!("a client controls the arm: it no longer follows the script");
         }
-        // The arm then follows its target without error, as a perfect controller would.
+        // In this case, the arm follows its target without error, as with a perfect controller.
         if self.is_client_controlled {
             return Joints {
                 position_rad: client_target.position_rad,

@@ -2,8 +2,8 @@
 //! datagrams.
 //!
 //! A [`DeviceScript`] holds the samples of a simulated or recorded rig. [`PlaybackClock`] maps
-//! their stamps to playback times. Images are not played back here; play back a file of the camera
-//! vendor's library instead.
+//! their stamps to playback times. Images are not played back here. To play back images, use a file
+//! of the camera vendor's library.
 
 #[cfg(target_os = "linux")]
 mod can;
@@ -77,7 +77,8 @@ impl PlaybackClock {
     }
 }
 
-/// Motion of the joints. Before and after the script, they rest at its first and last position.
+/// Motion of the joints. The joints rest at the first position before the script, and at the last
+/// position after it.
 #[derive(Clone, Debug)]
 pub struct JointTrack {
     history: JointHistory,
@@ -138,7 +139,7 @@ impl JointTrack {
         let state = match self.history.at(scripted) {
             Ok(state) => state,
             Err(_) if scripted < first.stamp => first.clone(),
-            // After the end, or in a gap. Simulated scripts have no gaps.
+            // The time is after the end or in a gap. Simulated scripts have no gaps.
             Err(_) => last.clone(),
         };
         JointState {

@@ -17,8 +17,8 @@ use std::time::Duration;
 /// Maximum echoes per datagram. Each takes about 60 bytes as JSON; a datagram holds at most 65 507
 /// bytes.
 const MAX_POINTS: usize = 1000;
-/// Period at which the state at rest is resent. Receivers count a sender as lost if they hear
-/// nothing, and interpolate only between readings that are close in time.
+/// Period at which the state at rest is resent. Receivers consider a sender lost if they receive
+/// nothing. They also interpolate only between readings that are close in time.
 const RESEND_PERIOD: Duration = Duration::from_millis(20);
 /// Period at which the thread checks whether to stop.
 const STOP_CHECK_PERIOD: Duration = Duration::from_millis(50);
@@ -114,7 +114,7 @@ impl Sender {
     fn run(mut self) {
         let script_entries = self.script_entries();
         if let Some((first, _)) = script_entries.first() {
-            // Before the script, the devices stand still at its start, so that a program can
+            // Before the script begins, the devices rest in its first state, so that a program can
             // connect.
             self.resend_end_state(0, *first);
         }
@@ -128,7 +128,7 @@ impl Sender {
                 ScriptEntry::Scan(scanner_ix, ix) => self.send_scan(scanner_ix, ix),
             }
         }
-        // Afterwards, they stand still at its end until they are dropped.
+        // After the script, the devices rest in its last state until the senders are dropped.
         self.resend_end_state(usize::MAX, Stamp(i64::MAX));
     }
 
@@ -186,8 +186,8 @@ impl Sender {
         let joints_ix = last(self.script.joints.len());
         let pose_ix = last(self.script.poses.len());
         let mut now = clock::now();
-        // The last state at rest comes at least one period before the script, so that its stamp
-        // stays below that of the script's first entry.
+        // The last resent state comes at least one period before the script. Its stamp is therefore
+        // below the stamp of the script's first entry.
         while now.plus_secs(RESEND_PERIOD.as_secs_f64()) < until {
             if let Some(ix) = joints_ix {
                 self.send_joints(ix, now, true);
@@ -212,7 +212,8 @@ impl Sender {
             if left.is_zero() {
                 return true;
             }
-            // In short pieces, so that dropping the senders does not wait for a distant entry.
+            // The thread sleeps in short pieces, so that dropping the senders does not wait for a
+            // distant entry.
             std::thread::sleep(left.min(STOP_CHECK_PERIOD));
         }
     }
@@ -268,7 +269,7 @@ impl Sender {
         } else {
             points.chunks(MAX_POINTS).collect()
         };
-        // The number of parts is in every datagram, so that a receiver notices lost ones.
+        // Every datagram contains the number of parts, so that a receiver notices lost datagrams.
         let n_parts = u32::try_from(chunks.len()).unwrap_or(u32::MAX);
         for (part, points) in (0..).zip(chunks) {
             let scan = ScanPart {

@@ -28,7 +28,8 @@ fn live_devices_deliver_until_the_rig_ends() {
         newest = state.stamp;
         n_readings += 1;
     }
-    // One second at 1 kHz. Readings are dropped only if the machine stalls for a second.
+    // The run takes one second at 1 kHz. Readings are dropped only if the machine stalls for a
+    // second.
     assert!((500..=1001).contains(&n_readings), "{n_readings} readings");
     assert!(newest > START && newest <= START.plus_secs(1.001));
 

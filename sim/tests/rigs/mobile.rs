@@ -99,7 +99,7 @@ fn scans_hit_the_walls_within_their_noise() {
             // At this height, above the furniture and below the lamps, there are only walls.
             if at.z > 2.15 && at.z < 2.6 {
                 let ray = (at.coords - world_from_scanner.translation.vector).normalize();
-                // The range error: the ray hits the wall at an angle.
+                // The difference is the range error. The ray hits the wall at an angle.
                 let (axis, off) = if past_wall_m[0] > past_wall_m[1] {
                     (0, past_wall_m[0])
                 } else {
@@ -285,8 +285,8 @@ fn mean_image_scores_low_and_noise_ceiling_is_high() {
 fn light_changes_when_camera_enters_cabinet() {
     let run_with_light = |light_inside_frac: f64| {
         let config = mobile_arm(0.25);
-        // Ends with the camera in the cabinet: 19 s to reach the second station, 9 s outside, 11 s
-        // on the way in.
+        // The run ends with the camera in the cabinet. It takes 19 s to reach the second station, 9
+        // s outside, and 11 s on the way in.
         let config = Config {
             light_inside_frac,
             duration_secs: Some(40.0),

@@ -242,11 +242,12 @@ fn tag_on_cube_is_at_its_pose_with_id_4() {
 fn tag_edges_are_accurate_to_a_fifth_of_a_pixel() {
     const TOLERANCE_PX: f64 = 0.2;
     let mut config = ideal(3);
-    config.cameras[0].sensor.supersample = 4; // Without it, edges are aliased.
+    config.cameras[0].sensor.supersample = 4; // Without supersampling, edges are aliased.
     let run = run_rig(&config);
     let intrinsics = &run.info.cameras[0].intrinsics;
     let truth = run.truth.last().expect("at least one image");
-    // Lines across the four outer edges of the black border. At the edge, brightness is half.
+    // Each line crosses one of the four outer edges of the black border. At the edge, the
+    // brightness is half of the way from black to white.
     let edges = [
         ([0.5, 0.05], [0.5, 0.15]),
         ([0.5, 0.95], [0.5, 0.85]),
@@ -278,7 +279,7 @@ fn tag_edges_are_accurate_to_a_fifth_of_a_pixel() {
 
 #[test]
 fn depth_matches_table_and_cube() {
-    const TOLERANCE_M: f64 = 1e-4; // One count of the depth image; rounding takes at most half of it.
+    const TOLERANCE_M: f64 = 1e-4; // One count; rounding errors are at most half of this.
     let run = run_rig(&ideal(5));
     let intrinsics = &run.info.cameras[0].intrinsics;
     let truth = run.truth.last().expect("at least one image");
@@ -362,7 +363,7 @@ fn noise_matches_configuration() {
 #[test]
 fn rolling_shutter_uses_the_pose_of_each_row() {
     const TOLERANCE_PX: f64 = 0.3;
-    const READOUT_SECS: f64 = 0.04; // Slower than real sensors, for a larger effect.
+    const READOUT_SECS: f64 = 0.04; // Slower than a real sensor, so that the effect is larger.
     let mut config = Config {
         n_images: Some(16),
         ..Config::default()
@@ -485,8 +486,8 @@ fn dropped_images_are_counted_and_samples_are_ordered() {
             Sample::Joints(state) => newest_joints = state.stamp,
             Sample::Image(image) => {
                 let age = newest_joints.nanos_since(image.stamp);
-                // Half the readout and exposure, one step, 20 ms of latency, and up to one more
-                // step.
+                // The delay consists of half the readout and exposure, one step, 20 ms of latency,
+                // and up to one more step.
                 assert!((29_000_000..=30_100_000).contains(&age), "{age} ns");
                 n_dropped += image.n_skipped;
                 images.insert(image.stamp, image.n_skipped);

@@ -38,8 +38,8 @@ pub(super) fn corners(target: &TargetSpec, plane: &Plane, fit: &Fit) -> Vec<(u32
         is_legacy: fit.layout.is_legacy,
     };
     let inner = squares.map(|count| count.cast_signed() - 1);
-    // Around a corner, the pattern is point-symmetric as far as the margins and borders of the
-    // markers reach. Within this distance, wrong scales do not displace the corner.
+    // Around a corner, the pattern is point-symmetric up to the distance that the margins and
+    // borders of the markers reach. Within this distance, wrong scales do not displace the corner.
     let symmetric_m = (square_m - marker_m) / 2.0 + marker_m / (dictionary.n_bits() + 2) as f64;
     let side_m = (symmetric_m / WINDOW_FRAC).min(square_m);
     let printed = Printed {
@@ -53,13 +53,13 @@ pub(super) fn corners(target: &TargetSpec, plane: &Plane, fit: &Fit) -> Vec<(u32
         printed,
         inner,
     };
-    // A wrong corner next to a marker would displace the predictions of others, so it is removed
-    // before the lattice is completed.
+    // A wrong corner next to a marker would displace the predictions of other corners. It is
+    // therefore removed before the lattice is completed.
     let mut lattice = search.near_markers(fit);
     lattice.remove_outliers();
     search.complete(&mut lattice);
-    // Now every corner has neighbors, which give a more accurate scale and shear than a marker, or
-    // the neighbors on one side only.
+    // Now every corner has neighbors on several sides. They give a more accurate scale and shear
+    // than a marker or neighbors on one side only.
     search.printed.align(plane, &mut lattice);
     lattice.remove_outliers();
     let id = |cell: Cell| (cell[1] * inner[0] + cell[0]).cast_unsigned();
@@ -160,7 +160,7 @@ impl Search<'_> {
             point_m,
             pixel,
             pixel_by_point,
-            // Unknown until the corner has neighbors on both sides.
+            // The second derivatives are unknown until the corner has neighbors on both sides.
             bend: [[0.0; 2]; 3],
             side_m,
             reach_px: None,

@@ -10,17 +10,18 @@ use crate::saddle::{self, angle_between};
 use crate::spec::TargetSpec;
 
 /// Images with more pixels are first searched at half resolution, which has a quarter of the
-/// pixels. Corners are refined in the full image in any case.
+/// pixels. Corners are always refined in the full image.
 const HALVE_ABOVE_PX: usize = 3_000_000;
-/// Number of resolutions that are searched. The ring around saddles has a fixed radius, so squares
-/// must neither be smaller than the ring nor blurred over much more than it. Three resolutions
-/// cover a factor of four.
+/// Number of resolutions that are searched. The ring around saddles has a fixed radius. Squares
+/// must not be smaller than the ring, and their blur must not be much larger than it. Three
+/// resolutions cover a factor of four.
 const N_LEVELS: usize = 3;
-/// A row or column belongs to the board if it has at least this part of its corners. Chance corners
-/// next to the board form lines with few corners; hidden corners leave most of a line.
+/// A row or column belongs to the board if it has at least this fraction of its corners. False
+/// corners next to the board form lines with few corners. If some corners of the board are hidden,
+/// most of a line remains.
 const MIN_LINE_FRAC: f64 = 0.5;
-/// A board is used if at least these percent of its corners are found. With fewer, a wrong grid of
-/// the right size is more likely than a board with that many hidden corners.
+/// A board is used if at least these percent of its corners are found. With fewer corners, a wrong
+/// grid of the right size is more likely than a board with that many hidden corners.
 const MIN_CORNER_PERCENT: usize = 60;
 
 /// Squares are empty.
@@ -141,8 +142,8 @@ fn matching(lattice: &mut Lattice, inner: [u32; 2], plane: &Plane) -> Result<Lat
             REFINEMENT,
         );
     }
-    // Corners of the surroundings are removed in three ways: they are no saddles, they do not fit
-    // their neighbors, or their line has too few corners.
+    // Corners of the surroundings are removed for three reasons: they are not saddles, they do not
+    // fit their neighbors, or their line has too few corners.
     lattice.refine(plane, REFINEMENT);
     lattice.remove_outliers();
     trim(lattice);
@@ -191,9 +192,9 @@ fn oriented(lattice: &Lattice, [low, high]: [Cell; 2], inner: [u32; 2]) -> Optio
             },
             if turns >= 2 { high[1] } else { low[1] },
         ];
-        // The square at the upper left of the board's first corner is black. Without rotation, it
-        // is the one that the grid counts as upper left, and colors alternate. Rotations by 90
-        // degrees look at another square.
+        // The square at the upper left of the board's first corner is black. Without rotation, this
+        // is the upper left square of the grid's first corner, and colors alternate from there.
+        // Rotations by 90 degrees select a different square.
         let is_black = (corner[0] + corner[1] + turns).rem_euclid(2) == 0;
         if !is_odd || is_black {
             rotations.push((is_black, renumber(lattice, corner, turns as usize)));
@@ -201,10 +202,10 @@ fn oriented(lattice: &Lattice, [low, high]: [Cell; 2], inner: [u32; 2]) -> Optio
     }
     // A square board with an odd number of corners per side changes colors with every rotation by
     // 90 degrees. If no rotation has a black square there, the board is printed with white corners,
-    // and all rotations remain.
+    // and all rotations are kept.
     let has_black = rotations.iter().any(|(is_black, _)| *is_black);
-    // What remains is a symmetry of the board. The choice follows the image, so that the ids stay
-    // the same in all images of a board that is roughly upright.
+    // The remaining rotations are symmetries of the board. The choice depends on the image, so that
+    // the ids are the same in all images of a board that is roughly upright.
     let from_right = |lattice: &Lattice| x_axis_rad(lattice).map_or(f64::INFINITY, f64::abs);
     rotations
         .into_iter()
@@ -216,8 +217,8 @@ fn oriented(lattice: &Lattice, [low, high]: [Cell; 2], inner: [u32; 2]) -> Optio
 /// Removes outermost lines that have few corners: these are not part of the board.
 pub(super) fn trim(lattice: &mut Lattice) {
     while let Some([low, high]) = lattice.range() {
-        // One line at a time, the weakest first: its removal changes the length of the lines across
-        // it.
+        // One line is removed at a time, starting with the weakest, because its removal changes the
+        // length of the lines across it.
         let lines: [(usize, i32); 4] = [(0, low[0]), (0, high[0]), (1, low[1]), (1, high[1])];
         let weakest = lines
             .into_iter()
@@ -235,7 +236,8 @@ pub(super) fn trim(lattice: &mut Lattice) {
     }
 }
 
-/// The part of the corners of a line that exist: of column `at` for axis 0, of row `at` for axis 1.
+/// The fraction of the corners of a line that exist. The line is column `at` for axis 0 and row
+/// `at` for axis 1.
 fn line_frac(lattice: &Lattice, axis: usize, at: i32, length: i32) -> f64 {
     let n = lattice
         .corners
@@ -261,8 +263,8 @@ fn renumber(lattice: &Lattice, corner: Cell, turns: usize) -> Lattice {
     renumbered
 }
 
-/// Direction of the board's x axis in the image: that of the sum of the distances between all
-/// neighbors along it.
+/// Direction of the board's x axis in the image. It is the direction of the sum of the vectors
+/// between all neighbors along it.
 fn x_axis_rad(lattice: &Lattice) -> Option<f64> {
     let mut sum = [0.0; 2];
     for (cell, pixel) in &lattice.corners {
@@ -290,7 +292,7 @@ fn wrong_size(lattice: &Lattice, size: [u32; 2], inner: [u32; 2], plane: &Plane)
         !plane.contains(*pixel, 1.5 * spacing_px)
     });
     let is_smaller = columns <= inner[0] && rows <= inner[1];
-    // Smaller than any chessboard that can be specified: chance corners.
+    // Smaller grids than this cannot be specified, so they consist of false corners.
     const MIN_SIDE: u32 = 3;
     if size.iter().any(|&side| side < MIN_SIDE) {
         NotDetected::Nothing {

@@ -10,17 +10,18 @@ use crate::marker::{Exact, Marker, read_exactly};
 use crate::quad::Quad;
 use crate::spec::{Millimeters, Pattern, TargetSpec};
 
-/// Fewer different markers without an error may be chance.
+/// Minimum number of different markers that were read without an error. Fewer such markers may
+/// occur by chance.
 const MIN_MARKERS: usize = 3;
-/// Cells per side from which a single marker without an error is no chance: random cells are one of
-/// 1000 markers, in any of four rotations, with a probability of `4000 / 2^36`, or 6e-8. With 4
-/// cells, it would be 6 %.
+/// With at least this many cells per side, a single marker without an error does not occur by
+/// chance. Random cells match one of 1000 markers, in any of four rotations, with a probability of
+/// `4000 / 2^36`, or 6e-8. With 4 cells, it would be 6 %.
 const MIN_BITS_OF_SINGLE: usize = 6;
 
-/// Difference of the size of markers that may prevent the detection of corners.
+/// Minimum relative difference in the size of markers that may prevent the detection of corners.
 pub(super) const MIN_SIZE_CHANGE: f64 = 0.1;
 
-/// The size of ChArUco markers relative to the squares, if it is not that of the target.
+/// The size of ChArUco markers relative to the squares, if it differs from that of the target.
 ///
 /// Each marker measures the distance to its neighbors in units of its side.
 ///
@@ -31,12 +32,12 @@ pub(super) fn marker_size(
     markers: &[Marker],
     min_change: f64,
 ) -> Option<NotDetected> {
-    /// Fewer pairs could agree by chance.
+    /// Minimum number of pairs. Fewer pairs could agree by chance.
     const MIN_PAIRS: usize = 4;
-    /// Pairs that measure the same size, if the markers are in the right places.
+    /// Minimum fraction of pairs that measure the same size if the markers are in the right places.
     const MIN_SAME_FRAC: f64 = 0.8;
-    /// Largest relative difference between sizes that are the same. Lens and perspective change the
-    /// scale from a marker to its neighbor.
+    /// Largest relative difference between sizes that count as the same. Lens and perspective
+    /// change the scale from a marker to its neighbor.
     const SAME: f64 = 0.1;
     let Pattern::Charuco {
         square_m, marker_m, ..
@@ -64,7 +65,7 @@ pub(super) fn marker_size(
         }
     }
     let found_frac = measured?;
-    // A marker as large as its square is a misreading, not a board.
+    // A marker that is as large as its square was misread.
     let is_possible = found_frac > 0.0 && found_frac < 1.0;
     (is_possible && (found_frac / expected_frac - 1.0).abs() > min_change).then(|| {
         NotDetected::MarkerSize {
@@ -85,9 +86,10 @@ pub(super) fn other_counts(
     markers: &[Marker],
     n_confirmed: usize,
 ) -> Option<NotDetected> {
-    // Bounds the time of a failed detection. Boards of common paper sizes have fewer columns.
+    // Maximum number of columns. It bounds the time of a failed detection. Boards of common paper
+    // sizes have fewer columns.
     const MAX_COLUMNS: u32 = 40;
-    // Below, another board may fit a few markers by chance.
+    // Minimum number of confirmed markers. With fewer, another board may fit by chance.
     const MIN_CONFIRMED: usize = 4;
     let (expected, what) = match target.pattern {
         Pattern::Charuco { squares, .. } => (squares, "squares"),
@@ -96,7 +98,8 @@ pub(super) fn other_counts(
     };
     let n_ids = markers.iter().map(|marker| marker.id + 1).max()?;
     // The number of columns alone determines where a marker is. The number of rows is the smallest
-    // that contains all ids, or that of the target with its sides swapped.
+    // number with which the board contains all ids. If the counts can be those of the target with
+    // its sides swapped, the swapped counts are used.
     let counts = (2..=MAX_COLUMNS)
         .filter(|columns| *columns != expected[0])
         .map(|columns| {
@@ -110,7 +113,8 @@ pub(super) fn other_counts(
         let layouts = layouts(&with_counts(&target.pattern, counts));
         Some((counts, layout::fit(layouts, markers)?.n_confirmed))
     });
-    // Of equals, the swapped sides: this mistake is more common than a different board.
+    // If several counts are equally good, the swapped sides are used, because this mistake is more
+    // common than a different board.
     let (found, n_found) =
         fits.max_by_key(|(counts, n)| (*n, *counts == [expected[1], expected[0]]))?;
     let of = |[columns, rows]: [u32; 2]| Counts { columns, rows };
@@ -121,8 +125,8 @@ pub(super) fn other_counts(
     })
 }
 
-/// A pattern with other counts of columns and rows. Patterns without counts of markers are the
-/// same.
+/// The pattern with other counts of columns and rows. Patterns without counts of markers are
+/// returned unchanged.
 fn with_counts(pattern: &Pattern, counts: [u32; 2]) -> Pattern {
     match pattern.clone() {
         Pattern::Charuco {
@@ -188,12 +192,12 @@ fn neighbor_fracs(layout: &Layout, markers: &[Marker], square_m: f64, marker_m: 
     fracs
 }
 
-/// Whether a number of different markers without an error is no chance.
+/// Whether this number of different markers without an error is too large to occur by chance.
 fn is_plausible(n: usize, dictionary: &Dictionary) -> bool {
     n >= MIN_MARKERS || (n > 0 && dictionary.n_bits() >= MIN_BITS_OF_SINGLE)
 }
 
-/// Number of markers, without those that may be chance: four times their expected number.
+/// Number of markers, reduced by those that may occur by chance: four times their expected number.
 #[expect(
     clippy::cast_possible_truncation,
     clippy::cast_sign_loss,
@@ -228,12 +232,13 @@ pub(super) fn markers(
     let expected = first_id..first_id + u32::try_from(n_on_target).unwrap_or(0);
     let mut ids: Vec<u32> = markers.iter().map(|marker| marker.id).collect();
     ids.dedup();
-    // Markers of the right dictionary: the target is another one, or is described wrongly.
+    // The markers belong to the right dictionary. Either the target is a different one, or its
+    // description is wrong.
     if is_plausible(ids.len(), dictionary) {
         let n_expected = ids.iter().filter(|id| expected.contains(id)).count();
         let found = Ids(ids);
-        // A majority of foreign ids means another board. With ids of the target, counts or sizes
-        // are wrong, from the most to the least specific reason.
+        // If most ids are not on the target, the board is a different one. Otherwise, the counts or
+        // sizes are wrong. The most specific reasons are tested first.
         return if 2 * n_expected < found.0.len() {
             NotDetected::OtherIds {
                 found,
@@ -252,10 +257,11 @@ pub(super) fn markers(
             n: mirrored.ids.len(),
         };
     }
-    // Last, all other dictionaries, which takes the longest.
+    // All other dictionaries are tried last, because this takes the longest.
     let others = Dictionary::all().filter(|other| other != dictionary);
     let read = others.map(|other| (read_exactly(plane, quads, &other, false), other));
-    // Of equals, the first: the smallest dictionary that contains all markers.
+    // If several dictionaries are equally good, the first one is used. It is the smallest
+    // dictionary that contains all markers.
     let best = read.reduce(|best, next| {
         if next.0.ids.len() > best.0.ids.len() {
             next

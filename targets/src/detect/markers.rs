@@ -12,14 +12,15 @@ use crate::quad::{self, Quad, shortest_side};
 use crate::spec::{Pattern, TargetSpec};
 use crate::template::{self, Neighborhood};
 
-/// Widths of the black border of tags, in cells: Kalibr prints 2, AprilTag 1.
+/// Widths of the black border of tags, in cells. Kalibr prints a border of 2 cells, AprilTag of 1
+/// cell.
 const TAG_BORDERS: [usize; 2] = [1, 2];
 /// Largest difference of the size of ChArUco markers from that of the target, relative to it. Blur
 /// makes small markers look up to 10 % smaller, so a found board needs a clearer contradiction than
 /// [`diagnosis::MIN_SIZE_CHANGE`].
 const MAX_SIZE_CHANGE: f64 = 0.2;
-/// Largest distance of a corner from the intersection of the tag's sides, relative to the side:
-/// lenses bend them.
+/// Largest distance of a corner from the intersection of the tag's sides, relative to the length of
+/// a side. The distance is not zero, because lenses bend the sides.
 const MAX_MOVE_FRAC: f64 = 0.04;
 
 /// Finds a ChArUco board, an AprilGrid or a tag.
@@ -51,8 +52,8 @@ pub(super) fn detect(target: &TargetSpec, plane: &Plane) -> Result<Detection, No
             .or_else(|| diagnosis::marker_size(target, &markers, diagnosis::MIN_SIZE_CHANGE));
         return Err(reason.unwrap_or(too_few));
     }
-    // The corners do not depend on the markers, but if their size is wrong, that of the squares may
-    // be wrong, too.
+    // The corners do not depend on the markers. However, if the size of the markers is wrong, the
+    // size of the squares may also be wrong.
     match diagnosis::marker_size(target, &fit.markers, MAX_SIZE_CHANGE) {
         Some(other) => Err(other),
         None => Ok(target.detection(pixels, fit.layout.is_legacy)),
@@ -105,8 +106,8 @@ fn corners(
     let centered = corners_m.map(|corner| [corner[0] - center_m[0], corner[1] - center_m[1]]);
     let mut corners_px = marker.corners_px;
     let mut is_found = [false; 4];
-    // Sides bent by the lens displace the corners; the second time, scale and rotation are more
-    // accurate.
+    // Sides that are bent by the lens displace the corners. In the second round, scale and rotation
+    // are more accurate.
     for reach_frac in [MAX_MOVE_FRAC, MAX_MOVE_FRAC / 4.0] {
         let Some(pixel_from_board) = Homography::from_corners(&centered, &corners_px) else {
             return Vec::new();
@@ -118,8 +119,8 @@ fn corners(
                 pixel_by_point: pixel_from_board.jacobian(centered[at]),
                 bend: [[0.0; 2]; 3],
                 side_m: CLEAR_FRAC * side_m,
-                // Far less than a cell, so that no edge inside the tag is taken for the corner.
-                // The lower limit leaves room for the error of the outline.
+                // The reach is far less than a cell, so that no edge inside the tag is mistaken for
+                // the corner. The lower limit leaves room for the error of the outline.
                 reach_px: Some((reach_frac * shortest_side(&marker.corners_px)).clamp(1.5, 4.0)),
             };
             let found = template::find(plane, &target.surface(), &neighborhood);

@@ -35,7 +35,7 @@ pub struct DetectedCorner {
     pub pixel: [f64; 2],
 }
 
-/// Smallest number of corners of a board; a pose needs four.
+/// Minimum number of corners of a board. A pose needs at least four.
 const MIN_CORNERS: usize = 4;
 
 impl TargetSpec {

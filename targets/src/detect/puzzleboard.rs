@@ -10,11 +10,12 @@ use crate::puzzle_code::{Edge, PERIOD, Position, locate};
 use crate::spec::TargetSpec;
 
 /// Largest part of dots that may be read wrong. With `n` random dots, the best of a million places
-/// agrees in about `0.5 + 2.4 / sqrt(n)` of them, which is 0.81 for [`MIN_DOTS`]. Larger values
-/// accept more blur, and come closer to that.
+/// agrees in about `0.5 + 2.4 / sqrt(n)` of them, which is 0.81 for [`MIN_DOTS`]. A larger value
+/// accepts more blur, but is closer to this chance level.
 const MAX_WRONG_FRAC: f64 = 0.12;
-/// Smallest number of dots; below, other places of the pattern may fit as well. The pattern has
-/// 501 x 501 places in four rotations, which 20 bits enumerate; the rest corrects wrong dots.
+/// Minimum number of dots. With fewer dots, other positions in the pattern may fit equally well.
+/// The pattern has 501 x 501 positions in four rotations, which 20 bits enumerate. The remaining
+/// dots correct wrong ones.
 const MIN_DOTS: usize = 60;
 /// Dots begin at a third of the square from each corner.
 const REFINEMENT: Refinement = Refinement { clear_frac: 0.3 };
@@ -66,8 +67,8 @@ impl Board<'_> {
         let nothing = NotDetected::Nothing {
             target: target.kind(),
         };
-        // Missing corners are completed before reading, because a dot needs the corners of both
-        // squares next to it.
+        // Missing corners are completed before reading, because reading a dot requires the corners
+        // of both squares next to it.
         let range = lattice.range().ok_or(nothing.clone())?;
         lattice.complete(smoothed, range, REFINEMENT);
         lattice.refine(smoothed, REFINEMENT);
@@ -103,7 +104,8 @@ impl Board<'_> {
             first_m: [0.0; 2],
             side_m: square_m,
         };
-        // Dots displace the corners found so far; the second time, their distances are right.
+        // Dots displace the corners found so far. In the second round, the distances of the dots
+        // are correct.
         printed.align_strictly(plane, &mut on_board);
         printed.align_strictly(plane, &mut on_board);
         if on_board.corners.len() < MIN_CORNERS {
@@ -146,7 +148,7 @@ impl Board<'_> {
             let expected = Counts { columns, rows };
             return Err(NotDetected::OtherSize { found, expected });
         };
-        // A foreign pattern has a best place, too, but too few of its dots agree there.
+        // A different pattern also has a best position, but too few of its dots agree there.
         let wrong_frac = 1.0 - n_right as f64 / dots.len() as f64;
         if wrong_frac > MAX_WRONG_FRAC {
             #[expect(
@@ -207,8 +209,8 @@ fn dots(plane: &Plane, lattice: &Lattice) -> Vec<Dot> {
             let (Some(there), [Some(a), Some(b)]) = (corner(end), squares) else {
                 continue;
             };
-            // One of the two squares is black, the other white. Half between their gray values is a
-            // threshold that follows shadows and vignetting.
+            // One of the two squares is black, the other white. The mean of their gray values is a
+            // threshold that adapts to shadows and vignetting.
             let [value_a, value_b] =
                 [a, b].map(|[c, d]| f64::from(plane.sample(middle([here, there, c, d]))));
             let value = f64::from(plane.sample(middle([here, there, here, there])));

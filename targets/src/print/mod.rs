@@ -33,7 +33,7 @@ impl TargetSpec {
             pattern_mm[0] + 2.0 * (PAGE_MARGIN_MM + MARK_MM),
             pattern_mm[1] + 2.0 * PAGE_MARGIN_MM + MARK_MM + FOOTER_MM,
         ];
-        // The tolerance absorbs rounding: a paper of exactly this size must fit.
+        // The tolerance absorbs rounding errors, because a paper of exactly this size must fit.
         let fits = |paper: &Paper| (0..2).all(|axis| need_mm[axis] <= paper.size_mm()[axis] + 1e-6);
         let Some(sheet) = [paper, paper.rotated()].into_iter().find(fits) else {
             return Err(PrintError::TooLarge {
@@ -44,7 +44,7 @@ impl TargetSpec {
             });
         };
         let size_mm = sheet.size_mm();
-        // Centered in the space left by mark and ruler.
+        // The pattern is centered in the space that mark and ruler leave free.
         let corner_mm = [
             (size_mm[0] - pattern_mm[0]) / 2.0,
             MARK_MM + PAGE_MARGIN_MM + (size_mm[1] - need_mm[1]) / 2.0,
@@ -68,7 +68,7 @@ impl TargetSpec {
                 Shape::Disk { .. } => None,
             })
             .collect();
-        // Rectangles first: dots of puzzleboards cover the squares.
+        // Rectangles are drawn first, because the dots of puzzleboards cover the squares.
         page.set_gray(0.0);
         page.fill_rectangles(&rectangles);
         for shape in shapes {
@@ -94,7 +94,7 @@ impl TargetSpec {
     ) {
         const RULERS_MM: [u32; 4] = [100, 50, 20, 10];
         let width_mm = size_mm[0] - 2.0 * PAGE_MARGIN_MM;
-        // 12 mm for the label next to the ruler.
+        // The label next to the ruler takes 12 mm.
         let is_short = |length: &u32| f64::from(*length) + 12.0 <= width_mm;
         let length = RULERS_MM.into_iter().find(is_short).unwrap_or(RULERS_MM[3]);
         let left = PAGE_MARGIN_MM;
@@ -137,7 +137,7 @@ fn draw_axes(page: &mut Page, corner_mm: [f64; 2]) {
     let y_end = [origin[0], origin[1] + LENGTH_MM];
     for (end, label) in [(x_end, "x"), (y_end, "y")] {
         page.line(origin, end, 0.25);
-        // Along the axis, and across it.
+        // Directions along the axis and across it.
         let along = [0, 1].map(|axis| (end[axis] - origin[axis]) / LENGTH_MM);
         for side in [-0.5, 0.5] {
             let back = [

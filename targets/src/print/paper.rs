@@ -21,7 +21,8 @@ const NAMED: [(&str, [f64; 2]); 7] = [
     ("a0", [841.0, 1189.0]),
     ("2a0", [1189.0, 1682.0]),
 ];
-/// Smallest and largest side of other papers, millimeters. Outside, the unit is probably wrong.
+/// Smallest and largest side of other papers, millimeters. If a side is outside this range, its
+/// unit is probably wrong.
 const SIDE_MM: [f64; 2] = [50.0, 5000.0];
 
 impl Paper {
@@ -50,7 +51,7 @@ impl Paper {
             .map(|(_, size_mm)| size_mm)
             .find(|&[width, height]| fits([width, height]) || fits([height, width]));
         Self {
-            // Rounded up to centimeters, a size that a print shop can be asked for.
+            // The size is rounded up to centimeters, so that a print shop can be asked for it.
             size_mm: named.unwrap_or_else(|| need_mm.map(|value| (value / 10.0).ceil() * 10.0)),
         }
     }

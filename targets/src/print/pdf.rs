@@ -38,7 +38,7 @@ impl Page {
 
     /// Sets the gray value of everything that follows; 0 is black, 1 is white.
     pub(super) fn set_gray(&mut self, gray: f64) {
-        // One operator for filling, one for lines.
+        // PDF has one operator for filling and another one for lines.
         self.operator(&[gray], "g");
         self.operator(&[gray], "G");
     }
@@ -110,7 +110,7 @@ impl Page {
             .collect();
         // Objects are numbered from 1 in this order, and refer to each other by these numbers.
         let objects = [
-            // Printer dialogs that follow this preference do not scale the page.
+            // Printer dialogs that respect this preference do not scale the page.
             "<< /Type /Catalog /Pages 2 0 R /ViewerPreferences << /PrintScaling /None >> >>"
                 .to_owned(),
             "<< /Type /Pages /Kids [3 0 R] /Count 1 >>".to_owned(),
@@ -132,8 +132,9 @@ impl Page {
             offsets.push(file.len());
             let _ = write!(file, "{number} 0 obj\n{object}\nendobj\n");
         }
-        // The table of positions. Readers start at its own position, which is at the end of the
-        // file. Each entry has exactly 20 bytes, and object 0 heads the list of free objects.
+        // The table of positions follows. Readers start with the position of this table, which is
+        // at the end of the file. Each entry has exactly 20 bytes, and object 0 heads the list of
+        // free objects.
         let start = file.len();
         let n = objects.len() + 1;
         let _ = write!(file, "xref\n0 {n}\n0000000000 65535 f \n");

@@ -1,6 +1,6 @@
-//! Nothing; see the dependencies of this package.
+//! This package contains only dependencies and no code.
 //!
 //! Cargo compiles a dependency with the features that all selected packages need together. The
-//! optional features of this workspace bring dependencies that need more features of others, such
-//! as those of `syn`, on which all derive macros depend. Without this package, `cargo clippy
-//! --no-default-features` compiles a hundred dependencies again.
+//! optional features of this workspace bring more dependencies. These need more features of other
+//! dependencies, such as `syn`, on which all derive macros depend. Without this package, `cargo
+//! clippy --no-default-features` compiles a hundred dependencies again.

@@ -10,15 +10,15 @@ use std::process::{Child, Command, Stdio};
 use std::time::{Duration, Instant};
 use tungstenite::{Message, WebSocket};
 
-/// Far more than a browser needs on two busy cores.
+/// This is far more time than a browser needs on two busy cores.
 const TIMEOUT: Duration = Duration::from_secs(300);
 
 /// A script for [`Browser::open_with`]: WebGL calls draw nothing, because drawing on the CPU takes
 /// most of the time.
 pub const NO_DRAWING: &str = include_str!("no_drawing.js");
 
-/// The hint at the first visit would cover a part of the view, so the page believes that this
-/// browser has shown it. Pages without an origin have no storage.
+/// The hint at the first visit would cover a part of the view. This script makes the page believe
+/// that the browser has already shown the hint. Pages without an origin have no storage.
 const LATER_VISIT: &str = "try { localStorage.setItem('gestures-seen', '1'); } catch {}\n";
 
 /// A running browser with one page.
@@ -64,7 +64,7 @@ fn chromium() -> Option<PathBuf> {
 pub struct Task {
     /// Duration, milliseconds.
     pub millis: f64,
-    /// CPU time, milliseconds: without the time for which other programs used the core.
+    /// CPU time, milliseconds, without the time for which other programs used the core.
     pub cpu_millis: f64,
 }
 

@@ -1,6 +1,7 @@
 //! Comparison of silhouettes of a robot in screenshots of the view.
 
-/// Part of the view that nothing else covers: distance from its top and bottom edges, pixels.
+/// Distance from the top and bottom edges of the view, pixels. Nothing else covers the part of the
+/// view between these margins.
 const MARGIN_PX: u32 = 60;
 /// Smaller silhouettes show too little of the robot.
 const MIN_PIXELS: usize = 5000;

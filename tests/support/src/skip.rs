@@ -20,7 +20,7 @@ pub fn is_demanded() -> bool {
 /// The test harness counts a test that returns as passed, so the caller must return at once.
 pub fn skip(reason: impl Display) {
     let reason = reason.to_string().replace(['\t', '\n'], " ");
-    // The harness names the threads of tests after them.
+    // The test harness gives each thread the name of its test.
     let thread = std::thread::current();
     let test = thread.name().unwrap_or("unknown test");
     if let Some(path) = std::env::var_os(SKIPPED_TESTS_VARIABLE) {
@@ -32,6 +32,6 @@ pub fn skip(reason: impl Display) {
         file.write_all(format!("{test}\t{reason}\n").as_bytes())
             .expect("the file can be written");
     }
-    // Not `eprintln`, because the harness hides the output of passing tests.
+    // `eprintln` is not used, because the test harness hides its output if a test passes.
     let _ = std::io::stderr().write_all(format!("{test}: skipped, because {reason}\n").as_bytes());
 }

@@ -8,7 +8,7 @@ use std::time::{Duration, Instant};
 
 /// Measures when a processor could not run even a thread of high priority, for example because the
 /// host ran another virtual machine. Without real-time priority, the load of other programs and of
-/// this one counts, too.
+/// this program counts, too.
 pub struct Stalls {
     start: Instant,
     is_over: Arc<AtomicBool>,
@@ -60,8 +60,8 @@ impl Stalls {
     }
 }
 
-/// Gives this thread a high priority on one processor. If that is denied, it measures less
-/// accurately.
+/// Gives this thread a high priority on one processor. If the priority is denied, the thread
+/// measures less accurately.
 fn pin_with_high_priority(cpu: usize) {
     /// Higher than the priority of the Franka driver and the emulated robot, so that their
     /// computing time does not count as a stall.

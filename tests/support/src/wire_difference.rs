@@ -121,7 +121,8 @@ pub fn difference(script: &Path, wire: &Path) -> Difference {
     }
 }
 
-/// Distance from the target at which `fieldrig move --json` reports that the arm arrived, rad or m.
+/// Distance from the target, rad or m, at the time when `fieldrig move --json` reports that the arm
+/// arrived.
 pub fn error_of_move(received: &str) -> f64 {
     let done = received
         .lines()

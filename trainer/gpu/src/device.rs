@@ -178,7 +178,7 @@ fn all_adapters(instance: &wgpu::Instance) -> Vec<wgpu::Adapter> {
 /// scene leave holes in these blocks, and a block is freed only when it is empty. In long runs,
 /// blocks took more than twice the memory in use. On a software adapter, blocks are host memory, so
 /// each large buffer gets its own block at the cost of a `malloc`. Drivers of real GPUs allocate
-/// blocks far more slowly and limit their number, so there we keep the default.
+/// blocks far more slowly and limit their number, so the default is kept for them.
 fn memory_hints(device_type: wgpu::DeviceType) -> wgpu::MemoryHints {
     match device_type {
         wgpu::DeviceType::Cpu => wgpu::MemoryHints::Manual {
@@ -207,8 +207,8 @@ impl Gpu {
         let instance = instance();
         let adapter = find_adapter(&instance, options.adapter)?;
         let optional = Optional::of(&adapter, options);
-        // All that the adapter has, instead of the defaults of WebGPU: large models need buffers
-        // beyond 128 MiB.
+        // The limits of the adapter are requested instead of the defaults of WebGPU, because large
+        // models need buffers above 128 MiB.
         let mut limits = adapter.limits();
         if let Some(bytes) = options.max_binding_bytes {
             limits.max_storage_buffer_binding_size =
@@ -355,8 +355,8 @@ impl Gpu {
 
     /// Loses the device on purpose, like a driver reset; for tests of recovery.
     pub fn lose(&self) {
-        // Unlike a driver reset, `destroy` frees memory at once, so wait for readers and copies
-        // first.
+        // Unlike a driver reset, `destroy` frees memory at once, so this waits for readers and
+        // copies first.
         let _no_reader = self.mapped.write();
         let _ = self.device.poll(wgpu::PollType::Wait {
             submission_index: None,
@@ -430,7 +430,8 @@ impl Gpu {
     /// Writes to a buffer before the next submit. Pads `contents` with zeros to a multiple of 4
     /// bytes.
     pub fn write(&self, buffer: &Buffer, offset_bytes: u64, contents: &[u8]) {
-        // wgpu writes only whole words. The tail is copied, so that the rest need not be.
+        // wgpu writes only whole words. Only the tail is copied and padded, so that the rest need
+        // not be copied.
         let whole = contents.len() / 4 * 4;
         self.queue
             .write_buffer(&buffer.raw, offset_bytes, &contents[..whole]);
@@ -491,7 +492,7 @@ impl Gpu {
         mut encoder: wgpu::CommandEncoder,
         reads: &[(&Buffer, usize)],
     ) -> PendingRead {
-        // Copies, too, have whole words only.
+        // Copies also consist of whole words only.
         let padded = |n_bytes: usize| n_bytes.next_multiple_of(4);
         let n_all_bytes = reads
             .iter()
@@ -534,8 +535,8 @@ impl Gpu {
     fn staging(&self, bytes: u64) -> Option<wgpu::Buffer> {
         let bytes = bytes.max(4);
         let mut idle = self.idle_staging.lock();
-        // Much larger buffers are left for large reads: a read of a few counters would block one
-        // for a picture.
+        // Much larger buffers are left for large reads. Otherwise, a read of a few counters would
+        // occupy a buffer that is needed for a picture.
         let fits = |buffer: &wgpu::Buffer| (bytes..=4 * bytes).contains(&buffer.size());
         let found = idle
             .iter()
@@ -545,7 +546,7 @@ impl Gpu {
         if let Some(buffer) = found.map(|(ix, _)| ix).and_then(|ix| idle.remove(ix)) {
             return Some(buffer);
         }
-        // Other threads must be able to return buffers while this one allocates.
+        // Other threads must be able to return buffers while this thread allocates.
         drop(idle);
         let memory = self.device.push_error_scope(wgpu::ErrorFilter::OutOfMemory);
         let staging = self.device.create_buffer(&wgpu::BufferDescriptor {
@@ -602,7 +603,7 @@ impl Gpu {
         }
     }
 
-    /// The recorded failure of the device, or an internal error if it works.
+    /// The recorded failure of the device, or an internal error if the device works.
     #[must_use]
     pub fn failure_or(&self, internal: &str) -> Error {
         self.check()
@@ -695,12 +696,13 @@ impl PendingRead {
             return Err(gpu.failure());
         }
         let reading = gpu.mapped.read();
-        // Before mapped memory is accessed, because destroying the device unmaps it.
+        // The device is checked before mapped memory is accessed, because destroying the device
+        // unmaps it.
         gpu.check()?;
         let view = staging.get_mapped_range(..).map_err(|_| gpu.failure())?;
         let read: Vec<&[u8]> = parts.iter().map(|part| &view[part.clone()]).collect();
         let taken = take(&read);
-        // In this order: a buffer must not be unmapped while a view of it exists.
+        // The order matters, because a buffer must not be unmapped while a view of it exists.
         drop(read);
         drop(view);
         drop(reading);

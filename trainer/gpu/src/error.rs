@@ -47,7 +47,7 @@ pub enum Error {
     /// The driver failed to execute a valid command.
     #[error("the GPU's driver failed: {0}")]
     DriverFailed(String),
-    /// A bug in this program: it gave the GPU an invalid command. Another device would not help, so
+    /// A bug: this program sent an invalid command to the GPU. Another device would not help, so
     /// this is not a [GPU error](Self::is_gpu_error).
     #[error("internal error: {0}; this is a bug in fieldrig, please report it")]
     Internal(String),

@@ -76,8 +76,8 @@ impl Passes {
         if n_groups == 0 {
             return;
         }
-        // Folded onto as few rows as possible, of almost equal length: at most one group less than
-        // `rows` is superfluous, and kernels return early in it.
+        // The groups are folded onto as few rows as possible, of almost equal length. The number of
+        // superfluous groups is less than `rows`, and kernels return early in them.
         let rows = n_groups.div_ceil(MAX_GROUPS_PER_AXIS);
         let columns = n_groups.div_ceil(rows);
         assert!(
@@ -175,8 +175,8 @@ impl Passes {
     ///
     /// If the device failed.
     pub fn submit_timed_total(&mut self, gpu: &Gpu) -> Result<Option<f64>, Error> {
-        // Two timestamps around the whole list, unlike in `submit_timed`: a pass per kernel would
-        // add time between kernels that a submit in training does not spend.
+        // Unlike `submit_timed`, this writes only two timestamps around the whole list. With a pass
+        // per kernel, there would be time between kernels that a submit in training does not need.
         let timed = gpu.optional.timestamps;
         let queries = timed.then(|| {
             gpu.device.create_query_set(&wgpu::QuerySetDescriptor {
@@ -191,7 +191,8 @@ impl Passes {
             usage: wgpu::BufferUsages::QUERY_RESOLVE | wgpu::BufferUsages::COPY_SRC,
             mapped_at_creation: false,
         });
-        // Queries can be resolved only into a buffer of its own usage, from which they are copied.
+        // Queries can be resolved only into a buffer with a special usage, from which they are
+        // copied.
         let copy = gpu.storage("span.copy", 16)?;
         let mut encoder = gpu
             .device
@@ -269,7 +270,7 @@ impl Passes {
         gpu.queue.submit([encoder.finish()]);
         let ticks: Vec<u64> = gpu.read(&copy, n_stamps)?;
         let nanos_per_tick = f64::from(gpu.queue.get_timestamp_period());
-        // Saturating, in case a driver reports an end before its beginning.
+        // The subtraction saturates, in case a driver reports an end before the beginning.
         let millis = |span: &[u64]| span[1].saturating_sub(span[0]) as f64 * nanos_per_tick / 1e6;
         Ok(names
             .into_iter()
@@ -289,7 +290,7 @@ fn buffers_by_binding<'b>(pipeline: &Pipeline, buffers: &[(&str, &'b Buffer)]) -
         .iter()
         .map(|binding| buffer_named(buffers, &binding.name))
         .collect();
-    // A buffer that the kernel does not bind is a mistake, too: probably a typo in its name.
+    // A buffer that the kernel does not bind is also an error, probably a misspelled name.
     let Some(found) = found.filter(|found| found.len() == buffers.len()) else {
         let reads: Vec<_> = pipeline
             .bindings
@@ -395,7 +396,7 @@ mod tests {
             .unwrap();
         let mut list = Passes::default();
         for n in [3, 1000, 2, 1000] {
-            // A copy in the list happens before the read.
+            // A copy in the list is executed before the read.
             list.copy((&second, 0), (&first, 4), 4);
             let read = list.submit_reading(&gpu, &[(&first, 7), (&second, 4 * n)]);
             assert!(list.is_empty());

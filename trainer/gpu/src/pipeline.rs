@@ -39,8 +39,8 @@ impl Pipeline {
         overrides: &[(&str, f64)],
     ) -> Result<Self, Error> {
         let module = reflect(name, text)?;
-        // Checked here, so that the error has the numbers. wgpu would report an invalid pipeline
-        // later, which looks like a bug of this program.
+        // The size is checked here, so that the error contains the numbers. Otherwise, wgpu would
+        // later report an invalid pipeline, which looks like a bug of this program.
         let bytes = wgsl::workgroup_bytes(&module);
         let limit_bytes = gpu.max_workgroup_bytes();
         if bytes > limit_bytes {
@@ -50,7 +50,8 @@ impl Pipeline {
                 limit_bytes,
             });
         }
-        // From the WGSL, so that Rust names no binding numbers, and a wrong name is detected.
+        // The bindings come from the WGSL, so that the Rust code contains no binding numbers and
+        // wrong names are detected.
         let bindings: Arc<[Binding]> = wgsl::bindings(&module).into();
         let device = &gpu.device;
         let source = wgpu::ShaderSource::Naga(Cow::Owned(module));
@@ -68,8 +69,9 @@ impl Pipeline {
         )]
         // SAFETY: every loop of our kernels counts to a bound that is fixed before it starts.
         let shader = unsafe { device.create_shader_module_trusted(described, checks) };
-        // Explicit, with all declared buffers: a layout that wgpu derives would lack those that
-        // this variant of the kernel does not use, and `dispatch` would have to know.
+        // The layout is explicit and has all declared buffers. A layout that wgpu derives would
+        // lack the buffers that this variant of the kernel does not use, and callers of `dispatch`
+        // would have to know these.
         let entries: Vec<_> = bindings.iter().map(layout_entry).collect();
         let layout = device.create_bind_group_layout(&wgpu::BindGroupLayoutDescriptor {
             label: Some(name),

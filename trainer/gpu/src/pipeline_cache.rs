@@ -27,7 +27,7 @@ pub(super) struct Key {
 
 impl Key {
     pub(super) fn new(text: String, overrides: &[(&str, f64)]) -> Self {
-        // Bits, because f64 has no `Eq`.
+        // The key contains the bits, because f64 has no `Eq`.
         let bits = overrides
             .iter()
             .map(|(name, value)| ((*name).to_owned(), value.to_bits()));
@@ -52,8 +52,9 @@ impl PipelineCache {
         key: Key,
         compile: impl FnOnce() -> Result<Pipeline, Error>,
     ) -> Result<Pipeline, Error> {
-        // The map is locked only to find the slot, and the slot while compiling. Other kernels
-        // therefore compile at the same time, and the same kernel is not compiled twice.
+        // The map is locked only to find the slot. The slot is locked while compiling. Other
+        // kernels can therefore be compiled at the same time, and the same kernel is not compiled
+        // twice.
         let slot = Arc::clone(self.0.lock().entry(key).or_default());
         let mut slot = slot.lock();
         if let Some(compiled) = &*slot {

@@ -40,8 +40,8 @@ impl Optional {
         let allowed = options.optional_features;
         let features = adapter.features();
         let info = adapter.get_info();
-        // Kernels compute their lane's place from the size of a subgroup, so it must not vary.
-        // Subgroups of fewer than 4 lanes would save no work.
+        // Kernels compute the position of a lane from the size of a subgroup, so the size must not
+        // vary. Subgroups of fewer than 4 lanes would save no work.
         let same_size = info.subgroup_min_size == info.subgroup_max_size;
         let subgroups =
             features.contains(wgpu::Features::SUBGROUP) && same_size && info.subgroup_min_size >= 4;

@@ -3,15 +3,15 @@
 use crate::{Error, Gpu, PendingRead};
 use std::time::Instant;
 
-/// Weight of the latest submit in the smoothed step time. A larger weight follows the growth of a
-/// model faster; a smaller one lets single slow submits, such as those that compete with a render,
-/// shorten the following submits less.
+/// Weight of the latest submit in the smoothed step time. With a larger weight, the step time
+/// follows the growth of a model faster. With a smaller weight, single slow submits, such as those
+/// that compete with a render, shorten the following submits less.
 const NEW_WEIGHT: f64 = 0.2;
-/// Maximum GPU time of a training submit. Short enough that checkpoints, keyframes and Ctrl-C are
-/// handled soon.
+/// Maximum GPU time of a training submit. It is short enough for checkpoints, keyframes and Ctrl-C
+/// to be handled soon.
 const SUBMIT_MILLIS: f64 = 20.0;
-/// Maximum while pictures are requested: each picture waits for the running submit and the queued
-/// submit.
+/// Maximum GPU time while pictures are requested. It is shorter, because each picture waits for the
+/// running submit and the queued submit.
 const SUBMIT_MILLIS_WATCHED: f64 = 2.0;
 
 /// Tracks training submits: at most one is in flight while the next one is recorded.
@@ -71,8 +71,8 @@ impl Submits {
         };
         let counters = counters.finish(gpu)?;
         let completed = Instant::now();
-        // The previous submit may have been running at `since`, and the GPU executes one after
-        // another.
+        // The previous submit may still have been running at `since`, and the GPU executes submits
+        // one after another.
         let began = since.max(self.idle_since);
         self.idle_since = completed;
         let millis = (completed - began).as_secs_f64() * 1e3 / n_steps.max(1) as f64;

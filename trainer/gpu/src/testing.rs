@@ -10,9 +10,9 @@ use std::sync::Arc;
 /// Devices of finished tests, with the options they were opened with.
 static DEVICES: Mutex<Vec<(GpuOptions, Arc<Gpu>)>> = Mutex::new(Vec::new());
 
-/// A device that no other test uses at the same time. It may have been used by an earlier test, so
-/// its pipelines are compiled already; it has no buffers left. Tests of the device itself open
-/// their own.
+/// A device that no other test uses at the same time. An earlier test may have used it, so its
+/// pipelines may already be compiled. It has no buffers left. Tests of the device itself open their
+/// own.
 #[must_use]
 pub fn test_gpu() -> Arc<Gpu> {
     test_gpu_with(&GpuOptions::default())

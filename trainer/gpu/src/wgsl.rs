@@ -60,7 +60,7 @@ fn append(
                 kernel: source.name,
                 import: name.to_owned(),
             })?;
-        // Marked before its own imports are resolved, so that imports in a circle end.
+        // The import is marked before its own imports are resolved, so that circular imports end.
         if !seen.contains(&import.name) {
             seen.push(import.name);
             append(*import, shared, seen, text)?;
@@ -119,7 +119,7 @@ pub(super) fn bindings(module: &naga::Module) -> Vec<Binding> {
                 naga::AddressSpace::Storage { .. } => Access::Read,
                 _ => return None,
             };
-            // Private and workgroup variables have no binding, and are no buffers.
+            // Private and workgroup variables have no binding, because they are not buffers.
             let number = variable.binding.as_ref()?.binding;
             Some(Binding {
                 name: variable.name.clone()?,

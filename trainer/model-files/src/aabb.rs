@@ -18,14 +18,16 @@ impl Aabb {
     /// Whether the box contains a point in world.
     #[must_use]
     pub fn contains(&self, point_m: [f64; 3]) -> bool {
-        // The box is aligned with its own axes, so the test is a comparison per axis in its frame.
+        // In its own frame, the box is aligned with the axes, so the test is one comparison per
+        // axis.
         let in_box = self
             .world_from_box
             .inverse_transform_point(&Point3::from(point_m));
         (0..3).all(|axis| (self.min_m[axis]..=self.max_m[axis]).contains(&in_box[axis]))
     }
 
-    /// Whether the box contains an ellipsoid as a whole; false also for some that it contains.
+    /// Whether the box certainly contains a whole ellipsoid. The result is also false for some
+    /// ellipsoids that the box contains.
     ///
     /// * `half_axes_m`: half axes in world, in any order.
     #[must_use]

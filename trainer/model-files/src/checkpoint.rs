@@ -11,8 +11,8 @@ use std::io::Write;
 use std::path::Path;
 
 const MAGIC: [u8; 8] = *b"FRIGCKPT";
-/// Version of the layout and of the states of all methods. There is only one number, because a
-/// checkpoint is continued by the program that wrote it, or by none.
+/// Version of the layout and of the states of all methods. There is only one number, because only
+/// the program that wrote a checkpoint can continue it.
 const VERSION: u32 = 6;
 /// Length of magic, version and header length together.
 const PREAMBLE_BYTES: usize = 16;
@@ -169,8 +169,8 @@ impl Checkpoint {
     fn from_bytes(bytes: &[u8]) -> Result<Self, String> {
         let n_header_bytes = n_header_bytes(bytes)?;
 
-        // The checksum is computed first, but reported last: a file that was cut off fails it, too,
-        // and `truncated` is the more useful reason.
+        // The checksum is computed first but reported last. A truncated file fails it, too, and
+        // `truncated` is the more useful reason.
         let whole = bytes
             .len()
             .checked_sub(CHECKSUM_BYTES)
@@ -253,7 +253,8 @@ fn word_at(preamble: &[u8], at: usize) -> u32 {
     ])
 }
 
-/// Divides the bytes after the header into arrays. Their lengths must add up to those of `bytes`.
+/// Divides the bytes after the header into arrays. The lengths of the arrays must add up to the
+/// length of `bytes`.
 fn arrays_in(headers: Vec<ArrayHeader>, bytes: &[u8]) -> Vec<Array> {
     let mut rest = bytes;
     let mut arrays = Vec::new();

@@ -1,4 +1,4 @@
-//! Contraction of the world to the unit cube: near space is scaled uniformly, far space is
+//! Contraction of the world to the unit cube. Near space is scaled uniformly, and far space is
 //! compressed. The cells of edits and the neural fields divide this cube.
 
 /// Contracts a point, given in units of the scene radius around its center, to the unit cube. The

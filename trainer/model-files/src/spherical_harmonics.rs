@@ -52,7 +52,7 @@ pub fn color_backward(
     let direction = offset.normalize();
     let basis = basis(&direction);
     let by_direction = basis_gradient(&direction);
-    // The gradient of max(color, 0): a channel below 0 does not depend on its coefficients.
+    // This is the gradient of max(color, 0). A channel below 0 does not depend on its coefficients.
     let unclamped = unclamped_color(sh, offset);
     let v_color: [f64; 3] = std::array::from_fn(|channel| {
         if unclamped[channel] > 0.0 {
@@ -180,8 +180,8 @@ mod tests {
 
     #[test]
     fn basis_has_the_signs_of_published_splat_files() {
-        // In this direction (x > sqrt(3) y > 0, z large), every polynomial without its constant is
-        // positive, so the constants determine the signs.
+        // In this direction (x > sqrt(3) y > 0, z large), all polynomials without their constants
+        // are positive, so the constants determine the signs.
         let signs = basis(&Vector3::new(0.36, 0.2, 0.9).normalize()).map(f64::signum);
         let published = [1, -1, 1, -1, 1, -1, 1, -1, 1, -1, 1, -1, 1, -1, 1, -1].map(f64::from);
         assert_eq!(signs, published);

@@ -50,9 +50,9 @@ pub fn surface_error(
     rendered_m: &[f32],
     measured: &DepthMap,
 ) -> Result<Option<SurfaceError>, Error> {
-    // Relative difference of depth between neighbors. At an edge, the normal would be that of no
-    // surface. A smaller value leaves out slanted surfaces, too; a larger one counts the rims of
-    // objects.
+    // Relative difference of depth between neighbors. At an edge, the normal would not belong to
+    // any surface. A smaller value also leaves out slanted surfaces. With a larger value, the edges
+    // of objects would count.
     const EDGE_FRAC: f64 = 0.04;
     let [width, height] = measured.size_px;
     let n_pixels = width as usize * height as usize;
@@ -90,9 +90,9 @@ pub fn surface_error(
         n_measured += 1;
         let rendered = f64::from(rendered_m[pixel(x, y)]);
         if rendered > 0.0 {
-            // A point on a ray is linear in its depth. The offset of the rendered point from the
-            // measured one is therefore the point of the same pixel at the difference of the
-            // depths.
+            // The position of a point on a ray is proportional to its depth. The offset of the
+            // rendered point from the measured point is therefore the point of the same pixel at
+            // the difference of the depths.
             let distance_m = normal.dot(&measured.point(x, y, rendered - z)).abs();
             sum_m += distance_m;
             n_rendered += 1;
@@ -170,8 +170,8 @@ mod tests {
         let truth = measured(depth_m.clone());
         let near_frac =
             |rendered: &[f32]| surface_error(rendered, &truth).unwrap().unwrap().near_frac;
-        // 28 rows of 38 pixels, minus two rows at the edge, minus five pixels on or next to the
-        // hole.
+        // There are 28 rows of 38 pixels. Two rows at the edge and five pixels on or next to the
+        // hole do not count.
         let n = 26.0 * 38.0 - 5.0;
         let mut rendered = depth_m.clone();
         rendered[10 * 40 + 10] = 3.0;

@@ -6,17 +6,17 @@ use candle_core::{Device, Tensor};
 use std::collections::HashMap;
 use std::path::Path;
 
-/// Minimum side length, pixels: the size of the patches to which the weights were fitted.
+/// Minimum side length, pixels. It is the size of the patches to which the weights were fitted.
 const MIN_SIDE_PX: u32 = 64;
-/// Channel means and standard deviations of the inputs, which are between -1 and 1. They are the
-/// usual ones of `ImageNet` for values between 0 and 1 (0.485, 0.456, 0.406 and 0.229, 0.224,
-/// 0.225), doubled, and the means lowered by 1.
+/// Channel means and standard deviations of the inputs, which are between -1 and 1. They are
+/// derived from the usual values of `ImageNet` for inputs between 0 and 1 (0.485, 0.456, 0.406 and
+/// 0.229, 0.224, 0.225): all are doubled, and the means are lowered by 1.
 const CHANNEL_MEAN: [f32; 3] = [-0.030, -0.088, -0.188];
 const CHANNEL_DEVIATION: [f32; 3] = [0.458, 0.448, 0.450];
 /// Keeps the normalization of an all-zero feature finite.
 const EPSILON: f64 = 1e-10;
-/// Stages of the network; features are compared after each stage. `true`: halve the size before the
-/// fire module.
+/// Stages of the network; features are compared after each stage. `true` means that the size is
+/// halved before the fire module.
 const STAGES: [&[(usize, bool)]; 6] = [
     &[(3, true), (4, false)],
     &[(6, true), (7, false)],

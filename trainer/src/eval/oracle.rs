@@ -116,7 +116,8 @@ fn slightly_brighter_picture_does_not_agree() {
     };
     let a = picture(&folder, "fox_a.png");
     let b = picture(&folder, "fox_b_noise.png");
-    // One level brighter everywhere: hardly visible, but every metric must detect it.
+    // The picture is one level brighter everywhere. This is hardly visible, but every metric must
+    // detect it.
     let brighter: Vec<u8> = b
         .rgba
         .iter()

@@ -86,7 +86,8 @@ fn masked_counts(pair: &PixelPair<'_>) -> Option<Vec<u8>> {
     let masked = |x: usize, y: usize| u8::from(!pair.is_visible(y * width + x));
     let mut counts = vec![0; width * (height - WINDOW + 1)];
     for x in 0..width {
-        // A running count: the window moves down by one row, which gains a pixel and loses another.
+        // This is a running count. When the window moves down by one row, it gains one pixel and
+        // loses another.
         let mut count: u8 = (0..WINDOW).map(|y| masked(x, y)).sum();
         counts[x] = count;
         for y in 1..=height - WINDOW {
@@ -124,7 +125,8 @@ impl RowScratch {
         masked: Option<&[u8]>,
         y: usize,
     ) -> (f64, usize) {
-        // The Gaussian window is separable. Along y first, so that the scratch memory is four rows.
+        // The Gaussian window is separable. The signals are blurred along y first, so that only
+        // four rows of scratch memory are needed.
         self.blur_along_y(signal, y);
         self.blur_along_x();
         let n_columns = self.width - WINDOW + 1;
@@ -233,7 +235,7 @@ mod tests {
         let a = noise(40 * 30, 1);
         let mut rendered = a.clone();
         let mut truth = a.clone();
-        // Wrong only at the masked pixel: all remaining windows are perfect.
+        // Only the masked pixel is wrong, so all remaining windows are perfect.
         let pixel = 4 * (15 * 40 + 20);
         rendered[pixel] ^= 0x80;
         truth[pixel + 3] = 0;

@@ -20,7 +20,8 @@ impl Groups {
     pub(crate) fn join(&mut self, a: u32, b: u32) {
         let a = self.representative(a);
         let b = self.representative(b);
-        // The smaller index wins, so the representative does not depend on the order of joining.
+        // The smaller index becomes the representative, so the representative does not depend on
+        // the order of joining.
         self.parents[a.max(b) as usize] = a.min(b);
     }
 

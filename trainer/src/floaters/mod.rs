@@ -14,8 +14,9 @@ use model_files::edits::{CellGrid, CellSet};
 /// A part with less than this fraction (1 / divisor) of the cells or triangles of the whole is a
 /// floater.
 ///
-/// In a room of radius R, this is a patch of surface about 0.16 R wide. Without scale, it resembles
-/// the diameter of 10 % of the scene below which `MeshLab` removes isolated pieces by default.
+/// In a room of radius R, this is a patch of surface about 0.16 R wide. Relative to the size of the
+/// scene, it is similar to the default of `MeshLab`, which removes isolated pieces with a diameter
+/// below 10 % of the scene.
 const SIZE_DIVISOR: usize = 500;
 
 /// Whether a part of this size is a floater.
@@ -58,8 +59,8 @@ impl CellLabels {
     /// Divides occupied cells into groups, after connecting adjacent ones. Groups with few cells
     /// are floaters.
     pub(crate) fn of_occupied(grid: &CellGrid, occupied: &CellMask, mut groups: Groups) -> Self {
-        // Cells that touch only at a corner are adjacent, too: a thin slanted surface must not fall
-        // apart.
+        // Cells that touch only at a corner also count as adjacent, so that a thin slanted surface
+        // stays connected.
         for cell in occupied.cells() {
             grid.neighbors(cell)
                 .filter(|other| occupied.contains(*other))
@@ -87,14 +88,16 @@ impl CellLabels {
 
     /// Also keeps the cells around those of large parts.
     pub(crate) fn keep_around(&mut self, grid: &CellGrid) {
-        // From a copy: otherwise the cells that were just added would spread, too.
+        // The neighbors are taken from a copy. Otherwise, cells that were just added would also add
+        // their neighbors.
         let inner = self.kept.clone();
         self.kept
             .extend(inner.cells().flat_map(|cell| grid.neighbors(cell)));
     }
 
-    /// The cells to erase: those of floaters and, because floaters move in training, the cells
-    /// around them, except for kept cells. `None` if there are none.
+    /// The cells to erase: those of floaters and the cells around them, except for kept cells. The
+    /// surrounding cells are included because floaters move during training. `None` if there are
+    /// none.
     pub(crate) fn erased(&self, grid: &CellGrid) -> Option<CellSet> {
         let mut erased = self.floating.clone();
         erased.extend(self.floating.cells().flat_map(|cell| grid.neighbors(cell)));

@@ -57,8 +57,8 @@ pub struct Loss {
 /// Loss of a rendered image, and its gradient with respect to the image.
 pub fn loss(image: &RenderedImage, target: &Target, weights: &Weights) -> (Loss, Upstream) {
     let n_pixels = target.rgb.len();
-    // Masked pixels are black in both images, so they have no residual. Windows of SSIM that
-    // contain some still count.
+    // Masked pixels are black in both images, so they have no residual. SSIM windows that contain
+    // masked pixels still count.
     let rendered = composed(image, target, weights);
     let truth = masked(&target.rgb, target);
     let mut upstream = Upstream {
@@ -171,7 +171,7 @@ fn depth(
         .enumerate()
         .filter(|(_, depth_m)| **depth_m > 0.0)
     {
-        // Compares the rendered depth with the true depth; both are weighted by the coverage.
+        // Both the rendered and the true depth are weighted by the coverage.
         let residual_m = image.depth[pixel_ix] - (1.0 - image.transmittance[pixel_ix]) * depth_m;
         // A clipped residual has no gradient: beyond the clip, the splats in this pixel belong to
         // another surface, and pulling them would not help.
@@ -185,7 +185,7 @@ fn depth(
     sum / n_pixels
 }
 
-/// The render over the background; black where the target is masked.
+/// The render over the background. Pixels are black where the target is masked.
 fn composed(image: &RenderedImage, target: &Target, weights: &Weights) -> Vec<[f64; 3]> {
     let over_background: Vec<_> = image
         .rgb
@@ -245,7 +245,7 @@ fn blurred_along(Axis { stride, side }: Axis, plane: &[f64]) -> Vec<f64> {
     let window = window();
     (0..plane.len())
         .map(|ix| {
-            // Taps outside the image multiply zeros, so they are left out.
+            // Values outside the image are zero, so these taps are left out.
             let position = ix / stride % side;
             let first = WINDOW_RADIUS.saturating_sub(position);
             let end = window.len().min(side + WINDOW_RADIUS - position);

@@ -52,7 +52,7 @@ fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u,
             wg_means[i] = means;
             wg_products[i] = product;
         }
-        workgroupBarrier(); // The rows are written; the next channel overwrites them only after its own first barrier.
+        workgroupBarrier(); // The rows are written. The next channel overwrites them only after its own first barrier.
         let pixel = vec2u(corner) + vec2u(lane % TILE_PX, lane / TILE_PX);
         if pixel.x < view.size_px.x && pixel.y < view.size_px.y {
             var m = vec4f(0.0);

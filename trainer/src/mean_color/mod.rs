@@ -210,7 +210,8 @@ impl Method for MeanColor {
     }
 
     fn recalibrate(&mut self, keyframes: &[CorrectedKeyframe], _: &Alignment) -> Result<(), Error> {
-        // The mean does not depend on poses. It restarts anyway, as an example for models that do.
+        // The mean does not depend on poses. It restarts anyway, as an example for models that
+        // depend on them.
         *self = Self::new(self.options.clone());
         keyframes
             .iter()

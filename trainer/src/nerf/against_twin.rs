@@ -363,7 +363,8 @@ fn check_colors_and_gradients(options: &GpuOptions) {
     assert_eq!(gpu.read::<u32>(&gradients.counts, 1).unwrap(), [0]);
 }
 
-/// Rendered colors differ from the twin because skipped samples take the color of the selected one.
+/// Rendered colors differ from the twin, because skipped samples get the color of the selected
+/// sample.
 fn check_pictures(options: &GpuOptions) {
     let twin = field(7);
     let rays = rays();
@@ -601,7 +602,8 @@ fn check_image_param_gradients(options: &GpuOptions) {
                     1e-12,
                     1e-4,
                 );
-                // The first step has the length of the rate; weight decay then undoes half of it.
+                // The length of the first step is the rate. Weight decay then undoes half of the
+                // step.
                 mismatches.check(
                     label("value"),
                     value,
@@ -789,7 +791,7 @@ fn optimizer_steps_match_twin() {
             .iter()
             .all(|sum| *sum == 0)
     );
-    // A tenth of a level's largest gradient still has 19 bits.
+    // With these scales, even a tenth of a level's largest gradient has 19 bits.
     let scales: Vec<f32> = gpu
         .read(&gradients.scales, twin.shape.n_cells.len())
         .unwrap();

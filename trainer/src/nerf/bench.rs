@@ -167,7 +167,7 @@ fn synthetic_rays(nerf_budget: NerfBudget) -> Vec<Ray> {
         n_steps,
         ..
     } = nerf_budget;
-    // Half a step shorter, so that rounding does not change the count.
+    // The rays are half a step shorter, so that rounding does not change the number of samples.
     let length = 2.0 / f64::from(n_steps) * (f64::from(n_samples / n_rays) - 0.5);
     (0..n_rays).map(|ix| synthetic_ray(ix, length)).collect()
 }
@@ -177,7 +177,8 @@ fn synthetic_ray(ix: u32, length: f64) -> Ray {
     let number = |stream: u64| 2.0 * unit_from_bits(hash(u64::from(ix) << 8 | stream)) - 1.0;
     let triple = |stream: u64| Vector3::from_fn(|axis, _| number(stream + axis as u64));
     let direction = triple(0).normalize();
-    // Clamped so that the whole ray is in the region where steps have constant length.
+    // The origin is clamped so that the whole ray is in the region where steps have constant
+    // length.
     let origin = (triple(3) * 0.5).map(|along| along.clamp(-0.5, 0.5)) - 0.5 * length * direction;
     let target = hash(u64::from(ix) << 8 | 6).to_le_bytes();
     Ray {

@@ -59,8 +59,8 @@ pub(crate) struct Occupancy {
     /// Two bit sets (cells to sample; solid cells), each with cells, groups and blocks; see
     /// `cell_blocks.wgsl`.
     pub(crate) occupied: Buffer,
-    /// One f32 per cell: its recent opacity over one step; negative: never updated; 0: outside all
-    /// views.
+    /// One f32 per cell: its recent opacity over one step. Negative if it was never updated; 0 if
+    /// it is outside all views.
     pub(crate) cell_occupancy: Buffer,
     pub(crate) occupancy_sum: Buffer,
     pub(crate) occupancy_update: Buffer,
@@ -114,8 +114,8 @@ pub(crate) const THREADS_PER_RAY: u32 = 8;
 pub(crate) struct RaySlot {
     pub(crate) n_rays: u32,
     pub(crate) rays: Buffer,
-    /// Number of segments found per ray; and, per thread of a ray, the number found by earlier
-    /// threads.
+    /// Number of segments found per ray. Also, for each thread of a ray, the number found by
+    /// earlier threads.
     pub(crate) n_found: Buffer,
     pub(crate) n_before: Buffer,
     pub(crate) march: Buffer,
@@ -237,7 +237,8 @@ impl FieldBuffers {
 impl FieldGradients {
     pub(crate) fn new(gpu: &Gpu, shape: &GridShape) -> Result<Self, Error> {
         Ok(Self {
-            // Integers: sums of floats would depend on the order of the atomic additions.
+            // The gradients are integers, because sums of floats would depend on the order of the
+            // atomic additions.
             grid: gpu.storage("nerf.v_grid", 8 * u64::from(shape.n_entries_total()))?,
             scales: gpu.storage("nerf.scales", 4 * shape.n_cells.len() as u64)?,
             counts: gpu.storage("nerf.counts", 8)?,

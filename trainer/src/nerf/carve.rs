@@ -13,10 +13,10 @@ const UNBOUNDED: u32 = 0;
 const FREE: u32 = 1 << 30;
 const SURFACE: u32 = 2 << 30;
 /// Maximum distance up to which cells along rays without a reading are marked, in units of the
-/// scene radius. At this distance, contraction leaves only 1 % of the cube's radius beyond.
+/// scene radius. In the contracted cube, only 1 % of the radius lies beyond this distance.
 const UNBOUNDED_DISTANCE: f64 = 50.0;
 /// Depth readings per ray whose free space is marked. Surfaces and missing readings are processed
-/// at a spacing of half a cell; free space needs fewer rays.
+/// at a spacing of half a cell. Free space needs fewer rays.
 const READINGS_PER_FREE_RAY: u32 = 4;
 /// Radius, in pixels, of the neighborhood that distinguishes a small hole in the depth image from a
 /// region that the depth camera cannot measure.
@@ -131,8 +131,8 @@ pub(crate) fn hints(keyframes: &[&Keyframe], extent: &Extent, march: &March) -> 
         surfaces,
     } = keyframes
         .par_iter()
-        // Threads collect sets of their own. Unions do not depend on the order in which they are
-        // joined.
+        // Each thread collects its own sets. Their union does not depend on the order in which they
+        // are joined.
         .fold(empty, |mut cells, keyframe| {
             if let Some(depth) = &keyframe.depth {
                 cells.add_depth_image(depth, extent, march);
@@ -141,8 +141,8 @@ pub(crate) fn hints(keyframes: &[&Keyframe], extent: &Extent, march: &March) -> 
             cells
         })
         .reduce(empty, Cells::and);
-    // A surface outweighs free space, which rays of other images may graze; free space outweighs
-    // missing readings, which prove nothing.
+    // Surfaces have priority over free space, because rays of other images may graze a surface.
+    // Free space has priority over missing readings, which are no evidence.
     let unbounded = unbounded.difference(&free).map(|cell| cell | UNBOUNDED);
     let free = free.difference(&surfaces).map(|cell| cell | FREE);
     let nothing = CellSet::new(0);
@@ -236,7 +236,7 @@ impl Cells {
                 let [right, down] =
                     [0, 1].map(|axis| (coordinate[axis] - principal_px[axis]) / focal_px[axis]);
                 let along = Vector3::new(right, down, 1.0).normalize();
-                // The depth image has the better hints where it covers the same direction.
+                // If the depth image covers the same direction, its hints are better.
                 let is_in_depth = depth
                     .as_ref()
                     .is_some_and(|(depth, pose)| is_in_depth_image(depth, pose, along));
@@ -258,8 +258,8 @@ impl Cells {
         let cell = |t: f64| march.cell(point(t)).0;
         let width = |t: f64| cell_width(march, point(t));
         let is_unbounded = distance == 0.0;
-        // Free space ends before the reading, by its error and the width of a cell: the cell of the
-        // surface must not be carved.
+        // Free space ends before the reading, at a distance of its error plus the width of a cell,
+        // so that the cell of the surface is not carved.
         let end = if is_unbounded {
             UNBOUNDED_DISTANCE
         } else {
@@ -270,7 +270,7 @@ impl Cells {
         } else {
             &mut self.free
         };
-        // Half a cell per step, so that few of the crossed cells are missed.
+        // The step is half a cell, so that few of the crossed cells are missed.
         let mut t = 0.0;
         while t < end {
             passed.insert(cell(t));

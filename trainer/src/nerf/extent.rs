@@ -9,11 +9,11 @@ use numbers::quantile::{Rank, quantile, trimmed_range};
 use serde::{Deserialize, Serialize};
 
 /// Depth readings per keyframe that are used to estimate the extent. The extent is a quantile over
-/// all keyframes, so few per keyframe suffice.
+/// all keyframes, so a few readings per keyframe are sufficient.
 const SAMPLES_PER_KEYFRAME: usize = 64;
 /// Fraction of the readings, on each side along each axis, that may be outside. With a larger
-/// fraction, walls are contracted; with a smaller one, a few wrong readings enlarge the cube, and
-/// cells are wider.
+/// fraction, walls would be contracted. With a smaller fraction, a few wrong readings would enlarge
+/// the cube and thus the cells.
 const OUTSIDE_FRAC: f64 = 0.02;
 /// Readings beyond this multiple of the median depth are ignored, because contraction covers them.
 const FAR_OVER_MEDIAN: f64 = 2.0;
@@ -149,7 +149,7 @@ fn depth_samples(keyframe: &Keyframe) -> Vec<(f64, Vector3<f64>)> {
         return Vec::new();
     };
     let width = depth.size_px[0].max(1);
-    // An odd step, so that samples cover all columns and rows.
+    // The step is odd, so that samples cover all columns and rows.
     let step = (depth.depth_m.len() / SAMPLES_PER_KEYFRAME).max(1) | 1;
     let valid = (0u32..)
         .zip(depth.depth_m.iter())
@@ -176,7 +176,7 @@ fn range_along(
         .collect();
     let of_points =
         trimmed_range(&mut along, OUTSIDE_FRAC).expect("readings at the median depth remain");
-    // No camera is trimmed: rays begin at cameras, where steps must be short.
+    // No camera is left out, because rays begin at cameras, and steps must be short there.
     let camera_coords = cameras.iter().map(|camera| camera[axis]);
     camera_coords.fold(of_points, |range, camera| {
         [range[0].min(camera), range[1].max(camera)]

@@ -45,7 +45,7 @@ struct Layer {
     n_in: u32,
     n_out: u32,
     relu_row: u32,          // row of the layer's inputs if a ReLU was applied to them, else NO_RELU
-    stored_row: u32,         // NOT_STORED: the gradients are not needed later
+    stored_row: u32,         // NOT_STORED if the gradients are not needed later
 }
 
 // Layers in backward order.

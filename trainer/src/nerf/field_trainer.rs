@@ -26,7 +26,7 @@ use rayon::prelude::*;
 use std::sync::Arc;
 
 /// Maximum number of steps per submit. The rays of all these steps are on the GPU at once, so more
-/// steps need more memory. With fewer, the GPU waits for the host more often.
+/// steps need more memory. With fewer steps, the GPU waits for the host more often.
 pub(crate) const STEPS_PER_SUBMIT: usize = 8;
 /// Steps between two updates of the occupancy, as in Mueller et al. 2022, appendix C.
 const OCCUPANCY_UPDATE_PERIOD: u64 = 16;
@@ -34,12 +34,12 @@ const OCCUPANCY_UPDATE_PERIOD: u64 = 16;
 /// the field.
 const FIRST_OCCUPANCY_UPDATE_WITH_DEPTH: u64 = 128;
 /// Factor on a cell's previous occupancy at each update. With a larger factor, cells that became
-/// empty are sampled longer; with a smaller one, a single point that happens to miss a thin object
-/// clears its cell.
+/// empty are sampled longer. With a smaller factor, a single point that happens to miss a thin
+/// object clears its cell.
 const OCCUPANCY_DECAY: f32 = 0.7;
 /// Fraction of the cells that an update evaluates, limited by the batch size, whose buffers it
-/// uses. A larger fraction makes updates slower; with a smaller one, cells follow the field with a
-/// longer delay.
+/// uses. A larger fraction makes updates slower. With a smaller fraction, cells follow the field
+/// with a longer delay.
 const UPDATED_FRAC: f64 = 0.25;
 /// Maximum number of samples of a training ray, as a multiple of the mean, so that few rays through
 /// unknown space cannot use up the batch.
@@ -49,32 +49,32 @@ const SAMPLES_PER_ROUND: u32 = 8;
 /// Maximum number of rounds, which limits the length of rays: 2048 samples, four times as many as
 /// steps cross the refined inner cube.
 const MAX_ROUNDS: u32 = 256;
-/// Number of rounds for the first picture, whose need is unknown. If it is too small, the picture
-/// is drawn again; superfluous rounds find no samples.
+/// Number of rounds for the first picture, for which the required number is unknown. If it is too
+/// small, the picture is drawn again. Superfluous rounds find no samples.
 const FIRST_ROUNDS: u32 = 16;
 /// The prepass traces one ray per square of this many pixels; `FRONT_STRIDE` of
 /// `picture_rays.wgsl`. It costs a 16th of the rays of the picture.
 const FRONT_STRIDE: u32 = 4;
 /// Initial range of the entries (Mueller et al. 2022, section 4).
 const INITIAL_ENTRY_RANGE: f64 = 1e-4;
-/// Distance residuals beyond this have no gradient, in units of the scene radius: such a reading
-/// belongs to a surface that the ray does not show yet, or is wrong.
+/// Distance residuals beyond this, in units of the scene radius, have no gradient. Such a reading
+/// is wrong, or belongs to a surface that the ray does not show yet.
 const DISTANCE_CLIP: f32 = 0.5;
 /// Relative error of a depth camera, which widens the band of the line-of-sight loss with distance.
-/// A wider band gives blurred surfaces; a narrower one penalizes correct surfaces.
+/// With a wider band, surfaces are blurred. A narrower band penalizes correct surfaces.
 const DEPTH_BAND_FRAC: f32 = 0.01;
 /// Minimum distance in the distortion loss, in units of the scene radius. The loss compares inverse
 /// distances, which would grow without bound near the camera.
 const DISTORTION_NEAR: f32 = 0.05;
-/// Initial step of an image's rotation (radians) and translation (units of the scene radius):
-/// observed surfaces are roughly a third of a radius away.
+/// Initial step of an image's rotation (radians) and translation (units of the scene radius). Their
+/// ratio follows from the distance of observed surfaces, which is roughly a third of a radius.
 const ROTATION_RATE: f32 = 5e-4;
 const TRANSLATION_RATE: f32 = ROTATION_RATE / 3.0;
-/// Initial step of a component of an image's appearance embedding: the initial learning rate of the
-/// weights that it is multiplied by.
+/// Initial step of a component of an image's appearance embedding. It is equal to the initial
+/// learning rate of the weights with which the component is multiplied.
 const EMBEDDING_RATE: f32 = 2e-2;
 /// Initial decay per step of an image's rotation, translation and embedding, as a fraction. Without
-/// it, all images could drift together, which no image contradicts.
+/// decay, all images could drift together, because no image contradicts such a drift.
 const IMAGE_PARAM_DECAY: f32 = 5e-4;
 /// Initial scale of gradients (2^20), before their magnitudes are known. Gradients of grid entries
 /// are summed as integers. `end_step` then chooses the scale of each level from its largest sum.
@@ -195,8 +195,8 @@ impl FieldTrainer {
         let mut weights: Vec<f32> = Vec::new();
         let layers = widths.layers().into_iter().zip(widths.used_layers());
         for (([n_in, n_out], [used_in, used_out]), stream) in layers.zip(2..) {
-            // Numbers and bound follow from the widths without padding, so that a field starts with
-            // the same weights on all adapters.
+            // The random numbers and their bound depend on the widths without padding, so that a
+            // field starts with the same weights on all adapters.
             let weight_stream = RandomStream { seed, stream };
             let bound = (6.0 / f64::from(used_in + used_out)).sqrt();
             for at in 0..n_in * n_out {
@@ -275,8 +275,8 @@ impl FieldTrainer {
         };
         let images = images.as_ref().filter(|_| !learned.is_empty());
         passes.convert_weights(list);
-        // The occupancy first: it evaluates the field in the buffers of the batch, and the rays of
-        // this step are sampled in the cells that it marks.
+        // The occupancy is updated first. The update evaluates the field in the buffers of the
+        // batch, and the rays of this step are then sampled in the cells that it marks.
         let first_update = if self.sizes.has_depth {
             FIRST_OCCUPANCY_UPDATE_WITH_DEPTH
         } else {
@@ -285,7 +285,7 @@ impl FieldTrainer {
         if step.is_multiple_of(OCCUPANCY_UPDATE_PERIOD) && step >= first_update {
             passes.occupancy_update(list, occupancy, moments);
         }
-        // Poses change the rays, so they precede the samples.
+        // Poses change the rays, so they are applied before samples are placed.
         if images.is_some() && learned.contains(ParamSet::IMAGE_POSES) {
             passes.apply_pose(list);
         }
@@ -383,7 +383,8 @@ impl FieldTrainer {
         let n_allocated = self.images.as_ref().map_or(0, |images| images.n_images);
         let rule = ImageParamRule {
             learned: learned_bits(learned),
-            // A power of two, so that images of a live run do not replace the buffer one by one.
+            // The number is a power of two, so that the buffer is not replaced for each new image
+            // of a live run.
             n_images: if n_allocated >= n_images {
                 n_allocated
             } else {
@@ -510,7 +511,8 @@ impl FieldTrainer {
         self.make_slot(gpu, slot_ix)?;
         let slot = &self.slots[slot_ix];
         gpu.write(&slot.rays, 0, bytemuck::cast_slice(rays));
-        // The limit of a single ray; the batch as a whole has its own, see `place_samples`.
+        // This is the limit of a single ray. The batch as a whole has its own limit, see
+        // `place_samples`.
         let max_samples_per_ray = n_samples / n_rays * MAX_SAMPLES_OVER_MEAN;
         gpu.write(
             &slot.march,
@@ -528,7 +530,8 @@ impl FieldTrainer {
             distortion: f32_of(options.specific.distortion),
             near: DISTORTION_NEAR,
             line_of_sight: f32_of(options.specific.line_of_sight),
-            // A surface cannot be located better than the steps; see design/nerf.md.
+            // A surface cannot be located more accurately than the length of the steps; see
+            // design/nerf.md.
             band: 2.0 * march_of(self.sizes.nerf_budget).step,
             band_frac: DEPTH_BAND_FRAC,
             unused: 0.0,
@@ -591,7 +594,7 @@ impl FieldTrainer {
     /// Halves the size of cells and steps. The new cells inherit the occupancy of the old ones. No
     /// submit may be in flight.
     pub(crate) fn refine_cells(&mut self, gpu: &Gpu) -> Result<(), Error> {
-        // Read before the old buffers are dropped.
+        // The occupancy is read before the old buffers are dropped.
         let n = self.sizes.nerf_budget.n_cells as usize;
         let known: Vec<f32> = gpu.read(&self.occupancy.cell_occupancy, n.pow(3))?;
         self.sizes.nerf_budget = self.sizes.nerf_budget.refined();
@@ -631,7 +634,7 @@ impl FieldTrainer {
             slot: &slots[0],
             image_params: &field.no_image_params,
         };
-        // Rays read the marks, not the values, so the marks are made before the next step.
+        // Rays read the marks instead of the values, so the marks are updated before the next step.
         passes.mark_occupied_cells(list, occupancy, moments);
         list.submit(gpu);
         Ok(())
@@ -797,7 +800,7 @@ impl FieldTrainer {
             canvas.n_pixels >= n_pixels && slot.n_rays >= n_rays
         };
         if !self.picture.as_ref().is_some_and(fits) {
-            // Freed before the larger ones are allocated.
+            // The old buffers are freed before the larger ones are allocated.
             self.passes.clear_bindings();
             self.picture = None;
             let samples = SampleBuffers::new(gpu, SAMPLES_PER_ROUND * n_rays)?;
@@ -906,8 +909,8 @@ fn write_view(
 /// Number of rounds for the next attempt, or for the next picture.
 fn next_rounds(n_rounds: u32, needed: u32, is_complete: bool) -> u32 {
     let n_next = if is_complete {
-        // Some more for the next picture, whose view may be deeper: without samples, they take
-        // little time.
+        // The next picture gets some more rounds, because its view may be deeper. Rounds without
+        // samples take little time.
         needed + needed / 4 + 2
     } else {
         2 * n_rounds
@@ -939,7 +942,7 @@ fn coarse_cells_of_row(row: usize, n: usize) -> impl Iterator<Item = usize> {
     (0..2 * n).map(move |x| x / 2 + n * (y / 2 + n * (z / 2)))
 }
 
-/// Opacity of a step of half the length, which is half the opacity as long as it is small. Values
+/// Opacity of a step of half the length. This is half the opacity if the opacity is small. Values
 /// that are not positive mark cells that were never updated, or that no image observes.
 fn half_step_opacity(cell_occupancy: f32) -> f32 {
     if cell_occupancy > 0.0 {
@@ -1059,8 +1062,8 @@ fn rule(options: &ModelOptions<NerfOptions>, weight_decay: f32) -> AdamRule {
     AdamRule {
         rate: f32_of(options.specific.rate),
         final_rate_frac: f32_of(options.specific.final_rate_frac),
-        // As in Mueller et al. 2022, section 4. Gradients of grid entries are small and rare, so
-        // epsilon must be far below them.
+        // The values are those of Mueller et al. 2022, section 4. Gradients of grid entries are
+        // small and rare, so epsilon must be far below them.
         betas: [0.9, 0.99],
         epsilon: 1e-15,
         weight_decay,

@@ -130,8 +130,8 @@ pub(crate) const KERNELS: &[Kernel] = &[
 /// Samples per workgroup; `TILE` of `network_tile.wgsl`. With 64 samples, a render took 0.48 ms
 /// instead of 0.30 ms ("Kernel layouts" in `docs/benchmarks/2026-11-23-nerf.md`).
 pub(crate) const N_TILE: u32 = 32;
-/// Tiles of samples per partial sum of weight gradients. More tiles leave fewer workgroups; fewer
-/// tiles give more partial sums to add.
+/// Tiles of samples per partial sum of weight gradients. With more tiles, there are fewer
+/// workgroups. With fewer tiles, there are more partial sums to add.
 pub(crate) const CHUNK_TILES: u32 = 16;
 pub(crate) const N_CHUNK: u32 = CHUNK_TILES * N_TILE;
 /// Threads per tile with cooperative matrices: a multiple of every subgroup size. With 64 threads,
@@ -174,7 +174,8 @@ fn layers_of([n_features, n_hidden, n_color_in]: [u32; 3]) -> [[u32; 2]; 5] {
 
 impl Widths {
     pub(crate) fn new(gpu: &Gpu, n_levels: u32, hidden: u32, embedding_dim: u32) -> Self {
-        // Of the 16 outputs of the first network, one is the density; the other 15 are inputs here.
+        // One of the 16 outputs of the first network is the density. The other 15 are inputs of the
+        // second network.
         let inputs = u32::try_from(N_DIRECTION).expect("16") + 15 + embedding_dim;
         let is_half_precision = gpu.optional().half_matrices;
         let used = [2 * n_levels, hidden, inputs].map(|width| width.next_multiple_of(4));
@@ -403,7 +404,7 @@ impl FieldPipelines {
         let layers = LayerKernels::new(gpu, widths);
         let hint = |kind: f64| Pipeline::new(gpu, kernel!("hint_cells"), &[("KIND", kind)]);
         let plain = |kernel: Kernel| Pipeline::new(gpu, kernel, &[]);
-        // These take long to compile, so they are compiled in parallel.
+        // These pipelines take long to compile, so they are compiled in parallel.
         let (
             (densities, (picture_densities, picture_colors)),
             (learned, (field_backward, weight_gradients)),

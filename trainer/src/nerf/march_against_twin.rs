@@ -46,7 +46,7 @@ fn random_ray(seed: u64) -> TestRay {
     let direction = nalgebra::Vector3::from(random.array::<3>(-1.0, 1.0))
         .normalize()
         .map(rounded);
-    // Some begin outside the inner cube, some end inside it.
+    // Some rays begin outside the inner cube, and some end inside it.
     let end = if seed.is_multiple_of(5) { 1.5 } else { 1000.0 };
     (
         random.array(-2.0, 2.0),

@@ -31,13 +31,13 @@ use std::path::Path;
 use std::sync::Arc;
 use std::time::Instant;
 
-/// Distance at which rays begin, in units of the scene radius. Nearer, the field could explain
-/// single images by fog in front of their cameras.
+/// Distance at which rays begin, in units of the scene radius. If rays began closer to the camera,
+/// the field could explain single images by fog in front of their cameras.
 const NEAR_DISTANCE: f32 = 0.03;
 /// Occupancy cells are refined after this fraction (1 / divisor) of the planned steps. This is
-/// before the first trial, because trials compare fields of the same size. Refined cells from the
-/// start on gave 18.0 instead of 25.1 dB after 1 s; without refinement, the static arm reached 30.0
-/// instead of 31.7 dB after 8 s (`docs/benchmarks/2026-11-23-nerf.md`).
+/// before the first trial, because trials compare fields of the same size. With refined cells from
+/// the start, the PSNR was 18.0 instead of 25.1 dB after 1 s. Without refinement, the static arm
+/// reached 30.0 instead of 31.7 dB after 8 s (`docs/benchmarks/2026-11-23-nerf.md`).
 const REFINE_DIVISOR: u64 = 10;
 /// Depth stride on a software adapter, where a 640x480 picture takes tens of seconds early in
 /// training. Every ninth pixel is enough for depth.
@@ -124,8 +124,8 @@ impl NerfModel {
             return Ok(false);
         }
         if std::mem::take(&mut self.is_extent_stale) || self.field.is_none() {
-            // Depth is reprojected on all cores here. Otherwise, the first ray of an image would do
-            // it, on one.
+            // Depth is reprojected here on all cores. Otherwise, the first ray of an image would
+            // cause it, on a single core.
             self.images.par_iter().for_each(|image| {
                 image.depth_m();
             });
@@ -189,7 +189,8 @@ impl NerfModel {
     /// Applies occupancy hints of new images, if any image has depth, and initializes their
     /// appearance embeddings.
     fn hint(&mut self) -> Result<(), Error> {
-        // The embeddings first: `n_hinted` still separates the known images from the new ones.
+        // The embeddings come first, because `n_hinted` still separates the known images from the
+        // new ones.
         self.initialize_embeddings()?;
         self.hint_images(self.n_hinted..self.images.len())?;
         if self.field.is_some() {
@@ -383,7 +384,7 @@ impl Method for NerfModel {
         let Some((_, field_trainer)) = &mut self.field else {
             return Err(no_field());
         };
-        // Waits for the previous submit while this one runs.
+        // This waits for the previous submit while the new one runs.
         let batch = field_trainer.submit(&self.gpu);
         self.finish_in_flight()?;
         self.submits.begin(batch, n_steps, since);
@@ -408,8 +409,8 @@ impl Method for NerfModel {
     }
 
     fn render(&mut self, request: &RenderRequest) -> Result<Picture, Error> {
-        // Rendering must not create a field: the times of pictures would then determine its initial
-        // keyframes.
+        // Rendering must not create a field, because the times of pictures would then determine its
+        // initial keyframes.
         self.finish_in_flight()?;
         let corrections = self.current_corrections()?;
         let embedding = images::embedding_of(corrections, request.appearance_of.as_ref());

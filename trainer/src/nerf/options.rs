@@ -72,8 +72,8 @@ impl NerfBudget {
 
 impl NerfBudget {
     /// Halves the size of cells and steps if they are those of [`Self::FULL`]. Does not refine
-    /// other sizes: refinement is too slow on software adapters, and even finer cells need too much
-    /// memory.
+    /// other sizes, because refinement is too slow on software adapters, and even finer cells would
+    /// need too much memory.
     #[must_use]
     pub(crate) fn refined(self) -> Self {
         if self.n_cells != Self::FULL.n_cells {

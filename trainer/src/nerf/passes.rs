@@ -139,8 +139,8 @@ impl FieldPasses<'_> {
             ("n_found", &slot.n_found),
             ("rays", &slot.rays),
         ];
-        // One workgroup: where the samples of a ray begin depends on all rays before it, and how
-        // many are kept depends on all rays.
+        // A single workgroup does this, because the first sample of a ray depends on all rays
+        // before it, and the number of samples that are kept depends on all rays.
         list.dispatch(gpu, &pipelines.place_samples, 1, &shared);
         let written = [
             ("n_before", &slot.n_before),
@@ -187,8 +187,8 @@ impl FieldPasses<'_> {
             ("points", &samples.points),
         ];
         list.dispatch(gpu, &pipelines.sample_cells, n_point_groups, &sampled);
-        // The points take the place of samples, so the kernels and buffers of training evaluate
-        // them.
+        // The points replace the samples of the batch, so that the kernels and buffers of training
+        // evaluate them.
         self.densities(list);
         let cell_occupancy = ("cell_occupancy", cell_occupancy);
         list.dispatch(
@@ -376,7 +376,7 @@ impl FieldPasses<'_> {
                 geometry,
             ],
         );
-        // Each round fills the list of selected samples anew.
+        // Each round fills the list of selected samples again from its beginning.
         list.clear_range(selected, N_SAMPLES_BYTES);
         let composited = [
             ("march", &slot.march),
@@ -734,8 +734,8 @@ impl FieldPasses<'_> {
             samples,
             ..
         } = *self;
-        // From the loss back to the samples, then through the networks to grid entries and
-        // activations, and from the activations to the weights.
+        // Gradients are propagated from the loss to the samples, then through the networks to grid
+        // entries and activations, and from the activations to the weights.
         self.composite(list, step);
         let batch = ("batch", &samples.batch);
         let v_log_density = ("v_log_density", &step.v_log_density);
@@ -761,8 +761,8 @@ impl FieldPasses<'_> {
             groups(samples.n_samples, N_TILE),
             &carried,
         );
-        // Partial sums per chunk of samples, which `update_weights` adds in a fixed order. Float
-        // atomics would add them in an order that depends on scheduling.
+        // There are partial sums per chunk of samples, which `update_weights` adds in a fixed
+        // order. With float atomics, the order would depend on scheduling.
         let n_chunks = groups(samples.n_samples, N_TILE * CHUNK_TILES);
         let summed = [
             batch,
@@ -829,7 +829,8 @@ impl FieldPasses<'_> {
             groups(field.n_entries, 256),
             &learned,
         );
-        // Last, because it replaces the scales with which this step's gradients were summed.
+        // This pass is last, because it replaces the scales with which this step's gradients were
+        // summed.
         list.dispatch(
             gpu,
             &pipelines.end_step,

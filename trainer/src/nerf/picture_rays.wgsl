@@ -1,7 +1,8 @@
 // picture_rays: generates the rays for a range of pixels of a view.
 //
-// The first pass renders every fourth pixel along x and y, which gives the distances of surfaces. In the second pass, rays
-// skip the haze in front of them, but no solid cell: a thin object may lie between the rays of the first pass.
+// The first pass renders every fourth pixel along x and y, which gives the distances of surfaces. In the second pass,
+// rays skip the haze in front of these surfaces. They do not skip solid cells, because a thin object may lie between
+// the rays of the first pass.
 //
 // threads   one per ray
 // reads     batch, march (first_ray: the first pixel in `pixel_order`; pixel_stride), view (in units of the scene radius around its
@@ -24,7 +25,7 @@
 override PICTURE_EMBEDDING_IX: u32;
 
 const FRONT_STRIDE = 4u;
-// Distance kept before a front: relative, and in steps.
+// Distance kept before a front, once relative to the distance of the front, and once in steps.
 const FRONT_MARGIN = 0.005;
 const FRONT_MARGIN_STEPS = 1.5;
 

@@ -41,7 +41,7 @@ fn contract_backward(at: vec3f, v: vec3f) -> vec3f {
     let max_abs = max(size.x, max(size.y, size.z));
     if max_abs <= 1.0 { return v / 4.0; }
     let is_max = select(vec3f(0.0), sign(at), size == vec3f(max_abs));
-    // Select a single axis if two are equal.
+    // If two axes are equal, only one of them is selected.
     let axis = select(select(vec3f(0.0, 0.0, is_max.z), vec3f(0.0, is_max.y, 0.0), is_max.y != 0.0), vec3f(is_max.x, 0.0, 0.0), is_max.x != 0.0);
     let factor = (2.0 * max_abs - 1.0) / (max_abs * max_abs);
     let by_max = (2.0 - 2.0 * max_abs) / (max_abs * max_abs * max_abs);

@@ -11,8 +11,8 @@ use numbers::{f32_of, f32s_of};
 use rayon::prelude::*;
 use std::sync::{Arc, OnceLock};
 
-/// Rays per parallel task. A ray takes only a few operations, so smaller tasks would cost more than
-/// they compute.
+/// Rays per parallel task. A ray takes only a few operations, so the overhead of smaller tasks
+/// would be larger than their work.
 const RAYS_PER_TASK: usize = 512;
 /// Attempts to find a pixel that is not masked. If all fail, the ray has no target and no effect.
 /// The number is bounded, because an image may be masked entirely.
@@ -63,9 +63,9 @@ impl RayImage {
         let mut in_camera = Vector3::new(along(x, 0), along(y, 1), 1.0);
         let mut origin_m = Vector3::zeros();
         if let Some(twist) = &self.keyframe.twist {
-            // The camera motion moves a point by -tau (v + w x p) in the camera; the ray applies
-            // the inverse. `tau` is the time of the pixel's row after the middle of the image, to
-            // which the pose belongs.
+            // The camera motion moves a point by -tau (v + w x p) in the camera frame. The inverse
+            // is applied to the ray. `tau` is the time of the pixel's row after the middle of the
+            // image, to which the pose belongs.
             let tau_secs =
                 ((y as f64 + 0.5) / f64::from(*height) - 0.5) * self.keyframe.readout_secs;
             in_camera += twist.angular_rad_s.cross(&in_camera) * tau_secs;
@@ -138,8 +138,8 @@ impl RaySampling {
     fn ray(&self, images: &[RayImage], extent: &Extent, ix: u64) -> params::Ray {
         let key = hash(self.seed ^ hash(self.step));
         let ray_key = hash(key ^ hash(ix));
-        // Stratified: successive rays belong to successive images, so all images get the same
-        // number of rays.
+        // The sampling is stratified. Successive rays belong to successive images, so all images
+        // get the same number of rays.
         let share = (ix as f64 + unit_from_bits(ray_key)) / f64::from(self.n_rays);
         #[expect(
             clippy::cast_possible_truncation,
@@ -149,7 +149,7 @@ impl RaySampling {
         let image_ix = ((share * images.len() as f64) as usize).min(images.len() - 1);
         let image = &images[image_ix];
         let pixel_ix = unmasked_pixel(&image.keyframe, ray_key);
-        // A number of its own for each purpose; the constant only makes the key different.
+        // Each purpose needs its own random number, so the constant only makes the key different.
         let jitter = f32_of(unit_from_bits(hash(ray_key ^ 0x5bd1_e995)));
         let embedding = u32::try_from(image_ix).expect("few images");
         params::Ray {
@@ -172,6 +172,6 @@ fn unmasked_pixel(keyframe: &Keyframe, ray_key: u64) -> usize {
 
 /// An index below `n` from random bits.
 fn random_ix(bits: u64, n: u64) -> usize {
-    // The upper half of a 64-bit product: uniform over all indices.
+    // The upper half of the product is uniformly distributed over all indices.
     usize::try_from((u128::from(bits) * u128::from(n)) >> 64).expect("less than a length")
 }

@@ -1,8 +1,8 @@
 // select_samples: composites the densities of one more round of samples, marks rays that are finished, and selects the
 // samples whose colors are evaluated.
 //
-// The color of a selected sample stands for the samples since the previous selected one, which contribute little: most
-// samples of a ray lie in front of or behind its surface.
+// The color of a selected sample represents all samples since the previous selected one. These contribute little,
+// because most samples of a ray lie in front of or behind its surface.
 //
 // threads   one per ray
 // reads     march (max_found: samples per round), spans, log_density [n_samples]

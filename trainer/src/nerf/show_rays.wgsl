@@ -50,7 +50,7 @@ fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u,
     let pixel_ix = at.x + view.size_px.x * at.y;
     let pixel = ray_of_pixel(at);
     let coverage = 1.0 - transmittance;
-    // Samples after the last selected one have its color.
+    // Samples after the last selected sample have the color of that sample.
     let pending = light[2u * ray_ix + 1u].y;
     if pending < 0.5 * coverage { rgb *= coverage / (coverage - pending); }
     let depth_m = distance / max(coverage, MIN_COVERAGE) / length(pixel.along) * backdrop.radius_m;

@@ -10,8 +10,8 @@ use serde::{Deserialize, Serialize};
 
 /// Cells of the coarsest level along an axis, as in Mueller et al. 2022, table 1.
 const N_CELLS_COARSEST: u32 = 16;
-/// Ratio of the resolutions of adjacent levels. With a larger one, fewer levels reach the finest
-/// cells, but structures between two levels are represented worse.
+/// Ratio of the resolutions of adjacent levels. With a larger ratio, fewer levels are needed to
+/// reach the finest cells, but structures between two levels are represented worse.
 const LEVEL_GROWTH: f64 = 1.5;
 /// Width of the finest cells in pixels. Finer cells would fit noise.
 const PIXELS_PER_CELL: f64 = 1.5;
@@ -53,7 +53,8 @@ fn has_dense_depth<'a>(keyframes: impl Iterator<Item = &'a Keyframe>) -> bool {
         let readings = depth.depth_m.iter().step_by(STRIDE);
         2 * readings.clone().filter(|z| **z > 0.0).count() > readings.count()
     };
-    // A majority in both cases: a few images without depth, or with holes, change little.
+    // A majority is sufficient in both cases, because a few images without depth or with holes
+    // change little.
     let known: Vec<bool> = keyframes
         .map(|keyframe| keyframe.depth.as_ref().is_some_and(is_known))
         .collect();
@@ -70,8 +71,8 @@ impl Sizes {
         keyframes: impl Iterator<Item = &'a Keyframe> + Clone,
         extent: &Extent,
     ) -> Result<Self, Error> {
-        // As many cells as pixels resolve, and levels from the coarsest to the finest. The unit
-        // cube covers four radii at the scale of the inner cube.
+        // The finest level has as many cells as pixels can resolve. The levels range from the
+        // coarsest to this one. The unit cube covers four radii at the scale of the inner cube.
         let cell_m = PIXELS_PER_CELL * pixel_size_m(keyframes.clone(), extent);
         #[expect(
             clippy::cast_possible_truncation,
@@ -86,8 +87,8 @@ impl Sizes {
         )]
         let n_levels =
             1 + (f64::from(finest / N_CELLS_COARSEST).ln() / LEVEL_GROWTH.ln()).ceil() as u32;
-        // An even number, so that the features, two per level, are a multiple of four like all
-        // widths.
+        // The number of levels is even. The number of features, two per level, is then a multiple
+        // of four like all widths.
         let n_levels = n_levels.next_multiple_of(2).clamp(
             MIN_LEVELS,
             nerf_budget.max_levels.clamp(MIN_LEVELS, MAX_LEVELS),
@@ -95,8 +96,8 @@ impl Sizes {
         let has_depth = keyframes.clone().any(|keyframe| keyframe.depth.is_some());
         let can_refine = nerf_budget.refined() != nerf_budget && has_dense_depth(keyframes.clone());
 
-        // As many entries as the largest image has detail, rounded up to a power of two, which
-        // hashing needs.
+        // The number of entries matches the detail of the largest image. It is rounded up to a
+        // power of two, which hashing requires.
         let n_pixels = keyframes
             .map(|keyframe| keyframe.rgba_srgb.len() / 4)
             .max()
@@ -110,8 +111,9 @@ impl Sizes {
         let max_log2_entries_allowed = nerf_budget.max_log2_entries.max(MIN_LOG2_ENTRIES);
         let mut log2_entries = entries_for_pixels.clamp(MIN_LOG2_ENTRIES, max_log2_entries_allowed);
 
-        // Fewer entries if the budget, or the largest buffer (the moments), does not hold them.
-        // More collisions blur the field, but fewer levels would lose its detail entirely.
+        // The number is reduced if the entries exceed the budget or the limit of the largest buffer
+        // (the moments). More collisions blur the field, but with fewer levels, its detail would be
+        // lost entirely.
         let max_bytes = options.common.max_bytes.unwrap_or(u64::MAX);
         loop {
             let shape = GridShape::between(N_CELLS_COARSEST, finest, n_levels, log2_entries);
@@ -159,8 +161,8 @@ impl Sizes {
             ..
         } = self.nerf_budget;
         let is_increasing = self.n_cells.windows(2).all(|pair| pair[0] <= pair[1]);
-        // Sizes come from files. Kernels are compiled and buffers allocated for them, so absurd
-        // ones must be refused before.
+        // Sizes come from files. Implausible ones must be rejected before kernels are compiled and
+        // buffers are allocated for them.
         let is_usable = (1..=16).contains(&self.n_cells.len())
             && self.n_cells.iter().all(|n| (1..=1 << 20).contains(n))
             && is_increasing

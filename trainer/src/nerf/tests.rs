@@ -426,8 +426,8 @@ fn drifting_poses_are_corrected() {
     train_until(&mut model, 600);
     let after_m = mean_position_error_m(&mut model, &drifted_keyframes);
     assert!(model.report()[0].kept, "{:?}", model.report());
-    // A few hundred small steps cannot remove all drift, and common motion is unobservable: 15 mm
-    // became 9.
+    // A few hundred small steps cannot remove all drift, and common motion is unobservable. The
+    // drift was reduced from 15 to 9 mm.
     assert!(after_m < 0.75 * before_m, "{before_m} m, then {after_m} m");
 
     let (mut resumed, rest) = NerfModel::resume(gpu(), &checkpoint, &drifted_keyframes).unwrap();

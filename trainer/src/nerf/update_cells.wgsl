@@ -25,6 +25,6 @@ fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u,
     let cell = updated_cell(occupancy_update, steps[1], ix);
     let opacity = density_of(log_density[ix]) * occupancy_update.step;
     let previous = cell_occupancy[cell];
-    // The field is not trained outside all views, so its density there is meaningless.
+    // The field is not trained in cells outside all views, so its density in these cells is meaningless.
     if previous != OUTSIDE_VIEWS { cell_occupancy[cell] = max(max(occupancy_update.decay * previous, opacity), MIN_OCCUPANCY); }
 }

@@ -85,8 +85,8 @@ impl Adam {
         gradients: &[f64],
         second: &mut f64,
     ) {
-        // One mean for all parameters saves memory, and moves them along their gradient instead of
-        // along its signs.
+        // A single mean for all parameters saves memory. The parameters then move along their
+        // gradient instead of along the signs of its components.
         let mean_square = gradients
             .iter()
             .map(|gradient| gradient * gradient)

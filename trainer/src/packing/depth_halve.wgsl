@@ -12,7 +12,7 @@
 @group(0) @binding(2) var<storage, read_write> halved: array<f32>;
 @group(0) @binding(3) var<storage, read_write> packed: array<atomic<u32>>;
 
-const NONE = 0x7f800000u;  // infinity; compared as bits, where NaN and negative numbers are larger
+const NONE = 0x7f800000u;  // bits of infinity; the bits of NaN and negative numbers are larger
 
 var<workgroup> wg_furthest: atomic<u32>;
 

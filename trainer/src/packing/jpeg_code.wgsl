@@ -59,7 +59,7 @@ fn category(value: i32) -> u32 {
     return 32u - countLeadingZeros(u32(abs(value)));
 }
 
-// Appends a code and the value's low bits; negative values minus one, as F.1.2.1 specifies.
+// Appends a code and the value's low bits. Negative values are decremented first, as F.1.2.1 specifies.
 fn put_value(writer: ptr<function, Writer>, code: u32, value: i32) {
     put_bits(writer, code & 0xffffu, code >> 16u);
     let n_bits = category(value);
@@ -69,7 +69,7 @@ fn put_value(writer: ptr<function, Writer>, code: u32, value: i32) {
 @compute @workgroup_size(32)
 fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u, @builtin(local_invocation_index) lane: u32) {
     let interval = folded(wg, n_wgs) * 32u + lane;
-    if interval >= packing.n_intervals { return; } // Allowed here: no barrier below.
+    if interval >= packing.n_intervals { return; } // No barrier follows this return.
     let n_mcus = packing.n_mcus.x * packing.n_mcus.y;
     let begin = interval * packing.mcus_per_interval;
     var writer = Writer(interval * packing.words_per_interval, 0u, 0u, 0u, 0u);

@@ -27,7 +27,7 @@ fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u,
     let mcu = folded(wg, n_wgs);
     let column = lane % 8u;
     let row = lane / 8u;
-    // Pixels beyond the edge repeat the last one.
+    // Pixels beyond the edge repeat the last pixel.
     let at = min(8u * vec2u(mcu % packing.n_mcus.x, mcu / packing.n_mcus.x) + vec2u(column, row), packing.size_px - vec2u(1u));
     let pixel = pixels[at.y * packing.size_px.x + at.x];
     let rgb = vec3f(vec3u(pixel & 255u, (pixel >> 8u) & 255u, (pixel >> 16u) & 255u));

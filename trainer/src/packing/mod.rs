@@ -9,9 +9,9 @@ use crate::{Error, Picture, Projection, RenderRequest};
 use gpu::{Buffer, Gpu, Passes, PendingRead, Pipeline, Source, shared};
 use panorama::{Face, Panorama};
 
-/// MCUs (8 x 8 pixels, no subsampling) per restart interval, which one lane encodes. More MCUs
-/// leave fewer lanes to work in parallel; with fewer, the markers between intervals lengthen the
-/// file.
+/// MCUs (8 x 8 pixels, no subsampling) per restart interval, which one lane encodes. With more
+/// MCUs, fewer lanes work in parallel. With fewer MCUs, the markers between intervals make the file
+/// longer.
 const MCUS_PER_INTERVAL: u32 = 2;
 /// Capacity of an interval, in words: four times the average at [`WORDS_PER_MCU`], because detail
 /// is distributed unevenly in a picture.
@@ -131,8 +131,8 @@ impl QueuedPicture {
         Self(Queued::Ready(rendered))
     }
 
-    /// A picture on the GPU. From the first part of `read`, `is_complete` determines whether the
-    /// buffers were large enough; the other parts are from [`Packer::record`].
+    /// A picture on the GPU. `is_complete` determines from the first part of `read` whether the
+    /// buffers were large enough. The other parts are from [`Packer::record`].
     pub(crate) fn packed(
         read: PendingRead,
         is_complete: fn(&[u8]) -> bool,
@@ -385,8 +385,9 @@ impl Packer {
             buffers.n_mcus >= sizes.n_mcus() && buffers.n_squares >= sizes.n_squares()
         };
         if !self.buffers.as_ref().is_some_and(fits) {
-            // Cached bindings own the old buffers, too. Both are dropped before the larger ones are
-            // allocated, so that memory need not hold both.
+            // Cached bindings also own the old buffers. Bindings and buffers are dropped before the
+            // larger buffers are allocated, so that the old and new buffers are never in memory
+            // together.
             passes.clear_bindings();
             self.buffers = None;
             self.buffers = Some(Buffers::new(gpu, sizes)?);
@@ -429,7 +430,7 @@ impl Packer {
         gpu.write(&buffers.packing, 0, bytemuck::bytes_of(&sizes));
         // The header has the overflow flag and the largest depth, which kernels update atomically.
         passes.clear_range(&buffers.packed, 0..4 * u64::from(HEADER_WORDS));
-        // Only what was requested is read back, but the header always.
+        // Apart from the header, only the requested parts are read back.
         let mut n_words = HEADER_WORDS;
         let tables = self
             .tables
@@ -482,7 +483,8 @@ impl Packer {
             packed,
         ];
         passes.dispatch(gpu, &self.code, n_intervals.div_ceil(32), &encoded);
-        // One workgroup: the offset of an interval is the sum of all lengths before it.
+        // A single workgroup does this, because the offset of an interval is the sum of all lengths
+        // before it.
         passes.dispatch(gpu, &self.offsets, 1, &[uniform, n_coded, packed]);
         passes.dispatch(
             gpu,
@@ -551,7 +553,7 @@ impl Reader {
         if gpu.is_software() {
             return Ok(unpacked);
         }
-        // Buffers are reserved here, where another format can still be chosen.
+        // Buffers are reserved here, because another format can still be chosen at this point.
         match created(&mut self.packer, gpu)?.reserve(
             gpu,
             passes,
@@ -699,7 +701,7 @@ pub(crate) fn unpack(
         let furthest_m = f64::from(f32::from_bits(furthest));
         PackedDepth {
             size_px: Sizes::of(size_px).half_size_px(),
-            // Without any depth, all counts are zero, and any step is right except zero.
+            // Without any depth, all counts are zero, so any step except zero is correct.
             meters_per_count: if furthest_m > 0.0 {
                 furthest_m / f64::from(u16::MAX)
             } else {

@@ -33,8 +33,8 @@ impl Face {
         self.ix + 1 == N_FACES
     }
 
-    /// Width and height of a face, pixels. Across its middle, a face covers a quarter of the
-    /// panorama's width and half of its height.
+    /// Width and height of a face, pixels. Measured through its middle, a face covers a quarter of
+    /// the panorama's width and half of its height.
     fn edge_px(self) -> u32 {
         let [width, height] = self.panorama_px;
         (width / 4).max(height / 2).max(1)
@@ -61,7 +61,7 @@ impl Face {
             world_from_camera: request.world_from_camera
                 * Transform::from_parts(Translation3::identity(), rotation),
             size_px: [edge_px; 2],
-            // A field of view of 90 degrees, so that the six faces cover all directions.
+            // The field of view is 90 degrees, so that the six faces cover all directions.
             focal_px: [f64::from(edge_px) / 2.0; 2],
             principal_px: [f64::from(edge_px) / 2.0; 2],
             shutter: None,
@@ -127,7 +127,7 @@ impl Panorama {
             .as_ref()
             .is_none_or(|panorama| panorama.n_pixels < n_pixels)
         {
-            // Freed before the larger one is allocated.
+            // The old panorama is freed before the larger one is allocated.
             passes.clear_bindings();
             *panorama = None;
             *panorama = Some(Self::new(gpu, n_pixels)?);

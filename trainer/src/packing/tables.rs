@@ -75,7 +75,7 @@ const HUFFMAN: [Huffman; 4] = [
 /// Position of each coefficient in zigzag order, row by row.
 fn zigzag() -> [usize; 64] {
     let mut order: Vec<usize> = (0..64).collect();
-    // Along a diagonal, odd ones go down and even ones go up.
+    // Odd diagonals go down, and even diagonals go up.
     order.sort_by_key(|at| {
         let row = at / 8;
         let column = at % 8;
@@ -94,8 +94,8 @@ fn zigzag() -> [usize; 64] {
 /// Quantization of luminance and chrominance, row by row, scaled as in the software of the
 /// Independent JPEG Group.
 fn quantizers(quality: u8) -> [[u8; 64]; 2] {
-    // Quality 50 is the table itself. Below, percentages grow hyperbolically; above, they fall
-    // linearly to 0, where every quantizer is 1.
+    // Quality 50 is the table itself. Below it, percentages grow hyperbolically. Above it, they
+    // fall linearly to 0, where every quantizer is 1.
     let quality = u32::from(quality.clamp(1, 100));
     let percent = if quality < 50 {
         5000 / quality
@@ -211,7 +211,7 @@ pub(super) fn file_header(size_px: [u16; 2], quality: u8, mcus_per_interval: u16
 
 /// Appends a marker segment (T.81, B.1.1.4).
 fn push_segment(file: &mut Vec<u8>, marker: u8, contents: &[u8]) {
-    // The length counts itself, but not the marker.
+    // The length includes its own bytes, but not the marker.
     let length = u16::try_from(contents.len() + 2).expect("segments are short");
     file.extend_from_slice(&[0xff, marker]);
     file.extend_from_slice(&length.to_be_bytes());

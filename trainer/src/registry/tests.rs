@@ -87,7 +87,7 @@ fn untrained_model_of_every_method_is_resumed_saved_and_recognized() {
     }
 }
 
-/// A live run deletes removed keyframes when it writes the next checkpoint.
+/// A live run deletes the files of removed keyframes when it writes the next checkpoint.
 #[test]
 fn removed_keyframe_is_not_needed_to_resume() {
     let gpu = test_gpu();
@@ -114,7 +114,7 @@ fn removed_keyframe_is_not_needed_to_resume() {
     }
 }
 
-/// A file of a keyframe may be damaged or deleted.
+/// The file of a keyframe may be damaged or deleted.
 #[test]
 fn every_method_resumes_without_missing_keyframes() {
     let gpu = test_gpu();

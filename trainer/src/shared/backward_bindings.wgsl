@@ -6,7 +6,8 @@
 @group(0) @binding(6) var<storage, read> upstream: array<vec4f>;
 @group(0) @binding(7) var<storage, read> pixel_totals: array<vec2f>;
 @group(0) @binding(8) var<storage, read> last: array<u32>;
-// Each intersection of splat and tile has its own slot, written once; `update` sums the slots of a splat in order.
+// Each intersection of splat and tile has its own slot, which is written once. `update` sums the slots of a splat in
+// order.
 @group(0) @binding(9) var<storage, read_write> gradients: array<f32>; // 12 per slot, see `Gradient`
 
 const N_PARTS_OF_GRADIENT = 12u;

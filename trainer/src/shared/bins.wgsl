@@ -1,8 +1,8 @@
 // bins: squares of 4 x 4 tiles. A splat is listed once per bin, with a mask of the tiles that it touches there.
 //
-// There are few lists with many entries: sorting splats into bins is much cheaper than sorting them into tiles, and a
-// tile finds its splats by testing one bit per entry of its bin's list. `count_bins` determines the tiles of each splat
-// once and stores the result as integers.
+// There are few lists with many entries. Sorting splats into bins is much faster than sorting them into tiles. A tile
+// finds its splats by testing one bit per entry of its bin's list. `count_bins` determines the tiles of each splat once
+// and stores the result as integers.
 
 const BIN_TILES = 4u;
 const BLOCK = 256u;        // splats per workgroup, consecutive in depth order

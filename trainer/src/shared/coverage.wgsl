@@ -1,6 +1,7 @@
 // coverage: evaluates a splat at a lane's pixels. Import after `pixels`.
 
-// Set or get one pixel's value. A variable index would spill the lane's values to memory.
+// These functions set or get one pixel's value. They use no variable index, because it would spill the lane's values to
+// memory.
 fn put(all: Px, k: u32, value: f32) -> Px {
     return select(all, Px(value), INDEX == PxU(k));
 }
@@ -29,7 +30,8 @@ fn power_at(half: vec4f, dx: Px, dy: f32) -> Px {
     return (half.x * dx + half.y * dy) * dx + half.z * dy * dy;
 }
 
-// Whether the power is between 0 and the maximum. Compared as integers, where negative numbers and NaN are larger.
+// Whether the power is between 0 and the maximum. The bits are compared as integers, because the bits of negative
+// numbers and NaN are larger.
 fn within_reach(half: vec4f, power: Px) -> PxB {
     return bitcast<PxU>(power) <= PxU(bitcast<u32>(half.w));
 }

@@ -2,7 +2,7 @@
 
 // Upper limit of the logarithm, to keep densities finite.
 const MAX_LOG_DENSITY = 12.0;
-// Added to the network's output. Sets the density of an untrained field.
+// This number is added to the network's output. It determines the density of an untrained field.
 const LOG_DENSITY_BIAS = 0.0;
 
 fn density_of(log_density: f32) -> f32 {

@@ -3,7 +3,7 @@
 //
 // needs     field, status and keys as arrays of atomics
 
-// The row plus one; 0 if the table is too full.
+// Returns the row plus one, or 0 if the table is too full.
 fn insert_chunk(chunk: vec3i) -> u32 {
     let key = key_of(chunk);
     var at = hash_of(key) & (field.n_chunk_slots - 1u);
@@ -18,7 +18,7 @@ fn insert_chunk(chunk: vec3i) -> u32 {
             there = exchange.old_value;
         }
         if there == key { return at + 1u; }
-        // Otherwise the weak exchange failed spuriously: retry.
+        // If the key is still 0, the weak exchange failed spuriously and is repeated.
         if there != 0u { at = (at + 1u) & (field.n_chunk_slots - 1u); }
     }
     return 0u;

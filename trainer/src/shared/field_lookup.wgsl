@@ -2,7 +2,7 @@
 //
 // needs     field, keys and entries as plain arrays
 
-// The row of a chunk plus one; 0 if there is no such chunk.
+// Returns the row of a chunk plus one, or 0 if there is no such chunk.
 fn find_row(chunk: vec3i) -> u32 {
     if !chunk_in_range(chunk) { return 0u; }
     let key = key_of(chunk);
@@ -16,13 +16,13 @@ fn find_row(chunk: vec3i) -> u32 {
     return 0u;
 }
 
-// Slot plus one of a block, given the row plus one of its chunk; 0 if there is no such block.
+// Returns the slot of a block plus one, or 0 if there is no such block. `row` is the row of its chunk plus one.
 fn slot_in_row(row: u32, block: vec3i) -> u32 {
     if row == 0u { return 0u; }
     return entries[(row - 1u) * BLOCK_VOXELS + voxel_in_block(block)];
 }
 
-// The slot of a block plus one; 0 if there is no such block.
+// Returns the slot of a block plus one, or 0 if there is no such block.
 fn find_slot(block: vec3i) -> u32 {
     return slot_in_row(find_row(block >> vec3u(3u)), block);
 }

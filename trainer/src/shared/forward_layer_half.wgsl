@@ -1,7 +1,7 @@
 // forward_layer: evaluates one layer. The outputs may be the inputs of the next layer.
 //
-// Each input and weight is the sum of two f16 numbers; the second is the rounding error of the first. With the 11 bits
-// of one f16, colors were noisy.
+// Each input and weight is the sum of two f16 numbers. The second number is the rounding error of the first. With the
+// 11 bits of one f16 alone, colors were noisy.
 
 var<workgroup> wg_residuals: array<vec4<f16>, 640>;
 

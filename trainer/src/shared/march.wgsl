@@ -17,8 +17,8 @@ struct Path {
     n_segments: u32,
 }
 
-// Fraction of the steps from the inner cube to infinity that are needed to reach a distance from it: steps grow with
-// distance.
+// Fraction of the steps from the inner cube to infinity that are needed to reach a distance from the cube. Steps grow
+// with distance.
 fn share_of(distance: f32) -> f32 { return 1.0 - 1.0 / (1.0 + distance); }
 fn distance_of(share: f32) -> f32 { return 1.0 / (1.0 - share) - 1.0; }
 
@@ -80,11 +80,13 @@ fn bit_of(first_word: u32, box: vec3u, log2_n: u32) -> bool {
     return (occupied[first_word + ix / 32u] >> (ix % 32u) & 1u) == 1u;
 }
 
-// Whether the contraction of the segment from `first` to `last`, both outside the inner cube, lies inside the box
-// [low, high] of the contracted space [-2, 2]^3; `first` does. Conservative: false if the dominant coordinate changes.
+// Whether the contraction of the segment from `first` to `last` lies inside the box [low, high] of the contracted space
+// [-2, 2]^3. Both points are outside the inner cube, and `first` is known to be in the box. The test is conservative:
+// it returns false if the dominant coordinate changes.
 //
-// If coordinate m is dominant (largest magnitude, same sign) at both points, so it is between them, and any coordinate is
-// p = a m + b. With u = 1 / m, it contracts to (2 - u) (a + b u), which has one extremum, at u = 1 - a / (2 b).
+// If coordinate m is dominant (largest magnitude, same sign) at both points, it is also dominant between them. Any
+// coordinate is then p = a m + b. With u = 1 / m, p contracts to (2 - u) (a + b u), which has one extremum, at u = 1 -
+// a / (2 b).
 fn stays_in_box(first: vec3f, last: vec3f, low: vec3f, high: vec3f) -> bool {
     let size = abs(first);
     let m = max(size.x, max(size.y, size.z));
@@ -130,7 +132,8 @@ fn visit(march: March, boxes: Boxes, ray: Ray, path: Path, ix: u32, end_ix: u32,
     let high = low + size;
     var n = 1u;
     if is_inside && all(low >= vec3f(-1.0)) && all(high <= vec3f(1.0)) {
-        // Inside the inner cube, unit cube and world differ by a constant factor, so all steps are equal.
+        // Inside the inner cube, coordinates of the unit cube and of the world differ by a constant factor, so all
+        // steps are equal.
         let out = (select(low, high, ray.direction > vec3f(0.0)) - middle) / ray.direction;
         let ends = select(out, vec3f(FAR), abs(ray.direction) < vec3f(1e-6));
         n = u32(clamp(min(ends.x, min(ends.y, ends.z)) / march.step + 0.5, 1.0, 4096.0)); // rounded down, with a margin

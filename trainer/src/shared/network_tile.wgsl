@@ -32,8 +32,8 @@ fn hidden_1_row() -> u32 { return N_FEATURES + N_HIDDEN + N_COLOR_IN; }
 fn hidden_2_row() -> u32 { return N_FEATURES + 2u * N_HIDDEN + N_COLOR_IN; }
 fn n_activation_rows() -> u32 { return N_FEATURES + 3u * N_HIDDEN + N_COLOR_IN; }
 
-// Rows of gradients with respect to: hidden layer and outputs of the first network, both hidden layers of the second,
-// colors, and features.
+// Rows of gradients with respect to the hidden layer and outputs of the first network, both hidden layers of the
+// second, colors, and features.
 fn v_density_out_row() -> u32 { return N_HIDDEN; }
 fn v_hidden_1_row() -> u32 { return N_HIDDEN + N_DENSITY_OUT; }
 fn v_hidden_2_row() -> u32 { return 2u * N_HIDDEN + N_DENSITY_OUT; }

@@ -7,7 +7,7 @@ struct OccupancyUpdate {
     step: f32,             // inside the inner cube, in units of the scene radius
 }
 
-// The factor is odd, so every cell is updated once before any cell is updated twice.
+// Because the factor is odd, every cell is updated once before any cell is updated twice.
 fn updated_cell(occupancy_update: OccupancyUpdate, n_updates: u32, ix: u32) -> u32 {
     return (n_updates * occupancy_update.n_points + ix) * 2654435761u % (occupancy_update.n_cells * occupancy_update.n_cells * occupancy_update.n_cells);
 }

@@ -27,7 +27,7 @@ fn ray_of_pixel(pixel: vec2u) -> PixelRay {
     let position_px = vec2f(pixel) + 0.5;
     let tau = position_px.y / f32(view.size_px.y) - 0.5;
     let direction = vec3f((position_px - view.principal_px) / view.focal_px, 1.0);
-    // The shutter motion moves a point by -tau (v + w x p) in the camera; the ray undoes that.
+    // The motion during the shutter time moves a point by -tau (v + w x p) in the camera. The ray reverses this motion.
     let rotated = direction + tau * cross(view.shutter_angular.xyz, direction);
     let origin = view.center_in_world.xyz + rotated_to_world(tau * view.shutter_linear.xyz);
     let along = rotated_to_world(rotated);

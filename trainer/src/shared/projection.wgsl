@@ -72,7 +72,7 @@ fn project_splat(view: View, mean: vec3f, rotation_wxyz: vec4f, log_scale: vec3f
     let row_y = out.jacobian_y * out.axes;
     let low_pass_px2 = view.center_in_world.w;
     out.covariance = vec3f(dot(row_x, row_x) + low_pass_px2, dot(row_x, row_y), dot(row_y, row_y) + low_pass_px2);
-    // Avoids cancellation: without the low-pass, the determinant is a squared cross product.
+    // Without the low-pass, the determinant is a squared cross product. Computing it this way avoids cancellation.
     let area = cross(row_x, row_y);
     out.determinant = dot(area, area) + low_pass_px2 * (out.covariance.x + out.covariance.z - low_pass_px2);
     out.compensation = sqrt(dot(area, area) / out.determinant);

@@ -1,5 +1,5 @@
-// rows_and_columns: windows of 11 x 11 pixels for a workgroup of 8 lanes in one subgroup, for adapters whose lanes
-// access memory one after another. The workgroup reads each value once and shares it between windows by shuffles.
+// rows_and_columns: windows of 11 x 11 pixels for a workgroup of 8 lanes in one subgroup. They are for adapters whose
+// lanes access memory one after another. The workgroup reads each value once and shares it between windows by shuffles.
 //
 // A lane holds 4 neighboring pixels of a row, and the workgroup moves down the rows. The two outer lanes on each side
 // only supply the border; the inner lanes cover the width of a tile. Import after `supervision`.

@@ -1,7 +1,7 @@
 // segment: a part of a tile's list, which one workgroup of `backward` processes.
 //
-// The longest lists are about ten times the average, and a step would wait for them. `rasterize` divides lists into
-// segments and stores the state of the tile's pixels at the start of every segment but the first.
+// The longest lists are about ten times the average, and a step would wait for them. `rasterize` therefore divides
+// lists into segments. At the start of every segment except the first, it stores the state of the tile's pixels.
 
 struct Segment {
     tile: u32,

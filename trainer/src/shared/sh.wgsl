@@ -8,7 +8,7 @@ const SH_1 = 0.4886025119029199;
 // Calls the kernel's `add_sh_term(sums, k, basis, gradient)` for basis functions 1 to 15 (k: 0 to 14) at a unit
 // direction, up to `degree`. The gradient is with respect to the direction; its components are treated as independent.
 //
-// Calls a function per basis function, because an array with a variable index would be placed in memory.
+// The code calls a function for each basis function, because an array with a variable index would be placed in memory.
 fn each_sh(sums: ptr<function, ShSums>, d: vec3f, degree: u32) {
     if degree >= 1u {
         add_sh_term(sums, 0u, -SH_1 * d.y, vec3f(0.0, -SH_1, 0.0));

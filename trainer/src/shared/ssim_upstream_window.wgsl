@@ -27,7 +27,7 @@ fn ssim_upstream(lane: u32, corner: vec2i, at: u32, picture: vec3f, expected: ve
             for (var k = 0u; k < WINDOW; k++) { sum += gaussian[k] * wg_gradients[from_ + k]; }
             wg_rows[i] = sum;
         }
-        workgroupBarrier(); // The rows are written; the next channel overwrites them only after its own first barrier.
+        workgroupBarrier(); // The rows are written. The next channel overwrites them only after its own first barrier.
         var sum = vec4f(0.0);
         for (var k = 0u; k < WINDOW; k++) { sum += gaussian[k] * wg_rows[lane + k * TILE_PX]; }
         v_color[channel] = sum.x + 2.0 * picture[channel] * sum.y + expected[channel] * sum.z;

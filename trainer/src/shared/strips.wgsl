@@ -1,8 +1,8 @@
 // strips: a workgroup of 8 lanes in one subgroup processes a tile in strips of two rows, 4 neighboring pixels per lane.
 //
-// For software adapters, whose lanes read memory one after another, while a shuffle is one instruction. Each lane
-// therefore reads one splat of eight and shares it by shuffles. A branch executes both of its sides, and only loops end
-// early, so splats that do not reach a strip are excluded before the loop.
+// This code is for software adapters, whose lanes read memory one after another, while a shuffle is one instruction.
+// Each lane therefore reads one splat of eight and shares it by shuffles. On these adapters, a branch executes both of
+// its sides, and only loops end early. Splats that do not reach a strip are therefore excluded before the loop.
 
 const LANES = 8u;
 const N_STRIPS = 8u;
@@ -17,8 +17,8 @@ fn strip_px(strip: u32, lane: u32) -> vec2u {
     return vec2u((lane & 3u) * PX, strip * 2u + (lane >> 2u));
 }
 
-// Whether a splat may reach two rows; the pixel centers of the first row are at `top`. Exact except for a margin that
-// exceeds the rounding error of c - b b / a.
+// Whether a splat may reach two rows; the pixel centers of the first row are at `top`. The result is exact except for a
+// margin that exceeds the rounding error of c - b b / a.
 fn reaches_strip(position: vec4f, conic: vec4f, top: f32) -> bool {
     let dy = max(max(top - position.y, position.y - (top + 1.0)), 0.0);
     let min_distance = (conic.z - conic.y * conic.y / conic.x - 1e-5 * conic.z) * dy * dy;
@@ -46,7 +46,7 @@ fn queue_entries(lane: u32, next: u32, tile: Tile) -> vec2u {
     while word * 32u < tile.end && n + LANES * 32u <= QUEUE {
         var bits = entries_of(tile, word + lane);
         let n_mine = countOneBits(bits);
-        // The prefix sum over the lanes, by doubling.
+        // This loop computes the prefix sum over the lanes by doubling the distance.
         var upto = n_mine;
         for (var stride = 1u; stride < LANES; stride *= 2u) {
             let below = subgroupShuffle(upto, max(lane, stride) - stride);

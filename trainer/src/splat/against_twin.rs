@@ -23,8 +23,8 @@ use nalgebra::Vector3;
 use numbers::f32_of;
 use std::sync::Arc;
 
-/// Colors are near 1 and f32 has 24 bits of precision; sums of a few dozen terms and `exp` lose a
-/// few bits.
+/// Colors are near 1, and f32 has 24 bits of precision. Sums of a few dozen terms and `exp` lose a
+/// few of these bits.
 const COLOR_ABS: f64 = 2e-5;
 /// Gradients are f32 sums over hundreds of pixels.
 const GRADIENT_REL: f64 = 2e-3;
@@ -247,7 +247,7 @@ fn pictures_with_dropped_splats_match_the_twin() {
     const SEED: u32 = 7;
     let view = scene::tilted_view();
     let mut splats = scene::small_scene(1, 40);
-    // At most 0.62, so that the raised opacity stays below 1.
+    // Opacities are at most 0.62, so that the raised opacity stays below 1.
     splats
         .iter_mut()
         .for_each(|splat| splat.opacity_logit = splat.opacity_logit.min(0.5));
@@ -391,7 +391,7 @@ fn long_lists(n: usize, log_scale: f64, opacity_logit: f64) -> (View, Vec<Splat>
     let world_from_camera = view.camera_from_world.inverse();
     let mut splats = scene::small_scene(5, n);
     for (ix, splat) in splats.iter_mut().enumerate() {
-        // Depths that differ, in an order unlike that of the indices.
+        // The depths differ, and their order is unlike the order of the indices.
         let z = 1.5 + 0.0025 * (ix * 149 % n) as f64;
         splat.mean = (world_from_camera * nalgebra::Point3::new(splat.mean[0], splat.mean[1], z))
             .coords
@@ -535,7 +535,7 @@ fn check_gradients(
         upstream,
         weights.background_rgb,
     );
-    // The loss first: an error there would appear in all gradients.
+    // The loss is compared first, because an error in it would appear in all gradients.
     let n = target.rgb.len();
     let param_values: Vec<[f32; 4]> = gpu.read(&fixture.image_buffers.upstream, n).unwrap();
     let mut mismatches = Mismatches::default();
@@ -575,8 +575,8 @@ fn largest(splats: &[Splat], of: fn(&Splat) -> Vec<f64>) -> f64 {
         .fold(1e-12f64, |max, value| max.max(value.abs()))
 }
 
-/// Compares the gradients of all splats, relative to the largest gradient of the same kind: small
-/// ones are differences of large sums.
+/// Compares the gradients of all splats, relative to the largest gradient of the same kind, because
+/// small gradients are differences of large sums.
 fn check_splat_gradients(got: &SplatArrays, expected: &[Splat]) {
     let mut mismatches = Mismatches::default();
     let mean = largest(expected, |splat| splat.mean.to_vec());
@@ -666,7 +666,7 @@ fn check_camera_gradients(
     background_rgb: [f64; 3],
 ) {
     const STEP: f64 = 1e-5;
-    // Decisions stay fixed: a splat that appears or vanishes would make the differences jump.
+    // Decisions stay fixed, because the differences would jump if a splat appeared or vanished.
     let decisions = reference::decide(view, splats);
     let loss_of =
         |changed: &View| upstream.dot(&reference::render_decided(changed, splats, &decisions));
@@ -693,8 +693,8 @@ fn check_camera_gradients(
         }));
     }
     let image = reference::render_decided(view, splats, &decisions);
-    // A gain multiplies the picture including its background, so the derivative with respect to its
-    // logarithm at 0 is the picture.
+    // A gain multiplies the picture including its background. The derivative with respect to the
+    // logarithm of the gain, at 0, is therefore the picture itself.
     for channel in 0..3 {
         let picture = |pixel: usize| {
             image.rgb[pixel][channel] + image.transmittance[pixel] * background_rgb[channel]

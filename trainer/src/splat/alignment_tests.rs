@@ -73,8 +73,8 @@ fn wrong_extrinsics_are_corrected_and_resuming_is_exact() {
     );
     train_to(&mut uninterrupted, ALIGNMENT_STEP + 10);
 
-    // Interrupt training before and after the alignment is applied. Stored keyframes are not in the
-    // order of arrival.
+    // The test interrupts training before and after the alignment is applied. Stored keyframes are
+    // not in the order of arrival.
     let mut stored = keyframes.clone();
     stored.reverse();
     let mut interrupted = new_model(&gpu, &keyframes);

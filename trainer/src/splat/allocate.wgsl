@@ -31,7 +31,7 @@ fn main(@builtin(local_invocation_index) lane: u32) {
         status[NEED_ENTRIES] = max(status[NEED_ENTRIES], n_entries);
         status[NEED_SLOTS] = max(status[NEED_SLOTS], n_slots);
         let fits = n_entries <= capacity.n_entries && (n_slots <= capacity.n_slots || capacity.n_slots == 0u);
-        status[FURTHEST] = 0u; // Reset for the next view; this one is sorted already.
+        status[FURTHEST] = 0u; // This is reset for the next view, because this view is sorted already.
         status[NEAREST] = 0u;
         status[N_SLOTS] = n_slots;
         segment_counts[0] = 0u;

@@ -1,16 +1,16 @@
 //! Detects that exposure or white balance changes during a live run.
 //!
 //! Each training keyframe is compared with a rendered picture when it arrives, before the model is
-//! trained on it: without gains, and with the gains of the previous keyframe of its camera. If the
-//! camera changes its exposure, in a step or slowly, then the previous gains predict those of the
-//! next keyframes better than no gains do.
+//! trained on it. The comparison is made without gains, and with the gains of the previous keyframe
+//! of its camera. If the camera changes its exposure, abruptly or slowly, the previous gains
+//! predict the next keyframes better than no gains.
 
 use calibration::{Candidate, MIN_VALIDATION_IMAGES, ParamSet, Trial};
 use serde::{Deserialize, Serialize};
 use std::collections::{BTreeMap, VecDeque};
 
-/// Number of latest keyframes that a decision is based on. More of them delay the detection of a
-/// change. Fewer let a single outlier decide.
+/// Number of latest keyframes that a decision is based on. With more keyframes, a change is
+/// detected later. With fewer, a single outlier could decide.
 const MAX_SCORED: usize = 8;
 /// Minimum mean gain, dB. Smaller gains may come from areas that the model does not show yet.
 const MIN_MEAN_GAIN_DB: f64 = 1.0;
@@ -40,8 +40,8 @@ impl ArrivalGains {
         log_gains: [f64; 3],
         psnr: impl Fn([f64; 3]) -> Option<f64>,
     ) -> Option<Trial> {
-        // Gains that were fitted to different content say nothing about the exposure, so they must
-        // not predict the next keyframe, either.
+        // Gains that were fitted to different content do not depend on the exposure, so they must
+        // not predict the next keyframe either.
         if psnr(log_gains.map(f64::exp))? < MIN_PSNR_DB {
             return None;
         }

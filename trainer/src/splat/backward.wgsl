@@ -92,10 +92,10 @@ fn write_hidden(lane: u32, segment: u32) {
 
 fn backward(workgroup: u32, lane: u32) {
     let n_tiles = view.n_tiles.x * view.n_tiles.y;
-    let hidden = workgroup - n_tiles - capacity.n_segments; // Wraps around for segments that are not hidden.
+    let hidden = workgroup - n_tiles - capacity.n_segments; // The number wraps around for segments that are not hidden.
     if workgroup >= n_tiles + capacity.n_segments {
         if hidden < segment_counts[1] { write_hidden(lane, workgroup); }
-        return; // Allowed here: the condition is the same for all lanes.
+        return; // A return is allowed here, because the condition is the same for all lanes.
     }
     let later = select(workgroup - n_tiles, NONE, workgroup < n_tiles);
     if later != NONE && later >= segment_counts[0] { return; } // Likewise.
@@ -103,7 +103,7 @@ fn backward(workgroup: u32, lane: u32) {
         wg_tile = tile_of(segments[workgroup]);
         atomicStore(&wg_past_last, 0u);
     }
-    let tile = workgroupUniformLoad(&wg_tile); // Also orders the zeroing before the first `atomicMax`.
+    let tile = workgroupUniformLoad(&wg_tile); // This barrier also orders the zeroing before the first `atomicMax`.
     let first = tile.corner + lane_px(lane);
     let center_x = f32(first.x) + 0.5 + RAMP;
     let center_y = f32(first.y) + 0.5;

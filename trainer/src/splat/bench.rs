@@ -236,7 +236,8 @@ impl KernelBench {
             supervision: gpu.uniform_with("bench.supervision", &supervision),
             gains: gpu.storage_with("bench.gains", bytemuck::cast_slice(&[1.0f32; 4]))?,
             rule: gpu.uniform_with("bench.rule", &rule()),
-            // Two rules instead of one that is rewritten, so that no upload is part of the timing.
+            // There are two rules instead of one that is rewritten, so that no upload is part of
+            // the timing.
             rule_visible: gpu.uniform_with(
                 "bench.rule_touched",
                 &Rule {
@@ -256,7 +257,7 @@ impl KernelBench {
 
     /// Measures the required size of the intersection buffers and allocates them.
     fn size_buffers(&mut self) -> Result<(), Error> {
-        // The first pass measures the lists, the second one verifies that they fit.
+        // The first pass measures the lists. The second pass verifies that they fit.
         for _ in 0..2 {
             let mut passes = Passes::default();
             self.view_passes().draw(&mut passes, &self.draw);
@@ -396,7 +397,7 @@ impl KernelBench {
             self.gpu.wait()?;
             n_warm += 1;
         }
-        // Back to back, which includes the time for recording on the CPU.
+        // The runs follow each other without a pause, so the time includes recording on the CPU.
         let since = Instant::now();
         for _ in 0..repeats.n_consecutive {
             record(self, passes)?;
@@ -404,7 +405,8 @@ impl KernelBench {
         }
         self.gpu.wait()?;
         let consecutive_millis = since.elapsed().as_secs_f64() * 1e3 / repeats.n_consecutive as f64;
-        // One by one, with timestamps on the GPU. The median ignores runs that other work delayed.
+        // These runs are timed one by one, with timestamps on the GPU. The median ignores runs that
+        // other work delayed.
         let mut spans = Vec::new();
         for _ in 0..repeats.n_timed {
             record(self, passes)?;

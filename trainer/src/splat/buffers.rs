@@ -78,12 +78,13 @@ impl SplatBuffers {
             active_degree: sh_degree,
             is_antialiased: false,
             model: gpu.uniform_with("splat.model", &sizes),
-            // `vec4f` per splat: a `vec3f` takes as much space in a storage buffer. The fourth
-            // component of a shape is the opacity logit.
+            // There is a `vec4f` per splat, because a `vec3f` takes the same space in a storage
+            // buffer. The fourth component of a shape is the opacity logit.
             means: gpu.storage("splat.means", 16 * n)?,
             rotations: gpu.storage("splat.rotations", 16 * n)?,
             shapes: gpu.storage("splat.shapes", 16 * n)?,
-            // One plane per color coefficient: neighboring lanes read neighboring words.
+            // There is one plane per color coefficient, so that neighboring lanes read neighboring
+            // words.
             sh_dc: gpu.storage("splat.sh_dc", 12 * n)?,
             sh_rest: gpu.storage("splat.sh_rest", 4 * rest * n)?,
             // First and second moments of means, rotations and shapes: 2 x 3 `vec4f`.
@@ -113,7 +114,7 @@ impl SplatBuffers {
         for ((from, n_planes, bytes), (to, n_planes_to, _)) in
             self.planes().iter().zip(larger.planes())
         {
-            // A lower degree has fewer planes of higher coefficients; they come last.
+            // A lower degree has fewer planes of higher coefficients, which are the last planes.
             for plane in 0..u64::from(*n_planes.min(&n_planes_to)) {
                 copies.copy(
                     (from, plane * stride_from * bytes),
@@ -326,7 +327,7 @@ impl PendingSplats {
         let dc: Vec<f32> = self.dc.finish(gpu)?;
         let rest: Vec<f32> = self.rest.map_or(Ok(Vec::new()), |rest| rest.finish(gpu))?;
         let n_coeffs = (sh_degree as usize + 1).pow(2);
-        // Planes on the GPU, but splat by splat in host memory.
+        // The coefficients are stored in planes on the GPU, but splat by splat in host memory.
         let mut sh = Vec::with_capacity(n * n_coeffs);
         for ix in 0..n {
             sh.push([0, 1, 2].map(|channel| dc[channel * stride + ix]));
@@ -361,7 +362,7 @@ fn plane_of(arrays: &SplatArrays, function: usize, channel: usize) -> Vec<f32> {
 pub(crate) struct Scratch {
     pub(crate) n_entries: u32,
     pub(crate) capacity: Buffer,
-    /// The same without slots, so that pictures need no memory for gradients.
+    /// The same capacity without slots, so that pictures need no memory for gradients.
     pub(crate) capacity_for_drawing: Buffer,
     pub(crate) projected_splats: Buffer,
     pub(crate) tile_counts: Buffer,
@@ -425,7 +426,7 @@ impl Scratch {
             16 * (u64::from(n_segments[0]) + u64::from(n_segments[1]) + u64::from(n_of_tiles));
         // A float for each part of the state of each pixel of a tile.
         let state_bytes = u64::from(4 * N_STATE_PARTS * 2 * STATE_PAIRS);
-        // In u64, because the product can exceed 32 bits.
+        // The product is computed in u64, because it can exceed 32 bits.
         let per_bin =
             |name: &str, n: u32| gpu.storage(name, 4 * u64::from(n_bins) * u64::from(n.max(1)));
         let capacity = Capacity {
@@ -444,7 +445,7 @@ impl Scratch {
                     ..capacity
                 },
             ),
-            // Per splat: what `project` and `count_bins` compute.
+            // Results of `project` and `count_bins` for each splat.
             projected_splats: gpu.storage("splat.projected_splats", 48 * u64::from(n_splats))?,
             tile_counts: words("splat.tile_counts", n_splats)?,
             touched: gpu.storage("splat.touched", 12 * u64::from(n_splats))?,
@@ -458,8 +459,8 @@ impl Scratch {
                 status::N_SPLATS,
                 status::FURTHEST,
             )?,
-            // Counts that become offsets. Two levels, because summing thousands of blocks one by
-            // one would take too long.
+            // Counts that are turned into offsets. There are two levels, because summing thousands
+            // of blocks one by one would take too long.
             bin_counts: per_bin("splat.bin_counts", n_blocks)?,
             group_counts: per_bin("splat.group_counts", n_blocks.div_ceil(GROUP))?,
             bin_totals: words("splat.bin_totals", n_bins)?,
@@ -470,8 +471,8 @@ impl Scratch {
                 "splat.tile_bits",
                 64 * u64::from(n_entries.div_ceil(32).max(1)),
             )?,
-            // The largest buffer: the gradient of every intersection has its own slot, so that sums
-            // have a fixed order.
+            // This is the largest buffer. The gradient of every intersection has its own slot, so
+            // that sums have a fixed order.
             gradients: gpu.storage("splat.gradients", 48 * u64::from(n_slots))?,
             camera_sums: gpu.storage(
                 "splat.camera_sums",
@@ -537,12 +538,12 @@ impl ImageBuffers {
         Ok(Self {
             n_pixels,
             n_tiles,
-            // Composited in f32, for the gradients: color with transmittance, depth, and the last
-            // splat that contributes.
+            // These buffers are composited in f32, for the gradients. They contain color with
+            // transmittance, depth, and the last splat that contributes.
             image: each("splat.image", 16)?,
             depth: each("splat.depth", 4)?,
             last: each("splat.last", 4)?,
-            // Packed for display and scores.
+            // These buffers are packed for display and scores.
             pixels: each("splat.pixels", 4)?,
             depths: each("splat.depths", 4)?,
             // Four u32 per color and workgroup of 256 pixels.

@@ -35,8 +35,8 @@ fn image_mask(set: ParamSet) -> u32 {
 
 /// Index of the first gain among the parameters, as in `shared/camera_params.wgsl`.
 const LOG_GAIN: u32 = 11;
-/// Initial learning rate of rotations, radians per step. All other rates are derived from it.
-/// Larger rates find large errors sooner, but let cameras follow the noise of single images.
+/// Initial learning rate of rotations, radians per step. All other rates are derived from it. With
+/// larger rates, large errors are corrected sooner, but cameras follow the noise of single images.
 const ROTATION_RATE: f64 = 1e-3;
 /// Fraction of the learning rates that remains after the planned steps, as for the means of splats.
 const FINAL_FRAC: f64 = 0.01;
@@ -177,7 +177,8 @@ impl CameraParams {
         self.n_used += 1;
         let bytes = SLOT_BYTES * u64::from(self.n_used);
         if bytes > self.params.bytes() {
-            // Twice the need, so that the buffer is copied rarely while images arrive.
+            // The new buffer has twice the required size, so that it is rarely copied while images
+            // arrive.
             let larger = gpu.storage("splat.camera_params", 2 * bytes)?;
             gpu.copy((&self.params, 0), (&larger, 0), self.params.bytes());
             self.params = larger;
@@ -192,13 +193,13 @@ impl CameraParams {
             camera_mask: camera_mask(self.set),
             image_mask: image_mask(self.set),
             rotation_rate: f32_of(rate),
-            // At the distance of the scene, a translation then moves the image as much as a
-            // rotation does.
+            // With this rate, a translation moves the image by the same amount as a rotation, at
+            // the distance of the scene.
             translation_rate_m: f32_of(rate * scene_size_m),
             time_offset_rate: f32_of(rate),
             focal_rate: f32_of(rate),
-            // Exposure can change by a factor of two between two images, so its logarithm has
-            // farther to go.
+            // Exposure can change by a factor of two between two images, so its logarithm needs
+            // larger steps.
             gain_rate: f32_of(10.0 * rate),
             image_decay: f32_of(IMAGE_DECAY),
         };
@@ -291,8 +292,8 @@ impl CameraParams {
             .0
             .values()
             .flat_map(|(camera, images)| std::iter::once(camera).chain(images.values()));
-        // Distinct slots need at least as many numbers. A shared slot would let two cameras change
-        // each other's parameters.
+        // All slots must be distinct, because two cameras with the same slot would change each
+        // other's parameters. There must be at least as many slot numbers as slots.
         self.n_used = all.map(|slot| slot + 1).max().unwrap_or(0);
         if (self.n_used as usize) < n_slots {
             return Err(Error::CheckpointState {
@@ -358,7 +359,7 @@ impl Slots {
 
 /// The parameters of all slots, in host memory.
 struct ParamValues {
-    /// Each with its value first, followed by the state of the optimizer.
+    /// Each parameter has its value first, followed by the state of the optimizer.
     params: Vec<[f32; 4]>,
     /// The optimized parameters.
     set: ParamSet,

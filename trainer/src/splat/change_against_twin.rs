@@ -81,7 +81,8 @@ fn check(got: &[Splat], expected: &[Splat], tolerances: [f64; 5]) {
     mismatches.assert_none();
 }
 
-/// Large enough that a step depends on the magnitude of a gradient, not only on its sign.
+/// The value is large enough that a step depends on the magnitude of a gradient, and not only on
+/// its sign.
 const EPSILON: f32 = 1e-4;
 const RULE: Rule = Rule {
     mean_rate_m: 1e-2,
@@ -109,7 +110,7 @@ fn optimizer_steps_match_the_twin() {
     const N_STEPS: u32 = 3;
     let view = scene::rolling_view();
     let mut splats = full_degree_scene(7, 40);
-    splats[3].opacity_logit = -5.5; // Barely visible: noise moves it.
+    splats[3].opacity_logit = -5.5; // Barely visible, so noise moves it.
     splats = splats_of(&arrays_of(&splats));
     let fixture = KernelFixture::new(&GpuOptions::default(), &view, &arrays_of(&splats));
     let gpu = &fixture.gpu;
@@ -294,7 +295,7 @@ fn growth_matches_the_twin() {
 #[test]
 fn dead_splats_have_no_children() {
     const N_BEFORE: u32 = 60_000;
-    const N_AFTER: u32 = 1_200_000; // Rounding selects a dead splat in a few of a million choices.
+    const N_AFTER: u32 = 1_200_000; // A few of a million choices hit a dead splat.
     let mut random = scene::F32Random::new(12);
     let n = N_BEFORE as usize;
     let is_dead: Vec<bool> = (0..n).map(|_| random.uniform(0.0, 1.0) < 0.5).collect();
@@ -372,8 +373,8 @@ fn squared_distance(position: &[f32; 4], conic: &[f32; 4], pixel: [u32; 2]) -> f
 /// the tile.
 #[test]
 fn tile_lists_are_complete_and_depth_ordered() {
-    /// Within this difference from the threshold (a squared Mahalanobis distance), f32 may decide
-    /// either way.
+    /// If the difference from the threshold (a squared Mahalanobis distance) is smaller than this,
+    /// f32 may decide either way.
     const MARGIN: f64 = 1e-3;
     let view = scene::tilted_view();
     let splats = full_degree_scene(10, 300);

@@ -9,8 +9,8 @@ use keyframe::Keyframe;
 use model_files::checkpoint::Checkpoint;
 use std::sync::Arc;
 
-/// Steps at which training stops: before the first change of splat count and SH degree, and between
-/// later changes.
+/// Steps at which training stops. They are before the first change of splat count and SH degree,
+/// and between later changes.
 const STOPS: [u64; 3] = [7, 230, 310];
 const END: u64 = 340;
 

@@ -2,7 +2,8 @@
 // after `project`, and only if there is a crop box or anything is erased.
 //
 // Boxes cut splats pixel by pixel, because a long splat with its center inside a box can reach far beyond it. Erased
-// cells hide a splat as a whole if they contain its center: they are parts of the model that were found by centers.
+// cells hide a whole splat if they contain its center. This is correct because the cells were also determined from the
+// centers of splats.
 //
 // threads   one per splat
 // reads     view, model, means, rotations, shapes, projected_splats, erased
@@ -33,14 +34,16 @@ const OUTSIDE = 0u;
 const CUT = 1u;
 const INSIDE = 2u;
 
-// Relation of the drawn part of a splat, within `half_extent` of its center along the axes of a box, to that box.
+// Relation of the drawn part of a splat to a box. The drawn part extends by `half_extent` from the center of the splat
+// along the axes of the box.
 fn relation(center: vec3f, half_extent: vec3f, low: vec3f, high: vec3f) -> u32 {
     if any(center + half_extent < low) || any(center - half_extent > high) { return OUTSIDE; }
     if all(center - half_extent >= low) && all(center + half_extent <= high) { return INSIDE; }
     return CUT;
 }
 
-// Half extent along the axes of a box of an ellipsoid; the columns of `axes` are its half axes in world.
+// Half extent of an ellipsoid along the axes of a box. The columns of `axes` are the half axes of the ellipsoid in
+// world.
 fn half_extent(row_0: vec4f, row_1: vec4f, row_2: vec4f, axes: mat3x3f) -> vec3f {
     return vec3f(length(row_0.xyz * axes), length(row_1.xyz * axes), length(row_2.xyz * axes));
 }
@@ -85,8 +88,9 @@ fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u,
     let scale = projection.scale;
     let axes = mat3x3f(rotation[0] * scale.x, rotation[1] * scale.y, rotation[2] * scale.z);
     let conic = projected_splats[splat_ix].conic;
-    // The conditional mean given the pixel: covariance of point and pixel times the inverse covariance of the pixel. With
-    // the low-pass in the latter, the point stays within the ellipsoid in which the splat is drawn.
+    // The conditional mean given the pixel follows from the covariance of point and pixel times the inverse covariance
+    // of the pixel. The covariance of the pixel includes the low-pass, so the point stays within the ellipsoid in which
+    // the splat is drawn.
     let with_x = axes * (projection.jacobian_x * projection.axes);
     let with_y = axes * (projection.jacobian_y * projection.axes);
     var clip = Clip(mean, 0u, with_x * conic.x + with_y * conic.y, 0u, with_x * conic.y + with_y * conic.z, 0u);

@@ -15,8 +15,8 @@ use model_files::{Aabb, Edits};
 use nalgebra::Vector3;
 use std::sync::Arc;
 
-/// Closer than this to a side of a box, meters, f32 and f64 may decide differently. The scene has
-/// coordinates of about 1 m.
+/// Distance from a side of a box, meters, below which f32 and f64 may decide differently. The scene
+/// has coordinates of about 1 m.
 const MARGIN_M: f64 = 1e-4;
 
 /// A rotated box in the middle of [`scene::small_scene`].
@@ -67,7 +67,7 @@ fn edits_of(edits: impl IntoIterator<Item = Edit>) -> Edits {
 }
 
 fn clippings(splats: &[Splat]) -> Vec<Clipping> {
-    // Bits of the second word of boxes.
+    // This number of boxes also uses bits of the second word.
     let many = (0..MAX_EDITS - 2).map(|ix| Edit::Box(empty_box(ix)));
     let last = [Edit::Box(other_box()), Edit::Box(middle_box())];
     let boxes = [Edit::Box(middle_box()), Edit::Box(other_box())];

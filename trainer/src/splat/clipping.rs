@@ -63,7 +63,8 @@ impl Clipper {
         let clips = match self.clips.take().filter(|clips| clips.bytes() >= n_bytes) {
             Some(clips) => clips,
             None => {
-                // Cached bindings hold the previous buffer, which would not be freed.
+                // Cached bindings hold the previous buffer. Without this call, it would not be
+                // freed.
                 passes.clear_bindings();
                 gpu.storage("splat.clips", n_bytes)?
             }

@@ -109,7 +109,7 @@ fn pictures_lack_erased_space_until_the_edit_is_undone() {
     let two = edits_of([erased_box([1.0, 0.0, 5.5]), erased_box([-2.0, 0.5, 5.0])]);
     let mut n_before = n_uncovered(&whole);
     for edits in [&one, &two] {
-        // Splats that no box cuts are drawn as in a model that has only them.
+        // Splats that no box cuts are drawn as in a model that has only these splats.
         let left = arrays.clone().without_hidden(edits);
         assert!(
             left.n_splats() < arrays.n_splats() && left.n_splats() > 300,
@@ -176,7 +176,8 @@ fn boxes_cut_splats_where_they_leave_them() {
         let differences = of_part.iter().zip(pixel).map(|(a, b)| a.abs_diff(*b));
         assert!(differences.max() <= Some(1), "pixel {ix}");
     }
-    // The needle is about 3.3 standard deviations of 0.6 m long on each side, the box 0.4 m.
+    // On each side, the needle is about 3.3 standard deviations of 0.6 m long, and the box is 0.4 m
+    // long.
     let [n_inside, n_outside] = n_of_parts;
     assert!(
         n_inside > 10 && n_outside > n_inside,
@@ -303,7 +304,7 @@ fn floaters_are_found_and_the_rest_is_kept() {
 
 #[test]
 fn background_far_away_is_not_a_floater() {
-    // A few large splats at ten times the radius of the scene, as of a sky.
+    // A few large splats are at ten times the radius of the scene, like the splats of a sky.
     const FACTOR: f32 = 10.0;
     let mut arrays = scene();
     for ix in (0..arrays.n_splats()).step_by(8) {

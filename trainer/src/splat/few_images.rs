@@ -5,17 +5,18 @@ use super::options::SplatOptions;
 use super::params::Supervision;
 use numbers::f32_of;
 
-/// From this number of images on, models are not regularized, and the number of splats is limited
-/// only by the options.
+/// With this number of images or more, models are not regularized, and the number of splats is
+/// limited only by the options.
 ///
 /// The measured data sets with few images have 6 to 36 of them, those with many 43 and more
 /// (docs/benchmarks/2026-11-25-few-images.md).
 pub(crate) const FEW_IMAGES: usize = 40;
 /// Maximum number of splats per image if there are few images.
 ///
-/// More splats overfit: beyond some number, other views score worse while the training images still
-/// score better. On eleven sets of 6 to 43 images, half as many cost 0.2 dB on average, and four
-/// times as many raised the depth error (docs/benchmarks/2026-11-29-number-of-splats.md).
+/// More splats overfit: beyond some number, other views score worse although the training images
+/// still score better. On eleven sets of 6 to 43 images, half as many splats reduced the score by
+/// 0.2 dB on average, and four times as many raised the depth error
+/// (docs/benchmarks/2026-11-29-number-of-splats.md).
 const MAX_SPLATS_PER_IMAGE: u32 = 8000;
 /// Up to this number of images, the regularization is complete. The changes were measured with 6
 /// and 11 images (docs/benchmarks/2026-11-25-few-images.md).
@@ -50,8 +51,8 @@ pub(crate) struct Scarcity(f64);
 impl Scarcity {
     /// Scarcity for `n` images, counting validation images.
     pub(crate) fn of_images(n: usize) -> Self {
-        // Linear between the two numbers, so that a single new image never changes the training
-        // much.
+        // The scarcity is linear between the two numbers, so that a single new image never changes
+        // the training much.
         let missing = FEW_IMAGES.saturating_sub(n) as f64 / (FEW_IMAGES - VERY_FEW_IMAGES) as f64;
         Self(missing.min(1.0))
     }
@@ -91,7 +92,7 @@ impl Scarcity {
     }
 
     /// Lower end of the random background's range of colors during training. With few images, the
-    /// range is centered at the mean color, as far as it fits into 0 to 1; with many images, it
+    /// range is centered at the mean color as far as it fits into 0 to 1. With many images, it
     /// begins at black.
     fn min_background_srgb(self, mean_srgb: [f32; 3], range: f64) -> [f32; 3] {
         // The random color is this minimum plus up to `range`.

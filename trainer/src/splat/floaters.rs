@@ -13,9 +13,9 @@ use model_files::splat::arrays::SplatArrays;
 use nalgebra::{Quaternion, UnitQuaternion, Vector3};
 use numbers::f32_of;
 
-/// Cells along an axis: cells within the radius of the scene are 2 % of it wide. Smaller cells
-/// separate parts that are only loosely connected, such as thin objects. Larger ones join floaters
-/// to nearby surfaces.
+/// Number of cells along an axis. Within the radius of the scene, the width of a cell is 2 % of the
+/// radius. Smaller cells would separate parts that are only loosely connected, such as thin
+/// objects. Larger cells would join floaters to nearby surfaces.
 const N_CELLS: u32 = 200;
 /// Sum of opacities above which a cell is occupied.
 const MIN_CELL_OPACITY: f32 = 0.5;
@@ -60,21 +60,22 @@ pub(super) fn floaters(splats: &SplatArrays) -> Option<Floaters> {
     })
 }
 
-/// The occupied cells, and the cells that opaque splats connect: large splats cover cells between
-/// their points, too.
+/// The occupied cells, and the cells that opaque splats connect. Large splats also cover cells
+/// between their points.
 fn occupied(splats: &SplatArrays, visible: &[usize], grid: &CellGrid) -> (CellMask, Groups) {
     let steps: Vec<[f64; 3]> = visible
         .iter()
         .map(|ix| n_steps(splats, *ix, grid))
         .collect();
-    // Large models with many large splats would take minutes. Coarser sampling of the largest
-    // splats loses least, because they still have many points.
+    // Large models with many large splats would take minutes. The largest splats are therefore
+    // sampled more coarsely, which loses least, because they still have many points.
     let mut max_samples = MAX_SAMPLES;
     while max_samples > 1.0 && n_samples_of_all(&steps, max_samples) > MAX_TOTAL_SAMPLES {
         max_samples /= 2.0;
     }
     let mut opacities = vec![0.0_f32; grid.n()];
-    // The last splat that covers a cell, counted from 1: each splat counts once.
+    // The last splat that covers each cell, counted from 1. With it, each splat counts only once
+    // per cell.
     let mut last_splat = vec![0_u32; grid.n()];
     let mut connected = Groups::new(grid.n());
     for (number, (&ix, steps)) in (1..).zip(visible.iter().zip(&steps)) {
@@ -82,8 +83,8 @@ fn occupied(splats: &SplatArrays, visible: &[usize], grid: &CellGrid) -> (CellMa
         let center = grid.cell_at(splats.means[ix].map(f64::from));
         for (point_m, falloff) in samples(splats, ix, &limited(steps, max_samples)) {
             let cell = grid.cell_at(point_m);
-            // The points nearest to the center come first, so a cell gets the highest opacity of
-            // its points. Several points in one cell must not add up.
+            // The points nearest to the center come first, so a cell gets the highest opacity of a
+            // splat's points in it. Several points of the same splat in one cell must not add up.
             if std::mem::replace(&mut last_splat[cell as usize], number) != number {
                 opacities[cell as usize] += f32_of(falloff * opacity);
                 // A faint splat that spans a gap, such as haze, must not connect both sides.
@@ -125,8 +126,8 @@ fn n_samples_of_all(steps: &[[f64; 3]], max: f64) -> f64 {
 
 /// The steps of a splat, fewer if it has more than `max_samples` points.
 fn limited(steps: &[f64; 3], max_samples: f64) -> [f64; 3] {
-    // The excess is divided evenly among the axes along which the splat extends beyond a cell: a
-    // flat splat has only two of them, and needs the square root.
+    // The excess is divided evenly among the axes along which the splat extends beyond a cell. For
+    // example, a flat splat has only two of these axes and needs the square root.
     let n_axes = steps.iter().filter(|n| **n > 0.0).count().max(1);
     let factor = (max_samples / n_samples(steps))
         .min(1.0)

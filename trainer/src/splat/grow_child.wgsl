@@ -6,8 +6,8 @@
 //           caller), parents [n_after]
 //
 // Dead splats have weight zero and cannot be parents. A child is therefore never a parent, and no thread reads values
-// that another thread writes. In one or two choices per million, rounding of the sums selects a splat of weight zero.
-// Such a choice is discarded.
+// that another thread writes. In one or two choices per million, rounding errors of the sums select a splat of weight
+// zero. Such a choice is discarded.
 
 #import view
 #import growth
@@ -39,7 +39,7 @@ fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u,
     let n_blocks = (growth.n_before + 255u) / 256u;
     let total = block_weights[n_blocks - 1u];
     let threshold = uniform3(vec3u(child, growth.key, 7u)).x * total;
-    // Find the first block, then the first splat, whose cumulative sum exceeds the threshold.
+    // These searches find the first block, and then the first splat, whose cumulative sum exceeds the threshold.
     var low = 0u;
     var high = n_blocks - 1u;
     while low < high {

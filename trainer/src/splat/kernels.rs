@@ -172,8 +172,9 @@ struct Blend {
 
 fn blend(gpu: &Gpu) -> Blend {
     match gpu.optional().subgroup_lanes {
-        // Software adapters: no GPU has subgroups of exactly 8 lanes. Their lanes read memory one
-        // after the other, so few lanes per tile are faster.
+        // This variant is for software adapters, because no GPU has subgroups of exactly 8 lanes.
+        // The lanes of these adapters read memory one after the other, so few lanes per tile are
+        // faster.
         Some(8) => Blend {
             rasterize: kernel!("rasterize_strips", BLEND_STRIPS),
             rasterize_clipped: kernel!("rasterize_strips", BLEND_STRIPS_CLIPPED),
@@ -239,11 +240,11 @@ pub(crate) const KERNELS: &[Kernel] = &[
     kernel!("gather"),
 ];
 
-/// Creates `Self` from fields that are computed as given, and from pipelines, which are compiled in
-/// parallel to them.
+/// Creates `Self` from given fields and from pipelines. The pipelines are compiled while the fields
+/// are computed.
 macro_rules! compile {
     ($gpu:expr, { $($given:ident: $value:expr),* $(,)? }, { $($field:ident: $kernel:expr, $overrides:expr);* $(;)? }) => {{
-        // The values may contain `?`, which needs a closure of its own. Both sides compile for
+        // The values may contain `?`, so they are in their own closure. Both sides compile for
         // seconds, so they run in parallel.
         let others = || -> Result<_, Error> { Ok(($($value),*)) };
         let compile = || Pipeline::compile_all($gpu, [$(($kernel, &$overrides[..])),*]);
@@ -368,7 +369,8 @@ pub(crate) struct TrainPipelines {
 impl TrainPipelines {
     pub(crate) fn new(gpu: &Gpu) -> Result<Self, Error> {
         let blend = blend(gpu);
-        // A constant of the kernel, so that the compiler unrolls the sums over a subgroup.
+        // The number of lanes is a constant of the kernel, so that the compiler unrolls the sums
+        // over a subgroup.
         let lanes: Vec<_> = blend
             .subgroup
             .map(|lanes| ("SUBGROUP", f64::from(lanes)))

@@ -15,9 +15,9 @@ pub(crate) fn mean_spacings_m(points: &[[f32; 3]]) -> Vec<Option<f64>> {
         .collect()
 }
 
-/// A balanced tree, stored as an order of the points. In each range of `order`, the middle point
-/// separates points with smaller coordinates along one axis from points with larger ones. The axes
-/// alternate.
+/// A balanced tree, represented by the order of the points. In each range of `order`, the middle
+/// point separates points with smaller coordinates along one axis from points with larger ones. The
+/// axes alternate.
 struct Tree<'a> {
     points: &'a [[f32; 3]],
     /// Indices of the points.
@@ -38,7 +38,7 @@ impl<'a> Tree<'a> {
         self.search(&self.order, 0, from, &mut nearest);
         let distances: Vec<f64> = nearest
             .into_iter()
-            // With fewer than four points, some places remain at infinity.
+            // With fewer than four points, some of the distances remain infinite.
             .filter(|squared| squared.is_finite())
             .map(f64::sqrt)
             .collect();
@@ -53,15 +53,15 @@ impl<'a> Tree<'a> {
         let point = &self.points[*ix as usize];
         let offset = |axis: usize| f64::from(from[axis]) - f64::from(point[axis]);
         let squared: f64 = (0..3).map(|axis| offset(axis) * offset(axis)).sum();
-        // A distance of zero is that of the point to itself.
+        // A distance of zero means that a point is compared with itself.
         if squared > 0.0 && squared < nearest[N_NEAREST - 1] {
             nearest[N_NEAREST - 1] = squared;
             nearest.sort_unstable_by(f64::total_cmp);
         }
         let smaller = &range[..middle];
         let larger = &range[middle + 1..];
-        // The side of the query point comes first: its points are likely to be near, and the found
-        // distances often exclude the other side.
+        // The side of the query point is searched first. Its points are likely to be near, and the
+        // distances found there often exclude the other side.
         let (near, far) = if offset(axis) < 0.0 {
             (smaller, larger)
         } else {
@@ -81,8 +81,9 @@ fn separate(points: &[[f32; 3]], range: &mut [u32], axis: usize) {
     if range.len() < 2 {
         return;
     }
-    // Selection is sufficient, because the halves need no order, and takes linear time per level.
-    // The order of equal coordinates does not matter: `search` visits both sides of them.
+    // Selection is sufficient, because the halves need not be sorted. It takes linear time per
+    // level. The order of points with equal coordinates does not matter, because `search` visits
+    // both sides.
     let middle = range.len() / 2;
     range.select_nth_unstable_by(middle, |a, b| {
         points[*a as usize][axis].total_cmp(&points[*b as usize][axis])
@@ -99,7 +100,7 @@ mod tests {
     use numbers::f32_of;
     use numbers::random::Random;
 
-    /// Relative; sums of three numbers in another order.
+    /// Relative tolerance for sums of three numbers in another order.
     const TOLERANCE: f64 = 1e-12;
 
     fn by_comparing_all(points: &[[f32; 3]], from: &[f32; 3]) -> f64 {

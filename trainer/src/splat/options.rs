@@ -23,8 +23,8 @@ pub struct SplatOptions {
     /// Weight of the depth loss, per meter.
     pub depth_per_m: f64,
     /// Maximum brightness of the background. It is random in every step, which keeps dark objects
-    /// opaque. A value of 1 costs 1 dB in the first few hundred steps, while large parts of the
-    /// image are uncovered.
+    /// opaque. With a value of 1, scores are 1 dB lower in the first few hundred steps, while large
+    /// parts of the image are uncovered.
     pub random_background: f64,
     /// Determines the costs of opacity and size: `(cost_images / n_images)^2`, relative to the
     /// color loss. The fewer images there are, the more each splat must reduce the color loss to
@@ -59,12 +59,12 @@ impl Default for SplatOptions {
         Self {
             max_splats: 400_000,
             count: CountPolicy::default(),
-            // As in Kerbl et al. 2023, like the weight of D-SSIM.
+            // This value and the weight of D-SSIM are those of Kerbl et al. 2023.
             sh_degree: 3,
             dssim_frac: 0.2,
             depth_per_m: 0.1,
             random_background: 0.25,
-            // Chosen from 0, 6, 13 and 20 by the scores of three data sets
+            // The value was chosen from 0, 6, 13 and 20 by the scores of three data sets
             // (docs/benchmarks/2026-11-23-splats.md, section "Ablation").
             cost_images: 13.0,
             // Twice the fraction of 3DGS-MCMC.

@@ -76,8 +76,8 @@ pub(crate) fn grow(
     let weights = ("weights", &buffers.weights);
     let block_weights = ("block_weights", &buffers.block_weights);
     passes.clear(&buffers.n_children);
-    // Cumulative errors within blocks of 256 splats, and of the blocks, from which parents are
-    // sampled by binary search.
+    // These passes compute cumulative errors within blocks of 256 splats and over the blocks.
+    // Parents are sampled from them by binary search.
     passes.dispatch(
         gpu,
         &pipelines.grow_weigh,
@@ -93,7 +93,7 @@ pub(crate) fn grow(
         ],
     );
     passes.dispatch(gpu, &pipelines.grow_scan, 1, &[uniform, block_weights]);
-    // Every child chooses its parent, and counts itself there.
+    // Every child chooses its parent and increments the parent's number of children.
     passes.dispatch(
         gpu,
         &pipelines.grow_child,
@@ -164,8 +164,8 @@ impl ViewPasses<'_> {
     ) {
         self.list(passes, draw, &self.scratch.capacity);
         let mut buffers = self.rasterized();
-        // The segments are by-products of blending: their states are the running values at their
-        // starts.
+        // The segments are a by-product of blending. The state of a segment consists of the running
+        // values at its start.
         let rasterize = match &train.rasterize_segments {
             Some(rasterize) => {
                 buffers.extend(self.segments());
@@ -241,7 +241,7 @@ impl ViewPasses<'_> {
             ]
             .concat(),
         );
-        // A separate kernel, so that training and other pictures do not pay for it.
+        // Clipping is a separate kernel, so that it does not slow down training and other pictures.
         if let Some(clipping) = &self.clipping {
             let [means, rotations, shapes, ..] = splats.parameters();
             let [erased, clips] = clipping.buffers();
@@ -284,8 +284,9 @@ impl ViewPasses<'_> {
         let touched = ("touched", &scratch.touched);
         let slot_offsets = ("slot_offsets", &scratch.slot_offsets);
         let entries = ("entries", &scratch.entries);
-        // Count first, then emit: WebGPU guarantees no forward progress between workgroups, so a
-        // single pass in which blocks wait for their predecessors could hang.
+        // Entries are counted first and emitted later. WebGPU guarantees no forward progress
+        // between workgroups, so a single pass in which blocks wait for their predecessors could
+        // hang.
         let counted = [
             view,
             model,
@@ -299,7 +300,8 @@ impl ViewPasses<'_> {
             bin_counts,
         ];
         passes.dispatch(gpu, &pipelines.count_bins, n_blocks * n_windows, &counted);
-        // Turns the counts into offsets: groups of blocks, then all groups of a bin, then all bins.
+        // These passes turn the counts into offsets, first within groups of blocks, then over all
+        // groups of a bin, and then over all bins.
         let n_groups = n_blocks.div_ceil(u64::from(GROUP));
         passes.dispatch(
             gpu,
@@ -400,7 +402,7 @@ impl ViewPasses<'_> {
             ("target_image", target.image),
             ("gains", target.gains),
         ];
-        // Before the loss, which reads the gradients of whole windows.
+        // SSIM comes before the loss, which reads the gradients of whole windows.
         if target.ssim {
             let mut buffers = base.to_vec();
             buffers.push(("ssim_gradients", &image_buffers.ssim_gradients));

@@ -53,7 +53,7 @@ fn project(splat_ix: u32) -> u32 {
     // The remaining splats become more opaque, so that the picture keeps its mean opacity.
     let drop_frac = bitcast<f32>(atomicLoad(&status[DROP_FRAC]));
     var opacity = sigmoid(shape.w) / (1.0 - drop_frac);
-    // The low-pass enlarges the splat; a model with this flag keeps the product of opacity and area.
+    // The low-pass enlarges the splat. In a model with this flag, the product of opacity and area stays the same.
     if model.is_antialiased != 0u { opacity *= projection.compensation; }
     // These comparisons are false for NaN, so a splat with a NaN is invisible.
     let visible = projection.visible && opacity > MIN_ALPHA && projection.determinant > 0.0
@@ -88,7 +88,7 @@ fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u,
     workgroupBarrier(); // All keys are written.
     for (var stride = 128u; stride > 0u; stride /= 2u) {
         if lane < stride { wg_depth_range[lane] = max(wg_depth_range[lane], wg_depth_range[lane + stride]); }
-        workgroupBarrier(); // The lower half of the lanes holds the maxima of both halves.
+        workgroupBarrier(); // The lower half of the lanes now holds the maxima of both halves.
     }
     if lane == 0u {
         atomicMax(&status[FURTHEST], wg_depth_range[0].x);

@@ -1,11 +1,11 @@
 //! The training schedule: progress, and the steps at which the splat count and the SH degree
 //! change.
 
-/// Steps between changes of the splat count. As in Kerbl et al. 2023.
+/// Steps between changes of the splat count, as in Kerbl et al. 2023.
 ///
 /// Each change restarts Adam moments and lowers the scores for some tens of steps
-/// (docs/benchmarks/2026-11-23-splats.md). A shorter period leaves no time to recover. A longer
-/// one delays growth.
+/// (docs/benchmarks/2026-11-23-splats.md). With a shorter period, there is no time to recover. A
+/// longer period delays growth.
 pub(crate) const GROWTH_PERIOD: u64 = 100;
 /// Step of the first change of the splat count. Before it, the error sums that select parents
 /// reflect mainly the initial colors.

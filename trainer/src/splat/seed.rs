@@ -19,17 +19,17 @@ use std::sync::Arc;
 
 /// Neighboring depths that differ by more than this fraction belong to different surfaces.
 ///
-/// A smaller value also rejects oblique surfaces, whose depth changes quickly, too. A larger one
-/// seeds discs that bridge the gap between an object and its background.
+/// A smaller value would also reject oblique surfaces, because their depth changes quickly. With a
+/// larger value, discs would bridge the gap between an object and its background.
 const EDGE_FRAC: f64 = 0.04;
-/// Standard deviation of a disc, in grid spacings. Neighbors overlap without blurring: smaller
-/// discs leave gaps, larger ones blend the colors of several neighbors.
+/// Standard deviation of a disc, in grid spacings. With this value, neighbors overlap without
+/// blurring. Smaller discs leave gaps, and larger discs blend the colors of several neighbors.
 const SPREAD: f64 = 0.6;
-/// Thickness of a disc, in grid spacings. It is a quarter of [`SPREAD`]: flat, because it lies on a
-/// surface, but thick enough to be seen from the side.
+/// Thickness of a disc, in grid spacings. It is a quarter of [`SPREAD`]. The disc is flat, because
+/// it lies on a surface, but thick enough to be seen from the side.
 const THICKNESS: f64 = 0.15;
-/// A disc is known to lie on a surface, so it is mostly opaque. It stays below 1, where the
-/// gradient of the logit vanishes.
+/// A disc is known to lie on a surface, so it is mostly opaque. The opacity is below 1, because the
+/// gradient of the logit vanishes at 1.
 const SEED_OPACITY: f64 = 0.7;
 /// Number of initial splats if there is no depth.
 const N_RANDOM: usize = 50_000;
@@ -73,15 +73,15 @@ pub(crate) struct Density {
 
 /// Number of discs that an image may get even if it has few pixels.
 ///
-/// At the density of a large image, a depth image of 160 x 120 pixels would get only 400 discs, too
-/// few to show the shape of a scene.
+/// At the density of a large image, a depth image of 160 x 120 pixels would get too few discs to
+/// show the shape of a scene.
 const MIN_DISCS: f64 = 4000.0;
 
 impl Density {
     /// Distance between discs in pixels, a whole number.
     fn stride_px(self, size_px: [u32; 2]) -> f64 {
         let n_pixels = f64::from(size_px[0]) * f64::from(size_px[1]);
-        // The maximum is applied last: it also holds for small images.
+        // The maximum is applied last, because it also holds for small images.
         let n = self
             .max_discs
             .min((n_pixels / self.px_per_disc).max(MIN_DISCS));
@@ -150,7 +150,8 @@ impl Seeder {
         let [width, height] = depth.size_px;
         let at = |x: u32, y: u32| f64::from(depth.depth_m[(y * width + x) as usize]);
         let z = at(x, y);
-        // Positive comparisons, so that a NaN is rejected. At the border, neighbors are missing.
+        // The comparisons are written so that NaN is rejected. At the border, neighbors are
+        // missing.
         if !(z > 0.0 && z <= FAR_M)
             || x < stride
             || y < stride
@@ -166,7 +167,7 @@ impl Seeder {
             at(x, y + stride),
         ];
         // At depth edges, readings mix both surfaces, and the normal would be wrong. Missing
-        // neighbors are no edge, because sensors have many holes.
+        // neighbors do not count as an edge, because sensors have many holes.
         if neighbors
             .iter()
             .any(|near| (near - z).abs() > EDGE_FRAC * z && *near > 0.0)
@@ -180,8 +181,8 @@ impl Seeder {
             return None;
         }
         let color = color_at(keyframe, &position)?;
-        // A missing neighbor is assumed at the depth of the center, which turns the normal toward
-        // the camera.
+        // A missing neighbor is assumed to be at the depth of the center, which rotates the normal
+        // toward the camera.
         let filled = |near: f64| if near > 0.0 { near } else { z };
         let across = depth.point(x + stride, y, filled(neighbors[1]))
             - depth.point(x - stride, y, filled(neighbors[0]));
@@ -400,7 +401,7 @@ impl InverseDepths {
     /// Sets a cell's inverse depth unless a nearer one is known.
     fn set_nearest(&mut self, [column, row]: [usize; 2], per_m: f64) {
         let known = &mut self.per_m[row * self.n_cells[0] + column];
-        // A nearer surface hides farther ones. Its inverse depth is larger.
+        // A nearer surface hides farther surfaces, and its inverse depth is larger.
         *known = known.max(per_m);
     }
 
@@ -511,8 +512,8 @@ pub(crate) fn random_cloud(keyframes: &[&Keyframe], seed: u64, n_max: usize) -> 
     let mut random = Random::new(seed ^ 0x5eed_5eed);
     let n = N_RANDOM.min(n_max);
     for _ in 0..n {
-        // A random pixel of a random image gives a ray that is certainly in view, and a color. The
-        // product may round up to the length, hence the minimum.
+        // A random pixel of a random image gives a color, and a ray that is certainly in view. The
+        // minimum is needed because the product may round up to the number of images.
         let keyframe =
             keyframes[((random.unit() * keyframes.len() as f64) as usize).min(keyframes.len() - 1)];
         let [width, height] = keyframe.size_px;

@@ -219,8 +219,8 @@ impl SplatTrainer {
         background_srgb: [f32; 3],
         keyframe: &Keyframe,
     ) -> Result<Option<f64>, Error> {
-        // Not `wait`: a score must not be delayed by the compilation of training pipelines. The
-        // caller can score the picture on the CPU.
+        // This does not wait, because the compilation of training pipelines must not delay a score.
+        // The caller can score the picture on the CPU.
         let Some(learn) = self.training.optimizer.pipelines.ready() else {
             return Ok(None);
         };
@@ -250,8 +250,8 @@ impl Method for SplatTrainer {
         if keyframe.split == Split::Test {
             return Ok(());
         }
-        // Its seeds would not be finite, and its steps would be wasted, because non-finite
-        // gradients are dropped.
+        // A keyframe with non-finite values is dropped. Its seeds would not be finite, and its
+        // steps would be wasted, because non-finite gradients are dropped.
         if !keyframe.is_finite() {
             log::warn!(
                 "skipping the image of camera {:?} at {} ns: its pose, intrinsics or velocity is not finite",
@@ -309,7 +309,8 @@ impl Method for SplatTrainer {
         self.trial_runner().run_due()?;
         let max_splats = self.max_splats();
         self.training.grow_when_due(&learn, max_splats)?;
-        // After both, because they can change the step count and the next step with other work.
+        // The number is computed after trials and growth, because both can change the step count
+        // and the next step with other work.
         let n_left = self.trials.steps_left(self.training.schedule.step);
         let n_validation = self.trials.n_validation();
         let n_steps = self
@@ -370,8 +371,8 @@ impl Method for SplatTrainer {
         request: &RenderRequest,
         packing: Packing,
     ) -> Result<QueuedPicture, Error> {
-        // Only single views can be queued. A panorama is composed of several, so it is drawn to
-        // the end here.
+        // Only single views can be queued. A panorama is composed of several views, so it is drawn
+        // completely here.
         let Projection::Pinhole {
             focal_px,
             principal_px,
@@ -454,8 +455,8 @@ impl Method for SplatTrainer {
     /// The estimated corrections, or the loaded ones if none are estimated.
     fn camera_corrections(&mut self) -> Result<BTreeMap<String, CameraCorrection>, Error> {
         self.training.finish_in_flight()?;
-        // Corrections belong to the displayed splats: during a trial of camera parameters, those
-        // in training differ.
+        // Corrections must belong to the displayed splats. During a trial of camera parameters, the
+        // corrections in training are different.
         let cameras = &self.training.model.cameras;
         let displayed = self.trials.baseline().map(|snapshot| &snapshot.cameras);
         let (set, params) = displayed.map_or((cameras.set, &cameras.params), |(set, params)| {
@@ -488,7 +489,7 @@ impl Method for SplatTrainer {
     }
 
     fn pause_growth(&mut self, is_paused: bool) -> Result<bool, Error> {
-        // Both halves of a comparison must grow alike.
+        // Both halves of a comparison must grow in the same way.
         let is_compared = self.trials.running_trial().is_some();
         if self.training.model.is_growth_paused == is_paused || is_compared {
             return Ok(false);
@@ -514,7 +515,7 @@ impl Method for SplatTrainer {
 
     fn save(&mut self, folder: &Path) -> Result<(), Error> {
         self.training.finish_in_flight()?;
-        // A change whose trial has not ended is not proven, so it is not saved.
+        // A change is not saved before its trial has ended, because its benefit is unknown.
         self.trial_runner().cancel()?;
         let arrays = self.arrays()?;
         std::fs::create_dir_all(folder).map_err(|source| Error::Write {

@@ -27,7 +27,7 @@ pub(super) fn scene() -> SplatArrays {
     const N_DISCS: usize = 400;
     let mut arrays = synthetic_cloud(N_DISCS, 3);
     for ix in 0..N_DISCS {
-        // Evenly distributed (Vogel 1979), facing the center.
+        // The discs are evenly distributed on a sphere (Vogel 1979) and face its center.
         let height = 1.0 - (2 * ix + 1) as f64 / N_DISCS as f64;
         let (angle, radius) = (ix as f64 * 2.399_963, (1.0 - height * height).sqrt());
         let out = Vector3::new(radius * angle.cos(), height, radius * angle.sin());
@@ -463,7 +463,7 @@ fn late_keyframe_resumes_growth() {
         planned,
         "growth has ended"
     );
-    // A second copy of an image has no uncovered area to seed.
+    // A second copy of an image has no uncovered area in which splats could be seeded.
     trainer
         .push(Arc::new(Keyframe {
             stamp: Stamp(99),
@@ -478,7 +478,7 @@ fn late_keyframe_resumes_growth() {
 
 #[test]
 fn crop_box_limits_the_picture() {
-    /// More than the radius of a disc.
+    /// The margin is larger than the radius of a disc.
     const MARGIN_M: f64 = 2.0;
     let gpu = test_gpu();
     let mut model = SplatTrainer::from_arrays(gpu, ModelOptions::default(), &scene()).unwrap();
@@ -648,7 +648,7 @@ fn black_objects_stay_opaque() {
         .map(|(_, pixel)| f64::from(pixel[3]) / 255.0)
         .collect();
     let mean = coverage.iter().sum::<f64>() / coverage.len() as f64;
-    // Measured: 0.89, and 0.003 with a constant black background.
+    // The measured coverage is 0.89, and 0.003 with a constant black background.
     assert!(mean > 0.8, "coverage of pixels with depth: {mean}");
 }
 

@@ -4,8 +4,8 @@ use serde::{Deserialize, Serialize};
 
 /// Steps at which trials start, and how many steps they take.
 ///
-/// They are options, not constants, so that a checkpoint keeps them, and so that tests can use
-/// fewer steps.
+/// These values are options instead of constants, so that a checkpoint keeps them, and so that
+/// tests can use fewer steps.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct TrialSteps {
@@ -24,9 +24,9 @@ impl Default for TrialSteps {
     fn default() -> Self {
         Self {
             first_trial: 500,
-            // Long enough for the optimizer to settle after the change, and short enough that a
-            // trial, whose losing half is discarded, does not cost much. A change that pays only
-            // later is rejected.
+            // This is long enough for the optimizer to settle after the change. It is also short
+            // enough that a trial does not cost much, although its losing half is discarded. A
+            // change that improves the model only later is rejected.
             trial_half: 250,
             // A pose of an image changes only in steps on this image.
             per_image: 4,

@@ -1,4 +1,4 @@
-//! Tests of trials while keyframes arrive and are removed: both halves train on the same data, no
+//! Tests of trials while keyframes arrive and are removed. Both halves train on the same data, no
 //! seed is lost, and a checkpoint contains the whole trial.
 
 use super::training_tests::{n_keyframes, options};
@@ -208,7 +208,7 @@ fn both_halves_score_the_same_images() {
 fn resuming_in_either_trial_half_is_bit_exact() {
     let gpu = test_gpu();
     let keyframes = n_keyframes(&gpu, 42, true);
-    // Arrivals of keyframes and interruptions of training, in total updates.
+    // Arrivals of keyframes and interruptions of training, as total numbers of updates.
     let arrivals: Vec<u64> = (0..42)
         .map(|ix| {
             if ix < 36 {

@@ -22,7 +22,7 @@ use std::sync::Arc;
 
 /// Maximum total loss of the accepted reductions, dB.
 ///
-/// Each halving alone may cost 0.1 dB. Without a limit of the sum, several accepted halvings would
+/// Each halving may lose up to 0.1 dB. Without a limit on the sum, several accepted halvings could
 /// add up to a visible loss. A larger value gives smaller models that look worse.
 const MAX_TOTAL_LOSS_DB: f64 = 0.15;
 /// Maximum number of validation keyframes that are scored.
@@ -45,7 +45,7 @@ pub enum CountPolicy {
     #[default]
     ToCap,
     /// Grows up to the limit, or to fewer splats if there are few images. Then halves the number
-    /// repeatedly while this costs less than 0.1 dB on validation images.
+    /// repeatedly as long as the loss on validation images is below 0.1 dB.
     // Runs of earlier versions also had `TestedGrowth`, which ended with the same halvings.
     #[serde(alias = "TestedGrowth")]
     Tested,
@@ -82,7 +82,8 @@ fn id_of(keyframe: &Keyframe) -> ImageId {
 
 /// Scores of the images that both maps contain.
 fn pair_scores(baseline_db: &Scores, variant_db: &Scores) -> (Vec<f64>, Vec<f64>) {
-    // A validation keyframe can be removed between the two scores. Its difference is unknown then.
+    // A validation keyframe can be removed between the two scores. In that case, its difference is
+    // unknown.
     baseline_db
         .iter()
         .filter_map(|(id, baseline)| Some((*baseline, *variant_db.get(id)?)))
@@ -248,8 +249,8 @@ impl SplatTrials {
             CountPolicy::ToCap => CountState::ToCap,
             CountPolicy::Tested => CountState::Growing,
         };
-        // Without anything to test, the validation keyframes are training keyframes from the first
-        // step on.
+        // If there is nothing to test, the validation keyframes are training keyframes from the
+        // first step on.
         let is_finished = candidates.is_empty() && count == CountState::ToCap;
         let trial_phase = if is_finished {
             SplatTrialPhase::Finished
@@ -320,8 +321,8 @@ impl SplatTrials {
             return Due::Nothing;
         }
         if self.validation.len() < MIN_VALIDATION_IMAGES {
-            // Wait for more images, but not indefinitely: without trials, validation images are
-            // more useful for training.
+            // Wait for more images, but not indefinitely. If there are no trials, validation images
+            // are more useful for training.
             return if context.step < 2 * self.steps.first_trial {
                 Due::Nothing
             } else {
@@ -345,8 +346,8 @@ impl SplatTrials {
             from: context.sh_degree,
             to: self.degree,
         };
-        // The degree is reduced last, at the final number of splats: the details that a color of a
-        // higher degree adds depend on how many splats there are.
+        // The degree is reduced last, at the final number of splats. The details that colors of a
+        // higher degree add depend on the number of splats.
         match self.count {
             CountState::ToCap => Due::ReleaseValidation,
             CountState::Finished if self.degree < context.sh_degree => Due::Begin(lower),
@@ -442,7 +443,8 @@ impl SplatTrials {
             _ => self.steps.trial_half,
         };
         let until = from.schedule.step + n_steps;
-        // Before the phase changes: `scored` returns the list of a running trial otherwise.
+        // This is called before the phase changes, because `scored` returns the list of the running
+        // trial during a trial.
         let scored = self.scored();
         self.trial_phase = SplatTrialPhase::Running(RunningTrial {
             candidate,
@@ -593,7 +595,7 @@ impl SplatTrials {
     fn take_second_half(&mut self) -> Option<RunningTrial> {
         match std::mem::replace(&mut self.trial_phase, SplatTrialPhase::Waiting) {
             SplatTrialPhase::Running(trial) if trial.is_second_half() => Some(trial),
-            // Not in a second half: put the phase back.
+            // The trial is not in its second half, so the phase is restored.
             other => {
                 self.trial_phase = other;
                 None
@@ -664,8 +666,8 @@ impl SplatTrials {
     pub(crate) fn remove(&mut self, is_removed: impl Fn(&Keyframe) -> bool) {
         self.validation
             .retain(|validation| !is_removed(&validation.keyframe));
-        // A removed keyframe must not come back at the same step of the second half, or at the end
-        // of the trial.
+        // A removed keyframe must not be added again at the same step of the second half or at the
+        // end of the trial.
         if let SplatTrialPhase::Running(trial) = &mut self.trial_phase {
             trial
                 .arrivals

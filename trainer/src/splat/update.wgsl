@@ -9,8 +9,8 @@
 // source    Kerbl et al. 2023, appendix A; Kingma and Ba 2015; noise of Kheradmand et al. 2024 (3DGS-MCMC), section 4.1;
 //           one second moment for many values as in Adam-mini (Zhang et al. 2024)
 //
-// The higher SH coefficients of a splat share one second moment and have no first moment. The squared basis functions of
-// a degree sum to the same value in every direction, so the mean square of the gradients is |v_color|^2 / (12 pi). A
+// The higher SH coefficients of a splat share one second moment and have no first moment. The sum of the squared basis
+// functions of a degree is the same in every direction, so the mean square of the gradients is |v_color|^2 / (12 pi). A
 // first moment is unnecessary because the learning rate is small: the parameters themselves average over many steps.
 
 #import view
@@ -145,7 +145,7 @@ fn gradient_of(lane: u32, splat_ix: u32, n_touched: u32) -> Gradient {
     workgroupBarrier(); // All large splats are listed.
     if lane == 0u { wg_n_large_read = atomicLoad(&wg_n_large); }
     let n_large = workgroupUniformLoad(&wg_n_large_read);
-    // After the barriers, so that subgroups do not wait for each other.
+    // This comes after the barriers, so that subgroups do not wait for each other.
     if n_touched > 0u && n_touched <= MAX_SLOTS_PER_LANE {
         let begin = slot_begins[splat_ix];
         for (var slot = begin; slot < begin + n_touched; slot++) {
@@ -194,7 +194,7 @@ fn update_splat(splat_ix: u32, n_touched: u32, sum: Gradient) -> CameraGradient 
     let drop_frac = bitcast<f32>(atomicLoad(&status[DROP_FRAC])); // `project` divides the opacity by one minus this.
     let v_opacity_logit = sum.position.w * opacity * (1.0 - opacity) / (1.0 - drop_frac);
     if n_touched != 0u {
-        // Conic to covariance: the inverse's derivative is -M G M.
+        // The gradient is propagated from the conic to the covariance. The derivative of the inverse is -M G M.
         let a = p.covariance.z / p.determinant;
         let b = -p.covariance.y / p.determinant;
         let c = p.covariance.x / p.determinant;
@@ -215,7 +215,7 @@ fn update_splat(splat_ix: u32, n_touched: u32, sum: Gradient) -> CameraGradient 
         let back = transpose(p.camera_rotation);
         let v = mat3x3f(back * v_axis_0 * p.scale.x, back * v_axis_1 * p.scale.y, back * v_axis_2 * p.scale.z);
 
-        // Rotation matrix to quaternion; v[column][row].
+        // The gradient is propagated from the rotation matrix, as v[column][row], to the quaternion.
         let norm = max(length(rotation), 1e-12);
         let q = rotation / norm;
         let v_unit = 2.0 * vec4f(
@@ -226,7 +226,7 @@ fn update_splat(splat_ix: u32, n_touched: u32, sum: Gradient) -> CameraGradient 
         );
         v_rotation = (v_unit - q * dot(q, v_unit)) / norm;
 
-        // Image plane to camera to world.
+        // The gradient is propagated from the image plane to the camera and to the world.
         let z = p.point.z;
         let f = view.focal_px;
         let ratio = -vec2f(p.jacobian_x.z, p.jacobian_y.z) * z / f; // clamped x/z, y/z
@@ -281,7 +281,7 @@ fn update_splat(splat_ix: u32, n_touched: u32, sum: Gradient) -> CameraGradient 
     sh_rest_moments[splat_ix] = mean_square;
     let progress = clamp((step - rule.schedule_start) / max(rule.n_planned_steps, 1.0), 0.0, 1.0);
     let mean_rate = rule.mean_rate_m * pow(rule.final_mean_rate_frac, progress);
-    // The costs double over the planned steps, because the model later starts to overfit single images.
+    // The costs double over the planned steps, because models start to overfit single images late in training.
     let cost_gradient = (1.0 + progress) * vec4f(rule.scale_cost * p.scale, rule.opacity_cost * opacity * (1.0 - opacity));
     let mean_step = adam4(0u, splat_ix, vec4f(v_mean, 0.0));
     let rotation_step = adam4(2u, splat_ix, v_rotation);

@@ -78,7 +78,7 @@ fn shuffled(round: u64, n_views: usize, seed: u64) -> Vec<usize> {
         state = state
             .wrapping_mul(6_364_136_223_846_793_005)
             .wrapping_add(1_442_695_040_888_963_407);
-        // The upper bits: the low bits of such a generator have short periods.
+        // The upper bits are used, because the low bits of such a generator have short periods.
         order.swap(at, ((state >> 33) % (at as u64 + 1)) as usize);
     }
     order
@@ -118,8 +118,8 @@ pub(crate) struct Keep<'a> {
 /// Removes images from the GPU and returns their buffers for reuse.
 ///
 /// First removes images coarser than [`Keep::coarsest`]. If the rest still exceeds `max_bytes`,
-/// removes the most recently used images. Every view is used once per round, so the other images
-/// are needed sooner.
+/// removes the most recently used images. Every view is used once per round, so less recently used
+/// images are needed sooner.
 pub(crate) fn drop_levels(views: &mut [TrainView], keep: Keep<'_>) -> Vec<Level> {
     let mut dropped = Vec::new();
     let mut candidates = Vec::new();
@@ -128,8 +128,8 @@ pub(crate) fn drop_levels(views: &mut [TrainView], keep: Keep<'_>) -> Vec<Level>
         let coarsest = view.clamped(keep.coarsest);
         for level_ix in 0..view.levels.len() {
             let is_needed = keep.needed.contains(&(view_ix, level_ix));
-            // Training never returns to a coarser resolution. Finer images stay: trials, gains and
-            // contributions use full resolution.
+            // Training never returns to a coarser resolution. Finer images are kept, because
+            // trials, gains and contributions use full resolution.
             if level_ix > coarsest && !is_needed {
                 dropped.extend(view.levels[level_ix].take());
             } else if let Some(level) = &view.levels[level_ix] {
@@ -175,7 +175,7 @@ impl TrainView {
     /// kept unless the correction changes them.
     pub(crate) fn replace_camera(&mut self, gpu: &Gpu, keyframe: Arc<Keyframe>) {
         let has_same_depth = has_same_depth(&self.keyframe, &keyframe);
-        // The lens is a slot of camera parameters, which start anew after a correction.
+        // The lens is a slot of camera parameters. They start again at zero after a correction.
         self.lens = None;
         self.keyframe = keyframe;
         // The color pixels never change, but uploaded depth is reprojected into the color camera,
@@ -252,8 +252,8 @@ impl TrainView {
         let depth_bytes = bytemuck::cast_slice(&images.depth_m);
         let size_px = images.camera.size_px;
         let view = images.camera.view();
-        // Writing to an existing buffer avoids an allocation in each step, if not all images fit
-        // into memory.
+        // If not all images fit into memory, writing to an existing buffer avoids an allocation in
+        // each step.
         self.levels[level] = Some(match reused {
             Some(reused) => {
                 gpu.write(&reused.view, 0, bytemuck::bytes_of(&view));
@@ -324,8 +324,9 @@ fn clamped(level: u32, [width, height]: [u32; 2]) -> usize {
 
 /// Whether the depth of two versions of a keyframe, seen from its color camera, is the same.
 fn has_same_depth(a: &Keyframe, b: &Keyframe) -> bool {
-    // A correction of the color camera's pose often moves the depth camera along with it. Then
-    // their relative pose, the only one that matters here, is the same up to rounding.
+    // A correction of the color camera's pose often moves the depth camera along with it. In that
+    // case, their relative pose is the same except for rounding. Only the relative pose matters
+    // here.
     let color_from_depth = |keyframe: &Keyframe| CalibratedCamera::of(keyframe).color_from_depth;
     let is_same_frame = match (color_from_depth(a), color_from_depth(b)) {
         (Some(a), Some(b)) => {
@@ -365,7 +366,7 @@ pub(crate) fn camera_of(keyframe: &Keyframe) -> Camera {
 
 /// Mean color of a sample of the pixels that are not masked.
 fn mean_srgb(keyframe: &Keyframe) -> Option<[f64; 3]> {
-    const STRIDE: usize = 61; // A prime, so that the sample covers all columns.
+    const STRIDE: usize = 61; // The step is a prime, so that the sample covers all columns.
     let mut sums = [0.0; 3];
     let mut n = 0.0;
     for pixel in keyframe

@@ -18,7 +18,7 @@ pub struct WorkCounts {
     pub n_tiles: u64,
     /// Length of the longest tile list.
     pub longest_list: u64,
-    /// Maximum number of visible intersections in a tile; not necessarily the tile of
+    /// Maximum number of visible intersections in a tile. This is not necessarily the tile of
     /// `longest_list`.
     pub longest_visible: u64,
     /// Tiles that the largest splat touches.

@@ -170,7 +170,8 @@ fn pictures_without_erased_space_match_twin() {
     check_pictures(&Arc::new(edits), 1500);
 }
 
-/// Compares a picture with the twin's, which must contain so many pixels with a surface.
+/// Compares a picture with the twin's picture, which must contain at least this number of pixels
+/// with a surface.
 fn check_pictures(edits: &Arc<Edits>, min_hits: usize) {
     let keyframes = scene();
     let (blocks, voxel_grid, mut model) = fused(&keyframes);
@@ -294,7 +295,7 @@ fn non_finite_depth_is_ignored() {
         f32::MIN_POSITIVE,
         -0.0,
     ];
-    // Holes in one copy, non-finite values at the same pixels in the other.
+    // One copy has holes. The other copy has non-finite values at the same pixels.
     let mut with_holes = finite.clone();
     replace_depth(&mut with_holes[1], &|ix, z| {
         if ix % 11 == 3 { 0.0 } else { z }
@@ -330,7 +331,7 @@ fn non_finite_depth_is_ignored() {
 const POSITION_ABS_M: f64 = 1e-6;
 /// Normals are stored in 16 bits per component.
 const NORMAL_ABS: f64 = 2e-4;
-/// Colors are stored in 8 bits; plus the rounding error of f32.
+/// Colors are stored in 8 bits. The rounding error of f32 is added.
 const MESH_COLOR_ABS: f64 = 0.51 / 255.0;
 
 fn edge_of(vertex: &Vertex) -> u32 {

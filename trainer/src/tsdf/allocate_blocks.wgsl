@@ -55,7 +55,7 @@ override WG_SIZE = 64u;
 @compute @workgroup_size(WG_SIZE)
 fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u, @builtin(local_invocation_index) lane: u32) {
     let at = folded(wg, n_wgs) * WG_SIZE + lane;
-    if at >= depth_view.depth_size_px.x * depth_view.depth_size_px.y { return; } // Allowed here: no barrier below.
+    if at >= depth_view.depth_size_px.x * depth_view.depth_size_px.y { return; } // No barrier follows this return.
     // An earlier depth image failed and must be fused first.
     if atomicLoad(&status[STOPPED]) != 0u { return; }
     let depth_m = readings[at].x;

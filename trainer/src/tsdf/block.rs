@@ -6,14 +6,14 @@
 
 use std::collections::BTreeMap;
 
-/// Voxels along an edge of a block, as in Niessner et al. 2013. Larger blocks store more voxels
-/// away from the surface; smaller ones need more entries in the table.
+/// Voxels along an edge of a block, as in Niessner et al. 2013. Larger blocks store more voxels far
+/// from the surface. Smaller blocks need more entries in the table.
 pub const BLOCK_EDGE: i32 = 8;
 /// Number of voxels in a block.
 pub const N_VOXELS: usize = 512;
-/// Weight of one observation, from 1 m, of a surface that faces the camera. Weights are integers of
-/// 16 bits, so this is the number of steps for weaker observations, and 65535 / 256 = 255 is the
-/// maximum of the option `max_weight`.
+/// Weight of one observation of a surface that faces the camera at a distance of 1 m. Weaker
+/// observations have a fraction of this weight, in integer steps. Weights have 16 bits, so the
+/// maximum of the option `max_weight` is 65535 / 256 = 255.
 pub const WEIGHT_ONE: f64 = 256.0;
 
 /// Coordinates of a block in blocks, or of a voxel in voxels, relative to the field's anchor along

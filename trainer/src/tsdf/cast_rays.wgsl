@@ -159,7 +159,7 @@ fn crossing(ray: Ray, outside_m: f32, inside_m: f32, outside_distance: f32, insi
 fn march(ray: Ray) -> f32 {
     let speed = length(ray.along);
     var at_m = ray.begin_m;
-    // Depth and distance of the last point known to be outside; depth -1: none.
+    // Depth and distance of the last point known to be outside. A depth of -1 means none.
     var outside = vec2f(-1.0, 0.0);
     // Steps are short up to this depth, because a long step passed an unobserved voxel.
     var short_steps_until_m = -1.0;
@@ -220,7 +220,7 @@ fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u,
     let ix = folded(wg, n_wgs);
     let n_columns = (view.size_px.x + 7u) / 8u;
     let pixel = vec2u(ix % n_columns, ix / n_columns) * 8u + lane.xy;
-    if any(pixel >= view.size_px) { return; } // Allowed here: no barrier below.
+    if any(pixel >= view.size_px) { return; } // No barrier follows this return.
     cached_chunk = vec3i(0x7fffffff);
     cached_block = vec3i(0x7fffffff);
     let ray = ray_of(pixel);

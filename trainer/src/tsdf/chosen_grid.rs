@@ -19,8 +19,8 @@ const TRUNCATION_VOXELS: f64 = 4.0;
 /// to the largest truncation, so a larger factor makes their steps coarser.
 const MAX_TRUNCATION_FACTOR: f64 = 4.0;
 /// Fraction of `max_bytes` that the surface in one image may take when the voxel size is chosen.
-/// The scene is larger than one image. A smaller fraction makes voxels coarser than necessary; with
-/// a larger one, more blocks have to be moved to host memory.
+/// The scene is larger than one image. A smaller fraction makes voxels coarser than necessary. With
+/// a larger fraction, more blocks have to be moved to host memory.
 const ONE_IMAGE_FRAC: f64 = 0.1;
 
 /// Voxel size and related settings of a field.
@@ -73,21 +73,22 @@ impl VoxelGrid {
             let n_blocks = ONE_IMAGE_FRAC * bytes as f64 / BYTES_PER_BLOCK as f64;
             (area_m2 / (16.0 * n_blocks.max(1.0))).sqrt()
         });
-        // The coarsest of the three wins: finer voxels than a pixel, or than the noise, store no
-        // detail.
+        // The coarsest of the three sizes is used, because voxels that are finer than a pixel or
+        // than the noise store no additional detail.
         let chosen_grid = px_m
             .max(by_noise_m)
             .max(by_bytes_m)
             .clamp(VOXEL_RANGE_M[0], VOXEL_RANGE_M[1]);
-        // Rounded up to a multiple of 0.5 mm, so that nearly equal first images give the same grid.
+        // The size is rounded up to a multiple of 0.5 mm, so that nearly equal first images give
+        // the same grid.
         let voxel_m = positive(options.voxel_m).unwrap_or_else(|| (chosen_grid * 2e3).ceil() / 2e3);
         let truncation_m = positive(options.truncation_m)
             .unwrap_or(TRUNCATION_VOXELS * voxel_m)
             // Weights fall off between one voxel behind the surface and the truncation, so the
             // truncation must be larger than a voxel.
             .max(2.0 * voxel_m);
-        // A multiple of the width of a chunk (8 blocks of 8 voxels): fields with the same voxels
-        // then have the same chunks, wherever they begin.
+        // The anchor is a multiple of the width of a chunk (8 blocks of 8 voxels). Fields with the
+        // same voxel size then have the same chunks, wherever they begin.
         let chunk_m = 64.0 * voxel_m;
         let anchor = depth
             .world_from_camera

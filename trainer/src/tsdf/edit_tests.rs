@@ -63,7 +63,7 @@ fn erased_object_shows_what_is_behind_it() {
             );
         } else if *after > 0.0 {
             n_revealed += 1;
-            // Rounding to f32 may move a point on a side of the box.
+            // Rounding to f32 may move a point that lies on a side of the box.
             assert!(
                 !erased.contains(point(*after + 1e-5)),
                 "pixel {ix} shows erased space"

@@ -1,4 +1,5 @@
-// end_keyframe: counts the depth image if it was fused, else stops later ones; then empties the list of visible blocks.
+// end_keyframe: counts the depth image if it was fused, otherwise stops later depth images. Then it empties the list of
+// visible blocks.
 //
 // threads   one
 // writes    status

@@ -21,7 +21,7 @@ override WG_SIZE = 64u;
 @compute @workgroup_size(WG_SIZE)
 fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u, @builtin(local_invocation_index) lane: u32) {
     let slot = folded(wg, n_wgs) * WG_SIZE + lane;
-    if atomicLoad(&status[FAILED]) != 0u { return; } // Allowed here: no barrier below.
+    if atomicLoad(&status[FAILED]) != 0u { return; } // No barrier follows this return.
     if slot >= min(atomicLoad(&status[N_BLOCKS]), field.n_block_slots) { return; }
     let center = depth_from_field(depth_view, (vec3f(coords[slot].xyz) + 0.5) * (8.0 * field.voxel_m));
     let radius_m = 7.0 * field.voxel_m; // Half the diagonal of a block is 6.93 voxels.

@@ -15,7 +15,7 @@
 @compute @workgroup_size(64)
 fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u, @builtin(local_invocation_index) lane: u32) {
     let ix = wg.y * n_wgs.x + wg.x;
-    if ix * BLOCK_VOXELS >= arrayLength(&gathered_geometry) { return; } // Allowed here: no barrier below.
+    if ix * BLOCK_VOXELS >= arrayLength(&gathered_geometry) { return; } // No barrier follows this return.
     let slot = listed[ix];
     for (var z = 0u; z < 8u; z++) {
         gathered_geometry[ix * BLOCK_VOXELS + z * 64u + lane] = geometry[slot * BLOCK_VOXELS + z * 64u + lane];

@@ -19,7 +19,7 @@ override WG_SIZE = 64u;
 @compute @workgroup_size(WG_SIZE)
 fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u, @builtin(local_invocation_index) lane: u32) {
     let slot = (wg.y * n_wgs.x + wg.x) * WG_SIZE + lane;
-    if slot >= min(atomicLoad(&status[N_BLOCKS]), field.n_block_slots) { return; } // Allowed here: no barrier below.
+    if slot >= min(atomicLoad(&status[N_BLOCKS]), field.n_block_slots) { return; } // No barrier follows this return.
     let block = coords[slot].xyz;
     let row = insert_chunk(block >> vec3u(3u));
     if row == 0u {

@@ -6,10 +6,10 @@
 // writes    geometry, colors [n_blocks * 512], changed [n_blocks] (1 if a voxel changed)
 // twin      tsdf/reference/integrate.rs
 // source    Curless and Levoy 1996, section 3; weights: Newcombe et al. 2011 (cosine of the angle; squared here,
-//           because an error across the ray moves the surface by its tangent) and Oleynikova et al. 2017 (Voxblox:
-//           inverse square of distance, drop behind the surface). Ours: distances are measured along the surface
-//           normal, and carving reduces the weight of a voxel instead of assigning a distance. A ray through a voxel
-//           shows that the voxel is free, but not how far away the nearest surface is.
+//           because an error across the ray moves the surface by the tangent of the angle times the error) and
+//           Oleynikova et al. 2017 (Voxblox: inverse square of distance, drop behind the surface). Ours: distances are
+//           measured along the surface normal, and carving reduces the weight of a voxel instead of assigning a
+//           distance. A ray through a voxel shows that the voxel is free, but not how far away the nearest surface is.
 // software  software adapters execute both sides of a branch, and run all lanes through a loop together, with an extra
 //           iteration if the test comes first. Loops are therefore tested at their end, and colors, which few voxels of
 //           a column have, are fused in a separate loop
@@ -32,8 +32,9 @@
 
 // Minimum cosine between ray and normal for scaling distances: normals of steeper surfaces are mostly noise.
 const MIN_RAY_DOT_NORMAL = 0.3;
-// Number of observations of a solid voxel that one observation through it cancels: if the surface behind the voxel is
-// one truncation away, and if it is at least two away. A nearer surface may be caused by a pose error.
+// Number of observations of a solid voxel that one observation through it cancels. The first constant applies if the
+// surface behind the voxel is one truncation away, the second if it is at least two away. A nearer surface may be
+// caused by a pose error.
 const CARVING_NEAR = 1.0;
 const CARVING_FAR = 4.0;
 // Colors are stored up to this distance from the surface, in voxels. Pictures and meshes do not read other colors.
@@ -108,7 +109,8 @@ fn fuse(at: u32, point_in_field: vec3f) -> Fused {
     let distance_m = (reading.x - point.z) * max(reading.y, MIN_RAY_DOT_NORMAL);
     let truncation_m = truncation_at(field, reading.x);
     let ray_m = length(ray_of(depth_view, position_px));
-    // Measured along the ray, not the normal: just past the rim of an object, a ray soon leaves the object again.
+    // The distance is measured along the ray instead of the normal. Just past the rim of an object, a ray soon leaves
+    // the object again.
     let behind_m = (point.z - reading.x) * ray_m;
     if !(behind_m <= truncation_m) { return UNCHANGED; } // Hidden.
     let nearness = min(1.0, 1.0 / (reading.x * reading.x));
@@ -142,7 +144,7 @@ fn center_of(first: vec3i, z: u32) -> vec3f {
 fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u, @builtin(local_invocation_index) lane: u32) {
     let n_visible = status[N_VISIBLE];
     var at = folded(wg, n_wgs);
-    if at >= n_visible { return; } // Allowed here: no barrier below.
+    if at >= n_visible { return; } // No barrier follows this return.
     loop {
         let slot = visible[at];
         let begin = slot * BLOCK_VOXELS + lane;

@@ -1,5 +1,6 @@
-// list_stale: lists the blocks whose triangles may have changed: changed blocks and all their neighbors, whose cubes
-// and normals read the changed voxels. The order depends on thread timing; blocks are processed independently.
+// list_stale: lists the blocks whose triangles may have changed. These are the changed blocks and all their neighbors,
+// whose cubes and normals read the changed voxels. The order depends on thread timing, but results do not, because
+// blocks are processed independently.
 //
 // groups    one per block of the pool; 32 threads, 27 of which handle the block and its neighbors
 // reads     field, status, coords, changed, keys, entries
@@ -23,7 +24,7 @@
 @compute @workgroup_size(32)
 fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u, @builtin(local_invocation_index) lane: u32) {
     let at = folded(wg, n_wgs);
-    if at >= min(status[N_BLOCKS], field.n_block_slots) || lane >= 27u { return; } // Allowed here: no barrier below.
+    if at >= min(status[N_BLOCKS], field.n_block_slots) || lane >= 27u { return; } // No barrier follows this return.
     if changed[at] == 0u { return; }
     let slot = find_slot(coords[at].xyz + around(lane));
     if slot == 0u { return; }

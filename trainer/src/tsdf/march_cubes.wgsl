@@ -188,7 +188,7 @@ fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u,
     var used_bits = 0u;
     if lane < USED_WORDS { used_bits = atomicLoad(&wg_used[lane]); }
     let n_vertices = countOneBits(used_bits);
-    var both = 0u; // Both sums in one word: a block has at most 2187 vertices and 2560 triangles.
+    var both = 0u; // Both sums fit in one word: at most 2187 vertices, 2560 triangles.
     let before = exclusive_scan(lane, n_vertices | (n_triangles << 16u), &both);
     let n = vec2u(both & 0xffffu, both >> 16u);
     if lane < USED_WORDS {

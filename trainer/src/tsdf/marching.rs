@@ -106,7 +106,8 @@ impl MeshBuffers {
     }
 
     fn grow(&mut self, gpu: &Gpu, needed: &[u32]) -> Result<(), Error> {
-        // A quarter more than needed, because the mesh of a growing field grows, too.
+        // The buffers get a quarter more than needed, because the mesh of a growing field grows,
+        // too.
         let [n_vertices, n_triangles] = [needed[0], needed[1]].map(|n| n.saturating_add(n / 4));
         self.mesh_capacity.n_vertices = self.mesh_capacity.n_vertices.max(n_vertices);
         self.mesh_capacity.n_triangles = self.mesh_capacity.n_triangles.max(n_triangles);
@@ -142,7 +143,8 @@ impl MeshBuffers {
                 vertices: vertices[own(part.first_vertex, part.n_vertices)].to_vec(),
                 triangles: triangles[own(part.first_triangle, part.n_triangles)]
                     .iter()
-                    // Indices on the GPU count through the batch; blocks are kept separately.
+                    // Indices on the GPU count through the whole batch, but the blocks are kept
+                    // separately here.
                     .map(|corners| corners.map(|ix| ix - part.first_vertex))
                     .collect(),
             };

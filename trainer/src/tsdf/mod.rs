@@ -1,5 +1,5 @@
-//! Truncated signed distance fields with color, built from keyframes with depth; the baseline for
-//! meshes.
+//! Truncated signed distance fields with color, built from keyframes with depth. They are the
+//! baseline for meshes.
 //!
 //! `docs/design/tsdf.md` follows a depth image through the kernels.
 

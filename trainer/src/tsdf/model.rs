@@ -193,7 +193,7 @@ impl TsdfModel {
                 return Ok(false);
             };
             // An image without valid readings, such as the first one of a sensor that is starting,
-            // says nothing about the scene.
+            // contains no information about the scene.
             match first
                 .depth
                 .as_ref()
@@ -239,8 +239,8 @@ impl TsdfModel {
 
     /// Fuses the first pending keyframe after loading the blocks that it could change.
     fn step_with_host_blocks(&mut self, n: u64) -> Result<u64, Error> {
-        // One keyframe at a time: which blocks the next one needs is known only on the host, and
-        // blocks of one may have to make room for those of another.
+        // Only one keyframe is fused at a time. Only the host knows which blocks the next keyframe
+        // needs, and these may have to replace other blocks.
         if n == 0 || self.queue.pending.is_empty() {
             return Ok(0);
         }
@@ -331,8 +331,8 @@ impl TsdfModel {
 
 impl Method for TsdfModel {
     fn push(&mut self, keyframe: Arc<Keyframe>) -> Result<(), Error> {
-        // A keyframe without depth contains no surface, so this is not an error: in a rig, only
-        // some cameras have depth.
+        // A keyframe without depth contains no surface. This is not an error, because often only
+        // some cameras of a rig have depth.
         if keyframe.split == Split::Test || keyframe.depth.is_none() {
             return Ok(());
         }
@@ -387,8 +387,8 @@ impl Method for TsdfModel {
             .passes
             .submit_reading(&self.gpu, &[(&field.status, 4 * status::LEN)]);
 
-        // Waits for the previous submit while this one runs. If the previous one overflowed, the
-        // new one had no effect, and its counters need not be read.
+        // This waits for the previous submit while the new one runs. If the previous one
+        // overflowed, the new one had no effect, and its counters need not be read.
         let failed = self.finish_in_flight()?;
         if !failed {
             self.fusion
@@ -480,7 +480,8 @@ impl Method for TsdfModel {
         self.fusion.submits.set_watched(watched);
     }
 
-    /// Fuses all keyframes again: the contribution of each one to the sums is unknown.
+    /// Fuses all keyframes again, because the contribution of a single keyframe to the sums is
+    /// unknown.
     fn recalibrate(&mut self, keyframes: &[CorrectedKeyframe], _: &Alignment) -> Result<(), Error> {
         self.finish_in_flight()?;
         let is_watched = self.fusion.submits.is_watched();

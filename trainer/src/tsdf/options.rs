@@ -4,7 +4,7 @@ use crate::model_options::MethodOptions;
 use serde::{Deserialize, Serialize};
 
 /// Options specific to a [`super::TsdfModel`]. Of the common options, only the maximum number of
-/// bytes and the alignment are used; nothing is random.
+/// bytes and the alignment are used. The seed has no effect, because nothing is random.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct TsdfOptions {

@@ -9,9 +9,9 @@ use crate::view::View;
 use gpu::{Buffer, Gpu, Passes};
 use keyframe::Keyframe;
 
-/// Maximum number of workgroups that share the visible blocks: enough to fill any GPU. Only the GPU
-/// knows how many blocks are visible, so each group processes several if there are more, and groups
-/// without a block end at once.
+/// Maximum number of workgroups that share the visible blocks. It is large enough to fill any GPU.
+/// Only the GPU knows how many blocks are visible, so each group processes several if there are
+/// more, and groups without a block end at once.
 const MAX_INTEGRATE_GROUPS: u32 = 8192;
 
 /// Buffers for one keyframe, and the readings derived from its depth.
@@ -86,7 +86,7 @@ pub(crate) fn fuse(
         readings,
         n_pixels,
     } = slot;
-    // Normals and validity first: invalid readings allocate no blocks.
+    // Normals and validity are computed first, because invalid readings must not allocate blocks.
     let n_groups = n_pixels.div_ceil(64);
     list.dispatch(
         gpu,
@@ -99,7 +99,8 @@ pub(crate) fn fuse(
             ("readings", readings),
         ],
     );
-    // All blocks before any voxel: if the pool overflows, nothing of this image may be fused.
+    // All blocks are allocated before any voxel is changed, because nothing of this image may be
+    // fused if the pool overflows.
     list.dispatch(
         gpu,
         &pipelines.allocate_blocks,
@@ -114,7 +115,8 @@ pub(crate) fn fuse(
             ("coords", coords),
         ],
     );
-    // Not only the blocks of this image's surfaces: voxels in front of them are carved.
+    // The visible blocks include more than the blocks of this image's surfaces, because voxels in
+    // front of them are carved.
     list.dispatch(
         gpu,
         &pipelines.find_visible,
@@ -144,8 +146,8 @@ pub(crate) fn fuse(
             ("changed", changed),
         ],
     );
-    // A pass of its own: all workgroups of `integrate` must have ended before the image counts as
-    // fused.
+    // This is a separate pass, because all workgroups of `integrate` must have ended before the
+    // image counts as fused.
     list.dispatch(gpu, &pipelines.end_keyframe, 1, &[("status", status)]);
 }
 

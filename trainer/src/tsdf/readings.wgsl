@@ -25,7 +25,8 @@ const MAX_FLAT_NOISES = 6.0;
 // Maximum slope of a valid surface: change of depth over lateral distance. Steeper surfaces count as edges.
 const MAX_SLOPE = 6.0;
 
-// Depth of a pixel; 0 if invalid. Finiteness is tested on the bits: the compiler may assume there is no NaN.
+// Depth of a pixel; 0 if invalid. Finiteness is tested on the bits, because the compiler may assume that there is no
+// NaN.
 fn depth_at(pixel: vec2i) -> f32 {
     if any(pixel < vec2i(0)) || any(pixel >= vec2i(depth_view.depth_size_px)) { return 0.0; }
     let bits = depth[u32(pixel.y) * depth_view.depth_size_px.x + u32(pixel.x)];
@@ -67,7 +68,7 @@ override WG_SIZE = 64u;
 @compute @workgroup_size(WG_SIZE)
 fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u, @builtin(local_invocation_index) lane: u32) {
     let at = folded(wg, n_wgs) * WG_SIZE + lane;
-    if at >= depth_view.depth_size_px.x * depth_view.depth_size_px.y { return; } // Allowed here: no barrier below.
+    if at >= depth_view.depth_size_px.x * depth_view.depth_size_px.y { return; } // No barrier follows this return.
     let pixel = vec2i(vec2u(at % depth_view.depth_size_px.x, at / depth_view.depth_size_px.x));
     let center_m = depth_at(pixel);
     let x = tangent_along(pixel, vec2i(1, 0), center_m, depth_view.depth_focal_px.x);

@@ -326,7 +326,7 @@ fn fusion_is_deterministic() {
 
 #[test]
 fn rendering_fuses_at_most_one_keyframe() {
-    // Voxels so fine that the first depth image overflows the pool at first.
+    // The voxels are so fine that the first depth image initially overflows the pool.
     let mut model = model_with(
         scenes::options().with(|options| options.specific.voxel_m = Some(0.006)),
         &ball_on_floor(3),
@@ -358,7 +358,7 @@ fn step_fuses_exactly_the_requested_keyframes() {
 
 #[test]
 fn growing_pool_keeps_results() {
-    // Voxels so fine that the initial pool and table are too small.
+    // The voxels are so fine that the initial pool and table are too small.
     let fine = scenes::options().with(|options| options.specific.voxel_m = Some(0.006));
     let keyframes = ball_on_floor(3);
     let mut grown = fused_model(fine.clone(), &keyframes);
@@ -372,7 +372,7 @@ fn growing_pool_keeps_results() {
 
 #[test]
 fn swapping_to_host_memory_is_lossless() {
-    // Two places, observed twice in alternation: only one of them fits at a time.
+    // Two places are observed alternately, twice each. Only one of them fits into memory at a time.
     let far = Point3::new(8.0, 0.0, 0.1);
     let shapes = [scenes::ball(BALL_CENTER), scenes::ball(far)];
     let options = || scenes::options().with(|options| options.specific.max_depth_m = 3.0);
@@ -412,7 +412,7 @@ fn swapping_to_host_memory_is_lossless() {
         ));
     }
     assert!(limited.mesh().unwrap() == unlimited.mesh().unwrap());
-    // A budget that is too small for one image: images are skipped and counted.
+    // The budget is too small for one image, so images are skipped and counted.
     let mut too_small = model_with_budget(20_000);
     assert_eq!((too_small.n_skipped(), too_small.progress().step), (8, 8));
     assert!(

@@ -11,8 +11,8 @@ use crate::Error;
 use gpu::{Gpu, Passes};
 use std::collections::BTreeSet;
 
-/// Blocks gathered at once: 12.6 MB. Larger batches need more GPU memory beside the field; smaller
-/// ones wait for the GPU more often.
+/// Blocks gathered at once: 12.6 MB. Larger batches need more GPU memory in addition to the field.
+/// Smaller batches wait for the GPU more often.
 const GATHER_BATCH: usize = 2048;
 
 impl FieldBuffers {
@@ -163,12 +163,12 @@ impl FieldBuffers {
         let block_coords = self.block_coords(gpu)?;
         let n_after = n_before as usize - evicted.len() + added.len();
         let gone: BTreeSet<u32> = evicted.iter().copied().collect();
-        // Blocks past the new end move into the holes; added blocks fill the rest.
+        // Blocks past the new end move into the holes. Added blocks fill the other holes.
         let end = u32::try_from(n_after).unwrap_or(u32::MAX);
         let moved_slots: Vec<u32> = (end.min(n_before)..n_before)
             .filter(|slot| !gone.contains(slot))
             .collect();
-        // Read before anything is written, because holes are filled in place.
+        // The blocks are read before anything is written, because holes are filled in place.
         let moved = self.read(gpu, pipelines, &moved_slots)?;
         let moved = moved_slots
             .iter()

@@ -7,8 +7,8 @@ use model_files::{Aabb, Edits};
 use numbers::{f32_of, f32s_of};
 use std::sync::Arc;
 
-/// Edge of a tile, pixels, as in Kerbl et al. 2023. Larger tiles sort fewer entries; in smaller
-/// ones, fewer pixels test splats that do not cover them.
+/// Edge of a tile, pixels, as in Kerbl et al. 2023. With larger tiles, fewer entries are sorted. In
+/// smaller tiles, fewer pixels test splats that do not cover them.
 pub(crate) const TILE_PX: u32 = 16;
 
 /// `View` of shared/view.wgsl.
@@ -49,9 +49,9 @@ pub(crate) struct Camera {
     pub(crate) low_pass_px2: f64,
 }
 
-/// Variance of the low-pass at full size, pixels squared, as in Kerbl et al. 2023: a splat covers
-/// about a pixel at least. A larger value blurs the picture; with a smaller one, splats fall
-/// between pixel centers.
+/// Variance of the low-pass at full size, pixels squared, as in Kerbl et al. 2023. With it, a splat
+/// covers at least about one pixel. A larger value blurs the picture. With a smaller value, splats
+/// fall between pixel centers.
 pub(crate) const LOW_PASS_PX2: f64 = 0.3;
 
 impl Camera {

@@ -95,7 +95,7 @@ mod tests {
         let pose = scenes::look_at(Point3::new(0.0, -2.0, 0.5), target);
         let mut keyframe = scenes::keyframe(0, &[scenes::ball(target)], pose);
         let depth = keyframe.depth.as_mut().expect("the scene has depth");
-        // From another camera, so that the depth is projected.
+        // The depth comes from another camera, so that it is projected.
         depth.world_from_camera *= Transform::translation(0.01, 0.0, 0.0);
         let n_seen = depth.depth_m.iter().filter(|z| **z > 0.0).count();
         depth.depth_m = depth.depth_m.iter().map(|_| f32::INFINITY).collect();

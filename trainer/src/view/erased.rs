@@ -12,8 +12,8 @@ use std::sync::Arc;
 /// depend on the kind of edit.
 const GROUPS_PER_EDIT: usize = 5;
 
-/// The buffers of shared/erased.wgsl: views without edits have one of their own, so that
-/// alternating views with and without edits replace neither.
+/// The buffers of shared/erased.wgsl. Views without edits have a separate buffer, so that no buffer
+/// is replaced when views with and without edits alternate.
 #[derive(Debug)]
 pub(crate) struct ErasedSpace {
     nothing: Buffer,
@@ -86,13 +86,13 @@ fn buffer(gpu: &Gpu, edits: &Edits, world_from_drawn: &Matrix4<f64>) -> Result<B
     )?)
 }
 
-/// The data of shared/erased.wgsl, for kernels whose points are in a frame, and in units, other
-/// than the world's.
+/// The data of shared/erased.wgsl, for kernels whose frame and units differ from those of the
+/// world.
 ///
 /// * `world_from_drawn`: maps points of the kernel to world, meters.
 fn words(edits: &Edits, world_from_drawn: &Matrix4<f64>) -> Vec<[u32; 4]> {
-    // All edits have the same size, so that a kernel finds each one by its index. The ranges of
-    // cells vary in number, so they follow after the last edit, which refers to them.
+    // All edits have the same size, so that a kernel finds each one by its index. The number of
+    // cell ranges varies, so the ranges follow after the last edit. Each edit refers to its ranges.
     let n = u32::try_from(edits.len()).expect("at most 64");
     let mut words = vec![[n, 0, 0, 0]];
     let mut ranges: Vec<[u32; 4]> = Vec::new();

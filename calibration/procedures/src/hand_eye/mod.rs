@@ -89,7 +89,7 @@ pub struct HandEyeOutcome {
 
 impl HandEyeTask {
     /// Reads a samples file, or takes the images from a recording or from the devices of a rig. If
-    /// the arm moves to take the images, it is returned, and [`MovedArm::finish`] must be called
+    /// the arm moves to take the images, returns the arm. [`MovedArm::finish`] must then be called
     /// with the result of the calibration.
     ///
     /// # Errors
@@ -268,7 +268,8 @@ impl HandEyeTask {
         if let Source::Scan { scan, .. } = source
             && scan.is_rolling_shutter()
         {
-            // The corners were corrected with the pose in the rig file. Now a better one is known.
+            // The corners were corrected with the pose in the rig file. They are corrected again,
+            // because a better pose is now known.
             input.samples = scan.samples(Some(&calibration.parent_from_camera)).0;
             calibration = calibrate_hand_eye(&input)?;
         }
@@ -398,7 +399,7 @@ fn with_reason(error: anyhow::Error, source: &Source, samples: &Samples) -> anyh
         .collect();
     match unused.first() {
         Some(first) if session::class(&error) == ErrorClass::InsufficientData => {
-            // Unreadable images do not count, because they say nothing about the target.
+            // Unreadable images do not count, because they contain no information about the target.
             let n_all = source.n_samples() - (samples.unused.len() - unused.len());
             let n = unused.len();
             let name = &first.name;
@@ -430,7 +431,8 @@ pub fn pose_toml(pose: &Transform) -> String {
     format!("{{ xyz_m = [{xyz_m}], quat_xyzw = [{quat_xyzw}] }}")
 }
 
-/// Numbers for a rig file. Nine digits are a nanometer, below any calibration error.
+/// Numbers for a rig file. Nine digits have a resolution of a nanometer, which is below any
+/// calibration error.
 fn nine_digits(values: &[f64]) -> String {
     values
         .iter()
@@ -439,8 +441,8 @@ fn nine_digits(values: &[f64]) -> String {
         .join(", ")
 }
 
-/// The start of the estimation of a lens. Without distortion, the estimate of a real lens would be
-/// wrong by more than its standard deviation.
+/// Start values for estimating a lens. They include distortion, because without it, the estimate of
+/// a real lens would be wrong by more than its standard deviation.
 fn with_distortion(given: Intrinsics) -> Intrinsics {
     match given.lens {
         Lens::Pinhole => Intrinsics {

@@ -21,14 +21,14 @@ use std::path::Path;
 use targets::{GrayImage, TargetSpec};
 
 /// Largest change of a joint from the start, radians. A user who has checked the surroundings of
-/// the arm expects motions near its current posture. Larger changes give more different poses, but
-/// also let elbow and cables reach farther.
+/// the arm expects motions near its current posture. Larger changes give more diverse poses, but
+/// the elbow and the cables also reach farther.
 const MAX_JOINT_CHANGE_RAD: f64 = 1.2;
 /// Maximum distance of the flange from its position at the start, unless a flag sets it, meters:
 /// room that is usually free around an arm that was moved to its target by hand.
 const DEFAULT_DISTANCE_M: f64 = 0.3;
-/// Standard deviation of the rotation at which the result is accurate, degrees: half a millimeter
-/// at a distance of half a meter.
+/// Standard deviation of the rotation below which the result counts as accurate, degrees. It
+/// corresponds to half a millimeter at a distance of half a meter.
 const GOAL_DEG: f64 = 0.05;
 
 /// How an arm moves to calibrate its camera.
@@ -84,8 +84,8 @@ impl MovedArm {
         }
     }
 
-    /// Holds an arm whose motors would release it, until a signal. Before, logs the error that the
-    /// program ends with.
+    /// Holds an arm whose motors would release it, until a signal. Before that, logs the error with
+    /// which the program will end.
     ///
     /// # Errors
     /// If the arm has stopped because of a fault.
@@ -166,7 +166,7 @@ impl MotionOptions {
         } else {
             Devices::Real
         };
-        // Before the arm: without its page, the planned motion is not shown.
+        // The page is opened before the arm, because without it, the planned motion is not shown.
         let view = request.host.open_view(&given_camera, activity)?;
         let mut capture = ArmCapture::new(open::movable(&given, devices, camera)?)?;
         let rig = resolved(&given, capture.rig());
@@ -198,7 +198,7 @@ impl MotionOptions {
         } = images;
         view.finish();
         drop(view);
-        // A simulated arm has nothing to fall.
+        // A simulated arm cannot fall.
         let holds_on_exit = is_simulated
             || given
                 .arm
@@ -212,7 +212,7 @@ impl MotionOptions {
             failure: None,
         };
         match failure {
-            // At most the first motion was tried.
+            // At this point, no more than the first motion was tried.
             Some(error) if found.len() < 2 => {
                 outputs::log_failure(arm.hold_after(Some(&error)));
                 return Err(error);
@@ -321,8 +321,8 @@ impl MotionOptions {
             };
             match images.add(image) {
                 Ok(_) => plan.seen(),
-                // A pose from which the target is not visible only costs time. The plan avoids its
-                // neighborhood.
+                // A pose from which the target is not visible only costs time. The plan then avoids
+                // poses near it.
                 Err(reason) => {
                     log::info!("pose {}: {reason}", images.found.len());
                     plan.unseen();
@@ -438,7 +438,7 @@ impl Images<'_> {
             setup: self.setup(),
             samples: self.found.iter().filter_map(sample_of).collect(),
             intrinsics: Some(self.camera.intrinsics.clone()),
-            intrinsics_covariance: None, // Further poses do not lower its effect.
+            intrinsics_covariance: None, // Further poses do not reduce this effect.
             board_symmetries: symmetries,
             chain: Some(chain),
             options: ArmPlan::estimate_options(&self.request.options),

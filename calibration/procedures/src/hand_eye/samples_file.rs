@@ -217,7 +217,7 @@ impl SamplesFile {
                 EntryBoard::Image(_) => {
                     let DetectedImage { name, board, .. } =
                         detected.next().expect("one result per image");
-                    // Listed in `unused` above.
+                    // This key is listed in `unused` above.
                     let Ok(board) = board else { continue };
                     // One lens model applies to all images, and it depends on their size.
                     samples.expect_size(&name, board.size_px)?;
@@ -248,7 +248,8 @@ impl SamplesFile {
     }
 }
 
-/// A hint at numbers that other programs write but JSON does not have.
+/// Returns a hint if the text contains numbers that other programs write but that are not valid
+/// JSON.
 fn not_json_hint(text: &str) -> &'static str {
     // Whole words only: "inf" is also a part of other words.
     let has = |word: &str| {
@@ -268,7 +269,7 @@ fn not_json_hint(text: &str) -> &'static str {
 }
 
 impl Samples {
-    /// Rejects images of another size than that of the first one.
+    /// Rejects images whose size differs from that of the first image.
     fn expect_size(&mut self, name: &str, size_px: [u32; 2]) -> Result<(), calibration::Error> {
         let first_px = *self.size_px.get_or_insert(size_px);
         // The first image defines the size.
@@ -314,7 +315,8 @@ fn pose(sample: &JsonObject<'_>, key: &str) -> Result<Option<Transform>, BadInpu
     /// Positions beyond this are assumed to be mistakes.
     const MAX_POSITION_M: f64 = 1e4;
     let pose = sample.transform(key)?;
-    // The largest coordinate stands for the distance: the limit is only a rough one.
+    // The largest coordinate is used instead of the distance, because the limit is only
+    // approximate.
     let farthest_m = pose.map_or(0.0, |pose| pose.translation.vector.amax());
     if farthest_m > MAX_POSITION_M {
         let why = format!(
@@ -333,13 +335,15 @@ impl Entry {
             (Some(pose), None) => EntryBoard::Pose(pose),
             (None, Some(image)) => {
                 let path = folder.join(image);
-                // Checked before any image is searched for the target, which takes long.
+                // The path is checked before any image is searched for the target, because the
+                // search takes long.
                 if !path.is_file() {
                     return Err(
                         sample.invalid("image", format!("{} does not exist", path.display()))
                     );
                 }
-                // The name in messages is the path from here, not from the samples file.
+                // Messages contain the path relative to the working directory, not to the samples
+                // file.
                 EntryBoard::Image(ImageFile {
                     name: path.display().to_string(),
                     path,
@@ -350,7 +354,7 @@ impl Entry {
                     sample.invalid("image", "missing; give \"image\" or \"camera_from_board\"")
                 );
             }
-            // Two sources for one value may contradict each other, so neither is preferred.
+            // Two sources for one value may contradict each other, so this is an error.
             (Some(_), Some(_)) => {
                 return Err(sample.invalid(
                     "image",

@@ -84,7 +84,7 @@ impl Source {
         }
     }
 
-    /// Detects the target in all images of a file; a scan has done so.
+    /// Detects the target in all images of a file. For a scan, this has already been done.
     pub(super) fn samples(&mut self, host: &dyn Host) -> anyhow::Result<Samples> {
         match self {
             Self::File(file) => file.detect(host),
@@ -105,8 +105,8 @@ impl Source {
 
     /// An error if there is no image, or if no image shows the target.
     pub(super) fn check(&self, samples: &Samples) -> anyhow::Result<()> {
-        // More images show another board than the given one, so the target is probably wrong. That
-        // explains missing detections better than the errors below.
+        // More images show a different board than the given one, so the given target is probably
+        // wrong. This explains missing detections better than the errors below.
         if let Some(size) = samples.other_size.as_ref().filter(|size| size.prevails) {
             return Err(InsufficientData(size.text.clone()).into());
         }

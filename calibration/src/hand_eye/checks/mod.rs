@@ -27,7 +27,7 @@ pub(crate) fn find_consensus(
     sorted: &Sorted,
 ) -> Result<Consensus, Error> {
     let samples = &sorted.usable;
-    // Units first: all other checks compare meters.
+    // Units are checked first, because all other checks compare meters.
     if let Err(refusal) = check_magnitudes(&input.samples) {
         let mistake = scale_mistake(samples, consensus(samples).as_ref());
         return Err(mistake
@@ -37,8 +37,8 @@ pub(crate) fn find_consensus(
     // Rotations about one axis do not determine the result, however good the images are.
     let given = input.samples.iter().map(|sample| sample.base_from_flange);
     rotations::check_rotations(&given.collect::<Vec<_>>())?;
-    // Samples without a board and repeated ones are reported, but not used: a repetition would
-    // count as an independent measurement.
+    // Samples without a board and repeated samples are reported but not used. A repeated sample
+    // would count as an independent measurement.
     if samples.len() < MIN_SAMPLES {
         let kind = if sorted.repeated.is_empty() {
             ""
@@ -51,8 +51,8 @@ pub(crate) fn find_consensus(
         ];
         return Err(samples::too_few(samples.len(), kind, what).into());
     }
-    // Known mistakes are named before anything is estimated: outlier rejection would only report
-    // that the samples disagree.
+    // Known mistakes are reported before anything is estimated, because outlier rejection would
+    // only report that the samples disagree.
     let found = consensus(samples);
     if let Some(refusal) = explain(input, samples, found.as_ref()) {
         return Err(refusal.into());
@@ -82,8 +82,8 @@ pub(crate) fn check_result(
     let Err(refusal) = check_uncertainty(input, refined) else {
         return Ok(());
     };
-    // An uncertain result has a cause. Contradicting intrinsics are the most specific one, then
-    // contradicting poses, then too little motion, which the refusal names.
+    // The refusal names the cause of an uncertain result. The most specific cause is tested first:
+    // contradicting intrinsics, then contradicting poses, then too little motion.
     let Some(doubt) = refined.intrinsics_doubt.as_deref() else {
         let contradiction = contradiction(refined, calibration.scatter.mm);
         let uncertain = || refusal.with_warnings(&calibration.warnings, None);
@@ -99,12 +99,12 @@ pub(crate) fn check_result(
 
 const NO_SOLUTION: &str = "no hand-eye transform explains three of the samples";
 
-/// Positions of a robot or distances of a board in meters do not exceed this; in millimeters they
-/// do, from 2 cm on.
+/// Positions of a robot or distances of a board in meters do not exceed this. If they are in
+/// millimeters, all lengths above 2 cm exceed it.
 const MAX_POSITION_M: f64 = 20.0;
 
-/// A variant of the input explains it if it fits better by this factor. A smaller factor would
-/// blame good input whose variant fits slightly better by chance.
+/// A variant of the input explains the disagreement if it fits better by this factor. With a
+/// smaller factor, good input would be rejected if a variant fits slightly better by chance.
 const MUCH_BETTER: f64 = 5.0;
 
 /// Checks that the positions can be meters.
@@ -127,7 +127,7 @@ fn check_magnitudes(samples: &[HandEyeSample]) -> Result<(), Refusal> {
                 .reduce(f64::max),
         })
         .collect();
-    // The median, because single positions may be wrong for other reasons.
+    // The median is used, because single positions may be wrong for other reasons.
     for (name, values) in [("base_from_flange", robot), ("the board", board)] {
         let median = numbers::quantile::median(&values).unwrap_or(0.0);
         if median > MAX_POSITION_M {
@@ -163,12 +163,13 @@ fn explain(
     } else {
         NO_SOLUTION.to_owned()
     };
-    // A shift is tested first: with shifted lists, all other tests would compare wrong pairs.
+    // A shift is tested first, because with shifted lists, all other tests would compare wrong
+    // pairs.
     if let Some(refusal) = shift_mistake(input, samples, found_m, distance_m) {
         return Some(refusal);
     }
-    // Wrong units are tested even if the samples agree roughly: a scale near 1, such as that of a
-    // board of another size, leaves small errors only.
+    // Wrong units are tested even if the samples agree roughly. If the scale is near 1, for example
+    // because the board has another size, the errors are small.
     if let Some((why, remedy)) = scale_mistake(samples, found) {
         return Some(Refusal::new(format!("{residual}, and {why}"), remedy));
     }
@@ -193,12 +194,13 @@ fn has_images(samples: &[Sample]) -> bool {
         .any(|sample| sample.candidates[0].corners.is_some())
 }
 
-/// Explanation of samples that agree on a board behind the camera: other camera axes, or both poses
-/// of each sample inverted, so that they agree on the inverse of another transform.
+/// Explanation of samples that agree on a board behind the camera. Either the camera axes are
+/// different, or both poses of each sample are inverted, so that the samples agree on the inverse
+/// of another transform.
 fn behind_mistake(samples: &[Sample]) -> Option<Refusal> {
     let is_behind = |sample: &&Sample| likely_board(sample).translation.z <= 0.0;
     let n_behind = samples.iter().filter(is_behind).count();
-    // Most, not all: a few samples may be wrong in another way.
+    // It is sufficient that most samples are behind, because a few may be wrong in another way.
     (5 * n_behind > 4 * samples.len()).then(|| {
         Refusal::new(
             format!(
@@ -246,8 +248,8 @@ fn inversion_mistake(
     );
     let robot_remedy = format!("invert the robot poses, or choose the setup {other}");
     let board = "camera_from_board is inverted: the given matrices are board_from_camera";
-    // Only boards in front of the camera are visible. Poses from corners are not inverted: this
-    // program computed them.
+    // Only boards in front of the camera are visible. Poses from corners are not inverted, because
+    // this program computed them.
     let is_in_front = |sample: &Sample| likely_board(sample).translation.z > 0.0;
     let inverse_is_in_front = |sample: &Sample| likely_board(sample).inverse().translation.z > 0.0;
     let may_be_robot = !has_poses || samples.iter().all(is_in_front);
@@ -264,8 +266,8 @@ fn inversion_mistake(
     })
 }
 
-/// Samples that contradict each other, which more samples do not change. `scatter_mm` is the
-/// scatter of the board.
+/// The refusal of samples that contradict each other. More samples would not help. `scatter_mm` is
+/// the scatter of the board.
 fn contradiction(refined: &Refined, scatter_mm: f64) -> Option<Refusal> {
     /// Scatter of the board relative to its distance. Detections and robots are far more accurate.
     const MAX_FRAC: f64 = 0.05;
@@ -328,7 +330,7 @@ fn shift_mistake(
     ))
 }
 
-/// A shift by chance does not fit this many samples better.
+/// With this many samples, a wrong shift does not fit better by chance.
 const MIN_SHIFTED_SAMPLES: usize = 6;
 
 /// Median distance of the samples, meters, if each board is paired with the robot pose of the
@@ -386,9 +388,10 @@ fn scale_mistake(samples: &[Sample], found: Option<&Consensus>) -> Option<(Strin
     Some(explain_scale(scale, sigma))
 }
 
-/// What a scale of the robot's translations relative to the board's means, and the remedy.
+/// Explains a scale of the robot's translations relative to the board's translations, and how to
+/// correct it.
 fn explain_scale(scale: f64, sigma: f64) -> (String, String) {
-    /// Units and how many make a meter.
+    /// Names of units, and the number of units per meter.
     const UNITS: [(&str, f64); 3] = [
         ("millimeters", 1000.0),
         ("centimeters", 100.0),
@@ -424,7 +427,7 @@ fn explain_scale(scale: f64, sigma: f64) -> (String, String) {
     }
 }
 
-/// A sentence on positions that are in another unit than those of another body.
+/// A sentence about positions whose unit differs from that of another body.
 fn wrong_unit(body: &str, other: &str, unit: &str, per_m: f64) -> String {
     format!(
         "the positions of {body} are {per_m} times too large relative to those of {other}: they are probably in {unit}"

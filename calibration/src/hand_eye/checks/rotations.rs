@@ -10,9 +10,9 @@ use kinematics::Transform;
 use nalgebra::{Matrix3, SymmetricEigen, UnitQuaternion, Vector3};
 use std::fmt;
 
-/// Pose errors may be amplified by at most this factor: the reciprocal of the rotation about the
-/// second axis, in radians. Robots whose poses are accurate to 0.1 to 1 mm then give a hand-eye
-/// transform that is accurate to 2 to 20 mm.
+/// Pose errors may be amplified by at most this factor. The amplification is the reciprocal of the
+/// rotation about the second axis, in radians. Robots whose poses are accurate to 0.1 to 1 mm then
+/// give a hand-eye transform that is accurate to 2 to 20 mm.
 const MAX_AMPLIFICATION: f64 = 20.0;
 
 /// Recommended rotation about each axis, degrees. Errors of the robot poses are then amplified by a
@@ -118,7 +118,7 @@ fn rotation_spread(poses: &[Transform]) -> Option<([f64; 3], Matrix3<f64>)> {
 /// Name of an axis: "the flange's z axis", or its components if it is not close to a coordinate
 /// axis.
 pub(crate) fn axis_name(axis: &Vector3<f64>, body: &str) -> String {
-    // 15 degrees: a person who moves an arm does not aim more accurately.
+    // 15 degrees. A person who moves an arm by hand does not aim more accurately.
     const CLOSE_RAD: f64 = 0.26;
     let largest = axis.iamax();
     if axis[largest].abs() >= CLOSE_RAD.cos() {
@@ -132,7 +132,7 @@ pub(crate) fn axis_name(axis: &Vector3<f64>, body: &str) -> String {
     )
 }
 
-/// Describes the missing rotations: those about the axes perpendicular to an axis of a body.
+/// Describes the missing rotations, which are about the axes perpendicular to an axis of a body.
 pub(super) fn rotations_across(axis: &Vector3<f64>, body: &str) -> String {
     let [first, second] = [["y", "z"], ["x", "z"], ["x", "y"]][axis.iamax()];
     format!(
@@ -142,12 +142,13 @@ pub(super) fn rotations_across(axis: &Vector3<f64>, body: &str) -> String {
 
 /// Number of poses after which no more are needed, if the rotations suffice.
 pub const RECOMMENDED_POSES: usize = 12;
-/// Rotation about each axis that the poses should span, degrees: 20 in both directions.
+/// Rotation about each axis that the poses should span, degrees. It corresponds to 20 degrees in
+/// both directions.
 const MIN_SPAN_DEG: f64 = 40.0;
-/// Number of poses that are asked for at a time: two in each direction.
+/// Number of poses that are requested at a time: two in each direction.
 const POSES_AT_A_TIME: usize = 4;
-/// A pose counts as rotated about an axis from this angle, degrees. It is half of the angle that is
-/// asked for, because people rotate an arm by eye.
+/// A pose counts as rotated about an axis if the angle is at least this, degrees. The limit is half
+/// of the requested angle, because people estimate rotations by eye.
 const ROTATED_DEG: f64 = 10.0;
 
 /// Coverage of the robot poses so far.

@@ -20,19 +20,21 @@ pub struct ArmPlanOptions {
     /// Standard deviation of the position along each axis at which the result is accurate,
     /// millimeters.
     pub goal_mm: f64,
-    /// The same of the rotation, degrees.
+    /// The same limit for the rotation, degrees.
     pub goal_deg: f64,
 }
 
-/// Minimum number of poses: standard deviations from fewer are not reliable.
+/// Minimum number of poses. Standard deviations from fewer poses are not reliable.
 pub const MIN_POSES: usize = 10;
-/// Number of poses in a row without the target after which the plan ends. Larger than the six
-/// rotations about the target, all of which fail if the given camera pose is wrong.
+/// Number of poses in a row without the target after which the plan ends. It is larger than the
+/// number of rotations about the target (six), because all of them fail if the given camera pose is
+/// wrong.
 const MAX_UNSEEN: usize = 8;
 
-/// Standard deviation of the position up to which an estimate selects poses, as long as small
-/// rotations remain, millimeters. With a larger error of the camera pose, suggested poses may not
-/// show the target; with a smaller limit, the arm makes more small rotations, which add little.
+/// As long as small rotations remain, an estimate selects poses only if the standard deviation of
+/// the position is at most this, millimeters. If the error of the camera pose is larger, the target
+/// may not be visible at suggested poses. With a smaller limit, the arm makes more small rotations,
+/// which add little information.
 const MAX_EARLY_SIGMA_MM: f64 = 20.0;
 
 /// What an arm does next.
@@ -162,8 +164,8 @@ impl<'a> ArmPlan<'a> {
                 "the target was not seen at the last {MAX_UNSEEN} poses"
             ));
         }
-        // A few small rotations first: with fewer samples, or a large uncertainty, an estimate may
-        // be far off.
+        // The plan starts with a few small rotations, because with few samples or a large
+        // uncertainty, an estimate may have large errors.
         if n < 5 || estimate.as_ref().map_or(true, |found| is_uncertain(found)) {
             // Poses that the arm does not reach are skipped and not tried again.
             while let Some((pose, purpose)) = self.first.pop_front() {
@@ -180,15 +182,16 @@ impl<'a> ArmPlan<'a> {
                 ));
             }
         };
-        // Another seed each time, so that a pose at which the target was not seen is not suggested
-        // again.
+        // The seed changes each time, so that a pose at which the target was not seen is not
+        // suggested again.
         self.n_refined += 1;
         let options = NextPoseOptions {
             reach: Some((self.reach, current)),
             seed: self.n_refined as u64,
             ..self.poses
         };
-        // One pose at a time: the next estimate may change what is worth measuring.
+        // Only one pose is suggested at a time, because the next estimate may change which poses
+        // are most informative.
         match suggest_next_poses(input, calibration, &options).pop() {
             Some(next) => match next.joints {
                 Some(joints) => ArmStep::Move { joints, purpose: next.relation },
@@ -219,15 +222,15 @@ fn purpose(verb: &str, (sign, axis): (f64, usize), degrees: f64, body: &str) -> 
 }
 
 /// Rotations about the center of the target according to the approximate pose of the camera, which
-/// keep the target in view. If that pose is far off, the target leaves the view. Therefore, small
-/// rotations about the flange follow.
+/// keep the target in view. If that pose has a large error, the target leaves the view. Therefore,
+/// small rotations about the flange follow.
 fn first_poses(
     reach: &Reach<'_>,
     first: &FirstView<'_>,
     center_in_board: &Vector3<f64>,
 ) -> VecDeque<(Transform, String)> {
-    /// Rotation about the target, degrees: large enough for a first estimate, small enough to be
-    /// reached almost everywhere.
+    /// Rotation about the target, degrees. It is large enough for a first estimate, and small
+    /// enough to be reached almost everywhere.
     const ABOUT_TARGET_DEG: f64 = 15.0;
     /// Rotations about the flange, degrees. They move the target in the image by the same angle, so
     /// it stays in view only if they are much smaller than half the field of view.
@@ -257,8 +260,8 @@ fn first_poses(
         poses.extend(DIRECTIONS.map(|direction| {
             let axis = base_from_camera.rotation * unit(direction);
             let rotation = UnitQuaternion::from_scaled_axis(axis * ABOUT_TARGET_DEG.to_radians());
-            // Maps the center to itself. For the eye to hand, the same motion of the flange rotates
-            // the target about its own center.
+            // This motion maps the center to itself. With the eye to hand, the same motion of the
+            // flange rotates the target about its own center.
             let about_center = Transform::from_parts((center - rotation * center).into(), rotation);
             (
                 about_center * start,
@@ -299,7 +302,7 @@ mod tests {
     ) -> (Vec<HandEyeSample>, String) {
         let chain = Chain::from_urdf(PANDA, "panda_link0", "panda_link8").expect("a robot");
         let scene = scene::Scene::new(setup, 1, 0.0, 3);
-        // The board where the camera sees it from the start configuration.
+        // The board is placed where the camera sees it from the start configuration.
         let start = chain.forward(&START).expect("a configuration");
         let (x, y) = (scene.parent_from_camera, scene.parent_from_board);
         let camera_from_board = scene.camera_from_board(&scene.base_from_flange[0]);

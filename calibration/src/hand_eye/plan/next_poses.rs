@@ -18,8 +18,8 @@ use numbers::random::Random;
 /// controllers stop an arm shortly before its limits.
 const LIMIT_MARGIN: f64 = 0.05;
 /// Largest change of a joint between two configurations of a path at which the distance from the
-/// start is checked, radians or meters. One joint moves the flange of an arm of 1 m by 5 cm between
-/// them.
+/// start is checked, radians or meters. With an arm of 1 m, one joint moves the flange by 5 cm
+/// between two configurations.
 const PATH_STEP: f64 = 0.05;
 
 /// The space around a start configuration in which an arm moves.
@@ -36,8 +36,8 @@ pub struct Reach<'a> {
 }
 
 impl Reach<'_> {
-    /// Joint values for a flange pose, if straight paths in joint space from `current` to it, and
-    /// from it back to the start, stay near the start.
+    /// Joint values for a flange pose. `None` unless two straight paths in joint space stay near
+    /// the start: from `current` to the pose, and from the pose back to the start.
     pub fn joints_for(&self, base_from_flange: &Transform, current: &[f64]) -> Option<Vec<f64>> {
         let start = self.chain.forward(self.start).ok()?;
         // The distance is checked before inverse kinematics, which takes long.
@@ -63,8 +63,8 @@ impl Reach<'_> {
             .chain
             .inverse(base_from_flange, self.start, &bounds)
             .ok()??;
-        // The way back is checked, too: an arm that cannot return to its start would have to be
-        // freed by hand.
+        // The way back is also checked. An arm that cannot return to its start would have to be
+        // moved by hand.
         let is_allowed = current.len() == joints.len()
             && self.path_is_near(current, &joints, &start)
             && self.path_is_near(self.start, &joints, &start);
@@ -158,8 +158,8 @@ pub fn suggest_next_poses(
     };
     let candidates = scene.candidates();
     let mut suggested: Vec<NextPose> = Vec::new();
-    // Greedily: the best pose, then the best one given the first, and so on. Comparing all sets of
-    // poses would take far longer.
+    // Poses are selected greedily: first the best pose, then the best pose given the first one, and
+    // so on. Comparing all sets of poses would take far longer.
     for _ in 0..options.n_poses {
         let Some(before) = log_volume(&information) else {
             break;
@@ -187,7 +187,8 @@ pub fn suggest_next_poses(
             joints: best.joints.clone(),
             motion,
             relation,
-            // The volume is that of variances: half of its logarithm, shared by six parameters.
+            // The volume is computed from variances of six parameters. The mean logarithm of the
+            // standard deviations is thus one twelfth of the gain.
             sigma_frac: (-gain / 12.0).exp(),
         });
     }
@@ -196,7 +197,8 @@ pub fn suggest_next_poses(
 
 /// Logarithm of the determinant of the covariance of the hand-eye transform.
 fn log_volume(information: &DMatrix<f64>) -> Option<f64> {
-    // Only the hand-eye transform counts. The pose of the board is estimated, but is no goal.
+    // Only the hand-eye transform counts. The pose of the board is also estimated, but its accuracy
+    // is not a goal.
     let covariance = information.clone().cholesky()?.inverse();
     let hand_eye: Matrix6<f64> = covariance.fixed_view::<6, 6>(0, 0).into_owned();
     Some(2.0 * hand_eye.cholesky()?.l().diagonal().map(f64::ln).sum())
@@ -229,7 +231,7 @@ struct Scene<'a> {
 
 impl Scene<'_> {
     fn candidates(&self) -> Vec<Candidate> {
-        // More trials find slightly better poses, and take longer, most of all with inverse
+        // More trials find slightly better poses but take longer, especially with inverse
         // kinematics.
         const TRIALS: usize = 1500;
         let refined = &self.calibration.refined;
@@ -248,7 +250,7 @@ impl Scene<'_> {
                 let camera_from_board = refined.solution.camera_from_board(&a);
                 self.is_well_visible(&camera_from_board, distance_m)
                     .then_some(())?;
-                // Inverse kinematics last, because it takes longest.
+                // Inverse kinematics comes last, because it takes longest.
                 let joints = match &self.options.reach {
                     Some((reach, current)) => Some(reach.joints_for(&base_from_flange, current)?),
                     None => joints,
@@ -299,7 +301,7 @@ impl Scene<'_> {
         sample_ix: usize,
         random: &mut Random,
     ) -> Option<(Transform, Option<Vec<f64>>)> {
-        // Large changes have more information, but the board leaves the image more often.
+        // Large changes give more information, but the board leaves the image more often.
         const MAX_JOINT_CHANGE: f64 = 0.8;
         const MAX_ROTATION_RAD: f64 = 0.9;
         let sample = &self.input.samples[sample_ix];
@@ -314,14 +316,15 @@ impl Scene<'_> {
                 .iter()
                 .zip(chain.limits())
                 .all(|(joint, limit)| (limit.lower..=limit.upper).contains(joint));
-            // Relative to the reported pose, because a tool frame may follow the chain's tip.
+            // The motion is applied relative to the reported pose, because a tool frame may follow
+            // the chain's tip.
             let before = chain.forward(joints).ok()?;
             let pose = chain.forward(&moved).ok()? * before.inverse() * sample.base_from_flange;
             return is_allowed.then_some((pose, Some(moved)));
         }
         // Rotates the camera about the center of the board, or the board about its own center.
         let solution = &self.calibration.refined.solution;
-        // A normal vector has a uniform direction.
+        // A vector of normally distributed numbers has a uniformly distributed direction.
         let axis = Vector3::new(random.normal(), random.normal(), random.normal()).normalize();
         let turn = UnitQuaternion::from_scaled_axis(axis * random.uniform(0.2, MAX_ROTATION_RAD));
         let base_from_board = match self.input.setup {
@@ -334,8 +337,8 @@ impl Scene<'_> {
         if self.options.reach.is_none() {
             return Some((turned, None));
         }
-        // An arm also changes the distance and the place of the board in the image, which a person
-        // does anyway.
+        // For an arm, the distance and the position of the board in the image are also changed. A
+        // person changes the rotations in any case.
         let distance_m = (solution.camera_from_board(&geometry::a_of(self.input.setup, &turned)))
             .translation
             .vector
@@ -349,12 +352,13 @@ impl Scene<'_> {
 
     /// Whether all of the board is in view, at a distance and tilt at which it is detected.
     fn is_well_visible(&self, camera_from_board: &Transform, distance_m: f64) -> bool {
-        // Relative to the samples so far, in which the board was detected.
+        // Allowed distances relative to the samples so far, in which the board was detected.
         const DISTANCES: std::ops::RangeInclusive<f64> = 0.6..=1.6;
         const MARGIN_FRAC: f64 = 0.02;
-        // The arm moves before anyone can check whether the board is in view.
+        // The margin for an arm is larger, because it moves before anyone can check whether the
+        // board is in view.
         const ARM_MARGIN_FRAC: f64 = 0.05;
-        // Without intrinsics: the field of view of a narrow camera.
+        // Without intrinsics, the field of view of a narrow camera is assumed.
         const HALF_VIEW_RAD: f64 = 0.35;
         let center = (camera_from_board * Point3::from(self.options.center_in_board)).coords;
         let normal = camera_from_board.rotation * Vector3::z();
@@ -395,7 +399,7 @@ impl Scene<'_> {
     fn motion(&self, candidate: &Candidate) -> [String; 2] {
         let sample = &self.input.samples[candidate.sample_ix];
         let old_from_new = sample.base_from_flange.inverse() * candidate.base_from_flange;
-        // The same rotation in camera axes (eye in hand).
+        // This is the same rotation in camera axes (eye in hand).
         let x = &self.calibration.refined.solution.x;
         let (rotation, body) = match self.input.setup {
             Setup::EyeInHand => (x.inverse() * old_from_new * x, "camera"),
@@ -489,7 +493,7 @@ mod tests {
             max_distance_m: 0.5,
         };
         let start = chain.forward(&START).unwrap();
-        // The flange is where it was, but on the way it moves.
+        // The position of the flange is the same at both ends, but it moves along the path.
         let rotated = start * Transform::new(Vector3::zeros(), Vector3::y() * 0.7);
         let joints = wide.joints_for(&rotated, &START).expect("the pose is near");
         let middle: Vec<f64> = joints

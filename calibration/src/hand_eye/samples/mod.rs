@@ -17,7 +17,8 @@ use planar_pose::BoardPose;
 pub(crate) struct Sample {
     /// Index in the input.
     pub(crate) sample_ix: usize,
-    /// Index of the stop: samples at the same robot pose share it, and the error of that pose.
+    /// Index of the stop of the robot. Samples at the same robot pose have the same stop, and share
+    /// the error of that pose.
     pub(crate) stop_ix: usize,
     /// See [`geometry::Solution`].
     pub(crate) a: Transform,
@@ -94,7 +95,7 @@ impl Candidate {
     }
 }
 
-/// What the corners of one image say about the pose of the board.
+/// Information of the corners of one image about the pose of the board.
 #[derive(Clone, Debug)]
 pub(crate) struct CornerStatistics {
     /// Covariance of the pose for corners with an error of one pixel, in the parameters of
@@ -209,7 +210,7 @@ fn is_same(a: &HandEyeSample, b: &HandEyeSample) -> bool {
 
 /// Whether a robot reports the same pose twice, up to the noise of its encoders.
 fn is_same_stop(a: &Transform, b: &Transform) -> bool {
-    // Above the noise of encoders, below any motion that adds information.
+    // The limits are above the noise of encoders, and below any motion that adds information.
     const SAME_M: f64 = 5e-4;
     const SAME_RAD: f64 = 1e-3;
     let difference = a.inverse() * b;
@@ -223,10 +224,10 @@ fn is_identity(transform: &Transform) -> bool {
 
 /// Removes the second solution if the corners exclude it.
 fn likely(mut poses: Vec<BoardPose>) -> Vec<BoardPose> {
-    /// Ratio of sums of squares; for a board of normal size, a wrong solution exceeds it by orders
-    /// of magnitude.
+    /// Ratio of sums of squares. For a board of normal size, the ratio of a wrong solution is
+    /// larger by orders of magnitude.
     const MAX_RATIO: f64 = 4.0;
-    // Residuals of an exact simulation do not exclude anything.
+    // With this minimum, the tiny residuals of an exact simulation do not exclude a solution.
     const MIN_PX: f64 = 0.05;
     if let [best, second] = poses.as_slice() {
         let (best, second) = (&best.corners, &second.corners);
@@ -358,7 +359,7 @@ fn check_chain(samples: &[HandEyeSample], chain: &Chain) -> Result<(), Error> {
 
 /// Rejects a matrix that is not a covariance of `n` parameters.
 fn check_covariance(covariance: &DMatrix<f64>, n: usize) -> Result<(), Error> {
-    // Relative to the variances. Files with fewer than 6 digits are rejected.
+    // Tolerance relative to the variances. Files with fewer than 6 digits are rejected.
     const ROUNDING: f64 = 1e-6;
     let (rows, columns) = covariance.shape();
     require((rows, columns) == (n, n), || {
@@ -387,7 +388,7 @@ fn check_covariance(covariance: &DMatrix<f64>, n: usize) -> Result<(), Error> {
 }
 
 /// Median angle by which the reported flange rotates against the tip of the chain, relative to the
-/// first sample, radians. It is zero if the joint values, times `factor`, explain the motion.
+/// first sample, radians. It is zero if the joint values multiplied by `factor` explain the motion.
 fn median_tip_rotation_rad(samples: &[HandEyeSample], chain: &Chain, factor: f64) -> f64 {
     let tip_from_flange = |sample: &HandEyeSample| {
         let joints = sample.joints.iter().flatten();
@@ -404,7 +405,7 @@ fn median_tip_rotation_rad(samples: &[HandEyeSample], chain: &Chain, factor: f64
 
 /// Rejects joint values that do not explain the motion of the flange.
 fn check_joints(samples: &[HandEyeSample], chain: &Chain) -> Result<(), Error> {
-    /// Offsets of the joints move the flange less than this.
+    /// Offsets of the joints rotate the flange by less than this.
     const MAX_ROTATION_RAD: f64 = 0.1;
     let found = median_tip_rotation_rad(samples, chain, 1.0);
     if found < MAX_ROTATION_RAD {

@@ -68,7 +68,7 @@ fn poses_in_range(
         pairs: plane.points.into_iter().zip(rays.iter().copied()).collect(),
         intrinsics,
     };
-    // All corners first: without outliers, this is the best result, and the fastest.
+    // All corners are tried first. Without outliers, this is the fastest way to the best result.
     let n_inliers = |poses: &[BoardPose]| poses.first().map_or(0, |best| best.corners.n_inliers());
     let mut poses = corners.poses(&vec![true; points.len()]);
     if n_inliers(&poses) < points.len()
@@ -79,7 +79,7 @@ fn poses_in_range(
             poses = robust;
         }
     }
-    // A near board has one solution only, which both initial poses lead to.
+    // A near board has only one solution, to which both initial poses converge.
     if poses.len() == 2 && is_same(&poses[0].camera_from_board, &poses[1].camera_from_board) {
         poses.truncate(1);
     }
@@ -121,8 +121,8 @@ impl Corners<'_> {
     /// The largest set of corners found that agrees with a homography of four of them (Fischler and
     /// Bolles 1981). `None` if it has fewer than half of the corners.
     fn consensus(&self) -> Option<Vec<bool>> {
-        // Finds four good corners with 99.99 % probability if half of them are wrong:
-        // (1 - 0.5^4)^150 = 6e-5.
+        // If half of the corners are wrong, this number of trials finds four good ones with a
+        // probability of 99.99 %: (1 - 0.5^4)^150 = 6e-5.
         const TRIALS: usize = 150;
         // A homography of four noisy corners is inaccurate far from them.
         const ALLOWED_PX: f64 = 3.0;
@@ -169,7 +169,8 @@ struct Plane {
 impl Plane {
     /// `None` if the points are too few or on a line.
     fn new(points: &[BoardPoint]) -> Option<Self> {
-        // Of the shorter to the longer side. Corners on a line determine no rotation about it.
+        // Minimum ratio of the shorter to the longer side. Corners on a line do not determine the
+        // rotation about that line.
         const MIN_WIDTH_RATIO: f64 = 1e-3;
         (points.len() >= MIN_CORNERS).then_some(())?;
         let centroid = points
@@ -248,8 +249,8 @@ fn initial_rotations(homography: &Matrix3<f64>) -> Vec<UnitQuaternion<f64>> {
     // upper left part of a rotation is 1.
     let upper = scaled / largest;
     let rest = Matrix2::identity() - upper.transpose() * upper;
-    // The third row completes the columns to unit length. Its sign is not determined: these are the
-    // two solutions, which tilt the board to opposite sides of the ray.
+    // The third row completes the columns to unit length. Its sign is not determined, which gives
+    // the two solutions. They tilt the board to opposite sides of the ray.
     let b0 = rest[(0, 0)].max(0.0).sqrt();
     let b1 = rest[(1, 1)].max(0.0).sqrt() * rest[(0, 1)].signum();
     [1.0, -1.0]
@@ -345,7 +346,7 @@ fn refine(
     let pose = least_squares::minimize(&problem, initial, &options)
         .ok()?
         .state;
-    // All corners are checked, not only the used ones: a corner that the initial set left out may
+    // All corners are checked, not only the used ones, because a corner outside the initial set may
     // fit the refined pose.
     let errors: Vec<f64> = points
         .iter()
@@ -375,9 +376,9 @@ fn refine(
 }
 
 /// The pose after one Gauss-Newton step from `predicted`, and the covariance of the step for
-/// corners with an error of one pixel. For a board that faces the camera, a pose near the true one
-/// describes the corners better than the best one, because small tilts change the corners only in
-/// second order.
+/// corners with an error of one pixel. Small tilts of a board that faces the camera change the
+/// corners only in second order. For such a board, this step describes the corners better than the
+/// pose with the smallest error.
 pub(crate) fn stepped(
     predicted: &Transform,
     points: &[BoardPoint],
@@ -391,13 +392,14 @@ pub(crate) fn stepped(
     ))
 }
 
-/// Largest residual that fits the others.
+/// Largest residual that is consistent with the others.
 fn inlier_limit(errors: &[f64]) -> f64 {
     /// Median of the norm of two normal numbers with deviation 1.
     const MEDIAN_OF_NORM: f64 = 1.1774;
-    /// One in 20 000 corners without a mistake exceeds it.
+    /// Of the corners without a mistake, 1 in 20 000 exceeds this limit.
     const DEVIATIONS: f64 = 4.5;
-    /// Deviations of corners within an image are not normal. Below this, none counts as wrong.
+    /// Deviations of corners within an image are not normally distributed. Corners with a smaller
+    /// deviation than this never count as wrong.
     const MIN_PX: f64 = 0.5;
     let median = numbers::quantile::median(errors).unwrap_or(0.0);
     (DEVIATIONS * median / MEDIAN_OF_NORM).max(MIN_PX)

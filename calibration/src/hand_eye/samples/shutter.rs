@@ -17,8 +17,8 @@ pub struct FlangeMotion<'a> {
     pub parent_from_camera: Transform,
 }
 
-/// Moves the corners in one image of a target to where a global shutter would see them at
-/// mid-exposure.
+/// Moves the corners in one image of a target to the positions at which a global shutter would see
+/// them at mid-exposure.
 ///
 /// The correction is the predicted image motion of each corner between mid-exposure and the
 /// exposure of its row. It is small, so approximate intrinsics and an approximate camera pose
@@ -45,7 +45,7 @@ fn corrected(
     motion: &FlangeMotion<'_>,
 ) -> BoardPoint {
     let at_mid = camera_from_board * Point3::from(point.point_in_board);
-    // The row of the detected corner is that in which it was exposed.
+    // The detected corner was exposed in the row in which it lies.
     let at_row = motion.row_from_mid(point.pixel[1] / f64::from(intrinsics.size_px[1])) * at_mid;
     let pixels = intrinsics
         .project(&at_mid.coords)

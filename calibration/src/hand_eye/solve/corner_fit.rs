@@ -15,8 +15,8 @@ use kinematics::{Chain, Intrinsics, Transform};
 use messages::Setting;
 use nalgebra::{DMatrix, DVector, Matrix2x3, Matrix3, Point3, SMatrix, Vector3, Vector6};
 
-/// Threshold of the robust loss, in standard deviations of a corner. Outliers were removed before,
-/// so it only limits the influence of what remains.
+/// Threshold of the robust loss, in standard deviations of a corner. Outliers have already been
+/// removed, so the loss only limits the influence of the remaining errors.
 const LOSS_THRESHOLD: f64 = 3.0;
 
 /// What is estimated besides hand-eye transform and board pose.
@@ -122,7 +122,8 @@ struct CornerProblem<'a> {
     noise: HandEyeNoise,
     /// Number of intrinsics to estimate: all, or 0.
     n_intrinsics: usize,
-    /// The arm, if joint offsets are estimated: those of all joints but the first and the last.
+    /// The arm, if joint offsets are estimated. They are estimated for all joints except the first
+    /// and the last.
     chain: Option<&'a Chain>,
 }
 
@@ -146,13 +147,14 @@ impl CornerProblem<'_> {
         let Some(chain) = self.chain else {
             return Some((view.base_from_flange, Vec::new()));
         };
-        // The reported pose need not be that of the chain's tip: a tool frame may be set in the
-        // controller. The difference is kept.
+        // The reported pose may differ from that of the chain's tip, because a tool frame may be
+        // set in the controller. This difference is kept.
         let corrected = corrected_joints(&view.joints, offsets);
         let tip_from_flange = chain.forward(&view.joints).ok()?.inverse() * view.base_from_flange;
         let twists = chain.tip_twists_by_joint(&corrected).ok()?;
-        // The first joint's offset is the same as a motion of the base, the last one's as a motion
-        // of the flange; both are contained in the other parameters.
+        // An offset of the first joint has the same effect as a motion of the base, and an offset
+        // of the last joint the same as a motion of the flange. The other parameters already
+        // contain both motions.
         let inner = twists[1..twists.len() - 1]
             .iter()
             .map(|twist| twist.of_attached(&tip_from_flange))
@@ -173,8 +175,8 @@ impl CornerProblem<'_> {
         let n_intrinsics = self.n_intrinsics;
         let n_shared = self.n_shared();
         let corner_px = self.noise.corner_px.unwrap_or(1.0);
-        // Shared parameters first (solution, intrinsics, joint offsets), then the error of the
-        // pose.
+        // The shared parameters come first (solution, intrinsics, joint offsets), then the error of
+        // the pose.
         let mut rows = [vec![0.0; n_shared + 6], vec![0.0; n_shared + 6]];
         for point in &view.points {
             let at = chain.at(&point.point_in_board);
@@ -238,7 +240,7 @@ impl least_squares::Problem for CornerProblem<'_> {
         for view in &self.stops[block_ix] {
             self.evaluate_view(state, view, error, sums)?;
         }
-        // The prior of the pose error. All images at a stop share it, so it is added once.
+        // This is the prior of the pose error. All images at a stop share it, so it is added once.
         for (first, sigma) in [(0, self.noise.rotation_rad), (3, self.noise.translation_m)] {
             for ix in first..first + 3 {
                 let mut row = vec![0.0; n_shared + 6];
@@ -300,7 +302,7 @@ struct PointChain {
 struct PointAt {
     point_in_camera: Vector3<f64>,
     by_solution: SMatrix<f64, 3, 12>,
-    /// By a motion of the corrected flange pose, in flange axes.
+    /// Derivatives with respect to a motion of the corrected flange pose, in flange axes.
     by_flange: SMatrix<f64, 3, 6>,
     /// By the pose error.
     by_error: SMatrix<f64, 3, 6>,
@@ -329,12 +331,14 @@ impl PointChain {
         let matrix =
             |rotation: nalgebra::UnitQuaternion<f64>| rotation.to_rotation_matrix().into_inner();
         let point_in_y = map(&self.y, point_in_board);
-        // The flange frame without and with the pose error, and the map of the last to the camera.
+        // The flange frame without and with the pose error, and the map from the latter to the
+        // camera.
         let error_rotation = matrix(self.error_motion.rotation);
         let cross = self.error_rad.cross_matrix();
         let (point_in_camera, camera_from_y, by_flange, by_error) = match self.setup {
             Setup::EyeInHand => {
-                // The board is at rest in the base; the point moves against the flange.
+                // The board is at rest in the base, so the point moves in the opposite direction
+                // relative to the flange.
                 let point_in_flange = map(&self.base_from_flange.inverse(), &point_in_y);
                 let point = map(&self.error_motion.inverse(), &point_in_flange);
                 let rotation = matrix(self.camera_from_x.rotation);
@@ -358,7 +362,7 @@ impl PointChain {
                 let camera_from_flange = self.camera_from_x * self.base_from_flange;
                 let rotation = matrix(camera_from_flange.rotation);
                 let by_flange = joined(-rotation * point.cross_matrix(), rotation);
-                // The left Jacobian, likewise.
+                // This is the left Jacobian, also up to first order.
                 let left = Matrix3::identity() + cross * 0.5;
                 let by_error = joined(-rotation * rotated.cross_matrix() * left, rotation);
                 (
@@ -403,12 +407,12 @@ fn joined(rotation: Matrix3<f64>, translation: Matrix3<f64>) -> SMatrix<f64, 3, 
 /// Covariance of the solution due to errors of the other shared parameters of a fit: intrinsics,
 /// then joint offsets.
 ///
-/// With the others fixed at values that are wrong by `e`, the solution moves by `-A e` with `A` the
-/// inverse of its own information times the information that it shares with the others. The
-/// covariance of a solution with all parameters free is the sum of this and of the covariance with
-/// fixed ones.
+/// If the other parameters are fixed at values that are wrong by `e`, the solution moves by `-A e`.
+/// `A` is the inverse of the solution's own information times the information that it shares with
+/// the others. The covariance of a solution with all parameters free is the sum of this covariance
+/// and of the covariance with fixed parameters.
 ///
-/// * `covariance`: covariance of the others; that of the fit itself if `None`.
+/// * `covariance`: covariance of the other parameters. If `None`, that of the fit itself is used.
 pub(super) fn propagated(
     free: &Fit<CornerState>,
     covariance: Option<&DMatrix<f64>>,
@@ -439,8 +443,8 @@ pub(super) struct IntrinsicsDoubt {
 }
 
 impl IntrinsicsDoubt {
-    /// `None` if free intrinsics do not fit significantly better, or differ by no more than the
-    /// uncertainty of the given ones explains.
+    /// `None` if free intrinsics do not fit significantly better, or if the uncertainty of the
+    /// given intrinsics explains the difference.
     ///
     /// * `free`: fit with free intrinsics.
     pub(super) fn new(
@@ -451,14 +455,14 @@ impl IntrinsicsDoubt {
         let intrinsics = start.intrinsics;
         let fixed = start.minimize(Free::NONE).ok()?;
         // Twice the decrease of the cost has as many degrees of freedom as there are intrinsics.
-        // Residuals of real images are not independent, so their variance scales it, and the limit
-        // is generous.
+        // Residuals of real images are not independent. The decrease is therefore scaled by their
+        // variance, and the limit is generous.
         let n_params = intrinsics.params().len() as f64;
         let decrease = 2.0 * (fixed.cost - free.cost) / free.variance.max(1.0);
         let limit = n_params + 6.0 * (2.0 * n_params).sqrt();
         (decrease > limit).then_some(())?;
-        // The given intrinsics have an uncertainty of their own. A change within it contradicts
-        // nothing, and the uncertainty is propagated to the result anyway.
+        // The given intrinsics are uncertain themselves. A change within this uncertainty is no
+        // contradiction, and the uncertainty is already propagated to the result.
         if covariance.is_some_and(|given| {
             squared_change(intrinsics, free, given).is_some_and(|square| square < limit)
         }) {
@@ -479,8 +483,8 @@ impl IntrinsicsDoubt {
         })
     }
 
-    /// Covariance to add to that of a solution with the given intrinsics: the effect of the
-    /// uncertainty of free intrinsics, and the square of the difference.
+    /// Covariance to add to that of a solution with the given intrinsics. It consists of the effect
+    /// of the uncertainty of free intrinsics, and of the square of the difference.
     pub(super) fn covariance(&self, solution: &Solution) -> DMatrix<f64> {
         let mut shift = DVector::zeros(N_PARAMS);
         for (first, from, to) in [(0, solution.x, self.free.x), (6, solution.y, self.free.y)] {
@@ -492,8 +496,8 @@ impl IntrinsicsDoubt {
     }
 }
 
-/// Squared change of the intrinsics relative to the uncertainty of both, given and free ones.
-/// `None` if neither is uncertain.
+/// Squared change of the intrinsics relative to the uncertainty of both the given and the free
+/// intrinsics. `None` if neither is uncertain.
 fn squared_change(
     given: &Intrinsics,
     free: &Fit<CornerState>,

@@ -1,5 +1,5 @@
-//! Initial solution that most samples agree with, and the board pose of each sample that fits it
-//! best.
+//! Finds an initial solution that agrees with most samples, and the board pose of each sample that
+//! fits this solution best.
 //!
 //! Least trimmed squares over closed-form solutions of three samples (Rousseeuw 1984; concentration
 //! steps of Rousseeuw and Van Driessen 1999). It resolves the two-fold ambiguity of planar boards
@@ -36,7 +36,8 @@ impl Consensus {
 
     /// Chooses the candidates, and excludes the samples that disagree with the solution.
     pub(super) fn apply_to(&self, samples: &mut [Sample]) {
-        /// With two fifths of wrong samples, the median is the 83 % quantile of the good ones.
+        /// If two fifths of the samples are wrong, the median of all is the 83 % quantile of the
+        /// good ones.
         const MEDIANS: f64 = 4.0;
         const ROUNDING_M: f64 = 1e-9;
         let limit = MEDIANS * self.median_m() + ROUNDING_M;
@@ -81,13 +82,13 @@ impl Metric {
 
 /// The best solution found. `None` if no three samples determine one.
 pub(crate) fn consensus(samples: &[Sample]) -> Option<Consensus> {
-    /// Three good samples with the right choice among four poses each are drawn with 99 %
-    /// probability if two fifths of the samples are wrong.
+    /// This number of trials draws three good samples, with the right choice among four poses each,
+    /// with a probability of 99 % if two fifths of the samples are wrong.
     const TRIALS: usize = 1500;
-    /// Without a choice, this number suffices.
+    /// If each sample has only one pose, this number is sufficient.
     const TRIALS_WITHOUT_CHOICE: usize = 200;
     let metric = Metric::of(samples);
-    // A fixed seed, so that the same samples give the same result.
+    // The seed is fixed, so that the same samples give the same result.
     let mut random = Random::new(1);
     let mut best: Option<(f64, Solution)> = None;
     let has_choice = samples.iter().any(|sample| sample.candidates.len() > 1);
@@ -108,8 +109,9 @@ pub(crate) fn consensus(samples: &[Sample]) -> Option<Consensus> {
             best = Some((score, solution));
         }
     }
-    // Concentration steps: solutions of half of the samples are more accurate than those of three.
-    // Each step decreases the sum of squares until the set of samples no longer changes.
+    // Concentration steps follow, because solutions of half of the samples are more accurate than
+    // solutions of three. Each step decreases the sum of squares until the set of samples no longer
+    // changes.
     let (mut least, mut solution) = best?;
     for _ in 0..10 {
         let Some(next) = concentrate(samples, &solution, metric) else {
@@ -135,8 +137,9 @@ fn pick(
     trial: usize,
     random: &mut Random,
 ) -> Option<[(Transform, Transform); 3]> {
-    // Flange and camera rotate by the same angle, so different angles show a wrong sample or
-    // candidate without solving. The limit is far above the errors of good samples.
+    // Flange and camera rotate by the same angle. Different angles therefore reveal a wrong sample
+    // or candidate before a solution is computed. The limit is far above the errors of good
+    // samples.
     const MAX_DIFFERENCE_RAD: f64 = 0.2;
     let n = samples.len();
     (n >= 3).then_some(())?;
@@ -191,7 +194,8 @@ pub(super) fn best_closed_form(samples: &[Sample]) -> Option<Solution> {
 
 /// Scatter of the positions of the board, each from a closed form without this pair, millimeters.
 fn leave_one_out_mm(pairs: &[(Transform, Transform)], solver: ClosedForm) -> Option<f64> {
-    /// Enough to rank three solvers; each one solves for all pairs of the others.
+    /// This number is sufficient to rank three solvers. In each fold, a solver uses all pairs of
+    /// the other samples.
     const MAX_FOLDS: usize = 20;
     let stride = pairs.len().div_ceil(MAX_FOLDS).max(1);
     let boards: Option<Vec<Transform>> = (0..pairs.len())
@@ -267,12 +271,12 @@ fn concentrate(samples: &[Sample], solution: &Solution, metric: Metric) -> Optio
     solve(&pairs, ClosedForm::ParkMartin)
 }
 
-/// Motions with a smaller rotation, in radians, have no usable rotation axis: the errors of their
-/// rotations may be as large.
+/// Motions with a smaller rotation, in radians, have no usable rotation axis, because the errors of
+/// their rotations may be as large as the rotations.
 const MIN_ROTATION_RAD: f64 = 1e-3;
 
-/// Maximum number of pairs of samples in a solution: all pairs of 63 samples. It bounds the time
-/// for recordings with hundreds of samples; every sample still is in many pairs.
+/// Maximum number of pairs of samples in a solution: all pairs of 63 samples. It limits the time
+/// for recordings with hundreds of samples. Every sample is still in many pairs.
 const MAX_MOTIONS: usize = 2000;
 
 /// A closed-form solver.
@@ -292,8 +296,8 @@ impl ClosedForm {
     pub const ALL: [Self; 3] = [Self::ParkMartin, Self::Daniilidis, Self::TsaiLenz];
 
     /// Pose of the camera on the flange from pairs `(base_from_flange, camera_from_board)`. All
-    /// pairs have the same weight, so a wrong one spoils the result. `None` if the rotation axes of
-    /// the motions are parallel.
+    /// pairs have the same weight, so a single wrong pair makes the result wrong. `None` if the
+    /// rotation axes of the motions are parallel.
     pub fn flange_from_camera(self, pairs: &[(Transform, Transform)]) -> Option<Transform> {
         self.solve(&motions(pairs))
     }
@@ -322,7 +326,7 @@ pub(crate) struct Motion {
 ///   constant.
 pub(crate) fn motions(pairs: &[(Transform, Transform)]) -> Vec<Motion> {
     let n = pairs.len();
-    // Numbers of pairs grow with the square of the number of samples.
+    // The number of pairs grows with the square of the number of samples.
     let stride = (n * n.saturating_sub(1) / 2).div_ceil(MAX_MOTIONS).max(1);
     let all = (0..n).flat_map(|i| (i + 1..n).map(move |j| (i, j)));
     all.step_by(stride)
@@ -370,14 +374,14 @@ fn modified_rodrigues(motion: &Transform) -> Vector3<f64> {
     2.0 * q.imag()
 }
 
-/// The quaternion of the two that represent the rotation whose scalar part is not negative.
+/// Of the two quaternions that represent the rotation, the one whose scalar part is not negative.
 fn positive(rotation: UnitQuaternion<f64>) -> Quaternion<f64> {
     let q = rotation.into_inner();
     if q.scalar() < 0.0 { -q } else { q }
 }
 
 fn solve_normal(normal: &Matrix3<f64>, right: &Vector3<f64>) -> Option<Vector3<f64>> {
-    // Of eigenvalues, which are squares of singular values.
+    // Minimum ratio of eigenvalues, which are squares of singular values.
     const MIN_RATIO: f64 = 1e-12;
     let eigen = SymmetricEigen::new(*normal);
     (eigen.eigenvalues.min() > MIN_RATIO * eigen.eigenvalues.max()).then_some(())?;
@@ -426,8 +430,8 @@ pub(crate) fn relative_scale(
     let inverse = (matrix.transpose() * &matrix).try_inverse()?;
     let solution = &inverse * matrix.transpose() * &right;
     let variance = (&matrix * &solution - right).norm_squared() / (rows - 4) as f64;
-    // The motions between all pairs of n samples contain n - 1 independent ones; with n (n - 1) / 2
-    // pairs, n is:
+    // The motions between all pairs of n samples contain n - 1 independent motions. The number of
+    // samples n follows from the number of pairs, n (n - 1) / 2.
     let n_samples = 0.5 + (0.25 + 2.0 * motions.len() as f64).sqrt();
     let repetition = motions.len() as f64 / (n_samples - 1.0);
     Some((
@@ -491,9 +495,9 @@ fn dot(p: &Quaternion<f64>, q: &Quaternion<f64>) -> f64 {
     p.coords.dot(&q.coords)
 }
 
-/// The combination of two null vectors, each with real and dual part, that is a dual quaternion of
-/// unit length after scaling: its real part is orthogonal to its dual part (Daniilidis 1999,
-/// equations 31 to 35).
+/// Coefficients of the combination of two null vectors, each with real and dual part, that is a
+/// dual quaternion of unit length after scaling. The real part of the combination is orthogonal to
+/// its dual part (Daniilidis 1999, equations 31 to 35).
 fn coefficients(null: &[(Quaternion<f64>, Quaternion<f64>); 2]) -> Option<(f64, f64)> {
     let [(u1, v1), (u2, v2)] = null;
     // Orthogonality is a quadratic equation for the ratio of both coefficients.
@@ -508,7 +512,7 @@ fn coefficients(null: &[(Quaternion<f64>, Quaternion<f64>); 2]) -> Option<(f64, 
             .map(|root| ((-middle + root) / (2.0 * first), 1.0))
             .to_vec()
     };
-    // One of the two solutions has a real part near zero, and is no rotation.
+    // The real part of one of the two solutions is near zero, so that solution is not a rotation.
     let squared_norm = |&(s, t): &(f64, f64)| {
         (s * s * dot(u1, u1) + 2.0 * s * t * dot(u1, u2) + t * t * dot(u2, u2)) / (s * s + t * t)
     };

@@ -70,8 +70,8 @@ pub(crate) fn refine(
     mut samples: Vec<Sample>,
     consensus: &Consensus,
 ) -> Result<Refined, Error> {
-    // First from board poses: this estimates the noise and finds the outliers, which the
-    // minimization of reprojection errors would not tolerate.
+    // The first fit uses board poses. It estimates the noise and finds the outliers, which would
+    // spoil a minimization of reprojection errors.
     consensus.apply_to(&mut samples);
     let start = initial::best_closed_form(&samples).unwrap_or(consensus.solution);
     let corner_px = corner_noise(&samples);
@@ -80,8 +80,8 @@ pub(crate) fn refine(
     let Some(given) = input.intrinsics.clone().filter(|_| corner_px.is_some()) else {
         return Ok(Refined::new(samples, fit, input.intrinsics.clone()));
     };
-    // The pose that fits one image best is biased for a board that faces the camera. Steps from the
-    // predicted poses are not, so outliers are searched again with them.
+    // For a board that faces the camera, the pose that fits one image best is biased. Steps from
+    // the predicted poses are not biased, so outliers are searched again with these.
     relinearize(input, &mut samples, &fit.solution, &given);
     let fit = reject_and_fit(input, &mut samples, fit.solution, fit.noise)?;
     // Then from corners.
@@ -100,7 +100,7 @@ fn refine_with_given(
     given: Intrinsics,
 ) -> Result<Refined, Error> {
     // A fit with free intrinsics shows whether the given ones are right, and how their uncertainty
-    // changes the result. This fit may fail if there are few images; both are then unknown.
+    // changes the result. With few images, this fit may fail. In that case, neither is known.
     let start = Start {
         input,
         samples: &samples,
@@ -119,7 +119,8 @@ fn refine_with_given(
         .and_then(|free| IntrinsicsDoubt::new(start, free, lens));
     let by_lens = free.as_ref().and_then(|free| propagated(free, Some(lens?)));
     let mut fit = minimize_weighted(start)?;
-    // The doubt contains the effect of the lens, so only one of both is added.
+    // The doubt already contains the effect of the lens, so only one of the two covariances is
+    // added.
     if let Some(doubt) = &doubt {
         fit.covariance += doubt.covariance(&fit.solution);
     } else if let Some(by_lens) = by_lens {
@@ -139,8 +140,8 @@ fn refine_with_others(
     given: Intrinsics,
 ) -> Result<Refined, Error> {
     let free = minimize_free(input, &mut samples, &mut fit, given)?;
-    // With the estimates of the others fixed, the solution is found as with given ones. Their
-    // uncertainty is added to its covariance.
+    // The solution is computed with the other parameters fixed at their estimates, as if they were
+    // given. Their uncertainty is then added to its covariance.
     let intrinsics = free.state.intrinsics.clone();
     let mut fit = minimize_weighted(Start {
         input: &with_offsets(input, &free.state.joint_offsets),
@@ -168,7 +169,8 @@ fn refine_with_others(
 }
 
 /// Estimates intrinsics and joint offsets. The variances depend on the poses of the board, and
-/// those on the intrinsics, so both are estimated in turns.
+/// these poses depend on the intrinsics. Variances and intrinsics are therefore estimated
+/// alternately.
 fn minimize_free(
     input: &HandEyeInput<'_>,
     samples: &mut Vec<Sample>,
@@ -233,12 +235,12 @@ fn reject_and_fit(
 ) -> Result<PoseFit, Error> {
     /// Squared distance with six degrees of freedom that one good sample in 100 000 exceeds.
     const MAX_SQUARED_DISTANCE: f64 = 33.1;
-    // Sets that alternate end here.
+    // This limit ends the loop if two sets of samples alternate.
     const MAX_ROUNDS: usize = 8;
     let mut n_rounds = 0;
     loop {
         n_rounds += 1;
-        // If a minority agrees, another group of samples may be the right one.
+        // If only a minority agrees, another group of samples may be the right one.
         let n_used = used(samples).count();
         if 2 * n_used < samples.len() || samples::n_stops(samples) < MIN_SAMPLES {
             let refusal = Refusal::new(
@@ -254,7 +256,8 @@ fn reject_and_fit(
         let fit = pose_fit::fit(input.setup, &measured, solution, noise, false)?;
         solution = fit.solution;
         noise = fit.noise;
-        // All samples are checked again, so that a sample that was excluded by a bad start returns.
+        // All samples are checked again, so that a sample that was excluded because of a bad start
+        // can be used again.
         let mut has_changed = initial::choose(samples, &solution);
         for sample in samples.iter_mut() {
             let measured = Measurement::of(sample);
@@ -274,7 +277,7 @@ fn reject_and_fit(
 /// Standard deviation of the corners from the residuals of the single images, pixels. `None` for
 /// given poses.
 fn corner_noise(samples: &[Sample]) -> Option<f64> {
-    // Exact corners of a simulation.
+    // Lower limit for the exact corners of a simulation.
     const MIN_PX: f64 = 0.003;
     let mut squares = 0.0;
     let mut n_free = 0.0;
@@ -294,8 +297,8 @@ fn relinearize(
     solution: &Solution,
     intrinsics: &Intrinsics,
 ) {
-    /// Beyond, the step may not be accurate. It is three times the limit of outliers, so that
-    /// excluded samples can return.
+    /// At larger distances, the step may be inaccurate. The limit is three times that of outliers,
+    /// so that excluded samples can be used again.
     const MAX_SQUARED_DISTANCE: f64 = 100.0;
     let near = samples
         .iter_mut()

@@ -13,16 +13,17 @@ use crate::least_squares::{self, BlockSums, Loss};
 use kinematics::Transform;
 use nalgebra::{DMatrix, DVector, Matrix6, SMatrix, Vector6};
 
-/// Norm of six whitened residuals, beyond which their loss is linear: 95 % of the samples without a
-/// mistake are below.
+/// Norm of six whitened residuals above which their loss is linear. Of the samples without a
+/// mistake, 95 % are below it.
 const LOSS_THRESHOLD: f64 = 3.55;
 
 /// Standard deviations of the measurement errors.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct HandEyeNoise {
     /// Error of the corners, pixels along each axis. `None` if poses of the board were given.
-    /// Errors of the lens model and blur are common to the corners of one image; they count as if
-    /// independent errors of this size caused their effect on the pose of the board.
+    /// Errors of the lens model and blur are common to the corners of one image. This value
+    /// includes them: independent errors of this size would have the same effect on the pose of the
+    /// board.
     pub corner_px: Option<f64>,
     /// Residual of the corners after a separate fit of each image, pixels along each axis. At most
     /// `corner_px`.
@@ -30,13 +31,13 @@ pub struct HandEyeNoise {
     /// Rotation error about each axis, radians: of the robot poses if corners were given, otherwise
     /// of the board poses including the robot's error.
     pub rotation_rad: f64,
-    /// Translation error along each axis, meters; likewise.
+    /// Translation error along each axis, meters, of the same poses.
     pub translation_m: f64,
 }
 
 impl HandEyeNoise {
-    /// Errors that no robot or board is below: they keep variances positive and limit the stated
-    /// accuracy.
+    /// No robot or board has smaller errors than these. They keep variances positive and limit the
+    /// stated accuracy.
     const MIN: Self = Self {
         corner_px: None,
         residual_px: None,
@@ -179,8 +180,8 @@ pub(super) fn fit(
         max_steps: 30,
         ..least_squares::Options::default()
     };
-    // The weights depend on the variances, and those on the residuals of the solution: both are
-    // estimated in turns.
+    // The weights depend on the variances, and the variances depend on the residuals of the
+    // solution. Solution and variances are therefore estimated alternately.
     let mut solution = initial;
     let mut noise = noise;
     let mut before: Option<DVector<f64>> = None;
@@ -213,12 +214,12 @@ pub(super) fn fit(
 }
 
 /// Largest number of fits of a cross-validation. With more measurements, several are left out at a
-/// time, because the time would grow with the square of their number. Leaving out one of 60 changes
-/// a solution very little already.
+/// time, because the time would grow with the square of their number. Leaving out even one of 60
+/// measurements changes a solution very little.
 pub const MAX_FOLDS: usize = 60;
 
-/// For each measurement, the solution of the others: stops are left out one by one, or with many
-/// stops in [`MAX_FOLDS`] interleaved folds.
+/// For each measurement, the solution of the others. Stops are left out one by one. If there are
+/// many stops, they are left out in [`MAX_FOLDS`] interleaved folds.
 ///
 /// * `knows_noise`: keeps the given noise, which is faster than estimating it without the
 ///   measurement.
@@ -292,7 +293,7 @@ pub(super) fn sandwich_covariance(
     }))
 }
 
-/// Noise that is consistent with an initial solution: from medians of the residuals.
+/// Noise that is consistent with an initial solution, computed from medians of the residuals.
 pub(super) fn initial_noise(
     measurements: &[Measurement],
     solution: &Solution,
@@ -331,8 +332,8 @@ fn covariance_parts(
     noise: &HandEyeNoise,
 ) -> Vec<Matrix6<f64>> {
     match (&measurement.unit_covariance, noise.corner_px) {
-        // With corners, errors of the robot pose act on the board as a motion of the flange does.
-        // They are correlated: a rotation of the flange also moves the board.
+        // With corners, errors of the robot pose have the same effect on the board as a motion of
+        // the flange. They are correlated: a rotation of the flange also moves the board.
         (Some(unit), Some(_)) => {
             let predicted = solution.camera_from_board(&measurement.a);
             let by_flange = geometry::residual_by_flange(setup, solution, &predicted);
@@ -342,7 +343,7 @@ fn covariance_parts(
             };
             vec![part(0), part(3), *unit]
         }
-        // Given poses: rotation and translation have independent errors of unknown origin.
+        // For given poses, rotation and translation have independent errors of unknown origin.
         _ => {
             let block = |first: usize| {
                 Matrix6::from_diagonal(&Vector6::from_fn(|ix, _| {
@@ -431,7 +432,7 @@ impl<'a> Whitened<'a> {
 }
 
 /// The matrix that turns the residual of a measurement into six independent residuals with unit
-/// variance. Zero, so that the measurement has no influence, if there is none.
+/// variance. If no such matrix exists, returns zero, so that the measurement has no influence.
 fn whitening(
     setup: Setup,
     measurement: &Measurement,
@@ -505,13 +506,14 @@ fn update_variances(
         .try_inverse()
         .unwrap_or_else(|| DMatrix::zeros(N_PARAMS, N_PARAMS));
     let x_information = inverse.view((0, 0), (6, 6)).into_owned().try_inverse();
-    // Per variance: the part of the squared residuals that it explains, and the part that is
-    // expected with the current values, given that the parameters were fitted to the same
-    // residuals.
+    // For each variance, these are the part of the squared residuals that it explains, and the part
+    // that is expected with the current values. The expectation considers that the parameters were
+    // fitted to the same residuals.
     let mut squares = vec![0.0; n_variances];
     let mut expected = vec![0.0; n_variances];
-    // The Fisher information about the variances, and the derivative of the logarithm of the
-    // hand-eye covariance (the mean over its six parameters), for the degrees of freedom.
+    // These are the Fisher information about the variances, and the derivative of the logarithm of
+    // the hand-eye covariance (the mean over its six parameters). The degrees of freedom follow
+    // from both.
     let mut fisher = DMatrix::<f64>::zeros(n_variances, n_variances);
     let mut log_volume_by_variance = DVector::<f64>::zeros(n_variances);
     for measurement in measurements {
@@ -545,7 +547,8 @@ fn update_variances(
     // A part of the residuals' information is spent on the parameters.
     let n_scalars = 6.0 * measurements.iter().map(|m| m.weight).sum::<f64>();
     fisher *= ((n_scalars - N_PARAMS as f64) / n_scalars).max(0.05);
-    // Limited, because the first steps may be far off, and a variance of zero would stay zero.
+    // The update is limited, because the first steps may be wrong by a large factor, and a variance
+    // of zero would stay zero.
     let updated = (0..n_variances).map(|k| {
         let factor: f64 = f64::sqrt(squares[k] / expected[k]);
         let is_valid = factor.is_finite();
@@ -575,7 +578,7 @@ fn update_variances(
 
 /// Weight of six whitened residuals, divided by its mean for normal residuals.
 fn robust_weight(squared_norm: f64) -> f64 {
-    // The mean of the weighted square relative to six. Without it, variances of normal residuals
+    // Mean of the weighted squared norm, divided by six. Without it, variances of normal residuals
     // would be 1 % too small.
     const MEAN: f64 = 0.99;
     (LOSS_THRESHOLD / squared_norm.sqrt()).min(1.0) / MEAN

@@ -84,7 +84,8 @@ fn essential_derivatives(to_from_from: &Transform) -> [[Matrix3<f64>; N_PARTS]; 
     });
     let of_second = std::array::from_fn(|part| {
         let axis = Vector3::ith(part % 3, 1.0);
-        // Rotating both parts of the essential matrix from the left rotates the matrix.
+        // If the two factors of the essential matrix are rotated from the left, the matrix is
+        // rotated.
         if part < 3 {
             -axis.cross_matrix() * rotation
         } else {
@@ -198,7 +199,8 @@ impl PairMatches {
                     row[params.partition_point(|other| *other < param)] += by_ray.dot(&motion);
                 }
             }
-            // The lower triangle only: this runs for every match in every iteration.
+            // Only the lower triangle is updated, because this code runs for every match in every
+            // iteration.
             for (ix, value) in row.iter().enumerate() {
                 let weighted = weight * value;
                 gradient[ix] -= weighted * residual;

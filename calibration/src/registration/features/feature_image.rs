@@ -28,8 +28,8 @@ const MAX_CORNERS: usize = 700;
 /// number of corners of a cell.
 const MIN_CELL: usize = 16;
 const CORNERS_PER_CELL: usize = 3;
-/// Minimum brightness gradient, in every direction, of a corner: root mean square per texel. Lower
-/// values add corners that are noise.
+/// Minimum brightness gradient of a corner in every direction: root mean square per texel. With a
+/// lower value, noise is detected as corners.
 const MIN_GRADIENT: f32 = 1.5;
 /// Half the side of the window of a corner, texels.
 const WINDOW_RADIUS: usize = 2;
@@ -92,7 +92,8 @@ pub(super) struct FeatureImage {
 /// Side of the window of a corner, texels.
 const DIAMETER: usize = 2 * WINDOW_RADIUS + 1;
 
-/// Whether a response is larger than those of its eight neighbors; of equal ones, the first is.
+/// Whether a response is larger than those of its eight neighbors. If responses are equal, the
+/// first one counts as larger.
 fn is_maximum(response: &[f32], width: usize, ix: usize) -> bool {
     let own = response[ix];
     let earlier = [ix - width - 1, ix - width, ix - width + 1, ix - 1];
@@ -135,7 +136,8 @@ struct Level {
 impl FeatureImage {
     pub(super) fn new(keyframe: &Arc<Keyframe>, camera: usize) -> Self {
         let levels = levels(keyframe);
-        // Cells of a size with which the finest level has about the maximum number of corners.
+        // The cell size is chosen such that the finest level has about the maximum number of
+        // corners.
         let n_texels = levels[0].values.len();
         let side = ((n_texels * CORNERS_PER_CELL) as f64 / MAX_CORNERS as f64).sqrt() as usize;
         let cell = side.max(MIN_CELL);
@@ -395,7 +397,7 @@ impl Level {
             .map(|sample| sample * sample)
             .sum::<f32>()
             .sqrt();
-        // Also false for NaN.
+        // This comparison is also false for NaN.
         let has_contrast = norm > MIN_CONTRAST * (DESCRIPTOR_LEN as f32).sqrt();
         has_contrast.then(|| samples.map(|sample| sample / norm))
     }

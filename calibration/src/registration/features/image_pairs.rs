@@ -12,12 +12,12 @@ use rayon::prelude::*;
 /// Maximum angle between the viewing directions of a pair, radians. Corners look too different
 /// beyond it.
 const MAX_VIEW_ANGLE_RAD: f64 = 0.8;
-/// Minimum distance between the cameras of a pair, meters, and relative to the median distance.
+/// Minimum distance between the cameras of a pair: in meters, and relative to the median distance.
 /// Closer images determine hardly any epipolar lines.
 const MIN_BASELINE_M: f64 = 0.02;
 const MIN_BASELINE_FRAC: f64 = 0.1;
-/// Minimum fraction of an image that its partner must show if all points are at one, favorable,
-/// depth.
+/// Minimum fraction of an image that its partner must show if all points are at the same, most
+/// favorable depth.
 const MIN_OVERLAP: f64 = 0.4;
 /// Depths for the overlap, relative to the distance between the cameras.
 const DEPTHS: [f64; 5] = [1.0, 2.0, 4.0, 8.0, 16.0];

@@ -5,13 +5,13 @@ use super::moving_camera::{MovingCamera, Sighting};
 use kinematics::Transform;
 use nalgebra::{Matrix3, Vector2, Vector3};
 
-/// Minimum normalized cross-correlation of a match. Lower values add matches that are mostly wrong;
-/// higher ones lose corners that are seen from different directions.
+/// Minimum normalized cross-correlation of a match. A lower value adds matches that are mostly
+/// wrong. A higher value loses corners that are seen from different directions.
 const MIN_CORRELATION: f32 = 0.75;
 /// Maximum squared distance of the best match's descriptor, relative to that of the second best.
 const MAX_RATIO: f32 = 0.7;
-/// Candidates closer than this to the best match, in texels, do not count as second best: they are
-/// the same corner on another level.
+/// Candidates closer than this to the best match, in texels, do not count as second best, because
+/// they are the same corner on another level.
 const SAME_CORNER_TEXELS: f64 = 3.0;
 /// Maximum difference of the levels of two corners: a factor of 1.5 in distance. More levels would
 /// allow larger differences, and more wrong matches.
@@ -73,12 +73,13 @@ pub(super) fn matches(
             };
             let correlation = dot(&from.descriptors[ix], descriptor);
             candidates.push((correlation, other_ix));
-            // For the check in the other direction, which needs no second search.
+            // This maximum is used for the check in the other direction, which thus needs no second
+            // search.
             if correlation > best_of_to[other_ix].0 {
                 best_of_to[other_ix] = (correlation, ix);
             }
         }
-        // Of equal ones, the first.
+        // If several are equal, the first one is taken.
         let Some(best) = candidates
             .iter()
             .copied()
@@ -123,8 +124,8 @@ fn roll(to_from_from: &Matrix3<f64>, ray: &Vector2<f64>) -> Option<[f64; 2]> {
     let project = |axis: Vector3<f64>| axis.xy() - ray * axis.z;
     let x = project(to_from_from.column(0).into());
     let y = project(to_from_from.column(1).into());
-    // The rotation nearest to the 2 x 2 matrix with these columns. Near zero, the images look in
-    // opposite directions.
+    // This is the rotation nearest to the 2 x 2 matrix with these columns. If the sum is near zero,
+    // the images look in opposite directions.
     let sum = Vector2::new(x.x + y.y, x.y - y.x).try_normalize(1e-6)?;
     Some(sum.into())
 }

@@ -1,9 +1,9 @@
-//! Estimates extrinsics, time offsets and lenses of cameras from color images alone: corners are
-//! matched between images, and each match must lie near its epipolar line, which follows from the
-//! poses of the two images.
+//! Estimates extrinsics, time offsets and lenses of cameras from color images alone. Corners are
+//! matched between images. Each match must lie near its epipolar line, which follows from the poses
+//! of the two images.
 //!
-//! An error of the extrinsics moves the epipolar lines of image pairs with different relative
-//! rotations differently, and a time offset those of images with different velocities, so both are
+//! The effect of an extrinsics error on the epipolar lines depends on the relative rotation of the
+//! two images. The effect of a time offset depends on their velocities. Both errors are therefore
 //! observable without knowing any depth. The search for matches uses the approximately known poses:
 //! it is limited to a band around the epipolar line, and patches are rotated by the relative
 //! rotation of the images. Matches are searched again in a narrower band after each estimate.
@@ -35,8 +35,8 @@ use rayon::prelude::*;
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 
-/// Typical errors relative to those of registration: registration starts from an approximate
-/// calibration, but without depth, transforms are often measured by hand.
+/// Typical errors relative to those of registration. Registration starts from an approximate
+/// calibration. Without depth, transforms are often measured by hand, so their errors are larger.
 const SCALE: f64 = 2.0;
 
 /// Cameras with fewer training and validation images keep the given extrinsics, because the errors
@@ -46,8 +46,9 @@ const MIN_IMAGES_PER_CAMERA: usize = 10;
 /// Minimum gain in cross-validation, dB. Errors of single poses cause smaller gains, too.
 const MIN_GAIN_DB: f64 = 0.1;
 
-/// Minimum gain with the matches of the baseline for a trial with others. It is lower than
-/// [`MIN_GAIN_DB`], because these matches favor the baseline.
+/// Minimum gain that a variant must reach with the matches of the baseline before it is tried with
+/// new matches. It is lower than [`MIN_GAIN_DB`], because the matches of the baseline favor the
+/// baseline.
 const MIN_QUICK_GAIN_DB: f64 = 0.03;
 
 /// One round of matching.
@@ -99,7 +100,7 @@ const CLOSE_FRAC: f64 = 0.1;
 const N_FOLDS: usize = 4;
 const CROSS_VALIDATION_PARTNERS: usize = 8;
 /// Largest displacement along the epipolar line, in units of the focal length, for which the search
-/// band is wide enough: points at twice the distance between the cameras or more.
+/// band is wide enough. It corresponds to points at twice the distance between the cameras.
 const MAX_PARALLAX: f64 = 0.5;
 /// Minimum half width of the band, texels of the finest level. Corners are less accurate than a
 /// texel, and matches must be able to move away from their start.
@@ -109,17 +110,17 @@ const NOISE_TEXELS: f64 = 0.5;
 /// Minimum number of matches of a pair. Fewer may all be wrong.
 const MIN_MATCHES: usize = 8;
 /// Limits of the standard deviation of the distances from the epipolar lines, texels. Above the
-/// upper one, the median contains wrong matches.
+/// upper limit, wrong matches affect the median.
 const MIN_NOISE_TEXELS: f64 = 0.25;
 const MAX_NOISE_TEXELS: f64 = 1.5;
-/// The standard deviation that an iteration assumes, relative to the previous iteration. A faster
-/// decrease excludes right matches before the estimate has come near them.
+/// The standard deviation that an iteration assumes, relative to the previous iteration. With a
+/// faster decrease, correct matches would be excluded before the estimate is close to them.
 const ANNEALING: f64 = 0.75;
 const MAX_ITERATIONS: usize = 40;
 /// A step smaller than this number of standard deviations ends a round.
 const CONVERGED_STEP_SIGMAS: f64 = 0.05;
-/// Minimum fraction of the last round's matches within this fraction of the band around the
-/// epipolar line. Random matches are spread evenly over the band.
+/// Minimum fraction of the last round's matches that are near the epipolar line. A match is near if
+/// it is within the same fraction of the band. Random matches are spread evenly over the band.
 const MIN_INNER_MATCHES: f64 = 0.5;
 const MAX_INNER_FRAC: f64 = 0.25;
 
@@ -165,7 +166,8 @@ pub(super) fn align(keyframes: &[Arc<Keyframe>], choice: &CameraRefinement) -> O
     for set in sets.into_iter().filter(|set| scene.layout(*set).n() > 0) {
         let has_extrinsics = set.contains(ParamSet::EXTRINSICS);
         // Matching takes most of the time, so parameters that hardly improve existing matches are
-        // rejected without searching for new ones. For extrinsics, the existing matches say little.
+        // rejected without searching for new ones. This does not apply to extrinsics, because
+        // existing matches contain little information about their improvement.
         if is_optional && !has_extrinsics {
             let matches =
                 kept_matches.get_or_insert_with(|| scene.matches(&kept.corrections, &QUICK_ROUND));
@@ -212,7 +214,7 @@ pub(super) fn align(keyframes: &[Arc<Keyframe>], choice: &CameraRefinement) -> O
         }
         trials.push(trial);
     }
-    // Without any trial, the images show nothing in common.
+    // If there was no trial, the images do not overlap.
     (!trials.is_empty()).then(|| {
         let summary = scene.summary(&pairs.unwrap_or_default());
         report::alignment(&summary, &kept, trials, unobservable)
@@ -286,8 +288,8 @@ impl FeatureScene {
     fn band_rad(&self, pair: &Pair, to_from_from: &Transform, round: &Round) -> f64 {
         let from = &self.images[pair.from];
         let to = &self.images[pair.to];
-        // An error that both images share cancels unless they are rotated relative to each other.
-        // Errors of two cameras are independent, and add up.
+        // An error that both images share cancels unless the images are rotated relative to each
+        // other. Errors of two cameras are independent and add up.
         let share = if from.camera == to.camera {
             2.0 * (0.5 * to_from_from.rotation.angle()).sin()
         } else {
@@ -364,8 +366,8 @@ impl FeatureScene {
             }
         }
         let (matches, fit) = last?;
-        // Images without texture or overlap also give matches, but not where the estimate predicts
-        // them.
+        // Images without texture or overlap also give matches, but these are not where the estimate
+        // predicts them.
         let cameras = self.moving_cameras(&corrections);
         let mut n_inner = 0;
         let mut n = 0;
@@ -402,8 +404,8 @@ impl FeatureScene {
                 .for_each(|distance| *distance = distance.abs());
             let measured = 1.4826 * quantile(&mut distances, 0.5, Rank::Upper)?;
             let target = measured.clamp(MIN_NOISE_TEXELS, MAX_NOISE_TEXELS);
-            // From wide to narrow, at most by `ANNEALING` per iteration: with a narrow scale from
-            // the start, most right matches would count as outliers.
+            // The scale decreases from wide to narrow, by at most `ANNEALING` per iteration. With a
+            // narrow scale at the start, most correct matches would count as outliers.
             let noise_texels = assumed_noise
                 .map_or(measured, |assumed| ANNEALING * assumed)
                 .max(target);
@@ -513,9 +515,9 @@ impl FeatureScene {
         Some(self.cross_validate(set, baseline, &variant, matches))
     }
 
-    /// Evaluates by cross-validation how much closer to their epipolar lines matches are with the
-    /// variant than with the baseline: both are estimated again without one group of images, and
-    /// applied to the matches of this group.
+    /// Evaluates by cross-validation how much closer matches are to their epipolar lines with the
+    /// variant than with the baseline. Both are estimated again without one group of images, and
+    /// then applied to the matches of this group.
     fn cross_validate(
         &self,
         set: ParamSet,
@@ -543,7 +545,8 @@ impl FeatureScene {
         matches: &[PairMatches],
         is_held_out: &[bool],
     ) -> Vec<f64> {
-        // A pair with one held-out image would reveal its corners to the estimate.
+        // A pair with one held-out image must not be used, because the estimate would then depend
+        // on the corners of that image.
         let (tested, used): (Vec<PairMatches>, Vec<PairMatches>) = matches
             .iter()
             .cloned()

@@ -46,7 +46,8 @@ impl MovingCamera {
         }
     }
 
-    /// Where the camera saw a corner, to first order in the motion during readout.
+    /// Ray and camera position at which a corner was observed, to first order in the motion during
+    /// readout.
     pub(super) fn sighting(&self, corner: &Corner) -> Sighting {
         // Time from mid-exposure to the readout of the row.
         let secs = self.readout_secs * corner.row_share;

@@ -178,7 +178,7 @@ pub enum StateCommand {
 }
 
 impl Mode {
-    /// Whether the value of [`SUPPORTED_MODES`] includes this mode.
+    /// Whether `supported`, the value of [`SUPPORTED_MODES`], includes this mode.
     pub fn is_in(self, supported: u32) -> bool {
         // The object counts modes from 1 and bits from 0.
         supported >> (self as i8 - 1) & 1 == 1
@@ -202,8 +202,8 @@ impl StateCommand {
 impl State {
     /// Decodes the state in a statusword. Mode-specific and manufacturer-specific bits are ignored.
     pub fn from_statusword(statusword: u16) -> Result<Self, CanError> {
-        // Bit 5 (quick stop, active low) is part of the state only in powered or ready states.
-        // Bits 0 to 3 and 6 are part of every state.
+        // Bits 0 to 3 and 6 are part of every state. Bit 5 (quick stop, active low) is part of the
+        // state only if the drive is powered or ready.
         match (statusword & 0x4F, statusword & 0x20 != 0) {
             (0x00, _) => Ok(Self::NotReadyToSwitchOn),
             (0x40, _) => Ok(Self::SwitchOnDisabled),
@@ -229,8 +229,8 @@ impl State {
             Self::SwitchOnDisabled => Some(StateCommand::Shutdown),
             Self::ReadyToSwitchOn => Some(StateCommand::SwitchOn),
             Self::SwitchedOn => Some(StateCommand::EnableOperation),
-            // A drive need not support the transition back to the enabled state, so the way leads
-            // through the disabled state.
+            // Drives are not required to support the direct transition back to the enabled state,
+            // so the drive is disabled first.
             Self::QuickStopActive => Some(StateCommand::DisableVoltage),
             Self::Fault if may_reset_fault => Some(StateCommand::ResetFault),
             Self::Fault
@@ -264,8 +264,8 @@ impl State {
             (Self::OperationEnabled | Self::QuickStopActive, StateCommand::DisableVoltage) => {
                 Self::SwitchOnDisabled
             }
-            // A fault ignores all other commands, so that no command enables a faulty drive by
-            // accident.
+            // A drive in the fault state ignores all other commands, so that no command enables it
+            // by accident.
             (Self::Fault, StateCommand::ResetFault) => Self::SwitchOnDisabled,
             (state, _) => state,
         }
@@ -379,8 +379,8 @@ mod tests {
 
     #[test]
     fn statuswords_match_standard() {
-        // Bit patterns like xxxx xxxx x0xx 0000, with x as 0 and 1; the last two are from drives in
-        // the field.
+        // The bit patterns have the form xxxx xxxx x0xx 0000, where x is tested as 0 and as 1. The
+        // last two statuswords are from real drives.
         for (statusword, state) in [
             (0x0000, State::NotReadyToSwitchOn),
             (0xFFB0, State::NotReadyToSwitchOn),
@@ -411,7 +411,7 @@ mod tests {
         let n_defined = (0..=u16::MAX)
             .filter(|word| State::from_statusword(*word).is_ok())
             .count();
-        // Of the 64 values of bits 0 to 3, 5 and 6: four states ignore bit 5, four do not.
+        // Bits 0 to 3, 5 and 6 have 64 values. Four states ignore bit 5, and four do not.
         assert_eq!(n_defined, (4 * 2 + 4) * 65_536 / 64);
         assert!(State::from_statusword(0x0003).is_err() && State::from_statusword(0x0067).is_err());
     }

@@ -24,8 +24,8 @@ fn decode_controlword(controlword: u16, before: u16) -> Option<StateCommand> {
     if controlword & !before & 0x80 != 0 {
         return Some(StateCommand::ResetFault);
     }
-    // The masks are the "don't care" bits of the table: disabling and the quick stop ignore most
-    // bits, so they work whatever was sent before.
+    // The masks exclude the "don't care" bits of the table. Disabling and the quick stop ignore
+    // most bits, so they work regardless of earlier commands.
     match controlword & 0x8F {
         word if word & 0x82 == 0 => Some(StateCommand::DisableVoltage),
         word if word & 0x86 == 0x02 => Some(StateCommand::QuickStop),
@@ -233,7 +233,7 @@ impl EmulatedCia402 {
                 })
             }
             codec::State::QuickStopActive => match written(drive, codec::QUICK_STOP_OPTION) {
-                // Only these values keep the drive in the state; with the others, it releases the
+                // With these values, the drive stays in the state. With all others, it releases the
                 // shaft.
                 Some(5..=7) => Actuation::Stop,
                 _ => {

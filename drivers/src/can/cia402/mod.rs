@@ -31,8 +31,8 @@ use std::ops::RangeInclusive;
 use std::sync::Arc;
 
 /// Heartbeat interval to which a drive is set, milliseconds. The first heartbeat proves that the
-/// drive is operational, so a longer interval slows the set-up of each drive; a shorter one takes
-/// bandwidth from the cycle.
+/// drive is operational, so a longer interval would slow the set-up of each drive. A shorter
+/// interval would take bandwidth from the cycle.
 const HEARTBEAT_MILLIS: i64 = 500;
 const COUNTS_PER_TURN: &str = "counts_per_turn";
 const RATED_TORQUE_NM: &str = "rated_torque_nm";
@@ -76,7 +76,7 @@ impl MotorFamily for Cia402Family {
     fn motor(&self, settings: &MotorSettings) -> Option<Arc<dyn MotorProtocol>> {
         let node = Node::new(u8::try_from(settings.id).ok()?).ok()?;
         let counts_per_turn = settings.number(COUNTS_PER_TURN)?;
-        // Torques are optional: reading positions does not need them.
+        // Torques are optional, because positions can be read without them.
         let rated_torque_nm = settings.number(RATED_TORQUE_NM).unwrap_or(0.0);
         Some(Arc::new(Cia402 {
             node,
@@ -105,7 +105,7 @@ pub struct Cia402 {
 impl Cia402 {
     fn limits(self) -> Limits {
         Limits {
-            // Beyond 32 bits of counts, a target cannot be encoded.
+            // A target whose count exceeds 32 bits cannot be encoded.
             position_rad: self.units.rad_from_raw(i32::MAX),
             ..UNLIMITED
         }

@@ -48,8 +48,8 @@ impl MotionProtocol for Cia402Motion {
     fn switch_off(&self, query: &MotorQuery<'_>) -> Result<(), Error> {
         let node = self.address.node;
         let deadline = clock::now() + MAX_CHANGE;
-        // A drive may need several commands: a fault reaction must end before the fault can be
-        // reset, and after that the drive may still be powered.
+        // A drive may need several commands. A fault reaction must end before the fault can be
+        // reset, and the drive may still be powered after the reset.
         loop {
             let statusword = get(query, node, codec::STATUSWORD)?;
             let [low, high, ..] = statusword.to_le_bytes();
@@ -108,7 +108,7 @@ impl MotionProtocol for Cia402Motion {
             )));
         }
         // A drive changes its mode some time after the object is written. A target that arrives
-        // before would be executed in the old mode.
+        // before the change would be executed in the old mode.
         set(query, node, codec::MODE, Mode::CyclicPosition as i64)?;
         let deadline = clock::now() + MAX_CHANGE;
         while get(query, node, codec::MODE_DISPLAY)? != Mode::CyclicPosition as u32 {
@@ -133,8 +133,8 @@ impl MotionProtocol for Cia402Motion {
                 result => query.map_error(result)?,
             }
         }
-        // Controlword and target travel in one PDO. In two, a drive could be enabled with an old
-        // target.
+        // Controlword and target are sent in one PDO. With two PDOs, a drive could be enabled with
+        // an old target.
         let targets = [codec::CONTROLWORD, codec::TARGET_POSITION];
         let mut entries = map_pdo_at_every_sync(Pdo::First, Direction::Receive, node, &targets);
         entries.extend(map_pdo_at_every_sync(
@@ -189,8 +189,8 @@ impl MotionProtocol for Cia402Motion {
         self.state = self.decode_state(frame)?;
         Some(match self.state {
             State::OperationEnabled => Health::Enabled,
-            // We send no quick stop while the arm moves, so the drive has stopped for a reason of
-            // its own, such as its watchdog.
+            // This program sends no quick stop while the arm moves. The drive has therefore stopped
+            // for another reason, such as its watchdog.
             State::QuickStopActive => Health::Fault("the drive made a quick stop".to_owned()),
             State::Fault | State::FaultReactionActive => {
                 Health::Fault("the drive reports a fault".to_owned())

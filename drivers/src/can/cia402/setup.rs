@@ -99,15 +99,15 @@ pub(super) fn map_pdo_at_every_sync(
 ) -> Vec<(Object, i64)> {
     let id = i64::from(pdo.id(direction, node).value());
     let mut entries = vec![
-        // Disabled first, then with 0 mapped objects: otherwise, drives refuse changes of the
-        // mapping.
+        // The PDO is disabled first, and then its number of mapped objects is set to 0. Otherwise,
+        // drives refuse changes of the mapping.
         (pdo.communication(direction, 1), id | PDO_OFF),
         (pdo.mapping(direction, 0), 0),
     ];
     for (place, object) in (1..).zip(objects) {
         entries.push((pdo.mapping(direction, place), object.mapped().into()));
     }
-    // The number of objects comes last: with it, the drive checks and accepts the mapping.
+    // The number of objects is written last, because the drive then checks and accepts the mapping.
     entries.push((
         pdo.mapping(direction, 0),
         i64::try_from(objects.len()).expect("at most eight objects"),

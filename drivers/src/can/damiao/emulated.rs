@@ -41,7 +41,7 @@ impl EmulatedProtocol for EmulatedDamiao {
                 state_command @ 0xFB..=0xFE,
             ] => match state_command {
                 0xFB => drive.faults = 0,
-                // A fault must be cleared first.
+                // A fault must be cleared before the motor can be enabled.
                 0xFC if drive.faults == 0 => drive.switch_on(),
                 0xFD => drive.actuation = Actuation::Free,
                 _ => {}
@@ -73,8 +73,8 @@ impl EmulatedProtocol for EmulatedDamiao {
 }
 
 impl EmulatedDamiao {
-    /// Executes a register message, and returns the answer. There is none if the message is for
-    /// another motor.
+    /// Executes a register message, and returns the answer. There is no answer if the message is
+    /// for another motor.
     fn access_register(
         &self,
         [low, high, code, register, a, b, c, d]: [u8; 8],

@@ -152,8 +152,9 @@ impl MotorProtocol for Damiao {
     }
 
     fn set_up(&self, query: &MotorQuery<'_>) -> Result<Limits, Error> {
-        // Owners can change these registers. With wrong ranges, all positions would be scaled
-        // wrongly without any error, so they are read instead of taken from the model.
+        // The ranges are read from the registers instead of taken from the model, because owners
+        // can change these registers. With wrong ranges, all positions would be scaled wrongly
+        // without any error.
         let [p_max, v_max, t_max] = [
             Register::PositionLimit,
             Register::VelocityLimit,

@@ -35,8 +35,8 @@ impl DamiaoMotion {
 
 impl MotionProtocol for DamiaoMotion {
     fn switch_off(&self, query: &MotorQuery<'_>) -> Result<(), Error> {
-        // A fault is cleared only if it is there, so that it can be logged first. A motor whose
-        // fault was cleared may be enabled, so it is disabled again.
+        // The command to clear a fault is sent only if there is a fault, so that the fault can be
+        // logged first. A motor whose fault was cleared may be enabled, so it is disabled again.
         let mut status = Status::Enabled;
         for state_command in [
             StateCommand::Disable,

@@ -59,8 +59,8 @@ impl EmulatedDrive {
 
     pub(super) fn set_motion(&mut self, motion: Motion) {
         self.shaft.motion = motion;
-        // Otherwise, the next step would simulate the time since the last one, and move the shaft
-        // away from where it was put.
+        // Otherwise, the next step would simulate the time since the previous step and move the
+        // shaft away from the position that was just set.
         self.simulated_until = None;
     }
 
@@ -99,8 +99,8 @@ impl EmulatedDrive {
 
     /// Follows an MIT-mode command if the motor is enabled.
     pub(in crate::can) fn obey(&mut self, command: Command) {
-        // Only commands that are followed reset the watchdog. A disabled motor that is polled must
-        // not seem to be commanded.
+        // A command resets the watchdog only if the motor follows it. Polling a disabled motor must
+        // not count as commanding it.
         if self.state() == State::Enabled {
             self.actuation = Actuation::Mit(command);
             self.target = Some(command);
@@ -108,7 +108,7 @@ impl EmulatedDrive {
         }
     }
 
-    /// Writes a setting, unless it is a timeout and timeouts are ignored.
+    /// Writes a setting. Does nothing if the setting is a timeout and the motor ignores timeouts.
     pub(in crate::can) fn set(&mut self, number: u32, value: u32, is_timeout: bool) {
         if !(is_timeout && self.ignores_timeout) {
             self.settings.insert(number, value);

@@ -37,7 +37,8 @@ pub struct EmulatedMotor {
 
 impl EmulatedMotor {
     /// Creates a disabled motor at rest at position 0. `limits` are the ranges of raw values that
-    /// it reports; for motors that do not report them, the ranges follow from the model.
+    /// the motor reports. They are ignored for motors that report no ranges, because those ranges
+    /// follow from the model.
     pub fn new(motor: &dyn MotorProtocol, limits: Limits) -> Self {
         let drive = EmulatedDrive::new(motor.ranges().unwrap_or(limits));
         Self {
@@ -54,7 +55,8 @@ impl EmulatedMotor {
         self.drive.set_motion(motion);
     }
 
-    /// Sets mechanical stops, the lowest and highest position of the shaft, as an obstacle does.
+    /// Sets mechanical stops: the lowest and highest position of the shaft. They simulate an
+    /// obstacle.
     pub fn set_stops(&mut self, stops_rad: [f64; 2]) {
         self.drive.set_stops(stops_rad);
     }
@@ -69,18 +71,18 @@ impl EmulatedMotor {
         self.drive.state()
     }
 
-    /// The last command that it followed. Commands of drives with their own position loop have no
-    /// gains.
+    /// The last command that the motor followed. Commands of drives with their own position loop
+    /// have no gains.
     pub fn target(&self) -> Option<Command> {
         self.drive.target
     }
 
-    /// Time at which its watchdog was last reset.
+    /// Time at which the motor's watchdog was last reset.
     pub fn watchdog_reset_at(&self) -> Option<Stamp> {
         self.drive.watchdog_reset_at
     }
 
-    /// Time at which its watchdog last stopped it.
+    /// Time at which the watchdog last stopped the motor.
     pub fn timed_out_at(&self) -> Option<Stamp> {
         self.drive.timed_out_at
     }
@@ -109,8 +111,8 @@ impl EmulatedMotor {
     /// Advances the simulation of shaft and watchdog to `now`, and returns the unsolicited frames.
     pub fn report(&mut self, now: Stamp) -> Result<Vec<Frame>, CanError> {
         self.drive.advance(now);
-        // The shaft moves up to `now` under the last command before the watchdog is checked. Called
-        // once per millisecond, this delays the reaction by a millisecond at most.
+        // The shaft moves up to `now` under the last command before the watchdog is checked. This
+        // is called once per millisecond, so the reaction is delayed by a millisecond at most.
         if self.has_timed_out(now) {
             self.time_out(now);
         }
@@ -139,8 +141,8 @@ impl EmulatedMotor {
     fn time_out(&mut self, now: Stamp) {
         // It expires once, and runs again after the next command.
         self.drive.watchdog_reset_at = None;
-        // The time is recorded for tests, which ask when a motor was stopped. An idle motor was
-        // not.
+        // The time is recorded for tests, which check when the watchdog stopped a motor. An idle
+        // motor is not stopped.
         if self.state() == State::Enabled {
             self.drive.timed_out_at = Some(now);
         }
@@ -148,7 +150,7 @@ impl EmulatedMotor {
     }
 }
 
-/// Whether `interval` has passed since `last`; if so, sets `last` to now.
+/// Returns whether `interval` has passed since `last`. If so, sets `last` to now.
 fn is_due(last: &mut Option<Stamp>, now: Stamp, interval: Duration) -> bool {
     let due = last.is_none_or(|last| now.duration_since(last) >= interval);
     if due {

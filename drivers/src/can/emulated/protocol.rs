@@ -8,8 +8,8 @@ use std::time::Duration;
 
 /// The motor's side of a protocol, for one motor.
 pub trait EmulatedProtocol: Debug + Send {
-    /// Processes a frame, and returns the answers. There are none if the frame is not addressed to
-    /// this motor.
+    /// Processes a frame, and returns the answers. There are no answers if the frame is not
+    /// addressed to this motor.
     ///
     /// # Errors
     /// If the protocol cannot encode an answer.

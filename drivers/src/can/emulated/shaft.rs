@@ -8,8 +8,8 @@ use crate::wire::can::mit::{Command, Limits, Motion};
 const INERTIA_KG_M2: f64 = 0.05;
 /// Viscous friction, N m s / rad.
 const FRICTION_NM_S_RAD: f64 = 0.25;
-/// Gain of the drive's position loop, 1 / s. The shaft lags a moving target by the velocity divided
-/// by this gain, unless the command contains the velocity. The next constant is the maximum
+/// Gain of the drive's position loop, 1 / s. Unless the command contains the velocity, the shaft
+/// lags a moving target by the velocity divided by this gain. The next constant is the maximum
 /// velocity of the loop, rad / s.
 const FOLLOWING_HZ: f64 = 60.0;
 const MAX_FOLLOWING_RAD_S: f64 = 40.0;
@@ -104,8 +104,8 @@ impl Shaft {
         // oscillations from growing.
         let acceleration = (torque_nm - FRICTION_NM_S_RAD * velocity_rad_s) / INERTIA_KG_M2;
         self.rotate(velocity_rad_s + acceleration * secs, secs);
-        // `rotate` sets the torque to 0, which is right for the position loop, whose torque is
-        // unknown.
+        // `rotate` sets the torque to 0. That is correct for the position loop, whose torque is
+        // unknown. For other commands, the torque is set here.
         self.motion.torque_nm = torque_nm;
     }
 
@@ -197,7 +197,8 @@ mod tests {
             "{:?}",
             free.motion
         );
-        // 3 rad/s fall to 0 within a tenth of a second: half of 3 rad/s times 0.1 s.
+        // The velocity falls from 3 rad/s to 0 within 0.1 s, so the shaft moves by half of 3 rad/s
+        // times 0.1 s.
         assert!(
             (stopped.motion.position_rad - 0.15).abs() < 1e-3,
             "{:?}",

@@ -4,7 +4,8 @@
 //! Sources: `odriverobotics/ODrive` `tools/odrive-cansimple.dbc` (messages since firmware 0.5);
 //! ODrive CAN protocol page and DBC of firmware 0.6.10 (heartbeat, errors, torques, endpoints,
 //! temperature). Frames contain turns; this module converts them to radians. Nodes send their
-//! messages at the rates set in `can.config` or `axis.config.can`, or in answer to a remote frame.
+//! messages periodically, at the rates set in `can.config` or `axis.config.can`. They also send
+//! them in answer to a remote frame.
 
 use crate::wire::can::{CanError, Frame, Id, decode_enum};
 use std::f64::consts::TAU;
@@ -296,8 +297,8 @@ pub fn decode_answer(frame: &Frame) -> Result<(Node, Answer), CanError> {
 
 /// Decodes the payload of the message with the command `code`.
 fn decode_payload(code: u8, [a, b, c, d, e, f, g, h]: [u8; 8]) -> Result<Answer, CanError> {
-    // Most payloads consist of two words, integers or floats. In the others, the bytes have their
-    // own meaning.
+    // Most payloads consist of two words, which are integers or floats. In the other payloads,
+    // single bytes have a meaning.
     let words = [
         u32::from_le_bytes([a, b, c, d]),
         u32::from_le_bytes([e, f, g, h]),
@@ -444,8 +445,8 @@ fn encode_thousandths(field: &'static str, value: f64) -> Result<[u8; 2], CanErr
     if value.is_nan() {
         Err(CanError::NotFinite { field })
     } else {
-        // Clamping is acceptable for feedforward: the position loop of the axis makes up for it. A
-        // clamped position would be another target.
+        // Clamping is acceptable for feedforward, because the position loop of the axis compensates
+        // for it. A clamped position would be a different target.
         Ok(((value / FEED_FORWARD).round() as i16).to_le_bytes())
     }
 }

@@ -32,7 +32,7 @@ fn request_state(data: &[u8], drive: &mut EmulatedDrive) {
     match data {
         [1, 0, 0, 0] => drive.actuation = Actuation::Free,
         [8, 0, 0, 0] if drive.faults == 0 => {
-            // It starts at its current position, whatever was requested before.
+            // The axis starts at its current position, whatever position was requested before.
             let position_rad = drive.motion().position_rad;
             drive.actuation = Actuation::Follow(Command {
                 position_rad,
@@ -55,8 +55,8 @@ impl EmulatedProtocol for EmulatedOdrive {
             return Ok(Vec::new());
         }
         let is_object = |code: Code| id.value() & 0x1F == code as u32;
-        // A remote frame requests a message. Of those that nodes do not send periodically, the
-        // driver needs only the version.
+        // A remote frame requests a message. Of the messages that nodes do not send periodically,
+        // the driver needs only the version.
         if frame.is_remote() {
             let version = Answer::Version {
                 hardware: HARDWARE,

@@ -10,8 +10,8 @@ use crate::wire::can::mit::Command;
 use crate::wire::can::{CanError, Frame};
 use std::time::Duration;
 
-/// Longest interval between reports of an axis. Encoder messages come every 10 ms by default, so
-/// this tolerates a few lost ones, and slower settings of the axis.
+/// Longest interval between reports of an axis. Encoder messages come every 10 ms by default. The
+/// limit tolerates a few lost messages and axes that are set to a lower rate.
 const MAX_REPORT_INTERVAL: Duration = Duration::from_millis(50);
 
 /// An `ODrive` axis that may be moved.
@@ -64,7 +64,7 @@ impl MotionProtocol for OdriveMotion {
         for request in [Request::SetState(State::Idle), Request::ClearErrors] {
             query.send(self.encode(&request))?;
         }
-        // Neither request has an answer, but the heartbeat reports state and errors.
+        // Neither of these requests is answered, but the heartbeat reports state and errors.
         let mut last = None;
         let off = query.wait(MAX_CHANGE, |frame| match codec::decode_answer(frame) {
             Ok((from, Answer::Heartbeat { errors, state })) if from == self.node => {
@@ -83,7 +83,7 @@ impl MotionProtocol for OdriveMotion {
             return Ok(());
         };
         self.check_endpoints(query, endpoints)?;
-        // A flag is one byte; the bytes after it in an answer are undefined.
+        // A flag is one byte. In an answer, the bytes after the flag are undefined.
         let settings = [
             (
                 endpoints.watchdog_timeout,
@@ -115,7 +115,7 @@ impl MotionProtocol for OdriveMotion {
     }
 
     fn set_mode(&self, query: &MotorQuery<'_>, _plan: &WatchdogPlan) -> Result<(), Error> {
-        // The mode cannot be read over CANSimple. A wrong mode shows as a following error at the
+        // The mode cannot be read over CANSimple. A wrong mode causes a following error at the
         // first motion.
         query.send(self.encode(&Request::SetMode(Control::Position)))
     }
@@ -154,7 +154,8 @@ impl MotionProtocol for OdriveMotion {
             Ok((from, Answer::Heartbeat { errors, state })) if from == self.node => {
                 Some(match (errors, state) {
                     (0, State::ClosedLoopControl) => Health::Enabled,
-                    // Idle without an error: somebody has disabled the axis.
+                    // An axis that is idle without an error was disabled by another program or a
+                    // person.
                     (0, _) => Health::Off,
                     (codec::WATCHDOG_TIMER_EXPIRED, _) => {
                         Health::Fault(COMMUNICATION_LOST.to_owned())

@@ -297,8 +297,8 @@ pub fn decode_answer(frame: &Frame, host: u8, limits: &Limits) -> Result<Answer,
             Err(foreign)
         };
     }
-    // Requests have the motor as their destination, so those of other programs are not mistaken for
-    // answers.
+    // Requests have the motor as their destination, so requests of other programs are not mistaken
+    // for answers.
     if to != host {
         return Err(foreign);
     }
@@ -350,7 +350,7 @@ fn decode_feedback(
     Ok(Feedback {
         motor,
         is_unsolicited: kind == Communication::ActiveReport as u8,
-        // Two bits of mode above six fault bits.
+        // Two bits contain the mode. The six bits below them are fault bits.
         mode: decode_enum("the mode", (flags >> 6).into(), &modes, |known| {
             known as u32
         })?,

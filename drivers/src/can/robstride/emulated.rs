@@ -7,13 +7,13 @@ use crate::wire::can::{CanError, Frame, Id};
 use std::time::Duration;
 
 const OVERLOAD: u32 = Faults::OVERLOAD as u32;
-/// Ticks of its timeout per second.
+/// Ticks per second in which the timeout of the motor is given.
 const TICKS_HZ: f64 = 20_000.0;
 
 #[derive(Debug)]
 pub(super) struct EmulatedRobstride {
     pub(super) motor: u8,
-    /// Whether it sends periodic reports.
+    /// Whether the motor sends periodic reports.
     pub(super) reports: bool,
 }
 

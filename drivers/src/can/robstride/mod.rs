@@ -153,8 +153,9 @@ impl MotorProtocol for Robstride {
     fn set_up(&self, query: &MotorQuery<'_>) -> Result<Limits, Error> {
         let limits = self.model.limits();
         let interval = Request::Write(Parameter::ReportInterval, Value::Integer(SHORTEST_REPORT));
-        // The interval is set first, so that the first reports already come at the right rate.
-        // Neither request is acknowledged separately: the reports show that both were executed.
+        // The interval is set first, so that the first reports already come at the right rate. No
+        // separate acknowledgment is needed, because the reports show that both requests were
+        // executed.
         for request in [interval, Request::ReportActively(true)] {
             self.send(query, &request, &limits)?;
         }

@@ -39,7 +39,7 @@ impl MotionProtocol for RobstrideMotion {
         self.address
             .send(query, &Request::Stop { clear_fault: true }, &self.limits)?;
         // The answer to the stop and the periodic reports have the same content, and an earlier
-        // report may still be queued. The wait ends at the first one that shows the new state.
+        // report may still be queued. The wait ends at the first message that shows the new state.
         let mut last = None;
         let off = query.wait(MAX_CHANGE, |frame| {
             let reported = self.address.feedback(frame, &self.limits)?;

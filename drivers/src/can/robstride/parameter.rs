@@ -76,8 +76,8 @@ impl Parameter {
     /// Encodes a value as the last four bytes of a message.
     pub(super) fn value_bytes(self, value: Value) -> Result<[u8; 4], CanError> {
         match (self.integer_bytes(), value) {
-            // A value that does not fit would be cut off by the motor. The comparison excludes four
-            // bytes, for which the shift would overflow.
+            // The motor would truncate a value that does not fit. Parameters of four bytes are not
+            // checked, because every value fits and the shift would overflow.
             (Some(n_bytes), Value::Integer(whole))
                 if n_bytes == 4 || whole < 1 << (8 * n_bytes) =>
             {

@@ -146,7 +146,8 @@ pub fn decode_feedback(
             id: frame.id().value(),
         });
     }
-    // Six bytes from older firmware, eight from newer. Any other length is another message.
+    // Older firmware sends six bytes, and newer firmware sends eight. Any other length is another
+    // message.
     let (motor, motion, rest) = match *frame.data() {
         [motor, a, b, c, d, e, ref rest @ ..] if rest.is_empty() || rest.len() == 2 => {
             (motor, [a, b, c, d, e], rest)
@@ -183,7 +184,8 @@ pub fn decode_feedback(
     })
 }
 
-/// Encodes the answer of an emulated motor. Its CAN ID is that of the host, `host`, by default 0.
+/// Encodes the answer of an emulated motor. Its CAN ID is `host`, the ID of the host, which is 0 by
+/// default.
 #[expect(
     clippy::cast_possible_truncation,
     clippy::cast_sign_loss,
@@ -207,7 +209,8 @@ pub fn encode_feedback(
         } else {
             0.0
         };
-        // Rounded before the check, so that values that round into the range are accepted.
+        // The value is rounded before the check, so that values that round into the range are
+        // accepted.
         let count = (drive_celsius + zero).round();
         if !(0.0..=255.0).contains(&count) {
             let field = "the temperature";

@@ -41,7 +41,7 @@ impl EmulatedProtocol for EmulatedTMotor {
             },
             command => drive.obey(mit::decode(&command, &drive.limits)),
         }
-        // Every frame gets an answer, also those that are ignored, because a driver polls with the
+        // Every frame gets an answer, even if it is ignored, because a driver polls with the
         // command that disables the motor.
         let fault = if drive.faults == 0 {
             Fault::None

@@ -148,8 +148,8 @@ impl MotorProtocol for TMotor {
     }
 
     fn watchdog(&self) -> Watchdog {
-        // All three are commands in MIT mode that the motor executes until the next one, so this
-        // computer can send any of them as its last.
+        // All three actions are commands in MIT mode. The motor executes a command until it
+        // receives the next one, so each of them can be the last command.
         let actions = &[OnLoss::Hold, OnLoss::Damp, OnLoss::Release];
         Watchdog::Missing {
             reason: "a motor of this family has no watchdog",

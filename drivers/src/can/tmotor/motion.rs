@@ -55,10 +55,10 @@ impl MotionProtocol for TMotorMotion {
 
     fn health(&mut self, frame: &Frame) -> Option<Health> {
         let reported = self.address.feedback(frame, &self.limits)?;
-        // It does not report whether it is enabled.
+        // The motor does not report whether it is enabled.
         Some(match reported.health.map(|health| health.fault) {
-            // Firmware of 2020 and earlier reports no faults. A motor that has stopped then shows
-            // as a following error.
+            // Firmware of 2020 and earlier reports no faults. With such firmware, a motor that has
+            // stopped is detected by its following error.
             None | Some(Fault::None) => Health::Enabled,
             Some(fault) => Health::Fault(format!("the motor stopped: {fault:?}")),
         })

@@ -1,4 +1,4 @@
-//! What the reader of TUM folders uses, names or refuses.
+//! Tests which parts of a TUM folder the reader uses, names in a message, or refuses.
 
 use super::super::{Dataset, read};
 use super::{save_counts, tum_folder};

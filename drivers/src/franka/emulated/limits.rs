@@ -139,7 +139,7 @@ impl Limits {
         before: &CommandedJoints,
         now: &CommandedJoints,
     ) -> Result<(), Violation> {
-        // NaN compares as false with everything, so it would pass the second condition.
+        // All comparisons with NaN are false, so NaN would pass the second condition.
         let exceeds =
             |number: f64, max_rate: f64| number.is_nan() || number.abs() > max_rate + ROUNDING;
         for ix in 0..N_JOINTS {

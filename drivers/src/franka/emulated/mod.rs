@@ -1,8 +1,8 @@
 //! An emulated robot controller for tests and simulators: commands over TCP, states at 1 kHz and
 //! motions over UDP.
 //!
-//! `robot` implements the controller without sockets, `limits` checks motions, `model` has the
-//! robot description, `message` and `state` encode and decode, `server` has the sockets. A callback
+//! `robot` implements the controller without sockets. `limits` checks motions. `model` has the
+//! robot description. `message` and `state` encode and decode. `server` has the sockets. A callback
 //! of the owner, such as a simulator or a test, returns the actual joint states once per
 //! millisecond.
 //!

@@ -99,8 +99,7 @@ impl Robot {
                 let status = self.begin(command_id, payload);
                 vec![self.move_byte(status)]
             }
-            // The client that waits for the end of the motion gets its reply before the one to this
-            // request.
+            // The reply about the end of the motion is sent before the reply to this request.
             Request::Stop => {
                 replies.extend(self.end(MoveStatus::Preempted));
                 vec![0]
@@ -118,8 +117,8 @@ impl Robot {
                 vec![u8::from(is_moving)]
             }
             Request::Model => [&[0], model::urdf(&self.config.limits).as_bytes()].concat(),
-            // A library is machine code for the client, which an emulator does not have. Clients
-            // can do without it.
+            // The library is machine code that runs on the client. The emulator does not have it,
+            // and clients work without it.
             Request::Library => vec![v5::LoadModelLibraryStatus::Error.to_u8()],
             Request::CartesianLimit => vec![0; size_of::<v5::GetCartesianLimitResponse>()],
             Request::Set(_) if is_moving => {
@@ -144,7 +143,8 @@ impl Robot {
             FciVersion::V5 => size_of::<v5::MoveRequest>(),
             FciVersion::V10 => size_of::<v10::MoveRequest>(),
         };
-        // In both versions the payload starts with the controller and the motion generator.
+        // In both versions, the payload starts with the codes of the controller and the motion
+        // generator.
         let (Ok((head, _)), true) = (
             <[[u8; 4]; 2]>::read_from_prefix(payload),
             payload.len() == n_bytes,
@@ -173,7 +173,7 @@ impl Robot {
         });
         self.reflex_reason = Errors::default();
         self.commanded.is_moving = true;
-        // The success rate is that of one motion.
+        // The success rate is computed for each motion separately.
         self.answered.clear();
         MoveStatus::MotionStarted
     }
@@ -226,8 +226,8 @@ impl Robot {
         let Mode::Move(motion) = self.mode else {
             return None;
         };
-        // Before the first command, the robot waits without counting. States that nobody could
-        // answer are not the client's fault.
+        // Before the first command, missing answers do not count. States that the client could not
+        // answer in time do not count either.
         if command.is_some() || (could_answer && motion.has_begun) {
             self.answered.truncate(N_SUCCESS_WINDOW - 1);
             self.answered.push_front(command.is_some());
@@ -241,8 +241,8 @@ impl Robot {
             TrajectoryGenerator::Velocity => command.velocity_rad_s[ix],
         });
         if let Err(violation) = self.config.limits.check(&before, &now) {
-            // A client that starts elsewhere violates other limits as well, but the wrong start is
-            // the cause.
+            // If a client starts at another position, it also violates other limits. The wrong
+            // start is the cause, so only this is reported.
             let is_wrong_start =
                 !motion.has_begun && motion.generator == TrajectoryGenerator::Position;
             let violation = if is_wrong_start {
@@ -328,8 +328,8 @@ impl Robot {
         }
     }
 
-    /// Handles the disconnection of the client. During a motion, it is a reflex, as after missing
-    /// commands.
+    /// Handles the disconnection of the client. During a motion, a disconnection triggers a reflex,
+    /// just as missing commands do.
     pub(super) fn abandon(&mut self) {
         if matches!(self.mode, Mode::Move(_)) {
             // No client is left to receive the reply.
@@ -375,7 +375,7 @@ impl Robot {
         })
     }
 
-    /// A status as numbered in the robot's FCI version.
+    /// The number of a status in the robot's FCI version.
     fn move_byte(&self, status: MoveStatus) -> u8 {
         match (self.config.version, status) {
             (FciVersion::V10, _) => status.to_u8(),

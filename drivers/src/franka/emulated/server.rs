@@ -156,20 +156,21 @@ impl Server {
         // The numbers start as if the robot had been on for a while.
         let mut number = 1_000_000;
         while !self.stop.load(Ordering::Relaxed) {
-            // Computed from the start, so that late steps do not shift all later ones.
+            // The due time is computed from the start time, so that late steps do not delay all
+            // later steps.
             let due = start_time + STEP * n_steps;
             let now = clock::now();
             let lag = now.duration_since(due);
             let max_lag = if self.robot.commanded.is_moving && !self.answer_wait.is_zero() {
-                // The answers to late states are awaited, too.
+                // The robot also waits for the answers to late states.
                 Duration::MAX
             } else {
                 MAX_LAG
             };
             if lag > max_lag {
                 let n_skipped = u32::try_from(lag.as_millis()).unwrap_or(u32::MAX);
-                // The numbers of skipped states are skipped, too, so that clients see them as lost,
-                // and the clock of the robot stays right.
+                // The numbers of skipped states are skipped, too. Clients thus count them as lost,
+                // and the clock of the robot stays correct.
                 n_steps = n_steps.saturating_add(n_skipped);
                 number += u64::from(n_skipped);
                 continue;
@@ -195,7 +196,7 @@ impl Server {
             }
         }
         self.accept_client();
-        // The answer to the last state moves the joints, and only then the next state is sent.
+        // First, the answer to the last state moves the joints. Only then is the next state sent.
         let command = self.command(number - 1, wait);
         // If several states are overdue, only the last one can have been answered.
         let could_answer = !is_late || !wait.is_zero();
@@ -215,7 +216,7 @@ impl Server {
                 return;
             }
             if let Some(states_to) = client.states_to {
-                // A client notices by its number that a state could not be sent.
+                // If a state cannot be sent, the client notices the gap in the numbers.
                 let sent = self.states.send_to(&self.robot.state(number), states_to);
                 self.n_states_sent
                     .fetch_add(u64::from(sent.is_ok()), Ordering::Relaxed);

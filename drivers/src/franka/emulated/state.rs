@@ -50,7 +50,8 @@ macro_rules! state {
             motion_generator_mode,
             controller_mode,
             robot_mode,
-            // Current errors end with the reflex. Its reason stays until the next motion.
+            // Current errors end with the reflex. The reason for the reflex stays until the next
+            // motion.
             errors: if matches!(robot.mode, Mode::Reflex) {
                 reasons
             } else {

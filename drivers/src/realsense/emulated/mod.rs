@@ -21,8 +21,8 @@ use std::ptr::NonNull;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::{Duration, Instant};
 
-/// Maximum number of images that the library still has to write. If there are more, we wait,
-/// because the library drops images that it cannot store.
+/// Maximum number of images that the library still has to write. If there are more, the writer
+/// waits, because the library drops images that it cannot store.
 const MAX_QUEUED_IMAGES: usize = 16;
 /// If no image is written for this long, the disk is assumed to be full or disconnected.
 const MAX_WAIT: Duration = Duration::from_secs(30);
@@ -101,7 +101,7 @@ impl BagWriter {
     /// Starts a file. An existing file of that name is replaced.
     pub fn create(path: &Path, camera: &EmulatedCamera) -> Result<Self, Problem> {
         let context = Context::new()?;
-        // Usually missing. If removal fails, the library reports an error.
+        // The file usually does not exist. If removing it fails, the library reports an error.
         let _ = std::fs::remove_file(path);
         let _guard = device_creation_lock();
         // SAFETY: the device is checked and then owned here; sensors and profiles live as long as
@@ -505,7 +505,7 @@ fn wait_until_written(
 ) -> Result<(), Problem> {
     let started = Instant::now();
     loop {
-        // In every round, because it frees images that have been written in the meantime.
+        // Every round polls, because this frees images that have been written in the meantime.
         poll()?;
         if LENT_PIXELS
             .lock()

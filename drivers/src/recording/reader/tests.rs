@@ -395,8 +395,8 @@ fn with_source(error: &crate::Error) -> String {
 
 type Change = fn(&mut Contents);
 
-/// A row of the table in docs/reference/recording.md, words that the note or error contains, and a
-/// change to a file.
+/// Each case has a row of the table in docs/reference/recording.md, words that the note or error
+/// contains, and a change to a file.
 const CASES: &[(&str, &str, Change)] = &[
     ("profile and library of the header", "", |file| {
         file.profile = "ros2"

@@ -2,8 +2,8 @@
 //!
 //! Source: CiA 301 (CANopen application layer and communication profile) 4.2.0: sections 7.2.2
 //! (PDO), 7.2.4 (SDO and its abort codes), 7.2.8 (NMT, heartbeat), 7.5.2 (objects); the same bytes
-//! in christiansandberg/canopen. Segmented and block transfers are not supported: no object that a
-//! drive needs is longer than four bytes.
+//! in christiansandberg/canopen. Segmented and block transfers are not supported, because no object
+//! that a drive needs is longer than four bytes.
 
 use super::{CanError, Frame, Id, decode_enum};
 
@@ -188,7 +188,8 @@ pub fn encode_sync() -> Frame {
     data_frame(0x80, &[])
 }
 
-/// Encodes a heartbeat: that of the host, without which drives stop, or that of an emulated node.
+/// Encodes a heartbeat of the host or of an emulated node. Without the host's heartbeat, drives
+/// stop.
 pub fn encode_heartbeat(node: Node, state: NodeState) -> Frame {
     data_frame(0x700 + u32::from(node.0), &[state as u8])
 }
@@ -243,8 +244,8 @@ pub fn encode_write(node: Node, object: Object, value: i64) -> Result<Frame, Can
             });
         }
     };
-    // From the smallest signed to the largest unsigned number: objects of one length may be either,
-    // and their bytes are the same.
+    // The range extends from the smallest signed to the largest unsigned number. Objects of the
+    // same length may be signed or unsigned, and their bytes are the same.
     let lower = -(1_i64 << (n_bits - 1));
     let upper = (1_i64 << n_bits) - 1;
     if !(lower..=upper).contains(&value) {
@@ -302,8 +303,8 @@ pub fn decode_sdo(frame: &Frame) -> Result<(Node, SdoAnswer), CanError> {
     };
     let index = u16::from_le_bytes([low, high]);
     let value = u32::from_le_bytes([a, b, c, d]);
-    // The upper three bits are the command. In answers to a read, the others are: number of unused
-    // bytes, expedited, length given.
+    // The upper three bits are the command. In answers to a read, the other bits contain the number
+    // of unused bytes and the flags "expedited" and "length given".
     match (command >> 5, command & 0b10 != 0, command & 0b01 != 0) {
         (3, ..) => Ok((node, SdoAnswer::Written { index, subindex })),
         (4, ..) => Err(CanError::Aborted {

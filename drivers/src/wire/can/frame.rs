@@ -167,9 +167,9 @@ impl Frame {
         let n_data = u32::try_from(8 * self.data().len()).expect("at most 64 bytes");
         let n_stuff_bits = |n_bits: u32| match stuffing {
             Stuffing::None => 0,
-            // A stuff bit follows five equal bits and starts the next group of five itself, so
-            // after the first one, every four bits of the frame may bring another (Davis et al.
-            // 2007, equation 1).
+            // A stuff bit follows five equal bits and is the first bit of the next group of five.
+            // After the first stuff bit, every four bits of the frame may therefore cause another
+            // one (Davis et al. 2007, equation 1).
             Stuffing::Worst => (n_bits - 1) / 4,
         };
         let Kind::Fd { switched } = self.kind else {
@@ -180,12 +180,12 @@ impl Frame {
                 data: 0,
             };
         };
-        // From the start of frame to the bit rate switch; then error state, length and data; then
-        // stuff count, CRC and their fixed stuff bits.
+        // The head ranges from the start of frame to the bit rate switch. The body contains error
+        // state, length and data. The check contains stuff count, CRC and their fixed stuff bits.
         let head = if self.id.extended { 36 } else { 17 };
         let body = 5 + n_data;
-        // Up to 16 bytes, the CRC has 17 bits, else 21. It has its own fixed stuff bits, and the
-        // stuff count in front of it has four bits.
+        // For up to 16 bytes, the CRC has 17 bits, otherwise 21. It has its own fixed stuff bits.
+        // The stuff count in front of it has four bits.
         let check = if n_data <= 8 * 16 {
             4 + 17 + 6
         } else {
@@ -367,7 +367,8 @@ mod tests {
             nominal_hz: 1e6,
             data_hz: 5e6,
         };
-        // Six motors with one command and one answer each, 500 times per second: 135 us per frame.
+        // Six motors have one command and one answer each, 500 times per second. A frame takes 135
+        // us.
         let bits = standard(8).bits(Stuffing::Worst);
         let load = load_frac([(bits, 6.0 * 500.0), (bits, 6.0 * 500.0)], rates);
         assert!((load - 0.81).abs() < 1e-12, "{load}");

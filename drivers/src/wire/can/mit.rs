@@ -212,8 +212,8 @@ mod tests {
             ),
             (command(500.0, 5.0, 12.5, 30.0, 10.0), [0xFF; 8]),
             (command(0.0, 0.0, -12.5, -30.0, -10.0), [0x00; 8]),
-            // 35388.9, 1842.75, 409.5, 819, 2559.375 are rounded to the nearest integer, and 409.5
-            // to 409.
+            // 35388.9, 1842.75, 409.5, 819 and 2559.375 are rounded to the nearest integer; 409.5
+            // is rounded to 409.
             (
                 command(50.0, 1.0, 1.0, -3.0, 2.5),
                 [0x8A, 0x3D, 0x73, 0x31, 0x99, 0x33, 0x39, 0xFF],

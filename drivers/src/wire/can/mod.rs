@@ -2,8 +2,8 @@
 //! family is in its folder of [`can`](crate::can).
 //!
 //! Every codec is pure: it converts between a [`Frame`] and SI values. Values outside the range of
-//! a field are clamped where the manufacturers' own examples clamp (MIT packing, Robstride,
-//! ODrive's feedforward), and are errors everywhere else. NaN is always an error.
+//! a field are clamped if the manufacturers' own examples clamp them (MIT packing, Robstride,
+//! ODrive's feedforward). Otherwise, they are errors. NaN is always an error.
 
 pub mod canopen;
 pub mod frame;

@@ -2,7 +2,7 @@
 //!
 //! Source: `float_to_uint` and `uint_to_float` of Ben Katz's mini cheetah firmware, as in
 //! `cmjang/DM_Control_Python`: 0 is the lower end of the range, the maximum integer the upper end.
-//! These sources truncate. We round to the nearest integer, and halves down, so that 0 in a
+//! These sources truncate. We round to the nearest integer. Halves are rounded down, so that 0 in a
 //! symmetric range is encoded as in these sources.
 
 use super::CanError;
@@ -55,8 +55,8 @@ impl Scale {
         }
         let unit_interval =
             (value.clamp(self.lower, self.upper) - self.lower) / (self.upper - self.lower);
-        // `ceil(x - 0.5)` rounds halves down, which makes 0 of a symmetric range the same integer
-        // as in the sources: half of the largest integer, which is odd, truncated.
+        // `ceil(x - 0.5)` rounds halves down. The largest integer is odd, so 0 of a symmetric range
+        // is half of it, rounded down. The sources truncate it to the same integer.
         Ok((unit_interval * self.max_raw() - 0.5)
             .ceil()
             .clamp(0.0, self.max_raw()) as u16)

@@ -3,7 +3,8 @@
 const SCAN_LANES = 256u;
 var<workgroup> wg_scan: array<u32, 256>;
 
-// Returns the sum of the values of the lanes below `lane`; `total` receives the sum of all. Every lane must call it.
+// Returns the sum of the values of the lanes below `lane`; `total` receives the sum over all lanes. Every lane must
+// call this function.
 fn exclusive_scan(lane: u32, value: u32, total: ptr<function, u32>) -> u32 {
     wg_scan[lane] = value;
     workgroupBarrier(); // The values are written before the first step reads them.

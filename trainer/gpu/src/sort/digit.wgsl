@@ -1,6 +1,7 @@
 // digit: the eight bits of the key that a pass sorts by. For kernels that bind digit and status.
 //
-// Keys are reduced to 16 bits: the offset from the smallest key is shifted right until the range of keys fits.
+// Keys are reduced to 16 bits. For this, the offset from the smallest key is shifted right until the range of keys
+// fits.
 
 struct Digit {
     shift: u32,

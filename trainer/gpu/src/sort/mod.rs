@@ -146,7 +146,7 @@ impl RadixSort {
         largest: u32,
     ) -> Result<SortBuffers, Error> {
         // The number of keys is known only on the GPU, so dispatches and buffers are sized for the
-        // largest one.
+        // largest number.
         let max_blocks = n_max.div_ceil(self.block()).max(1);
         let words =
             |name: &str, n: u32| gpu.storage(&format!("{label}.{name}"), 4 * u64::from(n.max(1)));
@@ -183,7 +183,7 @@ impl RadixSort {
             buffers.max_blocks.div_ceil(8)
         };
         for (pass, digit) in buffers.digits.iter().enumerate() {
-            // Two passes, so the results end up in the first buffers again.
+            // There are two passes, so the results are in the first buffers again.
             let from = pass % 2;
             let to = 1 - pass % 2;
             let keys = &buffers.keys[from];
@@ -233,8 +233,8 @@ impl RadixSort {
         }
     }
 
-    /// Number of keys in a block. Smaller blocks need more counts and scans; larger ones leave
-    /// fewer blocks to run in parallel. The kernels contain the same numbers.
+    /// Number of keys in a block. With smaller blocks, there are more counts and scans. With larger
+    /// blocks, fewer blocks run in parallel. The kernels contain the same numbers.
     fn block(&self) -> u32 {
         if self.parallel { 2048 } else { 256 }
     }
@@ -277,7 +277,7 @@ mod tests {
         let key_range = [counted_keys().min().unwrap(), counted_keys().max().unwrap()];
         let shift = (32 - (key_range[1] - key_range[0]).leading_zeros()).saturating_sub(16);
         let mut expected: Vec<(u32, u32)> = keys.iter().copied().zip(0..).collect();
-        // Stable, like the sort on the GPU.
+        // This sort is stable, like the sort on the GPU.
         expected.sort_by_key(|(key, _)| match *key {
             u32::MAX => 0xffff,
             key => ((key - key_range[0]) >> shift).min(0xfffe),

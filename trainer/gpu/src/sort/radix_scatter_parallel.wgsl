@@ -46,7 +46,7 @@ fn main(
         let peers = peers_of(key_digit, valid);
         let leader = lowest_lane(peers);
         var base = 0u;
-        // The shuffle makes the next round's leader wait for this sum, so the rounds count in order.
+        // Because of the shuffle, the leader of the next round waits for this sum. The rounds therefore count in order.
         if valid && sub_lane == leader { base = atomicAdd(&wg_ranks[subgroup * 256u + key_digit], n_bits(peers)); }
         base = subgroupShuffle(base, select(sub_lane, leader, valid));
         ranks[round] = base + n_bits(peers & lanes_below(sub_lane));

@@ -47,7 +47,7 @@ impl CellGrid {
     pub fn cell_m(&self, point_m: [f64; 3]) -> f64 {
         // The contracted cube is 4 radii wide. At the distance `largest`, the contraction of Barron
         // et al. 2022 (equation 10) maps to (2 - 1 / largest) / largest times the coordinate.
-        // Widths across the ray are divided by this factor; along the ray, cells are wider still.
+        // Widths across the ray are divided by this factor. Along the ray, cells are even wider.
         let largest = self
             .scaled(point_m)
             .iter()
@@ -98,7 +98,8 @@ impl CellSet {
     pub fn new(grid: CellGrid, cells: impl IntoIterator<Item = u32>) -> Self {
         let mut ranges: Vec<[u32; 2]> = Vec::new();
         for cell in cells {
-            // Floaters fill runs of cells along x, so ranges take fewer words than cells.
+            // Floaters fill runs of cells along x, so storing ranges takes fewer words than storing
+            // cells.
             match ranges.last_mut() {
                 Some([_, end]) if *end == cell => *end += 1,
                 _ => ranges.push([cell, cell + 1]),

@@ -77,8 +77,8 @@ fn check_box(
     Ok(())
 }
 
-/// The edits of a model, oldest first. Edits that were undone are remembered, but neither stored
-/// nor compared.
+/// The edits of a model, oldest first. Edits that were undone are kept in memory, but they are
+/// neither saved nor compared.
 #[derive(Clone, Debug, Default, Serialize, Deserialize)]
 #[serde(try_from = "Vec<StoredEdit>", into = "Vec<StoredEdit>")]
 pub struct Edits {
@@ -172,8 +172,8 @@ impl Edits {
         self.made.iter().any(|edit| edit.erases(point_m))
     }
 
-    /// Whether nothing of a splat remains in pictures: a box contains it as a whole, or an edit of
-    /// cells its center.
+    /// Whether nothing of a splat remains in pictures. This is the case if a box contains the whole
+    /// splat, or if an edit of cells contains its center.
     ///
     /// * `half_axes_m`: half axes in world of the ellipsoid within which the splat is drawn.
     #[must_use]
@@ -192,8 +192,8 @@ impl Edits {
     /// Fails if the file cannot be read or is damaged.
     pub fn read(model: &Path) -> Result<Self, Error> {
         let path = model.join(FILE);
-        // Anything else with this name, such as a broken link, is an error, because erased parts
-        // would otherwise reappear.
+        // If the name exists but cannot be read, such as a broken link, that is an error, because
+        // erased parts would otherwise reappear.
         if let Err(error) = path.symlink_metadata()
             && matches!(error.kind(), ErrorKind::NotFound | ErrorKind::NotADirectory)
         {
@@ -215,7 +215,7 @@ impl Edits {
     /// Fails if the file cannot be written or removed.
     pub fn write(&self, folder: &Path) -> Result<(), Error> {
         let path = folder.join(FILE);
-        // A file that is left over would erase parts again when the model is loaded.
+        // An old file would erase parts again when the model is loaded.
         if self.is_empty() {
             return match std::fs::remove_file(&path) {
                 Err(source) if source.kind() != std::io::ErrorKind::NotFound => {

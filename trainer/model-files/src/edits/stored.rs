@@ -48,7 +48,7 @@ impl TryFrom<Vec<StoredEdit>> for Edits {
     type Error = String;
 
     fn try_from(stored: Vec<StoredEdit>) -> Result<Self, String> {
-        // Files come from users, so they are checked like new edits.
+        // Files come from users, so the edits in them are checked like new edits.
         if stored.len() > MAX_EDITS {
             return Err(format!(
                 "{} edits, expected at most {MAX_EDITS}",

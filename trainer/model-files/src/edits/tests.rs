@@ -1,4 +1,4 @@
-//! Tests of edits as data; the tests of each method draw them.
+//! Tests of edits as data. The tests of each method check how edits are drawn.
 
 use super::{CellGrid, CellSet, Edit, Edits, MAX_EDITS};
 use crate::{Aabb, Error};
@@ -69,7 +69,7 @@ fn boxes_hide_only_splats_that_they_contain_as_a_whole() {
             "{along_m:?}"
         );
     }
-    // Half axes along no axis of the box: the ellipsoid is a sphere.
+    // The half axes are not all along axes of the box. The ellipsoid is a sphere.
     let half_axes = [[0.08, 0.06, 0.0], [-0.06, 0.08, 0.0], [0.0, 0.0, 0.1]].map(in_world);
     assert!(edits.hide_splat(center.coords.into(), half_axes));
     let outside = aabb.world_from_box * nalgebra::Point3::new(1.05, 1.0, 0.62);
@@ -417,7 +417,7 @@ fn boxes_that_cannot_be_stored_are_not_added() {
     assert!(edits.is_empty());
 }
 
-/// Erased parts would return unnoticed if the edits were taken as absent.
+/// If an unreadable file counted as absent, erased parts would return unnoticed.
 #[test]
 fn only_an_absent_file_means_no_edits() {
     let folder = tempfile::tempdir().unwrap();

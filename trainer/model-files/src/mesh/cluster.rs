@@ -66,7 +66,7 @@ impl Mesh {
 
 #[expect(clippy::cast_possible_truncation, reason = "sums are f64, normals f32")]
 fn normal_of(sum: &CellSum) -> [f32; 3] {
-    // The normals of a thin sheet cancel out. Any direction is as good then.
+    // The normals of a thin sheet cancel out. In this case, any direction is equally good.
     sum.normal
         .try_normalize(1e-9)
         .unwrap_or_else(Vector3::z)
@@ -80,8 +80,8 @@ fn merged(triangles: &[[u32; 3]], cell_of_vertex: &[u32]) -> Vec<[u32; 3]> {
     let mut kept = Vec::new();
     for triangle in triangles {
         let [a, b, c] = triangle.map(|ix| cell_of_vertex[ix as usize]);
-        // Rotation keeps the side from which the triangle is visible. The two sides of a sheet are
-        // different triangles.
+        // A rotation of the corners does not change the side from which the triangle is visible.
+        // The two sides of a sheet are different triangles.
         let smallest = a.min(b).min(c);
         let rotated = if a == smallest {
             [a, b, c]

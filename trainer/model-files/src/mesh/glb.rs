@@ -15,8 +15,8 @@ const UNSIGNED_INT: u32 = 5125;
 const VERTICES: u32 = 34_962;
 const INDICES: u32 = 34_963;
 
-/// Writes a mesh. glTF has y up and z toward the viewer, while the world has z up. One node holds
-/// that rotation, another the origin.
+/// Writes a mesh. glTF has y up and z toward the viewer, while the world has z up. One node
+/// contains this rotation, and another node the origin.
 pub fn write(path: &Path, mesh: &Mesh) -> Result<(), Error> {
     files::write(path, to_bytes(mesh)).map_err(|source| Error::Write {
         path: path.to_owned(),
@@ -95,7 +95,7 @@ fn linear(byte: u8) -> f32 {
     }
 }
 
-/// The extreme coordinate of the vertices along each axis.
+/// The smallest or largest coordinate of the vertices along each axis, selected by `pick`.
 fn extreme(mesh: &Mesh, pick: fn(f32, f32) -> f32, begin: f32) -> Vec<f32> {
     (0..3)
         .map(|axis| {

@@ -8,8 +8,8 @@ use crate::Error;
 use crate::splat::arrays::SplatArrays;
 use std::path::Path;
 
-/// Size of a splat: three floats for the mean and three for the standard deviations, four bytes
-/// each for color with opacity, and for the rotation.
+/// Size of a splat: three floats for the mean, three floats for the standard deviations, four bytes
+/// for color and opacity, and four bytes for the rotation.
 const SPLAT_BYTES: usize = 32;
 /// Standard deviations of 0, which have no finite logarithm, are raised to this value. A nanometer
 /// is invisible at any distance.
@@ -21,7 +21,7 @@ pub fn read(path: &Path) -> Result<SplatArrays, Error> {
 }
 
 fn from_bytes(bytes: &[u8]) -> Result<SplatArrays, String> {
-    // The format has no signature. The length is all that can be checked.
+    // The format has no signature, so only the length can be checked.
     let (rows, rest) = bytes.as_chunks::<SPLAT_BYTES>();
     if rows.is_empty() || !rest.is_empty() {
         return Err(format!(
@@ -55,7 +55,7 @@ fn floats(row: &[u8; SPLAT_BYTES], start: usize) -> [f32; 3] {
 
 /// Logarithm of a standard deviation; NaN for invalid ones.
 fn log_scale(scale: f32) -> f32 {
-    // False for NaN and negative numbers. The caller leaves out splats with NaN.
+    // This comparison is false for NaN and negative numbers. The caller leaves out splats with NaN.
     if scale >= 0.0 {
         scale.max(MIN_SCALE).ln()
     } else {

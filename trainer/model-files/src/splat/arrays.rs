@@ -122,7 +122,7 @@ impl SplatArrays {
         self.filtered(|ix| self.fault(ix).is_none()).checked()
     }
 
-    /// Why a splat from a file cannot be used; `None` if it can.
+    /// The reason why a splat from a file cannot be used; `None` if it can be used.
     fn fault(&self, ix: usize) -> Option<&'static str> {
         let n_coeffs = self.n_coefficients();
         let mean = &self.means[ix];
@@ -181,7 +181,7 @@ impl SplatArrays {
         1.0 / (1.0 + (-f64::from(self.opacity_logits[splat_ix])).exp())
     }
 
-    /// Indices of the splats that are drawn. Splats with values that are not finite are not.
+    /// Indices of the splats that are drawn. Splats with values that are not finite are not drawn.
     pub fn visible(&self) -> Vec<u32> {
         let is_visible =
             |ix: &u32| self.opacity(*ix as usize) > MIN_ALPHA && self.is_finite(*ix as usize);
@@ -204,7 +204,8 @@ impl SplatArrays {
     /// The splats for which `is_kept` is true of the index.
     #[must_use]
     pub fn filtered(&self, is_kept: impl Fn(usize) -> bool + Sync) -> Self {
-        // In parallel, because the condition may search through edits. The order is kept.
+        // The splats are tested in parallel, because the condition may search through edits. Their
+        // order is kept.
         let kept: Vec<usize> = (0..self.n_splats())
             .into_par_iter()
             .filter(|ix| is_kept(*ix))
@@ -252,8 +253,8 @@ impl SplatArrays {
         })
     }
 
-    /// The splats whose means are not in erased space. Files hold whole splats, so this is what is
-    /// exported.
+    /// The splats whose means are not in erased space. Files contain whole splats, so these splats
+    /// are exported.
     #[must_use]
     pub fn without_erased(self, edits: &Edits) -> Self {
         if edits.is_empty() {

@@ -40,7 +40,8 @@ const LARGE_SIZE: f64 = 60.0;
 #[expect(clippy::cast_possible_truncation, reason = "drawn in f64, used in f32")]
 pub fn synthetic_cloud(n_splats: usize, seed: u64) -> SplatArrays {
     let mut random = Random::new(seed);
-    // Splats fill a volume, so their spacing goes with the cube root of their number.
+    // Splats fill a volume, so their spacing is inversely proportional to the cube root of their
+    // number.
     let typical_log_scale = (0.6 / (n_splats as f64).cbrt()).ln();
     let mut splats = SplatArrays {
         sh_degree: SH_DEGREE,
@@ -81,15 +82,15 @@ fn random_color(random: &mut Random) -> [[f32; 3]; N_COEFFICIENTS] {
 #[expect(clippy::cast_possible_truncation, reason = "drawn in f64, used in f32")]
 pub fn scan_cloud(n_splats: usize, seed: u64) -> SplatArrays {
     let mut random = Random::new(seed);
-    // The same number of splats per pixel gives the same size in pixels.
+    // Sizes in pixels are the same if the number of splats per pixel is the same.
     let scale_m = 1.0 / (n_splats as f64).sqrt();
     let mut splats = SplatArrays {
         sh_degree: SH_DEGREE,
         ..SplatArrays::default()
     };
     for splat_ix in 0..n_splats {
-        // Drawn for every splat, also for the huge ones, so that their number does not change the
-        // others.
+        // The random number is drawn for every splat, even for huge ones, so that their number does
+        // not change the others.
         let kind = random.unit();
         let (xy_m, size_m, depth_m) = if splat_ix < N_HUGE {
             ([0.2 * random.normal(), 0.2 * random.normal()], 3.0, 0.0)
@@ -122,13 +123,13 @@ pub fn scan_cloud(n_splats: usize, seed: u64) -> SplatArrays {
             ]
             .map(|m| m as f32),
         );
-        // Flat along the third axis, and elongated along the second.
+        // Splats are flat along the third axis and elongated along the second.
         let log_size = size_m.ln() + 0.5 * random.normal();
         let flatness = [0.0, 0.4 * random.normal(), -2.0];
         splats
             .log_scales
             .push(flatness.map(|along| (log_size + along) as f32));
-        // Roughly parallel to the wall.
+        // The splats are roughly parallel to the wall.
         splats
             .rotations_wxyz
             .push([1.0, 0.2, 0.2, 1.0].map(|deviation| (deviation * random.normal()) as f32));

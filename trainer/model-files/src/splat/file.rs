@@ -67,7 +67,8 @@ fn read_file(path: &Path) -> Result<SplatArrays, Error> {
                 reason,
             })
         }
-        // Files of unknown extensions, too: a PLY header is recognized by its content.
+        // This also handles files with unknown extensions, because a PLY header is recognized by
+        // its content.
         _ => ply::read(path),
     }
 }

@@ -11,9 +11,9 @@ use crate::Error;
 use arrays::SplatArrays;
 use std::path::Path;
 
-/// Reads a file of splats. `parse` returns the splats, and notes on what it does not use, or the
-/// reason why the file is invalid. The notes are logged, and splats with invalid numbers are left
-/// out.
+/// Reads a file of splats. `parse` returns the splats and notes on the parts of the file that it
+/// does not use, or the reason why the file is invalid. The notes are logged, and splats with
+/// invalid numbers are left out.
 fn read_with(
     path: &Path,
     parse: impl FnOnce(&[u8]) -> Result<(SplatArrays, Vec<String>), String>,

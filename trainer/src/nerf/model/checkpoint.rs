@@ -137,7 +137,8 @@ fn finish(gpu: &Gpu, reads: Vec<(String, PendingRead)>) -> Result<Vec<Array>, Er
 impl NerfModel {
     fn state(&self) -> Result<NerfState, Error> {
         Ok(NerfState {
-            // The sizes in use, because another adapter would choose others.
+            // The state contains the sizes in use, because another adapter would choose other
+            // sizes.
             options: self.options.clone().with(|options| {
                 let nerf_budget = options.specific.budget_or_default(self.gpu.is_software());
                 options.specific.nerf_budget = Some(nerf_budget);
@@ -291,7 +292,7 @@ impl NerfModel {
         keyframes: &[Arc<Keyframe>],
     ) -> Result<(Self, Vec<Arc<Keyframe>>), Error> {
         let (mut model, state) = Self::of_state(gpu, checkpoint, FieldTrainer::training_buffers)?;
-        // The order of the images is the order of their parameters on the GPU.
+        // The images are in the order of their parameters on the GPU.
         let (images, rest) = keyframe_signature::match_keyframes(&state.images, keyframes)?;
         model.images = images.into_iter().map(RayImage::new).collect();
         model.is_extent_stale = state.is_extent_stale;

@@ -26,14 +26,14 @@ use nalgebra::{Translation3, UnitQuaternion, Vector3};
 use std::collections::{BTreeMap, VecDeque};
 use std::sync::Arc;
 
-/// Fractions (1 / divisor) of the planned steps: start of optimizing image parameters (earlier, the
-/// field is too coarse), start of trials, and length of each half of a trial. Longer halves show
-/// smaller gains, but a rejected variant costs all steps of its half.
+/// Fractions (1 / divisor) of the planned steps: start of optimizing image parameters (before it,
+/// the field is too coarse), start of trials, and length of each half of a trial. With longer
+/// halves, smaller gains are detected, but a rejected variant wastes all steps of its half.
 const POSE_START_DIVISOR: u64 = 32;
 const TRIAL_START_DIVISOR: u64 = 8;
 const TRIAL_LENGTH_DIVISOR: u64 = 16;
 /// Batches of rays for a comparison: some hundred rays per image. More rays reduce the noise of
-/// each image's score, but the scatter between images limits a decision, too.
+/// each image's score, but decisions are also limited by the scatter between images.
 const VALIDATION_BATCHES: u64 = 8;
 /// Seed for choosing the rays of a comparison. It is fixed, so that variant and baseline are
 /// compared on the same rays.
@@ -111,7 +111,7 @@ impl Trials {
     fn next_step(&self, common: &CommonOptions) -> Option<u64> {
         let share = |of: u64| (common.n_planned_steps / of).max(1);
         // Both halves begin at the same step, because the field is restored in between. The end of
-        // a half is therefore measured from there.
+        // each half is therefore measured from that step.
         let at = match self.before() {
             None => share(TRIAL_START_DIVISOR),
             Some(before) => before.step + share(TRIAL_LENGTH_DIVISOR),
@@ -162,7 +162,7 @@ impl NerfModel {
                 );
                 self.end_trials();
             }
-            // Start: the quick check first, because a trial costs steps.
+            // At the start, the quick check comes first, because a trial takes steps.
             None => match self.rule_out(candidate)? {
                 Some(trial) => self.end_trial(&trial),
                 None => {
@@ -173,8 +173,8 @@ impl NerfModel {
                     self.learned_params |= candidate;
                 }
             },
-            // Half time: the variant is scored and kept, and the baseline starts from the same
-            // field.
+            // After the first half, the variant is scored and stored, and the baseline starts from
+            // the same field.
             Some(RunningTrial {
                 before,
                 variant: None,
@@ -188,8 +188,8 @@ impl NerfModel {
                     variant: Some((variant, variant_errors)),
                 });
             }
-            // End: the baseline is scored. The field is the baseline already, so only a variant
-            // that is kept must be restored.
+            // At the end, the baseline is scored. The field already is the baseline, so it is
+            // replaced only if the variant is kept.
             Some(RunningTrial {
                 before,
                 variant: Some((variant, variant_errors)),
@@ -396,7 +396,8 @@ impl NerfModel {
             .iter()
             .map(|image| interpolated_embedding(&corrections, image))
             .collect();
-        // Without parameters so far, the next step allocates them, and all start at zero.
+        // If there are no parameters so far, the next step allocates them, and all of them start at
+        // zero.
         if field_trainer.images.is_some() {
             field_trainer.allocate_images(&self.gpu, self.images.len(), learned_params)?;
             field_trainer.initialize_images(&self.gpu, self.n_hinted, &appearance_embeddings);
@@ -516,8 +517,8 @@ impl Comparison {
 
 /// Gain of a candidate, from mean squared errors of the same images with it and without it.
 fn measure_gain(candidate: ParamSet, variant: &[f64], baseline: &[f64]) -> Trial {
-    // In dB, so that bright and dark images count alike. Images without rays have an error of 0,
-    // and no gain.
+    // The gains are in dB, so that bright and dark images have the same weight. Images without rays
+    // have an error of 0, and no gain.
     let gains: Vec<f64> = variant
         .iter()
         .zip(baseline)

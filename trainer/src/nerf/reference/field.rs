@@ -15,7 +15,7 @@ pub const N_DIRECTION: usize = 16;
 /// ray is opaque after a fraction of a step.
 pub const MAX_LOG_DENSITY: f64 = 12.0;
 
-/// Added to the network's log density. Sets the density of an untrained field.
+/// Added to the network's log density. It determines the density of an untrained field.
 pub const LOG_DENSITY_BIAS: f64 = 0.0;
 
 /// All parameters of a field.

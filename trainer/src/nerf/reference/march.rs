@@ -33,7 +33,8 @@ impl RaySegment {
         })
     }
 
-    /// Span of `stride` times the length around the middle.
+    /// Begin and end of a span around the middle of the segment. The span is `stride` times as long
+    /// as the segment.
     fn widened(&self, stride: usize) -> [f64; 2] {
         let middle = self.begin + 0.5 * self.length;
         let reach = 0.5 * self.length * stride as f64;
@@ -91,8 +92,10 @@ impl March {
     }
 
     /// All segments of a ray that are within a range of distances and in occupied cells. The first
-    /// step starts `jitter` steps after `range[0]`. Also returns a margin: the smallest distance of
-    /// a segment's middle to a cell's side, in cells, or of the number of steps to an integer.
+    /// step starts `jitter` steps after `range[0]`. Also returns a margin, which is the smallest of
+    /// two kinds of distances. The first is the distance from the middle of a segment to a side of
+    /// its cell, in cells. The second is the distance from a number of steps to the nearest
+    /// integer.
     ///
     /// Steps have constant length inside the inner cube. Outside, the step at a distance u from the
     /// cube is longer by (1 + u)^2, so that each step changes 1 / (1 + u) by the same amount.
@@ -128,7 +131,8 @@ impl March {
     }
 
     fn path(&self, (origin, direction): ([f64; 3], [f64; 3]), [begin, end]: [f64; 2]) -> Path {
-        // Intersection with the inner cube (slab method), and not before the beginning of the ray.
+        // Intersection with the inner cube (slab method), limited to the part after the beginning
+        // of the ray.
         let [mut enter, mut leave] = [begin, f64::INFINITY];
         for axis in 0..3 {
             let along = if direction[axis].abs() < MIN_DIRECTION {
@@ -182,7 +186,7 @@ impl March {
             reason = "a fraction of the stride"
         )]
         let phase = ((jitter * stride as f64) as usize).min(stride - 1);
-        // A random phase, so that all segments are sampled in the course of several steps.
+        // The phase is random, so that all segments are sampled in the course of several steps.
         segments
             .iter()
             .skip(phase)

@@ -16,8 +16,8 @@ impl Network {
         sizes.windows(2).map(|pair| pair[0] * pair[1]).sum()
     }
 
-    /// Activations of every layer for an input: the input first, then hidden layers after the
-    /// `ReLU`, then the output.
+    /// Activations of every layer for an input. The input comes first, then the hidden layers after
+    /// the `ReLU`, and then the output.
     pub fn forward(&self, input: &[f64]) -> Vec<Vec<f64>> {
         let mut layers = vec![input.to_vec()];
         let mut begin = 0;

@@ -85,7 +85,8 @@ pub fn composite_backward(
             .map(|sample| sample.density * sample.length())
             .sum();
         let transmittance_after = (-optical_depth).exp();
-        // More density adds to the weight of this sample, and takes from everything behind it.
+        // A higher density increases the weight of this sample and decreases the weights of all
+        // samples behind it.
         let v_density = samples[ix].length() * (transmittance_after * v_weight(ix) - behind);
         gradients.push((v_density, upstream.rgb.map(|v| v * rendered.weights[ix])));
         behind += rendered.weights[ix] * v_weight(ix);
@@ -94,7 +95,8 @@ pub fn composite_backward(
     gradients
 }
 
-/// Gradient with respect to the weight of a sample: through the color, the distance, and directly.
+/// Gradient with respect to the weight of a sample. It has three parts: through the color, through
+/// the distance, and directly.
 fn weight_gradient(sample: &Sample, upstream: &Upstream, ix: usize) -> f64 {
     let color: f64 = (0..3)
         .map(|channel| upstream.rgb[channel] * sample.rgb[channel])
@@ -105,8 +107,8 @@ fn weight_gradient(sample: &Sample, upstream: &Upstream, ix: usize) -> f64 {
 /// Distortion loss: spread of the weights along a ray. Also returns its gradient with respect to
 /// each weight. Zero if all weight is at one position.
 ///
-/// Distances are normalized to `1 - near / t`, so that spread far away costs less. Source: Barron
-/// et al. 2022, equation 15, summed in one pass as in Sun et al. 2022.
+/// Distances are normalized to `1 - near / t`, so that spread at large distances has a smaller
+/// loss. Source: Barron et al. 2022, equation 15, summed in one pass as in Sun et al. 2022.
 pub fn distortion(samples: &[Sample], weights: &[f64], near: f64) -> (f64, Vec<f64>) {
     let normalized_distance = |t: f64| 1.0 - near / t.max(near);
     let middles: Vec<f64> = samples

@@ -10,12 +10,12 @@ const N_LEVELS: u32 = 17;
 /// Edge of the root, meters; the smallest cells have edges of 8 mm. Splats outside belong to the
 /// nearest cell.
 const ROOT_M: f64 = 1024.0;
-/// Maximum number of splats in a cell: some ten kilobytes, so that a chunk does not delay pictures
-/// for long.
+/// Maximum number of splats in a cell. They take tens of kilobytes, so that a chunk does not delay
+/// pictures for long.
 const MAX_SPLATS: usize = 2048;
-/// A cell of the last version is divided only above this number. Without a distance from
-/// [`MAX_SPLATS`], a cell with about as many splats would be divided and merged again and again,
-/// and sent each time.
+/// A cell of the last version is divided only above this number. If it were equal to
+/// [`MAX_SPLATS`], a cell with about this many splats would be repeatedly divided and merged, and
+/// sent each time.
 const MAX_SPLATS_KEPT: usize = 2560;
 /// Cells of the last version are merged only if they have at most this many splats together.
 const MAX_SPLATS_MERGED: usize = 1024;
@@ -35,7 +35,8 @@ impl Cell {
 
     /// A number that differs for all cells of all levels.
     pub(super) fn id(self) -> u64 {
-        // A leading one marks the level. Without it, the first cells of all levels would be 0.
+        // A leading one marks the level. Without it, the ids of the first cells of all levels would
+        // be 0.
         1 << (3 * self.level) | self.first >> (3 * (N_LEVELS - self.level))
     }
 
@@ -106,8 +107,8 @@ fn divide<T>(
     last: &BTreeMap<Cell, T>,
     leaves: &mut Vec<(Cell, Range<usize>)>,
 ) {
-    // The cells of the last version do not overlap, so the first one here shows whether this cell
-    // was divided.
+    // The cells of the last version do not overlap, so the first one in this cell shows whether
+    // this cell was divided.
     let first_last = last
         .range(
             cell..Cell {

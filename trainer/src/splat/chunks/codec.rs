@@ -15,8 +15,8 @@ const MEAN_BITS: u32 = 13;
 /// Range of constant colors. It is wider than 0 to 1, because view-dependent parts are added to
 /// them.
 const COLOR_RANGE: [f64; 2] = [-0.5, 1.5];
-/// Larger ranges of standard deviations are clamped at the lower end: such splats are thinner than
-/// a pixel.
+/// Larger ranges of standard deviations are clamped at the lower end, because such splats are
+/// thinner than a pixel.
 const MAX_LOG_SCALE_SPAN: f64 = 10.0;
 /// Number of coefficients of degree 1, and of degree 1 and 2, per color channel.
 const N_DEGREE_1: usize = 3;
@@ -136,7 +136,7 @@ impl Ranges {
                 .into_iter()
                 .enumerate()
             {
-                // A range of 0 has no steps. All coefficients are 0 then.
+                // A range of 0 has no steps. In that case, all coefficients are 0.
                 let is_present = degree <= self.sh_degree as usize && range > 0.0;
                 let share = if is_present { value / range } else { 0.0 };
                 let field = 3 * function + channel;
@@ -180,7 +180,7 @@ fn higher_coefficient(splats: &SplatArrays, splat_ix: u32, function: usize) -> [
     reason = "clamped to the bits"
 )]
 fn count(value: f64, [min, max]: [f64; 2], bits: u32) -> u32 {
-    // In a range without extent, all values are equal, and 0 stands for them.
+    // In a range without extent, all values are equal and encoded as 0.
     let max_count = f64::from((1_u32 << bits) - 1);
     let share = if max > min {
         (value - min) / (max - min)
@@ -214,7 +214,7 @@ fn rotation_word(wxyz: [f32; 4]) -> u32 {
         .map(|part| part * part)
         .sum::<f64>()
         .sqrt()
-        // Not 0, even for an invalid rotation.
+        // The length must not be 0, even for an invalid rotation.
         .max(1e-30);
     let largest_ix = (1..4).fold(0, |largest, ix| {
         if wxyz[ix].abs() > wxyz[largest].abs() {

@@ -25,8 +25,8 @@ const COARSE_STRIDE: usize = 8;
 const MAX_SCALE_FACTOR: f64 = 2.0;
 /// Changes are measured in `N_PARTS` parts of a cell: 4 x 4 x 4.
 const N_PARTS: usize = 64;
-/// A change that leaves the sums of all parts as they are counts as this fraction of the sums.
-/// Without it, a chunk whose splats only trade places would never be sent.
+/// A change that does not affect the sums of all parts counts as this fraction of the sums.
+/// Otherwise, a chunk whose splats only exchange positions would never be sent.
 const MIN_CHANGE_FRAC: f64 = 1e-3;
 
 /// Sums over the splats in each part of a cell: visible area, and the same times red, green and
@@ -53,7 +53,7 @@ impl Chunker {
         if !only_changed {
             self.last.clear();
         }
-        // Without a last version, the receiver has to discard chunks that it may still have.
+        // If there is no last version, the receiver has to discard chunks that it may still have.
         let is_complete = self.last.is_empty();
         let sorted = location_codes(&splats.means, &splats.visible());
         let cells = leaves(&sorted, &self.last);
@@ -96,7 +96,7 @@ fn encoded(
     // The most visible splats come first, because the coarse form consists of the first ones.
     members.sort_by(|a, b| area(splats, *b).total_cmp(&area(splats, *a)));
     let fine = encode(splats, &members, 1.0, splats.sh_degree);
-    // A hash instead of the bytes, which would double the memory of the model.
+    // A hash is stored instead of the bytes, which would double the memory of the model.
     let mut hasher = DefaultHasher::new();
     hasher.write(&fine.bytes);
     // The bytes are relative to the box and the ranges in the layout. They stay the same if all
@@ -128,9 +128,9 @@ fn coarse(splats: &SplatArrays, members: &[u32]) -> Option<ChunkData> {
     let n = members.len().div_ceil(COARSE_STRIDE);
     let total = |members: &[u32]| members.iter().map(|ix| area(splats, *ix)).sum::<f64>();
     let ratio = total(members) / total(&members[..n]);
-    // An area grows with the square of the scale.
+    // An area is proportional to the square of the scale.
     let scale_factor = ratio.sqrt().clamp(1.0, MAX_SCALE_FACTOR);
-    // If the coarse form has all splats, the fine form takes no longer.
+    // A coarse form with all splats would be as large as the fine form, so it is left out.
     (n < members.len()).then(|| encode(splats, &members[..n], scale_factor, 0))
 }
 

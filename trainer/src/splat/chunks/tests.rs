@@ -1,5 +1,5 @@
-//! Chunks decoded as `docs/reference/protocol.md` says: errors of the values and of pictures, and
-//! what counts as changed.
+//! Tests of chunks, which are decoded as `docs/reference/protocol.md` says. The tests check the
+//! errors of the values and of pictures, and which chunks count as changed.
 
 use super::codec::{MAX_SH_DEGREE, encode};
 use super::{COARSE_STRIDE, Chunker};
@@ -386,7 +386,7 @@ fn changes_are_listed_where_they_are_and_by_their_size() {
     let mut changes: Vec<f64> = changed.chunks.iter().map(|chunk| chunk.change).collect();
     changes.sort_by(f64::total_cmp);
     assert!(changes[1] > 2.0 * changes[0], "{changes:?}");
-    // Growth divides cells; nothing is lost or doubled.
+    // When the model grows, cells are divided. No splat is lost or doubled.
     let more = of_degree_2(synthetic_cloud(20_000, 3));
     splats.means.extend(more.means);
     splats.log_scales.extend(more.log_scales);

@@ -105,8 +105,8 @@ pub(crate) fn update(
     );
 
     // Phase 3: noise moves nearly transparent splats to positions where they may be useful
-    // (Kheradmand et al. 2024, section 4.1). It is the product of the covariance and a normal
-    // vector, and fades out above the opacity below which splats are dead.
+    // (Kheradmand et al. 2024, section 4.1). The noise is the product of the covariance and a
+    // normal vector. It fades out above the opacity below which splats are dead.
     let [w, x, y, z] = splat.rotation_wxyz;
     let rotation = UnitQuaternion::from_quaternion(Quaternion::new(w, x, y, z));
     let along = rotation.inverse() * Vector3::from(normal3([splat_ix, step, rule.seed]));
@@ -114,8 +114,8 @@ pub(crate) fn update(
     let noise_weight = 1.0 / (1.0 + (100.0 * (opacity - f64::from(rule.noise_center))).exp());
     let jitter = rotation * variance.component_mul(&along) * (noise * mean_rate * noise_weight);
 
-    // Phase 4: values stay in range. A logit of 12 is an opacity that differs from 1 by 6e-6, where
-    // its gradient would vanish.
+    // Phase 4: values stay in range. At a logit of 12, the opacity differs from 1 by 6e-6. Closer
+    // to 1, its gradient would vanish.
     let range = rule.log_scale_range.map(f64::from);
     let norm = updated[6..10]
         .iter()
@@ -178,7 +178,7 @@ pub(crate) fn grow(splats: &[Splat], errors: &[f64], growth: &Growth) -> Grown {
         n_children[parent] += 1;
         let [w, x, y, z] = splats[parent].rotation_wxyz;
         let rotation = UnitQuaternion::from_quaternion(Quaternion::new(w, x, y, z));
-        // Clamped, so that no child leaves its parent.
+        // The offset is clamped, so that no child leaves its parent.
         let normal = normal3([child, growth.key, 11]);
         let offset_in_parent: [f64; 3] = std::array::from_fn(|axis| {
             splats[parent].log_scale[axis].exp() * normal[axis].clamp(-2.0, 2.0)
@@ -189,7 +189,8 @@ pub(crate) fn grow(splats: &[Splat], errors: &[f64], growth: &Growth) -> Grown {
             grown[ix].mean[axis] += offset[axis];
         }
     }
-    // A parent and its children get the same share. `n_children` of a child is that of its parent.
+    // A parent and its children get the same share. For a child, `n_children` of its parent is
+    // used.
     for (ix, splat) in grown.iter_mut().enumerate() {
         let n = n_children
             .get(parents[ix].unwrap_or(ix))
@@ -220,8 +221,8 @@ fn choose(n: u32, k: u32) -> f64 {
 /// Sets the opacity and size of one of `n` splats so that together they look like the original
 /// splat.
 fn share_opacity(splat: &mut Splat, n: u32, min_opacity: f64) {
-    // `n` splats of the new opacity at the same place are as opaque as the original one. The scale
-    // follows from Kheradmand et al. 2024, equation 9.
+    // Together, `n` splats of the new opacity at the same position are as opaque as the original
+    // splat. The scale follows from Kheradmand et al. 2024, equation 9.
     let opacity = sigmoid(splat.opacity_logit).clamp(1e-4, 0.9999);
     let shared = (1.0 - (1.0 - opacity).powf(1.0 / f64::from(n))).clamp(min_opacity, 0.9999);
     let term = |i: u32, k: u32| {

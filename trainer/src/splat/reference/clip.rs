@@ -2,8 +2,8 @@
 //!
 //! A splat is drawn at a pixel only if its density along the pixel's ray is largest at a point that
 //! is shown. In the linear approximation of the projection (Zwicker et al. 2001), this point is the
-//! conditional mean of the Gaussian given the pixel. Its center alone would not do: a long splat
-//! with a center inside a box can reach far beyond the box.
+//! conditional mean of the Gaussian given the pixel. The center of the splat is not sufficient,
+//! because a long splat with its center inside a box can reach far beyond the box.
 
 use super::project::{mean_given_pixel, row_share};
 use super::{Splat, View};

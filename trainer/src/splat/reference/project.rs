@@ -14,8 +14,8 @@ pub const MIN_ALPHA: f64 = 1.0 / 255.0;
 /// pixels.
 pub const BLUR_PX2: f64 = 0.3;
 /// Margin around the image beyond which the Jacobian is clamped, as a fraction of half the image
-/// size. As in gsplat. Far outside, the linear approximation of the projection would stretch splats
-/// across the whole image.
+/// size. The value is that of gsplat. Far outside the image, the linear approximation of the
+/// projection would stretch splats across the whole image.
 const MARGIN_FRAC: f64 = 0.3;
 
 /// Projects a splat; `None` if it is nearer than `near_m` or too transparent to draw.
@@ -56,7 +56,8 @@ pub fn project_at(view: &View, splat: &Splat, row_share: f64) -> Projected {
     };
     let opacity = sigmoid(splat.opacity_logit) * compensation;
     // Standard deviations until alpha is MIN_ALPHA: `opacity * exp(-reach^2 / 2) = MIN_ALPHA`.
-    // Along an axis of the image, an ellipse reaches that many square roots of the variance.
+    // Along an axis of the image, the ellipse extends by this number times the square root of the
+    // variance.
     let reach = (2.0 * (opacity / MIN_ALPHA).ln()).max(0.0).sqrt();
     Projected {
         mean_px: [fx * point.x / point.z + cx, fy * point.y / point.z + cy],
@@ -78,8 +79,8 @@ pub fn project_at(view: &View, splat: &Splat, row_share: f64) -> Projected {
 /// Change of the splat's conditional mean in world with the position of a pixel, meters per pixel.
 ///
 /// The mean of the splat given its projection is `mean + C J^T (J C J^T + B)^-1 offset_px` for the
-/// covariance `C` in world, the Jacobian `J` and the low-pass `B`. Because of the low-pass, it never
-/// leaves the ellipsoid within which the splat is drawn.
+/// covariance `C` in world, the Jacobian `J` and the low-pass `B`. Because of the low-pass, this
+/// mean is always inside the ellipsoid within which the splat is drawn.
 pub(super) fn mean_given_pixel(view: &View, splat: &Splat, row_share: f64) -> Matrix3x2<f64> {
     let parts = Parts::new(view, splat, row_share);
     parts.cov_in_world * parts.image_from_world.transpose() * parts.conic
@@ -103,9 +104,9 @@ pub fn project_backward(
     let (v_sh, v_offset) = sh::color_backward(&splat.sh, &offset_in_world(view, splat), &v.color);
     let opacity = sigmoid(splat.opacity_logit);
 
-    // From the conic to the log scale and the rotation. `b` of the conic stands for two entries of
-    // the symmetric matrix, so each gets half of its gradient. For the inverse M of a matrix, the
-    // derivative is `-M dC M`.
+    // Gradients are propagated from the conic to the log scale and the rotation. `b` of the conic
+    // represents two entries of the symmetric matrix, so each gets half of its gradient. For the
+    // inverse M of a matrix, the derivative is `-M dC M`.
     let v_conic = Matrix2::new(v.conic[0], 0.5 * v.conic[1], 0.5 * v.conic[1], v.conic[2]);
     let v_cov = -parts.conic * v_conic * parts.conic;
     let v_image_from_world = 2.0 * v_cov * parts.image_from_world * parts.cov_in_world;
@@ -114,8 +115,8 @@ pub fn project_backward(
     let v_cov_in_world = parts.image_from_world.transpose() * v_cov * parts.image_from_world;
     let (v_log_scale, v_rotation_wxyz) = shape_backward(splat, &v_cov_in_world);
 
-    // From the image to the point in the camera frame, first at the splat's row, then at the middle
-    // row.
+    // Gradients are propagated from the image to the point in the camera frame, first at the
+    // splat's row, then at the middle row.
     let mut v_point = pinhole_backward(view, &parts.point_in_camera, &v.mean_px)
         + jacobian_backward(view, &parts, &v_jacobian);
     v_point.z += v.depth;
@@ -188,8 +189,9 @@ impl Parts {
         let linear_m = Vector3::from(view.linear_m);
         let angular_rad = Vector3::from(view.angular_rad);
 
-        // Rolling shutter: the point moves against the camera while the rows are read. First order
-        // in the motion; see docs/design/splats.md, section "Rendering an image".
+        // With a rolling shutter, the point moves relative to the camera while the rows are read.
+        // The computation is first order in the motion; see docs/design/splats.md, section
+        // "Rendering an image".
         let still_point = camera_from_world * Vector3::from(splat.mean)
             + view.camera_from_world.translation.vector;
         let point_in_camera =
@@ -275,9 +277,9 @@ fn jacobian_backward(view: &View, parts: &Parts, v_jacobian: &Matrix2x3<f64>) ->
         let v_diagonal = v_jacobian[(axis, axis)];
         let v_last = v_jacobian[(axis, 2)];
         let f_per_z2 = view.focal_px[axis] / (z * z);
-        // Through the factors 1 / z, with a fixed ratio.
+        // The first part is through the factors 1 / z, with a fixed ratio.
         v_point.z += f_per_z2 * (ratio * v_last - v_diagonal);
-        // Through the ratio. A clamped ratio does not depend on the point.
+        // The second part is through the ratio. A clamped ratio does not depend on the point.
         if !clamped {
             v_point[axis] -= f_per_z2 * v_last;
             v_point.z += f_per_z2 * ratio * v_last;

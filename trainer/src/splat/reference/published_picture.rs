@@ -39,10 +39,11 @@ fn render_matches_a_published_picture() {
     else {
         panic!("the picture has four channels");
     };
-    // Conventions of the file: `scales` are logarithms, `opacities` logits, `quats` w first,
-    // `coeffs` as in 3DGS with the constant first. The camera has a field of view of 90 degrees, is
-    // at (0.123, 0.456, -8) and looks along z; the principal point is at the center. Colors are
-    // clamped at 0 and premultiplied, without background; the fourth channel is 1 - transmittance.
+    // The file has these conventions. `scales` are logarithms, and `opacities` are logits. `quats`
+    // have w first. `coeffs` are as in 3DGS, with the constant first. The camera has a field of
+    // view of 90 degrees, is at (0.123, 0.456, -8) and looks along z. The principal point is at the
+    // center. Colors are clamped at 0 and premultiplied, without background. The fourth channel is
+    // 1 - transmittance.
     let focal_px = 0.5 * width as f64;
     let view = View {
         camera_from_world: Transform::new(Vector3::new(-0.123, -0.456, 8.0), Vector3::zeros()),

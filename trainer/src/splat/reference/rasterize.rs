@@ -90,8 +90,8 @@ pub fn composite_backward(
             in_front.push(transmittance);
             transmittance *= 1.0 - Coverage::new(&projected[splat_ix], &center_px).alpha();
         }
-        // Part of the loss that depends on everything behind the current splat. The twin goes back
-        // to front, as in Kerbl et al. 2023. The kernel goes front to back.
+        // Part of the loss that depends on everything behind the current splat. The twin iterates
+        // back to front, as in Kerbl et al. 2023, whereas the kernel iterates front to back.
         let mut behind = upstream.transmittance[pixel_ix] * transmittance;
         for (&splat_ix, transmittance) in
             decisions.contributors[pixel_ix].iter().zip(in_front).rev()
@@ -104,8 +104,8 @@ pub fn composite_backward(
                 .map(|channel| splat.color[channel] * v_rgb[channel])
                 .sum::<f64>()
                 + splat.depth * v_depth;
-            // More alpha shows more of this splat, and less of everything behind it, whose weights
-            // all contain the factor `1 - alpha`.
+            // A higher alpha increases the weight of this splat. It decreases the weights of
+            // everything behind it, which all contain the factor `1 - alpha`.
             let v_alpha = transmittance * per_weight - behind / (1.0 - coverage.alpha());
             grad.color
                 .iter_mut()
@@ -260,7 +260,8 @@ fn contributors(
             continue;
         }
         transmittance *= 1.0 - coverage.alpha();
-        // Before the splat is added: it would not be visible anymore (Kerbl et al. 2023).
+        // Compositing stops before the splat is added, because it would no longer be visible (Kerbl
+        // et al. 2023).
         if transmittance <= MIN_TRANSMITTANCE {
             break;
         }

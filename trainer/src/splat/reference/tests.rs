@@ -196,7 +196,8 @@ fn wrong_gradient_is_detected() {
 
 #[test]
 fn each_parameter_has_a_gradient() {
-    // Otherwise, the comparisons with central differences would compare zeros.
+    // The gradients must not be zero. Otherwise, the comparisons with central differences would
+    // compare zeros.
     let view = rolling_view();
     let grad = render_backward(&view, &small_scene(4, 12), &some_upstream(7, &view));
     let visible: Vec<_> = grad
@@ -312,8 +313,8 @@ fn ratios_beyond_the_margin_are_clamped_only_in_covariance() {
         opacity_logit: 3.0,
         sh: vec![[0.0; 3]],
     };
-    // The margin is 0.15 of the image size. The clamps are (28 - 13.3 + 4.2) / 31 on the right,
-    // (10.4 + 3) / 28 above.
+    // The margin is 0.15 of the image size. The clamps are (28 - 13.3 + 4.2) / 31 on the right and
+    // (10.4 + 3) / 28 at the top.
     let (right, up) = (18.9 / 31.0, -13.4 / 28.0);
     let mut mismatches = Mismatches::default();
     for (ratio_x, ratio_y) in [

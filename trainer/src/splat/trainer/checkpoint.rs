@@ -342,8 +342,8 @@ pub(super) fn take(
     let (splats, schedule) = (&training.model.splats, &training.schedule);
     let scene = &training.seeding.scene;
     let state = SavedState {
-        // Defaults that depend on the adapter are fixed, so that training continues alike on
-        // another one.
+        // Defaults that depend on the adapter are stored as values, so that training continues in
+        // the same way on another adapter.
         options: training.options.clone().with(|options| {
             options.specific.coarse_steps = Some(training.views.coarse_steps());
             options.specific.seeds_per_image = Some(training.seeding.seeds_per_image());

@@ -29,8 +29,8 @@ pub(super) fn try_gains(training: &mut Training, trials: &mut SplatTrials) -> Re
         .iter()
         .map(|(keyframe, _)| training.views.neighbors(keyframe))
         .collect();
-    // The gains of a validation keyframe itself would be fitted to the image that they are
-    // scored on. Those of its neighbors predict them only if exposure really changes.
+    // Gains of the validation keyframe itself would be fitted to the image on which they are
+    // scored. Gains of its neighbors predict its gains only if the exposure really changes.
     let mut known = LogGains::new();
     let neighbor_ixs = neighbors.iter().flatten().copied().collect();
     add_gains(training, &comparer, &mut known, neighbor_ixs)?;
@@ -87,7 +87,8 @@ fn enable_gains(
         first_ix,
     }: InitialGains,
 ) -> Result<(), Error> {
-    // Created before gains are enabled: the pictures for the initial gains have none.
+    // The comparer is created before gains are enabled, because the pictures for the initial gains
+    // must not have gains.
     let comparer = Comparer::new(training, trials)?;
     training.model.cameras.enable(gains);
     // Assigns the slots that the gains are written to.
@@ -145,8 +146,8 @@ pub(super) fn add_live_arrival(
             enable_gains(training, trials, gains, initial)
         });
     }
-    // Training would need many steps on this image to reach these gains. Until then, its
-    // brightness would change the model.
+    // Without initial gains, training would need many steps on this image to reach them. Until
+    // then, the brightness of the image would change the model.
     training
         .views
         .assign_lenses(&training.recorder.gpu, &mut training.model.cameras)?;
@@ -169,8 +170,8 @@ fn add_gains(
         .into_iter()
         .filter(|view_ix| !known.contains_key(view_ix))
         .collect();
-    // In chunks: images are downscaled and uploaded in parallel, but not all of them fit into
-    // memory on a software adapter.
+    // Views are processed in chunks. Images are downscaled and uploaded in parallel, but on a
+    // software adapter, not all of them fit into memory.
     for chunk in unknown.chunks(VIEWS_AT_ONCE) {
         let places = chunk.iter().map(|view_ix| (*view_ix, 0)).collect();
         training

@@ -55,8 +55,8 @@ impl LazyPipelines {
         if let Self::Ready(ready) = self {
             return Ok(ready.clone());
         }
-        // `Failed` remains if an error is returned below: a second attempt would take seconds and
-        // fail again.
+        // If an error is returned below, the state remains `Failed`, because a second attempt would
+        // take seconds and fail again.
         let ready = Arc::new(match std::mem::replace(self, Self::Failed) {
             Self::Compiling(mut thread) => *thread.finish(gpu)?,
             Self::OnDemand => TrainPipelines::new(gpu)?,

@@ -42,8 +42,8 @@ pub(super) fn rule(
 ) -> Rule {
     let size = f32_of(scene.size_m);
     // The fewer the images, the more splats overfit, so the cost is `(13 / n)^2` by default
-    // (docs/design/splats.md, section "Loss"). The loss contains the mean opacity and the mean
-    // scale, hence the division by the number of splats.
+    // (docs/design/splats.md, section "Loss"). The cost is divided by the number of splats, because
+    // the loss contains the mean opacity and the mean scale.
     let cost = (options.specific.cost_images / n_views.max(1) as f64)
         .powi(2)
         .min(MAX_COST);

@@ -59,7 +59,8 @@ impl TrainedModel {
         if n_new == 0 {
             return Ok(());
         }
-        // Beyond the limit, a coarser sample of all areas is better than complete parts of a few.
+        // If the limit is exceeded, a coarser sample of all areas is better than a complete sample
+        // of a few areas.
         let kept = if n_new == arrays.n_splats() {
             arrays.clone()
         } else {
@@ -157,8 +158,8 @@ impl TrainedModel {
         if n_splats <= have {
             return Ok(());
         }
-        // At least half more than before, so that a model that grows by a tenth at a time is copied
-        // only at every few changes.
+        // The capacity grows by at least half. A model that grows by a tenth at a time is thus
+        // copied only every few changes.
         let capacity = n_splats
             .max(have.saturating_mul(3) / 2)
             .min(self.max_splats.max(n_splats));

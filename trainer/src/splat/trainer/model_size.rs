@@ -61,7 +61,7 @@ fn add_contributions(
     view_ix: usize,
     contributions: &Buffer,
 ) -> Result<(), Error> {
-    // Repeated with larger buffers until they suffice.
+    // The pass is repeated with larger buffers until they are sufficient.
     loop {
         let Training {
             recorder: Recorder { gpu, passes },
@@ -82,7 +82,7 @@ fn add_contributions(
             .view;
         view.draw_for_backward(passes, &renderer.pipelines, learn);
         view.backward(passes, learn);
-        // Has no effect if a buffer was too small, so no view is counted twice.
+        // This pass has no effect if a buffer was too small, so no view is counted twice.
         view.contribute(passes, learn, contributions);
         passes.submit(gpu);
         let counters: Vec<u32> = gpu.read(&optimizer.status, status::LEN)?;
@@ -101,7 +101,7 @@ pub(super) fn keep_most_contributing(training: &mut Training, n_kept: u32) -> Re
     let learn = training.learn()?;
     let contributions = contributions(training, &learn)?;
     let mut by_contribution: Vec<u32> = (0..training.model.splats.n_splats).collect();
-    // Ties are resolved by index, so that a seed gives one result.
+    // Ties are resolved by index, so that the same seed gives the same result.
     by_contribution.sort_by(|a, b| {
         contributions[*b as usize]
             .total_cmp(&contributions[*a as usize])

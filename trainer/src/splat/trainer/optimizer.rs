@@ -64,7 +64,7 @@ impl Optimizer {
                 "splat.supervision",
                 &<Supervision as bytemuck::Zeroable>::zeroed(),
             ),
-            // Without D-SSIM in the loss, its passes would take time and change nothing.
+            // If the loss has no D-SSIM, its passes would take time without any effect.
             has_ssim: options.specific.dssim_frac > 0.0,
             n_non_finite: 0,
         })
@@ -163,15 +163,15 @@ impl Optimizer {
         view.draw_for_backward(passes, &renderer.pipelines, learn);
         view.compare(passes, learn, &target);
         view.backward(passes, learn);
-        // The gradients with respect to the camera are sums over all splats, which only one of the
-        // two variants of the kernel writes.
+        // The gradients with respect to the camera are sums over all splats. Only one of the two
+        // variants of the kernel writes these sums.
         if let Some(lens) = lens {
             view.update(passes, &learn.update_with_camera, &self.rule, true);
             model.cameras.refine(&view, passes, learn, lens);
         } else {
             view.update(passes, &learn.update, &self.rule, false);
         }
-        // The last pass of the step, because the others read the step counter.
+        // This is the last pass of the step, because the others read the step counter.
         passes.dispatch(gpu, &learn.advance, 1, &[("status", &self.status)]);
         Ok(())
     }
@@ -190,7 +190,7 @@ impl Optimizer {
             renderer,
             model,
         } = *context;
-        // A rejected trial of camera parameters leaves slots behind that are not optimized.
+        // After a rejected trial of camera parameters, there are slots that are not optimized.
         let lens = lens.filter(|_| !model.cameras.set.is_empty());
         if let Some(lens) = lens {
             model.cameras.correct(gpu, passes, learn, &level.view, lens);

@@ -85,17 +85,17 @@ pub(super) fn psnr_with_gains(products: &[Products; 3], gains: [f64; 3]) -> Opti
             + color.image_image as f64
     };
     let squares: f64 = products.iter().zip(gains).map(square).sum();
-    // The score stays finite: the squared error is at least one, that is, one level of one color at
-    // one pixel.
+    // The squared error is limited to at least one, that is, one level of one color at one pixel.
+    // The score thus stays finite.
     (n > 0).then(|| 10.0 * (255.0f64.powi(2) * n as f64 / squares.max(1.0)).log10())
 }
 
 /// Logarithms of the gains that best match a picture to an image.
 pub(super) fn log_gains(products: &[Products; 3]) -> [f64; 3] {
-    // About two photographic stops: larger gains are not caused by exposure.
+    // The maximum is about two photographic stops. Larger gains are not caused by exposure.
     const MAX_LOG_GAIN: f64 = 1.5;
-    // The gain that minimizes the sum of `(gain * p - i)^2` is `sum(p i) / sum(p^2)`. It is
-    // undefined for a black picture, and its logarithm is for a black image.
+    // The gain that minimizes the sum of `(gain * p - i)^2` is `sum(p i) / sum(p^2)`. The gain is
+    // undefined for a black picture, and its logarithm is undefined for a black image.
     products.map(|color| match (color.picture_image, color.picture_picture) {
         (0, _) | (_, 0) => 0.0,
         (with_image, picture_only) => (with_image as f64 / picture_only as f64)

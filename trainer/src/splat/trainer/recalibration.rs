@@ -28,12 +28,12 @@ const MAX_KEYFRAMES: usize = 64;
 /// away. Otherwise, the surface hides it, or it floats in front.
 const SURFACE_FRAC: f64 = 0.05;
 /// Depth error, as a fraction of the depth, at which the weight of a keyframe is halved. With wrong
-/// cameras, keyframes disagree about a surface. The one from which a splat was seeded agrees best,
-/// and should move it.
+/// cameras, keyframes disagree about a surface. The keyframe from which a splat was seeded agrees
+/// best, and should determine its motion.
 const AGREEMENT_FRAC: f64 = 0.001;
-/// Weight of a keyframe without a depth reading: it shows the splat unless something hides it. The
-/// weight matters only if no keyframe has depth there: at an error of [`SURFACE_FRAC`], the weight
-/// with depth is still 4e-4.
+/// Weight of a keyframe without a depth reading. Such a keyframe shows the splat unless something
+/// hides it. The weight matters only if no keyframe has depth there, because the weight with depth
+/// is at least 4e-4 (at an error of [`SURFACE_FRAC`]).
 const WITHOUT_DEPTH: f64 = 1e-4;
 /// Parameters of single images, which stay enabled. Shared parameters are part of the alignment.
 const IMAGE_PARAMS: ParamSet = ParamSet::IMAGE_POSES.union(ParamSet::IMAGE_GAINS);
@@ -47,12 +47,13 @@ pub(super) fn move_with_keyframes(
     alignment: &Alignment,
 ) -> Result<(), Error> {
     let learned = training.learned_corrections()?;
-    // The splats first: their motion depends on the cameras before the correction.
+    // The splats are moved first, because their motion depends on the cameras before the
+    // correction.
     let gpu = training.recorder.gpu.clone();
     let motions = motions(keyframes, |camera| learned.get(camera));
     move_splats(&gpu, &training.model.splats, &motions)?;
-    // Then everything that refers to the keyframes. Views come before seeding, which takes the
-    // corrected depth from them.
+    // Then everything that refers to the keyframes is replaced. Views come before seeding, which
+    // takes the corrected depth from them.
     let corrected = replacement(keyframes);
     training.recorder.passes.clear_bindings();
     training.views.replace_cameras(&gpu, &corrected);
@@ -65,7 +66,8 @@ pub(super) fn move_with_keyframes(
         .for_each(|image| corrected(&mut image.keyframe));
     // Camera parameters start at zero again, because the keyframes now contain the correction.
     let mut params = training.model.cameras.set & IMAGE_PARAMS;
-    // Depth gives image poses to a few millimeters. The splats refine them, without a trial.
+    // Image poses from depth are accurate to a few millimeters. Training the splats refines them,
+    // without a trial.
     if alignment.has_image_poses() && trials.remove_candidate(ParamSet::IMAGE_POSES) {
         params |= ParamSet::IMAGE_POSES;
     }
@@ -165,7 +167,7 @@ impl Motion {
     /// the splats, if any.
     fn of(keyframe: &CorrectedKeyframe, learned: Option<&CameraCorrection>) -> Self {
         let CorrectedKeyframe { before, after } = keyframe;
-        // The splats fit the learned cameras, not those of the keyframes.
+        // The splats were fitted to the learned cameras, not to those of the keyframes.
         let before = learned.map_or_else(
             || before.clone(),
             |learned| Arc::new(learned.corrected(before)),
@@ -183,8 +185,8 @@ impl Motion {
         }
     }
 
-    /// Where the correction moves a point, and the weight of this motion; `None` if the keyframe
-    /// does not show the point.
+    /// The position to which the correction moves a point, and the weight of this motion; `None` if
+    /// the keyframe does not show the point.
     fn of_point(&self, point: &Point3<f64>) -> Option<(Point3<f64>, f64)> {
         let (px, z) = self.before.project(point)?;
         let known = self.depth.as_ref().and_then(|(camera, depth)| {

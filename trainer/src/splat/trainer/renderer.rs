@@ -16,9 +16,9 @@ use gpu::{Buffer, Gpu, PendingRead, Pipeline};
 /// models would otherwise overflow in their first steps.
 const MIN_ENTRIES: u32 = 1 << 14;
 
-/// Divisors of the need that give the headroom of grown buffers, tried in this order: 1/2, 1/16,
-/// none. Each overflow repeats steps, so more headroom saves time. Less is better than no larger
-/// buffer at all.
+/// Divisors of the required size that give the headroom of grown buffers: 1/2, 1/16, or none. They
+/// are tried in this order. Each overflow repeats steps, so more headroom saves time. If memory is
+/// insufficient, less headroom is better than no larger buffer.
 const HEADROOM_DIVISORS: [u32; 3] = [2, 16, u32::MAX];
 
 /// Draws pinhole views of splats.
@@ -129,7 +129,8 @@ impl Renderer {
         score: &Pipeline,
         rgba: &[u8],
     ) -> Result<[Products; 3], Error> {
-        // A larger buffer is fine: the kernel reads only the pixels of the view.
+        // A buffer that is too large can be used, because the kernel reads only the pixels of the
+        // view.
         let image = match self.compared.take() {
             Some(image) if image.bytes() >= rgba.len() as u64 => {
                 recorder.gpu.write(&image, 0, rgba);
@@ -187,7 +188,8 @@ impl Renderer {
         take: impl Fn(&[&[u8]]) -> R,
     ) -> Result<R, Error> {
         // The needed sizes depend on the view and are known only once it is binned. The counters
-        // contain the needs of the whole view, even if it does not fit, so one repetition suffices.
+        // contain the required sizes of the whole view even if it does not fit, so one repetition
+        // is sufficient.
         loop {
             let (counters, taken) =
                 self.submit(recorder, drawn, parts)?
@@ -250,7 +252,8 @@ impl Renderer {
         };
         passes.draw(list, &self.pipelines);
         passes.finish(list, &self.pipelines, &self.background);
-        // The counters are read along with the results: they say whether the results are complete.
+        // The counters are read together with the results, because they show whether the results
+        // are complete.
         let mut read = vec![(&self.status, 4 * status::LEN)];
         match parts {
             ReadParts::Picture(output) => {
@@ -335,8 +338,9 @@ impl Renderer {
         )
     }
 
-    /// Grows the scratch buffers if the submit failed, beyond the need if memory permits; those for
-    /// gradients only if `learned`. Returns whether the submit failed.
+    /// Grows the scratch buffers if the submit failed. They become larger than required if memory
+    /// permits. Buffers for gradients grow only if `learned` is set. Returns whether the submit
+    /// failed.
     pub(super) fn grow_scratch(
         &mut self,
         recorder: &mut Recorder,
@@ -385,8 +389,8 @@ impl Renderer {
         if fits {
             return Ok(());
         }
-        // No dimension shrinks. Otherwise, views of different sizes would take turns in replacing
-        // the buffers.
+        // No dimension shrinks. Otherwise, views of different sizes would alternately replace the
+        // buffers.
         let other = have.unwrap_or(need);
         let size = ScratchSize {
             n_splats: need.n_splats.max(other.n_splats),

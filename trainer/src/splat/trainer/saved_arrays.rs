@@ -30,7 +30,8 @@ pub(super) fn read_splats(
     prefix: &str,
     [n_splats, capacity, sh_degree, active_degree]: [u32; 4],
 ) -> Result<SplatBuffers, Error> {
-    // The numbers come from a file, and buffers are written at offsets that follow from them.
+    // The numbers are checked, because they come from a file and determine the offsets at which
+    // buffers are written.
     if n_splats > capacity || active_degree > sh_degree || sh_degree > 3 {
         return Err(invalid_state(format!(
             "{n_splats} splats of SH degree {active_degree} do not fit capacity {capacity} and SH degree {sh_degree}"
@@ -161,7 +162,7 @@ fn begin_read(
     if n_planes == 0 || splats.n_splats == 0 {
         return None;
     }
-    // All planes in one copy, without the unused end of the last one.
+    // All planes are read in one copy, without the unused end of the last plane.
     let n = u64::from(n_planes - 1) * u64::from(splats.capacity) + u64::from(splats.n_splats);
     Some(gpu.begin_read(buffer, to_usize(n * bytes / 4)))
 }

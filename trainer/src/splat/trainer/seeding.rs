@@ -14,8 +14,8 @@ use std::sync::Arc;
 /// Maximum share of the splat limit for the seeds of one image, so that enough remains for the
 /// other images.
 const SEED_SHARE: f64 = 1.0 / 8.0;
-/// Minimum number of pixels per seed. A higher density slows the first steps more than it helps:
-/// with 15 pixels per seed, redkitchen reached 2.2 dB less after 1 s
+/// Minimum number of pixels per seed. A higher density slows down the first steps more than it
+/// helps. With 15 pixels per seed, the PSNR of redkitchen was 2.2 dB lower after 1 s
 /// (docs/benchmarks/2026-11-23-splats.md).
 const PX_PER_SEED: f64 = 48.0;
 /// Default maximum number of seeds per image. An image of 1280 x 720 pixels has 19 200 at the
@@ -23,8 +23,8 @@ const PX_PER_SEED: f64 = 48.0;
 const SEEDS_PER_IMAGE: f64 = 20_000.0;
 /// The same on a software adapter, where steps with more splats would take too long.
 const SOFTWARE_SEEDS_PER_IMAGE: f64 = 4_000.0;
-/// Minimum scale of the scene. With a scale of zero, as of a single camera without depth, the means
-/// could not move.
+/// Minimum scale of the scene. With a scale of zero, which a single camera without depth would
+/// give, the means could not move.
 const MIN_SCENE_SIZE_M: f64 = 1e-3;
 
 /// Creates the initial splats for new keyframes.
@@ -87,7 +87,8 @@ impl Seeding {
         if arrived.is_empty() {
             return None;
         }
-        // All views, not only the new ones: the learning rate must fit the whole scene.
+        // All views are used, not only the new ones, because the learning rate must fit the whole
+        // scene.
         self.scene.size_m = scene_size_m(views);
         let discs = self.scene.seeder.discs(&arrived, self.density);
         self.unseeded.extend(

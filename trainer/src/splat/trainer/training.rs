@@ -113,7 +113,8 @@ impl Training {
     /// Seeds the areas that depth does not cover. Uses discs if any keyframe has depth; otherwise
     /// balls at the initial points, if there are any, and a random cloud.
     pub(super) fn prepare_model(&mut self) -> Result<(), Error> {
-        // Depth comes first, because the other discs take their depths from its discs.
+        // Depth comes first, because discs without depth readings take their depths from the discs
+        // with depth.
         self.seed_from_depth()?;
         for keyframe in self.seeding.take_unseeded() {
             if let Some(discs) = self.seeding.discs_without_depth(&keyframe) {
@@ -133,8 +134,8 @@ impl Training {
                 .map(|points| seed::balls(points, &keyframes, n_max))
                 .unwrap_or_default();
             let cloud = seed::random_cloud(&keyframes, self.options.common.seed, n_max);
-            // Structure from motion finds no points where images have no texture. Therefore, there
-            // are at least as many splats as without points.
+            // Structure from motion finds no points where images have no texture. A random cloud is
+            // therefore added, so that there are at least as many splats as without points.
             let n_random = cloud.n_splats().saturating_sub(balls.n_splats());
             self.add(&balls)?;
             self.add(&cloud.filtered(|ix| ix < n_random))?;
@@ -162,7 +163,7 @@ impl Training {
         }
         let counters = self.optimizer.submit(&mut self.recorder);
         self.schedule.step += n_steps;
-        // Waits for the previous submit while this one runs, so that the GPU never idles.
+        // This waits for the previous submit while the new one runs, so that the GPU never idles.
         let failed = self.finish_in_flight()?;
         // After a failure, the failure flag turns this submit into a no-op, too. Its steps are
         // repeated, so its counters are not needed.
@@ -290,7 +291,7 @@ impl Training {
     /// Uploads the missing images of the next `n` steps. On a GPU, prepares images of later steps
     /// as well, which keeps all CPU cores busy and avoids waiting for images in each step.
     fn prepare_images(&mut self, n: u64) -> Result<(), Error> {
-        // On a software adapter, the same cores would be taken from training.
+        // On a software adapter, preparing more images would take CPU cores from training.
         let n_at_once = if self.recorder.gpu.is_software() {
             0
         } else if self.optimizer.submits.is_watched() {
@@ -368,7 +369,7 @@ impl Training {
     /// The given error if the steps of all images were skipped.
     fn skip_step(&mut self, error: Error) -> Result<(), Error> {
         self.model.stop_growing(&error);
-        // Within two rounds, every image has had its turn.
+        // Every image is used at least once within two rounds.
         let step = self.schedule.step;
         if self.skipped.add(step) > 2 * self.views.len() as u64 {
             return Err(error);
@@ -443,7 +444,8 @@ struct SkippedSteps {
 impl SkippedSteps {
     /// Adds a step. Returns the number of consecutive skipped steps up to this one.
     fn add(&mut self, step: u64) -> u64 {
-        // Logs once per run: the number is at least 1 after the first skipped step.
+        // This is logged once per run of skipped steps, because the number is at least 1 after the
+        // first one.
         if self.n_consecutive == 0 {
             log::warn!("images that need too much GPU memory are skipped in training");
         }

@@ -133,7 +133,7 @@ impl TrialRunner<'_> {
 
     /// Cancels a trial that is in its second half.
     pub(super) fn cancel(&mut self) -> Result<(), Error> {
-        // In the first half, the model in training is the one without the change.
+        // In the first half, the model without the change is in training.
         let Some(canceled) = self.trials.cancel() else {
             return Ok(());
         };
@@ -168,9 +168,9 @@ impl TrialRunner<'_> {
 
     /// Restores a state and counts the reverted steps.
     fn restore(&mut self, snapshot: Snapshot) -> Result<(), Error> {
-        // The sum of steps and reverted steps stays the number of steps that were trained. The
-        // snapshot may be from a later step, if the second half of a trial is canceled. Its first
-        // half was reverted before, so the result is not negative.
+        // The sum of steps and reverted steps stays the number of steps that were trained. If the
+        // second half of a trial is canceled, the snapshot may be from a later step. The result is
+        // still not negative, because the steps of the first half were counted as reverted before.
         self.trials.n_reverted_steps =
             self.trials.n_reverted_steps + self.training.schedule.step - snapshot.schedule.step;
         self.training.restore_snapshot(snapshot)

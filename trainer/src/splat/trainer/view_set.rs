@@ -97,7 +97,7 @@ impl ViewSet {
 
     /// Mean color of the images, sRGB; black without images.
     pub(super) fn mean_srgb(&self) -> [f32; 3] {
-        // Fully masked images have no mean.
+        // Fully masked images have no mean color.
         let known: Vec<[f64; 3]> = self.views.iter().filter_map(TrainView::mean_srgb).collect();
         let mean = |color: usize| {
             known.iter().map(|image| image[color]).sum::<f64>() / known.len().max(1) as f64
@@ -185,8 +185,8 @@ impl ViewSet {
         steps: Range<u64>,
         n_at_once: u64,
     ) -> Result<(), Error> {
-        // A larger batch only if anything is missing: otherwise, each submit would upload images of
-        // one more step, and wait for it.
+        // The larger batch is used only if images are missing. Otherwise, each submit would upload
+        // the images of one more step and wait for them.
         let mut requested = self.levels_of_steps(steps.clone());
         if !requested.iter().all(|place| self.has_level(*place)) {
             requested = self.levels_of_steps(steps.start..steps.end.max(steps.start + n_at_once));
@@ -217,7 +217,7 @@ impl ViewSet {
         if !missing.is_empty() {
             self.upload_missing(recorder, missing, requested, step)?;
         }
-        // A counter instead of the time, so that eviction does not depend on timing.
+        // A counter is used instead of the time, so that eviction does not depend on timing.
         self.n_image_requests += 1;
         for (view_ix, level) in requested {
             self.views[*view_ix].mark_used(*level, self.n_image_requests);

@@ -1,7 +1,7 @@
 //! The triangles of a surface that crosses a cube, for each of the 256 combinations of inside and
 //! outside corners.
 //!
-//! The method is marching cubes (Lorensen and Cline 1987), but the table is computed: on each face,
+//! The method is marching cubes (Lorensen and Cline 1987), but the table is computed. On each face,
 //! one segment separates each run of inside corners from the rest. Two cubes therefore agree on a
 //! shared face, and segments join into loops.
 
@@ -50,7 +50,8 @@ fn triangles(case: usize) -> Vec<[Edge; 3]> {
                 .expect("each edge ends one segment and begins one");
             end = segments.swap_remove(next).1;
         }
-        // A fan from the first corner. The kernel has room for five triangles per case.
+        // The loop is divided into a fan of triangles from its first corner. The kernel has room
+        // for five triangles per case.
         triangles
             .extend((1..corners.len() - 1).map(|ix| [corners[0], corners[ix], corners[ix + 1]]));
     }
@@ -107,7 +108,7 @@ mod tests {
 
     #[test]
     fn triangles_face_away_from_the_inside() {
-        // Only corner 0 is inside: the normal points toward increasing coordinates.
+        // Only corner 0 is inside, so the normal points toward increasing coordinates.
         let edge_center = |edge: Edge| -> [f64; 3] {
             std::array::from_fn(|axis| {
                 if axis == edge.axis {

@@ -1,4 +1,4 @@
-//! Chunks of meshes, decoded as `docs/reference/protocol.md` says.
+//! Tests of chunks of meshes, which are decoded as `docs/reference/protocol.md` says.
 
 use crate::test_scenes as scenes;
 use crate::tsdf::TsdfModel;
@@ -139,7 +139,7 @@ impl Replica {
             .iter()
             .map(|corners| canonical(corners.map(|ix| ix as usize)))
             .collect();
-        // Rounding may swap vertices that are closer to each other than a count.
+        // Rounding may swap vertices whose distance is less than one count.
         let n_different = got.symmetric_difference(&expected).count();
         assert!(
             1000 * n_different < expected.len(),

@@ -15,7 +15,8 @@ use std::collections::{BTreeMap, HashMap};
 use std::io::Write;
 use std::sync::Arc;
 
-/// Blocks along an edge of a chunk: some thousand vertices, which a viewer draws at once.
+/// Blocks along an edge of a chunk. A chunk then has a few thousand vertices, which a viewer draws
+/// in one call.
 const CHUNK_BLOCKS: i32 = 4;
 /// Voxels along an edge of a chunk with the cubes that begin in it.
 const CHUNK_VOXELS: i32 = CHUNK_BLOCKS * BLOCK_EDGE + 1;
@@ -45,8 +46,8 @@ impl ChangedChunks {
         edits: &Arc<Edits>,
         only_changed: bool,
     ) -> Self {
-        // The list of changes is taken in either case: after all chunks were sent, none has
-        // changed.
+        // The list of changes is taken in both cases, because after all chunks were sent, no chunk
+        // has unsent changes.
         let changed = mesher.take_changed().filter(|_| only_changed);
         let is_complete = changed.is_none();
         let mut chunks: BTreeMap<GridCoord, ChunkBlocks> = BTreeMap::new();

@@ -7,8 +7,8 @@ use model_files::mesh::Mesh;
 use nalgebra::Vector3;
 
 /// Width of the cells with which floaters are erased, voxels. Narrower cells separate floaters
-/// better from nearby surfaces, but there are more of them; the largest grid has 1024 along an
-/// axis.
+/// better from nearby surfaces, but more of them are needed. The largest grid has 1024 cells along
+/// an axis.
 const CELL_VOXELS: f64 = 2.0;
 /// Number of these cells along an axis, half of which cover the larger part of the mesh.
 const N_CELLS_RANGE: [f64; 2] = [64.0, 1024.0];
@@ -40,8 +40,8 @@ pub(in crate::tsdf) fn floaters(mesh: &Mesh, voxel_m: f64) -> Option<Floaters> {
     let mut labels = CellLabels::none(&grid);
     for corners in &mesh.triangles {
         let is_floating = is_floater_size(part_sizes[corners[0] as usize], mesh.triangles.len());
-        // The triangles are small, so their corners are in all cells that they cross, or in
-        // neighbors.
+        // The triangles are small, so every cell that a triangle crosses contains one of its
+        // corners or is next to a cell that does.
         let cells = corners.map(|ix| grid.cell_at(positions_m[ix as usize]));
         if is_floating {
             &mut labels.floating
@@ -56,7 +56,7 @@ pub(in crate::tsdf) fn floaters(mesh: &Mesh, voxel_m: f64) -> Option<Floaters> {
         .iter()
         .filter(|corners| cells.contains(triangle_center_m(corners, &positions_m)))
         .count() as u64;
-    // Small parts right next to large ones share their cells.
+    // Small parts right next to large parts share the cells of the large parts.
     (n_erased > 0).then_some(Floaters {
         cells,
         n_erased,

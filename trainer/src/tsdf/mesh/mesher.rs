@@ -111,14 +111,14 @@ impl Mesher {
         self.changed.replace(BTreeSet::new())
     }
 
-    /// Marks the blocks as replaced of which other triangles are erased than before.
+    /// Marks blocks as replaced if the set of their erased triangles has changed.
     pub(in crate::tsdf) fn set_edits(&mut self, voxel_grid: &VoxelGrid, edits: &Arc<Edits>) {
         let before = std::mem::replace(&mut self.edits, Arc::clone(edits));
         let Some(changed) = self.changed.as_mut().filter(|_| before != *edits) else {
             return;
         };
-        // Edits may overlap, and may be undone. Only blocks in which other triangles are erased
-        // than before are sent again.
+        // Edits may overlap and may be undone. A block is sent again only if the set of its erased
+        // triangles has changed.
         let has_changed = |mesh: &BlockMesh| {
             mesh.erased(voxel_grid, &before)
                 .ne(mesh.erased(voxel_grid, edits))
@@ -167,7 +167,7 @@ pub(in crate::tsdf) fn joined(meshes: &BlockMeshes, voxel_grid: &VoxelGrid, edit
 /// Key of an edge that may belong to several blocks: its first voxel in the field, and its axis.
 pub(super) fn shared_key(block: GridCoord, edge: u32) -> Option<(GridCoord, u32)> {
     // An edge has the number axis + 3 (x + 9 (y + 9 z)) of its first voxel, 0 to 8 along each axis.
-    // Only edges on a face of the block can be edges of a neighbor, too.
+    // Only edges on a face of the block can also belong to a neighbor.
     let local = [edge / 3 % 9, edge / 27 % 9, edge / 243].map(u32::cast_signed);
     let is_shared = local.iter().any(|along| matches!(*along, 0 | BLOCK_EDGE));
     is_shared.then(|| {

@@ -113,8 +113,8 @@ fn mesh_of_slanted_wall_is_flat() {
         &scenes::ring(&[wall], Point3::origin(), 4),
     );
     let mut mesh = model.mesh().unwrap();
-    // Checks only near vertices: far away, pixels are wider than voxels and the wall is seen at an
-    // angle.
+    // The test checks only near vertices, because far away, pixels are wider than voxels and the
+    // wall is seen at an angle.
     let is_near = vertex_positions(&mesh)
         .map(|vertex| vertex.coords.norm() < 0.8)
         .collect::<Vec<_>>();

@@ -82,8 +82,8 @@ impl TsdfModel {
             ..
         } = &mut model.queue;
         let known: Vec<KeyframeSignature> = fused.iter().chain(&*unmatched).cloned().collect();
-        // Fused keyframes are only verified: their contribution is in the blocks. Pending ones are
-        // needed with their pixels.
+        // Fused keyframes are only verified, because the blocks contain their contribution. Pending
+        // keyframes are needed with their pixels.
         let (mut found, rest) = keyframe_signature::match_keyframes(&known, keyframes)?;
         *pending = found.split_off(fused.len()).into();
         unmatched.clear();
@@ -176,7 +176,7 @@ fn arrays_of(blocks: &Blocks) -> Vec<Array> {
 }
 
 /// Size of an array with `each` bytes per block. The number of blocks comes from a file, so it may
-/// be absurd.
+/// be implausibly large.
 fn n_bytes(n_blocks: u64, each: u64) -> Result<u64, Error> {
     n_blocks
         .checked_mul(each)
@@ -202,7 +202,8 @@ fn blocks_of(checkpoint: &Checkpoint, n_blocks: u64) -> Result<Blocks, Error> {
                 .map(|both| [word(&both[..4]), word(&both[4..])])
                 .collect(),
         });
-    // Of two blocks with the same coordinates, only one is left in the map.
+    // The map keeps only one of several blocks with the same coordinates, so a wrong number reveals
+    // duplicates.
     let blocks: Blocks = block_coords.zip(blocks).collect();
     if blocks.len() as u64 == n_blocks {
         Ok(blocks)

@@ -62,15 +62,15 @@ impl TsdfModel {
         };
         let in_field = in_field(camera, &store.voxel_grid);
         let frustum = ViewFrustum::of_camera(&in_field, &store.voxel_grid);
-        // Blocks in host memory that the view shows are loaded. If not all fit, a picture without
-        // the farthest ones is better than none.
+        // Blocks in host memory that the view shows are loaded. If not all blocks fit, a picture
+        // without the farthest blocks is better than no picture.
         store.load_visible(&self.gpu, &self.pipelines, &frustum, true)?;
         if self
             .canvas
             .as_ref()
             .is_none_or(|canvas| canvas.n_pixels < n)
         {
-            // Freed before the larger one is allocated.
+            // The smaller buffer is freed before the larger one is allocated.
             self.passes.clear_bindings();
             self.canvas = None;
         }

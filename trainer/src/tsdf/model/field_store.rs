@@ -16,7 +16,7 @@ use gpu::Gpu;
 use std::collections::BTreeSet;
 
 /// Initial capacity: 26 MB. Growing copies the field, so a much smaller capacity would slow down
-/// the first images; a larger one would exceed small budgets.
+/// the first images. A larger capacity would exceed small budgets.
 pub(super) const INITIAL_CAPACITY: Capacity = Capacity {
     n_blocks: 4096,
     n_chunks: 512,
@@ -65,8 +65,8 @@ impl FieldStore {
         max_bytes: Option<u64>,
         blocks: Blocks,
     ) -> Result<Self, Error> {
-        // The first blocks in order are resident, the rest is in host memory. Which ones does not
-        // matter: every image and every render loads those that it needs.
+        // The first blocks in order are resident, and the rest is in host memory. The choice does
+        // not matter, because every image and every render loads the blocks that it needs.
         let max_resident =
             capacity::max_blocks_within(gpu, max_bytes, INITIAL_CAPACITY.n_chunks) as usize;
         let stale = blocks.keys().copied().collect();
@@ -119,9 +119,9 @@ impl FieldStore {
         }
         let n_needed = counters[status::N_BLOCKS];
         let n_allowed = capacity::max_blocks_within(gpu, self.max_bytes, capacity.n_chunks);
-        // By half at least, so that a field of n blocks is copied only a logarithmic number of
-        // times. The counter goes on counting after an overflow, so it is the number that the image
-        // needs.
+        // The pool grows by at least half, so that a field of n blocks is copied only a logarithmic
+        // number of times. The counter continues to count after an overflow, so it contains the
+        // number that the image needs.
         if n_needed > capacity.n_blocks {
             let n_target = n_needed.max(capacity.n_blocks.saturating_add(capacity.n_blocks / 2));
             capacity.n_blocks = n_target.min(n_allowed).max(capacity.n_blocks);
@@ -179,7 +179,7 @@ impl FieldStore {
             return Ok(true);
         }
         visible.sort_by(|a, b| frustum.distance_m(*a).total_cmp(&frustum.distance_m(*b)));
-        // Resident blocks that the camera observes, too, must stay.
+        // Resident blocks that the camera also observes must stay.
         let n_slots = self.buffers.capacity.n_blocks as usize;
         let resident = self.buffers.block_coords(gpu)?;
         let n_observed = resident

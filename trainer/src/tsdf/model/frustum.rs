@@ -26,7 +26,8 @@ impl ViewFrustum {
     /// The frustum of a keyframe's depth camera; `None` if its depth image changes no block.
     pub(super) fn of_depth(keyframe: &Keyframe, voxel_grid: &VoxelGrid) -> Option<Self> {
         let depth = keyframe.depth.as_ref()?;
-        // The same condition as for recording the passes: without a depth view, nothing is fused.
+        // This is the same condition as for recording the passes. Without a depth view, nothing is
+        // fused.
         DepthView::of(keyframe, voxel_grid)?;
         Some(Self::new(
             &(voxel_grid.field_from_world() * depth.world_from_camera),
@@ -72,7 +73,8 @@ impl ViewFrustum {
         (Vector3::from(block.map(|along| f64::from(along) + 0.5)) * self.block_m).into()
     }
 
-    /// Conservative: true at least for all blocks that the kernel `find_visible` lists.
+    /// Whether a block may be visible. The result is true at least for all blocks that the kernel
+    /// `find_visible` lists.
     pub(super) fn may_be_visible(&self, block: GridCoord) -> bool {
         let center = self.camera_from_field * self.center_of_block_m(block);
         // Half the diagonal of a block is 4 sqrt(3) = 6.93 voxels, rounded up to 7.

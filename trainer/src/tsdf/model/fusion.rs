@@ -8,8 +8,8 @@ use crate::tsdf::passes::{self, KeyframeSlot};
 use gpu::{Gpu, Passes, Submits};
 use keyframe::Keyframe;
 
-/// Maximum number of keyframes per submit. Their images are on the GPU at once, so more keyframes
-/// need more memory. With fewer, the GPU waits for the host more often.
+/// Maximum number of keyframes per submit. Their images are on the GPU at the same time, so more
+/// keyframes need more memory. With fewer keyframes, the GPU waits for the host more often.
 pub(super) const KEYFRAMES_PER_SUBMIT: usize = 4;
 
 /// Records and tracks submits of depth images.
@@ -36,8 +36,9 @@ impl Fusion {
 
     /// Number of keyframes in a submit that stays within the time limit.
     pub(super) fn keyframes_per_submit(&self) -> usize {
-        // Pictures wait for the running submit, so it must be short while they are requested.
-        // Otherwise, more images per submit waste less time between submits.
+        // Pictures wait for the running submit, so submits must be short while pictures are
+        // requested. If no pictures are requested, more images per submit waste less time between
+        // submits.
         match self.submits.n_steps_in_limit() {
             Some(n) if self.submits.is_watched() => usize::try_from(n)
                 .unwrap_or(usize::MAX)

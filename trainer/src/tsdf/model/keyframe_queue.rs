@@ -35,7 +35,7 @@ impl KeyframeQueue {
         let n_before = self.fused.len();
         self.fused
             .retain(|signature| !signature.is_of(camera, stamp));
-        // Removed keyframes still count as steps: the field contains them.
+        // Removed keyframes still count as steps, because the field contains them.
         self.n_removed += (n_before - self.fused.len()) as u64;
     }
 

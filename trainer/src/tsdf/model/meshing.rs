@@ -14,8 +14,8 @@ use model_files::Edits;
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 
-/// Blocks per batch when not all blocks are on the GPU. Each batch gets a temporary field.
-/// Neighbors of the blocks are loaded, too, so small batches load many blocks twice; large ones
+/// Blocks per batch when not all blocks are on the GPU. Each batch gets a temporary field. The
+/// neighbors of the blocks are also loaded, so small batches load many blocks twice. Large batches
 /// need more memory.
 const BLOCKS_PER_BATCH: usize = 512;
 /// Initial number of chunks of such a temporary field.
@@ -85,8 +85,8 @@ impl Meshing {
             stale,
             ..
         } = store;
-        // The flags on the GPU were taken whenever blocks moved to or from host memory. Those
-        // blocks are flagged again.
+        // Whenever blocks moved to or from host memory, the flags on the GPU were read and cleared.
+        // Those blocks are flagged again here.
         if !stale.is_empty() {
             stale.extend(field.take_changed(gpu)?);
             field.set_changed(gpu, stale)?;

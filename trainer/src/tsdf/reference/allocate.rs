@@ -11,9 +11,9 @@ use std::collections::BTreeSet;
 /// The blocks that one depth image requires.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct RequiredBlocks {
-    /// Crossed for at least `margin` of a block's edge.
+    /// Blocks that the ray crosses over a length of at least `margin`.
     pub definite: BTreeSet<GridCoord>,
-    /// Crossed, or closer to the ray than `margin`.
+    /// Blocks that the ray crosses, or that are closer to it than `margin`.
     pub possible: BTreeSet<GridCoord>,
 }
 
@@ -24,7 +24,7 @@ impl VoxelGrid {
     }
 }
 
-/// The blocks to allocate. `margin`: tolerance for rounding, in blocks.
+/// Returns the blocks to allocate. `margin` is the tolerance for rounding, in blocks.
 #[expect(
     clippy::cast_possible_truncation,
     reason = "coordinates are rounded down on purpose"
@@ -38,8 +38,9 @@ pub fn required_blocks(
     let field_from_depth = voxel_grid.field_from_world() * depth.world_from_camera;
     let width = depth.size_px[0] as usize;
     let block_m = 8.0 * voxel_grid.voxel_m;
-    // The kernel rounds in f32, so it may add or miss blocks that a ray hardly touches. Blocks that
-    // it must and that it may allocate are therefore distinguished.
+    // The kernel rounds in f32, so it may add or miss blocks that a ray hardly touches. The twin
+    // therefore distinguishes blocks that the kernel must allocate from blocks that it may
+    // allocate.
     let mut required = RequiredBlocks::default();
     for (ix, reading) in readings
         .iter()
@@ -50,7 +51,8 @@ pub fn required_blocks(
             depth,
             [(ix % width) as f64 + 0.5, (ix / width) as f64 + 0.5],
         );
-        // The truncation is measured along the ray, whose length per meter of depth is above 1.
+        // The truncation is converted to a length along the ray, which is longer than the depth
+        // along z.
         let band_m = voxel_grid.truncation_at(reading.depth_m) / ray.norm();
         let at = |z: f64| (field_from_depth * Point3::from(ray * z)).coords / block_m;
         let begin = at((reading.depth_m - band_m).max(0.0));

@@ -37,13 +37,13 @@ pub fn cast(blocks: &Blocks, voxel_grid: &VoxelGrid, ray: &Ray, edits: &Edits) -
     let mut depth_m = ray.range_m[0];
     let mut before: Option<(f64, f64)> = None;
     while depth_m < ray.range_m[1] {
-        // Only from positive to negative: back faces are not rendered. A point next to an
-        // unobserved voxel has no distance, so no surface is found there.
+        // Only crossings from positive to negative count, because back faces are not rendered. A
+        // point next to an unobserved voxel has no distance, so no surface is found there.
         let here = distance_at(blocks, &at(depth_m));
         if let (Some((outside_m, outside)), Some(inside)) =
             (before, here.filter(|distance| *distance < 0.0))
         {
-            // The zero of the line through both distances.
+            // The surface is at the zero of the line through both distances.
             let hit_m = outside_m + (depth_m - outside_m) * outside / (outside - inside);
             let hit_in_world =
                 ray.origin_m + ray.along * hit_m + Vector3::from(voxel_grid.anchor_m);
@@ -97,8 +97,8 @@ fn distance_at(blocks: &Blocks, point: &Vector3<f64>) -> Option<f64> {
 }
 
 fn color_at(blocks: &Blocks, point: &Vector3<f64>) -> [f64; 3] {
-    // Unlike distances, colors may be missing: only voxels near the surface store one. The weights
-    // of the others are normalized.
+    // Unlike distances, colors may be missing, because only voxels near the surface store one. The
+    // weights of the available colors are normalized.
     let mut sum = Vector3::zeros();
     let mut weight = 0.0;
     for (voxel, part) in around(point) {

@@ -13,7 +13,7 @@ use std::collections::BTreeMap;
 pub struct Voxel {
     /// Signed distance to the surface, meters.
     pub distance_m: f64,
-    /// In 256ths, an integer; 0: not observed.
+    /// Weight in 256ths, an integer; 0 if not observed.
     pub weight: f64,
     /// sRGB, 0 to 1.
     pub color_srgb: [f64; 3],
@@ -24,16 +24,17 @@ pub struct Voxel {
 /// Voxels of blocks, x fastest.
 pub type VoxelBlocks = BTreeMap<GridCoord, Vec<Voxel>>;
 
-/// Minimum cosine between ray and normal for scaling distances: normals of steeper surfaces are
+/// Minimum cosine between ray and normal for scaling distances. Normals of steeper surfaces are
 /// mostly noise.
 const MIN_RAY_DOT_NORMAL: f64 = 0.3;
 /// Number of observations of a solid voxel that one observation through it cancels, if the surface
-/// behind it is one truncation away, and if it is at least two away. More would carve away surfaces
-/// that pose errors only shift; see "Carving" in `docs/benchmarks/2026-11-23-tsdf.md`.
+/// behind it is one truncation away, and if it is at least two away. With larger numbers, surfaces
+/// that are only displaced by pose errors would be carved away; see "Carving" in
+/// `docs/benchmarks/2026-11-23-tsdf.md`.
 const CARVING_NEAR: f64 = 1.0;
 const CARVING_FAR: f64 = 4.0;
-/// Colors are stored up to this distance from the surface, in voxels: pictures and meshes
-/// interpolate no others.
+/// Colors are stored up to this distance from the surface, in voxels. Pictures and meshes do not
+/// use colors beyond it.
 const COLOR_VOXELS: f64 = 2.0;
 
 /// Fuses a keyframe with depth into the given blocks.
@@ -75,12 +76,12 @@ fn fuse(
     if reading.depth_m <= 0.0 {
         return;
     }
-    // Distance to the tangent plane of the surface, rather than along the ray.
+    // The distance is measured to the tangent plane of the surface, rather than along the ray.
     let distance_m = (reading.depth_m - point.z) * reading.ray_dot_normal.max(MIN_RAY_DOT_NORMAL);
     let truncation_m = voxel_grid.truncation_at(reading.depth_m);
     let ray_m = ray_of(depth, position_px).norm();
-    // Hidden voxels are unknown. This is measured along the ray: just past the rim of an object, a
-    // grazing ray has left the object again.
+    // Hidden voxels are unknown. The distance behind the surface is measured along the ray, because
+    // a grazing ray leaves an object again just past its rim.
     let behind_m = (point.z - reading.depth_m) * ray_m;
     if behind_m > truncation_m {
         return;
@@ -91,8 +92,8 @@ fn fuse(
     let nearness = (1.0 / (reading.depth_m * reading.depth_m)).min(1.0);
     let falloff = ((truncation_m - behind_m) / (truncation_m - voxel_grid.voxel_m)).clamp(0.0, 1.0);
     let gain_frac = nearness * (reading.ray_dot_normal / ray_m).powi(2) * falloff;
-    // Free space far in front of a surface. The distance to the nearest surface is unknown, so only
-    // solid voxels change: they lose weight until they count as unobserved.
+    // The voxel is in free space far in front of a surface. The distance to the nearest surface is
+    // unknown, so only solid voxels change. They lose weight until they count as unobserved.
     if distance_m > truncation_m {
         if voxel.weight > 0.0 && voxel.distance_m < 0.0 {
             let past_truncation = (distance_m / truncation_m - 1.0).min(1.0);
@@ -109,7 +110,8 @@ fn fuse(
         }
         return;
     }
-    // A running mean (Curless and Levoy 1996). The maximum weight makes moved objects fade.
+    // This is a running mean (Curless and Levoy 1996). Because of the maximum weight, moved objects
+    // fade.
     let weight_gain = (256.0 * gain_frac + 0.5).floor().clamp(1.0, 256.0);
     let sum = voxel.weight + weight_gain;
     voxel.distance_m = (voxel.distance_m * voxel.weight + distance_m * weight_gain) / sum;
@@ -142,7 +144,7 @@ fn fuse_color(
         return;
     };
     let [red, green, blue, alpha] = color_near(keyframe, position_px);
-    // Near a masked pixel, the interpolated color contains the masked one.
+    // Near a masked pixel, the interpolated color would contain its color.
     if alpha <= 0.999 {
         return;
     }

@@ -102,8 +102,8 @@ impl<'a> BlockNeighborhood<'a> {
             (voxel + 0.5 + if along == axis { share } else { 0.0 }) * voxel_m
         });
         let normal = self.gradient(from).lerp(&self.gradient(to), share);
-        // In a thin sheet, the gradients of its two sides may cancel out. The normal then points
-        // along the edge, to its outer end.
+        // The gradients of the two sides of a thin sheet may cancel out. In that case, the normal
+        // points along the edge toward its outer end.
         let normal = normal.try_normalize(1e-12).unwrap_or_else(|| {
             let mut along = Vector3::zeros();
             along[axis] = (there - here).signum();

@@ -20,7 +20,7 @@ const WIDE_STEP: i64 = 3;
 /// difference has a standard deviation of sqrt(1 + 4 + 1) = 2.45 units, so this is 2.45 standard
 /// deviations.
 const MAX_FLAT_NOISES: f64 = 6.0;
-/// Nearer readings are errors of the sensor.
+/// Minimum valid depth, meters. Nearer readings are errors of the sensor.
 const MIN_DEPTH_M: f64 = 0.01;
 /// Maximum slope of a valid surface: change of depth over lateral distance. Steeper surfaces count
 /// as edges.
@@ -121,7 +121,7 @@ fn reading(depth: &DepthMap, voxel_grid: &VoxelGrid, pixel: [i64; 2]) -> Reading
     let ray = ray_of(depth, [pixel[0] as f64 + 0.5, pixel[1] as f64 + 0.5]);
     let normal = x.cross(&y);
     // The tangents point right and down, so their cross product points away from the camera.
-    // Anything else is no surface that the camera can see.
+    // Otherwise, the camera cannot see the surface.
     let ray_dot_normal = ray.dot(&normal) / normal.norm().max(1e-30);
     if ray_dot_normal > 0.0 {
         Reading {

@@ -22,8 +22,8 @@ pub(crate) const FIRST: u64 = 1_000_000;
 /// Maximum number of milliseconds to simulate without a client action; a step takes 0.1 ms.
 const MAX_STEPS: u16 = 500;
 
-/// Executes concatenated client actions. Each starts with one byte kind and two bytes length,
-/// little-endian.
+/// Executes concatenated client actions. Each starts with one byte for the kind and two bytes for
+/// the length, little-endian.
 ///
 /// Kind 0 sends that many bytes over TCP. Kind 1 sends them as a motion command over UDP. Kind 2
 /// lets `length` milliseconds pass. Checks that the commanded joint positions never violate the
@@ -177,7 +177,8 @@ mod tests {
                 first.position_rad, last.position_rad,
                 "the motion that is corrupted below: {version:?}"
             );
-            // Without the record that starts the motion: in any order, truncated or duplicated.
+            // The record that starts the motion is left out. The others are sent in any order,
+            // truncated or duplicated.
             for round in 0..30 {
                 let mut corrupted: Vec<_> = records
                     .iter()

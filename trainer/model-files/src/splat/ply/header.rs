@@ -221,7 +221,7 @@ impl<'a> Header<'a> {
             (["property", word, name], Some(element)) => {
                 let number_type = NumberType::of(word)
                     .ok_or_else(|| format!("property {name}: unknown type {word:?}"))?;
-                // Which of the two a reader means would be a guess.
+                // If a name occurs twice, it is not clear which property is meant.
                 if element
                     .properties
                     .iter()
@@ -244,7 +244,8 @@ impl<'a> Header<'a> {
     /// Finds the rows of each element up to the first incomplete one; later ones keep their error.
     fn locate_binary(&mut self, mut rest: &'a [u8], format: Format) {
         for element in &mut self.elements {
-            // Checked, because the count is any number of the file.
+            // The product is checked for overflow, because the count comes from the file and may be
+            // any number.
             let n_bytes = if element.lists.is_empty() {
                 element.count.checked_mul(element.row_bytes)
             } else {

@@ -106,7 +106,7 @@ fn from_bytes(bytes: &[u8]) -> Result<(SplatArrays, Vec<String>), String> {
         sh_degree: color.degree,
         is_antialiased,
     };
-    // Last, because the filter changes scales and opacities that were read.
+    // The filter is applied last, because it changes scales and opacities that were read before.
     if let Some(filter) = filter {
         rows.for_each(|row| widen(&mut splats, row, filter.f32(row)));
     }
@@ -202,8 +202,8 @@ struct ColorColumns<'a> {
     degree: u32,
     constant: ConstantColor<'a>,
     rest: Vec<Column<'a>>,
-    /// Higher coefficients per channel in the file; more than are used if the file has a higher
-    /// degree.
+    /// Number of higher coefficients per channel in the file. If the file has a higher degree, not
+    /// all of them are used.
     n_rest: usize,
 }
 
@@ -250,7 +250,7 @@ impl<'a> ColorColumns<'a> {
                 .each_ref()
                 .map(|column| (column.channel(row) - 0.5) / SH_0),
         };
-        // From planes of channels to one color per coefficient.
+        // The file stores one plane per channel. They are rearranged to one color per coefficient.
         let n_used = (self.degree as usize + 1).pow(2) - 1;
         let rest = (0..n_used)
             .map(|ix| std::array::from_fn(|color| self.rest[color * self.n_rest + ix].f32(row)));
@@ -289,7 +289,8 @@ fn write_to(file: &mut impl Write, splats: &SplatArrays) -> std::io::Result<()> 
         "opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3",
     ]
     .map(str::to_owned);
-    // As Brush writes it, so that other programs apply the opacity correction, too.
+    // The comment is the same as in files of Brush, so that other programs also apply the opacity
+    // correction.
     let comment = if splats.is_antialiased {
         "comment SplatRenderMode: mip\n"
     } else {

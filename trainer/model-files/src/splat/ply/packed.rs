@@ -164,8 +164,8 @@ fn rotation_wxyz(bits: u32) -> [f32; 4] {
     wxyz
 }
 
-/// Decodes a higher color coefficient. Bytes 0 and 255 are the ends of the range, other bytes the
-/// center of a step.
+/// Decodes a higher color coefficient. Bytes 0 and 255 stand for the ends of the range. Other bytes
+/// stand for the center of a step.
 fn higher_coefficient(byte: f32) -> f32 {
     let frac = match byte {
         0.0 => 0.0,

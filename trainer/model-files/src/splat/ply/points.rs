@@ -6,7 +6,8 @@ use crate::{Error, InitialPoints};
 use files::Budget;
 use std::path::Path;
 
-/// Larger coordinates, in meters, are assumed to be mistakes, like those of cameras.
+/// Larger coordinates, in meters, are assumed to be mistakes. The positions of cameras have the
+/// same limit.
 const MAX_COORDINATE_M: f32 = 1e4;
 const COORDINATES: [&str; 3] = ["x", "y", "z"];
 const CHANNELS: [&str; 3] = ["red", "green", "blue"];
@@ -53,7 +54,7 @@ fn points_from_bytes(bytes: &[u8]) -> Result<(InitialPoints, Vec<String>), Strin
     let mut points = InitialPoints::default();
     for row in 0..n_all {
         let position = coordinates.each_ref().map(|column| column.f32(row));
-        // NaN is not within the limit.
+        // The comparison also excludes NaN.
         if position
             .iter()
             .all(|coordinate| coordinate.abs() <= MAX_COORDINATE_M)

@@ -66,8 +66,8 @@ impl Axes {
 
     /// Converts x, y and z of a quaternion. A mirrored ellipsoid has the same scales.
     pub(super) fn rotation_xyz(self, [x, y, z]: [f32; 3]) -> [f32; 3] {
-        // The vector of a quaternion is along the axis of rotation, which is a pseudovector: a
-        // mirror also reverses the sense of rotation.
+        // The vector of a quaternion is along the axis of rotation. This axis is a pseudovector,
+        // because a mirror also reverses the sense of rotation.
         let [x_sign, y_sign, z_sign] = self.0;
         [
             y_sign * z_sign * x,

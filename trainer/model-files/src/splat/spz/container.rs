@@ -41,7 +41,8 @@ pub(super) struct Contents<'a> {
     /// The records of the extensions.
     pub(super) extensions: Cow<'a, [u8]>,
     /// Size of everything that is neither header, table nor attribute. It is larger than
-    /// `extensions` if these are not announced in the header, or exceed [`MAX_EXTENSION_BYTES`].
+    /// `extensions` if the extensions are not announced in the header or exceed
+    /// [`MAX_EXTENSION_BYTES`].
     pub(super) n_extension_bytes: u64,
 }
 
@@ -193,7 +194,8 @@ fn from_gzip(bytes: &[u8]) -> Result<Contents<'_>, String> {
             header.version
         ));
     }
-    // Limits on every read: a stream can decompress to more bytes than the header specifies.
+    // Every read is limited, because a stream can decompress to more bytes than the header
+    // specifies.
     let n_body_bytes = header.n_body_bytes(bytes.len())?;
     let mut body = Vec::new();
     gzip.by_ref()
@@ -302,7 +304,7 @@ fn from_zstd(header: Header, bytes: &[u8]) -> Result<Contents<'_>, String> {
     if !streams.is_empty() {
         return Err(format!("{} bytes follow the last stream", streams.len()));
     }
-    // Bytes that the header does not announce are no records.
+    // Bytes that the header does not announce are not records.
     let extensions: &[u8] = if header.has_extensions() {
         extensions
     } else {

@@ -7,7 +7,8 @@
 //!
 //! The axes of `.spz` are right, up, back, unless an extension names other axes (`axes.rs`). Other
 //! programs interpret the axes of a `.ply`, which are also our axes, as right, down, front. Like
-//! those programs, we flip the signs of y and z, so that viewers show both files alike.
+//! those programs, we flip the signs of y and z. Viewers then show both kinds of files in the same
+//! way.
 //!
 //! Source: "SPZ file format", Niantic, versions 2 to 4, <https://github.com/nianticlabs/spz>.
 
@@ -27,7 +28,7 @@ use std::path::Path;
 /// The version that is written.
 const WRITTEN_VERSION: u32 = 3;
 /// Maximum number of fractional bits of a mean, for steps of 15 micrometers. Finer steps would be
-/// below the accuracy of any scan, and random bits compress badly.
+/// below the accuracy of any scan, and their random bits would compress badly.
 const MAX_FRACTIONAL_BITS: u8 = 16;
 
 /// Reads a `.spz` file of splats.

@@ -27,7 +27,7 @@ pub(super) fn fixed_from_mean(meters: f32, fractional_bits: u8) -> [u8; 3] {
 }
 
 pub(super) fn mean_from_fixed([low, middle, high]: [u8; 3], fractional_bits: u8) -> f32 {
-    // In the upper bytes, so that an arithmetic shift extends the sign.
+    // The number is placed in the upper bytes, so that an arithmetic shift extends the sign.
     let fixed = i32::from_le_bytes([0, low, middle, high]) >> 8;
     (f64::from(fixed) / f64::from(1_u32 << fractional_bits)) as f32
 }
@@ -52,7 +52,7 @@ pub(super) fn color_from_byte(byte: u8) -> f32 {
 }
 
 pub(super) fn byte_from_log_scale(log_scale: f32) -> u8 {
-    // From exp(-10) to exp(5.9) in steps of 6 %.
+    // The range is from exp(-10) to exp(5.9) in steps of 6 %.
     byte((f64::from(log_scale) + 10.0) * 16.0)
 }
 
@@ -79,8 +79,8 @@ pub(super) fn smallest_from_rotation(xyzw: [f32; 4]) -> [u8; 4] {
     let xyzw = xyzw.map(f64::from);
     let length = xyzw.iter().map(|part| part * part).sum::<f64>().sqrt();
     let mut largest_ix = 0;
-    // The largest component is omitted: the error of a component that follows from the unit length
-    // is smallest for it.
+    // The largest component is omitted. If a component is computed from the unit length, its error
+    // is smallest for the largest component.
     for ix in 1..4 {
         if xyzw[ix].abs() > xyzw[largest_ix].abs() {
             largest_ix = ix;
@@ -100,7 +100,7 @@ pub(super) fn rotation_from_smallest(bytes: [u8; 4]) -> [f32; 4] {
     let mut bits = u32::from_le_bytes(bytes);
     let largest_ix = (bits >> 30) as usize;
     let mut xyzw = [0.0; 4];
-    // In reverse, because the last component is in the lowest bits.
+    // The components are read in reverse order, because the last one is in the lowest bits.
     for ix in (0..4).rev().filter(|ix| *ix != largest_ix) {
         let magnitude = f64::from(bits & MAX_COMPONENT) / f64::from(MAX_COMPONENT) * FRAC_1_SQRT_2;
         xyzw[ix] = if bits >> 9 & 1 == 0 {
