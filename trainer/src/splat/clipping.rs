@@ -7,7 +7,7 @@ use crate::view::ErasedSpace;
 use gpu::{Buffer, Gpu, Passes};
 use nalgebra::Matrix4;
 
-/// Size of `Clip` in shared/splat_clip.wgsl.
+/// Size of `Clip` in `shared/splat_clip.wgsl`.
 pub(crate) const CLIP_BYTES: u64 = 48;
 
 /// Prepares to clip the splats of pictures. Pipelines and buffers are created for the first picture

@@ -192,7 +192,7 @@ fn pack(
         }),
     };
     Ok(frame(
-        &BinaryHeader::KeyframeImage(header),
+        &BinaryHeader::KeyframeImage(&header),
         &[&jpeg, mask.as_deref().unwrap_or_default()],
     ))
 }

@@ -143,7 +143,7 @@ pub(crate) enum BinaryHeader<'a> {
     /// Points of a keyframe.
     KeyframePoints(PointsHeader),
     /// The photograph of a keyframe.
-    KeyframeImage(KeyframeImageHeader<'a>),
+    KeyframeImage(&'a KeyframeImageHeader<'a>),
     /// A scan of a range scanner.
     RangeScan(RangeScanHeader<'a>),
     /// When and how precisely each part of the scene was observed.
