@@ -197,6 +197,11 @@ fn operators_crop_edit_and_measure() {
     check_edits(&mut page);
     std::fs::write(scratch.join("edits-panel.png"), page.browser.screenshot()).expect("written");
     check_saving(&mut page);
+    page.press("Escape", "");
+    assert!(
+        page.is_hidden("edit") && page.is_hidden("box-panel"),
+        "Escape closes the panel, so that Delete erases nothing"
+    );
 
     drop(page);
     drop(thread);

@@ -271,6 +271,7 @@ fn the_page_can_be_used_with_keys_alone() {
     check_help(&mut page);
     check_switches(&mut page);
     check_full_screen(&mut page);
+    check_announcements(&mut page);
     page.close();
 }
 
@@ -547,6 +548,15 @@ fn check_full_screen(page: &mut Page) {
         "the side panel",
         "document.querySelector('aside').checkVisibility()",
     );
+}
+
+/// Changes of the run are announced to screen readers.
+fn check_announcements(page: &mut Page) {
+    page.hub
+        .change_status(|status| "paused".clone_into(&mut status.state));
+    page.wait("the announcement", |browser| {
+        browser.text("announcer") == "Run: paused"
+    });
 }
 
 #[test]

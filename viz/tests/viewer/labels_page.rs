@@ -16,9 +16,9 @@ use std::time::{Duration, Instant};
 use test_support::browser::{Browser, browser_for_page, canvas_shot, wait_for};
 use trainer::{Picture, RenderRequest};
 use viz::{
-    Advice, CheckpointState, Hub, Identity, ImageCounts, KeyframeStore, LiveImage, LivePixels,
-    ModelStatus, OperatorStatus, RangeScan, RequestedCheckpoint, RunResult, SceneHint, Server,
-    ServerConfig, Status,
+    Advice, CheckpointState, Hub, Identity, ImageCounts, KeyframePose, KeyframeStore, LiveImage,
+    LivePixels, ModelStatus, OperatorStatus, RangeScan, RequestedCheckpoint, RunResult, SceneHint,
+    Server, ServerConfig, Status,
 };
 
 const WINDOW_PX: [u32; 2] = [1280, 760];
@@ -518,20 +518,48 @@ fn check_ages(page: &mut Page) {
     wait_for(browser, "a frustum that has faded", |browser| {
         n_live(browser) < 10
     });
+    // The newest keyframe at the same pose has another color.
+    let image = live_image();
+    hub.set_keyframes(vec![KeyframePose {
+        camera: image.camera,
+        stamp: image.stamp,
+        world_from_camera: image.world_from_camera.expect("a pose"),
+        size_px: image.size_px,
+        focal_px: image.focal_px,
+        principal_px: image.principal_px,
+    }]);
+    let n_before = n_violet(browser);
+    browser.click("toggle-keyframes");
+    wait_for(browser, "the frustum of a keyframe", |browser| {
+        n_violet(browser) > n_before + 50
+    });
+    assert!(n_live(browser) < 10, "a keyframe looks like a live camera");
+    browser.click("toggle-keyframes");
     browser.click("toggle-model");
 }
 
-/// Number of pixels in the color of live cameras, away from the toolbar and the images.
+/// Number of pixels in the color of live cameras.
 fn n_live(browser: &mut Browser) -> usize {
-    let shot = canvas_shot(browser);
-    let rows = 80..shot.height().saturating_sub(240);
-    let is_live = |[red, green, blue]: [u8; 3]| {
+    n_pixels(browser, |[red, green, blue]| {
         // Unlike the z axis, it is more green than blue.
         green >= red.saturating_add(60) && blue >= red.saturating_add(40) && blue <= green
-    };
+    })
+}
+
+/// Number of pixels in the color of new keyframes, whose lines are translucent.
+fn n_violet(browser: &mut Browser) -> usize {
+    n_pixels(browser, |[red, green, blue]| {
+        red >= green.saturating_add(10) && blue >= green.saturating_add(20)
+    })
+}
+
+/// Number of pixels of a color, away from the toolbar and the images.
+fn n_pixels(browser: &mut Browser, is_color: impl Fn([u8; 3]) -> bool) -> usize {
+    let shot = canvas_shot(browser);
+    let rows = 80..shot.height().saturating_sub(240);
     let pixels = shot.enumerate_pixels();
     pixels
-        .filter(|(_, row, pixel)| rows.contains(row) && is_live(pixel.0))
+        .filter(|(_, row, pixel)| rows.contains(row) && is_color(pixel.0))
         .count()
 }
 

@@ -13,7 +13,7 @@ use std::path::PathBuf;
 use std::time::{Duration, Instant};
 use test_support::browser::{Browser, browser_for_page, canvas_shot, wait_for};
 use trainer::eval::{PixelPair, psnr};
-use trainer::{Method, RenderRequest};
+use trainer::{Method, Projection, RenderRequest};
 use viz::{
     Hub, LiveImage, LivePixels, ModelStatus, ObservationMap, ObservedCell, SceneHint, Server,
     ServerConfig, Status,
@@ -410,6 +410,105 @@ fn local_splats_hide_what_lies_behind_them() {
         };
         assert!(is_right, "{name}: {n_shown} of {n_all} pixels");
     }
+    drop(browser);
+    drop(thread.finish());
+    std::fs::remove_dir_all(&profile).expect("the browser has left its profile");
+}
+
+/// Green channel of the screenshot at a point in the world; `None` until a full picture was
+/// requested.
+#[expect(
+    clippy::cast_possible_truncation,
+    clippy::cast_sign_loss,
+    reason = "pixels of a window"
+)]
+fn green_at(browser: &mut Browser, request: &RenderRequest, point: &Point3<f64>) -> Option<u8> {
+    let shot = canvas_shot(browser);
+    let Projection::Pinhole {
+        focal_px,
+        principal_px,
+    } = request.projection
+    else {
+        return None;
+    };
+    if [shot.width(), shot.height()] != request.size_px {
+        return None;
+    }
+    let in_camera = request.world_from_camera.inverse_transform_point(point);
+    let [x, y] = [0, 1].map(|axis| {
+        (focal_px[axis] * in_camera[axis] / in_camera.z + principal_px[axis]).floor() as u32
+    });
+    shot.get_pixel_checked(x, y).map(|pixel| pixel.0[1])
+}
+
+/// The page cuts a splat where it leaves the crop box, although its center is in the box.
+#[test]
+fn local_splats_are_cut_at_the_sides_of_the_crop_box() {
+    const MIN_SPLAT: u8 = 80;
+    const MAX_BACKGROUND: u8 = 40;
+    let Some(program) = browser_for_page() else {
+        return;
+    };
+    let hub = Hub::new();
+    let rotation = UnitQuaternion::face_towards(&Vector3::y(), &-Vector3::z());
+    hub.set_scene_hint(SceneHint {
+        center_m: [0.0, 0.0, 0.1],
+        radius_m: 1.0,
+        world_from_camera: Transform::from_parts(Point3::new(0.0, -3.0, 0.1).into(), rotation),
+    });
+    hub.set_status(Status {
+        model: ModelStatus {
+            method: "splat".to_owned(),
+            has_chunks: true,
+            ..ModelStatus::default()
+        },
+        ..Status::default()
+    });
+    // One splat whose standard deviation along x is 1 m. The crop box ends at 0.6 m.
+    let mut splats = wall(20_000).filtered(|ix| ix == 0);
+    splats.means.fill([0.0, 0.0, 0.1]);
+    splats.rotations_wxyz.fill([1.0, 0.0, 0.0, 0.0]);
+    splats.log_scales.fill([0.0, -4.0, -1.0]);
+    splats.opacity_logits.fill(4.0);
+    splats.sh.fill([0.0; 3]);
+    splats.sh[0] = [1.5; 3]; // Nearly white.
+    let models: models::Models = vec![("splat", Box::new(splat_model(&splats)))];
+    let thread = ModelThread::start(hub.clone(), models);
+    let server = Server::start(
+        ServerConfig {
+            listen: ([127, 0, 0, 1], 0).into(),
+        },
+        hub,
+    )
+    .expect("a free port");
+    let profile = PathBuf::from(env!("CARGO_TARGET_TMPDIR"))
+        .join(format!("chromium-cut-splat-{}", std::process::id()));
+    let mut browser = Browser::open(&program, &profile, &server.url(), [1280, 760]);
+    wait_for(&mut browser, "a full picture", |browser| {
+        browser.text("picture-text").contains("100 %")
+    });
+    browser.click("toggle-grid");
+    browser.click("toggle-local");
+    wait_for(&mut browser, "all parts of the model", has_all_parts);
+
+    let inside = Point3::new(0.25, 0.0, 0.3);
+    let outside = Point3::new(0.9, 0.0, 0.3);
+    let wait_for_green = |browser: &mut Browser, what: &str, is_right: &dyn Fn([u8; 2]) -> bool| {
+        wait_for(browser, what, |browser| {
+            let request = thread.last_request();
+            let greens = [inside, outside].map(|point| green_at(browser, &request, &point));
+            matches!(greens, [Some(inside), Some(outside)] if is_right([inside, outside]))
+        });
+    };
+    wait_for_green(&mut browser, "the whole splat", &|greens| {
+        greens.iter().all(|green| *green > MIN_SPLAT)
+    });
+    browser.click("toggle-crop");
+    wait_for_green(&mut browser, "the splat in the box", &|greens| {
+        greens[0] > MIN_SPLAT && greens[1] < MAX_BACKGROUND
+    });
+    assert!(has_all_parts(&mut browser), "drawn by the page");
+
     drop(browser);
     drop(thread.finish());
     std::fs::remove_dir_all(&profile).expect("the browser has left its profile");

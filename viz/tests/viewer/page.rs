@@ -461,8 +461,10 @@ fn check_images(browser: &mut Browser) {
     wait_for(browser, "a small image", |browser| {
         browser.evaluate(height).as_u64() == Some(small)
     });
-    // Images in the side panel are small.
-    browser.evaluate("document.querySelector('#live figure').click()");
+    // The keyboard enlarges it, too. Images in the side panel are small.
+    browser.evaluate(
+        "document.querySelector('#live canvas')?.dispatchEvent(new KeyboardEvent('keydown', { key: 'Enter', bubbles: true }))",
+    );
     wait_for(browser, "a larger image", |browser| {
         browser.evaluate(height).as_u64() == Some(480)
     });

@@ -229,6 +229,13 @@ fn press(browser: &mut Browser, key: &str, code: &str) {
     }
 }
 
+/// Rolls the wheel, so that the eye moves back.
+fn roll(browser: &mut Browser) {
+    let event = json!({"type": "mouseWheel", "x": 200, "y": 200, "deltaX": 0, "deltaY": 300});
+    browser.call("Input.dispatchMouseEvent", event);
+    browser.next_frame();
+}
+
 /// Drags from the middle of the view to the right.
 fn drag(browser: &mut Browser) {
     let [left, top, width, height] =
@@ -348,6 +355,12 @@ fn check_first_view(browser: &mut Browser, run: &Run, hub: &Hub) {
         motion.translation.vector.norm() < 1e-6 && motion.rotation.angle() < 1e-6,
         "the view of the user stays"
     );
+    // The zoom would have ended at a distance of 8 m in the first scene, and ends at 37 m in this one.
+    wait_for(browser, "a view from far away", |browser| {
+        roll(browser);
+        run.last_request()
+            .is_some_and(|request| eye(&request).coords.norm() > 15.0)
+    });
     press(browser, "0", "Digit0");
     full_request(browser, run, "an overview of all", |request| {
         is_overview(request, &larger)
@@ -580,11 +593,6 @@ fn check_near_links(browser: &mut Browser, run: &Run, hub: &Hub) {
 fn a_wall_that_stops_the_eye_can_be_cut_away() {
     let Some(mut page) = eye_page::Page::open("cut", true, 2.0) else {
         return;
-    };
-    let roll = |browser: &mut Browser| {
-        let event = json!({"type": "mouseWheel", "x": 200, "y": 200, "deltaX": 0, "deltaY": 300});
-        browser.call("Input.dispatchMouseEvent", event);
-        browser.next_frame();
     };
     wait_for(
         &mut page.browser,
