@@ -6,7 +6,8 @@ set -eu
 cd "$(dirname "$0")/.."
 folder=.deps/qemu
 program=usr/bin/qemu-system-x86_64
-if [ -x "/$program" ] || [ -x "$folder/$program" ] || ! grep -q '^VERSION_CODENAME=bookworm$' /etc/os-release; then
+module=usr/lib/x86_64-linux-gnu/qemu/accel-tcg-x86_64.so
+if [ -x "/$program" ] || [ -x "$folder/$program" ] && [ -e "$folder/$module" ] || ! grep -q '^VERSION_CODENAME=bookworm$' /etc/os-release; then
     exit 0
 fi
 mkdir -p .deps
@@ -16,7 +17,7 @@ trap 'exit 130' HUP INT TERM
 echo "fetch-qemu: unpacking QEMU into $folder, because its packages conflict with the installed qemu-utils"
 mkdir "$download/packages" "$download/root"
 # `apt-get download` verifies the signatures. As root, it would otherwise switch to a user who may not write here.
-if ! (cd "$download/packages" && apt-get download -q -o APT::Sandbox::User=root qemu-system-x86 qemu-system-data seabios ipxe-qemu); then
+if ! (cd "$download/packages" && apt-get download -q -o APT::Sandbox::User=root qemu-system-x86 qemu-system-common qemu-system-data seabios ipxe-qemu); then
     echo "fetch-qemu: apt-get could not download the packages, see its message above" >&2
     exit 1
 fi
