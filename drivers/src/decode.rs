@@ -7,8 +7,8 @@ use std::borrow::Cow;
 use std::io::Cursor;
 
 impl PixelFormat {
-    /// Bytes per row without padding, and number of rows of that length; `None` for compressed
-    /// formats.
+    /// Bytes per row without padding, and number of such rows, including rows that contain only
+    /// chroma. `None` for compressed formats.
     pub(crate) fn raw_size(self, size_px: [u32; 2]) -> Option<[usize; 2]> {
         let [width, height] = size_px.map(|side| side as usize);
         let bytes_per_pixel = match self {
@@ -57,8 +57,9 @@ impl Image {
         }
     }
 
-    /// Decodes a depth image to `[height, width]`, meters along the camera's z axis; 0 if the depth
-    /// is unknown. The largest count means that the depth is out of range; it is also decoded to 0.
+    /// Decodes a depth image to `[height, width]`, meters along the camera's z axis. A value of 0
+    /// means that the depth is unknown. A pixel with the largest count is out of range, and is also
+    /// decoded to 0.
     pub fn decode_depth_m(&self) -> Result<Vec<f32>, Error> {
         let PixelFormat::DepthU16 { meters_per_count } = self.format else {
             return Err(self.wrong_kind("depth"));
@@ -81,8 +82,9 @@ impl Image {
         let Some([row_bytes, n_rows]) = self.format.raw_size(self.size_px) else {
             return Ok(self);
         };
-        // Sizes come from devices and recordings, so products saturate instead of overflowing; the
-        // comparison below then refuses them. The padding of the last row may be missing.
+        // Sizes come from devices and recordings and may be huge. Products therefore saturate
+        // instead of overflowing, and the comparison below refuses an image with such a size. The
+        // padding of the last row may be missing.
         let last_row = bytes_per_line.saturating_mul(n_rows.saturating_sub(1));
         let needed_bytes = last_row.saturating_add(row_bytes);
         if bytes_per_line < row_bytes || self.data.len() < needed_bytes {

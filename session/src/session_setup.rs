@@ -1,4 +1,5 @@
-//! Makes the sessions of a run in its folders: with decision logs, checkpoints and recovery.
+//! Makes the sessions of a run, with their decision logs, checkpoints and recovery. Each session
+//! has one folder.
 
 use crate::checkpoints::{CheckpointOptions, Checkpoints, RunFlags};
 use crate::decisions::{DecisionLog, RunDescription, Settings};
@@ -18,10 +19,12 @@ use std::path::Path;
 use std::sync::Arc;
 use trainer::{ModelSpec, Resumed};
 
-/// Returns the observer of one session of a run, from its limits and the number of sessions.
+/// Makes the observer of one session of a run. The arguments are the limits of the run and the
+/// number of its sessions.
 pub type NewObserver<'a> = &'a dyn Fn(Limits, usize) -> Box<dyn Observer>;
 
-/// Services of the program that runs a plan.
+/// Services that the program provides to the [`RunPlan`](crate::RunPlan) or
+/// [`TrainPlan`](crate::TrainPlan) that it runs.
 #[derive(Clone, Copy)]
 pub struct Services<'a> {
     /// Opens the GPU, also after it was lost.
@@ -49,22 +52,25 @@ pub(crate) struct SessionSetup<'a> {
     pub(crate) data: Option<&'a Path>,
     /// Fraction of the width and height to which images are scaled.
     pub(crate) scale: f64,
-    /// Points from which training starts if no keyframe has depth, and their SHA-256.
+    /// Points from which training starts if no keyframe has depth.
     pub(crate) initial_points: Option<Arc<InitialPoints>>,
+    /// SHA-256 of the initial points.
     pub(crate) points_sha256: Option<String>,
     pub(crate) checkpoints: CheckpointOptions,
     /// Whether the GPU time of each pass is reported at the end.
     pub(crate) profiles: bool,
     /// Flags for the checkpoints.
     pub(crate) run_flags: RunFlags,
-    /// Whether the keyframes of the run exist nowhere else, and viewers wait for pictures.
+    /// Whether the run is live. The keyframes of a live run exist nowhere else, and viewers wait
+    /// for its pictures.
     pub(crate) is_live: bool,
     /// Whether training continues on another device after a GPU failure.
     pub(crate) can_recover: bool,
 }
 
 impl SessionSetup<'_> {
-    /// The session of one model in its folder. It holds no keyframes yet.
+    /// Makes the session of one model, which writes into `folder`. The session holds no keyframes
+    /// yet.
     ///
     /// * `data`: for the report and the next commands.
     /// * `resume_command`: continues from the newest checkpoint.
@@ -93,7 +99,8 @@ impl SessionSetup<'_> {
             .filter(|keyframe| !untrained.iter().any(|other| Arc::ptr_eq(other, keyframe)))
             .cloned()
             .collect();
-        // The log repeats the run, so it also lists the keyframes with which the run begins.
+        // A replay of the log repeats the run, so the log also lists the keyframes with which the
+        // run begins.
         let mut decisions = DecisionLog::create(folder, settings.clone())?;
         for keyframe in &known {
             decisions.restored(from_step.unwrap_or_default(), keyframe);

@@ -131,13 +131,15 @@ impl Rig {
         &self.info
     }
 
-    /// Lets the rig run as fast as its samples are taken. Simulated time zero has the stamp 0.
+    /// Lets the rig run as fast as the caller takes its samples. Simulated time zero has the stamp
+    /// 0.
     pub fn into_lockstep(self) -> Lockstep {
         Lockstep::new(self.engine, self.info)
     }
 
-    /// Lets the rig run as fast as its devices are read. Its arm moves by commands within the given
-    /// limits, which are in the order of the joint readings. Simulated time zero has the stamp 0.
+    /// Lets the rig run as fast as its devices are read. The caller moves its arm with commands. It
+    /// moves only within `limits`, which are in the order of the joint readings. Simulated time
+    /// zero has the stamp 0.
     pub fn into_commanded(self, limits: &[MotionLimits]) -> Result<CommandedRig, Error> {
         CommandedRig::new(self.engine, self.info, limits)
     }
@@ -147,8 +149,9 @@ impl Rig {
         self.engine.reported_joints()
     }
 
-    /// Returns the cameras, which run in real time on an arm that emulated motors move. Simulated
-    /// time zero is the time of this call, which is `start` on the clock of the motors.
+    /// Lets the rig run in real time, with an arm that follows emulated motors. Returns its
+    /// cameras. Simulated time zero is the time of this call, which is `start` on the clock of the
+    /// motors.
     pub fn into_motorized(
         mut self,
         motors: MotorHistory,

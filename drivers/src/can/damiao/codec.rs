@@ -15,7 +15,7 @@ const REGISTER_ID: u32 = 0x7FF;
 const TIMEOUT_TICK_SECS: f64 = 50e-6;
 /// Value of [`Register::ControlMode`] for MIT mode.
 pub const MIT_MODE: u32 = 1;
-/// Name of messages from a motor in errors.
+/// Name that errors use for feedback.
 const FEEDBACK: &str = "feedback of a Damiao motor";
 const REGISTER: &str = "register message of a Damiao motor";
 
@@ -39,7 +39,7 @@ pub enum Model {
 }
 
 impl Model {
-    /// Factory ranges of its raw values.
+    /// Ranges of the raw values of a motor with factory settings.
     pub const fn limits(self) -> Limits {
         match self {
             Self::Dm4310 => Limits::of(12.5, 30.0, 10.0),
@@ -138,11 +138,11 @@ pub enum Register {
     ControlMode = 10,
     /// Firmware version.
     SoftwareVersion = 14,
-    /// `PMAX`: maximum absolute position of its raw values, rad.
+    /// `PMAX`: largest absolute position that raw values can represent, rad.
     PositionLimit = 21,
-    /// `VMAX`: maximum absolute velocity of its raw values, rad/s.
+    /// `VMAX`: largest absolute velocity that raw values can represent, rad/s.
     VelocityLimit = 22,
-    /// `TMAX`: maximum absolute torque of its raw values, N m.
+    /// `TMAX`: largest absolute torque that raw values can represent, N m.
     TorqueLimit = 23,
     /// Bit rate, as a numeric code.
     BitRate = 35,
@@ -192,7 +192,8 @@ pub struct RegisterMessage {
 pub enum Access {
     /// Reads a register; the answer is [`Access::Reported`].
     Read(Register),
-    /// Writes a register until power is lost; the answer repeats it.
+    /// Writes a register. The motor keeps the value until it loses power. Its answer repeats the
+    /// message.
     Write(Register, Value),
     /// The answer to [`Access::Read`].
     Reported(Register, Value),
@@ -271,8 +272,8 @@ pub fn encode_state_command(motor: u16, state_command: StateCommand) -> Result<F
     )
 }
 
-/// Encodes a register message to a motor, or, with `answer_id`, the answer of a motor with this
-/// feedback ID.
+/// Encodes a register message to a motor. With `answer_id`, encodes the answer of a motor that has
+/// this feedback ID.
 pub fn encode_register(
     message: &RegisterMessage,
     answer_id: Option<Id>,
@@ -298,7 +299,7 @@ pub fn encode_register(
 pub fn decode_register(frame: &Frame) -> Result<RegisterMessage, CanError> {
     let [low, high, code, number, a, b, c, d] = eight_bytes(frame, REGISTER, false)?;
     // The kind of access is decoded first, because feedback has the same CAN ID. In feedback, the
-    // byte of the register is part of the velocity.
+    // byte at the position of the register number is part of the velocity.
     let access = match code {
         0x33 => {
             let register = decode_register_number(number)?;

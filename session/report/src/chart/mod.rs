@@ -144,7 +144,7 @@ impl Chart {
         let mut shapes = Vec::new();
         self.draw_grid(&plot, &mut shapes);
         self.draw_thresholds(&plot, &mut shapes);
-        // All bands come before all lines: a band must not hide the line of another one.
+        // All bands are drawn before all lines, so that no band hides a line of the chart.
         for (ix, line) in self.lines.iter().enumerate() {
             draw_band(line, color_of(ix), &plot, &mut shapes);
         }
@@ -158,8 +158,8 @@ impl Chart {
     }
 
     fn draw_grid(&self, plot: &Plot, shapes: &mut Vec<VectorShape>) {
-        // Where the last label ends. A label that would overlap it is left out, but its grid line
-        // is drawn.
+        // The x position at which the last drawn label ends. A label that would start before it is
+        // left out, but the grid line of this label is drawn.
         let mut free_from = f64::MIN;
         for (value, label) in &plot.x.ticks {
             let x = plot.x(*value);
@@ -366,8 +366,8 @@ fn draw_line(line: &Line, ix: usize, plot: &Plot, shapes: &mut Vec<VectorShape>)
 
 /// Draws a dot whose shape identifies the line: disc, square, triangle, diamond.
 fn draw_dot([x, y]: [f64; 2], line_ix: usize, shapes: &mut Vec<VectorShape>) {
-    // Corners, direction of the first one as a fraction of a turn, radius. The shapes have about
-    // the same area; 24 corners look like a circle.
+    // Number of corners, direction of the first corner as a fraction of a turn, and radius. The
+    // shapes have about the same area; 24 corners look like a circle.
     let (n_corners, first_angle_frac, radius) = [
         (24, 0.0, 3.6),
         (4, 0.125, 4.6),
@@ -407,7 +407,8 @@ fn text(at: [f64; 2], text: &str, color: Color, anchor: Anchor) -> VectorShape {
     }
 }
 
-/// Wraps text into rows of at most `max_chars`, after spaces or, for longer words, anywhere.
+/// Wraps text into rows of at most `max_chars`. Rows break after spaces; a word that is longer than
+/// a row breaks anywhere.
 fn wrap(text: &str, max_chars: usize) -> Vec<String> {
     let mut rows = vec![String::new()];
     for word in text.split_inclusive(' ') {
@@ -420,8 +421,8 @@ fn wrap(text: &str, max_chars: usize) -> Vec<String> {
                 rows.push(String::new());
                 continue;
             }
-            // One more character than the maximum is taken, because the last one of a word is its
-            // space, which is removed at the end of a row.
+            // A word ends with a space, which is removed at the end of a row. A row may therefore
+            // have one character more than the maximum here.
             row.extend(left.drain(..left.len().min(max_chars + 1 - n_used.min(max_chars))));
         }
     }
