@@ -28,7 +28,7 @@ const TOUCH_ONLY: &str = "
     window.matchMedia = (query) => !query.includes('pointer') ? answer(query) : {
         matches: query.includes('coarse'), addEventListener() {}, removeEventListener() {},
     };";
-/// Everything on the page that assistive technology could not use. As the rules of axe-core: names,
+/// Everything on the page that assistive technology could not use. As in common checkers: names,
 /// unique ids, valid references, landmarks, headings in order, lists, reachable controls.
 const PROBLEMS: &str = r#"(() => {
     const found = [];
