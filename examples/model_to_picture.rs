@@ -1,8 +1,8 @@
 //! Loads a saved model of any method, and renders it to a PNG file.
 //!
-//! The virtual camera looks at the center of the model from outside. Without an argument, the program
-//! loads the model that the example `keyframes_to_model` saves. The argument can be the folder of a
-//! saved model, or a file of splats.
+//! The virtual camera looks at the center of the model from outside. Without an argument, the
+//! program loads the model that the example `keyframes_to_model` saves. The argument can be the
+//! folder of a saved model, or a file of splats.
 //!
 //! ```text
 //! cargo run --release --example model_to_picture

@@ -1,9 +1,9 @@
 //! Computes the pose of a camera on an arm at the middle of an exposure, and makes a keyframe.
 //!
-//! A real robot provides the same inputs: the URDF of the arm, stamped joint states, the pose of the
-//! camera on the flange (hand-eye), the intrinsics of the camera, and an image with the time of its
-//! exposure. `capture::Join` makes keyframes from all cameras of a rig, and decides which images to
-//! accept.
+//! A real robot provides the same inputs: the URDF of the arm, stamped joint states, the pose of
+//! the camera on the flange (hand-eye), the intrinsics of the camera, and an image with the time of
+//! its exposure. `capture::Join` makes keyframes from all cameras of a rig, and decides which
+//! images to accept.
 //!
 //! ```text
 //! cargo run --example pose_to_keyframe
