@@ -17,7 +17,7 @@ use std::sync::Arc;
 use std::time::Duration;
 
 const SIZE_PX: [u32; 2] = [320, 240];
-/// Time between two images: 20 images per second.
+/// Time between two images, for a rate of 20 images per second.
 const PERIOD: Duration = Duration::from_millis(50);
 const N_IMAGES: usize = 10;
 
@@ -100,7 +100,7 @@ fn main() -> anyhow::Result<()> {
     Ok(())
 }
 
-/// A gradient, `[height, width, 3]`, moved to the left.
+/// The pixels of a gradient that has moved to the left, in the shape `[height, width, 3]`.
 fn pattern_rgb(shift_px: u32) -> Vec<u8> {
     let [width, height] = SIZE_PX;
     let pixels = (0..height).flat_map(|y| (0..width).map(move |x| [x, y]));

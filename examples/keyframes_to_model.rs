@@ -52,13 +52,13 @@ fn main() -> anyhow::Result<()> {
     Ok(())
 }
 
-/// A ball on a floor, seen from a part of a ring around it.
+/// Keyframes of a ball on a floor. The cameras are on a part of a ring around the ball.
 fn synthetic_keyframes() -> Vec<Arc<Keyframe>> {
     let center = Point3::origin();
     scenes::ring(&[scenes::ball(center), scenes::floor()], center, 18)
 }
 
-/// The images of a dataset folder, decoded and undistorted.
+/// Keyframes of a dataset folder. Their images are decoded and undistorted.
 fn dataset_keyframes(folder: &Path) -> anyhow::Result<Vec<Arc<Keyframe>>> {
     let dataset = drivers::dataset::read(folder)?;
     let loaded = capture::dataset::load(&dataset, None, 1.0, &|_n_read| {})?;

@@ -1,8 +1,8 @@
 //! Loads a saved model of any method, and renders it to a PNG file.
 //!
-//! The virtual camera looks at the center of the model from outside. Without an argument, the model
-//! is the model that the example `keyframes_to_model` saves. With an argument, it is a folder of a
-//! saved model, or a file of splats.
+//! The virtual camera looks at the center of the model from outside. Without an argument, the
+//! program loads the model that the example `keyframes_to_model` saves. The argument can be the
+//! folder of a saved model, or a file of splats.
 //!
 //! ```text
 //! cargo run --release --example model_to_picture
@@ -21,7 +21,7 @@ use trainer::{LoadedModel, Projection, RenderRequest};
 const DEFAULT_MODEL: &str = "target/example-model";
 const PICTURE: &str = "target/example.png";
 const SIZE_PX: [u32; 2] = [640, 480];
-/// Focal length of the virtual camera, pixels: a horizontal field of view of 65 degrees.
+/// Focal length of the virtual camera in pixels. The horizontal field of view is 65 degrees.
 const FOCAL_PX: f64 = 500.0;
 
 fn main() -> anyhow::Result<()> {
@@ -57,7 +57,7 @@ fn main() -> anyhow::Result<()> {
         depth: false,
     })?;
 
-    // Alpha is coverage. The colors already include the background, so the file is opaque.
+    // The colors already include the background. The saved picture is opaque, so it needs no alpha.
     let rgb: Vec<u8> = picture
         .rgba_srgb
         .as_chunks::<4>()

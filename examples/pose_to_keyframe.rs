@@ -1,9 +1,9 @@
 //! Computes the pose of a camera on an arm at the middle of an exposure, and makes a keyframe.
 //!
-//! The inputs are the inputs that a real robot provides: the URDF of the arm, stamped joint states,
-//! the pose of the camera on the flange (hand-eye), the intrinsics of the camera, and an image with
-//! the time of its exposure. `capture::Join` does the same for all cameras of a rig, and decides
-//! which images to accept.
+//! A real robot provides the same inputs: the URDF of the arm, stamped joint states, the pose of
+//! the camera on the flange (hand-eye), the intrinsics of the camera, and an image with the time of
+//! its exposure. `capture::Join` makes keyframes from all cameras of a rig, and decides which
+//! images to accept.
 //!
 //! ```text
 //! cargo run --example pose_to_keyframe
@@ -27,7 +27,7 @@ const URDF: &str = r#"<robot name="two-joints">
     <limit lower="-2" upper="2" effort="50" velocity="2"/>
   </joint>
 </robot>"#;
-/// Joint states that are farther apart in time than this are not interpolated.
+/// Maximum time between two joint states for an interpolation between them.
 const MAX_GAP: Duration = Duration::from_millis(50);
 const EXPOSURE_START: Stamp = Stamp(43_000_000);
 const EXPOSURE_SECS: f64 = 0.008;
@@ -50,7 +50,8 @@ fn main() -> anyhow::Result<()> {
     let world_from_camera = world_from_base * base_from_flange * flange_from_camera;
     let flange_twist = chain.tip_twist(&state.position, &state.velocity)?;
 
-    // A keyframe holds the undistorted image, and the pinhole camera of this image.
+    // A keyframe contains an undistorted image, and the intrinsics of the pinhole camera that would
+    // have taken this image.
     let intrinsics = intrinsics();
     let pinhole = intrinsics.undistorted();
     let rgba_srgb = Undistortion::new(&intrinsics).apply_rgb(&image_rgb(intrinsics.size_px))?;
@@ -81,7 +82,7 @@ fn main() -> anyhow::Result<()> {
     Ok(())
 }
 
-/// The reading of an arm whose shoulder rotates at 0.5 rad/s.
+/// The joint state of an arm whose shoulder joint rotates at 0.5 rad/s.
 fn joint_state(stamp: Stamp) -> JointState {
     JointState {
         stamp,
@@ -91,8 +92,8 @@ fn joint_state(stamp: Stamp) -> JointState {
     }
 }
 
-/// `flange_from_camera`: the camera is 5 cm in front of the flange, and looks along the x axis of
-/// the flange. The camera's own axes are x right, y down, z forward.
+/// The pose `flange_from_camera`. The camera is 5 cm in front of the flange, and looks along the x
+/// axis of the flange. The camera's own axes are x right, y down, z forward.
 fn hand_eye() -> Transform {
     transform::from_xyz_xyzw([0.05, 0.0, 0.0, -0.5, 0.5, -0.5, 0.5])
 }
@@ -107,7 +108,7 @@ fn intrinsics() -> Intrinsics {
     }
 }
 
-/// A gray image, `[height, width, 3]`.
+/// The pixels of a gray image, in the shape `[height, width, 3]`.
 fn image_rgb([width, height]: [u32; 2]) -> Vec<u8> {
     vec![128; 3 * width as usize * height as usize]
 }
