@@ -14,8 +14,8 @@ use std::time::{Duration, Instant};
 
 /// Time between two samples.
 const SAMPLE_PERIOD: Duration = Duration::from_secs(1);
-/// Maximum number of time buckets. A run of an hour then has one per minute, whose medians are not
-/// affected by single slow pictures.
+/// Maximum number of time buckets. A run of an hour then has one bucket per minute. The median of
+/// such a bucket is not affected by single slow pictures.
 const MAX_BUCKETS: usize = 60;
 /// Minimum duration of a run for trends, measured at its last sample. In a shorter run, the second
 /// half is too short for a rate per hour. The limit is slightly below two minutes, because the last

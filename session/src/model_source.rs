@@ -77,7 +77,7 @@ fn modified(file: &Path) -> Option<u64> {
     Some(time.duration_since(UNIX_EPOCH).ok()?.as_secs())
 }
 
-/// Name without parents, also of `.`.
+/// Name of a path without its parents. The path `.` gets the name of the current folder.
 fn name_of(path: &Path) -> String {
     let full = path.canonicalize().unwrap_or_else(|_| path.to_owned());
     let name = full.file_name().unwrap_or(path.as_os_str());
