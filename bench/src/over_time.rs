@@ -228,8 +228,8 @@ impl Quantity {
 }
 
 impl OverTime {
-    /// Rows of a table: a quantity, and its median and change in each of the runs. Empty if all
-    /// runs are short.
+    /// Rows of a table, each with a quantity and its median and change in each of the runs. There
+    /// are no rows if all runs are short.
     pub(crate) fn rows(runs: &[&Self]) -> Vec<Vec<String>> {
         let mut rows = Vec::new();
         for quantity in &QUANTITIES {

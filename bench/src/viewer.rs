@@ -45,7 +45,8 @@ pub struct ViewerOptions {
     /// All directions around a point in the scene (equirectangular) instead of a pinhole view from
     /// outside.
     pub is_panorama: bool,
-    /// Minimum time between two requests; zero: each request follows the previous picture at once.
+    /// Minimum time between two requests. If it is zero, each request follows the previous picture
+    /// at once.
     pub period: Duration,
 }
 
@@ -269,7 +270,7 @@ impl Client {
                 if !self.pictures.lock().is_empty() || self.started.elapsed() > MAX_START {
                     log::warn!("a viewer received no picture: {message}");
                 }
-                // An immediate request would get the same answer.
+                // An immediate request would get the same error.
                 std::thread::sleep(Duration::from_millis(200));
                 self.request_picture()?;
             }
@@ -426,8 +427,8 @@ impl Client {
         Ok(())
     }
 
-    /// Sends a frame. The protocol requires a mask; it is zero, because there is no proxy to
-    /// protect on loopback.
+    /// Sends a frame. The protocol requires a mask to protect proxies. The mask is zero, because
+    /// there is no proxy on loopback.
     fn send(&mut self, opcode: u8, contents: &[u8]) -> Result<()> {
         let mut frame = vec![0x80 | opcode];
         match u8::try_from(contents.len()) {

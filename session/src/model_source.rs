@@ -13,7 +13,7 @@ use viz::{ModelSource, SourceKind};
 ///
 /// * `paths`: folders or files of the models, at least one.
 /// * `kinds`: the kind of each one.
-/// * `model_from_page`: the page is z up, the models may not be.
+/// * `model_from_page`: pose of the page's world, which is z up, in the world of the models.
 pub(crate) fn of_saved(
     paths: &[PathBuf],
     kinds: &[ModelKind],

@@ -129,7 +129,7 @@ impl Persistence {
 
     /// Keeps an evicted keyframe, without pixels, as long as the newest checkpoint may contain it.
     pub(super) fn evict(&mut self, keyframe: &Keyframe) {
-        // Without pixels, because evicting keyframes is what bounds the memory of a long run.
+        // The keyframe is kept without pixels, because eviction must free memory in a long run.
         if self.recovery.is_some() {
             self.evicted.push(Arc::new(without_pixels(keyframe)));
         }
