@@ -7,10 +7,10 @@ use std::collections::BTreeMap;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-/// A client gets keyframes and images this long after it has joined, or after its hello. Before
-/// that, the server does not know which of them the client wants, and at which size. With a shorter
-/// time, pages on slow links would first get complete lists and large images. With a longer time,
-/// clients that send no hello would wait longer.
+/// A client gets keyframes and images after its hello, or at the latest this long after it has
+/// joined. Before that, the server does not know which of them the client wants, and at which size.
+/// With a shorter time, pages on slow links would first get complete lists and large images. With a
+/// longer time, clients that send no hello would wait longer.
 const HELLO_GRACE: Duration = Duration::from_millis(500);
 
 /// What a client receives.

@@ -13,8 +13,8 @@ const MIN_GROWTH: f64 = 1.2;
 /// The extent that viewers have.
 #[derive(Default)]
 pub(super) struct GrowingScene {
-    /// The published extent. It contains the view of the first keyframe, because this keyframe may
-    /// be evicted later.
+    /// The published extent and view. Later extents keep the view of the first keyframe, because
+    /// this keyframe may be evicted later.
     published: Option<SceneView>,
 }
 
