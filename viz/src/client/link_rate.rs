@@ -9,8 +9,9 @@ const PART_TIME: f64 = 0.02;
 /// Data in the kernel's buffer, as transfer time in seconds. A shorter buffer runs empty on fast
 /// links, before this process is scheduled again.
 const BUFFER_TIME: f64 = 0.04;
-/// Limits of the size of a part, bytes. Larger parts and buffers do not make fast connections
-/// faster. Smaller ones would make the headers and calls cost more than the data.
+/// Limits of the size of a part, bytes; the next constant limits the buffer. Larger parts and
+/// buffers do not make fast connections faster. Smaller ones would make the headers and calls cost
+/// more than the data.
 const PART_BYTES: std::ops::RangeInclusive<f64> = 4096.0..=65_536.0;
 const BUFFER_BYTES: std::ops::RangeInclusive<f64> = 8192.0..=65_536.0;
 /// Rate before the first measurement: an ordinary wireless link.

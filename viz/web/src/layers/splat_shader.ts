@@ -107,7 +107,8 @@ ${TINT}
     float yy = dot(rowY, rowY) + LOW_PASS_PX2;
 
     if (steps.w == 2.0) {
-      // The low-pass enlarges the splat; the product of opacity and area is kept (Yu et al. 2024, equation 12).
+      // The low-pass filter enlarges the splat. The opacity is reduced so that the product of
+      // opacity and area stays the same (Yu et al. 2024, equation 12).
       vec3 area = cross(rowX, rowY);
       alpha *= sqrt(dot(area, area) / (xx * yy - xy * xy));
       if (alpha < MIN_ALPHA) return;

@@ -1,4 +1,4 @@
-// What the view says while there is no picture.
+// The text in the view while there is no picture.
 
 import type { ConnectionState } from "../connection/connection";
 import type { Status } from "../connection/protocol";
