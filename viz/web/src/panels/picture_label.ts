@@ -16,9 +16,9 @@ const OLD_MILLIS = 1000;
 export type DrawnHeader = Pick<PictureHeader, "id" | "method" | "step" | "scale" | "size_px" | "sent_millis">;
 
 /**
- * `current`: the picture shows the wanted view and model. `waiting`: it shows another view. `old`:
- * it has shown another view for more than a second, or it shows another model.
- */
+ * `current`: the picture shows the wanted view and model. `waiting`: the view has changed since, or
+ * there is no picture. `old`: a complete picture of the wanted view has been missing for more than
+ * a second, or the picture shows another model. /
 export type PictureState = "current" | "waiting" | "old";
 
 export interface PictureStatus {

@@ -55,9 +55,8 @@ export class Skeleton {
   }
 
   /**
-   * To be called when the shown picture is out of date until the next one arrives, after a
-   * reconnection or a lost drawing.
-   */
+   * To be called after a reconnection, and after the browser has discarded the drawing. The shown
+   * picture is then out of date until the next one arrives. /
   awaitPicture(): void {
     this.isAwaiting = this.shown.hasPicture;
     this.show();

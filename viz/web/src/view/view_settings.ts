@@ -45,7 +45,7 @@ export class ViewSettings {
       if (this.video.isRecording) this.video.cancel();
       else void this.record();
     });
-    // A user who takes over ends the playback.
+    // The playback ends when the user moves the view.
     element("canvas").addEventListener("pointerdown", () => this.edit(() => this.path.stop()));
     this.edit(() => undefined);
   }
