@@ -124,8 +124,9 @@ pub struct Bucket {
     pub psnr: Option<f64>,
     /// Training steps per second.
     pub steps_per_sec: f64,
-    /// Resident memory without the picture timings that the viewers of a benchmark store and, on a
-    /// software adapter, without the buffers of training; `None` if the system does not report it.
+    /// Resident memory without the picture timings that the viewers of a benchmark store. On a
+    /// software adapter, it also excludes the buffers of training. `None` if the system does not
+    /// report the resident memory.
     pub host_mb: Option<f64>,
 }
 

@@ -363,7 +363,7 @@ impl Client {
         // A panorama is taken near the center, a pinhole view from outside and above.
         let distance_m = if is_panorama { 0.2 } else { 1.5 } * self.radius_m;
         let offset = Vector3::new(angle.cos(), angle.sin(), 0.7) * distance_m;
-        // The y axis of `face_towards` points up, but that of a camera points down.
+        // The y axis of `face_towards` points up, but the y axis of a camera points down.
         let world_from_camera =
             Transform::face_towards(&(self.center_m + offset), &self.center_m, &-Vector3::z());
         let projection = if is_panorama {

@@ -79,8 +79,9 @@ impl DataOptions {
         rig.into_iter().chain(scale).flatten().collect()
     }
 
-    /// Fills in missing flags from those of an earlier run, `before`. A number must be the same as
-    /// before. A path may differ, because the file may have moved; its contents are compared later.
+    /// Fills in missing flags from the flags of an earlier run, `before`. A number must be the same
+    /// as before. A path may differ, because the file may have moved. The contents of the file are
+    /// compared later.
     ///
     /// `subject`: name of the earlier result in messages.
     pub fn completed_with(

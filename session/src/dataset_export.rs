@@ -42,8 +42,8 @@ pub struct Written {
     pub n_images: usize,
     /// Number of depth images.
     pub n_depth: usize,
-    /// Number of depth images that were left out, because their intrinsics differ from those of the
-    /// color image. The format cannot express this.
+    /// Number of depth images that were left out, because their intrinsics differ from the
+    /// intrinsics of the color image. The format cannot express this.
     pub n_depth_skipped: usize,
 }
 

@@ -18,8 +18,8 @@ use std::sync::mpsc::{SyncSender, sync_channel};
 use std::thread::JoinHandle;
 use trainer::ModelOptions;
 
-/// Version of the format. Logs of other versions are rejected: a decision that this program does
-/// not know would be missing in the replay.
+/// Version of the format. Logs of other versions are rejected, because a decision that this program
+/// does not know would be missing in the replay.
 const VERSION: u64 = 5;
 /// Name of the log in the run folder.
 const FILE: &str = "decisions.jsonl";

@@ -39,7 +39,7 @@ fn meshes(robot: &Robot, urdf_folder: &Path) -> Vec<RobotMesh> {
         _ => None,
     });
     for file in files {
-        // Several links often share a mesh, such as that of a joint module.
+        // Several links often share a mesh, such as the mesh of a joint module.
         if meshes.iter().any(|mesh| mesh.file == *file) {
             continue;
         }
@@ -70,7 +70,7 @@ fn read(file: &str, urdf_folder: &Path, left: Budget) -> Result<RobotMesh, Strin
         return Err(format!("no such file; tried {}", tried.join(", ")));
     };
     let shown = path.display();
-    // The budget of one file, but not more than what is left of the budget of all files.
+    // The budget of one file, but not more than the rest of the budget of all files.
     let max_bytes = Budget::MESH.max_bytes.min(left.max_bytes);
     let bytes = files::read(
         path,

@@ -134,7 +134,7 @@ fn first_view(
         .map(|camera| camera.world_from_camera)
         .collect();
     let in_page = bounds.map(|bounds| {
-        // The frame of the page may differ from that of the model.
+        // The frame of the page may differ from the frame of the model.
         let center = model_from_page.inverse() * Point3::from(bounds.center_m);
         Bounds {
             center_m: center.coords.into(),

@@ -372,7 +372,7 @@ impl AvailableData {
         let gains = ParamSet::IMAGE_GAINS;
         let poses = ParamSet::IMAGE_POSES;
         let with_scene = match self {
-            // Poses that drift have an error of their own in each image.
+            // Poses that drift have a separate error in each image.
             Self { drifts: true, .. } => vec![gains, poses],
             Self { depth: true, .. } => vec![gains],
             Self {

@@ -38,7 +38,7 @@ pub struct Findings<'a> {
     pub n_lost: u64,
 }
 
-/// Judges a result. The grade is that of the best model.
+/// Judges a result. The best model determines the grade.
 #[must_use]
 pub fn verdict(findings: &Findings<'_>) -> Verdict {
     let (grade, mut text) = judge_scores(findings);

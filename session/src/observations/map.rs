@@ -393,8 +393,8 @@ mod tests {
             at(&repeated, [0.0, 2.0, 0.0]).map(|cell| cell.sigma_m),
             Some(f64::INFINITY)
         );
-        // Two rays at right angles: the covariance is that of one pixel in both directions of their
-        // plane.
+        // With two rays at right angles, the standard deviation is one pixel in both directions of
+        // their plane.
         let across = map_of(&[
             view(0, [-2.0, 0.0, 0.0], false),
             view(1, [2.0, 0.0, 0.0], false),

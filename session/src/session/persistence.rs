@@ -333,8 +333,8 @@ impl Persistence {
     }
 }
 
-/// The newest checkpoint: one that this run has written, or else the one that the run was resumed
-/// from. `None` if there is none.
+/// The newest checkpoint. If this run has not written one, this is the checkpoint from which the
+/// run was resumed. `None` if there is no checkpoint.
 fn newest_checkpoint(
     checkpoints: Option<&mut Checkpoints>,
     resumed_folder: Option<&Path>,

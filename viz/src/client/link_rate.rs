@@ -26,7 +26,7 @@ const LOCAL_BYTES_PER_SEC: f64 = 3e7;
 /// Shorter sends do not measure the link, but the memory of this computer.
 const MIN_SEND_SECS: f64 = 2e-4;
 /// Parts of less than half the usual size measure the link only if they take at least this long.
-/// Otherwise, the time is mostly that of the call.
+/// Otherwise, the time is mostly the overhead of the call.
 const MIN_SHORT_SEND_SECS: f64 = 5e-3;
 /// Maximum factor by which the estimate increases at once. Decreases are followed quickly. If the
 /// estimate is too high, data waits in buffers. If it is too low, parts are only smaller than

@@ -43,7 +43,7 @@ use tokio::sync::{mpsc, watch};
 /// when there is room, so that a client that sends without reading cannot fill the memory.
 const MAX_REPLIES: usize = 64;
 /// A client that leaves [`MAX_REPLIES`] replies unread for this long is disconnected. With less
-/// time, a slow link that is busy with a picture would be taken for such a client.
+/// time, a client with a slow link that is busy with a picture would also be disconnected.
 const MAX_REPLY_WAIT: Duration = Duration::from_secs(2);
 /// After a goodbye, the connection stays open until the client closes it, but at most for this
 /// time. If it were closed while data from the client is unread, the kernel would reset the

@@ -20,7 +20,7 @@ const KEYFRAME_CHANGES: &str = "keyframe_changes";
 const PARTS: &str = "parts";
 const HEARTBEAT: &str = "heartbeat";
 
-/// Capabilities that change what the server sends without being asked.
+/// Capabilities that change the messages that the server sends without a request.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub(crate) struct Negotiated {
     /// The client applies changes of the keyframe list, so the list is not sent in full each time.

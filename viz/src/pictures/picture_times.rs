@@ -45,7 +45,7 @@ pub struct ShownPicture {
     pub method: Option<String>,
     /// The keyframes that the client had not shown in this view of this model before, counted from
     /// the start of the run. Keyframes of pictures that the client has not reported belong to the
-    /// next picture that it reports, unless the client has not waited for them (see [`MAX_WAIT`]).
+    /// next picture that it reports, unless the client has not waited for them (see `MAX_WAIT`).
     pub new_keyframes: Range<u64>,
     /// When the server began to send it.
     pub sent_at: Instant,
@@ -152,8 +152,8 @@ impl Stream {
         });
     }
 
-    /// Removes a picture and those that were sent before it. Their new keyframes become those of
-    /// the picture.
+    /// Removes a picture and the pictures that were sent before it. The new keyframes of these
+    /// earlier pictures are added to the new keyframes of the picture.
     fn take(&mut self, id: u64) -> Option<(SentPicture, Range<u64>)> {
         // The search begins at the end, because a client may use a number again.
         let ix = self

@@ -52,7 +52,8 @@ pub(crate) enum NextChunk {
 }
 
 impl ChunkSender {
-    /// The next message, which counts as sent. `viewpoint` is that of the client's newest picture.
+    /// The next message, which counts as sent. `viewpoint` is the viewpoint of the client's newest
+    /// picture.
     pub(crate) fn next(
         &mut self,
         list: &ChunkList,
@@ -230,7 +231,8 @@ fn is_hidden(list: &ChunkList, viewpoint: &Viewpoint, chunk: &VersionedChunk) ->
     is_hidden
 }
 
-/// The chunk that is needed first for a view; without a view, the one that has changed most.
+/// The chunk that is needed first for a view. Without a view, this is the chunk that has changed
+/// most.
 fn first_needed(
     list: &ChunkList,
     viewpoint: Option<&Viewpoint>,

@@ -404,7 +404,8 @@ mod tests {
             updates.next(subscriptions, true, *now, true)
         }
 
-        /// Receives what is sent within a time. Like the page, drops points without a keyframe.
+        /// Receives the messages that are sent within a time. Like the page, drops points without a
+        /// keyframe.
         fn receive(&mut self, millis: u64) {
             for _ in 0..millis / 10 {
                 while let NextUpdate::Short(message) | NextUpdate::Long(message) = self.next() {

@@ -128,8 +128,8 @@ impl KeyframeLog {
             // The pose is compared with the one in the log, not with the one in the last list, so
             // that slow drift adds up until it is noticeable.
             if before.is_none_or(|entry| has_changed(&entry.keyframe, keyframe)) {
-                // Every change has a version of its own, so that a long list can be interrupted
-                // after any keyframe.
+                // Every change has a separate version, so that a long list can be interrupted after
+                // any keyframe.
                 self.version += 1;
                 let added = before.map_or(self.version, |entry| entry.added);
                 let entry = Entry {

@@ -220,7 +220,7 @@ fn images_to_encode(
     wanted.sort_by_key(|(key, _)| encodings.get(key).map(|encoding| encoding.at));
     let to_encode = wanted.into_iter().filter_map(|(key, period)| {
         let image = live_images.get(&key.0)?;
-        // Every image that is set has an address of its own. The entry keeps its image, so the
+        // Every image that is set has its own address in memory. The entry keeps its image, so the
         // address cannot be used again.
         let is_new = encodings.get(&key).is_none_or(|encoding| {
             !encoding.is_running

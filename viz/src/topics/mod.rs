@@ -103,7 +103,7 @@ pub(crate) enum Priority {
 /// The half of a topic that encodes new data once for all clients. It runs on the server's thread,
 /// outside the tasks of clients.
 pub(crate) trait Topic: Send + Sync {
-    /// Encodes what is new and due, if a client receives it. Work that takes more than a
+    /// Encodes data that are new and due, if a client receives them. Work that takes more than a
     /// millisecond belongs on a thread for blocking tasks.
     fn encode(&self, context: &EncodeContext<'_>);
 
@@ -153,7 +153,7 @@ impl EncodeContext<'_> {
     }
 }
 
-/// What the feeds of a client know about it.
+/// Data about a client that its feeds need.
 pub(crate) struct ClientState<'a> {
     pub(crate) subscriptions: &'a Subscriptions,
     /// Whether it receives only the changes of the keyframe list.

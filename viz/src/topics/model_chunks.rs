@@ -41,7 +41,7 @@ type ModelLists = BTreeMap<Arc<str>, Arc<ChunkList>>;
 /// Pose of the models in the world of the clients; the identity if `None`.
 type WorldFromModel = Option<Transform>;
 
-/// The topic. Chunks are encoded for each client, because each has a budget of its own.
+/// The topic. Chunks are encoded for each client, because each client has its own budget.
 struct ChunkTopic {
     lists: Mutex<watch::Receiver<ModelLists>>,
 }

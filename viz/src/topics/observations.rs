@@ -135,7 +135,7 @@ impl PackedObservations {
             cell_m: self.cell_m,
             n_cells: self.n_cells,
             n_keyframes: self.n_keyframes,
-            // Each server has a clock of its own, so this cannot be packed in advance.
+            // Each server has its own clock, so this time cannot be packed in advance.
             newest_millis: self.newest_at.map(|at| clock.millis(at)),
             min_age_secs: MIN_AGE_SECS,
             min_sigma_m: MIN_SIGMA_M,

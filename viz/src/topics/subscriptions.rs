@@ -10,8 +10,8 @@ use std::time::Duration;
 pub(crate) const LIVE_IMAGES: &str = "live_images";
 /// Topic whose subscriptions choose a model and a budget.
 pub(crate) const MODEL_CHUNKS: &str = "model_chunks";
-/// Maximum number of cameras with a subscription of their own. A client can name cameras that do
-/// not exist, so the list needs a limit.
+/// Maximum number of cameras with a separate subscription. A client can name cameras that do not
+/// exist, so the list needs a limit.
 const MAX_CAMERAS: usize = 64;
 /// Maximum length of a camera name, bytes.
 const MAX_NAME_BYTES: usize = 256;
@@ -38,7 +38,7 @@ pub(crate) struct Subscriptions {
     topics: BTreeMap<&'static str, Subscription>,
     /// Chunks of a model; `None` if not sent.
     pub(crate) model_chunks: Option<ChunkSubscription>,
-    /// Images of cameras without a subscription of their own.
+    /// Images of cameras without a separate subscription.
     live_images: ImageSubscription,
     /// Images of single cameras.
     cameras: BTreeMap<Arc<str>, ImageSubscription>,

@@ -27,7 +27,7 @@ export interface Focus {
   isEditable: boolean;
 }
 
-/** Keys whose name differs from what is written on them. */
+/** Keys whose name differs from the text on the key. */
 const LABELS: Record<string, string> = {
   arrowleft: "←",
   arrowright: "→",

@@ -13,9 +13,9 @@ const LIMITS: Limits = Limits {
     connections: 4,
     clients: 2,
 };
-/// Shorter than that of a server.
+/// The timeout is shorter than the timeout of a server.
 const WRITE_TIMEOUT: Duration = Duration::from_millis(200);
-/// No test waits longer.
+/// No test waits longer than this.
 const TIMEOUT: Duration = Duration::from_secs(30);
 
 /// An admission and a listening port that creates both ends of connections.

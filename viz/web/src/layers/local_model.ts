@@ -141,7 +141,7 @@ export class LocalModel {
     this.shown?.setView(view, sizePx);
   }
 
-  /** Whether a copy can be drawn without holes, and is not worse than what is on screen. */
+  /** Whether a copy can be drawn without holes, and is not worse than the present picture. */
   private isReady(next: LocalCopy, hasPicture: boolean): boolean {
     const { arrival } = next;
     // An older copy of the same model is complete, and hardly differs.

@@ -1,5 +1,6 @@
-// Draws a splat as a quad. The twin of trainer/src/shared/projection.wgsl and coverage.wgsl, and with CLIPS of
-// trainer/src/splat/clip.wgsl and shared/clipping.wgsl: local pictures must equal those of the server. trainer/src/splat/chunks/codec.rs encodes the splats.
+// Draws a splat as a quad. It is the twin of trainer/src/shared/projection.wgsl and coverage.wgsl
+// and, with CLIPS, of trainer/src/splat/clip.wgsl and shared/clipping.wgsl. Local pictures must
+// equal the pictures of the server. trainer/src/splat/chunks/codec.rs encodes the splats.
 
 import { TINT } from "./observation_layer";
 import { CLIP_FRAGMENT, CLIP_VERTEX } from "./splat_clip";

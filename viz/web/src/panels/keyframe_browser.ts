@@ -1,4 +1,5 @@
-// The keyframe browser: chooses a keyframe, compares its photograph with the model, and says what is wrong with it.
+// The keyframe browser: chooses a keyframe, compares its photograph with the model, and describes
+// its faults.
 
 import type { Connection } from "../connection/connection";
 import { KeyframePhotos } from "../connection/keyframe_photos";

@@ -1,4 +1,4 @@
-// Says in words what is wrong with a keyframe.
+// Describes the faults of a keyframe in words.
 
 import type { KeyframeErrors } from "./keyframe_error";
 import { durationText } from "./quantities";

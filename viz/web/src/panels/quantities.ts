@@ -1,4 +1,4 @@
-// Numbers as text. Units are the ones of the terminal and of the report.
+// Numbers as text, with the units of the terminal and of the report.
 
 /** A count with separators. */
 export function countText(n: number): string {

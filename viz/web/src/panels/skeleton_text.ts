@@ -15,7 +15,7 @@ export interface Knowledge {
 export interface SkeletonText {
   title: string;
   detail: string;
-  /** Completed part of what is being done, 0 to 1; null if it is not known. */
+  /** Completed part of the present work, 0 to 1; null if it is not known. */
   doneFrac: number | null;
 }
 

@@ -27,7 +27,10 @@ export class Cut {
     this.keptM = null;
   }
 
-  /** Depth at which the model begins if the target is at this distance: at least that of the near plane, meters. */
+  /**
+   * Depth at which the model begins if the target is at this distance, meters. It is at least the
+   * depth of the near plane.
+   */
   depthM(distanceM: number, nearM: number): number {
     return this.keptM === null ? nearM : Math.max(nearM, distanceM - this.keptM);
   }
