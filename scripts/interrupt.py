@@ -29,7 +29,7 @@ import time
 from pathlib import Path
 
 PATIENCE_SECS = 300
-# Limits with which a model trains within seconds even without a GPU.
+# Limits that let a model train within seconds, even without a GPU.
 SMALL = ["--max-splats", "2000"]
 # Files that the hash of a saved model covers, in this order.
 MODEL_FILES = ["model.json", "splats.ply", "mesh.ply", "mesh.glb", "field.blocks", "field.nerf"]

@@ -30,8 +30,9 @@ import time
 # Programs that use a single processor and are sensitive to timing. They run on the last processor beside all other programs, with
 # a higher priority if this user may set it.
 BESIDE = ("fieldrig hil",)
-# Tests that need other settings than the rest of their program: program, part of the names of the tests, environment. Mesa's
-# software Vulkan has subgroups of 16 lanes with this width, so that the kernels for GPUs run, too.
+# Tests that need other settings than the rest of their program. Each entry has the program, a part
+# of the names of the tests, and the environment. With this vector width, Mesa's software Vulkan has
+# subgroups of 16 lanes, so that the kernels for GPUs are tested, too.
 SEPARATE = tuple((name, "needs_large_subgroups", {"LP_NATIVE_VECTOR_WIDTH": "512"}) for name in ("gpu unit", "trainer unit"))
 # Programs that only compute. They run one after another beside all other programs, with a lower
 # priority. They use the time in which the other programs wait for clocks, devices and browsers.
@@ -45,8 +46,9 @@ NICE = 10
 # Programs that start first, because they take longest. The other programs follow in the order of
 # their names.
 FIRST = ("fieldrig program", "trainer unit")
-# With --quick: only programs with unit tests, without these modules, whose tests need a GPU. No GPU is visible to the programs,
-# so a test that needs one fails unless its module is listed here.
+# With --quick, only programs with unit tests run. The modules in this list are left out, because
+# their tests need a GPU. No GPU is visible to the programs, so a test that needs one fails unless
+# its module is listed here.
 WITHOUT_GPU = {"VK_DRIVER_FILES": "/dev/null", "VK_ICD_FILENAMES": "/dev/null"}
 NOT_QUICK = {
     "gpu unit": ("device::tests", "passes::tests", "pipeline::tests", "sort::tests"),
@@ -92,8 +94,9 @@ class Program:
     def run(self, processors, nice=0):
         """Runs the program on some processors, with a priority that is lower by `nice`."""
         since = time.monotonic()
-        # Mesa's software Vulkan runs kernels on the calling thread, which takes a third less computing time than handing parts
-        # of them to other threads: tests run in parallel anyway.
+        # Mesa's software Vulkan runs kernels on the calling thread, which takes a third less
+        # computing time than distributing them to other threads. Other threads are not needed,
+        # because tests run in parallel.
         environment = dict(os.environ, LP_NUM_THREADS="0", **self.environment)
         # With a single thread, the test harness prints a line in two parts, and the output of the
         # test comes between them.

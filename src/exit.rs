@@ -62,7 +62,7 @@ pub(crate) fn from_losses(data_losses: &[String]) -> Exit {
 /// Whether the reader of stdout closed the pipe, as `head` does. A command whose result is its
 /// output then ends.
 pub(crate) fn is_broken_pipe(error: &anyhow::Error) -> bool {
-    // Other pipes, such as those of cameras, do not end a command in order.
+    // A broken pipe other than stdout, such as the pipe of a camera, is an error.
     let is_pipe = |io: &std::io::Error| io.kind() == ErrorKind::BrokenPipe;
     error
         .downcast_ref::<crate::print::StdoutError>()

@@ -272,7 +272,7 @@ impl<'ast> Visit<'ast> for Texts {
         }
     }
 
-    /// Only the messages of errors.
+    /// Of attributes, only the messages of errors are read.
     fn visit_attribute(&mut self, attribute: &'ast Attribute) {
         if let Meta::List(list) = &attribute.meta
             && list.path.is_ident("error")

@@ -23,8 +23,8 @@ use clap::Parser;
 use std::process::ExitCode;
 
 fn main() -> ExitCode {
-    // First, while the program has a single thread: changing the environment is unsafe with
-    // several.
+    // This comes first, while the program has a single thread, because changing the environment is
+    // unsafe with several threads.
     keep_wayland_quiet();
     messages::Setting::spell_as(flag_names::flag);
     let cli = cli::Cli::parse();
@@ -41,7 +41,8 @@ fn main() -> ExitCode {
     {
         print::error(error);
     }
-    // The writer threads would be killed with their queues by the exit.
+    // The output is flushed, because the exit would end the writer threads with text in their
+    // queues.
     print::flush();
     match result {
         Ok(exit) => exit.or_output_loss().into(),

@@ -346,7 +346,8 @@ fn of_workspace(level: &str) -> String {
 
 /// Sends log records to stderr. `RUST_LOG` takes precedence; `verbose` counts the `-v` flags.
 pub(crate) fn start_log(verbose: u8) {
-    // Other crates log much that concerns only their developers, so they start one level later.
+    // Other crates log many messages that concern only their developers, so they start one level
+    // later.
     let filter = match verbose {
         0 => format!("warn{}", of_workspace("info")),
         1 => format!("info{}", of_workspace("debug")),

@@ -73,7 +73,7 @@ fn handle_signals(mut signals: Signals, signaled: &AtomicBool, interrupted: &Ato
                 low_level::exit(SIGNAL_EXIT_BASE + SIGINT);
             }
         }
-        // Last, because `Stop::rearm` relies on this order.
+        // The flag is set last, because `Stop::rearm` relies on this order.
         signaled.store(true, Ordering::Relaxed);
     }
 }

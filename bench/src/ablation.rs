@@ -76,7 +76,7 @@ const VARIANTS: &[Variant<SplatOptions>] = &[
 pub struct AblationOptions {
     /// Folder or recording.
     pub data: PathBuf,
-    /// Training time of each run, seconds; 16 if there is no other limit.
+    /// Training time of each run, seconds. Runs without any limit train for 16 s.
     pub seconds: Option<f64>,
     /// Optimizer steps of each run.
     pub steps: Option<u64>,
@@ -246,7 +246,7 @@ fn psnr_near(run: &Run, secs: f64) -> Option<f64> {
         .map(|(_, psnr)| psnr)
 }
 
-/// Writes the findings so far.
+/// Writes the results of the variants that are finished.
 fn findings(
     options: &AblationOptions,
     runs: &Runs<'_>,

@@ -28,7 +28,7 @@ pub struct BudgetOptions {
     pub data: PathBuf,
     /// Limits on the number of splats.
     pub splats: Vec<u32>,
-    /// Training time of each run, seconds; 60 if there is no other limit.
+    /// Training time of each run, seconds. Runs without any limit train for 60 s.
     pub seconds: Option<f64>,
     /// Optimizer steps of each run.
     pub steps: Option<u64>,
@@ -94,8 +94,8 @@ pub fn run(options: &BudgetOptions, host: &Host<'_>) -> Result<BenchResult> {
         for seed in first_seed..first_seed.saturating_add(options.seeds) {
             let capped_options = base_options.clone().with(|model| {
                 model.common.seed = seed;
-                // With a cap, the number of splats is the size to measure. The trainer's tests of
-                // this number would reduce it.
+                // With a cap, the bench measures a model with exactly this number of splats. The
+                // trainer's own tests of the number would reduce it.
                 model.specific.count = if cap.is_some() {
                     CountPolicy::ToCap
                 } else {

@@ -124,8 +124,9 @@ pub fn run(options: &CurveOptions, host: &Host<'_>) -> Result<BenchResult> {
     for (path, n_left) in options.data.iter().zip((1..=options.data.len()).rev()) {
         let data = runs.load(path, &mut names)?;
         data_losses.extend(data.data.data_losses.iter().cloned());
-        // The methods of later data sets are not known yet. The estimate of the number of runs
-        // assumes as many methods as for this data set, and is corrected with each data set.
+        // The methods of later data sets are not known yet. The estimated number of runs assumes
+        // that each of them has as many methods as this data set. Each data set corrects the
+        // estimate.
         let model_specs = bench.applicable(&data);
         runs.expect((n_left * model_specs.len()) as u64 * options.seeds);
         for model_spec in model_specs {

@@ -1,12 +1,12 @@
 //! Disturbs keyframes, for example with pose noise or a clock offset of a given size.
 //!
-//! A clock offset and an exposure step affect all images, including test images, because this is
-//! also what happens on a robot. Pose noise does not affect test images: they keep their true
-//! poses, so that the scores measure the model.
+//! A clock offset and an exposure step affect all images, including test images, as they do on a
+//! robot. Pose noise does not affect test images: they keep their true poses, so that the scores
+//! measure the model.
 //!
 //! A disturbance is a pure function of its size, a seed and the keyframes. Its effect on a keyframe
-//! does not depend on the order of the keyframes. With one seed, all sizes use the same random
-//! directions, so that random variation between sizes does not add noise to a curve.
+//! does not depend on the order of the keyframes. All sizes with the same seed use the same random
+//! directions. Random differences between sizes therefore do not add noise to a curve.
 
 use crate::statistics::Interpolation;
 use keyframe::{Keyframe, Split};
@@ -98,8 +98,8 @@ impl Disturbance {
     /// Applies the disturbance to keyframes.
     ///
     /// * `level`: size in [`Self::unit`].
-    /// * `nanos_per_sec`: length of a second in units of the stamps; 1e9 unless stamps only count
-    ///   images.
+    /// * `nanos_per_sec`: length of a second in units of the stamps. It is 1e9, except for stamps
+    ///   that only count images.
     pub(crate) fn apply(
         self,
         keyframes: &[Arc<Keyframe>],
@@ -196,7 +196,7 @@ fn clock_offset(keyframes: &[Arc<Keyframe>], offset_nanos: f64) -> Vec<Arc<Keyfr
             .or_default()
             .push(state);
     }
-    // Keyframes may be in the order of their files. Two of them with the same stamp would give an
+    // Keyframes may be in the order of their files. Two keyframes with the same stamp would give an
     // interval of length 0.
     for trajectory in trajectories.values_mut() {
         trajectory.sort_by_key(|(stamp, ..)| *stamp);
@@ -270,7 +270,7 @@ pub(crate) fn expose(keyframe: &mut Keyframe, table: &[u8; 256]) {
         .collect();
 }
 
-/// Maps each sRGB byte to its value after multiplying the light by `gain`: linear light, clipped,
+/// Maps each sRGB byte to the byte for `gain` times its linear light. The result is clipped and
 /// rounded to 8 bits.
 ///
 /// Source: IEC 61966-2-1 for both transfer functions.

@@ -20,10 +20,12 @@ const DEFAULT_REPEATS_ON_CPU: u32 = 3;
 pub struct FieldOptions {
     /// Rays per step.
     pub n_rays: u32,
-    /// Samples per step, one row for each value; the defaults if empty. Each value is rounded down
-    /// to a multiple of the number of rays. At least one sample per ray is used.
+    /// Samples per step. Each value gives one row; an empty list stands for the defaults. Each
+    /// value is rounded down to a multiple of the number of rays. At least one sample per ray is
+    /// used.
     pub n_samples: Vec<u32>,
-    /// Number of timed steps, of which the median is reported. If `None`: 100, or 3 on the CPU.
+    /// Number of timed steps, of which the median is reported. If `None`, 100 steps are timed on a
+    /// GPU and 3 on the CPU.
     pub n_repeats: Option<u32>,
     /// Whether to report the GPU time of each pass.
     pub profile: bool,

@@ -11,9 +11,9 @@ const SETTLE_SECS: f64 = 60.0;
 /// Minimum time over which a rate is measured. Over a shorter time, a rate per hour is mostly noise
 /// of the allocator.
 const MIN_SPAN_SECS: f64 = 60.0;
-/// Maximum number of samples for a rate. If there are more samples, they are reduced to the medians
-/// of at most this many groups. The reason is that the number of pairs grows with the square. For
-/// example, 400 groups are 80 thousand pairs.
+/// Maximum number of samples from which a rate is estimated. If there are more samples, they are
+/// reduced to the medians of at most this many groups. The reason is that the estimate compares all
+/// pairs, and 400 samples already have 80 thousand pairs.
 const MAX_GROUPS: usize = 400;
 const SECS_PER_HOUR: f64 = 3600.0;
 
@@ -75,7 +75,7 @@ impl Excluded {
 /// Growth rate of memory once the keyframe store is full.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize)]
 pub struct Growth {
-    /// Whether the store was full; otherwise the second half of the run is measured.
+    /// Whether the store was full. If it was not, the second half of the run is measured.
     pub store_was_full: bool,
     /// Start of the measurement, seconds since the first image.
     pub from_seconds: f64,

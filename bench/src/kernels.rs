@@ -53,8 +53,8 @@ pub struct KernelsOptions {
     pub sizes_px: Vec<[u32; 2]>,
     /// Numbers of splats of the synthetic cloud; the defaults if empty.
     pub n_splats: Vec<u32>,
-    /// Number of timed images and steps, of which the median is reported. If `None`: 30, or 3 on
-    /// the CPU.
+    /// Number of timed images and steps, of which the median is reported. If `None`, 30 are timed
+    /// on a GPU and 3 on the CPU.
     pub n_repeats: Option<u32>,
     /// Whether the camera is inside the cloud, so that only some of the splats are visible.
     pub inside: bool,
@@ -141,7 +141,7 @@ pub fn measure(
         synthetic_cloud
     };
     // The warm-up has a minimum duration, because drivers are slow for a while after large buffers
-    // were allocated, and the steps of a GPU are short.
+    // were allocated. A number of steps would not be enough, because the steps of a GPU are short.
     let repeats = Repeats {
         n_warm_up: n_repeats.div_ceil(3),
         warm_up: Duration::from_millis(300),

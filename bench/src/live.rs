@@ -191,7 +191,8 @@ impl LiveRun {
 }
 
 /// Latencies of all pictures, and of all keyframes until the first viewer receives them in a
-/// picture. With several cameras, also the latencies of each camera up to the model.
+/// picture. If there are several cameras, the list also contains, for each camera, the latency
+/// until its keyframes are added to the models.
 fn latencies(
     pictures: &[Vec<ReceivedPicture>],
     keyframes: &[KeyframeTimes],
@@ -237,7 +238,8 @@ fn latencies(
     named.chain(since_shutter).chain(of_cameras).collect()
 }
 
-/// Time from mid-exposure until the keyframes of a camera are added to the models, with its name.
+/// Time from mid-exposure until the keyframes of a camera are added to the models, with the name of
+/// this latency.
 fn camera_latency(camera: &str, keyframes: &[KeyframeTimes]) -> Option<(String, Latency)> {
     let pushed = keyframes
         .iter()

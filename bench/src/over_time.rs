@@ -14,8 +14,8 @@ use std::time::{Duration, Instant};
 
 /// Time between two samples.
 const SAMPLE_PERIOD: Duration = Duration::from_secs(1);
-/// Maximum number of time buckets. A run of an hour then has one per minute, whose medians are not
-/// affected by single slow pictures.
+/// Maximum number of time buckets. A run of an hour then has one bucket per minute. The median of
+/// such a bucket is not affected by single slow pictures.
 const MAX_BUCKETS: usize = 60;
 /// Minimum duration of a run for trends, measured at its last sample. In a shorter run, the second
 /// half is too short for a rate per hour. The limit is slightly below two minutes, because the last
@@ -124,8 +124,9 @@ pub struct Bucket {
     pub psnr: Option<f64>,
     /// Training steps per second.
     pub steps_per_sec: f64,
-    /// Resident memory without the picture timings that the viewers of a benchmark store and, on a
-    /// software adapter, without the buffers of training; `None` if the system does not report it.
+    /// Resident memory without the picture timings that the viewers of a benchmark store. On a
+    /// software adapter, it also excludes the buffers of training. `None` if the system does not
+    /// report the resident memory.
     pub host_mb: Option<f64>,
 }
 
@@ -228,8 +229,8 @@ impl Quantity {
 }
 
 impl OverTime {
-    /// Rows of a table: a quantity, and its median and change in each of the runs. Empty if all
-    /// runs are short.
+    /// Rows of a table, each with a quantity and its median and change in each of the runs. There
+    /// are no rows if all runs are short.
     pub(crate) fn rows(runs: &[&Self]) -> Vec<Vec<String>> {
         let mut rows = Vec::new();
         for quantity in &QUANTITIES {

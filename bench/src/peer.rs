@@ -1,4 +1,5 @@
-//! Reads curves measured with other trainers: JSON with `rows` of `seconds` and `psnr`.
+//! Reads curves measured with other trainers. The files are JSON with `rows` of `seconds` and
+//! `psnr`.
 
 use anyhow::Result;
 use messages::{BadInput, Setting};

@@ -175,8 +175,8 @@ pub struct Run {
 }
 
 impl Run {
-    /// Final test PSNR, dB. It is infinite if renders and images are identical; 99 is returned
-    /// then.
+    /// Final test PSNR, dB. If renders and images are identical, it would be infinite, and 99 is
+    /// returned.
     #[must_use]
     pub fn psnr(&self) -> f64 {
         const WITHOUT_ERROR_DB: f64 = 99.0;
@@ -416,7 +416,8 @@ impl<'a> Runs<'a> {
             model_spec,
             keyframes: &keyframes,
             preparation_time: job.data.data.preparation_time,
-            // The points are not disturbed, and would reveal the true scene.
+            // The points are left out for disturbed data, because they are not disturbed and would
+            // reveal the true scene.
             initial_points: job
                 .data
                 .initial_points

@@ -43,13 +43,13 @@ pub struct StabilityOptions {
     pub data: PathBuf,
     /// Disturbances to measure, without duplicates.
     pub disturbances: Vec<Disturbance>,
-    /// If the images have no times: whether a clock offset is skipped instead of rejected.
+    /// Whether a clock offset is skipped instead of rejected if the images have no times.
     pub can_skip_clock_offset: bool,
     /// Sizes of a single disturbance, in its unit; the defaults if empty.
     pub levels: Vec<f64>,
     /// Images per second, for images without times.
     pub rate_hz: Option<f64>,
-    /// Training time of each run, seconds; 30 if there is no other limit.
+    /// Training time of each run, seconds. Runs without any limit train for 30 s.
     pub seconds: Option<f64>,
     /// Optimizer steps of each run.
     pub steps: Option<u64>,
@@ -303,7 +303,8 @@ impl StabilityOptions {
     /// for `all`.
     fn plans(&self, data: &NamedData) -> Result<Vec<DisturbancePlan>> {
         let mut selected = self.disturbances.clone();
-        // Stamps of photos only count images. Only a clock offset depends on their length.
+        // Stamps of photos only count images. Only a clock offset depends on the time between two
+        // such stamps.
         let (nanos_per_sec, rate_hz) = match (data.data.has_times, self.rate_hz) {
             (true, _) => (NANOS_PER_SEC, None),
             (false, Some(rate_hz)) => (NANOS_PER_COUNT * rate_hz, Some(rate_hz)),

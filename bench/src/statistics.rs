@@ -87,7 +87,7 @@ pub(crate) fn break_point(
     })
 }
 
-/// Minimum growth of a count; for less growth, the gain per doubling would be mostly noise.
+/// Minimum growth of a count. For less growth, the gain per doubling would be mostly noise.
 const MIN_GROWTH: f64 = 1.05;
 
 /// Gain per doubling of the count between two points `(count, dB)`; `None` if the count grew by

@@ -45,7 +45,8 @@ pub struct ViewerOptions {
     /// All directions around a point in the scene (equirectangular) instead of a pinhole view from
     /// outside.
     pub is_panorama: bool,
-    /// Minimum time between two requests; zero: each request follows the previous picture at once.
+    /// Minimum time between two requests. If it is zero, each request follows the previous picture
+    /// at once.
     pub period: Duration,
 }
 
@@ -269,7 +270,7 @@ impl Client {
                 if !self.pictures.lock().is_empty() || self.started.elapsed() > MAX_START {
                     log::warn!("a viewer received no picture: {message}");
                 }
-                // An immediate request would get the same answer.
+                // An immediate request would get the same error.
                 std::thread::sleep(Duration::from_millis(200));
                 self.request_picture()?;
             }
@@ -362,7 +363,7 @@ impl Client {
         // A panorama is taken near the center, a pinhole view from outside and above.
         let distance_m = if is_panorama { 0.2 } else { 1.5 } * self.radius_m;
         let offset = Vector3::new(angle.cos(), angle.sin(), 0.7) * distance_m;
-        // The y axis of `face_towards` points up, but that of a camera points down.
+        // The y axis of `face_towards` points up, but the y axis of a camera points down.
         let world_from_camera =
             Transform::face_towards(&(self.center_m + offset), &self.center_m, &-Vector3::z());
         let projection = if is_panorama {
@@ -426,8 +427,8 @@ impl Client {
         Ok(())
     }
 
-    /// Sends a frame. The protocol requires a mask; it is zero, because there is no proxy to
-    /// protect on loopback.
+    /// Sends a frame. The protocol requires a mask to protect proxies. The mask is zero, because
+    /// there is no proxy on loopback.
     fn send(&mut self, opcode: u8, contents: &[u8]) -> Result<()> {
         let mut frame = vec![0x80 | opcode];
         match u8::try_from(contents.len()) {

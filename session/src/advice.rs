@@ -12,7 +12,8 @@ const MIN_IMAGES: u64 = 8;
 /// Waiting for the first image for longer than this is a problem. Cameras take up to some seconds
 /// to start.
 const MAX_WAIT_SECS: f64 = 10.0;
-/// Maximum difference between a share and the fraction of small numbers that stands for it.
+/// Maximum difference between a share and the simple fraction, such as 7 of 8, by which it is
+/// described.
 const MAX_SHARE_ERROR: f64 = 0.01;
 /// Larger shares than this are not expressed as a fraction with a denominator of at most 10.
 const NEARLY_ALL: f64 = 0.95;
@@ -81,7 +82,7 @@ pub(crate) struct Situation {
     pub(crate) paused_by: Option<u64>,
 }
 
-/// The advice for a situation. Problems come first, in the order of what they cost.
+/// The advice for a situation. Problems come first, the most costly one before the others.
 #[must_use]
 pub(crate) fn advise(situation: &Situation) -> Advice {
     let state = state_text(situation);

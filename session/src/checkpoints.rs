@@ -27,7 +27,7 @@ const CHECKPOINT_SECS: &str = "checkpoint-secs";
 /// How often checkpoints are written.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct CheckpointOptions {
-    /// Time between two checkpoints: 60 s if `None`; no checkpoints if zero.
+    /// Time between two checkpoints. `None` stands for 60 s, and zero disables checkpoints.
     pub period: Option<Duration>,
 }
 
@@ -121,13 +121,13 @@ pub struct Checkpoints {
     writer: Option<WriterThread>,
     /// Whether this run has written a checkpoint.
     has_any: bool,
-    /// What has become of the last checkpoint that was requested.
+    /// Progress of the last requested checkpoint.
     requested: Option<CheckpointProgress>,
     /// Number of images that did not become keyframes so far, by reason.
     rejected: BTreeMap<String, u64>,
 }
 
-/// What has become of a checkpoint that was requested.
+/// Progress of a requested checkpoint.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum CheckpointProgress {
     /// It is due.
@@ -206,8 +206,8 @@ impl Checkpoints {
     /// Starts a checkpoint if one is due and the previous one is complete. Returns whether a
     /// checkpoint was started. Write errors are logged and do not stop training.
     pub fn write_when_due(&mut self, now: Snapshot<'_>) -> Result<bool, trainer::Error> {
-        // Only one writer at a time: a slow disk makes checkpoints rarer, instead of collecting
-        // copies of the state in memory.
+        // There is only one writer at a time. If the disk is slow, checkpoints become rarer, and
+        // copies of the state do not accumulate in memory.
         if self
             .writer
             .as_ref()
@@ -250,7 +250,7 @@ impl Checkpoints {
         self.requested = Some(CheckpointProgress::Due);
     }
 
-    /// What has become of the last requested checkpoint; `None` if none was requested.
+    /// Progress of the last requested checkpoint; `None` if none was requested.
     pub fn requested(&mut self) -> Option<&CheckpointProgress> {
         let has_ended = self
             .writer
@@ -307,7 +307,8 @@ impl Checkpoints {
         // A checkpoint also writes the new keyframes.
         self.last = Instant::now();
         self.last_keyframes = Instant::now();
-        // Ends an earlier due time: that of the first checkpoint, or of a request.
+        // The first checkpoint and requested checkpoints may be due earlier. From now on, the
+        // period applies again.
         self.due_after = self.period;
     }
 
@@ -393,8 +394,9 @@ impl CheckpointWrite {
     fn write(self) -> anyhow::Result<()> {
         let started = Instant::now();
         let RunFlags { depth_from, flags } = self.run_flags;
-        // In this order, the files on disk form a complete state at any time: the keyframes of the
-        // new checkpoint exist before it, and those of the old one until it is replaced.
+        // In this order, the files on disk form a complete state at any time. The keyframes of the
+        // new checkpoint are written before the checkpoint. The keyframes of the old checkpoint
+        // exist until it is replaced.
         if let Some((stored, keyframes)) = &self.keyframes {
             stored.add(keyframes)?;
         }

@@ -65,7 +65,7 @@ impl ChunkPublisher {
         self.finish();
         let name = kind.name();
         let Some(period) = self.hub.model_chunks().period(name) else {
-            // No client draws this model. The next one gets it at once.
+            // No client draws this model. It is published at once when a client draws it again.
             self.models.remove(name);
             return began.elapsed();
         };

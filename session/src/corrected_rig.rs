@@ -15,9 +15,9 @@ use std::path::{Path, PathBuf};
 const ALIGNED: &str = "registration of keyframes";
 const LEARNED: &str = "optimization with the scene";
 
-/// The rig with the corrections of alignment, followed by those optimized with the scene; of these,
-/// extrinsics are left out if alignment has estimated them. Corrections of single images have no
-/// key in a rig file and are left out, too.
+/// The rig with the corrections of alignment, followed by the corrections that were optimized with
+/// the scene. Extrinsics that were optimized with the scene are left out if alignment has estimated
+/// them. Corrections of single images are left out, too, because rig files have no key for them.
 pub fn corrected(
     rig: &Rig,
     alignment: Option<&Alignment>,
@@ -53,8 +53,8 @@ pub fn corrected(
             correct(camera, &correction, &[], LEARNED);
         }
     }
-    // All cameras on the arm have the same joint offsets. Cameras that no joint carries have none,
-    // so the longest list is taken.
+    // All cameras on the arm have the same joint offsets. Cameras that no joint carries have no
+    // joint offsets, so the longest list is taken.
     let joint_offsets = alignment
         .corrections
         .values()
@@ -99,7 +99,7 @@ pub fn camera<'a>(rig: &'a Rig, name: &str) -> anyhow::Result<&'a Camera> {
 
 /// The rig with other intrinsics of a camera. They also apply to depth images with the same lens.
 ///
-/// * `covariance`: that of the intrinsics, if it is known.
+/// * `covariance`: covariance of the intrinsics, if it is known.
 ///
 /// # Errors
 /// [`BadInput`] if there is no such camera, or if its images have another size.
@@ -119,7 +119,7 @@ pub fn with_intrinsics(
         let before = std::mem::replace(&mut camera.intrinsics, intrinsics.clone());
         // The intrinsics are known now, so they are no longer read from the device.
         camera.realsense.unknown.intrinsics = false;
-        // Symmetric, so the order of rows and columns does not matter.
+        // The matrix is symmetric, so the order of rows and columns does not matter.
         camera.intrinsics_covariance =
             covariance.map_or_else(Vec::new, |covariance| covariance.as_slice().to_vec());
         if let Some(depth) = &mut camera.depth
@@ -161,8 +161,8 @@ pub fn with_extrinsics(
     Ok(rig)
 }
 
-/// `parent_from_camera` for a pose of a camera on the flange or in a fixed base: the latter is
-/// converted if the parent is the world.
+/// `parent_from_camera` for a camera on the flange or in a fixed base. The pose of a camera in a
+/// fixed base is converted if its parent is the world.
 pub fn parent_from_camera(base: &Base, parent: Parent, pose: &Transform) -> Transform {
     match parent {
         Parent::World => base.world_from_base * pose,
@@ -228,10 +228,10 @@ fn other_robot(rig: &Rig, file: &Path) -> Option<PathBuf> {
     (existing != rig.arm.urdf_text).then_some(urdf)
 }
 
-/// Writes a rig file atomically, and the robot's URDF next to it. A file that it replaces is kept
-/// with the extension `.old`, or `.old2` and so on if that exists. Does not overwrite the URDF of
-/// another robot. Of two programs that write the same file at the same time, the second gets an
-/// error.
+/// Writes a rig file atomically, and the robot's URDF next to it. An existing file is kept with the
+/// extension `.old`, or with `.old2`, `.old3` and so on if `.old` exists. Does not overwrite the
+/// URDF of another robot. If two programs write the same file at the same time, the second program
+/// gets an error.
 pub fn write(rig: &Rig, file: &Path) -> anyhow::Result<()> {
     check_target_file(rig, file)?;
     let linked = std::fs::read_link(file);
@@ -256,14 +256,14 @@ pub fn write(rig: &Rig, file: &Path) -> anyhow::Result<()> {
 /// Writes the robot's URDF next to a rig file, unless it is there.
 fn write_urdf(rig: &Rig, file: &Path) -> std::io::Result<()> {
     let urdf = file.with_file_name(drivers::recording::URDF_FILE);
-    // Created, never replaced: the folder may belong to another robot.
+    // The URDF is created but never replaced, because the folder may belong to another robot.
     let error = match files::create(&urdf, |out| out.write_all(rig.arm.urdf_text.as_bytes())) {
         Ok(()) => return Ok(()),
         Err(error) => error,
     };
     let problem = match error.kind() {
         ErrorKind::AlreadyExists if urdf.exists() => match other_robot(rig, file) {
-            // Another program has written it since it was checked.
+            // Another program has written the URDF since it was checked.
             Some(_) => "it is that of another robot".to_owned(),
             None => return Ok(()),
         },
@@ -308,15 +308,15 @@ fn with_suffix(file: &Path, suffix: &str) -> PathBuf {
 }
 
 /// Applies a correction. `estimates` contain the standard deviation of the time offset, if it is
-/// known; `source` names the method of estimation.
+/// known. `source` names the method of estimation.
 fn correct(
     camera: &mut Camera,
     correction: &CameraCorrection,
     estimates: &[Estimate],
     source: &str,
 ) {
-    // A correction maps points from the frame of the reported camera to that of the true one, and a
-    // rig file has the inverse direction.
+    // A correction maps points from the frame of the reported camera to the frame of the true
+    // camera. A rig file has the inverse direction.
     camera.parent_from_camera *=
         rigid_motion(correction.rotation_rad, correction.translation_m).inverse();
     if correction.time_offset_secs != 0.0 {
@@ -343,8 +343,8 @@ fn correct(
         camera.readout_micros = Some(readout_micros.clamp(0.0, 1e6 / camera.rate_hz));
     }
     if let Some(depth) = &mut camera.depth {
-        // Compared before the lens of the color image is corrected. Depth that is aligned with
-        // color has the same lens, and must keep it.
+        // The lenses are compared before the lens of the color image is corrected. Depth that is
+        // aligned with color has the same lens as the color image, also after the correction.
         let shares_lens = depth.intrinsics == camera.intrinsics.resized(depth.intrinsics.size_px)
             || depth.intrinsics == camera.intrinsics;
         if shares_lens {
@@ -357,7 +357,7 @@ fn correct(
         depth.factor *= correction.log_depth_scale.exp();
     }
     correct_lens(&mut camera.intrinsics, correction);
-    // A covariance belongs to the values with which it was estimated.
+    // A covariance is valid only for the values with which it was estimated.
     if (correction.log_focal, correction.principal_offset_focals) != ([0.0; 2], [0.0; 2]) {
         camera.intrinsics_covariance.clear();
     }
@@ -493,7 +493,7 @@ mod tests {
         );
     }
 
-    /// As when several programs write their results into one rig file.
+    /// This happens when several programs write their results into one rig file.
     #[test]
     fn no_result_of_simultaneous_writers_disappears() {
         const N_WRITERS: u32 = 4;

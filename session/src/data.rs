@@ -27,8 +27,8 @@ use trainer::ModelKind;
 /// Which images are read, and how they are scaled and split.
 #[derive(Clone, Debug, Default)]
 pub struct DataOptions {
-    /// Test images: a number n for every n-th image, or a file that lists them. Every 8th image if
-    /// `None`.
+    /// Test images: a number n for every n-th image, or a file that lists them. `None` selects
+    /// every 8th image.
     pub holdout: Option<String>,
     /// List of the keyframes to use.
     pub keyframes: Option<PathBuf>,
@@ -79,8 +79,9 @@ impl DataOptions {
         rig.into_iter().chain(scale).flatten().collect()
     }
 
-    /// Fills in missing flags from those of an earlier run, `before`. A number must be the same as
-    /// before. A path may differ, because the file may have moved; its contents are compared later.
+    /// Fills in missing flags from the flags of an earlier run, `before`. A number must be the same
+    /// as before. A path may differ, because the file may have moved. The contents of the file are
+    /// compared later.
     ///
     /// `subject`: name of the earlier result in messages.
     pub fn completed_with(
@@ -90,7 +91,7 @@ impl DataOptions {
     ) -> anyhow::Result<Self> {
         let now = self.flags();
         for (name, setting) in SETTINGS {
-            // A path with other contents is detected later, when keyframes are compared.
+            // A file with other contents is detected later, when keyframes are compared.
             let is_other =
                 |now: &str, value: &str| now != value && is_number(now) && is_number(value);
             if let (Some(now), Some(value)) = (now.get(name), before.get(name))
@@ -141,7 +142,8 @@ fn is_number(text: &str) -> bool {
     text.parse::<f64>().is_ok()
 }
 
-/// The value of `--holdout` as it is stored: a number as given, a file with its absolute path.
+/// The value of `--holdout` as it is stored. A number is stored as given, and a file with its
+/// absolute path.
 fn holdout_value(text: &str) -> String {
     if is_number(text) {
         text.to_owned()
@@ -315,8 +317,8 @@ impl Data {
         Ok(())
     }
 
-    /// Returns an error if all pixels of all images are masked, and logs a warning if those of some
-    /// images are.
+    /// Returns an error if all pixels of all images are masked. Logs a warning if some images are
+    /// masked completely.
     fn check_masks(&self, path: &Path) -> anyhow::Result<()> {
         let n_masked = self
             .keyframes
@@ -352,8 +354,8 @@ impl Data {
         Ok(open::recording(path, rig, &[])?.rig)
     }
 
-    /// The methods to train if no flag names any: those in the rig file of a recording, or else the
-    /// default method.
+    /// The methods to train if no flag names any. They come from the rig file of a recording.
+    /// Otherwise, the default method is returned.
     pub fn default_methods(path: &Path, args: &DataOptions) -> anyhow::Result<Vec<ModelKind>> {
         expect(path)?;
         if is_recording(path) {
@@ -412,8 +414,9 @@ impl Data {
             .any(|keyframe| keyframe.depth.is_some())
     }
 
-    /// Reads the points from which models without depth start. `None` if the data names none, if
-    /// they cannot be read, or if a training or validation image has depth; the reason is logged.
+    /// Reads the points from which models without depth start. Returns `None` if the data name no
+    /// points, if the points cannot be read, or if a training or validation image has depth. The
+    /// reason is logged.
     pub fn initial_points(&self) -> Option<Arc<InitialPoints>> {
         let path = self.points_path.as_deref()?;
         let shown = path.display();
@@ -535,7 +538,8 @@ impl Data {
             apply(&mut keyframes, join.push(sample));
             report(progress, "keyframes", keyframes.len(), None);
         }
-        // Images at the end may still wait for a later pose. `finish` decides about them.
+        // At the end, some images may still wait for a later pose. `finish` accepts or rejects
+        // them.
         apply(&mut keyframes, join.finish());
         report(progress, "keyframes", keyframes.len(), None);
         log::info!("{}", join.counts());

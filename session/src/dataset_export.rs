@@ -15,8 +15,9 @@ use std::sync::Arc;
 /// Depth unit: millimeters, which readers assume if the file does not specify a unit.
 const METERS_PER_COUNT: f64 = 0.001;
 /// Maximum difference between the intrinsics of depth and color, in pixels of the depth image. If
-/// they differ more, depth is not exported. Half a pixel is the error of rounding a position to
-/// pixels, so smaller differences do not matter to readers that look up depth at a color pixel.
+/// the difference is larger, depth is not exported. Rounding a position to pixels has an error of
+/// up to half a pixel. Smaller differences therefore do not matter to readers that look up depth at
+/// a color pixel.
 const MAX_LENS_DIFFERENCE_PX: f64 = 0.5;
 /// List of the test images, one per line, in the format of `--holdout`.
 const TEST_LIST: &str = "test.txt";
@@ -27,8 +28,8 @@ const LISTS: [(&str, Split); 3] = [
     ("test_filenames", Split::Test),
 ];
 
-/// The entries of a dataset folder. The last one identifies a dataset, so a folder that has it is
-/// complete.
+/// The entries of a dataset folder, in the order of writing. The last entry identifies a dataset,
+/// so a folder with this entry is complete.
 const ENTRIES: [&str; 5] = [IMAGES, MASKS, DEPTH, TEST_LIST, nerfstudio::FILE_NAME];
 const IMAGES: &str = "images";
 const MASKS: &str = "masks";
@@ -41,8 +42,8 @@ pub struct Written {
     pub n_images: usize,
     /// Number of depth images.
     pub n_depth: usize,
-    /// Number of depth images that were left out, because their intrinsics differ from those of the
-    /// color image. The format cannot express this.
+    /// Number of depth images that were left out, because their intrinsics differ from the
+    /// intrinsics of the color image. The format cannot express this.
     pub n_depth_skipped: usize,
 }
 
@@ -66,7 +67,7 @@ pub fn write_nerfstudio(
     for entry in ENTRIES {
         files::check_no_link(&out.join(entry)).context("cannot export")?;
     }
-    // Checked before anything is created.
+    // The keyframes are checked before anything is created.
     let mut keyframes = keyframes.peekable();
     ensure!(keyframes.peek().is_some(), "no keyframe to export");
     let in_out = || format!("cannot write {}", out.display());
@@ -84,7 +85,7 @@ pub struct RecordingExport {
     pub recording: PathBuf,
     /// Rig file that replaces the one stored in the recording.
     pub rig: Option<PathBuf>,
-    /// List of the keyframes to export; those that a run would accept if `None`.
+    /// List of the keyframes to export. `None` exports the keyframes that a run would accept.
     pub keyframes: Option<PathBuf>,
     /// Folder to write.
     pub out: PathBuf,
@@ -115,7 +116,8 @@ impl RecordingExport {
         join.finish();
         let missing_from_list = join.check_list()?;
         let mut keyframes: Vec<_> = join.keyframes().cloned().collect();
-        // As in training, so that the exported poses are those that a model would use.
+        // Base poses are corrected as in training, so that a model trained on the export uses the
+        // same poses.
         if let Some(mut stations) = Stations::new(&opened.rig) {
             keyframes = stations.corrected(keyframes);
         }
@@ -155,7 +157,7 @@ fn write_dataset(
         json!(METERS_PER_COUNT),
     );
     document.extend(LISTS.map(|(key, split)| (key.to_owned(), json!(names(split)))));
-    // A single camera is written once at the top level, which every reader supports; several
+    // A single camera is written once at the top level, because every reader supports this. Several
     // cameras are written per frame.
     if cameras.iter().all(|camera| *camera == cameras[0]) {
         document.append(&mut cameras[0]);
@@ -232,7 +234,7 @@ fn write_frame(
                 ExtendedColorType::L16,
             )?;
             insert("depth_file_path", json!(depth_image));
-            // A key of this program, which other readers ignore.
+            // This key is specific to fieldrig, and other readers ignore it.
             if depth.world_from_camera != keyframe.world_from_camera {
                 insert(
                     "depth_transform_matrix",
@@ -449,7 +451,7 @@ mod tests {
     fn export_appears_when_it_is_complete() {
         let folder = tempfile::tempdir().unwrap();
         let out = folder.path().join("scan");
-        // What a killed export leaves behind.
+        // The files that a killed export leaves behind.
         let leftover = files::partial::path_of(&out).join("scan").join(IMAGES);
         std::fs::create_dir_all(&leftover).unwrap();
         std::fs::write(leftover.join("old.png"), b"half of").unwrap();

@@ -1,8 +1,9 @@
-//! The log of timing-dependent decisions: at which step each keyframe was added or removed, when
-//! the result of an alignment was applied, and when training ended.
+//! The log of timing-dependent decisions. For example, it contains the step at which each keyframe
+//! was added or removed, at which the result of an alignment was applied, and at which training
+//! ended.
 //!
-//! One JSON object per line, see `docs/reference/files.md`. The log contains steps but no times, so
-//! that replaying it with the same data gives the same model.
+//! The log has one JSON object per line, see `docs/reference/files.md`. The log contains steps but
+//! no times, so that replaying it with the same data gives the same model.
 
 use anyhow::{Context, anyhow};
 use keyframe::{Keyframe, Split, split_from_name, split_name};
@@ -17,14 +18,15 @@ use std::sync::mpsc::{SyncSender, sync_channel};
 use std::thread::JoinHandle;
 use trainer::ModelOptions;
 
-/// Version of the format. Logs of other versions are rejected: a decision that this program does
-/// not know would be missing in the replay.
+/// Version of the format. Logs of other versions are rejected, because a decision that this program
+/// does not know would be missing in the replay.
 const VERSION: u64 = 5;
 /// Name of the log in the run folder.
 const FILE: &str = "decisions.jsonl";
 /// Maximum number of decisions that wait to be written. Training waits while this queue is full, so
-/// that no decision is lost. A live run makes a few decisions per keyframe, so the queue bridges
-/// minutes of a disk that does not respond. Each waiting keyframe keeps its image in memory.
+/// that no decision is lost. A live run makes a few decisions per keyframe, so the queue is long
+/// enough for a disk that does not respond for minutes. Each waiting keyframe keeps its image in
+/// memory.
 const MAX_WAITING: usize = 4096;
 
 /// The first line: the settings.
@@ -45,8 +47,8 @@ pub struct Settings {
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub depth_from: Option<String>,
     /// SHA-256 of the points of the dataset from which training starts, see
-    /// [`points_sha256`](crate::points_sha256); `None` if there are none, or if they are not used
-    /// because of depth.
+    /// [`points_sha256`](crate::points_sha256); `None` if there are no points, or if they are not
+    /// used because the images have depth.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub points: Option<String>,
     /// Step of the checkpoint that training continued from; `None` for a new run.
@@ -97,8 +99,8 @@ impl Settings {
 }
 
 impl Settings {
-    /// The same settings for a run that continues from the checkpoint of step `from_step`, or
-    /// restarts if `None`.
+    /// The same settings for a run that continues from the checkpoint of step `from_step`. `None`
+    /// stands for a restart without a checkpoint.
     pub fn continued_from(&self, from_step: Option<u64>) -> Self {
         Self {
             from_step,
@@ -134,7 +136,8 @@ pub(crate) enum Decision {
     Begin(True),
     /// The result of an alignment in the background was applied.
     Align(True),
-    /// Growth of the model was paused, because its steps took too long, or continued.
+    /// Growth of the model was paused because its steps took too long (`true`), or continued
+    /// (`false`).
     PauseGrowth(bool),
     /// A checkpoint was taken at this step.
     Checkpoint(True),
@@ -207,8 +210,8 @@ impl Pushed {
         }
     }
 
-    /// The split of the keyframe. Always `Some` for a log that was read, because the parser checks
-    /// it.
+    /// The split of the keyframe. It is always `Some` in a log that was read, because the parser
+    /// checks it.
     pub(crate) fn split(&self) -> Option<Split> {
         split_from_name(&self.split)
     }
@@ -240,7 +243,8 @@ enum Activity {
 pub struct DecisionLog {
     sender: SyncSender<Line>,
     thread: JoinHandle<std::io::Result<()>>,
-    /// The file, which somebody may remove while it is written; `None` if it cannot be watched.
+    /// The log file. It is watched, because somebody may remove it while it is written; `None` if
+    /// it cannot be watched.
     kept: Option<files::Kept>,
     last_step: Option<u64>,
     activity: Activity,
@@ -258,7 +262,8 @@ impl DecisionLog {
     /// Creates the log in a run folder. A run that continues from a checkpoint writes a separate
     /// file and keeps the earlier log.
     pub fn create(folder: &Path, settings: Settings) -> anyhow::Result<Self> {
-        // The earlier log reproduces the model of the checkpoint. This one continues from it.
+        // The earlier log reproduces the model of the checkpoint. The new log continues from the
+        // checkpoint.
         let name = match settings.from_step {
             None => FILE.to_owned(),
             Some(step) => FILE.replace('.', &format!("-from-{step}.")),
@@ -344,9 +349,9 @@ impl DecisionLog {
         self.activity = Activity::Training;
     }
 
-    /// Logs that a checkpoint was taken after this many steps. It is not a decision, so it does not
-    /// affect which activity is logged: a replay takes other checkpoints, and its log must have the
-    /// same decisions.
+    /// Logs that a checkpoint was taken after this many steps. A checkpoint is not a decision, so
+    /// it does not affect which activity is logged. A replay takes other checkpoints, but its log
+    /// must have the same decisions.
     pub fn checkpoint(&mut self, step: u64) {
         self.write(Line::Entry(Entry {
             step,
@@ -397,7 +402,7 @@ impl DecisionLog {
             Activity::Nothing => None,
         };
         // A replay reaches a larger step only by training, which has the same effect as the
-        // activity. At the same step, it would do nothing without this entry.
+        // activity. If the step is the same, the replay needs this entry to repeat the activity.
         if let Some(decision) = pending
             && self.last_step == Some(step)
         {
@@ -466,8 +471,8 @@ impl Decisions {
         let invalid = BadInput;
         let mut lines = text.split_inclusive('\n').zip(1..);
         let first = lines.next().map_or("", |(line, _)| line);
-        // The version is checked before the other settings, because another version may have
-        // other settings, and the error should name the cause.
+        // The version is checked first, because another version may have other settings. The error
+        // then names the version and not a missing setting.
         let description: serde_json::Value =
             serde_json::from_str(first).map_err(|e| invalid(format!("line 1: {e}")))?;
         match description["version"].as_u64() {

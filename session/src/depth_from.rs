@@ -65,7 +65,8 @@ impl DepthSource {
             .method;
         let mut totals = Filled::default();
         let mut n_images = 0;
-        // Rendered depth is no measurement with which test images could be compared.
+        // Test images get no rendered depth: it is not a measurement, so depth scores against it
+        // would be meaningless.
         let mut lacking: Vec<&mut Arc<Keyframe>> = keyframes
             .iter_mut()
             .filter(|keyframe| keyframe.split != Split::Test && keyframe.lacks_dense_depth())
@@ -171,8 +172,8 @@ fn fill(model: &mut AlignedModel, keyframe: &mut Arc<Keyframe>) -> anyhow::Resul
     Ok(filled)
 }
 
-/// Measured depth in meters. Missing pixels are filled with rendered depth, or 0 if that is
-/// missing, too.
+/// Measured depth in meters. Pixels without measured depth get the rendered depth, or 0 if there is
+/// no rendered depth either.
 fn merge_depth(own_m: &[f32], rendered: &Picture) -> (Vec<f32>, Filled) {
     let is_known = |z: f32| z > 0.0 && z.is_finite();
     let mut filled = Filled::default();
@@ -185,7 +186,7 @@ fn merge_depth(own_m: &[f32], rendered: &Picture) -> (Vec<f32>, Filled) {
             return *measured;
         }
         filled.n_missing += 1;
-        // The depth of nearly transparent pixels is not that of a surface.
+        // Nearly transparent pixels do not show the depth of a surface.
         if *alpha < MIN_ALPHA || !is_known(*rendered) {
             return 0.0;
         }

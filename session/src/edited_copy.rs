@@ -8,11 +8,11 @@ use std::path::{Path, PathBuf};
 /// Maximum number of copies of a file, so that a search for a free name ends.
 const MAX_COPIES: usize = 10_000;
 
-/// Writes the splats of a file that are not in erased space to a new file in the same folder, whose
-/// path it returns; `None` if nothing is erased. Existing files are kept: the name of the new file
-/// gets a number instead.
+/// Writes the splats of a file that are not in erased space to a new file in the same folder.
+/// Returns the path of the new file, or `None` if nothing is erased. Existing files are never
+/// replaced. If the name is in use, the name of the new file gets a number.
 ///
-/// Files in SPZ stay in that format; others become PLY files with values at full precision.
+/// SPZ files are copied as SPZ. All other files become PLY files with values at full precision.
 ///
 /// # Errors
 ///
@@ -37,7 +37,7 @@ pub(crate) fn save(model: &Path, edits: &Edits) -> anyhow::Result<Option<PathBuf
     };
     let out = (1..=MAX_COPIES)
         .map(|number| path_of_copy(model, number, extension))
-        // A broken link is in the way, too.
+        // A broken symbolic link also occupies the name.
         .find(|out| out.symlink_metadata().is_err())
         .with_context(|| {
             format!(

@@ -80,8 +80,8 @@ impl Editor {
             .is_some_and(|search| !search.thread.is_finished())
     }
 
-    /// Takes the result of the search if it is ready, or waits for it if `wait`: the request and
-    /// the floaters, or the reason why there are none.
+    /// Takes the result of the search if it is ready. If `wait` is set, waits for the result. The
+    /// result is the request and the floaters, or the reason why the search failed.
     pub(crate) fn take_found(
         &mut self,
         wait: bool,

@@ -38,7 +38,7 @@ fn class_of(error: &(dyn Error + 'static)) -> Option<ErrorClass> {
     if error.is::<InsufficientData>() {
         return Some(ErrorClass::InsufficientData);
     }
-    // The budget is an argument, so another one is a remedy.
+    // The user sets the budget as an argument, so a larger budget solves the problem.
     if let Some(trainer::Error::BudgetTooSmall { .. }) = error.downcast_ref() {
         return Some(ErrorClass::BadInput);
     }

@@ -62,9 +62,9 @@ impl EvalPlan {
         let evaluator = Evaluator::thorough(self.lpips_weights.as_deref())?;
         // Invalid flags are rejected before the data is read, which takes long.
         self.images.holdout()?;
-        // So is a missing path.
+        // A missing path is also rejected before the data is read.
         data::expect(&self.data)?;
-        // The model comes before the data, too, because it may be invalid.
+        // The model is also loaded before the data, because it may be invalid.
         let loaded = methods::load(open_gpu()?, &self.model)?;
         let is_empty = methods::note_if_empty(&self.model, &loaded).is_some();
         let data = Data::load(
@@ -77,7 +77,8 @@ impl EvalPlan {
         let tests = data.of_split(Split::Test);
         self.warn_about_data(&data, &tests);
         let images = score(&evaluator, loaded.method, &tests, on_scored)?;
-        // An empty model has its own note, and covers nothing anyway.
+        // An empty model has its own note and covers no pixels, so no warning about coverage is
+        // needed.
         if !is_empty {
             let covered_fracs: Vec<_> = images
                 .iter()
@@ -85,8 +86,8 @@ impl EvalPlan {
                 .collect();
             warn_if_hardly_covered(&covered_fracs);
         }
-        // Scores are in the order of the test images, so names of the others are left out before
-        // both are joined.
+        // Scores are in the order of the test images. The names of other images are left out before
+        // names and scores are joined.
         let names = data
             .keyframes
             .iter()
@@ -141,7 +142,7 @@ fn score(
 /// Takes `base.realign` from the rig file of the model, because the base poses must be treated as
 /// in training.
 fn training_overrides(model: &Path) -> Vec<Override> {
-    // Without a rig file, as for a splat file, there is nothing to take over.
+    // A splat file has no rig file, so no key is taken from it.
     let training_rig = Rig::load(&model.join(drivers::recording::RIG_FILE), &[]);
     training_rig
         .iter()

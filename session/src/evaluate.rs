@@ -25,8 +25,8 @@ const NEAR_M: f64 = 0.01;
 /// Far plane of renders, meters. Photos of a dataset may show a landscape.
 const FAR_M: f64 = 1000.0;
 
-/// How long [`Evaluator::score_all`] waits for scores before it calls `meanwhile` again, which
-/// draws pictures for viewers. A longer wait would delay these pictures.
+/// How long [`Evaluator::score_all`] waits for scores before it calls `meanwhile` again.
+/// `meanwhile` draws pictures for viewers, so a longer wait would delay these pictures.
 const MEANWHILE_PERIOD: Duration = Duration::from_millis(5);
 
 /// Maximum length of the list of cameras in [`Scores::short`]. Lines with it fit into 110 columns.
@@ -35,8 +35,8 @@ const MAX_CAMERAS_CHARS: usize = 32;
 /// Minimum alpha of a pixel that counts as covered by the model: half of the range. Below it, the
 /// background contributes more to the color than the model.
 pub const MIN_ALPHA: u8 = 128;
-/// Minimum covered fraction. With less, model and images probably show different scenes. This only
-/// causes a warning, because a small object may cover as little.
+/// Minimum covered fraction. Below it, model and images probably show different scenes. It only
+/// causes a warning, because a small object may also cover such a small fraction.
 pub const MIN_COVERED_FRAC: f64 = 0.05;
 /// Hint to print if the covered fraction is below [`MIN_COVERED_FRAC`].
 pub const CHECK_SAME_SCENE: &str =
@@ -196,23 +196,23 @@ impl Evaluator {
     /// Scores test keyframes: while some are scored on the CPU, the next ones are rendered. The
     /// result has the order of `tests`.
     ///
-    /// * `meanwhile`: called often, with the number of scored keyframes, also while no render is
-    ///   due.
+    /// * `meanwhile`: called often with the number of scored keyframes, even if there is nothing to
+    ///   render.
     pub fn score_all<'a>(
         &self,
         method: &mut AlignedModel,
         tests: impl Iterator<Item = &'a Arc<Keyframe>>,
         mut meanwhile: impl FnMut(&mut AlignedModel, usize),
     ) -> anyhow::Result<Vec<ImageScores>> {
-        // Two pictures per thread: one that is scored, and one that waits for it. More would only
-        // use more memory.
+        // Each thread has two pictures: one that it scores, and one that waits. More pictures would
+        // only use more memory.
         let max_waiting = 2 * rayon::current_num_threads();
         let (sender, receiver) = std::sync::mpsc::sync_channel(max_waiting);
         let mut scored: Vec<(usize, ImageScores)> = Vec::new();
-        // In place: the method stays on this thread, because it cannot be sent to another one.
+        // The scope runs in place, because the method cannot be sent to another thread.
         let all: anyhow::Result<()> = rayon::in_place_scope(|scope| {
             let mut n_drawn = 0;
-            // Fused, because the loop asks again after the last image.
+            // The iterator is fused, because the loop calls `next` again after the last image.
             let mut tests = tests.fuse();
             loop {
                 let next = if n_drawn - scored.len() < max_waiting {
@@ -251,7 +251,8 @@ impl Evaluator {
             }
         });
         all?;
-        // The threads finish in any order. With a fixed one, means do not depend on timing.
+        // The threads finish in any order. The scores are sorted, so that means do not depend on
+        // timing.
         scored.sort_by_key(|(ix, _)| *ix);
         Ok(scored.into_iter().map(|(_, scores)| scores).collect())
     }
@@ -372,8 +373,8 @@ impl Scores {
 }
 
 impl Scores {
-    /// The PSNR in a few words, with that of each camera if there are few, for lines during
-    /// training.
+    /// The PSNR in a few words, for lines that are printed during training. If there are only a few
+    /// cameras, the text includes the PSNR of each.
     #[must_use]
     pub fn short(&self) -> String {
         let Some(psnr) = self.psnr else {
@@ -518,7 +519,8 @@ pub fn render_depth(
     let Some(color_from_depth) = lens.color_from_depth else {
         return Ok(None);
     };
-    // Rendered from the depth camera: between two viewpoints, near objects hide different parts.
+    // Depth is rendered from the pose of the depth camera. From the pose of the color camera, near
+    // objects would hide other parts of the scene.
     let drawn = method.model_mut().render(&RenderRequest {
         world_from_camera: lens.world_from_camera * color_from_depth,
         size_px: depth.size_px,

@@ -40,8 +40,9 @@ pub fn up_to(secs: f64) -> impl Iterator<Item = f64> {
     .take_while(move |evaluation_secs| *evaluation_secs <= secs)
 }
 
-/// Twice the time, except that 60 s follows 32 s. Models improve more and more slowly, so equal
-/// factors show both the first second and the last minutes. Times after 32 s are whole minutes.
+/// Returns twice the time, except that 60 s follows 32 s, so that later times are whole minutes.
+/// Models improve more and more slowly. With a constant factor, the curve shows both the first
+/// second and the last minutes.
 fn next_after(evaluation_secs: f64) -> f64 {
     if evaluation_secs == 32.0 {
         60.0

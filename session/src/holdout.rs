@@ -15,7 +15,8 @@ pub(crate) fn parse_holdout(text: &str) -> Result<Holdout, Error> {
         request: text.to_owned(),
         reason,
     };
-    // Signed, so that a negative number is refused as a number, and not sought as a file.
+    // The number is parsed as signed, so that a negative number is reported as an invalid number
+    // and not as a missing file.
     if let Ok(every) = text.parse::<i64>() {
         return usize::try_from(every)
             .ok()

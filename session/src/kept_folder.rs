@@ -39,7 +39,7 @@ impl KeptFolder {
     fn new(folder: &Path) -> Self {
         Self {
             kept: Kept::open(folder).ok(),
-            // A run has only some of these files.
+            // A run folder may lack some of these files.
             first_files: [RIG_FILE, URDF_FILE, KEYFRAME_LIST]
                 .into_iter()
                 .filter_map(|name| Some((name, text_file(folder, name)?)))
@@ -85,7 +85,7 @@ impl KeptFolder {
     fn make_again(&self, path: &Path) -> anyhow::Result<Kept> {
         let in_folder = || format!("cannot write {}", path.display());
         std::fs::create_dir_all(path).with_context(in_folder)?;
-        // The lock went with the old folder. Without a new one, another run could use the folder.
+        // The lock was in the old folder. Without a lock, another run could use the new folder.
         run_folder::lock(path)?;
         for (name, contents) in &self.first_files {
             files::write(&path.join(name), contents).with_context(in_folder)?;

@@ -78,8 +78,8 @@ impl Ledger {
         }
     }
 
-    /// Durations from mid-exposure by stage, in order. Those during which an operator had paused
-    /// the training are left out: they would only show how long the pause was.
+    /// Durations from mid-exposure by stage, in order. Durations that overlap a pause of the
+    /// training are left out, because they would only show the length of the pause.
     #[must_use]
     pub fn latencies(&self) -> Vec<(String, Latency)> {
         stages(&self.keyframes, &self.pauses)
@@ -120,7 +120,7 @@ impl Ledger {
 
     /// Records that a client has shown a picture of the first model.
     pub(crate) fn shown(&mut self, picture: &ShownPicture) {
-        // A range beyond the list must not end the run.
+        // A range that ends beyond the list must not cause a panic.
         let [begin, end] = [picture.new_keyframes.start, picture.new_keyframes.end].map(|n| {
             usize::try_from(n)
                 .unwrap_or(usize::MAX)
@@ -139,8 +139,8 @@ impl Ledger {
     }
 }
 
-/// Durations from mid-exposure to each stage, over these keyframes. Without stamps on the clock of
-/// this process, from the arrival of the image.
+/// Durations from mid-exposure to each stage, over these keyframes. If stamps are on another clock,
+/// the durations begin with the arrival of the image.
 pub fn latencies(keyframes: &[KeyframeTimes]) -> Vec<(String, Latency)> {
     stages(keyframes, &[])
 }
@@ -154,7 +154,7 @@ fn stages(
         Some((name.to_owned(), latency_until(keyframes, at, pauses)?))
     };
     let stages = [
-        // Without the time of capture, the arrival would be compared with itself.
+        // If the time of capture is not known, the duration would begin and end with the arrival.
         until("shutter to arrival", |keyframe| {
             keyframe.input.captured.and(Some(keyframe.input.arrived))
         }),

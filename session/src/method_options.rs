@@ -74,8 +74,8 @@ fn toml_value(value: &Value) -> Option<toml::Value> {
     }
 }
 
-/// The options that all methods share. With a rig file, whose keys the flags have overridden, they
-/// are those of the rig file. `steps` is the number of training steps, if known in advance.
+/// The options that all methods share. If there is a rig file, they come from it; the flags have
+/// already overridden its keys. `steps` is the number of training steps, if known in advance.
 pub(crate) fn common(
     options: &TrainingOptions,
     train: Option<&Train>,

@@ -13,7 +13,7 @@ use viz::{ModelSource, SourceKind};
 ///
 /// * `paths`: folders or files of the models, at least one.
 /// * `kinds`: the kind of each one.
-/// * `model_from_page`: the page is z up, the models may not be.
+/// * `model_from_page`: pose of the page's world, which is z up, in the world of the models.
 pub(crate) fn of_saved(
     paths: &[PathBuf],
     kinds: &[ModelKind],
@@ -77,7 +77,7 @@ fn modified(file: &Path) -> Option<u64> {
     Some(time.duration_since(UNIX_EPOCH).ok()?.as_secs())
 }
 
-/// Name without parents, also of `.`.
+/// Name of a path without its parents. The path `.` gets the name of the current folder.
 fn name_of(path: &Path) -> String {
     let full = path.canonicalize().unwrap_or_else(|_| path.to_owned());
     let name = full.file_name().unwrap_or(path.as_os_str());

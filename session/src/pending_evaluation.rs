@@ -19,9 +19,9 @@ pub(crate) struct PendingEvaluation {
 }
 
 impl PendingEvaluation {
-    /// An evaluation due at `seconds` that scores at most `max_images` of the test keyframes, and
-    /// fewer if `max_spent` is reached first: on a CPU, rendering a neural field takes seconds per
-    /// image.
+    /// An evaluation due at `seconds` that scores at most `max_images` of the test keyframes. It
+    /// scores fewer if `max_spent` is reached first. On a CPU, for example, rendering a neural
+    /// field takes seconds per image.
     pub(crate) fn new<'a>(
         seconds: f64,
         tests: impl ExactSizeIterator<Item = &'a Arc<Keyframe>>,
@@ -31,9 +31,9 @@ impl PendingEvaluation {
         let stride = tests.len().div_ceil(max_images).max(1);
         let mut selected: Vec<(usize, &Arc<Keyframe>)> =
             tests.step_by(stride).enumerate().collect();
-        // Bit-reversed indices are the van der Corput sequence: every prefix of it is spread evenly
-        // over all images. If the time limit ends the evaluation early, the scored images still
-        // represent the whole scene.
+        // Bit-reversed indices are the van der Corput sequence. Every prefix of this sequence is
+        // spread evenly over all images. If the time limit ends the evaluation early, the scored
+        // images still represent the whole scene.
         selected.sort_by_key(|(ix, _)| ix.reverse_bits());
         let remaining = selected
             .into_iter()

@@ -16,7 +16,8 @@ pub(crate) fn serve_stored<'a>(
     models: impl Iterator<Item = &'a Path>,
     model_from_page: &Transform,
 ) {
-    // If several models were trained at once, each has a folder of its own in that of the run.
+    // If several models were trained at once, each model has its own subfolder in the folder of the
+    // run.
     let folders = models.flat_map(|model| std::iter::once(model).chain(model.parent()));
     let mut stored = folders.map(StoredKeyframes::of_run);
     let Some(stored) = stored.find(StoredKeyframes::exist) else {

@@ -40,12 +40,12 @@ impl PreviousRun {
         format!("the checkpoint in {}", self.folder.display())
     }
 
-    /// The value of a flag of that run.
+    /// The value of a flag of the previous run.
     pub(crate) fn flag(&self, name: &str) -> Option<&str> {
         self.checkpoint.flags.get(name).map(String::as_str)
     }
 
-    /// The limits of that run.
+    /// The limits of the previous run.
     fn limits(&self) -> Limits {
         Limits {
             seconds: self.flag(SECONDS).and_then(|text| text.parse().ok()),
@@ -53,9 +53,9 @@ impl PreviousRun {
         }
     }
 
-    /// These limits, or those of that run if none is given. A given limit replaces both previous
-    /// ones. Otherwise, a limit of the steps would not continue a run that had reached its limit of
-    /// the time.
+    /// The given limits, or the limits of the previous run if none is given. A single given limit
+    /// replaces both previous limits. Otherwise, a new step limit could not continue a run that had
+    /// reached its time limit.
     pub(crate) fn limits_or_previous(&self, given: Limits) -> Limits {
         if given.seconds.is_some() || given.steps.is_some() {
             given
@@ -64,18 +64,18 @@ impl PreviousRun {
         }
     }
 
-    /// Rejects a limit of the time that this run has already reached.
+    /// Rejects a time limit that the previous run has already reached.
     pub(crate) fn check_not_passed(&self, limits: Limits) -> anyhow::Result<()> {
         checkpoints::check_limit_not_passed(limits.seconds, &self.checkpoint, &self.subject())
     }
 
-    /// Whether it has reached its limits and saved its model.
+    /// Whether the previous run has reached its limits and saved its model.
     pub(crate) fn is_finished(&self) -> bool {
         let has_model = || run_folder::check_no_model(&self.folder).is_err();
         self.checkpoint.is_finished && has_model()
     }
 
-    /// Its description if nothing is left to do.
+    /// Description of the previous run if nothing is left to do.
     pub(crate) fn finished(&self) -> FinishedRun {
         FinishedRun {
             folder: self.folder.clone(),
@@ -93,7 +93,8 @@ pub(crate) fn limit_flags(limits: Limits) -> [(&'static str, Option<String>); 2]
     ]
 }
 
-/// The folder of a run: the given one; an unfinished run continues in its previous folder.
+/// The folder of a run. This is the given folder, if there is one. Otherwise, an unfinished run
+/// continues in its previous folder.
 pub(crate) fn out_folder<'a>(out: Option<&'a Path>, resume: Option<&'a Path>) -> Option<&'a Path> {
     // The results of a finished run are not overwritten.
     out.or_else(|| resume.filter(|folder| run_folder::check_no_model(folder).is_ok()))

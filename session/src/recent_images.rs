@@ -4,8 +4,8 @@ use crate::advice::ImageFlow;
 use std::collections::VecDeque;
 use std::time::{Duration, Instant};
 
-/// Length of the window. In a shorter one, a camera at 1 Hz has too few images for advice; in a
-/// longer one, advice stays visible long after the operator has followed it.
+/// Length of the window. In a shorter window, a camera at 1 Hz has too few images for advice. With
+/// a longer window, advice stays visible long after the operator has followed it.
 const WINDOW: Duration = Duration::from_secs(10);
 
 /// Counts of the last seconds.
@@ -23,7 +23,8 @@ impl RecentImages {
         if self.totals.is_empty() {
             self.totals.push_back((now, ImageFlow::default()));
         }
-        // The first one kept is just outside of the window, so that the window is covered.
+        // The oldest counts that are kept lie just outside the window, so that the whole window is
+        // covered.
         let is_old = |(at, _): &(Instant, ImageFlow)| now.saturating_duration_since(*at) >= WINDOW;
         while self.totals.get(1).is_some_and(is_old) {
             self.totals.pop_front();

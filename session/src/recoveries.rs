@@ -8,9 +8,9 @@ use gpu::Gpu;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-/// Maximum number of attempts to reopen the GPU. A driver that resets needs seconds; a device that
-/// is still missing after several attempts has probably failed, and the run should report
-/// this instead of recording without training.
+/// Maximum number of attempts to reopen the GPU. A driver that resets needs seconds. A device that
+/// is still missing after several attempts has probably failed. The run should then report the
+/// failure instead of recording without training.
 const MAX_RECOVERIES: u32 = 3;
 /// The attempt count is reset after this time without a failure, because a run of several days may
 /// fail occasionally.
@@ -51,14 +51,14 @@ impl Recoveries {
     }
 
     /// Continues all sessions on a reopened device if the GPU caused `error`. Returns an error if
-    /// the cause was another one, or if all attempts fail.
+    /// the GPU was not the cause, or if all attempts fail.
     pub fn recover(
         &mut self,
         sessions: &mut [Session],
         error: anyhow::Error,
     ) -> anyhow::Result<()> {
-        // Another device would not help against other errors. All models share the device, so all
-        // of them must be able to restart.
+        // Other errors would also occur on another device. All models share the device, so all of
+        // them must be able to restart.
         let can_restart = sessions
             .iter_mut()
             .all(|session| session.persistence().can_restore());

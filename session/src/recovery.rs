@@ -32,7 +32,7 @@ impl Recovery {
             resume_command,
             ..
         } = self;
-        // The newest checkpoint first: an older one would lose more training.
+        // The newest checkpoint comes first, because an older one would lose more training.
         match (has_checkpoint, &self.resumed) {
             (true, _) => {
                 format!(

@@ -1,8 +1,9 @@
 //! Limits the share of time that is spent on drawing pictures during training.
 //!
-//! Each second of training adds credit for pictures: a second on a software adapter, 0.66 seconds
-//! on a GPU. Pictures are drawn immediately while credit is left. Training therefore keeps at least
-//! 1/2 or 3/5 of the time, unless a single picture takes longer than the maximum debt.
+//! Each second of training adds credit for pictures. The credit is one second on a software
+//! adapter, and 0.66 seconds on a GPU. Pictures are drawn immediately while credit is left.
+//! Training therefore keeps at least 1/2 of the time on a software adapter and 3/5 on a GPU, unless
+//! a single picture takes longer than the maximum debt.
 
 use std::time::Duration;
 
@@ -10,13 +11,14 @@ use std::time::Duration;
 /// slice of training, the maximum is the length of that slice. With a larger credit, a viewer that
 /// connects later would delay new keyframes by a longer burst.
 const MAX_CREDIT_SECS: f64 = 0.1;
-/// Maximum debt, seconds. After a picture that takes longer, training makes up for this time only.
+/// Maximum debt, seconds. After a picture that takes longer, training makes up for only this much
+/// time.
 const MAX_DEBT_SECS: f64 = 1.0;
 
-/// Credit per second of training on a CPU, where pictures take seconds: viewers wait long, so
+/// Credit per second of training on a CPU. Pictures take seconds there and viewers wait long, so
 /// pictures get half of the time.
 const CREDIT_ON_SOFTWARE: f64 = 1.0;
-/// Credit per second of training on a GPU: pictures get `0.66 / 1.66`, that is 40 %, of the time.
+/// Credit per second of training on a GPU. Pictures get `0.66 / 1.66` of the time, which is 40 %.
 /// With eight viewers that request pictures back to back, training keeps about 70 % of its rate,
 /// because part of the work overlaps (`docs/benchmarks/2026-11-26-live.md`). More credit would
 /// shorten the wait for pictures at the cost of training steps.
@@ -58,7 +60,7 @@ impl RenderBudget {
     pub(crate) fn add_training(&mut self, spent: Duration) {
         let spent_secs = self.rate * spent.as_secs_f64();
         // Credit does not accumulate over several slices without pictures. A single long slice, as
-        // on a CPU, still pays for a picture that takes as long.
+        // on a CPU, still gives enough credit for a picture that takes the same time.
         self.balance_secs = (self.balance_secs + spent_secs).min(MAX_CREDIT_SECS.max(spent_secs));
     }
 

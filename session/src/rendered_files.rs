@@ -17,7 +17,7 @@ fn files(folder: &Path, ix: usize) -> [PathBuf; 2] {
 ///
 /// # Errors
 ///
-/// If it does.
+/// If the folder holds such a file.
 pub fn check_no_overwrite(folder: &Path, n: usize) -> Result<(), BadInput> {
     match (0..n)
         .flat_map(|ix| files(folder, ix))

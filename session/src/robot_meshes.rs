@@ -8,8 +8,8 @@ use kinematics::urdf::Robot;
 use std::path::{Path, PathBuf};
 use viz::{MeshFormat, RobotDescription, RobotMesh};
 
-/// The robot of a rig; `None` if the rig has neither an arm nor a moving base. Shapes that cannot
-/// be drawn cause only a warning.
+/// The robot of a rig; `None` if the rig has neither an arm nor a moving base. A shape that cannot
+/// be drawn causes only a warning.
 ///
 /// # Errors
 ///
@@ -39,13 +39,13 @@ fn meshes(robot: &Robot, urdf_folder: &Path) -> Vec<RobotMesh> {
         _ => None,
     });
     for file in files {
-        // Several links often share a mesh, such as that of a joint module.
+        // Several links often share a mesh, such as the mesh of a joint module.
         if meshes.iter().any(|mesh| mesh.file == *file) {
             continue;
         }
         match read(file, urdf_folder, budget) {
             Ok(mesh) => {
-                // All meshes together are bounded, because every client gets them.
+                // The total size of all meshes is limited, because every client gets them.
                 budget = budget.after(mesh.bytes.len() as u64);
                 meshes.push(mesh);
             }
@@ -70,7 +70,7 @@ fn read(file: &str, urdf_folder: &Path, left: Budget) -> Result<RobotMesh, Strin
         return Err(format!("no such file; tried {}", tried.join(", ")));
     };
     let shown = path.display();
-    // The budget of one file, but not more than what is left of the budget of all files.
+    // The budget of one file, but not more than the rest of the budget of all files.
     let max_bytes = Budget::MESH.max_bytes.min(left.max_bytes);
     let bytes = files::read(
         path,
@@ -90,8 +90,8 @@ fn read(file: &str, urdf_folder: &Path, left: Budget) -> Result<RobotMesh, Strin
     })
 }
 
-/// Paths where a mesh file may be. A package is a folder of that name above the URDF, or beside a
-/// folder above it.
+/// Paths where a mesh file may be. The folder of a package has the name of the package. It is a
+/// parent folder of the URDF, or a folder beside such a parent.
 fn candidates(file: &str, urdf_folder: &Path) -> Vec<PathBuf> {
     let package_path = file
         .strip_prefix("package://")
@@ -102,8 +102,8 @@ fn candidates(file: &str, urdf_folder: &Path) -> Vec<PathBuf> {
     let above = urdf_folder
         .ancestors()
         .filter(|folder| !folder.as_os_str().is_empty());
-    // Without ROS, there is no index of packages. A copy of a robot description keeps the layout of
-    // its packages, so the folders around the URDF are searched.
+    // Without ROS, there is no index of packages. The folders around the URDF are searched, because
+    // a copy of a robot description keeps the layout of its packages.
     let mut candidates = Vec::new();
     for folder in above {
         if folder.file_name().is_some_and(|name| name == package) {

@@ -17,8 +17,7 @@ use trainer::{AlignedModel, ModelKind};
 const RECORDING_EXTENSION: &str = "mcap";
 /// Parent folder of runs without `--out`.
 const RUNS: &str = "runs";
-/// Until a model is complete, it is saved in the subfolder with the temporary name that belongs to
-/// this name.
+/// Base name of the temporary subfolder in which a model is saved until it is complete.
 const MODEL: &str = "model";
 /// The checkpoint in the folder of a run.
 pub const CHECKPOINT: &str = "training.ckpt";
@@ -97,7 +96,7 @@ pub(crate) fn check_out(
 /// Returns an error if results would be written into the folder of the data.
 pub fn check_not_data_folder(out: &Path, data: &Path) -> anyhow::Result<()> {
     // The same folder may have several names, for example through a link. A folder that does not
-    // exist yet has no canonical path, and is no data.
+    // exist yet has no canonical path, and cannot be the folder of the data.
     let canonical = |path: &Path| path.canonicalize().ok();
     match (canonical(out), canonical(data)) {
         (Some(folder), Some(data)) if folder == data => Err(BadInput(format!(
@@ -214,9 +213,9 @@ pub struct CreatedFolders {
 }
 
 impl CreatedFolders {
-    /// Creates the folder of each model of a run: the requested folder for a single model, else a
-    /// subfolder per method. Writes the resolved rig file, if any, into each folder; in a
-    /// subfolder, it lists only the method of that model.
+    /// Creates the folder of each model of a run. A single model gets the requested folder. Several
+    /// models get one subfolder per method. If there is a resolved rig file, writes it into each
+    /// folder. In a subfolder, the rig file lists only the method of that model.
     pub fn make_each(
         &mut self,
         requested: Option<&Path>,
@@ -233,7 +232,7 @@ impl CreatedFolders {
         };
         if let Some(rig) = rig {
             write_rig(rig, &out)?;
-            // With a single model, this replaces the same file.
+            // With a single model, this replaces the rig file that was written above.
             for (kind, folder) in kinds.iter().zip(&folders) {
                 write_rig(&rig.with_method(kind.name()), folder)?;
             }
@@ -244,7 +243,8 @@ impl CreatedFolders {
     /// Creates the requested folder, or `runs/<UTC time>`. A folder that already contains a model
     /// is an error.
     pub fn make(&mut self, requested: Option<&Path>) -> anyhow::Result<PathBuf> {
-        // Listed before the folders exist, so that only those are removed that this run has made.
+        // The missing folders are listed before they are created, so that a rejected run removes
+        // only the folders that it has created.
         let runs = missing_folders(Path::new(RUNS));
         let missing_parents = requested.map_or(Vec::new(), missing_folders);
         let created = make(requested)?;
@@ -359,8 +359,8 @@ fn make_in(parent: &Path, prefix: &str) -> anyhow::Result<PathBuf> {
             1 => parent.join(&name),
             _ => parent.join(format!("{name}-{attempt}")),
         };
-        // `create_dir` fails if the folder exists, so of two runs that start in the same second,
-        // only one gets it.
+        // `create_dir` fails if the folder exists. If two runs start in the same second, only one
+        // of them gets the folder.
         match std::fs::create_dir(&folder) {
             Ok(()) => {
                 lock(&folder)?;
@@ -381,7 +381,7 @@ fn make_in(parent: &Path, prefix: &str) -> anyhow::Result<PathBuf> {
 }
 
 /// Locks a folder against other runs for the lifetime of this process. A folder whose subfolders
-/// are links is rejected: it may come from somebody else, and files written through its links would
+/// are links is rejected. It may come from somebody else, and files written through its links would
 /// replace other files.
 pub(crate) fn lock(folder: &Path) -> anyhow::Result<()> {
     let of_methods = ModelKind::ALL.iter().map(|kind| kind.name());
@@ -415,8 +415,8 @@ fn partial_model(folder: &Path) -> PathBuf {
 /// complete.
 pub fn save_model(method: &mut AlignedModel, edits: &Edits, folder: &Path) -> anyhow::Result<()> {
     let partial_folder = partial_model(folder);
-    // Left over if an earlier run was killed while saving. No other run saves now, because this one
-    // has locked the folder.
+    // The temporary subfolder is left over if an earlier run was killed while saving. No other run
+    // saves now, because this run has locked the folder.
     let model_files: Vec<&OsStr> = ModelKind::model_files().map(OsStr::new).collect();
     files::partial::remove_leftover(&partial_folder, &model_files)?;
     let saved = method.save(&partial_folder).and_then(|()| {
@@ -430,7 +430,8 @@ pub fn save_model(method: &mut AlignedModel, edits: &Edits, folder: &Path) -> an
         let _ = std::fs::remove_dir_all(&partial_folder); // Frees the disk space of the incomplete model.
         return Err(error.into());
     }
-    // Before the model: a complete model without its edits would show what was erased.
+    // The edits are written before the model, because a complete model without its edits would show
+    // erased parts.
     edits.write(folder)?;
     // A model counts as complete once the last file of its method is in place.
     for name in ModelKind::model_files().filter(|name| partial_folder.join(name).exists()) {
@@ -472,7 +473,7 @@ pub fn checkpoint_sha256(folder: &Path) -> anyhow::Result<String> {
         }
         let bytes = files::read(&path, files::Budget::PLAIN)
             .with_context(|| format!("cannot read {}", path.display()))?;
-        // With name and length, different files cannot give the same sequence of bytes.
+        // Because of names and lengths, different files cannot give the same sequence of bytes.
         hash.update(format!("{name} {}\n", bytes.len()));
         hash.update(&bytes);
         n_files += 1;

@@ -14,7 +14,7 @@ use viz::{Hub, Identity, KeyframePose, ModelStatus, OperatorStatus, StateProgres
 /// Publishes the cameras, the status and the initial view of saved models.
 ///
 /// * `paths`: folders or files of the models, in the same order.
-/// * `model_from_page`: the page is z up, the models may not be.
+/// * `model_from_page`: pose of the page's world, which is z up, in the world of the models.
 pub fn publish_saved(
     hub: &Hub,
     gpu: &Gpu,
@@ -134,7 +134,7 @@ fn first_view(
         .map(|camera| camera.world_from_camera)
         .collect();
     let in_page = bounds.map(|bounds| {
-        // The frame of the page may differ from that of the model.
+        // The frame of the page may differ from the frame of the model.
         let center = model_from_page.inverse() * Point3::from(bounds.center_m);
         Bounds {
             center_m: center.coords.into(),
@@ -160,8 +160,8 @@ fn trained_status(model: &Path, kind: ModelKind, progress: &Progress) -> ModelSt
         step_millis: None,
         primitives: progress.primitives,
         primitives_label: kind.entry().primitives_label.to_owned(),
-        // A loaded model needs less memory than one in training. The number in the report is the one
-        // that the run has shown.
+        // A loaded model needs less memory than a model in training. The page shows the number in
+        // the report, as it did during the run.
         bytes: done["bytes"].as_u64().unwrap_or(progress.bytes),
         has_chunks: kind.entry().has_chunks,
         psnr: done["psnr"].as_f64(),

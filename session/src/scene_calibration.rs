@@ -42,7 +42,8 @@ impl SceneCalibration {
     pub fn relative(&self, camera: &str) -> Option<RelativePose> {
         let cameras = &self.rig.as_ref()?.cameras;
         let camera = cameras.iter().find(|other| *other.name == *camera)?;
-        // By name, so that the reference does not depend on the order in the rig file.
+        // Cameras are ordered by name, so that the reference does not depend on the order in the
+        // rig file.
         let same_parent = cameras.iter().filter(|other| other.parent == camera.parent);
         let first = same_parent
             .min_by_key(|other| &other.name)
@@ -93,8 +94,9 @@ pub const SCENE_PARAMS: [Refine; 8] = [
     Refine::Readout,
 ];
 
-/// Estimates calibration parameters from keyframes: those of `params`, or with [`Refine::Auto`] all
-/// that improve the prediction of validation images. Test images are used for the estimation, too.
+/// Estimates calibration parameters from keyframes. These are the parameters in `params`, or with
+/// [`Refine::Auto`] all parameters that improve the prediction of validation images. Test images
+/// are used for the estimation, too.
 ///
 /// * `rig`: the rig to correct, without settings that only apply to these data.
 ///
@@ -110,7 +112,7 @@ pub fn calibrate_scene(
         refine: params.to_vec(),
         ..TrainingOptions::default()
     };
-    // The same rules as for training.
+    // The rules are the same as for training.
     let settings = options.estimating(Setting::Params, data.available(), Refine::Auto)?;
     let choice = without_image_poses(settings.align);
     // Nothing is scored here, so test images would be wasted.

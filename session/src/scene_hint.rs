@@ -8,13 +8,13 @@ use std::sync::Arc;
 use trainer::Bounds;
 use viz::{Hub, SceneBounds, SceneHint};
 
-/// Assumed distance of the scene from each camera if the optical axes do not determine it, meters:
-/// a typical distance between the camera of an arm and its table. With a single camera, the view
-/// turns about a point at this distance.
+/// Assumed distance of the scene from each camera if the optical axes do not determine it, meters.
+/// It is a typical distance between the camera of an arm and its table. With a single camera, the
+/// view turns about a point at this distance.
 const PRIOR_DISTANCE_M: f64 = 0.5;
 /// Weight of the assumed distance relative to one optical axis. It matters only in directions that
 /// the axes do not constrain. A larger weight pulls the center away from the point where the axes
-/// meet; a smaller one leaves it undefined for nearly parallel axes.
+/// meet. A smaller weight leaves the center undefined for nearly parallel axes.
 const PRIOR_WEIGHT: f64 = 0.01;
 
 /// Distance of an outside view, in outer radii of the model. The whole sphere is then visible in a
@@ -27,8 +27,8 @@ const VIEW_DIRECTION: [f64; 3] = [0.5, -0.707, 0.5];
 /// Points per side of the grid of depth readings that a keyframe contributes to the bounds. With
 /// 400 keyframes, these are 10,000 points, which takes less than a millisecond.
 const GRID: u32 = 5;
-/// Fraction of the points left out on each side of the bounds: wrong depth readings, and what is
-/// seen through windows and doors.
+/// Fraction of the points left out on each side of the bounds. Such points are often wrong depth
+/// readings, or are seen through windows and doors.
 const OUTSIDE_FRAC: f64 = 0.03;
 /// Minimum radius of a scene, meters. Clients divide by it.
 const MIN_RADIUS_M: f64 = 0.01;
@@ -141,8 +141,8 @@ fn most_of(points: &[Point3<f64>]) -> Option<SceneBounds> {
     })
 }
 
-/// Points on the surfaces that a keyframe shows: from a grid of its depth readings or, without any,
-/// the point on its optical axis that is closest to the center of all axes.
+/// Points on the surfaces that a keyframe shows, from a grid of its depth readings. Without depth
+/// readings, this is the point on its optical axis that is closest to the center of all axes.
 fn surface_points(keyframe: &Keyframe, center: &Point3<f64>) -> Vec<Point3<f64>> {
     let measured: Vec<_> = keyframe.depth.iter().flat_map(grid_points).collect();
     if measured.is_empty() {

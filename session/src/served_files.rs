@@ -122,8 +122,8 @@ fn convert(
         cell_m: None,
     };
     write(&request).map_err(|error| format!("{:#}", anyhow::Error::from(error)))?;
-    // The folder is removed at the end of this function; the system keeps the content of an open
-    // file.
+    // The folder is removed at the end of this function. The file can still be read, because the
+    // system keeps the content of an open file.
     open(&out)
 }
 
@@ -131,7 +131,8 @@ fn open(path: &Path) -> Result<File, String> {
     files::open(path).map_err(|error| format!("cannot read {}: {error}", path.display()))
 }
 
-/// Name for saved files: of the run or of the file, and of the method if the run has several.
+/// Name for saved files. It is the name of the run or of the file. If the run has several methods,
+/// the name of the method follows.
 fn base_name(kind: ModelKind, model: &Path) -> String {
     let full = model.canonicalize().unwrap_or_else(|_| model.to_owned());
     let name = |path: &Path| {

@@ -175,8 +175,8 @@ impl Session {
 
     /// Adds a keyframe to the model. Test keyframes are also kept for evaluation.
     pub fn push(&mut self, keyframe: &Arc<Keyframe>) -> anyhow::Result<()> {
-        // Held first: after a GPU failure in `push`, the restored model gets all keyframes in the
-        // store, and this one must be among them.
+        // The keyframe is held first. After a GPU failure in `push`, the restored model gets all
+        // keyframes in the store, and this keyframe must be among them.
         self.hold(keyframe);
         self.method.push(keyframe.clone())?;
         self.persistence.log_push(&mut self.method, keyframe)
@@ -233,7 +233,7 @@ impl Session {
     /// Trains for at most `max_steps` steps.
     pub fn train_steps(&mut self, max_steps: u64) -> anyhow::Result<u64> {
         let left = self.time.n_steps_remaining(self.progress().step);
-        // Logged even if no step is made: the request alone starts training on the keyframes so
+        // The request is logged even if no step is made. It starts training on the keyframes so
         // far, which affects the model.
         self.persistence.log_step_request();
         let n = self.method.step(max_steps.min(left.unwrap_or(u64::MAX)))?;
@@ -258,8 +258,8 @@ impl Session {
         Ok(())
     }
 
-    /// Applies the result of an alignment in the background if it is ready, or waits for it if
-    /// `wait`. Returns whether a result was applied.
+    /// Applies the result of an alignment in the background if it is ready. If `wait` is set, waits
+    /// for the result. Returns whether a result was applied.
     pub fn poll_alignment(&mut self, wait: bool) -> anyhow::Result<bool> {
         let is_applied = self.method.poll_alignment(wait)?;
         if is_applied {
@@ -286,8 +286,8 @@ impl Session {
         Ok(())
     }
 
-    /// Corrections of cameras that were optimized with the scene; they follow those of
-    /// [`Self::alignment`].
+    /// Corrections of cameras that were optimized with the scene. They apply after the corrections
+    /// of [`Self::alignment`].
     pub fn camera_corrections(&mut self) -> anyhow::Result<BTreeMap<String, CameraCorrection>> {
         Ok(self.method.model_mut().camera_corrections()?)
     }
@@ -305,8 +305,8 @@ impl Session {
         set_initial_points(&mut self.method, self.initial_points.as_ref());
         // The checkpoint may be older than the last step, so that steps are left to make.
         self.time.unmark_finished();
-        // Drops an evaluation in progress: all of its images must be scored on the same model
-        // state, which is lost.
+        // An evaluation in progress is dropped. All of its images must be scored on the same model
+        // state, and this state is lost.
         self.scoreboard.take_pending();
         Ok(())
     }
@@ -370,7 +370,8 @@ impl Session {
         }
         if evaluation.is_complete() {
             self.scoreboard.add_spent(evaluation.spent());
-            // Reported with the time at which it was due, so that runs are compared at equal times.
+            // The evaluation is reported with the time at which it was due, so that runs are
+            // compared at equal times.
             let due_secs = evaluation.seconds;
             let images = evaluation.into_images();
             self.scoreboard.record(&images, self.time.secs());

@@ -126,7 +126,7 @@ impl StoredKeyframes {
         for error in errors {
             log::warn!("{error:#}; the run continues without it");
         }
-        // File names begin with the camera, so their order is not that of the stamps.
+        // File names begin with the camera, so they are not in the order of the stamps.
         keyframes.sort_by(|one, other| (one.stamp, &one.camera).cmp(&(other.stamp, &other.camera)));
         Ok(keyframes)
     }

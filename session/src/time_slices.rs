@@ -48,8 +48,8 @@ pub(crate) fn train_next(
             )?;
         }
     }
-    // Of all sessions, not only of the one that has trained: the clock is common, so evaluations
-    // and checkpoints of the others become due, too.
+    // All sessions are evaluated, not only the session that has trained. They share one clock, so
+    // evaluations and checkpoints of the other sessions become due, too.
     sessions.iter_mut().try_for_each(Session::evaluate_when_due)
 }
 

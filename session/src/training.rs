@@ -143,7 +143,8 @@ pub fn model_specs(
         .unwrap_or_else(|| vec![ModelKind::default()]);
     options.check_for(&kinds)?;
     let available = data.available();
-    // On a CPU, no trials by default: each takes hundreds of additional steps, which take minutes.
+    // On a CPU, there are no trials by default. A trial takes hundreds of additional steps, which
+    // take minutes on a CPU.
     let RefineSettings {
         align,
         with_scene: cameras,

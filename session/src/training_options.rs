@@ -193,7 +193,7 @@ impl TrainingOptions {
         self.estimating(Setting::Refine, available, default_value)
     }
 
-    /// As [`Self::refining`]; `setting` is the one that the user gave.
+    /// Does the same as [`Self::refining`]. `setting` is the setting that the user gave.
     pub(crate) fn estimating(
         &self,
         setting: Setting,
@@ -213,7 +213,8 @@ impl TrainingOptions {
         if has(Refine::Auto) {
             return Ok(available.auto_settings());
         }
-        // Only registration estimates these, and it compares measured surfaces.
+        // Only registration estimates these parameters. It compares measured surfaces, so it needs
+        // depth.
         let needs_depth = [
             Refine::Joints,
             Refine::DepthPose,
@@ -255,9 +256,10 @@ impl TrainingOptions {
         })
     }
 
-    /// Which calibration parameters a live run estimates. Without the flag, these are all that
-    /// registration or features can estimate, and image gains once the exposure changes; or none on
-    /// a software adapter, where training is already slow.
+    /// Which calibration parameters a live run estimates. Without the flag, these are all
+    /// parameters that registration or features can estimate, and image gains once the exposure
+    /// changes. On a software adapter, where training is already slow, no parameters are estimated
+    /// without the flag.
     pub fn refining_live(
         &self,
         available: AvailableData,
@@ -363,13 +365,14 @@ impl AvailableData {
     /// is depth, otherwise jointly with the scene.
     ///
     /// Without depth, extrinsics are estimated from features and then optimized with the scene from
-    /// the first step on: their error is shared by all images, so it is observable if the poses are
-    /// right, and a trial of a few hundred steps is too short to correct it.
+    /// the first step on. All images share the error of the extrinsics, so it is observable if the
+    /// poses are right. They are not candidates for trials, because a trial of a few hundred steps
+    /// is too short to correct this error.
     fn auto_settings(self) -> RefineSettings {
         let gains = ParamSet::IMAGE_GAINS;
         let poses = ParamSet::IMAGE_POSES;
         let with_scene = match self {
-            // Poses that drift have an error of their own in each image.
+            // Poses that drift have a separate error in each image.
             Self { drifts: true, .. } => vec![gains, poses],
             Self { depth: true, .. } => vec![gains],
             Self {

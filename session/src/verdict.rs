@@ -8,8 +8,9 @@ use viz::{Grade, Verdict};
 /// which is hardly visible. Splats reach 29 dB on the indoor scenes of Deep Blending, but only 24 dB
 /// on the outdoor scenes of Tanks and Temples (Kerbl et al. 2023, table 1).
 const GOOD_DB: f64 = 30.0;
-/// Minimum PSNR of a fair model, dB. The differences are twice as large, 16 gray levels: shapes are
-/// in place, but details are blurred. Below this, poses or lens are often wrong.
+/// Minimum PSNR of a fair model, dB. At this PSNR, pictures differ from photos by 16 gray levels
+/// (RMS), twice as much as for a good model. Shapes are in place, but details are blurred. Below
+/// this PSNR, poses or lens are often wrong.
 const FAIR_DB: f64 = 24.0;
 /// Minimum fraction of lost images that verdicts and reports mention. Cameras drop single images now and
 /// then, which the next image replaces.
@@ -37,7 +38,7 @@ pub struct Findings<'a> {
     pub n_lost: u64,
 }
 
-/// Judges a result. The grade is that of the best model.
+/// Judges a result. The best model determines the grade.
 #[must_use]
 pub fn verdict(findings: &Findings<'_>) -> Verdict {
     let (grade, mut text) = judge_scores(findings);
@@ -111,7 +112,8 @@ fn judge_scores(findings: &Findings<'_>) -> (Grade, String) {
         let text = "Not scored, because there are no test images";
         return (Grade::Unknown, text.to_owned());
     }
-    // NaN cannot be judged. Rounded, so that the grade agrees with the number that is shown.
+    // NaN cannot be judged. Scores are rounded, so that the grade agrees with the number that is
+    // shown.
     let scored: Vec<(&str, f64)> = findings
         .models
         .iter()

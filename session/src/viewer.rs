@@ -18,8 +18,8 @@ use viz::{
     Status,
 };
 
-/// Maximum response time to Ctrl-C while no client requests a picture. Edits wait as long; a
-/// shorter period would use more of a processor while nothing happens.
+/// Maximum response time to Ctrl-C while no client requests a picture. Edits are delayed by up to
+/// the same time. A shorter period would use more processor time while nothing happens.
 const POLL_PERIOD: Duration = Duration::from_millis(100);
 
 /// A model that clients can view.
@@ -43,7 +43,7 @@ struct Note {
 
 /// Trained models and the hub of the clients that view them.
 pub struct ModelViewer {
-    /// The first model is drawn for requests that name no method.
+    /// The models. The first model is drawn for requests that name no method.
     models: Vec<ServedModel>,
     hub: Hub,
     chunk_publisher: ChunkPublisher,
@@ -55,7 +55,7 @@ pub struct ModelViewer {
     editor: Editor,
     /// The edits that are stored.
     saved: Vec<Arc<Edits>>,
-    /// Number of requests to save them.
+    /// Number of requests to save edits.
     n_saves: u64,
     /// What the last edit or save did.
     note: Option<Note>,
@@ -378,8 +378,8 @@ fn model_mut<'a>(
     models: &'a mut [ServedModel],
     method: Option<&str>,
 ) -> Result<&'a mut ServedModel, String> {
-    // By index, because returning a reference from a search would keep `models` borrowed for the
-    // error.
+    // The search returns an index. A reference would keep `models` borrowed, and the error needs
+    // `models`, too.
     match models
         .iter()
         .position(|model| method.is_none_or(|name| model.kind.name() == name))

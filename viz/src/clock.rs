@@ -23,7 +23,7 @@ impl ServerClock {
 
     /// The time of an instant; negative before the server started.
     pub(crate) fn millis(self, at: Instant) -> f64 {
-        // One of the two is 0: durations cannot be negative.
+        // Durations cannot be negative, so one of the two differences is 0.
         let after = at.saturating_duration_since(self.started).as_secs_f64();
         let before = self.started.saturating_duration_since(at).as_secs_f64();
         (after - before) * 1e3

@@ -7,9 +7,10 @@ use std::collections::BTreeMap;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-/// A client gets keyframes and images this long after it has joined, or after its hello. Earlier,
-/// it is not known which of them it wants, and at which size. With less time, pages on slow links
-/// get complete lists and large images first; with more, clients that send no hello wait longer.
+/// A client gets keyframes and images after its hello, or at the latest this long after it has
+/// joined. Before that, the server does not know which of them the client wants, and at which size.
+/// With a shorter time, pages on slow links would first get complete lists and large images. With a
+/// longer time, clients that send no hello would wait longer.
 const HELLO_GRACE: Duration = Duration::from_millis(500);
 
 /// What a client receives.
@@ -38,7 +39,7 @@ impl Demand {
         }
     }
 
-    /// The time from which the client gets keyframes and images, if it is later.
+    /// The time from which the client gets keyframes and images; `None` if this time has passed.
     pub(crate) fn settles_at(&self, now: Instant) -> Option<Instant> {
         let settled = self.joined + HELLO_GRACE;
         (!self.has_hello && settled > now).then_some(settled)

@@ -17,7 +17,7 @@ pub enum Error {
         /// Requested address.
         address: SocketAddr,
     },
-    /// The address is reachable from other machines, and the server is not shared.
+    /// The address is reachable from other machines, but the server is not shared.
     #[error(
         "other machines can reach the address {address}: add {}, which encrypts the page and requires a token",
         Setting::Share

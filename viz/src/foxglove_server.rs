@@ -34,8 +34,8 @@ const CLIENT_CHECK_PERIOD: Duration = Duration::from_millis(200);
 /// Keyframes and metrics are repeated with this period, because Foxglove sends only what comes
 /// after a subscription.
 const REPEAT_PERIOD: Duration = Duration::from_secs(1);
-/// Messages that may wait for a client; older ones are dropped. With more, a slow client shows
-/// older data.
+/// Number of messages that may wait for a client. Older messages are dropped. With more messages, a
+/// slow client would show older data.
 const MAX_WAITING: usize = 64;
 /// The frame of all poses.
 const WORLD: &str = "world";
@@ -126,7 +126,7 @@ async fn serve(
     started: &SyncSender<Result<u16, FoxgloveError>>,
     mut stopped: watch::Receiver<bool>,
 ) {
-    // Not the context of the process, which all servers would share.
+    // The server does not use the context of the process, because all servers would share it.
     let context = Context::new();
     let server = WebSocketServer::new()
         .name(concat!("fieldrig ", env!("CARGO_PKG_VERSION")))
@@ -320,7 +320,7 @@ async fn publish_lists(topics: &Topics) {
             Ok(()) = keyframes.changed() => (true, false),
             Ok(()) = status.changed() => (false, true),
         };
-        // The list has no stamp of its own: it gets that of its newest keyframe.
+        // The list has no own stamp, so it gets the stamp of its newest keyframe.
         if has_keyframes {
             let keyframes = keyframes.borrow_and_update().clone();
             let newest = keyframes
@@ -341,7 +341,7 @@ async fn publish_lists(topics: &Topics) {
     }
 }
 
-/// Stamp of the newest image or robot state. Metrics have no stamp of their own.
+/// Stamp of the newest image or robot state. It is used for metrics, which have no own stamp.
 fn newest_stamp(hub: &Hub) -> Stamp {
     let images = hub.latest::<LiveImages>();
     let of_images = images.borrow().values().map(|image| image.stamp).max();
@@ -509,7 +509,7 @@ fn camera_frame(camera: &str) -> String {
     format!("camera/{camera}")
 }
 
-/// Nanoseconds of a stamp. Foxglove has no negative times, and no clock of ours has them.
+/// Nanoseconds of a stamp. Foxglove has no negative times, and clocks of fieldrig have none either.
 fn nanos(stamp: Stamp) -> u64 {
     u64::try_from(stamp.0).unwrap_or(0)
 }

@@ -43,10 +43,11 @@ impl Hub {
     }
 
     /// The latest data of this type. A type belongs to one topic, whose module sets and reads it. A
-    /// topic with a common type, such as a number, therefore wraps it in a type of its own.
+    /// topic with a common type, such as a number, therefore wraps it in a separate type.
     pub(crate) fn latest<T: Default + Send + Sync + 'static>(&self) -> watch::Sender<T> {
-        // Without a field for each topic, a new topic needs no change here. The lock is held only
-        // to find the sender, so the training thread does not wait for whoever reads the data.
+        // There is no field for each topic, so a new topic needs no change here. The lock is held
+        // only to find the sender, so the training thread does not wait for threads that read the
+        // data.
         let mut latest = self.shared.latest.lock();
         let sender = latest
             .entry(TypeId::of::<T>())

@@ -46,8 +46,8 @@ impl OperatorRequests {
     /// Requests an action of the run.
     pub(crate) fn control(&self, request: ControlRequest) {
         let mut controls = self.controls.lock();
-        // Repeated clicks count once, and as the last action: after pause, resume and pause, the
-        // run must pause.
+        // A repeated action counts once, at its last position. For example, the run must pause
+        // after pause, resume and pause.
         controls.retain(|earlier| earlier.action != request.action);
         controls.push(request);
     }

@@ -22,8 +22,8 @@ pub(crate) fn from_row_major(rows: &[f64; 16]) -> Option<Transform> {
         rows[0], rows[1], rows[2], rows[4], rows[5], rows[6], rows[8], rows[9], rows[10],
     );
     let skew = (rotation.transpose() * rotation - Matrix3::identity()).amax();
-    // Written so that NaN is rejected. The determinant excludes reflections, which are orthonormal,
-    // too.
+    // The comparisons are written so that NaN is rejected. The determinant excludes reflections,
+    // because they are orthonormal, too.
     let is_rigid = rows.iter().all(|number| number.is_finite())
         && skew <= MAX_SKEW
         && rotation.determinant() > 0.0

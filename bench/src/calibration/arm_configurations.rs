@@ -122,8 +122,8 @@ impl Arm<'_> {
         self.chain.forward(joints).expect("seven joints")
     }
 
-    /// Measurements around the mean positions, from which the whole board is visible. Fewer than
-    /// [`N_POSES`] if such positions are rare.
+    /// Measurements at joint positions around the mean, from which the whole board is visible. If
+    /// such positions are rare, there are fewer than [`N_POSES`].
     fn samples(&self, lens: &Intrinsics, random: &mut Random) -> Vec<HandEyeSample> {
         const MAX_ATTEMPTS: usize = 20_000;
         // The board is in front of the camera at the mean arm configuration.
@@ -164,7 +164,7 @@ impl Arm<'_> {
 
     /// The pose of the camera that a calibration should find.
     fn truth(&self) -> Transform {
-        // The offset of the last joint is equivalent to a rotation of the camera; it is not
+        // The offset of the last joint is equivalent to a rotation of the camera, so it is not
         // estimated separately.
         let mut last = vec![0.0; self.home.len()];
         last[self.home.len() - 1] = self.offsets[self.home.len() - 1];

@@ -26,8 +26,9 @@ pub(super) struct Coverage {
     pub(super) n_refused: usize,
     /// Fraction of the results whose 95 % ellipsoid contains the truth.
     pub(super) covered_frac: f64,
-    /// Median and 95th percentile of the error: position (mm) and rotation (degrees) of the camera;
-    /// for intrinsics, focal length and principal point (px).
+    /// Medians of two errors; `p95` has their 95th percentiles. For a camera pose, these are the
+    /// position (mm) and the rotation (degrees). For intrinsics, they are the focal length and the
+    /// principal point (px).
     pub(super) median: [f64; 2],
     pub(super) p95: [f64; 2],
     pub(super) units: [&'static str; 2],
@@ -86,8 +87,8 @@ pub(super) fn measure(scenes: CoverageScenes) -> Vec<Coverage> {
         estimate_intrinsics: true,
         ..default
     };
-    // The kinds of calibration differ in the source of uncertainty. It is the corners, the robot
-    // poses, the given lens, or a lens that is estimated, too.
+    // The kinds of calibration differ in the source of uncertainty: the corners, the robot poses,
+    // the given lens, or a lens that is estimated together with the pose.
     let hand_eye = |name, noise, given, options| hand_eye(scenes, name, noise, given, options);
     let lens = |name, lens, model| intrinsics_coverage(scenes, name, lens, model);
     vec![

@@ -58,7 +58,7 @@ pub struct CalibrationOptions {
     pub parts: Vec<Part>,
     /// Scenes of [`Part::Coverage`].
     pub coverage: CoverageScenes,
-    /// Scenes per number of poses or combination of conditions.
+    /// Number of scenes for each number of poses, and for each combination of conditions.
     pub seeds: u64,
     /// Rig file for [`Part::Rigs`]; skipped if `None`.
     pub rig: Option<PathBuf>,

@@ -124,8 +124,8 @@ fn coverage_line(coverage: &Coverage) -> Line {
 
 fn coverage_chart(results: &[Coverage]) -> Chart {
     // With the right covariance, the ellipsoid of a level contains the truth in that fraction of
-    // the results. A line below this one shows an overconfident covariance, and a line above shows
-    // a covariance that is too cautious.
+    // the results. A measured line below the ideal line shows a covariance that is too small. A
+    // measured line above it shows a covariance that is too large.
     let ideal = Line {
         label: "ideal".into(),
         points: LEVELS.map(|level| point(level, level)).into(),

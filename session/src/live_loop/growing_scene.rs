@@ -6,19 +6,21 @@ use std::sync::Arc;
 use viz::{Hub, SceneBounds};
 
 /// The extent is sent again when its radius has grown by this factor. Viewers that have not moved
-/// their view follow it; with a smaller factor, they would move more often, and each time wait for a
-/// picture.
+/// their view follow the extent. With a smaller factor, their view would move more often, and each
+/// time they would wait for a picture.
 const MIN_GROWTH: f64 = 1.2;
 
 /// The extent that viewers have.
 #[derive(Default)]
 pub(super) struct GrowingScene {
-    /// The first one had the view of the first keyframe, which may be evicted later.
+    /// The published extent and view. Later extents keep the view of the first keyframe, because
+    /// this keyframe may be evicted later.
     published: Option<SceneView>,
 }
 
 impl GrowingScene {
-    /// Publishes the extent of these keyframes if it is the first one, or has grown noticeably.
+    /// Publishes the extent of these keyframes if none was published before, or if it has grown
+    /// noticeably.
     pub(super) fn publish(&mut self, keyframes: &[Arc<Keyframe>], hub: &Hub) {
         let Some(mut view) = SceneView::from_keyframes(keyframes) else {
             return;
@@ -58,7 +60,7 @@ mod tests {
         assert!(has_grown(&published, &cube(1.25, 0.0)));
         // The scene has moved on, for example with a mobile base.
         assert!(has_grown(&published, &cube(1.0, 1.0)));
-        // It has not grown if a part of it is no longer in a keyframe.
+        // A scene does not grow when keyframes no longer show a part of it.
         assert!(!has_grown(&published, &cube(0.5, 0.0)));
     }
 }

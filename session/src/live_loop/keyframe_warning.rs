@@ -3,8 +3,8 @@
 use capture::Feed;
 use std::time::{Duration, Instant};
 
-/// Time without any keyframe until it is reported. A shorter time would warn while a robot has only
-/// just begun to move; after a longer one, an operator has waited in vain.
+/// Time without any keyframe until it is reported. With a shorter time, the warning would appear
+/// when a robot has only just begun to move. With a longer time, an operator would wait in vain.
 const WARN_AFTER: Duration = Duration::from_secs(10);
 
 /// When to report that there is still no keyframe.

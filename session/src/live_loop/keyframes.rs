@@ -9,7 +9,7 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 /// Polling period while waiting for a keyframe or a picture request. It delays pictures and
-/// keyframes by at most this time; a shorter one would use more of a processor.
+/// keyframes by at most this time. A shorter period would use more processor time.
 const POLL_PERIOD: Duration = Duration::from_millis(2);
 
 /// Keyframes that were accepted and not evicted.
@@ -30,8 +30,8 @@ impl AcceptedKeyframes {
             .any(|keyframe| keyframe.split == Split::Train)
     }
 
-    /// Number of keyframes accepted, and of those evicted. In a full store, each new keyframe
-    /// replaces another one, so that the length of the list stays the same.
+    /// Number of accepted keyframes and number of evicted keyframes. The length of the list is not
+    /// enough to detect a change: in a full store, each new keyframe replaces another one.
     fn n_changes(&self) -> (u64, u64) {
         (self.list.len() as u64 + self.n_evicted, self.n_evicted)
     }
@@ -100,8 +100,8 @@ impl LiveLoop {
             };
             let is_new = matches!(item.change, Change::Accepted(_));
             self.apply(item)?;
-            // An evicted keyframe makes room for a new one, and does not count. Before training
-            // starts, keyframes are taken without steps in between.
+            // Evictions do not count as new keyframes. Before training starts, keyframes are taken
+            // without steps in between.
             if is_new && self.is_training() {
                 self.models.schedule_next_keyframe(steps_per_keyframe);
             }
@@ -158,7 +158,7 @@ impl LiveLoop {
             Some(change) => change(keyframe),
             None => keyframe,
         };
-        // Read before the push, which may wait for queued steps.
+        // The steps are read before the push, because the push may wait for queued steps.
         let pushed_at_steps = self.models.steps();
         self.accepted.list.push(keyframe.clone());
         let pushed = self.models.push(&keyframe);

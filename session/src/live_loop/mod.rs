@@ -29,8 +29,8 @@ use std::time::{Duration, Instant};
 use trainer::AlignTiming;
 use viz::{Hub, Identity, StateProgress};
 
-/// Maximum wait for a keyframe when there is nothing to do. Controls, edits and the status wait as
-/// long; a shorter wait would use more of a processor for checks without result.
+/// Maximum wait for a keyframe when there is nothing to do. Controls, edits and the status may be
+/// delayed by this time. A shorter wait would use more processor time for checks without a result.
 const IDLE: Duration = Duration::from_millis(10);
 
 /// When the models receive keyframes.
@@ -143,8 +143,8 @@ impl LiveLoop {
             || (self.feed.ended() && !self.accepted.can_train())
     }
 
-    /// Whether the input ended and a model cannot reach its step limit without more keyframes.
-    /// Without a step limit, the run does not end, so that the result stays visible.
+    /// Whether the input has ended and a model cannot reach its step limit without more keyframes.
+    /// A run without a step limit does not end in this case, so that the result stays visible.
     pub fn has_exhausted_input(&self) -> bool {
         self.is_finished() && self.models.sessions.iter().any(has_steps_left)
     }
@@ -221,8 +221,8 @@ impl LiveLoop {
     /// Trains for one slice once there are enough keyframes. During an evaluation, scores one test
     /// image instead. Does not train if a requested picture may be drawn now.
     fn step(&mut self) -> anyhow::Result<()> {
-        // Checked even if no steps are made: callbacks may report a lost device at any time, and an
-        // idle run must recover, too.
+        // Lost devices are detected even if no steps are made. Callbacks may report a lost device
+        // at any time, and an idle run must recover, too.
         self.models
             .sessions
             .iter()
@@ -271,8 +271,8 @@ impl LiveLoop {
         // In lockstep, no model trains beyond the step at which its next keyframe is due. After the
         // end of the input, no keyframe is due any more.
         let is_paced = self.pace != Pace::RealTime && !self.feed.ended();
-        // Only in real time: the time of a step differs between runs, and a lockstep run must not
-        // depend on it.
+        // Growth is paused only in real time. The time of a step differs between runs, and a
+        // lockstep run must not depend on it.
         if self.pace == Pace::RealTime {
             self.models.pause_growth_when_slow()?;
         }
@@ -330,13 +330,13 @@ impl LiveLoop {
         self.accepted.can_train() && has_enough
     }
 
-    /// Whether the input ended and all training is done; the models stay visible until the user
+    /// Whether the input has ended and all training is done. The models stay visible until the user
     /// ends the run.
     fn is_finished(&self) -> bool {
         self.feed.ended() && self.models.is_idle()
     }
 
-    /// How far the work is that [`Self::state`] names.
+    /// Progress of the work that [`Self::state`] names.
     fn state_progress(&self) -> Option<StateProgress> {
         if let Some((n_scored, n_all)) = self.models.scoring_progress() {
             let text = format!("scoring {n_scored} of {n_all} test images");

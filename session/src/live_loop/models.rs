@@ -74,8 +74,8 @@ impl Models {
     pub(super) fn push(&mut self, keyframe: &Arc<Keyframe>) -> anyhow::Result<()> {
         let mut pushed = Ok(());
         for session in self.unfinished() {
-            // Continues after a GPU failure, so that every session holds the keyframe for its
-            // restored model.
+            // The loop continues after a GPU failure, so that every session holds the keyframe for
+            // its restored model.
             pushed = pushed.and(session.push(keyframe));
         }
         pushed

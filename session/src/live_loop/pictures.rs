@@ -12,7 +12,7 @@ use viz::PendingRender;
 /// delivered. Each queued picture holds memory for its read-back until it is delivered.
 const MAX_QUEUED_PICTURES: usize = 8;
 /// Maximum time for which pictures are drawn before other work continues. New keyframes, controls
-/// and the status wait as long.
+/// and the status are delayed by up to this time.
 const MAX_RENDER_TIME: Duration = Duration::from_millis(100);
 
 /// A requested picture that the GPU may still be drawing.
@@ -59,7 +59,8 @@ impl LiveLoop {
             self.budget.add_training(before.elapsed());
             let before = Instant::now();
             let (queued, is_any_on_gpu) = self.queue_pictures();
-            // Queued before the pictures are delivered, so that the GPU does not become idle.
+            // Steps are queued before the pictures are delivered, so that the GPU does not become
+            // idle.
             let trained = if is_any_on_gpu {
                 self.queue_steps()
             } else {
@@ -93,8 +94,8 @@ impl LiveLoop {
                 .is_ok_and(|queued| !queued.is_ready());
             is_any_on_gpu |= is_on_gpu;
             queued.push(picture);
-            // A picture that is complete already is delivered before the next one is drawn: its
-            // method draws pictures one by one, which may take long.
+            // A picture that is already complete is delivered before the next one is drawn. Methods
+            // that return complete pictures draw them one by one, which may take long.
             if !is_on_gpu || queued.len() == MAX_QUEUED_PICTURES {
                 break;
             }
@@ -104,8 +105,9 @@ impl LiveLoop {
 
     /// Queues steps behind pictures, which keeps the GPU busy while the pictures are delivered.
     ///
-    /// Only for a single model in real time, where this needs no other work: several models would
-    /// need a choice of the next one, and lockstep the check whether a keyframe is due.
+    /// Steps are queued only for a single model in real time, where no other decision is needed.
+    /// With several models, the next model would have to be chosen. In lockstep, the loop would
+    /// have to check whether a keyframe is due.
     fn queue_steps(&mut self) -> anyhow::Result<()> {
         let is_training = self.is_training()
             && !self.models.is_idle()
@@ -144,7 +146,8 @@ impl LiveLoop {
             let mut model = session.viewed();
             let queued = model.queue_picture(&pending.request, pending.packing());
             let pending = model.label(pending);
-            // Determined now: steps that are queued behind the picture are not in it.
+            // The keyframes are determined now, because steps that are queued behind the picture do
+            // not affect it.
             let trained_on = self
                 .ledger
                 .trained_keyframes(session_ix, session.progress().step);
@@ -159,8 +162,9 @@ impl LiveLoop {
     /// Records which pictures of the first model clients have shown.
     pub(super) fn record_shown_pictures(&mut self) {
         for picture in self.hub.pictures().take_shown() {
-            // The ledger has one time per keyframe. With several models, it would otherwise mix
-            // models that receive different shares of the time.
+            // The ledger has one time per keyframe, so only the first model is recorded. Several
+            // models receive different shares of the training time, so their times must not be
+            // mixed.
             if self.models.session_ix(picture.method.as_deref()) == Ok(0) {
                 self.ledger.shown(&picture);
             }

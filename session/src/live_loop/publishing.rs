@@ -20,11 +20,12 @@ use viz::{
     Hub, Identity, ImageCounts, KeyframePose, KeyframeStore, ModelStatus, OperatorStatus, Status,
 };
 
-/// Period of status messages. Shorter periods make the numbers of the page harder to read and send
-/// more; longer ones delay the results of controls and edits.
+/// Period of status messages. With a shorter period, the numbers of the page would be harder to
+/// read, and more data would be sent. With a longer period, the results of controls and edits would
+/// appear later.
 const PUBLISH_PERIOD: Duration = Duration::from_millis(250);
-/// Maximum fraction of the time that is spent on scoring between scheduled evaluations. It buys
-/// points of the PSNR curve with training time.
+/// Maximum fraction of the time that is spent on scoring between scheduled evaluations. Scoring
+/// adds points to the PSNR curve, but takes training time.
 const SCORE_FRAC: f64 = 0.03;
 
 /// What was published, and what to publish next.
@@ -109,8 +110,8 @@ impl Publishing {
         }
     }
 
-    /// Publishes when and how precisely each part of the scene was observed, if that is due. Depth
-    /// of cameras without depth is rendered with the first model. Returns the time spent.
+    /// Publishes when and how precisely each part of the scene was observed, if this map is due.
+    /// Depth of cameras without depth is rendered with the first model. Returns the time spent.
     fn publish_observations(
         &mut self,
         keyframes: &[Arc<Keyframe>],
@@ -300,7 +301,7 @@ fn posed_keyframe(session: &Session, keyframe: &Arc<Keyframe>) -> PosedKeyframe 
 
 /// When the image of a keyframe was captured; `None` for keyframes of an earlier run.
 fn captured_at(ledger: &Ledger, pose: &KeyframePose) -> Option<Instant> {
-    // The newest keyframe is asked for, so the search begins at the end.
+    // Callers usually ask for the newest keyframe, so the search begins at the end.
     let mut newest_first = ledger.keyframes().iter().rev();
     let times =
         newest_first.find(|times| times.camera == pose.camera && times.stamp == pose.stamp)?;

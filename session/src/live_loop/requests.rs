@@ -45,7 +45,7 @@ impl Requests {
         self.checkpoint.clone()
     }
 
-    /// Adopts what has become of the requested checkpoint of each model.
+    /// Updates the state of the requested checkpoint from the models.
     pub(super) fn update_checkpoint(&mut self, models: &mut Models) {
         let is_pending =
             |checkpoint: &RequestedCheckpoint| checkpoint.state == CheckpointState::Requested;
@@ -136,8 +136,8 @@ impl Requests {
         self.editor.is_searching()
     }
 
-    /// Erases floaters once they are found, or waits for them if `wait`. Returns whether a search
-    /// has ended.
+    /// Erases floaters once they are found. If `wait` is set, waits for the search. Returns whether
+    /// a search has ended.
     pub(super) fn erase_found(&mut self, wait: bool, hub: &Hub, models: &mut Models) -> bool {
         let Some((request, found)) = self.editor.take_found(wait) else {
             return false;

@@ -1,10 +1,11 @@
 //! Computes when and how precisely each part of a scene was observed.
 //!
-//! Each keyframe contributes the information (inverse covariance) that it has about the position of
-//! the surface in a cell: across the ray, from the size of a pixel; along the ray, from the depth
-//! camera, if there is one. Two keyframes from different directions therefore determine a position
-//! without depth, as in triangulation (Hartley and Zisserman 2004, section 12.6). Errors that
-//! keyframes have in common, for example of the calibration, are not part of the result.
+//! Each keyframe contributes information (inverse covariance) about the position of the surface in
+//! a cell. Across the ray, the information comes from the size of a pixel. Along the ray, it comes
+//! from the depth camera, if there is one. Two keyframes from different directions therefore
+//! determine a position without depth, as in triangulation (Hartley and Zisserman 2004, section
+//! 12.6). Errors that keyframes have in common, such as calibration errors, are not part of the
+//! result.
 #![expect(
     clippy::cast_possible_truncation,
     clippy::cast_sign_loss,
@@ -24,8 +25,8 @@ const MAX_CELLS: u32 = 96;
 /// The grid contains the points between these quantiles along each axis. A few wrong depth values,
 /// for example at reflections, would otherwise enlarge the grid and make all cells coarse.
 const QUANTILES: [f64; 2] = [0.01, 0.99];
-/// The grid contains this fraction of the extent beyond the quantiles, for the surfaces at the
-/// border that the quantiles cut off.
+/// The grid extends beyond the quantiles by this fraction of the extent, so that it also contains
+/// surfaces at the border.
 const MARGIN_FRAC: f64 = 0.1;
 /// Number of cells by which observations are extended. Depth maps have as many pixels per row as
 /// the grid has cells, so neighboring rays of a near camera meet adjacent cells. Seen from farther
@@ -34,8 +35,8 @@ const N_EXTENSIONS: usize = 2;
 /// Number of points that determine the quantiles. With this many, 200 points lie beyond each
 /// quantile.
 const MAX_SAMPLES: usize = 20_000;
-/// Standard deviation of a position across the ray, pixels of the image: includes the error of the
-/// pose.
+/// Standard deviation of a position across the ray, pixels of the image. It includes the error of
+/// the pose.
 const SIGMA_PX: f64 = 1.0;
 /// Standard deviation of depth at 1 m, meters. It grows with the square of the depth, as for stereo
 /// cameras.
@@ -102,8 +103,8 @@ pub(crate) fn map_of(keyframes: &[PosedDepth]) -> Option<ObservationMap> {
     })
 }
 
-/// Adds what a keyframe shows. Each cell is counted once, however many rays meet it, so that its
-/// size does not matter.
+/// Adds the observations of a keyframe. Each cell is counted once, however many rays meet it, so
+/// that the size of the cell does not matter.
 fn add_keyframe(cells: &mut SparseCells<Cell>, grid: &Grid, ix: usize, keyframe: &PosedDepth) {
     let camera = keyframe.depth.world_from_camera.translation.vector;
     for point in points(&keyframe.depth) {
@@ -115,8 +116,9 @@ fn add_keyframe(cells: &mut SparseCells<Cell>, grid: &Grid, ix: usize, keyframe:
             newest: keyframe.stamp,
             keyframe: usize::MAX,
         });
-        // Points of one keyframe are adjacent in the loop, so its index is enough to detect that it
-        // has already contributed to this cell.
+        // The loop handles all points of one keyframe before the next keyframe. The index of the
+        // last keyframe is therefore enough to detect that a keyframe has already contributed to
+        // this cell.
         if std::mem::replace(&mut cell.keyframe, ix) == ix {
             continue;
         }
@@ -271,7 +273,7 @@ fn points(depth: &DepthMap) -> impl Iterator<Item = Point3<f64>> {
 
 /// Gives each cell the newest age and the smallest deviation of its neighbors, too. Otherwise, a
 /// surface along a boundary between cells would get alternating values, and cells between sparse
-/// rays none.
+/// rays would have no values.
 fn extended(grid: &Grid, observed: &[ObservedCell]) -> Vec<ObservedCell> {
     let mut merged = SparseCells::new(grid);
     for cell in observed {
@@ -391,8 +393,8 @@ mod tests {
             at(&repeated, [0.0, 2.0, 0.0]).map(|cell| cell.sigma_m),
             Some(f64::INFINITY)
         );
-        // Two rays at right angles: the covariance is that of one pixel in both directions of their
-        // plane.
+        // With two rays at right angles, the standard deviation is one pixel in both directions of
+        // their plane.
         let across = map_of(&[
             view(0, [-2.0, 0.0, 0.0], false),
             view(1, [2.0, 0.0, 0.0], false),

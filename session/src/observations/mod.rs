@@ -22,8 +22,8 @@ const MAX_WIDTH_PX: u32 = 96;
 const CHECK_PERIOD: Duration = Duration::from_millis(50);
 /// Minimum time between two maps. Each one is computed and sent as a whole.
 const MAP_PERIOD: Duration = Duration::from_secs(1);
-/// Time for rendering depth per check, unless a single picture takes longer. Training waits as
-/// long.
+/// Time for rendering depth per check, unless a single picture takes longer. Training waits for
+/// this time.
 const RENDER_TIME: Duration = Duration::from_millis(5);
 /// Maximum fraction of the time for rendering, which training would otherwise use.
 const MAX_RENDER_FRAC: f64 = 0.1;
@@ -56,7 +56,7 @@ pub(crate) struct ModelState<'a> {
     pub(crate) step: u64,
     /// Its edits.
     pub(crate) edits: &'a Arc<Edits>,
-    /// When a keyframe was captured; `None` if that was not in this process.
+    /// When a keyframe was captured; `None` if another process captured it.
     pub(crate) captured_at: &'a dyn Fn(&KeyframePose) -> Option<Instant>,
 }
 
@@ -152,7 +152,8 @@ impl ObservationPublisher {
             let Entry::Vacant(entry) = self.depths.entry(keyframe.key()) else {
                 continue;
             };
-            // Odd, so that each remaining pixel is the center of the block that it stands for.
+            // The stride is odd, so that each remaining pixel is the center of the block that it
+            // represents.
             let stride = depth.size_px[0].div_ceil(MAX_WIDTH_PX) | 1;
             entry.insert(KnownDepth {
                 depth: depth.subsampled(stride),
@@ -179,8 +180,9 @@ impl ObservationPublisher {
                     .is_none_or(|known| known.is_outdated(step))
             })
             .collect();
-        // Keyframes without depth come first, because `None` is less than any step. Among those,
-        // the newest ones are the most interesting to an operator.
+        // Keyframes without depth come first, because `None` is less than any step. Among the
+        // keyframes without depth, the newest ones come first, because they matter most to an
+        // operator.
         due.sort_by_key(|keyframe| {
             (
                 rendered_at(keyframe),
@@ -244,7 +246,8 @@ impl ObservationPublisher {
         let newest_at = newest.and_then(|(keyframe, _)| captured_at(&keyframe.pose));
         let hub = self.hub.clone();
         let began = Instant::now();
-        // On another thread: a map of many keyframes takes longer than a training step.
+        // The map is computed on another thread, because a map of many keyframes takes longer than
+        // a training step.
         let task = Task::start("observations", move || {
             if let Some(map) = map::map_of(&observed) {
                 hub.set_observations(&viz::ObservationMap { newest_at, ..map });
@@ -255,7 +258,8 @@ impl ObservationPublisher {
 
     /// Whether corrections have moved the depth of a keyframe noticeably since the last map.
     fn has_moved(&self, keyframe: &PosedKeyframe) -> bool {
-        // A keyframe that is not in the map has no depth yet. Once it has, `is_changed` is set.
+        // A keyframe that is not in the map has no depth yet. When its depth is rendered,
+        // `is_changed` is set.
         self.mapped.get(&keyframe.key()).is_some_and(|mapped| {
             transform::is_noticeable(&(mapped.inverse() * keyframe.world_from_depth()))
         })
@@ -273,7 +277,8 @@ impl PosedKeyframe {
 }
 
 impl KnownDepth {
-    /// Whether the depth was rendered with a much less trained model. Measured depth never is.
+    /// Whether the depth was rendered with a much less trained model. Measured depth is never
+    /// outdated.
     #[expect(clippy::cast_precision_loss, reason = "steps are far below 2^52")]
     fn is_outdated(&self, step: u64) -> bool {
         self.rendered_at

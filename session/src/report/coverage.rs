@@ -12,8 +12,8 @@ const MIN_HEIGHT: f64 = 240.0;
 const MAX_HEIGHT: f64 = 640.0;
 /// Margin around the places, relative to their extent.
 const MARGIN_FRAC: f64 = 0.06;
-/// Fraction of the points that may be outside of the map at each end: a camera that looks through a
-/// door sees places far away.
+/// Fraction of the points that may be outside of the map at each end. For example, a camera that
+/// looks through a door sees places far away.
 const OUTSIDE_FRAC: f64 = 0.02;
 /// Approximate number of grid lines across the width.
 const N_GRID: f64 = 8.0;
@@ -130,7 +130,7 @@ impl Frame {
             .expect("a String never fails");
             x += spacing;
         }
-        // The y axis of the world points up, that of the drawing down.
+        // The y axis of the world points up, and the y axis of the drawing points down.
         let mut y = first(-self.top_m);
         while y <= self.height {
             writeln!(

@@ -93,7 +93,7 @@ impl Page<'_> {
         page
     }
 
-    /// The rig or the data, or else the folder.
+    /// Name of the rig or of the data. If neither is known, the name of the folder.
     fn name(&self) -> String {
         let text = |key: &str| self.report[key].as_str().map(str::to_owned);
         let data = text("data").map(|data| {
@@ -276,7 +276,8 @@ fn comparison_section(comparisons: &[Comparison], n_tests: usize) -> String {
     for comparison in comparisons {
         let is =
             |other: Option<&Comparison>| other.is_some_and(|other| std::ptr::eq(other, comparison));
-        // Of one or two images, every one would be the best or the worst.
+        // Tags are useful only for three or more images. Of one or two images, every image would be
+        // the best or the worst.
         let tag = match comparisons.len() {
             ..3 => "",
             _ if is(worst) => "<span class=\"tag\">worst</span>",
@@ -635,7 +636,7 @@ fn array(value: &Value) -> &[Value] {
 /// The settings of a run: the first line of the newest decision log in a folder; `Null` if there is
 /// no log.
 pub(crate) fn settings_in(folder: &Path) -> Value {
-    // A run that continues from a checkpoint has a log of its own, named after its first step.
+    // A run that continues from a checkpoint has a separate log, named after its first step.
     let names = std::fs::read_dir(folder).into_iter().flatten().flatten();
     let newest = names
         .filter_map(|entry| Some((first_step(entry.file_name().to_str()?)?, entry.path())))

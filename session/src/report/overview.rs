@@ -11,14 +11,14 @@ const SIZE_PX: [u32; 2] = [720, 450];
 const QUALITY: u8 = 82;
 /// Focal length in heights of the picture: a vertical field of view of 50 degrees.
 const FOCAL_HEIGHTS: f64 = 1.072;
-/// Angle above the horizon. Much higher, the picture would be a map; much lower, walls and
-/// furniture would hide each other.
+/// Angle above the horizon. With a much larger angle, the picture would look like a map. With a
+/// much smaller angle, walls and furniture would hide each other.
 const ELEVATION_RAD: f64 = 0.7;
 /// Distance of the eye from the center in radii of the scene, so that the scene fills most of the
 /// picture.
 const DISTANCE_RADII: f64 = 1.9;
-/// Everything that is farther from the center, toward the eye, is not drawn: the wall behind the
-/// cameras would hide the room.
+/// Parts of the model that are farther from the center than this, toward the eye, are not drawn.
+/// Otherwise, the wall behind the cameras would hide the room.
 const CUT_RADII: f64 = 1.15;
 const FAR_RADII: f64 = 50.0;
 

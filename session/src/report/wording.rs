@@ -87,7 +87,8 @@ pub(super) fn value_text(key: &str, value: &Value) -> Option<String> {
     }
 }
 
-/// Whether a key of `report.json` says nothing: the count of a device that the rig does not have.
+/// Whether a key of `report.json` is left out of the page, such as the count of a device that the
+/// rig does not have.
 #[must_use]
 pub(super) fn is_omitted(key: &str, value: &Value) -> bool {
     matches!(

@@ -23,12 +23,13 @@ pub struct RunInProgress {
     pub(super) stop: Stop,
     pub(super) rig: Rig,
     pub(super) folders: Vec<PathBuf>,
-    /// Description of the damage of the recording that is played, once it is reached.
+    /// Description of the damage in the played recording. It is set when playback reaches the
+    /// damage.
     pub(super) damage: Arc<OnceLock<String>>,
     pub(super) created: CreatedFolders,
 }
 
-/// What remains of a run that saves nothing.
+/// Results of a run that saves nothing.
 pub struct DiscardedRun {
     /// Results of the input.
     pub input_result: InputResult,
@@ -55,8 +56,8 @@ impl RunInProgress {
     /// far as possible also after an error.
     pub fn run_to_end(mut self) -> anyhow::Result<SavedRun> {
         let result = self.train();
-        // From here on, the results of the run are saved whatever happens. Then the folder must
-        // stay, even after an error.
+        // From here on, the results of the run are saved even after an error, so the folder must
+        // not be removed.
         let has_keyframes = !self.live.keyframes().is_empty();
         if result.is_ok() && self.live.has_exhausted_input() {
             log::info!("the devices have ended and all their data is in the model");
@@ -157,7 +158,7 @@ impl RunInProgress {
 /// Closes the recording and writes the keyframe lists after a GPU failure. Returns the error with a
 /// note of what was saved.
 fn keep_input(mut live: LiveLoop, folders: &[PathBuf], error: anyhow::Error) -> anyhow::Error {
-    // Described while the sessions still exist.
+    // The description is made while the sessions still exist.
     let recoverable = live.describe_recoverable();
     let EndedLoop {
         sessions,

@@ -46,8 +46,8 @@ const SIM: &str = "sim";
 const LOCKSTEP: &str = "lockstep";
 const RECORD: &str = "record";
 
-/// Steps between two keyframes if the plan does not set them. With more, a model learns more from
-/// each keyframe before the next one, and the run takes longer.
+/// Steps between two keyframes if the plan does not set them. With more steps, a model learns more
+/// from each keyframe before the next one arrives, but the run takes longer.
 const DEFAULT_STEPS_PER_KEYFRAME: u64 = 10;
 
 /// Options of a live run.
@@ -61,7 +61,7 @@ pub struct RunPlan {
     pub record: Option<PathBuf>,
     /// Folder of a run to continue, with its flags.
     pub resume: Option<PathBuf>,
-    /// When the run stops. Time and steps before `resume` count.
+    /// When the run stops. Time and steps of the resumed run count, too.
     pub limits: Limits,
     /// Optimizer steps between two keyframes, in a run that waits for the trainer.
     pub steps_per_keyframe: Option<u64>,
@@ -114,8 +114,8 @@ impl RunPlan {
         })
     }
 
-    /// Checks the plan, opens the GPU, and makes the models. Nothing that the plan could be refused
-    /// for starts devices or creates folders.
+    /// Checks the plan, opens the GPU, and makes the models. All checks that can reject the plan
+    /// come before devices are started or folders are created.
     pub fn prepare(
         self,
         previous: Option<PreviousLiveRun>,
@@ -137,8 +137,8 @@ impl RunPlan {
         let available = available_data(&rig);
         plan.check_training(&kinds, available)?;
         let pace = plan.pace(&rig)?;
-        // The GPU is opened before the devices: their queues fill while the GPU starts, and images
-        // would be lost.
+        // The GPU is opened before the devices. Otherwise, the queues of the devices would fill
+        // while the GPU starts, and images would be lost.
         log::info!("opening the GPU");
         let gpu = (services.open_gpu)()?;
         let models = match &previous {
@@ -344,7 +344,7 @@ impl RunPlan {
     /// Recordings and lockstep simulations wait for the trainer; everything else runs in real time.
     fn pace(&self, rig: &Rig) -> Result<Pace, BadInput> {
         let is_lockstep = match self.input {
-            // A recording waits for the trainer unless the plan says otherwise.
+            // A recording waits for the trainer, unless the plan sets real time.
             RunInput::Recording { is_real_time, .. } => !is_real_time,
             RunInput::Devices { is_simulated, .. } => {
                 (is_simulated || rig.arm.driver == ArmDriver::Sim) && rig.sim.lockstep

@@ -1,5 +1,5 @@
-//! What a run opens, in words: without them, the terminal would be silent until the devices are
-//! open, which can take ten seconds.
+//! Describes what a run opens. Opening the devices can take ten seconds, and the terminal would
+//! otherwise show nothing until then.
 
 use super::RunInput;
 use capture::config::{ArmDriver, Rig};

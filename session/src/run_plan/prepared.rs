@@ -26,8 +26,8 @@ use std::sync::Arc;
 use trainer::{ModelKind, Resumed};
 use viz::{Hub, Identity};
 
-/// Maximum time of the scheduled evaluations, as a fraction of the training time. With more, the
-/// scores are known more often, but the model is worse at the same time.
+/// Maximum time of the scheduled evaluations, as a fraction of the training time. With a larger
+/// fraction, there are more scores, but the model has had fewer training steps at any given time.
 const MAX_EVALUATION_FRAC: f64 = 0.1;
 /// Keyframes wait during an evaluation, so it must be short, especially on a software adapter.
 const MAX_IMAGES_SCORED_LIVE: usize = 12;
@@ -82,19 +82,19 @@ impl<'a> PreparedRun<'a> {
         for finding in doctor::suspicious_values(&self.rig) {
             log::warn!("{finding}");
         }
-        // A resumed run continues with the parameters of the first one.
+        // A resumed run continues with the parameters of the first run.
         if self.parts.previous.is_none() {
             let training = &self.parts.plan.training;
             training.log_unestimated(available_data(&self.rig), self.parts.gpu.is_software());
         }
-        // Compile kernels before the first image, so that keyframes do not wait.
+        // Kernels are compiled before the first image, so that keyframes do not wait.
         log::info!("compiling kernels for {}", self.parts.gpu.describe());
         for (model, kind) in self.parts.models.iter_mut().zip(&self.parts.kinds) {
             let text = format!("for the model {}", kind.name());
             startup::show(&self.hub, "compiling kernels", text);
             model.method.model_mut().prepare()?;
         }
-        // Only now the devices, because their data is used from the first sample on.
+        // The devices are opened last, because their data is used from the first sample on.
         startup::show(&self.hub, "opening devices", startup::devices(&self.rig));
         let device_notes = Notes::default();
         log::info!(
@@ -152,8 +152,8 @@ impl OpenedRun<'_> {
             models,
         } = parts;
         startup::show(&hub, "starting", "making the models".to_owned());
-        // Folders come after the devices, whose rig, with the calibration that cameras report, is
-        // written there.
+        // Folders are created after the devices are open. The rig that is written there contains
+        // the calibration that the cameras report.
         let folders = created.make_each(plan.out(), &kinds, Some(&rig))?;
         let held = previous
             .as_ref()
@@ -229,7 +229,8 @@ fn publish_robot(hub: &Hub, rig: &Rig, plan: &RunPlan) -> anyhow::Result<Option<
     Ok(Some(name))
 }
 
-/// Which robot and run this is. Several models have a folder each in that of the run.
+/// Name of the robot and of the run. If there are several models, each has a subfolder in the
+/// folder of the run.
 fn identity(plan: &RunPlan, folders: &[PathBuf], robot: Option<String>) -> Identity {
     let name = |name: Option<&OsStr>| name.map(|name| name.to_string_lossy().into_owned());
     let first = folders.first().map(PathBuf::as_path);
@@ -293,7 +294,7 @@ fn evaluators(gpu: &Gpu) -> anyhow::Result<Evaluators> {
 
 /// The session of one model, with the keyframes of the previous run.
 ///
-/// * `evicted`: those of them that exceed the memory limit of this run.
+/// * `evicted`: the keyframes of the previous run that exceed the memory limit of this run.
 fn session(
     setup: &SessionSetup<'_>,
     plan: &RunPlan,
@@ -308,7 +309,8 @@ fn session(
         plan.data_source(folder),
         plan.resume_command(folder),
     )?;
-    // The model of the checkpoint was trained on its keyframes already; only others are pushed.
+    // The model of the checkpoint was already trained on its keyframes, so only other keyframes are
+    // pushed.
     for keyframe in setup.keyframes {
         if untrained.iter().any(|other| Arc::ptr_eq(other, keyframe)) {
             session.push(keyframe)?;

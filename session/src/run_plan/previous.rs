@@ -15,7 +15,7 @@ use trainer::{ModelKind, Resumed};
 /// A live run to continue.
 pub struct PreviousLiveRun {
     pub(super) run: PreviousRun,
-    /// Its keyframes, ordered by stamp.
+    /// Keyframes of the previous run, ordered by stamp.
     pub(super) keyframes: Vec<Arc<Keyframe>>,
 }
 
@@ -39,7 +39,7 @@ impl PreviousLiveRun {
         Ok(Self { run, keyframes })
     }
 
-    /// Restores its model, without the keyframes that cannot be read.
+    /// Restores the model of the previous run, without the keyframes that cannot be read.
     pub(super) fn resume(&self, gpu: &Arc<Gpu>) -> anyhow::Result<Resumed> {
         let (resumed, missing) =
             trainer::resume_without_missing(gpu.clone(), &self.run.checkpoint, &self.keyframes)?;
@@ -55,7 +55,7 @@ impl PreviousLiveRun {
         Ok(resumed)
     }
 
-    /// Rig file settings that flags of that run have changed.
+    /// Rig file settings that flags of the previous run have changed.
     pub(super) fn overrides(&self) -> Vec<Override> {
         let realign = self
             .run

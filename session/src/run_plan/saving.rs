@@ -34,7 +34,7 @@ pub struct SavedRun {
     pub models: Vec<FinishedModel>,
     hub: Hub,
     data_losses: Vec<String>,
-    /// Number of color images that were received, and of those that were dropped before.
+    /// Number of received color images, and number of color images that were dropped before.
     n_received: u64,
     n_lost: u64,
     /// Whether the keyframe lists were written.
@@ -210,7 +210,7 @@ pub(super) fn save(
     let is_moved = plan.record.as_ref().is_some_and(|file| !file.exists());
     let is_recorded = input_result.recording_error.is_none() && !is_moved;
     let data_losses = data_losses(plan, &input_result, damage);
-    // Estimated before the models are saved, because saving consumes the sessions.
+    // The corrections are read before the models are saved, because saving consumes the sessions.
     let corrected_rigs = corrected_rigs(rig, &mut sessions, &folders);
     let mut details = DetailsOfRun {
         rig: plan.rig_name(),
@@ -376,7 +376,7 @@ fn corrected_rigs(
     for (session, folder) in sessions.iter_mut().zip(folders) {
         let learned = session.camera_corrections()?;
         let corrected = corrected_rig::corrected(rig, session.alignment(), &learned)?;
-        // An unchanged file would only look like a correction.
+        // An unchanged rig file is not written, because it would look like a correction.
         if !corrected.has_same_calibration(rig) {
             rigs.push((corrected, folder.join(CORRECTED_RIG)));
         }
@@ -433,7 +433,7 @@ fn publish_end(hub: &Hub, saved: &SavedRun) {
     publish_result(hub, result);
 }
 
-/// Publishes why a run has ended without a result. The error says what was saved.
+/// Publishes why a run has ended without a result. The error describes what was saved.
 pub(super) fn publish_failure(hub: &Hub, error: &anyhow::Error) {
     let result = RunResult {
         verdict: Some(Verdict {
@@ -456,8 +456,8 @@ fn publish_result(hub: &Hub, result: RunResult) {
     }
 }
 
-/// Removes that a checkpoint was requested. At the end of a run, the last one is written instead, so
-/// that the state of the requested one would never change.
+/// Removes a pending checkpoint request from the status. At the end of a run, the last checkpoint
+/// is written instead, so the state of the request would never change.
 fn remove_pending_checkpoint(status: &mut Status) {
     let is_pending =
         |checkpoint: &mut RequestedCheckpoint| checkpoint.state == CheckpointState::Requested;

@@ -1,4 +1,4 @@
-//! What viewers see of a run before its models are trained: what is being prepared.
+//! Shows viewers what a run prepares before its models are trained.
 
 use capture::config::{ArmDriver, Rig};
 use messages::counted;

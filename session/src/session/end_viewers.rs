@@ -8,11 +8,11 @@ use std::time::{Duration, Instant};
 use viz::{Hub, PendingRender, StateProgress};
 
 /// Period of checking whether work on another thread is done. It delays the end of a run by at most
-/// this time; a shorter one would use more of a processor.
+/// this time. A shorter period would use more processor time.
 const POLL_PERIOD: Duration = Duration::from_millis(10);
 
-/// Viewers of a run that ends. Between two pieces of work, they get pictures, and the chunks of
-/// models that they draw themselves.
+/// Viewers of a run that ends. Between other work, they get pictures, and the chunks of the models
+/// that they draw themselves.
 ///
 /// The first of the models is drawn for requests that name no method. Models are only drawn, never
 /// trained, so that files and scores do not depend on the viewers.
@@ -78,7 +78,7 @@ impl EndViewers {
     }
 }
 
-/// Draws a requested picture, or answers why this is not possible.
+/// Draws a requested picture, or sends the reason why this is not possible.
 fn answer(pending: PendingRender, models: &mut [ViewedModel<'_>]) {
     let method = pending.method().map(str::to_owned);
     let requested = models.iter_mut().find(|model| {

@@ -138,8 +138,8 @@ impl Errors {
     }
 }
 
-/// Saves all models. The results have the order of the sessions; those that cannot be saved have
-/// none.
+/// Saves all models. The results have the order of the sessions. A model that cannot be saved has
+/// no result.
 fn save_all<P>(
     endings: &mut [EndingSession<P>],
     ended_secs: &[f64],
@@ -407,7 +407,8 @@ fn score_at_end(session: &mut ScoredSession<'_>, seconds: f64) -> anyhow::Result
     let n_all = scoreboard.tests().len();
     let mut n_reported = None;
     let per_image = scoreboard.score_all(method, |method, n_scored| {
-        // Called often, also without progress, so that viewers do not wait for the next score.
+        // This is called often, even without progress, so that viewers do not wait for the next
+        // score.
         if n_reported.replace(n_scored) != Some(n_scored) {
             reporter.report_scoring(n_scored, n_all);
             viewing.show_scored(n_scored, n_all);
@@ -452,7 +453,7 @@ fn report_end(
         mut viewing,
     } = session;
     viewing.show_reporting();
-    // Rendered before profiling, because profiling trains the model further.
+    // The pictures are rendered before profiling, because profiling trains the model further.
     let pictures = reporter.draw_pictures(
         method,
         keyframes,
@@ -516,8 +517,8 @@ impl<P> EndingSession<P> {
             is_finished,
         });
         let saved = run_folder::save_model(&mut session.method, &session.edits, out);
-        // The checkpoint is written after the model: if the disk has no space for both, the model
-        // is the more important one.
+        // The checkpoint is written after the model. If the disk has no space for both, the model
+        // is more important.
         session.persistence.write_checkpoint(checkpoint);
         match saved {
             Ok(()) => Ok(None),
@@ -580,7 +581,7 @@ impl<P> EndingSession<P> {
     }
 }
 
-/// Saves a model in a new temporary folder, which is returned.
+/// Saves a model in a new temporary folder, and returns the folder.
 fn save_in_fallback_folder(method: &mut AlignedModel, edits: &Edits) -> anyhow::Result<PathBuf> {
     let folder = run_folder::make_fallback_folder()?;
     run_folder::save_model(method, edits, &folder)?;

@@ -30,8 +30,8 @@ const TIMEOUT: Duration = Duration::from_secs(120);
 const METHODS: [&str; 2] = ["splat", "tsdf"];
 
 /// A gray model. While it is viewed, it draws a test image only after a client has requested a
-/// picture, so that requests are pending between all images; and all but the first only after the
-/// client has received the progress of scoring.
+/// picture, so that requests are pending between all images. It also draws every test image after
+/// the first only after the client has received the progress of scoring.
 struct Gray {
     name: &'static str,
     level: u8,
@@ -177,7 +177,7 @@ fn endings(
 }
 
 /// A client that requests pictures of both methods in turn until the server stops. After each
-/// picture, it connects anew, as a page does that is loaded again.
+/// picture, it connects again, like a page that is reloaded.
 fn client(address: SocketAddr, received: Received) -> JoinHandle<()> {
     std::thread::spawn(move || {
         let add = |text: Option<String>| {

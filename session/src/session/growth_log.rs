@@ -1,5 +1,6 @@
-//! Logs pauses of the growth of a model: the first one when it begins, the others in one line at
-//! the end. On a busy computer, growth pauses and continues many times.
+//! Logs pauses of the growth of a model. The first pause is logged when it begins. All other pauses
+//! are logged in one line at the end, because growth pauses and continues many times on a busy
+//! computer.
 
 use super::MAX_LIVE_STEP_MILLIS;
 use std::time::{Duration, Instant};

@@ -129,7 +129,7 @@ impl Persistence {
 
     /// Keeps an evicted keyframe, without pixels, as long as the newest checkpoint may contain it.
     pub(super) fn evict(&mut self, keyframe: &Keyframe) {
-        // Without pixels, because evicting keyframes is what bounds the memory of a long run.
+        // The keyframe is kept without pixels, because eviction must free memory in a long run.
         if self.recovery.is_some() {
             self.evicted.push(Arc::new(without_pixels(keyframe)));
         }
@@ -290,8 +290,8 @@ impl Persistence {
         };
         // Kernels are compiled here, so that this time does not count as training time.
         method.model_mut().prepare()?;
-        // Evictions since the checkpoint are repeated. Keyframes that the model was not trained on
-        // are not in its store.
+        // Evictions since the checkpoint are repeated. They include keyframes that are not in the
+        // store of the model, because it was never trained on them.
         for keyframe in self
             .evicted
             .iter()
@@ -311,8 +311,8 @@ impl Persistence {
         held.iter()
             .filter(|keyframe| !contains(&untrained, keyframe))
             .for_each(|keyframe| decisions.restored(from_step, keyframe));
-        // Keyframes that arrived after the checkpoint. Those that were evicted since are among the
-        // untrained ones, too, and are left out.
+        // These keyframes arrived after the checkpoint. Keyframes that were evicted since then are
+        // also untrained, and are left out.
         for keyframe in untrained
             .iter()
             .filter(|keyframe| contains(&held, keyframe))
@@ -333,8 +333,8 @@ impl Persistence {
     }
 }
 
-/// The newest checkpoint: one that this run has written, or else the one that the run was resumed
-/// from. `None` if there is none.
+/// The newest checkpoint. If this run has not written one, this is the checkpoint from which the
+/// run was resumed. `None` if there is no checkpoint.
 fn newest_checkpoint(
     checkpoints: Option<&mut Checkpoints>,
     resumed_folder: Option<&Path>,
@@ -370,7 +370,7 @@ fn resume(
         Ok((resumed, _)) => Ok(Some(resumed)),
         // The new device has failed, too: the caller tries again.
         Err(error) if is_gpu_error(&error) => Err(error),
-        // The checkpoint is unusable, for example damaged. Starting again loses training time;
+        // The checkpoint is unusable, for example damaged. Starting again loses training time, but
         // an error would lose the run.
         Err(error) => {
             log::warn!("cannot resume from the newest checkpoint: {error:#}");

@@ -7,7 +7,8 @@ use std::time::{Duration, Instant};
 use trainer::Method;
 
 /// Number of profiled steps, over which medians are taken. It is odd, so that the median is one of
-/// the measured values. More steps would take longer; with few, one slow step changes the median.
+/// the measured values. More steps would take longer. With fewer steps, one slow step could change
+/// the median.
 const N_PROFILED: usize = 21;
 /// Warm-up time, because drivers are slow for a while after large buffers were freed. With a
 /// shorter warm-up, these slow steps would be part of the medians.

@@ -237,7 +237,8 @@ impl Reporter {
             adapter: model.adapter,
             details: model.details,
             alignment: model.alignment,
-            // Corrections of single images are as many as images, and mean nothing elsewhere.
+            // Corrections of single images are left out. There are as many of them as images, and
+            // they do not apply to other images.
             cameras: model
                 .cameras
                 .into_iter()

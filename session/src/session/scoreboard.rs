@@ -20,13 +20,14 @@ const MAX_HISTORY: usize = 512;
 /// How a session is evaluated.
 #[derive(Clone)]
 pub struct Evaluators {
-    /// Evaluator for scheduled evaluations: all scores in `train`, PSNR only in a live run.
+    /// Evaluator for scheduled evaluations. In `train`, it computes all scores; in a live run, only
+    /// PSNR.
     pub during_training: Evaluator,
     /// Maximum number of test keyframes in a scheduled evaluation, evenly spread. The final
     /// evaluation scores all.
     pub max_images_during_training: usize,
     /// Maximum time of all scheduled evaluations, as a fraction of the training time. To stay near
-    /// it, they score fewer images, or are skipped. `None`: no limit.
+    /// this limit, evaluations score fewer images, or are skipped. `None` means no limit.
     pub max_frac_during_training: Option<f64>,
     /// Evaluator for the end of training.
     pub at_end: Evaluator,
@@ -191,7 +192,7 @@ impl Scoreboard {
 
     /// Returns the test keyframe with the oldest score and moves it to the end of the queue.
     pub(super) fn next_to_refresh(&mut self) -> Option<Arc<Keyframe>> {
-        // A queue, so that every test keyframe is scored again once per round.
+        // The tests are in a queue, so that every test keyframe is scored again once per round.
         let oldest = self.tests.pop_front()?;
         self.tests.push_back(oldest.clone());
         Some(oldest)
@@ -199,8 +200,8 @@ impl Scoreboard {
 
     /// Records the scores of images at this training time.
     pub(super) fn record(&mut self, images: &[ImageScores], secs: f64) {
-        // The mean over the latest score of each image. A mean over only the images of this call
-        // would jump between easy and difficult ones.
+        // The mean is computed over the latest scores of all images. A mean over only the images of
+        // this call would vary with the difficulty of these images.
         for image in images {
             self.newest_psnr
                 .insert((image.camera.clone(), image.stamp_nanos), image.psnr);

@@ -29,7 +29,8 @@ pub struct TrainingTime {
     clock: Clock,
     /// Time for which this session has used a shared device.
     device_time: Duration,
-    /// Training time at which this session finished, seconds; other sessions may still train.
+    /// Training time at which this session finished, seconds. Other sessions may still train at
+    /// this time.
     finished_secs: Option<f64>,
 }
 

@@ -124,7 +124,8 @@ impl ViewedModel<'_> {
         editing::erase_floaters(self.edits, floaters)
     }
 
-    /// Sets whether pictures are requested during training. If so, submits are shorter.
+    /// Sets whether pictures are requested during training. While they are, each submit contains
+    /// fewer steps.
     pub(crate) fn set_watched(&mut self, watched: bool) {
         self.method.model_mut().set_watched(watched);
     }

@@ -42,10 +42,11 @@ pub struct TrainPlan {
     pub images: DataOptions,
     /// Which models are trained.
     pub training: TrainingOptions,
-    /// When training stops; 120 s if there is no limit. Time and steps before `resume` count.
+    /// When training stops. Without any limit, training stops after 120 s. Time and steps of the
+    /// resumed run count, too.
     pub limits: Limits,
-    /// Steps over which the learning rate decays and the model grows; the step limit or a default
-    /// if `None`.
+    /// Steps over which the learning rate decays and the model grows. If `None`, this is the step
+    /// limit, or a default if there is no step limit.
     pub n_planned_steps: Option<u64>,
     /// Folder of a run to continue, with its flags.
     pub resume: Option<PathBuf>,
@@ -117,7 +118,7 @@ impl TrainPlan {
         progress: OnReadProgress<'_>,
     ) -> anyhow::Result<TrainOutcome> {
         let started = Instant::now();
-        // First all checks that read little, so that an error of the user costs no time.
+        // First come all checks that read little, so that the user learns of an error at once.
         let schedule = self.schedule()?;
         training::limits(self.limits.seconds, self.limits.steps, DEFAULT_SECONDS)?;
         run_folder::check_out(
@@ -125,7 +126,8 @@ impl TrainPlan {
             self.resume.as_deref(),
             Some(&self.data),
         )?;
-        // Then the checkpoint of a run that is continued, whose flags complete the given ones.
+        // Then the checkpoint of the resumed run is read, because its flags complete the given
+        // ones.
         let previous = self.resume.as_deref().map(PreviousRun::read).transpose()?;
         if let Some(previous) = &previous {
             if previous.is_finished() && !self.asks_for_more() {
@@ -198,8 +200,8 @@ impl TrainPlan {
         flags.chain(self.checkpoints.flag()).collect()
     }
 
-    /// Returns this plan; missing options are taken from the previous run. The path of an output is
-    /// not, because the checkpoint may come from somebody else.
+    /// Returns this plan with missing options taken from the previous run. The path of an output is
+    /// never taken from it, because the checkpoint may come from somebody else.
     fn with_flags_of(&self, previous: &PreviousRun) -> Self {
         let path = |name: &str| previous.flag(name).map(PathBuf::from);
         if let (None, Some(file)) = (&self.write_rig, previous.flag(WRITE_RIG)) {
@@ -239,7 +241,7 @@ fn canonical(file: &Path) -> String {
         .to_string()
 }
 
-/// The path of a file to write, for the same purpose.
+/// The absolute path of a file to write, for a later run that may be started in another folder.
 fn absolute(file: &Path) -> String {
     std::path::absolute(file)
         .unwrap_or_else(|_| file.to_owned())

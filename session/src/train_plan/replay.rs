@@ -182,7 +182,7 @@ impl Replay {
                     session.remove(&removed.camera, Stamp(removed.stamp_nanos))?
                 }
                 Decision::Seed(_) => session.viewed().seed()?,
-                // Waits: in the logged run, the result was ready at this step.
+                // Waits for the result, because it was ready at this step in the logged run.
                 Decision::Align(_) => drop(session.poll_alignment(true)?),
                 Decision::PauseGrowth(is_paused) => session.pause_growth(*is_paused)?,
                 // Starts training on the keyframes so far without a step.
@@ -227,7 +227,7 @@ fn step(session: &mut Session, max_steps: u64) -> anyhow::Result<u64> {
 }
 
 impl Schedule for Replay {
-    /// No limits: a replay ends with the decisions of its log.
+    /// There are no limits, because a replay ends with the decisions of its log.
     fn limits(&self, _plan: &TrainPlan, _previous_secs: f64) -> anyhow::Result<Limits> {
         Ok(Limits::default())
     }
@@ -336,7 +336,7 @@ impl Schedule for Replay {
         _preparation_time: Duration,
         services: Services<'_>,
     ) -> anyhow::Result<()> {
-        // A log is that of a single model.
+        // A log describes a single model.
         self.replay(&mut sessions[0], keyframes, services.stop)
     }
 }

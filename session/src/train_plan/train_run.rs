@@ -27,8 +27,8 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 use trainer::{ModelKind, Resumed};
 
-/// Maximum time of the scheduled evaluations, as a fraction of the training time. With more, the
-/// scores are known more often, but training takes longer.
+/// Maximum time of the scheduled evaluations, as a fraction of the training time. With a larger
+/// fraction, there are more scores, but training takes longer.
 const MAX_EVALUATION_FRAC: f64 = 0.1;
 
 /// A plan that is carried out.
@@ -91,7 +91,7 @@ impl TrainRun<'_> {
         let limits = self.schedule.limits(self.plan, previous_secs)?;
         let selection = self.selection()?;
         let evaluators = self.evaluators()?;
-        // Then the data, which may take minutes.
+        // Then the data are read, which may take minutes.
         let input = self.input(&selection)?;
         let models = self.models(&input)?;
         let kinds: Vec<ModelKind> = models.iter().map(|model| model.model_spec.kind).collect();
@@ -362,8 +362,8 @@ impl TrainRun<'_> {
         selection: &Selection,
         data: Data,
     ) -> anyhow::Result<Trained> {
-        // Read before the sessions are consumed. Errors are returned only after the models are
-        // saved.
+        // The corrections are read before the sessions are consumed. Errors are returned only after
+        // the models are saved.
         let corrected_rig = self.plan.write_rig.as_ref().map(|file| {
             let rig = self.corrected_rig(&selection.images, &mut sessions);
             Box::new((rig, file.clone()))

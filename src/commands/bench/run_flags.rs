@@ -6,7 +6,7 @@ use messages::BadInput;
 use std::ffi::OsString;
 use std::path::Path;
 
-/// The flags of `run`, parsed as a command line.
+/// The flags of `run`, which are parsed as a command line.
 #[derive(Debug, Parser)]
 struct RunFlags {
     #[command(flatten)]

@@ -74,7 +74,7 @@ impl Browser {
         Self::open_with(program, profile, url, size_px, "")
     }
 
-    /// [`Browser::open`]; runs a script before the page's own scripts.
+    /// Does the same as [`Browser::open`], and runs a script before the page's own scripts.
     pub fn open_with(
         program: &Path,
         profile: &Path,

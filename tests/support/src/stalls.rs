@@ -63,8 +63,8 @@ impl Stalls {
 /// Gives this thread a high priority on one processor. If the priority is denied, the thread
 /// measures less accurately.
 fn pin_with_high_priority(cpu: usize) {
-    /// Higher than the priority of the Franka driver and the emulated robot, so that their
-    /// computing time does not count as a stall.
+    /// This priority is higher than the priorities of the Franka driver and the emulated robot, so
+    /// that their computing time does not count as a stall.
     #[cfg(target_os = "linux")]
     const PRIORITY: i32 = 90;
     #[cfg(target_os = "linux")]
@@ -83,13 +83,13 @@ impl Drop for Stalls {
 /// The times at which at least one processor was stalled.
 pub struct StalledTimes {
     start: Instant,
-    /// Since `start`.
+    /// Milliseconds since `start`.
     stalled_ms: BTreeSet<u128>,
 }
 
 impl StalledTimes {
-    /// Fraction of the time between two instants in which a processor was stalled; at most 20 %, so
-    /// that a stalled machine does not excuse every failure.
+    /// Fraction of the time between two instants in which a processor was stalled. It is at most 20
+    /// %, so that a stalled machine does not excuse every failure.
     pub fn frac(&self, from: Instant, to: Instant) -> f64 {
         const MAX_FRAC: f64 = 0.2;
         let ms = |time: Instant| time.duration_since(self.start).as_millis();

@@ -18,9 +18,9 @@ struct RecordedSamples {
 /// Differences between received and emulated samples, at the stamps of the images.
 #[derive(Debug)]
 pub struct Difference {
-    /// Number of received images, all of which are identical to emulated ones.
+    /// Number of received images. All of them are identical to emulated images.
     pub n_images: usize,
-    /// Largest difference of any joint, rad, in the median image and in the worst one.
+    /// Largest difference of any joint, rad, in the median image and in the worst image.
     pub joints_rad: [f64; 2],
     /// Largest difference of the base position, m.
     pub base_m: f64,

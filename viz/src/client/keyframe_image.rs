@@ -20,15 +20,15 @@ use std::io::Write;
 use std::sync::Arc;
 use tokio::sync::Semaphore;
 
-/// Maximum width and height of photographs that are sent. Larger ones take longer to send than to
-/// look at.
+/// Maximum width and height of photographs that are sent. Larger photographs would take too long to
+/// send.
 pub(crate) const MAX_PHOTOGRAPH_PX: u32 = 2048;
 /// Maximum width and height for clients that request no other size.
 const DEFAULT_PHOTOGRAPH_PX: u32 = 1280;
 /// Minimum value of a requested maximum size.
 const MIN_PHOTOGRAPH_PX: u32 = 16;
-/// JPEG quality. Clients compare photographs with pictures of the model, so that the errors of the
-/// compression must be smaller than those of a good model.
+/// JPEG quality. Clients compare photographs with pictures of the model, so the compression errors
+/// must be smaller than the errors of a good model.
 const QUALITY: u8 = 92;
 /// Valid pixels form few large regions, so higher levels gain little.
 const DEFLATE_LEVEL: u32 = 3;
@@ -230,8 +230,8 @@ fn photograph(keyframe: &Keyframe, size_px: [u32; 2]) -> Result<Photograph<'_>, 
     })
 }
 
-/// A byte per pixel of an image of this size: [`VALID`], or 0 if it covers a pixel that is masked
-/// or left empty by undistortion. `None` if all pixels are valid.
+/// A byte per pixel of an image of this size. The byte is 0 if the pixel covers a pixel that is
+/// masked or left empty by undistortion, and otherwise [`VALID`]. `None` if all pixels are valid.
 fn mask(keyframe: &Keyframe, size_px: [u32; 2]) -> Option<Vec<u8>> {
     let alpha = || keyframe.rgba_srgb.iter().skip(3).step_by(4);
     if alpha().all(|alpha| *alpha == u8::MAX) {

@@ -3,32 +3,34 @@
 use crate::pictures::compact_depth::Effort;
 use std::time::Duration;
 
-/// Data handed to the kernel at once, as transfer time. Together with the buffer, this is 60 ms,
-/// which stay below 100 ms even if the estimate of the rate is too high by a half.
+/// Data handed to the kernel at once, as transfer time in seconds. Together with the buffer, the
+/// transfer takes 60 ms. It stays below 100 ms even if the estimated rate is too high by a half.
 const PART_TIME: f64 = 0.02;
-/// Data in the kernel's buffer, as transfer time. A shorter buffer runs empty on fast links, before
-/// this process is scheduled again.
+/// Data in the kernel's buffer, as transfer time in seconds. A shorter buffer runs empty on fast
+/// links, before this process is scheduled again.
 const BUFFER_TIME: f64 = 0.04;
-/// Limits of both, bytes. Larger parts and buffers do not make fast connections faster. Smaller
-/// ones would make the headers and calls cost more than the data.
+/// Limits of the size of a part, bytes; the next constant limits the buffer. Larger parts and
+/// buffers do not make fast connections faster. Smaller ones would make the headers and calls cost
+/// more than the data.
 const PART_BYTES: std::ops::RangeInclusive<f64> = 4096.0..=65_536.0;
 const BUFFER_BYTES: std::ops::RangeInclusive<f64> = 8192.0..=65_536.0;
 /// Rate before the first measurement: an ordinary wireless link.
 const INITIAL_BYTES_PER_SEC: f64 = 1.25e6;
-/// Above this rate, fast compression saves more time than its additional bytes take: for depth of
-/// 512 x 512 pixels, about 4 ms of computation against 12 to 47 kB
+/// Above this rate, fast compression saves more time than its additional bytes take. For depth of
+/// 512 x 512 pixels, it saves about 4 ms of computation and adds 12 to 47 kB
 /// (`docs/benchmarks/2026-11-26-viewer-protocol.md`).
 const FAST_BYTES_PER_SEC: f64 = 6e6;
-/// Slower loopback connections are probably tunnels to another computer. A tunnel that is as fast
-/// gets uncompressed depth, which it can carry.
+/// Slower loopback connections are probably tunnels to another computer. A tunnel at or above this
+/// rate gets uncompressed depth, which it can transfer.
 const LOCAL_BYTES_PER_SEC: f64 = 3e7;
 /// Shorter sends do not measure the link, but the memory of this computer.
 const MIN_SEND_SECS: f64 = 2e-4;
 /// Parts of less than half the usual size measure the link only if they take at least this long.
-/// Otherwise, the time is mostly that of the call.
+/// Otherwise, the time is mostly the overhead of the call.
 const MIN_SHORT_SEND_SECS: f64 = 5e-3;
-/// The estimate follows decreases quickly, but increases slowly: if it is too high, data waits in
-/// buffers; if it is too low, parts are only smaller than necessary.
+/// Maximum factor by which the estimate increases at once. Decreases are followed quickly. If the
+/// estimate is too high, data waits in buffers. If it is too low, parts are only smaller than
+/// necessary.
 const MAX_INCREASE: f64 = 1.25;
 /// After a longer pause, the kernel's buffer may be empty. Data that fits into it then seems to be
 /// sent at once.
@@ -61,7 +63,8 @@ impl LinkRate {
             self.burst_secs = 0.0;
         }
         let secs = took.as_secs_f64().max(MIN_SEND_SECS);
-        // Shorter pauses count as sending: the kernel continues with what is in its buffer.
+        // Shorter pauses count as sending, because the kernel continues to send the data in its
+        // buffer.
         self.burst_bytes += n_bytes as f64;
         self.burst_secs += secs + pause.min(MAX_PAUSE).as_secs_f64();
         let measured = n_bytes as f64 / secs;
@@ -86,7 +89,8 @@ impl LinkRate {
     /// longer than it saves.
     pub(crate) fn effort(self, is_loopback: bool) -> Option<Effort> {
         match self.bytes_per_sec {
-            // The first rate is below this limit: a connection must prove that it is local.
+            // The initial rate is below this limit, so a connection counts as local only after a
+            // higher rate was measured.
             rate if is_loopback && rate > LOCAL_BYTES_PER_SEC => None,
             rate if rate > FAST_BYTES_PER_SEC => Some(Effort::Fast),
             _ => Some(Effort::Small),

@@ -1,5 +1,5 @@
-//! Checks the messages of viewers: every accepted request must be safe to render, and every
-//! accepted subscription must keep its limits. The fuzz target `page` calls it.
+//! Checks the messages of viewers. Every accepted request must be safe to render, and every
+//! accepted subscription must respect its limits. The fuzz target `page` calls this check.
 
 use crate::client::keyframe_image::{KeyframeImageRequest, MAX_PHOTOGRAPH_PX};
 use crate::client::negotiation::{capabilities, negotiate};

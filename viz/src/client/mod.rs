@@ -43,11 +43,11 @@ use tokio::sync::{mpsc, watch};
 /// when there is room, so that a client that sends without reading cannot fill the memory.
 const MAX_REPLIES: usize = 64;
 /// A client that leaves [`MAX_REPLIES`] replies unread for this long is disconnected. With less
-/// time, a slow link that is busy with a picture would be taken for such a client.
+/// time, a client with a slow link that is busy with a picture would also be disconnected.
 const MAX_REPLY_WAIT: Duration = Duration::from_secs(2);
 /// After a goodbye, the connection stays open until the client closes it, but at most for this
-/// time. If it were closed while something from the client is unread, the kernel would reset it and
-/// discard what was not sent yet, including the goodbye.
+/// time. If it were closed while data from the client is unread, the kernel would reset the
+/// connection and discard all unsent data, including the goodbye.
 const LINGER: Duration = Duration::from_millis(300);
 
 /// Serves one client until either side disconnects.
@@ -94,18 +94,19 @@ pub(crate) async fn serve(
         part_sent: Instant::now(),
         photograph: None,
     };
-    // Both run in one task, and neither waits for the other: a client can request another view
-    // while a picture is being sent.
+    // The reader and the writer run in one task, and neither waits for the other. A client can
+    // therefore request another view while a picture is being sent.
     let mut reading = std::pin::pin!(reader.run());
     tokio::select! {
         () = &mut reading => {}
         _ = writer.run(&wake, waiting_replies, demand) => {
-            // If the time is over, the client does not get a reply to its last messages.
+            // If the reader takes longer, the client does not get a reply to its last messages.
             let _ = tokio::time::timeout(LINGER, reading).await;
         }
         () = connection.closed() => {}
     }
-    // Before the log entry, so that the client is gone when somebody reads it.
+    // The client is removed before the log entry is written, so that it is no longer connected when
+    // somebody reads the entry.
     drop(client_guard);
     log.line(format_args!("client {client} disconnected"));
 }
@@ -147,7 +148,7 @@ impl Reader<'_> {
                     self.connection.record_pong();
                     continue;
                 }
-                // The WebSocket library answers them.
+                // The WebSocket library answers pings.
                 Message::Ping(_) => continue,
                 Message::Text(text) => self.answer(&text).unwrap_or_else(|error| {
                     Some(Reply::Error {
@@ -193,7 +194,7 @@ impl Reader<'_> {
     /// Handles a message. Returns the reply, if there is one.
     fn answer(&self, text: &str) -> Result<Option<Reply>, InvalidRequest> {
         let message: ClientMessage = serde_json::from_str(text)?;
-        // Here and not in the handlers, so that no message is forgotten.
+        // The role is checked here and not in the handlers, so that the check covers every message.
         if self.role < message.required_role() {
             return Err(InvalidRequest::NotOperator);
         }
@@ -286,7 +287,7 @@ impl Reader<'_> {
     }
 
     fn subscribe(&self, message: SubscribeMessage) -> Result<(), InvalidRequest> {
-        // A changed copy, because other threads may be reading the present subscriptions.
+        // A copy is changed, because other threads may be reading the present subscriptions.
         let mut subscriptions = (*self.demand.borrow().subscriptions).clone();
         subscriptions.apply(message)?;
         self.change_demand(|demand| demand.subscriptions = Arc::new(subscriptions));

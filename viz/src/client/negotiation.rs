@@ -20,10 +20,10 @@ const KEYFRAME_CHANGES: &str = "keyframe_changes";
 const PARTS: &str = "parts";
 const HEARTBEAT: &str = "heartbeat";
 
-/// Capabilities that change what the server sends without being asked.
+/// Capabilities that change the messages that the server sends without a request.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub(crate) struct Negotiated {
-    /// The client applies changes of the keyframe list, so that it is not sent in full.
+    /// The client applies changes of the keyframe list, so the list is not sent in full each time.
     pub(crate) has_keyframe_changes: bool,
     /// The client joins the parts of binary messages.
     pub(crate) has_parts: bool,
@@ -67,8 +67,8 @@ pub(crate) fn negotiate(hello: &ClientHello) -> Result<Agreement, String> {
             );
         }
     };
-    // The newest version of the one that is older. It must not be older than what the other one
-    // supports.
+    // The newest version that both sides may support is the smaller of their newest versions. It
+    // must not be below the oldest version of either side.
     let protocol = newest.min(PROTOCOL_VERSION);
     if protocol < oldest.max(BASE_PROTOCOL_VERSION) {
         let client = if oldest == newest {
@@ -86,7 +86,8 @@ pub(crate) fn negotiate(hello: &ClientHello) -> Result<Agreement, String> {
              {outdated}"
         ));
     }
-    // In the order of the server, each name once, whatever the client sends.
+    // The names have the order of the server's list, and each name occurs once, whatever the client
+    // sends.
     let names: Vec<_> = capabilities()
         .filter(|name| hello.capabilities.iter().any(|wanted| wanted == name))
         .collect();

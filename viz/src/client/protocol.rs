@@ -18,8 +18,8 @@ pub(crate) const MAX_MESSAGE_BYTES: usize = 64 * 1024;
 pub(crate) const MAX_RATE_HZ: f64 = 100.0;
 
 /// Maximum number of keyframes in a `keyframe_changes` message. Text messages are not split into
-/// parts, so their length limits how long urgent messages wait: 32 keyframes have about 20 kB. With
-/// fewer, a long list takes more messages.
+/// parts, so urgent messages wait until a text message is sent. 32 keyframes take about 20 kB. With
+/// a smaller maximum, a long list would take more messages.
 pub(crate) const MAX_CHANGED_KEYFRAMES: usize = 32;
 
 /// Messages from clients.
@@ -47,10 +47,10 @@ pub(crate) enum ClientMessage {
 }
 
 impl ClientMessage {
-    /// The role that a client needs to send this message. Whatever changes the run requires an
-    /// operator.
+    /// The role that a client needs to send this message. A message that changes the run requires
+    /// an operator.
     pub(crate) fn required_role(&self) -> Role {
-        // Without a wildcard, so that the compiler asks for the role of every new message.
+        // The match has no wildcard, so that the compiler asks for the role of every new message.
         match self {
             Self::Hello(_)
             | Self::Render(_)
@@ -84,7 +84,8 @@ pub(crate) struct SubscribeMessage {
     pub(crate) topic: String,
     /// Maximum rate; 0 ends the subscription.
     pub(crate) rate_hz: f64,
-    /// Only images of this camera; of all cameras without a subscription of their own if absent.
+    /// Camera whose images are sent. If absent, the subscription applies to all cameras that have
+    /// no separate subscription.
     pub(crate) camera: Option<String>,
     /// Maximum size of images.
     pub(crate) size_px: Option<[u32; 2]>,
@@ -258,7 +259,7 @@ pub(crate) enum Output {
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Deserialize, Serialize)]
 #[serde(rename_all = "snake_case")]
 pub(crate) enum DepthFormat {
-    /// 16-bit counts at half the picture's size; the nearest of each 2x2 pixels.
+    /// 16-bit counts at half the picture's size. Each count is the nearest depth of 2x2 pixels.
     #[default]
     U16Half,
     /// Logarithmic counts at half the picture's size, compressed: see `compact_depth.rs`.

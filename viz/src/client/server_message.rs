@@ -27,7 +27,8 @@ pub(crate) enum ServerMessage<'a> {
         default_stages: &'a [f64],
         clock_millis: f64,
     },
-    /// Reply to the client's hello: what the connection uses from now on.
+    /// Reply to the client's hello: the version and the capabilities that the connection uses from
+    /// now on.
     Welcome {
         protocol: u32,
         capabilities: Vec<&'static str>,

@@ -2,7 +2,7 @@
 //!
 //! Long messages are sent in parts if the client can join them, so that urgent messages wait for at
 //! most one part. The parts and the kernel's buffer are so small that their transfer takes less
-//! than 100 ms. Everything else waits here, where newer data replaces older data.
+//! than 100 ms. All other data waits in this process, where newer data replaces older data.
 
 use crate::client::keyframe_image::{KeyframeImageError, KeyframeImageRequest, encode_photograph};
 use crate::client::link_rate::LinkRate;
@@ -35,8 +35,8 @@ use tokio::sync::{Notify, mpsc, watch};
 use tokio::task::{JoinError, JoinHandle};
 use tokio::time::MissedTickBehavior;
 
-/// Period of heartbeats; short enough for pages to detect silence quickly. The page shows a problem
-/// after 0.8 s without a message, so that two heartbeats may be late.
+/// Period of heartbeats. It is short enough for pages to detect silence quickly. The page shows a
+/// problem after 0.8 s without a message, so two heartbeats may be late.
 const HEARTBEAT_PERIOD: Duration = Duration::from_millis(250);
 /// Period of WebSocket pings. The next one is sent only if the last one was answered.
 const PING_PERIOD: Duration = Duration::from_secs(1);
@@ -44,9 +44,9 @@ const PING_PERIOD: Duration = Duration::from_secs(1);
 /// time. With a longer time, camera images look stuck while the operator moves the view, which
 /// requests pictures back to back.
 const MAX_UPDATE_DELAY: Duration = Duration::from_millis(500);
-/// A client with the capability `heartbeat` that has been silent for longer gets no pictures,
-/// images and robot states: they would be outdated when the connection works again. The page sends
-/// a message every 500 ms, so this is four of its periods.
+/// A client with the capability `heartbeat` that has been silent for longer than this gets no
+/// pictures, images and robot states, because they would be outdated when the connection works
+/// again. The page sends a message every 500 ms, so the limit is four of its periods.
 const MAX_SILENCE: Duration = Duration::from_secs(2);
 
 /// A message that the reader asks the writer to send.
@@ -59,14 +59,14 @@ pub(crate) enum Reply {
     Pong {
         t: f64,
     },
-    /// Not sent itself: the photograph follows when it is encoded.
+    /// There is no immediate reply. The photograph is sent when it is encoded.
     KeyframeImage(KeyframeImageRequest),
     Goodbye {
         reason: String,
     },
 }
 
-/// Whether to serve the client further: continue or end.
+/// Whether to continue to serve the client.
 pub(crate) type ClientFlow = ControlFlow<()>;
 
 /// Sends to one client.
@@ -98,8 +98,8 @@ pub(crate) struct PhotographTask {
 }
 
 impl Drop for PhotographTask {
-    /// Removes the request of a client that has disconnected from the queue. Otherwise, a client
-    /// that connects again and again could fill it.
+    /// Removes the photograph request of a disconnected client from the queue. Otherwise, a client
+    /// that connects again and again could fill the queue.
     fn drop(&mut self) {
         self.task.abort();
     }
@@ -158,7 +158,7 @@ impl Writer<'_> {
             .hub
             .latest::<Option<Arc<RobotState>>>()
             .subscribe();
-        // A state from before the connection is as good as a new one.
+        // A robot state from before the connection is sent like a new one.
         robot_state.mark_changed();
         let mut robot_state_sent: Option<Instant> = None;
         let mut updates = ClientUpdates::new(&self.server_context.topics);
@@ -169,7 +169,8 @@ impl Writer<'_> {
         let mut transfers = Transfers::default();
         let mut heartbeat = tokio::time::interval(HEARTBEAT_PERIOD);
         let mut ping = tokio::time::interval(PING_PERIOD);
-        // If the client reads slowly, ticks are missed. Sending them all at once would say nothing.
+        // If the client reads slowly, ticks are missed. Sending the missed heartbeats all at once
+        // would be useless.
         heartbeat.set_missed_tick_behavior(MissedTickBehavior::Delay);
         ping.set_missed_tick_behavior(MissedTickBehavior::Delay);
         self.send_hello().await?;
@@ -177,15 +178,15 @@ impl Writer<'_> {
             // A client without heartbeats may be silent for any time.
             let is_heard =
                 !self.negotiated.has_heartbeat || self.connection.silence() <= MAX_SILENCE;
-            // One picture is encoded while the one before it is sent. If more were encoded in
-            // advance, they would be outdated when it is their turn.
+            // One picture is encoded while the one before it is sent. If more pictures were encoded
+            // in advance, they would be outdated when they are sent.
             if encoding.is_none()
                 && is_heard
                 && let Some(outgoing) = self.pictures().collect(self.client)
             {
                 encoding = self.begin(outgoing).await?;
                 if encoding.is_none() {
-                    // It was an error, which has been sent. There may be more results.
+                    // The result was an error, which has been sent. There may be more results.
                     continue;
                 }
             }
@@ -200,14 +201,15 @@ impl Writer<'_> {
             };
             let mut update_due = settles_at;
             // Long messages wait until the client has said which ones it wants, and until nothing
-            // else is being sent. A picture that is being encoded comes first, but not forever: on
-            // a slow machine, there is always one.
+            // else is being sent. A picture that is being encoded comes first, but only for a
+            // limited time, because on a slow machine there is always such a picture.
             let allows_long = is_heard
                 && settles_at.is_none()
                 && transfers.current.is_none()
                 && (encoding.is_none() || long_update_sent.elapsed() > MAX_UPDATE_DELAY);
             if waiting_update.is_none() {
-                // Before looking: a message that is published in between wakes up the loop again.
+                // The mark is cleared before the topics are checked, so that a message that is
+                // published in between wakes up the loop again.
                 published.mark_unchanged();
                 let has_changes = self.negotiated.has_keyframe_changes;
                 match updates.next(&subscriptions, has_changes, Instant::now(), allows_long) {
@@ -236,8 +238,9 @@ impl Writer<'_> {
                 });
             let is_sending = transfers.current.is_some();
             tokio::select! {
-                // In this order, because each branch is more urgent than the next. All of them can
-                // be dropped while they wait, so nothing is lost if another one is chosen.
+                // The branches are checked in this order, because each branch is more urgent than
+                // the next. All of them can be dropped while they wait, so nothing is lost if
+                // another branch is chosen.
                 biased;
                 _ = stopped.changed() => return self.send_goodbye_when_stopped().await,
                 Some(reply) = replies.recv() => self.reply(reply).await?,
@@ -263,7 +266,7 @@ impl Writer<'_> {
                 }
                 () = std::future::ready(()), if is_sending && is_heard => {
                     if let Some(mut current) = transfers.current.take() {
-                        // One part, and then everything above has its turn again.
+                        // One part is sent. Then all branches above are checked again.
                         let sent = self.send_part(&mut current).await;
                         let is_complete = current.n_sent == current.bytes.len();
                         // The run may now render the next picture for this client.
@@ -283,7 +286,8 @@ impl Writer<'_> {
                         None => {}
                     }
                 }
-                // Before pictures, which follow each other without a pause: the client waits for it.
+                // A photograph comes before pictures, because the client waits for it and pictures
+                // follow each other without a pause.
                 encoded = encoded_photograph(&mut self.photograph), if !is_sending && is_heard => {
                     self.send_photograph(encoded, &mut transfers).await?;
                 }
@@ -325,7 +329,7 @@ impl Writer<'_> {
             }
             Outgoing::Failed { id, view, reason } => {
                 let sent = self.send_error(Some(id), &view, &reason).await;
-                // Even if the connection is broken: the place of the picture must become free.
+                // The place of the picture must become free even if the connection is broken.
                 self.pictures().release(self.client);
                 sent?;
                 ControlFlow::Continue(None)
@@ -382,7 +386,8 @@ impl Writer<'_> {
                 names,
                 negotiated,
             }) => {
-                // Before the reply: the client may rely on it as soon as it has received the reply.
+                // The capabilities are set before the reply, because the client may rely on them as
+                // soon as it has received the reply.
                 self.negotiated = negotiated;
                 self.send_message(&ServerMessage::Welcome {
                     protocol,
@@ -482,7 +487,8 @@ impl Writer<'_> {
         self.part_sent = Instant::now();
         self.link
             .observe(end - begin, self.part_sent - began, pause);
-        // The buffer holds what cannot be replaced by newer data any more.
+        // Data in the kernel's buffer can no longer be replaced by newer data, so the buffer is
+        // kept small.
         self.connection.set_send_buffer(self.link.buffer_bytes());
         transfer.n_sent = end;
         ControlFlow::Continue(())
@@ -524,7 +530,7 @@ impl Writer<'_> {
         match self.sink.send(message).await {
             Ok(()) => ControlFlow::Continue(()),
             Err(error) => {
-                // Usual when a page is closed, so this is no warning.
+                // This error is usual when a page is closed, so it is not logged as a warning.
                 log::debug!("client {}: {error}", self.client);
                 ControlFlow::Break(())
             }
@@ -532,7 +538,8 @@ impl Writer<'_> {
     }
 }
 
-/// Encodes a picture on another thread: it takes milliseconds, in which no writer could send.
+/// Encodes a picture on another thread. Encoding takes milliseconds, during which no writer could
+/// send on this thread.
 fn encode(drawn: Box<DrawnPicture>, effort: Option<Effort>) -> EncodingTask {
     let view_request = &drawn.job.view_request;
     let id = view_request.id;
@@ -557,8 +564,9 @@ async fn encoded_photograph(photograph: &mut Option<PhotographTask>) -> Photogra
     }
 }
 
-/// The time at which something counts as sent: when it was due, so that inaccurate timers do not
-/// lower its rate, or now if that is more than a period ago.
+/// The time at which a message counts as sent. This is the time at which it was due, so that
+/// inaccurate timers do not lower the rate. If that time is more than a period ago, it is the
+/// present time.
 fn on_schedule((due, period): (Instant, Duration)) -> Instant {
     let now = Instant::now();
     if now.saturating_duration_since(due) < period {

@@ -1,4 +1,5 @@
-//! The depth format `compact_half`: differences of logarithmic counts, compressed to a zlib stream.
+//! The depth format `compact_half`. It stores differences of logarithmic counts, compressed to a
+//! zlib stream.
 //!
 //! Logarithmic counts have the same relative error at all distances. Most differences between
 //! neighbors are then 0, and zlib finds the patterns that repeat from row to row. Predicting from
@@ -11,24 +12,24 @@ use std::io::Write;
 use std::sync::LazyLock;
 use trainer::PackedDepth;
 
-/// Ratio of two consecutive counts, minus 1: depths are wrong by at most half of it, 0.2 %. The
-/// models' own errors are larger. Twice the step saves 30 % of the bytes, half the step costs 30 %
-/// (`docs/benchmarks/2026-11-26-viewer-protocol.md`).
+/// Ratio of two consecutive counts, minus 1. Rounding changes a depth by at most half of this, 0.2
+/// %. The errors of the models are larger. Twice the step saves 30 % of the bytes, and half the
+/// step costs 30 % (`docs/benchmarks/2026-11-26-viewer-protocol.md`).
 const LOG_STEP: f64 = 0.004;
 /// Symbol of a pixel whose count follows in the second part.
 const ESCAPE: u8 = 255;
 /// Largest symbol of a difference between a count and its prediction.
 const MAX_SYMBOL: u16 = 254;
-/// Deflate level for [`Effort::Small`]. Level 6 takes four times as long and saves 7 %.
+/// Deflate level for [`Effort::Small`]. Level 6 would take four times as long and save 7 %.
 const DEFLATE_LEVEL: u32 = 3;
 
 /// How much time is spent on compression.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Effort {
-    /// About 1 ms per megapixel of the picture, for connections on which more bytes take less time
-    /// than that.
+    /// Takes about 1 ms per megapixel of the picture. It is for fast connections, on which the
+    /// additional bytes take less time than better compression.
     Fast,
-    /// About 5 ms per megapixel.
+    /// Takes about 5 ms per megapixel of the picture.
     Small,
 }
 
@@ -68,7 +69,7 @@ pub(crate) fn compress(depth: &PackedDepth, effort: Effort) -> std::io::Result<C
     let log_step = LOG_STEP.ln_1p();
     let mut symbols = Vec::with_capacity(counts.len());
     let mut escaped = Vec::new();
-    // The count to the left predicts a count; in the first column, the count above.
+    // A count is predicted by the count to its left or, in the first column, by the count above it.
     let mut above = 0;
     // An empty picture must not lead to rows of length 0, which `chunks` does not allow.
     for row in counts.chunks((depth.size_px[0] as usize).max(1)) {
@@ -86,7 +87,7 @@ pub(crate) fn compress(depth: &PackedDepth, effort: Effort) -> std::io::Result<C
             predicted = code;
         }
     }
-    // Escaped counts come last: between the symbols, they would break the patterns that zlib finds.
+    // Escaped counts come last. Between the symbols, they would break the patterns that zlib finds.
     symbols.append(&mut escaped);
     let bytes = match effort {
         Effort::Fast => fdeflate::compress_to_vec(&symbols),
@@ -121,12 +122,13 @@ fn log_count(count: u16, nearest: u16, log_step: f64) -> u16 {
     // A table, because a picture has hundreds of thousands of pixels, but there are only 65536
     // counts.
     let above = LOGARITHMS[usize::from(count)] - LOGARITHMS[usize::from(nearest)];
-    // Rounded, and 1 more, because 0 means that there is no surface.
+    // The count is rounded and increased by 1, because 0 means that there is no surface.
     (above / log_step as f32 + 1.5) as u16
 }
 
-/// The difference to the prediction: 0, -1, 1, -2, 2, ...; `None` if it is too large, or the pixel
-/// or its prediction has no surface but not both.
+/// The symbol of the difference from the prediction; the order of differences is 0, -1, 1, -2, 2,
+/// and so on. `None` if the difference is too large, or if only one of the pixel and its prediction
+/// has a surface.
 fn symbol(code: u16, predicted: u16) -> Option<u8> {
     // The edge of a hole is a large jump that says nothing about the shape of the surface.
     if (code == 0) != (predicted == 0) {

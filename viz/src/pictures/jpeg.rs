@@ -175,7 +175,8 @@ fn encode_strip(
     quality: u8,
     chroma: Chroma,
 ) -> Result<Vec<u8>, JpegError> {
-    // Headers, and about one bit per channel value, so that the buffer rarely grows.
+    // Space for the headers, and for about one bit per channel value, so that the buffer rarely
+    // grows.
     let mut file = Vec::with_capacity(1024 + bytes.len() / 12);
     let mut encoder = Encoder::new(&mut file, quality);
     encoder.set_sampling_factor(match chroma {
@@ -218,7 +219,7 @@ fn join(strips: &[Vec<u8>], height_px: u16, interval: u16) -> Vec<u8> {
     file.extend_from_slice(&first[..parts.scan_header]);
     // The first strip has its own height.
     file[parts.height..parts.height + 2].copy_from_slice(&height_px.to_be_bytes());
-    // Must come before the scan header (ITU-T T.81, section B.2.4.4).
+    // The restart interval must come before the scan header (ITU-T T.81, section B.2.4.4).
     file.extend_from_slice(&[0xFF, DEFINE_RESTART_INTERVAL, 0, 4]);
     file.extend_from_slice(&interval.to_be_bytes());
     file.extend_from_slice(&first[parts.scan_header..parts.scan]);
@@ -237,9 +238,10 @@ fn join(strips: &[Vec<u8>], height_px: u16, interval: u16) -> Vec<u8> {
 /// Iterates over the segments of a file that the encoder wrote.
 fn parts_of(file: &[u8]) -> Parts {
     let mut height = 0;
-    // After the marker for the start of the image, which has no length.
+    // The first segment begins after the marker for the start of the image, which has no length.
     let mut at = 2;
-    // Ends, because the encoder always writes a scan. Files of others never come here.
+    // The loop ends, because the encoder always writes a scan. Files from other programs are never
+    // passed to this function.
     loop {
         let length = usize::from(u16::from_be_bytes([file[at + 2], file[at + 3]]));
         match file[at + 1] {
@@ -268,8 +270,8 @@ pub(crate) fn downscale(pixels: &Pixels<'_>, size_px: [u32; 2]) -> Result<Vec<u8
     let rows = Spans::new(pixels.size_px[1], size_px[1]);
     let mut rgb = Vec::with_capacity(3 * size_px[0] as usize * size_px[1] as usize);
     let mut row_sums = vec![0.0_f32; row_bytes];
-    // First along columns, then along rows: each source value is then read only once for each
-    // target row.
+    // The image is scaled first along columns, then along rows, so that each source value is read
+    // only once for each target row.
     for row in 0..size_px[1] {
         row_sums.fill(0.0);
         for (y, weight) in rows.of(row) {
@@ -464,7 +466,8 @@ mod tests {
             layout: Layout::Rgba,
             bytes: &rgba,
         };
-        // Columns of 1.5 pixels: (10 + 30 + (20 + 40) / 2) / 3 and ((20 + 40) / 2 + 2 * 99) / 3.
+        // Each target column covers 1.5 source columns: (10 + 30 + (20 + 40) / 2) / 3 and ((20 +
+        // 40) / 2 + 2 * 99) / 3.
         let rgb = downscale(&pixels, [2, 1]).expect("downscaled");
         assert_eq!(rgb, [23, 1, 1, 76, 66, 67]);
         assert_eq!(

@@ -15,8 +15,8 @@ use std::borrow::Cow;
 use std::time::Instant;
 use trainer::{JPEG_QUALITY, PackedDepth, Packing, Picture, Rendered};
 
-/// JPEG quality of intermediate stages, which are soon replaced. With a higher quality, they take
-/// longer to send, and the last stage comes later.
+/// JPEG quality of intermediate stages, which are soon replaced. With a higher quality, these
+/// stages would take longer to send, and the last stage would arrive later.
 const QUALITY_INTERMEDIATE: u8 = 80;
 /// JPEG quality of live images. They are shown without enlargement, several times per second. They
 /// are most of what an idle page receives: 56 of 62 kB/s with quality 80
@@ -25,7 +25,7 @@ const QUALITY_LIVE: u8 = 72;
 /// Smaller pictures keep full color resolution, because halving it saves little and the page
 /// enlarges these pictures.
 const MIN_HALVED_PX: usize = 256 * 256;
-/// Minimum depth pixels per thread; for smaller maps another thread does not help.
+/// Minimum number of depth pixels per thread. For smaller maps, another thread does not help.
 const MIN_DEPTH_PX: usize = 128 * 1024;
 
 /// Reason why a picture cannot be sent.
@@ -100,7 +100,8 @@ pub(crate) fn pack_picture(
     } = drawn;
     let view_request = &*job.view_request;
     let began = Instant::now();
-    // The GPU has packed it already, unless the client requests a format that it does not support.
+    // The GPU has already packed the stage, unless the client requests a format that the GPU does
+    // not support.
     let (color, depth) = match rendered {
         Rendered::Packed(packed) => (packed.jpeg, packed.depth),
         Rendered::Picture(picture) => encode_picture(view_request, header.last, &picture)?,
@@ -129,8 +130,8 @@ pub(crate) fn pack_picture(
     })
 }
 
-/// The depth in the requested format, and its position in the payload. Nothing if none was
-/// requested.
+/// The depth in the requested format, and its position in the payload. Both are empty if no depth
+/// was requested.
 fn depth_part(
     view_request: &ViewRequest,
     packed: PackedDepth,
@@ -138,7 +139,8 @@ fn depth_part(
     offset: usize,
 ) -> Result<(Option<DepthPart>, Vec<u8>), PackError> {
     let format = match (view_request.depth, effort) {
-        // Within a computer, compression takes longer than it saves. Clients look at the format.
+        // Within a computer, compression takes longer than it saves, so depth is sent uncompressed.
+        // The header names the format that is used.
         (Some(DepthFormat::CompactHalf), None) => DepthFormat::U16Half,
         (Some(requested), _) => requested,
         (None, _) => return Ok((None, Vec::new())),
@@ -175,7 +177,8 @@ fn encode_picture(
     picture: &Picture,
 ) -> Result<(Option<Vec<u8>>, Option<PackedDepth>), PackError> {
     let (color, depth) = std::thread::scope(|scope| {
-        // Color and depth in parallel: color takes most of the time and runs on this thread.
+        // Color and depth are encoded in parallel. Color takes most of the time and is encoded on
+        // this thread.
         let depth = view_request
             .depth
             .map(|format| scope.spawn(move || pack_depth(format, picture)));
@@ -230,7 +233,8 @@ pub(crate) fn pack_live_image(
 pub(crate) fn live_jpeg(image: &LiveImage, size_px: [u32; 2]) -> Result<Cow<'_, [u8]>, PackError> {
     let decoded;
     let pixels = match &image.pixels {
-        // Encoding the file again would cost time and quality.
+        // The JPEG file is sent unchanged, because encoding it again would take time and reduce the
+        // quality.
         LivePixels::Jpeg(file) if size_px == image.size_px => return Ok(Cow::Borrowed(file)),
         LivePixels::Jpeg(file) => {
             decoded =
@@ -310,13 +314,14 @@ fn f32_depth(picture: &Picture) -> PackedDepth {
 /// Halves the size of a depth map. Each block of 2x2 pixels keeps its nearest depth, so that thin
 /// objects in front stay visible; 0 means no depth.
 ///
-/// The largest depth maps to the largest count, for the finest step that 16 bits allow.
+/// The largest depth maps to the largest count, so that the step is as small as 16 bits allow.
 fn half_depth(picture: &Picture, n_threads: usize) -> PackedDepth {
     let width = picture.size_px[0] as usize;
     let size_px = picture.size_px.map(|n| n.div_ceil(2));
     let out_width = size_px[0] as usize;
     let pairs_per_thread = (size_px[1] as usize).div_ceil(n_threads.max(1)).max(1);
-    // Pairs of rows belong to one thread each. `chunks` does not allow a length of 0.
+    // Each pair of rows belongs to one thread. The length is at least 1, because `chunks` does not
+    // allow a length of 0.
     let bands = picture
         .depth_m
         .chunks((2 * width * pairs_per_thread).max(1));

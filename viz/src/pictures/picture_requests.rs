@@ -1,4 +1,4 @@
-//! Pictures between the clients that request them and the training thread that renders them.
+//! Passes pictures between the clients that request them and the training thread that renders them.
 
 use crate::client::protocol::ProjectionMessage;
 use crate::client::server_message::PictureHeader;
@@ -52,8 +52,8 @@ impl PictureRequests {
         queue.has_work()
     }
 
-    /// The pictures of models in training that clients have shown since the last call. If it is not
-    /// called for long, the oldest are missing.
+    /// The pictures of models in training that clients have shown since the last call. If this is
+    /// not called for a long time, the oldest pictures are missing.
     pub fn take_shown(&self) -> Vec<ShownPicture> {
         self.shown_pictures.lock().take()
     }
@@ -115,7 +115,8 @@ impl PictureRequests {
             .queue()
             .unreported(client)
             .and_then(|unreported| unreported.shown(id, view, shown_at));
-        // The lock of the queue has been released, so that there is no order of locks to keep.
+        // The lock of the queue has been released before another lock is taken, so no order of
+        // locks is needed.
         if let Some(picture) = picture {
             self.shown_pictures.lock().push(picture);
         }
@@ -151,13 +152,14 @@ pub struct PendingRender {
 }
 
 impl PendingRender {
-    /// Requested model; the first if `None`. The name comes from the client and may not exist.
+    /// Requested model; the first model if `None`. The name comes from the client and may not
+    /// exist.
     pub fn method(&self) -> Option<&str> {
         self.job.view_request.method.as_deref()
     }
 
     /// Sets the model that is drawn: its method and its number of steps. Clients label the picture
-    /// with it, so it must not be taken from the request.
+    /// with these values, so they must describe the drawn model and not the request.
     #[must_use]
     pub fn of_model(mut self, method: &str, step: u64) -> Self {
         self.model = Some(DrawnModel {
@@ -194,7 +196,8 @@ impl PendingRender {
     pub fn deliver(mut self, picture: impl Into<Rendered>) {
         let rendered = picture.into();
         let header = self.header(rendered.size_px());
-        // Coarse stages take less time, and the estimate is for the full picture.
+        // Only the last stage is recorded, because the estimate is for the full picture and coarse
+        // stages take less time.
         if header.last {
             self.pictures
                 .queue()
@@ -257,7 +260,8 @@ impl PendingRender {
 
 impl Drop for PendingRender {
     fn drop(&mut self) {
-        // The run dropped it, for example after an error. Its place must become free.
+        // The run dropped the request without an answer, for example after an error. The place of
+        // its picture must become free.
         if !self.is_released {
             self.pictures.release(self.job.client);
         }

@@ -6,31 +6,33 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 /// Maximum number of sent pictures per view and model of which a client can still report when they
-/// were shown. Only few pictures are on their way at a time; others were dropped by the client.
+/// were shown. Only a few pictures are in transit at a time. Other unreported pictures were dropped
+/// by the client.
 const MAX_UNREPORTED: usize = 16;
-/// Maximum number of pairs of a view and a model per client; the one that was sent longest ago is
-/// dropped.
+/// Maximum number of pairs of a view and a model per client. Beyond it, the pair whose last picture
+/// was sent longest ago is dropped.
 const MAX_STREAMS: usize = 8;
-/// A client has waited for the keyframes of a picture that it has not reported if less than this
-/// passed between the picture before that one and the next picture that it reports.
+/// Maximum time for which a client counts as waiting for new keyframes. Pictures that a client has
+/// not reported are attributed to the next picture that it reports. If the wait for their keyframes
+/// began longer ago than this, these keyframes are ignored, because the page was probably hidden.
 const MAX_WAIT: Duration = Duration::from_secs(10);
-/// Maximum number of shown pictures that wait for the run; the oldest are dropped. A command that
-/// does not measure latency never takes them.
+/// Maximum number of shown pictures that wait for the run. Beyond it, the oldest are dropped. A
+/// command that does not measure latency never takes them.
 const MAX_SHOWN: usize = 1024;
 
 /// The keyframes on which a model had been trained when a picture was drawn.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct TrainedKeyframes {
-    /// Their number, counted from the start of the run.
+    /// Number of these keyframes, counted from the start of the run.
     pub n: u64,
-    /// The last one of them; `None` if there are none.
+    /// The last of these keyframes; `None` if there are none.
     pub newest: Option<NewestKeyframe>,
 }
 
 /// The keyframe that was added last to a model.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct NewestKeyframe {
-    /// Mid-exposure of its image; the time of arrival if the stamp is on another clock.
+    /// Mid-exposure of its image. If the stamp is on another clock, this is the time of arrival.
     pub captured_at: Instant,
     /// When it was added to the model.
     pub added_at: Instant,
@@ -39,11 +41,11 @@ pub struct NewestKeyframe {
 /// A complete picture of a model in training that a client has shown.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct ShownPicture {
-    /// Requested model; the first if `None`.
+    /// Requested model; the first model if `None`.
     pub method: Option<String>,
     /// The keyframes that the client had not shown in this view of this model before, counted from
-    /// the start of the run. Keyframes of pictures that it has not reported belong to the next
-    /// picture that it reports, unless they are old.
+    /// the start of the run. Keyframes of pictures that the client has not reported belong to the
+    /// next picture that it reports, unless the client has not waited for them (see `MAX_WAIT`).
     pub new_keyframes: Range<u64>,
     /// When the server began to send it.
     pub sent_at: Instant,
@@ -67,7 +69,7 @@ pub(crate) struct SentPicture {
 struct Unreported {
     picture: SentPicture,
     new_keyframes: Range<u64>,
-    /// When the picture before it was sent, which did not contain the new keyframes.
+    /// When the previous picture was sent, which did not contain the new keyframes.
     waits_since: Instant,
 }
 
@@ -84,7 +86,7 @@ struct Stream {
 }
 
 /// Pictures that were sent to one client and that it has not reported as shown. The stream of the
-/// last one is the last.
+/// picture that was sent last is at the end.
 #[derive(Debug, Default)]
 pub(crate) struct UnreportedPictures(VecDeque<Stream>);
 
@@ -92,8 +94,7 @@ impl UnreportedPictures {
     /// Adds a picture that is about to be sent. The first picture of a model in a view has no new
     /// keyframes: the client did not wait for them.
     pub(crate) fn sent(&mut self, picture: SentPicture) {
-        // At most `MAX_STREAMS` entries, so searching is cheaper than a map with an order of its
-        // own.
+        // There are at most `MAX_STREAMS` entries, so searching is cheaper than a separate map.
         let found = self
             .0
             .iter()
@@ -151,10 +152,10 @@ impl Stream {
         });
     }
 
-    /// Removes a picture and those that were sent before it. Their new keyframes become those of
-    /// the picture.
+    /// Removes a picture and the pictures that were sent before it. The new keyframes of these
+    /// earlier pictures are added to the new keyframes of the picture.
     fn take(&mut self, id: u64) -> Option<(SentPicture, Range<u64>)> {
-        // From the end, because a client may use a number again.
+        // The search begins at the end, because a client may use a number again.
         let ix = self
             .pictures
             .iter()
@@ -166,7 +167,8 @@ impl Stream {
             ..
         } = self.pictures.pop_front()?;
         // The client has dropped the older pictures for newer ones, so its operator saw their
-        // keyframes only now. If the page was hidden for long, nobody waited for them.
+        // keyframes only now. If the page was hidden for a long time, nobody waited for these
+        // keyframes.
         let waited = older
             .iter()
             .filter(|old| picture.sent_at - old.waits_since <= MAX_WAIT);

@@ -14,27 +14,27 @@ use tokio::sync::Notify;
 use trainer::Rendered;
 
 /// Maximum number of pictures per client that are being rendered or sent. It limits rendering for
-/// slow clients. With one, the next picture would be rendered only after the last one was sent;
-/// with more, pictures are older when they arrive.
+/// slow clients. With a maximum of one, the next picture would be rendered only after the last one
+/// was sent. With a larger maximum, pictures would be older when they arrive.
 const MAX_UNSENT: usize = 2;
-/// Memory that each client may use for these pictures, bytes. Any picture without f32 depth fits:
-/// the largest, of 4096 x 4096 pixels, counts as exactly this much.
+/// Memory that each client may use for these pictures, bytes. Any picture without f32 depth fits.
+/// The largest picture, 4096 x 4096 pixels, counts as exactly this much.
 const CLIENT_BYTES: usize = 16 << 20;
 /// Additional memory for larger pictures, bytes, shared by all clients of a role. Viewers and
 /// operators have separate shares, so that slow viewers do not delay operators.
 const SHARED_BYTES: usize = 256 << 20;
 
-/// Maximum number of results that wait to be sent to a client. A client that does not read misses
-/// the reasons of further failed edits.
+/// Maximum number of results that wait to be sent to a client. A client that does not read its
+/// messages misses the reasons of further failed edits.
 const MAX_OUTBOX: usize = 64;
 
-/// Maximum number of views per client. The name of a view is text of the client, so without a
-/// limit, the list could grow forever.
+/// Maximum number of views per client. The client chooses the name of a view. Without a limit, the
+/// list of views could grow forever.
 pub(crate) const MAX_VIEWS: usize = 8;
 
-/// If the full picture is expected to take less time than this, coarser stages are skipped: they
-/// would be replaced before they are shown. At 30 pictures per second, a picture is shown for 33
-/// ms.
+/// If the full picture is expected to take less time than this, coarser stages are skipped, because
+/// they would be replaced before they are shown. At 30 pictures per second, a picture is shown for
+/// 33 ms.
 const FAST_MILLIS: f64 = 30.0;
 
 /// All connected clients and their requests.
@@ -186,8 +186,8 @@ impl Queue {
             .any(|waiting| self.next_view(waiting).is_some())
     }
 
-    /// The next stage to render: clients in turn, the views of a client in turn, and the stages of
-    /// a view in order.
+    /// The next stage to render. Clients take turns, the views of a client take turns, and the
+    /// stages of a view follow in order.
     pub(crate) fn take(&mut self) -> Option<RenderJob> {
         // Numbers of clients only grow, so the next one in turn is the next larger number.
         let after = self.clients.range(self.last_served + 1..);
@@ -206,7 +206,7 @@ impl Queue {
             .clients
             .values()
             .filter(|other| other.role == waiting.role);
-        // Clients need the shared memory only for what exceeds their own.
+        // Clients need the shared memory only for bytes beyond their own memory.
         let n_shared = same_role
             .map(|other| other.n_unsent_bytes().saturating_sub(CLIENT_BYTES))
             .sum();
@@ -306,7 +306,7 @@ impl ClientQueue {
 
     fn take(&mut self, client: u64, name: Arc<str>) -> Option<RenderJob> {
         let view = self.views.get_mut(&name)?;
-        // Counted before rendering, because the memory is needed from then on.
+        // The bytes are counted before rendering, because the memory is needed from then on.
         self.unsent.push_back(view.n_bytes_of_next()?);
         let view_request = view.view_request.clone()?;
         let stage = view.next_stage;
@@ -324,9 +324,9 @@ impl ClientQueue {
 }
 
 impl ViewQueue {
-    /// Memory that the picture of the next stage needs until it is sent, bytes: JPEG and packed
-    /// depth take less than a byte per pixel together; with depth as f32, color is not packed on
-    /// the GPU either.
+    /// Memory that the picture of the next stage needs until it is sent, bytes. JPEG and packed
+    /// depth together take less than a byte per pixel. If depth is sent as f32, color is not packed
+    /// on the GPU either, and the picture needs more memory.
     fn n_bytes_of_next(&self) -> Option<usize> {
         let view_request = self.view_request.as_ref()?;
         let [width, height] = view_request

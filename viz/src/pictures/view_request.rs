@@ -8,8 +8,8 @@ use std::sync::Arc;
 use std::time::Instant;
 use trainer::{Projection, RenderRequest};
 
-/// Maximum width and height that a client may request, pixels. It covers the screens in use, and
-/// bounds the memory for a picture: 64 MiB of colors.
+/// Maximum width and height that a client may request, pixels. It covers common screens, and limits
+/// the memory for the colors of a picture to 64 MiB.
 pub(crate) const MAX_SIZE_PX: u32 = 4096;
 /// Maximum number of stages of a request. Each of them is a picture that must be rendered.
 const MAX_STAGES: usize = 8;
@@ -94,7 +94,7 @@ pub(crate) struct ViewRequest {
     pub(crate) view: Arc<str>,
     /// When it was received.
     pub(crate) received: Instant,
-    /// Requested model; the first if `None`.
+    /// Requested model; the first model if `None`.
     pub(crate) method: Option<String>,
     /// The request at full size.
     pub(crate) request: RenderRequest,
@@ -113,7 +113,7 @@ impl ViewRequest {
         if outputs.is_empty() {
             return Err(InvalidRequest::NoOutput);
         }
-        // The size comes before everything that is computed from it.
+        // The size is checked first, because other values are computed from it.
         let size_px = checked_size(message.size_px)?;
         let (near_m, far_m) = checked_range(
             message.near_m.unwrap_or(DEFAULT_NEAR_M),
@@ -149,13 +149,14 @@ impl ViewRequest {
         })
     }
 
-    /// The request of one stage: same field of view, fewer pixels.
+    /// The request of one stage. It has the same field of view and fewer pixels.
     pub(crate) fn stage_request(&self, stage: usize) -> RenderRequest {
         let full = self.request.size_px.map(f64::from);
         let scale = self.stages[stage];
         let size_px = self.request.size_px.map(|n| scaled(n, scale));
-        // From the rounded size, which is not exactly `scale` times the full size. Otherwise, the
-        // stages would be shifted against each other by up to half a pixel.
+        // The ratio is computed from the rounded size, which is not exactly `scale` times the full
+        // size. Otherwise, the stages would be shifted relative to each other by up to half a
+        // pixel.
         let ratio = [
             f64::from(size_px[0]) / full[0],
             f64::from(size_px[1]) / full[1],
@@ -209,7 +210,7 @@ fn checked_size(size_px: [u32; 2]) -> Result<[u32; 2], InvalidRequest> {
 }
 
 fn checked_range(near_m: f64, far_m: f64) -> Result<(f64, f64), InvalidRequest> {
-    // This check and those below are written so that NaN is rejected.
+    // This check and the checks below are written so that NaN is rejected.
     let fits = near_m > 0.0 && near_m < far_m && far_m.is_finite();
     if fits {
         Ok((near_m, far_m))
@@ -241,7 +242,7 @@ fn checked_projection(
         return Ok(Projection::Equirectangular);
     };
     let [width, height] = size_px.map(f64::from);
-    // With both, they could contradict each other.
+    // If both were given, they could contradict each other.
     let focal_px = match (focal_px, vertical_fov_rad) {
         (Some(focal_px), None) => focal_px,
         (None, Some(angle)) if angle > 0.0 && angle < std::f64::consts::PI => {

@@ -1,5 +1,5 @@
-//! Where a client looks from, and in which direction. It decides which chunks of a model the client
-//! gets first.
+//! The viewpoint of a client: a position and a direction. It determines which chunks of a model the
+//! client gets first.
 
 use crate::pictures::view_request::ViewRequest;
 use kinematics::Transform;
@@ -17,7 +17,8 @@ pub(crate) struct Viewpoint {
 impl Viewpoint {
     /// The viewpoint of a request; `None` if it is for a named view or shows all directions.
     pub(crate) fn of(view_request: &ViewRequest) -> Option<Self> {
-        // Named views, such as the one in a corner, are not what the operator looks at most.
+        // Operators look mostly at the main view, and less at named views, such as the view in a
+        // corner.
         let request = &view_request.request;
         if !view_request.view.is_empty() {
             return None;
@@ -42,13 +43,13 @@ impl Viewpoint {
         })
     }
 
-    /// A chunk with a lower rank is needed earlier: those in view first, and the nearest of them
-    /// first.
+    /// The order in which chunks are needed. Chunks in view have the lowest ranks, and among them,
+    /// nearer chunks have lower ranks.
     pub(crate) fn rank(&self, world_from_model: &Transform, layout: &ChunkLayout) -> (bool, f64) {
         let (center, radius_m) = bounds(layout);
         let in_camera = (self.camera_from_world * world_from_model * center).coords;
         let distance_m = in_camera.norm();
-        // Inside the sphere, the angle to it is not defined.
+        // If the camera is inside the sphere, the angle to the sphere is not defined.
         let is_around = distance_m <= radius_m;
         // The sphere touches the cone if its center is outside by at most the angle of its radius.
         let is_in_view = is_around

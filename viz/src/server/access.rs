@@ -7,8 +7,8 @@ use subtle::ConstantTimeEq;
 
 /// Length of a token, random bytes: 128 bits cannot be guessed.
 const TOKEN_BYTES: usize = 16;
-/// The page keeps its token in a cookie whose name starts like this and ends in the port. Cookies
-/// do not distinguish ports, so a browser sends those of all servers of a computer.
+/// The page keeps its token in a cookie whose name starts with this prefix and ends with the port.
+/// Cookies do not distinguish ports, so a browser sends the cookies of all servers on a computer.
 const COOKIE_PREFIX: &str = "__Host-fieldrig-";
 
 /// What a client may do.
@@ -123,7 +123,7 @@ impl Refusal {
     pub(crate) fn status(self) -> StatusCode {
         match self {
             Self::ForeignOrigin | Self::ForeignPage => StatusCode::FORBIDDEN,
-            // RFC 9112, section 3.2: a proxy and the server could use different ones.
+            // A proxy and the server could use different `Host` headers (RFC 9112, section 3.2).
             Self::SeveralHosts => StatusCode::BAD_REQUEST,
             Self::NoToken | Self::WrongToken => StatusCode::UNAUTHORIZED,
         }
@@ -131,7 +131,8 @@ impl Refusal {
 }
 
 impl Access {
-    /// Allows only pages of this server: other web sites in the same browser can also reach it.
+    /// Allows only pages of this server, because other web sites in the same browser can also send
+    /// requests to it.
     ///
     /// The `Host` of a local server must be a loopback address, because the domain of another site
     /// may resolve to this computer. Such a site has neither a token nor a valid certificate.
@@ -147,12 +148,12 @@ impl Access {
         let host = text(header::HOST).ok_or(refusal)?;
         let has_same_origin = match headers.get(header::ORIGIN) {
             None => true, // Not a browser.
-            // An origin that is no text, or `null`, is foreign.
+            // An origin that is not text, or that is `null`, belongs to another site.
             Some(_) => {
                 text(header::ORIGIN).and_then(|origin| origin.strip_prefix(scheme)) == Some(host)
             }
         };
-        // A shared server has names that it does not know, such as those of a local name server.
+        // A shared server cannot know all of its names, for example names from a local name server.
         let is_known_host = matches!(self, Self::Tokens(_)) || is_loopback(host);
         if has_same_origin && is_known_host {
             Ok(())

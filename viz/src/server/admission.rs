@@ -1,8 +1,8 @@
 //! Limits the number of open connections, so that enough file descriptors remain and connections in
 //! use stay open.
 //!
-//! Addresses do not distinguish viewers from idle sockets: on this computer, all are the same. At a
-//! limit, a new connection replaces the least active one.
+//! Addresses do not distinguish viewers from idle sockets, because all clients on this computer
+//! have the same address. At a limit, a new connection replaces the least active one.
 
 use parking_lot::Mutex;
 use std::cmp::Reverse;
@@ -13,22 +13,22 @@ use std::time::{Duration, Instant};
 use tokio::sync::watch;
 use tokio::time::timeout_at;
 
-/// Maximum number of open connections; lower if the limit on open files requires it. A page needs
-/// one connection for the WebSocket, and a few for its files while it is loaded.
+/// Maximum number of open connections. The number is lower if the limit on open files requires it.
+/// A page needs one connection for the WebSocket, and a few for its files while it is loaded.
 const MAX_CONNECTIONS: usize = 256;
-/// Maximum number of WebSocket clients. Each one may use memory for pictures that are not sent yet:
-/// see `pictures/queue.rs`.
+/// Maximum number of WebSocket clients. Each client may use memory for pictures that are not sent
+/// yet (see `pictures/queue.rs`).
 const MAX_CLIENTS: usize = 32;
-/// The process may open this many files per connection: connections use at most a quarter of the
-/// limit.
+/// Number of file descriptors that must be available per connection. Connections therefore use at
+/// most a quarter of the limit on open files.
 const DESCRIPTORS_PER_CONNECTION: usize = 4;
 /// A client that does not answer a ping within this time is disconnected. It is longer than the time
 /// limit of a write, because the answer may wait behind data of a slow link.
 const PONG_TIMEOUT: Duration = Duration::from_secs(8);
 /// A client that has not answered a ping for this long may be replaced by a new one.
 const UNRESPONSIVE_AFTER: Duration = Duration::from_secs(1);
-/// A client that has sent no message for this long may be replaced by a new one; the page sends two
-/// per second.
+/// A client that has sent no message for this long may be replaced by a new one. The page sends two
+/// messages per second.
 const IDLE_CLIENT_AFTER: Duration = Duration::from_secs(3);
 
 /// Limits on the number of connections.
@@ -94,8 +94,8 @@ pub(crate) struct Connection {
 struct Activity {
     /// Whether a complete request has arrived.
     has_requested: bool,
-    /// Time of the last activity: when the last request arrived, or when the kernel last accepted
-    /// data for the peer. Initially, when the connection was opened.
+    /// Time of the last activity. This is when the last request arrived, or when the kernel last
+    /// accepted data for the peer. Before that, it is the time when the connection was opened.
     active_at: Instant,
     /// When the connection was accepted as a WebSocket client. The fields below are used from then
     /// on.
@@ -115,8 +115,8 @@ struct Activity {
 enum Importance {
     /// It has not answered the ping of this time.
     Unresponsive(Instant),
-    /// It was admitted at this time, and has never answered a ping or never sent a message: it may
-    /// be a socket that somebody has left open.
+    /// It was admitted at this time, and has never answered a ping or has never sent a message. It
+    /// may be a socket that somebody has left open.
     NeverUsed(Instant),
     /// It sent its last message at this time.
     Idle(Instant),
@@ -195,7 +195,7 @@ impl Admission {
     }
 }
 
-/// The connections that are not about to leave.
+/// The connections that are not about to be closed.
 fn open(connections: &[Arc<Connection>]) -> impl Iterator<Item = &Arc<Connection>> {
     connections
         .iter()
@@ -220,8 +220,8 @@ impl Connection {
         }
     }
 
-    /// Whether the peer has a loopback address. It may still be the end of a tunnel. Unknown peers
-    /// count as remote, which only costs compression.
+    /// Whether the peer has a loopback address. The peer may still be the end of a tunnel. Unknown
+    /// peers count as remote, and their data is then compressed without need.
     pub(crate) fn is_loopback(&self) -> bool {
         self.peer
             .is_some_and(|peer| peer.ip().to_canonical().is_loopback())
@@ -253,7 +253,8 @@ impl Connection {
 
     /// Sets the size of the kernel's send buffer from the next write on.
     pub(crate) fn set_send_buffer(&self, n_bytes: usize) {
-        // The writer does not have the socket: it is inside the WebSocket and TLS layers.
+        // The size is only stored here. The writer cannot set it, because the socket is inside the
+        // WebSocket and TLS layers.
         self.send_buffer_bytes.store(n_bytes, Ordering::Relaxed);
     }
 

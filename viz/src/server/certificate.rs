@@ -11,8 +11,8 @@ use std::io::{ErrorKind, Write};
 use std::path::Path;
 use std::sync::Arc;
 
-/// Name of the file with the self-signed certificate and its private key. One file, so that they
-/// always match.
+/// Name of the file with the self-signed certificate and its private key. Both are in one file, so
+/// that they always match.
 const FILE: &str = "page-certificate.pem";
 /// Years of validity. The period is so long because browsers cannot renew their trust in a
 /// self-signed certificate, and the clocks of robots may be wrong.
@@ -56,14 +56,15 @@ impl Certificate {
                 source,
             })?;
         }
-        // Stricter than for files of users: nobody else needs a key that this program has made.
+        // The check is stricter than for files of users, because nobody else needs a key that this
+        // program has made.
         check_is_private(&file, GROUP_AND_OTHERS)?;
         Self::read(&file, &file)
     }
 
     /// Reads a certificate with its chain, and its private key, from PEM files. They may be the
-    /// same file. A key that every user can read is refused; a group may read it, as is usual for
-    /// keys that several programs use.
+    /// same file. A key that every user can read is refused. A group may read the key, because keys
+    /// that several programs use are often readable by a group.
     pub fn read(certificate_file: &Path, key_file: &Path) -> Result<Self, Error> {
         let failed = |file: &Path, error: &dyn std::fmt::Display| Error::Certificate {
             file: file.to_owned(),
@@ -85,7 +86,8 @@ impl Certificate {
         let key = PrivateKeyDer::from_pem_slice(&read(key_file)?)
             .map_err(|error| failed(key_file, &error))?;
         let certificate = Self { chain, key };
-        // Detects a key of another certificate now, and not only when the first client connects.
+        // A key of another certificate is detected here, and not only when the first client
+        // connects.
         certificate
             .server_config()
             .map_err(|error| failed(certificate_file, &error))?;

@@ -4,8 +4,8 @@ use parking_lot::Mutex;
 use std::fmt::Arguments;
 use std::time::{Duration, Instant};
 
-/// Maximum number of lines per [`PERIOD`], for all clients together: a client could reconnect for
-/// new lines.
+/// Maximum number of lines per [`PERIOD`]. It applies to all clients together, because a client
+/// with its own limit could reconnect to log more lines.
 const MAX_LINES: u32 = 100;
 const PERIOD: Duration = Duration::from_secs(10);
 
@@ -31,8 +31,8 @@ impl ClientLog {
         }
     }
 
-    /// Logs a line, unless there were too many. The first line of the next period is preceded by
-    /// the number of omitted lines.
+    /// Logs a line, unless there were too many lines in this period. The first line of the next
+    /// period is preceded by the number of omitted lines.
     pub(crate) fn line(&self, text: Arguments<'_>) {
         // The lock is released before logging, which may wait for a disk or a terminal.
         let (n_omitted, is_logged) = self.budget.lock().count(Instant::now());
@@ -49,8 +49,8 @@ impl ClientLog {
 }
 
 impl Budget {
-    /// Counts a line. Returns how many lines of the last period were left out, when a new period
-    /// begins, and whether this line is logged.
+    /// Counts a line. Returns whether this line is logged. If a new period begins, also returns how
+    /// many lines of the last period were left out.
     fn count(&mut self, now: Instant) -> (u32, bool) {
         let mut n_omitted = 0;
         if now.saturating_duration_since(self.since) >= PERIOD {
@@ -60,7 +60,7 @@ impl Budget {
                 n_lines: 0,
             };
         }
-        // Lines that are left out count, too, because their number is logged.
+        // Lines that are left out are also counted, because their number is logged.
         self.n_lines = self.n_lines.saturating_add(1);
         (n_omitted, self.n_lines <= MAX_LINES)
     }

@@ -1,8 +1,8 @@
 //! Files that clients can download: the saved model in several formats, and the report of a run.
 //!
-//! Any client that the server accepts may download them, also a viewer: the files contain no more
-//! than the model and the results, which viewers see anyway. A client can only name an entry of the
-//! published list, never a path.
+//! Any client that the server accepts may download them, including viewers. The files contain only
+//! the model and the results, which viewers can see on the page. A client can only name an entry of
+//! the published list, never a path.
 
 use crate::Hub;
 use crate::topics::published_data::FileLink;
@@ -21,19 +21,19 @@ use tokio::task::spawn_blocking;
 const FOLDER: &str = "files";
 /// Files are read and sent in pieces of this size, bytes, so that large ones need little memory.
 const PIECE_BYTES: u64 = 256 * 1024;
-/// Maximum number of files that are opened or converted at once. A conversion holds a whole model in
-/// memory and keeps a processor busy, which pictures need as well.
+/// Maximum number of files that are opened or converted at once. A conversion holds a whole model
+/// in memory and keeps one processor busy, which rendering of pictures needs, too.
 const MAX_CONVERSIONS: usize = 1;
 /// Maximum number of files that wait, are converted or are sent at once. A converted file takes disk
 /// space until it is sent, which a slow client can delay.
 const MAX_DOWNLOADS: usize = 8;
-/// What a report may do: show its own styles and embedded pictures. Scripts and requests are not
-/// allowed, whatever a file contains.
+/// Content security policy of a report. It allows the styles and the embedded pictures of the
+/// report. Scripts and requests are not allowed, whatever a file contains.
 const REPORT_POLICY: &str = "default-src 'none'; img-src data:; style-src 'unsafe-inline'; base-uri 'none'; form-action 'none'; \
      frame-ancestors 'none'; sandbox";
 
-/// Opens a file at its beginning, or makes it; the error is a sentence for the client. It runs on a
-/// thread that may block.
+/// Opens a file at its beginning. The file may be made for this request. The error is a sentence
+/// for the client. The function runs on a thread that may block.
 pub type OpenFile = dyn Fn() -> Result<File, String> + Send + Sync;
 
 /// A file that clients can download.
@@ -43,7 +43,7 @@ pub struct ServedFile {
     pub name: String,
     /// What the file contains, for display.
     pub label: String,
-    /// Under which name browsers save it; `None` for an HTML page, which browsers show.
+    /// Name under which browsers save the file; `None` for an HTML page, which browsers show.
     pub save_as: Option<String>,
     /// Opens the file.
     pub open: Arc<OpenFile>,
@@ -70,7 +70,8 @@ pub fn publish_files(hub: &Hub, files: Vec<ServedFile>) {
         is_page: file.save_as.is_none(),
     };
     let links = files.iter().map(link).collect();
-    // Before the links, so that no client requests a file that is not served yet.
+    // The files are published before the links, so that no client requests a file that is not
+    // served yet.
     hub.latest::<Option<ServedFiles>>()
         .send_replace(Some(files.into()));
     hub.change_status(|status| status.files = links);
@@ -129,7 +130,8 @@ impl FileServer {
             .map_err(|error| error.to_string())?;
         let open = Arc::clone(&file.open);
         let opened = spawn_blocking(move || {
-            // Until the conversion has ended, even if the client no longer waits for it.
+            // The permit is held until the conversion has ended, even if the client no longer waits
+            // for it.
             let _permit = permit;
             let opened = open()?;
             let metadata = opened.metadata().map_err(|error| error.to_string())?;
@@ -144,7 +146,8 @@ struct Opened {
     file: File,
     /// Number of bytes that have not been sent.
     n_bytes: u64,
-    /// One of the downloads, until the file is sent or the client has disconnected.
+    /// Permit for one of the downloads. It is held until the file is sent or the client has
+    /// disconnected.
     _permit: OwnedSemaphorePermit,
 }
 
@@ -168,7 +171,7 @@ fn response(file: &ServedFile, opened: Opened) -> Response {
 }
 
 /// The content of a file. If the file becomes shorter meanwhile, the stream ends with an error, so
-/// that the client does not take a part for the whole.
+/// that the client does not use an incomplete file.
 fn pieces(opened: Opened) -> impl Stream<Item = std::io::Result<Bytes>> + Send {
     stream::try_unfold(opened, |mut opened| async move {
         if opened.n_bytes == 0 {

@@ -81,7 +81,8 @@ impl GuardedStream {
             self.connection.record_progress();
             return written;
         }
-        // Measures the whole blocked time: writes are polled again and again.
+        // The timer is kept across polls, so that it measures the whole time for which the write is
+        // blocked.
         let write_timeout = self.write_timeout;
         let timer = self
             .write_timer
@@ -137,7 +138,8 @@ impl AsyncWrite for GuardedStream {
 impl Drop for GuardedStream {
     fn drop(&mut self) {
         if self.connection.is_closed() {
-            // Unread data is discarded; otherwise the kernel would keep it for minutes.
+            // Data that the peer has not read is discarded. Otherwise, the kernel would keep it for
+            // minutes.
             if let Err(error) = self.stream.set_zero_linger() {
                 log::debug!("cannot discard unread bytes: {error}");
             }

@@ -82,12 +82,12 @@ impl Default for ServerConfig {
     }
 }
 
-/// What makes a server safe to reach from other machines.
+/// The certificate and the tokens that make a server safe to reach from other machines.
 #[derive(Debug)]
 pub struct Sharing {
     /// Encrypts all connections.
     pub certificate: Certificate,
-    /// Clients need one of them.
+    /// Clients need one of these tokens.
     pub tokens: Tokens,
 }
 
@@ -132,12 +132,13 @@ impl Server {
         access: Access,
         tls: Option<TlsAcceptor>,
     ) -> Result<Self, Error> {
-        // Here and not on the thread, so that errors are returned to the caller.
+        // The socket is bound here and not on the thread, so that errors are returned to the
+        // caller.
         let (listener, address) = listen(listen_address)?;
         let scheme = if tls.is_some() { "https" } else { "http" };
         let (stop, stopped) = watch::channel(false);
-        // One thread: clients mostly wait, and everything that computes runs on threads for
-        // blocking tasks.
+        // The server needs only one thread, because clients mostly wait, and computations run on
+        // threads for blocking tasks.
         let runtime = tokio::runtime::Builder::new_current_thread()
             .enable_all()
             .build()
@@ -236,7 +237,7 @@ async fn serve(
         () = accept(&listener, &admission, tls.as_ref(), &app) => {}
         _ = stopped.changed() => {}
     }
-    // No new connections while the clients receive the goodbye.
+    // The server accepts no new connections while the clients receive the goodbye.
     drop(listener);
     let all_disconnected = async {
         while hub.n_clients() > 0 {
@@ -292,12 +293,12 @@ async fn accept(
                     ErrorKind::ConnectionAborted | ErrorKind::ConnectionReset
                 ) => {}
             Err(error) => {
-                // Most likely all file descriptors are in use: free one, and pause to avoid a busy
-                // loop.
+                // Most likely, all file descriptors are in use. One is freed, and a pause avoids a
+                // busy loop.
                 if !is_failing {
                     log::warn!("cannot accept a connection: {error}");
                 }
-                // One warning per series of failures: it may last for hours.
+                // There is one warning per series of failures, because a series may last for hours.
                 is_failing = true;
                 admission.evict();
                 tokio::time::sleep(ACCEPT_PAUSE).await;
@@ -341,7 +342,7 @@ where
     let service = hyper::service::service_fn(|request: hyper::Request<hyper::body::Incoming>| {
         connection.record_request();
         let mut request = request.map(Body::new);
-        // The handler of the WebSocket needs it, to count the client.
+        // The handler of the WebSocket needs the connection to count the client.
         request.extensions_mut().insert(Arc::clone(&connection));
         app.call(request)
     });
@@ -375,15 +376,16 @@ fn router(app_state: AppState) -> Router {
         .route("/files/{name}", get(file))
         .route("/ws", get(connect))
         .route_layer(from_fn_with_state(app_state.clone(), require_token));
-    // The files of the page contain no data, and the page needs them before it can send the token:
-    // it reads it from the fragment of the address, which browsers do not send.
+    // The files of the page need no token. They contain no data, and the page needs them before it
+    // can send the token. The page reads the token from the fragment of the address, which browsers
+    // do not send.
     for file in FILES {
         router = router.route(
             file.path,
             get(move |headers: HeaderMap| async move { file.response(&headers) }),
         );
     }
-    // The last layer is the outermost: refusals have the security headers, too.
+    // The last layer is the outermost, so refusals have the security headers, too.
     router
         .layer(from_fn_with_state(
             app_state.clone(),
@@ -474,7 +476,8 @@ async fn connect(
     Extension(role): Extension<Role>,
     State(app_state): State<AppState>,
 ) -> Response {
-    // Before the upgrade, so that a refused client gets an HTTP status with a reason.
+    // The client is admitted before the upgrade, so that a refused client gets an HTTP status with
+    // a reason.
     if !app_state
         .admission
         .admit_client(&connection, role == Role::Operator)
@@ -495,7 +498,7 @@ async fn connect(
 async fn add_security_headers(request: Request, next: Next) -> Response {
     let mut response = next.run(request).await;
     let headers = response.headers_mut();
-    // Reports have a policy of their own.
+    // Reports have a separate policy.
     headers
         .entry(header::CONTENT_SECURITY_POLICY)
         .or_insert(HeaderValue::from_static(CONTENT_SECURITY_POLICY));

@@ -1,4 +1,4 @@
-//! What all clients of a server share.
+//! Data that all clients of a server share.
 
 use crate::Hub;
 use crate::clock::ServerClock;
@@ -14,7 +14,7 @@ pub(crate) struct ServerContext {
     pub(crate) hub: Hub,
     /// The server's clock.
     pub(crate) clock: ServerClock,
-    /// What clients receive besides pictures.
+    /// The topics, which are all data that clients receive besides pictures.
     pub(crate) topics: Arc<[Arc<dyn Topic>]>,
     /// Notices new messages of the topics.
     pub(crate) publisher: Publisher,

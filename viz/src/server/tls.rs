@@ -10,12 +10,12 @@ use tokio_rustls::server::TlsStream;
 /// A connection is closed if its handshake takes longer than this. Until then, it takes one of the
 /// places for connections.
 const HANDSHAKE_TIMEOUT: Duration = Duration::from_secs(3);
-/// Encrypted data that may wait for the kernel, bytes: at most one record, so that little data
-/// becomes outdated there.
+/// Maximum amount of encrypted data that waits for the kernel, bytes. It is one record, so that
+/// little data becomes outdated while it waits.
 const BUFFER_BYTES: usize = 16 * 1024;
 /// First byte of a TLS connection: a handshake record.
 const HANDSHAKE_RECORD: u8 = 0x16;
-/// What a client without TLS receives.
+/// The response to a client without TLS.
 const TLS_REQUIRED: &[u8] =
     b"HTTP/1.1 400 Bad Request\r\nContent-Type: text/plain\r\nConnection: close\r\n\r\n\
     this server requires TLS: open its address with https:// instead of http://\n";

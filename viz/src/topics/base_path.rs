@@ -9,8 +9,8 @@ use nalgebra::Vector3;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-/// Maximum number of points; beyond it, every second point is removed. The whole path is sent after
-/// every change. With 512 points, the message has about 12 kB, at most twice a second.
+/// Maximum number of points. Beyond it, every second point is removed. The whole path is sent after
+/// every change, at most twice a second. With 512 points, the message has about 12 kB.
 const MAX_POINTS: usize = 512;
 /// Minimum distance of two points at first, meters. A base at rest, whose position is measured with
 /// noise below this distance, adds no points.
@@ -42,7 +42,7 @@ impl SharedTopic for BasePathTopic {
 pub(crate) struct BasePath {
     points_m: Vec<[f64; 3]>,
     spacing_m: f64,
-    /// When a position was added or left out last.
+    /// Time of the last position, whether it was added or left out.
     extended: Option<Instant>,
 }
 

@@ -31,13 +31,13 @@ impl ChunkList {
     /// Applies new chunks. Returns false if they only contain changes, but the list is empty, so
     /// that the chunks that have not changed are missing.
     pub(crate) fn apply(&mut self, new: ModelChunks) -> bool {
-        // The list was dropped while the changes were computed, because no client drew the model
-        // for a moment.
+        // No client drew the model for a moment, so the list was dropped while the changes were
+        // computed.
         if !new.is_complete && self.version == 0 {
             return false;
         }
         self.version += 1;
-        // A complete list may lack chunks without naming them as removed.
+        // A complete list does not name the chunks that were removed.
         let before = if new.is_complete {
             std::mem::take(&mut self.chunks)
         } else {
@@ -47,7 +47,7 @@ impl ChunkList {
             self.chunks.remove(&id);
         }
         for chunk in new.chunks {
-            // The sum continues across complete lists, so that it stays known how much a client has
+            // The sum continues across complete lists, because it determines how much a client has
             // missed. NaN counts as no change, because `max` returns the other number.
             let last = before.get(&chunk.id).or_else(|| self.chunks.get(&chunk.id));
             let total_change = last.map_or(0.0, |last| last.total_change) + chunk.change.max(0.0);

@@ -1,6 +1,7 @@
-//! Decides which chunk of a model a client receives next: first all chunks coarsely, then all in
-//! full, then the chunks that have changed most, within a budget. While the client's copy is
-//! incomplete, chunks in its view come first.
+//! Decides which chunk of a model a client receives next. First, the client receives all chunks in
+//! their coarse form, and then all chunks in full. After that, it receives the chunks that have
+//! changed most, within a budget. While the client's copy is incomplete, chunks in its view come
+//! first.
 
 use crate::client::server_message::{BinaryHeader, ChunkHeader, ServerMessage, frame};
 use crate::pictures::viewpoint::Viewpoint;
@@ -13,10 +14,10 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 /// Unused budget is saved for at most this time, seconds. With a longer time, a pause of training
-/// is followed by a longer burst, which delays pictures on slow links.
+/// would be followed by a longer burst of chunks, which would delay pictures on slow links.
 const MAX_SAVED_SECS: f64 = 0.1;
-/// New chunks may exceed the budget. Changes make up for at most this time, seconds. Without a
-/// maximum, a large model would get no changes for a long time after it was sent completely.
+/// Maximum time for which changes wait after new chunks have exceeded the budget, seconds. Without
+/// a maximum, a large model would get no changes for a long time after it was sent completely.
 const MAX_DEBT_SECS: f64 = 1.0;
 
 /// What a client has of a model.
@@ -51,7 +52,8 @@ pub(crate) enum NextChunk {
 }
 
 impl ChunkSender {
-    /// The next message, which counts as sent. `viewpoint` is that of the client's newest picture.
+    /// The next message, which counts as sent. `viewpoint` is the viewpoint of the client's newest
+    /// picture.
     pub(crate) fn next(
         &mut self,
         list: &ChunkList,
@@ -60,35 +62,36 @@ impl ChunkSender {
         now: Instant,
     ) -> NextChunk {
         if subscription.number != self.n_subscriptions {
-            // It may be for another model, or the client may have discarded its chunks.
+            // The new subscription may be for another model, or the client may have discarded its
+            // chunks.
             *self = Self {
                 n_subscriptions: subscription.number,
                 ..Self::default()
             };
         }
         self.refill(subscription.max_bytes_per_sec, now);
-        // First round: something of everything. A coarse model without holes is more useful than an
-        // exact part of it.
+        // In the first round, every chunk is sent in some form. A coarse model without holes is
+        // more useful than an exact part of the model.
         let is_unsent = |chunk: &&Arc<VersionedChunk>| self.copy_of(chunk).is_none();
         if let Some(chunk) = first_needed(list, viewpoint, is_unsent) {
             // Meshes, and chunks of few splats, have no coarse form.
             let is_fine = chunk.chunk.coarse.is_none();
             return self.send(list, &chunk, is_fine, subscription, viewpoint);
         }
-        // Removed chunks were replaced by others, which the client has by now. If they were removed
-        // earlier, the picture would have holes.
+        // Removed chunks were replaced by other chunks, which the client has by now. If the removed
+        // chunks were deleted earlier, the picture would have holes.
         if let Some(removal) = self.next_removal(list, &subscription.method) {
             return NextChunk::Send(removal);
         }
-        // Second round: all details.
+        // In the second round, all chunks are sent in full.
         let is_coarse =
             |chunk: &&Arc<VersionedChunk>| self.copy_of(chunk).is_some_and(|copy| !copy.is_fine);
         if let Some(chunk) = first_needed(list, viewpoint, is_coarse) {
             return self.send(list, &chunk, true, subscription, viewpoint);
         }
-        // Changes, which never end while the model is trained. Only they wait for the budget. The
-        // largest come first. Changes that the client has missed add up, so every chunk has its
-        // turn.
+        // After that, changes are sent, which never end while the model is trained. Only changes
+        // wait for the budget. The largest changes come first. Changes that the client has missed
+        // add up, so every chunk is sent at some time.
         let is_outdated = |chunk: &&Arc<VersionedChunk>| {
             self.copy_of(chunk)
                 .is_some_and(|copy| copy.version != chunk.version)
@@ -98,7 +101,8 @@ impl ChunkSender {
             return NextChunk::Wait;
         };
         if self.balance_bytes < 0.0 {
-            // The chunk is chosen again then: another one may have changed more.
+            // The chunk is chosen again at that time, because another chunk may have changed more
+            // by then.
             let secs = -self.balance_bytes / subscription.max_bytes_per_sec;
             return NextChunk::WaitUntil(now + Duration::from_secs_f64(secs));
         }
@@ -161,7 +165,8 @@ impl ChunkSender {
                 total_change: *total_change,
             },
         );
-        // After the chunk was counted: the page shows how much is left after this message.
+        // The remaining chunks are counted after this chunk counts as sent, because the page shows
+        // how much is left after this message.
         let remaining = self.remaining(list, viewpoint);
         let data = if is_fine {
             &chunk.fine
@@ -181,7 +186,7 @@ impl ChunkSender {
             layout: data.layout,
         };
         let bytes = frame(&BinaryHeader::ModelChunk(&header), &[&data.bytes]);
-        // All chunks are paid for, so that changes wait after the model was sent.
+        // All chunks reduce the budget, so that changes wait after the model was sent.
         let max_debt_bytes = MAX_DEBT_SECS * subscription.max_bytes_per_sec;
         self.balance_bytes = (self.balance_bytes - bytes.len() as f64).max(-max_debt_bytes);
         NextChunk::Send(Message::binary(bytes))
@@ -226,7 +231,8 @@ fn is_hidden(list: &ChunkList, viewpoint: &Viewpoint, chunk: &VersionedChunk) ->
     is_hidden
 }
 
-/// The chunk that is needed first for a view; without a view, the one that has changed most.
+/// The chunk that is needed first for a view. Without a view, this is the chunk that has changed
+/// most.
 fn first_needed(
     list: &ChunkList,
     viewpoint: Option<&Viewpoint>,
@@ -236,7 +242,7 @@ fn first_needed(
     let Some(viewpoint) = viewpoint else {
         return most_changed(candidates, |chunk| chunk.total_change);
     };
-    // Every chunk has a fine form, so its bounds decide in both rounds.
+    // Every chunk has a fine form, so the bounds of the fine form are used in both rounds.
     let ranked = candidates.map(|chunk| {
         (
             viewpoint.rank(&list.world_from_model, &chunk.chunk.fine.layout),
@@ -446,7 +452,7 @@ mod tests {
                 [0, 0, 0, 0]
             ]
         );
-        // Without a view, it is not known what is in it.
+        // Without a view, the chunks in view are not known.
         client = Receiver::new();
         client.receive_one(&list).expect("a chunk");
         let header = client.header.take().expect("a chunk");

@@ -18,14 +18,14 @@ pub(crate) struct ClientUpdates {
     pub(crate) viewpoint: Option<Viewpoint>,
 }
 
-/// A feed with what the table says about its topic.
+/// A feed, and the entry of its topic in the table.
 pub(crate) struct NamedFeed {
     pub(crate) name: &'static str,
     pub(crate) priority: Priority,
     pub(crate) feed: Box<dyn Feed>,
 }
 
-/// What a client has asked for.
+/// The data that a client has requested.
 #[derive(Clone, Copy)]
 struct ClientNeeds<'a> {
     subscriptions: &'a Subscriptions,
@@ -84,8 +84,8 @@ impl ClientUpdates {
             return NextUpdate::Short(message);
         }
         if allows_long {
-            // On a slow link, a new image waits whenever the last one has been sent. With a fixed
-            // order, the second kind would then never be sent.
+            // Live data and keyframes take turns. On a slow link, a new image waits whenever the
+            // last one has been sent. With a fixed order, keyframes would then never be sent.
             let in_turn = if self.was_live {
                 [Priority::Keyframes, Priority::Live]
             } else {
@@ -404,7 +404,8 @@ mod tests {
             updates.next(subscriptions, true, *now, true)
         }
 
-        /// Receives what is sent within a time. Like the page, drops points without a keyframe.
+        /// Receives the messages that are sent within a time. Like the page, drops points without a
+        /// keyframe.
         fn receive(&mut self, millis: u64) {
             for _ in 0..millis / 10 {
                 while let NextUpdate::Short(message) | NextUpdate::Long(message) = self.next() {
@@ -476,7 +477,7 @@ mod tests {
             (50, 50),
             "after a new list"
         );
-        // Off and on again, faster than the server looks.
+        // The subscription ends and begins again before the server checks it.
         viewer.points.clear();
         viewer
             .client

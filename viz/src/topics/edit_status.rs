@@ -33,7 +33,7 @@ pub struct SavedEdits {
     pub revision: u64,
     /// Where the edits are, or why they could not be saved.
     pub text: String,
-    /// Whether they could not be saved.
+    /// Whether the edits could not be saved.
     pub has_failed: bool,
 }
 

@@ -6,11 +6,13 @@ use crate::topics::published_data::KeyframePose;
 use std::collections::{BTreeMap, VecDeque};
 use std::sync::Arc;
 
-/// Maximum number of remembered removals, 16 bytes each. A client that has not received older ones
-/// gets the complete list. With fewer, clients on slow links get complete lists more often.
+/// Maximum number of remembered removals. Each takes 16 bytes. A client that has not received an
+/// older removal gets the complete list. With fewer removals, clients on slow links would get
+/// complete lists more often.
 const MAX_REMOVALS: usize = 1024;
 
-/// The keyframes, and which version of the list changed them. The version counts single changes.
+/// The keyframes, and the versions of the list in which they were added and changed. The version
+/// counts single changes.
 #[derive(Clone, Debug)]
 pub(crate) struct KeyframeLog {
     version: u64,
@@ -107,8 +109,8 @@ impl KeyframeLog {
 
     /// Replaces the list.
     pub(crate) fn set(&mut self, keyframes: &[KeyframePose]) {
-        // Keyframes are recognized by camera and stamp, and among those with the same stamp by
-        // their order: stamps need not be unique.
+        // Keyframes are recognized by camera and stamp. Stamps need not be unique, so keyframes
+        // with the same stamp are recognized by their order.
         let mut numbers = BTreeMap::new();
         let mut n_same: BTreeMap<(&str, i64), u32> = BTreeMap::new();
         for keyframe in keyframes {
@@ -126,8 +128,8 @@ impl KeyframeLog {
             // The pose is compared with the one in the log, not with the one in the last list, so
             // that slow drift adds up until it is noticeable.
             if before.is_none_or(|entry| has_changed(&entry.keyframe, keyframe)) {
-                // Every change has a version of its own, so that a long list can be interrupted
-                // after any keyframe.
+                // Every change has a separate version, so that a long list can be interrupted after
+                // any keyframe.
                 self.version += 1;
                 let added = before.map_or(self.version, |entry| entry.added);
                 let entry = Entry {
@@ -139,8 +141,8 @@ impl KeyframeLog {
             }
             numbers.insert(key, number);
         }
-        // The rest is no longer in the list. Removals come after additions: between two messages, a
-        // client has too many keyframes rather than too few.
+        // The remaining keyframes are no longer in the list. Removals come after additions, so that
+        // a client between two messages has too many keyframes rather than too few.
         for number in std::mem::replace(&mut self.numbers, numbers).into_values() {
             self.keyframes.remove(&number);
             self.version += 1;
@@ -158,8 +160,8 @@ impl KeyframeLog {
     /// version 0 replaces the client's list.
     pub(crate) fn next_changes(&self, position: ListPosition) -> Option<KeyframeListUpdate> {
         // A list does not contain keyframes that were removed before it was started, so it needs
-        // only later removals.
-        // A version above that of the log would be a mistake, and a complete list corrects it.
+        // only later removals. A version above the version of the log would be a mistake, which a
+        // complete list corrects.
         let is_outdated = position.version.max(position.began) < self.forgotten
             || position.version > self.version;
         let position = if is_outdated {
@@ -171,7 +173,8 @@ impl KeyframeLog {
         if from_version == self.version {
             return None;
         }
-        // In the order of the changes: the last one that is sent is then the version of the client.
+        // The keyframes are in the order of their changes. The version of the last keyframe that is
+        // sent is then the version of the client.
         let mut changed: Vec<_> = self
             .keyframes
             .iter()
@@ -202,8 +205,8 @@ impl KeyframeLog {
         } else {
             position.began
         };
-        // Until the list is complete, a keyframe that was added earlier may not have been sent, if
-        // it has changed since then: its change is now near the end of the list.
+        // Until the list is complete, a keyframe that was added earlier may not have been sent. If
+        // it has changed since then, its change is now near the end of the list.
         let complete = if version == self.version {
             version
         } else {

@@ -21,10 +21,10 @@ use tokio::sync::watch;
 /// Maximum number of points per keyframe. A run has hundreds of keyframes that overlap. With 9
 /// bytes per point, a keyframe has 22 kB.
 const MAX_POINTS: usize = 2500;
-/// Points whose depth differs from that of a neighbor by more than this fraction are left out: they
-/// lie on edges, where depth cameras report values in between. With a smaller fraction, surfaces
-/// that are seen at a grazing angle lose their points, too; with a larger one, points float behind
-/// edges.
+/// Points whose depth differs from a neighbor's depth by more than this fraction are left out. They
+/// lie on edges, where depth cameras report values between the two depths. With a smaller fraction,
+/// surfaces seen at a grazing angle would lose their points, too. With a larger fraction, points
+/// would float behind edges.
 const MAX_EDGE_FRAC: f64 = 0.05;
 
 /// Name in `subscribe`.
@@ -52,7 +52,7 @@ pub(crate) struct PointTopic {
 /// The points that were packed.
 #[derive(Default)]
 struct Points {
-    /// By number of the keyframe; `None` for keyframes without points.
+    /// Messages by number of the keyframe; `None` for keyframes without points.
     messages: BTreeMap<u64, Option<Message>>,
     is_running: bool,
 }
@@ -97,8 +97,8 @@ impl Topic for PointTopic {
             return;
         };
         points.is_running = true;
-        // `None` if the run has dropped the keyframe in the meantime. It then counts as one without
-        // points, and is not looked for again.
+        // `None` if the run has dropped the keyframe in the meantime. The keyframe then counts as
+        // one without points, and is not looked up again.
         let source = context.hub.keyframe_source(&pose.camera, pose.stamp);
         let task = PackingTask {
             number,
@@ -149,7 +149,7 @@ impl PackingTask {
 impl Drop for PackingTask {
     fn drop(&mut self) {
         let mut points = self.points.lock();
-        // Has an effect only after a panic: `run` has inserted the message otherwise.
+        // This has an effect only after a panic. Otherwise, `run` has already inserted the message.
         points.messages.entry(self.number).or_insert(None);
         points.is_running = false;
     }
@@ -184,7 +184,8 @@ impl Feed for PointFeed {
         // Complete lists have no numbers to which the points could belong.
         let log = log.as_ref().filter(|_| client.has_keyframe_changes)?;
         let points = self.points.lock();
-        // Numbers are not used twice, so numbers of removed keyframes are no longer needed.
+        // A number is never used for a second keyframe, so the numbers of removed keyframes are no
+        // longer needed.
         self.sent
             .retain(|number| points.messages.contains_key(number));
         let mut newest_first = points.messages.iter().rev();
@@ -291,7 +292,7 @@ fn depth_at(depth: &DepthMap, [x, y]: [u32; 2]) -> f64 {
 fn is_edge(depth: &DepthMap, [x, y]: [u32; 2]) -> bool {
     let [width, height] = depth.size_px;
     let z_m = depth_at(depth, [x, y]);
-    // The neighbors of the other sides have the pixel as theirs.
+    // An edge to the neighbor on the left or above is detected at that neighbor.
     let neighbors = [[x + 1, y], [x, y + 1]]
         .into_iter()
         .filter(|[x, y]| *x < width && *y < height);
@@ -310,7 +311,7 @@ fn color_at(keyframe: &Keyframe, point: &Point3<f64>) -> Option<[u8; 3]> {
     let [width, height] = keyframe.size_px;
     let u = keyframe.focal_px[0] * point.x / point.z + keyframe.principal_px[0];
     let v = keyframe.focal_px[1] * point.y / point.z + keyframe.principal_px[1];
-    // Written so that NaN is not inside.
+    // The comparisons are written so that a NaN is not inside.
     let is_inside = point.z > 0.0
         && (0.0..f64::from(width)).contains(&u)
         && (0.0..f64::from(height)).contains(&v);
@@ -384,7 +385,7 @@ mod tests {
         let (mut n_left, mut n_right) = (0, 0);
         for (position, color) in positions.chunks_exact(6).zip(colors.chunks_exact(3)) {
             let [x, z] = [coordinate(&position[..2]), coordinate(&position[4..])];
-            // In the camera's frame, not in the world's.
+            // The points are in the frame of the camera, not of the world.
             let (expected_z, expected_color) = if x < 0.0 {
                 (2.0, [200, 0, 0])
             } else {

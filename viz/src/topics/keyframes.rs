@@ -1,5 +1,5 @@
-//! The poses of the keyframes: the changes of the list, or the complete list for clients that do
-//! not know changes.
+//! The poses of the keyframes. Clients receive the changes of the list. Clients that do not support
+//! changes receive the complete list.
 
 use crate::Hub;
 use crate::client::server_message::{KeyframeMessage, ServerMessage};
@@ -17,12 +17,12 @@ use tokio::sync::watch;
 
 /// Name in `subscribe`.
 const NAME: &str = "keyframes";
-/// Minimum time between two versions of the keyframe list. Each one is compared with the last one,
-/// keyframe by keyframe.
+/// Minimum time between two versions of the keyframe list. Each version is compared with the
+/// previous one, keyframe by keyframe.
 const LOG_PERIOD: Duration = Duration::from_millis(200);
 /// Minimum time between two complete lists, which are long: about 600 bytes for each keyframe. It
-/// is slightly shorter than the period of 1 s at which clients receive them, so that a new list is
-/// there when it is due.
+/// is slightly shorter than 1 s, the period at which clients receive the lists, so that a new list
+/// is ready when it is due.
 const LIST_PERIOD: Duration = Duration::from_millis(950);
 
 /// The topic in the table.
@@ -56,7 +56,7 @@ struct State {
     is_list_outdated: bool,
 }
 
-/// The complete list, if a client needs it.
+/// The complete list. It is encoded only if a client needs it.
 #[derive(Default)]
 struct List {
     item: Option<EncodedMessage>,
@@ -103,8 +103,8 @@ impl Topic for KeyframeTopic {
                 .publisher
                 .publish(|_| _ = self.shared_log.send_replace(Some(log)));
         }
-        // Clients that know changes need no complete list, but it is known only after their hello
-        // that they do.
+        // Clients that support changes need no complete list. Whether a client supports them is
+        // known only after its hello.
         let needs_list = context.settled().any(|demand| !demand.has_keyframe_changes);
         let is_due = state.is_list_outdated && state.list_made.is_due(context.now);
         // At most one list is encoded at a time. On a busy machine, tasks would pile up, and an
@@ -229,12 +229,12 @@ impl KeyframeFeed {
             position,
             is_new_list,
         } = log.next_changes(client.keyframes.position)?;
-        // The points depend on both: points are sent only after their keyframe, and again after a
-        // new list, with which clients discard them.
+        // The points depend on both values. Points are sent only after their keyframe. Clients
+        // discard all points when they receive a new list, so the points are then sent again.
         client.keyframes.n_lists += u64::from(is_new_list);
         client.keyframes.position = position;
-        // The parts of a long list follow each other without a pause: the period counts from the
-        // end of the last complete list.
+        // The period begins at the end of the last complete list, so that the parts of a long list
+        // follow each other without a pause.
         self.changes_at = log.is_up_to_date(position).then_some(timer.now);
         Some(Message::text(json))
     }

@@ -20,13 +20,13 @@ use std::time::{Duration, Instant};
 use tokio::sync::watch;
 
 /// Maximum number of images of a camera that are encoded at the same time. Clients may want many
-/// different sizes. With more, clients with unusual sizes wait less, but encoding takes more
-/// processors away from training.
+/// different sizes. With a larger maximum, clients with unusual sizes would wait less, but encoding
+/// would take more processors away from training.
 const MAX_IMAGE_ENCODINGS: usize = 4;
 
 /// Minimum time between two images for clients that have not subscribed. It is slightly shorter
-/// than the 200 ms of the documented rate, so that an image of a camera with 5 images per second
-/// that comes a little early need not wait for the rest of the period.
+/// than 200 ms, the period of the documented rate. Otherwise, a camera with 5 images per second
+/// could deliver an image slightly early, and this image would have to wait.
 const DEFAULT_PERIOD: Duration = Duration::from_millis(190);
 
 /// The topic in the table.
@@ -41,7 +41,7 @@ pub(crate) const ENTRY: TopicEntry = TopicEntry {
 /// Latest images by camera name.
 pub(crate) type LiveImages = BTreeMap<Arc<str>, Arc<LiveImage>>;
 
-/// For each camera: transform `reported_from_corrected`.
+/// The transform `reported_from_corrected` of each camera.
 type CameraCorrections = BTreeMap<Arc<str>, Transform>;
 
 /// Camera and maximum size of a live image.
@@ -96,8 +96,9 @@ impl Topic for LiveImageTopic {
             encodings,
             messages,
         } = &mut *images;
-        // Forget sizes that no client requests any longer, such as that of a window before it was
-        // resized. A running task still needs its entry, which says that it runs.
+        // Sizes that no client requests any longer are forgotten, for example the previous size of
+        // a resized window. The entry of a running task is kept, because it records that the task
+        // is running.
         encodings.retain(|key, encoding| encoding.is_running || wanted.contains_key(key));
         messages.retain(|key, _| wanted.contains_key(key));
         for (key, image) in images_to_encode(wanted, encodings, &live_images, context.now) {
@@ -106,8 +107,8 @@ impl Topic for LiveImageTopic {
                 at: context.now,
                 is_running: true,
             };
-            // The time counts from the beginning. If it counted from the end, the rate would be
-            // lower than requested by the time for encoding.
+            // The period begins when encoding begins. If it began at the end of encoding, the rate
+            // would be lower than requested.
             encodings.insert(key.clone(), encoding);
             let task = EncodingTask {
                 key,
@@ -121,7 +122,7 @@ impl Topic for LiveImageTopic {
 
     fn clear(&self) {
         let mut images = self.images.lock();
-        // Running tasks may still publish their image. It is removed in the next check.
+        // Running tasks may still publish their images, which the next check removes.
         images.encodings.retain(|_, encoding| encoding.is_running);
         images.messages.clear();
     }
@@ -191,8 +192,8 @@ fn wanted_images<'a>(
             let Some(period) = subscription.period else {
                 continue;
             };
-            // Each image is encoded at the highest rate that a client requests. The feeds of the
-            // others leave images out.
+            // Each image is encoded at the highest rate that a client requests. The feeds of
+            // clients with lower rates skip images.
             let shortest = wanted
                 .entry((Arc::clone(camera), subscription.max_px))
                 .or_insert(period);
@@ -202,8 +203,8 @@ fn wanted_images<'a>(
     wanted
 }
 
-/// The new images whose encoding can begin now. If a camera's images are wanted in many sizes,
-/// those come first that were encoded longest ago.
+/// The new images whose encoding can begin now. If the images of a camera are wanted in many sizes,
+/// the sizes that were encoded longest ago come first.
 fn images_to_encode(
     wanted: BTreeMap<ImageKey, Duration>,
     encodings: &BTreeMap<ImageKey, ImageEncoding>,
@@ -219,7 +220,7 @@ fn images_to_encode(
     wanted.sort_by_key(|(key, _)| encodings.get(key).map(|encoding| encoding.at));
     let to_encode = wanted.into_iter().filter_map(|(key, period)| {
         let image = live_images.get(&key.0)?;
-        // Every image that is set has an address of its own. The entry keeps its image, so the
+        // Every image that is set has its own address in memory. The entry keeps its image, so the
         // address cannot be used again.
         let is_new = encodings.get(&key).is_none_or(|encoding| {
             !encoding.is_running
@@ -274,7 +275,8 @@ impl Hub {
     /// clients are connected. Its pose is corrected as set by [`Self::set_camera_corrections`].
     pub fn set_live_image(&self, mut image: LiveImage) {
         let corrections = self.latest::<CameraCorrections>();
-        // Here and not when the image is sent, so that Foxglove gets the same pose.
+        // The pose is corrected here and not when the image is sent, so that Foxglove gets the same
+        // pose.
         if let (Some(pose), Some(correction)) = (
             &mut image.world_from_camera,
             corrections.borrow().get(&image.camera),

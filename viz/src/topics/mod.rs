@@ -6,7 +6,8 @@
 //!
 //! To add a topic, write a module and an entry of [`TOPICS`]. If all clients receive the same
 //! messages, implement [`SharedTopic`](shared_topic::SharedTopic), as `base_path.rs` does.
-//! ARCHITECTURE.md lists the other files of a topic, `docs/reference/protocol.md` all topics.
+//! ARCHITECTURE.md lists the other files of a topic, and `docs/reference/protocol.md` describes all
+//! topics.
 
 mod base_path;
 pub(crate) mod chunk_list;
@@ -102,12 +103,12 @@ pub(crate) enum Priority {
 /// The half of a topic that encodes new data once for all clients. It runs on the server's thread,
 /// outside the tasks of clients.
 pub(crate) trait Topic: Send + Sync {
-    /// Encodes what is new and due, if a client receives it. Work that takes more than a
+    /// Encodes data that are new and due, if a client receives them. Work that takes more than a
     /// millisecond belongs on a thread for blocking tasks.
     fn encode(&self, context: &EncodeContext<'_>);
 
-    /// Forgets what was encoded, because no client is connected. The next client receives
-    /// everything.
+    /// Forgets the encoded messages when no client is connected. The next client receives newly
+    /// encoded ones.
     fn clear(&self);
 
     /// The half for a client that has received nothing.
@@ -136,7 +137,8 @@ pub(crate) struct EncodeContext<'a> {
 }
 
 impl EncodeContext<'_> {
-    /// The demands of clients that have sent a hello, or have had time to.
+    /// The demands of clients that have sent a hello, and of clients that have had enough time to
+    /// send one.
     pub(crate) fn settled(&self) -> impl Iterator<Item = &Demand> {
         self.demands
             .iter()
@@ -151,7 +153,7 @@ impl EncodeContext<'_> {
     }
 }
 
-/// What the feeds of a client know about it.
+/// Data about a client that its feeds need.
 pub(crate) struct ClientState<'a> {
     pub(crate) subscriptions: &'a Subscriptions,
     /// Whether it receives only the changes of the keyframe list.
@@ -166,7 +168,8 @@ pub(crate) struct ClientState<'a> {
 #[derive(Clone, Copy, Debug, Default)]
 pub(crate) struct KeyframeProgress {
     pub(crate) position: ListPosition,
-    /// How often the list was started. Clients discard points together with their keyframes.
+    /// How often a complete list was begun for this client. When it begins, the client discards its
+    /// keyframes and their points.
     pub(crate) n_lists: u64,
 }
 
@@ -181,11 +184,11 @@ impl Publisher {
     /// Calls `store` with the number of a new message, and then wakes up the writers. Later
     /// messages have larger numbers.
     pub(crate) fn publish(&self, store: impl FnOnce(u64)) {
-        // Only the order of the numbers matters. The locks of the topics order the messages. Number
-        // 0 is left for clients that have received nothing.
+        // `Relaxed` is enough: only the order of the numbers matters, and the locks of the topics
+        // order the messages. Number 0 is reserved for clients that have received nothing.
         store(1 + self.n_messages.fetch_add(1, Ordering::Relaxed));
-        // After storing: a writer that is woken up earlier would find nothing, and then sleep
-        // until the next message.
+        // Writers are woken up after the message is stored. A writer that is woken up earlier would
+        // find nothing, and then sleep until the next message.
         self.changed.send_replace(());
     }
 
@@ -226,13 +229,14 @@ impl Timer {
 
     /// Whether a message may be sent after this period since the last one.
     pub(crate) fn is_due(&mut self, last: Option<Instant>, period: Duration) -> bool {
-        // The first message is due at once, and so is one whose time cannot be represented.
+        // The first message is due at once. A message whose due time cannot be represented is also
+        // due at once.
         let due = last
             .and_then(|at| at.checked_add(period))
             .unwrap_or(self.now);
         if due > self.now {
-            // There is something to send. Without this time, the writer would sleep until
-            // something else changes.
+            // The message exists but is not due yet. Without this time, the writer would sleep
+            // until something else changes.
             self.wait_until(due);
         }
         due <= self.now
@@ -287,7 +291,7 @@ const CHECK_PERIOD: Duration = Duration::from_millis(20);
 impl Default for Subscriptions {
     fn default() -> Self {
         Self::new(TOPICS.iter().filter_map(|entry| match entry.default {
-            // Nobody can subscribe to these topics, so their names must be unknown.
+            // Clients cannot subscribe to these topics, so `subscribe` must reject their names.
             DefaultRate::Always => None,
             DefaultRate::Period(period) => Some((entry.name, Some(period))),
             DefaultRate::Off => Some((entry.name, None)),
@@ -313,12 +317,12 @@ pub(crate) async fn encode_all(
     loop {
         check.tick().await;
         if hub.n_clients() == 0 {
-            // Messages may take much memory, and those of the next client must not be old.
+            // Messages may take much memory, and the next client must not receive old ones.
             topics.iter().for_each(|topic| topic.clear());
             continue;
         }
         let demands = hub.demands().all();
-        // One time for all topics, so that their periods end in the same check.
+        // All topics use the same time, so that their periods end in the same check.
         let now = Instant::now();
         let context = EncodeContext {
             hub: &hub,
@@ -342,7 +346,7 @@ fn take_if_changed<T: Clone>(receiver: &mut watch::Receiver<T>) -> Option<T> {
         .then(|| receiver.borrow_and_update().clone())
 }
 
-/// A receiver of data of the hub that also returns what was set earlier.
+/// A receiver of data of the hub that also returns a value that was set earlier.
 fn receiver<T: Default + Send + Sync + 'static>(hub: &Hub) -> watch::Receiver<T> {
     let mut receiver = hub.latest::<T>().subscribe();
     // A new receiver counts the present value as seen, but no client has received it.
@@ -372,7 +376,8 @@ mod tests {
                 "src/topics/{name}.rs is missing"
             );
             if entry.default == DefaultRate::Always {
-                // Nobody can subscribe to it: the page handles its message directly.
+                // Clients cannot subscribe to this topic, and the page handles its message
+                // directly.
                 assert!(page.contains(&format!("case \"{name}\"")), "{name}");
                 continue;
             }

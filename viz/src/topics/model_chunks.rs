@@ -30,9 +30,9 @@ pub(crate) const ENTRY: TopicEntry = TopicEntry {
     },
 };
 
-/// Maximum time for which chunks wait until the client has requested a picture, so that those in
-/// its view come first. A page requests one as soon as it is connected; other programs may never
-/// request any.
+/// Maximum time for which chunks wait until the client has requested a picture. Its request
+/// contains the view, and the chunks in this view are sent first. A page requests a picture as soon
+/// as it is connected. Other programs may never request one.
 const MAX_WAIT_FOR_VIEW: Duration = Duration::from_secs(1);
 
 /// Chunks of models by method.
@@ -41,7 +41,7 @@ type ModelLists = BTreeMap<Arc<str>, Arc<ChunkList>>;
 /// Pose of the models in the world of the clients; the identity if `None`.
 type WorldFromModel = Option<Transform>;
 
-/// The topic. Chunks are encoded for each client, because each has a budget of its own.
+/// The topic. Chunks are encoded for each client, because each client has its own budget.
 struct ChunkTopic {
     lists: Mutex<watch::Receiver<ModelLists>>,
 }
@@ -49,7 +49,7 @@ struct ChunkTopic {
 impl Topic for ChunkTopic {
     fn encode(&self, context: &EncodeContext<'_>) {
         if take_if_changed(&mut self.lists.lock()).is_some() {
-            // There is no message to store: this only wakes up the writers, whose feeds compare
+            // There is no message to store. The call only wakes up the writers, whose feeds compare
             // versions.
             context.publisher.publish(|_| ());
         }
@@ -71,7 +71,7 @@ impl Topic for ChunkTopic {
 struct ChunkFeed {
     lists: watch::Receiver<ModelLists>,
     sender: ChunkSender,
-    /// When the first chunk was due, but the view of the client was not known.
+    /// When the first chunk was due while the view of the client was not known.
     awaits_view_since: Option<Instant>,
 }
 
@@ -152,8 +152,8 @@ impl PublishedChunks<'_> {
     /// Sets the chunks of a model, or those that have changed. They are kept only while a client
     /// draws the model.
     pub fn set(&self, method: &str, chunks: ModelChunks) {
-        // The client may have left while the chunks were encoded on another thread. Nobody would
-        // free them.
+        // The client may have left while the chunks were encoded on another thread. The chunks
+        // would then never be freed.
         if self.period(method).is_none() {
             return;
         }
@@ -178,8 +178,8 @@ impl PublishedChunks<'_> {
         });
     }
 
-    /// Sets the pose of models in the world of the clients, for chunks; by default, the two frames
-    /// are the same.
+    /// Sets the pose of the models in the world of the clients. Chunks are sent with this pose. By
+    /// default, the two frames are the same.
     pub fn set_world_from_model(&self, world_from_model: Transform) {
         self.hub
             .latest::<WorldFromModel>()

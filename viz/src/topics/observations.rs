@@ -39,7 +39,7 @@ pub struct ObservationMap {
     pub observed: Vec<ObservedCell>,
     /// Number of views.
     pub n_keyframes: usize,
-    /// When the newest view was captured; `None` if that was not in this process.
+    /// When the newest view was captured; `None` if another process captured it.
     pub newest_at: Option<Instant>,
 }
 
@@ -110,7 +110,7 @@ impl PackedObservations {
         let n_cells: usize = map.n_cells.iter().map(|n| *n as usize).product();
         let mut codes = vec![UNOBSERVED; 2 * n_cells];
         let (ages, sigmas) = codes.split_at_mut(n_cells);
-        // A cell outside the grid would be a mistake of the caller, but no reason to panic on the
+        // A cell outside the grid is a mistake of the caller, but it must not cause a panic on the
         // thread that computes the map.
         for cell in map.observed.iter().filter(|cell| cell.ix < n_cells) {
             ages[cell.ix] = code(cell.age_secs, MIN_AGE_SECS);
@@ -135,7 +135,7 @@ impl PackedObservations {
             cell_m: self.cell_m,
             n_cells: self.n_cells,
             n_keyframes: self.n_keyframes,
-            // Each server has a clock of its own, so this cannot be packed in advance.
+            // Each server has its own clock, so this time cannot be packed in advance.
             newest_millis: self.newest_at.map(|at| clock.millis(at)),
             min_age_secs: MIN_AGE_SECS,
             min_sigma_m: MIN_SIGMA_M,
@@ -155,8 +155,8 @@ fn code(value: f64, min: f64) -> u8 {
         clippy::cast_sign_loss,
         reason = "between 1 and 254"
     )]
-    // The largest code, 254, stands for 253 steps. Infinity, for what was not measured, fails the
-    // test, too.
+    // The largest code, 254, stands for 253 steps. Infinity stands for a direction that was not
+    // measured, and fails this comparison, too.
     if steps < f64::from(UNDETERMINED - 2) + 0.5 {
         1 + steps.round() as u8
     } else {

@@ -1,5 +1,5 @@
-//! What an operator sees first in a status: which robot this is, what to do, what happens to the
-//! images, and who else is connected.
+//! The part of a status that an operator reads first: the robot, the advice, the counts of images,
+//! and the connected clients.
 
 use crate::server::access::Role;
 use serde::Serialize;
@@ -11,7 +11,8 @@ pub struct OperatorStatus {
     /// Which robot and run this is.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub identity: Option<Identity>,
-    /// What the run does now, and what the operator should do. `None` while the state says it all.
+    /// What the run does now, and what the operator should do. `None` if the state of the run is
+    /// enough.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub advice: Option<Advice>,
     /// What happened to the images of the cameras so far.
@@ -83,13 +84,13 @@ pub struct KeyframeStore {
 /// A client of the server.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
 pub struct ConnectedClient {
-    /// Its number, which it knows from the server's `hello`.
+    /// Number of the client, which the server's `hello` contains.
     pub id: u64,
     /// What it may do.
     pub role: Role,
 }
 
-/// What has become of a checkpoint that an operator requested.
+/// Progress of a checkpoint that an operator requested.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize)]
 pub struct RequestedCheckpoint {
     /// Whether it is on disk.

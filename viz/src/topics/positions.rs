@@ -2,9 +2,9 @@
 
 use nalgebra::Vector3;
 
-/// Packs positions relative to an origin: 3 signed little-endian counts each. Returns them with the
-/// meters per count; `None` if there is no point away from the origin, or a coordinate is not
-/// finite.
+/// Packs positions relative to an origin as 3 signed little-endian counts each. Returns the counts
+/// and the meters per count. Returns `None` if all points are at the origin, or if a coordinate is
+/// not finite.
 pub(crate) fn pack_positions(points_m: &[Vector3<f64>]) -> Option<(Vec<u8>, f64)> {
     let extent_m = points_m
         .iter()
@@ -18,7 +18,7 @@ pub(crate) fn pack_positions(points_m: &[Vector3<f64>]) -> Option<(Vec<u8>, f64)
     if has_nan || extent_m <= 0.0 || !extent_m.is_finite() {
         return None;
     }
-    // The farthest coordinate gets the largest count, for the finest step that 16 bits allow.
+    // The largest coordinate gets the largest count, so that the step is as small as 16 bits allow.
     let meters_per_count = extent_m / f64::from(i16::MAX);
     #[expect(
         clippy::cast_possible_truncation,

@@ -23,7 +23,7 @@ const MAX_HISTORY: usize = 512;
 pub struct Status {
     /// One or two words for the operator, such as `waiting for images` or `training`.
     pub state: String,
-    /// How far the work is that `state` names, if there is more to say about it.
+    /// Progress of the work that `state` names; `None` if it is not known.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub progress: Option<StateProgress>,
     /// Wall time since the first image, seconds.
@@ -63,7 +63,7 @@ pub struct Status {
     pub operator: OperatorStatus,
 }
 
-/// How far the work is that the state of a [`Status`] names.
+/// Progress of the work that the state of a [`Status`] names.
 #[derive(Clone, Debug, Default, PartialEq, Serialize)]
 pub struct StateProgress {
     /// A few words for the operator, such as `3 of 5 keyframes`.
@@ -156,12 +156,12 @@ pub struct ModelSource {
     pub path: String,
     /// Format of a file, such as `PLY`; `None` for a folder.
     pub format: Option<String>,
-    /// Size of the model's files, bytes; of several models, the sum.
+    /// Size of the model's files, bytes. If there are several models, this is the sum.
     pub bytes: u64,
     /// When the model was saved, seconds since 1970 in UTC; `None` if it is not known.
     pub modified_unix_secs: Option<u64>,
-    /// Dataset or recording that the model was trained on; `None` for live runs and if it is not
-    /// known.
+    /// Dataset or recording that the model was trained on. `None` if the run was live, or if the
+    /// data are not known.
     pub data: Option<String>,
     /// GPU on which it was trained; `None` if it is not known.
     pub adapter: Option<String>,
@@ -213,7 +213,8 @@ pub struct ModelStatus {
     pub edits: usize,
     /// Number of undone edits that can be redone.
     pub undone_edits: usize,
-    /// The erased boxes, for clients that draw the model themselves: a box can cut splats.
+    /// The erased boxes, for clients that draw the model themselves. They need the boxes because a
+    /// box can cut splats.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     pub erased_boxes: Vec<ErasedBox>,
     /// Mean PSNR over the test keyframes, dB; `None` before the first evaluation.
@@ -245,7 +246,8 @@ impl Status {
             let n = model.psnr_history.len();
             if n > MAX_HISTORY {
                 let last = n - 1;
-                // From index 0 to index `last`, both included. The page shows the newest score.
+                // The indices are spread from 0 to `last`, both included, because the page shows
+                // the newest score.
                 let kept = |ix: usize| model.psnr_history[ix * last / (MAX_HISTORY - 1)];
                 model.psnr_history = (0..MAX_HISTORY).map(kept).collect();
             }

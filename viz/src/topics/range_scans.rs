@@ -12,9 +12,9 @@ use nalgebra::{Point3, Vector3};
 use std::collections::BTreeMap;
 use std::sync::Arc;
 
-/// Maximum number of points that are sent per scan, 36 kB. Scans of 3D scanners have many more;
-/// with a larger number, their surfaces look denser on the page, and other data waits longer on
-/// slow links.
+/// Maximum number of points that are sent per scan. They take 36 kB. Scans of 3D scanners have many
+/// more points. With a larger maximum, their surfaces would look denser on the page, but other data
+/// would wait longer on slow links.
 const MAX_POINTS: usize = 6000;
 
 /// Latest scans by scanner name.
@@ -65,10 +65,12 @@ fn pack_range_scan(range_scan: &RangeScan, clock: ServerClock) -> Option<Vec<u8>
         map_from_odom,
         captured_at,
     } = range_scan;
-    // Relative to the scanner, counts of 16 bits have the finest step. Relative to the world, they
-    // would have to cover the distance to its origin, too.
+    // The points are relative to the scanner, so that counts of 16 bits have the smallest step.
+    // Relative to the world, the counts would have to cover the distance to the world's origin,
+    // too.
     let origin = map_from_odom * Point3::from(scan.world_from_scanner.translation.vector);
-    // Every n-th point: points are in the order of measurement, so all directions stay covered.
+    // Only every n-th point is sent. Points are in the order of measurement, so all directions stay
+    // covered.
     let stride = scan.points_in_world_m.len().div_ceil(MAX_POINTS).max(1);
     let from_origin =
         |point: &[f32; 3]| map_from_odom * Point3::from(*point).cast::<f64>() - origin;

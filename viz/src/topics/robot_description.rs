@@ -84,8 +84,8 @@ impl RobotStateMessage {
     /// Numbers are rounded to 10 micrometers or microradians, which shortens the message to a
     /// third.
     pub(crate) fn new(state: &RobotState, clock: ServerClock) -> Self {
-        // Much less than a pixel: at a distance of 1 m and a focal length of 600 pixels, a pixel
-        // covers 1.7 mm.
+        // The rounding error is much less than a pixel. At a distance of 1 m and a focal length of
+        // 600 pixels, a pixel covers 1.7 mm.
         let rounded = |value: f64| (value * 1e5).round() / 1e5;
         Self {
             stamp_nanos: state.stamp.0,
@@ -168,8 +168,9 @@ impl<'a> From<&'a RobotDescription> for RobotMessage<'a> {
         let joints = robot.joints().iter().map(|joint| JointMessage {
             name: &joint.name,
             kind: match joint.kind {
-                // The page draws links behind such a joint as if the joint stood at 0. Chains of
-                // cameras with it are refused, so that only the drawing can be wrong.
+                // The page draws links behind an unsupported joint as if its position were 0.
+                // Kinematic chains from the base to a camera are refused if they contain such a
+                // joint, so only the drawing can be wrong.
                 JointKind::Fixed | JointKind::Unsupported(_) => "fixed",
                 JointKind::Revolute => "revolute",
                 JointKind::Prismatic => "prismatic",

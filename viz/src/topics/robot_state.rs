@@ -41,7 +41,8 @@ impl Hub {
     /// Sets the current state of the robot.
     pub fn set_robot_state(&self, state: RobotState) {
         self.latest::<BasePath>()
-            // Positions that are left out must not cause a new message with the whole path.
+            // `push` leaves out positions close to the last one. They must not cause a new message
+            // with the whole path.
             .send_if_modified(|path| path.push(state.world_from_base.translation.vector.into()));
         self.latest::<Option<Arc<RobotState>>>()
             .send_replace(Some(Arc::new(state)));

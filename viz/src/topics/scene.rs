@@ -9,7 +9,8 @@ use crate::topics::{DefaultRate, Priority};
 use axum::extract::ws::Message;
 use std::sync::Arc;
 
-/// The topic. Every client receives it, because it cannot choose a view without it.
+/// The topic. Every client receives it, because a client cannot choose a view without the extent of
+/// the scene.
 #[derive(Default)]
 pub(crate) struct SceneTopic;
 
@@ -35,7 +36,7 @@ impl Hub {
     }
 
     /// Sets the extent of the scene. Initially, clients show everything in the bounds, together
-    /// with the robot and its path; the view of the hint is a second view.
+    /// with the robot and its path. They offer the view of the hint as a second view.
     pub fn set_scene(&self, hint: SceneHint, bounds: SceneBounds) {
         let bounds = Some(bounds);
         publish(self, PublishedScene { hint, bounds });

@@ -101,7 +101,8 @@ impl<T: SharedTopic> Topic for LatestMessages<T> {
             encoded,
             messages,
         } = &mut *state;
-        // Before looking at the data: what has changed must stay marked until the period is over.
+        // The period is checked before the data, because changed data must stay marked until the
+        // period is over.
         if !encoded.is_due(context.now) {
             return;
         }
@@ -109,8 +110,8 @@ impl<T: SharedTopic> Topic for LatestMessages<T> {
             return;
         };
         encoded.begin(context.now);
-        // The messages are numbered in the order of their keys. The feed sends those first whose
-        // number was sent longest ago, so that no key is preferred for long.
+        // The messages are numbered in the order of their keys. The feed first sends the keys whose
+        // last message was sent longest ago, so that no key is preferred for long.
         for (key, message) in topic.encode(&source, context.clock) {
             context
                 .publisher
@@ -152,8 +153,8 @@ impl<T: SharedTopic> Feed for LatestMessageFeed<T> {
         let state = self.messages.state.lock();
         let waiting = state.messages.iter().filter_map(|(key, item)| {
             let sent = self.sent.get(key).copied().unwrap_or_default();
-            // The timer is asked only about new messages: it remembers when those are due that
-            // are not.
+            // The timer is asked only about new messages, because it records the due time of each
+            // message that it rejects.
             let is_next = item.number > sent.number && timer.is_due(sent.at, period);
             is_next.then_some((sent.number, key, item))
         });

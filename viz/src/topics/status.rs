@@ -16,8 +16,8 @@ pub(crate) struct StatusTopic;
 
 impl SharedTopic for StatusTopic {
     const NAME: &'static str = "status";
-    // The documented rate is 5 Hz, a period of 200 ms. Data are checked every 20 ms, so that with
-    // exactly 200 ms, a message that is a little early would wait for the next check.
+    // The documented rate is 5 Hz, a period of 200 ms. The default is slightly shorter. With
+    // exactly 200 ms, a message that is slightly early would wait for the next check, 20 ms later.
     const DEFAULT: DefaultRate = DefaultRate::Period(Duration::from_millis(190));
     const PRIORITY: Priority = Priority::Short;
     const CAPABILITY: Option<&'static str> = None;
@@ -62,17 +62,19 @@ impl Hub {
         });
     }
 
-    /// Changes the latest status. If the state changes, but not what was said about the previous
-    /// state, this is removed.
+    /// Changes the latest status. If the state changes, fields that still describe the previous
+    /// state are removed.
     pub fn change_status(&self, change: impl FnOnce(&mut Status)) {
-        // Within the lock, so that two threads do not overwrite each other's changes.
+        // The change is made within the lock, so that two threads do not overwrite each other's
+        // changes.
         self.latest::<Option<Arc<Status>>>().send_modify(|latest| {
             let mut status = latest.as_deref().cloned().unwrap_or_default();
             change(&mut status);
             if let Some(previous) = latest.as_deref() {
                 remove_outdated(&mut status, previous);
             }
-            // Read within the lock, too: a client that joins afterwards changes this status.
+            // The clients are also read within the lock. A client that joins afterwards then
+            // changes this status.
             status.operator.clients = self.pictures().clients();
             *latest = Some(Arc::new(status));
         });
@@ -84,7 +86,8 @@ impl Hub {
     }
 }
 
-/// Removes what describes the previous state: the advice, and who has paused.
+/// Removes the fields that describe the previous state: the advice, and the client that has paused
+/// training.
 fn remove_outdated(status: &mut Status, previous: &Status) {
     if status.state == previous.state {
         return;

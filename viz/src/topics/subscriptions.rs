@@ -10,8 +10,8 @@ use std::time::Duration;
 pub(crate) const LIVE_IMAGES: &str = "live_images";
 /// Topic whose subscriptions choose a model and a budget.
 pub(crate) const MODEL_CHUNKS: &str = "model_chunks";
-/// Maximum number of cameras with a subscription of their own. A client can name cameras that do
-/// not exist, so the list needs a limit.
+/// Maximum number of cameras with a separate subscription. A client can name cameras that do not
+/// exist, so the list needs a limit.
 const MAX_CAMERAS: usize = 64;
 /// Maximum length of a camera name, bytes.
 const MAX_NAME_BYTES: usize = 256;
@@ -28,17 +28,17 @@ const DEFAULT_CHUNK_BYTES_PER_SEC: f64 = 6e5;
 /// Limits of that rate. Dividing by it gives the time until a chunk is due, so it must not be close
 /// to zero.
 const CHUNK_BYTES_PER_SEC: std::ops::RangeInclusive<f64> = 1e4..=1e9;
-/// Longest period. Slower subscriptions get one message a day.
+/// Longest period. Subscriptions with longer periods get one message a day.
 const MAX_PERIOD: Duration = Duration::from_secs(86_400);
 
 /// The subscriptions of one client.
 #[derive(Clone, Debug, PartialEq)]
 pub(crate) struct Subscriptions {
-    /// By name of the topic.
+    /// Subscriptions by name of the topic.
     topics: BTreeMap<&'static str, Subscription>,
     /// Chunks of a model; `None` if not sent.
     pub(crate) model_chunks: Option<ChunkSubscription>,
-    /// Images of cameras without a subscription of their own.
+    /// Images of cameras without a separate subscription.
     live_images: ImageSubscription,
     /// Images of single cameras.
     cameras: BTreeMap<Arc<str>, ImageSubscription>,
@@ -85,7 +85,7 @@ impl Subscriptions {
             .into_iter()
             .map(|(name, period)| (name, Subscription { period, number: 0 }))
             .collect();
-        // Images have two entries: the one in `topics` only counts the subscriptions, and this one
+        // Images have two entries. The entry in `topics` only counts the subscriptions. This entry
         // decides what is sent.
         let live_images = ImageSubscription {
             period: topics.get(LIVE_IMAGES).and_then(|topic| topic.period),
@@ -132,8 +132,9 @@ impl Subscriptions {
                 Some(camera) => self.set_camera(camera, images)?,
             }
         }
-        // The number grows with every message, even if the rate stays the same: some topics begin
-        // from the start after a new subscription, and this is how a client asks for that.
+        // The number grows with every message, even if the rate stays the same. Some topics send
+        // all data again after a new subscription, so a client can request all data by subscribing
+        // again.
         let number = 1 + self.number(topic);
         self.topics.insert(topic, Subscription { period, number });
         Ok(())
@@ -146,7 +147,7 @@ impl Subscriptions {
             let got = message.topic.clone();
             return Err(InvalidRequest::Topic { got, known });
         };
-        // Written so that NaN is rejected.
+        // The comparison is written so that a NaN is rejected.
         if !(0.0..=MAX_RATE_HZ).contains(&message.rate_hz) {
             return Err(InvalidRequest::Rate {
                 got: message.rate_hz,
@@ -326,7 +327,7 @@ mod tests {
             subscriptions.period("robot_state"),
             Some(Duration::from_millis(20))
         );
-        // The slowest rate that a number can express is no error.
+        // The smallest positive number is a valid rate.
         apply(
             &mut subscriptions,
             json!({"topic": "status", "rate_hz": 5e-324}),

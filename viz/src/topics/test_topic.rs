@@ -44,7 +44,8 @@ impl Hub {
     }
 }
 
-/// Over a connection: nothing before the subscription, then the latest value, then each new one.
+/// Over a connection, a client receives nothing before the subscription, then the latest value, and
+/// then each new value.
 #[test]
 fn new_topic_reaches_subscribed_clients() {
     let hub = Hub::new();

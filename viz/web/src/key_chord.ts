@@ -27,7 +27,7 @@ export interface Focus {
   isEditable: boolean;
 }
 
-/** Keys whose name differs from what is written on them. */
+/** Keys whose name differs from the text on the key. */
 const LABELS: Record<string, string> = {
   arrowleft: "←",
   arrowright: "→",
@@ -66,16 +66,18 @@ export function isPressed({ key, hasControl, hasShift }: Chord, press: Press): b
   return (ignoresShift || hasShift === press.shiftKey) && key === keyOf(press);
 }
 
-/** The key in lower case. On keyboards without Latin letters, the letter at the same place of an English keyboard. */
+/**
+ * The key in lower case. On keyboards without Latin letters, this is the letter at the same
+ * position of an English keyboard.
+ */
 export function keyOf({ key, code }: Pick<Press, "key" | "code">): string {
   const isLatin = key.length !== 1 || key.charCodeAt(0) < 0x250;
   return (isLatin ? key : (/^(?:Key|Digit)(.)$/.exec(code)?.[1] ?? key)).toLowerCase();
 }
 
 /**
- * Whether the focused element needs this key: fields need the keys of text, sliders and lists only those that change
- * their value. Escape always closes something.
- */
+ * Whether the focused element needs this key. Fields need the keys of text. Sliders and lists need
+ * only the keys that change their value. No element needs Escape, which always closes something. /
 export function keepsKey({ tag, type, isEditable }: Focus, key: string): boolean {
   if (key === "escape") return false;
   const isText = isEditable || tag === "textarea" || (tag === "input" && !NOT_TEXT.includes(type));

@@ -29,7 +29,10 @@ interface Closable {
 }
 
 const bindings: KeyBinding[] = [];
-/** Kinds of things that Escape closes, in this order; of one kind, the last registered one first. Cards hide little. */
+/**
+ * Kinds of elements that Escape closes, in this order. Within a kind, the last registered element
+ * is closed first. Cards come last, because they hide little.
+ */
 const closables: Record<"panel" | "mode" | "card", Closable[]> = { panel: [], mode: [], card: [] };
 let onToggle = (): void => undefined;
 let isFlying = false;
@@ -106,7 +109,7 @@ export function isKeptByFocus(event: KeyboardEvent): boolean {
   return keepsKey(focusOf(event.target), keyOf(event));
 }
 
-/** Whether a modal dialog covers the page: keys have no effect on what it covers. */
+/** Whether a modal dialog covers the page. Keys have no effect on elements that it covers. */
 export function isPageCovered(): boolean {
   return document.querySelector("dialog:modal") !== null;
 }

@@ -213,7 +213,7 @@ new Tooltip();
 const memory = new ViewMemory(view, settings, models);
 const namedViews = new NamedViews(memory);
 
-/** A new connection is open: the server may be another one, and does not know earlier requests. */
+/** Called when a new connection is open. The server may be another one, and does not know earlier requests. */
 function restart(): void {
   view.picture.forget();
   skeleton.awaitPicture();
@@ -248,7 +248,7 @@ function receiveText(message: TextMessage): void {
       break;
     case "error":
       if ([edits, ...sides, browser].some((part) => part.fail(message))) break;
-      // The skeleton says what is missing.
+      // The skeleton already shows what is missing.
       picture.failed(message.id, skeleton.isVisible && !model.status?.keyframes ? "" : message.message);
       break;
   }

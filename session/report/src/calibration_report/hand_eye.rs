@@ -67,7 +67,7 @@ impl HandEyeReport<'_> {
             "RMS rotation about three orthogonal axes. The second-largest rotation limits the accuracy: turn the flange by 20 degrees or more about different axes.",
             &self.excitation(),
         );
-        // The fraction is that of the standard deviation that remains.
+        // The fraction is the part of the standard deviation that would remain.
         let next = self.next_poses.iter().map(|next| {
             let percent = format!("{:.0} %", 100.0 * (1.0 - next.sigma_frac));
             vec![next.motion.clone(), percent]

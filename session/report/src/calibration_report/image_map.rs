@@ -100,8 +100,8 @@ impl ImageMap {
 
     /// Draws dots.
     pub(super) fn dots(&mut self, pixels: impl Iterator<Item = [f64; 2]>) {
-        // One path for all dots: thousands of elements would make the page slow. Lines without
-        // length have round caps, which are the dots.
+        // All dots are in one path, because thousands of elements would make the page slow. Each
+        // dot is a line without length, of which only the round caps are visible.
         let mut path = String::new();
         for [x, y] in pixels {
             write!(path, "M{x:.1} {y:.1}h0").expect("writing to a string cannot fail");

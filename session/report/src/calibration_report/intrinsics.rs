@@ -21,7 +21,7 @@ pub struct IntrinsicsReport<'a> {
     pub size_px: [u32; 2],
     /// The target in all images in which it was detected.
     pub views: &'a [BoardView],
-    /// Images in which it was not.
+    /// Images in which the target was not detected.
     pub unused: &'a [Unused],
     /// The result; `None` if the calibration was refused.
     pub calibration: Option<&'a IntrinsicsCalibration>,

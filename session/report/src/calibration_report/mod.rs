@@ -1,6 +1,6 @@
-//! Reports of calibrations: one page each that works offline, with the result, its uncertainty, the
-//! errors of all samples and, if the calibration was refused, the reason and the data that it is
-//! based on.
+//! Reports of calibrations. Each report is one page that works offline, with the result, its
+//! uncertainty and the errors of all samples. If the calibration was refused, the page shows the
+//! reason, and the data on which the refusal is based.
 
 mod bars;
 mod hand_eye;

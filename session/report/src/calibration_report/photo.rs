@@ -35,7 +35,7 @@ pub enum Photo {
 pub type Photos = BTreeMap<String, Photo>;
 
 /// The part of a photo around the corners, with the corners drawn over it, and a caption. Without
-/// corners, the whole photo. Empty if the photo cannot be read again.
+/// corners, the whole photo is shown. The result is empty if the photo cannot be read again.
 pub(super) fn with_corners(
     photos: &Photos,
     name: &str,

@@ -73,7 +73,8 @@ impl TimeOffsetReport<'_> {
         let Some(offset) = self.offset else {
             return before;
         };
-        // With drift, the offset holds at `mid_secs` and changes linearly with the time.
+        // With drift, the estimated offset is the offset at `mid_secs`, and it changes linearly
+        // with time.
         let drift = offset.drift_ppm.map_or(0.0, |[drift, _]| 1e-6 * drift);
         let on_a = |secs: f64| secs + offset.offset_secs + drift * (secs - offset.mid_secs);
         before
@@ -107,7 +108,8 @@ impl ShownPart {
 
 /// The interval of a curve in which its values vary most.
 fn liveliest(curve: &[[f64; 2]]) -> std::ops::RangeInclusive<f64> {
-    /// Long enough for several movements, short enough to see an offset of tens of milliseconds.
+    /// The interval is long enough for several movements, and short enough to see an offset of tens
+    /// of milliseconds.
     const SHOWN_SECS: f64 = 15.0;
     let (Some([first, _]), Some([last, _])) = (curve.first(), curve.last()) else {
         return 0.0..=0.0;
@@ -286,8 +288,8 @@ fn residual(offset: &TimeOffset) -> String {
 
 /// Inserts a NaN point into each gap, so that the line is interrupted.
 fn interrupted(curve: &[[f64; 2]]) -> Vec<[f64; 2]> {
-    // Relative to the smallest step. One missing sample doubles the step and is no gap; two of them
-    // are.
+    // Minimum length of a gap, relative to the smallest step. One missing sample doubles the step
+    // and does not count as a gap. Two missing samples do.
     const GAP: f64 = 2.5;
     let step = curve
         .windows(2)

@@ -122,8 +122,8 @@ fn linear_ticks(low: f64, high: f64) -> Vec<f64> {
         .find(|step| *step >= rough);
     let step = step.unwrap_or(10.0 * power);
     let mut ticks = Vec::new();
-    // Products instead of repeated sums, whose rounding errors would accumulate and could remove
-    // the last tick.
+    // Ticks are computed as products. Repeated sums would accumulate rounding errors, which could
+    // remove the last tick.
     let mut n = (low / step).ceil();
     while n * step <= high {
         ticks.push(n * step);
@@ -132,8 +132,8 @@ fn linear_ticks(low: f64, high: f64) -> Vec<f64> {
     ticks
 }
 
-/// Ticks at 1, 2 and 5 times powers of ten. If these are too many, only at the powers; if too few,
-/// at all multiples of the powers.
+/// Ticks at 1, 2 and 5 times powers of ten. If there are too many ticks, only the powers are used.
+/// If there are too few, all multiples of the powers are used.
 fn log_ticks(low: f64, high: f64) -> Vec<f64> {
     let mut powers = Vec::new();
     let mut power = 10.0_f64.powf(low.log10().floor());

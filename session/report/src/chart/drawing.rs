@@ -176,7 +176,8 @@ fn hex([red, green, blue]: Color) -> String {
 
 /// Escapes text for SVG and HTML, inside elements and quoted attributes.
 pub fn escaped(text: &str) -> String {
-    // `&` first. Otherwise, the entities of the other characters would be escaped again.
+    // `&` is replaced first. Otherwise, the entities of the other characters would be escaped
+    // again.
     text.replace('&', "&amp;")
         .replace('<', "&lt;")
         .replace('>', "&gt;")

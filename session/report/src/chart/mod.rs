@@ -421,8 +421,8 @@ fn wrap(text: &str, max_chars: usize) -> Vec<String> {
                 rows.push(String::new());
                 continue;
             }
-            // A word ends with a space, which is removed at the end of a row. A row may therefore
-            // have one character more than the maximum here.
+            // A word ends with a space, which is removed at the end of a row. Until the space is
+            // removed, a row may have one character more than the maximum.
             row.extend(left.drain(..left.len().min(max_chars + 1 - n_used.min(max_chars))));
         }
     }

@@ -30,7 +30,7 @@ fn act_like_page(connection: &Connection) {
     connection.record_pong();
 }
 
-/// How important it is now that a client stays.
+/// The present importance of a client.
 fn importance(connection: &Connection) -> Importance {
     connection.importance(Instant::now()).expect("a client")
 }

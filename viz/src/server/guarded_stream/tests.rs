@@ -13,9 +13,9 @@ const LIMITS: Limits = Limits {
     connections: 4,
     clients: 2,
 };
-/// Shorter than that of a server.
+/// The timeout is shorter than the timeout of a server.
 const WRITE_TIMEOUT: Duration = Duration::from_millis(200);
-/// No test waits longer.
+/// No test waits longer than this.
 const TIMEOUT: Duration = Duration::from_secs(30);
 
 /// An admission and a listening port that creates both ends of connections.
@@ -105,7 +105,7 @@ fn peers_that_do_not_read_time_out() {
         };
         let error = tokio::time::timeout(TIMEOUT, filling).await;
         assert_eq!(error, Ok(ErrorKind::TimedOut), "the peer never reads");
-        // Only a lower limit: on a busy machine, the connection is closed later.
+        // Only the lower limit is checked, because a busy machine may close the connection later.
         assert!(began.elapsed() >= WRITE_TIMEOUT);
         assert!(stuck.connection().is_closed());
     });

@@ -21,7 +21,7 @@ export function keepToken(): boolean {
   return true;
 }
 
-/** Why the server refuses this page, in one sentence; empty if it does not, or does not answer. */
+/** Why the server refuses this page, in one sentence. Empty if the server accepts the page or does not answer. */
 export async function refusalReason(): Promise<string> {
   try {
     const response = await fetch("status", { cache: "no-store" });
@@ -39,7 +39,7 @@ export function showRole(role: Role | undefined): void {
   disableAll("[data-operator]", isViewer ? VIEWER_REASON : "");
 }
 
-/** Disables everything that needs a server, until one says hello. */
+/** Disables all controls that need a server, until a server sends its hello. */
 export function disableServerControls(reason: string): void {
   disableAll("[data-server], [data-operator]", reason);
 }

@@ -8,7 +8,7 @@ import { ServerClock } from "./server_clock";
 
 const CHECK_MILLIS = 100;
 const PING_MILLIS = 500;
-/** The server sends a heartbeat four times a second; a longer silence indicates a problem. */
+/** The server sends four heartbeats a second, so a silence of this length indicates a problem. */
 const SILENT_MILLIS = 800;
 /** After this much silence, the page reconnects. */
 const GIVE_UP_MILLIS = 4000;
@@ -16,7 +16,7 @@ const GIVE_UP_MILLIS = 4000;
 const ATTEMPT_MILLIS = 2000;
 /** Pauses before the next attempts. A server on this computer or behind a tunnel is usually back within a second. */
 const RETRY_MILLIS = [250, 500, 1000];
-/** If a check is this late, messages from the server may be queued; they are handled first. */
+/** If a check is this late, messages from the server may be queued. They are handled before the check. */
 const LATE_MILLIS = 400;
 /** If a check is this late, the page or the computer was suspended. */
 const SUSPENDED_MILLIS = 5000;
@@ -36,11 +36,14 @@ export class Connection {
   /** Time from the last ping to its answer; null before the first answer of a connection. */
   roundTripMillis: number | null = null;
   private readonly parts = new PartJoiner();
-  /** Those of the last server until the next one says hello, so that the page still offers what needs no server. */
+  /**
+   * Capabilities of the last server until the next hello, so that the page still offers functions
+   * that need no server.
+   */
   private capabilities: ReadonlySet<string> = new Set();
   private socket: WebSocket | null = null;
   private goodbye = "";
-  /** Whether the server has said that it stops, and no server has answered since. */
+  /** Whether the server has announced its end, and no server has answered since. */
   hasStopped = false;
   /** Whether the current socket has received a hello. */
   private hasHello = false;

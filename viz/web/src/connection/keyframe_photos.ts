@@ -38,14 +38,14 @@ export class KeyframePhotos {
     });
   }
 
-  /** Takes a photograph; returns whether it was one. */
+  /** Takes a message if it is a photograph. Returns whether it was. */
   receive(header: { type: string }, payload: Uint8Array<ArrayBuffer>): boolean {
     if (header.type !== "keyframe_image") return false;
     const photo = header as KeyframeImageHeader;
     if (photo.id !== this.id || !this.pending) return true;
     const { keyframe, resolve, reject } = this.pending;
     this.pending = null;
-    // The numbers of a server that was started again mean other keyframes.
+    // A server that was started again uses the same numbers for other keyframes.
     const isSame = photo.camera === keyframe.camera && photo.stamp_nanos === keyframe.stamp_nanos;
     if (isSame) resolve({ header: photo, payload });
     else reject(new Error("the list of keyframes has changed"));
@@ -53,7 +53,7 @@ export class KeyframePhotos {
     return true;
   }
 
-  /** Takes an error about a photograph; returns whether it was one. */
+  /** Takes an error if it is about a photograph. Returns whether it was. */
   fail({ id, keyframe, message }: ErrorMessage): boolean {
     if (keyframe === undefined) return false;
     if (id === this.id && this.pending) {
@@ -65,7 +65,7 @@ export class KeyframePhotos {
     return true;
   }
 
-  /** Ends all requests with an error: a new connection does not know them. */
+  /** Ends all requests with an error, because a new connection does not know them. */
   restart(): void {
     const ended = [...(this.pending ? [this.pending] : []), ...this.queue.splice(0)];
     this.pending = null;

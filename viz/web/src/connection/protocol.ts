@@ -78,7 +78,7 @@ export interface ModelStatus {
 export interface Status extends ModelStatus {
   type: "status";
   state: string;
-  /** How far the work is that `state` names, if there is more to say about it. */
+  /** Progress of the work that `state` names; missing if it is not known. */
   progress?: StateProgress;
   seconds: number;
   keyframes: number;
@@ -139,7 +139,7 @@ export interface KeyframeStore {
   is_full: boolean;
 }
 
-/** How far the work is that a state names. */
+/** Progress of the work that a state names. */
 export interface StateProgress {
   text: string;
   /** Completed part of the work, 0 to 1; null if it is not known. */
@@ -218,7 +218,10 @@ export interface Scene {
   center_m: [number, number, number];
   radius_m: number;
   world_from_camera: number[];
-  /** The relevant parts, without the robot; missing on older servers, whose center and radius show only the first keyframes. */
+  /**
+   * Bounds of the relevant parts, without the robot. Missing on older servers, whose center and
+   * radius cover only the first keyframes.
+   */
   bounds?: { min_m: [number, number, number]; max_m: [number, number, number] };
 }
 
@@ -242,7 +245,7 @@ export interface NumberedKeyframe extends PosedCamera {
   stamp_nanos: number;
 }
 
-/** What has changed in the list of keyframes; a message from version 0 replaces the list. */
+/** Changes of the list of keyframes. A message from version 0 replaces the list. */
 export interface KeyframeChanges {
   type: "keyframe_changes";
   from_version: number;
@@ -399,10 +402,10 @@ export interface KeyframeImageHeader {
   /** Speed of the camera at mid-exposure; null if unknown. */
   speed_m_s: number | null;
   turn_rad_s: number | null;
-  /** Time from the first row's exposure to the last row's. */
+  /** Time from the exposure of the first row to the exposure of the last row. */
   readout_secs: number;
   color: { format: "jpeg"; offset: number; bytes: number };
-  /** A zlib stream of a byte per pixel, 0 where the photograph is not used; null if all pixels are. */
+  /** A zlib stream of one byte per pixel, 0 where the photograph is not used. Null if all pixels are used. */
   mask: { offset: number; bytes: number } | null;
 }
 
@@ -418,7 +421,7 @@ interface ChunkHeader {
   n_incomplete: number;
   /** Number of chunks that are missing after this message; missing on older servers. */
   n_unsent: number | undefined;
-  /** The same numbers for the view of the newest request; null if there was none, missing on older servers. */
+  /** The same numbers for the view of the newest request. Null if there was no request, missing on older servers. */
   n_incomplete_in_view: number | null | undefined;
   n_unsent_in_view: number | null | undefined;
   world_from_model: number[];
@@ -468,7 +471,7 @@ export interface RangeScanHeader {
   type: "range_scan";
   scanner: string;
   stamp_nanos: number;
-  /** Begin of the revolution on the server's clock; missing on older servers. */
+  /** Start of the revolution on the server's clock; missing on older servers. */
   captured_millis?: number;
   origin_m: [number, number, number];
   n_points: number;

@@ -1,7 +1,8 @@
 // Decides which picture to request and when.
 //
-// While the view moves: one small picture at a time, as large as the latency allows. At rest: the finer stages. While
-// the model trains: a periodic refresh of the full picture.
+// While the view moves, one small picture is requested at a time, as large as the latency allows.
+// At rest, the finer stages are requested. While the model trains, the full picture is refreshed
+// periodically.
 
 import type { Connection } from "./connection";
 import type { Crop } from "../view/crop_box";
@@ -23,21 +24,27 @@ const REST_MILLIS = 180;
 const REFRESH_MILLIS = 150;
 /** Maximum fraction of the time spent on refreshes, and thus of the bandwidth. */
 const REFRESH_SHARE = 0.25;
-/** The same if the page draws the model itself and needs only the depth. */
+/** Minimum pause between two refreshes if the page draws the model itself and needs only the depth. */
 const LOCAL_REFRESH_MILLIS = 3000;
-/** The model counts as changing for so long after a change: the status, which reports changes, arrives twice a second. */
+/**
+ * Time after a change for which the model counts as changing. The status, which reports changes,
+ * arrives twice a second.
+ */
 const CHANGING_MILLIS = 1200;
-/** While moving, pictures that take longer than this are requested smaller, and pictures that take less than a third of it larger. */
+/**
+ * While the view moves, pictures that take longer than this are requested smaller. Pictures that
+ * take less than a third of it are requested larger.
+ */
 const MOVING_MILLIS = 110;
 const MOVING_SCALES = [0.1, 0.15, 0.25, 0.35, 0.5, 0.7, 1];
 /** Timeouts for answers, while moving and at rest. */
 const TIMEOUT_MILLIS = { moving: 3000, resting: 30_000 };
 
-/** Follows what is wanted and what is requested. */
+/** Observes which picture is wanted and which one is requested. */
 export interface RequestObserver {
   /** Another view, model or part of the scene is wanted than in the requests so far. */
   viewChanged(): void;
-  /** A picture of what is wanted now was requested. */
+  /** A picture of the wanted view and model was requested. */
   requested(id: number): void;
 }
 
@@ -72,7 +79,7 @@ export class RenderScheduler {
   moved(): void {
     this.movedAt = performance.now();
     this.observer?.viewChanged();
-    // Does not wait for a full picture of the old view: the next request replaces it.
+    // The full picture of the old view is not awaited, because the next request replaces it.
     if (this.isResting) this.isWaiting = false;
     this.isResting = false;
   }
@@ -151,7 +158,7 @@ export class RenderScheduler {
     this.observer?.requested(this.id);
   }
 
-  /** What pictures of a view have in common with those of the main view. */
+  /** The part of a request that other views have in common with the main view. */
   picture(view: View): Omit<PictureRequest, "outputs"> {
     return {
       ...view,

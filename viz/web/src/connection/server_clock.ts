@@ -1,27 +1,33 @@
-// Estimates the server's clock, conservatively: ages are never understated.
+// Estimates the server's clock such that ages are never understated.
 
 /** Maximum age of samples, because clocks drift. */
 const MAX_SAMPLE_AGE_MILLIS = 30_000;
 
 export class ServerClock {
-  /** Send time of each ping, and the server's clock minus that time when the server answered. */
+  /** Send time of each ping, and the server's clock at its answer minus this send time. */
   private samples: { sentAt: number; ahead: number }[] = [];
 
-  /** Adds the answer to a ping. The server read its clock after the ping was sent, so it is ahead by at most this much. */
+  /**
+   * Adds the answer to a ping. The server read its clock after the ping was sent, so the difference
+   * is an upper bound.
+   */
   observePong(sentAt: number, clockMillis: number): void {
     const oldest = performance.now() - MAX_SAMPLE_AGE_MILLIS;
     this.samples = this.samples.filter((sample) => sample.sentAt > oldest);
     this.samples.push({ sentAt, ahead: clockMillis - sentAt });
   }
 
-  /** Checks samples against the time in any message. The server read its clock before now, so it is ahead by at least this much. */
+  /**
+   * Checks samples against the time in any message. The server read its clock before now, so the
+   * difference is a lower bound.
+   */
   observeMessage(clockMillis: number): void {
     const ahead = clockMillis - performance.now();
-    // Smaller samples were taken before one of the computers was suspended.
+    // Samples below the lower bound were taken before one of the computers was suspended.
     this.samples = this.samples.filter((sample) => sample.ahead >= ahead);
   }
 
-  /** Discards all samples: a new server has a new clock. */
+  /** Discards all samples, because a new server has a new clock. */
   forget(): void {
     this.samples = [];
   }

@@ -1,8 +1,9 @@
-// Measures the time from the shutter of a camera to the screen: from mid-exposure of a keyframe until the first picture of
-// a model with this keyframe has been presented.
+// Measures the time from the shutter of a camera to the screen. It is the time from mid-exposure of
+// a keyframe until the first picture of a model with this keyframe is presented.
 //
-// A picture counts only if it contains a keyframe that the previous picture did not contain. Otherwise it would show old
-// keyframes because nothing new was taken, not because of latency.
+// A picture counts only if it contains a keyframe that the previous picture did not contain.
+// Otherwise, the age of its keyframes would also contain the time without new keyframes, which is
+// not latency.
 
 import type { Connection } from "./connection";
 import { element } from "../panels/element";
@@ -49,14 +50,17 @@ export class ShownLatency {
     if (header.last) this.ready = { header, receivedAt };
   }
 
-  /** Called at the beginning of a frame: the browser has taken over what the last frame has drawn. */
+  /** Called at the beginning of a frame, when the browser has taken over the drawing of the last frame. */
   frameBegins(): void {
     if (this.drawn) this.presented(this.drawn);
     this.drawn = this.ready;
     this.ready = null;
   }
 
-  /** The next picture may contain keyframes for which the page has not waited, or be of another model. */
+  /**
+   * To be called if the next picture may contain keyframes for which the page has not waited, or
+   * may show another model.
+   */
   restart(): void {
     this.nKeyframes = null;
     this.ready = null;

@@ -26,7 +26,7 @@ export class ChunkArrival {
     this.nIncomplete = counts.n_incomplete;
     // Older servers do not distinguish missing chunks from coarse ones, and do not report on the view.
     this.nMissing = counts.n_unsent ?? counts.n_incomplete;
-    // Without a view, the server does not know what is in it.
+    // Without a view, the server cannot count the chunks in view.
     this.nMissingInView = counts.n_unsent_in_view ?? this.nMissing;
     this.nIncompleteInView = counts.n_incomplete_in_view ?? counts.n_incomplete;
     if (this.nMissing === 0 && this.hasAllSent) this.hasEverything = true;
@@ -36,7 +36,10 @@ export class ChunkArrival {
     for (const id of ids) this.received.delete(id);
   }
 
-  /** Whether each chunk was there at some time, at least coarsely. Later ones replace others without holes. */
+  /**
+   * Whether each chunk has arrived at some time, at least in its coarse form. Later chunks replace
+   * earlier ones without holes.
+   */
   get hasAll(): boolean {
     return this.hasEverything;
   }
@@ -52,9 +55,9 @@ export class ChunkArrival {
   }
 
   /**
-   * Whether everything has arrived that the server counts as sent. A message for an earlier subscription, which was on
-   * its way when the page discarded its chunks, counts chunks that the page does not have.
-   */
+   * Whether all chunks have arrived that the server counts as sent. A message for an earlier
+   * subscription may arrive after the page has discarded its chunks. Such a message counts chunks
+   * that the page does not have. /
   private get hasAllSent(): boolean {
     return this.nChunks > 0 && this.received.size >= this.nChunks - this.nMissing;
   }

@@ -33,7 +33,8 @@ export async function decodeCompactDepth(
       } else {
         // 0, -1, 1, -2, 2, ...
         const difference = symbol & 1 ? -((symbol + 1) >> 1) : symbol >> 1;
-        // The count to the left predicts a count; in the first column, the count above.
+        // A count is predicted by the count to its left or, in the first column, by the count above
+        // it.
         code = (codes[x > 0 ? ix - 1 : ix - width] ?? 0) + difference;
       }
       codes[ix] = code;

@@ -1,4 +1,4 @@
-// An arrow that points down at the place that is seen worst, visible through everything else.
+// An arrow that points down at the worst observed place. It is drawn over everything else.
 
 import * as THREE from "three";
 

@@ -11,9 +11,15 @@ export interface DepthMap {
   readonly isComplete: boolean;
   /** No surface is closer to the origin than this; negative infinity if that is not known in all directions. */
   readonly nearestM: number;
-  /** How far a point lies in front of the surface in its direction, meters: negative behind it, infinite if there is none. */
+  /**
+   * Distance of a point in front of the surface in its direction, meters. Negative behind the
+   * surface, infinite if there is no surface.
+   */
   clearance(point: Vector3): number;
-  /** The largest clearance within the resolution of the map: negative only if the point is certainly behind a surface. */
+  /**
+   * The largest clearance within the resolution of the map. It is negative only if the point is
+   * certainly behind a surface.
+   */
   largestClearance(point: Vector3): number;
   /** Whether most surfaces around the origin are closer than this. */
   isWithin(distanceM: number): boolean;

@@ -44,7 +44,7 @@ export class FrameLayer {
 
   /** Draws these frames by name, and removes all others. Names are placed for this camera. */
   update(posed: Map<string, PosedFrame>, camera: THREE.PerspectiveCamera): void {
-    // Read before styles change; otherwise, the browser would compute the layout twice.
+    // The size is read before styles change. Otherwise, the browser would compute the layout twice.
     const { clientWidth, clientHeight } = this.names;
     const scale = new THREE.Vector3().setScalar(this.axisLengthM);
     for (const [name, frame] of this.frames) if (!posed.has(name)) this.remove(name, frame);
@@ -62,7 +62,7 @@ export class FrameLayer {
     const drawn = axes(1);
     drawn.matrixAutoUpdate = false;
     drawn.frustumCulled = false;
-    // Frames lie inside bodies.
+    // Frames lie inside bodies, so they are drawn without a depth test.
     Object.assign(drawn.material, { depthTest: false, transparent: true });
     drawn.renderOrder = 2;
     const label = document.createElement("span");

@@ -1,11 +1,12 @@
-// How a link of the robot is drawn: in its colors, faintly while its pose is outdated, and not in the face of the viewer.
+// How a link of the robot is drawn. It has its own colors. It is faint while its pose is outdated,
+// and fades close to the eye.
 
 import * as THREE from "three";
 import { type Occlusion, SOLID } from "./occlusion";
 
 /** Opacity while the pose is outdated. */
 const OUTDATED_OPACITY = 0.35;
-/** A link fades between these distances to the eye, meters: closer ones would fill the view. */
+/** A link fades between these distances to the eye, meters. A closer link would fill the view. */
 const HIDDEN_M = 0.08;
 const FULL_M = 0.3;
 

@@ -19,7 +19,7 @@ export class LocalCopy {
   /** Chunks are decoded one after the other, so that older ones do not replace newer ones. */
   private decoding: Promise<void> = Promise.resolve();
   private isDisposed = false;
-  /** Version of the splats with which the copy became ready; null if it is not. */
+  /** Version of the splats with which the copy became ready; null if the copy is not ready. */
   private readyVersion: number | null = null;
 
   constructor(
@@ -96,9 +96,8 @@ export class LocalCopy {
   }
 
   /**
-   * Prepares to draw a copy that is not shown yet, if enough has arrived. Returns whether it can be shown: splats can
-   * only be drawn in an order, which a worker computes.
-   */
+   * Prepares to draw a copy that is not shown yet, if enough has arrived. Returns whether the copy
+   * can be shown. Splats can be drawn only after a worker has sorted them. /
   prepare(isReady: boolean, view: View, sizePx: [number, number]): boolean {
     if (!isReady) {
       this.readyVersion = null;

@@ -1,7 +1,8 @@
 // The model that the page draws itself, in the chunks that the server sends.
 //
-// Whatever was on screen stays there until the new chunks can replace it without holes: the server's picture, or an
-// older copy of a model, after another model was chosen or the connection was restored.
+// After another model is chosen or the connection is restored, the present picture stays on screen
+// until the new chunks can replace it without holes. The present picture is the server's picture,
+// or an older copy of a model.
 
 import * as THREE from "three";
 import type { Crop } from "../view/crop_box";
@@ -76,9 +77,8 @@ export class LocalModel {
   }
 
   /**
-   * Begins a new copy, because a new subscription or connection begins with all chunks. The drawn copy stays until the
-   * new one can replace it.
-   */
+   * Begins a new copy, because a new subscription or connection begins with all chunks. The drawn
+   * copy stays until the new copy can replace it. /
   renew(): void {
     this.next?.dispose();
     this.next = this.requested === null ? null : new LocalCopy(this.requested, this.observations, this.changed);
@@ -141,7 +141,7 @@ export class LocalModel {
     this.shown?.setView(view, sizePx);
   }
 
-  /** Whether a copy can be drawn without holes, and is not worse than what is on screen. */
+  /** Whether a copy can be drawn without holes, and is not worse than the present picture. */
   private isReady(next: LocalCopy, hasPicture: boolean): boolean {
     const { arrival } = next;
     // An older copy of the same model is complete, and hardly differs.

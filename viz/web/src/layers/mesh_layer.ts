@@ -11,7 +11,7 @@ const BYTES_PER_VERTEX = 9;
 
 export class MeshLayer {
   readonly root = new THREE.Group();
-  /** Of the crop box, and in front of the eye. */
+  /** Clipping planes of the crop box, and the plane in front of the eye. */
   private readonly planes: THREE.Plane[] = [new THREE.Plane(new THREE.Vector3(), 1)];
   private readonly near = this.planes[0]!;
   private readonly material: THREE.MeshBasicMaterial;
@@ -37,7 +37,10 @@ export class MeshLayer {
     };
   }
 
-  /** Adds a chunk or replaces its older version. Decodes it first; `isCurrent` says whether it is still wanted then. */
+  /**
+   * Decodes a chunk, then adds it or replaces its older version. `isCurrent` returns whether the
+   * chunk is still wanted after decoding.
+   */
   async set(header: MeshChunkHeader, payload: Uint8Array<ArrayBuffer>, isCurrent: () => boolean): Promise<void> {
     const geometry = await decodeMesh(header, payload);
     if (!isCurrent()) {
@@ -90,7 +93,7 @@ export class MeshLayer {
     this.planes.splice(0, this.planes.length, this.near, ...planes);
   }
 
-  /** Draws only what is at least this deep in the view of a camera, in fieldrig's convention. */
+  /** Draws only parts at or beyond this depth in the view of a camera. The pose is in fieldrig's convention. */
   setView(worldFromCamera: THREE.Matrix4, nearM: number): void {
     const forward = new THREE.Vector3().setFromMatrixColumn(worldFromCamera, 2);
     const eye = new THREE.Vector3().setFromMatrixPosition(worldFromCamera);
@@ -108,7 +111,8 @@ async function decodeMesh(header: MeshChunkHeader, payload: Uint8Array<ArrayBuff
   const copy = (begin: number, end: number): ArrayBuffer => bytes.slice(begin, end).buffer;
   const positions = new Uint16Array(copy(0, 6 * nVertices));
   const colors = bytes.slice(6 * nVertices, 9 * nVertices);
-  // Values are differences to those of the previous vertex. Typed arrays wrap around like the encoder.
+  // Values are differences from the values of the previous vertex. Typed arrays wrap around like
+  // the encoder.
   for (let ix = 3; ix < positions.length; ix++) positions[ix]! += positions[ix - 3]!;
   for (let ix = 3; ix < colors.length; ix++) colors[ix]! += colors[ix - 3]!;
   const indexBytes = copy(9 * nVertices, nExpected);

@@ -1,5 +1,5 @@
-// Reads the mesh files of robots. A bundle of its own, because it is large and many robots have no meshes. It returns plain
-// data, because it has a copy of three.js of its own.
+// Reads the mesh files of robots. This is a separate bundle, because it is large and many robots
+// have no meshes. It returns plain data, because it contains a separate copy of three.js.
 
 import { ColorManagement, type Material, Mesh, type Object3D } from "three";
 import { ColladaLoader } from "three/examples/jsm/loaders/ColladaLoader.js";
@@ -18,7 +18,7 @@ export interface MeshPart {
   positions: Float32Array;
   /** Three coordinates per vertex; null if the file has none. */
   normals: Float32Array | null;
-  /** Vertices of the triangles; null if each has three vertices of its own. */
+  /** Vertices of the triangles; null if triangles share no vertices. */
   indices: Uint32Array | null;
   colors: MeshColor[];
   /** Ranges of vertices or indices with a color; empty if there is one color. */

@@ -140,7 +140,7 @@ export class ObservationLayer {
     this.update();
   }
 
-  /** Without the depth of some keyframes, which is still being rendered, ages and uncertainties are too large. */
+  /** While the depth of some keyframes is still being rendered, ages and uncertainties are too large. */
   private get isComplete(): boolean {
     return this.nMapped >= MIN_MAPPED_FRAC * this.nAll;
   }

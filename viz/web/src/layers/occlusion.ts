@@ -1,8 +1,8 @@
-// Hides what lies behind the model: each fragment is compared with the depth of the newest picture at its own pixel, or
-// with the depth of the splats that the page draws.
+// Hides objects behind the model. Each fragment is compared with the depth of the newest picture at
+// its own pixel, or with the depth of the splats that the page draws.
 //
-// The comparison takes place in the camera of the picture. It is exact where the view and the picture agree, and close
-// to it while the next picture is pending.
+// The comparison takes place in the camera of the picture. It is exact where the view and the
+// picture agree, and nearly exact while the next picture is pending.
 
 import * as THREE from "three";
 
@@ -36,7 +36,8 @@ const FRAGMENT = /* glsl */ `
     vec2 sums = texture2D(occlusionDepth, vec2(uv.x, 1.0 - uv.y)).rg;
     return sums.g > 0.5 ? sums.r / sums.g : 0.0;
   }
-  // The smaller of two differences: the change of depth along the surface, but not the step at its edge.
+  // The smaller of two differences. It is the change of depth along the surface, without the step
+  // at its edge.
   float depthChange(float depth, float before, float after) {
     float a = before > 0.0 ? abs(before - depth) : 1e9;
     float b = after > 0.0 ? abs(after - depth) : 1e9;
@@ -59,7 +60,7 @@ const FRAGMENT = /* glsl */ `
 
 /** Depth and the camera that sees it. */
 export interface OcclusionDepth {
-  /** Depth in meters; stays the property of the caller. */
+  /** Depth in meters. The caller keeps the texture and frees it. */
   texture: THREE.Texture;
   /** Whether the texture holds sums of weighted depths and of weights instead. */
   isWeighted: boolean;

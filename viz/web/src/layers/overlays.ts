@@ -7,7 +7,10 @@ import { uprightRotation } from "../view/up_axis";
 import { type Occlusion, ON_SURFACE } from "./occlusion";
 import type { NumberedKeyframe, PosedCamera, Scene } from "../connection/protocol";
 
-/** Colors of the newest keyframe, unlike that of live cameras, and of keyframes that are much older than AGE_SECS. */
+/**
+ * Colors of the newest keyframe, and of keyframes that are much older than AGE_SECS. The first
+ * differs from the color of live cameras.
+ */
 const NEW_COLOR = new THREE.Color(0xc792ea);
 const OLD_COLOR = new THREE.Color(0x9aa4b2);
 /** The color of a keyframe of this age is halfway between both. */
@@ -15,7 +18,7 @@ const AGE_SECS = 10;
 const LIVE_COLOR = 0x4cc2a6;
 const SELECTED_COLOR = 0xe3b341;
 
-/** Length of the frustums of keyframes, at most: in a hall, longer ones would hide each other. */
+/** Maximum length of the frustums of keyframes. In a hall, longer frustums would hide each other. */
 const MAX_FRUSTUM_M = 0.2;
 
 /** A pose in the world. */
@@ -113,7 +116,7 @@ export class Overlays {
     setLines(this.selected, keyframe ? frustum(keyframe, 1.3 * this.frustumDepth) : []);
   }
 
-  /** Builds the frustums if they are visible: the list changes several times per second. */
+  /** Builds the frustums only if they are visible, because the list changes several times per second. */
   private drawKeyframes(): void {
     if (!this.keyframes.visible) return;
     const keyframes = this.posed;
@@ -133,7 +136,7 @@ export class Overlays {
     this.isLive = isLive;
   }
 
-  /** Draws live cameras the more faintly, the older their newest image is. Returns whether this is a change. */
+  /** Draws live cameras more faintly if their newest image is older. Returns whether this is a change. */
   showAges(ageMillis: (capturedMillis: number) => number): boolean {
     let isChange = false;
     for (const camera of this.live.values()) {
@@ -147,7 +150,7 @@ export class Overlays {
     return isChange;
   }
 
-  /** Removes the live cameras: a new server may have others. */
+  /** Removes the live cameras, because a new server may have others. */
   forgetLive(): void {
     for (const { lines } of this.live.values()) {
       lines.geometry.dispose();

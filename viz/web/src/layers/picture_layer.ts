@@ -13,7 +13,7 @@ import type { Occlusion } from "./occlusion";
 import type { DepthPart, PictureHeader } from "../connection/protocol";
 import type { PosedDepth } from "../view/surface_picker";
 
-/** Saturation of a picture that is not the wanted one. Its brightness stays, so that it can still be read. */
+/** Saturation of an outdated picture. Its brightness does not change, so that details remain visible. */
 const FADED_SATURATION = 0.15;
 
 const N_COLUMNS = 256;
@@ -56,7 +56,10 @@ const FRAGMENT = /* glsl */ `${TINT}${DEPTH}
   uniform mat4 worldFromPicture;
   varying vec3 pointInPicture;
 
-  /** Depth difference to the neighbor with the more similar depth, so that discontinuities do not count. */
+  /**
+   * Difference between the depth and the more similar of the neighboring depths, so that
+   * discontinuities do not count.
+   */
   float depthStep(vec2 uv, float depth, vec2 axis) {
     vec2 stepUv = axis / vec2(textureSize(depthMap, 0));
     return min(abs(depthAt(uv - stepUv) - depth), abs(depthAt(uv + stepUv) - depth));
@@ -99,7 +102,10 @@ export class PictureLayer {
   readonly mesh: THREE.Mesh<THREE.BufferGeometry, THREE.ShaderMaterial>;
   /** The depth of the shown picture. */
   posedDepth: PosedDepth | null = null;
-  /** Whether a picture may be shown; asked when it is decoded, because by then another model may be wanted. */
+  /**
+   * Whether a picture may be shown. It is called when the picture is decoded, because by then
+   * another model may be wanted.
+   */
   accepts: (header: PictureHeader) => boolean = () => true;
   private isEnabled = true;
   /** Whether the newest picture has colors. */
@@ -178,9 +184,8 @@ export class PictureLayer {
   }
 
   /**
-   * Shows a picture, unless a newer one arrives while an older one is decoded. Returns whether it did. A picture may
-   * consist of depth only.
-   */
+   * Shows a picture, unless a newer picture arrives before it is decoded. Returns whether the
+   * picture was shown. A picture may consist of depth only. /
   show(header: PictureHeader, payload: Uint8Array<ArrayBuffer>, emptyDepth: number): Promise<boolean> {
     return new Promise((resolve, reject) => {
       this.waiting?.resolve(false);

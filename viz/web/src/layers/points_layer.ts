@@ -22,7 +22,10 @@ export class PointsLayer {
     );
   }
 
-  /** Whether points are drawn. While they are not, none are kept: the server sends all of them again. */
+  /**
+   * Whether points are drawn. While they are not drawn, no points are kept. The server later sends
+   * all of them again.
+   */
   set enabled(enabled: boolean) {
     this.isEnabled = enabled;
     this.root.visible = enabled;

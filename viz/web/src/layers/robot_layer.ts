@@ -239,7 +239,7 @@ function geometryOf(shape: Exclude<RobotShape, { kind: "mesh" }>): THREE.BufferG
       return new THREE.BoxGeometry(...shape.size_m);
     case "sphere":
       return new THREE.SphereGeometry(shape.radius_m, N_SEGMENTS, N_SEGMENTS / 2);
-    // Along y in three.js, along z in URDF.
+    // Cylinders are along y in three.js, and along z in URDF.
     case "cylinder":
       return new THREE.CylinderGeometry(shape.radius_m, shape.radius_m, shape.length_m, N_SEGMENTS).rotateX(Math.PI / 2);
     case "capsule":

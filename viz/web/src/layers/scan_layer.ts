@@ -13,7 +13,7 @@ const HUES = [0.66, 0.05] as const;
 /** The latest scan of a scanner. */
 interface Scan {
   points: THREE.Points<THREE.BufferGeometry, THREE.PointsMaterial>;
-  /** Begin of the revolution, on the server's clock; null if the server does not report it. */
+  /** Start of the revolution, on the server's clock; null if the server does not report it. */
   capturedMillis: number | null;
 }
 
@@ -60,7 +60,7 @@ export class ScanLayer {
     this.scans.add(points);
   }
 
-  /** Draws scans the more faintly, the older they are. Returns whether this is a change. */
+  /** Draws older scans more faintly. Returns whether this is a change. */
   showAges(ageMillis: (capturedMillis: number) => number): boolean {
     let isChange = false;
     for (const { points, capturedMillis } of this.byScanner.values()) {

@@ -3,7 +3,7 @@
 import type { Connection } from "../connection/connection";
 import type { ErrorMessage, PictureHeader, RenderMessage } from "../connection/protocol";
 
-/** What a picture should show; the message gets its number and its view here. */
+/** A request for a picture, without its number and its view, which are added here. */
 export type PictureRequest = Omit<RenderMessage, "type" | "id" | "view" | "stages">;
 
 /** A picture as it arrived. */
@@ -51,12 +51,12 @@ export class SideView {
     this.waiting = null;
   }
 
-  /** Sends the pending request again: a new connection does not know it. */
+  /** Sends the pending request again, because a new connection does not know it. */
   restart(): void {
     if (this.waiting) this.connection.send(this.waiting.message);
   }
 
-  /** Takes a picture of this view; returns whether it was one. */
+  /** Takes a picture if it is of this view. Returns whether it was. */
   receive(header: PictureHeader, payload: Uint8Array<ArrayBuffer>): boolean {
     if (header.view !== this.name) return false;
     if (header.id === this.waiting?.message.id) {
@@ -66,7 +66,7 @@ export class SideView {
     return true;
   }
 
-  /** Takes an error of this view; returns whether it was one. */
+  /** Takes an error if it is about this view. Returns whether it was. */
   fail({ view, id, message }: ErrorMessage): boolean {
     if (view !== this.name) return false;
     if (id === this.waiting?.message.id) this.abandon(message);

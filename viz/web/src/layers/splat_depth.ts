@@ -1,5 +1,5 @@
-// Draws the depth of splats, so that they hide objects behind them: the mean depth of the splats at each pixel, weighted
-// like their colors, as on the server.
+// Draws the depth of splats, so that they hide objects behind them. The depth of a pixel is the
+// mean depth of its splats, weighted like their colors, as on the server.
 
 import * as THREE from "three";
 import { SPLAT_FRAGMENT, SPLAT_VERTEX } from "./splat_shader";
@@ -28,7 +28,7 @@ export class SplatDepth {
     this.material.dispose();
   }
 
-  /** Checks again what the GPU can draw: a lost WebGL context can draw nothing. */
+  /** Checks again whether the GPU can draw, because a lost WebGL context could not draw. */
   contextRestored(): void {
     this.isPossible = null;
   }
@@ -70,7 +70,7 @@ function isComplete(gl: WebGLRenderingContext | WebGL2RenderingContext): boolean
   return gl.checkFramebufferStatus(gl.FRAMEBUFFER) === gl.FRAMEBUFFER_COMPLETE;
 }
 
-/** Floats of 32 bits if the GPU can blend them; those of 16 bits have an error of 0.05 % per splat. */
+/** A target with 32-bit floats if the GPU can blend them. 16-bit floats have an error of 0.05 % per splat. */
 function depthTarget(renderer: THREE.WebGLRenderer): THREE.WebGLRenderTarget {
   const hasFloatBlend = renderer.extensions.has("EXT_color_buffer_float") && renderer.extensions.has("EXT_float_blend");
   return new THREE.WebGLRenderTarget(1, 1, {

@@ -18,11 +18,11 @@ export class SplatLayer {
   private readonly units = new Map<number, number[]>();
   private worker: Worker | null = null;
   private isSorting = false;
-  /** What the newest requested order is for, and whether the splats have changed since. */
+  /** View and version of the splats for which the newest order was requested. */
   private sortedFor = "";
   /** Counts the changes of the splats. */
   private nChanges = 0;
-  /** Number of changes in the order that was requested last, and in the one that was received last. */
+  /** Number of changes at the last requested order, and at the last received order. */
   private nChangesRequested = 0;
   private nChangesSorted = 0;
 

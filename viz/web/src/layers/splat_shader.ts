@@ -1,5 +1,6 @@
-// Draws a splat as a quad. The twin of trainer/src/shared/projection.wgsl and coverage.wgsl, and with CLIPS of
-// trainer/src/splat/clip.wgsl and shared/clipping.wgsl: local pictures must equal those of the server. trainer/src/splat/chunks/codec.rs encodes the splats.
+// Draws a splat as a quad. It is the twin of trainer/src/shared/projection.wgsl and coverage.wgsl
+// and, with CLIPS, of trainer/src/splat/clip.wgsl and shared/clipping.wgsl. Local pictures must
+// equal the pictures of the server. trainer/src/splat/chunks/codec.rs encodes the splats.
 
 import { TINT } from "./observation_layer";
 import { CLIP_FRAGMENT, CLIP_VERTEX } from "./splat_clip";
@@ -107,7 +108,8 @@ ${TINT}
     float yy = dot(rowY, rowY) + LOW_PASS_PX2;
 
     if (steps.w == 2.0) {
-      // The low-pass enlarges the splat; the product of opacity and area is kept (Yu et al. 2024, equation 12).
+      // The low-pass filter enlarges the splat. The opacity is reduced so that the product of
+      // opacity and area stays the same (Yu et al. 2024, equation 12).
       vec3 area = cross(rowX, rowY);
       alpha *= sqrt(dot(area, area) / (xx * yy - xy * xy));
       if (alpha < MIN_ALPHA) return;

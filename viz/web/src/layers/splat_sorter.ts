@@ -1,4 +1,4 @@
-// Sorts splats by depth, in a worker: a sort takes longer than a frame may.
+// Sorts splats by depth. It runs in a worker, because sorting takes longer than a frame.
 
 /** Splats per unit of memory, see splat_layer.ts. */
 export const UNIT_SPLATS = 128;
@@ -58,7 +58,7 @@ export class SplatSorter {
     for (const unit of units) this.counts[unit] = 0;
   }
 
-  /** Exact: two passes of a radix sort over the bits of the depths. */
+  /** Sorts exactly, with two passes of a radix sort over the bits of the depths. */
   sort({ forward, offset }: Sort): Uint32Array<ArrayBuffer> {
     const { positions } = this;
     const nAll = this.counts.reduce((sum, count) => sum + (count ?? 0), 0);
@@ -77,7 +77,8 @@ export class SplatSorter {
         n += 1;
       }
     });
-    // Positive floats sort like their bits. Inverted, the most distant come first.
+    // Positive floats sort like their bits. The bits are inverted, so that the most distant splats
+    // come first.
     for (let ix = 0; ix < n; ix++) keys[ix] = ~keys[ix]!;
     const [keysLow, slotsLow] = [new Uint32Array(n), new Uint32Array(n)];
     scatter(n, keys, slots, 0, keysLow, slotsLow);
@@ -95,7 +96,7 @@ export class SplatSorter {
   }
 }
 
-/** Sorts by 16 bits of the keys; equal ones keep their order. */
+/** Sorts by 16 bits of the keys. Equal keys keep their order. */
 function scatter(
   n: number,
   keys: Uint32Array,

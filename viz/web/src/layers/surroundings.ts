@@ -13,7 +13,7 @@ const PAUSE_MILLIS = 150;
 const MAX_TIME_FRAC = 0.25;
 /** Minimum time between two requests for the same eye while the model changes. */
 const REFRESH_MILLIS = 2000;
-/** An answer that is later than this is not waited for. */
+/** The page does not wait longer than this for an answer. */
 const TIMEOUT_MILLIS = 30_000;
 
 export class Surroundings {
@@ -21,7 +21,7 @@ export class Surroundings {
   private requestedAt = 0;
   private dueAt = 0;
   private hasUpdate = false;
-  /** Counts the calls of `forget`; answers from before are dropped. */
+  /** Counts the calls of `forget`. Answers to requests before the last call are dropped. */
   private generation = 0;
 
   constructor(

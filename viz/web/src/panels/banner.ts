@@ -1,4 +1,4 @@
-// One line across the view: why the picture is not live, or what to do.
+// One line across the view that shows why the picture is not live, or what to do.
 
 import type { ConnectionState } from "../connection/connection";
 import { element } from "./element";
@@ -34,7 +34,7 @@ export class Banner {
     return this.isResultShown || this.isSavedModel || this.guidance?.is_finished === true;
   }
 
-  /** Adopts whether the run has ended. Its result has a panel of its own. */
+  /** Adopts whether the run has ended. The result of the run has a separate panel. */
   setStatus(status: Status): void {
     this.isResultShown = status.result !== null;
     this.isSavedModel = status.source !== undefined;

@@ -4,7 +4,7 @@ import type { ConnectionState as State } from "../connection/connection";
 import { element } from "./element";
 import { setText } from "./html";
 
-/** What a state means: `hasEnded` if the program has ended as expected. */
+/** A state of the connection. `hasEnded` is set if the program has ended as expected. */
 export interface ConnectionNews {
   state: State;
   text: string;
@@ -17,7 +17,7 @@ export interface ConnectionSources {
   show: (news: ConnectionNews) => void;
   /** A new connection is open: the server may be another one. */
   restart: () => void;
-  /** The state is another one than before. */
+  /** The state has changed. */
   changed: () => void;
 }
 

@@ -24,14 +24,17 @@ export interface Direction {
   distanceM: number;
 }
 
-/** Standard deviations below this are good enough, and above that the place is hardly known. */
+/** Standard deviations below the first value are good enough. Above the second value, the place is hardly known. */
 const GOOD_SIGMA_M = 1e-3;
 const BAD_SIGMA_M = 1e-1;
-/** The same for ages. Old places count half as much as unknown ones: usually, nothing has changed there. */
+/**
+ * The same limits for ages. Old places count half as much as unknown places, because usually
+ * nothing has changed there.
+ */
 const RECENT_SECS = 30;
 const OLD_SECS = 600;
 const AGE_WEIGHT = 0.5;
-/** Places of this size compete, in radii of the scene: about what a camera sees from nearby. */
+/** Size of the compared places, in radii of the scene. It is about the area that a camera sees from nearby. */
 const PLACE_RADII = 0.12;
 /** Cells farther from the center of the scene than this, in its radii, are out of reach. */
 const REACH_RADII = 1;
@@ -62,7 +65,7 @@ function cellWeights({ header, codes }: ObservationCodes, scene: Pick<Scene, "ce
   const nCells = header.n_cells[0] * header.n_cells[1] * header.n_cells[2];
   const weights = new Float32Array(nCells);
   const sigmaWeights = table((code) => badness(decoded(header.min_sigma_m, header.log_step, code), GOOD_SIGMA_M, BAD_SIGMA_M));
-  // The ages of saved models say when they were recorded, not what has changed since then.
+  // In saved models, ages only show when places were recorded, and not what has changed since then.
   const isLive = header.newest_millis !== null;
   const ageWeights = table((code) =>
     isLive ? AGE_WEIGHT * badness(decoded(header.min_age_secs, header.log_step, code), RECENT_SECS, OLD_SECS) : 0,
@@ -132,7 +135,10 @@ function indexOfMax(values: Float32Array): number {
   return best;
 }
 
-/** The cell with a weight that is closest to the weighted mean around a cell: the mean may lie in empty space. */
+/**
+ * The cell with a weight that is closest to the weighted mean around a cell. The mean itself may
+ * lie in empty space.
+ */
 function weightedCell(weights: Float32Array, nCells: [number, number, number], center: number, reach: number): number {
   const [width, height] = nCells;
   const middle = [center % width, Math.floor(center / width) % height, Math.floor(center / (width * height))];
@@ -172,7 +178,7 @@ function heading(pose: readonly number[]): [number, number] {
   return [sign * pose[1]!, sign * pose[5]!];
 }
 
-/** Such as "turn right 40 degrees, 0.6 m up, 1.3 m away". */
+/** The direction as text, such as "turn right 40 degrees, 0.6 m up, 1.3 m away". */
 export function directionText({ rightRad, upM, distanceM }: Direction): string {
   const parts: string[] = [];
   const degrees = rightRad === null ? 0 : Math.round((rightRad * 180) / Math.PI);

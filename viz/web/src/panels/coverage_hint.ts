@@ -9,7 +9,7 @@ import { directionText, directionTo, reasonText, type WorstPlace, worstPlace } f
 import { element } from "./element";
 import { make, setText } from "./html";
 
-/** The live camera moves: its direction to the place is updated this often. */
+/** Period of updating the direction from the live camera to the place, because the camera moves. */
 const UPDATE_MILLIS = 250;
 
 /** What the hint needs from the rest of the page. */
@@ -60,7 +60,7 @@ export class CoverageHint {
     this.update();
   }
 
-  /** Forgets the map: a new connection sends another one. */
+  /** Forgets the map, because a new connection sends another one. */
   restart(): void {
     this.map = null;
     this.update();

@@ -39,7 +39,7 @@ export class EditControls {
     this.box.isEditing = isOpen;
   }
 
-  /** Forgets what a server has said: the edits of another one are no news. */
+  /** Forgets the edits of the previous server. The present edits of another server are not announced as changes. */
   restart(): void {
     this.before = null;
   }
@@ -62,7 +62,7 @@ export class EditControls {
     return true;
   }
 
-  /** Says who has changed the edits, and where they were saved. Returns whether there is a new note. */
+  /** Shows who has changed the edits, and where they were saved. Returns whether there is a new note. */
   private showNews(status: Status): boolean {
     const { edit_revision, last_edit, saved_edits } = status;
     const now: EditState = { edit_revision, last_edit, saved_edits };

@@ -1,4 +1,4 @@
-// What to say about edits that have changed since the last status.
+// Texts about edits that have changed since the last status.
 
 import type { LastEdit, SavedEdits } from "../connection/protocol";
 import { capitalized } from "./sentence";
@@ -11,14 +11,14 @@ export interface EditState {
 }
 
 export interface EditNews {
-  /** An edit of another client, for all to see. */
+  /** A message about an edit of another client. */
   toast: string | null;
-  /** The edit of this client, or the result of saving; null to keep the present note. */
+  /** A note on the edit of this client, or on the result of saving; null to keep the present note. */
   note: string | null;
   hasFailed: boolean;
 }
 
-/** What has changed between two statuses; `before` is null for the first one, which is no news. */
+/** Texts about the changes between two statuses. `before` is null for the first status, which is not announced. */
 export function editNews(before: EditState | null, now: EditState, client: number): EditNews {
   const news: EditNews = { toast: null, note: null, hasFailed: false };
   if (!before) return news;

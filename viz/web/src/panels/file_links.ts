@@ -2,7 +2,7 @@
 
 import type { FileLink } from "../connection/protocol";
 
-/** Links to files; without addresses if there is a reason why they cannot be opened. */
+/** Links to files. If there is a reason why the files cannot be opened, the links have no addresses. */
 export function fileLinks(files: readonly FileLink[], unavailable: string): HTMLAnchorElement[] {
   return files.map((file) => {
     const link = document.createElement("a");

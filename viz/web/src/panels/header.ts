@@ -1,4 +1,4 @@
-// The operator's header: which robot this is, what it does, what to do, and who else is connected.
+// The operator's header. It shows the robot, its state, the advice, and the connected clients.
 
 import type { Status } from "../connection/protocol";
 import { closesWithEscape } from "../keys";

@@ -20,7 +20,10 @@ export function descriptions(rows: readonly [string, string][]): HTMLElement {
   return list;
 }
 
-/** Shows a text. An unchanged one stays: screen readers would repeat it, and a selection would be lost. */
+/**
+ * Shows a text. An unchanged text is not set again, because screen readers would repeat it, and a
+ * selection would be lost.
+ */
 export function setText(target: Element, text: string): void {
   if (target.textContent !== text) target.textContent = text;
 }

@@ -1,4 +1,4 @@
-// What tells two robots apart: names, a color and a letter, which follow from the names.
+// Identifies robots by their names, and by a color and a letter that follow from the names.
 
 import type { Identity } from "../connection/protocol";
 

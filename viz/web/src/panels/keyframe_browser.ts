@@ -1,4 +1,5 @@
-// The keyframe browser: chooses a keyframe, compares its photograph with the model, and says what is wrong with it.
+// The keyframe browser: chooses a keyframe, compares its photograph with the model, and describes
+// its faults.
 
 import type { Connection } from "../connection/connection";
 import { KeyframePhotos } from "../connection/keyframe_photos";
@@ -82,18 +83,18 @@ export class KeyframeBrowser {
     else this.open();
   }
 
-  /** Takes a message for the browser; returns whether it was one. */
+  /** Takes a message if it is for the keyframe browser. Returns whether it was. */
   receive(header: BinaryHeader, payload: Uint8Array<ArrayBuffer>): boolean {
     if (header.type === "picture") return this.sides.some((side) => side.receive(header, payload));
     return this.photos.receive(header, payload);
   }
 
-  /** Takes an error about a message of the browser; returns whether it was one. */
+  /** Takes an error if it is about a request of the keyframe browser. Returns whether it was. */
   fail(error: ErrorMessage): boolean {
     return this.sides.some((side) => side.fail(error)) || this.photos.fail(error);
   }
 
-  /** To be called when a connection was opened: the server may be another one. */
+  /** To be called when a connection was opened, because the server may be another one. */
   restart(): void {
     this.photos.restart();
     for (const side of this.sides) side.restart();
@@ -101,7 +102,10 @@ export class KeyframeBrowser {
     this.modelChanged(true);
   }
 
-  /** To be called when the model has changed. `isOther`: it is another model, so that nothing measured is valid. */
+  /**
+   * To be called when the model has changed. If `isOther` is set, it is another model, and no
+   * measurement is valid any more.
+   */
   modelChanged(isOther: boolean): void {
     this.isOutdated = true;
     if (isOther) this.survey.forget();
@@ -151,7 +155,7 @@ export class KeyframeBrowser {
   /** Shows a keyframe, at first without images. */
   private show(keyframe: NumberedKeyframe): void {
     const isOther = !this.isShown(keyframe);
-    // A correction has moved it: the model's picture is another one now.
+    // A correction has moved the keyframe, so it needs another picture of the model.
     if (this.shown?.world_from_camera.join() !== keyframe.world_from_camera.join()) this.isOutdated = true;
     this.shown = keyframe;
     this.sources.view.overlays.select(keyframe);
@@ -165,7 +169,7 @@ export class KeyframeBrowser {
     void this.compare();
   }
 
-  /** Compares the shown keyframe. If another one is chosen meanwhile, that one is compared next. */
+  /** Compares the shown keyframe. If another keyframe is chosen meanwhile, it is compared next. */
   private async compare(): Promise<void> {
     if (this.isComparing) {
       // The request for the previous keyframe is not worth waiting for.
@@ -243,7 +247,10 @@ export class KeyframeBrowser {
     return header && poseDifference(header.reported_world_from_camera, keyframe.world_from_camera);
   }
 
-  /** The age of a keyframe: from the live image, which is on the same clock, or relative to the newest keyframe. */
+  /**
+   * The age of a keyframe. It is relative to the live image, whose stamp is on the same clock.
+   * Without a live image, it is relative to the newest keyframe.
+   */
   private age({ stamp_nanos: stampNanos }: NumberedKeyframe): { secs: number; text: string } {
     const live = this.sources.live();
     const liveMillis = live ? this.sources.connection.clock.age(live.captured_millis) : null;

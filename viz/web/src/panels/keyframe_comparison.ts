@@ -10,7 +10,10 @@ import { compareKeyframe, type KeyframeErrors } from "./keyframe_error";
 import { keyframeKey } from "./keyframe_order";
 import { reasonOf } from "./sentence";
 
-/** A photograph with its mask: by pixel, 0 where it is not used; null if all pixels are. */
+/**
+ * A photograph with its mask. The mask has one byte per pixel, 0 where the photograph is not used.
+ * It is null if all pixels are used.
+ */
 export interface DecodedPhoto {
   header: KeyframeImageHeader;
   image: ImageData;
@@ -30,7 +33,7 @@ export interface Comparison {
 /** What requests for pictures of the model have in common: the model, the clipping distances and the background. */
 export type CommonRequest = Omit<PictureRequest, "world_from_camera" | "size_px" | "projection" | "crop" | "outputs">;
 
-/** Waiting longer than this for a picture is not useful: the server is busy, for example with saving. */
+/** Maximum time to wait for a picture. If it takes longer, the server is busy, for example with saving. */
 const TIMEOUT_MILLIS = 30_000;
 
 export class KeyframeComparer {
@@ -45,7 +48,7 @@ export class KeyframeComparer {
     private readonly isUrgent: boolean,
   ) {}
 
-  /** Forgets the photograph: a new server may have another one under the same name. */
+  /** Forgets the photograph, because a new server may have another one under the same name. */
   restart(): void {
     this.last = null;
   }

@@ -1,4 +1,5 @@
-// Compares the photograph of a keyframe with the model's picture of the same view: where they differ, and how.
+// Compares the photograph of a keyframe with the model's picture of the same view. The result
+// describes where and how they differ.
 
 /** An image: sRGB, four bytes per pixel, row by row. `ImageData` is one. */
 export interface Pixels {
@@ -24,33 +25,44 @@ export interface WorstRegion {
 }
 
 export interface KeyframeErrors {
-  /** Mean difference of the color channels, 0 to 1, by pixel; -1 where there is nothing to compare. */
+  /** Mean difference of the color channels of each pixel, 0 to 1. It is -1 where the images cannot be compared. */
   map: Float32Array;
-  /** Over all compared pixels, dB. */
+  /** PSNR over all compared pixels, dB. */
   psnr: number;
   /** How much brighter the photograph is, in steps of a factor of two; null if it cannot be measured. */
   exposureEv: number | null;
-  /** Detail of the photograph relative to that of the model; null without texture. */
+  /** Detail of the photograph relative to the detail of the model's picture; null without texture. */
   detailRatio: number | null;
-  /** By how much the content of the photograph is displaced against the model, pixels; null if no shift explains the error. */
+  /**
+   * Displacement of the photograph's content relative to the model's picture, pixels. Null if no
+   * shift explains the error.
+   */
   shiftPx: [number, number] | null;
   worst: WorstRegion | null;
   /** Fraction of the photograph for which the model has no surface; null if that is unknown. */
   emptyFrac: number | null;
 }
 
-/** Values of pixels with less linear brightness are mostly noise; pixels above are overexposed. */
+/** Pixels below the first linear brightness are mostly noise. Pixels above the second are overexposed. */
 const MIN_EXPOSED = 0.01;
 const MAX_EXPOSED = 0.9;
-/** With fewer samples, a small object would decide about the exposure. */
+/** With fewer samples, a small object would determine the exposure. */
 const MIN_SAMPLES = 100;
 /** More samples take time, and do not change a median. */
 const MAX_SAMPLES = 20_000;
-/** Mean Laplacian of brightness below which a picture has no texture; noise of a good camera is below it. */
+/**
+ * Mean Laplacian of brightness below which a picture has no texture. The noise of a good camera is
+ * below this value.
+ */
 const MIN_DETAIL = 0.004;
-/** The picture is searched for the worst region in blocks of this part of a side: as large as objects on a table. */
+/**
+ * Number of blocks along a side of the picture, in which the worst region is searched. A block is
+ * about as large as an object on a table.
+ */
 const N_BLOCKS = 8;
-/** A region is worth a word if its error is this large, and this many times that of the middle block. */
+/**
+ * A region is mentioned if its error is at least the first value, and at least the second value
+ * times the median error of the blocks. /
 const MIN_REGION_ERROR = 0.1;
 const MIN_REGION_RATIO = 3;
 /** Shifts are estimated on images of at most this width, so that shifts of some pixels are below one pixel. */
@@ -58,7 +70,7 @@ const SHIFT_WIDTH_PX = 160;
 const N_SHIFT_STEPS = 4;
 /** Larger differences come from other objects than from a shift. */
 const MAX_SHIFT_ERROR = 0.25;
-/** A shift explains the error if it removes this part of its square. */
+/** A shift explains the error if it removes this fraction of the squared error. */
 const MIN_EXPLAINED_FRAC = 0.4;
 /** Smaller shifts, in pixels of the small images, are below the accuracy of the estimate. */
 const MIN_SHIFT_PX = 0.15;
@@ -103,7 +115,7 @@ export function compareKeyframe(photo: Pixels, render: Pixels, { mask, surface }
   };
 }
 
-/** 1 for each number above 0; 1 for all without numbers. */
+/** Returns 1 for each number above 0. Returns 1 for all pixels if there are no numbers. */
 function flags(nPx: number, numbers: ArrayLike<number> | null): Uint8Array {
   const made = new Uint8Array(nPx).fill(1);
   if (numbers) for (let ix = 0; ix < nPx; ix++) made[ix] = numbers[ix]! > 0 ? 1 : 0;
@@ -138,17 +150,23 @@ function linearGray({ width, height, data }: Pixels, isValid: Uint8Array): Gray 
   return { width, height, values, isValid };
 }
 
-/** Multiplies linear brightness by a factor, and makes steps about as large as they look: the root is close to sRGB. */
+/**
+ * Multiplies linear brightness by a factor, and takes the square root, which is close to sRGB.
+ * Differences are then about as large as they look.
+ */
 function encode(gray: Gray, factor: number): void {
   const { values } = gray;
   for (let ix = 0; ix < values.length; ix++) values[ix] = Math.sqrt(Math.min(1, values[ix]! * factor));
 }
 
-/** Median of the logarithm of the ratio: objects that are only in one of the images do not count. */
+/**
+ * Exposure from the median of the logarithm of the ratio. A median is not affected by objects that
+ * are only in one of the images.
+ */
 function exposure(photo: Gray, render: Gray): number | null {
   const ratios: number[] = [];
   const isExposed = (value: number): boolean => value > MIN_EXPOSED && value < MAX_EXPOSED;
-  // An odd step, so that the samples are not in a few columns.
+  // The step is odd, so that the samples are not in only a few columns.
   const step = 2 * Math.floor(photo.values.length / (2 * MAX_SAMPLES)) + 1;
   for (let ix = 0; ix < photo.values.length; ix += step) {
     const one = photo.values[ix]!;
@@ -213,7 +231,10 @@ function regionName(xFrac: number, yFrac: number): string {
   return row ? `${row} ${column}` : `${column} middle`;
 }
 
-/** Displacement of the photograph's content against the model (Lucas and Kanade 1981), on small images. */
+/**
+ * Displacement of the photograph's content relative to the model's picture, on small images (Lucas
+ * and Kanade 1981).
+ */
 function shift(photo: Gray, render: Gray): [number, number] | null {
   const scale = Math.max(1, Math.ceil(photo.width / SHIFT_WIDTH_PX));
   const [target, source] = [shrunk(photo, scale), shrunk(render, scale)];
@@ -274,7 +295,7 @@ function sample({ width, height, values, isValid }: Gray, x: number, y: number):
   return upper * (1 - down) + lower * down;
 }
 
-/** The image at `1 / scale` of its size; a pixel is valid if all pixels that it covers are. */
+/** The image at `1 / scale` of its size. A pixel is valid if all pixels that it covers are valid. */
 function shrunk({ width, height, values, isValid }: Gray, scale: number): Gray {
   const small = [Math.floor(width / scale), Math.floor(height / scale)] as const;
   const made: Gray = {

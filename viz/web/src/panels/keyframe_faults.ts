@@ -1,4 +1,4 @@
-// Says in words what is wrong with a keyframe.
+// Describes the faults of a keyframe in words.
 
 import type { KeyframeErrors } from "./keyframe_error";
 import { durationText } from "./quantities";
@@ -24,7 +24,7 @@ const BLURRED_RATIO = 0.6;
 const SMOOTH_RATIO = 2;
 /** Rotations above this, 30 degrees per second, are a likely cause of blur. */
 const FAST_TURN_RAD_S = 0.5;
-/** Steps of exposure that one sees side by side. */
+/** Minimum exposure difference that is visible side by side. */
 const MIN_EXPOSURE_EV = 0.2;
 /** Corrections that are larger than the noise of a good calibration. */
 const MIN_CORRECTION = { meters: 0.002, radians: 0.0035 };
@@ -86,7 +86,7 @@ export function correctionText({ meters, radians }: PoseDifference): string {
   return `${(1000 * meters).toFixed(1)} mm and ${degrees(radians).toFixed(2)} degrees`;
 }
 
-/** Such as "4 px to the right and 2 px up". */
+/** The shift as text, such as "4 px to the right and 2 px up". */
 function shiftText([dx, dy]: [number, number]): string {
   const part = (px: number, [negative, positive]: [string, string]): string[] =>
     Math.abs(px) < 0.5 ? [] : [`${Math.abs(px).toFixed(Math.abs(px) < 10 ? 1 : 0)} px ${px < 0 ? negative : positive}`];

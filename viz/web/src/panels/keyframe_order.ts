@@ -10,7 +10,10 @@ export function keyframeKey({ camera, stamp_nanos }: Pick<NumberedKeyframe, "cam
   return `${stamp_nanos} ${camera}`;
 }
 
-/** The keyframes, the oldest or the worst first. `psnrOf` has those that were measured; the others follow. */
+/**
+ * The keyframes, the oldest or the worst first. `psnrOf` has the PSNR of the measured keyframes.
+ * The other keyframes follow.
+ */
 export function orderedKeyframes(
   keyframes: readonly NumberedKeyframe[],
   order: KeyframeOrder,
@@ -24,9 +27,9 @@ export function orderedKeyframes(
 }
 
 /**
- * The keyframe `step` places after the shown one; the first or the last one at the ends. A keyframe that has been removed
- * in the meantime counts as between its neighbors in time.
- */
+ * The keyframe `step` places after the shown keyframe. Beyond the ends, this is the first or the
+ * last keyframe. A shown keyframe that has been removed meanwhile counts as between its neighbors
+ * in time. /
 export function neighborKeyframe(
   ordered: readonly NumberedKeyframe[],
   shown: NumberedKeyframe,
@@ -41,9 +44,8 @@ export function neighborKeyframe(
 }
 
 /**
- * The keyframe closest to a view: a distance of `radiusM` counts as much as an angle of 1 rad between the viewing
- * directions. Poses are 16 numbers, row major.
- */
+ * The keyframe closest to a view. A distance of `radiusM` counts as much as an angle of 1 rad
+ * between the viewing directions. Poses are 16 numbers, row major. /
 export function nearestKeyframe(
   keyframes: readonly NumberedKeyframe[],
   worldFromCamera: readonly number[],

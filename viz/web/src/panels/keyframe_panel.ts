@@ -98,14 +98,14 @@ export class KeyframePanel {
     this.showWhole();
   }
 
-  /** Without the other image, one is shown as a whole. */
+  /** If one of the two images is missing, the other one is shown as a whole. */
   private showWhole(): void {
     const isMissing = this.photo.width === 0 || this.render.width === 0;
     if (isMissing) this.views.dataset.missing = "";
     else delete this.views.dataset.missing;
   }
 
-  /** Shows why an image is missing; empty if none is. */
+  /** Shows why an image is missing. The text is empty if no image is missing. */
   showProblem(problem: string): void {
     this.problem.textContent = problem;
   }
@@ -117,7 +117,8 @@ export class KeyframePanel {
 
   showFacts(facts: [string, string][], faults: string[]): void {
     this.root.dataset.state = "shown";
-    // Ages are updated all the time. Elements that stay the same can be selected and copied.
+    // Ages are updated all the time. Unchanged elements are kept, so that their text can be
+    // selected and copied.
     const key = JSON.stringify([facts, faults]);
     if (key === this.shownFacts) return;
     this.shownFacts = key;

@@ -9,9 +9,9 @@ import { markRidden, rideButton } from "./ride_button";
 import type { ServerClock } from "../connection/server_clock";
 import { store, stored } from "./storage";
 
-/** Older images are not labeled live. */
+/** Images older than this are not labeled live. */
 const LIVE_MILLIS = 500;
-/** Older images are dimmed. */
+/** Images older than this are dimmed. */
 const DIM_MILLIS = 2000;
 /** Key under which the browser stores which cameras' images are in the side panel. */
 const DOCKED_KEY = "docked-cameras";
@@ -68,7 +68,7 @@ export class LiveImages {
     slot.isDecoding = false;
   }
 
-  /** Marks all images as not live: a new server has a new clock. */
+  /** Marks all images as not live, because a new server has a new clock. */
   forget(): void {
     for (const slot of this.slots.values()) slot.capturedMillis = -Infinity;
     this.showAges();
@@ -159,7 +159,7 @@ export class LiveImages {
     if (ridden === this.riddenCamera) return;
     this.riddenCamera = ridden;
     for (const [camera, { figure }] of this.slots) markRidden(figure, camera === ridden);
-    // Its images have a rate of their own from now on.
+    // From now on, its images have a separate rate.
     if (ridden !== null && !this.resized.has(ridden)) this.resized.set(ridden, false);
     this.onResize();
   }
@@ -174,7 +174,10 @@ export class LiveImages {
   }
 }
 
-/** Lets the keyboard click an element: the image, because its figure contains another button. */
+/**
+ * Lets the keyboard click an element. This is the image and not its figure, because the figure
+ * contains another button.
+ */
 function makeButton(target: HTMLElement, name: string): void {
   target.tabIndex = 0;
   target.role = "button";

@@ -10,7 +10,10 @@ import type { ViewMemory } from "../view/view_memory";
 const STORED_KEY = "named-views";
 const LOCAL_HOSTS = ["localhost", "127.0.0.1", "[::1]"];
 
-/** The rig, or else the run or model, to which views belong. Older servers do not name them. */
+/**
+ * Status with the identity to which views belong. This is the rig or, without a rig, the run or
+ * model. Older servers do not send it.
+ */
 type Identified = Status & { identity?: { rig?: string | null; run?: string | null } | undefined };
 
 export class NamedViews {
@@ -26,7 +29,7 @@ export class NamedViews {
     });
     element("copy-link").addEventListener("click", () => void this.copyLink());
     this.read();
-    // Another tab has changed the list.
+    // This event means that another tab has changed the list.
     window.addEventListener("storage", (event) => {
       if (event.key === this.key) this.read();
     });
@@ -96,7 +99,7 @@ export class NamedViews {
     return row;
   }
 
-  /** An input in place of a row: Enter or leaving it renames the view, Escape does not. */
+  /** An input in place of a row. Enter, or leaving the input, renames the view. Escape cancels. */
   private nameEditor(view: NamedView): HTMLInputElement {
     const { maxLength } = this.input;
     const input = make("input", { value: view.name, maxLength, ariaLabel: `New name of “${view.name}”` });

@@ -27,7 +27,7 @@ export function setUpPanels(entries: readonly PanelEntry[]): void {
   for (const entry of entries) {
     const [panel, button] = [element(entry.panel), element(entry.button)];
     action(entry.button, () => showOnly(panel.hidden ? entry : null));
-    // Also if the button was disabled or hidden in the meantime.
+    // Escape closes the panel even if its button was disabled or hidden in the meantime.
     closesWithEscape("panel", () => !panel.hidden, () => closePanel(panel, button, () => showOnly(null)), panel);
   }
 }

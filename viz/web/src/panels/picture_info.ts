@@ -1,4 +1,5 @@
-// Shows which model, stage and age the drawn picture has, and removes the colors of a picture that is not the wanted one.
+// Shows the model, the stage and the age of the drawn picture, and removes the colors of an
+// outdated picture.
 
 import type { ServerClock } from "../connection/server_clock";
 import type { OrbitView } from "../view/orbit_view";
@@ -52,7 +53,7 @@ export class PictureInfo {
     this.update();
   }
 
-  /** Shows the state of now. To be called for every display refresh, and after every event. */
+  /** Shows the present state. To be called for every display refresh, and after every event. */
   update(): void {
     const now = performance.now();
     this.label.show(this.view.picture.header, now);
@@ -92,7 +93,7 @@ export class PictureInfo {
     this.showStages(isComplete ? 1 : 0);
   }
 
-  /** Age of the picture, if it matters: the model has changed since, or the view has. */
+  /** Age of the picture, if the model or the view has changed since. */
   private ageMillis(header: DrawnHeader, status: PictureStatus): number | null {
     const latestStep = this.latestStep(header.method);
     const isOutdated = latestStep !== undefined && header.step !== undefined && latestStep > header.step;

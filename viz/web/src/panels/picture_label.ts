@@ -1,8 +1,10 @@
-// What the drawn picture is, and whether it is the one that was asked for. A state machine without DOM.
+// Describes the drawn picture, and determines whether it shows the wanted view and model. This is a
+// state machine without DOM.
 //
-// The view and the model that the operator wants change at any time. Each request takes what is wanted at its time. A
-// picture is current as long as nothing has changed since its request. All facts about a picture come from the header
-// that was drawn, so that a label can be late, but never describes another picture.
+// The view and the model that the operator wants change at any time. Each request is for the view
+// and model that are wanted at that time. A picture is current as long as nothing has changed since
+// its request. All facts about a picture come from the header that was drawn, so that a label can
+// be late, but never describes another picture.
 
 import type { PictureHeader } from "../connection/protocol";
 import { ageText, durationText } from "./quantities";
@@ -13,7 +15,10 @@ const OLD_MILLIS = 1000;
 /** The parts of a header that describe a picture. */
 export type DrawnHeader = Pick<PictureHeader, "id" | "method" | "step" | "scale" | "size_px" | "sent_millis">;
 
-/** `current`: it is of the wanted view and model. `old`: it is not for more than a second, or of another model. */
+/**
+ * `current`: the picture shows the wanted view and model. `waiting`: the view has changed since, or
+ * there is no picture. `old`: a complete picture of the wanted view has been missing for more than
+ * a second, or the picture shows another model. /
 export type PictureState = "current" | "waiting" | "old";
 
 export interface PictureStatus {
@@ -48,14 +53,14 @@ export class PictureLabel {
     this.firstOfModel = (this.newest ?? -1) + 1;
   }
 
-  /** A picture of what is wanted now was requested. Numbers of requests grow. */
+  /** A picture of the wanted view and model was requested. Numbers of requests grow. */
   requested(id: number, now: number): void {
     this.newest = id;
     this.firstRequestAt ??= now;
     this.outdatedAt.set(id, null);
   }
 
-  /** Whether a picture may be drawn: late stages of another model must not. */
+  /** Whether a picture may be drawn. Late stages of another model must not be drawn. */
   accepts({ id }: Pick<DrawnHeader, "id">): boolean {
     return id >= this.firstOfModel;
   }

@@ -1,4 +1,4 @@
-// Numbers as text. Units are the ones of the terminal and of the report.
+// Numbers as text, with the units of the terminal and of the report.
 
 /** A count with separators. */
 export function countText(n: number): string {
@@ -36,7 +36,7 @@ export function durationText(secs: number): string {
   return secs < 6000 ? `${Math.round(secs / 60)} min` : `${(secs / 3600).toFixed(1)} h`;
 }
 
-/** How old something is that should be live. An infinite age stands for an unknown one. */
+/** Age of data that should be live. An infinite age means that the age is unknown. */
 export function ageText(millis: number): string {
   return Number.isFinite(millis) ? `${durationText(millis / 1000)} old` : "not live";
 }

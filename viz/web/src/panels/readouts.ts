@@ -28,7 +28,10 @@ export class Readouts {
   }
 }
 
-/** What became of the images. Saved models only have a number of keyframes, and files of other programs not even that. */
+/**
+ * Shows the counts of the images. Saved models have only the number of keyframes, and files of
+ * other programs have no counts.
+ */
 function showKeyframes({ state, keyframes, rejected, images, store }: Status): void {
   const isSaved = state === "viewing";
   element("keyframes-card").hidden = isSaved && keyframes === 0;

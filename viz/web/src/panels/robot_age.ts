@@ -6,7 +6,7 @@ import type { RobotState } from "../connection/protocol";
 import type { RobotLayer } from "../layers/robot_layer";
 import type { ServerClock } from "../connection/server_clock";
 
-/** Older poses are not live. */
+/** Poses older than this are not live. */
 const LIVE_MILLIS = 500;
 
 export class RobotAge {
@@ -22,7 +22,7 @@ export class RobotAge {
     this.capturedMillis = state.captured_millis;
   }
 
-  /** A new server has a new clock. */
+  /** Forgets the age, because a new server has a new clock. */
   forget(): void {
     if (this.capturedMillis !== null) this.capturedMillis = -Infinity;
   }

@@ -1,7 +1,7 @@
-// A visible background with what is happening, in place of a view that would be black.
+// A background with a text about the state of the run, in place of a view that would be black.
 //
-// It is shown until the first picture, and while the browser has discarded what was drawn. After a reconnection, the
-// last picture stays, but gray, until a new one has arrived.
+// It is shown until the first picture, and while the browser has discarded the drawing. After a
+// reconnection, the last picture stays, but gray, until a new one has arrived.
 
 import type { ConnectionState } from "../connection/connection";
 import type { Status } from "../connection/protocol";
@@ -54,7 +54,9 @@ export class Skeleton {
     this.show();
   }
 
-  /** The shown picture is out of date until the next one: the server was away, or the browser has drawn anew. */
+  /**
+   * To be called after a reconnection, and after the browser has discarded the drawing. The shown
+   * picture is then out of date until the next one arrives. /
   awaitPicture(): void {
     this.isAwaiting = this.shown.hasPicture;
     this.show();

@@ -1,4 +1,4 @@
-// What the view says while there is no picture.
+// The text in the view while there is no picture.
 
 import type { ConnectionState } from "../connection/connection";
 import type { Status } from "../connection/protocol";
@@ -15,7 +15,7 @@ export interface Knowledge {
 export interface SkeletonText {
   title: string;
   detail: string;
-  /** Completed part of what is being done, 0 to 1; null if it is not known. */
+  /** Completed part of the present work, 0 to 1; null if it is not known. */
   doneFrac: number | null;
 }
 

@@ -29,7 +29,7 @@ export class TimePhoto {
     this.shownKey = "";
   }
 
-  /** Requests photographs until the wanted one is shown: while the slider moves, most keyframes are passed by. */
+  /** Requests photographs until the wanted one is shown. While the slider moves, most keyframes are skipped. */
   private async request(): Promise<void> {
     this.isBusy = true;
     for (let next = this.wanted; next && keyframeKey(next) !== this.shownKey; next = this.pending(next)) {
@@ -45,7 +45,7 @@ export class TimePhoto {
     this.isBusy = false;
   }
 
-  /** The wanted keyframe, if it is another one than this. */
+  /** The wanted keyframe, if it differs from the shown one. */
   private pending(shown: NumberedKeyframe): NumberedKeyframe | null {
     return this.wanted && keyframeKey(this.wanted) !== keyframeKey(shown) ? this.wanted : null;
   }

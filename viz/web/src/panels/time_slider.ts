@@ -17,7 +17,10 @@ export class TimeSlider {
   private readonly text = element("history-text");
   /** The keyframes, the oldest first. */
   private ordered: NumberedKeyframe[] = [];
-  /** Time of the oldest keyframe that the page has seen: the store of the run may have dropped it since. */
+  /**
+   * Time of the oldest keyframe that the page has received. The store of the run may have dropped
+   * this keyframe since.
+   */
   private firstNanos = Infinity;
   /** The chosen time on the clock of the rig; null while the present is shown. */
   private chosenNanos: number | null = null;
@@ -42,7 +45,10 @@ export class TimeSlider {
     return !this.panel.hidden;
   }
 
-  /** The panel was opened or closed. Both show the present: old keyframes would look like all there are. */
+  /**
+   * Called when the panel was opened or closed. In both cases, the present is shown. Otherwise, old
+   * keyframes could be taken for all keyframes.
+   */
   opened(isOpen: boolean): void {
     this.chosenNanos = null;
     this.keyframes.isBrowsed = isOpen;
@@ -60,7 +66,7 @@ export class TimeSlider {
     if (this.isOpen) this.showSlider();
   }
 
-  /** Returns to the present: these are the first keyframes, or those of another run. */
+  /** Returns to the present, because the keyframes are the first ones or belong to another run. */
   private forget(): void {
     this.firstNanos = Infinity;
     if (this.chosenNanos !== null) this.keyframes.showUntil(null);

@@ -1,6 +1,6 @@
 // Titles of elements, and why a control is disabled.
 
-/** Gives an element a title. As long as a control is disabled for a reason, its title says that instead. */
+/** Gives an element a title. While a control is disabled for a reason, its title is the reason instead. */
 export function setTitle(target: HTMLElement, title: string): void {
   // A title that is set again would appear beside the tooltip with the same text.
   if (target.dataset.title === title) return;

@@ -1,4 +1,5 @@
-// The toolbar: its buttons stay where they are when others appear, and on phones "More" shows those without a place in the bar.
+// The toolbar. Its buttons keep their places when other buttons appear. On phones, "More" shows the
+// buttons that do not fit in the bar.
 
 import { closesWithEscape } from "../keys";
 import { element } from "./element";
@@ -13,7 +14,7 @@ export function setUpToolbar(): void {
     toolbar.classList.toggle("is-open", isMore);
     more.setAttribute("aria-expanded", String(isMore));
   };
-  // Any other button has been found, or is in the bar.
+  // A click on any other button closes the list of "More".
   toolbar.addEventListener("click", (event) => {
     if (event.target instanceof Element && event.target.closest("button")) show(event.target === more && !isOpen());
   });

@@ -7,7 +7,7 @@ const HOVER_MILLIS = 400;
 const HOLD_MILLIS = 500;
 /** Time in which the mouse can move from the control to the tooltip. */
 const LEAVE_MILLIS = 150;
-/** A finger that moves farther drags. */
+/** A finger that moves farther than this is dragging. */
 const MAX_HOLD_PX = 10;
 const GAP_PX = 6;
 const MARGIN_PX = 8;
@@ -17,7 +17,7 @@ export class Tooltip {
   private owner: HTMLElement | null = null;
   private timer = 0;
   private heldAt: [x: number, y: number] | null = null;
-  /** Whether the end of the touch must not click, because it only asked for the tooltip. */
+  /** Whether the end of the touch must not cause a click, because the touch only requested the tooltip. */
   private ignoresClick = false;
 
   constructor() {

@@ -43,7 +43,7 @@ export class LiveImagesTopic implements Topic {
     private readonly changed: () => void,
   ) {}
 
-  /** Whether camera images are shown. Otherwise, they are small: their poses are still needed. */
+  /** Whether camera images are shown. If not, small images are requested, because their poses are still needed. */
   set shown(shown: boolean) {
     this.images.enabled = shown;
     this.isShown = shown;

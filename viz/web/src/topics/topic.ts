@@ -30,7 +30,7 @@ export interface Topic {
   readonly receivers: readonly Receiver[];
   /** What the page needs now. */
   subscriptions(isHidden: boolean): Subscription[];
-  /** Forgets what was received: a new connection sends everything, with the times of a new clock. */
+  /** Forgets the received data, because a new connection sends everything again, with the times of a new clock. */
   restart(isSupported: boolean): void;
 }
 
@@ -40,7 +40,10 @@ export function on<M extends Typed>(type: M["type"], receive: (message: M, paylo
 }
 
 const NO_PAYLOAD = new Uint8Array(0);
-/** While the window is being resized, subscriptions are not sent, because sizes of images depend on it. */
+/**
+ * Subscriptions are sent only after the size of the window has not changed for this time, because
+ * image sizes depend on it.
+ */
 const RESIZE_PAUSE_MILLIS = 200;
 
 export class Topics {
@@ -71,7 +74,7 @@ export class Topics {
     return topic.capability === undefined || this.connection.supportsTopic(topic.capability);
   }
 
-  /** Forgets what was received, and subscribes anew: a new connection has the server's defaults. */
+  /** Forgets the received data, and subscribes again, because a new connection has the server's defaults. */
   restart(): void {
     for (const topic of this.topics) topic.restart(this.isSupported(topic));
     this.sent.clear();

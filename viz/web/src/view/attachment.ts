@@ -10,7 +10,7 @@ import { lensDegrees, Ride } from "./ride";
 import type { RobotLayer } from "../layers/robot_layer";
 import type { SceneViews } from "./scene_views";
 
-/** After a longer pause, as much is moved as in this time. */
+/** Maximum time of one step. After a longer pause, the view moves only as far as in this time. */
 const MAX_STEP_SECS = 0.2;
 
 export class Attachment {
@@ -73,12 +73,12 @@ export class Attachment {
     this.cameras.set(camera.camera, camera);
   }
 
-  /** Forgets the cameras: a new server may have others. */
+  /** Forgets the cameras, because a new server may have others. */
   forgetCameras(): void {
     this.cameras.clear();
   }
 
-  /** Moves with the followed frame; goes behind the robot first if it is not in the picture. */
+  /** Moves with the followed frame. If the robot is not in the picture, the view first moves behind the robot. */
   startChase(isRobotVisible: boolean): void {
     this.end();
     this.chases = true;
@@ -105,7 +105,7 @@ export class Attachment {
     this.endRide();
   }
 
-  /** The user moves the view: it leaves the camera, but continues to follow the robot. */
+  /** Called when the user moves the view. The view leaves the camera, but continues to follow the robot. */
   endRide(): void {
     if (this.ownFovDegrees !== null) this.setFov(this.ownFovDegrees);
     this.ownFovDegrees = null;

@@ -3,9 +3,8 @@
 import type { Vector3 } from "three";
 
 /**
- * What stopped the eye: a surface, space that is hidden so far, or the shortest or longest distance to the target; or what
- * the robot is hidden by.
- */
+ * What stopped the eye, or what hides the robot. The eye can be stopped by a surface, by space that
+ * is not known yet, or by the shortest or longest distance to the target. /
 export type Block =
   | { by: "surface" | "unknown space"; direction: Direction }
   | { by: "near end" | "far end" | "model before robot" };

@@ -4,12 +4,18 @@ import { type Matrix4, Quaternion, Vector3 } from "three";
 import type { Viewpoint } from "./eye_guard";
 import { Follower, type Pose } from "./follower";
 
-/** An arm that scans moves its base or a slow link within these limits; pictures of a view at rest become sharp. */
+/**
+ * Motions within these limits are not followed, so that the view rests and its pictures become
+ * sharp. The base or a slow link of an arm that scans often stays within them.
+ */
 const DEAD_BAND_M = 0.02;
 const DEAD_BAND_RAD = (4 * Math.PI) / 180;
 const DAMPING_SECS = 0.25;
 
-/** The first view of a robot that was not in the picture: from behind, at this distance relative to its size. */
+/**
+ * Distance of the first view of a robot that was not in the picture, relative to its size. The
+ * robot is seen from behind.
+ */
 const BEHIND_SIZES = 2.2;
 const MIN_BEHIND_M = 0.8;
 const DOWN_RAD = (25 * Math.PI) / 180;
@@ -21,7 +27,7 @@ export class Chase {
     dampingSecs: DAMPING_SECS,
   });
 
-  /** Starts anew: the view keeps its place relative to where the frame is at the next update. */
+  /** Starts again. From the next update on, the view keeps its pose relative to the frame. */
   restart(): void {
     this.follower.forget();
   }

@@ -11,11 +11,11 @@ export type { Crop } from "./oriented_box";
 const COLOR = 0xe3b341;
 /** Color of the handle that rotates the box. */
 const YAW_COLOR = 0x6cb6ff;
-/** Opacity of a handle that is not at its place on the box, because that is out of view. */
+/** Opacity of a handle that is not at its place on the box, because this place is out of view. */
 const MOVED_OPACITY = 0.6;
 /** Radius of a handle, relative to its distance from the viewer. */
 const HANDLE_SIZE = 0.011;
-/** How far from a handle a press counts, pixels. Fingers are less precise. */
+/** Distance from a handle within which a press counts, pixels. Fingers are less precise than a mouse. */
 const REACH_PX = { mouse: 11, touch: 24 };
 /** Length of the sides before the user changes them, relative to the radius of the scene. */
 const CROP_SIDE = 1.2;
@@ -80,7 +80,7 @@ export class CropBox {
       this.root.add(mesh);
     }
     this.place();
-    // Before the orbit controls, which listen on the same element.
+    // This listener is added before the orbit controls, which listen on the same element.
     canvas.addEventListener("pointerdown", (event) => this.begin(event), { capture: true });
     canvas.addEventListener("pointermove", (event) => this.drag(event), { capture: true });
     for (const kind of ["pointerup", "pointercancel"] as const) {

@@ -1,12 +1,12 @@
 // Cuts away the part of the model between the eye and its target, so that a wall does not hide it.
 
-/** Without a wall that has stopped the eye, the cut leaves this fraction of the distance, or of the scene's radius. */
+/** If no wall has stopped the eye, the cut leaves this fraction of the distance or of the scene's radius. */
 const KEPT_FRAC = 0.5;
-/** With one, it leaves this fraction of the distance from the target to the wall. */
+/** If a wall has stopped the eye, the cut leaves this fraction of the distance from the target to the wall. */
 const KEPT_BEFORE_WALL_FRAC = 0.8;
 
 export class Cut {
-  /** What is in front of the target by more than this is cut away, meters; null without a cut. */
+  /** Parts of the model that are in front of the target by more than this are cut away, meters. Null without a cut. */
   private keptM: number | null = null;
 
   get isOn(): boolean {
@@ -27,7 +27,10 @@ export class Cut {
     this.keptM = null;
   }
 
-  /** Depth at which the model begins if the target is at this distance: at least that of the near plane, meters. */
+  /**
+   * Depth at which the model begins if the target is at this distance, meters. It is at least the
+   * depth of the near plane.
+   */
   depthM(distanceM: number, nearM: number): number {
     return this.keptM === null ? nearM : Math.max(nearM, distanceM - this.keptM);
   }

@@ -1,9 +1,10 @@
 // Keeps the eye in front of the surfaces of the model.
 //
-// A motion ends before a surface that is known from a picture or from the mesh. A surface that was not known during the
-// motion appears in a later picture, between the new eye and the places where it was before: the eye then returns.
-// What a surface hides is unknown space. If the surroundings of the eye are known, it waits at the edge of that space for
-// newer ones.
+// A motion ends before a surface that is known from a picture or from the mesh. A surface that was
+// not known during the motion may appear in a later picture, between the new and the earlier
+// positions of the eye. The eye then returns. Space behind a surface is unknown. If the
+// surroundings of the eye are known, the eye stops at the edge of unknown space until newer
+// surroundings arrive.
 
 import { Vector3 } from "three";
 import type { DepthMap } from "../layers/depth_map";
@@ -13,13 +14,19 @@ const MARGIN_NEARS = 3;
 /** Length of the steps along a motion, in margins. */
 const STEP_MARGINS = 0.25;
 const MAX_STEPS = 800;
-/** A step to a greater depth behind a surface, in margins, passed its edge instead of the surface. */
+/**
+ * If a step leads to a greater depth behind a surface than this, in margins, the eye has passed the
+ * edge of the surface and not the surface itself.
+ */
 const MAX_DEPTH_MARGINS = 4;
-/** The eye is inside an object if most of what it sees is closer than this, in margins. Corners are not as close. */
+/**
+ * The eye is inside an object if most visible surfaces are closer than this, in margins. Surfaces
+ * at a corner of a room are not as close.
+ */
 const INSIDE_MARGINS = 0.7;
 const MAX_TRAIL = 2000;
 
-/** The eye keeps these points, in margins around it, in front of surfaces. */
+/** Points around the eye, in margins, that must stay in front of surfaces. */
 const BALL = [0, 1, 2].flatMap((axis) => [-1, 1].map((sign) => new Vector3().setComponent(axis, sign)));
 
 /** An eye, and the point it looked at. */
@@ -28,17 +35,20 @@ export interface Viewpoint {
   target: Vector3;
 }
 
-/** The first surface of the mesh on a way: distance along it and normal, or null. */
+/** The first surface of the mesh on a path: distance along the path and normal, or null. */
 export type HitMesh = (from: Vector3, direction: Vector3, maxM: number) => { distance: number; normal: Vector3 } | null;
 
 export class EyeGuard {
   /** Distance of the near plane, meters. */
   nearM = 0.01;
   private readonly maps = new Map<string, DepthMap>();
-  /** The places of the eye since the last one that is known to be good; the first is that one, if there is any. */
+  /**
+   * The positions of the eye since the last position that is known to be good. The first entry is
+   * this good position, if there is one.
+   */
   private trail: Viewpoint[] = [];
   private hasGood = false;
-  /** Whether maps of all directions arrive. Others do not show whether the eye has passed a surface beside it. */
+  /** Whether maps of all directions arrive. Other maps do not show whether the eye has passed a surface beside it. */
   private hasComplete = false;
   /** Whether the last motion that was limited ended at a surface, and not at the edge of unknown space. */
   isStoppedBySurface = false;
@@ -49,7 +59,7 @@ export class EyeGuard {
     return MARGIN_NEARS * this.nearM;
   }
 
-  /** Starts at a place that the eye has not moved to; `isGood` if it is known to be in front of all surfaces. */
+  /** Starts at a new position after a jump. `isGood` is set if the position is known to be in front of all surfaces. */
   jump(viewpoint: Viewpoint, isGood: boolean): void {
     this.trail = [copy(viewpoint)];
     this.hasGood = isGood;
@@ -68,13 +78,16 @@ export class EyeGuard {
     this.hasComplete = false;
   }
 
-  /** There are no surfaces within this distance of the eye, meters; negative if that is not known. */
+  /** Radius around the eye without surfaces, meters; negative if it is not known. */
   freeRadiusM(eye: Vector3): number {
     const radii = [...this.maps.values()].map((map) => map.nearestM - map.origin.distanceTo(eye));
     return Math.max(-Infinity, ...radii);
   }
 
-  /** The last place of the eye on the way to another one; `slides` continues along a surface. */
+  /**
+   * The last allowed position of the eye on the path to another position. If `slides` is set, the
+   * motion continues along a surface.
+   */
   limit(to: Vector3, slides: boolean): Vector3 {
     const from = this.trail.at(-1)?.eye;
     if (!from || from.equals(to)) return to;
@@ -89,7 +102,8 @@ export class EyeGuard {
   /** Records where the eye is. */
   moved(viewpoint: Viewpoint): void {
     this.trail.push(copy(viewpoint));
-    // Beyond this length, the oldest places are given up, and the oldest that remains is returned to.
+    // Beyond this length, the oldest positions are removed. The eye then returns to the oldest
+    // position that remains.
     if (this.trail.length > MAX_TRAIL) this.trail.splice(0, MAX_TRAIL / 2);
   }
 
@@ -128,7 +142,8 @@ export class EyeGuard {
     for (let step = 1; step <= n; step++) {
       const next = from.clone().addScaledVector(motion, step / n);
       if (hit && (length * step) / n > hit.distance - margin) return { eye, normal: hit.normal, isSurface: true };
-      // Out of unknown space, there is a way back to where the surroundings were seen from.
+      // From unknown space, the eye can move back toward the point from which the surroundings were
+      // seen.
       const isBack = !wasKnown && complete && next.distanceTo(complete.origin) < eye.distanceTo(complete.origin);
       if (complete && !isBack && !this.isKnown(next)) return { eye, normal: null, isSurface: false };
       for (const { map, minM } of maps) {
@@ -147,7 +162,7 @@ export class EyeGuard {
     });
   }
 
-  /** Minimum clearance of points around the eye; those that are hidden are left out. */
+  /** Minimum clearance of the points around the eye. Hidden points are left out. */
   private clearanceOfBall(map: DepthMap, eye: Vector3): number {
     const clearances = BALL.map((point) => map.clearance(point.clone().multiplyScalar(this.marginM).add(eye)));
     return Math.min(...clearances.filter((clearance) => clearance > -MAX_DEPTH_MARGINS * this.marginM));
@@ -164,7 +179,7 @@ export class EyeGuard {
     return normal.length() > 0 ? normal.normalize() : null;
   }
 
-  /** Whether a way that begins at the origin of a map passes one of its surfaces. */
+  /** Whether a path that begins at the origin of a map passes one of its surfaces. */
   private isCrossed(map: DepthMap, way: Viewpoint[]): boolean {
     const margin = this.marginM;
     return way.some(({ eye }, ix) => {

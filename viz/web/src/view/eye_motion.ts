@@ -1,4 +1,5 @@
-// Moves the eye and the point that it orbits: motions by the user end before surfaces, jumps do not.
+// Moves the eye and the point that it orbits. Motions by the user end before surfaces, but jumps do
+// not.
 
 import * as THREE from "three";
 import type { OrbitControls } from "three/examples/jsm/controls/OrbitControls.js";
@@ -8,9 +9,12 @@ import { EyeGuard, type HitMesh, type Viewpoint } from "./eye_guard";
 
 /** Duration of the motion back to the front of a surface. */
 const RETURN_MILLIS = 250;
-/** After the eye has come closer to its target or was stopped, it may soon be at a surface, for this long. */
+/** Time for which the eye may soon be at a surface, after it has come closer to its target or was stopped. */
 const APPROACH_MILLIS = 1000;
-/** An orbit changes the distance to the target by rounding errors; an approach to less than this part of it. */
+/**
+ * An orbit changes the distance to the target only by rounding errors. An approach reduces it to
+ * less than this fraction.
+ */
 const MIN_APPROACH = 1 - 1e-6;
 /** The zoom is at its end within this fraction of the distance. */
 const END_FRAC = 0.999;
@@ -59,7 +63,7 @@ export class EyeMotion {
     return performance.now() - this.stoppedAt < APPROACH_MILLIS;
   }
 
-  /** There are no surfaces within this distance of the eye, meters; negative if that is not known. */
+  /** Radius around the eye without surfaces, meters; negative if it is not known. */
   get freeRadiusM(): number {
     return this.guard.freeRadiusM(this.camera.position);
   }
@@ -81,13 +85,13 @@ export class EyeMotion {
     this.guard.forgetComplete();
   }
 
-  /** Starts anew where the eye is: whether surfaces stop it has changed. */
+  /** Starts again at the present position, because surfaces now stop the eye, or no longer stop it. */
   forgetPlaces(): void {
     this.returning = null;
     this.guard.jump(this.viewpoint, false);
   }
 
-  /** Notices that the wheel cannot move the eye any further. */
+  /** Records that the wheel cannot move the eye any further. */
   private checkZoom(deltaY: number): void {
     const { enabled, minDistance, maxDistance } = this.controls;
     const distanceM = this.camera.position.distanceTo(this.controls.target);
@@ -97,7 +101,7 @@ export class EyeMotion {
     this.block = { what: { by: isAtFarEnd ? "far end" : "near end" }, at: performance.now() };
   }
 
-  /** Called after each motion by the user: stops before surfaces. */
+  /** Called after each motion by the user. Stops the eye before surfaces. */
   moved(): void {
     if (this.isPlacing) return;
     const { position } = this.camera;
@@ -137,7 +141,7 @@ export class EyeMotion {
     this.guard.jump(this.viewpoint, false);
   }
 
-  /** Adopts a pose that need not be upright; it lasts until the next motion. The camera looks at the target. */
+  /** Adopts a pose that need not be upright. It is kept until the next motion. The camera looks at the target. */
   attach(pose: { eye: THREE.Vector3; target: THREE.Vector3; rotation: THREE.Quaternion }): void {
     this.returning = null;
     this.camera.position.copy(pose.eye);

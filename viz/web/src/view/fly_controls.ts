@@ -1,4 +1,5 @@
-// Flies: keys move the eye, dragging turns the view. On touch screens, the left thumb moves and the right one turns.
+// Flying: keys move the eye, and dragging turns the view. On touch screens, the left thumb moves
+// the eye, and the right thumb turns the view.
 
 import * as THREE from "three";
 import { isKeptByFocus, isPageCovered } from "../keys";
@@ -9,16 +10,16 @@ import { uprightRotation } from "./up_axis";
 /** Speed in radii of the scene per second, and the factor of the Shift key. */
 const SPEED = 0.6;
 const FAST = 4;
-/** The speed approaches that of the keys with this time constant. */
+/** The speed approaches the speed that the keys request with this time constant. */
 const SMOOTHING_SECS = 0.08;
-/** Slower motions end. */
+/** Motions slower than this end. */
 const MIN_SPEED = 1e-3;
-/** After a longer pause, as much is flown as in this time. */
+/** Maximum time of one step. After a longer pause, the eye moves only as far as in this time. */
 const MAX_STEP_SECS = 0.2;
 /** A turn of the view per pixel, relative to the angle between two pixels. */
 const LOOK_SCALE = 1.5;
 const MAX_PITCH = 1.55;
-/** Full speed at this distance of the thumb from where it was put down. */
+/** Distance of the thumb from its first position at which the speed is full. */
 const STICK_PX = 60;
 /** Fraction of the scene's radius that a notch of the wheel moves. */
 const WHEEL_FRAC = 0.06;
@@ -47,7 +48,7 @@ export class FlyControls {
     private readonly canvas: HTMLCanvasElement,
     private readonly moved: () => void,
   ) {
-    // Before the keys of the buttons.
+    // This listener runs before the listener for the keys of buttons.
     window.addEventListener("keydown", (event) => this.press(event), { capture: true });
     window.addEventListener("keyup", (event) => this.keys.delete(event.code), { capture: true });
     window.addEventListener("blur", () => this.release());

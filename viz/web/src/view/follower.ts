@@ -3,14 +3,17 @@
 import type { Quaternion, Vector3 } from "three";
 
 export interface FollowerOptions {
-  /** Motions within these limits are not followed: the picture can become sharp meanwhile. */
+  /** Motions within these limits are not followed, so that the picture can become sharp meanwhile. */
   deadBandM: number;
   deadBandRad: number;
   /** The distance to the pose decays with this time constant. */
   dampingSecs: number;
 }
 
-/** Closer than this fraction of the dead band, the pose is reached, and the motion ends, although the pose is noisy. */
+/**
+ * The motion ends when the pose is closer than this fraction of the dead band, because a noisy pose
+ * is never reached exactly.
+ */
 const REACHED_FRAC = 0.04;
 
 export interface Pose {
@@ -19,7 +22,7 @@ export interface Pose {
 }
 
 export class Follower {
-  /** Where it is; null before the first pose. */
+  /** The present pose; null before the first pose. */
   pose: Pose | null = null;
   private isMoving = false;
 

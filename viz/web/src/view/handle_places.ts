@@ -1,4 +1,5 @@
-// Where the handles of a box appear on the screen: each can be reached, even if its place on the box is out of view.
+// Places the handles of a box on the screen. Each handle can be reached, even if its place on the
+// box is out of view.
 
 export interface Point {
   x: number;
@@ -14,7 +15,7 @@ export interface Rect {
 
 /** A handle's place on the box, projected to the view. */
 export interface Anchor extends Point {
-  /** Whether it is behind the viewer; then `x` and `y` only tell the direction from the middle of the view. */
+  /** Whether it is behind the viewer. In this case, `x` and `y` only have the direction from the middle of the view. */
   isBehind: boolean;
 }
 

@@ -2,7 +2,10 @@
 
 import { type Box3, Vector3 } from "three";
 
-/** Surfaces that are closer to a point of the robot than this, meters, may be the robot's own, or what it stands on. */
+/**
+ * Surfaces that are closer to a point of the robot than this, meters, may belong to the robot, or
+ * to the floor or table below it.
+ */
 const MARGIN_M = 0.05;
 
 /** Distance of the box from the eye if surfaces hide its center and the middles of its sides; otherwise null. */

@@ -1,4 +1,4 @@
-// Where the label of a measured line appears on the screen: beside the line, off its points.
+// Places the label of a measured line on the screen, beside the line and away from its points.
 
 import type { Point, Rect } from "./handle_places";
 
@@ -14,7 +14,7 @@ export function placeLabel(
 ): Point {
   const middle = { x: 0.5 * (from.x + to.x), y: 0.5 * (from.y + to.y) };
   const length = Math.hypot(to.x - from.x, to.y - from.y);
-  // Across the line, or upward if its direction is undefined.
+  // The label is moved across the line, or upward if the direction of the line is undefined.
   const across = length > 0 ? { x: (from.y - to.y) / length, y: (to.x - from.x) / length } : { x: 0, y: -1 };
   const away = 0.5 * (Math.abs(across.x) * size.width + Math.abs(across.y) * size.height) + GAP_PX;
   const halfWidth = 0.5 * Math.abs(to.x - from.x) + 0.5 * size.width + GAP_PX;

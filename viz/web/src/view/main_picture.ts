@@ -1,4 +1,4 @@
-// Receives the pictures of the main view, and says why one is missing.
+// Receives the pictures of the main view, and shows why a picture is missing.
 
 import type { PictureHeader } from "../connection/protocol";
 import type { RenderScheduler } from "../connection/render_scheduler";
@@ -45,7 +45,7 @@ export class MainPicture {
     if (header.color) info.drawn(millis);
   }
 
-  /** A requested picture will not arrive. */
+  /** Called when a requested picture will not arrive. */
   failed(id: number | null, reason: string): void {
     this.parts.scheduler.failed(id);
     setText(this.notice, reason);

@@ -29,7 +29,7 @@ export class MeasureTool {
   private readonly hint = element("measure-hint");
   private readonly labels = element("distances");
   private readonly sphere = new THREE.SphereGeometry(1, 16, 12);
-  // Always visible, like the handles of the crop box.
+  // The material is always visible, like the handles of the crop box.
   private readonly pointMaterial = new THREE.MeshBasicMaterial({ color: COLOR, depthTest: false, transparent: true });
   private readonly lineMaterial = new THREE.LineBasicMaterial({ color: COLOR, depthTest: false, transparent: true });
   private readonly measurements: Measurement[] = [];
@@ -48,7 +48,7 @@ export class MeasureTool {
       this.pressed = event.isPrimary && event.button === 0 ? [event.offsetX, event.offsetY] : null;
     });
     canvas.addEventListener("pointerup", (event) => this.release(event));
-    // Before other listeners, so that Delete has only one effect.
+    // This listener runs before other listeners, so that Delete has only one effect.
     window.addEventListener("keydown", (event) => this.keyDown(event), { capture: true });
   }
 

@@ -9,10 +9,10 @@ export interface NamedView {
 }
 
 export const MAX_NAME_LENGTH = 60;
-/** Browsers store a few megabytes for a page. */
+/** Maximum number of views, because browsers store only a few megabytes for a page. */
 export const MAX_NAMED_VIEWS = 100;
 
-/** Reads a stored list. Leaves out what is damaged, and what another program may have written there. */
+/** Reads a stored list. Leaves out entries that are damaged or have another format. */
 export function namedViewsIn(stored: string | null): NamedView[] {
   let list: unknown;
   try {
@@ -34,7 +34,7 @@ export function withView(views: readonly NamedView[], view: NamedView): NamedVie
   return views.length < MAX_NAMED_VIEWS ? [...views, named] : null;
 }
 
-/** The list with another name for a view; null if the name is empty or taken. */
+/** The list with another name for a view; null if the name is empty or in use. */
 export function renamed(views: readonly NamedView[], from: string, to: string): NamedView[] | null {
   const name = tidied(to);
   const isTaken = views.some((view) => view.name === name && name !== from);

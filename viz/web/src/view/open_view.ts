@@ -1,4 +1,4 @@
-// Opens the view, and says why that is not possible.
+// Opens the view, or shows why this is not possible.
 
 import type { ServerClock } from "../connection/server_clock";
 import type { Banner } from "../panels/banner";

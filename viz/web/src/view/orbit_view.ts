@@ -1,4 +1,5 @@
-// The main view: free camera that orbits or flies, newest picture, lines on top.
+// The main view. A free camera orbits or flies. The newest picture is drawn first, and lines are
+// drawn over it.
 
 import * as THREE from "three";
 import { OrbitControls } from "three/examples/jsm/controls/OrbitControls.js";
@@ -35,9 +36,12 @@ import { turnControls } from "./up_axis";
 import { listenToViewKeys } from "./view_keys";
 
 const VERTICAL_FOV_DEGREES = 50;
-/** Closer to surfaces than this, in sizes of details, new surroundings of the eye are needed: older ones are too coarse. */
+/**
+ * If the eye is closer to surfaces than this, in sizes of details, new surroundings are needed,
+ * because older ones are too coarse.
+ */
 const NEAR_SHARE = 1 / 2;
-/** A wall that has stopped the eye within this time is what the cut is for. */
+/** A cut removes the wall that has stopped the eye within this time. */
 const CUT_WALL_MILLIS = 10_000;
 /** The color --ground in app.css. */
 export const BACKGROUND: [number, number, number] = [0x0b / 255, 0x0e / 255, 0x13 / 255];
@@ -72,7 +76,7 @@ export class OrbitView {
   maxPictureWidthPx = 1280;
   /** Where to draw the arrow to the robot; null while the robot is in the picture. */
   arrow: ArrowPlace | null = null;
-  /** Until then, the view shows everything, or the first view of an older server. */
+  /** Until the user has moved the view, it shows everything, or the first view of an older server. */
   private hasUserMoved = false;
   private hasAskedForOverview = false;
   /** Distance of the robot from the eye of the overview if the model hides it, meters; otherwise null. */
@@ -293,7 +297,8 @@ export class OrbitView {
     if (flies) this.attachment.end();
     this.fly.enabled = flies;
     this.controls.enabled = !flies;
-    // Both look at the target, which is where the surface is, so that an orbit begins without a jump.
+    // When flying begins or ends, the target is placed on the surface ahead, so that an orbit
+    // begins without a jump.
     const ahead = this.surface.ahead();
     const { position } = this.camera;
     const distance = ahead?.distanceTo(position) ?? this.controls.target.distanceTo(position);
@@ -442,7 +447,10 @@ export class OrbitView {
     this.isStale = true;
   }
 
-  /** Draws only if something has changed: on a robot's computer the page shares the cores with other programs. */
+  /**
+   * Draws only if something has changed, because the page shares the cores of a robot's computer
+   * with other programs.
+   */
   draw(): void {
     this.fly.update();
     this.motion.moveBack();

@@ -1,4 +1,4 @@
-// Views of everything: from where the bounds of the scene, the robot and its path fill the picture.
+// Views of everything, in which the bounds of the scene, the robot and its path fill the picture.
 
 import { Box3, type Matrix4, Vector3 } from "three";
 import type { Scene } from "../connection/protocol";
@@ -9,9 +9,9 @@ import { uprightRotation } from "./up_axis";
 /** The overview looks down by this angle, and past the right side of the robot, which would hide the scene. */
 const DOWN_RAD = (35 * Math.PI) / 180;
 const LEFT_RAD = (25 * Math.PI) / 180;
-/** Fraction of the picture that is filled: beside it are toolbars and camera images. */
+/** Fraction of the picture that is filled. The rest is for toolbars and camera images. */
 const FILLED_FRAC = 0.86;
-/** Half the side of the bounds relative to the radius of the scene, if only that is known. */
+/** Half the side of the bounds relative to the radius of the scene, if only the radius is known. */
 const SIDE_PER_RADIUS = 0.75;
 /** The overview is adapted when something lies outside of it by more than this fraction of its diagonal. */
 const SLACK_FRAC = 0.05;
@@ -39,7 +39,10 @@ export function headingOfBase(worldFromBase: Matrix4): number {
   return Math.atan2(front.y, front.x);
 }
 
-/** Heading of a camera: where it looks or, if that is almost vertical, where the upper edge of its image is. */
+/**
+ * Heading of a camera. This is its viewing direction or, if this direction is almost vertical, the
+ * direction of the upper edge of its image.
+ */
 export function headingOfCamera(rowMajor: number[]): number {
   const pose = worldFromCamera(rowMajor);
   const forward = new Vector3().setFromMatrixColumn(pose, 2);
@@ -59,16 +62,16 @@ export function topDirection(): Vector3 {
   return new Vector3(0, 1e-3, -1).normalize();
 }
 
-/** The direction of a view of the front: of the robot or, without one, along y, as is usual for z-up models. */
+/** The direction of a view of the front of the robot. Without a robot, it is along y, as is usual for z-up models. */
 export function frontDirection(robotHeadingRad: number | null): Vector3 {
   if (robotHeadingRad === null) return new Vector3(0, 1, 0);
   return new Vector3(-Math.cos(robotHeadingRad), -Math.sin(robotHeadingRad), 0);
 }
 
 /**
- * The closest viewpoint from which all points are in the picture. The direction is given for a world that is z up; if
- * another direction points up, it turns with it. The target is amid the points.
- */
+ * The closest viewpoint from which all points are in the picture. The direction is given for a
+ * world that is z up. If another direction points up, the given direction is rotated accordingly.
+ * The target is in the middle of the points. /
 export function viewOf(points: Vector3[], direction: Vector3, { fovDegrees, aspect, up: upInWorld }: Lens): Viewpoint {
   const forward = direction.clone().normalize().applyQuaternion(uprightRotation(upInWorld));
   const right = forward.clone().cross(upInWorld).normalize();
@@ -93,7 +96,7 @@ function fit(places: number[], depths: number[], tangent: number): { depth: numb
   return { depth: (high - low) / (2 * tangent), middle: 0.5 * (low + high) };
 }
 
-/** The corners of boxes; empty ones have none. */
+/** The corners of boxes. Empty boxes have no corners. */
 export function cornersOf(boxes: Box3[]): Vector3[] {
   return boxes
     .filter((box) => !box.isEmpty())
@@ -102,7 +105,7 @@ export function cornersOf(boxes: Box3[]): Vector3[] {
     );
 }
 
-/** Whether something has grown out of what the overview shows. */
+/** Whether the content has grown beyond the part that the overview shows. */
 export function outgrows(content: Box3, shown: Box3): boolean {
   if (content.isEmpty()) return false;
   if (shown.isEmpty()) return true;

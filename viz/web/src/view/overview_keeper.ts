@@ -1,4 +1,4 @@
-// Keeps the overview: adapts it when the scene, the robot or its path have grown out of the picture.
+// Adapts the overview when the scene, the robot or its path have grown out of the picture.
 
 import { Box3 } from "three";
 import type { Viewpoint } from "./eye_guard";
@@ -34,7 +34,7 @@ export class OverviewKeeper {
     // A robot that turns does not turn the view.
     if (isFirstRobot) this.heading = heading;
     this.heading ??= heading;
-    // The overview only grows: an arm that moves to and fro must not move it each time.
+    // The overview only grows, so that an arm that moves back and forth does not move it each time.
     this.shown.union(content);
     return viewOf(cornersOf([...boxes, this.shown]), overviewDirection(this.heading.rad, this.heading.isRobot), lens);
   }

@@ -4,7 +4,7 @@ import { FRAMES_PER_SEC, type PathView } from "./camera_path";
 import { decodeJpeg } from "../layers/jpeg";
 import type { PictureRequest, SidePicture, SideView } from "../layers/side_view";
 
-/** What the worker gets; it answers each message before the next one is sent. */
+/** Messages to the worker. The worker answers each message before the next one is sent. */
 export type ToVideoWorker =
   | { kind: "begin"; sizePx: [number, number]; frameRate: number }
   | { kind: "frame"; bitmap: ImageBitmap }
@@ -42,7 +42,7 @@ export class PathVideo {
     this.fail(new Error("cancelled"));
   }
 
-  /** The video as an MP4 file; null if it was cancelled. */
+  /** The video as an MP4 file; null if it was canceled. */
   async record(
     frames: PathView[],
     [width, height]: [number, number],
@@ -74,7 +74,7 @@ export class PathVideo {
     }
   }
 
-  /** Throws if the recording of a worker was cancelled, maybe in favor of another one. */
+  /** Throws if the recording of this worker was canceled, even if another recording has begun. */
   private checkIsCurrent(worker: Worker): void {
     if (this.worker !== worker) throw new Error("cancelled");
   }

@@ -1,8 +1,9 @@
-// What the page remembers of its view, as a short text for links and for the storage of the browser.
+// The state of the view as a short text, for links and for the storage of the browser.
 //
-// The text may come from a link that somebody else has written. Reading it never fails: every number, name and list is
-// bounded, and a part that is malformed is left out. The text only has characters that need no escapes in an address,
-// and that chat programs keep when they recognize a link: letters, digits, `-`, `.`, `_` and `~`.
+// The text may come from a link that somebody else has written. Reading it never fails. Every
+// number, name and list is limited, and malformed parts are left out. The text only has characters
+// that need no escapes in an address, and that chat programs keep when they recognize a link:
+// letters, digits, `-`, `.`, `_` and `~`.
 
 import { isViewMode, type ViewMode, type ViewState } from "./view_state";
 
@@ -43,14 +44,14 @@ const PARAMETER = "view";
 const VERSION = "1";
 const MAX_TEXT_LENGTH = 8192;
 const MAX_SWITCHES = 64;
-/** More views make a link too long for some programs. */
+/** Maximum number of views, because a link with more views is too long for some programs. */
 export const MAX_PATH_VIEWS = 64;
-/** Farther away, single-precision numbers of the graphics card are too coarse. */
+/** Maximum coordinate, meters. Beyond it, single-precision numbers of the GPU are too coarse. */
 const MAX_COORDINATE_M = 1e5;
 const MIN_FOV_DEGREES = 1;
 const MAX_FOV_DEGREES = 150;
 const MIN_VIEW_DISTANCE_M = 1e-5;
-/** A micrometer: a view that is restored after a reload must not differ visibly. */
+/** Views are rounded to a micrometer, because a view that is restored after a reload must not differ visibly. */
 const VIEW_DECIMALS = 6;
 /** Paths are long, so their views are rounded to a tenth of a millimeter. */
 const PATH_DECIMALS = 4;
@@ -62,7 +63,7 @@ const METHOD = /^[a-z0-9_-]{1,32}$/;
 /** Names of links and cameras with other characters are left out. */
 const FRAME = /^[\w.-]{1,64}$/;
 const UPRIGHT: Point = [0, 0, 1];
-/** Most views orbit, so their texts do not say it. */
+/** Most views orbit, so their texts do not contain the mode. */
 const DEFAULT_MODE: ViewMode = "orbit";
 
 /** Text for [`decoded`]. */
@@ -109,12 +110,12 @@ export function textInFragment(fragment: string): string | null {
   return new URLSearchParams(fragment.slice(1)).get(PARAMETER);
 }
 
-/** A fragment with nothing but this text: in particular, without a token. */
+/** A fragment with only this text, and in particular without a token. */
 export function fragmentWith(text: string): string {
   return `#${PARAMETER}=${text}`;
 }
 
-/** The fragment without anything but the view, which is made of harmless characters. */
+/** The fragment with only the view, whose text needs no escapes. */
 export function onlyView(fragment: string): string {
   const remembered = decoded(textInFragment(fragment) ?? "");
   return remembered ? fragmentWith(encoded(remembered)) : "";
@@ -155,7 +156,7 @@ function pathNumbers({ position, target, fovDegrees }: RememberedPathView): numb
   return [...position, ...target, fovDegrees];
 }
 
-/** The views of a path; none if any of them is missing or invalid, because the rest would be another path. */
+/** The views of a path. If any view is missing or invalid, there are none, because the rest would be another path. */
 function pathOf(text: string): RememberedPathView[] {
   const [count = ""] = text.split("_", 1);
   const nViews = /^\d{1,2}$/.test(count) ? Number(count) : 0;
@@ -187,7 +188,7 @@ function pointOf(text: string): Point | null {
   return numbersOf(text, 3) as Point | null;
 }
 
-/** Exactly `n` numbers; null if the text has others. */
+/** Exactly `n` numbers; null if the text has more, fewer or invalid numbers. */
 function numbersOf(text: string, n: number): number[] | null {
   const words = text.split("_");
   if (words.length !== n || !words.every((word) => NUMBER.test(word))) return null;

@@ -1,4 +1,5 @@
-// Attaches the view to a camera of the robot: its pose, including its roll, and its lens.
+// Attaches the view to a camera of the robot. The view follows the pose of the camera, including
+// its roll, and has its lens.
 
 import { Quaternion, Vector3 } from "three";
 import type { PosedCamera } from "../connection/protocol";
@@ -9,7 +10,7 @@ import type { Viewpoint } from "./eye_guard";
 /** Smaller motions of a camera are errors of its pose. */
 const DEAD_BAND_M = 0.002;
 const DEAD_BAND_RAD = (0.2 * Math.PI) / 180;
-/** Poses arrive several times per second; between two of them, the view moves smoothly. */
+/** Time constant of the motion. Poses arrive several times per second, and the view moves smoothly between them. */
 const DAMPING_SECS = 0.12;
 
 export class Ride {
@@ -24,7 +25,10 @@ export class Ride {
     this.follower.forget();
   }
 
-  /** Moves the view with the camera; null if it rests. `distanceAhead` is the distance to what the view looks at. */
+  /**
+   * Moves the view with the camera; null if the view rests. `distanceAhead` is the distance to the
+   * target of the view.
+   */
   update(
     camera: PosedCamera,
     distanceAhead: (eye: Vector3, forward: Vector3) => number,
@@ -42,7 +46,8 @@ export class Ride {
 
 /** The vertical field of view with which the whole image of a camera fits into a view of this aspect ratio. */
 export function lensDegrees({ size_px, focal_px, principal_px }: PosedCamera, aspect: number): number {
-  // The view is symmetric; the principal point of a camera is not exactly in the middle of its image.
+  // The view is symmetric, but the principal point of a camera is not exactly in the middle of its
+  // image.
   const [across, along] = ([0, 1] as const).map(
     (axis) => Math.max(principal_px[axis], size_px[axis] - principal_px[axis]) / focal_px[axis],
   ) as [number, number];

@@ -3,7 +3,7 @@
 import { type Box3, type PerspectiveCamera, Vector3 } from "three";
 import { element } from "../panels/element";
 
-/** Distance of the arrow's center from the edges of the view, pixels: it must not be below toolbars or images. */
+/** Distance of the arrow's center from the edges of the view, pixels. Toolbars and images must not cover the arrow. */
 const INSET_PX = { x: 34, top: 96, bottom: 84 };
 
 export interface ArrowPlace {

@@ -20,7 +20,7 @@ export function setUpSavePicture(view: OrbitView): void {
   });
 }
 
-/** Such as 2026-11-29-110934, in local time. */
+/** A name from the local time, such as 2026-11-29-110934. */
 function timeName(now: Date): string {
   const digits = (value: number): string => String(value).padStart(2, "0");
   const date = [now.getFullYear(), digits(now.getMonth() + 1), digits(now.getDate())].join("-");

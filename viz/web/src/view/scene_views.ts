@@ -1,4 +1,5 @@
-// Views that depend on where the scene, the robot and its path are: the overview, from above, from the front.
+// Views that depend on the positions of the scene, the robot and its path: the overview, the view
+// from above, and the view from the front.
 
 import * as THREE from "three";
 import type { Viewpoint } from "./eye_guard";
@@ -17,9 +18,12 @@ import type { RobotLayer } from "../layers/robot_layer";
 import type { ScanLayer } from "../layers/scan_layer";
 import type { Scene } from "../connection/protocol";
 
-/** What one looks at in detail is not larger than this, even in a hall. Near plane, frames and speed depend on it. */
+/**
+ * Maximum size of the details that a user looks at, even in a hall. The near plane, the frames and
+ * the speed depend on this size.
+ */
 const MAX_DETAIL_M = 2;
-/** Distance of the point that a view from a camera orbits, at least, in sizes of details. */
+/** Minimum distance of the point that a view from a camera orbits, in sizes of details. */
 const MIN_AHEAD = 0.2;
 /** Time between two checks whether everything is still in the overview. */
 const CHECK_MILLIS = 250;
@@ -35,7 +39,7 @@ export class SceneViews {
     private readonly scans: ScanLayer,
   ) {}
 
-  /** Size of what one looks at in detail, meters. */
+  /** Size of the details that a user looks at, meters. */
   get detailM(): number {
     return Math.min(this.radiusM, MAX_DETAIL_M);
   }
@@ -71,7 +75,7 @@ export class SceneViews {
     this.keeper.refit();
   }
 
-  /** The overview, if another one than before is needed; otherwise null. Called for every display refresh. */
+  /** A new overview if one is needed; otherwise null. Called for every display refresh. */
   overview(): Viewpoint | null {
     const now = performance.now();
     if (now - this.checkedAt < CHECK_MILLIS) return null;
@@ -84,7 +88,7 @@ export class SceneViews {
     return this.robot.isVisible ? this.robot.box() : new THREE.Box3();
   }
 
-  /** Boxes around everything that there is to see. */
+  /** Boxes around everything that is visible. */
   private contents(): THREE.Box3[] {
     const scene = this.scene ? boundsOf(this.scene) : new THREE.Box3();
     return [scene, this.robotBox(), this.scans.pathBox];

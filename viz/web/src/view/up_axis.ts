@@ -1,4 +1,5 @@
-// Which direction points up: models of other programs often have another one than the page, whose world is z up.
+// The direction that points up. Models of other programs often differ from the page, whose world is
+// z up.
 
 import * as THREE from "three";
 import type { OrbitControls } from "three/examples/jsm/controls/OrbitControls.js";

@@ -3,7 +3,7 @@
 import { BufferTarget, CanvasSource, getFirstEncodableVideoCodec, Mp4OutputFormat, Output, Quality } from "mediabunny";
 import type { FromVideoWorker, ToVideoWorker } from "./path_video";
 
-/** The first one that the browser can encode is used. All players support H.264. */
+/** The first codec that the browser can encode is used. All players support H.264. */
 const CODECS = ["avc", "vp9", "av1"] as const;
 
 interface Video {

@@ -1,4 +1,5 @@
-// Buttons and notices of the view: what it is attached to, what is cut away, why the eye stops, where the robot is.
+// Buttons and notices of the view. They show what the view is attached to, what is cut away, why
+// the eye stops, and where the robot is.
 
 import { blockText, canBeCut } from "./block";
 import { element } from "../panels/element";
@@ -10,9 +11,9 @@ import { RobotArrow } from "./robot_arrow";
 import { isPressed, setFlying } from "../keys";
 import { nextCamera } from "./ride";
 
-/** For how long the reason is shown after the eye was stopped. */
+/** Time for which the reason is shown after the eye was stopped. */
 const BLOCKED_MILLIS = 6000;
-/** Unknown space usually becomes known within this time; the reason is shown only if the eye is stopped for longer. */
+/** Unknown space usually becomes known within this time. The reason is shown only if the eye is stopped for longer. */
 const WAIT_MILLIS = 1500;
 
 export class ViewControls {
@@ -20,7 +21,7 @@ export class ViewControls {
   private readonly frames: FrameChooser;
   private readonly blocked = element("blocked");
   private shownMode = "";
-  /** Since when the eye has been stopped again and again. */
+  /** Time since which the eye has been stopped repeatedly. */
   private stoppedSince = -Infinity;
   private lastStop = -Infinity;
 
@@ -56,7 +57,7 @@ export class ViewControls {
     if (this.view.isCut !== isCut) element("toggle-cut").click();
   }
 
-  /** Shows the mode at its buttons; it also changes when the user moves the view, and when a view is restored. */
+  /** Shows the mode at its buttons. The mode also changes when the user moves the view, and when a view is restored. */
   private showMode(): void {
     const { view } = this;
     const { riddenCamera, frame } = view.attachment;
@@ -78,7 +79,7 @@ export class ViewControls {
     setFlying(isFlying);
   }
 
-  /** Says why the eye was stopped, and offers to cut the wall away. */
+  /** Shows why the eye was stopped, and offers to cut the wall away. */
   private showBlock(): void {
     const { block } = this.view;
     const now = performance.now();

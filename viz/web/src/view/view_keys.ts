@@ -4,12 +4,12 @@ import type { OrbitControls } from "three/examples/jsm/controls/OrbitControls.js
 
 /** Angle per press of a key, radians. */
 const ORBIT_RAD = Math.PI / 36;
-/** Way per press, relative to the height of the view. */
+/** Distance per press, relative to the height of the view. */
 const PAN_FRAC = 0.05;
-/** Distance to the target after a step closer, relative to before. */
+/** Factor of the distance to the target per step closer. */
 const ZOOM = 0.9;
 
-/** What a press does to the view: to the right, up, closer; in steps. */
+/** Motion of the view by one press, in steps to the right, up, and closer. */
 export interface ViewStep {
   kind: "orbit" | "pan" | "zoom";
   right: number;

@@ -1,5 +1,5 @@
-// Keeps the view over a reload of the page, in the address, and for links: the camera, what is drawn, the crop box, the
-// chosen model and the camera path.
+// Keeps the view across a reload of the page, in the address, and in links. The view consists of
+// the camera, the drawn layers, the crop box, the chosen model and the camera path.
 
 import * as THREE from "three";
 import type { ModelSwitch } from "../panels/model_switch";
@@ -9,16 +9,19 @@ import { store, stored } from "../panels/storage";
 import type { ViewSettings } from "./view_settings";
 
 const STORED_KEY = "view";
-/** Safari allows 100 changes of the address in 30 s. */
+/** Minimum time between two changes of the address. Safari allows 100 changes in 30 s. */
 const WRITE_MILLIS = 1000;
-/** The switches that are remembered: what is drawn, and not tools such as the measurement. A cut ends with its view. */
+/**
+ * The switches that are remembered. They choose what is drawn, and do not include tools such as the
+ * measurement. A cut is not remembered, because it ends with its view.
+ */
 const SWITCHES = ".layers [id^=toggle-][aria-pressed]:not(#toggle-cut), #toggle-crop";
 const TOGGLE = "toggle-";
 
 export class ViewMemory {
   /** The switches that are pressed initially. */
   private readonly initiallyOn = new Set(switches().filter(isOn).map((button) => button.id));
-  /** Without an action of the user, the address stays as it is. */
+  /** Whether the user has acted. Before that, the address is not changed. */
   private hasUserActed = false;
   private written: string | null = null;
 
@@ -53,12 +56,13 @@ export class ViewMemory {
   show(text: string | null): void {
     const remembered = decoded(text ?? "");
     if (!remembered) return;
-    // Pressing buttons here is no action of the user.
+    // Buttons that are pressed here do not count as an action of the user.
     const { hasUserActed } = this;
     this.restore(remembered);
     this.hasUserActed = hasUserActed;
     this.written = encoded(this.present);
-    // The page may be about to be loaded again, with a token that came with the link.
+    // The view is stored at once, because the page may be loaded again now, with a token that came
+    // with the link.
     store(STORED_KEY, this.written, "sessionStorage");
   }
 

@@ -1,4 +1,4 @@
-// What a request for a picture says about the view.
+// The fields of a picture request that describe the view.
 
 import { PerspectiveCamera } from "three";
 import type { PathView } from "./camera_path";
@@ -18,7 +18,7 @@ export function viewOfCamera(camera: PerspectiveCamera, sizePx: [number, number]
   };
 }
 
-/** A camera at a place on the camera path, otherwise like the present one. */
+/** A camera at a place on the camera path. All other properties are those of the present camera. */
 export function cameraAlong(
   { position, target, fovDegrees }: PathView,
   [width, height]: [number, number],

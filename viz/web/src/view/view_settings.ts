@@ -45,7 +45,7 @@ export class ViewSettings {
       if (this.video.isRecording) this.video.cancel();
       else void this.record();
     });
-    // A user who takes over ends the playback.
+    // The playback ends when the user moves the view.
     element("canvas").addEventListener("pointerdown", () => this.edit(() => this.path.stop()));
     this.edit(() => undefined);
   }
@@ -60,7 +60,7 @@ export class ViewSettings {
     return this.path.all;
   }
 
-  /** Replaces the camera path by that of a link, if it has one. Shows the field of view of the link. */
+  /** Replaces the camera path by the path of a link, if the link has one. Shows the field of view of the link. */
   restorePath(views: readonly PathView[]): void {
     this.edit(() => {
       if (views.length > 0) this.path.clear();

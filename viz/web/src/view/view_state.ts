@@ -1,4 +1,4 @@
-// What is needed to show a view again, as plain data.
+// The data needed to show a view again.
 
 /**
  * How the view moves. `overview`: it shows everything, and follows growing bounds until the user moves it. `chase`: it
@@ -17,7 +17,7 @@ export interface ViewState {
   mode: ViewMode;
   /** Vertical field of view, degrees; without it, the present one stays. */
   fovDegrees?: number;
-  /** The followed frame in the mode `chase`, the camera in the mode `ride`. */
+  /** The followed frame in the mode `chase`, or the camera in the mode `ride`. */
   attachedTo?: string;
 }
 
