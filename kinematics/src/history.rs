@@ -417,7 +417,7 @@ impl PoseHistory {
         let pose = self.at(stamp)?;
         let span_secs = after.secs_since(before);
         // Both entries are the same reading, because the reading has no neighbor. The velocity is
-        // therefore unknown.
+        // therefore unknown, and zero is returned.
         if span_secs <= 0.0 {
             return Ok((pose, Twist::zero()));
         }
