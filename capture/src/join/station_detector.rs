@@ -8,10 +8,11 @@ use std::collections::VecDeque;
 /// moment at which a base reverses would count as a station. With a longer time, the first
 /// keyframes of a station would be lost.
 const STATIONARY_SECS: f64 = 0.5;
-/// Maximum distance from the pose near which the base is stationary, meters. The next constant is
-/// the same in radians. With larger values, slow motion would become part of a station. With
-/// smaller values, a station would be split if the base sways while its arm moves.
+/// Maximum distance from the pose near which the base is stationary, meters. With larger values,
+/// slow motion would become part of a station. With smaller values, a station would be split if the
+/// base sways while its arm moves.
 const STATIONARY_M: f64 = 0.005;
+/// Maximum rotation relative to the same pose, radians.
 const STATIONARY_RAD: f64 = 0.005;
 /// Maximum number of stations kept. No image waits for so long that it would need an older station.
 const MAX_STATIONS: usize = 64;
