@@ -29,8 +29,8 @@ use codec::Answer;
 use std::ops::RangeInclusive;
 use std::sync::Arc;
 
-/// Default rate of encoder messages. It is used to estimate the bus load; an axis with another rate
-/// loads the bus more or less.
+/// Default rate of encoder messages. It is used to estimate the bus load. The estimate is wrong for
+/// an axis with another rate.
 const REPORT_HZ: f64 = 100.0;
 /// Default rate of heartbeats, which contain the state of the axis.
 const HEARTBEAT_HZ: f64 = 10.0;
