@@ -2,12 +2,12 @@
 //! earlier stations.
 //!
 //! Keyframes pass through this module on their way from the join to the trainer. Keyframes of the
-//! first station pass unchanged. After that, keyframes taken while the base moves and the first
-//! keyframes of the next station are queued until the station can be registered with earlier ones
-//! ([`calibration::register_station`]). Then these keyframes and all later ones pass with the
-//! correction. The result depends only on the keyframes and their order, so that a run, its
-//! recording and the replay of that recording agree. Only the time at which keyframes pass depends
-//! on a clock.
+//! first station pass unchanged. Later, keyframes are queued while the base moves. The first
+//! keyframes of the next station are queued as well, until this station can be registered with
+//! earlier stations ([`calibration::register_station`]). Then these keyframes and all later ones
+//! pass with the correction. The result depends only on the keyframes and their order, so that a
+//! run, its recording and the replay of that recording agree. Only the time at which keyframes pass
+//! depends on a clock.
 
 use crate::config::{BaseDriver, Parent, Rig};
 use crate::join::Change;
@@ -134,8 +134,8 @@ struct PoseDistance {
 }
 
 impl Stations {
-    /// Corrections for the base of a rig; `None` unless it moves and
-    /// [`Base::realign`](crate::config::Base::realign) is set.
+    /// Corrections for the base of a rig. `None` if the base does not move, or if
+    /// [`Base::realign`](crate::config::Base::realign) is not set.
     #[must_use]
     pub fn new(rig: &Rig) -> Option<Self> {
         if rig.base.driver == BaseDriver::Fixed || !rig.base.realign {
@@ -160,7 +160,8 @@ impl Stations {
         })
     }
 
-    /// Continues after the keyframes of an earlier run; the first station is registered with them.
+    /// Continues after the keyframes of an earlier run. The first station is registered with these
+    /// keyframes.
     #[must_use]
     pub fn resume_from(mut self, keyframes: &[Arc<Keyframe>]) -> Self {
         /// Station index of the earlier run, different from all stations of this run.
@@ -182,7 +183,7 @@ impl Stations {
         self
     }
 
-    /// Processes a change; returns the changes that can be passed on, in order.
+    /// Processes a change. Returns the changes that can be passed on, in order.
     pub(crate) fn push(&mut self, change: Change) -> Vec<Change> {
         self.queue.push_back(change);
         let mut released = Vec::new();
@@ -204,7 +205,7 @@ impl Stations {
         released
     }
 
-    /// Processes all queued changes at the end of the input; returns them in order.
+    /// Processes all queued changes at the end of the input. Returns them in order.
     pub(crate) fn finish(&mut self) -> Vec<Change> {
         let mut released = Vec::new();
         self.process_queue(true, &mut released);
@@ -296,9 +297,9 @@ impl Stations {
     }
 
     fn take(&mut self, change: Change, released: &mut Vec<Change>) {
-        // If a keyframe shows that the scan is over, registration starts without this keyframe. It
-        // is put back and belongs to the next group. `advance_to` does the same with time alone,
-        // for a base that sends no more keyframes.
+        // If a keyframe shows that the scan is over, registration starts without this keyframe. The
+        // keyframe is put back and belongs to the next group. If no more keyframes arrive,
+        // `advance_to` ends the scan after a time limit.
         let ends_group = match &change {
             Change::Accepted(keyframe) => {
                 self.is_overdue(keyframe.stamp) || self.leaves_station(keyframe)
@@ -311,15 +312,15 @@ impl Stations {
             return;
         }
         match change {
-            // If no keyframes are held, keyframes of the current station pass at once. An arm that
-            // scans from one place is thus trained without delay.
+            // If no keyframes are queued, keyframes of the current station pass at once. While an
+            // arm scans from one place, its keyframes are therefore trained without delay.
             Change::Accepted(keyframe)
                 if self.held.is_empty() && self.is_at_current_station(&keyframe) =>
             {
                 released.push(Change::Accepted(self.placed(keyframe)));
             }
-            // Evictions must not overtake the keyframes that they evict, so they wait behind held
-            // ones.
+            // An eviction must not overtake the keyframe that it evicts, so it waits behind the
+            // queued keyframes.
             change if self.held.is_empty() && matches!(change, Change::Evicted { .. }) => {
                 released.push(change)
             }
@@ -432,7 +433,8 @@ impl Stations {
             estimated: correction.as_ref(),
         };
         let now = correction_change.at(&base_state.world_from_base, 1.0);
-        // The report counts the keyframes of the group, so it is made before they are taken out.
+        // The report counts the keyframes of the group, so it is made before the keyframes are
+        // taken out.
         let report = StationReport::new(
             &base_state,
             [&before, &now],
@@ -505,7 +507,7 @@ fn is_usable(keyframe: &Keyframe) -> bool {
     keyframe.depth.is_some() && keyframe.split != Split::Test
 }
 
-/// Distance between two poses of a base; one radian counts as one meter.
+/// Distance between two poses of a base. One radian counts as one meter.
 fn distance(one: &Transform, other: &Transform) -> f64 {
     // A radian counts as a meter, because wheel odometry drifts in rotation as well as in
     // translation, and only the ratio of two such distances is used.

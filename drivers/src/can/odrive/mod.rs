@@ -1,7 +1,7 @@
 //! `ODrive` axes with CANSimple. They send their encoder estimates and heartbeats periodically.
 //!
-//! Watchdog: `axis0.config.watchdog_timeout` and `enable_watchdog`; the axis is disarmed. Source:
-//! ODrive documentation, error `WATCHDOG_TIMER_EXPIRED`.
+//! Watchdog: `axis0.config.watchdog_timeout` and `enable_watchdog`. When it expires, the axis is
+//! disarmed. Source: ODrive documentation, error `WATCHDOG_TIMER_EXPIRED`.
 
 pub mod codec;
 #[cfg(feature = "emulation")]
