@@ -12,15 +12,16 @@ use kinematics::{Chain, JointState, Stamp, Transform};
 use std::collections::VecDeque;
 use std::time::{Duration, Instant};
 
-/// Largest change of a joint in one step, radians or meters. After each step, the position is
-/// checked, so this also bounds how far the arm pushes against an obstacle. Smaller steps are safer
-/// and slower.
+/// Largest change of a joint in one step, radians or meters. The position is checked after each
+/// step. The step therefore also bounds how far the arm pushes against an obstacle. Smaller steps
+/// are safer and slower.
 const MAX_STEP: f64 = 0.25;
 /// Time before an image during which the arm must stand still. It is longer than the errors of
-/// stamps and the vibration of camera mounts.
+/// stamps, and longer than a camera mount vibrates.
 const SETTLE_SECS: f64 = 0.3;
-/// Largest drift of a joint during that time, radians or meters. The drift is the difference
-/// between the means of both halves of the time, which averages the noise of encoders.
+/// Largest drift of a joint during [`SETTLE_SECS`], radians or meters. The drift is the difference
+/// between the mean positions in the two halves of that time. The means average the noise of
+/// encoders.
 ///
 /// With a smaller value, arms that sway or have coarse encoders never count as resting. With a
 /// larger value, images of a moving camera are accepted. At an arm's length of 1 m, 3e-4 rad is 0.3
@@ -28,16 +29,17 @@ const SETTLE_SECS: f64 = 0.3;
 const MAX_DRIFT: f64 = 3e-4;
 /// Maximum time until the arm stands still and an image arrives.
 const MAX_WAIT_SECS: f64 = 15.0;
-/// Largest distance of a joint from its target after a motion, and largest correction of its sag,
-/// radians or meters. Arms without gravity compensation sag by their load divided by their
-/// stiffness. Larger values let the arm push harder against an obstacle before it retreats.
+/// Largest distance of a joint from its target after a motion, radians or meters. It is also the
+/// largest correction of the joint's sag. Arms without gravity compensation sag by their load
+/// divided by their stiffness. Larger values let the arm push harder against an obstacle before it
+/// retreats.
 const MAX_ERROR: f64 = 0.1;
-/// The measured flange may be this much farther from its start than allowed for targets, meters. It
-/// allows for the sag that remains within [`MAX_ERROR`] of the joints.
+/// The measured flange may be farther from its start by this distance than targets may be, meters.
+/// The tolerance allows for sag, which may move each joint by up to [`MAX_ERROR`].
 const DISTANCE_TOLERANCE_M: f64 = 0.03;
 /// Duration of one wait for an image. It bounds the time until a fault of the arm is noticed.
 const POLL: Duration = Duration::from_millis(20);
-/// Number of joint states kept: those of four seconds at 1 kHz.
+/// Number of joint states kept. At 1 kHz, they cover four seconds.
 const MAX_STATES: usize = 4000;
 
 /// The start of a wait for an image.
@@ -75,7 +77,8 @@ pub struct ArmCapture {
     arm: SupervisedArm,
     /// The last accepted target. Before the first target, it is the first state.
     accepted: Option<Vec<f64>>,
-    /// Pose of the flange from which it may move at most this far, meters.
+    /// Start pose of the flange, and the distance by which the flange may move away from it,
+    /// meters.
     limit: Option<(Transform, f64)>,
     camera: Box<dyn drivers::Camera>,
     recent: VecDeque<JointState>,
@@ -105,8 +108,8 @@ impl ArmCapture {
         })
     }
 
-    /// Limits the distance of the flange from where it is now. A motion that exceeds it, for
-    /// example because the arm sags, is reversed.
+    /// Limits the distance of the flange from its current pose. A motion that exceeds the limit,
+    /// for example because the arm sags, is reversed.
     ///
     /// # Errors
     /// If the arm has stopped or reports nothing.
@@ -141,11 +144,12 @@ impl ArmCapture {
     }
 
     /// Moves to joint values in the order of the chain, in steps. Returns false if a stop was
-    /// requested; the arm then stands still.
+    /// requested. In this case, the arm stands still.
     ///
     /// # Errors
-    /// If the arm stops because of a fault, does not reach a step, or leaves the limit of the
-    /// distance. In the last two cases, it has returned to the previous step, or holds where it is.
+    /// If the arm stops because of a fault, does not reach a step, or exceeds the limit of the
+    /// distance. In the last two cases, the arm has returned to the previous step, or holds its
+    /// current position.
     pub fn move_to(&mut self, joints: &[f64], stop: &Stop) -> anyhow::Result<bool> {
         let from = self.joints()?;
         let largest = from
@@ -179,10 +183,10 @@ impl ArmCapture {
 
     fn step_to(&mut self, joints: &[f64], stop: &Stop) -> anyhow::Result<bool> {
         let free = self.read()?.position;
-        // This command makes the arm stay here. It is the previous target, unless someone has moved
-        // the arm since then. The sag of the last step is the best prediction for the next one,
-        // because the load changes little within a step. Commanding target plus sag brings the
-        // joint to the target itself.
+        // This command makes the arm stay at its current position. It is the previous target,
+        // unless someone has moved the arm since then. The sag of the last step is the best
+        // prediction for the next step, because the load changes little within a step. Commanding
+        // the target plus the sag brings the joint to the target itself.
         let accepted = self.accepted.get_or_insert_with(|| free.clone());
         let sag = accepted
             .iter()
@@ -222,18 +226,19 @@ impl ArmCapture {
             position: position.to_vec(),
         })?;
         self.accepted = Some(accepted.position);
-        // Only this field is borrowed, because the arm is borrowed at the same time.
+        // Only the field `recent` is borrowed, because the arm is borrowed at the same time.
         let recent = &mut self.recent;
         let end = self.arm.follow(stop, |state| remember(recent, state))?;
         if !end.has_arrived {
-            // The arm holds somewhere on its way.
+            // The arm holds at a position on its way to the target.
             self.accepted = Some(end.state.position);
             return Ok(None);
         }
         Ok(Some(end.state))
     }
 
-    /// Why the arm must not continue from a state. `None` if it is where it should be.
+    /// The reason why the arm must not continue from a state. `None` if the arm is where it should
+    /// be.
     fn problem(&self, state: &JointState, expected: &[f64]) -> anyhow::Result<Option<String>> {
         if let Some((ix, error)) = largest_error(&state.position, expected)
             && error > MAX_ERROR
@@ -262,7 +267,7 @@ impl ArmCapture {
     /// the arm where it is.
     ///
     /// * `stay`: the command of the previous step.
-    /// * `expected`: where it brings the arm.
+    /// * `expected`: the position to which `stay` brings the arm.
     fn retreat(
         &mut self,
         stay: &[f64],
@@ -275,21 +280,21 @@ impl ArmCapture {
         {
             return Ok("the arm has returned to the previous step");
         }
-        // If the current position is the target, the motors no longer push. A stop request must not
-        // prevent this.
+        // The current position becomes the target, so that the motors no longer push. A stop
+        // request must not prevent this command.
         let here = self.read()?.position;
         self.go(&here, &Stop::default())?;
         Ok("the arm did not return to the previous step, and holds where it is")
     }
 
-    /// Waits until the arm stands still, and returns the next image exposed from then on, with the
-    /// mean of the joints. `None` if a stop was requested.
+    /// Waits until the arm stands still. Returns the next image that is exposed from then on, with
+    /// the mean joint positions. Returns `None` if a stop was requested.
     ///
     /// # Errors
     /// If a device fails, the arm does not come to rest, or no image can be decoded.
     pub fn image(&mut self, stop: &Stop) -> anyhow::Result<Option<CalibrationImage>> {
-        // The wait starts at the newest state, not at one that has waited in a queue since before
-        // the motion.
+        // Queued states are read first, so that the wait starts at the newest state and not at a
+        // state from before the motion.
         self.read_queued()?;
         let began = self.read()?.stamp;
         let wait = Wait {
@@ -302,7 +307,8 @@ impl ArmCapture {
             if stop.requested() {
                 return Ok(None);
             }
-            // This call detects faults, and ends the wait if no image is usable.
+            // Reading the states detects faults. The check of the time then ends the wait if no
+            // image is usable.
             self.read_queued()?;
             let now = self.read()?.stamp;
             self.check_wait(&wait, now, &seen)?;
@@ -355,7 +361,7 @@ impl ArmCapture {
                 return Ok(false);
             }
             let now = self.read()?.stamp;
-            // If the clocks of camera and arm differ, `end` may never come.
+            // If the clocks of camera and arm differ, the joint states may never reach `end`.
             let seen = Seen::Early {
                 secs: end.secs_since(now),
             };
@@ -388,7 +394,7 @@ impl ArmCapture {
     }
 
     /// Reads the joint states that have arrived, so that a slow caller does not fall behind.
-    /// Simulated devices advance only when they are read.
+    /// Simulated devices only advance when a program reads them.
     fn read_queued(&mut self) -> anyhow::Result<()> {
         if self.camera.waits_for_caller() {
             return Ok(());
@@ -398,7 +404,8 @@ impl ArmCapture {
     }
 
     fn check_wait(&self, wait: &Wait, now: Stamp, seen: &Seen) -> anyhow::Result<()> {
-        // Simulated devices stand still between reads, so only their own time counts.
+        // Time in a simulation stands still between reads, so the wait is measured in simulated
+        // time.
         let secs = if self.camera.waits_for_caller() {
             now.secs_since(wait.began)
         } else {
@@ -463,8 +470,8 @@ impl ArmCapture {
         if !covers || span.len() < MIN_STATES {
             return Err(Seen::FewStates);
         }
-        // Means of both halves, because the noise of single readings may exceed the drift that
-        // matters.
+        // The means of both halves are compared, because the noise of single readings may exceed
+        // [`MAX_DRIFT`].
         let (early, late) = span.split_at(span.len() / 2);
         match largest_error(&mean(early), &mean(late)) {
             Some((joint_ix, drift)) if drift > MAX_DRIFT => Err(Seen::Drift { joint_ix, drift }),

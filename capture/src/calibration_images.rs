@@ -1,7 +1,7 @@
-//! Images of one camera for calibration with a target: from devices or a recording, with the pose
-//! of the flange.
+//! Images of one camera for calibration with a target. They come from devices or a recording, and
+//! have the pose of the flange.
 //!
-//! Images are kept while the robot is slow and at poses that differ from those of the images
+//! An image is kept if the robot is slow and its pose differs from the poses of all images kept
 //! before. If the robot has no arm, images are kept at a fixed interval.
 
 #[cfg(test)]
@@ -18,18 +18,19 @@ use std::collections::VecDeque;
 use std::ops::ControlFlow;
 use std::time::Duration;
 
-/// Maximum number of joint readings kept: those of 20 s at 1 kHz.
+/// Maximum number of joint readings kept. At 1 kHz, they cover 20 s.
 const MAX_READINGS: usize = 20_000;
 /// Maximum number of images that wait for joint readings. If the arm stops reporting, older images
 /// are dropped, so that memory stays bounded.
 const MAX_WAITING: usize = 64;
-/// Maximum number of images kept. Calibration needs tens of images; more cost memory and time.
+/// Maximum number of images kept. Calibration needs tens of images. More images only cost memory
+/// and time.
 const MAX_IMAGES: usize = 300;
-/// Interval between images of a robot without an arm, seconds. Images of a target held by hand that
-/// follow more closely show nearly the same view.
+/// Interval between images of a robot without an arm, seconds. With a shorter interval, consecutive
+/// images of a target that is held by hand show nearly the same view.
 const INTERVAL_SECS: f64 = 0.5;
-/// Uncertainty of image stamps for the check of the speed, seconds. A larger value keeps only
-/// images of slower motions.
+/// Assumed standard deviation of image stamps, seconds. The check of the speed uses it. With a
+/// larger value, only images of slower motions are kept.
 const STAMP_SIGMA_SECS: f64 = 0.002;
 
 /// A gray image.
@@ -64,7 +65,7 @@ impl ArmDuringImage {
     }
 }
 
-/// The images that were kept, and why others were not.
+/// The images that were kept, and the numbers of images that were not kept, by reason.
 #[derive(Debug, Default)]
 pub struct CalibrationImages {
     /// The images in the order of their stamps.
@@ -73,14 +74,14 @@ pub struct CalibrationImages {
     pub n_read: usize,
     /// Number of images during which the arm moved too fast.
     pub n_fast: usize,
-    /// Number of images without joint readings at their stamp, or that do not decode.
+    /// Number of images that have no joint readings at their stamp or do not decode.
     pub n_unusable: usize,
     /// Description of the damage, if the recording ends early.
     pub damage: Option<String>,
 }
 
 impl CalibrationImages {
-    /// How many images are used, and how many are not for each reason.
+    /// Describes how many images are used. For each reason, also says how many images are not used.
     #[must_use]
     pub fn summary(&self) -> String {
         let n_used = self.images.len();
@@ -112,9 +113,11 @@ impl CalibrationImages {
 
 /// Reads the images of a camera until `on_sample` breaks or the samples end.
 ///
-/// * `max_shift_px`: maximum predicted image motion over readout, exposure and stamp uncertainty,
-///   for a scene at `join.default_depth_m`. Images with more motion are not kept.
-/// * `on_sample`: is called with each sample before it is used, and with the images kept so far.
+/// * `max_shift_px`: maximum predicted image motion, for a scene at `join.default_depth_m`. The
+///   motion is that during the readout, the exposure and the error of the stamp together. Images
+///   with more motion are not kept.
+/// * `on_sample`: is called with each sample before the sample is used. It also receives the images
+///   that were kept so far.
 ///
 /// # Errors
 ///
@@ -285,8 +288,8 @@ impl<'a> Reader<'a> {
         });
     }
 
-    /// Whether the pose differs from those of all images kept; without an arm, whether the last one
-    /// is old enough.
+    /// Whether the pose differs from the poses of all images kept. Without an arm, returns whether
+    /// the last image is old enough.
     fn is_different(&self, secs: f64, arm: Option<&ArmDuringImage>) -> bool {
         let Some(arm) = arm else {
             return self
@@ -312,7 +315,8 @@ impl<'a> Reader<'a> {
             && motion.rotation.angle() < join.min_rotation_rad
     }
 
-    /// Maximum predicted image motion over readout, exposure and stamp uncertainty, pixels.
+    /// Predicted image motion during the readout, the exposure and the error of the stamp together,
+    /// pixels. It is an upper bound.
     fn shift_px(&self, image: &Image, arm: &ArmDuringImage) -> f64 {
         let [first, last] = &arm.base_from_flange_at_rows;
         let readout_secs = self.readout_secs();
@@ -320,7 +324,8 @@ impl<'a> Reader<'a> {
             .exposure_secs
             .or(self.camera.exposure_micros.map(|micros| 1e-6 * micros));
         let (motion, secs) = match (&self.arm, readout_secs > 0.0) {
-            // If there is no readout time, the motion during a short time before the image is used.
+            // Without a readout time, the speed is computed from the motion during a short time
+            // before the image.
             (Some(history), false) => {
                 let earlier = self
                     .camera
@@ -345,8 +350,8 @@ impl<'a> Reader<'a> {
         let focal_px = self.camera.intrinsics.focal_px[0];
         let angle = motion.rotation.angle()
             + motion.translation.vector.norm() / self.rig.join.default_depth_m;
-        // Speed in pixels per second, times the time for which the position of a pixel is
-        // uncertain.
+        // The speed in pixels per second is multiplied by the time span in which a pixel may have
+        // been exposed.
         focal_px * angle / secs * (readout_secs + exposure_secs.unwrap_or(0.0) + STAMP_SIGMA_SECS)
     }
 }
@@ -375,7 +380,7 @@ impl Arm {
             .iter()
             .map(|ix| state.velocity.get(*ix).copied())
             .collect::<Option<Vec<f64>>>();
-        // A reading with too few joints is dropped. Velocities are optional: without them,
+        // A reading with too few joints is dropped. Velocities are optional. Without velocities,
         // positions are interpolated linearly.
         if let Some(position) = position.collect::<Option<Vec<f64>>>() {
             let velocity = velocity.unwrap_or_default();

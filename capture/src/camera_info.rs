@@ -82,7 +82,7 @@ impl CameraInfo {
         })
     }
 
-    /// These parameters as the keys of samples files.
+    /// These parameters, with the keys of samples files.
     fn to_json(&self) -> Value {
         let (model, distortion): (_, &[f64]) = match &self.lens {
             Lens::Pinhole => ("pinhole", &[]),
@@ -101,7 +101,8 @@ impl CameraInfo {
 }
 
 /// Replaces a ROS `CameraInfo` object from a message or file with an object that has the keys of
-/// samples files. Does not change objects without a camera matrix. Returns notes for the user.
+/// fieldrig's samples files. Does not change objects without a camera matrix. Returns notes for the
+/// user.
 ///
 /// # Errors
 /// As for [`CameraInfo::parse`].
@@ -122,8 +123,8 @@ pub fn convert(intrinsics: &mut Value) -> Result<Vec<String>, String> {
 /// # Errors
 /// If the text is neither; the message gives line and column.
 pub fn parse_value(text: &str) -> Result<Value, String> {
-    // This is checked first. OpenCV's header is not a valid YAML directive, and the message of the
-    // parser would not name the cause.
+    // OpenCV's header is not a valid YAML directive, and the message of the parser would not name
+    // the cause. The header is therefore checked first.
     if text.starts_with("%YAML:") {
         return Err("it is YAML of OpenCV, expected a camera_info file of ROS".to_owned());
     }
@@ -150,8 +151,8 @@ pub fn is_yaml(text: &str) -> bool {
         .is_some_and(|(key, _)| is_key(key.trim_start_matches("- ")))
 }
 
-/// Whether a word can be a key. With this test, other formats with colons are not mistaken for
-/// YAML.
+/// Whether a word can be a key. Because of this test, other formats with colons are not mistaken
+/// for YAML.
 fn is_key(word: &str) -> bool {
     !word.is_empty()
         && word
@@ -159,7 +160,8 @@ fn is_key(word: &str) -> bool {
             .all(|c| c.is_ascii_alphanumeric() || "_-".contains(c))
 }
 
-/// The key that is used and its value; `None` if there is none. `null` counts as missing.
+/// The name under which a key appears, and its value. `None` if the key is missing. A value `null`
+/// counts as missing.
 fn find(
     object: &Map<String, Value>,
     names: Names,
@@ -194,7 +196,8 @@ fn numbers(key: &str, value: &Value) -> Result<Vec<f64>, String> {
         }
         None => value,
     };
-    // One value that is no number makes the whole list invalid, instead of shifting the others.
+    // A value that is no number makes the whole list invalid. If it were skipped, the values after
+    // it would shift.
     let numbers: Option<Vec<f64>> = list
         .as_array()
         .and_then(|list| list.iter().map(Value::as_f64).collect());
@@ -313,7 +316,8 @@ fn lens(object: &Map<String, Value>) -> Result<Lens, String> {
         "plumb_bob" => too_many(n, model, 5),
         "rational_polynomial" if n <= 8 => Ok(Lens::RationalBrownConrady(padded(&coefficients))),
         "rational_polynomial" => too_many(n, model, 8),
-        // Without coefficients, this is still a fisheye: the angle is proportional to the radius.
+        // Without coefficients, the lens is still a fisheye: the radius is proportional to the
+        // angle.
         "equidistant" | "fisheye" if n <= 4 => Ok(Lens::KannalaBrandt(padded(&coefficients))),
         "equidistant" | "fisheye" => too_many(n, model, 4),
         other => Err(format!(
@@ -339,7 +343,7 @@ fn notes(object: &Map<String, Value>, camera_matrix: &[f64; 9]) -> Result<Vec<St
     let mut rectified = Vec::new();
     if let Some((key, value)) = find(object, RECTIFICATION)? {
         let rotation: [f64; 9] = matrix_of(key, value)?;
-        // Drivers write zeros if they do not know it.
+        // Drivers write zeros if they do not know the rectification.
         rectified.extend((rotation != IDENTITY && rotation != [0.0; 9]).then_some(key));
     }
     if let Some((key, value)) = find(object, PROJECTION)? {

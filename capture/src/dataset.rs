@@ -12,10 +12,10 @@ use std::sync::{Arc, OnceLock};
 
 /// Name of the only camera of a dataset.
 const CAMERA: &str = "camera";
-/// Maximum number of pixels of the photos that are decoded at the same time: 134 million, which is
-/// also the maximum of a single photo. Each takes 4 to 12 bytes until the photo is scaled, so
-/// decoding needs at most about 1.6 GB. With a larger limit, more threads decode large photos at
-/// once, and more memory is needed.
+/// Maximum number of pixels of the photos that are decoded at the same time. It is 134 million,
+/// which is also the maximum of a single photo. Each pixel takes 4 to 12 bytes until the photo is
+/// scaled, so decoding needs at most about 1.6 GB. With a larger limit, more threads would decode
+/// large photos at once and need more memory.
 const MAX_PX_AT_ONCE: u64 = 1 << 27;
 
 /// The photos of a dataset as keyframes: undistorted and scaled, with the poses of the dataset.
@@ -33,14 +33,15 @@ pub struct LoadedDataset {
 
 /// Decodes all photos in parallel, few at a time if they are large.
 ///
-/// `holdout` assigns the splits; without it, the lists of the dataset do, or [`Holdout::default`]
-/// if it has none. `scale_frac` scales the undistorted photos (not their depth) by averaging areas;
-/// 1 keeps their size. `on_progress` receives the number of finished photos, from any thread. A
-/// photo that does not decode is skipped and reported in `data_losses`.
+/// `holdout` assigns the splits. Without `holdout`, the lists of the dataset assign them. If the
+/// dataset has no lists, [`Holdout::default`] assigns them. `scale_frac` scales the undistorted
+/// photos by averaging areas, and 1 keeps their size. Depth is not scaled. `on_progress` receives
+/// the number of finished photos, from any thread. A photo that does not decode is skipped and
+/// reported in `data_losses`.
 ///
 /// # Errors
 ///
-/// If no photo decodes, the scaled photos would be too small or do not fit into memory, or
+/// If no photo decodes, if the scaled photos would be too small or would not fit into memory, or if
 /// `holdout` does not match the names.
 pub fn load(
     dataset: &Dataset,
@@ -77,8 +78,8 @@ fn load_few_at_once(
     collect(dataset, results)
 }
 
-/// The split of each photo. It comes from `holdout`, or else from the lists of the dataset, or else
-/// from the default.
+/// The split of each photo. `holdout` has priority over the lists of the dataset. The default is
+/// used if there is neither.
 fn splits_of(
     dataset: &Dataset,
     holdout: Option<&Holdout>,
@@ -123,8 +124,8 @@ fn decode_all(
         );
         let n_at_once = n_at_once.unwrap_or(run.len());
         let run_splits = &splits[start..start + run.len()];
-        // The photos of a chunk are decoded in parallel. The next chunk waits for all of them, so
-        // that no more than one chunk is decoded but not scaled.
+        // The photos of a chunk are decoded in parallel. The next chunk waits until all of these
+        // photos are scaled. At most one chunk of full-size photos is therefore in memory.
         for (images, image_splits) in run.chunks(n_at_once).zip(run_splits.chunks(n_at_once)) {
             let jobs = images.par_iter().zip(image_splits);
             results.par_extend(jobs.map(|(image, split)| {
@@ -194,8 +195,8 @@ fn collect(
     Ok(loaded)
 }
 
-/// Number of photos of this size that may be decoded at the same time. It is at least 1; otherwise,
-/// the photos have at most `max_px` pixels in total. `None` if each thread may decode one.
+/// Number of photos of this size that may be decoded at the same time. Together, they have at most
+/// `max_px` pixels, but a single photo is always allowed. `None` if each thread may decode a photo.
 fn n_at_once(size_px: [u32; 2], max_px: u64, n_threads: usize) -> Option<usize> {
     let n_px: u64 = size_px.map(u64::from).iter().product();
     let n_photos = usize::try_from(max_px / n_px.max(1)).unwrap_or(usize::MAX);
@@ -252,7 +253,7 @@ fn split_of(listed: ListedSplit) -> Split {
     }
 }
 
-/// The first messages in one line, and the number of the others.
+/// The first messages in one line, and the number of the remaining messages.
 fn first_of(errors: &[String]) -> String {
     const MAX_SHOWN: usize = 3;
     messages::shortened(errors, MAX_SHOWN, "; ")
@@ -261,8 +262,8 @@ fn first_of(errors: &[String]) -> String {
 /// Undistortion maps of one lens; empty for a lens without distortion.
 struct LensMaps {
     color: Option<Undistortion>,
-    /// Map for depth images whose size differs from that of the photos; computed for the first such
-    /// image.
+    /// Map for depth images whose size differs from that of the photos. It is computed for the
+    /// first such image.
     depth: OnceLock<Undistortion>,
 }
 
@@ -301,7 +302,8 @@ impl LensMaps {
             return Ok(depth.depth_m.clone());
         };
         let size_px = depth.intrinsics.size_px;
-        // Depth of the same size shares the lens of the photo, and so its map.
+        // A depth image of the same size has the lens of the photo, and therefore uses the same
+        // map.
         if color.size_px() == size_px {
             return color.apply_depth(&depth.depth_m);
         }

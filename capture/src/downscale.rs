@@ -3,7 +3,7 @@
 use kinematics::Intrinsics;
 use messages::BadInput;
 
-/// Minimum side of a scaled image in pixels: smaller images contain too little detail for training.
+/// Minimum side of a scaled image, pixels. Smaller images contain too little detail for training.
 const MIN_SIDE_PX: u32 = 16;
 /// Minimum fraction of the width and height.
 pub(crate) const MIN_SCALE: f64 = 0.05;
@@ -153,8 +153,8 @@ fn covered_by(ix: u32, ratio: f64, from: u32) -> Vec<(usize, f32)> {
     let source_pixels = start as usize..(end.ceil() as usize).min(from as usize);
     source_pixels
         .map(|source_ix| (source_ix, overlap(source_ix) as f32))
-        // A pixel that is included only because of rounding must be left out. If it were masked, it
-        // would mask the new pixel.
+        // An old pixel that is included only because of rounding must be left out. If the old pixel
+        // were masked, it would mask the new pixel.
         .filter(|(_, share)| *share > 1e-6)
         .collect()
 }

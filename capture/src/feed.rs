@@ -25,8 +25,8 @@ use std::time::{Duration, Instant};
 /// trainer receives keyframes later. With a shorter queue, the input would stop at each long step.
 const MAX_WAITING: usize = 8;
 
-/// Number of images whose arrival times are kept until they become keyframes. It is larger than the
-/// number of images that a station holds back.
+/// Number of images whose arrival times are kept until they become keyframes. The number is larger
+/// than the number of images that wait for a station.
 const MAX_ARRIVALS: usize = 512;
 
 /// When a keyframe passed the stages of the input.
@@ -49,8 +49,8 @@ pub struct FeedItem {
     pub times: Option<InputTimes>,
 }
 
-/// Receives the camera images and the motion of the robot from a running input, for example to show
-/// them.
+/// Receives the camera images and the motion of the robot from a running input. A viewer, for
+/// example, shows them.
 pub trait InputObserver: Send {
     /// Whether images are needed. If not, they are not decoded.
     fn needs_images(&self) -> bool;
@@ -240,8 +240,9 @@ impl Pump {
                     break;
                 }
             };
-            // Images of the old round must be decided with the motion of that round, before the
-            // first sample of the new round is joined.
+            // After a restart of the source, images from before the restart are decided first, with
+            // the motion from before the restart. Only then is the first sample of the new round
+            // joined.
             let is_restarted = self.input.source.n_restarts() > n_restarts;
             n_restarts = self.input.source.n_restarts();
             if is_restarted && self.restart().is_err() {
@@ -251,11 +252,11 @@ impl Pump {
             // that the join received.
             self.record(&sample, &mut recording_error);
             self.remember_arrival(&sample);
-            // Viewers get the readings at once; the join may hold images back for up to its longest
-            // wait.
+            // Viewers get the readings at once. The join, in contrast, may hold images back for up
+            // to its longest wait.
             self.publish_robot(&sample);
-            // The time also advances the stations, because a base that sends no more keyframes must
-            // not hold the earlier ones forever.
+            // The stations are advanced by time as well. Otherwise, earlier keyframes would wait
+            // forever if no more keyframes arrive.
             let newest = sample.stamp();
             let events = self.input.join.push(sample);
             let newest = self.input.join.shifted(newest);
@@ -270,7 +271,7 @@ impl Pump {
         // The input has ended. Images that are still waiting get a decision now, and a station is
         // registered with the keyframes received so far.
         let events = self.input.join.finish();
-        // If the trainer has ended, it needs no more keyframes.
+        // An error here means that the trainer has ended and needs no more keyframes.
         let _ = self.forward(events).and_then(|()| self.release_held());
         // A recording that failed before is not finished, so that its first error is reported.
         if let (Some(recorder), None) = (self.input.recorder.take(), &recording_error)
@@ -324,7 +325,8 @@ impl Pump {
     }
 
     fn forward(&mut self, events: Vec<JoinEvent>) -> Result<(), TrainerGone> {
-        // Before the keyframes, because sending them waits while the trainer is busy.
+        // The counts are updated before the keyframes are sent, because sending waits while the
+        // trainer is busy.
         *self.shared.counts.lock() = InputCounts::of(&self.input.join);
         for event in events {
             match event {

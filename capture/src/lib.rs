@@ -1,13 +1,13 @@
 //! From a rig file to keyframes: opens the devices, joins images with poses, and corrects base
 //! poses.
 //!
-//! A [`Rig`] is a checked rig file. [`open::rig`] opens its devices, real or simulated, and
-//! [`open::recording`] a recording, as one source of samples. A [`Join`] turns the samples into
-//! keyframes: it pairs each image with the pose of its camera at mid-exposure, rejects images that
-//! are blurred, badly exposed or too close to others, and bounds the memory. [`Stations`] corrects
-//! the drift of a moving base. [`Feed`] does all of this on a separate thread. [`RecordPlan`] records
-//! the samples. [`dataset`] loads datasets with known poses instead. [`doctor`] checks whether this
-//! computer and its devices are ready.
+//! A [`Rig`] is a checked rig file. [`open::rig`] opens its real or simulated devices as one source
+//! of samples. [`open::recording`] opens a recording as such a source. A [`Join`] turns the samples
+//! into keyframes: it pairs each image with the pose of its camera at mid-exposure. It rejects
+//! images that are blurred, badly exposed or too close to others, and it bounds the memory.
+//! [`Stations`] corrects the drift of a moving base. [`Feed`] does all of this on a separate
+//! thread. [`RecordPlan`] records the samples. [`dataset`] loads the photos of datasets, whose
+//! poses are known. [`doctor`] checks whether this computer and its devices are ready.
 //!
 //! ```
 //! use capture::{Join, Rig};

@@ -1,7 +1,7 @@
 //! Memory of this computer.
 
-/// Memory that programs can still use, including free swap space, bytes; `None` if the system does
-/// not report it.
+/// Memory that programs can still use, bytes. It includes free swap space. `None` if the system
+/// does not report it.
 pub(crate) fn available_bytes() -> Option<u64> {
     available_in(&std::fs::read_to_string("/proc/meminfo").ok()?)
 }

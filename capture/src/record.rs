@@ -91,7 +91,8 @@ impl RecordPlan {
             overrides.push(Override::new("sim.lockstep", true));
         }
         let rig = Rig::load(&self.rig_file, &overrides)?;
-        // The end is checked before the devices are opened, because they may take long to start.
+        // The check for an end comes before the devices are opened, because devices may take long
+        // to start.
         self.check_end(&rig)?;
         if self.out.exists() {
             let path = self.out.clone();
@@ -124,8 +125,8 @@ impl RecordPlan {
             }
             End::Requested => finish(recorder, &mut n_written),
         };
-        // The file ends with its last complete chunk, so its contents are counted instead of what
-        // was written.
+        // After a write error, the file ends with its last complete chunk. The samples in the file
+        // are therefore counted instead of the samples that were passed to the recorder.
         if let Some(error) = write_error {
             data_losses.push(format!("{:#}", anyhow::Error::new(error)));
             recorded = recorded.recount_from_file();
@@ -233,7 +234,7 @@ impl Recorded {
             Sample::Base(_) => self.base_poses += 1,
             Sample::Range(_) => self.range_scans += 1,
             Sample::Truth(_) => self.truths += 1,
-            // These samples are not counted, because one arrives with every base pose.
+            // Ground truth of the base is not counted, because it arrives with every base pose.
             Sample::BaseTruth(_) => {}
         }
     }

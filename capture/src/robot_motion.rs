@@ -34,10 +34,10 @@ impl RobotMotion {
         }
     }
 
-    /// Takes a sample; returns the state of the robot if the sample moves it and the pose of its
-    /// base is known. The stamp of the state is the older of the stamps of joint positions and base
-    /// pose, so that neither is older than this stamp. The base pose does not include the
-    /// correction of its station. The joint positions include the joint offsets.
+    /// Takes a sample. Returns the state of the robot if the sample changes this state and the pose
+    /// of the base is known. The stamp of the state is the older one of the stamps of the joint
+    /// positions and of the base pose. The base pose does not include the correction of its
+    /// station. The joint positions include the joint offsets.
     pub fn push(&mut self, sample: &Sample, clock: &StampClock) -> Option<RobotState> {
         match sample {
             Sample::Joints(state) => {
@@ -67,7 +67,8 @@ impl RobotMotion {
             {
                 self.world_from_base = Some(pose.world_from_base);
                 self.base_stamp = Some(pose.stamp);
-                // Readings of the joints come more often than base poses.
+                // If the robot has joints, their readings report the state, because they come more
+                // often than base poses.
                 (self.n_joints == 0).then(|| RobotState {
                     stamp: pose.stamp,
                     captured_at: clock.captured_at(pose.stamp),

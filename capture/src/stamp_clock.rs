@@ -41,8 +41,8 @@ impl StampClock {
         }
     }
 
-    /// When a sample with this stamp was captured, or now if the stamp is on another clock
-    /// (recordings, simulations).
+    /// Time at which a sample with this stamp was captured. It is the current time if the stamp is
+    /// on another clock, as in recordings and simulations.
     #[must_use]
     pub fn captured_at(&self, stamp: Stamp) -> Instant {
         self.instant_of(stamp).unwrap_or_else(Instant::now)

@@ -2,11 +2,12 @@
 //! earlier stations.
 //!
 //! Keyframes pass through this module on their way from the join to the trainer. Keyframes of the
-//! first station pass unchanged. After that, keyframes taken while the base moves and the first
-//! keyframes of the next station are queued until the station can be registered with earlier ones
-//! ([`calibration::register_station`]). Then they and all later keyframes pass with the correction.
-//! The result depends only on the keyframes and their order, so that a run, its recording and the
-//! replay of that recording agree; only the time at which keyframes pass depends on a clock.
+//! first station pass unchanged. Later, keyframes are queued while the base moves. The first
+//! keyframes of the next station are queued as well, until this station can be registered with
+//! earlier stations ([`calibration::register_station`]). Then these keyframes and all later ones
+//! pass with the correction. The result depends only on the keyframes and their order, so that a
+//! run, its recording and the replay of that recording agree. Only the time at which keyframes pass
+//! depends on a clock.
 
 use crate::config::{BaseDriver, Parent, Rig};
 use crate::join::Change;
@@ -20,28 +21,30 @@ use std::collections::{BTreeSet, VecDeque};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-/// Number of keyframes with depth, excluding test keyframes, with which a station is registered. A
-/// scan of a few seconds gives this many keyframes. With a larger number, keyframes reach the
-/// trainer later. With a smaller number, the correction has fewer pairs of images and is less
-/// certain.
+/// Number of keyframes with which a station is registered. Only keyframes with depth that are not
+/// test keyframes count. A scan of a few seconds gives this many keyframes. With a larger number,
+/// keyframes reach the trainer later. With a smaller number, the correction has fewer pairs of
+/// images and is less certain.
 const MIN_KEYFRAMES: usize = 14;
-/// Maximum time to wait for that many keyframes, seconds. Without a limit, a short visit or a
-/// camera without texture in view would hold its keyframes until the base leaves.
+/// Maximum time to wait for [`MIN_KEYFRAMES`] keyframes, seconds. Without a limit, a short visit or
+/// a camera without texture in view would hold its keyframes until the base leaves.
 const MAX_SCAN_SECS: f64 = 10.0;
 /// Maximum time to wait for a station while the base moves, seconds. A base that drives for longer
-/// may not stop at all. Afterwards, or with
-/// [`MAX_HELD`] queued keyframes, the queued keyframes get the correction of the previous station.
+/// may not stop at all. After this time, or if [`MAX_HELD`] keyframes are queued, the queued
+/// keyframes get the correction of the previous station.
 const MAX_TRAVEL_SECS: f64 = 30.0;
 const MAX_HELD: usize = 128;
 /// Maximum number of reference keyframes from earlier stations. It bounds memory and the time of a
-/// registration, which compares new keyframes with these. When the maximum is reached, every other
-/// keyframe is removed, so that the remaining ones still cover all stations.
+/// registration, which compares new keyframes with the reference keyframes. When the maximum is
+/// reached, every second reference keyframe is removed. The remaining keyframes still cover all
+/// stations.
 const MAX_REFERENCE_KEYFRAMES: usize = 160;
 
 /// Corrects keyframes for errors of the reported base poses, at each station.
 ///
-/// A station is an interval in which the base is stationary. Its keyframes are registered with
-/// those of earlier stations; keyframes taken on the way get a share of the correction.
+/// A station is an interval in which the base is stationary. The keyframes of a station are
+/// registered with those of earlier stations. Keyframes that were taken on the way between two
+/// stations get a share of the correction.
 pub struct Stations {
     /// Cameras on the base or the arm.
     carried: BTreeSet<Arc<str>>,
@@ -72,7 +75,8 @@ struct CorrectionChange<'a> {
     arrived: Transform,
     /// The correction before the new station.
     before: Transform,
-    /// The correction that registration estimated in addition; `None` without overlap.
+    /// The additional correction that registration estimated. `None` if the images do not overlap
+    /// with those of earlier stations.
     estimated: Option<&'a StationCorrection>,
 }
 
@@ -87,7 +91,7 @@ impl CorrectionChange<'_> {
         }
         let from = distance(&self.left, &at.world_from_base);
         let to = distance(&at.world_from_base, &self.arrived);
-        // A base that has not moved yet has not drifted. This condition also avoids 0 / 0.
+        // If the base has not moved yet, it has not drifted. The condition also avoids 0 / 0.
         let fraction = if from > 0.0 { from / (from + to) } else { 0.0 };
         self.at(&at.world_from_base, fraction)
     }
@@ -117,7 +121,7 @@ pub struct StationReport {
     /// The correction since the previous station; null if the images do not overlap with those of
     /// earlier stations.
     correction: Option<StationCorrection>,
-    /// Error of the base pose before and after the correction; in simulation only.
+    /// Error of the base pose before and after the correction. It is known only in simulation.
     #[serde(skip_serializing_if = "Option::is_none")]
     base_error: Option<[PoseDistance; 2]>,
 }
@@ -130,8 +134,8 @@ struct PoseDistance {
 }
 
 impl Stations {
-    /// Corrections for the base of a rig; `None` unless it moves and
-    /// [`Base::realign`](crate::config::Base::realign) is set.
+    /// Corrections for the base of a rig. `None` if the base does not move, or if
+    /// [`Base::realign`](crate::config::Base::realign) is not set.
     #[must_use]
     pub fn new(rig: &Rig) -> Option<Self> {
         if rig.base.driver == BaseDriver::Fixed || !rig.base.realign {
@@ -156,13 +160,14 @@ impl Stations {
         })
     }
 
-    /// Continues after the keyframes of an earlier run; the first station is registered with them.
+    /// Continues after the keyframes of an earlier run. The first station is registered with these
+    /// keyframes.
     #[must_use]
     pub fn resume_from(mut self, keyframes: &[Arc<Keyframe>]) -> Self {
         /// Station index of the earlier run, different from all stations of this run.
         const PREVIOUS_RUN: usize = usize::MAX;
-        // The last keyframe has the correction that the earlier run ended with. It is the best
-        // guess for the first station, because odometry often continues between runs.
+        // The last keyframe has the correction with which the earlier run ended. This correction is
+        // the best guess for the first station, because odometry often continues between runs.
         if let Some(base_state) = keyframes
             .iter()
             .rev()
@@ -178,7 +183,7 @@ impl Stations {
         self
     }
 
-    /// Processes a change; returns the changes that can be passed on, in order.
+    /// Processes a change. Returns the changes that can be passed on, in order.
     pub(crate) fn push(&mut self, change: Change) -> Vec<Change> {
         self.queue.push_back(change);
         let mut released = Vec::new();
@@ -200,7 +205,7 @@ impl Stations {
         released
     }
 
-    /// Processes all queued changes at the end of the input; returns them in order.
+    /// Processes all queued changes at the end of the input. Returns them in order.
     pub(crate) fn finish(&mut self) -> Vec<Change> {
         let mut released = Vec::new();
         self.process_queue(true, &mut released);
@@ -292,9 +297,9 @@ impl Stations {
     }
 
     fn take(&mut self, change: Change, released: &mut Vec<Change>) {
-        // If a keyframe shows that the scan is over, registration starts without this keyframe. It
-        // is put back and belongs to the next group. `advance_to` does the same with time alone,
-        // for a base that sends no more keyframes.
+        // If a keyframe shows that the scan is over, registration starts without this keyframe. The
+        // keyframe is put back and belongs to the next group. If no more keyframes arrive,
+        // `advance_to` ends the scan after a time limit.
         let ends_group = match &change {
             Change::Accepted(keyframe) => {
                 self.is_overdue(keyframe.stamp) || self.leaves_station(keyframe)
@@ -307,15 +312,15 @@ impl Stations {
             return;
         }
         match change {
-            // If no keyframes are held, keyframes of the current station pass at once. An arm that
-            // scans from one place is thus trained without delay.
+            // If no keyframes are queued, keyframes of the current station pass at once. While an
+            // arm scans from one place, its keyframes are therefore trained without delay.
             Change::Accepted(keyframe)
                 if self.held.is_empty() && self.is_at_current_station(&keyframe) =>
             {
                 released.push(Change::Accepted(self.placed(keyframe)));
             }
-            // Evictions must not overtake the keyframes that they evict, so they wait behind held
-            // ones.
+            // An eviction must not overtake the keyframe that it evicts, so it waits behind the
+            // queued keyframes.
             change if self.held.is_empty() && matches!(change, Change::Evicted { .. }) => {
                 released.push(change)
             }
@@ -428,7 +433,8 @@ impl Stations {
             estimated: correction.as_ref(),
         };
         let now = correction_change.at(&base_state.world_from_base, 1.0);
-        // The report counts the keyframes of the group, so it is made before they are taken out.
+        // The report counts the keyframes of the group, so it is made before the keyframes are
+        // taken out.
         let report = StationReport::new(
             &base_state,
             [&before, &now],
@@ -501,7 +507,7 @@ fn is_usable(keyframe: &Keyframe) -> bool {
     keyframe.depth.is_some() && keyframe.split != Split::Test
 }
 
-/// Distance between two poses of a base; one radian counts as one meter.
+/// Distance between two poses of a base. One radian counts as one meter.
 fn distance(one: &Transform, other: &Transform) -> f64 {
     // A radian counts as a meter, because wheel odometry drifts in rotation as well as in
     // translation, and only the ratio of two such distances is used.

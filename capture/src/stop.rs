@@ -19,9 +19,9 @@ pub struct Stop {
 }
 
 impl Stop {
-    /// Creates a stop and two flags for signal handlers. Setting the first requests the stop; the
-    /// next query then logs the message. The second records a Ctrl-C, so that the next one ends the
-    /// process at once.
+    /// Creates a stop and two flags for signal handlers. Setting the first flag requests the stop.
+    /// The next query then logs the message. The second flag records a Ctrl-C, so that the next
+    /// Ctrl-C ends the process at once.
     #[must_use]
     pub fn with_signal_flags(message: &'static str) -> (Self, [Arc<AtomicBool>; 2]) {
         let stop = Self {
@@ -32,8 +32,8 @@ impl Stop {
         (stop, flags)
     }
 
-    /// Withdraws all requests, so that the next signal requests a stop again, with another message,
-    /// and the next Ctrl-C does not end the process at once.
+    /// Withdraws all requests. The next signal then requests a stop again, with another message.
+    /// The next Ctrl-C does not end the process at once.
     pub fn rearm(&mut self, message: &'static str) {
         self.message = message;
         // A signal that arrives during this loop still requests a stop, because its handler sets

@@ -11,15 +11,14 @@ use std::time::Duration;
 
 /// Duration of one wait for a joint state. It bounds the time until a request to stop is noticed.
 const POLL: Duration = Duration::from_millis(50);
-/// A movable arm that reports nothing for this long counts as lost. The time is longer than pauses
-/// of a busy computer, because an error here stops a motion.
+/// A movable arm that reports nothing for this long counts as lost. The time must be longer than
+/// the pauses of a busy computer, because an error here stops a motion.
 const MAX_SILENCE: Duration = Duration::from_secs(2);
 
-/// Instruction for the user while an arm is held that its motors would release.
+/// Instruction for the user while the program holds an arm that its motors would otherwise release.
 pub const HOLDING: &str = "holding the arm; support it before you press Ctrl-C, because the motors then no longer hold it";
 
-/// A movable arm and its joint offsets. All positions include `arm.joint_offsets`, as everywhere
-/// else.
+/// A movable arm and its joint offsets. All positions of this type include `arm.joint_offsets`.
 pub struct SupervisedArm {
     arm: Box<dyn MovableArm>,
     offsets: Vec<f64>,
@@ -101,8 +100,8 @@ impl SupervisedArm {
     /// # Errors
     /// As [`SupervisedArm::read`].
     pub fn read_queued(&mut self, mut on_state: impl FnMut(&JointState)) -> anyhow::Result<()> {
-        // Four seconds at 1 kHz. The limit ends the loop if states arrive faster than they are
-        // read.
+        // The states of four seconds at 1 kHz. The limit ends the loop if states arrive faster than
+        // they are read.
         const MAX_STATES: usize = 4000;
         for _ in 0..MAX_STATES {
             match self.read_within(Duration::ZERO)? {
@@ -113,7 +112,7 @@ impl SupervisedArm {
         Ok(())
     }
 
-    /// Sends a target; returns it as clamped to the limits.
+    /// Sends a target. Returns the target after it was clamped to the limits.
     ///
     /// # Errors
     /// If the arm rejects it.
@@ -149,7 +148,7 @@ impl SupervisedArm {
         on_state: impl FnMut(&JointState),
     ) -> anyhow::Result<MotionEnd> {
         let end = self.follow_while_read(stop, on_state);
-        // If the program can no longer read the arm, it must not leave it moving unsupervised. An
+        // If the program can no longer read the arm, it must not let the arm move unsupervised. An
         // arm that has already stopped is not commanded again.
         if end.is_err()
             && !matches!(self.arm.motion(), Motion::Stopped { .. })

@@ -10,8 +10,8 @@ pub fn now() -> Stamp {
     read(rustix::time::ClockId::Monotonic)
 }
 
-/// Current time of a clock that keeps counting while the computer is suspended. Use it only to
-/// detect a suspend.
+/// Current time of a clock that keeps counting while the computer is suspended. Use this clock only
+/// to detect that the computer was suspended.
 #[cfg(target_os = "linux")]
 pub(crate) fn now_including_suspend() -> Stamp {
     read(rustix::time::ClockId::Boottime)

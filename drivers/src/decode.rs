@@ -7,8 +7,8 @@ use std::borrow::Cow;
 use std::io::Cursor;
 
 impl PixelFormat {
-    /// Bytes per row without padding, and number of such rows, including rows that contain only
-    /// chroma. `None` for compressed formats.
+    /// Bytes per row without padding, and number of rows. Rows that contain only chroma are
+    /// included. `None` for compressed formats.
     pub(crate) fn raw_size(self, size_px: [u32; 2]) -> Option<[usize; 2]> {
         let [width, height] = size_px.map(|side| side as usize);
         let bytes_per_pixel = match self {
@@ -71,7 +71,7 @@ impl Image {
             .collect())
     }
 
-    /// Removes the padding that a device adds after each row, including the last.
+    /// Removes the padding that a device adds after each row. The last row may also have padding.
     ///
     /// `bytes_per_line` is the distance between the starts of two rows (`bytesperline` of V4L2;
     /// chroma rows have the same stride). Compressed images are returned unchanged.

@@ -136,7 +136,7 @@ pub enum Error {
         /// Description of the problem and how to fix it.
         reason: String,
     },
-    /// An arm cannot be moved, or not as requested.
+    /// An arm cannot be moved at all, or cannot be moved as requested.
     #[error("the arm cannot be moved: {reason}")]
     Motion {
         /// Description of the problem.
@@ -257,7 +257,8 @@ pub enum Error {
     EmptyRecording {
         /// The file.
         path: PathBuf,
-        /// Damage or other contents of the file, after a semicolon; empty if there are none.
+        /// A description of the file's damage or of its other contents. The text starts with a
+        /// semicolon. It is empty if there is nothing to describe.
         reason: String,
     },
     /// The file for a new recording already exists.
@@ -311,7 +312,8 @@ pub enum Error {
     NotADataset {
         /// The folder.
         path: PathBuf,
-        /// The format of another program that was recognized, and what to do; empty if none was.
+        /// Names the recognized format of another program and says what to do. The hint is empty if
+        /// no format was recognized.
         hint: String,
     },
     /// A dataset file is malformed or has invalid contents.
@@ -333,7 +335,8 @@ pub enum Error {
         n_missing: usize,
         /// Number of images that are corrupt or have no pose.
         n_unusable: usize,
-        /// The first unusable image with the reason, in parentheses; empty if there is none.
+        /// The first unusable image and the reason, in parentheses. The text is empty if all images
+        /// are usable.
         first_reason: String,
     },
     /// The lens parameters of a TUM folder are unknown.

@@ -9,7 +9,7 @@ const LATE_PERIODS: f64 = 0.75;
 /// Fraction of the delay of an image by which the next due time is shifted. Without this
 /// correction, due times would drift away from the images, because the actual frame rate differs
 /// from the nominal rate. The value 0.05 averages over about 20 images. With a larger value, a
-/// single late image would shift the due time more.
+/// single late image would shift the due time by a larger amount.
 const DRIFT_GAIN: f64 = 0.05;
 
 /// Estimates when the images of a camera are due. Images may be late, but never early.

@@ -1,5 +1,5 @@
-//! Extracts complete JPEG files from camera buffers, which may be truncated, hold two images, lack
-//! Huffman tables, or have extra bytes around the image.
+//! Extracts complete JPEG files from camera buffers. A buffer may be truncated, hold two images,
+//! lack Huffman tables, or have extra bytes around the image.
 //!
 //! Source: ITU-T T.81, annex B (markers) and annex K.3 (the tables that motion JPEG omits).
 
@@ -91,8 +91,8 @@ struct ImageExtent {
     end: usize,
     /// Index of the marker of its first scan.
     first_scan: usize,
-    /// Whether the image has no Huffman tables before its first scan, and its frame type fits the
-    /// standard tables.
+    /// Whether the standard Huffman tables must be added. This is so if the image has no tables
+    /// before its first scan, and if the standard tables fit its frame type.
     needs_tables: bool,
 }
 
@@ -104,9 +104,9 @@ fn scan_markers(buffer: &[u8], start: usize) -> Result<ImageExtent, (JpegError, 
     let mut has_tables = false;
     let mut is_sequential = false;
     loop {
-        // The next marker is searched for instead of being expected here. This skips stray bytes
-        // between segments. It also skips coded data, which contain no markers because a 0 follows
-        // each 0xff.
+        // The loop searches for the next marker instead of expecting it at this position. The
+        // search skips stray bytes between segments. It also skips coded data, which contain no
+        // markers because a 0 follows each 0xff.
         let (marker_at, marker) =
             next_marker(buffer, position).ok_or((JpegError::Truncated, buffer.len()))?;
         position = marker_at + 2;

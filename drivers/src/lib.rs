@@ -74,12 +74,13 @@ pub trait Camera: Send {
     /// [`Image::n_skipped`].
     ///
     /// # Errors
-    /// [`Error::NoImage`] after `timeout`; [`Error::Reconnecting`], for a limited time, while the
-    /// driver tries to reconnect to the camera. Cameras played back from a file return
-    /// [`Error::NotDue`] if the next image is due later, and [`Error::Ended`] at the end.
+    /// [`Error::NoImage`] if no image arrives within `timeout`. [`Error::Reconnecting`] while the
+    /// driver tries to reconnect to the camera; the driver gives up after a time limit. A camera
+    /// that is played back from a file returns [`Error::NotDue`] if its next image is due later. It
+    /// returns [`Error::Ended`] after its last image.
     fn next_image(&mut self, timeout: Duration) -> Result<Image, Error>;
-    /// Whether the camera waits for a slow caller instead of dropping images. True, for example,
-    /// for a file that is read as fast as possible.
+    /// Whether the camera waits for a slow caller instead of dropping images. A file that is read
+    /// as fast as possible, for example, waits for its caller.
     fn waits_for_caller(&self) -> bool {
         false
     }

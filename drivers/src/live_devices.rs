@@ -8,13 +8,15 @@ use std::sync::Arc;
 use std::thread::JoinHandle;
 use std::time::Duration;
 
-/// Queue capacity of a camera, in images. If it is full, the oldest image is dropped. Eight images
-/// are a quarter of a second at 30 Hz, which bridges pauses of the caller. A longer queue would
-/// keep stale images in memory, of up to several megabytes each.
+/// Queue capacity of a camera, in images. If the queue is full, the oldest image is dropped. At 30
+/// Hz, eight images bridge a pause of the caller of a quarter of a second. A longer queue would
+/// keep stale images of up to several megabytes each in memory.
 const MAX_IMAGES: usize = 8;
-/// Queue capacity for joint states and base poses: one second at 1 kHz.
+/// Queue capacity for joint states and for base poses. The queue holds one second of samples at 1
+/// kHz.
 const MAX_JOINTS: usize = 1000;
-/// Queue capacity of a range scanner, in scans: two seconds at 10 Hz, the usual rate.
+/// Queue capacity of a range scanner, in scans. The queue holds two seconds of scans at the usual
+/// rate of 10 Hz.
 const MAX_SCANS: usize = 20;
 /// A device that delivers no samples for this long causes an error. The limit must be longer than
 /// the few seconds that some devices need to start. It should be short, so that an operator does
@@ -39,13 +41,13 @@ pub struct Devices {
 
 /// A source that reads all devices of a rig, each in its own thread.
 ///
-/// If the caller is too slow, the oldest samples of a device are dropped. Dropped images are
-/// counted in [`Image::n_skipped`] of the next image of the same kind, all other samples in
-/// [`Source::n_other_samples_dropped`]. Cameras that wait for their caller are blocked instead.
+/// If the caller is too slow, the oldest samples of a device are dropped. [`Image::n_skipped`] of
+/// the next image of the same kind counts the dropped images. [`Source::n_other_samples_dropped`]
+/// counts all other dropped samples. A camera that waits for its caller is blocked instead.
 ///
-/// The first error of a device ends the source; [`Source::next_sample`] returns it once. If cameras
-/// are played back from files, the end of the last file also ends the source, after all samples
-/// read until then have been returned. Dropping the source stops the threads.
+/// The first error of a device ends the source; [`Source::next_sample`] returns it once. If all
+/// cameras are played back from files, the source also ends at the end of the last file. All
+/// samples that were read until then are returned first. Dropping the source stops the threads.
 #[derive(Debug)]
 pub struct LiveDevices {
     shared: Arc<Shared>,

@@ -1,5 +1,5 @@
 //! Outage of a camera: its start, the number of reconnection attempts, and the time of the next
-//! one.
+//! attempt.
 
 use kinematics::Stamp;
 use std::time::{Duration, Instant};
@@ -27,9 +27,9 @@ impl Outage {
         *outage
     }
 
-    /// Waits until the next attempt is due, one pause after the last attempt, and counts the
-    /// attempt. If the attempt is due after the deadline, waits until the deadline and returns
-    /// false.
+    /// Waits until the next attempt is due, which is one `pause` after the last attempt. Then
+    /// counts the attempt and returns true. If the attempt is due after the deadline, waits only
+    /// until the deadline and returns false.
     pub(crate) fn wait_for_retry(&mut self, pause: Duration, deadline: Instant) -> bool {
         let next_try = self.last_try + pause;
         std::thread::sleep(
@@ -54,8 +54,8 @@ pub(crate) fn n_between(last: Stamp, next: Stamp, rate_hz: f64) -> u64 {
         clippy::cast_sign_loss,
         reason = "the cast saturates as intended"
     )]
-    // Stamps jitter by a fraction of a period, so the number of periods is rounded. One fewer image
-    // than periods lies between two images.
+    // Stamps jitter by a fraction of a period, so the number of periods is rounded. The number of
+    // images between two images is one less than the number of periods.
     let n_images = (periods.round() - 1.0).max(0.0) as u64;
     n_images
 }

@@ -6,23 +6,25 @@ use std::collections::BTreeMap;
 use std::sync::{Arc, OnceLock};
 use std::time::{Duration, Instant};
 
-/// Images that are later than this are dropped. A camera at 30 Hz fills its queue in
-/// [`LiveDevices`](crate::LiveDevices) in this time, so a slow caller loses images as it would with
-/// devices.
+/// An image that is returned later than its due time by more than this is dropped. A camera at 30
+/// Hz fills its queue in [`LiveDevices`](crate::LiveDevices) in the same time. A slow caller
+/// therefore loses images just as it would with devices.
 const MAX_DELAY: Duration = Duration::from_millis(270);
 
-/// A source whose samples are returned when they are due, by their stamps and their order.
+/// A source that returns each sample when it is due. Stamps and order of the samples determine when
+/// they are due.
 ///
-/// The time from the first sample until a sample is due is the difference of their stamps. A sample
-/// is never due before the samples in front of it, which keeps the latency of cameras. For example,
-/// an image that was recorded after the joint states of the following 30 ms is returned 30 ms after
-/// its stamp. If the caller is too slow, images are dropped and counted, as with devices.
+/// A sample is due as long after the first sample as the difference of their stamps. A sample is
+/// never due before the samples in front of it. This rule preserves the latency of cameras. For
+/// example, an image that was recorded after the joint states of the following 30 ms is returned 30
+/// ms after its stamp. If the caller is too slow, images are dropped and counted, as with devices.
 pub struct Playback {
     source: Box<dyn Source>,
     clock: PlaybackClock,
     /// When the latest sample was due.
     last_due: Option<Instant>,
-    /// Dropped images that are not reported yet, by camera and whether they contain depth.
+    /// Numbers of dropped images that are not reported yet. The key is the camera, and whether the
+    /// images contain depth.
     n_dropped: BTreeMap<(Arc<str>, bool), u64>,
 }
 
@@ -102,8 +104,8 @@ impl Source for Playback {
             if let Sample::Image(image) = &mut sample {
                 let key = (image.camera.clone(), image.is_depth());
                 if delay > MAX_DELAY {
-                    // Only images are dropped: joint states are small, and without them, poses of
-                    // later images could not be interpolated.
+                    // Only images are dropped. Joint states are small, and the poses of later
+                    // images could not be interpolated without them.
                     *self.n_dropped.entry(key).or_default() += 1 + image.n_skipped;
                     continue;
                 }

@@ -20,27 +20,27 @@ pub(crate) trait ReopenableCamera: Debug {
     /// A problem of this kind of camera.
     type Problem: Display;
 
-    /// Opens the camera. Must return within about 100 ms, because the caller cannot be stopped in
-    /// the meantime. If opening takes longer, it must run on another thread; until it has ended,
-    /// [`Self::describe`] returns `None`.
+    /// Opens the camera. This function must return within about 100 ms, because the caller cannot
+    /// be stopped in the meantime. If opening takes longer, it must run on another thread.
+    /// [`Self::describe`] then returns `None` until the camera is open.
     fn open(&mut self) -> Result<Self::Stream, Failure<Self::Problem>>;
 
-    /// Description of device, mode and settings for the log; `None` while the camera is still being
-    /// opened. For a camera that only sends datagrams, opening does not prove that the camera
-    /// exists. It then returns `None` until the first image. A camera counts as reconnected once it
-    /// has a description.
+    /// Description of device, mode and settings for the log. Returns `None` while the camera is
+    /// still being opened. For a camera that only sends datagrams, opening does not prove that the
+    /// camera exists. For such a camera, this function returns `None` until the first image. A
+    /// camera counts as reconnected once it has a description.
     fn describe(&self, stream: &Self::Stream) -> Option<String>;
 
-    /// Waits for the next image. Returns `None` if no image arrived; the caller may call again if
-    /// the deadline has not passed.
+    /// Waits for the next image. Returns `None` if no image arrived. The caller may call again
+    /// until the deadline has passed.
     fn next_image(
         &mut self,
         stream: &mut Self::Stream,
         deadline: Instant,
     ) -> Result<Option<Image>, Failure<Self::Problem>>;
 
-    /// Called before each attempt to reopen the camera. `n_tries` counts the attempts from 1.
-    /// Returns true if it reset the camera, which ends the attempt.
+    /// May reset the camera before an attempt to reopen it. `n_tries` is the number of the attempt,
+    /// starting at 1. If this function returns true, it has reset the camera, and the attempt ends.
     fn reset(&mut self, _n_tries: u32) -> bool {
         false
     }
@@ -54,8 +54,8 @@ pub(crate) trait ReopenableCamera: Debug {
 pub(crate) enum Failure<P> {
     /// The camera is disconnected, or has a problem that may disappear if it is reopened.
     Lost(P),
-    /// An error that would occur again, because the camera answered and refuses the rig file's
-    /// settings. It is returned without another attempt.
+    /// A permanent error: the camera answered and refuses the settings of the rig file. The driver
+    /// returns this error without another attempt.
     #[cfg_attr(
         not(any(target_os = "linux", feature = "realsense", test)),
         expect(dead_code, reason = "the nokhwa driver has no such errors")
@@ -117,7 +117,8 @@ pub(crate) struct Reconnecting<C: ReopenableCamera> {
     /// The outage, from its start until the next image. A camera that can be opened but sends
     /// nothing still counts as disconnected.
     outage: Option<Outage>,
-    /// Stamp of the last color image and of the last depth image, kept across reconnections.
+    /// Stamps of the last color image and of the last depth image. Both are kept across
+    /// reconnections.
     last: [Option<Stamp>; 2],
     /// Whether a color image and a depth image have arrived since the camera was last opened.
     has_image: [bool; 2],
@@ -192,15 +193,15 @@ impl<C: ReopenableCamera> Reconnecting<C> {
         }
     }
 
-    /// Counts an image. If it is the first of its kind since the camera was reopened, also counts
-    /// the images missed before it.
+    /// Counts an image. If this is the first color or depth image since the camera was reopened,
+    /// also counts the images that were missed during the outage.
     fn count(&mut self, mut image: Image) -> Image {
         let kind = usize::from(image.is_depth());
         let last = self.last[kind].replace(image.stamp);
         // Sequence numbers start again when a camera is opened, so the driver cannot count images
         // that were lost during an outage. The number is estimated from the stamps instead. The
-        // larger number is used, because the driver may have counted images that were dropped after
-        // opening.
+        // driver may also have counted images that were dropped after opening, so the larger of
+        // both numbers is used.
         let is_first_since_open = !std::mem::replace(&mut self.has_image[kind], true);
         if let (true, Some(last)) = (is_first_since_open, last) {
             image.n_skipped =
@@ -216,15 +217,15 @@ impl<C: ReopenableCamera> Reconnecting<C> {
         image
     }
 
-    /// Closes the camera, because an open device node would keep its number when the camera
-    /// returns.
+    /// Closes the camera. If its device node stayed open, the camera would get another number when
+    /// it is connected again.
     fn disconnect(&mut self, problem: C::Problem) -> Result<(), Error> {
         let outage = Outage::of(&mut self.outage);
         // The stream is dropped before the warning and any wait, so that the device node is free
         // from here on.
         self.stream = None;
-        // The first problem is a warning. Later problems are logged as details until the time
-        // limit, because the log would otherwise repeat them at every attempt.
+        // The first problem is a warning. Later problems are logged at a lower level until the time
+        // limit, because every attempt would otherwise repeat the warning.
         if outage.n_tries > 0 {
             return self.fail_if_overdue(outage, problem);
         }

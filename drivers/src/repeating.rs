@@ -10,7 +10,8 @@ const PAUSE_NANOS: i64 = 1_100_000_000;
 /// A source that starts again from its beginning whenever it ends.
 ///
 /// Stamps continue to increase: those of each round are shifted by the length of the rounds before
-/// it. The robot jumps back at the beginning of a round, see [`Source::n_restarts`].
+/// it. At the beginning of a round, the robot jumps back to its first pose (see
+/// [`Source::n_restarts`]).
 pub struct Repeating<Reopen> {
     source: Box<dyn Source>,
     reopen: Reopen,
@@ -56,8 +57,8 @@ impl<Reopen: FnMut() -> Result<Box<dyn Source>, Error> + Send> Source for Repeat
                 return Ok(None);
             };
             self.has_image = false;
-            // The source is reopened before the offset changes. If reopening fails, this source
-            // thus still has consistent stamps.
+            // The source is reopened before the offset changes. The stamps of this source therefore
+            // stay consistent if reopening fails.
             self.source = (self.reopen)()?;
             let round_nanos = latest.nanos_since(earliest).saturating_add(PAUSE_NANOS);
             self.offset_nanos = self.offset_nanos.saturating_add(round_nanos);

@@ -24,7 +24,8 @@ pub enum PixelFormat {
     Jpeg,
     /// A PNG file.
     Png,
-    /// Depth along the camera's z axis as little-endian 16-bit counts; 0 if unknown.
+    /// Depth along the camera's z axis as little-endian 16-bit counts. A count of 0 means that the
+    /// depth is unknown.
     DepthU16 {
         /// Meters per count. By default 0.001 for a RealSense D4xx, 0.0001 for a D405 and 0.00025
         /// for an L515.
@@ -37,7 +38,7 @@ pub enum PixelFormat {
 pub struct Image {
     /// Name of the camera in the rig file.
     pub camera: Arc<str>,
-    /// Time of the image: mid-exposure, if the device reports it.
+    /// Time of the image. It is the middle of the exposure if the device reports that time.
     pub stamp: Stamp,
     /// Width and height, pixels.
     pub size_px: [u32; 2],
@@ -67,13 +68,13 @@ pub struct TruthImage {
     /// The noise-free image, [`PixelFormat::Rgb8`] or `Png`, with the camera and stamp of the noisy
     /// one.
     pub image: Image,
-    /// Noise-free depth along z, meters, `[height, width]`; 0 where there is no surface. Empty if
-    /// not requested.
+    /// Noise-free depth along z, meters, `[height, width]`. A value of 0 means that there is no
+    /// surface. The array is empty if depth was not requested.
     pub depth_m: Arc<[f32]>,
     /// True pose of the camera at mid-exposure of the middle row.
     pub world_from_camera: Transform,
-    /// PSNR in dB of the delivered image relative to the same image (including shear and blur)
-    /// before noise was added; `None` without noise.
+    /// PSNR in dB of the delivered image relative to the same image before noise was added. Both
+    /// images include shear and blur. `None` if the camera has no noise.
     pub psnr_ceiling: Option<f64>,
 }
 

@@ -1,8 +1,9 @@
 //! Converts YUV images (luma and chroma) from cameras to red, green and blue.
 //!
 //! Source: ITU-R BT.601-7 and BT.709-6 (matrices, limited range), Linux `videodev2.h` (defaults,
-//! layouts). The transfer function is assumed to be that of sRGB: the transfer function that
-//! cameras announce is rarely correct, and the difference is only a tone curve.
+//! layouts). The transfer function of sRGB is assumed for all cameras, because the transfer
+//! function that a camera announces is rarely correct. A wrong transfer function only changes the
+//! tone curve.
 
 use crate::Error;
 
@@ -13,8 +14,8 @@ pub enum YuvLayout {
     Yuyv,
     /// `U Y0 V Y1` for every two pixels of a row.
     Uyvy,
-    /// First all Y, in rows padded to an even width; then, for every two rows, one row with `U V`
-    /// for every two pixels.
+    /// First all Y, in rows padded to an even width. Then follows one row of chroma for every two
+    /// rows of pixels, with `U V` for every two pixels.
     Nv12,
 }
 
@@ -55,8 +56,8 @@ pub struct V4l2Colors {
     pub ycbcr_enc: u32,
     /// `enum v4l2_quantization`.
     pub quantization: u32,
-    /// Whether the device receives a high-definition television signal (it has DV timings), as HDMI
-    /// grabbers do and cameras do not.
+    /// Whether the device receives a high-definition television signal. HDMI grabbers receive one
+    /// and report DV timings. Cameras do not.
     pub is_hdtv: bool,
 }
 

@@ -2,16 +2,17 @@
 
 use std::fmt;
 
-/// Memory for decoded data that any input may use, bytes. Small files may expand by large factors,
-/// such as an image of one color; a larger value would let many small files fill the memory.
+/// Memory for decoded data that any input may use, bytes. A small file, such as an image of one
+/// color, may expand by a large factor. With a larger value, many small files could fill the
+/// memory.
 const FREE_BYTES: u64 = 64 << 20;
 
-/// Limits for one input. All are checked against numbers that the input declares, before memory is
-/// allocated for them.
+/// Limits for one input. The input declares its sizes. These sizes are checked against the limits
+/// before memory is allocated.
 ///
-/// Nesting is not limited here, because the parsers of JSON and TOML stop at 128 levels or fewer,
-/// and robot descriptions are parsed without recursion, with the limits of `kinematics::urdf`. Time
-/// is not limited either, because the time of all readers is linear in the size of their input.
+/// Nesting is not limited here. The parsers of JSON and TOML stop at 128 levels or fewer. Robot
+/// descriptions are parsed without recursion, with the limits of `kinematics::urdf`. Time is not
+/// limited either, because the time of all readers is linear in the size of their input.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Budget {
     /// Size of the input, bytes.
@@ -29,12 +30,12 @@ impl Budget {
         max_elements: u64::MAX,
         max_expansion: u64::MAX,
     };
-    /// Tables with free names in a rig file: cameras, scanners, motors or tags.
+    /// Tables in a rig file whose names the user chooses: cameras, scanners, motors or tags.
     pub const RIG_TABLES: Self = Self {
         max_elements: 1000,
         ..Self::TEXT
     };
-    /// Meshes of a robot, which are passed on as they are.
+    /// Meshes of a robot, which are passed on without decoding.
     pub const MESH: Self = Self {
         max_bytes: 64 << 20,
         max_elements: u64::MAX,
@@ -45,32 +46,33 @@ impl Budget {
         max_bytes: 256 << 20,
         ..Self::MESH
     };
-    /// Color images; elements are pixels. A small file of a uniform image can contain very many.
+    /// Color images. Elements are pixels. A small file of a uniform image can contain very many
+    /// pixels.
     pub const COLOR_IMAGE: Self = Self {
         max_bytes: 1 << 30,
         // 134 megapixels take 512 MiB as RGBA.
         max_elements: 1 << 27,
         max_expansion: u64::MAX,
     };
-    /// Depth images; elements are pixels.
+    /// Depth images. Elements are pixels.
     pub const DEPTH_IMAGE: Self = Self {
-        // 33 megapixels are above all depth cameras, and take 128 MiB as f32.
+        // No depth camera has 33 megapixels. An image of this size takes 128 MiB as f32.
         max_elements: 1 << 25,
         ..Self::COLOR_IMAGE
     };
-    /// Records of recordings; the largest contains one image. Compressed records expand to at most
-    /// this size, too.
+    /// Records of recordings. The largest record contains one image. Compressed records expand to
+    /// at most this size, too.
     pub const RECORD: Self = Self {
         max_bytes: 512 << 20,
         max_elements: u64::MAX,
         max_expansion: u64::MAX,
     };
-    /// Files of splats. Compressed ones expand by a factor of 2 to 4.
+    /// Files of splats. Compressed files expand by a factor of 2 to 4.
     pub const SPLATS: Self = Self {
         max_bytes: u64::MAX,
         max_elements: 100_000_000,
-        // This is far above the factor of real files, and far below the factor of a file made to
-        // fill the memory.
+        // The limit is far above the factor of real files. It is far below the factor of a file
+        // that was made to fill the memory.
         max_expansion: 50,
     };
     /// Point clouds from which training starts.
@@ -78,8 +80,8 @@ impl Budget {
         max_bytes: 1 << 30,
         ..Self::SPLATS
     };
-    /// Files whose decoded data is not larger than the file: checkpoints, weights. Their size is
-    /// limited by the disk only.
+    /// Files whose decoded data is not larger than the file, such as checkpoints and weights. Only
+    /// the disk limits their size.
     pub const PLAIN: Self = Self {
         max_bytes: u64::MAX,
         max_elements: u64::MAX,
@@ -123,7 +125,7 @@ impl Budget {
         n_decoded_bytes: u64,
         n_input_bytes: u64,
     ) -> Result<(), OverBudget> {
-        // The product saturates, so that an expansion without limit accepts everything.
+        // The product saturates, so that a budget with unlimited expansion accepts any size.
         if n_decoded_bytes > FREE_BYTES.max(self.max_expansion.saturating_mul(n_input_bytes)) {
             return Err(OverBudget::Decoded {
                 n_decoded_bytes,

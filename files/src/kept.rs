@@ -64,13 +64,13 @@ impl Kept {
             .is_ok_and(|own| (own.dev(), own.ino()) == (named.dev(), named.ino()))
     }
 
-    /// Writes the contents of a removed file to its path again, unless something else is there.
+    /// Writes the contents of a removed file to its path again, unless the path is taken.
     ///
     /// # Errors
     /// If it cannot be written, or if the path is taken.
     pub fn restore(&self) -> std::io::Result<()> {
-        // Opened again, because the position of `file` may be shared with whoever writes it.
-        // Without /proc, such as on macOS, the duplicate has to do.
+        // The file is opened again, because another user of `file` may share its position. Systems
+        // without /proc, such as macOS, use a duplicate of `file` instead.
         let mut contents = match File::open(self.in_proc()) {
             Err(error) if error.kind() == ErrorKind::NotFound => self.file.try_clone()?,
             opened => opened?,

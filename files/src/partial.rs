@@ -1,7 +1,8 @@
 //! Names and removes output files and folders that were not written completely.
 //!
-//! After an error or a signal, the writing functions of this crate remove what they have not
-//! finished. What a killed program leaves behind is removed when the same file is written again.
+//! After an error or a signal, the writing functions of this crate remove unfinished files and
+//! folders. If a program is killed, its leftover files are removed when the same file is written
+//! again.
 
 use parking_lot::{Mutex, MutexGuard};
 use std::collections::BTreeSet;
@@ -24,8 +25,8 @@ const MAX_NAME_BYTES: usize = 255;
 /// Temporary path of a file or folder that is being written: `.NAME.fieldrig.part` in the same
 /// folder.
 ///
-/// It depends only on the path, so that programs that write the same file at the same time notice
-/// each other.
+/// The temporary path depends only on the final path. Programs that write the same file at the same
+/// time therefore notice each other.
 pub fn path_of(path: &Path) -> PathBuf {
     let name = path.file_name().unwrap_or_default().as_bytes();
     // Very long names are truncated. Files whose truncated names are equal cannot be written at the
@@ -55,8 +56,8 @@ impl Registered {
 impl Drop for Registered {
     fn drop(&mut self) {
         if let Some(path) = &self.0 {
-            // The lock is held while the path is removed: otherwise, `remove_all` could return in
-            // between, and the process could exit with the file still there.
+            // The lock is held while the path is removed. Otherwise, `remove_all` could return
+            // before the removal, and the process could exit while the file still exists.
             let mut in_progress = IN_PROGRESS.lock();
             remove(path);
             in_progress.remove(path);
@@ -70,10 +71,10 @@ pub struct NoNewFiles {
     _in_progress: MutexGuard<'static, BTreeSet<PathBuf>>,
 }
 
-/// Removes all partial files. To be called before the process exits.
+/// Removes all partial files. Call this function before the process exits.
 pub fn remove_all() -> NoNewFiles {
-    // The lock is passed to the caller. Threads that want to start a file wait for it until the
-    // process has ended, so nothing is left behind after this call.
+    // The lock is passed to the caller. Threads that want to start a file wait for this lock until
+    // the process has ended, so no new partial file appears after this call.
     let in_progress = IN_PROGRESS.lock();
     in_progress.iter().for_each(|path| remove(path));
     NoNewFiles {
@@ -82,8 +83,8 @@ pub fn remove_all() -> NoNewFiles {
 }
 
 /// Removes the temporary file or folder that a killed program left at a path of [`path_of`], if
-/// there is one. A folder is removed only if it contains nothing but entries with these names,
-/// complete or not.
+/// there is one. A folder is removed only if all its entries have one of these names or the
+/// temporary path of one.
 ///
 /// # Errors
 /// If the folder has other entries, or cannot be removed.
@@ -93,7 +94,8 @@ pub fn remove_leftover(unfinished: &Path, names: &[&OsStr]) -> std::io::Result<(
         let mut entries = std::fs::read_dir(unfinished)
             .map_err(|error| cannot_remove(unfinished, &error))?
             .flatten();
-        // A folder with this name may hold files of a user, although the name is unlikely.
+        // A user may have stored files in a folder with this name, although such a name is
+        // unlikely.
         if entries.any(|entry| !is_one_of(&entry.path(), &own_paths)) {
             return Err(Error::new(
                 ErrorKind::AlreadyExists,
@@ -122,7 +124,7 @@ fn is_one_of(entry: &Path, own_paths: &[PathBuf]) -> bool {
         .any(|own| entry == own || entry == path_of(own))
 }
 
-/// Removes a file, a link or a folder, if it is there; warns if this fails.
+/// Removes a file, a link or a folder if it exists. Logs a warning if the removal fails.
 fn remove(path: &Path) {
     if let Err(error) = remove_any(path) {
         log::warn!(
@@ -139,7 +141,8 @@ fn remove_any(path: &Path) -> std::io::Result<()> {
         std::fs::remove_file(path)
     };
     match removed {
-        // The goal is reached: the writer may have published or removed it in the meantime.
+        // The path no longer exists, because the writer has published or removed it in the
+        // meantime.
         Err(error) if error.kind() == ErrorKind::NotFound => Ok(()),
         removed => removed,
     }

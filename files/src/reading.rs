@@ -48,13 +48,13 @@ fn check_type(kind: &std::fs::FileType) -> std::io::Result<()> {
 /// Reads a regular file within a budget.
 ///
 /// # Errors
-/// If the file cannot be opened or read, is not a regular file, or is larger.
+/// If the file cannot be opened or read, is not a regular file, or is larger than the budget.
 pub fn read(path: &Path, budget: Budget) -> std::io::Result<Vec<u8>> {
     let file = open(path)?;
     let n_bytes = file.metadata()?.len();
     budget.check_bytes(n_bytes)?;
     let mut bytes = Vec::new();
-    // Memory is reserved before reading, so that a file that is too large for it is an error
+    // Memory is reserved before reading. A file that does not fit into memory is then an error
     // instead of an abort.
     bytes.try_reserve_exact(usize::try_from(n_bytes).unwrap_or(usize::MAX))?;
     // The file may grow, and files in /proc have no size.

@@ -10,7 +10,8 @@ use std::path::{Path, PathBuf};
 /// Replaces a file, or writes a new one. A link with this name is replaced, not followed.
 ///
 /// # Errors
-/// If the file cannot be written, or another program is writing it; the previous file is kept.
+/// If the file cannot be written, or another program is writing it. The previous file is kept after
+/// an error.
 pub fn replace(
     path: &Path,
     contents: impl FnOnce(&mut File) -> std::io::Result<()>,
@@ -20,7 +21,7 @@ pub fn replace(
     })
 }
 
-/// As [`replace`], with contents that are in memory.
+/// Like [`replace`], but with contents that are already in memory.
 ///
 /// # Errors
 /// As [`replace`].
@@ -77,9 +78,9 @@ pub fn create_from<T, E: From<Error>>(
 }
 
 /// Calls `write` with a path in a temporary folder. `write` creates a folder there, which is then
-/// moved to `path`. If `path` is a folder already, those `entries` that `write` created are moved
-/// into it in the given order. If the program is killed, it may have moved only the first entries.
-/// The last entry should therefore be the one by which readers recognize the folder.
+/// moved to `path`. If the folder `path` already exists, the `entries` that `write` created are
+/// moved into it in the given order. If the program is killed, it may have moved only the first
+/// entries. The last entry should therefore be the entry by which readers recognize the folder.
 ///
 /// # Errors
 /// The errors of `write`, and those of [`create`]. Entries that have already been moved are removed
@@ -100,8 +101,8 @@ pub fn create_folder<T, E: From<Error>>(
     let mut moved = Vec::new();
     for entry in entries.iter().filter(|entry| inside.join(entry).exists()) {
         publish(&inside.join(entry), &path.join(entry))?;
-        // Until all entries are moved, a failure or signal also removes the entries that have been
-        // moved, because half an export looks like a complete one.
+        // Until all entries are moved, a failure or signal also removes the entries that have
+        // already been moved. Otherwise, an incomplete export would look like a complete one.
         moved.push(Registered::new(&path.join(entry)));
     }
     sync_parent(&contents)?;
@@ -164,8 +165,8 @@ fn sync_parent(path: &Path) -> std::io::Result<()> {
     }
 }
 
-/// A file or folder with a temporary name, locked by this process; removed on drop if it is still
-/// there.
+/// A file or folder with a temporary name, locked by this process. On drop, it is removed if it
+/// still exists.
 struct Unfinished {
     path: PathBuf,
     /// This field is declared before `file`. Fields drop in order, so the path is removed while it
@@ -192,7 +193,7 @@ impl Unfinished {
 
     /// Makes and locks the temporary file. A leftover file of a program that was killed is removed
     /// first. Until the new file is locked, another program may mistake it for a leftover and
-    /// remove it; then `make` returns `None`.
+    /// remove it. In this case, `make` returns `None`.
     fn new(
         path: &Path,
         make: impl Fn(&Path) -> std::io::Result<Option<File>>,
@@ -246,8 +247,8 @@ impl Unfinished {
     }
 }
 
-/// Takes the lock of an open file; returns whether it was free. On a file system without locks,
-/// always returns true.
+/// Takes the lock of an open file. Returns whether the lock was free. Always returns true on a file
+/// system without locks.
 fn try_lock(file: &File) -> std::io::Result<bool> {
     match flock(file, FlockOperation::NonBlockingLockExclusive) {
         // Refusing to write on such file systems would be worse than the rare case of two writers.
@@ -266,8 +267,8 @@ fn is_at(file: &File, path: &Path) -> bool {
     })
 }
 
-/// Takes the lock of a file, which is created if necessary and keeps its contents. Returns `None`
-/// if another program holds it. The lock is released when the file is closed.
+/// Takes the lock of a file. The file is created if necessary, and keeps its contents. Returns
+/// `None` if another program holds the lock. The lock is released when the file is closed.
 ///
 /// # Errors
 /// If the file cannot be created, or is a symbolic link.

@@ -47,8 +47,8 @@ impl Default for Hash {
 impl Hash {
     fn word(&mut self, word: u64) {
         // A multiplication carries information only into the upper bits. The rotation moves the
-        // upper bits down, where they affect all other bits. An odd factor keeps the map one to
-        // one, so that two different words cannot have the same result.
+        // upper bits down, so that the next multiplication spreads them to the bits above. An odd
+        // factor keeps the map one to one, so that two different words cannot have the same result.
         self.0 = (self.0.rotate_left(29) ^ word).wrapping_mul(0xd134_2543_de82_ef95);
         self.0 ^= self.0 >> 32;
     }

@@ -8,7 +8,7 @@ use std::path::Path;
 /// How test photos are chosen.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum Holdout {
-    /// Every n-th photo, starting with the first; n is at least 1.
+    /// Every n-th photo, starting with the first photo. The number n is at least 1.
     Every(usize),
     /// The photos with these names.
     Named(Vec<String>),
@@ -66,8 +66,8 @@ impl Holdout {
 fn every_nth(ix: usize, every: usize) -> Split {
     match ix % every {
         0 => Split::Test,
-        // With two or fewer photos between test photos, validation would take at least half of them
-        // from training.
+        // With two or fewer photos between two test photos, validation would take at least half of
+        // these photos from training.
         offset if every >= 4 && offset == every / 2 => Split::Validation,
         _ => Split::Train,
     }
@@ -90,8 +90,8 @@ fn splits_by_name(test_names: &[String], names: &[&str]) -> Result<Vec<Split>, E
             }
         }
         n_remaining += usize::from(!is_test);
-        // Validation photos are counted among the photos that are not for testing. They are
-        // therefore spread evenly wherever the test photos are.
+        // The position of a validation photo is counted among the photos that are not for testing.
+        // Validation photos are therefore spread evenly, wherever the test photos are.
         splits.push(if is_test {
             Split::Test
         } else if n_remaining % 8 == 5 {
@@ -100,8 +100,8 @@ fn splits_by_name(test_names: &[String], names: &[&str]) -> Result<Vec<Split>, E
             Split::Train
         });
     }
-    // A name without a photo is probably a typing error. Scores on the other listed photos would
-    // look like scores on the whole list.
+    // A name without a photo is probably a typing error. If it were ignored, scores on the other
+    // listed photos would look like scores on the whole list.
     match test_names.iter().find(|name| !requested[name.as_str()]) {
         Some(name) => Err(Error::Holdout {
             request: format!("{name:?}"),

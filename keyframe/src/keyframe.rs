@@ -10,15 +10,16 @@ use std::sync::Arc;
 pub enum Split {
     /// Used for training.
     Train,
-    /// Used to choose hyperparameters and to decide trials, and afterwards for training.
+    /// Used to choose hyperparameters and to decide trials. Afterwards, these keyframes are also
+    /// used for training.
     Validation,
     /// Used only for reported scores.
     Test,
 }
 
 impl Split {
-    /// The split of the keyframe at index `ix` of a camera: every 8th keyframe, starting at index
-    /// 0, is for testing, and every 8th, starting at index 4, for validation.
+    /// The split of the keyframe at index `ix` of a camera. Every 8th keyframe is for testing,
+    /// starting at index 0. Every 8th keyframe is for validation, starting at index 4.
     pub fn of(ix: usize) -> Self {
         match ix % 8 {
             0 => Self::Test,
@@ -48,9 +49,11 @@ pub struct Keyframe {
     pub depth: Option<DepthMap>,
     /// Pose at `stamp`.
     pub world_from_camera: Transform,
-    /// Velocity of the camera at `stamp`, if known; used with `readout_secs`.
+    /// Velocity of the camera at `stamp`, if known. Together with `readout_secs`, it describes the
+    /// rolling shutter.
     pub twist: Option<Twist>,
-    /// Time from the first row's exposure to the last row's, seconds; 0 for a global shutter.
+    /// Time from the exposure of the first row to the exposure of the last row, seconds. It is 0
+    /// for a global shutter.
     pub readout_secs: f64,
     /// For each joint that carries the camera, the twist of the camera, in its own axes, when only
     /// that joint moves at unit speed. Empty if unknown.
@@ -64,8 +67,8 @@ pub struct Keyframe {
 }
 
 impl Keyframe {
-    /// Whether most of the image has no depth. This is so if the keyframe has no depth, or if its
-    /// depth comes from a range scanner, which covers only a band.
+    /// Whether most of the image has no depth. The result is true if the keyframe has no depth. It
+    /// is also true if the depth comes from a range scanner, which covers only a band of the image.
     pub fn lacks_dense_depth(&self) -> bool {
         self.depth.as_ref().is_none_or(|depth| {
             // NaN compares false, so it counts as unknown.
@@ -114,7 +117,7 @@ impl Keyframe {
         Ok(())
     }
 
-    /// Returns the keyframe with a corrected base pose: all its poses are multiplied by
+    /// Returns the keyframe with a corrected base pose. All poses of the keyframe are multiplied by
     /// `map_from_odom` from the left.
     pub fn with_base_correction(&self, map_from_odom: &Transform) -> Self {
         Self {
@@ -131,7 +134,7 @@ impl Keyframe {
         }
     }
 
-    /// Whether all camera parameters are finite; depth readings are not checked.
+    /// Whether all camera parameters are finite. Depth readings are not checked.
     pub fn is_finite(&self) -> bool {
         let twists = self.twist.iter().chain(self.joint_twists.iter());
         transform::is_finite(&self.world_from_camera)
@@ -158,11 +161,12 @@ fn is_valid_lens(focal_px: [f64; 2], principal_px: [f64; 2]) -> bool {
 /// State of a mobile base at the time of a keyframe.
 #[derive(Clone, Debug, PartialEq)]
 pub struct BaseState {
-    /// Index of the station at which the base is stationary, from 0; `None` while the base moves.
+    /// Index of the station at which the base is stationary, counted from 0. `None` while the base
+    /// moves.
     pub station: Option<usize>,
-    /// Pose of the base at the keyframe's stamp, as reported by its source.
+    /// Reported pose of the base at the keyframe's stamp, without correction.
     pub world_from_base: Transform,
-    /// Drift correction by which the poses of the keyframe have been multiplied from the left.
+    /// Drift correction. The poses of the keyframe have been multiplied by it from the left.
     pub map_from_odom: Transform,
     /// The true pose of the base, from a simulator.
     pub truth: Option<Transform>,
@@ -208,8 +212,8 @@ impl DepthMap {
         Vector3::new(ray(x, 0), ray(y, 1), 1.0) * z_m
     }
 
-    /// Returns a smaller depth map that contains the center pixel of every square of `stride` by
-    /// `stride` pixels (`stride` is odd), with the same readings along the same rays. Incomplete
+    /// Returns a smaller depth map. It contains the center pixel of every square of `stride` by
+    /// `stride` pixels, with the same reading along the same ray. `stride` must be odd. Incomplete
     /// squares at the right and lower edges are dropped.
     #[must_use]
     pub fn subsampled(&self, stride: u32) -> Self {
@@ -240,8 +244,8 @@ pub struct Truth {
     pub rgba_srgb: Arc<[u8]>,
     /// True pose at the keyframe's stamp.
     pub world_from_camera: Transform,
-    /// PSNR of the keyframe's image against its noise-free version, dB; a perfect model reaches
-    /// this score. `None` without noise.
+    /// PSNR of the keyframe's image against its noise-free version, dB. A perfect model reaches
+    /// this score. `None` if the image has no noise.
     pub psnr_ceiling: Option<f64>,
 }
 

@@ -2,9 +2,9 @@
 //!
 //! A [`Keyframe`] is an undistorted image with the pose of its camera at mid-exposure. It may also
 //! have a [`DepthMap`], the motion of a rolling shutter and, from a simulator, the [`Truth`].
-//! [`RangePoints`] is one revolution of a range scanner. All are plain arrays without driver or GPU
-//! types. A [`KeyframeList`] or [`Holdout`] selects keyframes and assigns their splits. Cameras are
-//! x right, y down, z forward; the world is z up.
+//! [`RangePoints`] is one revolution of a range scanner. All these types are plain arrays without
+//! driver or GPU types. A [`KeyframeList`] or [`Holdout`] selects keyframes and assigns their
+//! splits. Cameras are x right, y down, z forward; the world is z up.
 //!
 //! ```
 //! use keyframe::{Keyframe, Split};

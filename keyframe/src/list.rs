@@ -72,8 +72,8 @@ impl KeyframeList {
             return Ok(None);
         };
         let n_missing = 1 + missing.count();
-        // Some keyframes may be missing because a recording was cut or images were deleted. If none
-        // is found, the list belongs to other data.
+        // Some keyframes may be missing because a recording was cut or images were deleted. If no
+        // listed keyframe is found, the list belongs to other data.
         if n_missing < self.len() {
             return Ok(Some(format!(
                 "{n_missing} of {} listed keyframes are not in the data; the first is {camera} {stamp}",
@@ -110,8 +110,8 @@ impl KeyframeList {
                     line_ix + 1
                 ));
             };
-            // A second line for the same keyframe may name another split, and one of the two lines
-            // would be ignored.
+            // A second line for the same keyframe is an error, because it may name another split.
+            // One of the two lines would then be ignored.
             if list.insert(key, split).is_some() {
                 return Err(format!("line {}: {line:?} is listed twice", line_ix + 1));
             }

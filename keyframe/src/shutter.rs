@@ -7,6 +7,6 @@ use kinematics::Twist;
 pub struct Shutter {
     /// Velocity of the camera in its own axes.
     pub twist: Twist,
-    /// Time from the first row's exposure to the last row's, seconds.
+    /// Time from the exposure of the first row to the exposure of the last row, seconds.
     pub readout_secs: f64,
 }

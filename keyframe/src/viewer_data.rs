@@ -63,6 +63,7 @@ pub struct RangeScan {
     pub scan: Arc<RangePoints>,
     /// Corrects the world coordinates of the points.
     pub map_from_odom: Transform,
-    /// Begin of the revolution; when the scan was read, if its stamp is on another clock.
+    /// Start of the revolution. If the stamp of the scan is on another clock, this is the time at
+    /// which the scan was read.
     pub captured_at: Instant,
 }

@@ -87,12 +87,12 @@ impl Lens {
 impl Intrinsics {
     /// Projects a point in camera coordinates to a pixel, which may lie outside the image.
     ///
-    /// Returns `None` if the lens cannot image the point: it lies behind or next to the camera (`z
-    /// <= 0`), it lies beyond the radius up to which the distortion polynomial is monotonic, or it
-    /// is not finite.
+    /// Returns `None` if the lens cannot image the point. This is the case if the point lies behind
+    /// or next to the camera (`z <= 0`), or if it is not finite. It is also the case if the point
+    /// lies beyond the radius up to which the distortion polynomial is monotonic.
     pub fn project(&self, point_in_camera: &Vector3<f64>) -> Option<[f64; 2]> {
-        // NaN is checked explicitly: every comparison with it is false, so `z <= 0` would accept
-        // it.
+        // NaN is checked explicitly, because every comparison with NaN is false. The test `z <= 0`
+        // alone would accept it.
         if point_in_camera.z.is_nan() || point_in_camera.z <= 0.0 {
             return None;
         }
@@ -142,9 +142,10 @@ impl Intrinsics {
         )
     }
 
-    /// Fraction of the image, 0 to 1, in which the lens coefficients are implausible. There, no
-    /// direction projects to the pixel, because the model is not monotonic, or the distortion moves
-    /// points outwards to more than 1.5 times their distance from the principal point.
+    /// Fraction of the image, 0 to 1, in which the lens coefficients are implausible. They are
+    /// implausible at a pixel if no direction projects to it, because the model is not monotonic
+    /// there. They are also implausible if the distortion moves points outwards to more than 1.5
+    /// times their distance from the principal point.
     pub fn implausible_lens_frac(&self) -> f64 {
         /// Number of pixels that are examined in each row and column of a grid.
         const N_PER_SIDE: u32 = 8;
@@ -203,8 +204,8 @@ impl Intrinsics {
 
     /// Returns the intrinsics for the image resized to `size_px`.
     pub fn resized(&self, size_px: [u32; 2]) -> Self {
-        // Pixel edges are at integers, so scaling maps edges to edges. Conventions with integer
-        // pixel centers need an additional offset of half a pixel.
+        // Pixel edges are at integers, so scaling maps edges to edges. With integer pixel centers,
+        // an additional offset of half a pixel would be needed.
         let ratio = |axis: usize| f64::from(size_px[axis]) / f64::from(self.size_px[axis]);
         Self {
             size_px,
@@ -293,7 +294,7 @@ impl Intrinsics {
     }
 }
 
-/// An error that names the parameter, unless its value is fine.
+/// Returns an error that names the parameter if its value is out of range.
 fn check(
     what: &'static str,
     value: f64,

@@ -8,8 +8,8 @@ use std::collections::HashMap;
 /// The joints between two links of a robot, ready to compute poses.
 ///
 /// Configurations are slices in the order of [`Chain::joint_names`]: radians for revolute joints,
-/// meters for prismatic ones. Mimic joints are not part of a configuration; they are computed from
-/// the joints they follow.
+/// meters for prismatic ones. Mimic joints are not part of a configuration. Their positions are
+/// computed from the joints that they follow.
 #[derive(Clone, Debug)]
 pub struct Chain {
     base_link: String,
@@ -63,7 +63,7 @@ impl Chain {
         let mut indices = HashMap::new();
         for joint in robot.path(base_link, tip_link)? {
             // Invalid joints are accepted in the file, because only chains through them need their
-            // poses. This chain does.
+            // poses. This chain leads through the joint, so its problem is an error here.
             if let Some(problem) = &joint.problem {
                 return Err(problem.clone());
             }
@@ -269,10 +269,11 @@ struct MimicRule<'a> {
     offset: f64,
 }
 
-/// The known rules, by joint. They ensure that chains of mimic joints are followed only once.
+/// The known rules, by joint. With them, each chain of mimic joints is followed only once.
 type MimicRules<'a> = HashMap<&'a str, MimicRule<'a>>;
 
-/// The rule that expresses `joint` by an independent joint, through any number of mimic joints.
+/// The rule that expresses `joint` by an independent joint. Any number of mimic joints may be
+/// between the two.
 fn follow_mimics<'a>(
     robot: &'a Robot,
     joint: &'a Joint,
@@ -327,7 +328,7 @@ fn follow_mimics<'a>(
     Ok(rule)
 }
 
-/// The error of a joint whose mimic rules cannot be followed; `mimic` is the rule that is at fault.
+/// The error of a joint whose mimic rules cannot be followed. `mimic` is the rule that is at fault.
 fn mimic_error(joint: &Joint, mimic: &Mimic, why: &'static str) -> Error {
     Error::Mimic {
         joint: joint.name.clone(),

@@ -5,11 +5,11 @@ use std::collections::VecDeque;
 
 /// Maps stamps of one device's clock to the host's monotonic clock.
 ///
-/// Every message arrives at `device * (1 + drift) + offset + latency`, where the latency has a
-/// fixed minimum and is often much larger. All arrivals therefore lie above a line. The map is the
-/// highest such line. It is the edge of the lower convex hull at the mean device time (Moon, Skelly
-/// and Towsley 1999, section 4). Late arrivals do not move the line. The minimum latency cannot be
-/// observed and remains in the result; calibration estimates it.
+/// Every message arrives at `device * (1 + drift) + offset + latency`. The latency has a fixed
+/// minimum and is often much larger. All arrivals therefore lie above a line. The map is the line
+/// below all arrivals that is closest to them. It is the edge of the lower convex hull at the mean
+/// device time (Moon, Skelly and Towsley 1999, section 4). Late arrivals do not move the line. The
+/// minimum latency cannot be observed and remains in the result; calibration estimates it.
 #[derive(Clone, Debug)]
 pub struct ClockMap {
     /// Device stamp and arrival of the first message since the start or the last restart. Device
@@ -49,8 +49,8 @@ struct Line {
 /// near the line. Shorter buckets keep more late arrivals, which never touch the line.
 const BUCKET_NANOS: i64 = 250_000_000;
 /// Arrivals older than this are discarded, so that the map follows a drift that changes with
-/// temperature. A longer window averages more latency. A shorter window follows temperature faster.
-/// With [`BUCKET_NANOS`], the window has at most 481 buckets.
+/// temperature. A longer window averages the latency of more messages. A shorter window follows
+/// changes of temperature faster. With [`BUCKET_NANOS`], the window has at most 481 buckets.
 const WINDOW_SECS: f64 = 120.0;
 /// Maximum drift. It exceeds the drift of all common crystals. Steeper slopes are caused by
 /// latency.
@@ -66,8 +66,8 @@ const MAX_DISORDER_NANOS: i64 = 500_000_000;
 /// once. They also occur when the latency of a connection decreases.
 const MAX_EARLY_SECS: f64 = 0.25;
 /// If all arrivals within [`MAX_LATE_NANOS`] are late by more than this, in seconds, the device
-/// clock has jumped back a little or was paused. A congested network also delays messages, but
-/// rarely every single one by this much.
+/// clock has jumped back a little or was paused. A congested network also delays messages, but it
+/// rarely delays every single message by this much.
 const MAX_LATE_SECS: f64 = 1.0;
 /// How long arrivals must be late before the clock counts as restarted. A blocked connection, whose
 /// messages arrive late together, should recover within this time.
@@ -105,8 +105,9 @@ impl ClockMap {
             return self.restart(device_nanos, arrival);
         }
         self.newest_nanos = self.newest_nanos.max(device_nanos);
-        // Differences are taken in integers before the conversion: an f64 of absolute nanoseconds
-        // since 1970 has a resolution of 256 ns, and delays are differences of two such numbers.
+        // Differences are taken in integers before the conversion to f64. As f64, absolute
+        // nanoseconds since 1970 have a resolution of only 256 ns, and a delay is the difference of
+        // two such numbers.
         let since_nanos = device_nanos.saturating_sub(origin.device_nanos);
         let device_secs = since_nanos as f64 / NANOS_PER_SEC;
         let delay_secs = arrival
@@ -136,9 +137,9 @@ impl ClockMap {
 
     /// Converts a device stamp to host time. Returns `None` before the first message.
     ///
-    /// The result includes the minimum latency of the connection. Stamps may map to slightly
-    /// earlier times once a faster message has arrived, so two stamps close together can change
-    /// order while there are few observations.
+    /// The result includes the minimum latency of the connection. Once a faster message has
+    /// arrived, stamps may map to slightly earlier times. Two stamps that are close together can
+    /// therefore change order while there are few observations.
     #[expect(
         clippy::cast_possible_truncation,
         reason = "a float to integer cast saturates"
@@ -214,8 +215,8 @@ impl ClockMap {
             .partition_point(|bucket| bucket.index < new.index);
         match self.buckets.get_mut(at) {
             None => self.buckets.push_back(new),
-            // Only the fastest message of a bucket can touch the line; the others need not be
-            // stored.
+            // Only the fastest message of a bucket can touch the line. The other messages need not
+            // be stored.
             Some(known) if known.index == new.index && new.delay_secs < known.delay_secs => {
                 *known = new
             }

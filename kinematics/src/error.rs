@@ -149,8 +149,8 @@ pub enum Error {
         /// Its type.
         kind: &'static str,
     },
-    /// A mimic joint follows a joint that does not exist or is not revolute, continuous or
-    /// prismatic, or mimic joints form a loop.
+    /// A mimic joint cannot be followed. The joint that it follows does not exist or is not
+    /// revolute, continuous or prismatic, or mimic joints form a loop.
     #[error("joint {joint:?} mimics {source_joint:?}, which {why}")]
     Mimic {
         /// The mimic joint.

@@ -72,9 +72,9 @@ struct Readings<T> {
     n_rejected: u64,
 }
 
-/// Two neighboring readings and the position of the stamp between them, 0 to 1. At 0 or 1, the
-/// stamp coincides with a reading. If that reading has no neighbor within `max_gap`, both entries
-/// are that reading.
+/// Two neighboring readings and the position of the stamp between them, from 0 to 1. If the
+/// position is 0 or 1, the stamp coincides with a reading. If that reading has no neighbor within
+/// `max_gap`, both entries are that reading.
 struct Bracket<'a, T> {
     before: (Stamp, &'a T),
     after: (Stamp, &'a T),
@@ -93,8 +93,8 @@ impl<T> Readings<T> {
     }
 
     fn push(&mut self, stamp: Stamp, reading: T) -> Result<(), HistoryError> {
-        // Readings must be in order, because stamps are searched by bisection. Equal stamps would
-        // also give an interval of length zero, by which `around` divides.
+        // Readings must be in order, because stamps are searched by bisection. Two equal stamps
+        // would also give an interval of length zero, and `around` divides by this length.
         if let Some(&(newest, _)) = self.buffer.back()
             && stamp <= newest
         {
@@ -147,7 +147,7 @@ impl<T> Readings<T> {
             return Ok(self.around_reading(after_ix, before, after));
         }
         let before = before.expect("the oldest reading is not after the stamp");
-        // The motion between readings that are far apart is unknown: a device may have been
+        // The motion between readings that are far apart is unknown, because a device may have been
         // disconnected while the arm moved.
         if !self.is_near(before.0, after.0) {
             return Err(HistoryError::Gap {
@@ -272,10 +272,11 @@ impl JointHistory {
 
     /// The joints at a stamp.
     ///
-    /// Positions follow the cubic through both neighbors' positions and velocities, or a line if
-    /// the device does not report velocities. Velocities are the derivative of that curve; efforts
-    /// are interpolated linearly. At the stamp of a reading, that reading is returned; if it has no
-    /// velocities, they are the slope of the line to a neighbor.
+    /// Positions follow the cubic polynomial through the positions and velocities of both
+    /// neighbors. If the device does not report velocities, positions follow a line. Velocities are
+    /// the derivative of that curve. Efforts are interpolated linearly. At the stamp of a reading,
+    /// that reading is returned. If it has no velocities, the slope of the line to a neighbor is
+    /// returned as its velocity.
     pub fn at(&self, stamp: Stamp) -> Result<JointState, HistoryError> {
         let Bracket {
             before: (before, a),
@@ -285,7 +286,7 @@ impl JointHistory {
         let span_secs = after.secs_since(before);
         let n_joints = a.position.len();
         let has_velocities = |state: &JointState| state.velocity.len() == n_joints;
-        // A reading is returned bit for bit instead of through the cubic, which would round it.
+        // A reading is returned bit for bit. The cubic would round it.
         if frac == 0.0 || frac == 1.0 {
             let mut at_reading = if frac == 0.0 { a.clone() } else { b.clone() };
             if !has_velocities(&at_reading) && before < after {
@@ -298,8 +299,8 @@ impl JointHistory {
             }
             return Ok(at_reading);
         }
-        // With velocities, the cubic is more accurate when the arm accelerates between readings. If
-        // a device reports velocities only in some readings, the line is used.
+        // The cubic needs velocities. It is more accurate than the line when the arm accelerates
+        // between readings. If only one of the two readings has velocities, the line is used.
         let is_cubic = has_velocities(a) && has_velocities(b);
         let (position, velocity) = (0..n_joints)
             .map(|joint| {
@@ -404,8 +405,8 @@ impl PoseHistory {
         })
     }
 
-    /// The pose and velocity at a stamp. The velocity is assumed constant between neighboring
-    /// poses, and is expressed in the body frame at the stamp. It is zero if the pose has no
+    /// The pose and velocity at a stamp. The velocity is assumed to be constant between neighboring
+    /// poses. It is expressed in the body frame at the stamp. It is zero if the pose has no
     /// neighbor within the allowed gap.
     pub fn with_twist_at(&self, stamp: Stamp) -> Result<(Transform, Twist), HistoryError> {
         let Bracket {
@@ -415,7 +416,8 @@ impl PoseHistory {
         } = self.readings.around(stamp)?;
         let pose = self.at(stamp)?;
         let span_secs = after.secs_since(before);
-        // Both entries are the same reading. Without a neighbor, there is no velocity.
+        // Both entries are the same reading, because the reading has no neighbor. The velocity is
+        // therefore unknown, and zero is returned.
         if span_secs <= 0.0 {
             return Ok((pose, Twist::zero()));
         }

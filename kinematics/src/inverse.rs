@@ -52,7 +52,8 @@ impl Chain {
             .map(|(value, bound)| clamped(*value, *bound))
             .collect();
         // The pose of `start` is computed even if the clamped values differ, because `forward`
-        // rejects wrong lengths and NaN. Clamping has turned NaN into a bound.
+        // rejects wrong lengths and NaN. NaN values no longer appear after clamping, because
+        // clamping turns NaN into a bound.
         let mut error = pose_error(base_from_tip, &self.forward(start)?);
         if q != start {
             error = pose_error(base_from_tip, &self.forward(&q)?);

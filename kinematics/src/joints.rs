@@ -9,8 +9,9 @@ pub struct JointState {
     pub stamp: Stamp,
     /// Positions, radians or meters.
     pub position: Vec<f64>,
-    /// Velocities, radians or meters per second; empty if the device does not report them.
+    /// Velocities, radians or meters per second. The list is empty if the device does not report
+    /// velocities.
     pub velocity: Vec<f64>,
-    /// Efforts, newton meters or newtons; empty if the device does not report them.
+    /// Efforts, newton meters or newtons. The list is empty if the device does not report efforts.
     pub effort: Vec<f64>,
 }

@@ -164,7 +164,7 @@ fn undistort(
         return Some(distorted);
     }
     // Without a tangential part, it is sufficient to solve for the radius. With a tangential part,
-    // that solution is the initial value of Newton's method in the plane.
+    // the solution for the radius is the initial value of Newton's method in the plane.
     let is_rising_to = |radius: f64| radial.is_rising_to(radius * radius);
     let radius = solve_rising(
         |radius| distorted_radius(radial, radius),
@@ -189,8 +189,8 @@ fn undistort(
             break;
         }
     }
-    // The steps may have left the invertible region, or may not have converged. Checking the
-    // solution forward covers both, so that no wrong ray is returned.
+    // The steps may have left the invertible region, or may not have converged. The solution is
+    // therefore distorted again and compared with the input, so that no wrong ray is returned.
     let check = distort(radial, tangential, plane)?;
     const CLOSE: f64 = 1e-12;
     ((check.value - distorted).norm() <= CLOSE * (1.0 + length)).then_some(plane)
@@ -254,8 +254,8 @@ pub(crate) fn kannala_brandt(k: &[f64; 4], plane: Vector2<f64>) -> Option<Distor
     let length = angle * series;
     // The derivative of `atan r` is `1 / (1 + r²)`.
     let length_by_radius = evaluate(&angle_derivative(k), angle2) / (1.0 + radius * radius);
-    // Computes length / radius, and its derivative divided by radius. Near the axis both quotients
-    // lose all digits, but the map is the identity up to third order.
+    // Computes length / radius, and its derivative divided by radius. Near the axis, both quotients
+    // lose all digits. The map is the identity there, up to third order.
     const NEAR_AXIS: f64 = 1e-6;
     let (share, share_by_radius2) = if radius < NEAR_AXIS {
         (

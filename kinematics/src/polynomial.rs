@@ -1,11 +1,11 @@
 //! Polynomials that must be positive on an interval, and inverses of rising functions.
 
-/// A root search stops when the step is below this fraction of the value, just above rounding
-/// errors.
+/// A root search stops when its step is below this fraction of the value. The fraction is just
+/// above rounding errors.
 pub(crate) const CONVERGED: f64 = 1e-15;
 
-/// The smallest `x` from 0 to `limit` at which a function that is 0 at 0 reaches `target`, if it
-/// rises from 0 up to it.
+/// The smallest `x` from 0 to `limit` at which a function reaches `target`. The function is 0 at 0
+/// and must rise up to `x`. Otherwise, there is no result.
 ///
 /// Uses Newton's method inside a bracket that shrinks with every step.
 ///
@@ -88,7 +88,7 @@ pub(crate) fn positive_on<const N: usize>(p: &[f64; N], end: f64) -> bool {
     let mut power = *p;
     let mut scale = 1.0;
     for coefficient in &mut power {
-        // Absent terms stay zero where the scale overflows.
+        // A coefficient of zero is skipped, because zero times an overflowed scale would be NaN.
         if *coefficient != 0.0 {
             *coefficient *= scale;
         }

@@ -22,7 +22,7 @@ pub struct Projection {
 
 impl Intrinsics {
     /// The parameters as a vector: focal length x and y, principal point x and y, then the
-    /// coefficients of the lens, which are left out if the image is rectified.
+    /// coefficients of the lens. The coefficients are left out if the image is rectified.
     pub fn params(&self) -> Vec<f64> {
         let lens = self.lens_in_use();
         self.focal_px

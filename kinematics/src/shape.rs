@@ -118,7 +118,8 @@ pub(crate) fn read_all(robot: Element<'_>, notes: &mut Notes) -> HashMap<String,
 /// A visual shape with the name of its link and its material, if it has a valid one.
 type Visual<'a> = (&'a str, Element<'a>, Option<Element<'a>>);
 
-/// Reads the visual shapes and gives each its color: its own, or that of the named material.
+/// Reads the visual shapes and gives each shape its color. The color is its own, or the color of
+/// the material that it names.
 fn add_visuals<'a>(
     visuals: Vec<Visual<'a>>,
     materials: &Materials<'a>,
@@ -183,7 +184,7 @@ fn own_color(material: Element<'_>) -> Result<Option<[f64; 4]>, Problem> {
     };
     let rgba = color.numbers::<4>("rgba")?;
     match rgba {
-        // Values up to 255 are a likely mistake, and would be drawn as white.
+        // Values from 0 to 255 are a common mistake. They would be drawn as white.
         Some(rgba) if !rgba.iter().all(|channel| (0.0..=1.0).contains(channel)) => Err(color
             .problem(format!(
                 "rgba is {rgba:?}, expected four numbers from 0 to 1"

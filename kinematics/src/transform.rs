@@ -19,10 +19,10 @@ pub struct Twist {
 }
 
 /// Largest element of `|RᵀR - 1|` that is accepted as a rounding error in a file. Quaternions with
-/// three decimals deviate by less than this. A scale error of 0.1 % exceeds it.
+/// three decimals deviate by less than this tolerance. A scale error of 0.1 % exceeds it.
 pub const RIGID_TOLERANCE: f64 = 1e-3;
-/// As [`RIGID_TOLERANCE`], for matrices with three decimals, which deviate by up to `2 * sqrt(3) *
-/// 0.0005`.
+/// Like [`RIGID_TOLERANCE`], but for matrices with three decimals. Such matrices deviate by up to
+/// `2 * sqrt(3) * 0.0005`.
 pub const ROUNDED_TOLERANCE: f64 = 2e-3;
 
 /// Below this angle, in radians, [`exp`] and [`log`] use series instead of quotients. At this
@@ -42,15 +42,16 @@ pub fn from_rows(rows: &[f64; 16]) -> Result<Transform, Error> {
     from_rows_within(rows, RIGID_TOLERANCE)
 }
 
-/// Like [`from_rows`], for numbers that may be rounded to three decimals. Also returns whether they
-/// deviate by more than [`from_rows`] accepts. The rotation is then wrong by up to 0.1 degrees.
+/// Like [`from_rows`], for numbers that may be rounded to three decimals. Also returns whether the
+/// numbers deviate by more than [`from_rows`] accepts. If so, the rotation is wrong by up to 0.1
+/// degrees.
 ///
 /// # Errors
 ///
 /// As [`from_rows`], with [`ROUNDED_TOLERANCE`].
 pub fn from_rounded_rows(rows: &[f64; 16]) -> Result<(Transform, bool), Error> {
     match from_rows(rows) {
-        // Only a deviation may come from rounding; all other errors remain errors.
+        // Only a deviation from a rotation may come from rounding. All other errors remain errors.
         Err(Error::NotRigid { .. }) => Ok((from_rows_within(rows, ROUNDED_TOLERANCE)?, true)),
         exact => Ok((exact?, false)),
     }
@@ -73,14 +74,14 @@ fn from_rows_within(rows: &[f64; 16], tolerance: f64) -> Result<Transform, Error
         return Err(Error::LastRow { row: last });
     }
     let given = Matrix3::from_fn(|row, column| rows[4 * row + column]);
-    // The orthogonality check comes before the projection to a rotation, which would turn any
-    // matrix, even a scaled one in millimeters, into a plausible pose.
+    // The orthogonality check comes before the projection to a rotation. The projection would turn
+    // any matrix into a plausible pose, even a matrix that is scaled to millimeters.
     let off = (given.transpose() * given - Matrix3::identity())
         .abs()
         .max();
     let determinant = given.determinant();
-    // A mirrored matrix is also orthogonal, and differs only in its determinant. It comes from a
-    // file with left-handed axes.
+    // A mirrored matrix is also orthogonal, but its determinant is negative. Files with left-handed
+    // axes contain such matrices.
     if off > tolerance || determinant < 0.0 {
         return Err(Error::NotRigid {
             off,
@@ -127,8 +128,8 @@ pub fn to_xyz_xyzw(transform: &Transform) -> [f64; 7] {
 
 /// The bit-exact inverse of [`to_xyz_xyzw`].
 ///
-/// The quaternion must have unit length: it is not normalized again, because that would change its
-/// last bits.
+/// The quaternion must have unit length. It is not normalized again, because a normalization would
+/// change its last bits.
 pub fn from_xyz_xyzw([x, y, z, i, j, k, w]: [f64; 7]) -> Transform {
     Transform::from_parts(
         Translation3::new(x, y, z),
@@ -136,8 +137,8 @@ pub fn from_xyz_xyzw([x, y, z, i, j, k, w]: [f64; 7]) -> Transform {
     )
 }
 
-/// Smaller motions of a camera are not noticeable, neither in a picture nor in a map of the scene.
-/// At a focal length of 600 pixels, both bounds move a point at a distance of 1 m by 0.3 pixels.
+/// A smaller motion of a camera is noticeable neither in a picture nor in a map of the scene. At a
+/// focal length of 600 pixels, both bounds move a point at a distance of 1 m by 0.3 pixels.
 const NOTICEABLE_M: f64 = 5e-4;
 const NOTICEABLE_RAD: f64 = 5e-4;
 

@@ -2,8 +2,8 @@
 
 use crate::{Error, Intrinsics};
 
-/// For every pixel of the pinhole image, its position in the distorted image. Computed once per
-/// camera.
+/// For every pixel of the pinhole image, its position in the distorted image. The map is computed
+/// once per camera.
 ///
 /// Input and output have the size of the camera. Pixel centers are at `(0.5, 0.5)`. OpenCV places
 /// them at integers, so its principal point differs by half a pixel, but the resulting images are
@@ -24,7 +24,7 @@ struct Tap {
 }
 
 impl Tap {
-    /// The tap of a pixel whose source lies outside the image.
+    /// The [`Tap`] of a pixel whose source lies outside the image.
     const OUTSIDE: Self = Self {
         upper_left: u32::MAX,
         right: 0,
@@ -88,7 +88,7 @@ impl Undistortion {
     }
 
     /// Undistorts `[height, width, 3]` to `[height, width, 4]` with bilinear sampling. Alpha is
-    /// 255, or 0 if the source lies outside the image.
+    /// 255. It is 0 if the source of a pixel lies outside the image.
     pub fn apply_rgb(&self, rgb: &[u8]) -> Result<Vec<u8>, Error> {
         self.check_len(rgb.len(), 3)?;
         Ok(self.resample::<3>(rgb))
@@ -97,7 +97,8 @@ impl Undistortion {
     /// Undistorts `[height, width, 4]` with bilinear sampling of all four channels. Pixels whose
     /// source lies outside the image are zero.
     ///
-    /// Alpha is straight: masks stored in it are interpolated like colors.
+    /// Alpha is straight (not premultiplied). Masks that are stored in alpha are interpolated like
+    /// colors.
     pub fn apply_rgba(&self, rgba: &[u8]) -> Result<Vec<u8>, Error> {
         self.check_len(rgba.len(), 4)?;
         Ok(self.resample::<4>(rgba))

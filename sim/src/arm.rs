@@ -12,11 +12,12 @@ use std::sync::Arc;
 /// Period of the dynamics steps and of the joint readings, nanoseconds.
 pub(crate) const STEP_NANOS: i64 = 1_000_000;
 const STEP_SECS: f64 = 1e-3;
-/// Stiffness, newton meters per radian, and damping, newton meter seconds per radian, of each
-/// joint's controller. The arm is stiff enough to follow the tour closely. Joints near the flange
-/// move less mass, so their stiffness and damping are lower. With much higher values, the joints
-/// could oscillate, because torques change only once per millisecond.
+/// Stiffness of each joint's controller, newton meters per radian. The arm is stiff enough to
+/// follow the tour closely. Joints near the flange move less mass, so their stiffness and damping
+/// are lower. With much higher values, the joints could oscillate, because torques change only once
+/// per millisecond.
 const STIFFNESS: [f64; N_JOINTS] = [2000.0, 2000.0, 1600.0, 1600.0, 600.0, 600.0, 300.0];
+/// Damping of each joint's controller, newton meter seconds per radian.
 const DAMPING: [f64; N_JOINTS] = [120.0, 120.0, 90.0, 90.0, 35.0, 35.0, 18.0];
 
 /// State of the joints at one step.
@@ -50,7 +51,7 @@ impl JointCommands {
     fn advance(&mut self) {
         let setpoint = self.commands.next_setpoint();
         for (value_ix, joint_ix) in self.joint_ixs.iter().enumerate() {
-            // Commands are in reported positions; the dynamics need true ones.
+            // Commands are reported positions, but the dynamics need true positions.
             let offset = self.joint_offsets.get(value_ix).copied().unwrap_or(0.0);
             self.position_rad[*joint_ix] = setpoint.position[value_ix] + offset;
             self.velocity_rad_s[*joint_ix] = setpoint.velocity[value_ix];
@@ -174,8 +175,8 @@ impl Arm {
     fn control(&self, position_rad: &Joints, velocity_rad_s: &Joints) -> Joints {
         let position_error = self.reference.position_rad() - position_rad;
         let velocity_error = self.reference.velocity_rad_s() - velocity_rad_s;
-        // These are the torques that gravity and velocities cause. They are added to the command,
-        // so that the controller only has to overcome the inertia.
+        // `bias` contains the torques that gravity and velocities cause. They are added to the
+        // command, so that the controller only has to overcome the inertia.
         let bias = self.data.qfrc_bias();
         Joints::from_fn(|ix, _| {
             let torque = bias[ix]

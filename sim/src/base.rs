@@ -21,18 +21,19 @@ pub(crate) enum BaseMotion {
 
 /// Duration of a lap at speed 1, seconds.
 const LAP_SECS: f64 = 36.0;
-/// Gait frequency at speed 1, and the body motion caused by a step. A trotting quadruped of this
-/// size takes one to two steps per second and moves its body by millimeters.
+/// Gait frequency at speed 1. A trotting quadruped of this size takes one to two steps per second.
 const GAIT_HZ: f64 = 1.7;
+/// Amplitudes of the body motion that the gait causes. A quadruped of this size moves its body by
+/// millimeters.
 const BOUNCE_M: f64 = 0.007;
 const ROLL_RAD: f64 = 0.008;
 const PITCH_RAD: f64 = 0.006;
 /// Height of the body's center above the floor, meters.
 pub(crate) const BODY_Z_M: f64 = 0.52;
 
-/// Time at which the base leaves the first station, and duration of the walk to the second, seconds
-/// at speed 1.
+/// Time at which the base leaves the first station, seconds at speed 1.
 const DEPARTURE_SECS: f64 = 14.0;
+/// Duration of the walk to the second station, seconds at speed 1.
 const WALK_DURATION_SECS: f64 = 5.0;
 /// The stations: x, y in meters and heading in radians.
 const FAR_STATION: [f64; 3] = [0.0, 0.15, -0.06];
@@ -65,8 +66,8 @@ impl BaseMotion {
         }
     }
 
-    /// Completed fraction of the walk (one lap, or from the first station to the last); above 1 in
-    /// later laps.
+    /// Completed fraction of the walk. The walk is one lap, or leads from the first station to the
+    /// last. The fraction is above 1 in later laps.
     pub(crate) fn walked_frac(&self, secs: f64) -> f64 {
         match self {
             Self::Fixed => 0.0,
@@ -92,8 +93,8 @@ impl BaseMotion {
         }
     }
 
-    /// Times at which the base leaves its first station and reaches its last, seconds; zero if it
-    /// has no stations.
+    /// Times at which the base leaves its first station and reaches its last station, seconds. Both
+    /// are zero if the base has no stations.
     pub(crate) fn walk_secs(&self) -> [f64; 2] {
         match self {
             Self::Stations(speed) => [
@@ -190,8 +191,8 @@ const CONSTRAINED_AXIS_FRAC: f64 = 0.3;
 /// Identifies the random number stream.
 const DRIFT: u64 = 0xd41f;
 
-/// Standard deviations of one step along three axes, so that the sum of all steps has the root mean
-/// square `size`, distributed by the weights.
+/// Standard deviations of one step along three axes. The sum of all steps has the root mean square
+/// `size`. The weights distribute it over the axes.
 fn step_sigmas(size: f64, weights: [f64; 3]) -> [f64; 3] {
     let norm = weights
         .iter()
@@ -221,8 +222,8 @@ impl Drift {
         let mut translation_error = Vector3::zeros();
         let mut rotation_vector = Vector3::zeros();
         let mut step = 0_u64;
-        // All steps are summed each time, which needs no state. Even a long run has only a few
-        // hundred steps.
+        // All steps are summed in each call, so that no state is needed. Even a long run has only a
+        // few hundred steps.
         while (step as f64) < steps {
             // The last step is blended in, so that the reported pose does not jump.
             let share = smooth(steps - step as f64);

@@ -1,9 +1,9 @@
-//! An arm that follows commands instead of a tour: a rig that advances only when its devices are
+//! A rig whose arm follows commands instead of a tour. The rig advances only when its devices are
 //! read.
 //!
-//! Cameras and the arm share one simulation. Reading the arm advances it by a millisecond; waiting
-//! for an image advances it until the image arrives. Timeouts count simulated time, so that results
-//! do not depend on the speed of the computer.
+//! Cameras and the arm share one simulation. Reading the arm advances the simulation by a
+//! millisecond. Waiting for an image advances it until the image arrives. Timeouts count simulated
+//! time, so that results do not depend on the speed of the computer.
 
 use crate::Error;
 use crate::arm::STEP_NANOS;
@@ -100,7 +100,8 @@ impl Simulation {
             .nanos
             .saturating_add(i64::try_from(timeout.as_nanos()).unwrap_or(i64::MAX));
         loop {
-            // This is done first, because a sample may have arrived while another device was read.
+            // The queue is checked before the simulation advances, because a sample may have
+            // arrived while another device was read.
             if let Some(taken) = take(self) {
                 return Ok(Some(taken));
             }

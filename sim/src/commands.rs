@@ -1,5 +1,5 @@
-//! Commanded joint motion, shared by the controller of the arm and its client. Positions are those
-//! that the arm reports.
+//! Commanded joint motion, which the controller of the arm and its client share. Positions are
+//! reported positions.
 
 use crate::Error;
 use drivers::motion::{JointTarget, Motion, MotionLimits, Setpoint, TrajectoryGenerator};

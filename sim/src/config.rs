@@ -12,15 +12,15 @@ pub struct Config {
     pub scene: Scene,
     /// Seed of all random numbers. In lockstep, the same seed gives identical bits.
     pub seed: u64,
-    /// Disables all sensor imperfections: noise, blur, rolling-shutter shear, holes, latency,
-    /// dropped images. Lens and range limits stay.
+    /// Disables all sensor imperfections: noise, blur, rolling-shutter shear, holes, latency and
+    /// dropped images. The lens and the range limits remain in effect.
     pub ideal: bool,
     /// Whether each color image is followed by its [`drivers::TruthImage`].
     pub truth: bool,
     /// Whether the ground truth of cameras with depth includes noise-free depth.
     pub truth_depth: bool,
-    /// Factor on the speed of the scanning motion, 0.01 to 2; at 1 the camera moves at 0.1 to 0.25
-    /// m/s.
+    /// Factor on the speed of the scanning motion, 0.01 to 2. With a factor of 1, the camera moves
+    /// at 0.1 to 0.25 m/s.
     pub speed: f64,
     /// Whether the camera only rotates about the vertical axis. Such a scan does not determine the
     /// whole hand-eye transform.
@@ -42,8 +42,8 @@ pub struct Config {
     pub scanners: Vec<ScannerConfig>,
     /// Reporting of a moving base.
     pub base: BaseConfig,
-    /// Brightness of all lamps while the arm's camera is inside the cabinet, relative to outside; 1
-    /// has no effect.
+    /// Brightness of all lamps while the arm's camera is inside the cabinet, relative to the
+    /// brightness outside. A value of 1 has no effect.
     pub light_inside_frac: f64,
     /// Printed calibration targets in the scene; names are unique.
     pub targets: Vec<TargetConfig>,
@@ -95,8 +95,9 @@ impl TargetConfig {
 pub struct BaseConfig {
     /// Poses per second.
     pub rate_hz: f64,
-    /// Root mean square error of the reported position at the end of the walk (one lap, or the last
-    /// station), meters. The error grows with the square root of the distance.
+    /// Root mean square error of the reported position at the end of the walk, meters. The walk
+    /// ends after one lap or at the last station. The error grows with the square root of the
+    /// distance.
     pub drift_m: f64,
     /// Root mean square error of the reported orientation at the end of the walk, radians.
     pub drift_rad: f64,
@@ -162,8 +163,8 @@ pub enum Scene {
     StaticArm,
     /// A quadruped walks around a wooden pedestal with a glass bowl in a laboratory of 15 x 10 m.
     MobileBase,
-    /// A Panda on a quadruped in front of a switchboard cabinet: first 2 m away, then close to and
-    /// inside it.
+    /// A Panda on a quadruped in front of a switchboard cabinet. The base first stands 2 m away,
+    /// and then close to the cabinet, where the arm moves the camera into it.
     MobileArm,
 }
 
@@ -233,7 +234,7 @@ pub struct CameraConfig {
 pub struct StampConfig {
     /// Time that must be added to a stamp to get mid-exposure, seconds.
     pub to_mid_exposure_secs: f64,
-    /// Rate error of the clock: it gains this fraction of the time since the start.
+    /// Rate error of the clock. The clock gains this fraction of the time since the start.
     pub drift_frac: f64,
 }
 
@@ -242,20 +243,23 @@ pub struct StampConfig {
 pub struct SensorConfig {
     /// Standard deviation of the noise at mid gray (128), on a scale of 0 to 255.
     pub noise_sigma: f64,
-    /// Fraction of the noise variance at mid gray that is shot noise (grows with brightness); the
-    /// rest is read noise.
+    /// Fraction of the noise variance at mid gray that is shot noise, which grows with brightness.
+    /// The rest is read noise.
     pub shot_frac: f64,
-    /// Exposure time, microseconds. Causes blur only if `blur_samples` is above 1.
+    /// Exposure time, microseconds. It causes blur only if `blur_samples` is above 1.
     pub exposure_micros: f64,
-    /// Number of instants averaged over the exposure time; 1 gives no motion blur.
+    /// Number of instants that are averaged over the exposure time. With 1, there is no motion
+    /// blur.
     pub blur_samples: u32,
-    /// Time from the first row's exposure to the last row's, microseconds; 0 for a global shutter.
+    /// Time from the exposure of the first row to the exposure of the last row, microseconds. It is
+    /// 0 for a global shutter.
     pub readout_micros: f64,
     /// Time from the end of the readout to the delivery, milliseconds.
     pub latency_millis: f64,
     /// Fraction of images that the device drops.
     pub dropped_frac: f64,
-    /// Rendered pixels per image pixel along each side, 1 to 4: 1 is fast and aliased, 2 is smooth.
+    /// Rendered pixels per image pixel along each side, 1 to 4. With 1, rendering is fast and
+    /// images are aliased. With 2, images are smooth.
     pub supersample: u32,
 }
 
@@ -282,7 +286,7 @@ pub struct DepthConfig {
     pub factor: f64,
     /// Separate depth sensor. If `None`, depth is registered to the color image.
     pub sensor: Option<DepthSensor>,
-    /// Standard deviation at 1 m, meters; grows with the square of the depth.
+    /// Standard deviation of the noise at 1 m, meters. It grows with the square of the depth.
     pub noise_sigma_m: f64,
     /// Fraction of pixels without depth, most of them at depth discontinuities.
     pub hole_frac: f64,
@@ -448,7 +452,7 @@ impl Config {
             });
         }
         self.joint_ixs()?;
-        // No offsets are the same as zeros, but a partial list is probably a mistake.
+        // An empty list means that all offsets are zero. A partial list is probably a mistake.
         if !self.joint_offsets.is_empty() && self.joint_offsets.len() != expected {
             return Err(Error::NJoints {
                 got: self.joint_offsets.len(),

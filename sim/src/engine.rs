@@ -40,11 +40,11 @@ pub(crate) struct Engine {
     start: Stamp,
     /// Whether the robot moves ahead of its samples while images are rendered.
     looks_ahead: bool,
-    /// Maximum number of images being rendered; the engine waits for the oldest before it submits
-    /// more.
+    /// Maximum number of images that are being rendered. When the maximum is reached, the engine
+    /// waits for the oldest image before it submits another.
     max_pending: usize,
-    /// Images that would arrive before this simulated time are skipped. Set by the real-time loop
-    /// when it is late.
+    /// Images that would arrive before this simulated time are skipped. The real-time loop sets the
+    /// time when it is late.
     skip_before_nanos: i64,
     slots: VecDeque<Slot>,
     n_pending: usize,
@@ -83,17 +83,18 @@ struct Exposure {
     arrival_nanos: i64,
     n_skipped: u64,
     world_from_camera: Transform,
-    /// Camera poses at the exposure instants of the rows, relative to `world_from_camera`; empty if
-    /// all are the same.
+    /// Camera poses at the exposure instants of the rows, relative to `world_from_camera`. The list
+    /// is empty if all poses are the same.
     row_motions: Vec<RowMotion>,
     picture: Pending,
     depth_picture: Option<Pending>,
 }
 
-/// First exposure of the first camera, and additional delay of each further camera. The first
-/// exposure is delayed, because the arm needs readings before it. The cameras have different
-/// delays, because cameras of a real rig are not synchronized either.
+/// Time of the first exposure of the first camera. The first exposure is delayed, because the pose
+/// of the camera needs joint readings from before the exposure.
 const FIRST_NANOS: i64 = 50_000_000;
+/// Additional delay of each further camera. The cameras have different delays, because cameras of a
+/// real rig are not synchronized either.
 const STAGGER_NANOS: i64 = 3_700_000;
 
 /// Random number streams of one image.
@@ -170,8 +171,9 @@ impl Camera {
         self.half_span_nanos() + STEP_NANOS + nanos_from_secs(1e-3 * self.sensor.latency_millis)
     }
 
-    /// Exposure instants relative to the stamp: all instants of the first row, then of the second,
-    /// and so on. Empty if the camera is stationary or exposes all rows at the stamp.
+    /// Exposure instants relative to the stamp. The list has all instants of the first row, then
+    /// those of the second row, and so on. It is empty if the camera is stationary or exposes all
+    /// rows at the stamp.
     fn row_offsets_nanos(&self) -> Vec<i64> {
         let sensor = &self.sensor;
         if self.config.parent == Parent::World
@@ -460,8 +462,8 @@ impl Engine {
                 world_from_base: reported,
             }),
         ));
-        // Ground truth follows its sample. A reader that waits for it thus finds it as the next
-        // sample.
+        // Ground truth follows its sample. A reader that waits for the ground truth therefore gets
+        // it as the next sample.
         if self.config.truth {
             self.ready.push_back((
                 nanos,
@@ -600,9 +602,8 @@ impl Engine {
             exposure_secs: Some(1e-6 * camera.sensor.exposure_micros),
             n_skipped: exposure.n_skipped,
         };
-        // Color comes first. The image without motion is also the ground truth. The images with and
-        // without motion are computed only if they are needed, because they take most of the
-        // processor time.
+        // Color comes first. The image without motion is also the ground truth. Each of the two
+        // images is computed only if it is needed, because both take most of the processor time.
         let is_moving = !exposure.row_motions.is_empty();
         let motion_free = if self.config.truth || !is_moving {
             camera.optics.motion_free(&picture)
@@ -631,15 +632,15 @@ impl Engine {
         } else {
             noise::to_bytes(sensed)
         };
-        // A perfect model of the scene cannot score better than this, because it cannot predict the
-        // noise.
+        // A perfect model of the scene cannot score better than this PSNR, because it cannot
+        // predict the noise.
         let psnr_ceiling = (is_noisy && self.config.truth).then(|| noise::psnr(&data, sensed));
         self.ready.push_back((
             exposure.arrival_nanos,
             Sample::Image(image(PixelFormat::Rgb8, data)),
         ));
-        // Then comes depth. It is taken from the view of a separate sensor if there is one,
-        // otherwise from the color view.
+        // Then comes depth. If there is a separate depth sensor, depth is taken from the view of
+        // that sensor. Otherwise, it is taken from the color view.
         let sensor_depth_m = match (&camera.depth_optics, exposure.depth_picture) {
             (Some(optics), Some(picture)) => Some(optics.depth_m(&picture.wait()?)),
             _ => None,

@@ -54,10 +54,11 @@ const DAMPING: f64 = 0.03;
 /// because it must not disturb the tracking of the pose.
 const POSE_GAIN_HZ: f64 = 8.0;
 const REST_POSTURE_GAIN_HZ: f64 = 0.6;
-/// The joint velocity follows the desired velocity as a critically damped spring of this frequency,
-/// radians per second, which keeps the motion smooth.
+/// Frequency of the critically damped spring with which the joint velocity follows the desired
+/// velocity, radians per second. The spring keeps the motion smooth.
 const SMOOTHING_RAD_S: f64 = 40.0;
-/// A joint may approach its limit by this fraction of the remaining distance per second.
+/// Maximum speed at which a joint approaches its limit, as a fraction of the remaining distance per
+/// second.
 const LIMIT_APPROACH_HZ: f64 = 3.0;
 /// Fraction of the arm's maximum accelerations and jerks that the scan uses.
 const DYNAMICS_LIMIT_FRAC: f64 = 0.6;
@@ -65,8 +66,8 @@ const DYNAMICS_LIMIT_FRAC: f64 = 0.6;
 impl Follower {
     /// Starts at rest, at the scan's first pose.
     pub(crate) fn new(scan: Tour, flange_from_camera: Transform) -> Result<Self, Error> {
-        // Tolerance of the norm of meters and radians. The first pose must be reached closely,
-        // because the scan would otherwise begin with a jump.
+        // Tolerance of the pose error, as the norm over meters and radians. The first pose must be
+        // reached closely, because the scan would otherwise begin with a jump.
         const TOLERANCE: f64 = 0.02;
         let mut follower = Self {
             scan,
@@ -127,8 +128,8 @@ impl Follower {
     pub(crate) fn advance(&mut self, secs: f64, step_secs: f64) {
         let target_pose = self.scan.arm_from_camera(secs);
         let before = self.scan.arm_from_camera(secs - step_secs);
-        // This is the feedforward. Without it, the camera would lag behind the tour by its velocity
-        // divided by the gain.
+        // The velocity of the target is the feedforward. Without it, the camera would lag behind
+        // the tour by the camera's velocity divided by the gain.
         let target_twist = pose_error(&target_pose, &before) / step_secs;
         let desired_velocity = self.desired_velocity(&target_pose, &target_twist);
         for ix in 0..N_JOINTS {

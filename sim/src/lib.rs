@@ -1,9 +1,9 @@
 //! Simulated rigs in MuJoCo, behind the traits of `drivers`.
 //!
-//! [`open`] builds a rig. [`Rig::into_lockstep`] runs it as fast as the caller takes samples; the
-//! same seed gives bit-identical samples. [`Rig::into_live`] runs it in real time as devices.
-//! [`Rig::into_commanded`] gives an arm that moves by commands, [`Rig::into_motorized`] cameras on
-//! an arm that emulated motors move.
+//! [`open`] builds a rig. [`Rig::into_lockstep`] runs it as fast as the caller takes samples. In
+//! this mode, the same seed gives bit-identical samples. [`Rig::into_live`] runs the rig in real
+//! time as devices. [`Rig::into_commanded`] returns an arm that moves by commands.
+//! [`Rig::into_motorized`] returns cameras on an arm that emulated motors move.
 //!
 //! ```no_run
 //! use sim::Config;

@@ -107,7 +107,8 @@ pub(crate) fn scan_revolution(
         )?;
         for (ring, (direction, distance_m)) in directions.iter().zip(distances).enumerate() {
             // Each ray has two random counters, one for its loss and one for its noise. The
-            // settings of the loss therefore do not change the noise, and the reverse.
+            // settings of the loss therefore do not change the noise, and the settings of the noise
+            // do not change the loss.
             let counter = u64::from(column) * u64::from(scanner.n_rings) + ring as u64;
             let Some(true_m) = distance_m else { continue };
             let is_dropped = !ideal && random.unit(2 * counter) < scanner.dropped_frac;

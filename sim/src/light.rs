@@ -42,9 +42,9 @@ const AMBIENT: [f64; 3] = [0.37, 0.37, 0.39];
 /// Tangent of half the angle that the key lamp covers. A larger lamp gives softer shadows, which
 /// need more rays.
 const KEY_SIZE: f64 = 0.06;
-/// Number of rays to the key lamp and of ambient rays. With fewer rays, there is visible noise,
-/// which [`Texture::shade`](crate::texture::Texture::shade) blurs. With more rays, building a scene
-/// takes longer.
+/// Number of rays to the key lamp and of ambient rays. With fewer rays, the noise would be visible,
+/// although [`Texture::shade`](crate::texture::Texture::shade) blurs it. With more rays, building a
+/// scene would take longer.
 const N_KEY_RAYS: u64 = 12;
 const N_AMBIENT_RAYS: u64 = 20;
 
@@ -150,7 +150,8 @@ impl Occluders {
         if is_behind_box {
             return true;
         }
-        // Most rays miss the sphere around all ellipsoids, which saves testing each of them.
+        // Most rays miss the sphere around all ellipsoids. For these rays, the single ellipsoids
+        // need not be tested.
         let (center, radius_m) = self.bounds;
         hits_sphere(
             &((from - center) / radius_m),

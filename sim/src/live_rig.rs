@@ -43,7 +43,8 @@ pub struct LiveTruth {
 }
 
 impl LiveTruth {
-    /// Returns the oldest queued ground truth without waiting; base poses come before images.
+    /// Returns the oldest queued ground truth without waiting. Base poses are returned before
+    /// images.
     pub fn take(&self) -> Option<Sample> {
         let mut state = self.simulation.shared.state.lock();
         state
@@ -180,8 +181,8 @@ fn run_simulation(mut engine: Engine, shared: &SharedQueues, names: &DeviceNames
     engine.set_start(start);
     let started = Instant::now();
     let end = loop {
-        // If rendering is slower than real time, images are skipped, so that joint readings stay on
-        // time. Delays then do not add up.
+        // If rendering is slower than real time, images are skipped. Joint readings then stay on
+        // time, and delays do not add up.
         let skip_until = started.elapsed().saturating_sub(MAX_LATE);
         engine.skip_before(i64::try_from(skip_until.as_nanos()).unwrap_or(i64::MAX));
         match engine.next() {

@@ -187,17 +187,17 @@ impl Mesh {
             *point = (self_from_other.cast::<f32>() * Point3::from(*point))
                 .coords
                 .into();
-            // A rigid motion rotates normals; for a scaling, they would need the inverse transpose.
+            // A rigid motion rotates normals. A scaling would need the inverse transpose instead.
             *normal = (self_from_other.cast::<f32>() * Vector3::from(*normal)).into();
         }
         self.append(other, Vector3::zeros());
     }
 
-    /// A surface of revolution about z. The profile is a list of `(radius, z)` in meters; the
+    /// A surface of revolution about z. The profile is a list of `(radius, z)` in meters. The
     /// outside is on the right of an upward profile.
     ///
-    /// The texture wraps around the axis once; its top is at the first point. With `is_smooth`,
-    /// normals are averaged where pieces of the profile meet.
+    /// The texture wraps around the axis once. Its top is at the first point of the profile. With
+    /// `is_smooth`, normals are averaged where pieces of the profile meet.
     pub(crate) fn lathe(
         profile_m: &[[f64; 2]],
         n_sectors: u32,

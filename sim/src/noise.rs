@@ -84,7 +84,8 @@ pub(crate) fn psnr(bytes: &[u8], colors: &[f32]) -> f64 {
     10.0 * (255.0 * 255.0 / mean_square).log10()
 }
 
-/// Converts true depth to counts: noise, range limits, holes, quantization. 0 is a hole.
+/// Converts true depth to counts. It adds noise, range limits, holes and quantization. A count of 0
+/// is a hole.
 pub(crate) fn depth_counts(
     depth_m: &[f32],
     width: usize,
@@ -125,8 +126,8 @@ pub(crate) fn depth_counts(
     counts
 }
 
-/// Pixels at which a stereo camera finds no match. They are next to depth edges first, and then in
-/// small clusters.
+/// Pixels at which a stereo camera finds no match. Most holes are next to depth edges, and the rest
+/// form small clusters.
 struct Holes {
     is_edge: Vec<bool>,
     width: usize,
@@ -136,7 +137,7 @@ struct Holes {
 }
 
 /// Maximum fraction of edge pixels that become holes. With 1, every depth edge would be missing,
-/// which real cameras do not show either.
+/// unlike in images of real cameras.
 const MAX_EDGE_SHARE: f64 = 0.6;
 /// Side of a cluster of holes, pixels.
 const CLUSTER_PX: usize = 4;

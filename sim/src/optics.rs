@@ -51,7 +51,8 @@ impl RowMotion {
 /// Maximum number of iterations that correct the pixel position until its depth matches the ray. On
 /// most surfaces, one iteration is enough. At depth edges, the search may never converge.
 const MAX_CORRECTIONS: usize = 3;
-/// Relative depth tolerance. At the speeds of the arm, it moves a point by less than 0.02 pixels.
+/// Relative depth tolerance. At the speeds of the arm, a depth error of this size moves a point by
+/// less than 0.02 pixels.
 const SAME_DEPTH_FRAC: f32 = 0.005;
 
 impl Optics {
@@ -86,7 +87,7 @@ impl Optics {
             }
         }
         // Rolling shutter and blur show content from outside the image. At the speeds of the arm,
-        // this is a few pixels.
+        // this content is a few pixels wide.
         let margin_px = if is_motion_free { 0 } else { 4 + height / 60 };
         let mut optics = Self {
             view_size_px: [0; 2],
@@ -273,8 +274,8 @@ impl Optics {
         let mut depth = nearest_depth(picture, guess);
         let mut drawn = guess;
         for _ in 0..MAX_CORRECTIONS {
-            // The point at this depth in the rendered image, on the moved ray. If the surface there
-            // has another depth, the search repeats with that depth.
+            // The point on the moved ray that has this depth in the rendered image. If the surface
+            // at this point has another depth, the search repeats with that depth.
             let along = (depth - row_motion.translation_m.z) / direction.z;
             let at =
                 |axis: usize| (direction[axis] * along + row_motion.translation_m[axis]) / depth;
@@ -325,9 +326,9 @@ impl Optics {
         sum.map(|channel| channel / area)
     }
 
-    /// Depth at a position in the rendered image: the mean of the four surrounding pixels if they
-    /// lie on one surface, else the smallest of the four depths. With odd supersampling, it is the
-    /// depth of the pixel at this position.
+    /// Depth at a position in the rendered image. If the four surrounding pixels lie on one
+    /// surface, it is their mean depth. Otherwise, it is the smallest of the four depths. With odd
+    /// supersampling, it is the depth of the pixel at this position.
     fn depth_at(&self, picture: &Picture, at: [f32; 2]) -> f32 {
         /// Neighbors whose depths differ by more than this fraction belong to different surfaces.
         const SAME_SURFACE_FRAC: f32 = 0.01;

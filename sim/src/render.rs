@@ -193,8 +193,8 @@ impl Canvas {
         self.draw_with(view, &options)
     }
 
-    /// The pixels at which MuJoCo's segmentation shows the robot. If `is_alone` is set, the scene
-    /// contains nothing else.
+    /// The pixels at which MuJoCo's segmentation shows the robot. If `is_alone` is set, only the
+    /// robot is drawn.
     pub(crate) fn robot_mask(&mut self, view: &View, is_alone: bool) -> Vec<bool> {
         let mut options = MjvOption::default();
         if is_alone {
@@ -263,7 +263,7 @@ impl Canvas {
         self.read(view.size_px, &viewport)
     }
 
-    /// Sets both (stereo) cameras of the scene; MuJoCo renders from their mean.
+    /// Sets both stereo cameras of the scene. MuJoCo renders from their mean.
     fn set_view(&mut self, view: &View) {
         let [near, far] = self.near_far_m;
         let pose = &view.world_from_camera;
@@ -339,7 +339,8 @@ impl Canvas {
     }
 }
 
-/// Inverts the perspective projection's depth, 0 at the near plane and 1 at the far plane.
+/// Converts the depth of the perspective projection to meters. That depth is 0 at the near plane
+/// and 1 at the far plane.
 fn meters_from_depth(depth: f32, near_far_m: [f64; 2]) -> f32 {
     let [near, far] = near_far_m.map(|meters| meters as f32);
     near * far / (far - depth * (far - near))

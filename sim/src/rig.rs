@@ -137,9 +137,9 @@ impl Rig {
         Lockstep::new(self.engine, self.info)
     }
 
-    /// Lets the rig run as fast as its devices are read. The caller moves its arm with commands. It
-    /// moves only within `limits`, which are in the order of the joint readings. Simulated time
-    /// zero has the stamp 0.
+    /// Lets the rig run as fast as its devices are read. The caller moves the arm with commands.
+    /// The arm moves only within `limits`, which are in the order of the joint readings. Simulated
+    /// time zero has the stamp 0.
     pub fn into_commanded(self, limits: &[MotionLimits]) -> Result<CommandedRig, Error> {
         CommandedRig::new(self.engine, self.info, limits)
     }

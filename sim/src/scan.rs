@@ -8,9 +8,9 @@ use std::f64::consts::TAU;
 /// The tour around the target area.
 ///
 /// Azimuth, elevation, distance, roll and look-at point oscillate with periods that have no common
-/// multiple, so the first seconds cover the whole range coarsely and later ones fill the gaps.
-/// Every quantity moves both ways at continuously changing speed, so a time offset and a hand-eye
-/// error have different effects.
+/// multiple. The first seconds therefore cover the whole range coarsely, and later seconds fill the
+/// gaps. Every quantity moves in both directions at continuously changing speed. A time offset and
+/// a hand-eye error therefore have different effects.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Scan {
     speed: f64,
@@ -41,8 +41,8 @@ const START_SECS: f64 = 0.5;
 const SPEED_OSCILLATION: (f64, f64) = (0.35, 4.9);
 
 impl Scan {
-    /// With `is_azimuth_only`, all quantities except the azimuth stay at their means: the camera
-    /// rotates about one axis.
+    /// With `is_azimuth_only`, all quantities except the azimuth stay at their means. The camera
+    /// then rotates about one axis.
     pub(crate) fn new(speed: f64, is_azimuth_only: bool) -> Self {
         Self {
             speed,

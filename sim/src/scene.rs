@@ -19,8 +19,8 @@ pub(crate) const ARM_GROUP: usize = 1;
 /// Group of transparent geometry.
 pub(crate) const GLASS_GROUP: usize = 2;
 
-/// Near and far plane, meters. The resolution of the depth buffer decreases with the ratio of both,
-/// so each scene has the narrowest range that contains it.
+/// Near and far plane, meters. The larger the ratio of far to near, the lower is the resolution of
+/// the depth buffer. Each scene therefore has the narrowest range that contains it.
 pub(crate) fn near_far_m(scene: Scene) -> [f64; 2] {
     match scene {
         Scene::StaticArm | Scene::MobileArm => [0.02, 12.0],
@@ -100,8 +100,8 @@ pub(crate) fn build(config: &Config, largest_px: [u32; 2]) -> Result<MjModel, Er
              <geom type=\"mesh\" mesh=\"{name}_plate\" material=\"frame\" group=\"0\" mass=\"0\" {pose}/>"
         );
     }
-    // Contacts are off because nothing touches. Shadows are off because they are baked into the
-    // textures.
+    // Contacts are off, because no objects touch each other. Shadows are off, because they are
+    // baked into the textures.
     let [near, far] = near_far_m(config.scene);
     let [width, height] = largest_px;
     let (lamps, ambient) = light::mjcf(brightness(config.scene));

@@ -258,7 +258,7 @@ pub(crate) fn body(light: Light<'_>) -> Mesh {
     let mut mesh = Mesh::default();
     for part in &PARTS {
         let [tip, root] = part.band.rows();
-        // Under hair, the skin has a color close to the roots; bare skin has the middle color of
+        // Skin under hair has a color close to that of the roots. Bare skin has the middle color of
         // the band.
         let texture_y = if part.n_hairs > 0 {
             0.3 * tip + 0.7 * root

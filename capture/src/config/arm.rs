@@ -9,7 +9,7 @@ use drivers::can::{BusConfig, MotorConfig};
 use kinematics::Chain;
 use toml::Table;
 
-/// Maximum joint offset, rad or m. A larger one is probably in degrees, or has the wrong sign.
+/// Maximum joint offset, rad or m. A larger offset is probably in degrees, or has the wrong sign.
 const MAX_JOINT_OFFSET: f64 = 1.0;
 
 keys! {
@@ -24,8 +24,8 @@ keys! {
         pub urdf_text: String => String::new();
         /// Moving joints in the order of the joint states.
         pub joints: Vec<String> = Vec::new();
-        /// Offsets added to the joint positions, in the order of `joints`, rad or m, each from -1
-        /// to 1; empty if there are none.
+        /// Offsets that are added to the joint positions, in the order of `joints`, rad or m. Each
+        /// is from -1 to 1. The list is empty if there are no offsets.
         pub joint_offsets: Vec<f64> = Vec::new();
         /// Settings of a simulated arm.
         pub sim: ArmSim;
@@ -50,7 +50,8 @@ keys! {
     #[derive(Clone, Debug, Default, PartialEq)]
     pub struct ArmSim {
         /// Offsets that must be added to the simulated readings to get the true joint positions, in
-        /// the order of `joints`, rad, each from -1 to 1; empty if the readings are right.
+        /// the order of `joints`, rad. Each is from -1 to 1. The list is empty if the readings are
+        /// right.
         pub true_joint_offsets: Vec<f64> = Vec::new();
     }
 }
@@ -77,8 +78,8 @@ choices! {
     }
 }
 
-/// Reads the arm without its robot description, and the path of the description, which is empty if
-/// there is none.
+/// Reads the arm without its robot description. Also returns the path of the robot description,
+/// which is empty if there is none.
 pub(super) fn read(mut keys: Section<'_>) -> Option<(Arm, String)> {
     let has_flange_link = keys.has("flange_link");
     let arm = Arm::read_keys(&mut keys);

@@ -8,7 +8,7 @@ use std::collections::BTreeMap;
 use std::net::{IpAddr, Ipv4Addr, SocketAddr};
 use toml::{Table, Value};
 
-/// Default address for base poses; it accepts data from this computer only.
+/// Default address for base poses. It accepts data from this computer only.
 const DEFAULT_ADDRESS: SocketAddr = SocketAddr::new(IpAddr::V4(Ipv4Addr::LOCALHOST), 7009);
 
 keys! {
@@ -25,9 +25,11 @@ keys! {
         pub rate_hz: f64 = 100.0, in 1.0..=1000.0;
         /// Whether the pose is re-estimated at each station.
         pub realign: bool = true;
-        /// Measured poses with a larger root mean square position error are discarded, meters.
+        /// Maximum root mean square position error of a measured pose, meters. Poses with a larger
+        /// error are discarded.
         pub max_sigma_m: f64 = 0.05, in 0.0001..=100.0;
-        /// Measured poses with a larger root mean square orientation error are discarded, radians.
+        /// Maximum root mean square orientation error of a measured pose, radians. Poses with a
+        /// larger error are discarded.
         pub max_sigma_rad: f64 = 0.03, in 0.0001..=3.2;
         /// Family of the tags that [`BaseDriver::Tags`] detects.
         pub tag_family: Family = Family::Tag36h11;
@@ -42,7 +44,7 @@ keys! {
     pub struct BaseSim {
         /// Position error at the end of the path of the base, root mean square, meters.
         pub drift_m: f64 = 0.02, in 0.0..=10.0;
-        /// The same for the orientation, radians.
+        /// Orientation error at the end of the path of the base, root mean square, radians.
         pub drift_rad: f64 = 0.0175, in 0.0..=1.0;
     }
 

@@ -22,17 +22,17 @@ keys! {
         pub name: Arc<str> => "".into();
         /// Driver of the camera.
         pub driver: CameraDriver, required "realsense, v4l2, nokhwa or sim";
-        /// Path or serial number; empty if the driver needs none.
+        /// Path or serial number of the camera. It is empty if the driver needs neither.
         pub device: String = String::new();
         /// Frame rate, Hz.
         pub rate_hz: f64, in 0.01..=1000.0, required "images per second";
         /// Exposure time, microseconds, at most one frame period. `None` means automatic exposure.
         /// The exposure time of each image is then known only if the camera reports it.
         pub exposure_micros: Option<f64>, in 0.0..=period_micros(rate_hz);
-        /// Time from the first to the last row, microseconds, at most one frame period; `None` if
-        /// unknown, 0 for a global shutter.
+        /// Time from the exposure of the first row to that of the last row, microseconds, at most
+        /// one frame period. It is 0 for a global shutter. `None` if the time is unknown.
         pub readout_micros: Option<f64>, in 0.0..=period_micros(rate_hz);
-        /// Time added to a stamp to get mid-exposure; `None` if unknown.
+        /// Time that is added to a stamp to get mid-exposure. `None` if the time is unknown.
         pub stamp_to_mid_exposure: Option<TimeOffset> as "stamp_to_mid_exposure_millis";
         /// Frame to which the camera is attached.
         pub parent: Parent, required "flange, base or world";
@@ -40,7 +40,8 @@ keys! {
         pub parent_from_camera: Transform = Transform::identity();
         /// Lens and size of the color images.
         pub intrinsics: Intrinsics = PLACEHOLDER_INTRINSICS;
-        /// Covariance of [`Intrinsics::params`], row by row; empty if it is unknown.
+        /// Covariance of [`Intrinsics::params`], row by row. The list is empty if the covariance is
+        /// unknown.
         pub intrinsics_covariance: Vec<f64> = Vec::new();
         /// Depth images, if the camera delivers them.
         pub depth: Option<Depth> => None;
@@ -112,7 +113,8 @@ keys! {
     /// Depth images of a camera.
     #[derive(Clone, Debug, PartialEq)]
     pub struct Depth {
-        /// Device of the depth images with the driver `v4l2`; empty if the driver needs none.
+        /// Device of the depth images with the driver `v4l2`. It is empty if the driver needs no
+        /// such device.
         pub device: String = String::new();
         /// Meters per count if the device does not report it.
         pub meters_per_count: Option<f64>, in 1e-6..=0.1;
@@ -122,9 +124,9 @@ keys! {
         pub camera_from_depth: Transform = Transform::identity();
         /// Scale factor for the readings.
         pub factor: f64 = 1.0, in 0.5..=2.0;
-        /// Smaller readings, after scaling, are discarded, meters.
+        /// Minimum depth after scaling, meters. Smaller readings are discarded.
         pub min_m: f64 = 0.1, in 0.0..=100.0;
-        /// Larger readings, after scaling, are discarded, meters.
+        /// Maximum depth after scaling, meters. Larger readings are discarded.
         pub max_m: f64 = 6.0, in min_m..=1000.0;
     }
 
@@ -150,16 +152,17 @@ keys! {
         pub depth_hole_frac: f64 = 0.02, in 0.0..=0.9;
         /// Meters per count of the depth images.
         pub meters_per_count: f64 = 1e-4, in 1e-6..=0.1;
-        /// True calibration, where it differs from the rest of the rig file.
+        /// True calibration. Only values that differ from the rest of the rig file are set.
         pub truth: CameraTruth;
     }
 
-    /// True calibration of a simulated camera. Values that are absent are those of the rig file.
+    /// True calibration of a simulated camera. If a value is absent, the value in the rest of the
+    /// rig file is true.
     #[derive(Clone, Debug, Default, PartialEq)]
     pub struct CameraTruth {
         /// True [`Camera::parent_from_camera`].
         pub parent_from_camera: Option<Transform>;
-        /// True lens of the color images; their size is that of the rig file.
+        /// True lens of the color images. The size of the images is that of the rig file.
         pub intrinsics: Option<Intrinsics>;
         /// True time from the stamps to mid-exposure, milliseconds.
         pub stamp_to_mid_exposure_millis: f64 = 0.0, in -1000.0..=1000.0;

@@ -27,7 +27,7 @@ pub(super) fn insert_contents(
         };
         let files = Files { folder, context };
         files.insert(&format!("camera.{name}"), camera, &Table::new())?;
-        // Depth inherits the size of the color images if it has no size of its own.
+        // Depth images inherit the size of the color images if the rig file sets no size for depth.
         let color = camera.clone();
         if let Some(Value::Table(depth)) = camera.get_mut("depth") {
             files.insert(&format!("camera.{name}.depth"), depth, &color)?;
@@ -78,8 +78,8 @@ impl Files<'_> {
         }
         let sides = setting("size_px").and_then(Value::as_array);
         let sides = sides.and_then(|sides| sides.iter().map(number).collect::<Option<Vec<f64>>>());
-        // The parameters are not scaled to another size. Cameras may crop instead of scaling, and
-        // the file does not show which of the two they do.
+        // The parameters are not scaled to another size. A camera may crop its images instead of
+        // scaling them, and the file does not show which of the two it does.
         if let (Some([width, height]), Some(sides)) = (info.size_px, sides)
             && sides != [f64::from(width), f64::from(height)]
         {

@@ -21,7 +21,7 @@ keys! {
         accept_no_restart: bool = false;
     }
 
-    /// The keys of every motor; the family adds its own.
+    /// The keys of every motor. The motor's family adds further keys.
     struct MotorKeys {
         family: &'static dyn MotorFamily, required family_names();
         bus: String, required "interface of the motor, which has a table [arm.bus.NAME]";
@@ -154,7 +154,7 @@ fn motor(joint: String, mut keys: Section<'_>, buses: &[BusConfig]) -> Option<Mo
     };
     let protocol = protocol(&mut keys, family, id);
     keys.end();
-    // This returns only now, so that all problems of the motor have been reported.
+    // The function returns only now, so that all problems of the motor have been reported.
     let bus_ix = bus_ix?;
     let protocol = protocol?;
     Some(MotorConfig {

@@ -13,8 +13,8 @@ keys! {
         pub max_keyframes: usize = 400, in 8..=1_000_000;
         /// Maximum host memory of the keyframes in the store, bytes.
         pub max_bytes: u64 = 4_000_000_000, in 1_000_000..=1 << 50;
-        /// Minimum distance to every keyframe of the same camera, meters. A keyframe needs this
-        /// distance or `min_rotation_rad`.
+        /// Minimum distance to every keyframe of the same camera, meters. A new keyframe needs this
+        /// distance or the rotation `min_rotation_rad`.
         pub min_translation_m: f64 = 0.02, in 1e-6..=100.0;
         /// Minimum rotation relative to every keyframe of the same camera, radians.
         pub min_rotation_rad: f64 = 0.05, in 1e-6..=3.2;
@@ -47,8 +47,8 @@ keys! {
 
 impl JoinConfig {
     /// Number of keyframes with which training starts. By default, a run in real time starts with
-    /// the first keyframe if there is depth, which shows where surfaces are. Other runs wait for
-    /// five keyframes.
+    /// the first keyframe if a camera has depth, because depth shows where surfaces are. Other runs
+    /// wait for five keyframes.
     pub fn start_keyframes_or_default(&self, is_real_time: bool, has_depth: bool) -> usize {
         self.start_keyframes
             .unwrap_or(if is_real_time && has_depth { 1 } else { 5 })

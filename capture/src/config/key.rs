@@ -2,8 +2,8 @@
 //! fields are keys.
 //!
 //! serde is not used, because its derived code has no ranges and stops at the first problem. Here,
-//! all problems are collected, so that a misspelled key is reported as unknown, and not the correct
-//! key as missing.
+//! all problems are collected. A misspelled key is therefore reported as unknown, instead of the
+//! correct key as missing.
 
 use super::section::Section;
 use std::borrow::Cow;
@@ -17,7 +17,8 @@ pub(super) trait Key: Sized {
     /// Limits of the allowed values, in addition to those of the type.
     type Limits;
 
-    /// Reads the value of a key; `None` if it is absent or invalid. An invalid value is reported.
+    /// Reads the value of a key. `None` if the value is absent or invalid. An invalid value is
+    /// reported.
     fn read(keys: &mut Section<'_>, key: &'static str, limits: Self::Limits) -> Option<Self>;
 
     /// The value in a rig file; `None` if the key is omitted.
@@ -59,20 +60,21 @@ macro_rules! choices {
 }
 pub(super) use choices;
 
-/// Defines structs whose fields are keys of one table, with everything that a rig file needs to
-/// know of a key:
+/// Defines structs whose fields are keys of one table. A field has everything that is needed to
+/// read and write its key:
 ///
 /// ```text
 /// pub name: Type as "key" = default, in limits, required "meaning" => initial;
 /// ```
 ///
 /// - `as "key"`: the key, if it differs from the name of the field.
-/// - `= default`: the value if the key is absent. It may use earlier fields. Without a default, the
-///   key is required, or the type is [`Optional`].
-/// - `in limits`: the allowed values, [`Key::Limits`]. They may use earlier fields, which are
-///   options if they have no default.
+/// - `= default`: the value if the key is absent. The default may use earlier fields. Without a
+///   default, the key must be required, or its type must be [`Optional`].
+/// - `in limits`: the allowed values, [`Key::Limits`]. The limits may use earlier fields. An
+///   earlier field without a default is an option.
 /// - `required "meaning"`: an absent key is reported, with its meaning.
-/// - `=> initial`: the field is not a key; code that reads the struct sets it afterwards.
+/// - `=> initial`: the field is not a key. The code that reads the struct sets the field
+///   afterwards.
 macro_rules! keys {
     ($(
         $(#[$attribute:meta])*
@@ -150,7 +152,7 @@ pub(super) fn entry(key: &str, value: &impl Key) -> Option<(String, Value)> {
 }
 
 impl Section<'_> {
-    /// The value of a key; `None` if it is absent or invalid. An invalid value is reported.
+    /// The value of a key. `None` if the value is absent or invalid. An invalid value is reported.
     pub(super) fn get<T: Key>(&mut self, key: &'static str, limits: T::Limits) -> Option<T> {
         T::read(self, key, limits)
     }
@@ -164,7 +166,7 @@ impl Section<'_> {
         T::read(self, key, limits).or_else(|| T::absent(self, key))
     }
 
-    /// The value of a key; if it is absent, reports that it is missing.
+    /// The value of a key. If the key is absent, it is reported as missing.
     pub(super) fn required<T: Key>(
         &mut self,
         key: &'static str,
@@ -178,7 +180,7 @@ impl Section<'_> {
         value
     }
 
-    /// Reads the whole table; other keys in it are unknown.
+    /// Reads the whole table. Other keys in the table are unknown.
     pub(super) fn read<T: Keys>(mut self) -> Option<T> {
         let value = T::read_keys(&mut self);
         self.end();

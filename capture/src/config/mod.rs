@@ -1,6 +1,7 @@
-//! The rig file: TOML -> checked types, and back to the effective rig file that reproduces a run.
+//! The rig file. This module converts TOML to checked types, and these types back to the effective
+//! rig file, which reproduces a run.
 //!
-//! Every key is in `docs/reference/rig.md`. Unknown keys are errors; flags override keys of the
+//! Every key is in `docs/reference/rig.md`. Unknown keys are errors. Flags override keys of the
 //! same name. In the code, each table is a struct, and each key is a field with its default and
 //! range (macro `keys!`).
 
@@ -92,7 +93,7 @@ impl Rig {
     /// other problem with keys.
     pub fn load(path: &Path, overrides: &[Override]) -> Result<Self, ConfigError> {
         let text = read_file("the rig file", path)?;
-        // Messages name the file and not its folder, which the user has given.
+        // Messages name the file without its folder, because the user has given the folder.
         let file = path.file_name().map_or_else(
             || path.display().to_string(),
             |name| name.to_string_lossy().into_owned(),
@@ -127,8 +128,8 @@ impl Rig {
         Ok(rig)
     }
 
-    /// The folder of the robot description that a rig file names; `None` if it names none or cannot
-    /// be read. Mesh files are named relative to this folder.
+    /// The folder of the robot description that a rig file names. `None` if the rig file names no
+    /// robot description or cannot be read. Mesh files are named relative to this folder.
     #[must_use]
     pub fn urdf_folder(path: &Path) -> Option<PathBuf> {
         let table: toml::Table = toml::from_str(&files::read_text(path).ok()?).ok()?;
@@ -139,8 +140,8 @@ impl Rig {
         std::path::absolute(urdf).ok()?.parent().map(Path::to_owned)
     }
 
-    /// Checks the text of a rig file and the robot description `urdf_text`; `file` is the name used
-    /// in messages.
+    /// Checks the text of a rig file and the robot description `urdf_text`. Messages use the name
+    /// `file`.
     ///
     /// # Errors
     ///
@@ -154,15 +155,15 @@ impl Rig {
         rig_file::read(file, text, overrides, None, |_| Ok(urdf_text.to_owned()))
     }
 
-    /// The effective rig file with every key, from which the same rig can be read. It expects the
-    /// robot description next to it.
+    /// The effective rig file with every key. The same rig can be read from it if the robot
+    /// description is in the same folder.
     #[must_use]
     pub fn to_toml(&self) -> String {
         rig_file::write(self)
     }
 
-    /// Whether the calibration is the same: extrinsics, intrinsics, time offsets and depth of the
-    /// cameras, and joint offsets.
+    /// Whether the calibration is the same. The calibration consists of extrinsics, intrinsics,
+    /// time offsets and depth of the cameras, and of the joint offsets.
     #[must_use]
     pub fn has_same_calibration(&self, other: &Self) -> bool {
         self.arm.joint_offsets == other.arm.joint_offsets
@@ -187,7 +188,7 @@ impl Rig {
         }
     }
 
-    /// Writes the effective rig file and the robot description into a folder; returns the path of
+    /// Writes the effective rig file and the robot description into a folder. Returns the path of
     /// the rig file.
     ///
     /// # Errors

@@ -30,8 +30,8 @@ impl Key for Transform {
         } = keys.get(key, ())?;
         let quaternion = Quaternion::new(w, i, j, k);
         let norm = quaternion.norm();
-        // Numbers rounded to three or more digits pass. A larger deviation shows a typing error or
-        // another convention, such as Euler angles.
+        // Quaternions that are rounded to three or more digits pass. A larger deviation is a sign
+        // of a typing error or of another convention, such as Euler angles.
         if (norm - 1.0).abs() > 1e-3 {
             let got = Value::from(vec![i, j, k, w]);
             return keys.invalid(

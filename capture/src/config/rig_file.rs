@@ -9,7 +9,7 @@ use toml::{Table, Value};
 /// Robot description of a rig without an arm, if the rig file names none.
 const EMPTY_URDF: &str = r#"<robot name="none"><link name="base"/></robot>"#;
 
-/// Reads a rig; `read_urdf` returns the robot description for the path in the file. Lens parameters
+/// Reads a rig. `read_urdf` returns the robot description for the path in the file. Lens parameters
 /// may be in other files only if the folder of the rig file is given.
 pub(super) fn read(
     file: &str,

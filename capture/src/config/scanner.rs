@@ -6,7 +6,7 @@ use kinematics::Transform;
 use std::net::{IpAddr, Ipv4Addr, SocketAddr};
 use std::sync::Arc;
 
-/// Default address for range scans; it accepts data from this computer only.
+/// Default address for range scans. It accepts data from this computer only.
 const DEFAULT_ADDRESS: SocketAddr = SocketAddr::new(IpAddr::V4(Ipv4Addr::LOCALHOST), 7010);
 
 keys! {

@@ -1,6 +1,7 @@
 //! A TOML table whose keys are read one by one. Keys that are never read are unknown keys.
 //!
-//! Problems are collected, so that a misspelled key is reported as such and not as a missing key.
+//! Problems are collected, so that a misspelled key is reported as unknown and the correct key is
+//! not reported as missing.
 
 use super::error::{ConfigError, SourceLocation};
 use crate::nearest_name;
@@ -11,8 +12,8 @@ use std::collections::{BTreeMap, BTreeSet};
 use toml::de::{DeTable, DeValue};
 use toml::{Table, Value};
 
-/// Maximum number of listed problems; further ones are only counted. A file of another kind, given
-/// by mistake, may have thousands of unknown keys.
+/// Maximum number of listed problems. Further problems are only counted. If a user gives a file of
+/// another kind by mistake, it may have thousands of unknown keys.
 const MAX_PROBLEMS: usize = 50;
 
 /// State shared by all sections while a rig file is read.
@@ -24,12 +25,13 @@ pub(super) struct ParseContext {
     flags: BTreeSet<String>,
     problems: RefCell<Vec<ConfigError>>,
     n_more_problems: Cell<usize>,
-    /// Every key that was read, by dotted path with `NAME` for free names.
+    /// Dotted path of every key that was read. Names that the user chooses are replaced with
+    /// `NAME`.
     accessed: RefCell<BTreeSet<String>>,
 }
 
 impl ParseContext {
-    /// Records the lines of all keys; fails if the text is not TOML.
+    /// Records the lines of all keys. Fails if the text is not TOML.
     pub(super) fn new(
         file: &str,
         text: &str,
@@ -72,8 +74,8 @@ impl ParseContext {
             } => *line,
             _ => 0,
         });
-        // If a misspelled key has been reported with the key that it probably means, that key is
-        // not reported as missing in addition.
+        // If the error about a misspelled key suggests the correct key, the correct key is not
+        // reported as missing in addition.
         let is_meant = |problem: &ConfigError| matches!(problem, ConfigError::Missing { key, .. } if is_suggested(key, &problems));
         let others: Vec<_> = others
             .into_iter()
@@ -109,7 +111,8 @@ impl ParseContext {
 
     /// The place that sets the value of a key. The key is a dotted path.
     pub(super) fn location(&self, key: &str) -> SourceLocation {
-        // A flag may replace a whole table, and keys inside an inline table are on its line.
+        // A flag may replace a whole table, and keys inside an inline table are on the line of that
+        // table. Parent tables are therefore searched as well.
         let mut path = key;
         loop {
             if self.flags.contains(path) {
@@ -225,8 +228,8 @@ impl<'a> Section<'a> {
         }
     }
 
-    /// The tables inside this one that have free names, with their names. More than
-    /// [`Budget::RIG_TABLES`] are a problem: probably an error of the program that wrote the file.
+    /// The tables inside this one whose names the user chooses, with their names. More tables than
+    /// [`Budget::RIG_TABLES`] are a problem. The program that wrote the file probably has an error.
     pub(super) fn named_sections(&mut self, key: &'static str) -> Vec<(String, Self)> {
         let Some(mut parent) = self.optional_section(key) else {
             return Vec::new();

@@ -19,8 +19,8 @@ keys! {
         pub ideal: bool = false;
         /// Whether the simulation waits for its consumer and always gives the same samples.
         pub lockstep: bool = false;
-        /// Whether an arm that is moved with `--sim` keeps its driver, which then moves emulated
-        /// motors in real time.
+        /// Whether an arm that is moved with `--sim` keeps its driver. The driver then moves
+        /// emulated motors in real time.
         pub emulate_arm: bool = false;
         /// Speed factor of the scanning motion.
         pub speed: f64 = 1.0, in 0.01..=2.0;
@@ -36,7 +36,7 @@ keys! {
         /// Whether the ground truth includes depth without noise.
         pub truth_depth: bool = false;
         /// Brightness of the lights while a camera on the flange is inside the cabinet, relative to
-        /// their brightness otherwise.
+        /// the brightness outside the cabinet.
         pub light_inside_frac: f64 = 1.0, in 0.0..=4.0;
         /// Printed calibration targets in the scene, by name.
         pub targets: BTreeMap<String, SimTarget> => BTreeMap::new();
@@ -50,7 +50,7 @@ keys! {
         /// Pose of the board frame: x points right on the print, y down, z into the board. `None`
         /// on the flange.
         pub world_from_board: Option<Transform>;
-        /// The same relative to the flange, for a board that the arm carries.
+        /// Pose of the board frame relative to the flange, for a board that the arm carries.
         pub flange_from_board: Option<Transform>;
     }
 }

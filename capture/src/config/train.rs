@@ -45,8 +45,8 @@ pub struct Methods {
 
 impl PartialEq for Methods {
     fn eq(&self, other: &Self) -> bool {
-        // The location in the file is not compared, because a rig that was read from its effective
-        // rig file must equal the original.
+        // The location in the file is not compared. A rig that was read from its effective rig file
+        // must be equal to the original rig, although its lines differ.
         self.names == other.names
     }
 }

@@ -1,4 +1,4 @@
-//! Checks for camera values in the rig file that are valid but implausible. Such values are in
+//! Finds camera values in the rig file that are valid but implausible. Such values are probably in
 //! another unit, or were left at the default.
 
 use super::Finding;
@@ -6,13 +6,13 @@ use crate::config::{Camera, Parent, Rig};
 use kinematics::{Lens, Transform};
 
 const CHECK: &str = "calibration";
-/// Maximum plausible distance of a camera from the flange that carries it. Lengths in centimeters
-/// or millimeters exceed it.
+/// Maximum plausible distance of a camera from the flange that carries it. Distances that were
+/// given in centimeters or millimeters exceed it.
 const MAX_DISTANCE_M: f64 = 3.0;
-/// Plausible horizontal fields of view. Focal lengths in millimeters or normalized by the width
-/// fall outside.
+/// Plausible horizontal fields of view. If focal lengths are in millimeters or are normalized by
+/// the width, the field of view is outside this range.
 const FIELD_OF_VIEW_DEG: std::ops::RangeInclusive<f64> = 5.0..=160.0;
-/// Minimum plausible exposure time. Times in milliseconds are below it.
+/// Minimum plausible exposure time. Times that were given in milliseconds are below it.
 const MIN_EXPOSURE_MICROS: f64 = 5.0;
 
 /// Checks the values of all cameras. Empty if all are plausible.

@@ -99,7 +99,7 @@ fn finding(
         (0, 1.., _, _) => "stop one of the senders, and let the other one keep its socket",
         _ => "correct the sender: docs/reference/udp.md describes the format",
     };
-    // States of other joints are no problem as long as there are states of the arm, too.
+    // States of other joints are no problem if states of the arm arrive as well.
     let is_problem = n_rejected + n_foreign + n_uncertain > 0;
     match (n_received, has_data) {
         (0, _) => None,

@@ -17,8 +17,8 @@ use std::time::{Duration, Instant};
 /// allows for one missing sample in a short measurement.
 const MIN_RATE_FRAC: f64 = 0.95;
 
-/// Minimum time between the first and the last sample for comparing the stamps with the clock of
-/// this computer. In a shorter time, the variation of latencies would be large in comparison.
+/// Minimum time between the first and the last sample. If the time is shorter, the stamps are not
+/// compared with the clock of this computer, because the latencies vary too much in comparison.
 const MIN_RECEIVED_SECS: f64 = 0.5;
 
 /// Measurements of one device, or of the keyframes made from its images.
@@ -39,8 +39,8 @@ pub struct DeviceStatistics {
     pub latency: Option<Latency>,
     /// 99th percentile of the intervals between samples.
     pub gap_p99_millis: f64,
-    /// Seconds by which the stamps advance per second of this computer, normally 1. `None` for
-    /// simulated devices, and if the samples arrived within less than 0.5 s.
+    /// Seconds by which the stamps advance per second of this computer's clock. The normal value is
+    /// 1. `None` for simulated devices, and if the samples arrived within less than 0.5 s.
     pub stamp_secs_per_sec: Option<f64>,
 }
 
@@ -163,7 +163,7 @@ pub fn listen(rig: &Rig, secs: f64, stop: &Stop) -> anyhow::Result<ListenResult>
         let track = tracks.entry(device).or_default();
         track.note(sample.stamp(), now);
         track.dropped += dropped;
-        // The samples are joined as in a run, because missing poses show only here.
+        // The samples are joined as in a run, because missing poses are found only in the join.
         for event in join.push(sample) {
             if let JoinEvent::Accepted(keyframe) = event {
                 let track = tracks
@@ -201,7 +201,7 @@ pub fn listen(rig: &Rig, secs: f64, stop: &Stop) -> anyhow::Result<ListenResult>
 }
 
 /// Name of the device that delivered a sample, and the number of its images that were dropped
-/// before; `None` for ground truth, which no device delivers.
+/// before the sample. `None` for ground truth, which no device delivers.
 fn device_of(sample: &Sample) -> Option<(String, u64)> {
     Some(match sample {
         Sample::Image(image) if image.is_depth() => {
@@ -215,8 +215,8 @@ fn device_of(sample: &Sample) -> Option<(String, u64)> {
     })
 }
 
-/// Lists why images did not become keyframes. This is normal, for example while the robot stands
-/// still, unless most images have no pose.
+/// Lists the reasons why images did not become keyframes. Rejected images are normal, for example
+/// while the robot stands still. It is a problem only if most images have no pose.
 fn join_finding(join: &Join) -> Option<Finding> {
     let counts = join.counts();
     let rejected: Vec<_> = counts
@@ -245,7 +245,8 @@ fn join_finding(join: &Join) -> Option<Finding> {
     })
 }
 
-/// The devices of a rig with their expected rates; `None` if the rig file does not set a rate.
+/// The devices of a rig with their expected rates. A rate is `None` if the rig file does not set
+/// it.
 fn expected(rig: &Rig) -> BTreeMap<String, Option<f64>> {
     let mut expected = BTreeMap::new();
     for camera in &rig.cameras {
@@ -358,8 +359,8 @@ fn problem(statistics: &DeviceStatistics) -> Option<Finding> {
     ))
 }
 
-/// Reports stamps that advance faster or slower than time, usually because they are in another
-/// unit.
+/// Reports stamps that advance faster or slower than the clock of this computer. Usually, such
+/// stamps are in another unit.
 fn wrong_unit(statistics: &DeviceStatistics) -> Option<Finding> {
     let rate = statistics
         .stamp_secs_per_sec

@@ -98,8 +98,8 @@ impl std::fmt::Display for Finding {
     }
 }
 
-/// Checks clocks, memory, priorities and permissions, the devices of `rig`, and connected devices
-/// in general.
+/// Checks clocks, memory, priorities and permissions of this computer. Also checks the devices of
+/// `rig` and all connected devices.
 pub fn check(rig: Option<&Rig>) -> Vec<Finding> {
     let dev = Path::new("/dev");
     let proc = Path::new("/proc");

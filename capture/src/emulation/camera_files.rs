@@ -13,7 +13,7 @@ pub(super) struct CameraFiles {
     camera_files: Vec<CameraFile>,
 }
 
-/// A camera of the rig; its file is created once the first images define its format.
+/// A camera of the rig. Its file is created once the first images define its format.
 struct CameraFile {
     camera: Camera,
     path: PathBuf,
@@ -46,7 +46,7 @@ impl CameraFiles {
         })
     }
 
-    /// Adds an image; images of other cameras are ignored.
+    /// Adds an image. Images of other cameras are ignored.
     pub(super) fn take(&mut self, image: Image) -> anyhow::Result<()> {
         match self
             .camera_files
@@ -122,8 +122,8 @@ impl CameraFile {
                 camera_from_depth: depth.camera_from_depth,
                 meters_per_count,
             }),
-            // Keep waiting, because the rig file has depth, and the first depth image contains the
-            // unit.
+            // The file is not created yet, because the rig file has depth, and the first depth
+            // image contains the unit.
             (Some(_), None) => return Ok(()),
             (None, _) => None,
         };

@@ -42,9 +42,10 @@ const SCENES: [(&str, &str, &str); 2] = [
 pub struct EmulationPlan {
     /// A rig file, or the name of a scene.
     pub rig_or_scene: String,
-    /// Folder for the rig file to run against the emulated devices; `sim-NAME` if `None`.
+    /// Folder for the rig file to run against the emulated devices. The folder is `sim-NAME` if
+    /// this is `None`.
     pub out: Option<PathBuf>,
-    /// Recording of the rig that is played back; a simulation if `None`.
+    /// Recording of the rig that is played back. If this is `None`, a simulation is played back.
     pub recording: Option<PathBuf>,
     /// Length of the playback, seconds.
     pub seconds: f64,
@@ -125,8 +126,8 @@ impl EmulationPlan {
             scripted: first,
             emulated: clock::now().plus_secs(self.start_in_secs),
         };
-        // The playback time is known only now, so the stamps of the camera files are shifted by an
-        // offset in the rig file.
+        // The start time of the playback is known only now. An offset in the rig file therefore
+        // shifts the stamps of the camera files.
         for camera in &mut rig.cameras {
             camera.realsense.clock_offset_nanos = playback_clock
                 .emulated
@@ -175,13 +176,14 @@ impl EmulationPlan {
         if !is_complete {
             return Ok(None);
         }
-        // An interrupted simulation is left unfinished, and removed by the next one.
+        // The recording of an interrupted simulation is left unfinished. The next simulation
+        // removes it.
         recorder.finish()?;
         Ok(Some(path))
     }
 
-    /// Passes on the samples of the first `seconds`, and their time since the first one in seconds.
-    /// Returns false if interrupted.
+    /// Passes on the samples of the first `seconds`. Each sample is passed with its time since the
+    /// first sample, in seconds. Returns false if interrupted.
     fn for_each_sample(
         &self,
         source: &mut dyn Source,
@@ -204,8 +206,8 @@ impl EmulationPlan {
         Ok(true)
     }
 
-    /// Reads the samples of the first `seconds` of a recording; images go to the camera files.
-    /// `None` if interrupted.
+    /// Reads the samples of the first `seconds` of a recording. Images are written to the camera
+    /// files. `None` if interrupted.
     fn read(
         &self,
         recording: &Path,
@@ -380,7 +382,7 @@ fn robot_config(rig: &Rig, fci: &str) -> anyhow::Result<RobotConfig> {
     })
 }
 
-/// Address at which the emulated controller listens; it must belong to this computer.
+/// Address at which the emulated controller listens. It must belong to this computer.
 fn fci_address(text: &str) -> anyhow::Result<SocketAddr> {
     let found = match text.parse() {
         Ok(address) => Some(address),

@@ -15,9 +15,9 @@ pub(super) struct Acceptance {
     spacing: Spacing,
     is_fixed: bool,
     readout_secs: f64,
-    /// All poses accepted so far, including those of evicted keyframes. Otherwise, a full store
-    /// would accept the same views again and again. Their number is limited, because the camera can
-    /// reach only a limited space and poses have a minimum spacing.
+    /// All poses accepted so far, including the poses of evicted keyframes. Without the evicted
+    /// poses, a full store would accept the same views again and again. The number of poses is
+    /// limited, because the camera can reach only a limited space and poses have a minimum spacing.
     accepted: Vec<Transform>,
     last: Option<Stamp>,
     sharpness: SharpnessHistory,
@@ -49,8 +49,8 @@ impl Acceptance {
     /// Checks that the camera has moved enough since the nearest keyframe. For a fixed camera,
     /// checks instead that enough time has passed.
     pub(super) fn check_motion(&self, stamp: Stamp, pose: &Transform) -> Result<(), Rejection> {
-        // A fixed camera would never move by the minimum spacing. Its images still show moving
-        // objects, so a few of them are taken over time.
+        // A fixed camera never moves by the minimum spacing. Its images still show moving objects,
+        // so it gets a keyframe at regular intervals.
         let moved = if self.is_fixed {
             let waited = self.last.is_none_or(|last| {
                 stamp.secs_since(last) * 1e3 >= self.config.fixed_interval_millis
@@ -90,8 +90,8 @@ impl Acceptance {
             };
         };
         let speed_px_s = camera_motion::image_speed_px_s(twist, pinhole, depth_m);
-        // A camera that does not report its exposure is not tested for blur here. Its blurred
-        // images are found by their sharpness.
+        // If a camera does not report its exposure time, its images are not tested for blur here.
+        // The sharpness test finds its blurred images.
         let blur_px = speed_px_s * exposure_secs.unwrap_or(0.0);
         let shear_px = speed_px_s * self.readout_secs;
         // The comparison is written so that a NaN speed is also rejected.
@@ -113,8 +113,9 @@ impl Acceptance {
         if !is_well_exposed || statistics.clipped_frac > self.config.max_clipped_frac {
             return Err(Rejection::Exposure);
         }
-        // The history is updated before the test, also with images that are rejected. Otherwise,
-        // all later images of a camera that rotates toward a blurry scene would be rejected.
+        // The history of sharpness is updated before the test, even with images that are rejected.
+        // Otherwise, once a camera rotates toward a scene with little texture, all its later images
+        // would be rejected.
         let relative = self.sharpness.relative(statistics.sharpness);
         if relative >= self.config.min_sharpness_frac {
             Ok(())

@@ -44,7 +44,7 @@ impl Undistorter {
         self.pinhole.size_px != self.full.size_px
     }
 
-    /// Undistorts and scales `[height, width, 3]` to `[height, width, 4]`; alpha is 0 where the
+    /// Undistorts and scales `[height, width, 3]` to `[height, width, 4]`. Alpha is 0 where the
     /// source image has no pixel.
     pub(super) fn rgba(&self, rgb: &[u8]) -> anyhow::Result<Arc<[u8]>> {
         // At full size, no intermediate image is needed.
@@ -123,7 +123,8 @@ pub(super) fn truth(
     let rgba_srgb = undistorter
         .rgba(&rgb(&truth.image, intrinsics)?)
         .context("the true image")?;
-    // The PSNR ceiling applies to noise at full size; averaging areas removes much of the noise.
+    // The PSNR ceiling is that of the noise at full size. Averaging areas removes much of the
+    // noise, so the ceiling does not apply to scaled images.
     let psnr_ceiling = if undistorter.is_downscaled() {
         None
     } else {

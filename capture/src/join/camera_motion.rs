@@ -20,13 +20,14 @@ const MAX_READINGS: usize = 20_000;
 /// Tolerance for joint positions beyond the limits, radians or meters. Calibration errors and soft
 /// stops stay within it.
 const MAX_LIMIT_EXCESS: f64 = 0.2;
-/// Joint states that imply more than this multiple of a joint's speed limit are ignored as states
-/// of another arm. The margin allows for an arm that is pushed, and for a URDF with reduced limits.
-/// With a smaller value, the states of such arms would be ignored. With a larger value, states of a
-/// second arm would be accepted if they happen to be close.
+/// Joint states that imply a joint speed above this multiple of the speed limit are ignored. They
+/// are assumed to be states of another arm. The margin allows for an arm that is pushed, and for a
+/// URDF with reduced limits. With a smaller value, the states of such arms would be ignored. With a
+/// larger value, states of a second arm would be accepted if they happen to be close.
 const MAX_SPEED_FACTOR: f64 = 3.0;
-/// Added to the time between two readings, because their stamps may be inaccurate. At 1 kHz, two
-/// readings whose stamps are too close would otherwise seem to move at many times their speed.
+/// Time that is added to the time between two readings, because their stamps may be inaccurate. At
+/// 1 kHz, two readings whose stamps are too close would otherwise seem to move at many times their
+/// speed.
 const MAX_STAMP_ERROR_SECS: f64 = 0.02;
 /// If this many consecutive ignored states agree with each other, they are accepted. With a smaller
 /// number, states of another arm that arrive between ours would be accepted. With a larger number,
@@ -119,8 +120,8 @@ impl Motion {
             .context("the arm's URDF")?;
         let order = chain.order_in(&rig.arm.joints).context("arm.joints")?;
         let max_gap = Duration::from_secs_f64(rig.join.max_gap_millis * 1e-3);
-        // With tags, the slowest camera decides how far apart base poses are.
-        // Tags give the base pose only at images, not in between.
+        // Tags give the base pose only at images, not in between. The slowest camera therefore
+        // decides how far apart base poses are.
         let min_rate_hz = rig
             .cameras
             .iter()
@@ -184,10 +185,11 @@ impl Motion {
     /// Adds joint readings in the order of the device.
     ///
     /// # Errors
-    /// If they are not valid, or imply an impossible speed. They are then ignored.
+    /// If the readings are not valid, or imply an impossible speed. Such readings are ignored.
     pub(crate) fn push_joints(&mut self, state: JointState) -> Result<(), JointsRejection> {
-        // Devices report joints in their own order. The chain needs its own, and it needs offsets
-        // before interpolation, so that everything after this line uses URDF positions.
+        // Devices report joints in their own order. The chain needs the joints in its own order.
+        // Offsets are added before interpolation, so that all code after this line uses URDF
+        // positions.
         let state = match (self.ordered(&state.position), self.ordered(&state.velocity)) {
             (Some(position), Some(velocity)) if !position.is_empty() => {
                 let position = position
@@ -211,7 +213,8 @@ impl Motion {
             .newest()
             .and_then(|newest| self.joints.at(newest).ok());
         if let Some(jump) = newest.and_then(|newest| self.jump(&newest, &state)) {
-            // If the states stay there, the last accepted state was the wrong one.
+            // If later states agree with the ignored state, the last accepted state was the wrong
+            // one.
             let continues = self
                 .ignored
                 .as_ref()
@@ -232,8 +235,8 @@ impl Motion {
             .map_err(|_| JointsRejection::Invalid)
     }
 
-    /// The numbers of a reading in the order of the chain; empty if the device does not report
-    /// them, `None` if some are missing.
+    /// The numbers of a reading in the order of the chain. The list is empty if the device does not
+    /// report these numbers. `None` if some of them are missing.
     fn ordered(&self, numbers: &[f64]) -> Option<Vec<f64>> {
         if numbers.is_empty() {
             return Some(Vec::new());

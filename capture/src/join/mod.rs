@@ -1,4 +1,4 @@
-//! Joins images with joint readings, base poses and calibration, which gives keyframes.
+//! Joins images with joint readings, base poses and calibration to make keyframes.
 //!
 //! Samples are pushed one by one. The result depends only on their order, so a live lockstep run,
 //! its recording and the replay of that recording give bit-identical keyframes.
@@ -37,8 +37,8 @@ use waiting::{Partner, Waiting};
 
 /// Converts samples to keyframes.
 ///
-/// Samples go in one by one with [`Join::push`]; [`Join::finish`] ends the stream. The store of
-/// keyframes is bounded: beyond its limits, the most redundant keyframe is evicted.
+/// [`Join::push`] takes samples one by one. [`Join::finish`] ends the stream. The store of
+/// keyframes is bounded. Beyond its limits, the most redundant keyframe is evicted.
 pub struct Join {
     motion: Motion,
     cameras: Vec<CameraState>,
@@ -164,8 +164,8 @@ impl Join {
         self
     }
 
-    /// Continues a run that already has these keyframes. Returns the camera and stamp of those that
-    /// do not fit into the store.
+    /// Continues a run that already has these keyframes. Returns the camera and stamp of each
+    /// keyframe that does not fit into the store.
     ///
     /// Clocks restart when a simulation or the computer restarts. If the stamp of the first new
     /// keyframe is not later than the earlier stamps, all new keyframes get a stamp offset.
@@ -201,7 +201,7 @@ impl Join {
     /// Processes one sample and returns the resulting events.
     pub fn push(&mut self, sample: Sample) -> Vec<JoinEvent> {
         let mut events = Vec::new();
-        // The newest stamp of any device is the clock of all waits. Wall time would make a replay
+        // All waits are measured by the newest stamp of any device. With wall time, a replay would
         // decide differently from the run that it repeats.
         self.newest = self.newest.max(sample.stamp());
         match sample {
@@ -291,11 +291,11 @@ impl Join {
         )?)
     }
 
-    /// Adds a joint state. The first state of each kind of problem is logged, all of them are
-    /// counted.
+    /// Adds a joint state. All states with a problem are counted. For each kind of problem, only
+    /// the first state is logged.
     fn push_joints(&mut self, state: JointState) {
-        // States that are ignored below are also checked here. Readings in degrees imply impossible
-        // speeds as well, but this warning names the cause.
+        // This check includes states that are ignored below. Readings in degrees also imply
+        // impossible speeds and are ignored for this reason, but the warning here names the cause.
         if !self.warned_joint_limits
             && let Some(joint_limit_warning) = self.motion.joint_limit_warning(&state)
         {
@@ -328,7 +328,7 @@ impl Join {
             .find(|camera| camera.config.name == image.camera)
         else {
             // Only color images are counted and rejected. A depth image of an unknown camera
-            // belongs to a color image that is rejected already.
+            // belongs to a color image, which is rejected and counted itself.
             if !image.is_depth() {
                 self.counts
                     .unknown_cameras
@@ -340,7 +340,8 @@ impl Join {
         if image.is_depth() {
             let stamp = camera.config.mid_exposure(image.stamp);
             camera.waiting.push_depth(stamp, image);
-        // Color images keep their device stamp in the queue, because ground truth is found by it.
+        // Color images keep their device stamp in the queue, because ground truth is found by the
+        // device stamp.
         } else if let Some(dropped_image) = camera.waiting.push_color(image) {
             let stamp = camera.config.mid_exposure(dropped_image.stamp);
             self.reject(&dropped_image.camera, stamp, Rejection::QueueFull, events);
@@ -361,8 +362,8 @@ impl Join {
                 .cloned()
                 .map(JoinEvent::RangeScan),
         );
-        // The order of the cameras is fixed (that of the rig file), so that a replay gives the
-        // keyframes in the order of the run.
+        // Cameras are processed in the order of the rig file. With this fixed order, a replay gives
+        // the keyframes in the order of the run.
         for camera_ix in 0..self.cameras.len() {
             while let Some(ready) = self.next_ready(camera_ix, at_end) {
                 match ready {
@@ -390,8 +391,8 @@ impl Join {
         let camera = &mut self.cameras[camera_ix];
         let device_stamp = camera.waiting.oldest()?.stamp;
         let stamp = camera.config.mid_exposure(device_stamp);
-        // An image with a lost partner must not wait forever, because newer images of its camera
-        // queue behind it.
+        // An image whose depth image or ground truth was lost must not wait forever, because newer
+        // images of its camera queue behind it.
         let overdue = at_end || self.newest.secs_since(stamp) > self.max_wait_secs;
         let camera_pose = match self.motion.at(&camera.config, stamp) {
             Err(HistoryError::NotYet { .. }) if !overdue => return None,
@@ -418,7 +419,8 @@ impl Join {
                             .cloned()
                             .zip(Some(camera_pose))
                     }
-                    // Depth without a pose is useless, but the color image is still good.
+                    // A depth image without a pose is useless, but the color image can still be
+                    // used.
                     Err(_) => {}
                 }
             }
@@ -434,8 +436,8 @@ impl Join {
             camera.waiting.stop_waiting_for_truth();
         }
         let image = camera.waiting.take_oldest()?;
-        // The depth image of this color image may also be the nearest one of the next, so it is
-        // kept for one period.
+        // The depth image of this color image may also be the nearest depth image of the next color
+        // image, so it is kept for one period.
         camera
             .waiting
             .forget_before(stamp, device_stamp, period_secs);
@@ -481,9 +483,9 @@ impl Join {
         } else {
             None
         };
-        // The offset is chosen once, at the first keyframe of this run, so that the distances in
-        // time between its keyframes stay those of the device. One second keeps them apart from the
-        // last keyframe of the earlier run.
+        // The stamp offset is chosen once, at the first keyframe of this run. The time differences
+        // between the keyframes therefore stay those of the device. One second separates the first
+        // keyframe from the last keyframe of the earlier run.
         let stamp_offset_nanos =
             *self
                 .stamp_offset_nanos
@@ -637,7 +639,7 @@ impl CameraState {
         map.map_err(|e| self.undecodable(&e)).ok()
     }
 
-    /// Logs the first decoding error of a camera; all of them are counted.
+    /// Logs only the first decoding error of a camera. All decoding errors are counted.
     fn undecodable(&mut self, error: &anyhow::Error) -> Rejection {
         if !std::mem::replace(&mut self.warned_undecodable, true) {
             log::warn!("{error:#}");

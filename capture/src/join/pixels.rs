@@ -20,8 +20,8 @@ pub(super) struct PixelStatistics {
     pub(super) luma_frac: f64,
     /// Fraction of pixels that are black or white.
     pub(super) clipped_frac: f64,
-    /// Variance of the Laplacian of the reduced image divided by the variance of that image, so
-    /// that contrast does not affect it. Only ratios between images of the same camera are
+    /// Variance of the Laplacian of the reduced image, divided by the variance of that image. The
+    /// division removes the effect of contrast. Only ratios between images of the same camera are
     /// meaningful.
     pub(super) sharpness: f64,
 }
@@ -30,8 +30,8 @@ impl PixelStatistics {
     /// Computes the statistics of `rgb`, `[height, width, 3]`, sRGB.
     pub(super) fn of(rgb: &[u8], size_px: [u32; 2]) -> Self {
         let [width, height] = size_px.map(|side| side as usize);
-        // Integer blocks, so that every pixel has the same weight. Pixels of an incomplete block at
-        // the right and bottom edge are left out.
+        // The blocks have an integer size, so that every pixel has the same weight. Pixels of an
+        // incomplete block at the right and bottom edge are left out.
         let block = (width / REDUCED_WIDTH).max(1);
         let reduced = Reduced::of(rgb, [width, height], block);
         #[expect(

@@ -10,17 +10,17 @@ use nalgebra::Point3;
 use std::collections::VecDeque;
 use std::sync::Arc;
 
-/// Maximum number of scans that wait for base poses; beyond it, the oldest are dropped. At 10 Hz,
-/// these are the scans of more than six seconds.
+/// Maximum number of scans that wait for base poses. If there are more, the oldest scans are
+/// dropped. At 10 Hz, 64 scans cover more than six seconds.
 const MAX_WAITING: usize = 64;
 
 /// Side of a depth cell in pixels. The rings of a scanner are about ten pixels apart.
 const CELL_PX: u32 = 8;
-/// Maximum time between an image and the scans used for its depth. Older and newer scans were taken
-/// from elsewhere, with other occlusions.
+/// Maximum time between an image and the scans used for its depth. The scanner was at another
+/// position during older and newer scans, and saw other occlusions.
 const MAX_TIME_DIFFERENCE_SECS: f64 = 1.0;
-/// Minimum number of filled cells for a depth map. Fewer points contain little information about
-/// the image, but a map with them would count as depth in registration.
+/// Minimum number of filled cells for a depth map. A map with fewer cells contains little
+/// information about the image, but would count as depth in registration.
 const MIN_CELLS: usize = 16;
 
 /// The scans that wait for base poses, and the newest transformed ones.
@@ -110,8 +110,8 @@ impl RangeScans {
         let mut n_filled = 0;
         for depth_m in &mut depth_m {
             n_filled += usize::from(depth_m.is_finite());
-            // Infinity marks an empty cell while the minimum is taken. In depth maps, 0 means no
-            // reading.
+            // While the minimum is taken, infinity marks an empty cell. Afterwards, it is replaced
+            // by 0, which means "no reading" in depth maps.
             *depth_m = if depth_m.is_finite() { *depth_m } else { 0.0 };
         }
         let world_from_camera = keyframe.world_from_camera;

@@ -82,7 +82,8 @@ pub struct Counts {
     pub without_depth: u64,
     /// Images dropped by devices or queues before the join.
     pub device_skipped: u64,
-    /// Those of them that were color images. Cameras with depth lose images of both kinds.
+    /// Number of these dropped images that were color images. Cameras with depth lose images of
+    /// both kinds.
     pub color_skipped: u64,
     /// Joint readings that were out of order or not finite, or had the wrong number of joints.
     pub joints_rejected: u64,
@@ -113,7 +114,7 @@ pub enum SampleUse {
 }
 
 impl Counts {
-    /// Lost data that should have been kept, one sentence each.
+    /// Messages about data that should have been kept but were lost. Each message is one sentence.
     #[must_use]
     pub fn data_losses(&self, sample_use: SampleUse) -> Vec<String> {
         let mut data_losses = Vec::new();

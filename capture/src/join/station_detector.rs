@@ -8,12 +8,13 @@ use std::collections::VecDeque;
 /// moment at which a base reverses would count as a station. With a longer time, the first
 /// keyframes of a station would be lost.
 const STATIONARY_SECS: f64 = 0.5;
-/// Maximum distance from that pose, meters and (next constant) radians. With larger values, slow
-/// motion would become part of a station. With smaller values, a station would be split if the base
-/// sways while its arm moves.
+/// Maximum distance from the pose near which the base is stationary, meters. With larger values,
+/// slow motion would become part of a station. With smaller values, a station would be split if the
+/// base sways while its arm moves.
 const STATIONARY_M: f64 = 0.005;
+/// Maximum rotation relative to the same pose, radians.
 const STATIONARY_RAD: f64 = 0.005;
-/// Maximum number of stations kept, far more than any image waits for.
+/// Maximum number of stations kept. No image waits for so long that it would need an older station.
 const MAX_STATIONS: usize = 64;
 
 /// The stations of a moving base, counted from 0.
@@ -36,7 +37,7 @@ struct Span {
 impl StationDetector {
     /// Adds the next pose of the base.
     pub(super) fn push(&mut self, stamp: Stamp, world_from_base: &Transform) {
-        // Each pose is compared with the first one of the rest, not with its predecessor.
+        // Each pose is compared with the first pose of the standstill, not with its predecessor.
         // Otherwise, a base that creeps would count as stationary.
         let Some((since, _)) = self
             .stationary_since
@@ -49,8 +50,8 @@ impl StationDetector {
         if stamp.secs_since(since) < STATIONARY_SECS {
             return;
         }
-        // A station begins when it is detected, not when the rest began. An image before that
-        // moment may have been decided already, without a station.
+        // A station begins when it is detected, not when the base came to rest. An image from
+        // before the detection may have been decided already, without a station.
         if !std::mem::replace(&mut self.is_known, true) {
             let station = self.stations.back().map_or(0, |last| last.station + 1);
             self.stations.push_back(Span {

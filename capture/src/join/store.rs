@@ -2,15 +2,16 @@
 //!
 //! A keyframe is evicted from the split (train, validation, test) that exceeds its share most. The
 //! splits thus keep their proportions in a long run. If test keyframes were never evicted, they
-//! would eventually fill the store. Within that split, the keyframe nearest to another one of its
-//! camera is evicted. If two are equally near, the older one is evicted.
+//! would eventually fill the store. Within that split, the store evicts the keyframe that is
+//! nearest to another keyframe of its camera. If two keyframes are equally near, the older one is
+//! evicted.
 
 use super::spacing::Spacing;
 use keyframe::{Keyframe, Split};
 use kinematics::Stamp;
 use std::sync::Arc;
 
-/// Shares of the splits: of eight keyframes, one is for testing and one for validation.
+/// Shares of the splits. Of eight keyframes, one is for testing and one is for validation.
 const SHARES: [(Split, f64); 3] = [
     (Split::Train, 6.0),
     (Split::Validation, 1.0),
@@ -41,8 +42,7 @@ pub struct StoreUse {
 }
 
 impl StoreUse {
-    /// Whether there is no room for another keyframe of average size, so that it will replace
-    /// others.
+    /// Whether the store is full, so that another keyframe of average size will replace others.
     #[must_use]
     pub fn is_full(&self) -> bool {
         let n = self.keyframes as u64;
@@ -85,11 +85,11 @@ impl KeyframeStore {
         }
     }
 
-    /// Adds a keyframe; returns the cameras and stamps of the evicted ones.
+    /// Adds a keyframe. Returns the cameras and stamps of the evicted keyframes.
     pub(super) fn push(&mut self, keyframe: Arc<Keyframe>) -> Vec<(Arc<str>, Stamp)> {
         // Distances are symmetric, so one pass updates the entries and finds the distance of the
-        // new keyframe. Cameras are independent: equal poses of two cameras are not redundant,
-        // because their images differ.
+        // new keyframe. Only keyframes of the same camera are compared. Equal poses of two cameras
+        // are not redundant, because their images differ.
         let mut nearest = f64::INFINITY;
         for kept in self
             .kept

@@ -1,8 +1,8 @@
 //! Images of one camera that wait until all their data have arrived.
 //!
-//! Color, depth and ground truth come in any order; joint readings may come before or after.
-//! Decisions depend only on the order of the samples, never on a clock, so that a replay makes the
-//! same decisions.
+//! Color, depth and ground truth come in any order. Joint readings may come before or after the
+//! images. Decisions depend only on the order of the samples, never on a clock, so that a replay
+//! makes the same decisions.
 
 use drivers::{Image, TruthImage};
 use kinematics::Stamp;
@@ -60,7 +60,7 @@ impl Waiting {
     }
 
     pub(super) fn push_truth(&mut self, truth: TruthImage) {
-        // Ground truth that arrives after all is waited for again.
+        // Ground truth has arrived after all, so later images wait for it again.
         self.expects_truth = true;
         push(&mut self.truth, truth);
     }
@@ -73,8 +73,8 @@ impl Waiting {
         self.color.pop_front()
     }
 
-    /// Mid-exposure of the depth image nearest to a stamp, at most `max_difference_secs` away, and
-    /// whether no nearer image can follow.
+    /// Mid-exposure of the depth image that is nearest to a stamp and at most `max_difference_secs`
+    /// away. Also returns whether no nearer image can follow.
     pub(super) fn depth_near(
         &self,
         stamp: Stamp,

@@ -1,4 +1,4 @@
-//! Opens simulated cameras on an arm whose driver is not simulated: it connects to an emulated
+//! Opens simulated cameras on an arm whose driver is real. The driver connects to an emulated
 //! controller, whose motors move the simulated arm in real time.
 
 use super::real;
@@ -15,8 +15,9 @@ use sim::wire::{JointTrack, emulate_fci};
 use std::net::{Ipv4Addr, SocketAddr};
 use std::time::Duration;
 
-/// How long the controller waits for each answer of the driver. The wait is long because both are
-/// in this process, and because the motion must not depend on the load of the computer.
+/// Time for which the controller waits for each answer of the driver. It is long, because
+/// controller and driver share this process, and because the motion must not depend on the load of
+/// the computer.
 const ANSWER_WAIT: Duration = Duration::from_millis(15);
 
 /// Opens the camera, and the arm for motion. The address of the arm becomes that of the controller.

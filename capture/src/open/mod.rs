@@ -56,7 +56,8 @@ pub struct Opened {
     pub rig: Rig,
     /// The samples of all devices, or of the recording.
     pub source: Box<dyn Source>,
-    /// Description of the damage, set if the samples end early because the recording is damaged.
+    /// Description of the damage of a recording. It is set if the samples end early because of the
+    /// damage.
     pub damage: Arc<OnceLock<String>>,
     /// The clock of the stamps.
     pub stamp_clock: StampClock,
@@ -75,9 +76,9 @@ impl Opened {
         }
     }
 
-    /// Compares the poses of cameras with the tags in the rig file, and warns once about each
-    /// camera that contradicts them. Without tags, or if the tags locate the base, nothing is
-    /// compared.
+    /// Compares the poses of cameras with the tags in the rig file. Warns once about each camera
+    /// whose pose contradicts the tags. Nothing is compared if there are no tags, or if the tags
+    /// locate the base.
     ///
     /// * `notes`: gets the warnings.
     ///
@@ -151,8 +152,8 @@ pub(crate) fn rig_with_monitors(
     } else {
         (Box::new(LiveDevices::new(real)?), StampClock::Computer)
     };
-    // This source comes after all devices, because tags are searched in the images of all cameras
-    // on the robot.
+    // This source wraps all devices, because tags are searched in the images of all cameras on the
+    // robot.
     let source = match rig.base.driver {
         BaseDriver::Tags => Box::new(TagBaseSource::new(&rig, source)?),
         _ => source,
@@ -172,8 +173,8 @@ pub(crate) fn rig_with_monitors(
 fn use_simulated_devices(rig: &mut Rig) {
     rig.arm.driver = ArmDriver::Sim;
     rig.base.driver = match rig.base.driver {
-        // The scene decides whether the base moves. Tags locate a simulated base, too, because the
-        // cameras see them.
+        // The scene decides whether the base moves. Tags can locate a simulated base, too, because
+        // the simulated cameras see the tags.
         _ if base_moves(&rig.sim.scene) => BaseDriver::Sim,
         BaseDriver::Tags => BaseDriver::Tags,
         _ => BaseDriver::Fixed,
@@ -186,7 +187,7 @@ fn use_simulated_devices(rig: &mut Rig) {
     }
 }
 
-/// Opens a recording with the rig stored in it, or with the given one. The joint order is the one
+/// Opens a recording with the stored rig or with the given rig. The joints have the order that is
 /// stored in the recording.
 ///
 /// # Errors
@@ -199,8 +200,8 @@ pub fn recording(path: &Path, rig: Option<Rig>, overrides: &[Override]) -> anyho
         None => stored_rig(path, &recording, overrides)?,
     };
     if let Some(recorded) = recording.joint_names() {
-        // A rig given by the user may have another joint order, or even belong to another robot.
-        // Joint readings in the recording keep their order, so offsets must follow it.
+        // A rig from the user may have another joint order, or may even belong to another robot.
+        // Joint readings keep the order of the recording, so the offsets must have the same order.
         chain_of(&rig)?
             .order_in(recorded)
             .with_context(|| format!("the recording {path:?} does not match the robot"))?;
@@ -225,7 +226,8 @@ pub fn recording(path: &Path, rig: Option<Rig>, overrides: &[Override]) -> anyho
     })
 }
 
-/// Offsets of `joints`, in the order of the recorded joints; empty if there are none.
+/// Offsets of `joints`, in the order of the recorded joints. The list is empty if there are no
+/// offsets.
 fn in_recorded_order(offsets: &[f64], joints: &[String], recorded: &[String]) -> Vec<f64> {
     if offsets.is_empty() {
         return Vec::new();
@@ -253,8 +255,8 @@ pub fn recorder(path: &Path, rig: &Rig) -> anyhow::Result<Recorder> {
         .iter()
         .map(|camera| (&*camera.name, &camera.intrinsics))
         .collect();
-    // The rig with all settings resolved, including the calibration that cameras report. The
-    // recording can then be used without these files and devices.
+    // All settings of the rig are stored, including the calibration that cameras report. The
+    // recording can then be used without the original files and devices.
     let resolved = rig.to_toml();
     let description = RecordingMetadata {
         files: &[
@@ -402,7 +404,7 @@ impl Source for RecordingSource {
         if sample.is_none()
             && let Some(damage) = self.recording.damage()
         {
-            // The damage is reported once, at the end, with the other losses.
+            // The damage is reported once, at the end, together with other losses of data.
             let _ = self.damage.set(damage.to_owned());
         }
         Ok(sample)

@@ -58,8 +58,8 @@ pub fn movable(rig: &Rig, devices: Devices, camera: &str) -> anyhow::Result<Mova
         }
         return simulated(rig);
     }
-    // The camera is opened first, so that the arm is enabled only if everything else works. The arm
-    // is opened for motion, not for reading.
+    // The camera is opened first, so that the arm is enabled only if everything else works. With
+    // the driver `none`, the arm is not opened for reading here. It is opened for motion below.
     let driver = std::mem::replace(&mut rig.arm.driver, ArmDriver::None);
     let opened = real::open(&mut rig);
     rig.arm.driver = driver;

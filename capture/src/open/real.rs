@@ -21,14 +21,14 @@ use messages::BadInput;
 use std::net::{IpAddr, Ipv4Addr, SocketAddr};
 use std::time::Duration;
 
-/// Default address for receiving joint states: this computer only.
+/// Default address for receiving joint states. It accepts data from this computer only.
 const DEFAULT_ARM_ADDRESS: SocketAddr = SocketAddr::new(IpAddr::V4(Ipv4Addr::LOCALHOST), 7011);
 
 /// Error for an arm that this program cannot move.
 const READ_ONLY: &str = "arms with this driver can only be read; to move the arm, set arm.driver = \"can\" or \"franka\"";
 
-/// Opens all real devices of a rig, possibly none, with monitors of those that receive datagrams.
-/// Fills in calibration that is stored in a camera.
+/// Opens all real devices of a rig. There may be none. Also returns monitors of the devices that
+/// receive datagrams. Fills in calibration that is stored in a camera.
 pub(super) fn open(rig: &mut Rig) -> anyhow::Result<(Devices, Vec<DatagramMonitor>)> {
     let mut devices = Devices::default();
     let mut monitors = Vec::new();
@@ -96,7 +96,7 @@ pub fn movable_arm(rig: &Rig) -> anyhow::Result<Box<dyn MovableArm>> {
     }
 }
 
-/// How the arm of a rig may be moved.
+/// The settings with which the arm of a rig may be moved.
 ///
 /// # Errors
 ///
@@ -129,8 +129,8 @@ pub fn check_motion(rig: &Rig) -> anyhow::Result<()> {
     }
 }
 
-/// Motion limits of each joint, in the order of `arm.joints`: positions from the URDF, speed from
-/// the rig file.
+/// Motion limits of each joint, in the order of `arm.joints`. The position limits come from the
+/// URDF, and the speed limit comes from the rig file.
 pub(super) fn motion_limits(
     rig: &Rig,
     acceleration_secs: f64,
@@ -208,7 +208,7 @@ fn movable_config(rig: &Rig, motion: &ArmMotion) -> anyhow::Result<MovableArmCon
     })
 }
 
-/// Limits the efforts that the rig file does not limit to those of the robot description.
+/// For each effort that the rig file does not limit, uses the limit of the robot description.
 #[cfg(target_os = "linux")]
 fn limit_efforts(arm: &mut can::ArmConfig, chain: &kinematics::Chain) {
     for motor in &mut arm.motors {

@@ -24,12 +24,12 @@ mod with_sdk {
     /// camera, pixels. If the difference is larger, one of the two probably belongs to another
     /// camera.
     ///
-    /// A recalibration of the same camera changes its projections by less, and another camera of
-    /// the same type usually by more.
+    /// A recalibration of the same camera changes its projections by less. The projections of
+    /// another camera of the same type usually differ by more.
     const MAX_DIFFERENCE_PX: f64 = 5.0;
 
-    /// Opens a camera and copies calibration that the rig file omits from it. Values in the rig
-    /// file take precedence.
+    /// Opens a camera. Copies the calibration that the rig file omits from the camera to the rig.
+    /// Values in the rig file take precedence.
     pub(in crate::open) fn open(camera: &mut Camera) -> anyhow::Result<Box<dyn drivers::Camera>> {
         let open = RealsenseCamera::open(config(camera))?;
         let known = open.calibration();
@@ -118,8 +118,8 @@ mod with_sdk {
             // A grid from border to border, because lens models differ most in the corners.
             let side = |axis: usize| f64::from(rig.size_px[axis] * steps[axis]) / f64::from(STEPS);
             let pixel = [side(0), side(1)];
-            // Pixels that one of the lenses cannot project are left out: distortion models are only
-            // defined near the image.
+            // Pixels that one of the lenses cannot project are left out, because distortion models
+            // are only defined near the image.
             let projected = known.project(&rig.unproject(pixel)?)?;
             Some((projected[0] - pixel[0]).hypot(projected[1] - pixel[1]))
         });

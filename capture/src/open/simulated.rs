@@ -35,8 +35,8 @@ pub(super) fn open(rig: &Rig, real: Devices) -> anyhow::Result<(Box<dyn Source>,
     } else {
         (Stamp::default(), StampClock::Simulation)
     };
-    // In real time, the limits are checked here, because devices that end would look like devices
-    // that have failed.
+    // In real time, this source checks the limits itself. If the simulated devices ended instead,
+    // they would look like devices that have failed.
     config.duration_secs = None;
     config.n_images = None;
     let sim::LiveRig {
@@ -62,7 +62,7 @@ pub(super) fn commanded(rig: &Rig, limits: &[MotionLimits]) -> anyhow::Result<si
     Ok(sim::open(&unlimited(rig)?)?.into_commanded(limits)?)
 }
 
-/// The simulator configuration of a rig whose arm is commanded: without end and ground truth.
+/// The simulator configuration of a rig whose arm is commanded. It has no end and no ground truth.
 pub(super) fn unlimited(rig: &Rig) -> anyhow::Result<sim::Config> {
     Ok(sim::Config {
         duration_secs: None,
@@ -212,8 +212,8 @@ fn scanner_of(scanner: &Scanner) -> sim::ScannerConfig {
 fn camera_of(camera: &Camera) -> sim::CameraConfig {
     let default = sim::SensorConfig::default();
     let truth = &camera.sim.truth;
-    // The simulated camera has the true values. The rig file may contain wrong ones on purpose, as
-    // the input of a calibration.
+    // The simulated camera has the true values. The rig file may contain wrong values on purpose,
+    // as the input of a calibration.
     let intrinsics = truth.intrinsics.as_ref().unwrap_or(&camera.intrinsics);
     sim::CameraConfig {
         name: camera.name.to_string(),

@@ -11,7 +11,7 @@ use kinematics::{HistoryError, Stamp};
 use std::collections::{BTreeMap, VecDeque};
 
 /// Interval between the images of a camera in which tags are searched, seconds. Detection must not
-/// slow down a run. A contradiction is confirmed by several images, so it is found after a few
+/// slow down a run. Several images must confirm a contradiction, so it is found after a few
 /// seconds.
 const INTERVAL_SECS: f64 = 0.5;
 /// Maximum number of detections that wait for joint states.
@@ -21,7 +21,7 @@ const MAX_WAITING: usize = 16;
 pub(super) struct TagCheckSource {
     source: Box<dyn Source>,
     detector: TagDetector,
-    /// Whether every image is processed, however long that takes.
+    /// Whether every image is processed, even if detection is slow.
     is_lockstep: bool,
     cameras: BTreeMap<String, CheckedCamera>,
     tags: BTreeMap<u32, TagPlacement>,
@@ -86,7 +86,8 @@ impl TagCheckSource {
             camera.last_image = Some(image.stamp);
             let new_detections = self.detector.detect_blocking(image.clone());
             self.enqueue(new_detections);
-        // If the detector is busy, the next image is tried, without waiting for another interval.
+        // If the detector is busy, the next image of the camera is tried, without waiting for
+        // another interval.
         } else if self.detector.detect(image.clone()) {
             camera.last_image = Some(image.stamp);
         }

@@ -13,11 +13,12 @@ use kinematics::{HistoryError, Stamp, Transform, Twist};
 use nalgebra::{Matrix6, Vector3, Vector6};
 use std::collections::{BTreeMap, VecDeque};
 
-/// Maximum number of detections that wait for joint states. If there are more, the arm sends
-/// nothing, which is reported elsewhere.
+/// Maximum number of detections that wait for joint states. If more detections wait, the arm sends
+/// nothing. Other code reports a silent arm.
 const MAX_WAITING: usize = 64;
-/// After this many images in which no pose fits the tags, one of the tags is probably not where the
-/// rig file places it. A single image may have a wrong detection.
+/// Number of images in which no pose fits the tags, before a warning. After this many images, the
+/// rig file probably has a wrong pose of one of the tags. A single image may have a wrong
+/// detection.
 const MIN_MISFIT_IMAGES: u64 = 3;
 /// Time without a pose after which a warning gives the reason, seconds.
 const WARN_AFTER_SECS: f64 = 5.0;
@@ -26,7 +27,7 @@ const WARN_AFTER_SECS: f64 = 5.0;
 pub(super) struct TagBaseSource {
     source: Box<dyn Source>,
     detector: TagDetector,
-    /// Whether every image is processed, however long that takes.
+    /// Whether every image is processed, even if detection is slow.
     is_lockstep: bool,
     cameras: Vec<Camera>,
     tags: BTreeMap<u32, TagPlacement>,
@@ -206,8 +207,8 @@ impl TagBaseSource {
                 }
             }
         }
-        // A single image without a tag is normal; only a long time without any pose keeps the run
-        // from making keyframes.
+        // A single image without a tag is normal. Only a long time without any pose prevents
+        // keyframes.
         let since = *self
             .no_pose_since
             .get_or_insert(self.newest.unwrap_or(stamp));

@@ -15,8 +15,8 @@ const MAX_STRIPS: usize = 4;
 const PAD: usize = MAX_STRIPS;
 /// Number of cells of all strips. Every 16-bit index is valid, so no access needs a bounds check.
 const N_STRIP_CELLS: usize = 1 << 16;
-/// Number of cells behind the strips for pixels without depth. They are used in rotation, because
-/// with a single cell, each write would have to wait for the previous one.
+/// Number of cells behind the strips for pixels without depth. They are used in rotation. With a
+/// single cell, each write would have to wait for the previous write.
 const N_DISCARD_CELLS: usize = 256;
 /// Marks a square that is too wide for the strips.
 const WIDE: u16 = u16::MAX;
@@ -46,8 +46,8 @@ pub(super) struct NearestDepth {
     /// Number of strips that fit.
     n_strips: usize,
     stride: usize,
-    /// For each pixel of the row: first line in the upper 16 bits, last line in the lower 16 bits;
-    /// 0 if it covers nothing.
+    /// For each pixel of the row, the first line in the upper 16 bits and the last line in the
+    /// lower 16 bits. The value is 0 if the pixel covers nothing.
     lines: Vec<u32>,
     /// For each pixel of the row: index of its cell in the strips.
     strip_cells: Vec<u16>,
@@ -72,7 +72,8 @@ impl NearestDepth {
         }
     }
 
-    /// Nearest count minus one of each pixel; [`NO_DEPTH`] if no square covers it.
+    /// Nearest count minus one of each pixel. The value is [`NO_DEPTH`] if no square covers the
+    /// pixel.
     pub(super) fn into_nearest(self) -> Vec<u16> {
         self.nearest
     }

@@ -133,9 +133,9 @@ impl DepthAlignment {
         }
     }
 
-    /// Resamples the depth image to the pixels of the color image. Counts keep their unit and are
-    /// along the z axis of the depth camera; 0 means no depth. Readings of 0 and of the largest
-    /// count are invalid and are skipped.
+    /// Resamples the depth image to the pixels of the color image. Counts keep their unit and
+    /// measure depth along the z axis of the depth camera. A count of 0 means no depth. Input
+    /// pixels with a count of 0 or with the largest count are invalid and are skipped.
     ///
     /// # Errors
     /// If the image contains no depth or its size differs from that of the depth camera.
@@ -334,8 +334,8 @@ fn number(numbers: &mut [u16], positions_px: &[f32], side: u32, corner: Corner) 
         let one_based = positions_px[ix] + 1.0;
         let one_based = if one_based > min { one_based } else { min };
         let one_based = if one_based < max { one_based } else { max };
-        // Adding and subtracting the constant rounds to the nearest integer. If this rounded up,
-        // one is subtracted to obtain the integer below.
+        // Adding and subtracting the constant rounds to the nearest integer. If the result was
+        // rounded up, one is subtracted to obtain the integer below.
         let nearest = (one_based + INTEGER_FLOAT) - INTEGER_FLOAT;
         let below = nearest - if nearest > one_based { 1.0 } else { 0.0 };
         numbers[ix] = (below + INTEGER_FLOAT).to_bits() as u16;
@@ -370,13 +370,14 @@ impl ColorCamera {
 /// Largest radius on the plane `z` = 1 at the edge of the image, plus a margin for corners just
 /// outside.
 fn max_radius(camera: &Intrinsics) -> f64 {
-    // Squares at the edge of the image have corners outside, which must still be projected. A
-    // larger margin would reach the radii at which distortion polynomials stop increasing. Depth
-    // from far outside the field of view would then be drawn into the image.
+    // Squares at the edge of the image have corners outside the image. These corners must still be
+    // projected. A larger margin would reach the radii at which distortion polynomials stop
+    // increasing. Depth from far outside the field of view would then be drawn into the image.
     const MARGIN: f64 = 1.02;
     let [width, height] = camera.size_px;
-    // The largest radius of a lens is not necessarily in a corner, because the principal point may
-    // be off center and the tangential part is not symmetric. So the whole border is searched.
+    // The principal point may be off center, and the tangential part of the distortion is not
+    // symmetric. The largest radius is therefore not necessarily in a corner, so the whole border
+    // is searched.
     let columns = (0..=width).flat_map(|column| [[column, 0], [column, height]]);
     let rows = (0..=height).flat_map(|row| [[0, row], [width, row]]);
     let radii = columns

@@ -16,17 +16,18 @@ use std::sync::mpsc::{Receiver, RecvTimeoutError, SyncSender, TrySendError, sync
 use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
-/// Interval at which a bus thread checks whether it should stop, if no cycle is due earlier. A
-/// longer interval delays the drop of the arm, which waits for the threads.
+/// Maximum interval at which a bus thread checks whether it should stop. Dropping the arm waits for
+/// its threads, so a longer interval would delay the drop.
 const POLL: Duration = Duration::from_millis(50);
-/// Capacity of the queue of readings for a slow caller: one second of seven motors at 1 kHz.
+/// Capacity of the queue of readings. It holds one second of readings of seven motors at 1 kHz, in
+/// case the caller is slow.
 pub(super) const MAX_WAITING: usize = 7000;
 /// If a loop iteration of a bus thread takes this much longer than its waits, the thread was not
 /// scheduled.
 const MAX_LOOP_DELAY: Duration = Duration::from_millis(20);
-/// A motor that sends nothing for this long causes an error. With a lower value, motors would be
-/// reported while their bus restarts after a bus-off. With a higher value, the caller learns later
-/// that a joint is missing.
+/// A motor that sends nothing for this long causes an error. With a lower value, a motor would
+/// count as silent while its bus restarts after a bus-off. With a higher value, the caller learns
+/// later that a joint is missing.
 const MAX_SILENCE: Duration = Duration::from_secs(1);
 
 /// A read-only arm, which cannot be moved. Dropping it stops the polling but does not affect the
@@ -104,8 +105,8 @@ impl Arm for CanArm {
     }
 
     /// Returns a state of all joints as soon as every motor has sent a new reading. The state has
-    /// the stamp of the newest of these readings; the others are extrapolated to it with their own
-    /// velocity.
+    /// the stamp of the newest reading. All other readings are extrapolated to this stamp with
+    /// their own velocity.
     fn read(&mut self, timeout: Duration) -> Result<JointState, Error> {
         let deadline = Instant::now() + timeout;
         loop {
@@ -159,8 +160,8 @@ impl Cycle {
         {
             poll_frames.push(canopen::encode_sync());
         }
-        // The load of the bus includes the answers. The load of motors that report at their own
-        // rate does not depend on our rate, so it is counted separately.
+        // The load of the bus includes the answers. Motors that report at their own rate cause a
+        // load that does not depend on the polling rate, so this load is counted separately.
         let mut cycle_frames = poll_frames.clone();
         let mut unsolicited = Vec::new();
         for (answer, own_rate_hz) in motors
@@ -228,8 +229,8 @@ impl BusReader {
         let mut next_cycle = start;
         let mut previous = start;
         // An iteration waits up to `POLL` for a frame. It also waits for each poll that finds the
-        // queue of the interface full. On a blocked bus, these waits are not a stall, so the
-        // silence of its motors counts.
+        // queue of the interface full. These waits on a blocked bus are not a stall of this
+        // computer, so the motors of the bus count as silent meanwhile.
         let n_polls = u32::try_from(self.cycle.poll_frames.len()).unwrap_or(u32::MAX);
         let max_iteration = POLL + MAX_SENDING.saturating_mul(n_polls) + MAX_LOOP_DELAY;
         let mut progress = Progress {
@@ -275,8 +276,8 @@ impl BusReader {
     /// Sends the poll frames of one cycle.
     fn poll(&self, progress: &mut Progress) -> Result<(), Error> {
         for poll_frame in &self.cycle.poll_frames {
-            // A poll that finds the queue full is only counted. The next cycle replaces it, and a
-            // bus that stays blocked shows as silence of its motors.
+            // A poll that finds the queue full is only counted, because the next cycle sends a new
+            // poll. If the bus stays blocked, its motors count as silent.
             progress.n_unsent += u64::from(!self.bus.send(poll_frame)?);
         }
         Ok(())
@@ -328,9 +329,9 @@ impl BusReader {
         );
     }
 
-    /// Returns an error for the first motor that has been silent for too long; this ends the joint
-    /// states. The error includes the errors on the wire, because a failed bus silences its motors,
-    /// too.
+    /// Returns an error for the first motor that has been silent for too long. After this error,
+    /// the arm returns no more joint states. The error includes the errors on the wire, because a
+    /// failed bus silences its motors, too.
     fn check_silence(&self, progress: &Progress, now: Stamp) -> Result<(), Error> {
         let silent = |last_heard: &Stamp| now.duration_since(*last_heard) > MAX_SILENCE;
         let Some(((_, motor), _)) = self
@@ -354,8 +355,8 @@ impl BusReader {
         })
     }
 
-    /// Logs errors on the wire each time the controller goes bus-off or restarts, and otherwise
-    /// each time their number has doubled.
+    /// Logs errors on the wire each time the controller goes bus-off or restarts. Otherwise, logs
+    /// them each time their number has doubled.
     fn log_errors(&self, total: &mut WireErrors, new_errors: &WireErrors) {
         // A controller retransmits an unacknowledged frame continuously, and each attempt may be
         // reported. Logging at powers of two shows the first errors at once and does not flood the

@@ -1,12 +1,13 @@
 //! The thread that moves an arm. It prepares the motors, enables them, sends setpoints, and stops
 //! permanently on any fault.
 //!
-//! It stops if a motor is silent, reports that it stopped or does not follow its commands, if a bus
-//! fails, or if this computer stalls for so long that the watchdogs of the motors have expired or
-//! are about to. After that, it discards earlier setpoints and sends no new ones until it receives
+//! The thread stops the arm if a motor is silent, reports that it stopped, or does not follow its
+//! commands. It also stops the arm if a bus fails. Another reason is a stall of this computer, if
+//! the stall is so long that the watchdogs of the motors have expired or are about to expire. After
+//! a stop, the thread discards earlier setpoints and sends no new ones until it receives
 //! [`Request::Recover`].
 //!
-//! It sends the fail-safe command before it ends, even if it panics.
+//! The thread sends the fail-safe command before it ends, even if it panics.
 
 use super::bus::Bus;
 use super::config::MovableArmConfig;
@@ -28,31 +29,32 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::mpsc::{Receiver, SyncSender};
 use std::time::Duration;
 
-/// Fraction of the watchdog timeout after which this thread stops the arm. It stops before the
-/// motors do, so that no motor is commanded while others have already stopped.
+/// Fraction of the watchdog timeout after which this thread stops the arm. The thread stops the arm
+/// before the watchdogs of the motors expire. Otherwise, it could command some motors while others
+/// have already stopped.
 ///
-/// A larger fraction leaves less time for the fail-safe command to reach all motors. A smaller one
-/// stops the arm after shorter stalls of this computer.
+/// A larger fraction leaves less time for the fail-safe command to reach all motors. With a smaller
+/// fraction, shorter stalls of this computer stop the arm.
 const SILENCE_FRAC: f64 = 0.8;
-/// A motor counts as silent only after this many cycles. If this thread was late, the answer of the
-/// motor may still arrive. Without this guard, a thread that wakes up after a stall would compare
-/// the old stamps with the new time before it reads the waiting frames.
+/// A motor counts as silent only after this many cycles without a frame. A thread that wakes up
+/// after a stall compares old stamps with the new time before it reads the waiting frames. Without
+/// this limit, the motor would then count as silent although its answer is waiting.
 const MIN_MISSED_CYCLES: u64 = 3;
 /// Maximum time for the motors to report their positions, and to report that they are enabled.
 const STARTUP_TIMEOUT: Duration = Duration::from_secs(2);
-/// Time in which an interface sends half of its queue, which usually holds ten frames: five frames
-/// of up to 135 bits take 0.68 ms at 1 Mbit/s. A longer wait would delay the commands of the other
-/// motors of this cycle.
+/// Maximum wait for space in the queue of an interface. In this time, the interface sends half of
+/// its queue, which usually holds ten frames: five frames of up to 135 bits take 0.68 ms at 1
+/// Mbit/s. A longer wait would delay the commands of the other motors of this cycle.
 const MAX_QUEUED: Duration = Duration::from_micros(800);
 /// Maximum wait for space in the queue when sending a fail-safe command. If the queue stays full,
 /// nobody is receiving.
 const MAX_FAIL_SAFE_WAIT: Duration = Duration::from_millis(5);
-/// Interval at which an idle thread checks for requests. It also limits the delay with which a
-/// thread with a long cycle notices that it must shut down.
+/// Interval at which an idle thread checks for requests. A thread with a long cycle also checks at
+/// this interval whether it must shut down.
 const POLL: Duration = Duration::from_millis(20);
-/// Additional time, beyond the time that its limits require, in which an arm must come to rest on
-/// shutdown. It covers late cycles and a target that was set just before the shutdown. Without a
-/// limit, an arm that never comes to rest would keep the program from ending.
+/// Additional time in which an arm must come to rest on shutdown. It is added to the time that the
+/// limits of the arm require. It covers late cycles and a target that was set just before the
+/// shutdown. Without a limit, an arm that never comes to rest would keep the program from ending.
 const STOP_MARGIN: Duration = Duration::from_secs(1);
 
 type Reply<T> = SyncSender<Result<T, Error>>;
@@ -206,8 +208,8 @@ impl ArmLoop {
                     .set_target(&target)
                     .map_err(|reason| Error::Motion { reason });
                 if accepted.is_ok() {
-                    // A requester may start waiting for the end of the motion as soon as its target
-                    // is accepted.
+                    // The state is set before the reply, because the requester may wait for the end
+                    // of the motion as soon as its target is accepted.
                     *self.motion.lock() = Motion::Moving;
                 }
                 let _ = answer.try_send(accepted);
@@ -233,8 +235,8 @@ impl ArmLoop {
                 match self.prepare() {
                     Ok(prepared) => {
                         self.prepared = Some(prepared);
-                        // Preparing takes longer than a watchdog timeout. This time is not a stall
-                        // of this thread.
+                        // The preparation takes longer than a watchdog timeout, but it is not a
+                        // stall of this thread.
                         self.last_cycle = clock::now_including_suspend();
                         self.arm_state = ArmState::Measuring {
                             since: clock::now(),
@@ -293,8 +295,8 @@ impl ArmLoop {
             return Ok(());
         };
         prepared.cycle_ix += 1;
-        // A single missed cycle does no harm, because every setpoint is followed by a newer one.
-        // Late cycles are only counted, for the summary at the end.
+        // A single missed cycle does no harm, because a newer setpoint follows every setpoint. Late
+        // cycles are therefore only counted for the summary at the end.
         if stall > 2 * self.plan.period {
             self.n_late += 1;
             self.max_stall = self.max_stall.max(stall);
@@ -335,7 +337,8 @@ impl ArmLoop {
 
     /// A cycle of an arm that stopped at `since`.
     fn stopped_cycle(&mut self, since: Stamp, now: Stamp) {
-        // Polls may also reset a watchdog, so they wait until it has expired.
+        // Polls may also reset a watchdog, so the thread polls only after the watchdogs have
+        // expired.
         if let Some(prepared) = &self.prepared
             && now.duration_since(since) > 2 * self.plan.timeout
         {
@@ -363,8 +366,8 @@ impl ArmLoop {
         let limits = prepared.limits(&self.config.motion.limits);
         let generator =
             TrajectoryGenerator::new(&limits, &positions, self.plan.period).map_err(motion)?;
-        // Frames that queued up during the preparation may report faults that it has cleared. Only
-        // reports from now on count.
+        // Frames that queued up during the preparation may report faults that the preparation has
+        // cleared. Only reports from now on count.
         prepared
             .movable_motors
             .iter_mut()
@@ -518,8 +521,8 @@ impl ArmLoop {
     /// The fail-safe command of all motors: `on_loss`, or release if not all motors were enabled
     /// yet.
     fn fail_safe_command(&self) -> OnLoss {
-        // Holding or damping needs enabled motors. If only some are enabled, those would hold while
-        // the others fall, so all are released.
+        // Holding or damping needs enabled motors. If only some motors were enabled, these would
+        // hold while the others fall. In this case, all motors are released.
         if matches!(self.arm_state, ArmState::Moving { .. }) {
             self.plan.on_loss
         } else {
@@ -612,8 +615,8 @@ impl ArmLoop {
 
     /// Resends the fail-safe command once per cycle to motors without a watchdog, because a motor
     /// that misses it would execute its last command forever. Continues until each of these motors
-    /// has sent a frame after the watchdog timeout, at which the watchdogs of the other motors have
-    /// expired. Ends at most [`STARTUP_TIMEOUT`] after that timeout.
+    /// has sent a frame after the watchdog timeout. At that time, the watchdogs of the other motors
+    /// have expired, too. Ends at most [`STARTUP_TIMEOUT`] after the watchdog timeout.
     fn resend_fail_safe(&mut self, now: Stamp) {
         let ArmState::Stopped {
             since,
@@ -627,8 +630,8 @@ impl ArmLoop {
             *pending_fail_safe = None;
             return;
         };
-        // Motors with a watchdog are left out. A resent command would reset their watchdog, and
-        // they stop in any case.
+        // Motors with a watchdog are left out, because they stop in any case. A resent command
+        // would reset their watchdog.
         prepared.shutdown(fail_safe, has_no_watchdog);
         // An answer soon after the stop may reply to an earlier command, so it does not prove that
         // the motor has received this one.
@@ -704,8 +707,9 @@ impl PreparedMotors {
             if movable_motor.config().bus_ix != bus_ix {
                 continue;
             }
-            // A frame without a reading, such as a statusword, still updates the health. The motor
-            // does not count as heard, because the following error is computed from positions.
+            // A frame without a reading, such as a statusword, still updates the health. Only a
+            // frame with a reading counts against the silence of the motor, because the following
+            // error is computed from positions.
             if let Some(reading) = movable_motor.process_frame(frame) {
                 self.last_heard[joint_ix] = (stamp, self.cycle_ix);
                 self.latest[joint_ix] = Some(reading);
@@ -876,8 +880,9 @@ impl PreparedMotors {
                     );
                 }
             }
-            // Both conditions must hold. Time alone would blame a motor for a stall of this thread;
-            // cycles alone would stop the arm after a few lost frames at a high rate.
+            // A motor is silent only if both its time and its number of cycles exceed the limits.
+            // With the time alone, a stall of this thread would count as silence of the motor. With
+            // the cycles alone, a few lost frames at a high rate would stop the arm.
             let silence = now.duration_since(*stamp);
             if silence > movable_motor.max_silence(max_silence_allowed)
                 && self.cycle_ix - cycle_ix > MIN_MISSED_CYCLES

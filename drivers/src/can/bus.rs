@@ -77,9 +77,9 @@ impl Bus {
     /// Sends a frame, and waits briefly while the interface's queue is full. Returns whether the
     /// kernel accepted the frame.
     ///
-    /// It returns `false` if the queue stayed full, which happens if no node acknowledges frames.
-    /// `true` does not mean that the frame was sent: the kernel accepts and drops frames while the
-    /// controller is bus-off.
+    /// The result is `false` if the queue stayed full. The queue stays full if no node acknowledges
+    /// frames. The result `true` does not mean that the frame was sent. While the controller is
+    /// bus-off, the kernel accepts frames and drops them.
     pub fn send(&self, frame: &Frame) -> Result<bool, Error> {
         self.send_within(frame, MAX_SENDING)
     }
@@ -138,8 +138,8 @@ impl Bus {
 
     /// Waits for the next event. Returns `None` if there was none within the timeout.
     pub fn receive(&self, timeout: Duration) -> Result<Option<(Stamp, BusEvent)>, Error> {
-        // The socket's receive timeout has a resolution of a jiffy, up to 10 ms; `ppoll` has a high
-        // resolution.
+        // The resolution of the socket's receive timeout is one tick of the kernel (up to 10 ms).
+        // `ppoll` has a higher resolution.
         match poll(
             &mut [PollFd::new(&self.socket, PollFlags::IN)],
             Some(&timespec(timeout)),

@@ -36,8 +36,8 @@ pub struct BusConfig {
     pub bitrate_hz: u32,
     /// Bit rate of the data phase of FD frames, bit/s; `None` on a classic bus.
     pub data_bitrate_hz: Option<u32>,
-    /// Accept that the kernel cannot restart the adapter, as with serial-line adapters (`slcan`).
-    /// After a bus-off, such an adapter stays bus-off.
+    /// Whether to accept an adapter that the kernel cannot restart, such as a serial-line adapter
+    /// (`slcan`). After a bus-off, such an adapter stays bus-off.
     pub accept_no_restart: bool,
 }
 

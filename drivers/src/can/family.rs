@@ -14,15 +14,16 @@ use std::ops::RangeInclusive;
 use std::sync::Arc;
 use std::time::Duration;
 
-/// Maximum time until the first report of a motor that sends unsolicited reports. The rarest report
-/// is the heartbeat of CANopen drives, which is set to every 500 ms, so one of them may be lost.
+/// Maximum time until the first report of a motor that sends unsolicited reports. The least
+/// frequent report is the heartbeat of CANopen drives, which is sent every 500 ms. The limit allows
+/// for one lost heartbeat.
 pub(super) const MAX_REPORT: Duration = Duration::from_secs(1);
 /// Maximum time for a motor to report that it is disabled, or in another mode.
 pub(super) const MAX_CHANGE: Duration = Duration::from_secs(1);
 /// Fault of a motor whose watchdog has expired.
 pub(super) const COMMUNICATION_LOST: &str = "it received no command for longer than its timeout";
-/// Ranges for motors whose values need no scaling. If such motors have gains, these have the usual
-/// ranges.
+/// Ranges for motors whose values need no scaling. If such motors have gains, the gains have the
+/// usual ranges.
 pub(super) const UNLIMITED: Limits = Limits::of(f64::INFINITY, f64::INFINITY, f64::INFINITY);
 
 /// Motors that share a protocol.
@@ -79,7 +80,7 @@ pub trait MotorProtocol: Debug + Send + Sync {
         None
     }
     /// A frame of the same size as the motor's position reports. If the motor determines the rate
-    /// of the reports, also returns that rate in Hz.
+    /// of its reports, the rate in Hz is also returned.
     fn typical_answer(&self) -> (Frame, Option<f64>);
     /// The reading in a frame; `None` if the frame is from another motor or has other content.
     fn read(&self, frame: &Frame, limits: &Limits) -> Option<MotorReading>;

@@ -3,7 +3,7 @@
 use super::motor::Reading;
 use kinematics::{JointState, Stamp};
 
-/// Positions of slower joints are not extrapolated, rad/s.
+/// Minimum velocity for extrapolation, rad/s. The position of a slower joint is not extrapolated.
 ///
 /// Most motors encode the velocity as an integer that cannot represent 0, so a motor at rest
 /// reports the nearest velocity. With 12 bits for -60 to 60 rad/s, this is 0.015 rad/s. If an

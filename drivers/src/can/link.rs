@@ -8,10 +8,10 @@ use socketcan::nl::{CanState, InterfaceDetails, Mtu};
 use std::io;
 use std::path::Path;
 
-/// Time from a bus-off to the automatic restart in the commands that we print, milliseconds. With a
-/// shorter time, a node with a permanent fault would disturb the bus more often. A longer time
-/// lengthens the gap in the joint states, which must stay below one second: after that time, a
-/// motor counts as silent.
+/// Time from a bus-off to the automatic restart, in milliseconds. The printed commands set this
+/// time. With a shorter time, a node with a permanent fault would disturb the bus more often. With
+/// a longer time, the gap in the joint states would be longer. The gap must stay below one second,
+/// because a motor then counts as silent.
 const RESTART_MILLIS: u32 = 100;
 
 /// State of a controller according to its error counters.
@@ -230,7 +230,7 @@ fn set_up_command(interface: &str, is_virtual: bool, config: &BusConfig) -> Stri
         };
     }
     // An interface must be down while its bit rate changes, so the command takes it down first.
-    // That is harmless if it is down already.
+    // This step has no effect if the interface is down already.
     let fd = config
         .data_bitrate_hz
         .map_or_else(String::new, |rate| format!(" dbitrate {rate} fd on"));
@@ -257,7 +257,8 @@ fn bit_rate_hz(timing: Option<socketcan::nl::CanBitTiming>) -> Option<u32> {
 const ENODEV: i32 = 19;
 
 fn missing_interface(interface: &str) -> io::Error {
-    // A virtual interface does not exist before it is created, so listing hardware would not help.
+    // A virtual interface is missing if nobody has created it, so a list of the hardware would not
+    // help.
     if interface.starts_with("vcan") {
         let create_command = format!(
             "sudo modprobe vcan; sudo ip link add dev {interface} type vcan; sudo ip link set {interface} up"

@@ -8,9 +8,9 @@ use crate::Error;
 use crate::wire::can::Frame;
 use crate::wire::can::mit::Limits;
 
-/// Greater positions (rad) or velocities (rad/s) of a joint are implausible and ignored. The limit
-/// is far beyond every motor, and small enough that computations with the values stay finite.
-/// Corrupted floating-point values are mostly much larger.
+/// Maximum plausible position (rad) or velocity (rad/s) of a joint. Readings with greater values
+/// are ignored. The limit is far beyond every motor, and small enough that computations with the
+/// values stay finite. Corrupted floating-point values are mostly much larger.
 pub(super) const MAX_RAD: f64 = 1e4;
 
 /// Position, velocity and effort of a joint.
@@ -32,8 +32,8 @@ impl Motor {
     /// Makes the motor report its position, and waits for the first report.
     pub(super) fn set_up(bus: &dyn FrameIo, config: &MotorConfig) -> Result<Self, Error> {
         let motor = Self::set_up_for_motion(bus, config)?;
-        // Such a motor is silent until another master commands it, and cannot be read before that.
-        // The error therefore names this cause.
+        // A motor that reports only when commanded is silent until another master commands it. If
+        // it does not report, the error names this cause.
         if let Reports::WhenCommanded { if_silent } = config.protocol.reports() {
             motor.wait_for_reading(&MotorQuery::new(bus, &config.joint), if_silent)?;
         }

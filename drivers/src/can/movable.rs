@@ -27,8 +27,8 @@ const MAX_RECOVERY: Duration = Duration::from_secs(60);
 /// An arm that may be moved. After opening, it holds its current position.
 ///
 /// Dropping this value brings the arm to rest within its limits. Then each motor gets the fail-safe
-/// command for `on_loss`; motors without a watchdog get it repeatedly until they answer, for a
-/// limited time.
+/// command for `on_loss`. Motors without a watchdog get the command repeatedly until they answer,
+/// for a limited time.
 #[derive(Debug)]
 pub struct MovableCanArm {
     names: Vec<String>,
@@ -43,18 +43,18 @@ pub struct MovableCanArm {
 }
 
 impl MovableCanArm {
-    /// Makes the checks that need no connection to the motors: the limits, and whether each motor
-    /// supports the configuration.
+    /// Makes the checks that need no connection to the motors. It checks the limits, and whether
+    /// each motor supports the configuration.
     pub fn check(config: &MovableArmConfig) -> Result<(), Error> {
         watchdog_plan(config).map(drop)
     }
 
-    /// Checks the capabilities of the motors, sets and verifies their timeouts, and enables them,
-    /// holding their positions.
+    /// Checks the capabilities of the motors, sets and verifies their timeouts, and enables them.
+    /// The enabled motors hold their positions.
     ///
     /// # Errors
-    /// If another program moves motors on one of the buses; nothing is sent then. If any step
-    /// fails; all motors are then disabled.
+    /// If another program moves motors on one of the buses. In this case, nothing is sent. If any
+    /// later step fails. In this case, all motors are disabled.
     pub fn open(config: &MovableArmConfig) -> Result<Self, Error> {
         let names: Vec<String> = config
             .arm
@@ -88,8 +88,8 @@ impl MovableCanArm {
             .collect::<Result<_, _>>()?;
         let device = "movable CAN arm".to_owned();
         let commanded = CommandedArm::new();
-        // `apply_fail_safe` waits until `commanded` is dropped, which must not be before each motor
-        // has its fail-safe command.
+        // `apply_fail_safe` waits until `commanded` is dropped. It must therefore not be dropped
+        // before each motor has its fail-safe command.
         let run = move || {
             arm_loop.run();
             drop(commanded);

@@ -77,8 +77,8 @@ impl MovableMotor {
         let config = self.motor.config();
         let per_turn = self.motor.per_turn();
         let range = self.motor.limits();
-        // Commands in MIT mode are clamped silently to this range. A joint that is sent beyond it
-        // would stop short of its target, with a growing following error.
+        // Commands in MIT mode are clamped silently to this range. If a target were beyond the
+        // range, the joint would stop before it, with a growing following error.
         let max = range.position_rad * per_turn.abs();
         let [lower, upper] = joint.position;
         MotionLimits {
@@ -165,9 +165,9 @@ impl MovableMotor {
     /// Stiffness and damping at the motor: those of the joint, divided by the square of the gear
     /// ratio.
     fn gains(&self) -> Option<[f64; 2]> {
-        // With `n` motor turns per joint turn, the motor deviates `n` times as far, and its torque
-        // counts `n` times at the joint. Both factors apply, so the same stiffness at the joint
-        // needs `1 / n²` of it at the motor.
+        // With `n` motor turns per joint turn, the position error at the motor is `n` times that at
+        // the joint. The torque at the joint is `n` times that of the motor. The stiffness at the
+        // motor is therefore `1 / n²` of the stiffness at the joint.
         let squared = self.motor.per_turn().powi(2);
         let gains = self.motor.config().gains?;
         Some([

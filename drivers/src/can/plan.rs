@@ -8,8 +8,8 @@ use crate::wire::can::canopen::{self, NodeState};
 use std::time::Duration;
 
 /// Minimum watchdog timeout, in cycles. The arm is stopped after 80 % of the timeout. A motor may
-/// always be silent for three cycles. Four is the smallest number of cycles for which 80 % are more
-/// than that.
+/// always be silent for three cycles. Four is the smallest number of cycles of which 80 % are more
+/// than three.
 const MIN_CYCLES: u32 = 4;
 
 /// Makes all checks that are possible before any frame is sent, and returns the watchdog
@@ -39,8 +39,8 @@ pub(super) fn watchdog_plan(config: &MovableArmConfig) -> Result<WatchdogPlan, E
     for motor in &arm.motors {
         check_motor(&plan, motor, &arm.buses[motor.bus_ix].interface)?;
     }
-    // The period depends on the bus load, so only now is it known how many cycles fit into the
-    // timeout.
+    // The number of cycles in the timeout is checked here, because the period depends on the bus
+    // load.
     if plan.timeout < MIN_CYCLES * plan.period {
         let reason = format!(
             "arm.motion.timeout_millis must be at least {MIN_CYCLES} cycles of {:.1} ms",
@@ -58,8 +58,8 @@ pub(super) fn check_motor(
     interface: &str,
 ) -> Result<(), Error> {
     let watchdog = config.protocol.watchdog();
-    // Without a watchdog, the arm would continue after a crash of this computer. That must be a
-    // decision of the person who wrote the rig file.
+    // Without a watchdog, the motor would continue after a crash of this computer. Only the author
+    // of the rig file may accept this risk.
     if let Watchdog::Missing { reason, .. } = watchdog
         && !plan.accept_no_watchdog
     {
@@ -70,8 +70,8 @@ pub(super) fn check_motor(
         return Err(motor_error(config, interface, reason));
     }
     let can = watchdog.actions();
-    // All motors of an arm must react alike. If one held its joint while the others released
-    // theirs, the arm would swing around it.
+    // All motors of an arm must react alike. If one motor held its joint while the others released
+    // theirs, the arm would swing around the held joint.
     if !can.contains(&plan.on_loss) {
         let can: Vec<_> = can.iter().map(|can| format!("{:?}", can.name())).collect();
         let requested = plan.on_loss.name();

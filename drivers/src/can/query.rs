@@ -1,5 +1,5 @@
-//! Sends requests to one motor and waits for the answers, before the cycle starts and while nothing
-//! else reads the bus.
+//! Sends requests to one motor and waits for the answers. It is used before the cycle starts, while
+//! nothing else reads the bus.
 
 use super::frame_io::{BusEvent, FrameIo, WireErrors};
 use crate::wire::can::{CanError, Frame};
@@ -7,8 +7,8 @@ use crate::{Error, clock};
 use std::cell::Cell;
 use std::time::Duration;
 
-/// Maximum time for an answer. On a full bus at 1 Mbit/s a frame waits for some milliseconds. A
-/// longer time delays the error about a missing motor.
+/// Maximum time for an answer. On a full bus at 1 Mbit/s, a frame waits for some milliseconds. With
+/// a longer time, the error about a missing motor would come later.
 const MAX_ANSWER: Duration = Duration::from_millis(50);
 /// Number of requests before the motor counts as silent. Repeating a request is harmless, because
 /// all requests set or read absolute values. A single lost frame must not fail the set-up of an arm

@@ -10,10 +10,12 @@ use std::sync::Arc;
 use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
-/// Capacity of the queue in bytes. If it is exceeded, the oldest datagram is dropped. It bounds
-/// bytes instead of datagrams, because parts of scans are a hundred times as long as joint states.
+/// Capacity of the queue in bytes. If the queue would exceed this capacity, the oldest datagram is
+/// dropped. The limit counts bytes instead of datagrams, because a part of a scan is a hundred
+/// times as long as a joint state.
 const MAX_WAITING_BYTES: usize = 16 << 20;
-/// Approximate memory use of a datagram in addition to its bytes, so that empty ones count, too.
+/// Approximate memory use of a datagram in addition to its bytes. Because of it, empty datagrams
+/// count, too.
 const OVERHEAD_BYTES: usize = 128;
 /// Maximum length of a datagram.
 const MAX_DATAGRAM_BYTES: usize = 65_536;
@@ -106,7 +108,8 @@ impl Receiver {
         &self.device
     }
 
-    /// Returns the oldest queued datagram, or `None` if none came until `until`.
+    /// Returns the oldest queued datagram. Returns `None` if no datagram arrives before the time
+    /// `until`.
     pub(crate) fn next(&self, until: Instant) -> Result<Option<ReceivedDatagram>, Error> {
         let mut state = self.shared.state.lock();
         // Old datagrams are discarded. Otherwise, the first read would return a burst of old
@@ -180,7 +183,8 @@ impl State {
         {
             self.n_bytes -= discarded.len() + OVERHEAD_BYTES;
         }
-        // Drops before the first read are no fault of a slow caller.
+        // Datagrams that were dropped before the first read do not count, because the caller was
+        // not slow.
         self.n_dropped = 0;
     }
 

@@ -11,12 +11,13 @@ use std::time::Duration;
 /// when one of them pauses. A longer time delays the data of a restarted sender.
 const MAX_SENDER_SILENCE: Duration = Duration::from_secs(2);
 
-/// If this many datagrams come from different ports of one host, one program has opened a socket
-/// for each of them. If the datagrams came from up to four programs that keep their sockets, a port
-/// would have occurred twice.
+/// If this many datagrams come from different ports of one host, a single program opens a new
+/// socket for each datagram. Up to four programs that keep their sockets would have used one of the
+/// ports twice.
 const MIN_NEW_PORTS: usize = 5;
-/// Number of recent ports of such a program that are stored. It is small, because the system
-/// chooses ports at random and may soon choose one again.
+/// Number of recent ports that are stored for a program that opens a new socket for each datagram.
+/// The number is small, because the system chooses ports at random and may soon choose a port
+/// again.
 const MAX_RECENT_PORTS: usize = 8;
 
 /// The current sender. There is only one at a time, so that the data of two programs cannot mix.
@@ -46,8 +47,9 @@ impl Senders {
         match self.current {
             Some((current, last)) if !self.is_current(current, from) => {
                 let is_silent = at.duration_since(last) >= MAX_SENDER_SILENCE;
-                // This is checked first, because such a sender is never silent. Otherwise, each of
-                // its datagrams would be ignored as a datagram of another program.
+                // A sender with a new port for each datagram is detected first, because it is never
+                // silent. Otherwise, each of its datagrams would be ignored as a datagram of
+                // another program.
                 if self.finds_new_ports(current, from) {
                     log::warn!(
                         "{device}: every datagram comes from another port of {}, so its sender opens a socket for each of \

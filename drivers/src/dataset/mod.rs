@@ -18,17 +18,19 @@ pub struct Dataset {
     pub path: PathBuf,
     /// Images, sorted by file name (nerfstudio) or time (TUM); never empty.
     pub images: Vec<DatasetImage>,
-    /// PLY file of points on the surfaces of the scene, in the world frame of the images; it may
-    /// not exist. `None` if the dataset names none.
+    /// PLY file of points on the surfaces of the scene, in the world frame of the images. The file
+    /// may not exist. `None` if the dataset names no such file.
     pub points_path: Option<PathBuf>,
     /// Number of images skipped because their file does not exist.
     pub n_missing: usize,
     /// Number of images skipped because their file is corrupt, or no pose or depth is close enough
     /// in time.
     pub n_unusable: usize,
-    /// Notes for the user: one sentence each, with the names of the first skipped images.
+    /// Notes for the user. Each note is one sentence and contains the names of the first skipped
+    /// images.
     pub notes: Vec<String>,
-    /// Messages about corrupt data that are missing from the result: one sentence each.
+    /// Messages about corrupt data. These data are missing from the result. Each message is one
+    /// sentence.
     pub data_losses: Vec<String>,
 }
 

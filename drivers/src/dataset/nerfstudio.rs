@@ -23,8 +23,8 @@ pub const FILE_NAME: &str = "transforms.json";
 /// Reason of the error about a file that is not an input.
 pub(super) const OTHER_FILE: &str =
     "not a recording (.mcap), a dataset folder or a transforms.json";
-/// Relative difference of two focal lengths that are meant to be equal. Rounded angles differ by
-/// far less; angles of another camera or axis differ by more.
+/// Relative difference of two focal lengths that are meant to be equal. Focal lengths from rounded
+/// angles differ by far less. Focal lengths of another camera or axis differ by more.
 const MAX_FOCAL_DIFFERENCE: f64 = 0.01;
 /// Depth counts are millimeters unless the file specifies another unit.
 const DEFAULT_METERS_PER_COUNT: f64 = 0.001;
@@ -59,8 +59,8 @@ const UNUSED: [&str; 14] = [
 /// are explained in docs/reference/datasets.md.
 ///
 /// # Errors
-/// If the file cannot be parsed, no image is usable, or a frame uses an unsupported camera model;
-/// the error names the frame.
+/// If the file cannot be parsed, no image is usable, or a frame uses an unsupported camera model.
+/// In the last case, the error names the frame.
 pub fn read(path: &Path) -> Result<Dataset, Error> {
     let file = if path.is_file() {
         path.to_owned()
@@ -77,8 +77,8 @@ pub fn read(path: &Path) -> Result<Dataset, Error> {
     }
     let mut document: Document = serde_json::from_str(&json::nan_as_null(&text))
         .map_err(|error| file_error(&file, error.to_string()))?;
-    // Files list frames in any order. Sorted by name, the numbered images of a video follow each
-    // other, and repeated entries are neighbors.
+    // Files list frames in any order. After sorting by name, the numbered images of a video follow
+    // each other, and repeated entries are neighbors.
     document
         .frames
         .sort_by(|a, b| a.file_path.cmp(&b.file_path));
@@ -128,7 +128,7 @@ struct Reading<'a> {
     unlisted: Vec<String>,
     /// Images whose poses are rounded.
     rounded: Vec<String>,
-    /// Whether an image had another size than its lens parameters.
+    /// Whether the size of an image differed from the size in its lens parameters.
     has_other_size: bool,
 }
 
@@ -168,8 +168,8 @@ impl Reading<'_> {
             self.skipped.missing.push(name.clone());
             return Ok(());
         };
-        // Only the header is read here. Decoding all images would take long, and each is decoded
-        // when it is needed.
+        // Only the header is read here, because decoding all images would take long. Each image is
+        // decoded when it is needed.
         let size_px = match image_size_px(&image_path) {
             Ok(size_px) => size_px,
             Err(error) => {
@@ -201,8 +201,8 @@ impl Reading<'_> {
             ),
             image_path,
             depth,
-            // A mask that is named but missing causes an error when the image is loaded. Otherwise,
-            // nobody would notice that the pixels that it should exclude are used for training.
+            // If a named mask is missing, loading the image fails. Otherwise, pixels that the mask
+            // should exclude would be used for training without a message.
             mask_path: entry.mask_path.as_ref().map(|name| {
                 find_image(self.folder, name).unwrap_or_else(|| self.folder.join(name))
             }),

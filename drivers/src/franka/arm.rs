@@ -19,15 +19,16 @@ use std::sync::Arc;
 use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
-/// Capacity of the queue of states for a slow caller: one second. When it is full, the oldest state
-/// is dropped.
+/// Capacity of the queue of states. It holds the states of one second, in case the caller is slow.
+/// When the queue is full, the oldest state is dropped.
 const MAX_WAITING: usize = 1000;
 /// A robot that sends nothing for this long counts as lost. At a thousand states per second, lost
 /// datagrams cannot cause such a silence. The cause is a cable, the power or a closed connection.
 const MAX_SILENCE: Duration = Duration::from_secs(1);
-/// Maximum difference between our forward kinematics and the robot's own. Beyond it, the
-/// description belongs to another robot. Poses of FCI 10 are rounded by less than a micrometer, and
-/// the wrong link or tool is usually off by centimeters, so the value need not be exact.
+/// Maximum difference between the flange position from our forward kinematics and the position that
+/// the robot reports. With a larger difference, the description belongs to another robot. FCI 10
+/// rounds poses by less than a micrometer. A wrong link or tool is usually off by centimeters, so
+/// the value need not be exact.
 const MAX_POSE_ERROR_M: f64 = 2e-3;
 const MAX_POSE_ERROR_RAD: f64 = 0.5 / 180.0 * std::f64::consts::PI;
 const NANOS_PER_STATE: i64 = 1_000_000;
@@ -96,7 +97,8 @@ impl FrankaArm {
         let version = connection.version;
         let (sender, first) = first_state(address, &connection)?;
         // A wrong robot description would give every image a wrong pose, and the error would look
-        // like a bad calibration. So it is detected before anything is read or moved.
+        // like a bad calibration. The description is therefore checked before anything is read or
+        // moved.
         check_kinematics(config, &first).map_err(|reason| fault(address, reason))?;
         let motion_loop =
             motion_loop(&connection, &first).map_err(|reason| fault(address, reason))?;
@@ -142,8 +144,8 @@ impl Arm for FrankaArm {
         &self.names
     }
 
-    /// Returns the next state. Its stamp is the robot's clock, mapped to ours. Efforts are the
-    /// measured link-side torques, including gravity.
+    /// Returns the next state. Its stamp is the time on the robot's clock, mapped to the clock of
+    /// this computer. Efforts are the measured link-side torques, including gravity.
     fn read(&mut self, timeout: Duration) -> Result<JointState, Error> {
         let deadline = Instant::now() + timeout;
         let mut state = self.shared.state.lock();
@@ -190,8 +192,8 @@ fn first_state(address: &str, connection: &Connection) -> Result<(SocketAddr, Ro
             Some((sender, first)) => return Ok((sender, first.state)),
             None if clock::now() < deadline => {}
             None => {
-                // TCP is not blocked, because requests are answered. A firewall may block the UDP
-                // port to which the states are sent.
+                // TCP works, because the controller has answered a request. A firewall may block
+                // the UDP port to which the states are sent.
                 return Err(fault(
                     address,
                     format!(
@@ -316,8 +318,8 @@ impl StateReader {
     ) -> Result<(), String> {
         let network = &connection.network;
         let mut buffer = [0; MAX_STATE_BYTES];
-        // States that were queued in the meantime arrive all at once, so they are useless for
-        // estimating the robot's clock.
+        // States that were queued before this thread started are all read at once. Their arrival
+        // times are useless for estimating the robot's clock, so they are discarded.
         while let Ok(Some(_)) = network.udp.try_receive(&mut buffer) {}
         let mut last_received = clock::now();
         loop {
@@ -340,8 +342,8 @@ impl StateReader {
                 }
                 received = network.udp.try_receive(&mut buffer).unwrap_or(None);
                 // Every state gets its own arrival time. With the arrival time of an earlier state,
-                // a state could seem to have arrived before it was sent. That would shift the
-                // stamps of all later states.
+                // a state could seem to have arrived before it was sent. Such a state would shift
+                // the stamps of all later states.
                 at = clock::now();
             }
             if let Some((from, numbered, stamp)) = newest {
@@ -364,7 +366,7 @@ impl StateReader {
             if shared.state.lock().stop {
                 return Ok(());
             }
-            // A closed connection is noticed here, earlier than by the silence.
+            // This check notices a closed connection earlier than the check for silence.
             network
                 .tcp
                 .throw_if_connection_closed()
@@ -430,7 +432,8 @@ impl StateReader {
             return None;
         };
         statistics.count(at.duration_since(stamp));
-        // The oldest is dropped: joint states are matched with images that are about to arrive.
+        // The oldest state is dropped, because joint states are needed for images that are about to
+        // arrive.
         if state_queue.queue.len() >= MAX_WAITING {
             state_queue.queue.pop_front();
             statistics.n_dropped += 1;

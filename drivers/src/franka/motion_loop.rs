@@ -17,9 +17,9 @@ use std::sync::Arc;
 use std::time::Duration;
 
 const STEP: Duration = Duration::from_millis(1);
-/// Number of states at rest after which a motion ends, so that a person may guide the arm by hand.
-/// Starting a motion takes a request and its answer. A caller that sends several targets in a row
-/// should not have to start a motion for each target.
+/// Number of states at rest after which a motion ends. After the end, a person may guide the arm by
+/// hand. Starting a motion takes a request and its answer. A caller that sends several targets in a
+/// row should not have to start a motion for each target.
 const MAX_AT_REST: u32 = 1000;
 /// Number of states within which a motion must start. Source: FCI documentation.
 const MAX_STATES_UNTIL_START: u32 = 1000;
@@ -115,8 +115,8 @@ impl MotionLoop {
                 None => MotionState::Idle,
             },
             MotionState::Beginning { id, n_waited } => self.start_motion(id, n_waited, stamped),
-            // The robot has ended the motion: as requested, or because of a reflex or the user
-            // stop. A command that arrives now belongs to the next motion.
+            // The robot has ended the motion, either as requested or because of a reflex or the
+            // user stop. A command that arrives now belongs to the next motion.
             MotionState::ActiveMotion(active) if state.robot_mode != RobotMode::Move => {
                 self.mailbox
                     .update(|mailbox_state| mailbox_state.accepts_commands = false);
@@ -141,7 +141,7 @@ impl MotionLoop {
         };
     }
 
-    /// Handles the loss of the connection; the robot stops on its own.
+    /// Handles the loss of the connection. In this case, the robot stops without a command.
     pub(super) fn handle_disconnect(&mut self, reason: &str) {
         self.motion_state = MotionState::Idle;
         self.mailbox
@@ -217,7 +217,7 @@ impl MotionLoop {
         let NumberedState { number, state } = stamped.numbered;
         let n_states = number.saturating_sub(active.number);
         // The first step determines what the robot did with the last command. The next command must
-        // continue from there. Otherwise, the robot would see a jump.
+        // continue from the resulting state. Otherwise, the robot would see a jump.
         let fate = match n_states {
             0 => CommandFate::Followed,
             n => active.tracker.advance(active.sent, n, state),
@@ -229,8 +229,8 @@ impl MotionLoop {
             Ok(position_rad) => position_rad,
             Err(why) => return self.halt(active.id, why),
         };
-        // The motion advances even if nothing is sent. The next state then shows that the robot has
-        // extrapolated.
+        // The generator advances even if nothing is sent. The next state then shows that the robot
+        // has extrapolated.
         if stamped.is_fresh {
             self.send(&mut active, stamped, position_rad);
         }
@@ -269,8 +269,8 @@ impl MotionLoop {
         let is_at_rest = active.generator.is_at_rest() && command.is_none();
         active.n_at_rest = if is_at_rest { active.n_at_rest + 1 } else { 0 };
         if is_at_rest && (active.n_at_rest > MAX_AT_REST || mailbox_state.is_shutting_down) {
-            // This is set under the same lock under which the command was taken above. No command
-            // can thus arrive in between and be accepted by a motion that ends.
+            // The flag is set under the same lock under which the command was taken above. A motion
+            // that ends can therefore not accept a command that arrives in between.
             active.is_ending = true;
             mailbox_state.accepts_commands = false;
         }
@@ -313,8 +313,8 @@ impl MotionLoop {
         // them. The position that is sent must always be within the limits of the robot.
         let (position_rad, is_limited) = self.robot.limited(desired, reference)?;
         if is_limited {
-            // The generator must know that its setpoint was not sent. Otherwise, its next setpoint
-            // would have to be limited, too.
+            // The generator continues from the position that was sent instead of its own setpoint.
+            // Otherwise, its next setpoint would have to be limited, too.
             generator.resume(&reference.sent(position_rad).setpoint())?;
             self.mailbox.lock().statistics.n_limited += 1;
         }
@@ -337,7 +337,8 @@ impl MotionLoop {
                     .statistics
                     .count(clock::now().duration_since(stamped.stamp));
             }
-            // This has the same effect as a lost datagram: the robot extrapolates.
+            // A command that cannot be sent has the same effect as a lost datagram: the robot
+            // extrapolates.
             Err(error) => log::debug!(
                 "{}: a command could not be sent: {}",
                 self.device,
@@ -393,8 +394,8 @@ impl MotionLoop {
                 };
             }
             Ok(Some(MotionResponse::Finished)) => reason,
-            // The states describe the cause, such as the reflex, in more detail. The answer is
-            // added because it may contain information that the states lack.
+            // The states describe the cause, such as the reflex, in more detail. The robot's answer
+            // is added, because it may contain information that the states lack.
             Ok(Some(MotionResponse::Rejected(why))) => {
                 Some(reason.map_or(why.clone(), |reason| format!("{reason} ({why})")))
             }

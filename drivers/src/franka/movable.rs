@@ -66,7 +66,7 @@ impl MovableFrankaArm {
     ///
     /// `motion.limits` are in the order of the joints. They are reduced to at most half of the
     /// robot's limits (an eighth for the jerk), and to slightly less than its joint ranges. A
-    /// Franka arm always brakes and holds after 20 ms without a command; other fail-safe settings
+    /// Franka arm always brakes and holds after 20 ms without a command. Other fail-safe settings
     /// are rejected.
     pub fn open(
         config: &ArmConfig,
@@ -88,7 +88,7 @@ impl MovableFrankaArm {
         )?;
         let mailbox = Arc::new(MotionMailbox::default());
         // The limits depend on the robot, which is known only after the connection. The closure
-        // stores the limits that this value needs.
+        // stores the limits, because the returned value needs them.
         let connected = OnceLock::new();
         let arm = FrankaArm::open_with(config, |connection, first| {
             // A Panda serves no description, so its limits are built in.
@@ -165,8 +165,8 @@ impl MovableFrankaArm {
         if let Some(why) = refusal.or_else(|| request::blocking_reason(mode).map(str::to_owned)) {
             return Err(self.fault(why));
         }
-        // Settings are sent with the first motion, so that a program that only opens the arm
-        // changes nothing.
+        // Settings are sent with the first motion. A program that only opens the arm therefore
+        // changes no settings.
         if !self.is_set {
             request::set(&self.connection, &self.contact).map_err(|why| self.fault(why))?;
             self.is_set = true;
@@ -241,8 +241,8 @@ impl MovableArm for MovableFrankaArm {
         Ok(())
     }
 
-    /// Clears the reflex, if a reflex stopped the arm. A person must first release a user stop or
-    /// locked joints; the error names the cause.
+    /// Clears the reflex if a reflex stopped the arm. If the user stop is active or joints are
+    /// locked, a person must release them first. In this case, the error names the cause.
     fn recover(&mut self) -> Result<(), Error> {
         let Some(mailbox_state) = self.mailbox.wait(STOP_TIMEOUT, |mailbox_state| {
             mailbox_state.is_idle || mailbox_state.is_lost
@@ -282,8 +282,8 @@ impl Drop for MovableFrankaArm {
     fn drop(&mut self) {
         self.mailbox.update(|mailbox_state| {
             mailbox_state.is_shutting_down = true;
-            // The stop replaces a pending target. Without a motion, the stop has no effect, and
-            // would otherwise wait in the mailbox until the next motion.
+            // The stop replaces a pending target. Without a motion, the stop is not stored, because
+            // it would wait in the mailbox until the next motion.
             mailbox_state.command = mailbox_state
                 .accepts_commands
                 .then_some(MotionCommand::Stop);

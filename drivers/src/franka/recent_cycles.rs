@@ -40,8 +40,9 @@ impl Cycle {
 pub(super) struct RecentCycles(VecDeque<Cycle>);
 
 impl RecentCycles {
-    /// A robot gives up after 20 missed commands, and reports the reflex some states later. This
-    /// number covers both, and some cycles before them.
+    /// Maximum number of cycles that are kept. A robot gives up after 20 missed commands, and
+    /// reports the reflex some states later. The number covers all of these cycles and some cycles
+    /// before them.
     const MAX: usize = 60;
 
     pub(super) fn new() -> Self {

@@ -8,17 +8,17 @@ use franka::{RobotState, rate_limiting};
 /// Seconds between commands.
 const STEP_SECS: f64 = rate_limiting::DELTA_T;
 /// Maximum position difference between our reference and the robot's, in rad. Smaller differences
-/// come from the rounding of FCI 10, for positions up to 8 rad: its floats are 4.8e-7 apart there,
-/// so rounding changes them by at most 2.4e-7. A larger tolerance would hide missed commands. With
-/// a smaller tolerance, rounding would look like a displaced reference.
+/// come from the rounding of FCI 10. Close to 8 rad, its floats are 4.8e-7 apart, so rounding
+/// changes them by at most 2.4e-7. A larger tolerance would hide missed commands. With a smaller
+/// tolerance, rounding would look like a displaced reference.
 const POSITION_TOLERANCE_RAD: f64 = 4e-7;
 /// Maximum velocity difference between our reference and the robot's, for velocities up to 8 rad/s.
 /// Rounding accounts for a quarter of this tolerance. A missed command with a jerk of 10 rad/s³
-/// changes the velocity by 1e-5 rad/s, ten times this tolerance.
+/// changes the velocity by 1e-5 rad/s, which is ten times this tolerance.
 const VELOCITY_TOLERANCE_RAD_S: f64 = 1e-6;
-/// Maximum number of steps by which a reported reference may be behind. `franka-sim` needs this,
-/// because it reports what its joint thread has processed. A larger value would accept wrong
-/// references: at 1 rad/s, each step is a milliradian.
+/// Maximum number of steps by which a reported reference may be behind. `franka-sim` needs this
+/// number, because it reports the reference that its joint thread has processed. A larger value
+/// would accept wrong references: at 1 rad/s, each step is a milliradian.
 const MAX_BEHIND: f64 = 3.0;
 /// Number of consecutive missing commands after which the robot stops. Source: FCI documentation,
 /// "Real-time control commands".
@@ -64,9 +64,10 @@ impl CommandFate {
 #[derive(Debug)]
 pub(super) struct ReferenceTracker {
     reference: Reference,
-    /// The reference if the robot received all commands that were sent since it last followed one.
+    /// The reference if the robot received all commands that were sent since it last followed a
+    /// command.
     if_all_received: Reference,
-    /// Number of commands since then that the robot seems to have missed.
+    /// Number of commands that the robot seems to have missed since it last followed a command.
     n_doubtful: u64,
 }
 
@@ -85,12 +86,13 @@ impl ReferenceTracker {
 
     /// Advances over `n_states` new states. `sent` is the answer to the state before them.
     ///
-    /// If a received command is mistaken for a missed one, our reference is off by the effect of
-    /// that command. The next command is then exactly where the robot would have extrapolated to,
-    /// so it looks missed as well. This repeats, and the robot keeps its acceleration for as long
-    /// as the commanded jerk is constant. The reported success rate reveals the mistake, because it
-    /// limits how many commands can have been missed. In the first [`N_SUCCESS_WINDOW`] states of a
-    /// motion, a rate that starts at 0 reveals it later.
+    /// If a received command is mistaken for a missed command, our reference is off by the effect
+    /// of that command. The next command is then exactly where the robot would have extrapolated
+    /// to, so it looks missed as well. The mistake repeats, and the robot keeps its acceleration
+    /// for as long as the commanded jerk is constant. The reported success rate reveals the
+    /// mistake, because it limits how many commands can have been missed. In the first
+    /// [`N_SUCCESS_WINDOW`] states of a motion, the rate may start at 0, and then reveals the
+    /// mistake later.
     pub(super) fn advance(
         &mut self,
         sent: Option<[f64; N_JOINTS]>,
@@ -106,14 +108,15 @@ impl ReferenceTracker {
             self.n_doubtful = 0;
             return fate;
         }
-        // Two explanations are tracked in parallel: all commands since the last certain one were
-        // missed, or all were received.
+        // Two explanations are tracked in parallel. Either the robot missed all commands since the
+        // last certain command, or it received all of them.
         self.if_all_received = self.if_all_received.after(sent, n_states);
-        // A state that was not answered is a missed command for certain, so it raises no doubt.
+        // If a state was not answered, the robot has certainly missed a command, so this state
+        // raises no doubt.
         self.n_doubtful += u64::from(sent.is_some());
         let is_contradicted = self.n_doubtful as f64 > n_reported_missed(state) + MAX_UNREPORTED;
-        // The rate alone does not decide. If several states were lost, the other explanation may be
-        // wrong as well, so it must also match the reported position.
+        // The success rate alone does not decide. If several states were lost, the other
+        // explanation may be wrong as well. It must therefore also match the reported position.
         if !is_contradicted || !self.if_all_received.is_near(state) {
             return fate;
         }
@@ -134,8 +137,8 @@ fn n_reported_missed(state: &RobotState) -> f64 {
 impl Reference {
     /// A reference at rest, at the commanded position that the robot reports.
     pub(super) fn at_rest(state: &RobotState) -> Self {
-        // Before the first command, the reported rates may still be those of the joints, which sag
-        // or are guided by hand.
+        // Before the first command, the reported velocities and accelerations may still be those of
+        // joints that sag or are guided by hand. They are therefore set to zero.
         Self {
             position_rad: state.q_d,
             velocity_rad_s: [0.0; N_JOINTS],
@@ -191,10 +194,10 @@ impl Reference {
     /// answer to the state before them.
     ///
     /// Keeps our own numbers if they match the robot's up to rounding, because differences of
-    /// rounded numbers are inaccurate. If the effect of a missing command is within that rounding,
-    /// the reported velocities decide, because the effect on them is a thousand times larger.
-    /// Velocities that still match the earlier reference prove nothing: `franka-sim` reports the
-    /// velocities of its joints, which start to move some time after their target.
+    /// rounded numbers are inaccurate. If the effect of a missing command on the position is within
+    /// that rounding, the reported velocities decide. The effect on velocities is a thousand times
+    /// larger. Velocities that still match the earlier reference prove nothing: `franka-sim`
+    /// reports the velocities of its joints, which start to move some time after their target.
     pub(super) fn advance(
         &self,
         sent: Option<[f64; N_JOINTS]>,
@@ -207,8 +210,8 @@ impl Reference {
         if n_states > MAX_MISSED {
             return (reported, CommandFate::Unknown);
         }
-        // Only the first new state can have followed `sent`. Nothing was sent in answer to the
-        // others, because they arrived together with the newest one, or not at all.
+        // Only the first new state can have followed `sent`. No command was sent in answer to the
+        // other states, because they arrived together with the newest state, or not at all.
         let n_after = n_states - 1;
         let if_sent_received = sent.map(|position_rad| self.after(Some(position_rad), n_states));
         let if_received = if_sent_received.filter(|reference| reference.is_near(state));
@@ -228,8 +231,8 @@ impl Reference {
             // The position does not match the prediction with the command, or there was no command.
             None => match if_sent_received {
                 _ if if_missed.is_near(state) => (if_missed, CommandFate::Missed(n_states)),
-                // A robot that reports late seems to be behind. Our own reference is kept, because
-                // the robot will reach it.
+                // A robot that reports late seems to be behind our reference. Our reference is
+                // kept, because the robot will reach it.
                 Some(if_received) if n_after == 0 && if_received.is_shortly_after(&reported) => {
                     (if_received, CommandFate::Followed)
                 }
@@ -266,7 +269,8 @@ impl Reference {
         })
     }
 
-    /// Converts to a continuous motion: a difference is the velocity half a millisecond earlier.
+    /// Converts the reference to a continuous motion. The difference of two positions is the
+    /// velocity half a millisecond earlier.
     pub(super) fn setpoint(&self) -> Setpoint {
         let velocity = self.velocity_rad_s.iter().zip(self.acceleration_rad_s2);
         Setpoint {

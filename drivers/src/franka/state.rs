@@ -26,7 +26,8 @@ pub(super) fn n_bytes(version: FciVersion) -> usize {
     }
 }
 
-/// Decodes a datagram; `None` if it is not a state of this version, or its numbers are implausible.
+/// Decodes a datagram. `None` if the datagram is not a state of this version, or if its numbers are
+/// implausible.
 pub(super) fn decode(version: FciVersion, bytes: &[u8]) -> Option<NumberedState> {
     let (number, state) = match version {
         FciVersion::V5 => {

@@ -3,8 +3,8 @@
 use std::time::Duration;
 
 /// Width of a histogram bin. Delays of interest range from some tens of microseconds to a
-/// millisecond, so this is fine enough for a median, and 2000 bins reach 40 ms, beyond which a
-/// robot has stopped anyway.
+/// millisecond, so this width is fine enough for a median. With this width, 2000 bins reach 40 ms.
+/// After such a delay, a robot has stopped in any case.
 const BIN_WIDTH: Duration = Duration::from_micros(20);
 /// Number of bins; longer delays count in the last bin.
 const N_BINS: usize = 2000;
@@ -29,7 +29,7 @@ pub struct StateStatistics {
 }
 
 impl StateStatistics {
-    /// Fraction of the robot's states that were received in order, 0 to 1; 1 before the first
+    /// Fraction of the robot's states that were received in order, 0 to 1. It is 1 before the first
     /// state.
     pub fn success_frac(&self) -> f64 {
         match self.n_received + self.n_lost {
@@ -94,12 +94,12 @@ pub struct MotionStatistics {
     pub n_cycles: u64,
     /// Number of those states that were answered with a command.
     pub n_answered: u64,
-    /// States that arrived too late to be answered: the robot had already extrapolated.
+    /// States that arrived too late to be answered, because the robot had already extrapolated.
     pub n_stale: u64,
     /// States that never arrived, or arrived together with a newer one.
     pub n_lost: u64,
-    /// Commands that the robot missed, according to its reported reference. With a small jerk this
-    /// is not detectable, or a few received commands may count as missed.
+    /// Commands that the robot missed, according to its reported reference. With a small jerk,
+    /// missed commands may not be detectable, and a few received commands may count as missed.
     pub n_missed: u64,
     /// Commands that were changed to stay within the limits of the robot.
     pub n_limited: u64,
@@ -116,10 +116,10 @@ struct ReportedSuccess {
 }
 
 impl MotionStatistics {
-    /// Fraction of the robot's states during motions that were answered, 0 to 1; 1 before the first
-    /// motion.
+    /// Fraction of the robot's states during motions that were answered, 0 to 1. It is 1 before the
+    /// first motion.
     pub fn success_frac(&self) -> f64 {
-        // Lost states count as unanswered, because for the robot there is no difference.
+        // Lost states count as unanswered, because the robot receives no command in either case.
         match self.n_cycles + self.n_lost {
             0 => 1.0,
             n => self.n_answered as f64 / n as f64,

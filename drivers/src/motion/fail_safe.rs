@@ -7,18 +7,18 @@ use std::time::{Duration, Instant};
 static IS_DUE: AtomicBool = AtomicBool::new(false);
 /// Arms that this process commands, and that need a fail-safe command.
 static N_COMMANDED: AtomicUsize = AtomicUsize::new(0);
-/// Maximum time to wait for the arms. The fail-safe command is resent for at most the largest
-/// timeout (2 s) plus 2 s; the rest is a reserve for a busy computer.
+/// Maximum time to wait for the arms. An arm resends the fail-safe command for at most its timeout
+/// plus 2 s. The largest timeout is 2 s. The remaining second is a reserve for a busy computer.
 const MAX_WAIT: Duration = Duration::from_secs(5);
 
-/// Sends the fail-safe command to all arms with CAN motors that this process moves, without
-/// bringing them to rest first. Waits until their threads have ended, for at most 5 s. These arms
+/// Sends the fail-safe command to all arms with CAN motors that this process moves. The arms are
+/// not brought to rest first. Waits until their threads have ended, for at most 5 s. These arms
 /// accept no further commands. Call this function before the process ends without an orderly stop.
 ///
 /// Franka arms brake when the connection ends.
 pub fn apply_fail_safe() {
-    // The flag is never reset, because the program is about to end. An arm that is opened later
-    // therefore sends nothing either.
+    // The flag is never reset, because the program is about to end. An arm that is opened after
+    // this point therefore sends no commands either.
     IS_DUE.store(true, Ordering::Relaxed);
     let deadline = Instant::now() + MAX_WAIT;
     // Polling needs no locks, so this also works if another thread has panicked or holds a lock.

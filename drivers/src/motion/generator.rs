@@ -13,17 +13,19 @@ use std::time::Duration;
 
 /// Maximum distance by which a joint may be outside its range, radians or meters. Causes are
 /// backlash, an encoder offset, or a motion that continued without commands and is too fast to stop
-/// before the end of the range.///
-/// With a smaller value, an arm with such a joint cannot be enabled, or stops with an error. A
-/// larger one permits motions closer to the mechanical stops beyond the range.
+/// before the end of the range.
+///
+/// With a smaller value, an arm with such a joint could not be enabled, or would stop with an
+/// error. A larger value permits motions closer to the mechanical stops beyond the range.
 const MAX_OVERSHOOT: f64 = 0.02;
 
 /// Fractions by which the jerk is reduced if no trajectory is found with the full jerk. The
-/// smallest reduction comes first, because it changes the motion least. The reduction must only
-/// exceed the rounding errors that cause the degenerate case.
+/// smallest reduction comes first, because it changes the motion least. A reduction is sufficient
+/// if it exceeds the rounding errors that prevent the trajectory from being found.
 const JERK_REDUCTIONS: [f64; 3] = [1e-6, 1e-4, 1e-2];
 
-/// Setpoint of all joints at an instant, in their order; radians or meters, and seconds.
+/// Setpoint of all joints at an instant, in the order of the joints. Units are radians or meters,
+/// and seconds.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Setpoint {
     /// Positions.
@@ -87,8 +89,8 @@ impl TrajectoryGenerator {
                     ix + 1
                 ));
             }
-            // A joint that starts outside its range may stay there, so the range is widened to its
-            // position. It never widens further.
+            // A joint that starts outside its range may stay there, so the range is widened to the
+            // joint's position. The range is never widened further.
             joint.position = [lower.min(*position), upper.max(*position)];
         }
         let each = |of: fn(&MotionLimits) -> f64| data_array(limits.iter().map(of));
@@ -126,8 +128,8 @@ impl TrajectoryGenerator {
         self.input.control_interface = ControlInterface::Position;
         self.input.synchronization = Synchronization::Time;
         self.input.target_position = data_array(position.iter().copied());
-        // An earlier trajectory may have been allowed to overshoot. The new one must stay inside
-        // again, if it can.
+        // An earlier trajectory may have been allowed to overshoot. The new one must stay
+        // inside the ranges again, if possible.
         self.keep_in_range();
         self.is_at_rest = false;
         Ok(JointTarget { position })
@@ -153,8 +155,8 @@ impl TrajectoryGenerator {
         self.input.current_position = data_array(from.position.iter().copied());
         self.input.current_velocity = data_array(from.velocity.iter().copied());
         self.input.current_acceleration = data_array(from.acceleration.iter().copied());
-        // An earlier trajectory may have been allowed to overshoot. The new one must stay inside
-        // again, if it can.
+        // An earlier trajectory may have been allowed to overshoot. The new one must stay
+        // inside the ranges again, if possible.
         self.keep_in_range();
         self.is_at_rest = false;
         Ok(())
@@ -189,8 +191,9 @@ impl TrajectoryGenerator {
         result
     }
 
-    /// Tries a trajectory that leaves the ranges slightly and comes back, if none stays inside;
-    /// `None` if that fails, too. A stop is as short as possible, wherever it ends.
+    /// Tries a trajectory that leaves the ranges slightly and comes back. This function is called
+    /// if no trajectory stays inside the ranges. Returns `None` if no such trajectory exists
+    /// either. A stop is as short as possible, wherever it ends.
     fn update_with_overshoot(&mut self) -> Option<RuckigResult> {
         let position_bounds = (
             self.input.min_position.take(),
@@ -209,8 +212,8 @@ impl TrajectoryGenerator {
                     trajectory.min >= lower - MAX_OVERSHOOT
                         && trajectory.max <= upper + MAX_OVERSHOOT
                 });
-        // A stop is accepted wherever it ends: it is the shortest way to rest, and an error would
-        // end the control of a moving arm.
+        // A stop is accepted wherever it ends, because it is the shortest way to rest. An error
+        // here would end the control of a moving arm.
         let is_stop = self.input.control_interface == ControlInterface::Velocity;
         match result {
             Ok(result) if is_within_tolerance || is_stop => Some(result),
@@ -255,8 +258,8 @@ impl TrajectoryGenerator {
     pub fn step(&mut self) -> Result<Setpoint, String> {
         if !self.is_at_rest {
             let result = match self.ruckig.update(&self.input, &mut self.output) {
-                // The full limits come first, then a barely slower motion, then one that leaves the
-                // range for a moment.
+                // The first attempt uses the full limits. The second attempt uses a slightly
+                // reduced jerk. The third attempt may leave the range for a moment.
                 Err(error) => self
                     .update_with_less_jerk()
                     .or_else(|| self.update_with_overshoot())

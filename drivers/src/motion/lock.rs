@@ -5,8 +5,8 @@ use rustix::net::sockopt::socket_peercred;
 use std::os::linux::net::SocketAddrExt;
 use std::os::unix::net::{SocketAddr, UnixListener, UnixStream};
 
-/// The right to move the arms on a bus or controller. The kernel takes it back when the program
-/// ends in any way.
+/// The exclusive right of this process to move the arms on a bus or controller. The kernel releases
+/// the lock when the process ends, even if the process is killed.
 ///
 /// The lock is a Unix socket with an abstract name. Unlike a file, it needs no folder that all
 /// users may write to. It also belongs to the same network namespace as a CAN interface.
@@ -33,8 +33,9 @@ impl MotionLock {
                 _listener: listener,
             }),
             Err(error) if error.kind() == std::io::ErrorKind::AddrInUse => {
-                // Connecting shows who holds the lock, because the kernel reports the process that
-                // listens. This process may end at the same time, so its number is optional.
+                // A connection to the socket shows which process holds the lock, because the kernel
+                // reports the process that listens. The other process may end at the same time, so
+                // its number is optional.
                 let owner = UnixStream::connect_addr(&address)
                     .ok()
                     .and_then(|stream| socket_peercred(stream).ok());

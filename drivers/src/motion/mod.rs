@@ -32,8 +32,8 @@ pub enum Motion {
     Holding,
     /// The arm is moving to its target.
     Moving,
-    /// The arm stopped because of a fault, or the connection to it was lost. It accepts no target
-    /// before [`MovableArm::recover`].
+    /// The arm stopped because of a fault, or because the connection to it was lost. The arm
+    /// accepts no target until [`MovableArm::recover`] succeeds.
     Stopped {
         /// The reason for the stop.
         reason: String,
@@ -42,8 +42,8 @@ pub enum Motion {
 
 /// An arm that can also be moved.
 ///
-/// Before an arm is opened, the reaction of its motors to missing commands is set and verified. The
-/// owner of this trait object may move the arm; programs that only read use an [`Arm`].
+/// Opening an arm first sets and verifies how its motors react to missing commands. The owner of
+/// this trait object may move the arm. Programs that only read joint states use an [`Arm`].
 pub trait MovableArm: Arm {
     /// Moves to a target from any position and state of motion, within the limits of
     /// [`MotionConfig`]. A later target replaces this one.
@@ -70,7 +70,7 @@ pub enum OnLoss {
     Hold,
     /// Resist motion without holding a position.
     Damp,
-    /// Release the joints: an arm without brakes falls.
+    /// Release the joints. An arm without brakes then falls.
     Release,
 }
 
@@ -113,8 +113,8 @@ pub struct MotionLimits {
 
 impl MotionLimits {
     /// Limits of a joint from its description, with the velocity reduced to at most `max_speed`.
-    /// From rest, full acceleration is reached in `jerk_secs`, and the maximum velocity in
-    /// `acceleration_secs` at full acceleration.
+    /// From rest, a joint reaches its full acceleration in `jerk_secs`. At full acceleration, it
+    /// reaches its maximum velocity in `acceleration_secs`.
     pub fn new(
         joint: &JointLimits,
         max_speed: f64,
@@ -123,7 +123,7 @@ impl MotionLimits {
     ) -> Self {
         let velocity = joint.velocity.min(max_speed);
         // The limits are computed from times, because the same times suit joints of any size. An
-        // acceleration would have to be chosen for each joint.
+        // acceleration would have to be chosen for each joint separately.
         let acceleration = velocity / acceleration_secs;
         Self {
             position: [joint.lower, joint.upper],

@@ -11,16 +11,17 @@ use std::sync::{Arc, Weak};
 use std::time::{Duration, Instant};
 
 /// A call is abandoned if no image arrives for this time. The next constant is the same limit in
-/// periods of images; the longer of the two applies.
+/// image periods. The longer of the two limits applies.
 const MAX_SILENCE: Duration = Duration::from_millis(1500);
 const MAX_SILENT_IMAGES: f64 = 5.0;
-/// Maximum time to open a camera. It is longer because cameras adjust the exposure first.
+/// Maximum time to open a camera. It is longer than [`MAX_SILENCE`], because cameras adjust the
+/// exposure first.
 const MAX_OPENING: Duration = Duration::from_secs(8);
 /// Pause between two attempts to reconnect.
 const RETRY_PAUSE: Duration = Duration::from_millis(200);
 /// Maximum number of threads that hang in a call and cannot be ended. Beyond this number, no new
-/// thread is started. Each thread holds memory and perhaps the camera, and further attempts are
-/// unlikely to succeed.
+/// thread is started. Each thread holds memory and perhaps the camera. After this many failures,
+/// further attempts are unlikely to succeed.
 const MAX_ABANDONED: usize = 8;
 /// Maximum time to wait until a streaming thread stops.
 const SHUTDOWN_TIMEOUT: Duration = Duration::from_secs(1);
@@ -229,8 +230,8 @@ impl ReopenableCamera for NokhwaDevice {
 }
 
 impl Drop for NokhwaStream {
-    /// Stops the thread and waits for its end, because the camera can be opened again only after
-    /// that. If the thread hangs, does not wait.
+    /// Stops the thread. Waits for its end, because the camera can be opened again only after the
+    /// thread has ended. Does not wait for a thread that hangs.
     fn drop(&mut self) {
         self.worker.stop();
         let until = Instant::now() + SHUTDOWN_TIMEOUT;

@@ -20,10 +20,10 @@ use std::time::Duration;
 pub struct Config {
     /// Name in the rig file.
     pub name: String,
-    /// Name of the device or a part of it, its number, or on Linux the path of its node or of a
-    /// link to it.
+    /// The device: its name, a part of its name, or its number. On Linux, it may also be the path
+    /// of the device node, or of a link to the node.
     pub device: String,
-    /// Pixel format; `None` selects the first one available at this size and rate.
+    /// Pixel format. `None` selects the first format that is available at this size and rate.
     pub format: Option<V4l2Format>,
     /// Lens parameters and size of the images.
     pub intrinsics: Intrinsics,

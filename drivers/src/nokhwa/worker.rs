@@ -14,7 +14,7 @@ use std::collections::VecDeque;
 use std::sync::Arc;
 use std::time::Instant;
 
-/// Capacity of the queue to the caller: a quarter of a second at 30 Hz.
+/// Capacity of the queue to the caller. It holds the images of a quarter of a second at 30 Hz.
 const MAX_WAITING: usize = 8;
 /// Color encoding assumed for YUV formats, since cameras do not report one.
 const DEFAULT_COLORS: YuvColors = YuvColors {
@@ -114,7 +114,7 @@ impl Worker {
         }
     }
 
-    /// Returns the oldest queued event, or `None` if none came until `until`.
+    /// Returns the oldest queued event. Returns `None` if no event arrives before the time `until`.
     pub(super) fn next(&self, until: Instant) -> Option<WorkerEvent> {
         let mut state = self.shared.state.lock();
         loop {
@@ -137,8 +137,8 @@ impl Worker {
 
 impl Shared {
     /// Queues an event and returns whether the caller is still listening. If the queue is full, the
-    /// oldest image is dropped; the gap is detected from the stamps. Other events are kept, because
-    /// the caller would otherwise never learn that the camera is open.
+    /// oldest image is dropped. The gap is later detected from the stamps. Other events are kept,
+    /// because the caller would otherwise never learn that the camera is open.
     fn send(&self, event: WorkerEvent) -> bool {
         let mut state = self.state.lock();
         if state.queue.len() >= MAX_WAITING
@@ -170,8 +170,7 @@ fn stream(config: &Config, shared: &Shared) -> Result<(), Problem> {
     )));
     while is_receiving {
         let buffer = camera.frame().map_err(unplugged)?;
-        // The arrival is taken before the copy, so that the time of copying does not count as
-        // latency.
+        // The arrival time is taken before the copy, so that the copy does not count as latency.
         let arrival = clock::now();
         let bytes = trim(buffer.buffer(), format, config.intrinsics.size_px);
         is_receiving = shared.send(WorkerEvent::Frame(Frame {
@@ -183,14 +182,14 @@ fn stream(config: &Config, shared: &Shared) -> Result<(), Problem> {
     Ok(())
 }
 
-/// Finds the camera by name. This is repeated for every connection, because the numbers of cameras
-/// may change.
+/// Finds the camera by name. The search is repeated for every connection, because the numbers of
+/// cameras may change.
 fn find(device: &str) -> Result<CameraIndex, Problem> {
     if let Some(index) = number(device) {
         return Ok(CameraIndex::Index(index));
     }
     let mut cameras = nokhwa::query(ApiBackend::Auto).unwrap_or_default();
-    // Some cameras have several nodes; the first one delivers images.
+    // Some cameras have several nodes. The first node delivers images.
     cameras.sort_by_key(|camera| camera.index().as_index().unwrap_or(u32::MAX));
     let is_exact_match = |camera: &&CameraInfo| camera.human_name() == device;
     let is_partial_match =
@@ -228,7 +227,8 @@ fn number(device: &str) -> Option<u32> {
     node.strip_prefix("/dev/video").unwrap_or(node).parse().ok()
 }
 
-/// Opens the camera in the requested format, or else in the first format that it supports.
+/// Opens the camera in the requested format. If none was requested, opens it in the first format
+/// that it supports.
 fn open(config: &Config, index: CameraIndex) -> Result<(Camera, V4l2Format), Problem> {
     let rate_hz = config.rate_hz;
     #[expect(

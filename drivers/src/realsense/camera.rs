@@ -13,17 +13,17 @@ use std::time::{Duration, Instant};
 /// seconds.
 const RETRY_PAUSE: Duration = Duration::from_millis(500);
 /// A stream is restarted if no image arrives for this time, because cameras may hang. The next
-/// constant is the same limit in periods of images; the longer of the two applies.
+/// constant is the same limit in image periods. The longer of the two limits applies.
 const MAX_SILENCE: Duration = Duration::from_secs(2);
 const MAX_SILENT_IMAGES: f64 = 10.0;
 /// Number of failed attempts after which a camera that is connected but does not stream is reset.
 const TRIES_BEFORE_RESET: u32 = 3;
 
-/// A RealSense camera that streams color or infrared and, if configured, depth; or a file that is
-/// played back.
+/// A RealSense camera, or a file that is played back. It streams color or infrared images and, if
+/// configured, depth.
 ///
 /// A camera that is disconnected or hangs is reopened with the same settings for at most
-/// [`Config::reconnect_for`], and reset if that does not help. During that time,
+/// [`Config::reconnect_for`]. If it cannot be reopened, it is reset. During that time,
 /// [`Camera::next_image`] returns [`Error::Reconnecting`]. Afterwards, it returns the cause.
 /// Dropping this value stops the streams.
 #[derive(Debug)]

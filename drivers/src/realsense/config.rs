@@ -8,13 +8,14 @@ use std::time::Duration;
 pub struct Config {
     /// Name in the rig file.
     pub name: String,
-    /// Serial number; if empty, the only connected camera is used.
+    /// Serial number. If it is empty, the only connected camera is used.
     pub serial: String,
     /// Recorded file to play back instead of a camera.
     pub file: Option<PathBuf>,
     /// Timing of images played back from a file.
     pub pace: Pace,
-    /// Offset added to the stamps of the file, nanoseconds; used only with [`Pace::Clock`].
+    /// Offset that is added to the stamps of the file, nanoseconds. It is used only with
+    /// [`Pace::Clock`].
     pub clock_offset_nanos: i64,
     /// Stream of the images that are not depth.
     pub stream: Stream,
@@ -22,7 +23,7 @@ pub struct Config {
     pub size_px: [u32; 2],
     /// Images per second.
     pub rate_hz: f64,
-    /// Width and height of depth images, pixels; `None` for no depth.
+    /// Width and height of depth images, pixels. `None` if depth is not streamed.
     pub depth_size_px: Option<[u32; 2]>,
     /// Settings of the camera.
     pub settings: Settings,
@@ -42,8 +43,8 @@ pub enum Pace {
     /// As fast as the caller takes them, with the stamps of the file.
     Fast,
     /// Stamps are those of the file plus [`Config::clock_offset_nanos`], on the monotonic clock of
-    /// this computer. Each image is delivered at the time of its stamp. Used by simulations that
-    /// emulate other devices in parallel with the file.
+    /// this computer. Each image is delivered at the time of its stamp. Simulations use this pace
+    /// to emulate other devices in parallel with the file.
     Clock,
 }
 
@@ -57,12 +58,12 @@ pub enum Stream {
     Infrared,
 }
 
-/// Camera settings. A missing setting is automatic if the camera supports that, else it is left
-/// unchanged.
+/// Camera settings. A missing setting is set to automatic if the camera supports it. Otherwise, the
+/// setting is left unchanged.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Settings {
-    /// Exposure time of [`Config::stream`], microseconds; `None` for automatic exposure without
-    /// lowering the rate.
+    /// Exposure time of [`Config::stream`], microseconds. `None` selects automatic exposure that
+    /// does not lower the rate.
     pub exposure_micros: Option<f64>,
     /// Gain, in units of the camera.
     pub gain: Option<i32>,
@@ -72,7 +73,8 @@ pub struct Settings {
     pub brightness: Option<i32>,
     /// Name of a preset of the depth camera.
     pub preset: Option<String>,
-    /// Power of the projector or laser, in units of the camera (D4xx: milliwatts); 0 turns it off.
+    /// Power of the projector or laser, in units of the camera. The unit of a D4xx is milliwatts. A
+    /// power of 0 turns the projector or laser off.
     pub laser_power: Option<f64>,
 }
 

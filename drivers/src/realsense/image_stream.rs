@@ -15,7 +15,8 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
-/// Queue capacity for images of all streams: a quarter of a second of two streams at 30 Hz.
+/// Queue capacity for images of all streams. The queue holds a quarter of a second of two streams
+/// at 30 Hz.
 const N_WAITING: u8 = 16;
 /// Polling interval for the end of a file.
 const POLL: Duration = Duration::from_millis(100);
@@ -149,8 +150,8 @@ impl ImageStream {
                 std::thread::sleep(remaining.min(due_in));
                 continue;
             }
-            // This is checked before the queue, so that all images read until then are in the
-            // queue.
+            // The end of the file is checked before the queue, so that all images read until the
+            // end are in the queue.
             let has_stopped = self.is_file && self.device.has_stopped()?;
             match self.queue.wait(remaining.min(POLL))? {
                 Some(frame) => {
@@ -192,7 +193,7 @@ impl ImageStream {
 
     /// Copies a frame to an image. Returns `None` for duplicates.
     fn image(&mut self, frame: Frame) -> Result<Option<Image>, Problem> {
-        // The arrival is taken first, so that filters and copies do not delay the stamp.
+        // The arrival time is taken first, so that filters and copies do not delay the stamp.
         let arrival = clock::now();
         let is_depth = frame.stream_profile().kind() == Rs2StreamKind::Depth;
         let counter = &mut self.counter[usize::from(is_depth)];
@@ -232,8 +233,8 @@ impl ImageStream {
             exposure_secs,
             n_skipped: std::mem::take(&mut counter.n_unreported),
         };
-        // This check comes before the filters. They take most of the time, and the file has to
-        // catch up.
+        // This check comes before the filters, because the filters take most of the time and the
+        // playback has to catch up.
         if self.stamps.is_before_open(image.stamp) {
             self.n_before_open += 1;
             return Ok(None);
@@ -278,8 +279,8 @@ fn warn_of_device(camera: &str, found: &FoundCamera) {
 }
 
 impl Drop for ImageStream {
-    /// Stops the streams while draining the queue. Otherwise they would deadlock: stopping waits
-    /// for the thread that reads the file, and that thread waits for space in the queue.
+    /// Stops the streams while draining the queue. Otherwise, there would be a deadlock: stopping
+    /// waits for the thread that reads the file, and this thread waits for space in the queue.
     fn drop(&mut self) {
         let queue = &self.queue;
         let is_stopped = AtomicBool::new(false);

@@ -9,8 +9,8 @@ use kinematics::{Intrinsics, Lens, Transform};
 use nalgebra::{Matrix3, Matrix5, Rotation3, Translation3, UnitQuaternion, Vector5};
 use realsense_sys as sys;
 
-/// Maximum error of a fit of our lens model to one of the library, in pixels. The error for a D455
-/// is 0.04.
+/// Maximum error, in pixels, when a lens model of this crate is fitted to a lens model of the
+/// library. The error for a D455 is 0.04 pixels.
 const MAX_FIT_ERROR_PX: f64 = 0.5;
 /// Number of fit points along each side of the image. Five coefficients of smooth polynomials need
 /// far fewer points. With this density, the maximum error between the points is close to the
@@ -68,8 +68,9 @@ pub(super) fn intrinsics(
     Ok(intrinsics)
 }
 
-/// Converts our intrinsics to those of the library. The library has no rational model. The closest
-/// polynomial replaces this model. If no polynomial is close, the result has no distortion.
+/// Converts our intrinsics to those of the library. The library has no rational model, so the
+/// closest polynomial model replaces it. If no polynomial model is close enough, the result has no
+/// distortion.
 #[cfg(feature = "emulation")]
 pub(super) fn raw(intrinsics: &Intrinsics) -> sys::rs2_intrinsics {
     let lens = if intrinsics.is_pinhole() {

@@ -1,16 +1,16 @@
-//! Exposure, gain, white balance, presets and laser of a RealSense camera: set from the rig file
-//! and read back.
+//! Sets exposure, gain, white balance, presets and laser of a RealSense camera from the rig file,
+//! and reads them back.
 
 use super::sdk::{Device, Sensor};
 use super::{Problem, Settings};
 use realsense_rust::kind::{Rs2CameraInfo, Rs2Option};
 use realsense_sys as sys;
 
-/// Maximum relative difference of the exposure when read back: cameras round it to rows of their
-/// sensor.
+/// Maximum relative difference between the exposure that was set and the exposure that is read
+/// back. Cameras round the exposure to rows of their sensor.
 const EXPOSURE_TOLERANCE_FRAC: f32 = 0.1;
-/// The RGB module of a depth camera counts exposure like a webcam; depth sensors count
-/// microseconds.
+/// Name of the RGB module of a depth camera. The module counts exposure like a webcam, whereas
+/// depth sensors count microseconds.
 const RGB_MODULE: &str = "RGB Camera";
 const RGB_MICROS_PER_COUNT: f64 = 100.0;
 
@@ -110,7 +110,7 @@ fn exposure_and_gain(
             });
         }
         (Some(micros), gain) => {
-            // The automatic mode goes off first, because it overwrites values.
+            // The automatic mode is switched off first, because it overwrites values.
             set_if_supported(sensor, Rs2Option::EnableAutoExposure, 0.0);
             let counts = narrow(micros / exposure_micros_per_count(sensor));
             set(
@@ -173,7 +173,7 @@ fn laser(sensor: &mut Sensor, power: f64) -> Result<(), Problem> {
     set(sensor, KEY, Rs2Option::LaserPower, narrow(power), step)
 }
 
-/// Value of the preset with this name. Case is ignored; underscores and hyphens match spaces.
+/// Value of the preset with this name. Case is ignored. Underscores and hyphens match spaces.
 fn preset(sensor: &Sensor, name: &str) -> Result<f32, Problem> {
     const KEY: &str = "realsense.preset";
     // Case and separators have no meaning in names of presets.

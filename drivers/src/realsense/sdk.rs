@@ -92,8 +92,8 @@ impl Context {
             let n_devices = call(WHAT, |error| sys::rs2_get_device_count(list, error));
             let device =
                 |ix| Device::new(call(WHAT, |error| sys::rs2_create_device(list, ix, error))?);
-            // A camera that another program is currently resetting cannot be opened; the others
-            // can.
+            // A camera that another program is currently resetting cannot be opened. The other
+            // cameras can be opened.
             let devices = n_devices
                 .map(|n_devices| (0..n_devices).filter_map(|ix| device(ix).ok()).collect());
             sys::rs2_delete_device_list(list);
@@ -460,7 +460,7 @@ impl Queue {
         Ok(Self(non_null(WHAT, queue)?))
     }
 
-    /// Waits for the next image. Returns `None` if none came in time.
+    /// Waits for the next image. Returns `None` if no image arrives in time.
     pub(super) fn wait(&self, timeout: Duration) -> Result<Option<Frame>, Problem> {
         const WHAT: &str = "wait for an image";
         // The library counts whole milliseconds.

@@ -1,9 +1,9 @@
 //! Computes the time at which an image of a RealSense camera was taken, on our clock.
 //!
-//! With metadata (a patched kernel module, or the USB backend of the library), a camera reports
-//! mid-exposure on its own clock, a 32-bit count of microseconds. The library's conversion to
-//! "global time" is switched off because our mapping is robust to late arrivals. Without metadata,
-//! only the arrival time is known.
+//! Metadata are available with a patched kernel module, or with the USB backend of the library.
+//! With metadata, a camera reports mid-exposure on its own clock, which is a 32-bit count of
+//! microseconds. Without metadata, only the arrival time is known. The library's conversion to
+//! "global time" is switched off, because the mapping here is robust to late arrivals.
 
 use super::{Config, Pace};
 use crate::clock;

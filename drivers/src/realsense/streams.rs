@@ -14,8 +14,8 @@ const YUV_COLORS: YuvColors = YuvColors {
     matrix: YuvMatrix::Bt601,
     range: YuvRange::Limited,
 };
-/// Image formats in order of preference: native formats of the camera come before those converted
-/// by the library.
+/// Image formats in order of preference. Native formats of the camera come before formats that the
+/// library converts.
 const FORMATS: [(sys::rs2_format, &str, PixelFormat); 5] = [
     (
         sys::rs2_format_RS2_FORMAT_YUYV,
@@ -161,8 +161,8 @@ pub(super) fn start(
     device: &Device,
     queue: &Queue,
 ) -> Result<ActiveStreams, Problem> {
-    // The modes of all sensors are needed first: color and depth may be streams of one sensor or of
-    // two.
+    // The modes of all sensors are needed first, because color and depth may be streams of one
+    // sensor or of two sensors.
     let modes: Vec<Modes> = device
         .sensors
         .iter()
@@ -217,8 +217,8 @@ pub(super) fn start(
         description: description.join(" and "),
         _modes: Vec::new(),
     };
-    // All modes of a sensor must be opened in one call, because depth and infrared share a sensor,
-    // and a second call fails.
+    // All modes of a sensor must be opened in one call, because a second call fails. Depth and
+    // infrared share a sensor.
     for sensor in &started.sensors {
         let sensor_modes: Vec<_> = chosen
             .iter()
@@ -234,7 +234,7 @@ pub(super) fn start(
         .run(device, queue, config.file.is_some())
         .inspect_err(|_| started.stop(device))?;
     Ok(ActiveStreams {
-        // The running modes point into the lists, so these are kept as long as the streams.
+        // The running modes point into the lists, so the lists are kept as long as the streams run.
         _modes: modes,
         ..started
     })

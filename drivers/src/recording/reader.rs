@@ -129,7 +129,7 @@ impl Recording {
             .iter()
             .any(|name| recording.attachment(name).is_none())
         {
-            // This reads the headers of the whole file, so it is done only if necessary.
+            // The search reads the headers of the whole file, so it runs only if necessary.
             recording.find_attachments().map_err(open)?;
         }
         Ok(recording)
@@ -149,26 +149,26 @@ impl Recording {
         }
     }
 
-    /// Returns the attached [`super::RIG_FILE`] or [`super::URDF_FILE`]. Other attachments are not
-    /// kept.
+    /// Returns the attachment with this name: [`super::RIG_FILE`] or [`super::URDF_FILE`]. Other
+    /// attachments are not kept.
     pub fn attachment(&self, name: &str) -> Option<&[u8]> {
         self.attachments.get(name).map(Vec::as_slice)
     }
 
-    /// Names of the joints in the order of the joint states, if the recording contains joint
-    /// states. Available from the first sample on.
+    /// Names of the joints in the order of the joint states. The names are available from the first
+    /// sample on. `None` if the recording contains no joint states.
     pub fn joint_names(&self) -> Option<&[String]> {
         self.joint_names.as_deref()
     }
 
-    /// Describes the damage of the file and how much could be read. Available after the last
-    /// sample.
+    /// Describes the damage of the file and how much of it could be read. The description is
+    /// available after the last sample.
     pub fn damage(&self) -> Option<&str> {
         self.damage.as_deref()
     }
 
-    /// Finds attachments behind the first sample. `mcap filter`, `merge` and others write them at
-    /// the end of the file.
+    /// Finds attachments behind the first sample. `mcap filter`, `mcap merge` and other programs
+    /// write attachments at the end of the file.
     fn find_attachments(&mut self) -> std::io::Result<()> {
         let mut file = BufReader::new(files::open(&self.path)?);
         file.seek_relative(i64::try_from(mcap::MAGIC.len()).unwrap_or_default())?;
@@ -318,8 +318,8 @@ impl Recording {
                 Ok(())
             };
         };
-        // A topic with one of our names but other messages is an error. If it were skipped, a
-        // camera or the joints would be missing silently.
+        // A topic with a name of this program but with messages of another type is an error. If the
+        // topic were skipped, a camera or the joints would be missing without a message.
         let (readable, readable_encoding) = topic.readable();
         // Calibrations are not read.
         let is_read = !matches!(topic, Topic::Calibration(_));
@@ -330,7 +330,7 @@ impl Recording {
             ));
         }
         let used_key = topic.metadata_key();
-        // Other keys are reported, because whoever wrote them expected an effect.
+        // Other keys are reported, because the program that wrote them expected an effect.
         let value = used_key
             .and_then(|key| metadata.get(key))
             .map(|value| (*value).to_owned());
@@ -430,7 +430,7 @@ impl Recording {
         }))
     }
 
-    /// A pose of the base, or its true pose in the frame `base_truth`.
+    /// A reported pose of the base. With the frame `base_truth`, it is the true pose.
     fn base_pose(
         &mut self,
         topic_name: &str,
@@ -458,8 +458,8 @@ impl Recording {
         let (stamp, world_from_camera, psnr_ceiling) = foxglove::decode_true_pose(data)?;
         let depth_m = self.true_depth_m.take().unwrap_or_else(|| Arc::from([]));
         let color = self.true_color.take();
-        // With images of another camera or time, scores would be computed against the wrong ground
-        // truth.
+        // If the images came from another camera or time, scores would be computed against the
+        // wrong ground truth.
         let image = color
             .filter(|image| *image.camera == *camera && image.stamp == stamp)
             .ok_or(Malformed::Missing {

@@ -2,7 +2,8 @@
 //!
 //! Source: the MCAP format specification, <https://mcap.dev/spec>. Memory is allocated for received
 //! bytes, not for declared lengths. The recorder writes uncompressed chunks, whose records are
-//! available as soon as they are complete; a compressed chunk is decompressed as a whole.
+//! available as soon as they are complete. A compressed chunk from another program is decompressed
+//! as a whole.
 
 use crc32fast::Hasher;
 use files::Budget;
@@ -57,13 +58,14 @@ pub(super) struct Records<R> {
 /// A chunk that is being read.
 #[derive(Debug)]
 struct Chunk {
-    /// Its decompressed records; `None` if they are uncompressed and follow in the file.
+    /// Decompressed records of the chunk. `None` if the records are uncompressed and follow in the
+    /// file.
     decompressed: Option<Cursor<Vec<u8>>>,
     /// Remaining bytes of its records.
     n_remaining: u64,
     /// Number of bytes after the records.
     n_padding: u64,
-    /// Checksum of all its records; 0 if the writer stored none.
+    /// Checksum of all records of the chunk. It is 0 if the writer stored no checksum.
     checksum: u32,
     hasher: Hasher,
 }
@@ -93,8 +95,9 @@ impl<R: Read> Records<R> {
 
     fn read(&mut self) -> Result<Option<RawRecord>, ReadError> {
         loop {
-            // The checksum is checked after the last record of the chunk has been returned. The
-            // records before the damage are thus usable, and the error then ends the recording.
+            // The checksum is checked after the last record of the chunk has been returned. A wrong
+            // checksum ends the recording, but the records that were already returned remain
+            // usable.
             if let Some(chunk) = self.chunk.take_if(|chunk| chunk.n_remaining == 0) {
                 let computed = chunk.hasher.finalize();
                 if chunk.checksum != 0 && chunk.checksum != computed {
@@ -235,8 +238,8 @@ fn array<const N: usize>(mut input: impl Read) -> Result<[u8; N], ReadError> {
     Ok(bytes)
 }
 
-/// Reads the given number of bytes; more than [`Budget::RECORD`] are damage. Memory grows with the
-/// bytes received.
+/// Reads the given number of bytes. A number above [`Budget::RECORD`] counts as damage. Memory
+/// grows with the bytes received.
 fn bytes_of(input: &mut (impl Read + ?Sized), n_bytes: u64) -> Result<Vec<u8>, ReadError> {
     if Budget::RECORD.check_bytes(n_bytes).is_err() {
         return Err(ReadError::TooLong { n_bytes });

@@ -18,8 +18,8 @@ use std::path::{Path, PathBuf};
 /// Size at which a chunk is closed. Viewers read whole chunks, and the index has one entry per
 /// chunk. Smaller chunks make the index longer, and larger chunks make seeking slower.
 const CHUNK_BYTES: u64 = 4 << 20;
-/// Maximum time span of the samples in an open chunk, which are lost in a crash. With a shorter
-/// time, the file is written more often.
+/// Maximum time span of the samples in an open chunk. A crash loses these samples. With a shorter
+/// time span, the file is written more often.
 const FLUSH_NANOS: i64 = 1_000_000_000;
 
 /// Description of the rig, written before the first sample.

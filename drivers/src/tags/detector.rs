@@ -11,15 +11,15 @@ use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
 /// detected as a tag (Olson 2011, section V.B).
 const CORRECTED_BITS: usize = 1;
 /// Minimum mean difference in gray value between the cells of a tag and the decision threshold. The
-/// authors of AprilTag consider values below 10 noise. The limit is higher, because the corners of
-/// a barely visible tag are not accurate enough.
+/// authors of AprilTag regard values below 10 as noise. The limit here is higher, because the
+/// corners of a barely visible tag are not accurate enough.
 const MIN_MARGIN: f32 = 20.0;
 /// Images with at least this many pixels are searched for quads at half resolution. Corners are
 /// always refined at full resolution.
 const DECIMATE_ABOVE_PX: usize = 1_000_000;
 
-/// Minimum width and height. The detector reads out of bounds for images smaller than a few of its
-/// 4-pixel tiles, and such images are too small for a tag anyway.
+/// Minimum width and height. The detector reads out of bounds if an image is smaller than a few of
+/// its 4-pixel tiles. Such images are too small for a tag in any case.
 const MIN_SIDE_PX: usize = 16;
 
 /// Tag family to detect.
@@ -113,7 +113,7 @@ impl TagDetector {
     /// Detects tags in a color image and waits for the result. Also returns the results of earlier
     /// images.
     pub fn detect_blocking(&mut self, image: Image) -> Vec<Result<TagDetections, Error>> {
-        // Sending succeeds because the thread only ends after this is dropped.
+        // Sending succeeds, because the thread only ends after this value is dropped.
         let is_accepted = self.images.send(image).is_ok();
         self.n_pending += usize::from(is_accepted);
         self.finish()
@@ -161,7 +161,7 @@ fn detector(family: Family) -> Detector {
         .add_family_bits(tag_family, CORRECTED_BITS)
         .build();
     let mut detector = detector.expect("the detector has a family");
-    // The detector has its own thread. More of them would compete with training for the processor.
+    // The detector runs on one thread. More threads would compete with training for the processor.
     detector.set_thread_number(1);
     detector
 }

@@ -1,10 +1,10 @@
 //! Estimates the pose of a camera from tags at known poses.
 //!
 //! All tag corners are projected with the lens model of the camera, and the reprojection error is
-//! minimized with the Levenberg-Marquardt method. The optimization starts from both poses that fit
-//! a single tag almost equally well, since the image of a small square hardly determines in which
-//! direction the square is tilted (Schweighofer and Pinz 2006, "Robust Pose Estimation from a
-//! Planar Target"). If neither pose fits clearly better, no pose is returned.
+//! minimized with the Levenberg-Marquardt method. The image of a small square hardly determines in
+//! which direction the square is tilted (Schweighofer and Pinz 2006, "Robust Pose Estimation from a
+//! Planar Target"). Two poses therefore fit a single tag almost equally well, and the optimization
+//! starts from both. If neither pose fits clearly better, no pose is returned.
 
 use kinematics::{Intrinsics, Transform, Twist, transform};
 use nalgebra::{
@@ -15,8 +15,8 @@ use nalgebra::{
 /// Standard deviation of detected corners in a sharp image, pixels. It is the lower limit of the
 /// assumed noise.
 const CORNER_SIGMA_PX: f64 = 0.2;
-/// Residuals above this count linearly instead of quadratically (Huber 1964), because corners of
-/// tags viewed at a grazing angle are unreliable.
+/// Residual above which the cost is linear instead of quadratic (Huber 1964). It reduces the effect
+/// of unreliable corners, such as those of tags that are viewed at a grazing angle.
 const HUBER_PX: f64 = 3.0 * CORNER_SIGMA_PX;
 /// Maximum root mean square error, pixels. If it is larger, the corners do not match the tags of
 /// the rig file. The limit is several times the noise of corners. It accepts poses from inaccurate
@@ -33,9 +33,9 @@ const MAX_ITERATIONS: usize = 50;
 /// A tag with a known pose.
 #[derive(Clone, Debug, PartialEq)]
 pub struct TagPlacement {
-    /// Side length of its border, where black meets white, meters.
+    /// Side length of the tag, meters. It is measured at the border where black meets white.
     pub size_m: f64,
-    /// Pose of its center; x to the right of the print, y down, z into it.
+    /// Pose of the center of the tag. On the print, x points right, y down, and z into the print.
     pub world_from_tag: Transform,
 }
 
@@ -44,10 +44,11 @@ pub struct TagPlacement {
 pub struct RollingShutterCamera<'a> {
     /// Its lens parameters.
     pub intrinsics: &'a Intrinsics,
-    /// Its velocity in its own axes. Rows are exposed one after another, so each corner is observed
-    /// from a different pose.
+    /// Velocity of the camera in its own axes. Rows are exposed one after another, so each corner
+    /// is observed from a different pose.
     pub twist: Twist,
-    /// Time from the first row to the last, seconds; 0 for a global shutter.
+    /// Time from the exposure of the first row to that of the last row, seconds. It is 0 for a
+    /// global shutter.
     pub readout_secs: f64,
 }
 
@@ -134,11 +135,13 @@ pub fn locate(
     if rms_error_px > MAX_RMS_ERROR_PX {
         return Err(LocateError::LargeReprojectionError { rms_error_px });
     }
-    // Contribution of noise to the cost. It is added to both costs. The ratio of two nearly perfect
-    // fits is then about 1, so that their tiny costs do not decide which tilt is right.
+    // Contribution of noise to the cost. It is added to the costs of both poses. The ratio of the
+    // costs of two nearly perfect fits is then about 1, so that their tiny costs do not decide
+    // which tilt is right.
     let floor = corners.len() as f64 * CORNER_SIGMA_PX * CORNER_SIGMA_PX;
-    // Solutions from several tags usually converge to one pose. 0.05 rad (3 degrees) separates
-    // rounding differences of one minimum from two minima, which are mirror images of each other.
+    // With several tags, both solutions usually converge to one pose. If they differ by less than
+    // 0.05 rad (3 degrees), they are the same minimum with rounding differences. Otherwise, they
+    // are two minima, which are mirror images of each other.
     let is_different_pose = |(_, pose): &&(f64, Transform)| {
         (pose * camera_from_world.inverse()).rotation.angle() > 0.05
     };
@@ -149,8 +152,8 @@ pub fn locate(
     {
         return Err(LocateError::Ambiguous);
     }
-    // The residuals of four corners may be small by chance, as there are only two more measurements
-    // than unknowns.
+    // The residuals of four corners may be small by chance, because there are only two more
+    // measurements than unknowns.
     let sigma_px = rms_error_px.max(CORNER_SIGMA_PX);
     // The inverse of the normal matrix, times the variance of a corner, is the covariance of the
     // least-squares solution.

@@ -3,8 +3,9 @@
 use kinematics::{Transform, Twist, transform};
 use nalgebra::{Matrix6, Vector6};
 
-/// Squared Mahalanobis distance from the average above which the object is assumed to have moved.
-/// Without motion, this happens once in 10 000 poses (chi-squared, 6 degrees of freedom).
+/// Maximum squared Mahalanobis distance of a new pose from the average. If the distance is larger,
+/// the object is assumed to have moved. Without motion, one in 10 000 poses exceeds the maximum
+/// (chi-squared distribution with 6 degrees of freedom).
 const MAX_CHI_SQUARED: f64 = 27.86;
 /// Information in the average decays by this factor per pose, which limits the average to about 30
 /// poses. More poses would not help, because errors of the lens parameters and of measured tag
@@ -29,7 +30,7 @@ impl StationaryPoseFilter {
         average
     }
 
-    /// Merges another pose into the average; `None` if that pose is too far away.
+    /// Merges a new pose into the average. `None` if the new pose is too far from the average.
     fn merged(
         &self,
         pose: &Transform,

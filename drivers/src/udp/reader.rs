@@ -62,9 +62,9 @@ impl DatagramReader {
         self.monitor.set_counts(self.counts);
     }
 
-    /// Returns the next value that `decode` accepts with its stamp on our clock, or `None` if none
-    /// came in time. A datagram without a value, such as the state of a gripper, only advances the
-    /// sequence.
+    /// Returns the next value that `decode` accepts, with its stamp on the clock of this computer.
+    /// Returns `None` if no value arrives in time. A datagram without a value, such as the state of
+    /// a gripper, only advances the sequence.
     pub(super) fn next<T>(
         &mut self,
         timeout: Duration,
@@ -85,7 +85,7 @@ impl DatagramReader {
         Ok(None)
     }
 
-    /// Checks one datagram and counts it. Returns its stamp and value, if it has a new one.
+    /// Checks one datagram and counts it. Returns its stamp and its value if the value is new.
     pub(super) fn take<T>(
         &mut self,
         datagram: &ReceivedDatagram,

@@ -11,10 +11,11 @@ const MAX_SEQUENCE_GAP: u64 = 1000;
 /// Maximum delay of a reordered datagram. If the newest datagram is older than this, a lower
 /// sequence number means that the sender restarted.
 const MAX_REORDER_AGE: Duration = Duration::from_secs(1);
-/// Stamps of our own clock older than this, or ahead by more than [`MAX_AHEAD`], are invalid. No
-/// network delays datagrams this long; such a stamp comes from another clock.
+/// Maximum age of a stamp that is on this computer's clock. Older stamps are invalid, and so are
+/// stamps that are ahead by more than [`MAX_AHEAD`]. No network delays a datagram for this long, so
+/// such a stamp comes from another clock.
 const MAX_AGE: Duration = Duration::from_secs(5);
-/// Tolerance for rounding. Apart from that, stamps cannot be in the future.
+/// Maximum time by which a stamp may be in the future. It only allows for rounding.
 const MAX_AHEAD: Duration = Duration::from_millis(1);
 
 /// Position of a datagram in the sequence.

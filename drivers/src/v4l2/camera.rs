@@ -11,7 +11,7 @@ use std::time::{Duration, Instant};
 /// fails at once and a shorter outage loses fewer images.
 const RETRY_PAUSE: Duration = Duration::from_millis(100);
 /// A stream is restarted if no image arrives for this time, because cameras may hang. The next
-/// constant is the same limit in periods of images; the longer of the two applies.
+/// constant is the same limit in image periods. The longer of the two limits applies.
 const MAX_SILENCE: Duration = Duration::from_secs(2);
 const MAX_SILENT_IMAGES: f64 = 5.0;
 
@@ -113,8 +113,8 @@ impl ReopenableCamera for V4l2Device {
         let image = stream.next_image(&self.config, deadline);
         self.n_damaged += stream.take_n_damaged();
         let image = image?;
-        // Damaged images count as silence: a camera that sends only damaged ones has hung, and is
-        // opened again.
+        // Damaged images do not end the silence. A camera that sends only damaged images has hung,
+        // and is opened again.
         let waited = stream.time_since_image();
         if image.is_none()
             && waited

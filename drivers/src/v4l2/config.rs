@@ -13,8 +13,8 @@ pub struct Config {
     /// A path (preferably a link under `/dev/v4l`, whose name is stable), a USB serial number, or
     /// the port as reported by the kernel (`usb-0000:00:14.0-2`).
     pub device: String,
-    /// Pixel format; `None` selects the first one available at this size and rate, see
-    /// [`V4l2Format::COLOR_FORMATS`].
+    /// Pixel format. `None` selects the first of [`V4l2Format::COLOR_FORMATS`] that is available at
+    /// this size and rate.
     pub format: Option<V4l2Format>,
     /// Lens parameters and size of the images.
     pub intrinsics: Intrinsics,
@@ -30,8 +30,8 @@ pub struct Config {
     pub reconnect_for: Duration,
 }
 
-/// Sets a control of a device by its kernel id, even while another process streams from it. For
-/// tests that provoke faults.
+/// Sets a control of a device by its kernel id, even while another process streams from the device.
+/// Tests use it to provoke faults.
 ///
 /// # Errors
 /// If the kernel rejects the value.

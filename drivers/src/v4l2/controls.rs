@@ -12,8 +12,8 @@ use std::io;
 
 /// Exposure is in units of 100 us.
 const MICROS_PER_COUNT: f64 = 100.0;
-/// Maximum relative difference of the exposure when read back: cameras round it to rows of their
-/// sensor.
+/// Maximum relative difference between the exposure that was set and the exposure that is read
+/// back. Cameras round the exposure to rows of their sensor.
 const EXPOSURE_TOLERANCE_FRAC: f64 = 0.1;
 
 /// Kernel id of a control.
@@ -38,11 +38,11 @@ const EXPOSURE_MANUAL: i32 = 1;
 const EXPOSURE_SHUTTER_PRIORITY: i32 = 2;
 const EXPOSURE_APERTURE_PRIORITY: i32 = 3;
 
-/// Image settings of the rig file. A missing setting is automatic if the camera supports that, else
-/// it is left unchanged.
+/// Image settings of the rig file. A missing setting is set to automatic if the camera supports it.
+/// Otherwise, the setting is left unchanged.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Settings {
-    /// Exposure time, microseconds; `None` for automatic exposure without lowering the rate.
+    /// Exposure time, microseconds. `None` selects automatic exposure that does not lower the rate.
     pub exposure_micros: Option<f64>,
     /// Gain, in units of the camera.
     pub gain: Option<i32>,
@@ -117,8 +117,8 @@ pub(super) fn apply(
     let steps = plan(settings, camera)?;
     for step in &steps {
         match camera.set(step.id, step.value) {
-            // A missing device counts as disconnected even if the control is optional, so that the
-            // driver reconnects.
+            // If the device is missing, the camera counts as disconnected even if the control is
+            // optional. The driver then reconnects.
             Err(error) if step.is_required || error == Errno::NODEV => {
                 return Err(refused(step.control, error));
             }
@@ -129,8 +129,8 @@ pub(super) fn apply(
     check(settings, camera, &steps)
 }
 
-/// Checks the settings again after the stream has started, and reapplies them if necessary, because
-/// some cameras reset them at that point.
+/// Checks the settings again after the stream has started, and reapplies them if necessary. Some
+/// cameras reset their settings at the start of the stream.
 pub(super) fn confirm(
     settings: &Settings,
     camera: &impl Controls,
@@ -172,7 +172,8 @@ fn check(
     if settings.exposure_micros.is_none() {
         applied.reports_exposure = exposure_secs(camera).is_some();
     } else if applied.exposure_secs.is_none() {
-        // The exposure cannot be set, so the value of the rig file is used.
+        // The camera cannot set the exposure, so the exposure time of the rig file is taken as the
+        // known value.
         applied.exposure_secs = settings.exposure_micros.map(|micros| micros * 1e-6);
     }
     Ok(applied)
@@ -243,7 +244,7 @@ impl AutoControl {
             steps.push(Step {
                 control,
                 id,
-                // The automatic mode is off if the rig file sets a value, else on.
+                // The automatic mode is off if the rig file sets a value. Otherwise, it is on.
                 value: i32::from(!is_required),
                 tolerance: 0,
                 is_required,
@@ -287,8 +288,8 @@ fn fixed(
     })
 }
 
-/// Plans the exposure mode, the option that keeps the rate under automatic exposure, and the time
-/// if it is fixed.
+/// Plans the exposure mode and the option that keeps the rate under automatic exposure. Also plans
+/// the exposure time if it is fixed.
 fn exposure(
     micros: Option<f64>,
     camera: &impl Controls,
@@ -337,7 +338,7 @@ fn exposure_time(micros: f64, known: &QueryControl) -> Result<Step, Problem> {
     let step = f64::from(known.step.max(1));
     let nearest = ((micros / MICROS_PER_COUNT - f64::from(known.minimum)) / step).round() * step
         + f64::from(known.minimum);
-    // Values that round to outside the range are rejected.
+    // A value is rejected if rounding moves it outside the range.
     let counts = (f64::from(known.minimum)..=f64::from(known.maximum))
         .contains(&nearest)
         .then_some(nearest);

@@ -76,7 +76,7 @@ impl Device {
     /// Opens a node in nonblocking mode.
     pub(super) fn open(path: &Path) -> rustix::io::Result<Self> {
         // The node is opened in nonblocking mode, so that a device that stops sending cannot block
-        // the thread: `wait` has a timeout, but `DQBUF` has none. The descriptor is closed in child
+        // the thread. `wait` has a timeout, but `DQBUF` has none. The descriptor is closed in child
         // processes, which would otherwise keep the device busy.
         let flags = OFlags::RDWR | OFlags::NONBLOCK | OFlags::CLOEXEC;
         Ok(Self {
@@ -266,7 +266,8 @@ impl Device {
         self.ioctl(&abi::S_CTRL, &mut abi::Control { id, value })
     }
 
-    /// Allocates `n_buffers` buffers (the device may use more or fewer) and starts the stream.
+    /// Allocates buffers and starts the stream. `n_buffers` buffers are requested, but the device
+    /// may use more or fewer.
     pub(super) fn stream(self, n_buffers: u32) -> Result<Stream, Refused> {
         let mut requested = abi::RequestBuffers {
             count: n_buffers,
@@ -298,9 +299,10 @@ impl Device {
 /// Step at which a stream was rejected.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Refused {
-    /// Allocating buffers: there is no memory for images, or another program uses the device.
+    /// The buffers cannot be allocated. There is no memory for images, or another program uses the
+    /// device.
     Buffers(Errno),
-    /// Starting the stream (`STREAMON`), usually because of the USB bandwidth.
+    /// The stream cannot be started (`STREAMON`). The usual reason is the USB bandwidth.
     Begin(Errno),
 }
 
@@ -328,13 +330,14 @@ impl Stream {
             // The caller compares its deadline and waits again.
             Err(Errno::INTR) => Ok(false),
             Err(error) => Err(error),
-            // This is also `true` after an error, because taking the image then returns the error.
+            // The result is also `true` after an error, because taking the image then returns the
+            // error.
             Ok(_) => Ok(!poll_fds[0].revents().is_empty()),
         }
     }
 
-    /// Takes the oldest filled buffer out of the queue; `None` if none is filled. The buffer must
-    /// be [requeued](Self::requeue).
+    /// Takes the oldest filled buffer out of the queue. `None` if no buffer is filled. The caller
+    /// must [requeue](Self::requeue) the buffer.
     pub(super) fn take(&mut self) -> rustix::io::Result<Option<FilledBuffer>> {
         let mut buffer = buffer_of(0);
         match self.device.ioctl(&abi::DQBUF, &mut buffer) {

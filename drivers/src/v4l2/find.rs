@@ -17,7 +17,7 @@ pub struct FoundCamera {
     pub bus: String,
     /// USB serial number, if it has one.
     pub serial: Option<String>,
-    /// Stable udev links: by device, then by port.
+    /// Stable udev links. Links by device come first, and then links by port.
     pub links: Vec<PathBuf>,
     /// Speed of the USB connection, megabits per second.
     pub usb_mbits: Option<f64>,
@@ -26,14 +26,16 @@ pub struct FoundCamera {
 }
 
 impl FoundCamera {
-    /// Name for the rig file: a udev link, or else the serial number, or else the bus address.
+    /// Name for the rig file. It is a udev link if there is one. Otherwise, it is the serial number
+    /// or, without one, the bus address.
     pub fn address(&self) -> String {
         let link = self.links.first().map(|link| link.display().to_string());
         link.or_else(|| self.serial.clone())
             .unwrap_or_else(|| self.bus.clone())
     }
 
-    /// USB bandwidth available to one camera, bytes per second; `None` if not on USB.
+    /// USB bandwidth that is available to one camera, bytes per second. `None` if the camera is not
+    /// connected over USB.
     pub fn usb_bytes_per_sec(&self) -> Option<f64> {
         self.usb_mbits.map(format::usb_bytes_per_sec)
     }
@@ -111,8 +113,8 @@ pub(super) fn modes(device: &Device) -> Vec<Mode> {
     modes
 }
 
-/// Nodes that match `device` of a rig file, which is a path, or a serial number or bus address
-/// shared by the nodes of a camera.
+/// Nodes that match `device` of a rig file. `device` is a path, a serial number or a bus address.
+/// The nodes of a camera share their serial number and bus address.
 pub(super) fn candidates(device: &str) -> Result<Vec<PathBuf>, Problem> {
     if device.starts_with('/') {
         return Ok(vec![PathBuf::from(device)]);
@@ -141,8 +143,8 @@ pub fn check_connected(device: &str) -> Result<(), Problem> {
     })
 }
 
-/// Checks that all nodes belong to one camera, since serial numbers are not always unique, and
-/// returns their paths.
+/// Checks that all nodes belong to one camera, and returns their paths. The check is needed because
+/// serial numbers are not always unique.
 fn paths_of_one_camera(device: &str, found: Vec<Node>) -> Result<Vec<PathBuf>, Problem> {
     let device = device.to_owned();
     // A camera has several nodes, which share a USB device. Two cameras of one model may have the
@@ -169,7 +171,8 @@ fn nodes(root: &Path) -> Vec<Node> {
         .filter_map(|entry| entry.ok()?.file_name().into_string().ok())
         .filter_map(|name| Some((number(&name)?, name)))
         .collect();
-    // The nodes are sorted by number. Sorted as text, video10 would come before video2.
+    // The nodes are sorted by number. If they were sorted as text, video10 would come before
+    // video2.
     names.sort_unstable();
     names
         .into_iter()

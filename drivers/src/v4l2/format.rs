@@ -6,8 +6,9 @@ use super::V4l2Format;
 use super::abi::{DISCRETE, Fraction, FrameInterval, FrameSize};
 use crate::{Error, PixelFormat, V4l2Colors, YuvColors, YuvLayout};
 
-/// Rates with a smaller relative difference are considered equal, because devices report fractions
-/// of integers: 29.97 Hz differs from 30 Hz by 0.1 %. A larger value could accept 24 for 25 Hz.
+/// Rates with a smaller relative difference count as equal, because devices report rates as
+/// fractions of integers. For example, 29.97 Hz differs from 30 Hz by 0.1 %. With a larger value,
+/// 24 Hz could count as 25 Hz.
 const SAME_RATE_FRAC: f64 = 0.01;
 
 impl V4l2Format {
@@ -38,7 +39,7 @@ impl V4l2Format {
         default_code.map_or(0, |(code, _)| u32::from_le_bytes(**code))
     }
 
-    /// Bytes per second of images of a size at a rate; `None` for compressed formats.
+    /// Bytes per second for images of this size and rate. `None` for compressed formats.
     pub fn bytes_per_sec(self, [width, height]: [u32; 2], rate_hz: f64) -> Option<f64> {
         let bytes_per_pixel = match self {
             Self::Mjpeg => return None,
@@ -66,7 +67,8 @@ impl V4l2Format {
             Self::Grey => return Ok(PixelFormat::Gray8),
             Self::Z16 => return Ok(PixelFormat::DepthU16 { meters_per_count }),
         };
-        // Only YUV depends on the reported colors, so unknown ones are no error for other formats.
+        // Only YUV depends on the reported color encoding, so an unknown color encoding is no error
+        // for other formats.
         Ok(PixelFormat::Yuv {
             layout,
             colors: YuvColors::from_v4l2(colors)?,
@@ -197,8 +199,8 @@ impl Rates {
     }
 }
 
-/// Selects a mode of the given format, or else of the first suitable format in
-/// [`V4l2Format::COLOR_FORMATS`].
+/// Selects a mode of the given format. Without a format, selects a mode of the first suitable
+/// format in [`V4l2Format::COLOR_FORMATS`].
 pub(super) fn choose(
     modes: &[Mode],
     format: Option<V4l2Format>,
@@ -288,8 +290,8 @@ pub(super) fn rate_of(interval: Fraction) -> f64 {
     f64::from(interval.denominator) / f64::from(interval.numerator.max(1))
 }
 
-/// Interval of a rate as a kernel fraction: exact for integer rates, otherwise accurate to one
-/// millionth.
+/// Interval of a rate as a kernel fraction. It is exact for integer rates, and accurate to one
+/// millionth for other rates.
 pub(super) fn interval_of(rate_hz: f64) -> Fraction {
     const PARTS: f64 = 1e6;
     #[expect(
@@ -311,7 +313,8 @@ pub(super) fn interval_of(rate_hz: f64) -> Fraction {
     }
 }
 
-/// Describes modes for messages: each format with its sizes and the highest rate at each.
+/// Describes modes for messages. Lists each format with its sizes and the highest rate at each
+/// size.
 pub fn summary(modes: &[Mode]) -> String {
     let formats = V4l2Format::COLOR_FORMATS
         .iter()

@@ -4,8 +4,8 @@
 //! `abi.rs` declares the kernel interface, and only `device.rs` calls it. `config.rs` and
 //! `problem.rs` define configuration and errors. `find.rs` lists devices; `format.rs`,
 //! `pixel_format.rs` and `controls.rs` select formats and settings; `stream.rs` and `sequence.rs`
-//! read images; `camera.rs` handles disconnections. On other systems than Linux, only the names of
-//! the formats are available, because rig files need them on every system.
+//! read images; `camera.rs` handles disconnections. On systems other than Linux, only the names of
+//! the formats are available. Rig files need these names on every system.
 
 #[cfg(target_os = "linux")]
 mod abi;

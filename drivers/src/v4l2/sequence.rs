@@ -10,8 +10,8 @@ impl Sequence {
     /// Records the sequence number of the next image and returns the number of images missing
     /// before it.
     ///
-    /// Numbers may wrap. A number that repeats or decreases counts no missing images, because some
-    /// devices do not count, or restart.
+    /// Numbers may wrap. If a number repeats or decreases, no image counts as missing. Some devices
+    /// do not count their images, and others restart the count.
     pub(super) fn n_skipped_before(&mut self, number: u32) -> u64 {
         let ahead = self
             .last

@@ -14,11 +14,12 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-/// Number of image buffers: a quarter of a second at 30 Hz. With fewer buffers, images are lost
-/// when the caller pauses. More buffers take more kernel memory.
+/// Number of image buffers. Eight buffers hold a quarter of a second of images at 30 Hz. With fewer
+/// buffers, images are lost when the caller pauses. More buffers take more kernel memory.
 const N_BUFFERS: u32 = 8;
-/// A stamp that is earlier than the start of the stream or later than now by more than this comes
-/// from another clock, regardless of its flag.
+/// Maximum time by which a stamp may be earlier than the start of the stream, or later than the
+/// current time. A stamp outside these limits comes from another clock, even if its flag says
+/// otherwise.
 const MAX_STAMP_ERROR_SECS: f64 = 1.0;
 /// Maximum duration of an exposure query, as a fraction of the time between two images. Some
 /// cameras answer so slowly that images would be lost in the meantime.
@@ -38,7 +39,8 @@ pub(super) struct V4l2Stream {
     started_at: Stamp,
     /// Number of lost images that are not reported yet.
     n_unreported: u64,
-    /// Number of damaged images since [`Self::take_n_damaged`]. They also count as skipped.
+    /// Number of damaged images since the last call of [`Self::take_n_damaged`]. They also count as
+    /// skipped.
     n_damaged: u64,
     last_image_at: Instant,
     has_warned_of_clock: bool,
@@ -148,8 +150,8 @@ impl V4l2Stream {
         Ok(())
     }
 
-    /// Returns the next image, or `None` if none came before the deadline. An error means that the
-    /// device was disconnected.
+    /// Returns the next image. Returns `None` if no image arrives before the deadline. An error
+    /// means that the device was disconnected.
     pub(super) fn next_image(
         &mut self,
         config: &Config,
@@ -177,7 +179,8 @@ impl V4l2Stream {
                     if let Some(Err(error)) = other {
                         log::debug!("{error}");
                     }
-                    // A damaged image counts as lost, too: it is never returned to the caller.
+                    // A damaged image counts as lost, too, because it is never returned to the
+                    // caller.
                     self.n_unreported += 1;
                     self.n_damaged += 1;
                     if Instant::now() >= deadline {
@@ -188,8 +191,8 @@ impl V4l2Stream {
         }
     }
 
-    /// Takes the next buffer to deliver: the oldest or the newest. In the latter case, older
-    /// buffers are requeued.
+    /// Takes the next buffer to deliver, which is the oldest or the newest. If the newest buffer is
+    /// taken, older buffers are requeued.
     fn next_filled(
         &mut self,
         delivery: Delivery,

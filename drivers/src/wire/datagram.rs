@@ -1,4 +1,4 @@
-//! UDP datagrams of arms, range scanners and bases: one JSON object per datagram.
+//! UDP datagrams of arms, range scanners and bases. Each datagram is one JSON object.
 //! `docs/reference/udp.md` documents the fields.
 
 use super::{Malformed, json};
@@ -31,16 +31,17 @@ const UNIT_NORM_TOLERANCE: f64 = 1e-3;
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Clock {
-    /// `CLOCK_MONOTONIC` of the receiving computer, on which the sender must run, too.
+    /// `CLOCK_MONOTONIC` of the receiving computer. The sender must run on the same computer.
     Monotonic,
-    /// Any other clock with a steady rate. It is mapped to our clock by the arrival times.
+    /// Any other clock with a steady rate. The arrival times are used to map it to the clock of the
+    /// receiving computer.
     Device,
 }
 
 /// Fields of every datagram.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct DatagramHeader {
-    /// Sequence number: increases by one with every scan, pose or joint state.
+    /// Sequence number. It increases by one with every scan, pose or joint state.
     pub seq: u64,
     /// Clock of the stamp.
     pub clock: Clock,
@@ -70,15 +71,15 @@ pub struct PoseDatagram {
     pub header: DatagramHeader,
     /// Pose of the base.
     pub world_from_base: Transform,
-    /// Covariance of the pose if the sender reports it, row-major: position along the world's axes,
-    /// then small rotations about them (as in `geometry_msgs/PoseWithCovariance` of ROS); m², m
-    /// rad, rad².
+    /// Covariance of the pose, row-major, if the sender reports it. The order is that of
+    /// `geometry_msgs/PoseWithCovariance` of ROS: position along the world's axes, then small
+    /// rotations about these axes. Units are m², m rad and rad².
     pub covariance: Option<Box<[f64; 36]>>,
 }
 
 impl PoseDatagram {
-    /// Uncertainty that the covariance reports: root mean square errors of position (meters) and
-    /// rotation (radians); `None` without a covariance.
+    /// Root mean square errors of position (meters) and rotation (radians), computed from the
+    /// covariance. `None` without a covariance.
     pub fn sigmas(&self) -> Option<[f64; 2]> {
         let covariance = self.covariance.as_ref()?;
         let trace = |first: usize| (first..first + 3).map(|ix| covariance[7 * ix]).sum::<f64>();
@@ -93,9 +94,10 @@ pub struct JointsDatagram {
     pub header: DatagramHeader,
     /// Positions, radians or meters.
     pub position: Vec<f64>,
-    /// Velocities, radians or meters per second; empty if the sender does not report them.
+    /// Velocities, radians or meters per second. The list is empty if the sender does not report
+    /// velocities.
     pub velocity: Vec<f64>,
-    /// Efforts, newton meters or newtons; empty if the sender does not report them.
+    /// Efforts, newton meters or newtons. The list is empty if the sender does not report efforts.
     pub effort: Vec<f64>,
 }
 
@@ -152,7 +154,7 @@ struct Pose {
     quat_xyzw: [f64; 4],
 }
 
-/// `N` is a number, or an optional one in datagrams of others.
+/// `N` is a number. In datagrams from other programs, it is an optional number.
 #[derive(Serialize, Deserialize)]
 struct WireJoints<N> {
     kind: String,
@@ -177,7 +179,7 @@ fn default_parts() -> u32 {
     1
 }
 
-/// Encodes a part of a scan; [`decode_scan`] restores it exactly.
+/// Encodes a part of a scan. [`decode_scan`] restores it exactly.
 pub fn encode_scan(part: &ScanPart) -> Vec<u8> {
     let ScanPart {
         header,
@@ -206,7 +208,7 @@ pub fn encode_scan(part: &ScanPart) -> Vec<u8> {
     serde_json::to_vec(&wire).expect("numbers and lists always serialize")
 }
 
-/// Encodes a base pose; [`decode_pose`] restores it exactly.
+/// Encodes a base pose. [`decode_pose`] restores it exactly.
 pub fn encode_pose(pose: &PoseDatagram) -> Vec<u8> {
     let PoseDatagram {
         header,
@@ -228,7 +230,7 @@ pub fn encode_pose(pose: &PoseDatagram) -> Vec<u8> {
     serde_json::to_vec(&wire).expect("numbers and lists always serialize")
 }
 
-/// Encodes the state of joints with these names; [`decode_joints`] restores it exactly.
+/// Encodes the state of joints with these names. [`decode_joints`] restores it exactly.
 pub fn encode_joints(joints: &JointsDatagram, names: &[String]) -> Vec<u8> {
     let JointsDatagram {
         header,
@@ -328,8 +330,8 @@ pub fn decode_pose(bytes: &[u8]) -> Result<PoseDatagram, Malformed> {
     if !is_unit {
         return Err(invalid("quat_xyzw is not a unit quaternion".to_owned()));
     }
-    // A quaternion of f64 is kept bit for bit, so that a pose survives encoding and decoding. One
-    // that was rounded is normalized.
+    // A quaternion with the precision of f64 is kept bit for bit, so that encoding and decoding do
+    // not change a pose. A quaternion that was rounded is normalized.
     let rotation = if (quaternion.norm() - 1.0).abs() < 1e-12 {
         UnitQuaternion::new_unchecked(quaternion)
     } else {
@@ -372,7 +374,7 @@ fn covariance(numbers: Vec<f64>) -> Result<Box<[f64; 36]>, Malformed> {
     Ok(covariance)
 }
 
-/// Decodes the state of joints with these names; `None` if the datagram names other joints only,
+/// Decodes the state of joints with these names. `None` if the datagram names only other joints,
 /// such as those of a gripper.
 ///
 /// Joints are found by their names. Without names, the numbers must be in the order of `names`.
@@ -471,7 +473,7 @@ impl JointLayout {
     }
 }
 
-/// Index of each joint in `reported`; `None` if it contains none of the joints.
+/// Index of each joint in `reported`. `None` if `reported` contains none of the joints.
 fn order_of(joints: &[String], reported: &[String]) -> Result<Option<Vec<usize>>, Malformed> {
     let found = joints
         .iter()
@@ -507,7 +509,8 @@ fn only_index_of(joint: &str, reported: &[String]) -> Result<Option<usize>, Malf
     }
 }
 
-/// Names for a message, without control characters: they come from the network and are logged.
+/// Names for a message. Control characters are removed, because the names come from the network and
+/// are logged.
 fn shown(names: &[String]) -> String {
     names
         .join(", ")
@@ -517,7 +520,8 @@ fn shown(names: &[String]) -> String {
         .collect()
 }
 
-/// Positions of the echoes: one entry per direction of a part; `None` if there was no echo.
+/// Positions of the echoes. The list has one entry per direction of a part. An entry is `None` if
+/// there was no echo.
 fn echo_positions(wire: &WireScan) -> Result<Vec<Option<[f32; 3]>>, Malformed> {
     match (&wire.points_m, &wire.ranges_m) {
         (Some(numbers), None) => {
@@ -619,8 +623,8 @@ fn check_kind(bytes: &[u8], expected: &'static str) -> Result<(), Malformed> {
 fn parse_json<T: DeserializeOwned>(bytes: &[u8]) -> Result<T, Malformed> {
     let parse =
         |bytes: &[u8]| serde_json::from_slice(bytes).map_err(|error| invalid(reported(&error)));
-    // Replacing them requires a copy of the text, so it is done only if the original text is not
-    // valid JSON.
+    // `NaN` and `Infinity` are replaced only if the original text is not valid JSON, because the
+    // replacement requires a copy of the text.
     parse(bytes).or_else(|error| match std::str::from_utf8(bytes) {
         Ok(text) if text.contains("NaN") || text.contains("Infinity") => {
             parse(json::nan_as_null(text).as_bytes())
@@ -629,8 +633,8 @@ fn parse_json<T: DeserializeOwned>(bytes: &[u8]) -> Result<T, Malformed> {
     })
 }
 
-/// The parser may repeat the sender's text, which may be long and contain anything, and the message
-/// is logged.
+/// Makes the message of the parser safe to log. The parser may repeat the sender's text, which may
+/// be long and contain any characters.
 fn reported(error: &serde_json::Error) -> String {
     error
         .to_string()

@@ -380,7 +380,7 @@ pub fn encode_transform(
 }
 
 /// Decodes stamp and pose from a `FrameTransform`. Poses that this program wrote are restored bit
-/// for bit. Quaternions of other programs may be rounded; they are normalized.
+/// for bit. Quaternions of other programs may be rounded, and are normalized.
 pub fn decode_transform(bytes: &[u8]) -> Result<(Stamp, Transform), Malformed> {
     let mut stamp = None;
     let mut translation = None;
@@ -430,7 +430,8 @@ fn unit_quaternion(quaternion: [f64; 4]) -> Result<[f64; 4], Malformed> {
     })
 }
 
-/// Decodes the names of the parent and the child of a `FrameTransform`; empty if they are absent.
+/// Decodes the names of the parent and the child of a `FrameTransform`. A name is empty if it is
+/// absent.
 pub fn decode_frames(bytes: &[u8]) -> Result<[&str; 2], Malformed> {
     let mut names = [""; 2];
     for field in fields(bytes) {
@@ -473,7 +474,7 @@ pub fn decode_true_pose(bytes: &[u8]) -> Result<(Stamp, Transform, Option<f64>),
     Ok((stamp, world_from_camera, None))
 }
 
-/// The doubles 1 to `N` of a message that has no other fields; absent ones are zero.
+/// The fields 1 to `N` of a message that consists only of doubles. Absent fields are zero.
 pub(super) fn numbers<const N: usize>(field: &Field<'_>) -> Result<[f64; N], Malformed> {
     let mut numbers = [0.0; N];
     for inner in fields(field.bytes()?) {

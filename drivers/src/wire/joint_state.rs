@@ -1,5 +1,5 @@
-//! Joint states as JSON with our own schema. Foxglove has no schema for joint states that every
-//! version of its viewer opens.
+//! Joint states as JSON with a schema of fieldrig. Foxglove has no schema for joint states that
+//! every version of its viewer opens.
 
 use super::Malformed;
 use kinematics::{JointState, Stamp};

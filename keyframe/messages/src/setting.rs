@@ -139,8 +139,9 @@ settings! {
 static SPELLER: OnceLock<fn(Setting) -> &'static str> = OnceLock::new();
 
 impl Setting {
-    /// Sets how [`Display`] writes settings in this program, for example as flags. Until then, it
-    /// writes the names of the options in the libraries. Only the first call has an effect.
+    /// Sets how [`Display`] writes settings in this program, for example as flags. Before the first
+    /// call, [`Display`] writes the names that the options have in the libraries. Only the first
+    /// call has an effect.
     pub fn spell_as(speller: fn(Self) -> &'static str) {
         let _ = SPELLER.set(speller);
     }

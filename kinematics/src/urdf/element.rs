@@ -22,8 +22,8 @@ const MAX_NOTES: usize = 100;
 /// prefixes without a namespace. Lines stay as they are.
 pub(super) fn repaired(xml: &str) -> Cow<'_, str> {
     let mut text = Cow::Borrowed(xml);
-    // A declaration that does not start the file is an error in XML 1.0. Everything else in it,
-    // such as the encoding, does not matter for text that has been decoded already.
+    // An XML declaration that does not start the file is an error in XML 1.0. The contents of the
+    // declaration, such as the encoding, do not matter, because the text has already been decoded.
     let begin = xml.len() - xml.trim_start().len();
     if begin > 0
         && xml[begin..].starts_with("<?xml")
@@ -48,13 +48,15 @@ pub(super) fn repaired(xml: &str) -> Cow<'_, str> {
     text
 }
 
-/// The prefixes of elements and attributes, a limited number; values of attributes may add others.
+/// The prefixes of elements and attributes. Their number is limited. Words in the values of
+/// attributes may be returned as well.
 fn prefixes(xml: &str) -> BTreeSet<&str> {
     let mut found = BTreeSet::new();
     for tag in xml.split('<').skip(1) {
         let tag = tag.split('>').next().unwrap_or_default();
-        // The name of the element, then those of its attributes. White space in values yields words
-        // that look like attributes; these only add declarations that nothing uses.
+        // The first word is the name of the element, and the other words are its attributes. White
+        // space in values yields words that look like attributes. These words only add declarations
+        // that nothing uses.
         let names = tag
             .split_whitespace()
             .enumerate()

@@ -1,9 +1,9 @@
 //! CiA 402 drives: CANopen nodes that send a PDO with position and velocity on each SYNC.
 //!
-//! Watchdog: consumer heartbeat (`0x1016`) with abort connection option code (`0x6007`): either a
-//! quick stop after which the drive stays stopped (`0x605A` = 6), or voltage off. Source: CiA 301,
-//! section 7.5.2.20; CiA 402-2, objects 6007h and 605Ah. The reaction of the drive to its own
-//! faults (`0x605E`) is left unchanged.
+//! Watchdog: consumer heartbeat (`0x1016`) with abort connection option code (`0x6007`). The
+//! reaction is either a quick stop after which the drive stays stopped (`0x605A` = 6), or voltage
+//! off. Source: CiA 301, section 7.5.2.20; CiA 402-2, objects 6007h and 605Ah. The reaction of the
+//! drive to its own faults (`0x605E`) is left unchanged.
 
 pub mod codec;
 #[cfg(feature = "emulation")]

@@ -79,7 +79,8 @@ impl MotionProtocol for Cia402Motion {
 
     fn set_watchdog(&self, query: &MotorQuery<'_>, plan: &WatchdogPlan) -> Result<(), Error> {
         let node = self.address.node;
-        // A time that does not fit is shortened, which stops the drive earlier rather than later.
+        // A timeout that does not fit into the object is shortened, so that the drive stops earlier
+        // rather than later.
         let millis = u16::try_from(plan.timeout.as_millis()).unwrap_or(u16::MAX);
         let heartbeat = canopen::consumer_heartbeat(plan.host, millis);
         set_and_check(query, node, canopen::CONSUMER_HEARTBEAT, heartbeat.into())?;
@@ -163,8 +164,8 @@ impl MotionProtocol for Cia402Motion {
                 .unwrap_or(StateCommand::DisableVoltage),
         };
         let [low, high] = state_command.controlword().to_le_bytes();
-        // A position that does not fit is an error, because clamping would move the joint
-        // elsewhere.
+        // A position that cannot be encoded is an error, because a clamped position would move the
+        // joint elsewhere.
         let raw = self
             .address
             .units

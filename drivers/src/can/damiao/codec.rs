@@ -65,7 +65,7 @@ pub enum StateCommand {
     ClearError = 0xFB,
     /// Enable the motor.
     Enable = 0xFC,
-    /// Disable the motor; the shaft is free.
+    /// Disable the motor. The shaft is then free.
     Disable = 0xFD,
     /// Set the current position as zero.
     SetZero = 0xFE,
@@ -132,7 +132,8 @@ pub enum Register {
     FeedbackId = 7,
     /// ID of the motor.
     MotorId = 8,
-    /// Time without commands after which the motor stops, in ticks of 50 us; 0 means never.
+    /// Time without commands after which the motor stops, in ticks of 50 us. With 0, it never
+    /// stops.
     Timeout = 9,
     /// Control mode; 1 is MIT mode.
     ControlMode = 10,
@@ -190,14 +191,14 @@ pub struct RegisterMessage {
 /// Operation of a register message.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Access {
-    /// Reads a register; the answer is [`Access::Reported`].
+    /// Reads a register. The answer is [`Access::Reported`].
     Read(Register),
     /// Writes a register. The motor keeps the value until it loses power. Its answer repeats the
     /// message.
     Write(Register, Value),
     /// The answer to [`Access::Read`].
     Reported(Register, Value),
-    /// Stores all registers permanently; only possible while disabled.
+    /// Stores all registers permanently. The motor must be disabled.
     Store,
     /// Requests feedback without a command.
     Refresh,

@@ -1,9 +1,9 @@
-//! Damiao motors. They answer each command and each poll with feedback; the ranges of their raw
+//! Damiao motors. They answer each command and each poll with feedback. The ranges of their raw
 //! values are in their registers.
 //!
-//! Watchdog: register `TIMEOUT`; the motor leaves the enabled state and reports "communication
-//! lost". Source: Damiao DM-J4310-2EC manual V1.0, as in `jia-xie/python-damiao-driver`
-//! `docs/concept/`.
+//! Watchdog: register `TIMEOUT`. When it expires, the motor leaves the enabled state and reports
+//! "communication lost". Source: Damiao DM-J4310-2EC manual V1.0, as in
+//! `jia-xie/python-damiao-driver` `docs/concept/`.
 
 pub mod codec;
 #[cfg(feature = "emulation")]
@@ -27,7 +27,7 @@ use codec::{Access, Register, RegisterMessage, Value};
 use std::ops::RangeInclusive;
 use std::sync::Arc;
 
-/// Maximum ID of a motor and of its answers. The next ID is that of register messages.
+/// Maximum ID of a motor and of its answers. The next higher ID is that of register messages.
 const MAX_ID: u64 = 0x7FE;
 const FEEDBACK_ID: &str = "feedback_id";
 

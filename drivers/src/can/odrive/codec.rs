@@ -1,5 +1,5 @@
-//! ODrive's CANSimple protocol: the 11-bit CAN ID consists of a 6-bit node ID and a 5-bit command;
-//! numbers in the payload are little-endian.
+//! ODrive's CANSimple protocol. The 11-bit CAN ID consists of a 6-bit node ID and a 5-bit command.
+//! Numbers in the payload are little-endian.
 //!
 //! Sources: `odriverobotics/ODrive` `tools/odrive-cansimple.dbc` (messages since firmware 0.5);
 //! ODrive CAN protocol page and DBC of firmware 0.6.10 (heartbeat, errors, torques, endpoints,
@@ -19,7 +19,7 @@ const FEED_FORWARD: f64 = 1e-3;
 /// Error bit of [`Answer::Heartbeat`]: no command arrived within the timeout of the axis' watchdog.
 pub const WATCHDOG_TIMER_EXPIRED: u32 = 1 << 24;
 
-/// Node ID of an axis, 0 to 62; 63 means that no ID is assigned.
+/// Node ID of an axis, 0 to 62. The value 63 means that no ID is assigned.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Node(u8);
 
@@ -132,13 +132,13 @@ pub enum Control {
     Position = 3,
 }
 
-/// A message to a node. Values that are not finite are errors; feedforward is clamped to its 16
+/// A message to a node. Values that are not finite are errors. Feedforward is clamped to its 16
 /// bits.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Request {
     /// Requests a message of a node with a remote frame.
     Ask(Code),
-    /// Stops at once; the shaft is free.
+    /// Stops at once. The shaft is then free.
     EmergencyStop,
     /// Clears the errors.
     ClearErrors,
@@ -167,8 +167,8 @@ pub enum Request {
     SetTorque(f64),
     /// Reads an endpoint, by its number in the firmware's `flat_endpoints.json`.
     ReadEndpoint(u16),
-    /// Writes an endpoint, for instance the axis' watchdog timeout; the bytes are encoded according
-    /// to its type.
+    /// Writes an endpoint, for instance the axis' watchdog timeout. The bytes are encoded according
+    /// to the type of the endpoint.
     WriteEndpoint(u16, [u8; 4]),
 }
 
@@ -191,7 +191,7 @@ pub enum Answer {
     },
     /// Active errors and the reason of the last disarming, bits of the firmware's `ODrive.Error`.
     Errors {
-        /// Active errors; firmware 0.5 reports the motor's errors here.
+        /// Active errors. Firmware 0.5 reports the errors of the motor here.
         active: u32,
         /// Errors that disarmed the axis.
         disarm_reason: u32,
@@ -217,7 +217,7 @@ pub enum Answer {
         /// Estimated.
         estimate_nm: f64,
     },
-    /// Value of an endpoint; the bytes are encoded according to its type.
+    /// Value of an endpoint. The bytes are encoded according to the type of the endpoint.
     Endpoint(u16, [u8; 4]),
 }
 
@@ -445,8 +445,8 @@ fn encode_thousandths(field: &'static str, value: f64) -> Result<[u8; 2], CanErr
     if value.is_nan() {
         Err(CanError::NotFinite { field })
     } else {
-        // Clamping is acceptable for feedforward, because the position loop of the axis compensates
-        // for it. A clamped position would be a different target.
+        // Feedforward may be clamped, because the position loop of the axis compensates for the
+        // difference. A clamped position, in contrast, would be a different target.
         Ok(((value / FEED_FORWARD).round() as i16).to_le_bytes())
     }
 }

@@ -1,7 +1,7 @@
 //! `ODrive` axes with CANSimple. They send their encoder estimates and heartbeats periodically.
 //!
-//! Watchdog: `axis0.config.watchdog_timeout` and `enable_watchdog`; the axis is disarmed. Source:
-//! ODrive documentation, error `WATCHDOG_TIMER_EXPIRED`.
+//! Watchdog: `axis0.config.watchdog_timeout` and `enable_watchdog`. When it expires, the axis is
+//! disarmed. Source: ODrive documentation, error `WATCHDOG_TIMER_EXPIRED`.
 
 pub mod codec;
 #[cfg(feature = "emulation")]
@@ -29,8 +29,8 @@ use codec::Answer;
 use std::ops::RangeInclusive;
 use std::sync::Arc;
 
-/// Default rate of encoder messages. It is used to estimate the bus load; an axis with another rate
-/// loads the bus more or less.
+/// Default rate of encoder messages. It is used to estimate the bus load. The estimate is wrong for
+/// an axis with another rate.
 const REPORT_HZ: f64 = 100.0;
 /// Default rate of heartbeats, which contain the state of the axis.
 const HEARTBEAT_HZ: f64 = 10.0;

@@ -115,8 +115,8 @@ impl MotionProtocol for OdriveMotion {
     }
 
     fn set_mode(&self, query: &MotorQuery<'_>, _plan: &WatchdogPlan) -> Result<(), Error> {
-        // The mode cannot be read over CANSimple. A wrong mode causes a following error at the
-        // first motion.
+        // The mode cannot be read over CANSimple. If the mode is wrong, the first motion causes a
+        // following error.
         query.send(self.encode(&Request::SetMode(Control::Position)))
     }
 

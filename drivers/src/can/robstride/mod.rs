@@ -1,8 +1,8 @@
 //! Robstride motors with their private protocol. Once configured, they report periodically.
 //!
-//! Watchdog: parameter `canTimeout`; the motor goes to its reset mode. Do not rely on the damping
-//! of its parameter `damper`, which only protects unpowered motors against surges. Source: RS00 to
-//! RS06 user manuals, sections 4.2 and 4.3.5.
+//! Watchdog: parameter `canTimeout`. When it expires, the motor goes to its reset mode. Do not rely
+//! on the damping of the parameter `damper`, which only protects unpowered motors against surges.
+//! Source: RS00 to RS06 user manuals, sections 4.2 and 4.3.5.
 
 pub mod codec;
 #[cfg(feature = "emulation")]
@@ -29,7 +29,7 @@ use std::ops::RangeInclusive;
 use std::sync::Arc;
 
 /// Our host ID, to which motors send their answers. The manufacturer's program uses the same ID, so
-/// fieldrig must not run beside it on one bus.
+/// fieldrig and this program must not use one bus at the same time.
 pub(super) const HOST: u8 = 0xFD;
 /// Value of [`Parameter::ReportInterval`] for the shortest interval.
 const SHORTEST_REPORT: u32 = 1;

@@ -25,10 +25,11 @@ pub enum Parameter {
     Supply = 0x701C,
     /// `loc_kp`: stiffness of the motor's own position mode.
     PositionGain = 0x701E,
-    /// `EPScan_time`: interval of unsolicited reports. 1 is 10 ms; each further unit adds 5 ms.
+    /// `EPScan_time`: interval of unsolicited reports. A value of 1 is 10 ms. Each further unit
+    /// adds 5 ms.
     ReportInterval = 0x7026,
-    /// `canTimeout`: time without commands after which the motor stops, 20 000 ticks per second; 0
-    /// means never.
+    /// `canTimeout`: time without commands after which the motor stops, 20 000 ticks per second.
+    /// With 0, it never stops.
     Timeout = 0x7028,
 }
 

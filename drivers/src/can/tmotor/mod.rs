@@ -2,7 +2,7 @@
 //! gains would make a motor limp. A read-only arm therefore sends nothing and only listens while
 //! another master commands the motors.
 //!
-//! Watchdog: none; the motor executes its last command forever. Source: CubeMars AK Series Module
+//! Watchdog: none. The motor executes its last command forever. Source: CubeMars AK Series Module
 //! Product Manual, MIT mode.
 
 pub mod codec;
@@ -130,8 +130,8 @@ impl MotorProtocol for TMotor {
     }
 
     fn typical_answer(&self) -> (Frame, Option<f64>) {
-        // Another master causes its answers, at a rate that is unknown here, so they are left out
-        // of the bus load.
+        // The motor answers another master at a rate that is unknown here, so its answers are left
+        // out of the bus load.
         (short_frame(), Some(0.0))
     }
 
