@@ -27,7 +27,7 @@ impl Plane {
     /// Copies an image.
     ///
     /// # Errors
-    /// If the number of bytes does not match the size or the image is too small.
+    /// Fails if the number of bytes does not match the size or the image is too small.
     pub(crate) fn new(image: GrayImage<'_>) -> Result<Self, NotDetected> {
         let [width, height] = image.size_px;
         let n_pixels = u64::from(width) * u64::from(height);

@@ -37,7 +37,8 @@ impl TargetSpec {
     /// white.
     ///
     /// # Errors
-    /// If the resolution is not a positive number or the picture would be larger than 16384 pixels.
+    /// Fails if the resolution is not a positive number or the picture would be larger than 16384
+    /// pixels.
     pub fn raster(&self, px_per_m: f64) -> Result<Raster, PrintError> {
         let [low, high] = self.bounds_m();
         let margin_m = self.margin_m();

@@ -20,7 +20,7 @@ impl<T> Pending<T> {
     ///
     /// # Errors
     ///
-    /// If the GPU failed.
+    /// Fails if the GPU failed.
     pub fn finish(self) -> Result<T, Error> {
         (self.0)()
     }

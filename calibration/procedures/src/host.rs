@@ -24,7 +24,7 @@ pub trait Host: Sync {
     /// Starts listening for stop requests. Called at most once, before an activity.
     ///
     /// # Errors
-    /// If the program cannot receive stop requests.
+    /// Fails if the program cannot receive stop requests.
     fn stop_requests(&self, activity: Activity) -> anyhow::Result<Stop>;
 
     /// Reports how many images have been read or searched for the target. Called from several
@@ -38,7 +38,7 @@ pub trait Host: Sync {
     /// the view closes it.
     ///
     /// # Errors
-    /// If images cannot be shown as requested.
+    /// Fails if images cannot be shown as requested.
     fn open_view(&self, camera: &Camera, activity: Activity)
     -> anyhow::Result<Box<dyn CameraView>>;
 }

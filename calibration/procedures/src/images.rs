@@ -115,7 +115,7 @@ fn is_image(path: &Path) -> bool {
 /// Images that cannot be read are named in a warning.
 ///
 /// # Errors
-/// If no image can be read.
+/// Fails if no image can be read.
 pub(crate) fn detect(
     files: &[ImageFile],
     target: &TargetSpec,

@@ -57,7 +57,7 @@ impl IntrinsicsTask {
     /// Detects the target, calibrates, and writes the report.
     ///
     /// # Errors
-    /// If the images cannot be read, or do not determine the lens.
+    /// Fails if the images cannot be read, or do not determine the lens.
     pub fn run(&self, host: &dyn Host) -> anyhow::Result<IntrinsicsOutcome> {
         // Checked first, so that a wrong path does not cost a calibration.
         self.report.as_ref().map_or(Ok(()), ReportOptions::check)?;
@@ -218,7 +218,7 @@ impl IntrinsicsOutcome {
     /// Writes the rig file, if it was requested. Called after the result was printed.
     ///
     /// # Errors
-    /// If the rig file or the report cannot be written.
+    /// Fails if the rig file or the report cannot be written.
     pub fn finish(self) -> anyhow::Result<()> {
         if let Some(mut rig) = self.rig {
             rig.set_intrinsics(

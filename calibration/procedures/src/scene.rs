@@ -57,7 +57,8 @@ impl SceneTask {
     /// Reads the images, calibrates, and writes the report.
     ///
     /// # Errors
-    /// If the options contradict each other, or if the data cannot be read or are not sufficient.
+    /// Fails if the options contradict each other, or if the data cannot be read or are not
+    /// sufficient.
     pub fn run(&self, host: &dyn Host) -> anyhow::Result<SceneOutcome> {
         // `auto` chooses the parameters itself, so a list contradicts it.
         if self.params.len() > 1 && self.params.contains(&Refine::Auto) {
@@ -232,7 +233,7 @@ impl SceneOutcome {
     /// result was printed.
     ///
     /// # Errors
-    /// If no camera could be calibrated, or if the rig file or the report cannot be written.
+    /// Fails if no camera could be calibrated, or if the rig file or the report cannot be written.
     pub fn finish(self) -> anyhow::Result<()> {
         if let Some(reason) = self.refused {
             outputs::log_failure(self.written);

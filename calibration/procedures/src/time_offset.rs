@@ -36,7 +36,7 @@ impl TimeOffsetTask {
     /// outcome contains the reason.
     ///
     /// # Errors
-    /// If a file cannot be read, or if no report can be written to the given path.
+    /// Fails if a file cannot be read, or if no report can be written to the given path.
     pub fn run(&self) -> anyhow::Result<TimeOffsetOutcome> {
         // Checked first, so that a wrong path does not cost a calibration.
         self.report.as_ref().map_or(Ok(()), ReportOptions::check)?;

@@ -18,8 +18,8 @@ const MIN_DISTANCE_PX: f64 = 1.0;
 /// rejects the others.
 ///
 /// # Errors
-/// If the sizes differ, a value is not finite, the target is not flat or has an implausible size,
-/// or there are too few images.
+/// Fails if the sizes differ, a value is not finite, the target is not flat or has an implausible
+/// size, or there are too few images.
 pub(super) fn usable_images(
     views: &[BoardView],
     sizes_px: &[[u32; 2]],

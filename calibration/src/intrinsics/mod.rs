@@ -69,8 +69,9 @@ pub enum LensModel {
 /// are rejected and named; up to half of the images may be.
 ///
 /// # Errors
-/// If the input is malformed, if too few images are usable, if no lens model fits, or if the images
-/// do not determine the focal length or the principal point. The message contains the remedy.
+/// Fails if the input is malformed, if too few images are usable, if no lens model fits, or if the
+/// images do not determine the focal length or the principal point. The message contains the
+/// remedy.
 pub fn calibrate_intrinsics(input: &IntrinsicsInput<'_>) -> Result<IntrinsicsCalibration, Error> {
     // Each phase rejects what would affect the next one: malformed input, gross errors of single
     // corners, images that contradict the others, and results that are not determined.

@@ -83,7 +83,7 @@ impl Default for Options {
 /// Minimizes the sum of the losses from an initial state.
 ///
 /// # Errors
-/// If a residual is not defined at the initial state, or if there are not more residuals than
+/// Fails if a residual is not defined at the initial state, or if there are not more residuals than
 /// parameters.
 pub fn minimize<P: Problem>(
     problem: &P,

@@ -69,7 +69,7 @@ impl BlockSums {
     ///   by those with respect to the block's local parameters.
     ///
     /// # Panics
-    /// If a row has another length.
+    /// Panics if a row has another length.
     pub fn add<const D: usize>(&mut self, residual: [f64; D], derivatives: [&[f64]; D]) {
         let n = self.n_shared + self.n_local;
         let squared_norm = residual.iter().map(|value| value * value).sum::<f64>();

@@ -22,7 +22,7 @@ pub(super) struct Coarse {
 /// The offset with the most significant correlation, followed by other maxima.
 ///
 /// # Errors
-/// If the streams have no rotation, or no significant correlation.
+/// Fails if the streams have no rotation, or no significant correlation.
 pub(super) fn correlate(
     a: &Stream,
     b: &Stream,
@@ -216,7 +216,7 @@ impl Rates {
     }
 
     /// # Errors
-    /// If the rate hardly changes.
+    /// Fails if the rate hardly changes.
     fn check_excitation(&self, name: &str) -> Result<(), Refusal> {
         /// A tenth of the value for a hand-held or slowly moving camera. Below it, tracking noise
         /// dominates.

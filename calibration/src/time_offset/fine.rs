@@ -35,7 +35,7 @@ pub(super) struct Fine {
 /// * `a`: the stream that is interpolated; the one with the higher rate.
 ///
 /// # Errors
-/// If the streams do not overlap.
+/// Fails if the streams do not overlap.
 pub(super) fn refine(a: &Stream, b: &Stream, offset_secs: f64) -> Result<Fine, Error> {
     const MIN_SIGMAS: f64 = 3.0;
     // The fit is done twice, first without a drift and then with one. An insignificant drift would

@@ -27,7 +27,7 @@ impl Stream {
     /// Sorts the poses and drops repeated stamps.
     ///
     /// # Errors
-    /// If a value is not finite, or if there are too few poses.
+    /// Fails if a value is not finite, or if there are too few poses.
     pub(super) fn new(name: &str, samples: &[PoseSample]) -> Result<Self, Error> {
         /// Neighbors whose distance exceeds the median by this factor are not interpolated. Up to
         /// two consecutive poses may thus be missing.

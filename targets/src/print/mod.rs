@@ -24,8 +24,8 @@ impl TargetSpec {
     /// the board frame and a caption.
     ///
     /// # Errors
-    /// If the target does not fit the paper in either orientation. The message names a paper that
-    /// fits.
+    /// Fails if the target does not fit the paper in either orientation. The message names a paper
+    /// that fits.
     pub fn pdf(&self, paper: Paper) -> Result<Vec<u8>, PrintError> {
         let [low, high] = self.bounds_m();
         let pattern_mm = [0, 1].map(|axis| (high[axis] - low[axis]) * 1e3);

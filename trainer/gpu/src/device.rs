@@ -202,7 +202,7 @@ impl Gpu {
     ///
     /// # Errors
     ///
-    /// If there is no such adapter, or if it cannot open a device.
+    /// Fails if there is no such adapter, or if it cannot open a device.
     pub fn open(options: &GpuOptions) -> Result<Arc<Self>, Error> {
         let instance = instance();
         let adapter = find_adapter(&instance, options.adapter)?;
@@ -330,8 +330,8 @@ impl Gpu {
     ///
     /// # Errors
     ///
-    /// If the device was lost, ran out of memory, failed or got an invalid command since it was
-    /// opened.
+    /// Fails if the device was lost, ran out of memory, failed or got an invalid command since it
+    /// was opened.
     pub fn check(&self) -> Result<(), Error> {
         let failed = self.health.failed.get();
         if matches!(failed, Some(Failure::Invalid(_))) && !self.is_lost() {
@@ -369,7 +369,7 @@ impl Gpu {
     ///
     /// # Errors
     ///
-    /// If the adapter cannot bind the buffer or has no memory for it.
+    /// Fails if the adapter cannot bind the buffer or has no memory for it.
     pub fn storage(&self, label: &str, bytes: u64) -> Result<Buffer, Error> {
         // An empty buffer cannot be bound, and arrays of `vec4f` need whole elements.
         let bytes = bytes.max(16).next_multiple_of(16);
@@ -401,7 +401,7 @@ impl Gpu {
     ///
     /// # Errors
     ///
-    /// As [`Self::storage`].
+    /// Fails as [`Self::storage`] does.
     pub fn storage_with(&self, label: &str, contents: &[u8]) -> Result<Buffer, Error> {
         let buffer = self.storage(label, contents.len() as u64)?;
         self.write(&buffer, 0, contents);
@@ -465,7 +465,7 @@ impl Gpu {
     ///
     /// # Errors
     ///
-    /// If the device failed, or if there is no memory for the read-back.
+    /// Fails if the device failed, or if there is no memory for the read-back.
     pub fn read<T: bytemuck::Pod>(&self, buffer: &Buffer, n: usize) -> Result<Vec<T>, Error> {
         if n == 0 {
             return Ok(Vec::new());
@@ -581,7 +581,7 @@ impl Gpu {
     ///
     /// # Errors
     ///
-    /// As [`Self::check`].
+    /// Fails as [`Self::check`] does.
     pub fn wait(&self) -> Result<(), Error> {
         self.poll(wgpu::PollType::Wait {
             submission_index: None,
@@ -657,7 +657,7 @@ impl PendingRead {
     ///
     /// # Errors
     ///
-    /// If the device failed, or if there was no memory for the read-back.
+    /// Fails if the device failed, or if there was no memory for the read-back.
     pub fn finish<T: bytemuck::Pod>(self, gpu: &Gpu) -> Result<Vec<T>, Error> {
         self.finish_with(gpu, |parts| bytemuck::pod_collect_to_vec(parts[0]))
     }
@@ -666,7 +666,7 @@ impl PendingRead {
     ///
     /// # Errors
     ///
-    /// As [`Self::finish`].
+    /// Fails as [`Self::finish`] does.
     pub fn finish_with<R>(self, gpu: &Gpu, take: impl FnOnce(&[&[u8]]) -> R) -> Result<R, Error> {
         let reading = self.0.map_err(|bytes| Error::OutOfMemory {
             label: "readback".to_owned(),

@@ -64,8 +64,8 @@ impl Passes {
     ///
     /// # Panics
     ///
-    /// If the names differ from those in the kernel, which is a bug in the caller. The message
-    /// lists both.
+    /// Panics if the names differ from those in the kernel, which is a bug in the caller. The
+    /// message lists both.
     pub fn dispatch(
         &mut self,
         gpu: &Gpu,
@@ -173,7 +173,7 @@ impl Passes {
     ///
     /// # Errors
     ///
-    /// If the device failed.
+    /// Fails if the device failed.
     pub fn submit_timed_total(&mut self, gpu: &Gpu) -> Result<Option<f64>, Error> {
         // Unlike `submit_timed`, this writes only two timestamps around the whole list. With a pass
         // per kernel, there would be time between kernels that a submit in training does not need.
@@ -220,7 +220,7 @@ impl Passes {
     ///
     /// # Errors
     ///
-    /// If the device failed.
+    /// Fails if the device failed.
     pub fn submit_timed(&mut self, gpu: &Gpu) -> Result<Vec<PassTiming>, Error> {
         if !gpu.optional.timestamps {
             self.submit(gpu);

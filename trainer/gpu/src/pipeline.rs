@@ -22,7 +22,7 @@ impl Pipeline {
     ///
     /// # Errors
     ///
-    /// If the WGSL is invalid, or needs more workgroup memory than the adapter has.
+    /// Fails if the WGSL is invalid, or needs more workgroup memory than the adapter has.
     pub fn new(gpu: &Gpu, kernel: Kernel, overrides: &[(&str, f64)]) -> Result<Self, Error> {
         let text = resolve(kernel.source, kernel.shared)?;
         let key = Key::new(text.clone(), overrides);
@@ -108,7 +108,7 @@ impl Pipeline {
     ///
     /// # Errors
     ///
-    /// As [`Self::new`], for any of the kernels.
+    /// Fails as [`Self::new`] does, for any of the kernels.
     pub fn compile_all<const N: usize>(
         gpu: &Gpu,
         kernels: [(Kernel, &[(&str, f64)]); N],

@@ -59,7 +59,7 @@ impl Submits {
     ///
     /// # Errors
     ///
-    /// If the device failed.
+    /// Fails if the device failed.
     pub fn finish(&mut self, gpu: &Gpu) -> Result<Option<Vec<u32>>, Error> {
         let Some(InFlight {
             counters,

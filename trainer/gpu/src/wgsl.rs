@@ -33,7 +33,7 @@ pub(super) struct Binding {
 ///
 /// # Errors
 ///
-/// If a file imports a name that is not among the shared sources.
+/// Fails if a file imports a name that is not among the shared sources.
 pub fn resolve(kernel: Source, shared: &[Source]) -> Result<String, Error> {
     let mut text = String::new();
     let mut seen = Vec::new();
@@ -73,7 +73,7 @@ fn append(
 ///
 /// # Errors
 ///
-/// If the WGSL is invalid. The message names the kernel.
+/// Fails if the WGSL is invalid. The message names the kernel.
 pub fn reflect(name: &'static str, text: &str) -> Result<naga::Module, Error> {
     let rejected = |message: String| Error::Wgsl {
         kernel: name,

@@ -93,7 +93,7 @@ impl HandEyeTask {
     /// with the result of the calibration.
     ///
     /// # Errors
-    /// If the input does not fit the options, or if it cannot be read.
+    /// Fails if the input does not fit the options, or if it cannot be read.
     pub fn read(&self, host: &dyn Host) -> anyhow::Result<(HandEyeSamples, Option<MovedArm>)> {
         // Checked first, so that a wrong path does not cost a calibration.
         self.report.as_ref().map_or(Ok(()), ReportOptions::check)?;
@@ -105,7 +105,7 @@ impl HandEyeTask {
     /// Calibrates, and writes the report. If there is no result, the outcome contains the reason.
     ///
     /// # Errors
-    /// If the images cannot be read, or if a result would not fit the rig file to write.
+    /// Fails if the images cannot be read, or if a result would not fit the rig file to write.
     pub fn calibrate(
         &self,
         samples: HandEyeSamples,
@@ -353,7 +353,7 @@ impl HandEyeOutcome {
     /// Writes the rig file, if it was requested. Called after the result was printed.
     ///
     /// # Errors
-    /// If there is no result, or if the rig file or the report cannot be written.
+    /// Fails if there is no result, or if the rig file or the report cannot be written.
     pub fn finish(self) -> anyhow::Result<()> {
         let CalibratedHandEye {
             calibration,

@@ -61,7 +61,7 @@ impl MovedArm {
     /// Returns the result of the calibration, or the reason why the motion was not completed.
     ///
     /// # Errors
-    /// If the calibration or the motion failed, or if the arm has stopped because of a fault.
+    /// Fails if the calibration or the motion failed, or if the arm has stopped because of a fault.
     pub fn finish<T>(mut self, result: anyhow::Result<T>) -> anyhow::Result<T> {
         let failure = self.failure.take();
         // The arm is held before anything is returned, because the motors of some arms release it
@@ -88,7 +88,7 @@ impl MovedArm {
     /// which the program will end.
     ///
     /// # Errors
-    /// If the arm has stopped because of a fault.
+    /// Fails if the arm has stopped because of a fault.
     fn hold_after(&mut self, error: Option<&anyhow::Error>) -> anyhow::Result<()> {
         if self.holds_on_exit {
             return Ok(());

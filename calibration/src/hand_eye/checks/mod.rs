@@ -110,7 +110,7 @@ const MUCH_BETTER: f64 = 5.0;
 /// Checks that the positions can be meters.
 ///
 /// # Errors
-/// If most of them are too large.
+/// Fails if most of them are too large.
 fn check_magnitudes(samples: &[HandEyeSample]) -> Result<(), Refusal> {
     let robot: Vec<f64> = samples
         .iter()

@@ -126,7 +126,7 @@ pub(crate) struct Sorted {
 /// Candidates of all samples, except repeated samples.
 ///
 /// # Errors
-/// If the input is invalid or has too few samples.
+/// Fails if the input is invalid or has too few samples.
 pub(crate) fn prepare(input: &HandEyeInput<'_>) -> Result<Sorted, Error> {
     check(input)?;
     Ok(sort(input, input.intrinsics.as_ref()))

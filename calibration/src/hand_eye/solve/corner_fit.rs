@@ -60,7 +60,7 @@ impl Start<'_> {
     /// Minimizes the reprojection error of the used samples.
     ///
     /// # Errors
-    /// If a corner cannot be projected, or if there are too few corners.
+    /// Fails if a corner cannot be projected, or if there are too few corners.
     pub(super) fn minimize(self, free: Free) -> Result<Fit<CornerState>, Error> {
         let chain = self.input.chain.filter(|_| free.joints);
         let n_intrinsics = usize::from(free.intrinsics) * self.intrinsics.params().len();

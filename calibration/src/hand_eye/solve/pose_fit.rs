@@ -161,7 +161,7 @@ pub(super) struct PoseFit {
 ///   estimated.
 ///
 /// # Errors
-/// If fewer than three measurements are given.
+/// Fails if fewer than three measurements are given.
 pub(super) fn fit(
     setup: Setup,
     measurements: &[Measurement],

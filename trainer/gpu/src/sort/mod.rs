@@ -86,7 +86,7 @@ impl RadixSort {
     ///
     /// # Errors
     ///
-    /// If a kernel is invalid.
+    /// Fails if a kernel is invalid.
     pub fn new(gpu: &Gpu) -> Result<Self, Error> {
         // The parallel scatter has ranks for 16 subgroups of its 256 threads, so subgroups need 16
         // lanes. On a CPU, barriers are expensive.
@@ -136,7 +136,7 @@ impl RadixSort {
     ///
     /// # Errors
     ///
-    /// If the adapter has no memory for the buffers or cannot bind them.
+    /// Fails if the adapter has no memory for the buffers or cannot bind them.
     pub fn buffers(
         &self,
         gpu: &Gpu,
