@@ -164,7 +164,7 @@ pub(super) fn alignment(
         .iter()
         .zip(&kept.corrections.by_camera)
         .map(|(name, correction)| (name.to_string(), correction.clone()));
-    // Without accepted parameters, there are no corrections instead of corrections of zero.
+    // Without accepted parameters, the list is empty instead of containing corrections of zero.
     // Keyframes then stay unchanged.
     let corrections = if kept.set.is_empty() {
         BTreeMap::new()

@@ -97,9 +97,8 @@ pub struct BodyTransform {
 /// The streams may have different rates, gaps, outliers and clocks with different zeros, but must
 /// overlap in time.
 ///
-/// # Errors
-/// [`Error::Refused`] if the motion does not determine the offset. [`Error::TimeOffsetInput`] if a
-/// stream is invalid.
+/// # Errors Returns [`Error::Refused`] if the motion does not determine the offset, and
+/// [`Error::TimeOffsetInput`] if a stream is invalid.
 ///
 /// ```
 /// use calibration::time_offset::{PoseSample, TimeOffsetOptions, estimate_time_offset};

@@ -17,8 +17,8 @@ pub struct Kernel {
 }
 
 impl Pipeline {
-    /// Compiles `kernel` with the given values of its `override`s, or returns the pipeline that
-    /// this device has already compiled for them.
+    /// Compiles `kernel` with the given values of its `override`s. If this device has already
+    /// compiled such a pipeline, returns that pipeline.
     ///
     /// # Errors
     ///
@@ -67,11 +67,12 @@ impl Pipeline {
             unsafe_code,
             reason = "a second bound would cost time in every iteration of the innermost loops"
         )]
-        // SAFETY: every loop of our kernels counts to a bound that is fixed before it starts.
+        // SAFETY: every loop of fieldrig's kernels counts to a bound that is fixed before the loop
+        // starts.
         let shader = unsafe { device.create_shader_module_trusted(described, checks) };
         // The layout is explicit and has all declared buffers. A layout that wgpu derives would
-        // lack the buffers that this variant of the kernel does not use, and callers of `dispatch`
-        // would have to know these.
+        // lack the buffers that this variant of the kernel does not use. Callers of `dispatch`
+        // would then have to know which buffers each variant uses.
         let entries: Vec<_> = bindings.iter().map(layout_entry).collect();
         let layout = device.create_bind_group_layout(&wgpu::BindGroupLayoutDescriptor {
             label: Some(name),

@@ -1,4 +1,4 @@
-//! WGSL sources: `#import name` and reflection through naga.
+//! Resolves `#import name` in WGSL sources, and inspects the sources with naga.
 
 use crate::Error;
 use wgpu::naga;
@@ -28,7 +28,7 @@ pub(super) struct Binding {
     pub(super) access: Access,
 }
 
-/// Replaces each line `#import name` with the shared source of that name, recursively; repeated
+/// Replaces each line `#import name` with the shared source of that name, recursively. Repeated
 /// imports are skipped.
 ///
 /// # Errors
@@ -79,8 +79,8 @@ pub fn reflect(name: &'static str, text: &str) -> Result<naga::Module, Error> {
         kernel: name,
         message,
     };
-    // All capabilities are allowed here: wgpu checks those of the adapter when it creates the
-    // module.
+    // All capabilities are allowed here, because wgpu checks the capabilities of the adapter when
+    // it creates the module.
     let module =
         naga::front::wgsl::parse_str(text).map_err(|error| rejected(error.emit_to_string(text)))?;
     naga::valid::Validator::new(

@@ -21,8 +21,7 @@ const RECOMMENDED_DEG: f64 = 20.0;
 
 /// Checks that the rotations span at least two directions.
 ///
-/// # Errors
-/// Names the only axis of rotation.
+/// # Errors The error names the only axis of rotation.
 pub(super) fn check_rotations(base_from_flange: &[Transform]) -> Result<(), Refusal> {
     let Some((spreads, axes)) = rotation_spread(base_from_flange) else {
         return Err(Refusal::new(

@@ -63,8 +63,8 @@ impl Refined {
 
 /// Refines a consensus.
 ///
-/// # Errors
-/// [`Error::Refused`] if fewer than three samples, or less than half of them, agree.
+/// # Errors Returns [`Error::Refused`] if fewer than three samples agree, or fewer than half of all
+/// samples.
 pub(crate) fn refine(
     input: &HandEyeInput<'_>,
     mut samples: Vec<Sample>,

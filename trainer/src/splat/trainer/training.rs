@@ -366,7 +366,7 @@ impl Training {
     ///
     /// # Errors
     ///
-    /// The given error if the steps of all images were skipped.
+    /// Returns the given error if the steps of all images were skipped.
     fn skip_step(&mut self, error: Error) -> Result<(), Error> {
         self.model.stop_growing(&error);
         // Every image is used at least once within two rounds.
