@@ -19,7 +19,7 @@ use nalgebra::{DMatrix, DVector, Matrix2x3, Matrix3, Point3, SMatrix, Vector3, V
 /// removed, so the loss only limits the influence of the remaining errors.
 const LOSS_THRESHOLD: f64 = 3.0;
 
-/// What is estimated besides hand-eye transform and board pose.
+/// Parameters that are estimated besides the hand-eye transform and the board pose.
 #[derive(Clone, Copy)]
 pub(super) struct Free {
     pub(super) intrinsics: bool,
@@ -41,7 +41,7 @@ pub(super) struct Start<'a> {
     /// Fit to the board poses of the used samples.
     pub(super) fit: &'a PoseFit,
     pub(super) intrinsics: &'a Intrinsics,
-    /// One per inner joint, radians or meters. Empty: zeros.
+    /// One offset per inner joint, radians or meters. An empty list stands for zeros.
     pub(super) joint_offsets: &'a [f64],
 }
 
@@ -89,7 +89,8 @@ impl Start<'_> {
         least_squares::minimize(&problem, initial, &options)
     }
 
-    /// The images at each stop of the robot. They share the error of its pose.
+    /// The images at each stop of the robot. Images at the same stop share the error of the robot
+    /// pose.
     fn stops(self, has_joints: bool) -> Vec<Vec<View>> {
         let mut by_stop = std::collections::BTreeMap::<usize, Vec<View>>::new();
         for sample in used(self.samples) {
@@ -110,7 +111,7 @@ struct View {
     base_from_flange: Transform,
     /// Corners without outliers, in the chosen board frame.
     points: Vec<BoardPoint>,
-    /// Joint values; empty if joint offsets are not estimated.
+    /// Joint values. The list is empty if joint offsets are not estimated.
     joints: Vec<f64>,
 }
 
@@ -120,10 +121,10 @@ struct CornerProblem<'a> {
     /// The images at each stop of the robot.
     stops: Vec<Vec<View>>,
     noise: HandEyeNoise,
-    /// Number of intrinsics to estimate: all, or 0.
+    /// Number of intrinsics to estimate, which is 0 or the number of all intrinsics.
     n_intrinsics: usize,
-    /// The arm, if joint offsets are estimated. They are estimated for all joints except the first
-    /// and the last.
+    /// The arm, if joint offsets are estimated. The offsets of all joints except the first and the
+    /// last are estimated.
     chain: Option<&'a Chain>,
 }
 
