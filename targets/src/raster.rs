@@ -12,7 +12,7 @@ const MAX_SIDE_PX: u32 = 16_384;
 pub struct Raster {
     /// Width and height in pixels.
     pub size_px: [u32; 2],
-    /// One byte per pixel, row by row from the top left; 0 is black, 255 white.
+    /// One byte per pixel, row by row from the top left. A value of 0 is black, and 255 is white.
     pub pixels: Vec<u8>,
     /// Position of the upper left corner of the picture in the board frame, meters.
     pub origin_m: [f64; 2],

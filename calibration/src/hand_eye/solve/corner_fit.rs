@@ -332,8 +332,8 @@ impl PointChain {
         let matrix =
             |rotation: nalgebra::UnitQuaternion<f64>| rotation.to_rotation_matrix().into_inner();
         let point_in_y = map(&self.y, point_in_board);
-        // The flange frame without and with the pose error, and the map from the latter to the
-        // camera.
+        // The flange frame without and with the pose error, and the map from the frame with the
+        // error to the camera.
         let error_rotation = matrix(self.error_motion.rotation);
         let cross = self.error_rad.cross_matrix();
         let (point_in_camera, camera_from_y, by_flange, by_error) = match self.setup {
@@ -374,8 +374,8 @@ impl PointChain {
                 )
             }
         };
-        // `x` and `y` move in the axes of camera and board: see `Solution::moved`. A motion of the
-        // camera moves the point in the opposite direction.
+        // `x` moves in the axes of the camera, and `y` in the axes of the board; see
+        // `Solution::moved`. A motion of the camera moves the point in the opposite direction.
         let mut by_solution = SMatrix::<f64, 3, 12>::zeros();
         let camera_from_board = camera_from_y * matrix(self.y.rotation);
         for (column, block) in [
@@ -413,7 +413,8 @@ fn joined(rotation: Matrix3<f64>, translation: Matrix3<f64>) -> SMatrix<f64, 3, 
 /// the others. The covariance of a solution with all parameters free is the sum of this covariance
 /// and of the covariance with fixed parameters.
 ///
-/// * `covariance`: covariance of the other parameters. If `None`, that of the fit itself is used.
+/// * `covariance`: covariance of the other parameters. If `None`, the covariance of the fit itself
+///   is used.
 pub(super) fn propagated(
     free: &Fit<CornerState>,
     covariance: Option<&DMatrix<f64>>,
@@ -444,8 +445,8 @@ pub(super) struct IntrinsicsDoubt {
 }
 
 impl IntrinsicsDoubt {
-    /// `None` if free intrinsics do not fit significantly better, or if the uncertainty of the
-    /// given intrinsics explains the difference.
+    /// Returns `None` if free intrinsics do not fit significantly better, or if the uncertainty of
+    /// the given intrinsics explains the difference.
     ///
     /// * `free`: fit with free intrinsics.
     pub(super) fn new(
@@ -484,8 +485,8 @@ impl IntrinsicsDoubt {
         })
     }
 
-    /// Covariance to add to that of a solution with the given intrinsics. It consists of the effect
-    /// of the uncertainty of free intrinsics, and of the square of the difference.
+    /// Covariance to add to the covariance of a solution with the given intrinsics. It consists of
+    /// the effect of the uncertainty of free intrinsics, and of the square of the difference.
     pub(super) fn covariance(&self, solution: &Solution) -> DMatrix<f64> {
         let mut shift = DVector::zeros(N_PARAMS);
         for (first, from, to) in [(0, solution.x, self.free.x), (6, solution.y, self.free.y)] {
