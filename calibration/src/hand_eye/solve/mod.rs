@@ -120,7 +120,7 @@ fn refine_with_given(
         .and_then(|free| IntrinsicsDoubt::new(start, free, lens));
     let by_lens = free.as_ref().and_then(|free| propagated(free, Some(lens?)));
     let mut fit = minimize_weighted(start)?;
-    // The covariance of the doubt already contains the effect of the lens, so only one of the two
+    // The covariance of `doubt` already contains the effect of the lens, so only one of the two
     // covariances is added.
     if let Some(doubt) = &doubt {
         fit.covariance += doubt.covariance(&fit.solution);
