@@ -1,5 +1,5 @@
 //! Runs alignment in parallel with training. Alignment starts with the first training step, on its
-//! own thread; its result is applied at a fixed step.
+//! own thread. Its result is applied at a fixed step.
 
 use crate::registration::{Alignment, CameraMovement, MovementDetector, align};
 use crate::{CalibratedCamera, CameraCorrection, CameraRefinement, Error};
@@ -10,9 +10,8 @@ use std::sync::Arc;
 
 /// Step at which training waits for the result and applies it.
 ///
-/// With a later step, alignment has more time and training waits less, but it trains longer with
-/// wrong poses. The step is smaller on software adapters, where one step takes as long as the whole
-/// alignment.
+/// With a later step, training waits less for alignment, but trains longer with wrong poses. The
+/// step is smaller on software adapters, where one step takes as long as the whole alignment.
 const ALIGNMENT_STEP: u64 = 400;
 const SOFTWARE_ALIGNMENT_STEP: u64 = 50;
 
@@ -31,7 +30,8 @@ pub fn alignment_step(is_software: bool, n_planned_steps: u64) -> u64 {
 #[derive(Debug)]
 pub struct AlignmentTask {
     state: TaskState,
-    /// The latest result; `None` before the first end, or if alignment was not possible.
+    /// The latest result. `None` until the first alignment has ended, and if alignment was not
+    /// possible.
     result: Option<Alignment>,
 }
 
@@ -59,7 +59,7 @@ impl AlignmentTask {
         }
     }
 
-    /// Alignment that ended with this result.
+    /// A task whose alignment has ended with this result.
     pub fn done(result: Option<Alignment>) -> Self {
         Self {
             state: TaskState::Done,
@@ -67,7 +67,8 @@ impl AlignmentTask {
         }
     }
 
-    /// The latest result; `None` before the first end, or if alignment was not possible.
+    /// The latest result. `None` until the first alignment has ended, and if alignment was not
+    /// possible.
     pub fn result(&self) -> Option<&Alignment> {
         self.result.as_ref()
     }
@@ -176,8 +177,8 @@ const COLOR_ACCURACY_RAD: f64 = 1.75e-3;
 const COLOR_ACCURACY_M: f64 = 3e-3;
 
 /// Whether the latest corrections are as good as newer ones. Without depth, this is the case if
-/// both agree within their accuracy, or if the newer estimate was rejected. Otherwise, cameras
-/// would move back and forth.
+/// both agree within their accuracy, or if the newer estimate was rejected. Without this check,
+/// cameras would move back and forth.
 fn is_as_good(latest: &Alignment, newer: &Alignment, keyframes: &[Arc<Keyframe>]) -> bool {
     if !latest.has_corrections() || keyframes.iter().any(|keyframe| keyframe.depth.is_some()) {
         return false;
@@ -254,8 +255,8 @@ impl MovementTask {
         if self.pending.is_empty() {
             return;
         }
-        // The detector moves to the thread and comes back with its result. Creating it prepares all
-        // references, so that is done on the thread, too.
+        // The detector moves to the thread and comes back with its result. The thread also creates
+        // the detector, because creating it prepares all references.
         let detector: Box<dyn FnOnce() -> MovementDetector + Send> =
             match std::mem::replace(&mut self.worker, Worker::Done) {
                 Worker::New(references) => Box::new(move || MovementDetector::new(&references)),

@@ -10,8 +10,8 @@ use std::collections::BTreeMap;
 #[derive(Clone, Debug, PartialEq, serde::Serialize, serde::Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct CameraCorrection {
-    /// Rotation vector in the camera's own axes, radians. The rotation, then the translation, are
-    /// applied after `camera_from_world`.
+    /// Rotation vector in the camera's own axes, radians. The rotation is applied after
+    /// `camera_from_world`, and the translation after the rotation.
     pub rotation_rad: [f64; 3],
     /// Translation in the camera's axes, meters.
     pub translation_m: [f64; 3],
@@ -24,8 +24,8 @@ pub struct CameraCorrection {
     /// Offsets added to the readings of the joints that carry the camera, radians or meters; may be
     /// empty.
     pub joint_offsets: Vec<f64>,
-    /// Rotation vector in the camera's own axes, radians. The rotation, then the translation, are
-    /// applied after `color_from_depth`.
+    /// Rotation vector in the camera's own axes, radians. The rotation is applied after
+    /// `color_from_depth`, and the translation after the rotation.
     pub depth_rotation_rad: [f64; 3],
     /// Translation in the camera's axes, meters.
     pub depth_translation_m: [f64; 3],
@@ -34,7 +34,7 @@ pub struct CameraCorrection {
     /// Offset added to the readout time, seconds.
     pub readout_secs: f64,
     /// Pose correction of each training image, by stamp in nanoseconds: rotation vector (radians)
-    /// and translation (meters). Interpolated linearly between images.
+    /// and translation (meters). Between images, the correction is interpolated linearly.
     pub drift: BTreeMap<i64, [f64; 6]>,
     /// Share of the interpolated drift that is applied to images without an entry in `drift`, 0 to
     /// 1.
@@ -89,8 +89,8 @@ pub struct CalibratedCamera {
     pub gains: [f64; 3],
 }
 
-/// Relative differences of focal lengths up to this are negligible. At the border of an image of
-/// 1280 px, it corresponds to 0.6 px.
+/// Relative differences of focal lengths up to this value are negligible. At the border of an image
+/// of 1280 px, this value corresponds to 0.6 px.
 const NOTICEABLE_FOCAL: f64 = 1e-3;
 
 impl CalibratedCamera {
@@ -180,8 +180,8 @@ impl CameraCorrection {
         }
     }
 
-    /// Drift of an image: its own entry if there is one, otherwise the interpolation between its
-    /// neighbors in time, multiplied by `drift_weight`.
+    /// Drift of an image. If the image has an entry, this is its entry. Otherwise, it is the
+    /// interpolation between its neighbors in time, multiplied by `drift_weight`.
     pub fn drift_at(&self, stamp: Stamp) -> [f64; 6] {
         let share = if self.drift.contains_key(&stamp.0) {
             1.0
@@ -287,10 +287,10 @@ pub fn interpolate<const N: usize>(
     }
 }
 
-/// Share of the drift between images that also applies to other images, 0 to 1.
+/// Share of the interpolated drift that applies to images without an entry, 0 to 1.
 ///
-/// Leaves out each image in turn, predicts its drift from its neighbors in time, and returns 1
-/// minus the ratio of the squared prediction errors to the squared drifts.
+/// Leaves out each image in turn and predicts its drift from its neighbors in time. Returns 1 minus
+/// the ratio of the squared prediction errors to the squared drifts.
 ///
 /// Returns 0 if the errors of images are independent, if predicting is worse than assuming no
 /// drift, or if there are too few images.

@@ -133,8 +133,8 @@ pub enum Error {
         /// What is wrong, with the value found and the value expected.
         why: String,
     },
-    /// The measurements do not determine the result, or a mistake in them explains why they
-    /// disagree.
+    /// The measurements do not determine the result, or they contain a mistake that explains why
+    /// they disagree.
     #[error("calibration refused: {0}")]
     Refused(Box<Refusal>),
 }
@@ -168,7 +168,7 @@ impl Error {
 pub struct Refusal {
     /// What is missing or wrong, with values.
     pub why: String,
-    /// Axis in the flange frame, a unit vector: the only axis of rotation seen, or the direction
+    /// Unit vector in the flange frame. It is the only observed axis of rotation, or the direction
     /// that is not observable. `None` if the reason is not about an axis.
     pub axis: Option<[f64; 3]>,
     /// The motion or correction that would help.

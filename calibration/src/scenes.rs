@@ -1,5 +1,5 @@
-//! A room of textured planes, observed by a camera on an arm with four joints: keyframes with known
-//! calibration errors.
+//! Keyframes with known calibration errors, from a simulated room of textured planes that a camera
+//! on an arm with four joints observes.
 
 use crate::{CameraCorrection, rigid_transform};
 use keyframe::{DepthMap, Keyframe, Split};
@@ -26,7 +26,8 @@ fn base_from_flange([azimuth, elevation, roll, reach]: Joints) -> Transform {
         Isometry3::from_parts(Translation3::identity(), rotation)
     };
     let translation = |x: f64, y: f64, z: f64| Isometry3::translation(x, y, z);
-    // At zero, the flange looks along x, with its x axis to the right: -y of the base.
+    // At joint positions of zero, the flange looks along x. Its x axis points to the right, which
+    // is -y of the base.
     let look_at = UnitQuaternion::from_matrix(&nalgebra::Matrix3::from_columns(&[
         -Vector3::y(),
         -Vector3::z(),
@@ -94,7 +95,8 @@ fn cast(from: Point3<f64>, ray: Vector3<f64>) -> (f64, f64) {
     for (normal, offset) in planes {
         let along = normal.dot(&ray);
         let distance = (offset - normal.dot(&from.coords)) / along;
-        // Planes behind the camera, or seen from outside the room, do not count.
+        // Planes behind the camera do not count, and neither do planes that are seen from outside
+        // the room.
         if along > 0.0 && distance > 0.0 {
             nearest = nearest.min(distance);
         }
@@ -117,13 +119,13 @@ fn cast(from: Point3<f64>, ray: Vector3<f64>) -> (f64, f64) {
 /// Calibration errors and image noise.
 #[derive(Clone)]
 pub struct Miscalibration {
-    /// Extrinsics error: the input camera pose is the true pose times this transform.
+    /// Extrinsics error. The input camera pose is the true pose times this transform.
     pub extrinsics: Transform,
     /// Time by which the input poses lag behind the images, seconds.
     pub time_offset_secs: f64,
     /// Error of the joint readings.
     pub joints: Joints,
-    /// Error of the depth pose: the input pose of the depth frame is the true pose times this
+    /// Error of the depth pose. The input pose of the depth frame is the true pose times this
     /// transform.
     pub depth_pose: Transform,
     /// Relative error of the focal lengths.

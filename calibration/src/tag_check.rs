@@ -17,19 +17,20 @@ const MIN_IMAGES: usize = 8;
 /// Number of latest images that are compared. With more images, images from before and after a
 /// movement would be averaged for a longer time.
 const MAX_IMAGES: usize = 24;
-/// Smaller differences are not reported: measured tags and robots are rarely more accurate.
+/// Smaller differences are not reported, because measured tags and robots are rarely more accurate.
 const MIN_TRANSLATION_M: f64 = 0.005;
 const MIN_ROTATION_RAD: f64 = 0.0087;
 /// A difference is significant if it is at least this multiple of its standard deviation. The
 /// multiple is larger than in a single test, because the check is repeated with every image for
 /// hours and the errors of images are not normally distributed.
 const MIN_SIGMAS: f64 = 5.0;
-/// Images of a camera that moves less than this show the same errors and count once, unless this
-/// time has passed.
+/// If a camera moves less than these limits between two images, both show the same errors. They
+/// count once, unless this time has passed between them.
 const MIN_STEP_M: f64 = 0.02;
 const MIN_STEP_RAD: f64 = 0.05;
 const MIN_STEP_SECS: f64 = 2.0;
-/// Length that makes a rotation comparable with a translation, meters: a usual distance of a tag.
+/// Length that makes a rotation comparable with a translation, meters. It is a usual distance of a
+/// tag.
 const ARM_M: f64 = 0.4;
 /// One explanation is better than the other if its residuals are smaller by this factor.
 const CLEARER: f64 = 2.0;
@@ -41,7 +42,8 @@ pub struct TagObservation {
     pub stamp: Stamp,
     /// Pose of the camera according to calibration and robot.
     pub calibrated: Transform,
-    /// Pose of the camera according to the tags; both are `world_from_camera`.
+    /// Pose of the camera according to the tags. Like the calibrated pose, it is
+    /// `world_from_camera`.
     pub seen: Transform,
     /// Covariance of `seen` for a small motion in camera axes: meters, then radians.
     pub covariance: Matrix6<f64>,
@@ -148,7 +150,7 @@ impl TagCheck {
             ContradictionCause::Unknown
         };
         // The variance is the larger of two values: the scatter about the better explanation, and
-        // the stated noise, which is larger if the robot stands still.
+        // the stated noise. The stated noise is larger if the robot stands still.
         let residuals = if squares_of_camera <= squares_of_world {
             &of_camera
         } else {
@@ -234,7 +236,7 @@ fn mean(transforms: impl Iterator<Item = Transform>) -> Option<Transform> {
     Some(first * transform::exp(&mean, 1.0))
 }
 
-/// The motion as a vector: translation, then rotation.
+/// The motion as a vector of the translation, then the rotation.
 fn twist(motion: &Transform) -> Vector6<f64> {
     let Twist {
         linear_m_s: linear,
@@ -422,7 +424,7 @@ mod tests {
                 "{found:?}"
             );
             // A rotation about the origin of the world usually also moves the camera. It does not
-            // if the camera is straight above the origin.
+            // move the camera if the camera is straight above the origin.
             assert!((found.translation_m[0] - 0.04).abs() < 1e-3, "{found:?}");
         }
     }

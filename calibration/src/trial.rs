@@ -10,10 +10,10 @@ use std::collections::BTreeMap;
 pub const MIN_VALIDATION_IMAGES: usize = 4;
 /// Minimum gain of camera parameters and of a color degree, dB. Smaller gains are not visible.
 const MIN_GAIN_DB: f64 = 0.05;
-/// Minimum gain in standard errors: about 2 % of useless changes exceed it by chance.
+/// Minimum gain in standard errors. About 2 % of useless changes exceed it by chance.
 const MIN_STANDARD_ERRORS: f64 = 2.0;
-/// Maximum loss from half as many splats, dB. It is larger than the others, because splats take time
-/// and memory in every step.
+/// Maximum loss from halving the number of splats, dB. It is larger than the other limits, because
+/// splats take time and memory in every step.
 const MAX_LOSS_OF_HALVING_DB: f64 = 0.1;
 
 /// Selection of the camera parameters to optimize.

@@ -18,7 +18,7 @@ pub(crate) struct Printed<'a> {
 }
 
 impl Printed<'_> {
-    /// Aligns all corners. Corners where this fails stay as they are.
+    /// Aligns all corners. If the alignment of a corner fails, its position stays unchanged.
     pub(crate) fn align(&self, plane: &Plane, lattice: &mut Lattice) {
         let aligned = self.aligned(plane, lattice);
         lattice
@@ -36,7 +36,7 @@ impl Printed<'_> {
             .collect();
     }
 
-    /// Positions of all corners after alignment. `None` where this fails.
+    /// Positions of all corners after alignment. `None` for corners whose alignment fails.
     fn aligned(&self, plane: &Plane, lattice: &Lattice) -> BTreeMap<Cell, Option<[f64; 2]>> {
         // Every corner is predicted from the lattice before alignment, so that the result does not
         // depend on the order of the corners.

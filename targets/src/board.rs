@@ -81,7 +81,8 @@ impl TargetSpec {
                 tag_m,
                 spacing_frac,
             } => {
-                // Small squares, as wide as the gap between tags, surround the outermost tags.
+                // Small squares surround the outermost tags. They are as wide as the gap between
+                // tags.
                 let gap = tag_m * spacing_frac;
                 [
                     [-gap; 2],
@@ -92,8 +93,8 @@ impl TargetSpec {
         }
     }
 
-    /// Rotations of the board that give the same picture: `board_from_rotated_board`, starting with
-    /// the identity.
+    /// Rotations `board_from_rotated_board` of the board that give the same picture. The first one
+    /// is the identity.
     ///
     /// A pose of such a board is ambiguous: `camera_from_board * rotation` fits the image equally
     /// well for every rotation of this list. A chessboard whose numbers of inner corners are both

@@ -5,14 +5,15 @@ use std::sync::LazyLock;
 
 /// Markers with their ids.
 ///
-/// The codes come from the crate `calib-targets-aruco`; they equal those of OpenCV, `DICT_4X4_50`
-/// to `DICT_7X7_1000` and `DICT_APRILTAG_36h11`.
+/// The codes come from the crate `calib-targets-aruco`. They equal the codes of OpenCV's
+/// `DICT_4X4_50` to `DICT_7X7_1000` and `DICT_APRILTAG_36h11`.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Dictionary {
     name: &'static str,
     /// Cells per side, without the border.
     n_bits: usize,
-    /// One code per id, row by row; the least significant bit is the top left cell, 1 is black.
+    /// One code per id. Its bits are the cells row by row, and the least significant bit is the top
+    /// left cell. A bit of 1 is black.
     codes: &'static [u64],
     /// Wrong cells that are corrected.
     n_corrected: u32,
@@ -40,9 +41,9 @@ const ARUCO: [&str; 16] = [
     "4X4_50", "4X4_100", "4X4_250", "4X4_1000", "5X5_50", "5X5_100", "5X5_250", "5X5_1000",
     "6X6_50", "6X6_100", "6X6_250", "6X6_1000", "7X7_50", "7X7_100", "7X7_250", "7X7_1000",
 ];
-/// Maximum number of wrong cells that are corrected: first in 4X4 markers, whose codes are similar,
-/// then in larger ones. With more corrections, more markers are found in bad images, but also more
-/// false markers.
+/// Maximum numbers of wrong cells that are corrected. The first number is for 4X4 markers, whose
+/// codes are similar. The second number is for larger markers. With more corrections, more markers
+/// are found in bad images, but also more false markers.
 const CORRECTED: [u32; 2] = [0, 2];
 
 impl Dictionary {
@@ -62,7 +63,7 @@ impl Dictionary {
         TAGS.expect("the crate contains this dictionary")
     }
 
-    /// All dictionaries, smaller ones before larger ones that contain them.
+    /// All dictionaries. Smaller dictionaries come before larger dictionaries that contain them.
     pub(crate) fn all() -> impl Iterator<Item = Self> {
         ARUCO
             .into_iter()

@@ -187,14 +187,15 @@ pub enum NotDetected {
         Setting::Target
     )]
     OtherCounts {
-        /// Columns of the board in the image, and the fewest rows that contain all its marker ids.
+        /// Columns of the board in the image, and the smallest number of rows that contains all its
+        /// marker ids.
         found: Counts,
         /// Columns and rows of the target.
         expected: Counts,
         /// What is counted.
         what: &'static str,
     },
-    /// A part of the board is in the image and cannot be identified.
+    /// The image shows a part of the board that cannot be identified.
     #[error(
         "only {found} of the {expected} inner corners found; move the camera until the whole board is in view"
     )]

@@ -1,4 +1,5 @@
-//! Gray images: input of detection, and a float copy with interpolation, blur and pyramid.
+//! Gray images, which are the input of detection, and a float copy with interpolation, blur and
+//! pyramid.
 
 use crate::error::NotDetected;
 
@@ -27,7 +28,7 @@ impl Plane {
     /// Copies an image.
     ///
     /// # Errors
-    /// If the number of bytes does not match the size or the image is too small.
+    /// Fails if the number of bytes does not match the size or the image is too small.
     pub(crate) fn new(image: GrayImage<'_>) -> Result<Self, NotDetected> {
         let [width, height] = image.size_px;
         let n_pixels = u64::from(width) * u64::from(height);
@@ -67,7 +68,7 @@ impl Plane {
             && y <= self.height as f64 - margin
     }
 
-    /// Interpolates bilinearly between pixel centers; positions outside the image take the nearest
+    /// Interpolates bilinearly between pixel centers. Positions outside the image take the nearest
     /// value.
     #[expect(
         clippy::cast_possible_truncation,

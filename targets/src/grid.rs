@@ -33,7 +33,8 @@ pub(crate) fn link(plane: &Plane, saddles: &[Saddle], min: usize) -> Vec<Lattice
     let mut is_used = vec![false; saddles.len()];
     let mut grids = Vec::new();
     for seed in 0..saddles.len() {
-        // A saddle with a single link is at the end of a line, not on a board of at least 3 x 3.
+        // A saddle with a single link is at the end of a line. It is not on a board of at least 3 x
+        // 3 corners.
         if is_used[seed] || links[seed].iter().flatten().count() < 2 {
             continue;
         }
@@ -116,7 +117,8 @@ fn is_edge(plane: &Plane, from: &Saddle, edge: usize, to: &Saddle) -> bool {
     // Distance of the samples from the line, relative to its length. It must exceed the deviation
     // of a bent line, and stay inside the square.
     const ACROSS: f64 = 0.12;
-    // Blur reduces the contrast of small squares near their edges, so a part of it is enough.
+    // Blur reduces the contrast of small squares near their edges, so a part of the contrast is
+    // enough.
     const MIN_CONTRAST_FRAC: f32 = 0.25;
     let dx = to.pixel[0] - from.pixel[0];
     let dy = to.pixel[1] - from.pixel[1];
@@ -133,8 +135,8 @@ fn is_edge(plane: &Plane, from: &Saddle, edge: usize, to: &Saddle) -> bool {
     })
 }
 
-/// The position next to a point of a line with direction `[dx, dy]`: at ascending angles for a
-/// positive sign.
+/// The position next to a point of a line with direction `[dx, dy]`. For a positive sign, it is on
+/// the side of ascending angles.
 fn beside(point: [f64; 2], sign: f64, across_px: f64, [dx, dy]: [f64; 2]) -> [f64; 2] {
     [
         point[0] - sign * across_px * dy,
@@ -163,7 +165,7 @@ fn drop_odd_lengths(saddles: &[Saddle], links: &mut [[Link; 4]]) {
     }
 }
 
-/// Length of the shortest link of a saddle, pixels; infinite if it has none.
+/// Length of the shortest link of a saddle, pixels. It is infinite if the saddle has no link.
 fn shortest_link_px(saddles: &[Saddle], from: usize, edges: &[Link; 4]) -> f64 {
     edges
         .iter()
@@ -195,8 +197,8 @@ fn walk(saddles: &[Saddle], links: &[[Link; 4]], seed: usize, is_used: &mut [boo
             is_used[to] = true;
             lattice.corners.insert(neighbor, saddles[to].pixel);
             // Edge `back` of the neighbor points in the direction opposite to `step`, which is
-            // `step + 2`. Edge 0 of the neighbor is `back` quarter turns before that. The 4 keeps
-            // the difference positive.
+            // `step + 2`. Edge 0 of the neighbor is `back` quarter turns before this direction.
+            // Adding 4 keeps the difference positive.
             queue.push_back((to, neighbor, (step + 2 + 4 - back) % 4));
         }
     }
@@ -212,8 +214,8 @@ struct Buckets {
 
 impl Buckets {
     fn new(saddles: &[Saddle]) -> Self {
-        // About the size of a square in a common image, so that the nearest neighbor is found in
-        // the first rings.
+        // The size is about that of a square in a common image, so that the nearest neighbor is
+        // found in the first rings.
         const SIDE_PX: f64 = 24.0;
         let bucket = |pixel: [f64; 2]| pixel.map(|value| index(value, SIDE_PX));
         let mut counts = [1, 1];
@@ -240,12 +242,13 @@ impl Buckets {
         pixel: [f64; 2],
         accept: impl Fn(usize) -> Option<T>,
     ) -> Option<(usize, T)> {
-        // Squares of up to about 260 pixels. Larger ones are found at a lower resolution.
+        // The search covers squares of up to about 260 pixels. Larger squares are found at a lower
+        // resolution.
         const MAX_RINGS: usize = 12;
         let center = pixel.map(|value| index(value, self.side_px));
         let mut best: Option<(f64, usize, T)> = None;
         for ring in 0..=MAX_RINGS.min(self.counts[0].max(self.counts[1])) {
-            // Everything outside the rings searched so far is farther away than this.
+            // Everything outside the rings searched so far is farther away than this distance.
             let searched_px = (ring as f64 - 1.0) * self.side_px;
             if best.as_ref().is_some_and(|best| best.0 < searched_px) {
                 break;

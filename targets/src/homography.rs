@@ -7,8 +7,8 @@ use nalgebra::{Matrix2, Matrix3, SMatrix, SVector, Vector3};
 pub(crate) struct Homography(Matrix3<f64>);
 
 impl Homography {
-    /// The map that takes four points to four others. `None` if three points of one of these sets
-    /// lie on a line.
+    /// The map that takes four points to four other points. `None` if three points of one of these
+    /// sets lie on a line.
     ///
     /// Source: Hartley and Zisserman 2004, section 4.1, with the last element fixed to 1. The image
     /// of the first plane's origin must therefore be finite, so points of the first plane should be
@@ -39,7 +39,7 @@ impl Homography {
         })))
     }
 
-    /// The image of a point; not finite for points at infinity.
+    /// The image of a point. It is not finite for points at infinity.
     pub(crate) fn map(&self, [x, y]: [f64; 2]) -> [f64; 2] {
         let mapped = self.0 * Vector3::new(x, y, 1.0);
         [mapped.x / mapped.z, mapped.y / mapped.z]
@@ -48,7 +48,7 @@ impl Homography {
     /// Derivative of the image of a point with respect to the point.
     pub(crate) fn jacobian(&self, [x, y]: [f64; 2]) -> Matrix2<f64> {
         let mapped = self.0 * Vector3::new(x, y, 1.0);
-        // The quotient rule: d(a / z) = (da - a / z dz) / z.
+        // This is the quotient rule: d(a / z) = (da - a / z dz) / z.
         let quotient = |row: usize, column: usize| {
             (self.0[(row, column)] - mapped[row] / mapped.z * self.0[(2, column)]) / mapped.z
         };

@@ -60,14 +60,15 @@ impl Lattice {
     /// Predicts a corner from its neighbors, without using the corner itself. Also returns the
     /// distance between neighbors there.
     ///
-    /// The mean of all predictions of the most accurate available kind is used. The kinds are:
-    /// between two neighbors, extrapolation of a parabola, completion of a square, and linear
-    /// extrapolation.
+    /// The mean of all predictions of the most accurate available kind is used. The kinds, from the
+    /// most to the least accurate, are: between two neighbors, extrapolation of a parabola,
+    /// completion of a square, and linear extrapolation.
     pub(crate) fn predict(&self, cell: Cell) -> Option<Prediction> {
         // Let `c` be the second difference of the corners (due to lenses and perspective), and `s`
-        // the noise of each corner. The approximate errors are c / 2 and 0.7 s between neighbors,
-        // the third difference and 4.4 s for the parabola, the mixed second difference and 1.7 s
-        // for the square, and c and 2.2 s for the line.
+        // the noise of each corner. Each kind of prediction has a systematic error and noise. They
+        // are approximately c / 2 and 0.7 s between neighbors, the third difference and 4.4 s for
+        // the parabola, the mixed second difference and 1.7 s for the square, and c and 2.2 s for
+        // the line.
         mean(
             STEPS[..2]
                 .iter()
@@ -125,7 +126,8 @@ impl Lattice {
     }
 
     /// Derivative of the pixel with respect to the point on the board (pixels per meter) at a cell
-    /// whose corner is at `pixel`, from the cell's neighbors. `None` if it has none along an axis.
+    /// whose corner is at `pixel`, from the cell's neighbors. `None` if the cell has no neighbor
+    /// along an axis.
     pub(crate) fn pixel_by_point(
         &self,
         cell: Cell,
@@ -141,7 +143,7 @@ impl Lattice {
     fn pixel_by_step(&self, cell: Cell, pixel: [f64; 2], step: Cell) -> Option<[f64; 2]> {
         match (self.at(cell, step, -1), self.at(cell, step, 1)) {
             (Some(before), Some(after)) => Some(combine(&[(0.5, after), (-0.5, before)])),
-            // The corner is at the border of the board, or next to a missing corner.
+            // In this case, the corner is at the border of the board or next to a missing corner.
             _ => self
                 .one_sided(cell, pixel, step, 1)
                 .or_else(|| self.one_sided(cell, pixel, step, -1)),
@@ -149,7 +151,7 @@ impl Lattice {
     }
 
     /// Like [`Self::pixel_by_step`], from the corners on one side. If there are two such corners,
-    /// it is of second order: the derivative of the parabola through three corners.
+    /// it is the derivative of the parabola through three corners, which is of second order.
     fn one_sided(&self, cell: Cell, pixel: [f64; 2], step: Cell, sign: i32) -> Option<[f64; 2]> {
         let near = self.at(cell, step, sign)?;
         let ahead = match self.at(cell, step, 2 * sign) {
@@ -160,7 +162,7 @@ impl Lattice {
     }
 
     /// Second derivatives of the pixel with respect to x and x, x and y, y and y, pixels per square
-    /// meter, from the neighbors of a cell; zero where there are too few.
+    /// meter, from the neighbors of a cell. They are zero if there are too few neighbors.
     pub(crate) fn bend(&self, cell: Cell, pixel: [f64; 2], square_m: f64) -> [[f64; 2]; 3] {
         // At the corners of the board, only one of the four squares exists, which is enough.
         let twists: Vec<[f64; 2]> = [[1, 1], [1, -1], [-1, 1], [-1, -1]]

@@ -11,16 +11,16 @@ use crate::spec::Pattern;
 /// One arrangement of the markers of a board.
 #[derive(Clone, Debug)]
 pub(crate) struct Layout {
-    /// Corners of every marker in the board frame, meters, by id; in the order of
-    /// [`Marker::corners_px`].
+    /// Corners of every marker in the board frame by marker id, meters. The corners of a marker are
+    /// in the order of [`Marker::corners_px`].
     pub(crate) corners_m: Vec<Quad>,
-    /// Whether this is the arrangement of ChArUco boards before OpenCV 4.6.
+    /// Whether the layout is the arrangement of ChArUco boards before OpenCV 4.6.
     pub(crate) is_legacy: bool,
 }
 
 /// Largest deviation of a marker from the position that its neighbor predicts, relative to its
-/// side. Lenses and blur cause a part of this; in another arrangement, markers are a whole square
-/// away.
+/// side. Lenses and blur cause smaller deviations. In another arrangement, markers are a whole
+/// square away.
 const MAX_DEVIATION: f64 = 0.35;
 
 /// The arrangements in which a board may be printed, the standard one first.
@@ -100,8 +100,8 @@ pub(crate) struct Fit {
     pub(crate) n_confirmed: usize,
 }
 
-/// Chooses the layout in which most markers predict the places of their neighbors. `None` if there
-/// is no marker.
+/// Chooses the layout in which most markers predict the positions of their neighbors. Returns
+/// `None` if there is no marker.
 ///
 /// A single marker cannot be confirmed, but is kept.
 pub(crate) fn fit(layouts: Vec<Layout>, markers: &[Marker]) -> Option<Fit> {
@@ -125,8 +125,8 @@ pub(crate) fn fit(layouts: Vec<Layout>, markers: &[Marker]) -> Option<Fit> {
     best.filter(|fit| !fit.markers.is_empty())
 }
 
-/// The markers that a majority of their neighbors confirm, or a single marker, and the number of
-/// confirmed ones.
+/// The markers that a majority of their neighbors confirm, or a single marker. Also returns the
+/// number of confirmed markers.
 fn confirmed(layout: &Layout, markers: &[Marker]) -> (Vec<Marker>, usize) {
     let known: Vec<&Marker> = markers
         .iter()

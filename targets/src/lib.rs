@@ -2,8 +2,8 @@
 //!
 //! A [`TargetSpec`] is parsed from text such as `chessboard:9x6:25mm`,
 //! `charuco:5x7:34mm:28mm:6X6_250`, `aprilgrid:6x6:88mm:0.3`, `puzzleboard:12x9:20mm` or
-//! `tag:36h11:5:100mm`. It returns the positions of all corners in the [board frame](board),
-//! detects them in images, and draws the target.
+//! `tag:36h11:5:100mm`. A specification returns the positions of all corners in the [board
+//! frame](board), detects the corners in images, and draws the target.
 //!
 //! ```
 //! use targets::{GrayImage, Paper, TargetSpec};

@@ -9,8 +9,9 @@ use crate::quad::{Quad, shortest_side};
 /// Smallest difference in gray value between black and white cells. With a lower value, cells are
 /// read from noise. With a higher value, markers in dark images are lost.
 const MIN_CONTRAST: f32 = 14.0;
-/// Fraction of the border cells that may be read wrong: 2 of the 20 of a 4X4 marker. Fingers and
-/// highlights cover single cells. In texture without a border, about half of the cells are wrong.
+/// Fraction of the border cells that may be read wrong. These are 2 of the 20 border cells of a 4X4
+/// marker. Fingers and highlights cover single cells. In texture without a border, about half of
+/// the cells are wrong.
 const MAX_BORDER_ERRORS: f64 = 0.1;
 
 /// A square of side 1 with its corners in the order of a [`Quad`].
@@ -26,9 +27,9 @@ pub(crate) struct Marker {
 }
 
 /// Decodes the markers among quadrilaterals, in ascending order of ids. Markers found several times
-/// are merged; if an id is at several places, all are returned.
+/// are merged. If an id is at several places, all its markers are returned.
 ///
-/// `borders`: widths of the black border in cells that occur.
+/// `borders` contains the possible widths of the black border, in cells.
 pub(crate) fn decode(
     plane: &Plane,
     quads: &[Quad],
@@ -51,7 +52,7 @@ pub(crate) fn decode(
         else {
             continue;
         };
-        // Start with the corner that is the upper left one of the upright marker.
+        // The order starts with the upper left corner of the upright marker.
         let corners_px = std::array::from_fn(|at| quad[(at + quarter_turns) % 4]);
         let marker = Marker {
             id,
@@ -85,7 +86,7 @@ pub(crate) struct Exact {
     pub(crate) n_by_chance: f64,
 }
 
-/// Reads the markers of a dictionary, or those that are its markers mirrored.
+/// Reads the markers of a dictionary, or the mirrored markers of this dictionary.
 pub(crate) fn read_exactly(
     plane: &Plane,
     quads: &[Quad],
@@ -112,8 +113,8 @@ pub(crate) fn read_exactly(
     exact
 }
 
-/// Reads the cells inside the border, row by row; true is black. `None` if the border is not black
-/// or the contrast is low.
+/// Reads the cells inside the border, row by row. A value of true is black. `None` if the border is
+/// not black or the contrast is low.
 fn read_cells(plane: &Plane, quad: &Quad, n_bits: usize, border: usize) -> Option<Vec<bool>> {
     let n = n_bits + 2 * border;
     // Cells smaller than 1.5 pixels are blurred into each other.

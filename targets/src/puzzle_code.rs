@@ -1,12 +1,13 @@
-//! Code of PuzzleBoards: which edges between squares carry a black or a white dot.
+//! Code of PuzzleBoards, which determines whether the dot on an edge between squares is black or
+//! white.
 //!
 //! Source: Stelldinger, Schönherr and Biermann 2024, "PuzzleBoard: A new camera calibration pattern
-//! with position encoding". The maps are those of the authors, from the crate
+//! with position encoding". The maps come from the authors, by way of the crate
 //! `calib-targets-puzzleboard`.
 
 use calib_targets_puzzleboard::code_maps::{horizontal_edge_bit, vertical_edge_bit};
 
-/// The master pattern has this many columns and rows and repeats after them.
+/// Number of columns and rows after which the master pattern repeats.
 pub(crate) const PERIOD: u32 = 501;
 /// The code of one kind of edges repeats after 3 squares along one axis and after this many along
 /// the other.
@@ -21,7 +22,7 @@ pub(crate) struct Edge {
     /// The square left of or above the edge.
     pub(crate) column: i32,
     pub(crate) row: i32,
-    /// Whether the edge is vertical: its other square is to the right.
+    /// Whether the edge is vertical. The other square of a vertical edge is to the right.
     pub(crate) is_vertical: bool,
 }
 

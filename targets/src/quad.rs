@@ -10,8 +10,8 @@ use crate::lattice::distance;
 /// window, the middle of a black area is not darker than its surroundings, so larger markers need
 /// larger windows.
 const WINDOWS_PX: [usize; 3] = [9, 23, 61];
-/// A pixel is dark if it is darker than the local mean by this much. It exceeds the noise of common
-/// images, so that areas of constant brightness do not contain many dark dots.
+/// A pixel is dark if it is darker than the local mean by this difference. The difference exceeds
+/// the noise of common images, so that areas of constant brightness do not contain many dark dots.
 const DARKER_BY: f32 = 5.0;
 /// Shortest side of a quadrilateral, pixels. The smallest markers have 6 x 6 cells with the border,
 /// which cannot be read with less than a pixel per cell.
@@ -24,10 +24,10 @@ const MIN_TOLERANCE_PX: f64 = 1.2;
 /// Corners in the order clockwise as seen in the image, pixels.
 pub(crate) type Quad = [[f64; 2]; 4];
 
-/// Finds dark quadrilaterals. The same one may be found several times, with slightly different
-/// corners.
+/// Finds dark quadrilaterals. The same quadrilateral may be found several times, with slightly
+/// different corners.
 ///
-/// `do_touch`: whether corners of quadrilaterals touch other dark regions, as on AprilGrids.
+/// `do_touch` states whether corners of quadrilaterals touch other dark regions, as on AprilGrids.
 pub(crate) fn find(plane: &Plane, do_touch: bool) -> Vec<Quad> {
     let sums = Sums::new(plane);
     let mut quads = Vec::new();
@@ -136,8 +136,8 @@ impl<'a> Mask<'a> {
         y.cast_unsigned() as usize * self.width + x.cast_unsigned() as usize
     }
 
-    /// Walks around every dark region (of pixels with common sides), on the borders between pixels,
-    /// dark on the right.
+    /// Walks around every dark region on the borders between pixels. The dark region is on the
+    /// right. Pixels of a region have common sides.
     ///
     /// Points are pixel corners, so the outline lies between dark and bright pixels. Holes are
     /// skipped.
@@ -196,9 +196,9 @@ impl<'a> Mask<'a> {
                 _ => ([-1, -1], [0, -1]),
             };
             let is_dark_at = |[dx, dy]: [i32; 2]| self.at([point[0] + dx, point[1] + dy]);
-            // The dark region stays on the right. Turn right where it ends, and left where it
-            // blocks the way. If two dark pixels touch at a corner, the left one belongs to another
-            // region.
+            // The dark region stays on the right. The walk turns right where the region ends, and
+            // left where it blocks the way. If two dark pixels touch at a corner, the left pixel
+            // belongs to another region.
             step = match (is_dark_at(left), is_dark_at(right)) {
                 (_, false) => (step + 1) % 4,
                 (true, true) => (step + 3) % 4,
@@ -216,14 +216,15 @@ fn quad(outline: &[[i32; 2]]) -> Option<Quad> {
     let points: Vec<[f64; 2]> = outline.iter().map(|point| point.map(f64::from)).collect();
     let area = area(&points);
     let tolerance_px = (TOLERANCE * area.sqrt()).max(MIN_TOLERANCE_PX);
-    // Outlines of quadrilaterals are short compared to their area: a square has 4, a rectangle of
-    // 1 x 30 has 11. This also bounds the time for text and texture, whose outlines are long.
+    // Outlines of quadrilaterals are short compared to the square root of their area. For a square,
+    // the ratio is 4. For a rectangle of 1 x 30, it is 11. This also bounds the time for text and
+    // texture, whose outlines are long.
     if points.len() as f64 > 12.0 * area.sqrt() {
         return None;
     }
     let n = points.len();
-    // The point farthest from the center is a corner, and so is the one farthest from that corner.
-    // From these two, splitting finds the others.
+    // The point farthest from the center is a corner, and so is the point farthest from that
+    // corner. Splitting finds the other corners from these two.
     let center = [0, 1].map(|axis| points.iter().map(|point| point[axis]).sum::<f64>() / n as f64);
     let farthest = |from: [f64; 2]| {
         (0..n).max_by(|&a, &b| distance(points[a], from).total_cmp(&distance(points[b], from)))
@@ -263,12 +264,13 @@ fn split(points: &[[f64; 2]], from: usize, to: usize, tolerance_px: f64, corners
     split(points, at, to, tolerance_px, corners);
 }
 
-/// Cross product of the vectors from `a` to `b` and to a point: twice the area of the triangle.
+/// Cross product of the vectors from `a` to `b` and from `a` to a point. It is twice the area of
+/// the triangle.
 fn cross(a: [f64; 2], b: [f64; 2], point: [f64; 2]) -> f64 {
     (b[0] - a[0]) * (point[1] - a[1]) - (b[1] - a[1]) * (point[0] - a[0])
 }
 
-/// Enclosed area; positive for clockwise outlines.
+/// Enclosed area. It is positive for clockwise outlines.
 fn area(points: &[[f64; 2]]) -> f64 {
     let next = points.iter().cycle().skip(1);
     points
@@ -336,7 +338,7 @@ impl Line {
     }
 }
 
-/// Fits a line to the transition from dark to bright along a side; dark is on the right.
+/// Fits a line to the transition from dark to bright along a side. The dark region is on the right.
 fn fit_side(plane: &Plane, from: [f64; 2], to: [f64; 2]) -> Option<Line> {
     // The outline follows pixel borders, so it is off by about a pixel, and more with blur.
     const REACH_PX: f64 = 2.0;
@@ -349,7 +351,7 @@ fn fit_side(plane: &Plane, from: [f64; 2], to: [f64; 2]) -> Option<Line> {
         clippy::cast_sign_loss,
         reason = "a small positive number"
     )]
-    // One point per pixel. Beyond 40, more points hardly improve the line.
+    // There is one point per pixel, but at most 40 points. More points hardly improve the line.
     let n = (length as usize).clamp(4, 40);
     let mut points: Vec<[f64; 2]> = Vec::with_capacity(n);
     for at in 0..n {

@@ -12,7 +12,7 @@ const MAX_SIDE_PX: u32 = 16_384;
 pub struct Raster {
     /// Width and height in pixels.
     pub size_px: [u32; 2],
-    /// One byte per pixel, row by row from the top left; 0 is black, 255 white.
+    /// One byte per pixel, row by row from the top left. A value of 0 is black, and 255 is white.
     pub pixels: Vec<u8>,
     /// Position of the upper left corner of the picture in the board frame, meters.
     pub origin_m: [f64; 2],
@@ -37,7 +37,8 @@ impl TargetSpec {
     /// white.
     ///
     /// # Errors
-    /// If the resolution is not a positive number or the picture would be larger than 16384 pixels.
+    /// Fails if the resolution is not a positive number or the picture would be larger than 16384
+    /// pixels.
     pub fn raster(&self, px_per_m: f64) -> Result<Raster, PrintError> {
         let [low, high] = self.bounds_m();
         let margin_m = self.margin_m();

@@ -14,7 +14,7 @@ use std::f64::consts::{PI, TAU};
 /// of detection were tuned on the photographs of docs/benchmarks/2026-11-26-calibration.md.
 const MIN_CONTRAST: f32 = 12.0;
 /// Largest deviation of opposite edges from a straight line, radians. Perspective keeps lines
-/// straight, so the tolerance is for blur, noise and fisheye lenses.
+/// straight, so the tolerance is needed only for blur, noise and fisheye lenses.
 const MAX_BEND_RAD: f64 = 0.55;
 /// Smallest angle of a sector, radians. It corresponds to about two samples of the ring, because a
 /// sector without a sample inside cannot be detected. Such sharp sectors occur only on strongly
@@ -23,7 +23,7 @@ const MIN_SECTOR_RAD: f64 = 0.35;
 /// Radius of the ring around candidates, pixels. The ring must be outside the blur of the corner,
 /// and smaller than the squares around it.
 const RING_PX: f64 = 4.0;
-/// Samples of the ring: one per 0.8 pixels of its length.
+/// Number of samples of the ring. There is one per 0.8 pixels of its length.
 const N_RING: usize = 32;
 
 /// A saddle point.
@@ -59,8 +59,8 @@ pub(crate) fn find(plane: &Plane) -> Vec<Saddle> {
     saddles
 }
 
-/// Smallest determinant, gray values squared per pixel to the fourth: a chessboard corner of
-/// minimum contrast, blurred.
+/// Smallest determinant, in squared gray values per pixel to the fourth. A blurred chessboard
+/// corner of minimum contrast has this determinant.
 const MIN_RESPONSE: f32 = 0.2;
 
 /// Minus the determinant of the Hessian at every pixel.
@@ -111,7 +111,7 @@ fn stationary_point(plane: &Plane, x: usize, y: usize) -> [f64; 2] {
     [x as f64 + 0.5 + limited(dx), y as f64 + 0.5 + limited(dy)]
 }
 
-/// Limits a Newton step to one pixel. The expansion holds only near the pixel; on a plateau, the
+/// Limits a Newton step to one pixel. The expansion holds only near the pixel. On a plateau, the
 /// determinant is zero and the step is not finite.
 fn limited(delta_px: f64) -> f64 {
     if delta_px.is_finite() {
@@ -146,8 +146,8 @@ pub(crate) fn ring(plane: &Plane, center: [f64; 2], radius_px: f64) -> Option<Sa
     if contrast < MIN_CONTRAST {
         return None;
     }
-    // Walk around the ring and note every change of color: its angle, interpolated between the two
-    // samples, and whether black follows.
+    // The loop walks around the ring and collects every change of color. A change has an angle,
+    // which is interpolated between two samples, and whether black follows.
     let mut edges = [(0.0, false); 4];
     let mut n_edges = 0;
     for at in 0..N_RING {
@@ -212,7 +212,7 @@ pub(crate) fn refine(plane: &Plane, start: [f64; 2], half_window_px: f64) -> Opt
     // Most corners converge in a few steps. Points that still move after this number of steps are
     // kept.
     const MAX_STEPS: usize = 12;
-    // A fiftieth of the smallest error of corners in renders, which is 0.011 pixels
+    // This is a fiftieth of the smallest error of corners in renders, which is 0.011 pixels
     // (docs/benchmarks/2026-11-26-calibration.md).
     const CONVERGED_PX: f64 = 2e-4;
     let reach = half_window_px.ceil() + 1.0;
@@ -221,8 +221,8 @@ pub(crate) fn refine(plane: &Plane, start: [f64; 2], half_window_px: f64) -> Opt
         if !plane.contains(center, reach + 1.5) {
             return None;
         }
-        // Sums of the normal equations: the structure tensor, and its product with the positions.
-        // Positions are relative to the current center, so the solution is the step.
+        // Sums of the normal equations, which are the structure tensor and its product with the
+        // positions. Positions are relative to the current center, so the solution is the step.
         let mut xx = 0.0;
         let mut xy = 0.0;
         let mut yy = 0.0;
@@ -271,8 +271,8 @@ pub(crate) fn refine(plane: &Plane, start: [f64; 2], half_window_px: f64) -> Opt
     Some(center)
 }
 
-/// Finds a saddle near a predicted position: the largest response within `reach_px`, verified by a
-/// ring.
+/// Finds a saddle near a predicted position. It is the largest response within `reach_px`, and a
+/// ring verifies it.
 #[expect(
     clippy::cast_possible_truncation,
     reason = "pixel indices are bounded by the image"
@@ -297,8 +297,8 @@ pub(crate) fn find_near(
             }
         }
     }
-    // A negative response is a blob. Weak responses are allowed, unlike in `find`: the prediction
-    // is evidence, and the ring checks the contrast.
+    // A negative response is a blob. Unlike in `find`, weak responses are allowed, because the
+    // prediction is evidence and the ring checks the contrast.
     let (_, x, y) = best.filter(|best| best.0 > 0.0)?;
     ring(plane, stationary_point(plane, x, y), radius_px)
 }

@@ -5,7 +5,8 @@ use crate::error::SpecError;
 use std::fmt;
 use std::str::FromStr;
 
-/// Smallest and largest square or tag, meters. Outside, the unit is probably wrong.
+/// Smallest and largest side of a square or tag, meters. For a side outside this range, the unit is
+/// probably wrong.
 const SIDE_M: [f64; 2] = [0.001, 2.0];
 /// Largest number of columns or rows. It bounds the time and the memory of detection, and keeps
 /// products of counts far below the range of `u32`.
@@ -13,7 +14,8 @@ const MAX_COUNT: u32 = 100;
 
 /// A calibration target: its pattern and its dimensions.
 ///
-/// Made by parsing; every value describes a target that can be printed and detected.
+/// Values are made by parsing text. Every value describes a target that can be printed and
+/// detected.
 ///
 /// ```
 /// use targets::TargetSpec;
@@ -29,7 +31,7 @@ pub struct TargetSpec {
     pub(crate) pattern: Pattern,
 }
 
-/// What is printed. Lengths in meters; counts are columns and rows.
+/// The printed pattern. Lengths are in meters, and counts are columns and rows.
 #[derive(Clone, Debug, PartialEq)]
 pub(crate) enum Pattern {
     /// Counts of inner corners.
@@ -47,7 +49,8 @@ pub(crate) enum Pattern {
         tag_m: f64,
         spacing_frac: f64,
     },
-    /// Counts of squares; `origin` is the column and row of the first square in the master pattern.
+    /// `squares` contains the numbers of columns and rows. `origin` is the column and row of the
+    /// first square in the master pattern.
     Puzzleboard {
         squares: [u32; 2],
         square_m: f64,
@@ -152,8 +155,8 @@ pub(crate) struct Millimeters(pub(crate) f64);
 
 impl fmt::Display for Millimeters {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        // The resolution is a picometer. This is far above the rounding errors of the conversion,
-        // and far below any length in use.
+        // The resolution is a picometer. A picometer is far above the rounding errors of the
+        // conversion, and far below any length in use.
         const DIGITS: f64 = 1e9;
         write!(f, "{}mm", (self.0 * 1e3 * DIGITS).round() / DIGITS)
     }

@@ -14,9 +14,9 @@ const BORDER: usize = 1;
 /// A black or white shape in the board frame, meters. Later shapes cover earlier ones.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(crate) enum Shape {
-    /// Black rectangle: smallest x and y, largest x and y.
+    /// Black rectangle, given by its smallest x and y and its largest x and y.
     Rectangle([[f64; 2]; 2]),
-    /// Disk: center, radius.
+    /// Disk with its center and radius.
     Disk {
         center: [f64; 2],
         radius: f64,
@@ -94,7 +94,7 @@ impl Surface<'_> {
         }
     }
 
-    /// Whether a ChArUco board is black at a position in squares. `marker_frac`: side of the
+    /// Whether a ChArUco board is black at a position in squares. `marker_frac` is the side of the
     /// markers relative to the squares.
     fn is_black_on_charuco(
         &self,
@@ -119,7 +119,7 @@ impl Surface<'_> {
         is_black_cell(dictionary, id, BORDER, in_marker)
     }
 
-    /// Id of the marker in a white square: they are numbered row by row.
+    /// Id of the marker in a white square. Markers are numbered row by row.
     fn charuco_id(&self, squares: [u32; 2], column: u32, row: u32) -> u32 {
         let is_white = |column, row| !is_black_square(column, row, squares[1], self.is_legacy);
         let n_before = |row: u32, n: u32| (n + u32::from(is_white(0, row))) / 2;
@@ -222,7 +222,7 @@ fn cells(counts: [u32; 2]) -> impl Iterator<Item = [u32; 2]> {
     (0..counts[1]).flat_map(move |row| (0..counts[0]).map(move |column| [column, row]))
 }
 
-/// Appends the black squares of a board. `first_m`: x and y of the upper left corner.
+/// Appends the black squares of a board. `first_m` is the x and y of the upper left corner.
 fn black_squares(
     counts: [u32; 2],
     first_m: f64,
@@ -288,7 +288,8 @@ fn dots(squares: [u32; 2], square_m: f64, origin: [u32; 2], shapes: &mut Vec<Sha
 
 /// Mean of a color over a pixel, from samples at positions 0 to 1 along both axes.
 pub(crate) fn pixel_mean(color: impl Fn(f64, f64) -> f64) -> f64 {
-    /// Samples per pixel, a Fibonacci number, and the ratio of the previous one to it.
+    /// Samples per pixel, which is a Fibonacci number, and the ratio of the previous Fibonacci
+    /// number to it.
     const N_SAMPLES: usize = 89;
     const GOLDEN_FRAC: f64 = 55.0 / 89.0;
     const BORDER: [[f64; 2]; 8] = [
@@ -502,7 +503,8 @@ mod tests {
                     is_legacy: layout.is_legacy,
                 };
                 for [first, _, third, _] in &layout.corners_m {
-                    // Just inside the marker is black, just outside white or another black square.
+                    // The board is black just inside the marker. Just outside, it is white or
+                    // another black square.
                     let inside = [
                         0.99 * first[0] + 0.01 * third[0],
                         0.99 * first[1] + 0.01 * third[1],

@@ -143,7 +143,7 @@ fn point_on_board(view: &View, pixel: [f64; 2]) -> Option<[f64; 2]> {
         .then(|| [origin.x + distance * ray.x, origin.y + distance * ray.y])
 }
 
-/// Blurs along one axis. `stride`: distance of neighbors in the array.
+/// Blurs along one axis. `stride` is the distance of neighbors in the array.
 fn blur(values: &[f64], [width, height]: [usize; 2], stride: usize, sigma_px: f64) -> Vec<f64> {
     if sigma_px <= 0.0 {
         return values.to_vec();

@@ -149,8 +149,9 @@ impl AlignedModel {
         placeholders: &[Arc<Keyframe>],
         resume: impl FnOnce(&Checkpoint, &[Arc<Keyframe>]) -> Result<ResumedModel, Error>,
     ) -> Result<ResumedModel<Self>, Error> {
-        // The model does not know the state of the alignment, so it is taken out first. A
-        // checkpoint without it was written by a model that is not aligned.
+        // The model does not know the state of the alignment, so this state is removed from the
+        // checkpoint first. A checkpoint without this state was written by a model that is not
+        // aligned.
         let mut own_checkpoint = checkpoint.clone();
         let Some(state) = own_checkpoint
             .state
@@ -169,7 +170,8 @@ impl AlignedModel {
             alignment_task.request_again();
         }
 
-        // The model was trained on corrected keyframes, and verifies that it gets the same ones.
+        // The model was trained on corrected keyframes. It verifies that it receives the same
+        // keyframes.
         let corrected = keyframes
             .iter()
             .map(|keyframe| alignment_task.corrected(keyframe));
@@ -269,8 +271,8 @@ impl AlignedModel {
         self.model.remove(camera, stamp)
     }
 
-    /// Queues up to `n` optimizer updates; see [`Method::step`]. Begins an alignment, or applies
-    /// its result, when that is due.
+    /// Queues up to `n` optimizer updates; see [`Method::step`]. Also begins an alignment or
+    /// applies its result, if this is due.
     pub fn step(&mut self, n: u64) -> Result<u64, Error> {
         if self.precedes_training() {
             self.begin_alignment();
@@ -297,9 +299,9 @@ impl AlignedModel {
         self.model.is_idle() && (!self.is_awaited() || self.model.progress().step == 0)
     }
 
-    /// In a live run, applies the result of an alignment in the background if it is ready, or waits
-    /// for it if `wait`. Returns whether a result was applied, which depends on timing unless
-    /// `wait` is set.
+    /// In a live run, applies the result of the alignment in the background if it is ready. With
+    /// `wait`, waits for the result. Returns whether a result was applied. Without `wait`, this
+    /// depends on timing.
     pub fn poll_alignment(&mut self, wait: bool) -> Result<bool, Error> {
         if self.state.timing != AlignTiming::RealTime {
             return Ok(false);
@@ -323,8 +325,8 @@ impl AlignedModel {
         Ok(self.state.n_steps_before_restart + self.model.n_total_steps()?)
     }
 
-    /// The camera of a keyframe with the corrections of alignment, followed by those that the model
-    /// learned for the camera, but without those for single images.
+    /// The camera of a keyframe with the corrections of alignment, followed by the corrections that
+    /// the model learned for this camera. Corrections of single images are not applied.
     pub fn calibrated_camera(&mut self, keyframe: &Keyframe) -> Result<CalibratedCamera, Error> {
         let learned = self.model.camera_corrections()?;
         Ok(self
@@ -332,8 +334,8 @@ impl AlignedModel {
             .calibrated_camera(keyframe, learned.get(&*keyframe.camera)))
     }
 
-    /// Result of keyframe alignment; `None` until it is done, or if it was not requested or not
-    /// possible.
+    /// Result of keyframe alignment. `None` until alignment has finished, and if it was not
+    /// requested or not possible.
     pub fn alignment(&self) -> Option<&Alignment> {
         self.alignment_task.result()
     }
@@ -469,7 +471,8 @@ impl AlignedModel {
                 _ => {}
             }
         }
-        // Nothing reads the originals after a single alignment, and they hold all pixels.
+        // After a single alignment, nothing reads the original keyframes. They are dropped because
+        // they hold all pixels.
         if self.state.timing == AlignTiming::Once {
             self.original_keyframes.clear();
         }
@@ -501,8 +504,8 @@ impl AlignedModel {
         Ok(())
     }
 
-    /// Detects movements from now on: the first `n_references` keyframes are references, later ones
-    /// are tested.
+    /// Detects movements from now on. The first `n_references` keyframes are references, and later
+    /// keyframes are tested.
     fn detect_movements(&mut self, n_references: usize) {
         let corrected = |keyframe: &Arc<Keyframe>| self.alignment_task.corrected(keyframe);
         let (references, later) = self.original_keyframes.split_at(n_references);

@@ -18,7 +18,7 @@ pub(crate) const MIN_RADIUS_M: f64 = 0.01;
 /// A sphere that contains most of a model.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Bounds {
-    /// In world, meters.
+    /// Position in the world frame, meters.
     pub center_m: [f64; 3],
     /// Meters.
     pub radius_m: f64,

@@ -20,7 +20,7 @@ pub enum Error {
     /// The GPU, or a kernel, failed.
     #[error(transparent)]
     Gpu(#[from] gpu::Error),
-    /// A bug in this program: its state contradicts itself. Another device would not help, so this
+    /// A bug in this program. Its state contradicts itself. Another device would not help, so this
     /// is not a [GPU error](Self::is_gpu_error).
     #[error("internal error: {0}; this is a bug in fieldrig, please report it")]
     Internal(String),
@@ -37,7 +37,7 @@ pub enum Error {
     /// A picture does not have four bytes per pixel.
     #[error("{what} picture of {width}x{height} pixels: got {got} bytes, expected {expected}")]
     PictureBytes {
-        /// Which picture: `rendered` or `true`.
+        /// The picture, which is `rendered` or `true`.
         what: &'static str,
         /// Width, pixels.
         width: u32,
@@ -126,7 +126,7 @@ pub enum Error {
         .placeholders.len(), if .placeholders.len() == 1 { "is" } else { "are" }, .placeholders[0].stamp.0, .placeholders[0].camera
     )]
     MissingKeyframes {
-        /// Keyframes without pixels that stand for the missing ones, at least one.
+        /// Keyframes without pixels that stand for the missing keyframes. There is at least one.
         placeholders: Vec<Arc<Keyframe>>,
     },
     /// No registered method has this name.
@@ -172,7 +172,7 @@ pub enum Error {
 }
 
 impl Error {
-    /// An [`Error::Internal`]; `what` is a clause without a period.
+    /// An [`Error::Internal`]. `what` is a clause without a period.
     pub(crate) fn internal(what: &str) -> Self {
         Self::Internal(what.to_owned())
     }

@@ -96,8 +96,8 @@ impl KeyframeSignature {
 /// The matched keyframes in the expected order, and all other keyframes.
 pub(crate) type MatchedAndOthers = (Vec<Arc<Keyframe>>, Vec<Arc<Keyframe>>);
 
-/// Finds the expected keyframes. Fails if one differs, or if some are missing; the error then
-/// contains placeholders for the missing ones.
+/// Finds the expected keyframes. Fails if a keyframe differs or is missing. If keyframes are
+/// missing, the error contains placeholders for them.
 pub(crate) fn match_keyframes(
     expected: &[KeyframeSignature],
     keyframes: &[Arc<Keyframe>],

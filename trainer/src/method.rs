@@ -21,32 +21,33 @@ pub struct Progress {
     pub step: u64,
     /// Splats, voxel blocks or table entries.
     pub primitives: u64,
-    /// GPU memory of the model, bytes; 0 for a model in host memory.
+    /// GPU memory of the model, bytes. It is 0 for a model in host memory.
     pub bytes: u64,
-    /// GPU time of a step, milliseconds, smoothed.
+    /// Smoothed GPU time of a step, milliseconds.
     pub step_millis: f64,
 }
 
 /// A scene model that trains on keyframes.
 ///
-/// Several models can share one device; each is owned by one thread. The alignment of cameras is
-/// added by [`AlignedModel`](crate::AlignedModel).
+/// Several models can share one device. Each model is owned by one thread.
+/// [`AlignedModel`](crate::AlignedModel) adds the alignment of cameras.
 pub trait Method {
     /// Adds a keyframe. Test keyframes are used for evaluation only. The method checks the parts of
     /// the keyframe that it uses ([`Keyframe::check`]).
     fn push(&mut self, keyframe: Arc<Keyframe>) -> Result<(), Error>;
-    /// Removes the keyframe with this camera and stamp, if there is one. The scene learned from it
-    /// stays, but resuming from a later checkpoint must not require the keyframe.
+    /// Removes the keyframe with this camera and stamp, if there is one. The scene that was learned
+    /// from the keyframe stays. Resuming from a later checkpoint must not require the keyframe.
     fn remove(&mut self, camera: &str, stamp: Stamp) -> Result<(), Error>;
     /// Sets points on the surfaces of the scene, from which the model starts if no keyframe has
-    /// depth. Call before the first step, and again after resuming, because checkpoints do not
-    /// contain the points. Returns false if the method does not use them.
+    /// depth. This must be called before the first step. It must be called again after resuming,
+    /// because checkpoints do not contain the points. Returns false if the method does not use
+    /// initial points.
     fn set_initial_points(&mut self, _points: &Arc<InitialPoints>) -> bool {
         false
     }
-    /// Queues up to `n` optimizer updates, but at most 20 ms of GPU work (2 ms while watched,
-    /// [`Method::set_watched`]). Returns the number of queued updates. At most one submit runs and
-    /// one is queued.
+    /// Queues up to `n` optimizer updates, but at most 20 ms of GPU work. While pictures are
+    /// requested ([`Method::set_watched`]), the limit is 2 ms. Returns the number of queued
+    /// updates. At any time, at most one submit runs and one more is queued.
     ///
     /// If a buffer is too small, a queued update is discarded and repeated later. If all `n`
     /// updates were queued, the call waits for them, so that [`Method::progress`] is exact. Call in
@@ -63,12 +64,12 @@ pub trait Method {
         Ok(())
     }
     /// Waits until all training kernels are compiled. Without this call, the first [`Method::step`]
-    /// waits.
+    /// waits for the compilation.
     fn prepare(&mut self) -> Result<(), Error> {
         Ok(())
     }
-    /// Sets whether pictures are requested during training. If so, submits are shorter; the trained
-    /// parameters are bit-identical either way.
+    /// Sets whether pictures are requested during training. If they are, submits are shorter. The
+    /// trained parameters are bit-identical in both cases.
     fn set_watched(&mut self, _watched: bool) {}
     /// Renders a picture. If the model is empty, first initializes it as [`Method::seed`] does.
     fn render(&mut self, request: &RenderRequest) -> Result<Picture, Error>;
@@ -106,8 +107,8 @@ pub trait Method {
     }
     /// Starts to search for small parts that are not connected to the large parts of the model.
     /// Space that is already erased is ignored. Later training does not affect the result. The
-    /// search, which may take seconds, takes place in [`PendingFloaters::finish`]; it fails if
-    /// there are no floaters.
+    /// search takes place in [`PendingFloaters::finish`] and may take seconds. It fails if there
+    /// are no floaters.
     ///
     /// # Errors
     ///
@@ -117,7 +118,7 @@ pub trait Method {
     }
     /// PSNR of the requested picture against a keyframe's image of the same size, dB, computed on
     /// the GPU. Bit-identical to [`crate::eval::psnr`] of the 8-bit picture. `None` if the model
-    /// does not support this, or not yet.
+    /// cannot compute the PSNR, or cannot compute it yet.
     fn psnr(
         &mut self,
         _request: &RenderRequest,
@@ -125,12 +126,13 @@ pub trait Method {
     ) -> Result<Option<f64>, Error> {
         Ok(None)
     }
-    /// Background for comparisons with images, sRGB 0 to 1: the expected color of unobserved areas.
+    /// Background for comparisons with images, as sRGB values from 0 to 1. It is the expected color
+    /// of unobserved areas.
     fn background_srgb(&self) -> [f32; 3] {
         [0.0; 3]
     }
     /// Pixel stride along both axes for depth images that are compared with measured ones. It is
-    /// odd, and above 1 if rays are expensive.
+    /// odd. It is above 1 if rendering a ray is expensive.
     fn depth_stride(&self) -> u32 {
         1
     }
@@ -139,13 +141,13 @@ pub trait Method {
     fn bounds(&mut self) -> Result<Option<Bounds>, Error> {
         Ok(None)
     }
-    /// Corrections of cameras that were optimized with the scene, by camera name. They are applied
-    /// after the corrections of alignment. Waits for queued work.
+    /// Waits for queued work and returns the camera corrections that were optimized with the scene,
+    /// by camera name. They are applied after the corrections of alignment.
     fn camera_corrections(&mut self) -> Result<BTreeMap<String, CameraCorrection>, Error> {
         Ok(BTreeMap::new())
     }
-    /// Replaces all keyframes pushed so far. The model moves along with its keyframes, or forgets
-    /// all training if it cannot be moved.
+    /// Replaces all keyframes pushed so far. If the model can be moved, it moves with its
+    /// keyframes. Otherwise, it forgets all training.
     ///
     /// * `keyframes`: in the order of their arrival, without test keyframes.
     /// * `alignment`: the source of the new corrections.
@@ -154,10 +156,10 @@ pub trait Method {
         keyframes: &[CorrectedKeyframe],
         alignment: &Alignment,
     ) -> Result<(), Error>;
-    /// Takes one step with timestamps around every pass; returns an empty list if the adapter does
-    /// not support them.
+    /// Takes one step with timestamps around every pass. Returns an empty list if the adapter does
+    /// not support timestamps.
     fn profile_step(&mut self) -> Result<Vec<PassTiming>, Error>;
-    /// Pauses or continues the growth of the model. Returns false if this changes nothing, or is
+    /// Pauses or continues the growth of the model. Returns false if the call changes nothing or is
     /// not possible now.
     fn pause_growth(&mut self, _is_paused: bool) -> Result<bool, Error> {
         Ok(false)
@@ -171,12 +173,12 @@ pub trait Method {
     /// Writes the model into an existing folder. The files do not depend on the number of planned
     /// steps.
     fn save(&mut self, folder: &Path) -> Result<(), Error>;
-    /// Writes the files of a saved model that are only for other programs, without erased space.
-    /// All other files contain the complete model.
+    /// Writes the files of a saved model that only other programs read. These files leave out
+    /// erased space. All other files contain the complete model.
     fn write_for_others(&mut self, _folder: &Path, _edits: &Edits) -> Result<(), Error> {
         Ok(())
     }
-    /// Takes a checkpoint of everything needed to continue training; later training does not change
-    /// it.
+    /// Takes a checkpoint of everything needed to continue training. Later training does not change
+    /// the checkpoint.
     fn checkpoint(&mut self) -> Result<PendingCheckpoint, Error>;
 }

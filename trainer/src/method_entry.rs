@@ -24,7 +24,7 @@ pub struct MethodEntry {
     pub name: &'static str,
     /// Short description of the method's models, for help texts.
     pub description: &'static str,
-    /// Noun phrase for one of its models, with article, such as `a distance field`.
+    /// Noun phrase with an article for one model of the method, such as `a distance field`.
     pub model: &'static str,
     /// The items that [`crate::Progress::primitives`] counts, in the singular.
     pub primitive: &'static str,
@@ -33,7 +33,8 @@ pub struct MethodEntry {
     /// Files of a saved model besides `model.json`, in the order in which they are moved into
     /// place. A folder that contains the last file contains the complete model.
     pub files: &'static [&'static str],
-    /// Files that each hold a complete model; `None` if a model is always a folder.
+    /// Type of the files that each hold a complete model. `None` if a saved model is always a
+    /// folder.
     pub single_file: Option<SingleFile>,
     /// Whether the method trains only on keyframes with depth.
     pub needs_depth: bool,
@@ -50,15 +51,15 @@ pub struct MethodEntry {
     pub check_options: fn(&ModelOptions) -> Result<(), Error>,
     /// Creates an untrained model.
     pub start: StartModel,
-    /// Restores a model from a checkpoint, whose `state.options` are [`ModelOptions`]. The
-    /// keyframes must include all training keyframes that were not removed. A keyframe may lack
-    /// pixels if the caller removes it right afterwards.
+    /// Restores a model from a checkpoint. The `state.options` of the checkpoint are
+    /// [`ModelOptions`]. The keyframes must include all training keyframes that were not removed. A
+    /// keyframe may lack pixels if the caller removes it right afterwards.
     pub resume: ResumeModel,
     /// Loads a saved model from its folder, or from a single file.
     pub load: LoadModel,
 }
 
-/// A resumed model of one method as a model of any method.
+/// Converts a resumed model of one method to a model of any method.
 pub(crate) fn boxed<M: Method + 'static>((model, untrained): ResumedModel<M>) -> ResumedModel {
     (Box::new(model), untrained)
 }
@@ -66,7 +67,7 @@ pub(crate) fn boxed<M: Method + 'static>((model, untrained): ResumedModel<M>) ->
 /// A type of file that holds a complete model.
 #[derive(Clone, Copy, Debug)]
 pub struct SingleFile {
-    /// Noun phrase for such a file, with article, such as `a file of splats`.
+    /// Noun phrase with an article for such a file, such as `a file of splats`.
     pub description: &'static str,
     /// Supported extensions.
     pub extensions: &'static [&'static str],
@@ -88,9 +89,9 @@ pub struct Export {
 
 /// Function that exports a saved model.
 pub enum ExportWriter {
-    /// Without a GPU.
+    /// A function that does not need a GPU.
     Cpu(fn(&ExportRequest<'_>) -> Result<Exported, Error>),
-    /// With a GPU.
+    /// A function that needs a GPU.
     Gpu(fn(Arc<Gpu>, &ExportRequest<'_>) -> Result<Exported, Error>),
 }
 

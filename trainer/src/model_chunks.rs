@@ -6,8 +6,8 @@ use serde::Serialize;
 /// The chunks of a model at one moment.
 #[derive(Debug, Default)]
 pub struct ModelChunks {
-    /// Whether `chunks` are all chunks of the model. Otherwise, they are those that have changed
-    /// since the last call.
+    /// Whether `chunks` are all chunks of the model. Otherwise, they are the chunks that have
+    /// changed since the last call.
     pub is_complete: bool,
     /// The chunks.
     pub chunks: Vec<ModelChunk>,
@@ -18,8 +18,8 @@ pub struct ModelChunks {
 /// A spatial part of a model.
 #[derive(Debug)]
 pub struct ModelChunk {
-    /// Identifies the chunk within its model; less than 2^53, so that JavaScript represents it
-    /// exactly.
+    /// Identifies the chunk within its model. It is less than 2^53, so that JavaScript represents
+    /// it exactly.
     pub id: u64,
     /// How much the chunk has changed since the last call, in a unit of the method.
     pub change: f64,
@@ -38,7 +38,7 @@ pub struct ChunkData {
     pub bytes: Vec<u8>,
 }
 
-/// Largest count of the position of a vertex in a mesh, along each axis.
+/// Largest integer coordinate of a vertex in a mesh, along each axis.
 pub const MAX_MESH_COUNT: u16 = 33 * 1024;
 
 /// Layout of an encoded chunk.
@@ -72,7 +72,7 @@ pub enum ChunkLayout {
         sh_degree: u32,
         /// Largest coefficients of degree 1 and 2.
         sh_ranges: [f32; 2],
-        /// Whether opacities are lowered where the low-pass enlarges splats.
+        /// Whether opacities are lowered where the low-pass filter enlarges splats.
         is_antialiased: bool,
     },
 }

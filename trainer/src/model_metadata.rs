@@ -1,5 +1,5 @@
-//! The `model.json` of a saved model: camera corrections and background, and facts that are
-//! compared with the model's files.
+//! The `model.json` of a saved model. It contains camera corrections, the background, and facts
+//! that are compared with the model's files.
 
 use crate::Error;
 use calibration::{Alignment, CameraCorrection};
@@ -37,7 +37,7 @@ pub(crate) struct ModelMetadata {
     pub(crate) background_srgb: [f32; 3],
     /// Number of splats, to be compared with their file.
     pub(crate) splats: Option<u64>,
-    /// Degree of their spherical harmonics, to be compared with their file.
+    /// Degree of the splats' spherical harmonics, which is compared with the file of the splats.
     pub(crate) sh_degree: Option<u64>,
     #[serde(flatten)]
     others: BTreeMap<String, serde_json::Value>,
@@ -64,8 +64,8 @@ impl ModelMetadata {
     }
 }
 
-/// Describes that a stated number differs from the actual one; `None` if it does not, or if no
-/// number is stated.
+/// Describes the difference between a stated number and the actual number. `None` if they are
+/// equal, or if no number is stated.
 fn difference(what: &str, stated: Option<u64>, actual: u64) -> Option<String> {
     let stated = stated.filter(|stated| *stated != actual)?;
     Some(format!(
@@ -73,7 +73,7 @@ fn difference(what: &str, stated: Option<u64>, actual: u64) -> Option<String> {
     ))
 }
 
-/// Reads the file in the folder of a saved model; everything is empty if it does not exist.
+/// Reads the file in the folder of a saved model. If the file does not exist, everything is empty.
 ///
 /// # Errors
 ///
@@ -120,8 +120,8 @@ mod tests {
         parse(&serde_json::to_vec(&json!({ key: value })).expect("JSON"))
     }
 
-    /// Every field in the table of `docs/reference/files.md` is read, compared or known as
-    /// information.
+    /// Every field in the table of `docs/reference/files.md` is read, compared or listed in
+    /// `INFORMATION`.
     #[test]
     fn every_documented_field_is_read_or_named() {
         let page = include_str!("../../docs/reference/files.md");

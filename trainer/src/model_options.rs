@@ -16,8 +16,9 @@ pub trait MethodOptions: Serialize + DeserializeOwned + Default {
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum AlignTiming {
-    /// Once, with the keyframes that are known at the first step. The result is applied a fixed
-    /// number of steps later, or before the first step if no keyframe has depth.
+    /// Once, with the keyframes that are known at the first step. If a keyframe has depth, the
+    /// result is applied a fixed number of steps later. Otherwise, it is applied before the first
+    /// step.
     #[default]
     Once,
     /// Repeatedly as keyframes arrive. Results are applied a fixed number of steps later.
@@ -40,19 +41,19 @@ pub struct CommonOptions {
     pub n_planned_steps: u64,
     /// Camera parameters that are optimized with the scene.
     pub cameras: CameraRefinement,
-    /// Camera parameters that alignment estimates by registering keyframes that have depth, or from
-    /// features of keyframes without depth.
+    /// Camera parameters that alignment estimates. It registers keyframes that have depth. Without
+    /// depth, it matches features of the keyframes.
     pub align: CameraRefinement,
-    /// When they are estimated.
+    /// When alignment estimates these parameters.
     pub align_timing: AlignTiming,
-    /// Whether movements of cameras relative to their mounts are detected, if cameras are aligned
-    /// repeatedly. The poses must not drift.
+    /// Whether movements of cameras relative to their mounts are detected. Detection needs cameras
+    /// that are aligned repeatedly, and poses that do not drift.
     #[serde(default)]
     pub detects_movements: bool,
 }
 
-/// Options of a model. `S` is the type of the method-specific options; the default, JSON, holds
-/// those of any method.
+/// Options of a model. `S` is the type of the method-specific options. Its default is JSON, which
+/// holds the options of any method.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct ModelOptions<S = Value> {

@@ -48,9 +48,9 @@ pub struct LoadedModel {
 }
 
 impl ModelSpec {
-    /// The default options of the method, overridden by `settings`: names and values of options.
-    /// Settings that the method does not have are ignored, so that several methods can share one
-    /// list of settings.
+    /// The default options of the method, overridden by `settings`, which contains names and values
+    /// of options. Settings that the method does not have are ignored, so that several methods can
+    /// share one list of settings.
     ///
     /// # Errors
     ///

@@ -7,7 +7,7 @@ use std::fmt::{Debug, Formatter};
 /// A result that another thread can wait for.
 pub struct Pending<T>(Box<dyn FnOnce() -> Result<T, Error> + Send>);
 
-/// Training state that is being read back from the GPU. Training may continue meanwhile.
+/// Training state that is being read back from the GPU. Training may continue during this time.
 pub type PendingCheckpoint = Pending<Checkpoint>;
 
 impl<T> Pending<T> {
@@ -20,7 +20,7 @@ impl<T> Pending<T> {
     ///
     /// # Errors
     ///
-    /// If the GPU failed.
+    /// Fails if the GPU failed.
     pub fn finish(self) -> Result<T, Error> {
         (self.0)()
     }

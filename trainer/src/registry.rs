@@ -41,8 +41,8 @@ impl ModelKind {
     }
 
     /// The method of a saved model. `None` if it cannot be determined. For a folder, it is read
-    /// from `model.json`, or else derived from the files in the folder; for a single file, it is
-    /// derived from the extension.
+    /// from `model.json`. Without this file, it is derived from the files in the folder. For a
+    /// single file, it is derived from the extension.
     ///
     /// # Errors
     ///
@@ -55,7 +55,8 @@ impl ModelKind {
         if model.is_file() {
             return Ok(Self::of_single_file(model));
         }
-        // Folders of other programs have no `model.json`, so the method follows from their files.
+        // Folders of other programs have no `model.json`, so the method is derived from their
+        // files.
         let path = model.join(METADATA_FILE);
         let bytes = match files::read(&path, files::Budget::TEXT) {
             Err(error) if error.kind() == std::io::ErrorKind::NotFound => {
@@ -75,7 +76,7 @@ impl ModelKind {
             .or_else(|| Self::of_files(model)))
     }
 
-    /// The first method of which the folder contains a complete model.
+    /// The first method for which the folder contains a complete model.
     fn of_files(folder: &Path) -> Option<Self> {
         Self::ALL
             .iter()

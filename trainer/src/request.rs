@@ -9,15 +9,15 @@ use std::sync::Arc;
 /// How directions map to pixels.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Projection {
-    /// Pinhole with focal length and principal point in pixels of the full size.
+    /// Pinhole camera. Focal length and principal point are in pixels of the full-size picture.
     Pinhole {
         /// Focal length, pixels.
         focal_px: [f64; 2],
         /// Principal point, pixels.
         principal_px: [f64; 2],
     },
-    /// All directions: longitude along x from -180 to 180 degrees, latitude along y from up to
-    /// down, forward in the center.
+    /// All directions. Longitude runs along x from -180 to 180 degrees, and latitude along y from
+    /// up to down. The forward direction is in the center.
     Equirectangular,
 }
 
@@ -30,7 +30,7 @@ pub struct RenderRequest {
     pub size_px: [u32; 2],
     /// How directions map to pixels.
     pub projection: Projection,
-    /// Rolling shutter to simulate, for comparison with a real image; `None` for viewers.
+    /// Rolling shutter to simulate, for comparison with a real image. `None` for viewers.
     pub shutter: Option<Shutter>,
     /// Nothing nearer than this along z is rendered, meters.
     pub near_m: f64,
@@ -42,8 +42,8 @@ pub struct RenderRequest {
     pub edits: Arc<Edits>,
     /// Background color, sRGB 0 to 1.
     pub background_srgb: [f32; 3],
-    /// Camera and stamp of the image whose lighting and exposure to use, if the model has them;
-    /// `None`: the mean image.
+    /// Camera and stamp of the image whose lighting and exposure are used, if the model has them.
+    /// `None` selects the mean of the images.
     pub appearance_of: Option<(Arc<str>, Stamp)>,
     /// Whether depth is requested. Without depth, [`Picture::depth_m`] is empty and the GPU
     /// readback is half as large.
@@ -55,10 +55,11 @@ pub struct RenderRequest {
 pub struct Picture {
     /// Width and height, pixels.
     pub size_px: [u32; 2],
-    /// `[height, width, 4]`, sRGB over the background; alpha is coverage.
+    /// Array `[height, width, 4]` of sRGB over the background. Alpha is coverage.
     pub rgba_srgb: Vec<u8>,
-    /// `[height, width]`, meters along z (distance for equirectangular); 0 for pixels without a
-    /// surface. Empty without [`RenderRequest::depth`].
+    /// Array `[height, width]` of depths along z, meters. Equirectangular pictures have distances
+    /// instead. The value is 0 for pixels without a surface. The array is empty without
+    /// [`RenderRequest::depth`].
     pub depth_m: Vec<f32>,
 }
 

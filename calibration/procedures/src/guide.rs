@@ -1,4 +1,4 @@
-//! Guidance while devices are read: what the images cover so far, and what to do next.
+//! Guidance while devices are read. It shows what the images cover so far and what to do next.
 
 use crate::host::CameraView;
 use crate::images::{self, DetectedImage};
@@ -13,9 +13,9 @@ use targets::TargetSpec;
 /// What images are taken for.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Purpose {
-    /// The lens: corners in all parts of the image, and tilts.
+    /// The lens, which needs corners in all parts of the image and tilted targets.
     Lens,
-    /// The pose of the camera on the robot: rotations.
+    /// The pose of the camera on the robot, which needs rotations.
     HandEye,
 }
 
@@ -52,8 +52,7 @@ impl<'a> Guide<'a> {
         guide
     }
 
-    /// Shows a sample if it is an image of the camera, and detects the target in the images that
-    /// are new.
+    /// Shows a sample if it is an image of the camera. Detects the target in the new images.
     pub(crate) fn update(&mut self, sample: &Sample, images: &[CalibrationImage]) {
         if let Sample::Image(image) = sample {
             self.shown.show_live(image);

@@ -1,5 +1,5 @@
-//! The interface between a calibration and the program that runs it: stop requests, progress, and
-//! views of camera images.
+//! The interface between a calibration and the program that runs it. It covers stop requests,
+//! progress, and views of camera images.
 
 use calibration::BoardView;
 use capture::Stop;
@@ -21,13 +21,13 @@ pub enum Activity {
 
 /// The program that runs a calibration.
 pub trait Host: Sync {
-    /// Starts listening for stop requests. Called at most once, before an activity.
+    /// Starts listening for stop requests. It is called at most once, before an activity.
     ///
     /// # Errors
-    /// If the program cannot receive stop requests.
+    /// Fails if the program cannot receive stop requests.
     fn stop_requests(&self, activity: Activity) -> anyhow::Result<Stop>;
 
-    /// Reports how many images have been read or searched for the target. Called from several
+    /// Reports how many images have been read or searched for the target. It is called from several
     /// threads.
     fn on_progress(&self, progress: ReadProgress);
 
@@ -38,7 +38,7 @@ pub trait Host: Sync {
     /// the view closes it.
     ///
     /// # Errors
-    /// If images cannot be shown as requested.
+    /// Fails if images cannot be shown as requested.
     fn open_view(&self, camera: &Camera, activity: Activity)
     -> anyhow::Result<Box<dyn CameraView>>;
 }

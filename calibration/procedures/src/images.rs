@@ -111,11 +111,11 @@ fn is_image(path: &Path) -> bool {
     })
 }
 
-/// Detects a target in image files, on all processors; the results are in the order of the files.
-/// Images that cannot be read are named in a warning.
+/// Detects a target in image files, on all processors. The results are in the order of the files. A
+/// warning names images that cannot be read.
 ///
 /// # Errors
-/// If no image can be read.
+/// Fails if no image can be read.
 pub(crate) fn detect(
     files: &[ImageFile],
     target: &TargetSpec,
@@ -129,7 +129,7 @@ pub(crate) fn detect(
     Ok(detected)
 }
 
-/// Calls a function for each image, on all processors; the results are in the order of the images.
+/// Calls a function for each image, on all processors. The results are in the order of the images.
 pub(crate) fn detect_each<T: Sync>(
     images: &[T],
     host: &dyn Host,
@@ -187,7 +187,7 @@ fn check_readable(images: &[DetectedImage]) -> Result<(), BadInput> {
 pub(crate) struct OtherSize {
     /// What the images show, and what to do.
     pub(crate) text: String,
-    /// Whether more images show the other size than the given one.
+    /// Whether more images show the other size than the size of the target.
     pub(crate) prevails: bool,
 }
 

@@ -14,7 +14,7 @@ use report::calibration_report::{IntrinsicsReport, Photos, Unused};
 use std::path::PathBuf;
 use targets::TargetSpec;
 
-/// An intrinsic calibration: its input and options.
+/// Input and options of an intrinsic calibration.
 #[derive(Clone, Debug)]
 pub struct IntrinsicsTask {
     /// A folder of images, a recording, or a rig file whose devices are read.
@@ -57,13 +57,14 @@ impl IntrinsicsTask {
     /// Detects the target, calibrates, and writes the report.
     ///
     /// # Errors
-    /// If the images cannot be read, or do not determine the lens.
+    /// Fails if the images cannot be read, or do not determine the lens.
     pub fn run(&self, host: &dyn Host) -> anyhow::Result<IntrinsicsOutcome> {
-        // Checked first, so that a wrong path does not cost a calibration.
+        // The paths are checked first, so that a wrong path does not cost a calibration.
         self.report.as_ref().map_or(Ok(()), ReportOptions::check)?;
         let mut rig = self.rig.open(&self.input)?;
         let detected = self.detect(host, rig.as_mut())?;
-        // The size is checked before the calibration, because its result could not be written.
+        // The size is checked before the calibration, because a result for another size could not
+        // be written.
         if let (Some(rig), Some(size_px)) = (&rig, detected.sizes_px.first()) {
             rig.expect_size(*size_px)?;
         }
@@ -141,15 +142,15 @@ impl IntrinsicsTask {
         if let Some(reason) = no_images {
             return Err(InsufficientData(reason.clone()).into());
         }
-        // A board of another size would be calibrated with wrong corners, so this is an error if
-        // most images show it.
+        // With a board of another size, the calibration would use wrong corners. It is an error if
+        // most images show such a board.
         if let Some(size) = other_size.as_ref().filter(|size| size.prevails) {
             return Err(
                 InsufficientData(format!("{}: {}", self.input.display(), size.text)).into(),
             );
         }
         if views.is_empty() {
-            // All images usually fail for the same reason. Those that cannot be read were reported
+            // All images usually fail for the same reason. Images that cannot be read were reported
             // before.
             let read: Vec<&Unused> = unused
                 .iter()
@@ -215,10 +216,10 @@ impl IntrinsicsOutcome {
         warnings(&self.calibration)
     }
 
-    /// Writes the rig file, if it was requested. Called after the result was printed.
+    /// Writes the rig file, if it was requested. This is called after the result was printed.
     ///
     /// # Errors
-    /// If the rig file or the report cannot be written.
+    /// Fails if the rig file or the report cannot be written.
     pub fn finish(self) -> anyhow::Result<()> {
         if let Some(mut rig) = self.rig {
             rig.set_intrinsics(

@@ -82,7 +82,7 @@ impl<'de> Visitor<'de> for UniqueVisitor {
 #[derive(Clone, Debug)]
 pub(crate) struct JsonObject<'a> {
     file: &'a str,
-    /// Where the object is in the file, such as `samples[3]`; empty for the whole file.
+    /// Path of the object in the file, such as `samples[3]`. It is empty for the whole file.
     path: String,
     map: &'a Map<String, Value>,
 }
@@ -210,7 +210,8 @@ impl<'a> JsonObject<'a> {
     }
 }
 
-/// The transform of a matrix in JSON: four lists of four numbers, or one list of 16, row by row.
+/// The transform of a matrix in JSON. The matrix is four lists of four numbers or one list of 16
+/// numbers, row by row.
 fn transform_of(value: &Value) -> Result<Transform, String> {
     let rows = value.as_array().map_or(0, Vec::len);
     let row_of = |row: &Value| row.as_array().filter(|row| row.len() == 4).cloned();

@@ -10,7 +10,8 @@ use serde::Serialize;
 #[derive(Clone, Debug, Serialize)]
 pub struct LensFile {
     /// `pinhole`, `brown_conrady` (five or eight coefficients) or `kannala_brandt`, as in rig
-    /// files. The default is `brown_conrady` with distortion coefficients, and pinhole without.
+    /// files. With distortion coefficients, the default is `brown_conrady`. Without coefficients,
+    /// it is `pinhole`.
     #[serde(skip_serializing_if = "Option::is_none")]
     model: Option<String>,
     #[serde(skip_serializing_if = "Option::is_none")]
@@ -22,10 +23,11 @@ pub struct LensFile {
     pub principal_px: [f64; 2],
     /// Coefficients in OpenCV's order.
     pub distortion: Vec<f64>,
-    /// Covariance of all these parameters, row by row; empty if it is unknown.
+    /// Covariance of all these parameters, row by row. It is empty if it is unknown.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     covariance: Vec<f64>,
-    /// Standard deviations of parameters, by their index; used if the covariance is unknown.
+    /// Standard deviations of parameters, by the index of the parameter. They are used if the
+    /// covariance is unknown.
     #[serde(skip)]
     sigmas: Vec<(usize, f64)>,
 }
@@ -35,8 +37,8 @@ const BROWN_CONRADY: &str = "brown_conrady";
 const KANNALA_BRANDT: &str = "kannala_brandt";
 
 impl LensFile {
-    /// Keys of a file with intrinsics, including those that `calibrate intrinsics --json` prints
-    /// and that are not needed.
+    /// Keys of a file with intrinsics. They include the unused keys that `calibrate intrinsics
+    /// --json` prints.
     pub(crate) const KEYS: [&'static str; 17] = [
         "focal_px",
         "principal_px",
@@ -140,10 +142,11 @@ impl LensFile {
             // Without standard deviations, the uncertainty is unknown, not zero.
             return Ok((!self.sigmas.is_empty()).then_some(independent));
         };
-        /// Relative difference of two standard deviations that are meant to be equal; they may be
+        /// Maximum relative difference of two standard deviations that should be equal. They may be
         /// rounded.
         const MAX_DIFFERENCE: f64 = 0.01;
-        // Files often contain both, and one of them may have been edited.
+        // Files often contain both the covariance and the standard deviations, and one of them may
+        // have been edited.
         for (ix, sigma) in &self.sigmas {
             let of_covariance = given[(*ix, *ix)].max(0.0).sqrt();
             if (sigma - of_covariance).abs() > MAX_DIFFERENCE * sigma.max(of_covariance) {

@@ -1,4 +1,4 @@
-//! Files that calibrations write: a rig file with the result, and a report.
+//! The files that calibrations write, which are a rig file with the result and a report.
 
 use anyhow::Context;
 use calibration::hand_eye::{JointOffset, Setup};
@@ -13,17 +13,17 @@ use std::path::{Path, PathBuf};
 /// How the images of one camera are read, and where its calibration is written.
 #[derive(Clone, Debug, Default)]
 pub struct RigOptions {
-    /// Name of the camera to calibrate in a recording or rig file, or of the camera to change in
-    /// the rig file for `write_rig`. `None`: the only camera.
+    /// Name of the camera to calibrate in a recording or rig file. With images, it is the camera to
+    /// change in the rig file for `write_rig`. `None` selects the only camera.
     pub camera: Option<String>,
     /// With a recording, the rig file that replaces the one stored in it. With image files, the rig
     /// file into which the result is written.
     pub rig: Option<PathBuf>,
     /// The rig file to write, with the result.
     pub write_rig: Option<PathBuf>,
-    /// Whether all devices are simulated; only with a rig file as input.
+    /// Whether all devices are simulated. This requires a rig file as input.
     pub sim: bool,
-    /// Time for which devices are read, seconds; only with a rig file as input.
+    /// Time for which devices are read, seconds. This requires a rig file as input.
     pub seconds: Option<f64>,
     /// Whether flags of the page were given. They are only allowed if the input is a rig file.
     pub has_page_flags: bool,
@@ -134,7 +134,8 @@ impl RigOptions {
             (InputKind::Rig | InputKind::Files, _) => Rig::load(input, &[])?,
         };
         let camera = self.camera_of(&rig)?.name.to_string();
-        // This is checked before images are taken, because the result could not be written.
+        // This is checked before images are taken, because otherwise the result could not be
+        // written.
         corrected_rig::check_target_file(&rig, file)?;
         Ok(Some(RigOutput {
             rig,
@@ -308,7 +309,7 @@ impl ReportOptions {
     }
 
     /// The heading of the report on a result. `None` for errors other than a refusal, because no
-    /// report is written for them.
+    /// report is written for such errors.
     pub(crate) fn heading<T>(
         &self,
         input: &Path,
@@ -317,7 +318,7 @@ impl ReportOptions {
     ) -> Option<Heading> {
         let refused = match result {
             Ok(_) => None,
-            // A refusal is a result, too: the report shows what is missing.
+            // A refusal also gets a report, which shows what is missing.
             Err(error) if session::class(error) == ErrorClass::InsufficientData => {
                 let text = format!("{error:#}");
                 Some(
@@ -346,8 +347,9 @@ fn is_other_file(file: &Path) -> bool {
     }
 }
 
-/// Writes the report, if one is requested, on a result or on the reason why there is none. Returns
-/// the result, and whether the report was written. The result is printed in both cases.
+/// Writes the requested report on a result or on the reason why there is no result. Returns the
+/// result, and whether the report was written. The result is printed even if the report was not
+/// written.
 pub(crate) fn reported<T>(
     result: anyhow::Result<T>,
     report: Option<&ReportOptions>,
@@ -370,7 +372,7 @@ pub(crate) fn log_failure(written: anyhow::Result<()>) {
     }
 }
 
-/// The contents of a text file; a missing or unreadable file is a bad argument.
+/// The contents of a text file. A missing or unreadable file is a bad argument.
 pub(crate) fn read_text(path: &Path) -> Result<String, BadInput> {
     files::read_text(path)
         .map_err(|error| BadInput(format!("cannot read {}: {error}", path.display())))

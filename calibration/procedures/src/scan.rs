@@ -24,12 +24,13 @@ use std::ops::ControlFlow;
 use std::path::Path;
 use targets::TargetSpec;
 
-/// Time for which devices are read if no flag limits it, seconds: enough for about twenty poses of
-/// an arm or a target moved by hand.
+/// Time for which devices are read if no flag limits it, seconds. It is enough for about twenty
+/// poses of an arm or target that is moved by hand.
 const DEFAULT_SECS: f64 = 30.0;
-/// Maximum predicted image motion over readout, exposure and stamp uncertainty, pixels. Corners are
-/// corrected for the motion during the readout, but only as well as the velocity is known. A
-/// smaller value rejects images of slow motions. A larger value accepts blurred corners.
+/// Maximum predicted image motion, pixels. The motion is predicted over the readout time, the
+/// exposure time and the uncertainty of the stamp. Corners are corrected for the motion during the
+/// readout, but the correction is only as accurate as the velocity. A smaller value rejects images
+/// of slow motions. A larger value accepts blurred corners.
 const MAX_SHIFT_PX: f64 = 3.0;
 
 /// Images of one camera in which a target was searched.
@@ -61,7 +62,7 @@ pub(crate) struct ScanOptions<'a> {
 }
 
 impl RigOptions {
-    /// Reads a recording, or the devices of a rig. `None` if the input is neither.
+    /// Reads a recording or the devices of a rig. Returns `None` if the input is neither.
     ///
     /// * `output`: gets the calibration that devices report.
     pub(crate) fn read(
@@ -97,7 +98,8 @@ impl RigOptions {
                 open::recording(input, rig, &[])?
             }
         };
-        // The rig as opened: cameras may have reported calibration that the file lacks.
+        // This is the rig after its devices were opened. Cameras may have reported calibration that
+        // the file lacks.
         let rig = opened.rig.clone();
         if options.purpose == Purpose::HandEye && rig.arm.driver == ArmDriver::None {
             return Err(BadInput(format!(
@@ -106,7 +108,8 @@ impl RigOptions {
             ))
             .into());
         }
-        // The calibration that a simulated camera reports is not that of the real one.
+        // The calibration that a simulated camera reports is not the calibration of the real
+        // camera.
         if let Some(output) = output.filter(|_| kind == InputKind::Rig && !self.sim) {
             output.set_rig(&rig);
         }
@@ -121,7 +124,7 @@ impl RigOptions {
             .images
             .is_empty()
             .then(|| no_images(input, &rig, &camera, &found));
-        // From devices, the target was detected while they were read.
+        // If devices were read, the target was already detected during reading.
         let detected = detected.unwrap_or_else(|| {
             images::detect_each(&found.images, options.host, |image| {
                 images::detect_in_image(image, target)
@@ -165,7 +168,7 @@ impl RigOptions {
         let host = options.host;
         let activity = Activity::ReadImages;
         let stop = host.stop_requests(activity)?;
-        // Only recordings have stamps that are unrelated to this computer's clock.
+        // Only the stamps of recordings are unrelated to this computer's clock.
         let is_live = !matches!(opened.stamp_clock, StampClock::Unrelated);
         let view = is_live
             .then(|| host.open_view(camera, activity))
@@ -261,8 +264,8 @@ impl Scan {
         images: Vec<(DetectedImage, Option<ArmDuringImage>)>,
         photos: Photos,
     ) -> anyhow::Result<Self> {
-        // Hand-eye calibration knows only flange and base. A camera in the world does not move
-        // relative to the base, because the base is fixed.
+        // In hand-eye calibration, a camera is attached to the flange or to the base. A camera in
+        // the world counts as attached to the base, because the base is fixed.
         let base_from_world = rig.base.world_from_base.inverse();
         let (setup, parent_from_camera) = match camera.parent {
             Parent::Flange => (Setup::EyeInHand, camera.parent_from_camera),
@@ -272,7 +275,7 @@ impl Scan {
                 base_from_world * camera.parent_from_camera,
             ),
         };
-        // Without an arm, as for a lens, no robot description is needed.
+        // Without an arm, as in the calibration of a lens, no robot description is needed.
         let chain = images
             .iter()
             .any(|(_, arm)| arm.is_some())
@@ -365,8 +368,9 @@ impl Scan {
             .collect()
     }
 
-    /// Samples for hand-eye calibration, and the images without target with the reasons.
-    /// `parent_from_camera`: pose of the camera, if it is known better than in the rig file.
+    /// Samples for hand-eye calibration. Also returns the images in which no target was found, with
+    /// the reasons. `parent_from_camera` is the pose of the camera, if a better one than that of
+    /// the rig file is known.
     pub(crate) fn samples(
         &self,
         parent_from_camera: Option<&Transform>,

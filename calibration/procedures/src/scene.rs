@@ -17,20 +17,20 @@ use std::path::PathBuf;
 /// Time for which devices are read if no flag limits it, seconds.
 const DEFAULT_SECS: f64 = 30.0;
 
-/// A calibration from a scene: its input and options.
+/// Input and options of a calibration from a scene.
 #[derive(Clone, Debug)]
 pub struct SceneTask {
     /// A recording, a dataset folder, or a rig file whose devices are read.
     pub input: PathBuf,
-    /// The list of the keyframes to use; only with a recording or folder.
+    /// The list of the keyframes to use. This requires a recording or a folder as input.
     pub keyframes: Option<PathBuf>,
     /// The rig file to read a recording with, instead of the one stored in it.
     pub rig: Option<PathBuf>,
     /// What to estimate.
     pub params: Vec<Refine>,
-    /// Whether all devices are simulated; only with a rig file as input.
+    /// Whether all devices are simulated. This requires a rig file as input.
     pub sim: bool,
-    /// Time for which devices are read, seconds; only with a rig file as input.
+    /// Time for which devices are read, seconds. This requires a rig file as input.
     pub seconds: Option<f64>,
     /// The rig file to write, with the accepted corrections.
     pub write_rig: Option<PathBuf>,
@@ -44,7 +44,7 @@ pub struct SceneOutcome {
     pub data: Data,
     /// The estimates.
     pub calibration: SceneCalibration,
-    /// Why no camera could be calibrated; `None` if one could.
+    /// The reason why no camera could be calibrated. `None` if at least one camera was calibrated.
     pub refused: Option<String>,
     /// The rig before the calibration, if there is one.
     before: Option<Rig>,
@@ -57,7 +57,8 @@ impl SceneTask {
     /// Reads the images, calibrates, and writes the report.
     ///
     /// # Errors
-    /// If the options contradict each other, or if the data cannot be read or are not sufficient.
+    /// Fails if the options contradict each other, or if the data cannot be read or are not
+    /// sufficient.
     pub fn run(&self, host: &dyn Host) -> anyhow::Result<SceneOutcome> {
         // `auto` chooses the parameters itself, so a list contradicts it.
         if self.params.len() > 1 && self.params.contains(&Refine::Auto) {
@@ -67,7 +68,7 @@ impl SceneTask {
             ))
             .into());
         }
-        // Checked first, so that a wrong path does not cost a calibration.
+        // The paths are checked first, so that a wrong path does not cost a calibration.
         self.report.as_ref().map_or(Ok(()), ReportOptions::check)?;
         let given = self.rig_as_given()?;
         // Checked before data is read, which may take long.
@@ -149,7 +150,7 @@ impl SceneTask {
         report.write(&page.html())
     }
 
-    /// The rig file, without settings that apply only to this command; `None` for a folder.
+    /// The rig file, without settings that apply only to this command. `None` for a folder.
     fn rig_as_given(&self) -> anyhow::Result<Option<Rig>> {
         if !self.input.exists() {
             return Err(BadInput(format!("{} does not exist", self.input.display())).into());
@@ -228,11 +229,11 @@ impl SceneTask {
 }
 
 impl SceneOutcome {
-    /// Writes the rig file, if it was requested and a correction was accepted. Called after the
-    /// result was printed.
+    /// Writes the rig file, if it was requested and a correction was accepted. This is called after
+    /// the result was printed.
     ///
     /// # Errors
-    /// If no camera could be calibrated, or if the rig file or the report cannot be written.
+    /// Fails if no camera could be calibrated, or if the rig file or the report cannot be written.
     pub fn finish(self) -> anyhow::Result<()> {
         if let Some(reason) = self.refused {
             outputs::log_failure(self.written);
@@ -258,7 +259,7 @@ impl SceneOutcome {
     }
 }
 
-/// Why no camera could be calibrated; `None` if one could.
+/// The reason why no camera could be calibrated. `None` if at least one camera was calibrated.
 fn refusal(data: &Data, calibration: &SceneCalibration) -> Option<String> {
     let alignment = &calibration.alignment;
     // Without validation images, no correction can be accepted, whatever the data show.

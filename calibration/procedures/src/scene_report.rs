@@ -16,7 +16,7 @@ pub(crate) struct SceneReport<'a> {
     pub(crate) rig: Option<&'a Rig>,
     /// Names of the cameras and the number of images of each.
     pub(crate) n_images: &'a [(String, usize)],
-    /// The result; `None` if the data are not sufficient.
+    /// The result. `None` if the data are not sufficient.
     pub(crate) calibration: Option<&'a SceneCalibration>,
 }
 
@@ -132,7 +132,8 @@ impl SceneReport<'_> {
         );
     }
 
-    /// The row of a camera: its number of images, the accepted gain, and whether it was corrected.
+    /// The row of a camera with its number of images, the accepted gain, and whether the camera was
+    /// corrected.
     fn camera(&self, name: &str, n_images: usize) -> Vec<String> {
         let refused = self
             .calibration
@@ -183,8 +184,8 @@ impl SceneReport<'_> {
         both.collect()
     }
 
-    /// Standard deviations of the poses in the parents and between cameras, along and about the
-    /// axes of the camera.
+    /// Standard deviations of the camera poses, along and about the axes of the camera. They are
+    /// relative to the parents of the cameras and between cameras.
     fn sigmas(&self, calibration: &SceneCalibration) -> Vec<Vec<String>> {
         let mut rows = Vec::new();
         for (name, _) in self.n_images {

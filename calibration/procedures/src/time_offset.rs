@@ -10,7 +10,7 @@ use nalgebra::{Quaternion, Translation3, UnitQuaternion};
 use report::calibration_report::TimeOffsetReport;
 use std::path::{Path, PathBuf};
 
-/// An estimation of a time offset: its input and options.
+/// Input and options of the estimation of a time offset.
 #[derive(Clone, Debug)]
 pub struct TimeOffsetTask {
     /// Poses of the first body as rows t,x,y,z,qx,qy,qz,qw (seconds, meters).
@@ -36,9 +36,9 @@ impl TimeOffsetTask {
     /// outcome contains the reason.
     ///
     /// # Errors
-    /// If a file cannot be read, or if no report can be written to the given path.
+    /// Fails if a file cannot be read, or if no report can be written to the given path.
     pub fn run(&self) -> anyhow::Result<TimeOffsetOutcome> {
-        // Checked first, so that a wrong path does not cost a calibration.
+        // The paths are checked first, so that a wrong path does not cost a calibration.
         self.report.as_ref().map_or(Ok(()), ReportOptions::check)?;
         let a = read(&self.a)?;
         let b = read(&self.b)?;
@@ -80,7 +80,7 @@ impl TimeOffsetTask {
     }
 }
 
-/// Reads the rows of a file. Comments and a header are skipped; a row of numbers that is not a pose
+/// Reads the rows of a file. Comments and a header are skipped. A row of numbers that is not a pose
 /// is an error.
 fn read(path: &Path) -> anyhow::Result<Vec<PoseSample>> {
     let text = outputs::read_text(path)?;

@@ -94,8 +94,9 @@ pub(crate) fn residual_jacobian(predicted: &Transform, residual: &Vector6<f64>) 
     jacobian
 }
 
-/// Derivatives of [`residual`] with respect to a small motion of the flange in flange axes: the
-/// predicted pose of a flange at `base_from_flange * exp(motion)`; rotation first.
+/// Derivatives of [`residual`] with respect to a small motion of the flange in flange axes. The
+/// motion is a rotation, then a translation. The predicted flange is at `base_from_flange *
+/// exp(motion)`.
 pub(crate) fn residual_by_flange(
     setup: Setup,
     solution: &Solution,
@@ -218,7 +219,8 @@ pub(crate) fn scatter(boards: &[Transform]) -> Option<Scatter> {
     })
 }
 
-/// Sum of squared reprojection errors, square pixels; infinite if a point cannot be projected.
+/// Sum of squared reprojection errors, square pixels. It is infinite if a point cannot be
+/// projected.
 pub(crate) fn reprojection_squares(
     camera_from_board: &Transform,
     points: &[BoardPoint],

@@ -1,12 +1,12 @@
 //! Hand-eye calibration with a target: pose of a camera on the flange or beside the robot.
 //!
-//! [`calibrate_hand_eye`] takes robot poses and, for each, the pose of a board in the camera or its
-//! corners in the image. Closed-form solutions of sample triples give an initial solution that most
-//! samples agree with. The solution is then refined. With board poses, generalized least squares is
-//! used, with noise variances estimated by restricted maximum likelihood. With corners, the
-//! reprojection error is minimized, with a small unknown error of each robot pose. The result has
-//! an uncertainty and the errors of held-out samples. Input that does not determine the result is
-//! refused.
+//! [`calibrate_hand_eye`] takes robot poses. For each robot pose, it takes the pose of a board in
+//! the camera or the corners of the board in the image. Closed-form solutions of sample triples
+//! give an initial solution that most samples agree with. The solution is then refined. With board
+//! poses, it is refined by generalized least squares. The noise variances are estimated by
+//! restricted maximum likelihood. With corners, the reprojection error is minimized. Each robot
+//! pose may have a small unknown error. The result has an uncertainty and the errors of held-out
+//! samples. Input that does not determine the result is refused.
 
 mod checks;
 mod geometry;
@@ -60,7 +60,8 @@ pub struct HandEyeSample {
     pub base_from_flange: Transform,
     /// The board in the camera.
     pub board: BoardObservation,
-    /// Joint values in the order of the chain, radians or meters. Needed for joint offsets only.
+    /// Joint values in the order of the chain, radians or meters. They are needed only for
+    /// estimating joint offsets.
     pub joints: Option<Vec<f64>>,
 }
 
@@ -71,15 +72,16 @@ pub struct HandEyeInput<'a> {
     pub setup: Setup,
     /// At least three samples, all with poses or all with corners.
     pub samples: Vec<HandEyeSample>,
-    /// Lens parameters. Needed for corners; initial values if they are estimated.
+    /// Lens parameters, which are needed for corners. If the lens is estimated, they are the
+    /// initial values.
     pub intrinsics: Option<Intrinsics>,
     /// Covariance of the given intrinsics in the order of [`Intrinsics::params`]. It enlarges the
-    /// covariance of the result. `None`: the intrinsics are taken as exact. Not used if they are
-    /// estimated.
+    /// covariance of the result. With `None`, the intrinsics count as exact. The covariance is not
+    /// used if the intrinsics are estimated.
     pub intrinsics_covariance: Option<DMatrix<f64>>,
-    /// Rotations of the board after which it looks the same, `board_from_equivalent_board`: for
-    /// example a half turn about the center of a chessboard whose numbers of inner corners are both
-    /// even or both odd. Empty if the orientation is unique.
+    /// Rotations `board_from_equivalent_board` after which the board looks the same. An example is
+    /// a half turn about the center of a chessboard whose numbers of inner corners are both even or
+    /// both odd. Empty if the orientation is unique.
     pub board_symmetries: &'a [Transform],
     /// The arm, for joint offsets.
     pub chain: Option<&'a Chain>,
@@ -90,18 +92,19 @@ pub struct HandEyeInput<'a> {
 /// Options of [`calibrate_hand_eye`].
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct HandEyeOptions {
-    /// Estimates the intrinsics together with the hand-eye transform. Needs corners.
+    /// Estimates the intrinsics together with the hand-eye transform. This needs corners.
     pub estimate_intrinsics: bool,
-    /// Estimates offsets of the joints except the first and the last. Needs corners, joint values
-    /// and a chain.
+    /// Estimates offsets of the joints except the first and the last. This needs corners, joint
+    /// values and a chain.
     pub estimate_joint_offsets: bool,
-    /// Whether the second poses are those of a board that a camera sees, so that it must be in
-    /// front of the camera.
+    /// Whether the second pose of each sample is the pose of a board that a camera sees. Such a
+    /// board must be in front of the camera.
     pub board_is_seen: bool,
-    /// Refuses a result with a larger standard deviation of the position along any direction,
-    /// meters.
+    /// Maximum standard deviation of the position along any direction, meters. A less certain
+    /// result is refused.
     pub max_sigma_m: f64,
-    /// Refuses a result with a larger standard deviation of the rotation around any axis, radians.
+    /// Maximum standard deviation of the rotation around any axis, radians. A less certain result
+    /// is refused.
     pub max_sigma_rad: f64,
 }
 
@@ -120,12 +123,12 @@ impl Default for HandEyeOptions {
 /// Minimum number of samples.
 pub const MIN_SAMPLES: usize = 3;
 
-/// Estimates the pose of the camera on the flange (eye in hand) or in the base (eye to hand), and
-/// that of the board.
+/// Estimates the pose of the camera on the flange (eye in hand) or in the base (eye to hand). Also
+/// estimates the pose of the board.
 ///
-/// # Errors
-/// [`Error::Refused`] if the samples do not determine the result or contain a mistake: the message
-/// names the reason and the remedy. [`Error::HandEyeInput`] if the input is invalid.
+/// # Errors Returns [`Error::Refused`] if the samples do not determine the result or contain a
+/// mistake. The message names the reason and the remedy. Returns [`Error::HandEyeInput`] if the
+/// input is invalid.
 ///
 /// ```
 /// use calibration::hand_eye::{BoardObservation, HandEyeInput, HandEyeOptions, HandEyeSample, Setup, calibrate_hand_eye};

@@ -27,12 +27,12 @@ pub struct HandEyeCalibration {
     pub sigma_mm: [f64; 3],
     /// Standard deviations of the rotation around the camera's axes, degrees.
     pub sigma_deg: [f64; 3],
-    /// Scatter of the board over the used samples, with the result that was estimated from all of
-    /// them.
+    /// Scatter of the board over the used samples. It is computed with the result that was
+    /// estimated from all used samples.
     pub scatter: Scatter,
-    /// The same for held-out samples: each sample is evaluated with a calibration from other
-    /// samples. One sample is left out at a time. With more than [`MAX_FOLDS`](super::MAX_FOLDS)
-    /// samples, cross-validation with that number of folds is used.
+    /// Scatter of the board over held-out samples. Each sample is evaluated with a calibration from
+    /// other samples. One sample is left out at a time. With more than
+    /// [`MAX_FOLDS`](super::MAX_FOLDS) samples, cross-validation with that number of folds is used.
     pub held_out_scatter: Option<Scatter>,
     /// RMS length of the reprojection error of the used corners, pixels. The robot poses are taken
     /// as exact.
@@ -54,7 +54,7 @@ pub struct HandEyeCalibration {
     pub(super) refined: Refined,
 }
 
-/// Offset of one joint: the joint is at the reported value plus the offset.
+/// Offset of one joint. The joint is at the reported value plus the offset.
 #[derive(Clone, Debug, PartialEq)]
 pub struct JointOffset {
     /// Name of the joint.
@@ -90,19 +90,20 @@ pub struct SampleReport {
     pub position_mm: Option<f64>,
     /// Angle between measured and predicted board, degrees.
     pub rotation_deg: Option<f64>,
-    /// Deviation relative to the estimated noise: 1 is typical.
+    /// Deviation relative to the estimated noise. A value of 1 is typical.
     pub normalized: Option<f64>,
     /// RMS reprojection error, pixels.
     pub rms_px: Option<f64>,
-    /// Origin of the board according to this sample minus that of the result, millimeters along the
-    /// axes of the base (eye in hand) or the flange (eye to hand).
+    /// Origin of the board according to this sample minus the origin according to the result,
+    /// millimeters. The axes are those of the base (eye in hand) or the flange (eye to hand).
     pub board_offset_mm: Option<[f64; 3]>,
     /// Corners without outliers, with their reprojection errors. Empty for given poses.
     pub points: Vec<PointFit>,
 }
 
-/// A joint offset counts as observable up to this standard deviation, radians or meters; 1 degree.
-/// With a larger value, offsets that the data hardly determine would be reported.
+/// A joint offset counts as observable up to this standard deviation, radians or meters. For a
+/// rotation, it is 1 degree. With a larger value, offsets that the data hardly determine would be
+/// reported.
 const MAX_JOINT_SIGMA: f64 = 0.0175;
 
 /// Evaluates a refined solution.
@@ -279,8 +280,8 @@ fn with_status(reports: &[SampleReport], status: SampleStatus) -> Vec<&str> {
     reports.map(|report| report.name.as_str()).collect()
 }
 
-/// Problems that do not invalidate the result: those of the lens, of single samples, and of their
-/// number.
+/// Problems that do not invalidate the result. They concern the lens, single samples, and the
+/// number of samples.
 fn problems(input: &HandEyeInput<'_>, refined: &Refined, reports: &[SampleReport]) -> Vec<String> {
     let mut warnings: Vec<String> = refined.intrinsics_doubt.clone().into_iter().collect();
     let repeated = with_status(reports, SampleStatus::Repeated);
@@ -314,7 +315,7 @@ fn problems(input: &HandEyeInput<'_>, refined: &Refined, reports: &[SampleReport
         ));
     }
     // There are twelve unknowns. With three to five poses, a wrong pose hardly contradicts the
-    // others.
+    // other poses.
     if n_stops < 6 {
         warnings
             .push(format!("only {n_stops} robot poses were used: with fewer than 6, wrong samples may go unnoticed"));
@@ -323,8 +324,8 @@ fn problems(input: &HandEyeInput<'_>, refined: &Refined, reports: &[SampleReport
 }
 
 /// Names of the samples that show the board from the other side than most samples, so that its
-/// corners are mirrored. If only a few samples do so, the detection swapped corners. If most
-/// samples show the back, the points of the board are defined that way.
+/// corners are mirrored. If only a few samples are mirrored, the detection has swapped corners. If
+/// most samples show the back of the board, the points of the board are defined that way.
 fn mirrored<'a>(input: &'a HandEyeInput<'_>, refined: &Refined) -> Vec<&'a str> {
     // The board's z axis points away from a viewer of the printed side.
     let is_front = |sample: &Sample| {

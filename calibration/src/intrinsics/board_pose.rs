@@ -153,7 +153,7 @@ pub(super) fn refine(
                     break;
                 }
             }
-            // Steps as short as this one change nothing; the pose is at a minimum.
+            // Steps as short as this one change nothing. The pose is at a minimum.
             None if damping > 1e6 => break,
             None => damping *= 10.0,
         }
@@ -168,8 +168,9 @@ pub(super) fn refine(
     })
 }
 
-/// Reprojection error of a point, projected minus detected, pixels, and its derivatives with respect
-/// to the step of [`moved`], one array per component. `None` if the lens cannot image the point.
+/// Reprojection error of a point (projected minus detected), pixels. Also returns its derivatives
+/// with respect to the step of [`moved`], with one array per component. `None` if the lens cannot
+/// image the point.
 pub(crate) fn residual(
     intrinsics: &Intrinsics,
     point: &BoardPoint,

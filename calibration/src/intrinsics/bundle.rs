@@ -23,8 +23,8 @@ pub(super) struct Bundle {
 }
 
 impl Bundle {
-    /// Distances between detected and projected points, pixels; infinite where the lens cannot image
-    /// the point.
+    /// Distances between detected and projected points, pixels. A distance is infinite if the lens
+    /// cannot image the point.
     pub(super) fn errors_px(&self, image_ix: usize, points: &[BoardPoint]) -> Vec<f64> {
         let error_px = |point: &BoardPoint| {
             let in_camera = self.poses[image_ix] * Point3::from(point.point_in_board);
@@ -52,8 +52,7 @@ impl Bundle {
 /// * `images`: points of each image, in the order of the poses.
 /// * `tolerance`: see [`Options::tolerance`].
 ///
-/// # Errors
-/// See [`least_squares::minimize`].
+/// # Errors Fails as [`least_squares::minimize`] does.
 pub(super) fn refine(
     images: &[&[BoardPoint]],
     start: Bundle,
@@ -153,7 +152,8 @@ mod tests {
     #[test]
     fn derivatives_match_central_differences() {
         const NUDGE: f64 = 1e-6;
-        // Relative to the gradient's norm; truncation and rounding errors are 1e-9 of it.
+        // The tolerance is relative to the norm of the gradient. Truncation and rounding errors are
+        // 1e-9 of this norm.
         const REL: f64 = 1e-6;
         for (camera, coefficients) in [
             (brown_conrady_camera(), Coefficients::BROWN_CONRADY),

@@ -8,7 +8,7 @@ use crate::{BoardPoint, BoardView, Error};
 use nalgebra::Vector3;
 use numbers::quantile::median;
 
-/// Minimum number of images: each gives two constraints on focal lengths and principal point.
+/// Minimum number of images. Each image gives two constraints on focal lengths and principal point.
 pub(super) const MIN_IMAGES: usize = 3;
 /// Images whose corners differ by less than this, in pixels, are repetitions. If they counted as
 /// independent, the uncertainty would be underestimated.
@@ -18,8 +18,8 @@ const MIN_DISTANCE_PX: f64 = 1.0;
 /// rejects the others.
 ///
 /// # Errors
-/// If the sizes differ, a value is not finite, the target is not flat or has an implausible size,
-/// or there are too few images.
+/// Fails if the sizes differ, a value is not finite, the target is not flat or has an implausible
+/// size, or there are too few images.
 pub(super) fn usable_images(
     views: &[BoardView],
     sizes_px: &[[u32; 2]],
@@ -97,8 +97,8 @@ fn is_finite(point: &BoardPoint) -> bool {
         .all(|value| value.is_finite())
 }
 
-/// Median distance of the points that two images share, pixels; `None` if they do not share most of
-/// them.
+/// Median distance of the points that two images share, pixels. `None` if they do not share most of
+/// their points.
 fn median_distance_px(view: &BoardView, other: &BoardView) -> Option<f64> {
     let distances: Vec<f64> = view
         .points
@@ -160,8 +160,9 @@ fn check_target<'a>(points: impl Iterator<Item = &'a BoardPoint> + Clone) -> Res
 
 /// Refuses a result whose focal length or principal point the images do not determine.
 pub(super) fn check_observable(fit: &Fit<Bundle>) -> Result<(), Error> {
-    /// Maximum standard deviation of the focal length, relative to it, and of the principal point,
-    /// relative to the focal length or to the longer side of the image.
+    /// Maximum standard deviation of the focal length and of the principal point. For the focal
+    /// length, it is relative to the focal length. For the principal point, it is relative to the
+    /// focal length or to the longer side of the image.
     const MAX_SIGMA_FRAC: f64 = 0.05;
     /// Focal lengths, relative to the longer side of the image, that occur in cameras.
     const FOCAL_FRACS: std::ops::Range<f64> = 0.05..100.0;

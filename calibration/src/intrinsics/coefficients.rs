@@ -3,7 +3,7 @@
 use kinematics::{Intrinsics, Lens};
 use nalgebra::DVector;
 
-/// A lens model and the coefficients of it that are estimated; the others are zero.
+/// A lens model and those of its coefficients that are estimated. The other coefficients are zero.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) struct Coefficients {
     pub(super) family: Family,
@@ -31,7 +31,7 @@ impl Coefficients {
         is_estimated: [true, true, true, true, false, false, false, false],
     };
 
-    /// Selected coefficients of Brown-Conrady: k1, k2, p1, p2, k3.
+    /// Selects among the coefficients k1, k2, p1, p2 and k3 of Brown-Conrady.
     pub(super) const fn brown_conrady([k1, k2, p1, p2, k3]: [bool; 5]) -> Self {
         Self {
             family: Family::BrownConrady,
@@ -39,8 +39,8 @@ impl Coefficients {
         }
     }
 
-    /// The rational model with all radial coefficients, and with the tangential ones if this set
-    /// has them.
+    /// The rational model with all radial coefficients. It has the tangential coefficients if this
+    /// set has them.
     pub(super) fn rational(self) -> Self {
         let [_, _, p1, p2, ..] = self.is_estimated;
         Self {
@@ -86,8 +86,8 @@ impl Coefficients {
 
     /// Typical magnitudes of the estimated parameters.
     pub(super) fn scales(self, intrinsics: &Intrinsics) -> DVector<f64> {
-        // Radial coefficients of common lenses are a few tenths. Tangential ones describe elements
-        // that are not centered, and are ten times smaller.
+        // Radial coefficients of common lenses are a few tenths. Tangential coefficients describe
+        // lens elements that are not centered, and are ten times smaller.
         const COEFFICIENT: f64 = 0.1;
         const TANGENTIAL: f64 = 0.01;
         let [fx, fy] = intrinsics.focal_px.map(f64::abs);

@@ -1,4 +1,5 @@
-//! Values on a regular grid over the image: coverage by corners, and projection uncertainty.
+//! Values on a regular grid over the image, such as the coverage by corners and the projection
+//! uncertainty.
 
 use kinematics::{Intrinsics, Projection};
 use nalgebra::{DMatrix, Matrix2, Matrix2x3, Matrix3, Matrix3xX, SMatrix, Vector3};
@@ -14,7 +15,7 @@ pub struct ImageGrid<T> {
     pub values: Vec<T>,
 }
 
-/// Cells of the aspect ratio of common images, 16:9. With more cells, more images are needed to
+/// The grid has the aspect ratio of common images, 16:9. With more cells, more images are needed to
 /// cover them.
 const N_COLUMNS: usize = 16;
 const N_ROWS: usize = 9;

@@ -1,4 +1,5 @@
-//! What images of a target cover so far, and which ones to take next, without a calibration.
+//! Determines what images of a target cover so far and which images to take next. This needs no
+//! calibration.
 //!
 //! Calibrating a lens requires corners in all parts of the image and tilts in all directions.
 //! Without tilts, a longer focal length cannot be distinguished from a larger distance (Zhang 2000,
@@ -11,13 +12,13 @@ use kinematics::Intrinsics;
 use nalgebra::Vector3;
 use std::fmt;
 
-/// Number of images after which no more are needed, if they cover everything.
+/// Number of images that are sufficient, if they cover everything.
 pub const RECOMMENDED_IMAGES: usize = 15;
 /// A part of the image is covered if this fraction of its cells has corners. Not all cells are
 /// required, because a target rarely reaches the outermost ones.
 const MIN_COVERED_FRAC: f64 = 0.5;
 /// A tilt counts if the angle between the normal of the target and the line of sight is at least
-/// this. It is below the requested 20 degrees, because people estimate tilts by eye.
+/// this value. The value is below the requested 20 degrees, because people estimate tilts by eye.
 const MIN_TILT_DEG: f64 = 15.0;
 /// Number of images with each tilt.
 const MIN_TILTED: usize = 2;
@@ -88,7 +89,8 @@ const REGIONS: [(ImageRegion, [[f64; 2]; 2]); 5] = [
 impl IntrinsicsGuidance {
     /// Guidance for the images so far.
     ///
-    /// * `intrinsics`: an approximate lens, for the tilts; its size is that of the images.
+    /// * `intrinsics`: an approximate lens with the size of the images. It is used to estimate the
+    ///   tilts.
     pub fn new(views: &[BoardView], intrinsics: &Intrinsics) -> Self {
         let points = views.iter().flat_map(|view| &view.points);
         let coverage = ImageGrid::coverage(intrinsics.size_px, points.map(|point| point.pixel));
@@ -101,7 +103,7 @@ impl IntrinsicsGuidance {
     }
 }
 
-/// The first thing that is missing: tilts, then parts of the image.
+/// Advice about the first missing item. Missing tilts come before missing parts of the image.
 fn advice(
     views: &[BoardView],
     coverage: &ImageGrid<usize>,
@@ -134,7 +136,7 @@ fn advice(
     }
 }
 
-/// Whether a tilt, as of [`tilt_deg`], moves a side away from the camera.
+/// Whether a tilt that [`tilt_deg`] has returned moves a side away from the camera.
 fn is_tilted(side: Side, [about_x, about_y]: [f64; 2]) -> bool {
     let angle = match side {
         Side::Left => about_y,
@@ -164,8 +166,8 @@ fn covered_frac(coverage: &ImageGrid<usize>, [columns, rows]: [[f64; 2]; 2]) -> 
 }
 
 /// Rotation of the target about the x and the y axis of the camera relative to facing it, degrees.
-/// A positive angle about y means that the left side is farther away, a positive angle about x that
-/// the lower side is.
+/// With a positive angle about y, the left side is farther away. With a positive angle about x, the
+/// lower side is farther away.
 fn tilt_deg(view: &BoardView, intrinsics: &Intrinsics) -> Option<[f64; 2]> {
     let pose = board_pose(intrinsics, &view.points)?.camera_from_board;
     let center = view

@@ -115,10 +115,10 @@ impl Normalization {
 /// The pose `camera_from_plane` of the plane z = 0 from its homography to the plane `z = 1` of the
 /// camera.
 ///
-/// Source: Zhang 2000, section 3.1; the rotation is the nearest one (appendix C).
+/// Source: Zhang 2000, section 3.1. The rotation is the one nearest to the matrix (appendix C).
 pub(super) fn pose(homography: &Matrix3<f64>) -> Option<Transform> {
-    // The first two columns are those of the rotation, up to the scale. With noise, their lengths
-    // differ a little.
+    // The first two columns are the columns of the rotation, up to the scale. With noise, their
+    // lengths differ a little.
     let first = homography.column(0).into_owned();
     let second = homography.column(1).into_owned();
     let length = 0.5 * (first.norm() + second.norm());

@@ -8,8 +8,9 @@ use kinematics::{Intrinsics, Lens, Transform};
 use nalgebra::{Matrix2, Matrix3, Matrix6, Translation3, Vector2, Vector6};
 use numbers::quantile::median;
 
-/// Focal lengths that are tried, relative to the longer side of the image: fields of view of about
-/// 20 to 100 degrees for a pinhole, and of 20 to 200 degrees for an equidistant fisheye.
+/// Focal lengths that are tried, relative to the longer side of the image. They correspond to
+/// fields of view of about 20 to 100 degrees for a pinhole, and of 20 to 200 degrees for an
+/// equidistant fisheye.
 const PINHOLE_FOCAL_FRACS: [f64; 6] = [0.4, 0.6, 0.9, 1.3, 2.0, 3.0];
 const FISHEYE_FOCAL_FRACS: [f64; 9] = [0.27, 0.33, 0.4, 0.5, 0.65, 0.8, 1.1, 1.6, 2.4];
 
@@ -18,7 +19,8 @@ const FISHEYE_FOCAL_FRACS: [f64; 9] = [0.27, 0.33, 0.4, 0.5, 0.65, 0.8, 1.1, 1.6
 pub(super) struct Start {
     pub(super) intrinsics: Intrinsics,
     pub(super) poses: Vec<Option<Transform>>,
-    /// Root mean square of the reprojection error of each image, pixels; infinite without a pose.
+    /// Root mean square of the reprojection error of each image, pixels. It is infinite without a
+    /// pose.
     pub(super) errors_px: Vec<f64>,
 }
 
@@ -62,8 +64,9 @@ fn rms_px(intrinsics: &Intrinsics, pose: Transform, points: &[BoardPoint]) -> f6
     (squares / points.len() as f64).sqrt()
 }
 
-/// Initial values for lenses that are close to a pinhole: the best of Zhang's closed form, of the
-/// closed form with the principal point at the center of the image, and of a set of focal lengths.
+/// Initial values for lenses that are close to a pinhole. They are the best of three results:
+/// Zhang's closed form, the closed form with the principal point at the center of the image, and a
+/// scan over focal lengths.
 ///
 /// Returns `None` if fewer than half of the images have a homography that fits one of them.
 pub(super) fn pinhole(images: &[&[BoardPoint]], size_px: [u32; 2]) -> Option<Start> {
@@ -97,7 +100,7 @@ pub(super) fn pinhole(images: &[&[BoardPoint]], size_px: [u32; 2]) -> Option<Sta
     best(starts)
 }
 
-/// Initial values for fisheye lenses: the best of a set of equidistant lenses.
+/// Initial values for fisheye lenses. They are the best of a set of equidistant lenses.
 pub(super) fn fisheye(images: &[&[BoardPoint]], size_px: [u32; 2]) -> Option<Start> {
     /// Number of candidates whose poses are refined. Poses of homographies are inaccurate for wide
     /// angles.
@@ -263,8 +266,9 @@ fn single_focal(homographies: &[Matrix3<f64>]) -> Option<Plane> {
     focal.is_finite().then_some(([focal; 2], [0.0; 2]))
 }
 
-/// Products of two columns of a homography: the product over the first two rows, which is divided
-/// by the squared focal length, and minus the product in the last row.
+/// Two products of two columns of a homography. The first is the product over the first two rows,
+/// which is divided by the squared focal length. The second is the negative product in the last
+/// row.
 fn products(homography: &Matrix3<f64>, i: usize, j: usize) -> Vector2<f64> {
     let a = homography.column(i);
     let b = homography.column(j);

@@ -39,7 +39,7 @@ pub struct IntrinsicsInput<'a> {
     /// The target in each image. The numbering of its points must be consistent. It may be mirrored
     /// or rotated.
     pub views: &'a [BoardView],
-    /// Width and height of each image, pixels; all equal.
+    /// Width and height of each image, pixels. All sizes must be equal.
     pub sizes_px: &'a [[u32; 2]],
     /// The lens model.
     pub model: LensModel,
@@ -48,9 +48,10 @@ pub struct IntrinsicsInput<'a> {
 /// A lens model to estimate.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum LensModel {
-    /// The simplest model that explains the images: a coefficient is estimated only if it lowers
-    /// the error on held-out corners significantly. With fewer than four images, all coefficients
-    /// of the better of Brown-Conrady (k1, k2, p1, p2, k3) and Kannala-Brandt are estimated.
+    /// The simplest model that explains the images. A coefficient is estimated only if it lowers
+    /// the error on held-out corners significantly. With fewer than four images, two models are
+    /// compared: Brown-Conrady (k1, k2, p1, p2, k3) and Kannala-Brandt. All coefficients of the
+    /// better one are estimated.
     #[default]
     Auto,
     /// No distortion.
@@ -66,11 +67,12 @@ pub enum LensModel {
 /// Estimates the intrinsics of a camera from images of a flat target, with their uncertainty.
 ///
 /// Images may show parts of the target. Images and corners that are inconsistent with the others
-/// are rejected and named; up to half of the images may be.
+/// are rejected and named. Up to half of the images may be inconsistent.
 ///
 /// # Errors
-/// If the input is malformed, if too few images are usable, if no lens model fits, or if the images
-/// do not determine the focal length or the principal point. The message contains the remedy.
+/// Fails if the input is malformed, if too few images are usable, if no lens model fits, or if the
+/// images do not determine the focal length or the principal point. The message contains the
+/// remedy.
 pub fn calibrate_intrinsics(input: &IntrinsicsInput<'_>) -> Result<IntrinsicsCalibration, Error> {
     // Each phase rejects what would affect the next one: malformed input, gross errors of single
     // corners, images that contradict the others, and results that are not determined.
@@ -118,15 +120,15 @@ pub fn calibrate_intrinsics(input: &IntrinsicsInput<'_>) -> Result<IntrinsicsCal
     Ok(report::report(&views, fit, rejected, trials))
 }
 
-/// Selects the lens model, with the images and corners that the better of two fits keeps. With too
-/// few images for a comparison, the better fit is the result.
+/// Selects the lens model from two fits, with the images and corners that the better fit keeps.
+/// With too few images for a comparison of coefficients, the better fit is the result.
 fn select(
     images: &[&[BoardPoint]],
     near_pinhole: Option<RobustFit>,
     fisheye: Option<RobustFit>,
 ) -> Result<(Option<RobustFit>, Vec<LensTrial>), Error> {
-    // Maximum error relative to the smaller of both typical errors. The errors of a wrong lens
-    // model are far above it.
+    // Maximum error relative to the smaller of the two typical errors. The errors of a wrong lens
+    // model are far above this maximum.
     const MAX_ERROR_RATIO: f64 = 3.0;
     // A fit that rejects images is not better than a fit that explains them. A fit with large
     // errors explains no images.
@@ -163,8 +165,8 @@ fn select(
 
 /// Refuses a fit with errors that no corner detector has.
 fn check_match(fit: &RobustFit, size_px: [u32; 2]) -> Result<(), Error> {
-    // Maximum error as a fraction of the longer side of the image: 38 px of 1280. Errors of this
-    // size come from a wrong layout of the target.
+    // Maximum error as a fraction of the longer side of the image. For a side of 1280 px, it is 38
+    // px. Larger errors come from a wrong layout of the target.
     const MAX_ERROR_FRAC: f64 = 0.03;
     let side_px = f64::from(size_px[0].max(size_px[1]));
     if fit.typical_px < MAX_ERROR_FRAC * side_px {

@@ -10,10 +10,10 @@ use nalgebra::{DMatrix, Translation3, UnitQuaternion, Vector3};
 pub struct NextView {
     /// The suggested pose of the target.
     pub camera_from_board: Transform,
-    /// What to do, such as `tilt the target 35 degrees with its left side away from the camera, at
-    /// the upper right of the image, 0.42 m away`.
+    /// Instruction for the user, such as `tilt the target 35 degrees with its left side away from
+    /// the camera, at the upper right of the image, 0.42 m away`.
     pub instruction: String,
-    /// Root mean square over the image of the projection uncertainty now, pixels.
+    /// Root mean square over the image of the current projection uncertainty, pixels.
     pub sigma_px: f64,
     /// The same, predicted with the suggested image.
     pub predicted_sigma_px: f64,
@@ -78,8 +78,8 @@ pub(super) fn suggest(
         let covariance = information.cholesky()?.inverse() * known.variance;
         Some(mean_square.dot(&covariance).max(0.0).sqrt())
     };
-    // 162 poses are evaluated. Each adds the information of one image in which all points of the
-    // target are detected.
+    // 162 poses are evaluated. Each pose adds the information of one image in which all points of
+    // the target are detected.
     let current_px = sigma_px(known.information.clone())?;
     let mut best: Option<NextView> = None;
     for (region, region_words) in REGIONS {

@@ -23,8 +23,8 @@ pub struct IntrinsicsCalibration {
     pub params: Vec<EstimatedParam>,
     /// Covariance of [`Self::params`].
     pub covariance: DMatrix<f64>,
-    /// Root mean square of the distances between detected and projected points, pixels; over the
-    /// points in use, as in OpenCV.
+    /// Root mean square of the distances between detected and projected points, pixels. As in
+    /// OpenCV, it is computed over the points in use.
     pub rms_px: f64,
     /// Standard deviation of a detected corner along one axis, estimated from the residuals,
     /// pixels.
@@ -36,7 +36,8 @@ pub struct IntrinsicsCalibration {
     pub images: Vec<ImageFit>,
     /// Images and corners that were not used, with the reason.
     pub rejected: Vec<Rejected>,
-    /// Comparisons of lens models; empty unless the model is [`super::LensModel::Auto`].
+    /// Comparisons of lens models. The list is empty unless the model is
+    /// [`super::LensModel::Auto`].
     pub trials: Vec<LensTrial>,
     /// Number of corners in use in each part of the image.
     pub coverage: ImageGrid<usize>,
@@ -44,10 +45,10 @@ pub struct IntrinsicsCalibration {
     /// worst direction, pixels. `None` beyond the range of the lens model.
     ///
     /// The uncertainty of the intrinsics is propagated to the pixel. A rotation of the camera frame
-    /// absorbs most of each change of the intrinsics. It is removed, because such a rotation does
-    /// not matter for images of unknown pose. mrcal 2.4 ("projection uncertainty") derives this
-    /// rotation from the poses of the target; here it minimizes the squared displacements over the
-    /// whole image.
+    /// absorbs most of each change of the intrinsics. This part is removed, because such a rotation
+    /// does not matter for images of unknown pose. mrcal 2.4 ("projection uncertainty") derives
+    /// this rotation from the poses of the target. Here, the rotation minimizes the squared
+    /// displacements over the whole image.
     pub uncertainty_px: ImageGrid<Option<f64>>,
     /// The pose of the target that would lower the projection uncertainty the most.
     pub next_view: Option<NextView>,
@@ -200,7 +201,7 @@ pub(super) fn rejections(views: &[&BoardView], fit: &RobustFit) -> Vec<Rejected>
     rejected
 }
 
-/// Why an image or some of its corners are not used. `None` if all are.
+/// The reason why an image or some of its corners are not used. `None` if all corners are used.
 fn rejection(image_ix: usize, view: &BoardView, fit: &RobustFit) -> Option<RejectionReason> {
     let kept = &fit.kept;
     let intrinsics = &fit.fit.state.intrinsics;
@@ -228,7 +229,7 @@ fn rejection(image_ix: usize, view: &BoardView, fit: &RobustFit) -> Option<Rejec
             typical_px,
         });
     };
-    // Corners with the largest errors are rejected first, so the largest error of all belongs to a
+    // Corners with the largest errors are rejected first, so the largest error belongs to a
     // rejected corner.
     let n_corners = view.points.len() - kept.points[position].len();
     let max_px = errors_px.iter().copied().fold(0.0, f64::max);
@@ -275,7 +276,7 @@ pub(super) fn report(
             }
         })
         .collect();
-    // The projection uncertainty now, and the image that reduces it most.
+    // The current projection uncertainty, and the next image that reduces it most.
     let derivatives = ProjectionDerivatives::new(&fit.state.intrinsics, &params);
     let known = next_view::Known {
         intrinsics: &fit.state.intrinsics,

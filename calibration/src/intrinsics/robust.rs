@@ -15,14 +15,15 @@ use numbers::random::Random;
 /// Minimum number of corners that an image keeps. With fewer corners, its pose has too little
 /// redundancy.
 pub(super) const MIN_POINTS: usize = 6;
-/// A corner is rejected if its error exceeds this multiple of the standard deviation of the others.
-/// Normal errors do not (1 in 10^8), but errors of real corners have longer tails.
+/// A corner is rejected if its error exceeds this multiple of the standard deviation of the other
+/// corners. Only 1 in 10^8 normally distributed errors would exceed it, but errors of real corners
+/// have longer tails.
 const MAX_SIGMAS: f64 = 6.0;
-/// An image is rejected if its median error exceeds this multiple of the median error of the
-/// others. Blurred images have larger errors, but still contribute.
+/// An image is rejected if its median error exceeds this multiple of the median error of the other
+/// images. Blurred images have larger errors, but still contribute.
 const MAX_MEDIAN_RATIO: f64 = 6.0;
-/// An image is rejected if more than this fraction of its corners are rejected. In that case, the
-/// minority of the corners may be right.
+/// An image is rejected if more than this fraction of its corners is rejected. In that case, the
+/// rejected corners may be the correct ones.
 const MAX_OUTLIER_FRAC: f64 = 0.5;
 /// Ratio between the median and the standard deviation per axis of the norm of a normal error
 /// (Rayleigh distribution).
@@ -76,9 +77,9 @@ impl Kept {
 
 /// Fits a lens model to all consistent images. `None` if there is no solution.
 ///
-/// Corners are weighted by Huber's loss until the outliers are found; the last fit weights all that
-/// remain equally, which is optimal for normal errors. A rejected image or corner returns if a
-/// later fit agrees with it.
+/// Corners are weighted by Huber's loss until the outliers are found. The last fit weights all
+/// remaining corners equally, which is optimal for normal errors. A rejected image or corner
+/// returns if a later fit agrees with it.
 ///
 /// * `start_images`: the points of the start; see [`without_gross_errors`].
 pub(super) fn fit(
@@ -108,7 +109,7 @@ pub(super) fn fit(
         image_ixs,
     };
     // The coefficients of the rational model are nearly redundant, so they start from the
-    // polynomial's.
+    // coefficients of the polynomial.
     let first = if coefficients.family == Family::RationalBrownConrady {
         Coefficients::BROWN_CONRADY
     } else {
@@ -125,8 +126,8 @@ pub(super) fn fit(
 /// The points of each image that are consistent with one homography, up to a smooth distortion. For
 /// most images, these are all points.
 ///
-/// Half of the points may be wrong: the homography has the least median of errors over random
-/// samples (Rousseeuw 1984).
+/// Half of the points may be wrong, because the homography is the one with the least median of
+/// errors over random samples (Rousseeuw 1984).
 pub(super) fn without_gross_errors(images: &[&[BoardPoint]]) -> Vec<Vec<BoardPoint>> {
     images
         .iter()
@@ -138,8 +139,8 @@ fn consistent_points(points: &[BoardPoint]) -> Vec<BoardPoint> {
     /// Samples of four points. With 45 % wrong points, one of them is free of errors with a
     /// probability of 99.9 %.
     const N_SAMPLES: usize = 75;
-    /// Points are kept up to this multiple of the median error. Deviations due to distortion are
-    /// smaller.
+    /// Points with errors up to this multiple of the median error are kept. Deviations due to
+    /// distortion are smaller.
     const MAX_MEDIAN_RATIO: f64 = 8.0;
     let pairs: Vec<_> = points
         .iter()
@@ -184,8 +185,8 @@ fn consistent_points(points: &[BoardPoint]) -> Vec<BoardPoint> {
         .collect()
 }
 
-/// Distances between the second points of pairs and the images of the first ones; infinite for
-/// points at infinity.
+/// Distances between the second points of pairs and the images of the first points. A distance is
+/// infinite for a point at infinity.
 fn transfer_errors(homography: &Matrix3<f64>, pairs: &[(Vector2<f64>, Vector2<f64>)]) -> Vec<f64> {
     pairs
         .iter()
@@ -238,7 +239,8 @@ pub(super) fn refit(
 
 /// A fit that limits the influence of remaining outliers.
 fn huber(kept: &Kept, bundle: Bundle, coefficients: Coefficients) -> Option<Bundle> {
-    // For normal errors, the norm exceeds this in 4 % of the corners: exp(-2.5² / 2).
+    // For normal errors, the norm exceeds this limit at 4 % of the corners, because exp(-2.5² / 2)
+    // = 0.04.
     const THRESHOLD_SIGMAS: f64 = 2.5;
     let errors: Vec<f64> = (0..kept.points.len())
         .flat_map(|ix| bundle.errors_px(ix, &kept.points[ix]))
@@ -288,8 +290,8 @@ fn median_px(image: &Option<(Transform, Vec<f64>)>) -> Option<f64> {
 /// Selects the images and corners that agree with the intrinsics, and returns the poses of these
 /// images and the typical error.
 fn judge(images: &[&[BoardPoint]], kept: &Kept, bundle: &Bundle) -> Option<(Kept, Bundle, f64)> {
-    // The poses of all images are estimated, including images that are not in use, so that these
-    // can be used again.
+    // The poses of all images are estimated, including images that are not in use, so that such
+    // images can be used again.
     let poses: Vec<_> = (0..images.len())
         .map(|image_ix| {
             let position = kept

@@ -16,22 +16,22 @@ pub struct LensTrial {
     pub baseline: String,
     /// The model that was tested against it.
     pub variant: String,
-    /// Decrease of the error on held-out corners, dB: 20 times the decimal logarithm of the ratio
-    /// of the root mean squares, averaged over the images.
+    /// Decrease of the error on held-out corners, dB. It is 20 times the decimal logarithm of the
+    /// ratio of the root mean squares, averaged over the images.
     pub gain_db: f64,
     /// Standard error of the gain, dB.
     pub standard_error_db: f64,
     /// Number of images.
     pub n_images: usize,
-    /// Whether the variant replaces the baseline: the gain is significant, or the variant is
-    /// simpler and not worse.
+    /// Whether the variant replaces the baseline. It does if the gain is significant, or if the
+    /// variant is simpler and not worse.
     pub kept: bool,
 }
 
 /// Minimum gain of additional coefficients, dB. Smaller gains do not change an image by a visible
 /// amount.
 const MIN_GAIN_DB: f64 = 0.05;
-/// Minimum gain in standard errors: about 2 % of useless coefficients exceed it by chance.
+/// Minimum gain in standard errors. About 2 % of useless coefficients exceed it by chance.
 const MIN_STANDARD_ERRORS: f64 = 2.0;
 
 /// A model with its held-out error in each image.
@@ -44,11 +44,10 @@ struct Scored {
 /// Adds coefficients one group at a time, and keeps those that lower the error on held-out corners
 /// significantly. Returns the selected model with its parameters, and all comparisons.
 ///
-/// Brown-Conrady starts as a pinhole. The groups k1, k2, p1 and p2, and k3 are added in this order;
-/// the rational terms follow unless k3 was not needed. If k1 alone is not significant, k1 and k2
-/// are tried together. Finally, the result is compared with Kannala-Brandt. Since Kannala-Brandt
-/// has fewer coefficients than a rational model, it replaces that model even if both are equally
-/// good.
+/// Brown-Conrady starts as a pinhole. The groups are added in this order: k1; k2; p1 and p2; k3. If
+/// k3 was needed, the rational terms follow. If k1 alone is not significant, k1 and k2 are tried
+/// together. Finally, the result is compared with Kannala-Brandt. Since Kannala-Brandt has fewer
+/// coefficients than a rational model, it replaces that model even if both are equally good.
 pub(super) fn select(
     kept: &Kept,
     near_pinhole: Option<&RobustFit>,
@@ -133,8 +132,8 @@ fn start_of(kept: &Kept, fit: &RobustFit) -> Option<Bundle> {
     if let Some(positions) = positions {
         return Some(fit.fit.state.with_images(positions.into_iter()));
     }
-    // The fit rejected an image that the reference keeps. Its pose is estimated with the lens of
-    // the fit, so that both models are compared on the same images.
+    // The fit rejected an image that the reference keeps. The pose of this image is estimated with
+    // the lens of the fit, so that both models are compared on the same images.
     let intrinsics = &fit.fit.state.intrinsics;
     let pose = |points: &Vec<BoardPoint>| {
         Some(board_pose::board_pose(intrinsics, points)?.camera_from_board)
@@ -172,7 +171,7 @@ fn compare(baseline: &Scored, variant: &Scored) -> LensTrial {
 /// Fits a model to all images, and computes its error in each image when that image is held out.
 ///
 /// The intrinsics are fitted to the other folds. The pose of the held-out image is fitted to every
-/// second corner and evaluated on the others, and the other way around.
+/// second corner and evaluated on the other corners. Then the two sets of corners swap roles.
 fn score(kept: &Kept, start: &Bundle, coefficients: Coefficients) -> Option<Scored> {
     // Each fold requires a fit. With five folds, a fit uses 80 % of the images.
     const MAX_FOLDS: usize = 5;

@@ -37,7 +37,7 @@ pub struct Fit<S> {
 /// An eigenvector of the information about the shared parameters, in units of their scales.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Direction {
-    /// Unit vector; component `i` is the change of shared parameter `i` divided by its scale.
+    /// Unit vector. Component `i` is the change of shared parameter `i` divided by its scale.
     pub components: DVector<f64>,
     /// Standard deviation along the vector, as a multiple of the scales. Above about 1, the
     /// residuals do not determine this direction.
@@ -51,10 +51,10 @@ impl<S> Fit<S> {
     }
 }
 
-/// The standard deviation of a variance; infinite if the variance is NaN or negative beyond
+/// The standard deviation of a variance. It is infinite if the variance is NaN or negative beyond
 /// rounding errors.
 pub(crate) fn sigma_of(variance: f64) -> f64 {
-    // Variances of unobservable parameters are sums of numbers that cancel.
+    // Variances of unobservable parameters are sums of large numbers that cancel.
     const TINY: f64 = 1e-15;
     if variance >= -TINY {
         variance.max(0.0).sqrt()

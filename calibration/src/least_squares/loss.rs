@@ -3,15 +3,16 @@
 /// Loss of one residual vector `r`, as a function of its squared norm.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Loss {
-    /// `|r|²`: least squares.
+    /// `|r|²`, which gives least squares.
     Squared,
-    /// `|r|²` up to the threshold, then linear in `|r|`. Convex. Source: Huber 1964, equation 2.16.
+    /// `|r|²` up to the threshold, then linear in `|r|`. This loss is convex. Source: Huber 1964,
+    /// equation 2.16.
     Huber {
         /// Norm above which the loss is linear, in units of the residuals.
         threshold: f64,
     },
-    /// `threshold² ln(1 + |r|² / threshold²)`: the influence of large residuals tends to zero. Not
-    /// convex, so the initial parameters must be close.
+    /// `threshold² ln(1 + |r|² / threshold²)`. The influence of large residuals tends to zero. This
+    /// loss is not convex, so the initial parameters must be close.
     Cauchy {
         /// Norm at which the weight of a residual has dropped to one half, in units of the
         /// residuals.
@@ -22,8 +23,8 @@ pub enum Loss {
 /// Loss of a residual vector and its derivatives.
 pub(super) struct LossAt {
     pub(super) value: f64,
-    /// Derivative with respect to the squared norm: the weight of iteratively reweighted least
-    /// squares.
+    /// Derivative with respect to the squared norm, which is the weight of iteratively reweighted
+    /// least squares.
     pub(super) weight: f64,
     /// Derivative of `weight * |r|` with respect to `|r|`.
     pub(super) radial_derivative: f64,

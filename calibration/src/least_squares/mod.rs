@@ -1,9 +1,10 @@
 //! Robust nonlinear least squares with shared parameters and local parameters per block.
 //!
-//! Levenberg-Marquardt (Marquardt 1963) with the damping schedule of Nielsen 1999 and robust losses
-//! by iteratively reweighted least squares. Local parameters, such as the pose of one view, are
-//! eliminated by a Schur complement (Triggs et al. 2000, section 6.1), so the cost of a step grows
-//! linearly with the number of blocks. Without local parameters, the solver is a dense one.
+//! The method is Levenberg-Marquardt (Marquardt 1963) with the damping schedule of Nielsen 1999.
+//! Robust losses are minimized by iteratively reweighted least squares. Local parameters, such as
+//! the pose of one view, are eliminated by a Schur complement (Triggs et al. 2000, section 6.1), so
+//! the cost of a step grows linearly with the number of blocks. Without local parameters, the
+//! solver is a dense one.
 
 mod fit;
 mod loss;
@@ -26,15 +27,15 @@ pub trait Problem {
     /// Values of all parameters.
     type State: Clone;
 
-    /// Typical magnitude of each shared parameter, all positive: a change of this size is large.
-    /// Its length is the number of shared parameters.
+    /// Typical magnitude of each shared parameter. All values are positive, and a change of this
+    /// size is large. The length of the vector is the number of shared parameters.
     fn scales(&self) -> DVector<f64>;
 
     /// Number of blocks.
     fn n_blocks(&self) -> usize;
 
-    /// Number of local parameters of a block. 0 for residuals that depend on shared parameters
-    /// only.
+    /// Number of local parameters of a block. It is 0 for residuals that depend only on shared
+    /// parameters.
     fn n_local(&self, block_ix: usize) -> usize;
 
     /// Adds the residuals of a block and their derivatives with respect to a small step from this
@@ -83,7 +84,7 @@ impl Default for Options {
 /// Minimizes the sum of the losses from an initial state.
 ///
 /// # Errors
-/// If a residual is not defined at the initial state, or if there are not more residuals than
+/// Fails if a residual is not defined at the initial state, or if there are not more residuals than
 /// parameters.
 pub fn minimize<P: Problem>(
     problem: &P,
@@ -160,8 +161,7 @@ struct Evaluation<S> {
 }
 
 impl<S: Clone> Evaluation<S> {
-    /// # Errors
-    /// The block with a residual that is not defined.
+    /// # Errors Returns the block with a residual that is not defined.
     fn new<P: Problem<State = S>>(problem: &P, state: S, loss: Loss) -> Result<Self, usize> {
         let n_shared = problem.scales().len();
         let mut blocks = Vec::with_capacity(problem.n_blocks());

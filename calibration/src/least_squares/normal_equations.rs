@@ -10,9 +10,9 @@ pub struct BlockSums {
     loss: Loss,
     n_shared: usize,
     n_local: usize,
-    /// Derivatives of the residuals times the roots of their weights, one column per scalar
-    /// residual, until they are summed. The product of the whole matrix is several times faster
-    /// than one update per residual.
+    /// Derivatives of the residuals times the roots of their weights, with one column per scalar
+    /// residual. They are kept until they are summed, because the product of the whole matrix is
+    /// several times faster than one update per residual.
     weighted_derivatives: Vec<f64>,
     /// Weighted products of the derivatives with respect to all parameters, shared ones first.
     products: DMatrix<f64>,
@@ -69,7 +69,7 @@ impl BlockSums {
     ///   by those with respect to the block's local parameters.
     ///
     /// # Panics
-    /// If a row has another length.
+    /// Panics if a row has another length.
     pub fn add<const D: usize>(&mut self, residual: [f64; D], derivatives: [&[f64]; D]) {
         let n = self.n_shared + self.n_local;
         let squared_norm = residual.iter().map(|value| value * value).sum::<f64>();

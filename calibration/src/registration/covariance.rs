@@ -11,8 +11,8 @@ use nalgebra::{DMatrix, DVector, Matrix6, Vector3, Vector6};
 pub struct ExtrinsicsCovariance {
     /// Names of the cameras.
     pub cameras: Vec<String>,
-    /// For each camera three translations (meters), then three rotations (radians), along and about
-    /// its own axes.
+    /// For each camera, three translations (meters), then three rotations (radians), along and
+    /// about its own axes.
     pub covariance: DMatrix<f64>,
 }
 

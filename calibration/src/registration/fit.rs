@@ -14,11 +14,11 @@ const MAX_ITERATIONS: [usize; 4] = [12, 4, 4, 4];
 /// Relative depth error above which a point counts as occluded, the finest level first. It is
 /// larger at coarse levels, where poses still have larger errors.
 pub(super) const OCCLUSION_FRAC: [f64; 4] = [0.04, 0.05, 0.07, 0.1];
-/// A step smaller than this number of standard deviations ends a level, the finest first. Further
-/// steps would be smaller than the error of the result.
+/// A step smaller than this number of standard deviations ends a level. The value of the finest
+/// level comes first. Further steps would be smaller than the error of the result.
 const CONVERGED_STEP_SIGMAS: [f64; 4] = [0.2, 2.0, 2.0, 2.0];
-/// Noise for the first residuals. It is then replaced by an estimate, so it must only be large
-/// enough not to reject many of these residuals.
+/// Noise for the first residuals. An estimate replaces it afterwards, so it must only be large
+/// enough not to reject many of the first residuals.
 pub(super) const INITIAL_NOISE: Noise = Noise {
     photo: 20.0,
     depth: 0.005,
@@ -34,11 +34,11 @@ pub(super) struct Fit {
 }
 
 impl Fit {
-    /// Adds the discretization error to the covariance: the change of the estimate between the
-    /// finest level and the next one. All pairs share this error, so their scatter does not contain
-    /// it. At half the pixel size, an error of first or higher order in the pixel size is at most
-    /// as large as this change. Its direction may be different, because the error is a sum of
-    /// several errors, some of which depend on the pixel size in another way.
+    /// Adds the discretization error to the covariance. It is estimated by the change of the
+    /// estimate between the finest level and the next one. All pairs share this error, so their
+    /// scatter does not contain it. At half the pixel size, an error of first or higher order in
+    /// the pixel size is at most as large as this change. Its direction may be different, because
+    /// the error is a sum of several errors, some of which depend on the pixel size in another way.
     pub(super) fn add_discretization_error(&mut self, images: &[PreparedImage], pairs: &[Pair]) {
         // The estimate converges at level 1, starting from the result of level 0. The change is the
         // difference of both results.
@@ -84,8 +84,8 @@ fn step(layout: &Layout, corrections: &Corrections, pairs: &[Pair], sums: &[Pair
     Solution::new(scales, &values, pairs, sums)
 }
 
-/// Estimates the parameters of a layout, starting from given corrections; `None` if the pairs have
-/// no valid residuals.
+/// Estimates the parameters of a layout, starting from given corrections. Returns `None` if the
+/// pairs have no valid residuals.
 pub(super) fn fit(
     images: &[PreparedImage],
     pairs: &[Pair],

@@ -20,17 +20,17 @@ mod prior {
 /// One parameter to estimate. The first number is the index of the camera or joint.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum CalibrationParam {
-    /// Motion of a camera relative to its parent, in its own axes: parts 0 to 2 in meters, 3 to 5
-    /// in radians.
+    /// Motion of a camera relative to its parent, in its own axes. Parts 0 to 2 are in meters, and
+    /// parts 3 to 5 in radians.
     Extrinsics(usize, usize),
     /// Time offset of a camera, seconds.
     TimeOffset(usize),
-    /// Offset of a joint that carries cameras: radians or meters.
+    /// Offset of a joint that carries cameras, radians or meters.
     Joint(usize),
     /// Motion of the depth frame in the axes of its camera, with the same parts as the extrinsics.
     DepthPose(usize, usize),
-    /// Parts 0 and 1: logarithm of the factors on the focal lengths; 2 and 3: offset of the
-    /// principal point in focal lengths.
+    /// Parts 0 and 1 are the logarithms of the factors on the focal lengths. Parts 2 and 3 are the
+    /// offset of the principal point in focal lengths.
     Lens(usize, usize),
     /// Logarithm of the factor on depth.
     DepthScale(usize),
@@ -75,8 +75,9 @@ pub(super) struct CameraParamOffsets {
 }
 
 impl CameraParamOffsets {
-    /// Motions of a camera, in its own axes, per unit of its extrinsics and time offset: parameter
-    /// index, meters, radians.
+    /// Motions of a camera in its own axes, per unit of each of its extrinsics and of its time
+    /// offset. Each entry has the parameter index, the translation in meters and the rotation in
+    /// radians.
     ///
     /// * `twist`: velocity of the camera in its own axes, if known.
     pub(super) fn motions(

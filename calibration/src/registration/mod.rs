@@ -7,8 +7,8 @@
 //! fine. A parameter is kept if it improves the prediction of images that were not used to estimate
 //! it. Parameters that the motion does not make observable are reported and stay at zero.
 //!
-//! All functions are pure functions of keyframes: no clock, no I/O, and sums in a fixed order for
-//! any number of threads.
+//! All functions are pure functions of keyframes. They use no clock and no I/O, and sum in a fixed
+//! order for any number of threads.
 
 mod corrections;
 mod covariance;
@@ -47,8 +47,8 @@ use std::sync::Arc;
 use sums::PixelSubset;
 
 /// Maximum number of images for estimating the shared parameters. The next constant is the maximum
-/// number of partners of each image. Time grows with the product of both; a few parameters do not
-/// need more images.
+/// number of partners of each image. The time grows with the product of both numbers. The few
+/// shared parameters do not need more images.
 const MAX_IMAGES: usize = 100;
 const PARTNERS_PER_IMAGE: usize = 4;
 /// Maximum number of validation images.
@@ -84,11 +84,10 @@ pub fn candidates() -> Vec<ParamSet> {
     ]
 }
 
-/// Estimates the requested parameters; `None` if too few keyframes overlap. Without depth,
-/// extrinsics, time offsets and lenses are estimated from matched features, and other parameters
-/// are not.
+/// Estimates the requested parameters. Returns `None` if too few keyframes overlap. Without depth,
+/// only extrinsics, time offsets and lenses are estimated, from matched features.
 ///
-/// Parameters are estimated from training keyframes and evaluated on validation keyframes; test
+/// Parameters are estimated from training keyframes and evaluated on validation keyframes. Test
 /// keyframes are not used.
 pub fn align(keyframes: &[Arc<Keyframe>], choice: &CameraRefinement) -> Option<Alignment> {
     if keyframes.iter().all(|keyframe| keyframe.depth.is_none()) {
@@ -185,7 +184,8 @@ impl AlignmentScene {
             &training_subset,
             PARTNERS_PER_IMAGE,
         );
-        // Poses of all images need pairs of all images; shared parameters do not.
+        // Estimating the poses of all images needs pairs of all images. Shared parameters need
+        // fewer pairs.
         let all_pairs = if for_poses && training_subset.len() < train.len() {
             pairs::choose(&images, &views, &train, &train, PARTNERS_PER_IMAGE)
         } else {
@@ -290,8 +290,8 @@ impl AlignmentScene {
         restricted
     }
 
-    /// Adds each candidate whose gain is significant, then removes those whose gain is no longer
-    /// significant.
+    /// Adds each candidate whose gain is significant. Then removes the candidates whose gain is no
+    /// longer significant.
     ///
     /// If extrinsics are not corrected, they may still be wrong in directions that the motion does
     /// not make observable. These directions are added to `unobservable`.
@@ -302,8 +302,8 @@ impl AlignmentScene {
         trials: &mut Vec<Trial>,
         unobservable: &mut Vec<Unobservable>,
     ) -> CalibrationModel {
-        // Forward selection: the candidates are tested in order of likelihood, each together with
-        // those kept so far.
+        // In this forward selection, the candidates are tested in order of likelihood. Each is
+        // tested together with the candidates that were kept before.
         let mut kept = uncorrected;
         let mut kept_sets: Vec<ParamSet> = Vec::new();
         for candidate in candidates {
@@ -330,8 +330,9 @@ impl AlignmentScene {
             }
             trials.push(trial);
         }
-        // Backward elimination: a later parameter may explain the same errors as an earlier one,
-        // which is then no longer needed. The last parameter was already tested with all others.
+        // This backward elimination is needed, because a later parameter may explain the same
+        // errors as an earlier one. The earlier one is then superfluous. The last parameter was
+        // already tested with all others.
         for kept_set in kept_sets.clone().into_iter().rev().skip(1) {
             let other_params = kept_sets
                 .iter()
@@ -377,8 +378,8 @@ impl AlignmentScene {
             return self.trial(params, &comparison.scores_with_free_poses());
         }
         let trial = self.trial(params, &comparison.scores());
-        // Individual image poses hide shared errors, so a parameter is rejected only if neither
-        // comparison shows a gain.
+        // Individual image poses hide shared errors. A parameter is therefore rejected only if
+        // neither comparison shows a gain.
         if !trial.kept && baseline.set.contains(ParamSet::IMAGE_POSES) {
             return self.trial(params, &comparison.scores_with_free_poses());
         }

@@ -3,14 +3,14 @@
 //! Each new image is compared with reference images, which are older than the last
 //! [`MOVEMENT_WINDOW`] images of its camera. If the camera has not moved, no motion estimated from
 //! previous new images improves the prediction of the next one. If it has moved, one motion
-//! explains all images from then on.
+//! explains all images since the movement.
 //!
 //! The test is a Shiryaev-Roberts e-detector (Shin, Ramdas and Rinaldo 2022), so it may be repeated
-//! with every image. For each possible start of the movement, a bet is placed that the motion
-//! estimated from the images since the start improves the prediction of each later image. The stake
-//! is multiplied by a factor that is at most 1 on average if the camera has not moved. The
-//! probability that the sum of all stakes reaches [`ALARM`] within `n` images is therefore at most
-//! `n / ALARM`.
+//! with every image. For each possible start of the movement, the detector bets on a motion that it
+//! estimates from the images since this start. The bet is that this motion improves the prediction
+//! of each later image. The stake is multiplied by a factor that is at most 1 on average if the
+//! camera has not moved. The probability that the sum of all stakes reaches [`ALARM`] within `n`
+//! images is therefore at most `n / ALARM`.
 
 use super::corrections::Corrections;
 use super::fit;
@@ -44,8 +44,8 @@ const ALARM: f64 = 1e5;
 /// Fraction of the stake that is bet on each image. With a larger bet, movements are detected with
 /// fewer images, but one bad image loses most of the stake.
 const BET_FRAC: f64 = 0.8;
-/// Prediction gain that is ignored, dB: other calibration errors may improve neighboring images by
-/// this much.
+/// Prediction gain that is ignored, dB. Because of other calibration errors, a motion may improve
+/// neighboring images by this gain.
 const MARGIN_DB: f64 = 0.2;
 /// Losses are clamped to this value, dB. Without a limit, the factor on the stake could become
 /// negative.
@@ -66,8 +66,8 @@ pub struct CameraMovement {
     pub since_nanos: i64,
     /// Time of that image after the first keyframe, seconds.
     pub since_secs: f64,
-    /// Rotation vector (radians) and translation (meters) of the correction for images from then
-    /// on, as in [`CameraCorrection`]. It is applied before all other corrections.
+    /// Rotation vector (radians) and translation (meters) of the correction for images since the
+    /// movement, as in [`CameraCorrection`]. It is applied before all other corrections.
     pub rotation_rad: [f64; 3],
     /// See `rotation_rad`.
     pub translation_m: [f64; 3],
@@ -105,7 +105,7 @@ impl std::fmt::Display for CameraMovement {
 struct ImageState {
     is_reference: bool,
     /// Individual motion of the camera relative to the reference images (meters, then radians) and
-    /// its information; `None` if the image and the references show no common surfaces.
+    /// its information. `None` if the image and the references show no common surfaces.
     motion: Option<(Vector6<f64>, Matrix6<f64>)>,
     /// Stake of the bets on a movement that began with this image.
     stake: f64,
@@ -121,8 +121,8 @@ pub struct MovementDetector {
 }
 
 impl MovementDetector {
-    /// A detector that compares later keyframes with these. Their cameras must already be
-    /// corrected.
+    /// A detector that compares later keyframes with `references`. The cameras of the references
+    /// must already be corrected.
     pub fn new(references: &[Arc<Keyframe>]) -> Self {
         let used: Vec<_> = references
             .iter()
@@ -151,8 +151,8 @@ impl MovementDetector {
     }
 
     /// Tests the next keyframe, which has the same corrections as the references. Returns a
-    /// movement if one is detected; create a new detector afterwards. The movement applies to the
-    /// corrected keyframes.
+    /// movement if one is detected. The caller must then create a new detector. The movement
+    /// applies to the corrected keyframes.
     pub fn push(&mut self, keyframe: &Arc<Keyframe>) -> Option<CameraMovement> {
         let image = is_used(keyframe)
             .then(|| PreparedImage::new(keyframe, 0))
@@ -228,8 +228,8 @@ impl MovementDetector {
 
     /// Bets on an image, then estimates its own motion.
     fn bet(&mut self, ix: usize, pairs: &[Pair], recent: &[usize]) {
-        // Each bet is placed before the image is used: its motion is predicted from earlier images
-        // only. Otherwise, the factor would exceed 1 on average.
+        // Each bet is placed before the image is used, so its motion is predicted only from earlier
+        // images. Otherwise, the factor would exceed 1 on average.
         let Some(noise) = self.noise(pairs) else {
             return;
         };
@@ -317,7 +317,7 @@ impl MovementDetector {
     }
 
     /// Gain in the prediction of an image from reference images if its camera has moved by
-    /// `motion`, dB; `None` if too few samples are visible.
+    /// `motion`, dB. `None` if too few samples are visible.
     fn gain_db(&self, pairs: &[Pair], noise: Noise, motion: &Vector6<f64>) -> Option<f64> {
         let ix = pairs.first()?.to;
         let moved =
@@ -325,7 +325,7 @@ impl MovementDetector {
         validation::gain_db(&self.images, &self.views, pairs, &moved, noise)
     }
 
-    /// The movement that explains the recent images of a camera; `None` if it is too small or
+    /// The movement that explains the recent images of a camera. `None` if it is too small or
     /// explains too little.
     fn movement(&mut self, recent: &[usize]) -> Option<CameraMovement> {
         // The start with the largest stake gives a first estimate of the motion.
@@ -439,7 +439,7 @@ fn factor(gain_db: f64) -> f64 {
     1.0 + BET_FRAC * (gain_db.max(-MAX_LOSS_DB) - MARGIN_DB) / (MAX_LOSS_DB + MARGIN_DB)
 }
 
-/// The correction for a motion of the camera in its own axes: meters, then radians.
+/// The correction for a motion of the camera in its own axes (meters, then radians).
 fn correction_of(motion: &Vector6<f64>) -> CameraCorrection {
     let twist = kinematics::Twist {
         linear_m_s: motion.fixed_rows::<3>(0).into_owned(),

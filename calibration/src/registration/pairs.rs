@@ -13,11 +13,11 @@ const N_PROBES: usize = 40;
 /// Readings that differ by more than this fraction belong to different surfaces. The fraction is
 /// large because poses may have errors of centimeters.
 const SAME_SURFACE_FRAC: f64 = 0.1;
-/// Minimum distance of a partner: the rotation in radians plus the translation divided by the
-/// depth. Closer partners carry no information.
+/// Minimum distance of a partner. The distance is the rotation in radians plus the translation
+/// divided by the depth. Closer partners carry no information.
 const MIN_MOTION: f64 = 0.01;
 
-/// A pair of images: samples of image `from` are compared with image `to`.
+/// A pair of images. Samples of image `from` are compared with image `to`.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) struct Pair {
     pub(super) from: usize,
@@ -53,8 +53,8 @@ pub(super) fn choose(
 /// Chooses at most `max` of the images, which are given with their distances, spread evenly over
 /// the ranks of the distances.
 ///
-/// Near partners have accurate residuals and converge from large errors. Distant ones determine the
-/// parameters better.
+/// Near partners have accurate residuals and converge from large errors. Distant partners determine
+/// the parameters better.
 pub(super) fn spread_evenly(mut images: Vec<(f64, usize)>, max: usize) -> Vec<usize> {
     // Equal distances are ordered by index, so that the result does not depend on the sort.
     images.sort_by(|one, other| one.0.total_cmp(&other.0).then(one.1.cmp(&other.1)));
@@ -68,8 +68,8 @@ pub(super) fn spread_evenly(mut images: Vec<(f64, usize)>, max: usize) -> Vec<us
     }
 }
 
-/// Distance between two images: the rotation in radians plus the translation in mean depths; `None`
-/// without sufficient overlap.
+/// Distance between two images. It is the rotation in radians plus the translation in mean depths.
+/// `None` without sufficient overlap.
 fn distance(
     images: &[PreparedImage],
     views: &[CorrectedView],

@@ -30,7 +30,7 @@ const MAX_STEP: f64 = 2.0;
 /// Other images get the interpolated drift of their neighbors, weighted by its predictability.
 ///
 /// The expected pose error is estimated from the corrections themselves at each level. If almost
-/// all poses are correct, it becomes small, so noise does not move them.
+/// all poses are correct, the expected error becomes small, so noise does not move the poses.
 pub(super) fn fit(
     images: &[PreparedImage],
     pairs: &[Pair],
@@ -93,7 +93,7 @@ pub(super) fn fit(
     Some(corrections)
 }
 
-/// Places of the images of pairs among the unknowns, in the order of their indices.
+/// Indices of the images of pairs among the unknowns, in the order of their image indices.
 fn slots(pairs: &[Pair]) -> BTreeMap<usize, usize> {
     let mut ixs: Vec<usize> = pairs.iter().flat_map(|pair| [pair.from, pair.to]).collect();
     ixs.sort_unstable();
@@ -220,7 +220,7 @@ fn median_depth_m(images: &[PreparedImage]) -> f64 {
 /// Removes the significant part of the mean correction of a camera's images from the steps, because
 /// other parameters explain that part.
 ///
-/// A mean within its tolerance is not removed: independent errors have a nonzero mean, too, and
+/// A mean within its tolerance is not removed. Independent errors also have a nonzero mean, and
 /// removing it would leave the images misaligned.
 fn remove_mean(
     steps: &mut [Vector6<f64>],
@@ -250,7 +250,7 @@ fn remove_mean(
     }
 }
 
-/// Moves the camera of an image in its own axes: meters, then radians.
+/// Moves the camera of an image in its own axes (meters, then radians).
 fn apply_step(correction: &mut CameraCorrection, image: &PreparedImage, step: &Vector6<f64>) {
     // Drift is applied before the extrinsics correction, so the motion is converted to the axes of
     // the camera before that correction.

@@ -1,4 +1,4 @@
-//! Preparation of a keyframe for alignment: a brightness pyramid, and depth samples on surfaces.
+//! Prepares a keyframe for alignment, with a brightness pyramid and with depth samples on surfaces.
 #![expect(
     clippy::cast_possible_truncation,
     clippy::cast_sign_loss,
@@ -52,7 +52,7 @@ pub(super) struct GrayImage {
     size: [usize; 2],
     /// Pixels of the keyframe per texel, along each side.
     pixels: f64,
-    /// Brightness and its gradient per pixel of the keyframe; NaN in masked areas.
+    /// Brightness and its gradient per pixel of the keyframe. They are NaN in masked areas.
     texels: Vec<[f32; 3]>,
 }
 
@@ -172,7 +172,7 @@ fn select_samples(
     (strongest, uniform)
 }
 
-/// The sample at a pixel; `None` at holes and edges.
+/// The sample at a pixel. `None` at holes and edges.
 fn sample(depth: &DepthMap, x: usize, y: usize) -> Option<DepthSample> {
     const RADIUS: usize = 2;
     let [width, height] = depth.size_px.map(|side| side as usize);
@@ -206,8 +206,8 @@ fn sample(depth: &DepthMap, x: usize, y: usize) -> Option<DepthSample> {
     })
 }
 
-/// Depth interpolated between pixels, and its gradient along x and y; `None` at holes and edges.
-/// Interpolates inverse depths, which are linear on a plane.
+/// Depth interpolated between pixels, and its gradient along x and y. `None` at holes and edges.
+/// Inverse depths are interpolated, because they are linear on a plane.
 pub(super) fn depth_at(depth: &DepthMap, pixel: [f64; 2]) -> Option<SampledValue> {
     let [width, height] = depth.size_px.map(|side| side as usize);
     let [x, y] = pixel.map(|coordinate| coordinate - 0.5);
@@ -241,7 +241,8 @@ pub(super) fn depth_at(depth: &DepthMap, pixel: [f64; 2]) -> Option<SampledValue
     })
 }
 
-/// Size and mean brightness (0 to 255) of squares of `edge` pixels; NaN in masked areas.
+/// Size of the image in squares of `edge` pixels, and the mean brightness (0 to 255) of each
+/// square. It is NaN in masked areas.
 pub(super) fn brightness(keyframe: &Keyframe, edge: usize) -> ([usize; 2], Vec<f32>) {
     let [width, height] = keyframe.size_px.map(|side| side as usize);
     let size = [width / edge, height / edge];

@@ -25,8 +25,8 @@ pub struct Alignment {
     pub corrections: BTreeMap<String, CameraCorrection>,
     /// Accepted corrections with their uncertainties.
     pub estimates: Vec<Estimate>,
-    /// Directions of the accepted parameters that the motion does not make observable; corrections
-    /// along them are zero.
+    /// Directions of the accepted parameters that the motion does not make observable. Corrections
+    /// along these directions are zero.
     pub unobservable: Vec<Unobservable>,
     /// Tested parameter sets, and how much better they predict the validation images.
     pub trials: Vec<Trial>,
@@ -123,13 +123,14 @@ pub struct ScalarEstimate {
     pub sigma: f64,
 }
 
-/// A direction in parameter space that the motion does not make observable: changing all its parts
+/// A direction in parameter space that the motion does not make observable. Changing all its parts
 /// together changes no residual.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Unobservable {
     /// Descriptions of the parts.
     pub parts: Vec<String>,
-    /// Names of the cameras that it moves, if it changes only extrinsics; otherwise empty.
+    /// Names of the cameras whose extrinsics the direction changes. Empty if the direction also
+    /// changes other parameters.
     #[serde(default)]
     pub moves_cameras: Vec<String>,
 }
@@ -163,8 +164,8 @@ pub(super) fn alignment(
         .iter()
         .zip(&kept.corrections.by_camera)
         .map(|(name, correction)| (name.to_string(), correction.clone()));
-    // Without accepted parameters, there are no corrections, rather than corrections of zero:
-    // keyframes then stay as they are.
+    // Without accepted parameters, the list is empty instead of containing corrections of zero.
+    // Keyframes then stay unchanged.
     let corrections = if kept.set.is_empty() {
         BTreeMap::new()
     } else {

@@ -4,7 +4,7 @@
 //! with its brightness in image `j`. Its distance along the z axis of `j`'s depth camera is
 //! compared with the depth reading of `j`. Source: Kerbl, Sturm and Cremers 2013 (the two
 //! residuals), Schoeps et al. 2019 (both cameras move). The separate pose of the depth camera and
-//! the rolling shutter are our additions.
+//! the rolling shutter are additions of fieldrig.
 
 use super::prepared_image::{DepthSample, GrayImage, PreparedImage, depth_at, point};
 use super::view::{CorrectedView, unit_twist};
@@ -58,8 +58,8 @@ pub(super) struct Tone {
 }
 
 impl Correspondence {
-    /// Projects a sample; `None` if it is outside `j`, occluded, or at an edge or hole. Readings
-    /// may differ by `occlusion_frac` of the depth.
+    /// Projects a sample. Returns `None` if the sample is outside `j`, occluded, or at an edge or
+    /// hole. Readings may differ by `occlusion_frac` of the depth.
     pub(super) fn new(
         i: Side<'_>,
         j: Side<'_>,
@@ -86,7 +86,7 @@ impl Correspondence {
         if (reading_m - in_depth.z).abs() > occlusion_frac * reading_m {
             return None;
         }
-        // Slope of the surface at the reading: change of depth per meter across the axis.
+        // Slope of the surface at the reading, as the change of depth per meter across the axis.
         let tilt =
             [0, 1].map(|axis| reading_gradient[axis] * j.view.depth_focal_px[axis] / reading_m);
         let [level_i, level_j] = levels([i, j], [in_i.z, in_j.z], level);
@@ -166,8 +166,8 @@ impl Correspondence {
         row[n - 1] = -1.0;
     }
 
-    /// Jacobian of [`Correspondence::depth`] with respect to the parameters; zero for gain and
-    /// offset.
+    /// Jacobian of [`Correspondence::depth`] with respect to the parameters. It is zero for gain
+    /// and offset.
     pub(super) fn depth_jacobian(
         &self,
         i: &ParamColumns<'_>,
@@ -211,9 +211,9 @@ impl Correspondence {
     }
 }
 
-/// Pyramid levels at which both images have about the same resolution on the surface. Neither is
-/// finer than `level`. Different levels are needed because a near view has detail that a distant
-/// view lacks.
+/// Pyramid levels at which both images have about the same resolution on the surface. Neither level
+/// is finer than `level`. The levels differ because a near view has detail that a distant view
+/// lacks.
 fn levels([i, j]: [Side<'_>; 2], [z_i, z_j]: [f64; 2], level: usize) -> [usize; 2] {
     let texel_m =
         |side: Side<'_>, z_m: f64| z_m * side.image.level(level).texel_px() / side.view.focal_px[0];
@@ -271,7 +271,7 @@ impl<'a> ParamColumns<'a> {
         }
     }
 
-    /// Columns for the motion of the camera only: meters, then radians, starting at `begin`.
+    /// Columns for only the motion of the camera (meters, then radians), starting at `begin`.
     pub(super) fn free(view: &'a CorrectedView, begin: usize) -> Self {
         let columns = (0..6)
             .map(|part| {
@@ -351,7 +351,7 @@ fn add_motion(
     }
 }
 
-/// Adds the derivatives with respect to a motion of a point: translation, then rotation.
+/// Adds the derivatives with respect to a motion of a point (translation, then rotation).
 fn add_twist(row: &mut [f64], point: &Vector3<f64>, gradient: &Vector3<f64>, sign: f64) {
     let lever = point.cross(gradient);
     for axis in 0..3 {
@@ -379,7 +379,7 @@ fn add_depth(
     if let Some(scale) = i.depth_scale {
         row[scale] += in_depth.dot(&correspondence.point_in_depth_i);
     }
-    // The depth reading stays at its pixel; the lens moves the ray of that pixel.
+    // The depth reading stays at its pixel, but the lens moves the ray of that pixel.
     if let (Some(lens), true) = (i.lens, i.view.shares_lens) {
         for axis in 0..2 {
             row[lens + axis] -= in_depth[axis] * correspondence.point_in_depth_i[axis];
@@ -390,7 +390,7 @@ fn add_depth(
     }
 }
 
-/// Adds the derivatives with respect to the lens of a color camera: the point stays, and its pixel
+/// Adds the derivatives with respect to the lens of a color camera. The point stays, and its pixel
 /// moves.
 fn add_lens(
     param_columns: &ParamColumns<'_>,

@@ -5,8 +5,8 @@ use super::sums::PairSums;
 use nalgebra::{DMatrix, DVector, SymmetricEigen};
 
 /// Factor by which the information of the residuals is reduced, because residuals of neighboring
-/// samples are correlated. Used only for damping and observability; reported uncertainties are
-/// measured, see [`Solution::variance`].
+/// samples are correlated. It is used only for damping and observability. Reported uncertainties
+/// are computed from the scatter of the pairs, see [`Solution::variance`].
 pub(super) const INFLATION: f64 = 10.0;
 /// A direction is observable if its standard deviation is below this fraction of the parameters'
 /// scales.

@@ -4,7 +4,8 @@
 //! The six parameters of the base's pose are estimated like those of cameras: from depth samples of
 //! one image in another, differences of brightness and depth, and Gauss-Newton steps from coarse to
 //! fine. Each pair has one image from the new station and one from earlier ones. Pairs are formed
-//! in both directions, because a near view is contained in a distant one but not vice versa.
+//! in both directions, because a distant view contains a near view, but a near view does not
+//! contain a distant view.
 
 use super::corrections::Corrections;
 use super::fit::{INITIAL_NOISE, OCCLUSION_FRAC};
@@ -25,7 +26,8 @@ use serde::Serialize;
 use std::collections::BTreeSet;
 use std::sync::Arc;
 
-/// Typical errors of the base pose, meters and (next constant) radians.
+/// Typical error of the position of the base, meters. The next constant is that of its rotation,
+/// radians.
 const PRIOR_TRANSLATION_M: f64 = 0.02;
 const PRIOR_ROTATION_RAD: f64 = 0.0175;
 
@@ -47,12 +49,13 @@ pub struct StationCorrection {
     pub translation_m: [f64; 3],
     /// Standard deviations, meters.
     pub translation_sigma_m: [f64; 3],
-    /// Rotation of the base about its own position: rotation vector in the axes of the world,
+    /// Rotation of the base about its own position, as a rotation vector in the axes of the world,
     /// radians.
     pub rotation_rad: [f64; 3],
     /// Standard deviations, radians.
     pub rotation_sigma_rad: [f64; 3],
-    /// Descriptions of directions that are not observable; the correction along them is zero.
+    /// Descriptions of directions that are not observable. The correction along these directions is
+    /// zero.
     pub unobservable: Vec<String>,
     /// How much better the corrected poses predict validation images across the stations, dB.
     pub gain_db: f64,
@@ -66,10 +69,10 @@ pub struct StationCorrection {
     pub kept: bool,
 }
 
-/// Estimates the pose of the base from the keyframes of the new station (`new`) and of earlier ones
-/// (`reference`); `None` if they have no depth or too little overlap.
+/// Estimates the pose of the base from the keyframes of the new station (`new`) and of earlier
+/// stations (`reference`). Returns `None` if they have no depth or too little overlap.
 ///
-/// Poses are estimated from training keyframes and evaluated on validation keyframes; test
+/// Poses are estimated from training keyframes and evaluated on validation keyframes. Test
 /// keyframes are not used.
 ///
 /// * `world_from_base`: the reported base pose from which the poses of the new station's keyframes

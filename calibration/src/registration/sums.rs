@@ -1,4 +1,4 @@
-//! Normal equations of pairs with robust weights; gain and offset of each pair are eliminated.
+//! Normal equations of pairs with robust weights. Gain and offset of each pair are eliminated.
 
 use super::pairs::Pair;
 use super::prepared_image::{DepthSample, PreparedImage};
@@ -20,7 +20,7 @@ const PRIOR_OFFSET: f64 = 30.0;
 /// absorb most of their information.
 const MIN_SAMPLES: usize = 12;
 
-/// Scatter of the residuals: brightness on a scale of 0 to 255, depth in meters at 1 m.
+/// Scatter of the residuals. Brightness is on a scale of 0 to 255, and depth is in meters at 1 m.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) struct Noise {
     pub(super) photo: f64,
@@ -42,8 +42,8 @@ pub(super) struct ResidualOptions {
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum PixelSubset {
     All,
-    /// Every second block, as in a checkerboard: poses are estimated on one half of the blocks and
-    /// evaluated on the other.
+    /// Every second block, as in a checkerboard. Poses are estimated on one half of the blocks and
+    /// evaluated on the other half.
     Blocks {
         odd: bool,
     },
@@ -128,7 +128,7 @@ pub(super) fn tone<'a>(
     correspondences: impl Iterator<Item = &'a Correspondence> + Clone,
     noise: f64,
 ) -> Tone {
-    // The equations are linear; only the weights change between iterations.
+    // The equations are linear. Only the weights change between iterations.
     const MAX_ITERATIONS: usize = 3;
     let mut tone = Tone {
         gain: 1.0,
@@ -194,8 +194,8 @@ fn of_shared_pair(sides: [Side<'_>; 2], options: &ResidualOptions) -> PairSums {
     of_pair(sides, &param_columns, params.clone(), options)
 }
 
-/// Contribution of every pair to the motions of its two cameras: six parameters of the first, then
-/// six of the second.
+/// Contribution of every pair to the motions of its two cameras. The six parameters of the first
+/// camera come before those of the second.
 pub(super) fn of_free_pairs(
     images: &[PreparedImage],
     views: &[CorrectedView],
@@ -267,7 +267,8 @@ impl ToneSums {
         self.information[row.max(column) * self.n + row.min(column)]
     }
 
-    /// Writes the normal equations of the parameters: the Schur complement of gain and offset.
+    /// Writes the normal equations of the parameters, which are the Schur complement of gain and
+    /// offset.
     fn eliminate_tone(&self, sums: &mut PairSums) {
         let n = self.n - 2;
         let prior_information = [
@@ -343,9 +344,9 @@ fn of_pair(
     sums
 }
 
-/// Scatter of the residuals of all pairs, from their median; `None` without residuals.
+/// Scatter of the residuals of all pairs, from their median. `None` without residuals.
 pub(super) fn noise_of(sums: &[PairSums]) -> Option<Noise> {
-    /// Lower limit of the noise: rounding to bytes and to a tenth of a millimeter.
+    /// Lower limit of the noise. It is due to rounding to bytes and to a tenth of a millimeter.
     const MIN_NOISE: Noise = Noise {
         photo: 0.3,
         depth: 5e-5,

@@ -15,9 +15,9 @@ use std::collections::BTreeMap;
 /// Maximum brightness difference that counts, on a scale of 0 to 255. Larger differences come from
 /// other surfaces or highlights.
 const CLIP: f64 = 50.0;
-/// Noise that is added to each squared difference, on a scale of 0 to 255. With it, differences
-/// below the noise of a camera image do not count. It is needed because the compared images are
-/// blurred and thus have less noise.
+/// Noise whose square is added to each squared difference, on a scale of 0 to 255. With this noise,
+/// differences below the noise of a camera image do not count. It is needed because the compared
+/// images are blurred and thus have less noise.
 const IMAGE_NOISE: f64 = 2.0;
 /// Relative depth difference above which a sample counts as occluded, as at the finest level of
 /// registration.
@@ -67,16 +67,16 @@ impl PairedComparison<'_> {
         })
     }
 
-    /// Like [`Self::scores`], but each validation image gets an individual pose, estimated on one
-    /// half of its blocks and evaluated on the other half, then vice versa.
+    /// Like [`Self::scores`], but each validation image gets an individual pose, which is estimated
+    /// on one half of its blocks and evaluated on the other half. Then the halves swap roles.
     ///
     /// This tests whether the training images are more consistent with each other. If they are
     /// misaligned, no single pose fits the predictions of all of them. The test must not depend on
     /// anything else. The baseline therefore also estimates the individual pose, with the same
-    /// residuals, prior, number of steps and partners, and both are evaluated at samples that both
-    /// show. As a result, both have the same freedom, overfitting to noise lowers the score on the
-    /// other half, and the accuracy of the validation image's own pose does not matter. The
-    /// correction itself was not estimated from these images.
+    /// residuals, prior, number of steps and partners. Baseline and variant are evaluated at
+    /// samples that both show. As a result, both have the same freedom, and the accuracy of the
+    /// validation image's own pose does not matter. Overfitting to noise lowers the score on the
+    /// other half. The correction itself was not estimated from these images.
     pub(super) fn scores_with_free_poses(&self) -> Vec<ImageScore> {
         let views = self.views();
         let mut by_image: BTreeMap<usize, Vec<Pair>> = BTreeMap::new();
@@ -192,7 +192,7 @@ fn image_scores(
         .collect()
 }
 
-/// Gain of the prediction of an image if its view is replaced, dB; `None` if too few samples are
+/// Gain of the prediction of an image if its view is replaced, dB. `None` if too few samples are
 /// visible. All pairs must end at this image.
 pub(super) fn gain_db(
     images: &[PreparedImage],
@@ -230,8 +230,8 @@ fn errors(sides: [[Side<'_>; 2]; 2], noise: Noise, part: PixelSubset) -> PairedE
     };
     let correspondences =
         sides.map(|sides| sums::correspondences(sides, &sides[0].image.uniform_samples, &options));
-    // Samples that only one of them shows are left out, because they would favor or penalize it for
-    // its visibility.
+    // Samples that only the baseline or only the variant shows are left out, because they would
+    // favor or penalize it for its visibility.
     let (baseline, variant): (Vec<&Correspondence>, Vec<&Correspondence>) = correspondences[0]
         .iter()
         .zip(&correspondences[1])

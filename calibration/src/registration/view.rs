@@ -52,7 +52,7 @@ pub(super) struct CorrectedView {
     pub(super) color_from_depth: RigidTransform,
     pub(super) focal_px: [f64; 2],
     pub(super) principal_px: [f64; 2],
-    /// Focal lengths of the keyframe; lens parameters are relative to them.
+    /// Focal lengths of the keyframe. Lens parameters are relative to these focal lengths.
     pub(super) keyframe_focal_px: [f64; 2],
     pub(super) height_px: f64,
     pub(super) twist: Twist,
@@ -60,8 +60,8 @@ pub(super) struct CorrectedView {
     pub(super) depth_focal_px: [f64; 2],
     pub(super) depth_principal_px: [f64; 2],
     pub(super) depth_factor: f64,
-    /// Motion of the camera per unit of each parameter, in the camera's axes: parameter index,
-    /// meters, radians.
+    /// Motion of the camera per unit of each parameter, in the camera's axes. Each entry has the
+    /// parameter index, the translation in meters and the rotation in radians.
     pub(super) columns: Vec<(usize, Vector3<f64>, Vector3<f64>)>,
     pub(super) depth_pose: Option<usize>,
     pub(super) lens: Option<usize>,
@@ -129,7 +129,7 @@ impl CorrectedView {
     }
 
     /// The view with another camera pose, for a camera that moves rigidly with a frame. Parameters
-    /// 0 to 5 are the motion of the frame in its own axes: meters, then radians.
+    /// 0 to 5 are the motion of the frame in its own axes (meters, then radians).
     pub(super) fn moved_with_frame(
         &self,
         world_from_camera: &Transform,

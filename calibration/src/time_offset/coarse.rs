@@ -22,7 +22,7 @@ pub(super) struct Coarse {
 /// The offset with the most significant correlation, followed by other maxima.
 ///
 /// # Errors
-/// If the streams have no rotation, or no significant correlation.
+/// Fails if the streams have no rotation, or no significant correlation.
 pub(super) fn correlate(
     a: &Stream,
     b: &Stream,
@@ -30,8 +30,8 @@ pub(super) fn correlate(
 ) -> Result<Vec<Coarse>, Refusal> {
     /// Lower maxima are not tried.
     const SIMILAR: f64 = 0.7;
-    /// Periodic motions have a maximum per period. Each one is refined, which takes most of the
-    /// time.
+    /// Periodic motions have one maximum per period. Each maximum is refined, which takes most of
+    /// the time.
     const MAX_OTHERS: usize = 4;
     // Stamps in other units spread the motion over a long time, which looks like no rotation. This
     // is tested per stream, because streams in different units do not overlap.
@@ -72,8 +72,8 @@ pub(super) fn correlate(
             ),
         });
     };
-    // There is no correlation. A wrong rate of one clock is also a possible cause, with another
-    // remedy.
+    // There is no correlation. A wrong rate of one clock is also a possible cause, but it has
+    // another remedy.
     if best.value < MIN_CORRELATION {
         if let Some(refusal) = clock_rate_mistake(a, b) {
             return Err(refusal);
@@ -104,9 +104,10 @@ pub(super) fn correlate(
         .collect())
 }
 
-/// Explanation by stamps that advance too fast or too slowly by a factor of two.
+/// Explains the missing correlation by stamps that advance too fast or too slowly by a factor of
+/// two.
 pub(super) fn clock_rate_mistake(a: &Stream, b: &Stream) -> Option<Refusal> {
-    /// The correlation of unrelated motions of usual length is below this.
+    /// The correlation of unrelated motions of usual length is below this value.
     const MIN_CORRELATION: f64 = 0.7;
     let words = [(0.5, "twice"), (2.0, "half")]
         .into_iter()
@@ -143,8 +144,8 @@ pub(super) struct Grid {
 
 impl Grid {
     pub(super) fn new(a: &Stream, b: &Stream) -> Self {
-        // The time grows with the square of the number of points. In recordings that need more, the
-        // step is longer, and the refinement starts from a less accurate offset.
+        // The time grows with the square of the number of points. In recordings that need more
+        // points, the step is longer, and the refinement starts from a less accurate offset.
         const MAX_POINTS: f64 = 4000.0;
         let durations = [a, b].map(|stream| stream.end_secs() - stream.start_secs());
         let finest = a.step_secs().max(b.step_secs());
@@ -184,7 +185,7 @@ impl Grid {
     }
 }
 
-/// Rotation rates on a regular grid; `None` in gaps.
+/// Rotation rates on a regular grid. They are `None` in gaps.
 pub(super) struct Rates {
     pub(super) values: Vec<Option<f64>>,
 }
@@ -216,10 +217,10 @@ impl Rates {
     }
 
     /// # Errors
-    /// If the rate hardly changes.
+    /// Fails if the rate hardly changes.
     fn check_excitation(&self, name: &str) -> Result<(), Refusal> {
-        /// A tenth of the value for a hand-held or slowly moving camera. Below it, tracking noise
-        /// dominates.
+        /// This is a tenth of the value for a hand-held or slowly moving camera. Below this limit,
+        /// tracking noise dominates.
         const MIN_DEVIATION_RAD_S: f64 = 0.02;
         let rates: Vec<f64> = self.values.iter().flatten().copied().collect();
         let n = rates.len().max(1) as f64;
@@ -297,7 +298,7 @@ fn is_maximum(correlations: &[Correlation], ix: usize) -> bool {
         && value > correlations[ix + 1].value
 }
 
-/// Maxima outside the neighborhood of the best one, the most significant first.
+/// Maxima outside the neighborhood of the best maximum, the most significant first.
 fn other_maxima<'a>(correlations: &'a [Correlation], best: &Correlation) -> Vec<&'a Correlation> {
     // The neighborhood of the maximum ends where the correlation falls to half.
     let best_ix = correlations

@@ -1,5 +1,5 @@
-//! Continuous-time refinement: orientations of one stream are interpolated at the times of the
-//! other.
+//! Continuous-time refinement. Orientations of one stream are interpolated at the times of the
+//! other stream.
 
 use super::stream::Stream;
 use crate::Error;
@@ -17,12 +17,13 @@ const DRIFT_IX: usize = 7;
 pub(super) struct Fine {
     pub(super) offset_secs: f64,
     pub(super) sigma_secs: f64,
-    /// Drift and its standard deviation, seconds per second; `None` if it is not significant.
+    /// Drift and its standard deviation, seconds per second. `None` if the drift is not
+    /// significant.
     pub(super) drift: Option<[f64; 2]>,
     pub(super) mid_secs: f64,
     /// RMS rotation residual, radians.
     pub(super) rms_rad: f64,
-    /// Rotation residuals: seconds on B's clock, radians.
+    /// Rotation residuals. Each entry is a time in seconds on B's clock and an angle in radians.
     pub(super) residuals: Vec<[f64; 2]>,
     /// Deviation of the residuals per axis from their median, radians.
     pub(super) median_rad: f64,
@@ -32,10 +33,10 @@ pub(super) struct Fine {
 
 /// Refines an offset.
 ///
-/// * `a`: the stream that is interpolated; the one with the higher rate.
+/// * `a`: the stream that is interpolated, which has the higher rate.
 ///
 /// # Errors
-/// If the streams do not overlap.
+/// Fails if the streams do not overlap.
 pub(super) fn refine(a: &Stream, b: &Stream, offset_secs: f64) -> Result<Fine, Error> {
     const MIN_SIGMAS: f64 = 3.0;
     // The fit is done twice, first without a drift and then with one. An insignificant drift would
@@ -129,7 +130,8 @@ impl<'a> Orientations<'a> {
             a,
             rate_half_secs,
             times_b,
-            // The drift is relative to the middle, where it is not correlated with the offset.
+            // The drift is relative to the middle of the overlap, because there, it is not
+            // correlated with the offset.
             mid_secs: 0.5 * (first + last),
             half_secs: 0.5 * (last - first),
             has_drift: false,
@@ -191,10 +193,11 @@ impl<'a> Orientations<'a> {
         })
     }
 
-    /// Robust fit; the scale of the residuals is estimated in three rounds.
+    /// Robust fit. The scale of the residuals is estimated in three rounds.
     fn fit(&self, initial: State) -> Result<Fit<State>, Error> {
         const ROUNDS: usize = 4;
-        // Lower limit of the scale, because exact poses of a simulation have no residuals.
+        // Lower limit of the scale. It is needed because exact poses of a simulation have no
+        // residuals.
         const MIN_SCALE_RAD: f64 = 1e-7;
         let options = least_squares::Options {
             // The threshold is in standard deviations. The Cauchy loss is not convex, but the start
@@ -294,8 +297,8 @@ impl<'a> Orientations<'a> {
         ))
     }
 
-    /// Standard deviations that allow for errors that are correlated in time: the gradients of
-    /// consecutive parts of the stream are independent (Liang and Zeger 1986).
+    /// Standard deviations that allow for errors that are correlated in time. Only the gradients of
+    /// consecutive parts of the stream count as independent (Liang and Zeger 1986).
     fn sigmas(&self, fit: &Fit<State>) -> Vec<f64> {
         let n = fit.information.nrows();
         let scale = self.median_rad(&fit.state).max(1e-7);

@@ -41,7 +41,7 @@ pub struct TimeOffsetOptions {
     /// Largest absolute offset that is searched, seconds. `None` searches all offsets at which the
     /// recordings overlap.
     pub max_offset_secs: Option<f64>,
-    /// Refuses a result with a larger standard deviation, seconds.
+    /// Maximum standard deviation of the offset, seconds. A less certain offset is refused.
     pub max_sigma_secs: f64,
 }
 
@@ -58,7 +58,8 @@ impl Default for TimeOffsetOptions {
 /// Result of [`estimate_time_offset`].
 #[derive(Clone, Debug)]
 pub struct TimeOffset {
-    /// Seconds to add to B's clock to get A's; with a drift, at `mid_secs`.
+    /// Seconds to add to B's clock to get A's clock. If the clocks drift, this is the value at
+    /// `mid_secs`.
     pub offset_secs: f64,
     /// Standard deviation of the offset.
     pub sigma_secs: f64,
@@ -70,9 +71,11 @@ pub struct TimeOffset {
     pub mid_secs: f64,
     /// RMS difference of the orientations after alignment, degrees.
     pub rms_deg: f64,
-    /// Differences of the orientations after alignment over time: seconds on B's clock, degrees.
+    /// Differences of the orientations after alignment. Each entry is a time on B's clock in
+    /// seconds and a difference in degrees.
     pub residuals: Vec<[f64; 2]>,
-    /// The transform between the bodies, or why it is refused. `None` if it was not requested.
+    /// The transform between the bodies, or the reason for its refusal. `None` if it was not
+    /// requested.
     pub hand_eye: Option<Result<BodyTransform, Refusal>>,
 }
 
@@ -94,9 +97,8 @@ pub struct BodyTransform {
 /// The streams may have different rates, gaps, outliers and clocks with different zeros, but must
 /// overlap in time.
 ///
-/// # Errors
-/// [`Error::Refused`] if the motion does not determine the offset. [`Error::TimeOffsetInput`] if a
-/// stream is invalid.
+/// # Errors Returns [`Error::Refused`] if the motion does not determine the offset, and
+/// [`Error::TimeOffsetInput`] if a stream is invalid.
 ///
 /// ```
 /// use calibration::time_offset::{PoseSample, TimeOffsetOptions, estimate_time_offset};
@@ -172,7 +174,7 @@ fn estimate(
             "search larger offsets",
         )));
     }
-    // Written so that NaN is refused.
+    // The condition is written so that NaN is refused.
     let is_certain = fine.sigma_secs <= options.max_sigma_secs;
     if !is_certain {
         return Err(refused(Refusal::new(
@@ -222,8 +224,7 @@ fn estimate(
 
 /// The refined offset with the smallest residuals, and the offset from which it started.
 ///
-/// # Errors
-/// If another offset fits as well, or none.
+/// # Errors Fails if no offset fits, or if another offset fits equally well.
 fn refine_best(
     interpolated: &Stream,
     points: &Stream,

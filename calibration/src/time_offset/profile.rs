@@ -18,8 +18,7 @@ pub struct MotionProfile {
 /// The rotation rates that [`super::estimate_time_offset`] compares. They are available even if the
 /// estimate is refused.
 ///
-/// # Errors
-/// [`Error::TimeOffsetInput`] if a stream is invalid.
+/// # Errors Returns [`Error::TimeOffsetInput`] if a stream is invalid.
 pub fn motion_profile(
     a: &[PoseSample],
     b: &[PoseSample],
@@ -39,7 +38,7 @@ pub fn motion_profile(
     })
 }
 
-/// Times and rates of one of the streams of a grid. Gaps are left out.
+/// Times and rates of one stream of a grid. Gaps are left out.
 fn curve(stream: &Stream, grid: &Grid, stream_ix: usize) -> Vec<[f64; 2]> {
     let values = grid.rates[stream_ix].values.iter().enumerate();
     values

@@ -5,8 +5,8 @@ use crate::Error;
 use crate::hand_eye::Refusal;
 use nalgebra::{Quaternion, UnitQuaternion};
 
-/// The order w, x, y, z of the quaternions of one or both streams, if the orientations fit several
-/// times better with it.
+/// Explains large residuals by the order w, x, y, z of the quaternions of one or both streams, if
+/// the orientations fit several times better with this order.
 ///
 /// * `found`: the estimate for the order x, y, z, w.
 pub(super) fn mistake(
@@ -20,7 +20,7 @@ pub(super) fn mistake(
     /// Residual with the right order.
     const MAX_EXPLAINED_DEG: f64 = 6.0;
     /// Factor by which the other order must fit better. With a smaller factor, noisy streams would
-    /// be reported, too.
+    /// also be reported.
     const BETTER: f64 = 3.0;
     let found_deg = match found {
         Ok(offset) => median_deg(offset),

@@ -4,14 +4,15 @@
 use super::PoseSample;
 use crate::hand_eye::Refusal;
 
-/// Units in which stamps are often given by mistake, and how many make a second.
+/// Units in which stamps are often given by mistake, and their number per second.
 const UNITS: [(&str, f64); 3] = [
     ("milliseconds", 1e3),
     ("microseconds", 1e6),
     ("nanoseconds", 1e9),
 ];
-/// Times between poses of cameras, trackers and robots, seconds: 2.5 to 2500 Hz. The range spans a
-/// factor of 1000, the ratio of neighboring units, so that a step fits one unit only.
+/// Times between poses of cameras, trackers and robots, seconds. They correspond to rates of 2.5 to
+/// 2500 Hz. The range spans a factor of 1000, which is the ratio of neighboring units, so that a
+/// step fits only one unit.
 const USUAL_STEPS_SECS: std::ops::RangeInclusive<f64> = 0.0004..=0.4;
 
 /// The unit of stamps that are not seconds. Stamps in seconds with steps of several seconds look

@@ -5,7 +5,7 @@ use crate::Error;
 use kinematics::{Transform, transform};
 use nalgebra::Vector3;
 
-/// Minimum number of poses of a stream. Fewer cannot show a correlation.
+/// Minimum number of poses of a stream. Fewer poses cannot show a correlation.
 const MIN_POSES: usize = 20;
 
 /// Whether a sample is finite and its rotation has unit length.
@@ -27,7 +27,7 @@ impl Stream {
     /// Sorts the poses and drops repeated stamps.
     ///
     /// # Errors
-    /// If a value is not finite, or if there are too few poses.
+    /// Fails if a value is not finite, or if there are too few poses.
     pub(super) fn new(name: &str, samples: &[PoseSample]) -> Result<Self, Error> {
         /// Neighbors whose distance exceeds the median by this factor are not interpolated. Up to
         /// two consecutive poses may thus be missing.
@@ -125,8 +125,8 @@ impl Stream {
         Some(transform::interpolate(&before.pose, &after.pose, frac))
     }
 
-    /// The pose at a time and the angular velocity of the body, in its own frame: the mean over
-    /// `half_secs` before and after.
+    /// The pose at a time and the angular velocity of the body in its own frame. The velocity is
+    /// the mean over `half_secs` before and after this time.
     pub(super) fn at_with_rate(
         &self,
         secs: f64,

@@ -1,4 +1,4 @@
-//! Inner corners of ChArUco boards: found next to markers, then next to other corners.
+//! Finds the inner corners of ChArUco boards, first next to markers, then next to other corners.
 
 use crate::alignment::Printed;
 use crate::gray::Plane;
@@ -104,8 +104,8 @@ impl Search<'_> {
         }
         let mut lattice = Lattice::default();
         for (cell, predictions) in predictions {
-            // Most corners touch two squares with markers. The mean of both predictions has less
-            // noise.
+            // Most corners touch two squares with markers. The mean of the predictions of both
+            // markers has less noise.
             let n = predictions.len() as f64;
             let pixel = [0, 1].map(|axis| {
                 predictions

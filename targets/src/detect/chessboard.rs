@@ -112,7 +112,8 @@ pub(super) fn detect(
 
 /// Whether almost all corners of a larger grid were found.
 fn is_complete_and_larger(grid: &Lattice, inner: [u32; 2]) -> bool {
-    // A grid with gaps may contain corners of the surroundings, so it is no evidence.
+    // A grid with gaps may contain corners of the surroundings, so it is no evidence of a larger
+    // board.
     const MIN_PERCENT: usize = 95;
     let Some([low, high]) = grid.range() else {
         return false;
@@ -168,8 +169,8 @@ fn matching(lattice: &mut Lattice, inner: [u32; 2], plane: &Plane) -> Result<Lat
     })
 }
 
-/// Chooses among the rotations of a grid with these smallest and largest cells that give the board.
-/// Returns the renumbered corners.
+/// Chooses one of the rotations that turn a grid with these smallest and largest cells into the
+/// board. Returns the renumbered corners.
 fn oriented(lattice: &Lattice, [low, high]: [Cell; 2], inner: [u32; 2]) -> Option<Lattice> {
     let size = [high[0] - low[0] + 1, high[1] - low[1] + 1].map(i32::cast_unsigned);
     let is_odd = (inner[0] + inner[1]) % 2 == 1;
@@ -214,7 +215,7 @@ fn oriented(lattice: &Lattice, [low, high]: [Cell; 2], inner: [u32; 2]) -> Optio
         .min_by(|a, b| from_right(a).total_cmp(&from_right(b)))
 }
 
-/// Removes outermost lines that have few corners: these are not part of the board.
+/// Removes outermost lines that have few corners, because such lines are not part of the board.
 pub(super) fn trim(lattice: &mut Lattice) {
     while let Some([low, high]) = lattice.range() {
         // One line is removed at a time, starting with the weakest, because its removal changes the
@@ -247,7 +248,7 @@ fn line_frac(lattice: &Lattice, axis: usize, at: i32, length: i32) -> f64 {
     n as f64 / f64::from(length)
 }
 
-/// The cells seen from a corner, with the x axis along `STEPS[turns]`.
+/// The cells relative to a corner, with the x axis along `STEPS[turns]`.
 fn renumber(lattice: &Lattice, corner: Cell, turns: usize) -> Lattice {
     let x = STEPS[turns];
     let y = STEPS[(turns + 1) % 4];
@@ -277,7 +278,7 @@ fn x_axis_rad(lattice: &Lattice) -> Option<f64> {
 
 /// The board is of another size, or a part of it is outside the image.
 fn wrong_size(lattice: &Lattice, size: [u32; 2], inner: [u32; 2], plane: &Plane) -> NotDetected {
-    // Columns are the longer side of the target, in the message only.
+    // For the message, columns and rows are swapped so that the longer side is that of the target.
     let is_swapped = (size[0] < size[1]) != (inner[0] < inner[1]);
     let [columns, rows] = if is_swapped { [size[1], size[0]] } else { size };
     let found = Counts { columns, rows };

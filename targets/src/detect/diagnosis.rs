@@ -77,8 +77,8 @@ pub(super) fn marker_size(
     })
 }
 
-/// The counts of the board that the markers form, if they fit other counts better than those of the
-/// target.
+/// The counts of the board that the markers form, if the markers fit other counts better than the
+/// counts of the target.
 ///
 /// * `n_confirmed`: number of markers that fit those of the target.
 pub(super) fn other_counts(
@@ -89,7 +89,8 @@ pub(super) fn other_counts(
     // Maximum number of columns. It bounds the time of a failed detection. Boards of common paper
     // sizes have fewer columns.
     const MAX_COLUMNS: u32 = 40;
-    // Minimum number of confirmed markers. With fewer, another board may fit by chance.
+    // Minimum number of confirmed markers. With fewer confirmed markers, another board may fit by
+    // chance.
     const MIN_CONFIRMED: usize = 4;
     let (expected, what) = match target.pattern {
         Pattern::Charuco { squares, .. } => (squares, "squares"),
@@ -181,8 +182,9 @@ fn neighbor_fracs(layout: &Layout, markers: &[Marker], square_m: f64, marker_m: 
             let squares = distance(layout::center(to_m), center_m) / square_m;
             let [x, y] = layout::center(&to.corners_px);
             let [across, along] = board_from_pixel.map([x - center_px[0], y - center_px[1]]);
-            // The distance of the neighbor is known in squares from the layout, and measured in
-            // sides of the marker by its homography. Their ratio is the size of the marker.
+            // The layout gives the distance of the neighbor in squares, and the homography of the
+            // marker measures it in sides of the marker. The ratio of the two distances is the size
+            // of the marker.
             let sides = across.hypot(along) / marker_m;
             if squares < MAX_SQUARES && sides > 0.0 && sides.is_finite() {
                 fracs.push(squares / sides);
@@ -197,7 +199,7 @@ fn is_plausible(n: usize, dictionary: &Dictionary) -> bool {
     n >= MIN_MARKERS || (n > 0 && dictionary.n_bits() >= MIN_BITS_OF_SINGLE)
 }
 
-/// Number of markers, reduced by those that may occur by chance: four times their expected number.
+/// Number of markers, reduced by four times the number of markers that are expected by chance.
 #[expect(
     clippy::cast_possible_truncation,
     clippy::cast_sign_loss,

@@ -15,9 +15,9 @@ use crate::template::{self, Neighborhood};
 /// Widths of the black border of tags, in cells. Kalibr prints a border of 2 cells, AprilTag of 1
 /// cell.
 const TAG_BORDERS: [usize; 2] = [1, 2];
-/// Largest difference of the size of ChArUco markers from that of the target, relative to it. Blur
-/// makes small markers look up to 10 % smaller, so a found board needs a clearer contradiction than
-/// [`diagnosis::MIN_SIZE_CHANGE`].
+/// Largest relative difference between the size of the ChArUco markers in the image and the size on
+/// the target. Blur makes small markers look up to 10 % smaller, so a found board needs a clearer
+/// contradiction than [`diagnosis::MIN_SIZE_CHANGE`].
 const MAX_SIZE_CHANGE: f64 = 0.2;
 /// Largest distance of a corner from the intersection of the tag's sides, relative to the length of
 /// a side. The distance is not zero, because lenses bend the sides.
@@ -89,8 +89,8 @@ fn aprilgrid(target: &TargetSpec, tag_m: f64, plane: &Plane, fit: &Fit) -> Vec<(
     pixels
 }
 
-/// Refines the corners of a marker. `corners_m`: their positions on the board, in the order of the
-/// marker.
+/// Refines the corners of a marker. `corners_m` contains their positions on the board, in the order
+/// of the marker.
 fn corners(
     target: &TargetSpec,
     plane: &Plane,
@@ -139,7 +139,7 @@ fn corners(
         .collect()
 }
 
-/// The id among `ids` of the target's corner at a position on the board.
+/// The id of the target's corner at a position on the board. Only the given `ids` are considered.
 fn id_at(target: &TargetSpec, ids: [u32; 4], point_m: [f64; 2], tolerance_m: f64) -> Option<u32> {
     ids.into_iter().find(|&id| {
         target

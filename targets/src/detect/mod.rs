@@ -31,7 +31,7 @@ pub struct DetectedCorner {
     pub id: u32,
     /// Position in the board frame, meters.
     pub point_in_board: Vector3<f64>,
-    /// Position in the image; the center of the first pixel is (0.5, 0.5).
+    /// Position in the image. The center of the first pixel is (0.5, 0.5).
     pub pixel: [f64; 2],
 }
 
@@ -41,13 +41,13 @@ const MIN_CORNERS: usize = 4;
 impl TargetSpec {
     /// Finds this target in an image.
     ///
-    /// ChArUco boards, AprilGrids and PuzzleBoards may be partly visible. Of a chessboard, some
-    /// inner corners may be missing, but its outermost rows and columns must be visible, because it
-    /// could not be identified otherwise. If the board is symmetric, the rotation is chosen whose x
-    /// axis points most to the right in the image; see [`TargetSpec::symmetry`].
+    /// ChArUco boards, AprilGrids and PuzzleBoards may be partly visible. Some inner corners of a
+    /// chessboard may be missing. Its outermost rows and columns must be visible, because they
+    /// identify the board. If the board is symmetric ([`TargetSpec::symmetry`]), the rotation is
+    /// chosen whose x axis points most to the right in the image.
     ///
-    /// Lines may be bent by any lens, including fisheye lenses: only neighboring corners are
-    /// compared. The result depends only on the image. The function can be called from several
+    /// Lines may be bent by any lens, including fisheye lenses, because only neighboring corners
+    /// are compared. The result depends only on the image. The function can be called from several
     /// threads at the same time.
     ///
     /// # Errors
@@ -78,7 +78,7 @@ impl TargetSpec {
         }
     }
 
-    /// Collects corners; ids outside the target are left out.
+    /// Collects corners. Corners whose ids are not on the target are left out.
     fn detection(
         &self,
         pixels: impl IntoIterator<Item = (u32, [f64; 2])>,

@@ -1,4 +1,5 @@
-//! Detection of PuzzleBoards: a chessboard grid whose place is read from the dots on its edges.
+//! Detection of PuzzleBoards. A PuzzleBoard is a chessboard grid, and the dots on its edges encode
+//! its position in a master pattern.
 
 use super::chessboard::{Levels, trim};
 use super::{Detection, MIN_CORNERS};
@@ -9,13 +10,13 @@ use crate::lattice::{Cell, Lattice, Refinement, STEPS};
 use crate::puzzle_code::{Edge, PERIOD, Position, locate};
 use crate::spec::TargetSpec;
 
-/// Largest part of dots that may be read wrong. With `n` random dots, the best of a million places
-/// agrees in about `0.5 + 2.4 / sqrt(n)` of them, which is 0.81 for [`MIN_DOTS`]. A larger value
-/// accepts more blur, but is closer to this chance level.
+/// Largest fraction of dots that may be read wrong. With `n` random dots, the best of a million
+/// positions agrees with a fraction of about `0.5 + 2.4 / sqrt(n)` of the dots. This is 0.81 for
+/// [`MIN_DOTS`]. A larger value accepts more blur, but is closer to this chance level.
 const MAX_WRONG_FRAC: f64 = 0.12;
 /// Minimum number of dots. With fewer dots, other positions in the pattern may fit equally well.
 /// The pattern has 501 x 501 positions in four rotations, which 20 bits enumerate. The remaining
-/// dots correct wrong ones.
+/// dots correct wrong dots.
 const MIN_DOTS: usize = 60;
 /// Dots begin at a third of the square from each corner.
 const REFINEMENT: Refinement = Refinement { clear_frac: 0.3 };
@@ -38,7 +39,7 @@ impl Board<'_> {
             target: self.target.kind(),
         };
         // At a wrong resolution, few corners are found. If no grid can be read, the reason for the
-        // largest one is reported.
+        // largest grid is reported.
         let mut n_best = 0;
         for lattice in Levels::new(plane).grids() {
             let n = lattice.corners.len();
@@ -126,8 +127,8 @@ impl Board<'_> {
 }
 
 impl Board<'_> {
-    /// Quarter turns of a lattice with this range of cells, and its offset in the master pattern,
-    /// from its dots.
+    /// Determines the quarter turns of a lattice with this range of cells and its offset in the
+    /// master pattern from its dots.
     ///
     /// `found`: counts of the lattice, for messages.
     fn located(
@@ -187,8 +188,8 @@ impl Board<'_> {
     }
 }
 
-/// An edge between two corners of the lattice: the first of them, the direction to the second, and
-/// the dot's color.
+/// An edge between two corners of the lattice: the first corner, the direction to the second
+/// corner, and the dot's color.
 type Dot = (Cell, Cell, bool);
 
 /// Reads the dots on all edges with squares on both sides that are bounded by corners.

@@ -24,8 +24,8 @@ impl TargetSpec {
     /// the board frame and a caption.
     ///
     /// # Errors
-    /// If the target does not fit the paper in either orientation. The message names a paper that
-    /// fits.
+    /// Fails if the target does not fit the paper in either orientation. The message names a paper
+    /// that fits.
     pub fn pdf(&self, paper: Paper) -> Result<Vec<u8>, PrintError> {
         let [low, high] = self.bounds_m();
         let pattern_mm = [0, 1].map(|axis| (high[axis] - low[axis]) * 1e3);
@@ -98,7 +98,7 @@ impl TargetSpec {
         let is_short = |length: &u32| f64::from(*length) + 12.0 <= width_mm;
         let length = RULERS_MM.into_iter().find(is_short).unwrap_or(RULERS_MM[3]);
         let left = PAGE_MARGIN_MM;
-        // Below the white margin that the detection of outer corners needs.
+        // This is below the white margin that the detection of outer corners needs.
         let top = corner_mm[1] + pattern_mm[1] + 4.0;
         page.line([left, top], [left + f64::from(length), top], 0.2);
         for at in 0..=length {
@@ -181,7 +181,7 @@ mod tests {
         .unwrap()
     }
 
-    /// Rectangles of the file: x, y, width, height in millimeters.
+    /// Rectangles of the file as x, y, width and height in millimeters.
     fn rectangles(text: &str) -> Vec<[f64; 4]> {
         let numbers = |line: &str| -> Option<[f64; 4]> {
             let parts: Vec<f64> = line

@@ -43,7 +43,8 @@ impl Paper {
         }
     }
 
-    /// The smallest named paper into which a rectangle fits, or one of exactly this size.
+    /// The smallest named paper into which a rectangle fits. If none is large enough, a paper of
+    /// about the size of the rectangle.
     pub(super) fn for_size(need_mm: [f64; 2]) -> Self {
         let fits = |[width, height]: [f64; 2]| need_mm[0] <= width && need_mm[1] <= height;
         let named = NAMED

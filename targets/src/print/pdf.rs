@@ -4,7 +4,7 @@
 
 use std::fmt::Write;
 
-/// Points per millimeter: PDF measures in 1/72 inch.
+/// Points per millimeter. PDF measures in points of 1/72 inch.
 const POINTS_PER_MM: f64 = 72.0 / 25.4;
 
 /// A page. Positions are millimeters from the upper left corner.
@@ -36,7 +36,7 @@ impl Page {
         self.content.push('\n');
     }
 
-    /// Sets the gray value of everything that follows; 0 is black, 1 is white.
+    /// Sets the gray value of everything that is drawn afterwards, from 0 (black) to 1 (white).
     pub(super) fn set_gray(&mut self, gray: f64) {
         // PDF has one operator for filling and another one for lines.
         self.operator(&[gray], "g");

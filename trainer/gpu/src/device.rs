@@ -14,8 +14,8 @@ use std::time::Duration;
 /// Interval between checks of the device while waiting for a read-back. It delays only the
 /// detection of a lost device.
 const CHECK_PERIOD: Duration = Duration::from_millis(100);
-/// Size of the memory blocks that small buffers share on a software adapter: the smallest size that
-/// wgpu accepts.
+/// Size of the memory blocks that small buffers share on a software adapter. It is the smallest
+/// size that wgpu accepts.
 const SOFTWARE_BLOCK_BYTES: u64 = 4 << 20;
 /// Maximum total size of read-back buffers kept for reuse. A 1024x1024 picture with depth takes 8
 /// MiB, so four of them are kept.
@@ -52,9 +52,9 @@ struct LiveBuffers {
 }
 
 impl LiveBuffers {
-    /// Counts a new buffer; returns its label and the total bytes of all buffers.
+    /// Counts a new buffer. Returns its label and the total bytes of all buffers.
     fn add(&self, label: &str, bytes: u64) -> (Arc<str>, u64) {
-        // Labels are shared: models create buffers with the same label again and again.
+        // Labels are shared, because models create buffers with the same label many times.
         let mut by_label = self.by_label.lock();
         let key = by_label
             .get_key_value(label)
@@ -72,8 +72,8 @@ impl LiveBuffers {
     }
 }
 
-/// Errors that the device reports outside of any call. They are permanent: only a new device can
-/// continue.
+/// Errors that the device reports outside of any call. They are permanent. Work can continue only
+/// on a new device.
 #[derive(Debug, Default)]
 struct Health {
     /// Why the device was lost.
@@ -132,7 +132,8 @@ fn instance() -> wgpu::Instance {
     })
 }
 
-/// The adapter with this index, or the fastest one; a software adapter if there is no other.
+/// The adapter with this index. Without an index, it is the fastest adapter. A software adapter is
+/// used only if there is no other.
 fn find_adapter(
     instance: &wgpu::Instance,
     requested: Option<usize>,
@@ -157,8 +158,8 @@ fn find_adapter(
 /// Experimental features of wgpu that the optional features need.
 fn experimental_features(optional: Optional) -> wgpu::ExperimentalFeatures {
     if optional.half_matrices {
-        // SAFETY: kernels with cooperative matrices are our own; each load and store stays
-        // within its array.
+        // SAFETY: only fieldrig's own kernels use cooperative matrices, and each of their loads and
+        // stores stays within its array.
         #[expect(unsafe_code, reason = "cooperative matrices are experimental in wgpu")]
         unsafe {
             wgpu::ExperimentalFeatures::enabled()
@@ -189,7 +190,8 @@ fn memory_hints(device_type: wgpu::DeviceType) -> wgpu::MemoryHints {
 }
 
 impl Gpu {
-    /// Names of all adapters, software ones too, in the order in which the drivers list them.
+    /// Names of all adapters, including software adapters, in the order in which the drivers list
+    /// them.
     pub fn adapters() -> Vec<String> {
         all_adapters(&instance())
             .iter()
@@ -197,12 +199,12 @@ impl Gpu {
             .collect()
     }
 
-    /// Opens the requested adapter, or the fastest one; uses a software adapter if there is no
-    /// other.
+    /// Opens the requested adapter, or the fastest one if none was requested. A software adapter is
+    /// used only if there is no other.
     ///
     /// # Errors
     ///
-    /// If there is no such adapter, or if it cannot open a device.
+    /// Fails if there is no such adapter, or if it cannot open a device.
     pub fn open(options: &GpuOptions) -> Result<Arc<Self>, Error> {
         let instance = instance();
         let adapter = find_adapter(&instance, options.adapter)?;
@@ -311,8 +313,8 @@ impl Gpu {
         self.peak_bytes.load(Ordering::Relaxed)
     }
 
-    /// Bytes that the allocator reserves for buffers, including unused memory; `None` if the
-    /// backend does not report them. Slow, because it lists every allocation.
+    /// Bytes that the allocator reserves for buffers, including unused memory. `None` if the
+    /// backend does not report them. The call is slow, because it lists every allocation.
     pub fn reserved_bytes(&self) -> Option<u64> {
         Some(
             self.device
@@ -330,12 +332,12 @@ impl Gpu {
     ///
     /// # Errors
     ///
-    /// If the device was lost, ran out of memory, failed or got an invalid command since it was
-    /// opened.
+    /// Fails if the device was lost, ran out of memory, failed or got an invalid command since it
+    /// was opened.
     pub fn check(&self) -> Result<(), Error> {
         let failed = self.health.failed.get();
         if matches!(failed, Some(Failure::Invalid(_))) && !self.is_lost() {
-            // Commands for a lost device are invalid, too, and wgpu may report the loss only when
+            // Commands for a lost device are also invalid, and wgpu may report the loss only when
             // it is polled.
             let _ = std::panic::catch_unwind(AssertUnwindSafe(|| {
                 self.device.poll(wgpu::PollType::Poll)
@@ -353,10 +355,10 @@ impl Gpu {
         }
     }
 
-    /// Loses the device on purpose, like a driver reset; for tests of recovery.
+    /// Loses the device on purpose, like a driver reset. This is for tests of recovery.
     pub fn lose(&self) {
-        // Unlike a driver reset, `destroy` frees memory at once, so this waits for readers and
-        // copies first.
+        // Unlike a driver reset, `destroy` frees memory at once. The write lock therefore waits for
+        // readers and copies first.
         let _no_reader = self.mapped.write();
         let _ = self.device.poll(wgpu::PollType::Wait {
             submission_index: None,
@@ -369,7 +371,7 @@ impl Gpu {
     ///
     /// # Errors
     ///
-    /// If the adapter cannot bind the buffer or has no memory for it.
+    /// Fails if the adapter cannot bind the buffer or has no memory for it.
     pub fn storage(&self, label: &str, bytes: u64) -> Result<Buffer, Error> {
         // An empty buffer cannot be bound, and arrays of `vec4f` need whole elements.
         let bytes = bytes.max(16).next_multiple_of(16);
@@ -390,8 +392,8 @@ impl Gpu {
         let usage = wgpu::BufferUsages::STORAGE
             | wgpu::BufferUsages::COPY_SRC
             | wgpu::BufferUsages::COPY_DST;
-        // Callers can react to a lack of memory with smaller buffers. Outside of an error scope, it
-        // would be recorded as a permanent failure of the device.
+        // Callers can react to a lack of memory with smaller buffers. Outside of an error scope,
+        // the lack of memory would be recorded as a permanent failure of the device.
         let memory = self.device.push_error_scope(wgpu::ErrorFilter::OutOfMemory);
         let buffer = self.buffer(label, bytes, usage);
         pollster::block_on(memory.pop()).map_or(Ok(buffer), |_| Err(full()))
@@ -401,7 +403,7 @@ impl Gpu {
     ///
     /// # Errors
     ///
-    /// As [`Self::storage`].
+    /// Fails as [`Self::storage`] does.
     pub fn storage_with(&self, label: &str, contents: &[u8]) -> Result<Buffer, Error> {
         let buffer = self.storage(label, contents.len() as u64)?;
         self.write(&buffer, 0, contents);
@@ -465,7 +467,7 @@ impl Gpu {
     ///
     /// # Errors
     ///
-    /// If the device failed, or if there is no memory for the read-back.
+    /// Fails if the device failed, or if there is no memory for the read-back.
     pub fn read<T: bytemuck::Pod>(&self, buffer: &Buffer, n: usize) -> Result<Vec<T>, Error> {
         if n == 0 {
             return Ok(Vec::new());
@@ -531,7 +533,7 @@ impl Gpu {
         }))
     }
 
-    /// Returns a read-back buffer, reused if one fits; `None` if no memory is left.
+    /// Returns a read-back buffer, and reuses one if it fits. Returns `None` if no memory is left.
     fn staging(&self, bytes: u64) -> Option<wgpu::Buffer> {
         let bytes = bytes.max(4);
         let mut idle = self.idle_staging.lock();
@@ -565,8 +567,8 @@ impl Gpu {
         self.idle_staging.lock().len()
     }
 
-    /// Keeps a read-back buffer for reuse, within [`MAX_IDLE_STAGING_BYTES`]; the least recently
-    /// used ones are dropped first.
+    /// Keeps a read-back buffer for reuse, within [`MAX_IDLE_STAGING_BYTES`]. The least recently
+    /// used buffers are dropped first.
     fn keep_staging(&self, buffer: wgpu::Buffer) {
         let mut idle = self.idle_staging.lock();
         idle.push_back(buffer);
@@ -581,7 +583,7 @@ impl Gpu {
     ///
     /// # Errors
     ///
-    /// As [`Self::check`].
+    /// Fails as [`Self::check`] does.
     pub fn wait(&self) -> Result<(), Error> {
         self.poll(wgpu::PollType::Wait {
             submission_index: None,
@@ -657,7 +659,7 @@ impl PendingRead {
     ///
     /// # Errors
     ///
-    /// If the device failed, or if there was no memory for the read-back.
+    /// Fails if the device failed, or if there was no memory for the read-back.
     pub fn finish<T: bytemuck::Pod>(self, gpu: &Gpu) -> Result<Vec<T>, Error> {
         self.finish_with(gpu, |parts| bytemuck::pod_collect_to_vec(parts[0]))
     }
@@ -666,7 +668,7 @@ impl PendingRead {
     ///
     /// # Errors
     ///
-    /// As [`Self::finish`].
+    /// Fails as [`Self::finish`] does.
     pub fn finish_with<R>(self, gpu: &Gpu, take: impl FnOnce(&[&[u8]]) -> R) -> Result<R, Error> {
         let reading = self.0.map_err(|bytes| Error::OutOfMemory {
             label: "readback".to_owned(),
@@ -712,7 +714,7 @@ impl PendingRead {
     }
 }
 
-/// Memory on the GPU; freed on drop, once the GPU is done with it.
+/// Memory on the GPU. After a drop, it is freed as soon as the GPU no longer uses it.
 #[derive(Debug)]
 pub struct Buffer {
     pub(crate) id: u64,

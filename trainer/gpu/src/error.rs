@@ -30,7 +30,7 @@ pub enum Error {
     /// The GPU stopped answering.
     #[error("the GPU stopped answering: its driver reset or lost the device")]
     DeviceLost,
-    /// The GPU has no memory left for a buffer, or for commands; for commands, `label` is empty and
+    /// The GPU has no memory left for a buffer or for commands. For commands, `label` is empty and
     /// `bytes` is 0.
     #[error(
         "the GPU ran out of memory{}; close other programs that use it, use smaller images, or train a smaller model ({} or {} of `fieldrig train` and `run`)",
@@ -96,7 +96,7 @@ pub enum Error {
 }
 
 impl Error {
-    /// An [`Error::Internal`]; `what` is a clause without a period.
+    /// An [`Error::Internal`]. `what` is a clause without a period.
     pub(crate) fn internal(what: &str) -> Self {
         Self::Internal(what.to_owned())
     }

@@ -1,8 +1,8 @@
-//! GPU access: one device, pipelines that bind buffers by their names in the WGSL, and lists of
+//! GPU access with one device, pipelines that bind buffers by their names in the WGSL, and lists of
 //! passes. Only this crate encodes GPU commands. It does not depend on any scene model.
 //!
 //! [`Gpu`] opens the device, [`Pipeline`] compiles a [`Kernel`], and [`Passes`] records dispatches.
-//! [`sort`] is a radix sort, [`shared`] is WGSL that kernels of other crates import, too.
+//! [`sort`] is a radix sort. [`shared`] contains WGSL that kernels of other crates also import.
 //!
 //! ```
 //! use gpu::{Source, reflect, resolve, shared};

@@ -7,11 +7,12 @@ pub struct GpuOptions {
     pub optional_features: bool,
     /// Whether cooperative matrices may be used.
     pub matrices: bool,
-    /// Lowers the maximum size of a binding, bytes; for tests of buffer limits.
+    /// Lowers the maximum size of a binding, bytes. This is for tests of buffer limits.
     pub max_binding_bytes: Option<u64>,
-    /// Maximum total size of all storage buffers, bytes; for tests of running out of memory.
+    /// Maximum total size of all storage buffers, bytes. This is for tests of running out of
+    /// memory.
     pub memory_limit_bytes: Option<u64>,
-    /// Index into [`Gpu::adapters`](crate::Gpu::adapters); `None`: the fastest adapter.
+    /// Index into [`Gpu::adapters`](crate::Gpu::adapters). `None` selects the fastest adapter.
     pub adapter: Option<usize>,
 }
 

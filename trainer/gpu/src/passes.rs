@@ -36,8 +36,8 @@ enum Pass {
 
 /// A list of GPU passes. Adding a pass does not touch the GPU.
 ///
-/// Bind groups are cached across submits, keyed by kernel and buffers; [`Passes::clear_bindings`]
-/// drops them.
+/// Bind groups are cached across submits by kernel and buffers. [`Passes::clear_bindings`] drops
+/// them.
 #[derive(Default)]
 pub struct Passes {
     list: Vec<Pass>,
@@ -64,8 +64,8 @@ impl Passes {
     ///
     /// # Panics
     ///
-    /// If the names differ from those in the kernel, which is a bug in the caller. The message
-    /// lists both.
+    /// Panics if the names differ from those in the kernel, which is a bug in the caller. The
+    /// message lists both.
     pub fn dispatch(
         &mut self,
         gpu: &Gpu,
@@ -173,10 +173,11 @@ impl Passes {
     ///
     /// # Errors
     ///
-    /// If the device failed.
+    /// Fails if the device failed.
     pub fn submit_timed_total(&mut self, gpu: &Gpu) -> Result<Option<f64>, Error> {
         // Unlike `submit_timed`, this writes only two timestamps around the whole list. With a pass
-        // per kernel, there would be time between kernels that a submit in training does not need.
+        // per kernel, the total would include time between kernels that a submit in training does
+        // not need.
         let timed = gpu.optional.timestamps;
         let queries = timed.then(|| {
             gpu.device.create_query_set(&wgpu::QuerySetDescriptor {
@@ -220,15 +221,15 @@ impl Passes {
     ///
     /// # Errors
     ///
-    /// If the device failed.
+    /// Fails if the device failed.
     pub fn submit_timed(&mut self, gpu: &Gpu) -> Result<Vec<PassTiming>, Error> {
         if !gpu.optional.timestamps {
             self.submit(gpu);
             gpu.wait()?;
             return Ok(Vec::new());
         }
-        // A timestamp can only be written at the boundaries of a pass, so every kernel gets its
-        // own.
+        // A timestamp can only be written at the boundaries of a pass, so every kernel gets its own
+        // pass.
         let n = u32_of(self.list.len() as u64);
         let queries = gpu.device.create_query_set(&wgpu::QuerySetDescriptor {
             label: Some("timing"),
@@ -290,7 +291,7 @@ fn buffers_by_binding<'b>(pipeline: &Pipeline, buffers: &[(&str, &'b Buffer)]) -
         .iter()
         .map(|binding| buffer_named(buffers, &binding.name))
         .collect();
-    // A buffer that the kernel does not bind is also an error, probably a misspelled name.
+    // A buffer that the kernel does not bind is also an error. Its name is probably misspelled.
     let Some(found) = found.filter(|found| found.len() == buffers.len()) else {
         let reads: Vec<_> = pipeline
             .bindings

@@ -17,12 +17,12 @@ pub struct Kernel {
 }
 
 impl Pipeline {
-    /// Compiles `kernel` with the given values of its `override`s, or returns the pipeline that
-    /// this device has already compiled for them.
+    /// Compiles `kernel` with the given values of its `override`s. If this device has already
+    /// compiled such a pipeline, returns that pipeline.
     ///
     /// # Errors
     ///
-    /// If the WGSL is invalid, or needs more workgroup memory than the adapter has.
+    /// Fails if the WGSL is invalid, or needs more workgroup memory than the adapter has.
     pub fn new(gpu: &Gpu, kernel: Kernel, overrides: &[(&str, f64)]) -> Result<Self, Error> {
         let text = resolve(kernel.source, kernel.shared)?;
         let key = Key::new(text.clone(), overrides);
@@ -67,11 +67,12 @@ impl Pipeline {
             unsafe_code,
             reason = "a second bound would cost time in every iteration of the innermost loops"
         )]
-        // SAFETY: every loop of our kernels counts to a bound that is fixed before it starts.
+        // SAFETY: every loop of fieldrig's kernels counts to a bound that is fixed before the loop
+        // starts.
         let shader = unsafe { device.create_shader_module_trusted(described, checks) };
         // The layout is explicit and has all declared buffers. A layout that wgpu derives would
-        // lack the buffers that this variant of the kernel does not use, and callers of `dispatch`
-        // would have to know these.
+        // lack the buffers that this variant of the kernel does not use. Callers of `dispatch`
+        // would then have to know which buffers each variant uses.
         let entries: Vec<_> = bindings.iter().map(layout_entry).collect();
         let layout = device.create_bind_group_layout(&wgpu::BindGroupLayoutDescriptor {
             label: Some(name),
@@ -108,7 +109,7 @@ impl Pipeline {
     ///
     /// # Errors
     ///
-    /// As [`Self::new`], for any of the kernels.
+    /// Fails as [`Self::new`] does, for any of the kernels.
     pub fn compile_all<const N: usize>(
         gpu: &Gpu,
         kernels: [(Kernel, &[(&str, f64)]); N],

@@ -39,14 +39,14 @@ impl Key {
 }
 
 /// The pipelines of one device. Each is compiled once, on first use, and kept as long as the
-/// device: a second model, or a model that is loaded again, takes milliseconds instead of seconds
-/// to start.
+/// device. A second model, or a model that is loaded again, therefore starts in milliseconds
+/// instead of seconds.
 #[derive(Debug, Default)]
 pub(super) struct PipelineCache(Mutex<HashMap<Key, Arc<Mutex<Option<Pipeline>>>>>);
 
 impl PipelineCache {
-    /// The pipeline with this key. If it is missing, compiles it; callers with the same key wait
-    /// for each other, callers with different keys do not.
+    /// The pipeline with this key. Compiles the pipeline if it is missing. Callers with the same
+    /// key wait for each other. Callers with different keys do not wait.
     pub(super) fn get_or_compile(
         &self,
         key: Key,
@@ -60,7 +60,7 @@ impl PipelineCache {
         if let Some(compiled) = &*slot {
             return Ok(compiled.clone());
         }
-        // If this fails, the slot stays empty, and the next caller gets the error, too.
+        // If this fails, the slot stays empty. The next caller then gets the same error.
         let compiled = compile()?;
         Ok(slot.insert(compiled).clone())
     }

@@ -2,18 +2,19 @@
 
 use crate::GpuOptions;
 
-/// Optional features of the adapter; each has a fallback.
+/// Optional features of the adapter. Each feature has a fallback.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Optional {
-    /// Smallest number of lanes per subgroup, 4 to 128; `None` if subgroup operations may not be
+    /// Smallest number of lanes per subgroup, 4 to 128. `None` if subgroup operations may not be
     /// used.
     ///
     /// Without subgroups, sorting ranks keys sequentially, and the backward pass sums over lanes in
     /// workgroup memory.
     pub subgroup_lanes: Option<u32>,
-    /// GPU timestamps for the time of each pass; without them, only wall time is available.
+    /// GPU timestamps for the time of each pass. Without timestamps, only wall time is available.
     pub timestamps: bool,
-    /// Subgroup products of 16x16 f16 matrices, summed in f32. Without them, neural fields use f32.
+    /// Subgroup products of 16x16 f16 matrices, summed in f32. Without these products, neural
+    /// fields use f32.
     pub half_matrices: bool,
 }
 

@@ -14,7 +14,7 @@ const SUBMIT_MILLIS: f64 = 20.0;
 /// running submit and the queued submit.
 const SUBMIT_MILLIS_WATCHED: f64 = 2.0;
 
-/// Tracks training submits: at most one is in flight while the next one is recorded.
+/// Tracks training submits. At most one submit is in flight while the next one is recorded.
 #[derive(Debug)]
 pub struct Submits {
     in_flight: Option<InFlight>,
@@ -59,7 +59,7 @@ impl Submits {
     ///
     /// # Errors
     ///
-    /// If the device failed.
+    /// Fails if the device failed.
     pub fn finish(&mut self, gpu: &Gpu) -> Result<Option<Vec<u32>>, Error> {
         let Some(InFlight {
             counters,
@@ -92,7 +92,7 @@ impl Submits {
             .map_or(0, |in_flight| in_flight.n_steps)
     }
 
-    /// Number of steps that fit into the time limit of a submit; `None` until a submit has been
+    /// Number of steps that fit into the time limit of a submit. `None` until a submit has been
     /// timed.
     #[must_use]
     pub fn n_steps_in_limit(&self) -> Option<u64> {
@@ -105,7 +105,7 @@ impl Submits {
         (self.step_millis > 0.0).then(|| n_steps(self.step_millis))
     }
 
-    /// Smoothed GPU time of a step, milliseconds; 0 until a submit has been timed.
+    /// Smoothed GPU time of a step, milliseconds. It is 0 until a submit has been timed.
     #[must_use]
     pub fn step_millis(&self) -> f64 {
         self.step_millis
@@ -123,7 +123,7 @@ impl Submits {
         self.is_watched
     }
 
-    /// Sets whether pictures are requested. If so, submits must be short.
+    /// Sets whether pictures are requested. If they are, submits must be short.
     pub fn set_watched(&mut self, watched: bool) {
         self.is_watched = watched;
     }

@@ -1,4 +1,4 @@
-//! WGSL sources: `#import name` and reflection through naga.
+//! Resolves `#import name` in WGSL sources, and inspects the sources with naga.
 
 use crate::Error;
 use wgpu::naga;
@@ -28,12 +28,12 @@ pub(super) struct Binding {
     pub(super) access: Access,
 }
 
-/// Replaces each line `#import name` with the shared source of that name, recursively; repeated
+/// Replaces each line `#import name` with the shared source of that name, recursively. Repeated
 /// imports are skipped.
 ///
 /// # Errors
 ///
-/// If a file imports a name that is not among the shared sources.
+/// Fails if a file imports a name that is not among the shared sources.
 pub fn resolve(kernel: Source, shared: &[Source]) -> Result<String, Error> {
     let mut text = String::new();
     let mut seen = Vec::new();
@@ -73,14 +73,14 @@ fn append(
 ///
 /// # Errors
 ///
-/// If the WGSL is invalid. The message names the kernel.
+/// Fails if the WGSL is invalid. The message names the kernel.
 pub fn reflect(name: &'static str, text: &str) -> Result<naga::Module, Error> {
     let rejected = |message: String| Error::Wgsl {
         kernel: name,
         message,
     };
-    // All capabilities are allowed here: wgpu checks those of the adapter when it creates the
-    // module.
+    // All capabilities are allowed here, because wgpu checks the capabilities of the adapter when
+    // it creates the module.
     let module =
         naga::front::wgsl::parse_str(text).map_err(|error| rejected(error.emit_to_string(text)))?;
     naga::valid::Validator::new(

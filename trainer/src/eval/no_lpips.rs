@@ -10,8 +10,7 @@ use std::path::Path;
 pub enum Lpips {}
 
 impl Lpips {
-    /// # Errors
-    /// Always [`Error::LpipsNotBuilt`].
+    /// # Errors Always returns [`Error::LpipsNotBuilt`].
     pub fn load(_: &Path) -> Result<Self, Error> {
         Err(Error::LpipsNotBuilt)
     }

@@ -18,7 +18,7 @@ pub struct NerfOptions {
     pub rate: f64,
     /// Fraction of the initial rate that remains after the planned steps.
     pub final_rate_frac: f64,
-    /// Sizes of batch and networks; `None`: chosen for the adapter.
+    /// Sizes of the batch and of the networks. `None` selects the default sizes for the adapter.
     pub nerf_budget: Option<NerfBudget>,
 }
 

@@ -157,7 +157,7 @@ impl QueuedPicture {
     ///
     /// # Errors
     ///
-    /// If the GPU failed.
+    /// Fails if the GPU failed.
     pub fn finish(self, gpu: &Gpu) -> Result<Option<Rendered>, Error> {
         match self.0 {
             Queued::Ready(rendered) => Ok(Some(rendered)),

@@ -8,12 +8,12 @@ use numbers::f32_of;
 /// With this number of images or more, models are not regularized, and the number of splats is
 /// limited only by the options.
 ///
-/// The measured data sets with few images have 6 to 36 of them, those with many 43 and more
-/// (docs/benchmarks/2026-11-25-few-images.md).
+/// The measured data sets with few images have 6 to 36 images. Those with many images have 43 and
+/// more (docs/benchmarks/2026-11-25-few-images.md).
 pub(crate) const FEW_IMAGES: usize = 40;
 /// Maximum number of splats per image if there are few images.
 ///
-/// More splats overfit: beyond some number, other views score worse although the training images
+/// More splats overfit. Beyond some number, other views score worse although the training images
 /// still score better. On eleven sets of 6 to 43 images, half as many splats reduced the score by
 /// 0.2 dB on average, and four times as many raised the depth error
 /// (docs/benchmarks/2026-11-29-number-of-splats.md).
@@ -28,8 +28,8 @@ const DROP_RAMP_FRAC: f64 = 0.2;
 /// the sensor.
 const DEPTH_CLIP_M: f64 = 0.2;
 /// Limit for few images. Splats that float in front of a surface are often farther from it than
-/// [`DEPTH_CLIP_M`]. With many images, the color loss removes them; with few images, only the depth
-/// loss does.
+/// [`DEPTH_CLIP_M`]. With many images, the color loss removes such splats. With few images, only
+/// the depth loss removes them.
 const FEW_DEPTH_CLIP_M: f64 = 1.0;
 /// Weight of the depth loss for few images, relative to the usual weight. It lowers the depth
 /// error. Ten times the weight lowers it a little more, but also the PSNR
@@ -44,7 +44,7 @@ pub(crate) fn max_splats(n_images: usize) -> u32 {
     }
 }
 
-/// How much regularization a model needs: 0 to 1.
+/// How much regularization a model needs, from 0 to 1.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(crate) struct Scarcity(f64);
 
@@ -85,8 +85,8 @@ impl Scarcity {
         self.between(1.0, FEW_DEPTH_WEIGHT)
     }
 
-    /// Background of pictures: the mean color of the images, the best guess for unobserved areas.
-    /// Black with many images.
+    /// Background of pictures. With few images, it is the mean color of the images, which is the
+    /// best guess for unobserved areas. With many images, it is black.
     pub(crate) fn background_srgb(self, mean_srgb: [f32; 3]) -> [f32; 3] {
         mean_srgb.map(|color| f32_of(self.0) * color)
     }

@@ -26,9 +26,9 @@ pub struct SplatOptions {
     /// opaque. With a value of 1, scores are 1 dB lower in the first few hundred steps, while large
     /// parts of the image are uncovered.
     pub random_background: f64,
-    /// Determines the costs of opacity and size: `(cost_images / n_images)^2`, relative to the
-    /// color loss. The fewer images there are, the more each splat must reduce the color loss to
-    /// persist. 0 disables the costs.
+    /// Determines the costs of opacity and size. Relative to the color loss, they are `(cost_images
+    /// / n_images)^2`. The fewer images there are, the more each splat must reduce the color loss
+    /// to persist. 0 disables the costs.
     pub cost_images: f64,
     /// Growth at each change of the splat count, as a fraction of the count.
     pub growth_frac: f64,
@@ -39,8 +39,8 @@ pub struct SplatOptions {
     /// few images, and zero if there are many.
     pub drop_frac: f64,
     /// Steps at which training switches from a quarter to half of the resolution, and from half to
-    /// the full resolution. `None` selects a default for the adapter. It is higher on a CPU, where
-    /// the duration of a step is proportional to the number of pixels.
+    /// the full resolution. `None` selects a default for the adapter. The default is higher on a
+    /// CPU, where the duration of a step is proportional to the number of pixels.
     pub coarse_steps: Option<[u64; 2]>,
     /// Maximum number of splats added for one depth image. `None` selects a default, which is lower
     /// on a CPU.
@@ -67,7 +67,7 @@ impl Default for SplatOptions {
             // The value was chosen from 0, 6, 13 and 20 by the scores of three data sets
             // (docs/benchmarks/2026-11-23-splats.md, section "Ablation").
             cost_images: 13.0,
-            // Twice the fraction of 3DGS-MCMC.
+            // This is twice the growth fraction of 3DGS-MCMC.
             growth_frac: 0.1,
             // As in 3DGS-MCMC.
             noise: 5e5,

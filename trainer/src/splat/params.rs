@@ -106,8 +106,8 @@ pub(crate) mod status {
 
 /// Opacity below which a splat is dead, that is, replaced by a child of another splat, as in
 /// 3DGS-MCMC (Kheradmand et al. 2024). At most 0.5 % of a pixel depends on such a splat. It is also
-/// the minimum opacity of a new member of a family, which would otherwise be dead at once. At this
-/// opacity, exploration noise has half its maximum.
+/// the minimum opacity of a new member of a family. With less opacity, the new member would be dead
+/// at once. At this opacity, exploration noise has half its maximum.
 pub(crate) const MIN_OPACITY: f32 = 0.005;
 
 /// `Growth` of shared/growth.wgsl.

@@ -25,7 +25,7 @@ const MAX_SH_DEGREE: u64 = 3;
 pub(crate) struct Schedule {
     /// Optimizer updates so far.
     pub(super) step: u64,
-    /// Step at which the planned steps begin; late keyframes move it forward.
+    /// Step at which the planned steps begin. Late keyframes move it forward.
     pub(super) start: u64,
     pub(super) last_growth_step: u64,
     pub(super) n_planned_steps: u64,

@@ -1,5 +1,5 @@
-//! Initial splats: flat discs at depth readings, or balls at given points and a random cloud in the
-//! cameras' common field of view.
+//! Initial splats. With depth, they are flat discs at depth readings. Without depth, they are balls
+//! at given points and a random cloud in the cameras' common field of view.
 #![expect(
     clippy::cast_possible_truncation,
     reason = "pixels, cells and random draws are rounded down on purpose, within ranges that are checked"
@@ -67,7 +67,7 @@ struct Disc {
 pub(crate) struct Density {
     /// Maximum number of discs.
     pub(crate) max_discs: f64,
-    /// Minimum number of pixels per disc, unless this results in fewer than [`MIN_DISCS`].
+    /// Minimum number of pixels per disc, unless this minimum results in fewer than [`MIN_DISCS`].
     pub(crate) px_per_disc: f64,
 }
 
@@ -97,9 +97,9 @@ impl Seeder {
     /// given the discs of all earlier batches. Positions are then claimed sequentially, so the
     /// result does not depend on thread scheduling.
     pub(crate) fn discs(&mut self, keyframes: &[Arc<Keyframe>], density: Density) -> SplatArrays {
-        // Within a batch, several keyframes may propose discs at the same place, all but one of
-        // which are discarded. A larger batch wastes more of this work, and a smaller one keeps
-        // fewer cores busy.
+        // Within a batch, several keyframes may propose discs at the same position. All but one of
+        // these discs are discarded. A larger batch wastes more of this work, and a smaller one
+        // keeps fewer cores busy.
         const BATCH: usize = 32;
         let mut seeds = Seeds::new();
         for batch in keyframes.chunks(BATCH) {
@@ -224,8 +224,8 @@ impl Seeder {
         let filled = inverse_depths.filled(1.0 / default_m);
         for row in 0..n_cells[1] {
             for column in 0..n_cells[0] {
-                // Neighbors count as covered, too: a seeded position is only a sample of a surface
-                // that extends to the adjacent cells.
+                // Neighbors also count as covered, because a seeded position is only a sample of a
+                // surface that extends to the adjacent cells.
                 if inverse_depths.is_known_nearby([column, row]) {
                     continue;
                 }
@@ -427,8 +427,9 @@ impl InverseDepths {
                 .map(|per_m| if *per_m > 0.0 { *per_m } else { default_per_m })
                 .collect();
         }
-        // One level of a pyramid: each coarse cell has the mean of its known cells, and remains
-        // unknown (0) without any. Recursion then fills the unknown coarse cells.
+        // This computes one level of a pyramid. Each coarse cell has the mean of its known cells.
+        // Without known cells, it remains unknown (0). Recursion then fills the unknown coarse
+        // cells.
         let mut coarse = Self::new([width.div_ceil(2), height.div_ceil(2)]);
         for (ix, mean) in coarse.per_m.iter_mut().enumerate() {
             let [column, row] = [2 * (ix % coarse.n_cells[0]), 2 * (ix / coarse.n_cells[0])];
@@ -452,12 +453,12 @@ impl InverseDepths {
 }
 
 /// Creates balls at given points. Their standard deviation is the mean distance to the three
-/// nearest points (Kerbl et al. 2023, section 5.1). Of more than `n_max` points, those at regular
-/// intervals of the list are used. Points without a color get the color of the first keyframe that
-/// shows them.
+/// nearest points (Kerbl et al. 2023, section 5.1). If there are more than `n_max` points, points
+/// at regular intervals of the list are used. Points without a color get the color of the first
+/// keyframe that shows them.
 pub(crate) fn balls(points: &InitialPoints, keyframes: &[&Keyframe], n_max: usize) -> SplatArrays {
-    // Of several points at one position, the first is used, because a distance of zero cannot be a
-    // size.
+    // If several points have one position, only the first is used, because a distance of zero
+    // cannot be a size.
     let mut seen = HashSet::new();
     let is_first = |ix: &usize| seen.insert(points.points_in_world_m[*ix].map(f32::to_bits));
     let distinct: Vec<usize> = (0..points.points_in_world_m.len())
@@ -543,8 +544,8 @@ pub(crate) fn random_cloud(keyframes: &[&Keyframe], seed: u64, n_max: usize) -> 
             continue;
         }
         let position = keyframe.world_from_camera * Point3::from(ray * z);
-        // Mean distance of the splats in one image: each image has about `n / keyframes.len()` of
-        // them. The size follows the depth, so near and far splats look equally large.
+        // Mean distance of the splats in one image. Each image has about `n / keyframes.len()`
+        // splats. The size follows the depth, so near and far splats look equally large.
         let spacing_px =
             (f64::from(width) * f64::from(height) * keyframes.len() as f64 / n as f64).sqrt();
         let size = 0.3 * spacing_px * z / keyframe.focal_px[0];
@@ -575,7 +576,7 @@ pub(crate) fn common_focus(keyframes: &[&Keyframe]) -> Vector3<f64> {
         .unwrap_or_else(Vector3::zeros)
 }
 
-/// Color of the keyframe at the projection of `position`; `None` outside the image and in masked
+/// Color of the keyframe at the projection of `position`. `None` outside the image and in masked
 /// areas.
 fn color_at(keyframe: &Keyframe, position: &Point3<f64>) -> Option<[f64; 3]> {
     let point = keyframe.world_from_camera.inverse() * position;

@@ -67,7 +67,7 @@ pub struct SplatTrainer {
 }
 
 impl SplatTrainer {
-    /// Creates an empty model. Drawing works immediately; the training pipelines are compiled on
+    /// Creates an empty model. Drawing works immediately. The training pipelines are compiled on
     /// another thread.
     pub fn new(gpu: Arc<Gpu>, options: ModelOptions<SplatOptions>) -> Result<Self, Error> {
         let pipelines = LazyPipelines::start(&gpu);
@@ -211,7 +211,7 @@ impl SplatTrainer {
         )
     }
 
-    /// PSNR in dB of a displayed view against a keyframe's image; `None` if their sizes differ or
+    /// PSNR in dB of a displayed view against a keyframe's image. `None` if their sizes differ or
     /// training has not started.
     fn psnr_of_view(
         &mut self,
@@ -304,8 +304,8 @@ impl Method for SplatTrainer {
             return Ok(0);
         }
         let learn = self.training.learn()?;
-        // Trials come before growth: a trial that starts at a growth step copies the model from
-        // before the growth, so that both halves grow at this step.
+        // Trials come before growth. A trial that starts at a growth step copies the model before
+        // the growth, so that both halves grow at this step.
         self.trial_runner().run_due()?;
         let max_splats = self.max_splats();
         self.training.grow_when_due(&learn, max_splats)?;
@@ -452,7 +452,7 @@ impl Method for SplatTrainer {
         Ok(bounds(&self.arrays()?))
     }
 
-    /// The estimated corrections, or the loaded ones if none are estimated.
+    /// The estimated corrections, or the loaded corrections if none are estimated.
     fn camera_corrections(&mut self) -> Result<BTreeMap<String, CameraCorrection>, Error> {
         self.training.finish_in_flight()?;
         // Corrections must belong to the displayed splats. During a trial of camera parameters, the

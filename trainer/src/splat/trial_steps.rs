@@ -13,8 +13,8 @@ pub struct TrialSteps {
     pub first_trial: u64,
     /// Steps of each half of a trial.
     pub trial_half: u64,
-    /// Steps per image in each half of a trial of per-image parameters, if these are more than
-    /// [`Self::trial_half`].
+    /// Steps per image in each half of a trial of per-image parameters. They apply if they add up
+    /// to more than [`Self::trial_half`].
     pub per_image: u64,
     /// Maximum number of steps of each half of a trial.
     pub max_trial_half: u64,

@@ -61,7 +61,8 @@ pub(crate) struct ValidationImage {
 impl ValidationImage {
     /// The image on the GPU, uploaded on first use.
     pub(crate) fn uploaded(&mut self, gpu: &Gpu) -> Result<&Buffer, Error> {
-        // `take` and `insert` instead of `get_or_insert_with`, because the upload can fail.
+        // This uses `take` and `insert` instead of `get_or_insert_with`, because the upload can
+        // fail.
         let image = match self.image.take() {
             Some(image) => image,
             None => gpu.storage_with("splat.validation", &self.keyframe.rgba_srgb)?,
@@ -443,7 +444,7 @@ impl SplatTrials {
             _ => self.steps.trial_half,
         };
         let until = from.schedule.step + n_steps;
-        // This is called before the phase changes, because `scored` returns the list of the running
+        // `scored` is called before the phase changes, because it returns the list of the running
         // trial during a trial.
         let scored = self.scored();
         self.trial_phase = SplatTrialPhase::Running(RunningTrial {
@@ -581,7 +582,7 @@ impl SplatTrials {
         })
     }
 
-    /// Ends the trial in progress, in either half; it is repeated.
+    /// Ends the trial in progress, in either half. The trial is repeated later.
     pub(crate) fn abort(&mut self) -> Option<TrialEnd> {
         let canceled = self.cancel();
         if self.running_trial().is_some() {

@@ -17,10 +17,11 @@ use std::sync::Arc;
 /// Near clipping distance of training cameras along z, meters. Nearer splats would cover the whole
 /// image.
 const NEAR_M: f64 = 0.01;
-/// Far clipping distance along z, meters. Larger depth readings are not seeded, either.
+/// Far clipping distance along z, meters. Larger depth readings are also not seeded.
 pub(crate) const FAR_M: f64 = 1e4;
 
-/// Transforms that differ by less, in meters and radians, are the same up to rounding.
+/// Transforms that differ by less than this value, in meters and radians, are the same up to
+/// rounding.
 const MAX_ROUNDING: f64 = 1e-9;
 
 /// One training keyframe.
@@ -29,7 +30,7 @@ pub(crate) struct TrainView {
     pub(crate) keyframe: Arc<Keyframe>,
     /// Median of the keyframe's depth readings, if any.
     pub(crate) median_depth_m: Option<f64>,
-    /// Mean color of the pixels that are not masked, sRGB; `None` if all are masked.
+    /// Mean color of the pixels that are not masked, sRGB. `None` if all pixels are masked.
     mean_srgb: Option<[f64; 3]>,
     levels: [Option<Level>; 3],
     /// Present once camera parameters are optimized.
@@ -166,13 +167,13 @@ impl TrainView {
         }
     }
 
-    /// Mean color of the pixels that are not masked, sRGB; `None` if all are masked.
+    /// Mean color of the pixels that are not masked, sRGB. `None` if all pixels are masked.
     pub(crate) fn mean_srgb(&self) -> Option<[f64; 3]> {
         self.mean_srgb
     }
 
-    /// Replaces the camera by that of the same keyframe with other corrections. Uploaded images are
-    /// kept unless the correction changes them.
+    /// Replaces the camera by the camera of the same keyframe with other corrections. Uploaded
+    /// images are kept unless the correction changes them.
     pub(crate) fn replace_camera(&mut self, gpu: &Gpu, keyframe: Arc<Keyframe>) {
         let has_same_depth = has_same_depth(&self.keyframe, &keyframe);
         // The lens is a slot of camera parameters. They start again at zero after a correction.
@@ -410,8 +411,8 @@ fn downscaled_image(keyframe: &Keyframe, size_px: [u32; 2], level: u32) -> Arc<[
                     }
                 }
             }
-            // Half of the area is added for rounding to the nearest value. Rounding down would
-            // darken coarse images by half a level.
+            // Half of the area is added, so that the division rounds to the nearest value. Rounding
+            // down would darken coarse images by half a level.
             let area = (edge * edge) as u32;
             downscaled.extend(sums.map(|sum| {
                 u8::try_from((sum + area / 2) / area).expect("a mean of bytes is a byte")

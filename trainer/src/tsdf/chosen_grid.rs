@@ -1,4 +1,4 @@
-//! Voxel size and related settings of a field: given, or chosen from the first depth image.
+//! Voxel size and related settings of a field. They are given or chosen from the first depth image.
 
 use super::block::WEIGHT_ONE;
 use super::capacity::BYTES_PER_BLOCK;
@@ -15,8 +15,8 @@ const VOXEL_RANGE_M: [f64; 2] = [0.001, 0.2];
 /// Minimum truncation in voxels. With fewer, interpolation lacks observed voxels on both sides of
 /// slanted surfaces. With more, the two sides of thicker objects share voxels.
 const TRUNCATION_VOXELS: f64 = 4.0;
-/// Maximum factor by which depth noise increases the truncation. Stored distances have 16 bits up
-/// to the largest truncation, so a larger factor makes their steps coarser.
+/// Maximum factor by which depth noise increases the truncation. A stored distance has 16 bits for
+/// the range up to the largest truncation, so a larger factor makes its resolution coarser.
 const MAX_TRUNCATION_FACTOR: f64 = 4.0;
 /// Fraction of `max_bytes` that the surface in one image may take when the voxel size is chosen.
 /// The scene is larger than one image. A smaller fraction makes voxels coarser than necessary. With
@@ -48,11 +48,11 @@ impl VoxelGrid {
     /// Chooses the settings that the options leave open, based on the first depth image. Returns
     /// `None` if the image has no valid readings.
     ///
-    /// The voxel size is the size of a pixel at the median depth, but at least the noise there, and
-    /// large enough that the surface in this image takes at most a tenth of `max_bytes`. Noise is
-    /// the deviation of depth from a plane through its neighbors: the 90th percentile of `|z[-1] -
-    /// 2 z[0] + z[1]|`, divided by `1.6449 sqrt(6)`. The median would be 0 for sensors that report
-    /// depth in discrete steps.
+    /// The voxel size is the largest of three sizes: the size of a pixel at the median depth, the
+    /// noise at this depth, and the size at which the surface in this image takes a tenth of
+    /// `max_bytes`. The noise is the deviation of depth from a plane through its neighbors. It is
+    /// estimated as the 90th percentile of `|z[-1] - 2 z[0] + z[1]|`, divided by `1.6449 sqrt(6)`.
+    /// The median would be 0 for sensors that report depth in discrete steps.
     #[expect(
         clippy::cast_possible_truncation,
         clippy::cast_sign_loss,

@@ -8,18 +8,18 @@ use serde::{Deserialize, Serialize};
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct TsdfOptions {
-    /// Edge of a voxel, meters; `None`: chosen from the first depth image, see
+    /// Edge of a voxel, meters. With `None`, it is chosen from the first depth image; see
     /// [`super::VoxelGrid::choose`].
     pub voxel_m: Option<f64>,
-    /// Minimum truncation distance, meters; `None`: four voxels.
+    /// Minimum truncation distance, meters. `None` selects four voxels.
     pub truncation_m: Option<f64>,
-    /// Standard deviation of depth at 1 m, meters; it grows with the square of depth. `None`:
-    /// estimated from the first depth image.
+    /// Standard deviation of depth at 1 m, meters. The standard deviation grows with the square of
+    /// depth. With `None`, it is estimated from the first depth image.
     pub noise_per_m2: Option<f64>,
     /// Readings beyond this depth are ignored, meters.
     pub max_depth_m: f64,
-    /// Maximum weight of a voxel, in observations from 1 m; up to 255. With a smaller maximum,
-    /// moved objects fade sooner.
+    /// Maximum weight of a voxel, up to 255. One observation from a distance of 1 m has a weight of
+    /// 1. With a smaller maximum, moved objects fade sooner.
     pub max_weight: f64,
 }
 

@@ -27,20 +27,20 @@ use source::Source;
 use std::path::PathBuf;
 use targets::TargetSpec;
 
-/// A hand-eye calibration: its input and options.
+/// Input and options of a hand-eye calibration.
 #[derive(Clone, Debug)]
 pub struct HandEyeTask {
     /// A samples file (JSON), a recording, or a rig file whose devices are read.
     pub input: PathBuf,
-    /// The target; only with a recording or rig file.
+    /// The target. This requires a recording or a rig file as input.
     pub target: Option<TargetSpec>,
     /// Whether the intrinsics are also estimated, which requires images.
     pub with_intrinsics: bool,
     /// Whether the offsets of all joints except the first and the last are also estimated.
     pub with_joints: bool,
-    /// The arm; only with a samples file.
+    /// The arm. This requires a samples file as input.
     pub robot: Option<RobotOptions>,
-    /// How the arm moves. `None`: it is only read.
+    /// How the arm moves. With `None`, the arm is only read.
     pub motion: Option<MotionOptions>,
     /// The camera, and the rig file to write.
     pub rig: RigOptions,
@@ -70,7 +70,7 @@ pub struct CalibratedHandEye {
     pub calibration: HandEyeCalibration,
     /// The poses that would reduce the uncertainty most.
     pub next_poses: Vec<NextPose>,
-    /// Intrinsics that were given or estimated; `None` without images.
+    /// Intrinsics that were given or estimated. `None` without images.
     pub intrinsics: Option<Intrinsics>,
     /// `parent_from_camera` for the rig file.
     pub rig_pose: Transform,
@@ -93,9 +93,9 @@ impl HandEyeTask {
     /// with the result of the calibration.
     ///
     /// # Errors
-    /// If the input does not fit the options, or if it cannot be read.
+    /// Fails if the input does not fit the options, or if it cannot be read.
     pub fn read(&self, host: &dyn Host) -> anyhow::Result<(HandEyeSamples, Option<MovedArm>)> {
-        // Checked first, so that a wrong path does not cost a calibration.
+        // The paths are checked first, so that a wrong path does not cost a calibration.
         self.report.as_ref().map_or(Ok(()), ReportOptions::check)?;
         let mut rig = self.rig.open(&self.input)?;
         let (source, arm) = self.source(host, rig.as_mut())?;
@@ -105,7 +105,7 @@ impl HandEyeTask {
     /// Calibrates, and writes the report. If there is no result, the outcome contains the reason.
     ///
     /// # Errors
-    /// If the images cannot be read, or if a result would not fit the rig file to write.
+    /// Fails if the images cannot be read, or if a result would not fit the rig file to write.
     pub fn calibrate(
         &self,
         samples: HandEyeSamples,
@@ -235,7 +235,7 @@ impl HandEyeTask {
             .unwrap_or_default();
         let chain = self.chain()?;
         let intrinsics = source.intrinsics(samples.size_px)?;
-        // If the lens is estimated, too, the given one is only a start.
+        // If the lens is also estimated, the given lens is only the initial value.
         let covariance = match &intrinsics {
             Some(intrinsics) if !self.with_intrinsics => {
                 source.intrinsics_covariance(intrinsics)?
@@ -258,7 +258,8 @@ impl HandEyeTask {
             intrinsics: intrinsics.clone(),
             intrinsics_covariance: covariance,
             board_symmetries: &symmetries,
-            // Only one of them can exist: `--urdf` is refused with a rig.
+            // Only one of the two robot descriptions can exist, because `--urdf` is refused with a
+            // rig.
             chain: chain.as_ref().or(source.chain()),
             options: self.options(),
         };
@@ -350,10 +351,10 @@ impl HandEyeOutcome {
             .map(|size| size.text.as_str())
     }
 
-    /// Writes the rig file, if it was requested. Called after the result was printed.
+    /// Writes the rig file, if it was requested. This is called after the result was printed.
     ///
     /// # Errors
-    /// If there is no result, or if the rig file or the report cannot be written.
+    /// Fails if there is no result, or if the rig file or the report cannot be written.
     pub fn finish(self) -> anyhow::Result<()> {
         let CalibratedHandEye {
             calibration,
@@ -441,8 +442,8 @@ fn nine_digits(values: &[f64]) -> String {
         .join(", ")
 }
 
-/// Start values for estimating a lens. They include distortion, because without it, the estimate of
-/// a real lens would be wrong by more than its standard deviation.
+/// Initial values for estimating a lens. They include distortion. Without distortion, the estimate
+/// of a real lens would be wrong by more than its standard deviation.
 fn with_distortion(given: Intrinsics) -> Intrinsics {
     match given.lens {
         Lens::Pinhole => Intrinsics {

@@ -1,4 +1,5 @@
-//! `fieldrig calibrate hand-eye --move`: the arm itself moves to poses that show the target.
+//! Implements `fieldrig calibrate hand-eye --move`, which moves the arm to poses from which the
+//! target is visible.
 
 use super::{next_pose_options, with_distortion};
 use crate::host::{Activity, CameraView, Host};
@@ -24,8 +25,8 @@ use targets::{GrayImage, TargetSpec};
 /// the arm expects motions near its current posture. Larger changes give more diverse poses, but
 /// the elbow and the cables also reach farther.
 const MAX_JOINT_CHANGE_RAD: f64 = 1.2;
-/// Maximum distance of the flange from its position at the start, unless a flag sets it, meters:
-/// room that is usually free around an arm that was moved to its target by hand.
+/// Default of the maximum distance of the flange from its position at the start, meters. This room
+/// is usually free around an arm that was moved to its target by hand.
 const DEFAULT_DISTANCE_M: f64 = 0.3;
 /// Standard deviation of the rotation below which the result counts as accurate, degrees. It
 /// corresponds to half a millimeter at a distance of half a meter.
@@ -41,8 +42,9 @@ pub struct MotionOptions {
     /// Goal for the standard deviations of the camera position, millimeters. The motion ends when
     /// they are below it.
     pub goal_mm: f64,
-    /// Maximum distance of the flange from its position at the start, millimeters. `None`: 300, but
-    /// at most half the distance to the target if the camera is on the flange.
+    /// Maximum distance of the flange from its position at the start, millimeters. The default
+    /// (`None`) is 300. If the camera is on the flange, the default is at most half the distance to
+    /// the target.
     pub max_distance_mm: Option<f64>,
 }
 
@@ -57,11 +59,11 @@ pub struct MovedArm {
 }
 
 impl MovedArm {
-    /// If the motors would release the arm at the end of the program, holds it until Ctrl-C.
+    /// If the motors would release the arm at the end of the program, holds the arm until Ctrl-C.
     /// Returns the result of the calibration, or the reason why the motion was not completed.
     ///
     /// # Errors
-    /// If the calibration or the motion failed, or if the arm has stopped because of a fault.
+    /// Fails if the calibration or the motion failed, or if the arm has stopped because of a fault.
     pub fn finish<T>(mut self, result: anyhow::Result<T>) -> anyhow::Result<T> {
         let failure = self.failure.take();
         // The arm is held before anything is returned, because the motors of some arms release it
@@ -88,7 +90,7 @@ impl MovedArm {
     /// which the program will end.
     ///
     /// # Errors
-    /// If the arm has stopped because of a fault.
+    /// Fails if the arm has stopped because of a fault.
     fn hold_after(&mut self, error: Option<&anyhow::Error>) -> anyhow::Result<()> {
         if self.holds_on_exit {
             return Ok(());
@@ -290,8 +292,8 @@ impl MotionOptions {
         };
         let mut plan = ArmPlan::new(&reach, &poses, &goals, &first);
         let symmetries = images.request.target.symmetry();
-        // Estimate with the images so far, choose the pose that lowers the uncertainty most, move
-        // there, and take an image.
+        // Each round estimates the result from the images so far and chooses the pose that lowers
+        // the uncertainty most. It then moves the arm there and takes an image.
         loop {
             let estimate_input = images.hand_eye_input(&chain, &symmetries);
             let estimate = calibrate_hand_eye(&estimate_input);
@@ -335,7 +337,7 @@ impl MotionOptions {
     }
 }
 
-/// The given rig with the camera as opened, whose calibration may be stored in the device.
+/// The given rig with the opened camera. The calibration of the camera may be stored in the device.
 fn resolved(given: &Rig, opened: &Rig) -> Rig {
     let mut rig = given.clone();
     for camera in &mut rig.cameras {
@@ -378,7 +380,7 @@ struct Images<'a> {
 }
 
 impl Images<'_> {
-    /// Detects the target in an image. An error if it is not visible.
+    /// Detects the target in an image. Fails if the target is not visible.
     fn add(&mut self, image: CalibrationImage) -> Result<BoardView, InsufficientData> {
         let n = self.found.len() + 1;
         let CalibrationImage {

@@ -38,7 +38,7 @@ enum EntryBoard {
     Image(ImageFile),
 }
 
-/// Samples of the file that can be used, and what is known about the others.
+/// Usable samples of the file, and the reasons why other samples cannot be used.
 #[derive(Debug, Default)]
 pub(super) struct Samples {
     pub(super) used: Vec<HandEyeSample>,
@@ -62,7 +62,7 @@ impl SamplesFile {
             .map_err(|error| BadInput(format!("{name}: {error}{}", not_json_hint(&text))))?;
         // Paths in the file are relative to it, so that its folder can be moved.
         let folder = path.parent().unwrap_or(Path::new(""));
-        // The intrinsics may be written in several formats, or be in a file of their own. They are
+        // The intrinsics may be written in several formats, or be in a separate file. They are
         // converted in place, so that the code below reads one format.
         if let Some(intrinsics) = value.get_mut("intrinsics") {
             let invalid = |why: String| BadInput(format!("{name}: intrinsics: {why}"));
@@ -154,7 +154,7 @@ impl SamplesFile {
         })
     }
 
-    /// Notes about parts of the file that do not affect the result, without a period.
+    /// Notes about parts of the file that do not affect the result. They do not end with a period.
     ///
     /// * `estimates_joints`: whether the offsets of joints are estimated.
     pub(super) fn unused(&self, estimates_joints: bool) -> Vec<String> {
@@ -196,7 +196,7 @@ impl SamplesFile {
         };
         let files: Vec<ImageFile> = self.entries.iter().filter_map(image).collect();
         let detected = match &self.target {
-            // Without images there is nothing to detect, and the target is optional.
+            // Without images, there is nothing to detect, so the target is optional.
             Some(target) if !files.is_empty() => images::detect(&files, target, host)?,
             _ => Vec::new(),
         };
@@ -209,7 +209,8 @@ impl SamplesFile {
             photos: images::photos(&files),
             ..Samples::default()
         };
-        // The results are in the order of the images, so one is taken for each entry with an image.
+        // The results are in the order of the images, so the next result belongs to the next entry
+        // with an image.
         let mut detected = detected.into_iter();
         for (ix, entry) in self.entries.iter().enumerate() {
             let (name, board) = match &entry.board {
@@ -251,7 +252,7 @@ impl SamplesFile {
 /// Returns a hint if the text contains numbers that other programs write but that are not valid
 /// JSON.
 fn not_json_hint(text: &str) -> &'static str {
-    // Whole words only: "inf" is also a part of other words.
+    // Only whole words count, because "inf" is also a part of other words.
     let has = |word: &str| {
         text.split(|c: char| !c.is_ascii_alphabetic())
             .any(|found| found == word)

@@ -45,7 +45,7 @@ impl Source {
     /// Kinematics of the arm, if the rig has one.
     pub(super) fn chain(&self) -> Option<&Chain> {
         match self {
-            // A samples file has joint values at most, no robot description.
+            // A samples file may have joint values, but it has no robot description.
             Self::File(_) => None,
             Self::Scan { scan, .. } => scan.chain(),
         }
@@ -103,10 +103,10 @@ impl Source {
         }
     }
 
-    /// An error if there is no image, or if no image shows the target.
+    /// Fails if there is no image, or if no image shows the target.
     pub(super) fn check(&self, samples: &Samples) -> anyhow::Result<()> {
         // More images show a different board than the given one, so the given target is probably
-        // wrong. This explains missing detections better than the errors below.
+        // wrong. A wrong target explains missing detections better than the errors below.
         if let Some(size) = samples.other_size.as_ref().filter(|size| size.prevails) {
             return Err(InsufficientData(size.text.clone()).into());
         }

@@ -19,9 +19,8 @@ use nalgebra::{DMatrix, SymmetricEigen, Vector3};
 
 /// Finds an initial solution, and reports mistakes in the samples.
 ///
-/// # Errors
-/// [`Error::Refused`] if the samples contain a known mistake, do not determine the result, or
-/// disagree.
+/// # Errors Returns [`Error::Refused`] if the samples contain a known mistake, do not determine the
+/// result, or disagree.
 pub(crate) fn find_consensus(
     input: &HandEyeInput<'_>,
     sorted: &Sorted,
@@ -68,8 +67,7 @@ pub(crate) fn find_consensus(
 
 /// Checks that the samples that were used determine the result.
 ///
-/// # Errors
-/// [`Error::Refused`] with the likely cause of a result that is too uncertain.
+/// # Errors Returns [`Error::Refused`] with the likely cause of a result that is too uncertain.
 pub(crate) fn check_result(
     input: &HandEyeInput<'_>,
     refined: &Refined,
@@ -99,7 +97,7 @@ pub(crate) fn check_result(
 
 const NO_SOLUTION: &str = "no hand-eye transform explains three of the samples";
 
-/// Positions of a robot or distances of a board in meters do not exceed this. If they are in
+/// Positions of a robot or distances of a board in meters do not exceed this limit. If they are in
 /// millimeters, all lengths above 2 cm exceed it.
 const MAX_POSITION_M: f64 = 20.0;
 
@@ -109,8 +107,7 @@ const MUCH_BETTER: f64 = 5.0;
 
 /// Checks that the positions can be meters.
 ///
-/// # Errors
-/// If most of them are too large.
+/// # Errors Fails if most of the positions are too large.
 fn check_magnitudes(samples: &[HandEyeSample]) -> Result<(), Refusal> {
     let robot: Vec<f64> = samples
         .iter()
@@ -163,13 +160,13 @@ fn explain(
     } else {
         NO_SOLUTION.to_owned()
     };
-    // A shift is tested first, because with shifted lists, all other tests would compare wrong
-    // pairs.
+    // A shift between the lists is tested first, because with shifted lists, all other tests would
+    // compare wrong pairs.
     if let Some(refusal) = shift_mistake(input, samples, found_m, distance_m) {
         return Some(refusal);
     }
-    // Wrong units are tested even if the samples agree roughly. If the scale is near 1, for example
-    // because the board has another size, the errors are small.
+    // Wrong scales are tested even if the samples agree roughly. If the scale is near 1, for
+    // example because the board has another size, the samples still agree roughly.
     if let Some((why, remedy)) = scale_mistake(samples, found) {
         return Some(Refusal::new(format!("{residual}, and {why}"), remedy));
     }
@@ -200,7 +197,8 @@ fn has_images(samples: &[Sample]) -> bool {
 fn behind_mistake(samples: &[Sample]) -> Option<Refusal> {
     let is_behind = |sample: &&Sample| likely_board(sample).translation.z <= 0.0;
     let n_behind = samples.iter().filter(is_behind).count();
-    // It is sufficient that most samples are behind, because a few may be wrong in another way.
+    // It is sufficient that most boards are behind the camera, because a few samples may be wrong
+    // in another way.
     (5 * n_behind > 4 * samples.len()).then(|| {
         Refusal::new(
             format!(
@@ -212,8 +210,8 @@ fn behind_mistake(samples: &[Sample]) -> Option<Refusal> {
     })
 }
 
-/// Explanation by robot or board poses that are inverted, if the samples agree after inverting the
-/// robot poses.
+/// Explains the disagreement by inverted robot or board poses, if the samples agree after inverting
+/// the robot poses.
 ///
 /// * `[found_m, distance_m]`: how well the samples agree as given, and the distance of the board.
 /// * `residual`: the disagreement, as text.
@@ -284,8 +282,9 @@ fn contradiction(refined: &Refined, scatter_mm: f64) -> Option<Refusal> {
     })
 }
 
-/// Explanation by lists of robot poses and images that are off by one, if pairing each image with
-/// the robot pose of the next or the previous sample makes the samples agree.
+/// Explains the disagreement by lists of robot poses and images that are off by one. This is the
+/// case if pairing each image with the robot pose of the next or the previous sample makes the
+/// samples agree.
 fn shift_mistake(
     input: &HandEyeInput<'_>,
     samples: &[Sample],
@@ -334,7 +333,7 @@ fn shift_mistake(
 const MIN_SHIFTED_SAMPLES: usize = 6;
 
 /// Median distance of the samples, meters, if each board is paired with the robot pose of the
-/// sample `shift` places later. Infinite if they have no solution.
+/// sample `shift` places later. It is infinite if the samples have no solution.
 fn shifted_median_m(input: &HandEyeInput<'_>, samples: &[Sample], shift: isize) -> f64 {
     let shifted: Vec<Sample> = samples
         .iter()
@@ -354,7 +353,8 @@ fn shifted_median_m(input: &HandEyeInput<'_>, samples: &[Sample], shift: isize) 
     consensus(&shifted).map_or(f64::INFINITY, |found| found.median_m())
 }
 
-/// Explanation by different units of the robot's and the board's translations, and the remedy.
+/// Explains the disagreement by different units of the robot's and the board's translations, and
+/// gives the remedy.
 fn scale_mistake(samples: &[Sample], found: Option<&Consensus>) -> Option<(String, String)> {
     /// A scale closer to 1 or to 0 may be noise.
     const MIN_SIGMAS: f64 = 5.0;
@@ -436,8 +436,7 @@ fn wrong_unit(body: &str, other: &str, unit: &str, per_m: f64) -> String {
 
 /// Checks the predicted uncertainty of position and rotation along every direction.
 ///
-/// # Errors
-/// Names the direction that is determined worst.
+/// # Errors The error names the direction that is determined worst.
 fn check_uncertainty(input: &HandEyeInput<'_>, refined: &Refined) -> Result<(), Refusal> {
     let [max_sigma_m, max_sigma_rad] = [input.options.max_sigma_m, input.options.max_sigma_rad];
     let (sigma_rad, rotation_axis) = worst_direction(&refined.covariance, 0);
@@ -461,7 +460,7 @@ fn check_uncertainty(input: &HandEyeInput<'_>, refined: &Refined) -> Result<(), 
         );
         (rotation_axis, what)
     };
-    // People move the flange, so its axes are named if the camera is on it.
+    // People move the flange, so the axes of the flange are named if the camera is on the flange.
     let is_on_flange = input.setup == Setup::EyeInHand;
     let (axis, body) = if is_on_flange {
         (refined.solution.x.rotation * in_camera, "flange")

@@ -1,4 +1,5 @@
-//! Whether the rotations of the robot determine all parameters, and which rotations are missing.
+//! Checks whether the rotations of the robot determine all parameters, and which rotations are
+//! missing.
 //!
 //! A rotation about one axis leaves the position along it and the rotation around it undetermined
 //! (Tsai and Lenz 1989, section III). Errors of the robot poses are amplified by the reciprocal of
@@ -21,8 +22,7 @@ const RECOMMENDED_DEG: f64 = 20.0;
 
 /// Checks that the rotations span at least two directions.
 ///
-/// # Errors
-/// Names the only axis of rotation.
+/// # Errors The error names the only axis of rotation.
 pub(super) fn check_rotations(base_from_flange: &[Transform]) -> Result<(), Refusal> {
     let Some((spreads, axes)) = rotation_spread(base_from_flange) else {
         return Err(Refusal::new(
@@ -118,7 +118,7 @@ fn rotation_spread(poses: &[Transform]) -> Option<([f64; 3], Matrix3<f64>)> {
 /// Name of an axis: "the flange's z axis", or its components if it is not close to a coordinate
 /// axis.
 pub(crate) fn axis_name(axis: &Vector3<f64>, body: &str) -> String {
-    // 15 degrees. A person who moves an arm by hand does not aim more accurately.
+    // The limit is 15 degrees. A person who moves an arm by hand does not aim more accurately.
     const CLOSE_RAD: f64 = 0.26;
     let largest = axis.iamax();
     if axis[largest].abs() >= CLOSE_RAD.cos() {
@@ -140,12 +140,12 @@ pub(super) fn rotations_across(axis: &Vector3<f64>, body: &str) -> String {
     )
 }
 
-/// Number of poses after which no more are needed, if the rotations suffice.
+/// Number of poses that are sufficient, if their rotations suffice.
 pub const RECOMMENDED_POSES: usize = 12;
 /// Rotation about each axis that the poses should span, degrees. It corresponds to 20 degrees in
 /// both directions.
 const MIN_SPAN_DEG: f64 = 40.0;
-/// Number of poses that are requested at a time: two in each direction.
+/// Number of poses that are requested at a time. There are two in each direction.
 const POSES_AT_A_TIME: usize = 4;
 /// A pose counts as rotated about an axis if the angle is at least this, degrees. The limit is half
 /// of the requested angle, because people estimate rotations by eye.
@@ -156,8 +156,8 @@ const ROTATED_DEG: f64 = 10.0;
 pub struct HandEyeGuidance {
     /// Number of poses at which the target was seen.
     pub n_poses: usize,
-    /// Range of the rotations about the x, y and z axis, degrees: of the camera (eye in hand) or
-    /// the flange.
+    /// Range of the rotations about the x, y and z axis, degrees. With the eye in hand, these are
+    /// the axes of the camera, otherwise of the flange.
     pub span_deg: [f64; 3],
     /// What to do next.
     pub advice: HandEyeAdvice,
@@ -172,9 +172,9 @@ pub enum HandEyeAdvice {
     Rotate {
         /// Number of poses.
         n_poses: usize,
-        /// Index of the axis: x, y or z.
+        /// Index of the axis, from 0 (x) to 2 (z).
         axis: usize,
-        /// The body that the axis belongs to: the camera or the flange.
+        /// The body that the axis belongs to, which is the camera or the flange.
         body: &'static str,
     },
     /// Add this many poses in any direction.
@@ -248,7 +248,7 @@ fn rotations(
         .collect()
 }
 
-/// Difference of the largest and the smallest value; 0 without values.
+/// Difference of the largest and the smallest value. It is 0 without values.
 fn span(values: impl Iterator<Item = f64>) -> f64 {
     let (low, high) = values.fold((f64::INFINITY, f64::NEG_INFINITY), |(low, high), value| {
         (low.min(value), high.max(value))

@@ -1,5 +1,5 @@
-//! Where an arm moves to calibrate its camera: first small rotations about the target, then poses
-//! by information gain, until the result is accurate.
+//! Plans where an arm moves to calibrate its camera. The plan starts with small rotations about the
+//! target. Poses with the largest information gain follow until the result is accurate.
 
 mod next_poses;
 
@@ -110,8 +110,8 @@ impl<'a> ArmPlan<'a> {
         }
     }
 
-    /// Options of the calibrations during the plan: they may be uncertain, and joint offsets need
-    /// more poses.
+    /// Options of the calibrations during the plan. Uncertain results are accepted, and joint
+    /// offsets are not estimated, because they need more poses.
     pub fn estimate_options(options: &HandEyeOptions) -> HandEyeOptions {
         HandEyeOptions {
             estimate_joint_offsets: false,
@@ -134,15 +134,15 @@ impl<'a> ArmPlan<'a> {
     /// The next step.
     ///
     /// * `input`: the samples so far.
-    /// * `estimate`: their calibration, or why there is none.
-    /// * `current`: the joints now, in the order of the chain.
+    /// * `estimate`: the calibration from these samples, or the reason why there is none.
+    /// * `current`: the current joint values, in the order of the chain.
     pub fn next(
         &mut self,
         input: &HandEyeInput<'_>,
         estimate: Result<&HandEyeCalibration, &Error>,
         current: &[f64],
     ) -> ArmStep {
-        // A plan ends in three ways; an accurate result is reported first.
+        // A plan ends in three ways. The end by an accurate result has priority.
         let n = input.samples.len();
         if let Ok(calibration) = estimate {
             let sigma_mm = calibration.sigma_mm.into_iter().fold(0.0, f64::max);
@@ -182,8 +182,8 @@ impl<'a> ArmPlan<'a> {
                 ));
             }
         };
-        // The seed changes each time, so that a pose at which the target was not seen is not
-        // suggested again.
+        // The seed changes with each suggestion, so that a pose at which the target was not seen is
+        // not suggested again.
         self.n_refined += 1;
         let options = NextPoseOptions {
             reach: Some((self.reach, current)),
@@ -292,8 +292,8 @@ mod tests {
     const PANDA: &str = include_str!("../../../../rigs/robots/panda.urdf");
     const START: [f64; 7] = [0.0, -0.3, 0.0, -2.2, 0.0, 2.2, 0.8];
 
-    /// Runs a plan with simulated corners. Returns the samples, the end, and whether each
-    /// configuration was allowed.
+    /// Runs a plan with simulated corners. Returns the samples, how the plan ended, and whether
+    /// each configuration was allowed.
     fn run(
         setup: Setup,
         options: &ArmPlanOptions,

@@ -115,7 +115,8 @@ pub struct NextPoseOptions<'a> {
     pub radius_m: f64,
     /// Largest angle between the normal of the board and the viewing direction, radians.
     pub max_tilt_rad: f64,
-    /// The space in which the arm moves, and its joints now. `None` if a person moves it.
+    /// The space in which the arm moves, and its current joint values. `None` if a person moves the
+    /// arm.
     pub reach: Option<(Reach<'a>, &'a [f64])>,
     /// Seed of the random candidates.
     pub seed: u64,
@@ -126,23 +127,23 @@ pub struct NextPoseOptions<'a> {
 pub struct NextPose {
     /// Pose of the flange.
     pub base_from_flange: Transform,
-    /// Joint values within the limits; `None` without a chain.
+    /// Joint values within the limits. `None` without a chain.
     pub joints: Option<Vec<f64>>,
     /// The motion from the closest sample, as a sentence.
     pub motion: String,
-    /// Its rotation relative to this sample, for example `rotated by 20 degrees about the camera's
-    /// x axis relative to pose 3`.
+    /// The rotation of the pose relative to this sample, for example `rotated by 20 degrees about
+    /// the camera's x axis relative to pose 3`.
     pub relation: String,
     /// Factor by which the standard deviations of the hand-eye transform shrink on average, 0 to 1.
     pub sigma_frac: f64,
 }
 
-/// Suggests poses for a finished calibration. `input` must be that of the calibration.
+/// Suggests poses for a finished calibration. `input` must be the input of the calibration.
 ///
 /// With a [`Reach`], candidates are poses around the board to which the arm moves within it. With a
 /// chain and joint values, they are configurations near those of the samples, within the joint
-/// limits. Without, they are flange poses that rotate the camera around the board or about its own
-/// axes; the caller must check that the arm reaches them.
+/// limits. Otherwise, they are flange poses that rotate the camera around the board or about its
+/// own axes. The caller must check that the arm reaches these poses.
 pub fn suggest_next_poses(
     input: &HandEyeInput<'_>,
     calibration: &HandEyeCalibration,
@@ -231,8 +232,8 @@ struct Scene<'a> {
 
 impl Scene<'_> {
     fn candidates(&self) -> Vec<Candidate> {
-        // More trials find slightly better poses but take longer, especially with inverse
-        // kinematics.
+        // With more trials, slightly better poses are found. The trials take longer, especially
+        // with inverse kinematics.
         const TRIALS: usize = 1500;
         let refined = &self.calibration.refined;
         let used: Vec<_> = used(&refined.samples).collect();
@@ -350,9 +351,10 @@ impl Scene<'_> {
         ))
     }
 
-    /// Whether all of the board is in view, at a distance and tilt at which it is detected.
+    /// Whether the whole board is in view, at a distance and tilt at which the board is detected.
     fn is_well_visible(&self, camera_from_board: &Transform, distance_m: f64) -> bool {
-        // Allowed distances relative to the samples so far, in which the board was detected.
+        // Allowed distances, relative to those of the samples so far. In these samples, the board
+        // was detected.
         const DISTANCES: std::ops::RangeInclusive<f64> = 0.6..=1.6;
         const MARGIN_FRAC: f64 = 0.02;
         // The margin for an arm is larger, because it moves before anyone can check whether the
@@ -394,8 +396,8 @@ impl Scene<'_> {
         }
     }
 
-    /// The motion from the sample that the candidate was derived from, as an instruction, and its
-    /// rotation, as a description.
+    /// Describes the motion from the sample that the candidate was derived from. The first string
+    /// is an instruction, and the second string describes the rotation.
     fn motion(&self, candidate: &Candidate) -> [String; 2] {
         let sample = &self.input.samples[candidate.sample_ix];
         let old_from_new = sample.base_from_flange.inverse() * candidate.base_from_flange;

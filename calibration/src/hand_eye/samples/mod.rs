@@ -26,7 +26,7 @@ pub(crate) struct Sample {
     pub(crate) candidates: Vec<Candidate>,
     /// Index of the candidate that fits the solution.
     pub(crate) choice: usize,
-    /// Whether the sample agrees with the solution. The others are outliers.
+    /// Whether the sample agrees with the solution. Samples that do not agree are outliers.
     pub(crate) is_used: bool,
     /// Squared Mahalanobis distance from the solution, six degrees of freedom.
     pub(crate) squared_distance: f64,
@@ -78,10 +78,10 @@ pub(crate) fn n_stops(samples: &[Sample]) -> usize {
 #[derive(Clone, Debug)]
 pub(crate) struct Candidate {
     pub(crate) camera_from_board: Transform,
-    /// Equivalent rotation of the board: the corners are at `board_from_equivalent.inverse() *
+    /// Equivalent rotation of the board. The corners are at `board_from_equivalent.inverse() *
     /// point_in_board`.
     board_from_equivalent: Transform,
-    /// Accuracy; `None` for a pose that was given.
+    /// Accuracy of the corners. `None` for a pose that was given.
     pub(crate) corners: Option<CornerStatistics>,
 }
 
@@ -103,7 +103,7 @@ pub(crate) struct CornerStatistics {
     pub(crate) unit_covariance: Matrix6<f64>,
     /// Sum of squared residuals of the inliers, square pixels.
     pub(crate) squares_px2: f64,
-    /// Per corner: whether its residual fits those of the others.
+    /// For each corner, whether its residual fits the residuals of the other corners.
     pub(crate) is_inlier: Vec<bool>,
 }
 
@@ -126,7 +126,7 @@ pub(crate) struct Sorted {
 /// Candidates of all samples, except repeated samples.
 ///
 /// # Errors
-/// If the input is invalid or has too few samples.
+/// Fails if the input is invalid or has too few samples.
 pub(crate) fn prepare(input: &HandEyeInput<'_>) -> Result<Sorted, Error> {
     check(input)?;
     Ok(sort(input, input.intrinsics.as_ref()))
@@ -342,7 +342,8 @@ fn is_finite(point: &BoardPoint) -> bool {
 
 /// Rejects a chain with too few joints for offsets, and joint values that do not belong to it.
 fn check_chain(samples: &[HandEyeSample], chain: &Chain) -> Result<(), Error> {
-    // The offsets of the first and the last joint are not observable, so one must be left.
+    // The offsets of the first and the last joint are not observable, so at least one other joint
+    // is needed.
     const MIN_JOINTS: usize = 3;
     let n_joints = chain.n_joints();
     require(n_joints >= MIN_JOINTS, || {
@@ -370,8 +371,8 @@ fn check_covariance(covariance: &DMatrix<f64>, n: usize) -> Result<(), Error> {
     require(covariance.iter().all(|value| value.is_finite()), || {
         "the covariance of the intrinsics is not finite".to_owned()
     })?;
-    // Focal lengths in pixels and distortion coefficients have variances of different magnitude.
-    // In the correlation matrix, one tolerance fits all.
+    // Focal lengths in pixels and distortion coefficients have variances of different magnitude. In
+    // the correlation matrix, one tolerance is suitable for all of them.
     let scales = covariance
         .diagonal()
         .map(|variance| variance.abs().max(f64::MIN_POSITIVE).sqrt());

@@ -2,8 +2,8 @@
 //! ambiguity.
 //!
 //! The initial poses follow from the homography at the center of the board (Collins and Bartoli
-//! 2014, "Infinitesimal plane-based pose estimation", section 4.3). Both are refined by minimizing
-//! the reprojection error.
+//! 2014, "Infinitesimal plane-based pose estimation", section 4.3). Both initial poses are refined
+//! by minimizing the reprojection error.
 
 use super::super::geometry::nearest_rotation;
 use super::CornerStatistics;
@@ -17,7 +17,7 @@ use nalgebra::{
 };
 use numbers::random::Random;
 
-/// Minimum number of corners for a pose: a homography has eight parameters, and a corner two
+/// Minimum number of corners for a pose. A homography has eight parameters, and a corner has two
 /// coordinates.
 const MIN_CORNERS: usize = 4;
 
@@ -32,8 +32,8 @@ pub(crate) struct BoardPose {
     pub(crate) corners: CornerStatistics,
 }
 
-/// The poses that explain the corners, best first: one or two. Empty if the corners do not
-/// determine a pose. Corners beyond the range of the lens model are outliers.
+/// The one or two poses that explain the corners, best first. The list is empty if the corners do
+/// not determine a pose. Corners beyond the range of the lens model are outliers.
 pub(crate) fn board_poses(view: &BoardView, intrinsics: &Intrinsics) -> Vec<BoardPose> {
     // Corners without a ray cannot be used, but keep their place in the list of inliers.
     let ray = |point: &BoardPoint| intrinsics.unproject(point.pixel).map(|ray| ray.xy());
@@ -121,10 +121,10 @@ impl Corners<'_> {
     /// The largest set of corners found that agrees with a homography of four of them (Fischler and
     /// Bolles 1981). `None` if it has fewer than half of the corners.
     fn consensus(&self) -> Option<Vec<bool>> {
-        // If half of the corners are wrong, this number of trials finds four good ones with a
-        // probability of 99.99 %: (1 - 0.5^4)^150 = 6e-5.
+        // If half of the corners are wrong, this number of trials finds four good corners with a
+        // probability of 99.99 %, because (1 - 0.5^4)^150 = 6e-5.
         const TRIALS: usize = 150;
-        // A homography of four noisy corners is inaccurate far from them.
+        // A homography of four noisy corners is inaccurate far from these corners.
         const ALLOWED_PX: f64 = 3.0;
         let n = self.pairs.len();
         // Rays are in units of the focal length.
@@ -245,8 +245,8 @@ fn initial_rotations(homography: &Matrix3<f64>) -> Vec<UnitQuaternion<f64>> {
     if largest.is_nan() || largest <= 0.0 {
         return Vec::new();
     }
-    // The scale follows from the unit length of the columns: the largest singular value of the
-    // upper left part of a rotation is 1.
+    // The scale follows from the unit length of the columns, because the largest singular value of
+    // the upper left part of a rotation is 1.
     let upper = scaled / largest;
     let rest = Matrix2::identity() - upper.transpose() * upper;
     // The third row completes the columns to unit length. Its sign is not determined, which gives
@@ -270,7 +270,8 @@ fn with_translation(
     rotation: UnitQuaternion<f64>,
     pairs: &[(Vector2<f64>, Vector2<f64>)],
 ) -> Option<Transform> {
-    // The rotated point plus the translation must be parallel to the ray: two linear equations.
+    // The rotated point plus the translation must be parallel to the ray. This gives two linear
+    // equations.
     let mut normal = Matrix3::zeros();
     let mut right = Vector3::zeros();
     for (point, ray) in pairs {

@@ -11,7 +11,8 @@ pub struct FlangeMotion<'a> {
     pub setup: Setup,
     /// Pose of the flange at mid-exposure.
     pub base_from_flange: Transform,
-    /// Pose of the flange when a row is exposed, 0 to 1 from the first to the last row.
+    /// Pose of the flange when a row is exposed. The argument is the position of the row, from 0
+    /// (first row) to 1 (last row).
     pub base_from_flange_at: &'a dyn Fn(f64) -> Transform,
     /// Approximate pose of the camera on the flange (eye in hand) or in the base (eye to hand).
     pub parent_from_camera: Transform,
@@ -45,7 +46,7 @@ fn corrected(
     motion: &FlangeMotion<'_>,
 ) -> BoardPoint {
     let at_mid = camera_from_board * Point3::from(point.point_in_board);
-    // The detected corner was exposed in the row in which it lies.
+    // The detected corner was exposed together with the row in which it lies.
     let at_row = motion.row_from_mid(point.pixel[1] / f64::from(intrinsics.size_px[1])) * at_mid;
     let pixels = intrinsics
         .project(&at_mid.coords)
@@ -53,7 +54,7 @@ fn corrected(
     let Some((mid, row)) = pixels else {
         return *point;
     };
-    // Only the difference of both predictions is applied, so that errors of the pose cancel.
+    // Only the difference of the two predictions is applied, so that errors of the pose cancel.
     BoardPoint {
         pixel: [0, 1].map(|axis| point.pixel[axis] + mid[axis] - row[axis]),
         ..*point

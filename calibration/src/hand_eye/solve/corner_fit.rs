@@ -19,7 +19,7 @@ use nalgebra::{DMatrix, DVector, Matrix2x3, Matrix3, Point3, SMatrix, Vector3, V
 /// removed, so the loss only limits the influence of the remaining errors.
 const LOSS_THRESHOLD: f64 = 3.0;
 
-/// What is estimated besides hand-eye transform and board pose.
+/// Parameters that are estimated besides the hand-eye transform and the board pose.
 #[derive(Clone, Copy)]
 pub(super) struct Free {
     pub(super) intrinsics: bool,
@@ -41,7 +41,7 @@ pub(super) struct Start<'a> {
     /// Fit to the board poses of the used samples.
     pub(super) fit: &'a PoseFit,
     pub(super) intrinsics: &'a Intrinsics,
-    /// One per inner joint, radians or meters. Empty: zeros.
+    /// One offset per inner joint, radians or meters. An empty list stands for zeros.
     pub(super) joint_offsets: &'a [f64],
 }
 
@@ -60,7 +60,7 @@ impl Start<'_> {
     /// Minimizes the reprojection error of the used samples.
     ///
     /// # Errors
-    /// If a corner cannot be projected, or if there are too few corners.
+    /// Fails if a corner cannot be projected, or if there are too few corners.
     pub(super) fn minimize(self, free: Free) -> Result<Fit<CornerState>, Error> {
         let chain = self.input.chain.filter(|_| free.joints);
         let n_intrinsics = usize::from(free.intrinsics) * self.intrinsics.params().len();
@@ -89,7 +89,8 @@ impl Start<'_> {
         least_squares::minimize(&problem, initial, &options)
     }
 
-    /// The images at each stop of the robot. They share the error of its pose.
+    /// The images at each stop of the robot. Images at the same stop share the error of the robot
+    /// pose.
     fn stops(self, has_joints: bool) -> Vec<Vec<View>> {
         let mut by_stop = std::collections::BTreeMap::<usize, Vec<View>>::new();
         for sample in used(self.samples) {
@@ -110,7 +111,7 @@ struct View {
     base_from_flange: Transform,
     /// Corners without outliers, in the chosen board frame.
     points: Vec<BoardPoint>,
-    /// Joint values; empty if joint offsets are not estimated.
+    /// Joint values. The list is empty if joint offsets are not estimated.
     joints: Vec<f64>,
 }
 
@@ -120,10 +121,10 @@ struct CornerProblem<'a> {
     /// The images at each stop of the robot.
     stops: Vec<Vec<View>>,
     noise: HandEyeNoise,
-    /// Number of intrinsics to estimate: all, or 0.
+    /// Number of intrinsics to estimate, which is 0 or the number of all intrinsics.
     n_intrinsics: usize,
-    /// The arm, if joint offsets are estimated. They are estimated for all joints except the first
-    /// and the last.
+    /// The arm, if joint offsets are estimated. The offsets of all joints except the first and the
+    /// last are estimated.
     chain: Option<&'a Chain>,
 }
 
@@ -331,8 +332,8 @@ impl PointChain {
         let matrix =
             |rotation: nalgebra::UnitQuaternion<f64>| rotation.to_rotation_matrix().into_inner();
         let point_in_y = map(&self.y, point_in_board);
-        // The flange frame without and with the pose error, and the map from the latter to the
-        // camera.
+        // The flange frame without and with the pose error, and the map from the frame with the
+        // error to the camera.
         let error_rotation = matrix(self.error_motion.rotation);
         let cross = self.error_rad.cross_matrix();
         let (point_in_camera, camera_from_y, by_flange, by_error) = match self.setup {
@@ -373,8 +374,8 @@ impl PointChain {
                 )
             }
         };
-        // `x` and `y` move in the axes of camera and board: see `Solution::moved`. A motion of the
-        // camera moves the point in the opposite direction.
+        // `x` moves in the axes of the camera, and `y` in the axes of the board; see
+        // `Solution::moved`. A motion of the camera moves the point in the opposite direction.
         let mut by_solution = SMatrix::<f64, 3, 12>::zeros();
         let camera_from_board = camera_from_y * matrix(self.y.rotation);
         for (column, block) in [
@@ -412,7 +413,8 @@ fn joined(rotation: Matrix3<f64>, translation: Matrix3<f64>) -> SMatrix<f64, 3, 
 /// the others. The covariance of a solution with all parameters free is the sum of this covariance
 /// and of the covariance with fixed parameters.
 ///
-/// * `covariance`: covariance of the other parameters. If `None`, that of the fit itself is used.
+/// * `covariance`: covariance of the other parameters. If `None`, the covariance of the fit itself
+///   is used.
 pub(super) fn propagated(
     free: &Fit<CornerState>,
     covariance: Option<&DMatrix<f64>>,
@@ -443,8 +445,8 @@ pub(super) struct IntrinsicsDoubt {
 }
 
 impl IntrinsicsDoubt {
-    /// `None` if free intrinsics do not fit significantly better, or if the uncertainty of the
-    /// given intrinsics explains the difference.
+    /// Returns `None` if free intrinsics do not fit significantly better, or if the uncertainty of
+    /// the given intrinsics explains the difference.
     ///
     /// * `free`: fit with free intrinsics.
     pub(super) fn new(
@@ -483,8 +485,8 @@ impl IntrinsicsDoubt {
         })
     }
 
-    /// Covariance to add to that of a solution with the given intrinsics. It consists of the effect
-    /// of the uncertainty of free intrinsics, and of the square of the difference.
+    /// Covariance to add to the covariance of a solution with the given intrinsics. It consists of
+    /// the effect of the uncertainty of free intrinsics, and of the square of the difference.
     pub(super) fn covariance(&self, solution: &Solution) -> DMatrix<f64> {
         let mut shift = DVector::zeros(N_PARAMS);
         for (first, from, to) in [(0, solution.x, self.free.x), (6, solution.y, self.free.y)] {

@@ -1,9 +1,10 @@
 //! Finds an initial solution that agrees with most samples, and the board pose of each sample that
 //! fits this solution best.
 //!
-//! Least trimmed squares over closed-form solutions of three samples (Rousseeuw 1984; concentration
-//! steps of Rousseeuw and Van Driessen 1999). It resolves the two-fold ambiguity of planar boards
-//! and boards with rotational symmetry, and tolerates wrong samples up to almost one half.
+//! The method is least trimmed squares over closed-form solutions of three samples (Rousseeuw
+//! 1984), with the concentration steps of Rousseeuw and Van Driessen 1999. It resolves the two-fold
+//! ambiguity of planar boards and the symmetries of boards. Almost half of the samples may be
+//! wrong.
 //!
 //! The closed forms solve `a x = x b`: Park and Martin 1994, Daniilidis 1999, Tsai and Lenz 1989.
 //! `a` is the motion of the flange between two samples, `b` the motion of the camera, and `x` is
@@ -24,7 +25,7 @@ pub(crate) struct Consensus {
     pub(crate) solution: Solution,
     /// Candidate of each sample.
     pub(crate) choice: Vec<usize>,
-    /// Distance of each sample: see [`Metric`].
+    /// Distance of each sample from the solution; see [`Metric`].
     distances_m: Vec<f64>,
 }
 
@@ -36,8 +37,8 @@ impl Consensus {
 
     /// Chooses the candidates, and excludes the samples that disagree with the solution.
     pub(super) fn apply_to(&self, samples: &mut [Sample]) {
-        /// If two fifths of the samples are wrong, the median of all is the 83 % quantile of the
-        /// good ones.
+        /// If two fifths of the samples are wrong, the median of all distances is the 83 % quantile
+        /// of the distances of the good samples.
         const MEDIANS: f64 = 4.0;
         const ROUNDING_M: f64 = 1e-9;
         let limit = MEDIANS * self.median_m() + ROUNDING_M;
@@ -48,14 +49,14 @@ impl Consensus {
     }
 }
 
-/// Number of samples whose agreement decides: `(n + p + 1) / 2` for solutions of `p = 3` samples,
-/// which tolerates the most wrong samples (Rousseeuw 1984).
+/// Number of samples whose agreement decides. With `(n + p + 1) / 2` for solutions of `p = 3`
+/// samples, the largest number of wrong samples is tolerated (Rousseeuw 1984).
 fn n_deciding(n: usize) -> usize {
     (n + 4).div_ceil(2).min(n)
 }
 
-/// Distance between poses: translation, and rotation times the typical distance of the board,
-/// meters.
+/// Distance between poses, meters. It combines the translation with the rotation times the typical
+/// distance of the board.
 #[derive(Clone, Copy, Debug)]
 struct Metric {
     lever_m: f64,
@@ -63,8 +64,8 @@ struct Metric {
 
 impl Metric {
     fn of(samples: &[Sample]) -> Self {
-        // A rotation error moves the board in the image as much as a translation of the angle times
-        // the distance.
+        // In the image, a rotation error moves the board as much as a translation by the angle
+        // times the distance of the board.
         let likely = samples
             .iter()
             .map(|sample| &sample.candidates[0].camera_from_board);
@@ -82,8 +83,9 @@ impl Metric {
 
 /// The best solution found. `None` if no three samples determine one.
 pub(crate) fn consensus(samples: &[Sample]) -> Option<Consensus> {
-    /// This number of trials draws three good samples, with the right choice among four poses each,
-    /// with a probability of 99 % if two fifths of the samples are wrong.
+    /// If two fifths of the samples are wrong, this number of trials draws three good samples with
+    /// a probability of 99 %. Each draw must also select the right one of the four poses of each
+    /// sample.
     const TRIALS: usize = 1500;
     /// If each sample has only one pose, this number is sufficient.
     const TRIALS_WITHOUT_CHOICE: usize = 200;
@@ -131,7 +133,7 @@ pub(crate) fn consensus(samples: &[Sample]) -> Option<Consensus> {
     })
 }
 
-/// Three samples with one candidate each; `None` if the rotation angles of their motions disagree.
+/// Three samples with one candidate each. `None` if the rotation angles of their motions disagree.
 fn pick(
     samples: &[Sample],
     trial: usize,
@@ -209,7 +211,7 @@ fn leave_one_out_mm(pairs: &[(Transform, Transform)], solver: ClosedForm) -> Opt
     Some(geometry::scatter(&boards?)?.mm)
 }
 
-/// For each sample the candidate that fits best, and its distance in meters.
+/// For each sample, the candidate that fits best and its distance in meters.
 fn distances(samples: &[Sample], solution: &Solution, metric: Metric) -> (Vec<usize>, Vec<f64>) {
     samples
         .iter()
@@ -242,7 +244,7 @@ pub(super) fn choose(samples: &mut [Sample], solution: &Solution) -> bool {
     has_changed
 }
 
-/// Sum of the squares of the smallest distances. The others may be arbitrarily wrong.
+/// Sum of the squares of the smallest distances. The other samples may be arbitrarily wrong.
 fn trimmed_squares(distances_m: &[f64]) -> f64 {
     let mut sorted = distances_m.to_vec();
     sorted.sort_unstable_by(f64::total_cmp);
@@ -275,8 +277,8 @@ fn concentrate(samples: &[Sample], solution: &Solution, metric: Metric) -> Optio
 /// their rotations may be as large as the rotations.
 const MIN_ROTATION_RAD: f64 = 1e-3;
 
-/// Maximum number of pairs of samples in a solution: all pairs of 63 samples. It limits the time
-/// for recordings with hundreds of samples. Every sample is still in many pairs.
+/// Maximum number of pairs of samples in a solution. It is enough for all pairs of 63 samples. It
+/// limits the time for recordings with hundreds of samples. Every sample is still in many pairs.
 const MAX_MOTIONS: usize = 2000;
 
 /// A closed-form solver.
@@ -374,7 +376,8 @@ fn modified_rodrigues(motion: &Transform) -> Vector3<f64> {
     2.0 * q.imag()
 }
 
-/// Of the two quaternions that represent the rotation, the one whose scalar part is not negative.
+/// One of the two quaternions that represent the rotation. It is the one whose scalar part is not
+/// negative.
 fn positive(rotation: UnitQuaternion<f64>) -> Quaternion<f64> {
     let q = rotation.into_inner();
     if q.scalar() < 0.0 { -q } else { q }
@@ -405,8 +408,8 @@ fn with_translation(motions: &[Motion], rotation: UnitQuaternion<f64>) -> Option
 }
 
 /// Scale of the translations of `b` relative to those of `a`, estimated together with the
-/// translation, and its standard deviation. 1 if both have the same unit; 1000 if only those of `a`
-/// are in millimeters.
+/// translation, and its standard deviation. The scale is 1 if both have the same unit, and 1000 if
+/// only the translations of `a` are in millimeters.
 pub(crate) fn relative_scale(
     motions: &[Motion],
     rotation: UnitQuaternion<f64>,
@@ -415,8 +418,8 @@ pub(crate) fn relative_scale(
     (rows > 4).then_some(())?;
     let mut matrix = DMatrix::zeros(rows, 4);
     let mut right = DVector::zeros(rows);
-    // (R_a - 1) t - s R t_b = -t_a: the equation of `with_translation`, with the scale as the
-    // fourth unknown.
+    // The equation is that of `with_translation`, with the scale as the fourth unknown: (R_a - 1) t
+    // - s R t_b = -t_a.
     for (ix, motion) in motions.iter().enumerate() {
         let factor = motion.a.rotation.to_rotation_matrix().into_inner() - Matrix3::identity();
         matrix.fixed_view_mut::<3, 3>(3 * ix, 0).copy_from(&factor);
@@ -495,12 +498,12 @@ fn dot(p: &Quaternion<f64>, q: &Quaternion<f64>) -> f64 {
     p.coords.dot(&q.coords)
 }
 
-/// Coefficients of the combination of two null vectors, each with real and dual part, that is a
-/// dual quaternion of unit length after scaling. The real part of the combination is orthogonal to
-/// its dual part (Daniilidis 1999, equations 31 to 35).
+/// Coefficients that combine two null vectors to a dual quaternion, which has unit length after
+/// scaling. Each null vector has a real and a dual part. The real part of the combination is
+/// orthogonal to its dual part (Daniilidis 1999, equations 31 to 35).
 fn coefficients(null: &[(Quaternion<f64>, Quaternion<f64>); 2]) -> Option<(f64, f64)> {
     let [(u1, v1), (u2, v2)] = null;
-    // Orthogonality is a quadratic equation for the ratio of both coefficients.
+    // Orthogonality is a quadratic equation for the ratio of the two coefficients.
     let first = dot(u1, v1);
     let middle = dot(u1, v2) + dot(u2, v1);
     let last = dot(u2, v2);

@@ -63,8 +63,8 @@ impl Refined {
 
 /// Refines a consensus.
 ///
-/// # Errors
-/// [`Error::Refused`] if fewer than three samples, or less than half of them, agree.
+/// # Errors Returns [`Error::Refused`] if fewer than three samples agree, or fewer than half of all
+/// samples.
 pub(crate) fn refine(
     input: &HandEyeInput<'_>,
     mut samples: Vec<Sample>,
@@ -81,7 +81,7 @@ pub(crate) fn refine(
         return Ok(Refined::new(samples, fit, input.intrinsics.clone()));
     };
     // For a board that faces the camera, the pose that fits one image best is biased. Steps from
-    // the predicted poses are not biased, so outliers are searched again with these.
+    // the predicted poses are not biased, so outliers are searched again with these steps.
     relinearize(input, &mut samples, &fit.solution, &given);
     let fit = reject_and_fit(input, &mut samples, fit.solution, fit.noise)?;
     // Then from corners.
@@ -99,8 +99,9 @@ fn refine_with_given(
     fit: PoseFit,
     given: Intrinsics,
 ) -> Result<Refined, Error> {
-    // A fit with free intrinsics shows whether the given ones are right, and how their uncertainty
-    // changes the result. With few images, this fit may fail. In that case, neither is known.
+    // A fit with free intrinsics shows whether the given intrinsics are right, and how their
+    // uncertainty changes the result. With few images, this fit may fail. In that case, neither is
+    // known.
     let start = Start {
         input,
         samples: &samples,
@@ -119,8 +120,8 @@ fn refine_with_given(
         .and_then(|free| IntrinsicsDoubt::new(start, free, lens));
     let by_lens = free.as_ref().and_then(|free| propagated(free, Some(lens?)));
     let mut fit = minimize_weighted(start)?;
-    // The doubt already contains the effect of the lens, so only one of the two covariances is
-    // added.
+    // The covariance of `doubt` already contains the effect of the lens, so only one of the two
+    // covariances is added.
     if let Some(doubt) = &doubt {
         fit.covariance += doubt.covariance(&fit.solution);
     } else if let Some(by_lens) = by_lens {
@@ -156,7 +157,7 @@ fn refine_with_others(
     }
     let is_estimated = input.options.estimate_intrinsics;
     let n_intrinsics = usize::from(is_estimated) * intrinsics.params().len();
-    // Order of the shared parameters: solution, intrinsics, joint offsets.
+    // The order of the shared parameters is: solution, intrinsics, joint offsets.
     let offsets = free.state.joint_offsets.iter().enumerate();
     let offsets = offsets.map(|(ix, offset)| (*offset, free.sigma(N_PARAMS + n_intrinsics + ix)));
     Ok(Refined {
@@ -233,7 +234,7 @@ fn reject_and_fit(
     mut solution: Solution,
     mut noise: HandEyeNoise,
 ) -> Result<PoseFit, Error> {
-    /// Squared distance with six degrees of freedom that one good sample in 100 000 exceeds.
+    /// Squared distance with six degrees of freedom. One good sample in 100 000 exceeds it.
     const MAX_SQUARED_DISTANCE: f64 = 33.1;
     // This limit ends the loop if two sets of samples alternate.
     const MAX_ROUNDS: usize = 8;
@@ -284,7 +285,7 @@ fn corner_noise(samples: &[Sample]) -> Option<f64> {
     for sample in used(samples) {
         let corners = sample.chosen().corners.as_ref()?;
         squares += corners.squares_px2;
-        // Two coordinates per corner; six parameters were fitted to each image.
+        // Each corner has two coordinates, and six parameters were fitted to each image.
         n_free += 2.0 * corners.n_inliers() as f64 - 6.0;
     }
     Some((squares / f64::max(n_free, 1.0)).sqrt().max(MIN_PX))
@@ -297,8 +298,8 @@ fn relinearize(
     solution: &Solution,
     intrinsics: &Intrinsics,
 ) {
-    /// At larger distances, the step may be inaccurate. The limit is three times that of outliers,
-    /// so that excluded samples can be used again.
+    /// At larger distances, the step may be inaccurate. The limit is three times the limit of
+    /// outliers, so that excluded samples can be used again.
     const MAX_SQUARED_DISTANCE: f64 = 100.0;
     let near = samples
         .iter_mut()
@@ -320,8 +321,9 @@ fn relinearize(
 /// If the lens model has errors that are common to all images, the estimated robot errors are too
 /// large. Weights for smaller robot errors then predict held-out images better. Weights without
 /// robot errors minimize the reprojection error alone. The alternatives are compared by the product
-/// of three held-out errors, which does not depend on units: reprojection, position of the board,
-/// and its rotation. The covariance follows from the estimated noise in all cases.
+/// of three held-out errors: the reprojection error, and the errors of the position and rotation of
+/// the board. This product does not depend on units. The covariance follows from the estimated
+/// noise in all cases.
 fn minimize_weighted(start: Start<'_>) -> Result<PoseFit, Error> {
     const FACTORS: [f64; 5] = [1.0, 0.5, 0.25, 0.1, 0.0];
     let setup = start.input.setup;

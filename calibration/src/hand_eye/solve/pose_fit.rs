@@ -1,9 +1,9 @@
 //! Generalized least squares over board poses, with noise variances estimated by restricted maximum
 //! likelihood.
 //!
-//! Source of the variance estimate: Patterson and Thompson 1971; its iteration: Rao and Kleffe
-//! 1988, section 8.2, with square roots, which keep the variances positive and increase the
-//! likelihood monotonically.
+//! The source of the variance estimate is Patterson and Thompson 1971. Its iteration is that of Rao
+//! and Kleffe 1988, section 8.2, but with square roots. The square roots keep the variances
+//! positive and increase the likelihood monotonically.
 
 use super::super::Setup;
 use super::super::geometry::{self, Matrix6x12, N_PARAMS, Solution};
@@ -13,8 +13,8 @@ use crate::least_squares::{self, BlockSums, Loss};
 use kinematics::Transform;
 use nalgebra::{DMatrix, DVector, Matrix6, SMatrix, Vector6};
 
-/// Norm of six whitened residuals above which their loss is linear. Of the samples without a
-/// mistake, 95 % are below it.
+/// Norm of six whitened residuals above which their loss is linear. 95 % of the samples without a
+/// mistake are below this norm.
 const LOSS_THRESHOLD: f64 = 3.55;
 
 /// Standard deviations of the measurement errors.
@@ -22,14 +22,14 @@ const LOSS_THRESHOLD: f64 = 3.55;
 pub struct HandEyeNoise {
     /// Error of the corners, pixels along each axis. `None` if poses of the board were given.
     /// Errors of the lens model and blur are common to the corners of one image. This value
-    /// includes them: independent errors of this size would have the same effect on the pose of the
-    /// board.
+    /// includes such errors. Independent errors of this size would have the same effect on the pose
+    /// of the board.
     pub corner_px: Option<f64>,
-    /// Residual of the corners after a separate fit of each image, pixels along each axis. At most
-    /// `corner_px`.
+    /// Residual of the corners after a separate fit of each image, pixels along each axis. It is at
+    /// most `corner_px`.
     pub residual_px: Option<f64>,
-    /// Rotation error about each axis, radians: of the robot poses if corners were given, otherwise
-    /// of the board poses including the robot's error.
+    /// Rotation error about each axis, radians. If corners were given, it is the error of the robot
+    /// poses. Otherwise, it is the error of the board poses, which includes the error of the robot.
     pub rotation_rad: f64,
     /// Translation error along each axis, meters, of the same poses.
     pub translation_m: f64,
@@ -81,12 +81,12 @@ impl HandEyeNoise {
 pub(crate) struct Measurement {
     /// See [`Sample`].
     stop_ix: usize,
-    /// One divided by the number of measurements of the stop. The error of the robot pose is common
-    /// to them, so that a stop counts once.
+    /// One divided by the number of measurements of the stop. A stop counts once, because its
+    /// measurements share the error of the robot pose.
     weight: f64,
     pub(crate) a: Transform,
     pub(crate) camera_from_board: Transform,
-    /// Covariance of the pose for corners with an error of one pixel; `None` for given poses.
+    /// Covariance of the pose for corners with an error of one pixel. `None` for given poses.
     pub(crate) unit_covariance: Option<Matrix6<f64>>,
 }
 
@@ -161,7 +161,7 @@ pub(super) struct PoseFit {
 ///   estimated.
 ///
 /// # Errors
-/// If fewer than three measurements are given.
+/// Fails if fewer than three measurements are given.
 pub(super) fn fit(
     setup: Setup,
     measurements: &[Measurement],
@@ -218,8 +218,8 @@ pub(super) fn fit(
 /// measurements changes a solution very little.
 pub const MAX_FOLDS: usize = 60;
 
-/// For each measurement, the solution of the others. Stops are left out one by one. If there are
-/// many stops, they are left out in [`MAX_FOLDS`] interleaved folds.
+/// For each measurement, the solution from the other measurements. Stops are left out one by one.
+/// If there are many stops, they are left out in [`MAX_FOLDS`] interleaved folds.
 ///
 /// * `knows_noise`: keeps the given noise, which is faster than estimating it without the
 ///   measurement.
@@ -333,7 +333,8 @@ fn covariance_parts(
 ) -> Vec<Matrix6<f64>> {
     match (&measurement.unit_covariance, noise.corner_px) {
         // With corners, errors of the robot pose have the same effect on the board as a motion of
-        // the flange. They are correlated: a rotation of the flange also moves the board.
+        // the flange. Their components are correlated, because a rotation of the flange also moves
+        // the board.
         (Some(unit), Some(_)) => {
             let predicted = solution.camera_from_board(&measurement.a);
             let by_flange = geometry::residual_by_flange(setup, solution, &predicted);
@@ -377,10 +378,10 @@ pub(crate) fn covariance(
     )
 }
 
-/// Squared Mahalanobis distance of a measurement; it has six degrees of freedom.
+/// Squared Mahalanobis distance of a measurement, with six degrees of freedom.
 ///
 /// * `fit`: a fit with or without the measurement. Without it, the uncertainty of the prediction
-///   counts, too.
+///   also counts.
 pub(super) fn squared_distance(
     setup: Setup,
     measurement: &Measurement,

@@ -14,8 +14,8 @@ const CAUCHY_SCALE: f64 = 2.385;
 /// Number of parts of a rigid motion.
 const N_PARTS: usize = 6;
 
-/// Distance of a match from its epipolar line: the first-order approximation of the smallest motion
-/// of both corners that makes their rays meet (Sampson 1982), radians near the image center.
+/// Distance of a match from its epipolar line, radians near the image center. It is the first-order
+/// approximation of the smallest motion of both corners that makes their rays meet (Sampson 1982).
 struct Sampson {
     rays: [Vector3<f64>; 2],
     numerator: f64,
@@ -69,8 +69,8 @@ impl Sampson {
     }
 }
 
-/// Derivatives of the essential matrix by motions of the two cameras in their own axes:
-/// translation, then rotation, of the first camera, then of the second.
+/// Derivatives of the essential matrix by motions of the two cameras in their own axes. The order
+/// is: translation and rotation of the first camera, then of the second camera.
 fn essential_derivatives(to_from_from: &Transform) -> [[Matrix3<f64>; N_PARTS]; 2] {
     let rotation = *to_from_from.rotation.to_rotation_matrix().matrix();
     let cross = to_from_from.translation.vector.cross_matrix();
@@ -156,7 +156,7 @@ impl PairMatches {
         let to_from_from = self.to_from_from(cameras);
         let pair_cameras = [&cameras[self.pair.from], &cameras[self.pair.to]];
         // If both images are from one camera, its parameters change both. Lens parameters do not
-        // change the essential matrix; their entries are zero.
+        // change the essential matrix, so their entries are zero.
         let mut derivatives: BTreeMap<usize, Matrix3<f64>> = BTreeMap::new();
         for (ix, by_motion) in essential_derivatives(&to_from_from).into_iter().enumerate() {
             for (param, translation, rotation) in pair_cameras[ix].motions(layout, self.cameras[ix])

@@ -28,8 +28,8 @@ const MAX_CORNERS: usize = 700;
 /// number of corners of a cell.
 const MIN_CELL: usize = 16;
 const CORNERS_PER_CELL: usize = 3;
-/// Minimum brightness gradient of a corner in every direction: root mean square per texel. With a
-/// lower value, noise is detected as corners.
+/// Minimum brightness gradient of a corner in every direction, as root mean square per texel. With
+/// a lower value, noise is detected as corners.
 const MIN_GRADIENT: f32 = 1.5;
 /// Half the side of the window of a corner, texels.
 const WINDOW_RADIUS: usize = 2;
@@ -39,8 +39,8 @@ const SIDE: usize = 8;
 const SPACING: f64 = 2.5;
 /// Number of samples of a descriptor.
 pub(super) const DESCRIPTOR_LEN: usize = SIDE * SIDE;
-/// Minimum standard deviation of the samples of a descriptor. Below, normalization would amplify
-/// noise.
+/// Minimum standard deviation of the samples of a descriptor. Below this value, normalization would
+/// amplify noise.
 const MIN_CONTRAST: f32 = 4.0;
 
 /// Brightness around a corner with zero mean and unit norm, so that the dot product of two
@@ -52,7 +52,7 @@ pub(super) type Descriptor = [f32; DESCRIPTOR_LEN];
 pub(super) struct Corner {
     /// Position in the keyframe, pixels.
     pub(super) px: [f64; 2],
-    /// Ray through the corner with the keyframe's lens: x and y at a depth of 1.
+    /// Ray through the corner with the keyframe's lens, given by x and y at a depth of 1.
     pub(super) ray: Vector2<f64>,
     /// When the corner's row was read out, as a share of the readout time: -0.5 for the first row,
     /// 0.5 for the last.
@@ -124,7 +124,7 @@ fn window_sum(tensors: &[[f32; 3]], ix: usize, stride: usize) -> [f32; 3] {
     sum
 }
 
-/// A gray image, 0 to 255; NaN in masked areas.
+/// A gray image with values from 0 to 255. Masked areas are NaN.
 #[derive(Debug)]
 struct Level {
     size: [usize; 2],
@@ -325,7 +325,8 @@ impl Level {
         corners
     }
 
-    /// Smaller eigenvalue of the mean structure tensor in a window; 0 at edges and in masked areas.
+    /// Smaller eigenvalue of the mean structure tensor in a window. It is 0 at edges and in masked
+    /// areas.
     fn corner_response(&self) -> Vec<f32> {
         let [width, height] = self.size;
         let mut tensors = vec![[f32::NAN; 3]; self.values.len()];
@@ -358,7 +359,7 @@ impl Level {
         response
     }
 
-    /// Descriptor at a position; `None` near the edges, in masked areas, and without contrast.
+    /// Descriptor at a position. `None` near the edges, in masked areas, and without contrast.
     fn descriptor(&self, center: [f64; 2], [cos, sin]: [f64; 2]) -> Option<Descriptor> {
         // Half the diagonal of the samples, so that the window fits at any rotation.
         const RADIUS: f64 = 0.5 * (SIDE - 1) as f64 * SPACING * std::f64::consts::SQRT_2 + 1.0;

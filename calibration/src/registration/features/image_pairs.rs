@@ -12,8 +12,8 @@ use rayon::prelude::*;
 /// Maximum angle between the viewing directions of a pair, radians. Corners look too different
 /// beyond it.
 const MAX_VIEW_ANGLE_RAD: f64 = 0.8;
-/// Minimum distance between the cameras of a pair: in meters, and relative to the median distance.
-/// Closer images determine hardly any epipolar lines.
+/// Minimum distances between the cameras of a pair. One is in meters, and the other is relative to
+/// the median distance. Closer images hardly determine any epipolar lines.
 const MIN_BASELINE_M: f64 = 0.02;
 const MIN_BASELINE_FRAC: f64 = 0.1;
 /// Minimum fraction of an image that its partner must show if all points are at the same, most
@@ -70,7 +70,7 @@ fn sees_the_same(from: &FeatureImage, to: &FeatureImage, to_from_from: &Transfor
     view_angle_rad < MAX_VIEW_ANGLE_RAD && overlap(from, to, to_from_from) > MIN_OVERLAP
 }
 
-/// Median distance between the positions of two images, meters; positive.
+/// Median distance between the positions of two images, meters. It is positive.
 fn median_baseline_m(poses: &[Transform]) -> f64 {
     let distance = |one: &Transform, other: &Transform| {
         (one.translation.vector - other.translation.vector).norm()
@@ -80,7 +80,7 @@ fn median_baseline_m(poses: &[Transform]) -> f64 {
     median(&distances).unwrap_or(0.0).max(f64::MIN_POSITIVE)
 }
 
-/// Largest fraction of an image that another one shows, over the depths.
+/// Largest fraction of an image that another image shows, over the depths.
 fn overlap(from: &FeatureImage, to: &FeatureImage, to_from_from: &Transform) -> f64 {
     let baseline_m = to_from_from.translation.vector.norm();
     let from = &from.keyframe;

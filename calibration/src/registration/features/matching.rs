@@ -8,13 +8,14 @@ use nalgebra::{Matrix3, Vector2, Vector3};
 /// Minimum normalized cross-correlation of a match. A lower value adds matches that are mostly
 /// wrong. A higher value loses corners that are seen from different directions.
 const MIN_CORRELATION: f32 = 0.75;
-/// Maximum squared distance of the best match's descriptor, relative to that of the second best.
+/// Maximum squared distance of the best match's descriptor, relative to that of the second-best
+/// match.
 const MAX_RATIO: f32 = 0.7;
 /// Candidates closer than this to the best match, in texels, do not count as second best, because
 /// they are the same corner on another level.
 const SAME_CORNER_TEXELS: f64 = 3.0;
-/// Maximum difference of the levels of two corners: a factor of 1.5 in distance. More levels would
-/// allow larger differences, and more wrong matches.
+/// Maximum difference of the levels of two corners, which is a factor of 1.5 in distance. With more
+/// levels, larger differences would be allowed, but there would be more wrong matches.
 const MAX_LEVEL_DIFFERENCE: usize = 1;
 
 /// Two corners that show the same point.
@@ -73,8 +74,8 @@ pub(super) fn matches(
             };
             let correlation = dot(&from.descriptors[ix], descriptor);
             candidates.push((correlation, other_ix));
-            // This maximum is used for the check in the other direction, which thus needs no second
-            // search.
+            // This maximum is used for the check in the other direction, so this check needs no
+            // second search.
             if correlation > best_of_to[other_ix].0 {
                 best_of_to[other_ix] = (correlation, ix);
             }
@@ -120,7 +121,7 @@ pub(super) fn matches(
 /// Cosine and sine of the angle from the axes of the second image at a ray to those of the first
 /// image.
 fn roll(to_from_from: &Matrix3<f64>, ray: &Vector2<f64>) -> Option<[f64; 2]> {
-    // The axes of the first image as seen in the second: derivatives of the projection.
+    // The axes of the first image as seen in the second image are derivatives of the projection.
     let project = |axis: Vector3<f64>| axis.xy() - ray * axis.z;
     let x = project(to_from_from.column(0).into());
     let y = project(to_from_from.column(1).into());
@@ -132,7 +133,7 @@ fn roll(to_from_from: &Matrix3<f64>, ray: &Vector2<f64>) -> Option<[f64; 2]> {
 
 /// The area of an image in which the match of a corner is searched.
 struct Band {
-    /// Normal of the epipolar line and its offset: the distance from the line is `normal · ray +
+    /// Normal of the epipolar line and its offset. The distance from the line is `normal · ray +
     /// offset`.
     normal: Vector2<f64>,
     offset: f64,

@@ -4,8 +4,8 @@
 //!
 //! The effect of an extrinsics error on the epipolar lines depends on the relative rotation of the
 //! two images. The effect of a time offset depends on their velocities. Both errors are therefore
-//! observable without knowing any depth. The search for matches uses the approximately known poses:
-//! it is limited to a band around the epipolar line, and patches are rotated by the relative
+//! observable without knowing any depth. The search for matches uses the approximately known poses.
+//! It is limited to a band around the epipolar line, and patches are rotated by the relative
 //! rotation of the images. Matches are searched again in a narrower band after each estimate.
 
 mod epipolar;
@@ -43,7 +43,7 @@ const SCALE: f64 = 2.0;
 /// of an estimate may exceed those of the given ones.
 const MIN_IMAGES_PER_CAMERA: usize = 10;
 
-/// Minimum gain in cross-validation, dB. Errors of single poses cause smaller gains, too.
+/// Minimum gain in cross-validation, dB. Errors of single poses also cause gains, but smaller ones.
 const MIN_GAIN_DB: f64 = 0.1;
 
 /// Minimum gain that a variant must reach with the matches of the baseline before it is tried with
@@ -61,7 +61,7 @@ struct Round {
     n_partners: usize,
 }
 
-/// Rounds of matching. A few pairs are enough for the coarse ones. The last one is repeated,
+/// Rounds of matching. A few pairs are enough for the coarse rounds. The last round is repeated,
 /// because matches near the edge of the band pull the estimate towards its start.
 const ROUNDS: [Round; 5] = [
     Round {
@@ -135,11 +135,11 @@ struct FeatureScene {
     cameras: Vec<Arc<str>>,
 }
 
-/// Estimates the requested parameters from color; `None` if none of them can be estimated from
-/// color, or if too few images overlap or have corners.
+/// Estimates the requested parameters from color. Returns `None` if none of them can be estimated
+/// from color, or if too few images overlap or have corners.
 ///
 /// Parameters are estimated from training and validation keyframes and evaluated by
-/// cross-validation; test keyframes are not used.
+/// cross-validation. Test keyframes are not used.
 pub(super) fn align(keyframes: &[Arc<Keyframe>], choice: &CameraRefinement) -> Option<Alignment> {
     let always = choice.always() & PARAMS;
     let candidates = choice.candidates().iter().map(|set| *set & PARAMS);

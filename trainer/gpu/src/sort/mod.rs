@@ -2,7 +2,7 @@
 //! to 16 bits, relative to the smallest and the largest key. Returns the original indices of the
 //! sorted keys.
 //!
-//! Two variants give the same result: `parallel` ranks keys by subgroup ballots, `sequential`
+//! Two variants give the same result. `parallel` ranks keys by subgroup ballots. `sequential`
 //! assigns one block of keys to each thread.
 
 use crate::shared::{FOLDED, SCAN};
@@ -48,7 +48,7 @@ const KERNELS: &[Kernel] = &[
     kernel!("radix_scatter_sequential"),
 ];
 
-/// The eight bits that a pass sorts by; the layout of `Digit` in digit.wgsl.
+/// The eight bits that a pass sorts by. The struct has the layout of `Digit` in digit.wgsl.
 #[repr(C)]
 #[derive(Clone, Copy, bytemuck::Pod, bytemuck::Zeroable)]
 struct Digit {
@@ -68,12 +68,13 @@ pub struct RadixSort {
     scatter_indices: Pipeline,
 }
 
-/// Buffers of one sort: two buffers each for keys and values, and the digit counts.
+/// Buffers of one sort. There are two buffers for keys, two for values, and one for the digit
+/// counts.
 #[derive(Debug)]
 pub struct SortBuffers {
-    /// Keys; sorting alternates between the two buffers.
+    /// Keys. Sorting alternates between the two buffers.
     pub keys: [Buffer; 2],
-    /// Values; sorting alternates between the two buffers.
+    /// Values. Sorting alternates between the two buffers.
     pub values: [Buffer; 2],
     counts: Buffer,
     totals: Buffer,
@@ -86,7 +87,7 @@ impl RadixSort {
     ///
     /// # Errors
     ///
-    /// If a kernel is invalid.
+    /// Fails if a kernel is invalid.
     pub fn new(gpu: &Gpu) -> Result<Self, Error> {
         // The parallel scatter has ranks for 16 subgroups of its 256 threads, so subgroups need 16
         // lanes. On a CPU, barriers are expensive.
@@ -103,7 +104,8 @@ impl RadixSort {
             .optional()
             .subgroup_lanes
             .is_some_and(|lanes| lanes > 32);
-        // A ballot of up to 32 lanes fits into one word; the wide kernel compares four.
+        // A ballot of up to 32 lanes fits into one word. The kernel for wide subgroups compares
+        // four words.
         let [count, scan, scatter] = if parallel {
             [
                 kernel!("radix_count_parallel"),
@@ -136,7 +138,7 @@ impl RadixSort {
     ///
     /// # Errors
     ///
-    /// If the adapter has no memory for the buffers or cannot bind them.
+    /// Fails if the adapter has no memory for the buffers or cannot bind them.
     pub fn buffers(
         &self,
         gpu: &Gpu,
@@ -172,10 +174,10 @@ impl RadixSort {
     }
 
     /// Records the passes of a sort. The results are in the first keys and values buffers. The
-    /// values are replaced by the original indices of the keys; their previous content does not
-    /// matter.
+    /// values are replaced by the original indices of the keys. The previous content of the values
+    /// does not matter.
     pub fn sort(&self, gpu: &Gpu, passes: &mut Passes, buffers: &SortBuffers, status: &Buffer) {
-        // Sequential kernels assign a thread, not a workgroup, to each block; eight share a
+        // Sequential kernels assign a thread, not a workgroup, to each block. Eight threads share a
         // workgroup.
         let n_groups = if self.parallel {
             buffers.max_blocks
@@ -216,7 +218,7 @@ impl RadixSort {
                 ("keys_out", &buffers.keys[to]),
                 ("values_out", &buffers.values[to]),
             ]);
-            // The parallel scan has a workgroup per digit, which sums its own row of counts. The
+            // In the parallel scan, the workgroup of each digit sums its own row of counts. The
             // scatter then adds the totals of smaller digits.
             if self.parallel {
                 passes.dispatch(

@@ -89,7 +89,7 @@ impl SplatArrays {
     /// first of them in a warning. An infinite opacity is limited.
     ///
     /// # Errors
-    /// If the lengths of the arrays do not match, or there are splats but none is valid.
+    /// Fails if the lengths of the arrays do not match, or there are splats but none is valid.
     pub(crate) fn without_invalid(mut self, path: &Path) -> Result<Self, Error> {
         const MAX_LOGIT: f32 = 30.0;
         self.check_lengths()?;

@@ -72,7 +72,7 @@ struct ModelState {
     params: ParamSet,
 }
 
-/// A running trial. [`SavedState::model`] is the state in training; `other` is the state in
+/// A running trial. [`SavedState::model`] is the state in training. `other` is the state in
 /// [`RunningTrial::other`].
 #[derive(Debug, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
@@ -327,8 +327,8 @@ impl SavedKeyframes {
     }
 }
 
-/// Captures the state after all queued steps. This call only copies the model within GPU
-/// memory; [`PendingCheckpoint::finish`] copies it to the host and may run on any thread.
+/// Captures the state after all queued steps. This call only copies the model within GPU memory.
+/// [`PendingCheckpoint::finish`] copies it to the host and may run on any thread.
 pub(super) fn take(
     training: &mut Training,
     trials: &SplatTrials,

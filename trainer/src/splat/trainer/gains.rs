@@ -1,4 +1,4 @@
-//! Image gains: decides whether they are needed, and computes their initial values.
+//! Decides whether image gains are needed, and computes their initial values.
 
 use super::products;
 use super::scoring::{Comparer, compare_validation};
@@ -12,8 +12,8 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 
 /// Number of latest views whose gains are computed when gains are enabled in a live run. It is
-/// twice the number of keyframes that the decision is based on, so it usually includes all that
-/// arrived after the change of exposure. Each view costs one picture.
+/// twice the number of keyframes that the decision is based on, so it usually includes all
+/// keyframes that arrived after the change of exposure. Each view costs one picture.
 const MAX_NEW_EXPOSURES: usize = 16;
 
 /// Logarithms of the red, green and blue gains of views, by the index of the view.
@@ -34,7 +34,7 @@ pub(super) fn try_gains(training: &mut Training, trials: &mut SplatTrials) -> Re
     let mut known = LogGains::new();
     let neighbor_ixs = neighbors.iter().flatten().copied().collect();
     add_gains(training, &comparer, &mut known, neighbor_ixs)?;
-    // Subtract the mean over all images, because it is an error of the model's brightness.
+    // The mean over all images is subtracted, because it is an error of the model's brightness.
     let mean = [0, 1, 2].map(|color| mean_gain(&known, color));
     let mut baseline_db = Vec::new();
     let mut variant_db = Vec::new();

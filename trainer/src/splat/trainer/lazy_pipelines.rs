@@ -1,4 +1,5 @@
-//! Training pipelines, compiled on another thread or on demand because compilation takes seconds.
+//! Training pipelines. They are compiled on another thread or on demand, because compilation takes
+//! seconds.
 
 use crate::Error;
 use crate::splat::kernels::TrainPipelines;

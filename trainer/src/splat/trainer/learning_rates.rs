@@ -22,7 +22,7 @@ const SH_DC_RATE: f32 = 2.5e-3;
 const SH_REST_DIVISOR: f32 = 20.0;
 /// Adam's decay rates.
 const BETAS: [f32; 2] = [0.9, 0.999];
-/// Adam's epsilon. It is far below the usual 1e-8, because gradients of single splats are tiny: the
+/// Adam's epsilon. It is far below the usual 1e-8. Gradients of single splats are tiny, because the
 /// loss is a mean over all pixels.
 const EPSILON: f32 = 1e-15;
 /// Range of the splats' standard deviations, in scene sizes. The lower end keeps the covariance
@@ -71,7 +71,7 @@ pub(super) fn rule(
         log_scale_range: SCALE_RANGE.map(|scale| (scale * size).ln()),
         seed,
         // Without depth, many splats start at wrong positions. Costs and noise then act in every
-        // step, also on splats that its image does not show.
+        // step, also on splats that the image of the step does not show.
         update_all: u32::from(!scene.has_depth),
         noise_center: MIN_OPACITY,
     }

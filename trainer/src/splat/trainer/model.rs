@@ -1,4 +1,5 @@
-//! The optimized state: splats and camera parameters. Grows the splat count up to a limit.
+//! The optimized state, which consists of splats and camera parameters. Grows the splat count up to
+//! a limit.
 
 use super::recorder::Recorder;
 use super::renderer::Renderer;
@@ -15,7 +16,7 @@ use model_files::splat::arrays::SplatArrays;
 
 /// Standard deviation of a child's offset from its parent, in standard deviations of the parent.
 /// 3DGS-MCMC places children at the parent's mean. With a larger spread, a family no longer renders
-/// as its parent did. With a smaller one, its members take longer to separate.
+/// as its parent did. With a smaller spread, the members of the family take longer to separate.
 const CHILD_SPREAD: f32 = 0.5;
 
 /// Splats and camera parameters in training.

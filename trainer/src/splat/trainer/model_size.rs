@@ -16,7 +16,8 @@ use gpu::Buffer;
 /// would be pruned.
 const MAX_VIEWS: usize = 64;
 
-/// Contribution of each splat to the views: the sum of its blending weights, in pixels.
+/// Contribution of each splat to the views. It is the sum of the splat's blending weights, in
+/// pixels.
 fn contributions(training: &mut Training, learn: &TrainPipelines) -> Result<Vec<f32>, Error> {
     let n_splats = training.model.splats.n_splats;
     let contributions = training

@@ -5,7 +5,8 @@ use crate::Error;
 use crate::splat::buffers::ImageBuffers;
 use gpu::{Buffer, Gpu, Passes, Pipeline};
 
-/// Bytes of sums that each workgroup of `score.wgsl` writes: four u32 for each of three colors.
+/// Bytes of sums that each workgroup of `score.wgsl` writes. There are four u32 for each of three
+/// colors.
 const GROUP_BYTES: usize = 48;
 /// Pixels per workgroup.
 const GROUP_PIXELS: u32 = 256;
@@ -76,7 +77,7 @@ pub(super) fn psnr(products: &[Products; 3]) -> Result<f64, Error> {
     Ok(10.0 * (255.0_f64.powi(2) / mean_square).log10())
 }
 
-/// PSNR in dB of a picture whose colors are multiplied by gains; `None` if all pixels are masked.
+/// PSNR in dB of a picture whose colors are multiplied by gains. `None` if all pixels are masked.
 /// Values above white are not clamped.
 pub(super) fn psnr_with_gains(products: &[Products; 3], gains: [f64; 3]) -> Option<f64> {
     let n: u64 = products.iter().map(|color| color.n_visible).sum();
@@ -85,8 +86,8 @@ pub(super) fn psnr_with_gains(products: &[Products; 3], gains: [f64; 3]) -> Opti
             + color.image_image as f64
     };
     let squares: f64 = products.iter().zip(gains).map(square).sum();
-    // The squared error is limited to at least one, that is, one level of one color at one pixel.
-    // The score thus stays finite.
+    // The squared error is at least one, which is one level of one color at one pixel. The score
+    // thus stays finite.
     (n > 0).then(|| 10.0 * (255.0f64.powi(2) * n as f64 / squares.max(1.0)).log10())
 }
 

@@ -1,4 +1,4 @@
-//! Corrects the cameras of a model in training: the splats move along with the keyframes that show
+//! Corrects the cameras of a model in training. The splats move along with the keyframes that show
 //! them.
 //!
 //! A correction moves every point that a keyframe observes. A splat moves by the weighted mean of
@@ -21,8 +21,9 @@ use numbers::f32s_of;
 use rayon::prelude::*;
 use std::sync::Arc;
 
-/// Maximum number of keyframes that determine the motion of the splats, spread evenly over all.
-/// Every splat is projected into each of them, so the time is proportional to their number.
+/// Maximum number of keyframes that determine the motion of the splats. They are spread evenly over
+/// all keyframes. Every splat is projected into each of them, so the time is proportional to their
+/// number.
 const MAX_KEYFRAMES: usize = 64;
 /// A splat belongs to the surface of a depth reading if it is at most this fraction of its depth
 /// away. Otherwise, the surface hides it, or it floats in front.
@@ -185,7 +186,7 @@ impl Motion {
         }
     }
 
-    /// The position to which the correction moves a point, and the weight of this motion; `None` if
+    /// The position to which the correction moves a point, and the weight of this motion. `None` if
     /// the keyframe does not show the point.
     fn of_point(&self, point: &Point3<f64>) -> Option<(Point3<f64>, f64)> {
         let (px, z) = self.before.project(point)?;
@@ -219,8 +220,9 @@ fn motions<'a>(
         .collect()
 }
 
-/// Position and rotation of a splat after the correction: the weighted means over the keyframes
-/// that show it, or those of the nearest camera if none does.
+/// Position and rotation of a splat after the correction. They are the weighted means over the
+/// keyframes that show the splat. If no keyframe shows it, the motion of the nearest camera is
+/// used.
 fn moved(motions: &[Motion], point: &Point3<f64>) -> Option<(Point3<f64>, UnitQuaternion<f64>)> {
     let mut weights = 0.0;
     let mut shift = Vector3::zeros();

@@ -16,9 +16,9 @@ use gpu::{Buffer, Gpu, PendingRead, Pipeline};
 /// models would otherwise overflow in their first steps.
 const MIN_ENTRIES: u32 = 1 << 14;
 
-/// Divisors of the required size that give the headroom of grown buffers: 1/2, 1/16, or none. They
-/// are tried in this order. Each overflow repeats steps, so more headroom saves time. If memory is
-/// insufficient, less headroom is better than no larger buffer.
+/// Divisors of the required size that give the headroom of grown buffers. The headroom is 1/2,
+/// 1/16, or none, and is tried in this order. Each overflow repeats steps, so more headroom saves
+/// time. If memory is insufficient, less headroom is better than no larger buffer.
 const HEADROOM_DIVISORS: [u32; 3] = [2, 16, u32::MAX];
 
 /// Draws pinhole views of splats.
@@ -297,8 +297,8 @@ impl Renderer {
         size_px: [u32; 2],
         learned: bool,
     ) -> Result<(), Error> {
-        // First estimates: two bins per splat, and two tiles per bin. Buffers grow if a view needs
-        // more.
+        // The first estimates are two bins per splat, and two tiles per bin. Buffers grow if a view
+        // needs more.
         let n_entries = (2 * capacity).max(MIN_ENTRIES);
         let n_slots = if learned { 2 * n_entries } else { 0 };
         self.reserve(
@@ -417,8 +417,8 @@ fn is_complete(counters: &[u8]) -> bool {
     counters[4 * status::FAILED..4 * (status::FAILED + 1)] == [0; 4]
 }
 
-/// New size of a buffer: `have` if it suffices, otherwise `need` plus its fraction
-/// `1 / headroom_divisor`.
+/// New size of a buffer. It is `have` if that suffices, and otherwise `need` plus its fraction `1 /
+/// headroom_divisor`.
 fn with_headroom(need: u32, have: u32, headroom_divisor: u32) -> u32 {
     if need > have {
         need.saturating_add(need / headroom_divisor)

@@ -1,4 +1,4 @@
-//! The arrays of a checkpoint: splats, seeds and camera parameters.
+//! The arrays of a checkpoint, which contain splats, seeds and camera parameters.
 
 use crate::Error;
 use crate::splat::buffers::{N_PLANAR_BUFFERS, SplatBuffers};

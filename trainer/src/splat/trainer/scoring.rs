@@ -148,7 +148,7 @@ pub(super) fn compare_validation(
     Ok(compared)
 }
 
-/// Identity and PSNR in dB of a compared keyframe; `None` if it is fully masked.
+/// Identity and PSNR in dB of a compared keyframe. `None` if it is fully masked.
 fn score_of((keyframe, products): &ScoredKeyframe) -> Option<(ImageId, f64)> {
     Some((
         (keyframe.camera.clone(), keyframe.stamp),

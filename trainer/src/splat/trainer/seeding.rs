@@ -21,7 +21,7 @@ const PX_PER_SEED: f64 = 48.0;
 /// Default maximum number of seeds per image. An image of 1280 x 720 pixels has 19 200 at the
 /// density above.
 const SEEDS_PER_IMAGE: f64 = 20_000.0;
-/// The same on a software adapter, where steps with more splats would take too long.
+/// The default on a software adapter, where steps with more splats would take too long.
 const SOFTWARE_SEEDS_PER_IMAGE: f64 = 4_000.0;
 /// Minimum scale of the scene. With a scale of zero, which a single camera without depth would
 /// give, the means could not move.
@@ -80,8 +80,8 @@ impl Seeding {
         self.unseeded.retain(|keyframe| !is_removed(keyframe));
     }
 
-    /// Creates discs at the uncovered depth readings of the keyframes queued since the last call;
-    /// `None` if there are none. `views` are all training views.
+    /// Creates discs at the uncovered depth readings of the keyframes that were queued since the
+    /// last call. Returns `None` if there are none. `views` are all training views.
     pub(super) fn discs_from_depth(&mut self, views: &ViewSet) -> Option<SplatArrays> {
         let arrived = std::mem::take(&mut self.pending);
         if arrived.is_empty() {
@@ -99,7 +99,7 @@ impl Seeding {
         Some(discs)
     }
 
-    /// Replaces the cameras of all keyframes; `correct` replaces a keyframe. The corrected `views`
+    /// Replaces the cameras of all keyframes. `correct` replaces a keyframe. The corrected `views`
     /// determine which positions have splats.
     pub(super) fn replace_cameras(
         &mut self,
@@ -134,7 +134,7 @@ impl Seeding {
         std::mem::take(&mut self.unseeded)
     }
 
-    /// Discs for the areas of a keyframe that depth does not cover; `None` if there is no depth at
+    /// Discs for the areas of a keyframe that depth does not cover. `None` if there is no depth at
     /// all.
     pub(super) fn discs_without_depth(&mut self, keyframe: &Keyframe) -> Option<SplatArrays> {
         let ObservedScene {

@@ -1,5 +1,5 @@
-//! The model in training, and everything that a training step needs. A submit is prepared and sent;
-//! later, its results are applied.
+//! The model in training, and everything that a training step needs. A submit is prepared and sent.
+//! Its results are applied later.
 
 use super::lazy_pipelines::LazyPipelines;
 use super::learning_rates;
@@ -36,7 +36,7 @@ const MAX_STEPS_PER_SUBMIT: u64 = 64;
 /// number would delay the pictures too much.
 const VIEWS_AT_ONCE_WATCHED: u64 = 4;
 
-/// The model in training. It does not depend on trials; they change it through its functions.
+/// The model in training. It does not depend on trials. Trials change it through its functions.
 #[derive(Debug)]
 pub(super) struct Training {
     pub(super) options: ModelOptions<SplatOptions>,
@@ -110,8 +110,8 @@ impl Training {
         }
     }
 
-    /// Seeds the areas that depth does not cover. Uses discs if any keyframe has depth; otherwise
-    /// balls at the initial points, if there are any, and a random cloud.
+    /// Seeds the areas that depth does not cover. If any keyframe has depth, discs are used.
+    /// Otherwise, balls at the initial points (if there are any) and a random cloud are used.
     pub(super) fn prepare_model(&mut self) -> Result<(), Error> {
         // Depth comes first, because discs without depth readings take their depths from the discs
         // with depth.
@@ -165,7 +165,7 @@ impl Training {
         self.schedule.step += n_steps;
         // This waits for the previous submit while the new one runs, so that the GPU never idles.
         let failed = self.finish_in_flight()?;
-        // After a failure, the failure flag turns this submit into a no-op, too. Its steps are
+        // After a failure, the failure flag also turns this submit into a no-op. Its steps are
         // repeated, so its counters are not needed.
         if !failed {
             self.optimizer.submits.begin(counters, n_steps, since);
@@ -366,7 +366,7 @@ impl Training {
     ///
     /// # Errors
     ///
-    /// The given error if the steps of all images were skipped.
+    /// Returns the given error if the steps of all images were skipped.
     fn skip_step(&mut self, error: Error) -> Result<(), Error> {
         self.model.stop_growing(&error);
         // Every image is used at least once within two rounds.

@@ -61,8 +61,8 @@ impl TrialRunner<'_> {
     /// Restores the state at the start of the trial and applies the tested change.
     fn begin_second_half(&mut self) -> Result<(), Error> {
         let baseline_db = scoring::score_validation(self.training, self.trials)?;
-        // The trained baseline is kept: it is displayed during the second half, and restored if
-        // the change is rejected.
+        // The trained baseline is kept. It is displayed during the second half, and restored if the
+        // change is rejected.
         let snapshot = match self.training.snapshot() {
             Ok(snapshot) => snapshot,
             Err(error) => return self.finish_without_memory(error),
@@ -141,7 +141,7 @@ impl TrialRunner<'_> {
         self.end(canceled)
     }
 
-    /// Ends a trial without a decision; it is repeated.
+    /// Ends a trial without a decision. The trial is repeated later.
     pub(super) fn abort(&mut self) -> Result<(), Error> {
         self.trials
             .abort()

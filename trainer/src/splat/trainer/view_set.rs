@@ -1,4 +1,4 @@
-//! The training views: their training order, their resolution, and their images on the GPU.
+//! The training views, with their training order, their resolution, and their images on the GPU.
 
 use super::recorder::Recorder;
 use crate::Error;
@@ -18,13 +18,14 @@ use std::sync::Arc;
 /// keyframes.
 const SOFTWARE_IMAGE_BYTES: u64 = 256 << 20;
 /// Number of images uploaded together when iterating over all views. They are downscaled in
-/// parallel, so the number should be at least that of the cores. All of them must fit into memory.
+/// parallel, so their number should be at least the number of cores. All of them must fit into
+/// memory.
 pub(super) const VIEWS_AT_ONCE: usize = 16;
 /// Default of [`SplatOptions::coarse_steps`]. Coarse images make the first steps fast. On the
 /// static arm, training at full resolution from the start lost 2 dB at 1 s and 0.1 dB at 8 s
 /// (docs/benchmarks/2026-11-23-splats.md).
 const COARSE_STEPS: [u64; 2] = [150, 400];
-/// The same on a software adapter, whose steps at full resolution take much longer.
+/// The default on a software adapter, whose steps at full resolution take much longer.
 const SOFTWARE_COARSE_STEPS: [u64; 2] = [500, 4000];
 
 /// Training views.
@@ -95,7 +96,7 @@ impl ViewSet {
         self.views.push(TrainView::new(keyframe));
     }
 
-    /// Mean color of the images, sRGB; black without images.
+    /// Mean color of the images, sRGB. It is black without images.
     pub(super) fn mean_srgb(&self) -> [f32; 3] {
         // Fully masked images have no mean color.
         let known: Vec<[f64; 3]> = self.views.iter().filter_map(TrainView::mean_srgb).collect();
@@ -128,7 +129,7 @@ impl ViewSet {
         self.views = keyframes.into_iter().map(TrainView::new).collect();
     }
 
-    /// Replaces the cameras of all views; `correct` replaces a keyframe. Uploaded images are kept
+    /// Replaces the cameras of all views. `correct` replaces a keyframe. Uploaded images are kept
     /// where possible.
     pub(super) fn replace_cameras(&mut self, gpu: &Gpu, correct: impl Fn(&mut Arc<Keyframe>)) {
         for view in &mut self.views {

@@ -19,7 +19,8 @@ const CHANNELS: [&str; 3] = ["red", "green", "blue"];
 /// Points whose coordinates are not finite or exceed 10 km are left out.
 ///
 /// # Errors
-/// If the file cannot be read, is not a PLY file, contains splats, or contains no usable point.
+/// Fails if the file cannot be read, is not a PLY file, contains splats, or contains no usable
+/// point.
 pub fn read_points(path: &Path) -> Result<(InitialPoints, Vec<String>), Error> {
     let bytes = files::read(path, Budget::POINTS).map_err(|source| Error::Read {
         path: path.to_owned(),
