@@ -9,8 +9,8 @@ const LUMINANCE: [u8; 64] = [
     92, 49, 64, 78, 87, 103, 121, 120, 101, 72, 92, 95, 98, 112, 100, 103, 99,
 ];
 
-/// Quantization of chrominance at quality 50 in the first four rows and columns (table K.2); 99
-/// elsewhere.
+/// Quantization of chrominance at quality 50 in the first four rows and columns (table K.2). It is
+/// 99 elsewhere.
 const CHROMINANCE: [[u8; 4]; 4] = [
     [17, 18, 24, 47],
     [18, 21, 26, 66],
