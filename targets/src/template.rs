@@ -132,7 +132,7 @@ impl Patch {
 
 /// The part of a pixel that is white, 0 to 1, in the printed pattern around a corner.
 ///
-/// `offset`: position of the pixel's center relative to the corner, pixels.
+/// `offset` is the position of the pixel's center relative to the corner, pixels.
 fn white_frac(
     surface: &Surface<'_>,
     neighborhood: &Neighborhood,

@@ -139,7 +139,8 @@ fn exit_depth_m(ray: Ray, corner: vec3i, size: i32) -> f32 {
     return within_box(vec2f(0.0, 1e30), ray.origin, ray.along, vec3f(corner), vec3f(corner + size)).y;
 }
 
-// Depth of the zero crossing between a point outside and a point inside. UNKNOWN if space between them was not observed.
+// Depth of the zero crossing between a point outside and a point inside.
+// UNKNOWN if space between them was not observed.
 fn crossing(ray: Ray, outside_m: f32, inside_m: f32, outside_distance: f32, inside_distance: f32, speed: f32) -> f32 {
     var low = vec2f(outside_m, outside_distance);
     var high = vec2f(inside_m, inside_distance);

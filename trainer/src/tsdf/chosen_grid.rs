@@ -147,7 +147,7 @@ fn valid_depth(options: &TsdfOptions, depth: &DepthMap, ix: usize) -> Option<f64
         .filter(|z| *z > 0.01 && *z <= options.max_depth_m)
 }
 
-/// Standard deviation of depth at 1 m, estimated from second differences along rows; see
+/// Standard deviation of depth at 1 m, estimated from second differences along rows. See
 /// [`VoxelGrid::choose`].
 fn noise_per_m2(options: &TsdfOptions, depth: &DepthMap) -> f64 {
     let width = depth.size_px[0] as usize;

@@ -12,7 +12,8 @@ use nalgebra::{Vector2, Vector3};
 pub(super) struct MovingCamera {
     /// Pose at mid-exposure.
     pub(super) world_from_camera: Transform,
-    /// Velocity in the camera's own axes, and time from the first to the last row; zero if unknown.
+    /// Velocity in the camera's own axes, and time from the first to the last row. Both are zero if
+    /// unknown.
     twist: Twist,
     readout_secs: f64,
     focal_px: [f64; 2],
@@ -61,7 +62,7 @@ impl MovingCamera {
         }
     }
 
-    /// Motion of the camera per unit of each parameter; see [`CameraParamOffsets::motions`].
+    /// Motion of the camera per unit of each parameter. See [`CameraParamOffsets::motions`].
     ///
     /// [`CameraParamOffsets::motions`]: crate::registration::layout::CameraParamOffsets::motions
     pub(super) fn motions(

@@ -151,7 +151,7 @@ pub fn distortion(samples: &[Sample], weights: &[f64], near: f64) -> (f64, Vec<f
 pub struct Target {
     /// 0 to 1.
     pub rgb: [f64; 3],
-    /// Distance along the ray; 0 where unknown.
+    /// Distance along the ray. It is 0 where unknown.
     pub distance: f64,
 }
 

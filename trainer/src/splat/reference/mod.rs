@@ -68,7 +68,7 @@ pub struct View {
     /// Rotation of the camera during the whole readout in its own axes, radians: angular velocity
     /// times readout time.
     pub angular_rad: [f64; 3],
-    /// Whether opacities are lowered where [`BLUR_PX2`](project::BLUR_PX2) enlarges splats; see
+    /// Whether opacities are lowered where [`BLUR_PX2`](project::BLUR_PX2) enlarges splats. See
     /// [`SplatArrays::is_antialiased`](model_files::splat::arrays::SplatArrays::is_antialiased).
     /// Gradients ignore this.
     pub is_antialiased: bool,

@@ -106,7 +106,7 @@ impl Mesher {
         &self.meshes
     }
 
-    /// The blocks replaced since the last call; `None` in the first call, for all blocks.
+    /// The blocks replaced since the last call. `None` in the first call, for all blocks.
     pub(in crate::tsdf) fn take_changed(&mut self) -> Option<BTreeSet<GridCoord>> {
         self.changed.replace(BTreeSet::new())
     }

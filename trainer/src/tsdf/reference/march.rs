@@ -81,8 +81,8 @@ impl<'a> BlockNeighborhood<'a> {
         self.at(voxel).and_then(|(block, ix)| block.color_srgb(ix))
     }
 
-    /// Case of the cube that begins at `voxel`: bit c is set if corner c is inside; `None` if any
-    /// was not observed.
+    /// Case of the cube that begins at `voxel`. Bit c is set if corner c is inside. `None` if any
+    /// corner was not observed.
     fn case_of(&self, voxel: GridCoord) -> Option<usize> {
         (0..8).try_fold(0, |case, corner| {
             let is_inside = self.distance(moved(voxel, corner))? < 0.0;

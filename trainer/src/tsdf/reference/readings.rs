@@ -7,7 +7,7 @@ use nalgebra::Vector3;
 /// A pixel's depth and surface orientation.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Reading {
-    /// Meters along z; 0 for invalid pixels.
+    /// Meters along z. It is 0 for invalid pixels.
     pub depth_m: f64,
     /// Dot product of the ray (z = 1) and the unit surface normal.
     pub ray_dot_normal: f64,

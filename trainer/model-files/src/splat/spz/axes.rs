@@ -58,7 +58,7 @@ impl Axes {
         }
     }
 
-    /// Converts a vector between the axes of the file and ours.
+    /// Converts a vector between the axes of the file and fieldrig's axes.
     pub(super) fn vector(self, [x, y, z]: [f32; 3]) -> [f32; 3] {
         let [x_sign, y_sign, z_sign] = self.0;
         [x_sign * x, y_sign * y, z_sign * z]

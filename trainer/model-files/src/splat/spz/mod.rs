@@ -132,7 +132,7 @@ fn mean(axes: Axes, fractional_bits: u8, bytes: &[u8; 9]) -> [f32; 3] {
     axes.vector([x, y, z].map(|fixed| quantize::mean_from_fixed(fixed, fractional_bits)))
 }
 
-/// Converts a decoded rotation to our axes and order.
+/// Converts a decoded rotation to fieldrig's axes and order.
 fn rotation_wxyz(axes: Axes, xyzw: [f32; 4]) -> [f32; 4] {
     let [x, y, z] = axes.rotation_xyz([xyzw[0], xyzw[1], xyzw[2]]);
     [xyzw[3], x, y, z]
