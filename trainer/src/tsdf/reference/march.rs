@@ -11,7 +11,8 @@ const GRAY: f64 = 0.5;
 /// A vertex of a block's triangles.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Vertex {
-    /// The edge of the vertex: its first voxel, relative to the block's first voxel, and its axis.
+    /// The edge of the vertex. It has its first voxel, relative to the block's first voxel, and its
+    /// axis.
     pub between: (GridCoord, usize),
     /// Relative to the field's anchor, along the world's axes, meters.
     pub position_m: [f64; 3],

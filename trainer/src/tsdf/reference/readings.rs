@@ -22,8 +22,8 @@ const WIDE_STEP: i64 = 3;
 const MAX_FLAT_NOISES: f64 = 6.0;
 /// Minimum valid depth, meters. Nearer readings are errors of the sensor.
 const MIN_DEPTH_M: f64 = 0.01;
-/// Maximum slope of a valid surface: change of depth over lateral distance. Steeper surfaces count
-/// as edges.
+/// Maximum slope of a valid surface, which is the change of depth over lateral distance. Steeper
+/// surfaces count as edges.
 const MAX_SLOPE: f64 = 6.0;
 
 /// The ray through a position in the image, scaled to z = 1.
