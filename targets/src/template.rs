@@ -32,7 +32,8 @@ pub(crate) struct Neighborhood {
     /// Size of the part of the board whose image is about as large as the compared window should
     /// be.
     pub(crate) side_m: f64,
-    /// Largest distance from the predicted position. With `None`, it is a fraction of the window.
+    /// Largest distance from the predicted position, pixels. With `None`, it is a fraction of the
+    /// image of `side_m`.
     pub(crate) reach_px: Option<f64>,
 }
 
