@@ -144,7 +144,7 @@ impl AlignmentTask {
         Ok(is_changed)
     }
 
-    /// Adds a movement of a camera to the result; see [`Alignment::add_movement`].
+    /// Adds a movement of a camera to the result. See [`Alignment::add_movement`].
     pub fn add_movement(&mut self, movement: CameraMovement, first: Stamp) {
         self.result
             .get_or_insert_default()

@@ -267,7 +267,7 @@ impl CameraCorrection {
     }
 }
 
-/// Linear interpolation at a stamp between the entries before and after it; `None` if there are no
+/// Linear interpolation at a stamp between the entries before and after it. `None` if there are no
 /// entries.
 pub fn interpolate<const N: usize>(
     known: &BTreeMap<i64, [f64; N]>,

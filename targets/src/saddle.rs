@@ -201,8 +201,8 @@ pub(crate) fn angle_between(a_rad: f64, b_rad: f64) -> f64 {
 /// there.
 ///
 /// Returns the point `q` that minimizes the weighted sum of `(gradient · (pixel - q))^2` (Förstner
-/// and Gülch 1987), with Gaussian weights centered at `q`: every pixel on a straight edge through
-/// `q` has a gradient perpendicular to it. `None` if the point moves out of the window or the
+/// and Gülch 1987), with Gaussian weights centered at `q`. Every pixel on a straight edge through
+/// `q` has a gradient perpendicular to the edge. `None` if the point moves out of the window or the
 /// window shows only one edge.
 #[expect(
     clippy::cast_possible_truncation,

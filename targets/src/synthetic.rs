@@ -13,7 +13,7 @@ use numbers::random::Random;
 pub struct View {
     /// The camera.
     pub intrinsics: Intrinsics,
-    /// Pose of the board; see [`crate::board`] for its frame.
+    /// Pose of the board. See [`crate::board`] for its frame.
     pub camera_from_board: Transform,
     /// Standard deviation of the Gaussian blur, pixels.
     pub blur_px: f64,

@@ -32,7 +32,8 @@ pub(crate) struct Neighborhood {
     /// Size of the part of the board whose image is about as large as the compared window should
     /// be.
     pub(crate) side_m: f64,
-    /// Largest distance from the predicted position. `None`: a part of the window.
+    /// Largest distance from the predicted position, pixels. With `None`, it is a fraction of the
+    /// image of `side_m`.
     pub(crate) reach_px: Option<f64>,
 }
 
@@ -132,7 +133,7 @@ impl Patch {
 
 /// The part of a pixel that is white, 0 to 1, in the printed pattern around a corner.
 ///
-/// `offset`: position of the pixel's center relative to the corner, pixels.
+/// `offset` is the position of the pixel's center relative to the corner, pixels.
 fn white_frac(
     surface: &Surface<'_>,
     neighborhood: &Neighborhood,
@@ -158,8 +159,8 @@ fn is_white(
     [x, y]: [f64; 2],
 ) -> bool {
     // The pixel is a function of second order of the board point. Its inverse is approximated by
-    // one step: the linear inverse gives the point at which the second-order part is evaluated, and
-    // this part is subtracted before the final linear inverse.
+    // one step. The linear inverse gives the point at which the second-order part is evaluated.
+    // This part is subtracted before the final linear inverse.
     let first = point_by_pixel * Vector2::new(x, y);
     let [xx, xy, yy] = [
         first.x * first.x / 2.0,
@@ -219,8 +220,8 @@ impl Template {
         let mean = values.iter().sum::<f64>() / values.len() as f64;
         let values: Vec<f64> = values.into_iter().map(|value| value - mean).collect();
         let norm = values.iter().map(|value| value * value).sum::<f64>().sqrt();
-        // The derivatives are those of the pattern, not of the image, so they are computed once
-        // instead of in each step (Baker and Matthews 2004).
+        // The derivatives are derivatives of the pattern, not of the image, so they are computed
+        // once instead of in each step (Baker and Matthews 2004).
         let steepest: Vec<Vector4<f64>> = inner()
             .zip(&values)
             .map(|((x, y), &value)| {
@@ -291,7 +292,7 @@ impl Template {
     /// Shifts the pattern to the position of least squares.
     fn align(&self, plane: &Plane, start: [f64; 2]) -> Option<[f64; 2]> {
         // This number is sufficient for any shift within the limits below. It also ends oscillating
-        // steps; the correlation then decides.
+        // steps. The correlation then decides.
         const MAX_STEPS: usize = 20;
         const CONVERGED_PX: f64 = 1e-3;
         let mut center = start;
@@ -302,7 +303,7 @@ impl Template {
                 .map(|(sample, row)| row * sample)
                 .sum::<Vector4<f64>>();
             let solution = self.inverse * right;
-            // The image is gain * pattern(shifted) + offset; its derivative with respect to the
+            // The image is gain * pattern(shifted) + offset. Its derivative with respect to the
             // shift is gain * gradient.
             let gain = solution[2];
             // Black and white are swapped, so this is another part of the pattern.

@@ -76,10 +76,10 @@ struct AlignedState {
     detects_movements: bool,
     /// Stamp of the first keyframe, which may have been evicted since, nanoseconds.
     first_nanos: Option<i64>,
-    /// Number of original keyframes that are references of movement detection; `None` before it
+    /// Number of original keyframes that are references of movement detection. `None` before it
     /// begins.
     n_references: Option<usize>,
-    /// Number of original keyframes when alignment began; `None` before that.
+    /// Number of original keyframes when alignment began. `None` before that.
     n_begun: Option<usize>,
     /// Whether the alignment task is done. This field and the next two are set only in checkpoints.
     is_aligned: bool,
@@ -226,7 +226,7 @@ impl AlignedModel {
         self.model.as_mut()
     }
 
-    /// Adds a keyframe; see [`Method::push`]. It may begin or end an alignment.
+    /// Adds a keyframe. See [`Method::push`]. It may begin or end an alignment.
     pub fn push(&mut self, keyframe: Arc<Keyframe>) -> Result<(), Error> {
         // Test keyframes must not influence the cameras. If alignment runs only once and is done,
         // it needs no more keyframes. In live runs, the task is always requested again.
@@ -255,7 +255,7 @@ impl AlignedModel {
         Ok(())
     }
 
-    /// Removes a keyframe; see [`Method::remove`].
+    /// Removes a keyframe. See [`Method::remove`].
     pub fn remove(&mut self, camera: &str, stamp: Stamp) -> Result<(), Error> {
         if let Some(ix) = self
             .original_keyframes
@@ -271,7 +271,7 @@ impl AlignedModel {
         self.model.remove(camera, stamp)
     }
 
-    /// Queues up to `n` optimizer updates; see [`Method::step`]. Also begins an alignment or
+    /// Queues up to `n` optimizer updates. See [`Method::step`]. Also begins an alignment or
     /// applies its result, if this is due.
     pub fn step(&mut self, n: u64) -> Result<u64, Error> {
         if self.precedes_training() {
@@ -340,7 +340,7 @@ impl AlignedModel {
         self.alignment_task.result()
     }
 
-    /// Writes the model and its alignment into an existing folder; see [`Method::save`].
+    /// Writes the model and its alignment into an existing folder. See [`Method::save`].
     pub fn save(&mut self, folder: &Path) -> Result<(), Error> {
         // The model writes its own metadata; the alignment is added to the same file afterwards.
         self.model.save(folder)?;
@@ -369,7 +369,7 @@ impl AlignedModel {
         })
     }
 
-    /// Takes a checkpoint of the model and its alignment; see [`Method::checkpoint`].
+    /// Takes a checkpoint of the model and its alignment. See [`Method::checkpoint`].
     pub fn checkpoint(&mut self) -> Result<PendingCheckpoint, Error> {
         // Without alignment, the checkpoint of the model is sufficient.
         if self.state.choice == CameraRefinement::default() && self.alignment().is_none() {

@@ -136,7 +136,7 @@ pub trait Method {
     fn depth_stride(&self) -> u32 {
         1
     }
-    /// A sphere that contains most of the model; `None` if the model is empty or does not support
+    /// A sphere that contains most of the model. `None` if the model is empty or does not support
     /// this.
     fn bounds(&mut self) -> Result<Option<Bounds>, Error> {
         Ok(None)

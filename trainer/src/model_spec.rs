@@ -85,7 +85,7 @@ impl ModelSpec {
         })
     }
 
-    /// The options as the method-specific type `S`; `None` if the model uses another method.
+    /// The options as the method-specific type `S`. `None` if the model uses another method.
     ///
     /// # Errors
     ///

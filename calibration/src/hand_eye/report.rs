@@ -19,8 +19,9 @@ pub struct HandEyeCalibration {
     pub parent_from_camera: Transform,
     /// `base_from_board` (eye in hand) or `flange_from_board` (eye to hand).
     pub parent_from_board: Transform,
-    /// Covariance of `parent_from_camera`: position in meters along the camera's x, y and z axes,
-    /// then rotation in radians around them. The squared Mahalanobis distance of the error is below
+    /// Covariance of `parent_from_camera`. The parameters are the position in meters along the
+    /// camera's x, y and z axes, then the rotation in radians around them. The squared Mahalanobis
+    /// distance of the error is below
     /// 12.59 with a probability of 95 %.
     pub covariance: Matrix6<f64>,
     /// Standard deviations of the position along the camera's axes, millimeters.

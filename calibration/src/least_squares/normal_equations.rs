@@ -258,7 +258,7 @@ struct Reduced {
     /// Lower triangle.
     matrix: DMatrix<f64>,
     gradient: DVector<f64>,
-    /// Factors of the local parts; `None` for blocks without local parameters.
+    /// Factors of the local parts. `None` for blocks without local parameters.
     factors: Vec<Option<Cholesky<f64, Dyn>>>,
 }
 

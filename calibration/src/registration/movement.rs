@@ -463,7 +463,7 @@ mod tests {
     /// Index of the first image after the movement.
     const MOVED_AT: usize = 26;
 
-    /// Tests the images after the references; returns the movement, and the number of images until
+    /// Tests the images after the references. Returns the movement, and the number of images until
     /// it was found.
     fn detect(keyframes: &[Arc<Keyframe>]) -> Option<(CameraMovement, usize)> {
         let mut detector = MovementDetector::new(&keyframes[..N_REFERENCES]);

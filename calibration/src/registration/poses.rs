@@ -120,7 +120,7 @@ fn rms_motion(motions: &[Vector6<f64>]) -> [f64; 2] {
 
 /// Estimates the pose of one image relative to others that stay fixed, from a subset of its pixels.
 /// All `pairs` must lead to this image. Returns the correction of its camera with an entry for this
-/// image; `None` if the other images do not show the same surfaces.
+/// image. `None` if the other images do not show the same surfaces.
 pub(super) fn fit_one(
     images: &[PreparedImage],
     views: &[CorrectedView],

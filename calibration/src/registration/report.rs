@@ -21,7 +21,7 @@ use std::sync::Arc;
 /// Result of alignment.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct Alignment {
-    /// Corrections by camera; empty if none were accepted.
+    /// Corrections by camera. The map is empty if no corrections were accepted.
     pub corrections: BTreeMap<String, CameraCorrection>,
     /// Accepted corrections with their uncertainties.
     pub estimates: Vec<Estimate>,
@@ -194,8 +194,8 @@ fn rms(drift: &BTreeMap<i64, [f64; 6]>, parts: std::ops::Range<usize>) -> f64 {
     (squares.sum::<f64>() / drift.len().max(1) as f64).sqrt()
 }
 
-/// The estimate of the group of parameters that starts with a parameter; `None` if the parameter is
-/// not the first of its group.
+/// The estimate of a group of parameters, which is given by its first parameter. `None` if the
+/// parameter is not the first of its group.
 fn estimate(
     scene: &AlignmentScene,
     kept: &CalibrationModel,
@@ -288,7 +288,7 @@ fn pose_estimate(
     }
 }
 
-/// Direction of a vector; zero for a zero vector.
+/// Direction of a vector. It is zero for a zero vector.
 fn unit_or_zero(vector: Vector3<f64>) -> Vector3<f64> {
     vector.try_normalize(0.0).unwrap_or_else(Vector3::zeros)
 }
@@ -465,7 +465,7 @@ impl Alignment {
         }
     }
 
-    /// Combined correction of a camera's movements up to a stamp; `None` if there are none.
+    /// Combined correction of a camera's movements up to a stamp. `None` if there are none.
     pub fn movement_correction(&self, camera: &str, stamp: Stamp) -> Option<CameraCorrection> {
         let movements = self
             .movements

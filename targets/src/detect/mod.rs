@@ -27,7 +27,7 @@ pub struct Detection {
 /// A corner of a target in an image.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct DetectedCorner {
-    /// Id on the target; see [`crate::board`].
+    /// Id on the target. See [`crate::board`].
     pub id: u32,
     /// Position in the board frame, meters.
     pub point_in_board: Vector3<f64>,

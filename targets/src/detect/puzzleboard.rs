@@ -130,7 +130,7 @@ impl Board<'_> {
     /// Determines the quarter turns of a lattice with this range of cells and its offset in the
     /// master pattern from its dots.
     ///
-    /// `found`: counts of the lattice, for messages.
+    /// `found` contains the counts of the lattice, for messages.
     fn located(
         &self,
         dots: &[Dot],

@@ -22,7 +22,7 @@ pub struct Optional {
 const HALF_MATRICES: wgpu::Features =
     wgpu::Features::EXPERIMENTAL_COOPERATIVE_MATRIX.union(wgpu::Features::SHADER_F16);
 
-/// Whether the adapter multiplies matrices of the size and types that our kernels use.
+/// Whether the adapter multiplies matrices of the size and types that fieldrig's kernels use.
 fn has_half_matrices(adapter: &wgpu::Adapter) -> bool {
     adapter
         .cooperative_matrix_properties()

@@ -114,7 +114,7 @@ pub fn assert_valid<'k>(kernels: impl IntoIterator<Item = &'k Kernel>) {
     assert!(errors.is_empty(), "{}", errors.join("\n"));
 }
 
-/// Why a kernel is invalid; `None` if it is valid.
+/// Why a kernel is invalid. `None` if it is valid.
 fn validation_error(kernel: &Kernel) -> Option<Error> {
     let validate = |text: String| reflect(kernel.source.name, &text).map(drop);
     resolve(kernel.source, kernel.shared)
@@ -145,7 +145,7 @@ pub fn layout_in_wgsl(kernels: &[Kernel], name: &str) -> StructLayout {
     first.clone()
 }
 
-/// The layout of a struct in one kernel; `None` if the kernel does not declare it.
+/// The layout of a struct in one kernel. `None` if the kernel does not declare it.
 fn declared_layout(kernel: &Kernel, name: &str) -> Option<StructLayout> {
     let module = module_of(kernel);
     module
@@ -186,7 +186,7 @@ pub fn constant_in_wgsl(kernels: &[Kernel], name: &str) -> u32 {
     first
 }
 
-/// The value of a constant in one kernel; `None` if the kernel does not declare it.
+/// The value of a constant in one kernel. `None` if the kernel does not declare it.
 fn declared_constant(kernel: &Kernel, name: &str) -> Option<u32> {
     let module = module_of(kernel);
     let (_, constant) = module

@@ -94,7 +94,7 @@ impl Checkpoint {
     }
 
     /// Writes the file under a temporary name, syncs it and renames it. The final name therefore
-    /// always refers to a complete file: the previous one or the new one.
+    /// always refers to a complete file, which is the previous file or the new file.
     pub fn write(&self, path: &Path) -> Result<(), Error> {
         files::replace(path, |file| self.write_to(file)).map_err(|source| Error::Write {
             path: path.to_owned(),
@@ -169,8 +169,8 @@ impl Checkpoint {
     fn from_bytes(bytes: &[u8]) -> Result<Self, String> {
         let n_header_bytes = n_header_bytes(bytes)?;
 
-        // The checksum is computed first but reported last. A truncated file fails it, too, and
-        // `truncated` is the more useful reason.
+        // The checksum is computed first but reported last. A truncated file also fails the
+        // checksum, but `truncated` is the more useful reason.
         let whole = bytes
             .len()
             .checked_sub(CHECKSUM_BYTES)
@@ -189,7 +189,7 @@ impl Checkpoint {
             Err(_) => return Err("damaged: the checksum does not match".to_owned()),
         };
 
-        // Lengths come from the file, so their sum may overflow; such a file is too short as well.
+        // Lengths come from the file, so their sum may overflow. Such a file is also too short.
         let expected = header
             .arrays
             .iter()

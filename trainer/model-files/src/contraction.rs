@@ -2,7 +2,7 @@
 //! compressed. The cells of edits and the neural fields divide this cube.
 
 /// Contracts a point, given in units of the scene radius around its center, to the unit cube. The
-/// inner cube from -1 to 1 fills the central half along each axis; everything outside maps to the
+/// inner cube from -1 to 1 fills the central half along each axis. Everything outside maps to the
 /// surrounding shell.
 ///
 /// Source: Barron et al. 2022, equation 10, with the largest coordinate in place of the length, so

@@ -3,8 +3,8 @@
 /// Points of another program, such as those of structure from motion.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct InitialPoints {
-    /// Positions in world, meters; all are finite.
+    /// Positions in world, meters. All are finite.
     pub points_in_world_m: Vec<[f32; 3]>,
-    /// sRGB color of each point; empty if the colors are unknown.
+    /// sRGB color of each point. The list is empty if the colors are unknown.
     pub colors_srgb: Vec<[u8; 3]>,
 }

@@ -1,4 +1,5 @@
-//! Files of models: splats, meshes, checkpoints and edits. Nothing here uses the GPU.
+//! Files of models, which are splats, meshes, checkpoints and edits. This crate does not use the
+//! GPU.
 //!
 //! ```
 //! use model_files::edits::Edit;

@@ -1,7 +1,7 @@
 //! Color of a splat as a function of the viewing direction: real spherical harmonics up to degree
 //! 3.
 //!
-//! Source: Kerbl et al. 2023 for constants, order and signs; the polynomials agree with Sloan 2013
+//! Source: Kerbl et al. 2023 for constants, order and signs. The polynomials agree with Sloan 2013
 //! on the unit sphere.
 
 use nalgebra::Vector3;
@@ -34,16 +34,16 @@ const C3: [f64; 7] = [
     -0.590_043_589_926_643_5,
 ];
 
-/// Color in the direction `offset`, the vector from the camera to the splat in the world frame;
-/// clamped below at 0.
+/// Color in the direction `offset`, which is the vector from the camera to the splat in the world
+/// frame. The color is clamped below at 0.
 ///
 /// `sh` holds 1, 4, 9 or 16 coefficients.
 pub fn color(sh: &[[f64; 3]], offset: &Vector3<f64>) -> [f64; 3] {
     unclamped_color(sh, offset).map(|channel| channel.max(0.0))
 }
 
-/// Gradient with respect to `sh` and `offset`, from the gradient with respect to the color; zero
-/// for clamped channels.
+/// Gradient with respect to `sh` and `offset`, from the gradient with respect to the color. It is
+/// zero for clamped channels.
 pub fn color_backward(
     sh: &[[f64; 3]],
     offset: &Vector3<f64>,
@@ -126,8 +126,8 @@ fn basis_gradient(direction: &Vector3<f64>) -> [Vector3<f64>; MAX_N_COEFFS] {
 
 fn unclamped_color(sh: &[[f64; 3]], offset: &Vector3<f64>) -> [f64; 3] {
     let basis = basis(&offset.normalize());
-    // The offset 0.5 is part of the format of splat files: coefficients of zero are gray (Kerbl et
-    // al. 2023).
+    // The offset 0.5 is part of the format of splat files, in which coefficients of zero are gray
+    // (Kerbl et al. 2023).
     std::array::from_fn(|channel| {
         0.5 + sh
             .iter()

@@ -6,7 +6,7 @@ use keyframe::DepthMap;
 /// Root mean squared difference of two depth images in meters, over pixels where both have a depth
 /// above 0.
 ///
-/// Returns `None` if there is no such pixel; fails if the images differ in size.
+/// Returns `None` if there is no such pixel. Fails if the images differ in size.
 pub fn depth_rmse_m(rendered_m: &[f32], truth_m: &[f32]) -> Result<Option<f64>, Error> {
     if rendered_m.len() != truth_m.len() {
         return Err(Error::DepthSizeMismatch {
@@ -29,7 +29,7 @@ pub fn depth_rmse_m(rendered_m: &[f32], truth_m: &[f32]) -> Result<Option<f64>, 
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct SurfaceError {
     /// Mean distance along the normal of the measured surface, meters, over measured pixels with a
-    /// rendered depth; `None` if there are none.
+    /// rendered depth. `None` if there are none.
     pub mean_m: Option<f64>,
     /// Fraction of the measured pixels whose rendered surface is within [`SurfaceError::NEAR_M`].
     pub near_frac: f64,
@@ -40,8 +40,8 @@ impl SurfaceError {
     pub const NEAR_M: f64 = 0.005;
 }
 
-/// Distance of a rendered surface from a measured one; both are depth images of the same camera,
-/// meters.
+/// Distance of a rendered surface from a measured surface, meters. Both are depth images of the
+/// same camera.
 ///
 /// Only measured pixels with a known surface normal count: all four neighbors must have a reading,
 /// and none may differ by more than 4 % (an edge). Returns `None` if there is no such pixel. Fails

@@ -15,7 +15,7 @@ const CHANNEL_MEAN: [f32; 3] = [-0.030, -0.088, -0.188];
 const CHANNEL_DEVIATION: [f32; 3] = [0.458, 0.448, 0.450];
 /// Keeps the normalization of an all-zero feature finite.
 const EPSILON: f64 = 1e-10;
-/// Stages of the network; features are compared after each stage. `true` means that the size is
+/// Stages of the network. Features are compared after each stage. `true` means that the size is
 /// halved before the fire module.
 const STAGES: [&[(usize, bool)]; 6] = [
     &[(3, true), (4, false)],
@@ -26,9 +26,9 @@ const STAGES: [&[(usize, bool)]; 6] = [
     &[(12, false)],
 ];
 
-/// The learned perceptual distance of two pictures; 0 for equal ones.
+/// The learned perceptual distance of two pictures. It is 0 for equal pictures.
 ///
-/// Features of seven depths of `SqueezeNet` 1.1 are normalized per pixel; squared differences are
+/// Features of seven depths of `SqueezeNet` 1.1 are normalized per pixel. Squared differences are
 /// weighted per channel, averaged over pixels and summed over depths. Source: Zhang, Isola, Efros,
 /// Shechtman, Wang 2018, section 3; Iandola et al. 2016.
 #[derive(Debug)]
@@ -144,7 +144,7 @@ fn feature_distance(
         .sum_keepdim(1)?
         .flatten_all()?
         .to_vec1::<f32>()?;
-    // Summed in f64: a large picture has millions of pixels.
+    // The sum is in f64, because a large picture has millions of pixels.
     Ok(per_pixel.iter().copied().map(f64::from).sum::<f64>() / per_pixel.len() as f64)
 }
 
@@ -219,7 +219,7 @@ impl Fire {
     }
 }
 
-/// Max pooling over 3 x 3 windows with a stride of two; for even sizes, the last window reaches
+/// Max pooling over 3 x 3 windows with a stride of two. For even sizes, the last window reaches
 /// past the edge.
 ///
 /// Features are not negative, so the zeros that pad such a window do not change a maximum.

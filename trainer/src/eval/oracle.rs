@@ -1,4 +1,4 @@
-//! Compares our metrics with independent libraries on the shared picture pairs.
+//! Compares the metrics of fieldrig with independent libraries on the shared picture pairs.
 
 #[cfg(feature = "lpips")]
 use super::Lpips;

@@ -3,8 +3,8 @@
 use super::PixelPair;
 use crate::Error;
 
-/// Peak signal-to-noise ratio in decibels over the three colors of the unmasked pixels; infinite
-/// for equal pictures.
+/// Peak signal-to-noise ratio in decibels over the three colors of the unmasked pixels. It is
+/// infinite for equal pictures.
 ///
 /// `10 log10(255^2 / mean squared difference)`, on values already rounded to 8 bits. Fails if all
 /// pixels are masked.

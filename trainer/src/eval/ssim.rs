@@ -42,9 +42,9 @@ pub fn ssim(pair: &PixelPair<'_>) -> Result<f64, Error> {
 
 /// `rendered + truth` and `rendered - truth`, colors interleaved, each picture in 0 to 1.
 ///
-/// SSIM follows from the local variances of these two signals: the sum of the variances is twice
-/// the sum of the pictures' variances, and their difference is four times the covariance. This
-/// takes four blurs instead of five.
+/// SSIM follows from the local variances of these two signals. The sum of the variances is twice
+/// the sum of the pictures' variances. Their difference is four times the covariance. This takes
+/// four blurs instead of five.
 struct SumAndDifference {
     row_len: usize,
     sum: Vec<f32>,
@@ -76,8 +76,8 @@ impl SumAndDifference {
     }
 }
 
-/// For each column of each row of windows, the number of masked pixels among its 11; `None` if no
-/// pixel is masked.
+/// For each column of each row of windows, the number of masked pixels among its 11 pixels. `None`
+/// if no pixel is masked.
 fn masked_counts(pair: &PixelPair<'_>) -> Option<Vec<u8>> {
     let [width, height] = pair.size_px.map(|side| side as usize);
     if (0..width * height).all(|ix| pair.is_visible(ix)) {

@@ -2,7 +2,7 @@
 
 use model_files::edits::CellGrid;
 
-/// Marks cells of a grid: one bit per cell.
+/// Marks cells of a grid with one bit per cell.
 #[derive(Clone, Debug)]
 pub(crate) struct CellMask(Vec<u64>);
 

@@ -38,7 +38,7 @@ pub struct Floaters {
 /// A search for floaters.
 pub type PendingFloaters = Pending<Floaters>;
 
-/// Cells that contain parts of the model, by whether the part is a floater.
+/// Cells that contain parts of the model. Cells of floaters are separate from cells of other parts.
 #[derive(Debug)]
 pub(crate) struct CellLabels {
     /// Cells of large parts.
@@ -95,9 +95,9 @@ impl CellLabels {
             .extend(inner.cells().flat_map(|cell| grid.neighbors(cell)));
     }
 
-    /// The cells to erase: those of floaters and the cells around them, except for kept cells. The
-    /// surrounding cells are included because floaters move during training. `None` if there are
-    /// none.
+    /// The cells to erase. They are the cells of floaters and the cells around them, except for
+    /// kept cells. The surrounding cells are included because floaters move during training. `None`
+    /// if there are none.
     pub(crate) fn erased(&self, grid: &CellGrid) -> Option<CellSet> {
         let mut erased = self.floating.clone();
         erased.extend(self.floating.cells().flat_map(|cell| grid.neighbors(cell)));

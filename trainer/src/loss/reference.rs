@@ -1,9 +1,9 @@
 //! Plain CPU version of the training loss in f64: absolute difference, structural similarity (SSIM)
 //! and depth, with gradients.
 //!
-//! Source: Kerbl et al. 2023, equation 7; SSIM of Wang et al. 2004 with a Gaussian window. We
-//! divide by the total number of pixels, including masked ones. We do not divide the depth residual
-//! by the coverage, so that it is linear in the image.
+//! Source: Kerbl et al. 2023, equation 7; SSIM of Wang et al. 2004 with a Gaussian window. Unlike
+//! there, sums are divided by the total number of pixels, including masked pixels. The depth
+//! residual is not divided by the coverage, so that it is linear in the image.
 
 use super::rendered_image::{RenderedImage, Upstream};
 
@@ -22,16 +22,16 @@ pub struct Target {
     pub size_px: [usize; 2],
     /// Color, 0 to 1.
     pub rgb: Vec<[f64; 3]>,
-    /// Whether each pixel has a color; masked pixels have no color loss, but may have a depth.
+    /// Whether each pixel has a color. Masked pixels have no color loss, but may have a depth.
     pub visible: Vec<bool>,
-    /// Depth along z, meters; 0 if unknown. Empty if the camera has no depth.
+    /// Depth along z, meters. It is 0 if unknown. The array is empty if the camera has no depth.
     pub depth_m: Vec<f64>,
 }
 
 /// Weights of the parts of the loss.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Weights {
-    /// Weight of D-SSIM in the color loss; the rest is the absolute difference.
+    /// Weight of D-SSIM in the color loss. The rest is the absolute difference.
     pub dssim_frac: f64,
     /// Weight of the depth loss, per meter.
     pub depth_per_m: f64,
@@ -138,7 +138,7 @@ pub fn mean_ssim(size_px: [usize; 2], rendered: &[f64], truth: &[f64]) -> (f64, 
         let denominator = luminance.1 * contrast.1;
         let ssim = luminance.0 * contrast.0 / denominator;
         sum += ssim;
-        // The variances depend on the mean, too, so its gradient has three parts: directly, through
+        // The variances also depend on the mean, so its gradient has three parts: directly, through
         // variance = mean_xx - x², and through covariance = mean_xy - x y.
         let v_variance = -ssim / contrast.1;
         let v_covariance = 2.0 * luminance.0 / denominator;
@@ -156,7 +156,7 @@ pub fn mean_ssim(size_px: [usize; 2], rendered: &[f64], truth: &[f64]) -> (f64, 
     (sum / n_pixels, v.collect())
 }
 
-/// Mean clipped depth residual over all pixels; adds its weighted gradient to `upstream`.
+/// Mean clipped depth residual over all pixels. Adds its weighted gradient to `upstream`.
 fn depth(
     image: &RenderedImage,
     target: &Target,
@@ -173,7 +173,7 @@ fn depth(
     {
         // Both the rendered and the true depth are weighted by the coverage.
         let residual_m = image.depth[pixel_ix] - (1.0 - image.transmittance[pixel_ix]) * depth_m;
-        // A clipped residual has no gradient: beyond the clip, the splats in this pixel belong to
+        // A clipped residual has no gradient. Beyond the clip, the splats in this pixel belong to
         // another surface, and pulling them would not help.
         sum += residual_m.abs().min(weights.depth_clip_m);
         if residual_m.abs() < weights.depth_clip_m {
@@ -208,7 +208,7 @@ fn masked(rgb: &[[f64; 3]], target: &Target) -> Vec<[f64; 3]> {
         .collect()
 }
 
-/// Weights of the SSIM window along one axis; they sum to 1.
+/// Weights of the SSIM window along one axis. Their sum is 1.
 pub fn window() -> [f64; 2 * WINDOW_RADIUS + 1] {
     let weights: [f64; 2 * WINDOW_RADIUS + 1] = std::array::from_fn(|ix| {
         let offset = ix as f64 - WINDOW_RADIUS as f64;
@@ -218,7 +218,7 @@ pub fn window() -> [f64; 2 * WINDOW_RADIUS + 1] {
     weights.map(|weight| weight / sum)
 }
 
-/// Convolution with the window along x, then along y; 0 outside the borders.
+/// Convolution with the window along x, then along y. Values outside the borders are 0.
 fn blurred(size_px: [usize; 2], plane: &[f64]) -> Vec<f64> {
     let [width, height] = size_px;
     let along_x = Axis {

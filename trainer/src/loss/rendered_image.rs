@@ -7,8 +7,8 @@ pub struct RenderedImage {
     pub rgb: Vec<[f64; 3]>,
     /// Fraction of the background that is visible, 0 to 1.
     pub transmittance: Vec<f64>,
-    /// Depth along z, weighted like the colors, meters; divide by `1 - transmittance` for the mean
-    /// depth.
+    /// Depth along z, weighted like the colors, meters. Divided by `1 - transmittance`, it is the
+    /// mean depth.
     pub depth: Vec<f64>,
     /// Index of the last splat that contributed to the pixel.
     pub last_contributor: Vec<Option<usize>>,

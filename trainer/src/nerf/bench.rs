@@ -39,7 +39,7 @@ pub struct StepFigures {
     /// GPU time to render the colors of `n_samples` samples of a picture, milliseconds: median;
     /// wall time if there are no timestamps.
     pub colors_millis: f64,
-    /// GPU time of each pass of one step; empty without timestamps.
+    /// GPU time of each pass of one step. The list is empty without timestamps.
     pub passes: Vec<PassTiming>,
     /// Peak size of live GPU buffers, bytes.
     pub peak_bytes: u64,

@@ -17,8 +17,8 @@ pub(crate) struct FieldBuffers {
     pub(crate) grid: Buffer,
     /// Weights of all layers of both networks, `[outputs, inputs]` each.
     pub(crate) weights: Buffer,
-    /// The weights before the step, as two f16 numbers each; only if layers use cooperative
-    /// matrices.
+    /// The weights before the step, as two f16 numbers each. They exist only if layers use
+    /// cooperative matrices.
     pub(crate) half_weights: Option<Buffer>,
     /// Placeholder for bindings that a kernel does not use.
     pub(crate) unused_buffer: Buffer,
@@ -34,14 +34,14 @@ pub(crate) struct FieldGradients {
     pub(crate) grid: Buffer,
     /// One power of two per level.
     pub(crate) scales: Buffer,
-    /// Number of contributions that overflowed their scale: in this step and in all earlier steps.
+    /// Numbers of contributions that overflowed their scale, in this step and in all earlier steps.
     pub(crate) counts: Buffer,
 }
 
 /// State of the optimizer.
 #[derive(Debug)]
 pub(crate) struct FieldMoments {
-    /// Four f32 per entry: first and second moments of both numbers.
+    /// Four f32 per entry, which are the first and second moments of both numbers.
     pub(crate) grid: Buffer,
     /// Eight f32 per four weights: four first moments, then four second moments.
     pub(crate) weights: Buffer,
@@ -56,11 +56,11 @@ pub(crate) struct FieldMoments {
 /// Occupancy grid: the cells in which rays are sampled.
 #[derive(Debug)]
 pub(crate) struct Occupancy {
-    /// Two bit sets (cells to sample; solid cells), each with cells, groups and blocks; see
-    /// `cell_blocks.wgsl`.
+    /// Two bit sets: the cells to sample, and the solid cells. Each set has cells, groups and
+    /// blocks; see `cell_blocks.wgsl`.
     pub(crate) occupied: Buffer,
-    /// One f32 per cell: its recent opacity over one step. Negative if it was never updated; 0 if
-    /// it is outside all views.
+    /// One f32 per cell, which is its recent opacity over one step. It is negative if the cell was
+    /// never updated, and 0 if the cell is outside all views.
     pub(crate) cell_occupancy: Buffer,
     pub(crate) occupancy_sum: Buffer,
     pub(crate) occupancy_update: Buffer,
@@ -89,7 +89,7 @@ impl Occupancy {
         let n = occupancy_update.n_cells.pow(3) as usize;
         let n_set_words = n.div_ceil(32) + n_box_words(occupancy_update.n_cells) as usize;
         Ok(Self {
-            // All bits are set: without hints, rays are sampled everywhere until the first update.
+            // All bits are set. Without hints, rays are sampled everywhere until the first update.
             occupied: gpu.storage_with(
                 "nerf.occupied",
                 &vec![255; 4 * (2 * n_set_words).next_multiple_of(4)],
@@ -106,7 +106,7 @@ impl Occupancy {
     }
 }
 
-/// Threads that walk one ray; `THREADS_PER_RAY` of `march_threads.wgsl`.
+/// Threads that walk one ray. It equals `THREADS_PER_RAY` of `march_threads.wgsl`.
 pub(crate) const THREADS_PER_RAY: u32 = 8;
 
 /// The rays of one step or of part of a picture, and the parameters for walking them.

@@ -25,7 +25,7 @@ const HOLE_RADIUS_PX: u32 = 2;
 /// free.
 const DEPTH_ERROR_FRAC: f64 = 0.03;
 
-/// Cells that images observe: along rays without a reading, as free space, or as a surface.
+/// Cells that images observe along rays without a reading, as free space, or as a surface.
 #[derive(Debug)]
 struct Cells {
     unbounded: CellSet,
@@ -70,7 +70,7 @@ impl CellSet {
 /// Origin and direction of a ray, in units of the scene radius.
 type UnitRay = ([f64; 3], [f64; 3]);
 
-/// Spacing of the rays in pixels: half a cell at a distance of one radius.
+/// Spacing of the rays in pixels. It is half a cell at a distance of one radius.
 #[expect(
     clippy::cast_possible_truncation,
     clippy::cast_sign_loss,
@@ -95,8 +95,8 @@ fn is_reading(z_m: f64) -> bool {
     z_m.is_finite() && z_m > 0.0
 }
 
-/// Whether most pixels around a pixel without a reading have one. Such a small hole is not evidence
-/// of a far or unmeasurable region.
+/// Whether most pixels around a pixel without a reading have a reading. Such a small hole is not
+/// evidence of a far or unmeasurable region.
 fn is_small_hole(depth: &DepthMap, [x, y]: [u32; 2]) -> bool {
     let [width, height] = depth.size_px;
     let around = |coordinate: u32, size: u32| {
@@ -104,8 +104,8 @@ fn is_small_hole(depth: &DepthMap, [x, y]: [u32; 2]) -> bool {
     };
     let pixels =
         around(y, height).flat_map(|y| around(x, width).map(move |x| (y * width + x) as usize));
-    // A hole, such as a reflection, is surrounded by readings. In a window or the sky, they are
-    // missing all around.
+    // A hole, such as a reflection, is surrounded by readings. In a window or the sky, the
+    // surrounding readings are also missing.
     let (n, n_read) = pixels.fold((0, 0), |(n, n_read), pixel| {
         (
             n + 1,
@@ -121,8 +121,8 @@ fn cell_width(march: &March, point: [f64; 3]) -> f64 {
     4.0 / march.n_cells as f64 * largest(point).1.max(1.0).powi(2)
 }
 
-/// Derives occupancy hints from images, at most one per cell. Cells that no image observes get
-/// none.
+/// Derives occupancy hints from images, at most one per cell. Cells that no image observes get no
+/// hint.
 pub(crate) fn hints(keyframes: &[&Keyframe], extent: &Extent, march: &March) -> Vec<u32> {
     let empty = || Cells::new(march.n_cells.pow(3));
     let Cells {

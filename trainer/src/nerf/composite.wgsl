@@ -101,7 +101,7 @@ fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u,
     }
 }
 
-// Whether a sample is near the depth reading. `band`: distance and tolerance of the reading.
+// Whether a sample is near the depth reading. `band` is the distance and tolerance of the reading.
 fn is_near_reading(sample: Sample, band: vec2f) -> bool {
     return abs(0.5 * (sample.begin + sample.end) - band.x) <= band.y;
 }

@@ -21,8 +21,8 @@ const FAR_OVER_MEDIAN: f64 = 2.0;
 const DEFAULT_RADIUS_M: f64 = 1.0;
 /// Minimum radius, meters. It keeps divisions finite if all cameras and readings are at one place.
 const MIN_RADIUS_M: f64 = 0.01;
-/// A scene that extends beyond this many radii needs a new field: contraction leaves too little
-/// resolution there.
+/// A scene that extends beyond this many radii needs a new field, because contraction leaves too
+/// little resolution there.
 const MAX_REACH: f64 = 2.0;
 
 /// The cube modeled at full resolution. The space outside is contracted.
@@ -105,7 +105,8 @@ impl Extent {
         offset.amax() + other.radius_m > MAX_REACH * self.radius_m
     }
 
-    /// Converts a pose: its position becomes relative to the center, in units of the radius.
+    /// Converts a pose to scene units. Its position becomes relative to the center, in units of the
+    /// radius.
     pub(crate) fn in_scene_units(&self, world_from_other: &Transform) -> Transform {
         let mut pose = *world_from_other;
         pose.translation.vector =
@@ -143,7 +144,8 @@ impl Extent {
     }
 }
 
-/// A sample of a keyframe's depth readings: depth along z in meters, and position in world.
+/// A sample of a keyframe's depth readings. Each has the depth along z in meters and the position
+/// in world.
 fn depth_samples(keyframe: &Keyframe) -> Vec<(f64, Vector3<f64>)> {
     let Some(depth) = &keyframe.depth else {
         return Vec::new();
@@ -183,7 +185,7 @@ fn range_along(
     })
 }
 
-/// Size of a pixel in the scene, meters: median over the keyframes.
+/// Size of a pixel in the scene, meters. It is the median over the keyframes.
 pub(crate) fn pixel_size_m<'a>(
     keyframes: impl Iterator<Item = &'a Keyframe>,
     extent: &Extent,

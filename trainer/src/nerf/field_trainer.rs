@@ -44,21 +44,22 @@ const UPDATED_FRAC: f64 = 0.25;
 /// Maximum number of samples of a training ray, as a multiple of the mean, so that few rays through
 /// unknown space cannot use up the batch.
 const MAX_SAMPLES_OVER_MEAN: u32 = 4;
-/// Samples per round for a ray of a picture; `MAX_SAMPLES_PER_ROUND` of `find_samples.wgsl`.
+/// Samples per round for a ray of a picture. It equals `MAX_SAMPLES_PER_ROUND` of
+/// `find_samples.wgsl`.
 const SAMPLES_PER_ROUND: u32 = 8;
-/// Maximum number of rounds, which limits the length of rays: 2048 samples, four times as many as
-/// steps cross the refined inner cube.
+/// Maximum number of rounds, which limits the length of rays to 2048 samples. This is four times
+/// the number of steps that cross the refined inner cube.
 const MAX_ROUNDS: u32 = 256;
 /// Number of rounds for the first picture, for which the required number is unknown. If it is too
 /// small, the picture is drawn again. Superfluous rounds find no samples.
 const FIRST_ROUNDS: u32 = 16;
-/// The prepass traces one ray per square of this many pixels; `FRONT_STRIDE` of
-/// `picture_rays.wgsl`. It costs a 16th of the rays of the picture.
+/// The prepass traces one ray per square with sides of this many pixels. It equals `FRONT_STRIDE`
+/// of `picture_rays.wgsl`. The prepass costs a 16th of the rays of the picture.
 const FRONT_STRIDE: u32 = 4;
 /// Initial range of the entries (Mueller et al. 2022, section 4).
 const INITIAL_ENTRY_RANGE: f64 = 1e-4;
-/// Distance residuals beyond this, in units of the scene radius, have no gradient. Such a reading
-/// is wrong, or belongs to a surface that the ray does not show yet.
+/// Distance residuals beyond this limit, in units of the scene radius, have no gradient. Such a
+/// reading is wrong, or belongs to a surface that the ray does not show yet.
 const DISTANCE_CLIP: f32 = 0.5;
 /// Relative error of a depth camera, which widens the band of the line-of-sight loss with distance.
 /// With a wider band, surfaces are blurred. A narrower band penalizes correct surfaces.
@@ -405,7 +406,7 @@ impl FieldTrainer {
             n_rays, n_samples, ..
         } = self.sizes.nerf_budget;
         let images = ImageParamBuffers::new(gpu, &rule, n_rays, n_samples)?;
-        // Values and optimizer state of known images stay; those of new images start at zero.
+        // Values and optimizer state of known images stay. Those of new images start at zero.
         if let Some(known) = self.images.take() {
             gpu.copy(
                 (&known.image_params, 0),
@@ -739,7 +740,7 @@ impl FieldTrainer {
         };
         picture_passes.convert_for_picture(list, canvas);
 
-        // The prepass over every fourth pixel along x and y comes first: all rays of the picture
+        // The prepass over every fourth pixel along x and y comes first. All rays of the picture
         // start at the distances that it finds.
         let low_px: usize = camera
             .size_px
@@ -823,7 +824,7 @@ impl FieldTrainer {
 struct PictureBatch {
     first_ray: u32,
     n_rays: u32,
-    /// Pixels along x and y per ray: 1, or more in the prepass.
+    /// Pixels along x and y per ray. It is 1, or more in the prepass.
     pixel_stride: u32,
 }
 

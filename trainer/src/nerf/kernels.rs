@@ -56,7 +56,7 @@ macro_rules! layers {
 /// Variants with f32 layers, and with f16 cooperative matrices.
 const FULL: &[Source] = layers!("full");
 const HALF: &[Source] = layers!("half");
-/// For rendering: entries of the grid as two f16, and layers with single f16 numbers.
+/// Variants for rendering. Entries of the grid are two f16, and layers use single f16 numbers.
 const FULL_PICTURE: &[Source] = layers!("full", "full", "packed");
 const HALF_PICTURE: &[Source] = layers!("half", "single", "packed");
 
@@ -127,15 +127,15 @@ pub(crate) const KERNELS: &[Kernel] = &[
     kernel!("end_step"),
 ];
 
-/// Samples per workgroup; `TILE` of `network_tile.wgsl`. With 64 samples, a render took 0.48 ms
-/// instead of 0.30 ms ("Kernel layouts" in `docs/benchmarks/2026-11-23-nerf.md`).
+/// Samples per workgroup. It equals `TILE` of `network_tile.wgsl`. With 64 samples, a render took
+/// 0.48 ms instead of 0.30 ms ("Kernel layouts" in `docs/benchmarks/2026-11-23-nerf.md`).
 pub(crate) const N_TILE: u32 = 32;
 /// Tiles of samples per partial sum of weight gradients. With more tiles, there are fewer
 /// workgroups. With fewer tiles, there are more partial sums to add.
 pub(crate) const CHUNK_TILES: u32 = 16;
 pub(crate) const N_CHUNK: u32 = CHUNK_TILES * N_TILE;
-/// Threads per tile with cooperative matrices: a multiple of every subgroup size. With 64 threads,
-/// a render took 0.37 ms instead of 0.30 ms ("Kernel layouts" in
+/// Threads per tile with cooperative matrices. It is a multiple of every subgroup size. With 64
+/// threads, a render took 0.37 ms instead of 0.30 ms ("Kernel layouts" in
 /// `docs/benchmarks/2026-11-23-nerf.md`).
 const HALF_LANES: u32 = 128;
 /// Maximum number of rows of a layer, for which workgroup memory is reserved.
@@ -146,8 +146,9 @@ const MATRIX: u32 = 16;
 const N_DENSITY_OUT: u32 = 16;
 const N_COLORS: u32 = 4;
 
-/// Layer widths of both networks in the kernels: multiples of four, or of the matrix size with
-/// cooperative matrices. Saved fields use multiples of both, so that files work on all adapters.
+/// Layer widths of both networks in the kernels. They are multiples of four. With cooperative
+/// matrices, they are multiples of the matrix size. Saved fields use multiples of both, so that
+/// files work on all adapters.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub(crate) struct Widths {
     pub(crate) n_features: u32,
@@ -214,7 +215,7 @@ impl Widths {
         self.layers().iter().map(|[n_in, n_out]| n_in * n_out).sum()
     }
 
-    /// Outputs of the last layer: three colors and padding.
+    /// Outputs of the last layer, which are three colors and padding.
     fn n_colors(&self) -> u32 {
         if self.is_half_precision {
             MATRIX
@@ -234,13 +235,13 @@ impl Widths {
         if self.is_half_precision { 2 } else { 4 }
     }
 
-    /// Numbers stored per sample for the backward pass: the inputs of each layer.
+    /// Numbers stored per sample for the backward pass, which are the inputs of each layer.
     pub(crate) fn n_activations(&self) -> u32 {
         self.layers().iter().map(|[n_in, _]| n_in).sum()
     }
 
-    /// Gradients stored per sample: with respect to the outputs of each layer, and to the grid
-    /// features.
+    /// Gradients stored per sample. They are with respect to the outputs of each layer and to the
+    /// grid features.
     pub(crate) fn n_gradients(&self) -> u32 {
         self.layers().iter().map(|[_, n_out]| n_out).sum::<u32>() + self.n_colors() - N_COLORS
             + self.n_features

@@ -65,7 +65,7 @@ pub struct NerfModel {
     validation_images: Vec<RayImage>,
     /// Camera corrections of a loaded field.
     loaded_corrections: BTreeMap<String, CameraCorrection>,
-    /// Camera corrections after the last step; `None` if they must be recomputed.
+    /// Camera corrections after the last step. `None` if they must be recomputed.
     corrections: Option<BTreeMap<String, CameraCorrection>>,
     step: u64,
     /// Steps of rejected trials.
@@ -99,12 +99,12 @@ impl NerfModel {
         &self.options
     }
 
-    /// Extent of the scene; `None` before training starts.
+    /// Extent of the scene. `None` before training starts.
     pub fn extent(&self) -> Option<&Extent> {
         self.field.as_ref().map(|(extent, _)| extent)
     }
 
-    /// Correction of each camera; empty if none are optimized or loaded.
+    /// Correction of each camera. It is empty if no corrections are optimized or loaded.
     fn current_corrections(&mut self) -> Result<&BTreeMap<String, CameraCorrection>, Error> {
         if self.corrections.is_none() {
             self.finish_in_flight()?;
@@ -231,7 +231,7 @@ impl NerfModel {
         }
     }
 
-    /// Refines the cells when due. Coarse cells need fewer updates at first; fine cells later
+    /// Refines the cells when due. Coarse cells need fewer updates at first. Later, fine cells
     /// separate empty space better.
     fn refine_cells_when_due(&mut self) -> Result<(), Error> {
         let is_refinement_due = self.step >= refinement_step(&self.options.common);
@@ -333,7 +333,7 @@ impl Method for NerfModel {
             return Ok(());
         }
         keyframe.check()?;
-        // Validation keyframes decide trials. Afterwards, they are images like all others.
+        // Validation keyframes decide trials. Afterwards, they are training images like all others.
         let is_validation = keyframe.split == Split::Validation && !self.trials.are_finished();
         let image = RayImage::new(keyframe);
         if is_validation {
@@ -370,7 +370,7 @@ impl Method for NerfModel {
             return Ok(0);
         }
         self.advance_trials_when_due()?;
-        // Validation images may have become training images. Use them from the next step on.
+        // Validation images may have become training images. They are used from the next step on.
         self.begin()?;
         // A submit ends where the host has to change the field.
         let max_steps = self

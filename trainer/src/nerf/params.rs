@@ -144,8 +144,8 @@ pub(crate) struct ImageParamRule {
     pub(crate) unused: [u32; 2],
 }
 
-/// One of the [`IMAGE_PARAM_STRIDE`] parameters of an image: value, Adam's two moments, and the
-/// number of steps taken. The first three parameters are the rotation, the next three the
+/// One of the [`IMAGE_PARAM_STRIDE`] parameters of an image. It has the value, Adam's two moments,
+/// and the number of steps taken. The first three parameters are the rotation, the next three the
 /// translation, and the appearance embedding starts at [`EMBEDDING`], as in
 /// `shared/image_params.wgsl`.
 pub(crate) type ImageParam = [f32; 4];
@@ -190,7 +190,7 @@ pub(crate) fn levels(shape: &GridShape) -> Vec<Level> {
 }
 
 fn level(shape: &GridShape, ix: usize) -> Level {
-    // A level with fewer corners than entries needs no hash; the mask 0 marks it.
+    // A level with fewer corners than entries needs no hash. The mask 0 marks such a level.
     let is_dense = (u64::from(shape.n_cells[ix]) + 1).pow(3) <= 1 << shape.log2_entries;
     let mask = if is_dense {
         0

@@ -36,13 +36,13 @@ pub(crate) struct Canvas {
     pub(crate) light: Buffer,
     /// Distances at which the weights of every fourth ray along x and y first reach 1/64.
     fronts: Buffer,
-    /// Per batch of rays: samples in its last round, and rounds that had samples.
+    /// For each batch of rays, the samples in its last round and the rounds that had samples.
     pub(crate) progress: Buffer,
     /// The grid's entries as f16.
     packed_grid: Buffer,
     /// Outputs of the first network.
     geometry: Buffer,
-    /// Samples whose colors are evaluated: their number, spans, and weights in their rays.
+    /// Samples whose colors are evaluated, with their number, spans, and weights in their rays.
     pub(crate) selected: Buffer,
     selected_spans: Buffer,
     selected_weights: Buffer,
@@ -88,7 +88,7 @@ impl Canvas {
 
 /// Layers of both networks.
 const N_LAYERS: u64 = 5;
-/// Maximum number of workgroups that evaluate the networks; they process larger batches in a loop.
+/// Maximum number of workgroups that evaluate the networks. They process larger batches in a loop.
 /// The number of samples is known only on the GPU, so there are groups for a full batch.
 const MAX_NETWORK_GROUPS: u64 = 8192;
 /// Byte range of the number of samples in a batch.
@@ -266,7 +266,7 @@ impl FieldPasses<'_> {
             steps,
         ];
         list.dispatch(gpu, &pipelines.mark_cells, n_word_groups, &marked);
-        // Groups and blocks of both sets: the cells to sample, and the solid cells.
+        // Groups and blocks of both sets, which are the cells to sample and the solid cells.
         let n_words = 2 * n_box_words(*n_cells);
         list.dispatch(
             gpu,

@@ -29,7 +29,7 @@ const FRONT_STRIDE = 4u;
 const FRONT_MARGIN = 0.005;
 const FRONT_MARGIN_STEPS = 1.5;
 
-// Distance beyond which all occupied cells are sampled; before it, only solid cells.
+// Distance beyond which all occupied cells are sampled. Before this distance, only solid cells are sampled.
 fn start_of(pixel: vec2u) -> f32 {
     let size = (view.size_px + FRONT_STRIDE - 1u) / FRONT_STRIDE;
     let at = vec2i(pixel / FRONT_STRIDE);

@@ -1,5 +1,5 @@
-//! Training rays: pixels of all keyframes, chosen by a hash of seed, step and position in the
-//! batch.
+//! Training rays, which are pixels of all keyframes. A hash of seed, step and position in the batch
+//! chooses the pixels.
 
 use super::extent::Extent;
 use super::params;
@@ -20,8 +20,9 @@ const MAX_ATTEMPTS: u64 = 4;
 /// End of rays without a reading. Contraction leaves no resolution far beyond this distance.
 const MAX_DISTANCE: f32 = 1e3;
 
-/// Distance behind a reading up to which a ray is sampled: an offset in units of the scene radius,
-/// and a fraction of the reading's distance. The space farther back is unobserved.
+/// Offset in units of the scene radius up to which a ray is sampled behind a reading. A fraction of
+/// the reading's distance is added, which is the next constant. The space farther back is
+/// unobserved.
 const BEHIND_SURFACE: f64 = 0.03;
 const BEHIND_SURFACE_FRAC: f64 = 0.03;
 
@@ -29,8 +30,8 @@ const BEHIND_SURFACE_FRAC: f64 = 0.03;
 #[derive(Clone, Debug)]
 pub(crate) struct RayImage {
     pub(crate) keyframe: Arc<Keyframe>,
-    /// Depth of each pixel, meters along z; 0 where unknown; empty without depth. Computed on first
-    /// use.
+    /// Depth of each pixel, meters along z. It is 0 where unknown. The array is empty without
+    /// depth, and computed on first use.
     depth_m: OnceLock<Arc<[f32]>>,
 }
 
@@ -133,7 +134,7 @@ pub(crate) fn draw(images: &[RayImage], extent: &Extent, draw: &RaySampling) -> 
 }
 
 impl RaySampling {
-    /// The ray at an index of the batch. It depends on seed, step and index only, so rays are
+    /// The ray at an index of the batch. It depends only on seed, step and index, so rays are
     /// computed in parallel.
     fn ray(&self, images: &[RayImage], extent: &Extent, ix: u64) -> params::Ray {
         let key = hash(self.seed ^ hash(self.step));

@@ -25,7 +25,7 @@ pub(crate) const MAX_LEVELS: u32 = 16;
 /// The coarsest level has 17^3 corners, about 2^12. With fewer entries, even this level would have
 /// many collisions.
 const MIN_LOG2_ENTRIES: u32 = 12;
-/// Bytes per entry: the entry, its gradients and its moments.
+/// Bytes per entry, for the entry, its gradients and its moments.
 const BYTES_PER_ENTRY: u64 = 8 + 8 + MOMENT_BYTES_PER_ENTRY;
 const MOMENT_BYTES_PER_ENTRY: u64 = 16;
 
@@ -72,7 +72,8 @@ impl Sizes {
         extent: &Extent,
     ) -> Result<Self, Error> {
         // The finest level has as many cells as pixels can resolve. The levels range from the
-        // coarsest to this one. The unit cube covers four radii at the scale of the inner cube.
+        // coarsest level to this level. The unit cube covers four radii at the scale of the inner
+        // cube.
         let cell_m = PIXELS_PER_CELL * pixel_size_m(keyframes.clone(), extent);
         #[expect(
             clippy::cast_possible_truncation,
@@ -161,7 +162,7 @@ impl Sizes {
             ..
         } = self.nerf_budget;
         let is_increasing = self.n_cells.windows(2).all(|pair| pair[0] <= pair[1]);
-        // Sizes come from files. Implausible ones must be rejected before kernels are compiled and
+        // Sizes come from files. Implausible sizes must be rejected before kernels are compiled and
         // buffers are allocated for them.
         let is_usable = (1..=16).contains(&self.n_cells.len())
             && self.n_cells.iter().all(|n| (1..=1 << 20).contains(n))

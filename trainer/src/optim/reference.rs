@@ -1,7 +1,7 @@
 //! Plain CPU version of the optimizer in f64.
 //!
-//! Source: Kingma and Ba 2015, algorithm 1, with both bias corrections; one second moment for
-//! several parameters as in Zhang et al. 2024 (Adam-mini).
+//! Source: Kingma and Ba 2015, algorithm 1, with both bias corrections. One second moment for
+//! several parameters is used as in Zhang et al. 2024 (Adam-mini).
 
 /// Constants of Adam.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -15,7 +15,7 @@ pub struct Adam {
 }
 
 impl Default for Adam {
-    /// The constants of gsplat: `epsilon` is far below any gradient of a splat.
+    /// The constants of gsplat. `epsilon` is far below any gradient of a splat.
     fn default() -> Self {
         Self {
             beta1: 0.9,
@@ -25,7 +25,7 @@ impl Default for Adam {
     }
 }
 
-/// Running means of one parameter's gradient; zero before the first step.
+/// Running means of one parameter's gradient. They are zero before the first step.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Moments {
     /// Mean gradient.
@@ -35,7 +35,7 @@ pub struct Moments {
 }
 
 impl Adam {
-    /// Takes one step for a parameter at the given `rate`; `step` counts from 1.
+    /// Takes one step for a parameter at the given `rate`. `step` counts from 1.
     pub fn update(
         &self,
         step: u32,

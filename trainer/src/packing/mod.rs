@@ -37,7 +37,7 @@ pub(crate) enum Format {
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Output {
     pub(crate) format: Format,
-    /// Set for a face of a panorama; only the last face is read back.
+    /// The face, if the picture is a face of a panorama. Only the last face is read back.
     face: Option<Face>,
 }
 
@@ -64,7 +64,7 @@ impl Output {
 /// What to pack.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Packing {
-    /// Quality of the JPEG file, 1 to 100; `None` to omit the color.
+    /// Quality of the JPEG file, 1 to 100. With `None`, the color is omitted.
     pub jpeg_quality: Option<u8>,
     /// Whether depth is included.
     pub depth: bool,
@@ -89,7 +89,8 @@ pub struct PackedDepth {
     pub size_px: [u32; 2],
     /// Length of a step of the counts, meters.
     pub meters_per_count: f64,
-    /// `[height, width]`, 16-bit little-endian counts along z; 0 where nothing is visible.
+    /// Array `[height, width]` of 16-bit little-endian counts along z. They are 0 where nothing is
+    /// visible.
     pub counts: Vec<u8>,
 }
 
@@ -115,8 +116,8 @@ pub struct QueuedPicture(Queued);
 #[derive(Debug)]
 enum Queued {
     Ready(Rendered),
-    /// The first part of `read` has the counters that `is_complete` checks; the others are from
-    /// [`Packer::record`].
+    /// The first part of `read` has the counters that `is_complete` checks. The other parts are
+    /// from [`Packer::record`].
     Packed {
         read: PendingRead,
         is_complete: fn(&[u8]) -> bool,
@@ -152,7 +153,7 @@ impl QueuedPicture {
         matches!(self.0, Queued::Ready(_))
     }
 
-    /// Waits for the picture. `None` if a buffer was too small:
+    /// Waits for the picture. Returns `None` if a buffer was too small. In this case,
     /// [`Method::render_packed`](crate::Method::render_packed) makes it larger.
     ///
     /// # Errors
@@ -330,7 +331,8 @@ pub(crate) struct Packer {
 
 #[derive(Debug)]
 struct Buffers {
-    /// Capacities: squares of 8 x 8 and of 2 x 2 pixels.
+    /// Capacity in squares of 8 x 8 pixels. The next field is the capacity in squares of 2 x 2
+    /// pixels.
     n_mcus: u32,
     n_squares: u32,
     packing: Buffer,
@@ -449,7 +451,7 @@ impl Packer {
     }
 
     /// Records the passes that encode the color. Each restart interval is encoded independently
-    /// into its own words; then the intervals are joined without gaps.
+    /// into its own words. Then the intervals are joined without gaps.
     fn record_jpeg(
         &self,
         gpu: &Gpu,
@@ -565,8 +567,8 @@ impl Reader {
     }
 
     /// Records the passes after those that draw a view into `canvas`: pixels (rgba8) and depths
-    /// (meters). Returns the buffers to read back for [`Self::take`], none if the picture is not
-    /// complete.
+    /// (meters). Returns the buffers to read back for [`Self::take`]. Returns no buffers if the
+    /// picture is not complete.
     pub(crate) fn record<'a>(
         &'a mut self,
         gpu: &Gpu,
@@ -595,8 +597,8 @@ impl Reader {
         }
     }
 
-    /// The picture from the data read back after [`Self::record`]; `None` if it could not be
-    /// packed.
+    /// The picture from the data that was read back after [`Self::record`]. `None` if it could not
+    /// be packed.
     pub(crate) fn take(output: Output, view_px: [u32; 2], parts: &[&[u8]]) -> Option<Rendered> {
         let size_px = output.size_px(view_px);
         match output.format {

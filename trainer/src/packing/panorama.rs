@@ -1,5 +1,5 @@
-//! Panoramas: the six faces of a cube, drawn as pinhole views and copied into one equirectangular
-//! picture on the GPU.
+//! Panoramas. The six faces of a cube are drawn as pinhole views and copied into one
+//! equirectangular picture on the GPU.
 
 use super::kernel;
 use crate::view::{Camera, LOW_PASS_PX2};

@@ -9,8 +9,8 @@ const LUMINANCE: [u8; 64] = [
     92, 49, 64, 78, 87, 103, 121, 120, 101, 72, 92, 95, 98, 112, 100, 103, 99,
 ];
 
-/// Quantization of chrominance at quality 50 in the first four rows and columns (table K.2); 99
-/// elsewhere.
+/// Quantization of chrominance at quality 50 in the first four rows and columns (table K.2). It is
+/// 99 elsewhere.
 const CHROMINANCE: [[u8; 4]; 4] = [
     [17, 18, 24, 47],
     [18, 21, 26, 66],
@@ -120,8 +120,8 @@ fn chrominance(at: usize) -> u8 {
         .unwrap_or(99)
 }
 
-/// The table of `jpeg_transform`: cosines `[frequency, position]`; reciprocal quantizers of
-/// luminance and chrominance, row by row; zigzag positions, row by row.
+/// The table of `jpeg_transform`. It contains cosines `[frequency, position]`, then reciprocal
+/// quantizers of luminance and chrominance row by row, then zigzag positions row by row.
 pub(super) fn transform_tables(quality: u8) -> Vec<f32> {
     let basis = (0..64).map(|at| {
         let frequency = f64::from(at / 8);
@@ -144,8 +144,8 @@ pub(super) fn transform_tables(quality: u8) -> Vec<f32> {
         .collect()
 }
 
-/// The table of `jpeg_code`, for luminance, then for chrominance: codes of 16 DC categories and of
-/// 256 AC symbols, with their lengths in the high 16 bits.
+/// The table of `jpeg_code`, for luminance, then for chrominance. It contains the codes of 16 DC
+/// categories and of 256 AC symbols, with their lengths in the high 16 bits.
 pub(super) fn codes() -> Vec<u32> {
     HUFFMAN
         .chunks_exact(2)

@@ -10,7 +10,7 @@ struct AdamRule {
     unused: f32,
 }
 
-// Scale of the next step; recomputed at the end of each step.
+// Scale of the next step. It is recomputed at the end of each step.
 struct StepScale {
     rate_frac: f32,        // fraction of the initial rate
     unused: f32,

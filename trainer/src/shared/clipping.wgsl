@@ -46,7 +46,7 @@ fn in_erased_box(group: u32, points: Points) -> PxB {
         & is_between(along_row(bitcast<vec4f>(erased[group + 2u]), points), low.z, high.z);
 }
 
-// The pixels of `hit` at which the splat `clip` is drawn; `dx` and `dy` point from the pixel to the splat.
+// The pixels of `hit` at which the splat `clip` is drawn. `dx` and `dy` point from the pixel to the splat.
 fn clipped(hit: PxB, clip: u32, dx: Px, dy: f32) -> PxB {
     if clip == UNCUT || !any(hit) { return hit; }
     let cut = clips[clip];

@@ -25,7 +25,7 @@ fn halved(conic: vec4f) -> vec4f {
     return conic * vec4f(0.5, 1.0, 0.5, 0.5) / LN_2;
 }
 
-// The falloff is 2^-power; `dx` and `dy` point from the pixel to the splat.
+// The falloff is 2^-power. `dx` and `dy` point from the pixel to the splat.
 fn power_at(half: vec4f, dx: Px, dy: f32) -> Px {
     return (half.x * dx + half.y * dy) * dx + half.z * dy * dy;
 }
@@ -51,7 +51,7 @@ fn unblended(live: PxB) -> Blend {
     return Blend(Px(0.0), Px(0.0), Px(0.0), Px(0.0), Px(1.0), PxU(0u), live);
 }
 
-// Composites a splat into the pixels of `hit`; `rank` is its position in the bin's list.
+// Composites a splat into the pixels of `hit`. `rank` is its position in the bin's list.
 fn blended(before: Blend, hit: PxB, power: Px, opacity_and_depth: vec2f, color: vec3f, rank: u32) -> Blend {
     var after = before;
     let alpha = min(Px(MAX_ALPHA), opacity_and_depth.x * exp2(-power));

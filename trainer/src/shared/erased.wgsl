@@ -12,7 +12,7 @@ fn row_of_edit(group: u32, point: vec4f) -> f32 {
     return dot(bitcast<vec4f>(erased[group]), point);
 }
 
-// A range of cells: the first one, and the one after the last.
+// A range of cells, given by the first cell and the cell after the last one.
 fn erased_range(first: u32, ix: u32) -> vec2u {
     let pair = erased[first + ix / 2u];
     return select(pair.xy, pair.zw, (ix & 1u) == 1u);

@@ -7,7 +7,7 @@
 const PARAM_BETAS = vec2f(0.9, 0.99);
 const PARAM_EPSILON = 1e-15;
 
-// decay: fraction by which the step decays the value toward zero.
+// `decay` is the fraction by which the step decays the value toward zero.
 fn adam_step(before: vec4f, gradient: f32, rate: f32, decay: f32) -> vec4f {
     let moments = mix(vec2f(gradient, gradient * gradient), before.yz, PARAM_BETAS);
     let n_steps = before.w + 1.0;

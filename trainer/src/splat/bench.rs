@@ -58,8 +58,8 @@ pub struct KernelFigures {
     pub mean_rgb: [f64; 3],
     /// Peak size of all GPU buffers, bytes.
     pub peak_bytes: u64,
-    /// GPU time of each pass of one step, then of each pass that packs a picture; empty without
-    /// timestamps.
+    /// GPU time of each pass of one step, then of each pass that packs a picture. The list is empty
+    /// without timestamps.
     #[serde(skip)]
     pub passes: Vec<PassTiming>,
 }

@@ -3,12 +3,12 @@
 use crate::Bounds;
 use model_files::splat::arrays::SplatArrays;
 
-/// Minimum fraction of opaque splats. Below it, the bounds are computed from all splats, because a
-/// few opaque splats may be outliers. At the start of training without depth, all splats are
-/// transparent.
+/// Minimum fraction of opaque splats. Below this fraction, the bounds are computed from all splats,
+/// because a few opaque splats may be outliers. At the start of training without depth, all splats
+/// are transparent.
 const MIN_OPAQUE_FRAC: f64 = 0.02;
 
-/// Bounds around the median of the splats that are at least half opaque; `None` without splats.
+/// Bounds around the median of the splats that are at least half opaque. `None` without splats.
 pub(super) fn bounds(splats: &SplatArrays) -> Option<Bounds> {
     // A logit above 0 is an opacity above one half.
     let n_opaque = splats

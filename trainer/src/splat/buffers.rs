@@ -7,7 +7,7 @@ use gpu::sort::SortBuffers;
 use gpu::{Buffer, Gpu, Passes, PendingRead};
 use model_files::splat::arrays::SplatArrays;
 
-/// Splats per block, consecutive in depth. This constant and the next two are those of
+/// Splats per block, consecutive in depth. This constant and the next two equal those of
 /// shared/bins.wgsl.
 pub(crate) const BLOCK: u32 = 256;
 /// Bins per workgroup.
@@ -33,7 +33,7 @@ pub(crate) fn n_sh_rest(sh_degree: u32) -> u32 {
     3 * ((sh_degree + 1) * (sh_degree + 1) - 1)
 }
 
-/// The model: parameters and Adam's moments, with capacity for `capacity` splats.
+/// Parameters and Adam's moments of the model, with capacity for `capacity` splats.
 #[derive(Debug)]
 pub(crate) struct SplatBuffers {
     pub(crate) n_splats: u32,
@@ -87,10 +87,10 @@ impl SplatBuffers {
             // words.
             sh_dc: gpu.storage("splat.sh_dc", 12 * n)?,
             sh_rest: gpu.storage("splat.sh_rest", 4 * rest * n)?,
-            // First and second moments of means, rotations and shapes: 2 x 3 `vec4f`.
+            // First and second moments of means, rotations and shapes, which are 2 x 3 `vec4f`.
             moments: gpu.storage("splat.moments", 96 * n)?,
             sh_dc_moments: gpu.storage("splat.sh_dc_moments", 24 * n)?,
-            // All higher coefficients share one second moment; see docs/design/splats.md, section
+            // All higher coefficients share one second moment. See docs/design/splats.md, section
             // "Optimizer".
             sh_rest_moments: gpu.storage("splat.sh_rest_moments", 4 * n)?,
             error_sums: gpu.storage("splat.error_sums", 4 * n)?,
@@ -153,7 +153,7 @@ impl SplatBuffers {
         let sizes = Model {
             n_splats: self.n_splats,
             capacity: self.capacity,
-            // Kernels see only the active degree. Inactive coefficients stay as they are.
+            // Kernels see only the active degree. Inactive coefficients stay unchanged.
             sh_degree: self.active_degree,
             n_sh_rest: n_sh_rest(self.active_degree),
             is_antialiased: self.is_antialiased.into(),
@@ -164,7 +164,7 @@ impl SplatBuffers {
         gpu.write(&self.model, 0, bytemuck::bytes_of(&sizes));
     }
 
-    /// Appends splats; the caller must reserve capacity. Drops coefficients above this model's
+    /// Appends splats. The caller must reserve capacity. Drops coefficients above this model's
     /// degree, and sets missing coefficients to zero. `is_antialiased` of `arrays` then applies to
     /// all splats of the model.
     pub(crate) fn append(&mut self, gpu: &Gpu, arrays: &SplatArrays) {
@@ -207,8 +207,8 @@ impl SplatBuffers {
                 bytemuck::cast_slice(&plane_of(arrays, 0, channel)),
             );
         }
-        // The memory may hold the coefficients of splats that were removed, so missing ones are
-        // cleared. A clear needs no transfer from the host, unlike a write of zeros.
+        // The memory may hold the coefficients of splats that were removed, so missing coefficients
+        // are cleared. A clear needs no transfer from the host, unlike a write of zeros.
         let mut zeros = Passes::default();
         for ix in 0..n_sh_rest(self.sh_degree) as usize {
             let at = 4 * (ix as u64 * stride + first);
@@ -348,7 +348,8 @@ impl PendingSplats {
     }
 }
 
-/// The values of one color coefficient of all splats; zeros if the splats have no such coefficient.
+/// The values of one color coefficient of all splats. They are zeros if the splats have no such
+/// coefficient.
 fn plane_of(arrays: &SplatArrays, function: usize, channel: usize) -> Vec<f32> {
     arrays
         .sh
@@ -362,7 +363,7 @@ fn plane_of(arrays: &SplatArrays, function: usize, channel: usize) -> Vec<f32> {
 pub(crate) struct Scratch {
     pub(crate) n_entries: u32,
     pub(crate) capacity: Buffer,
-    /// The same capacity without slots, so that pictures need no memory for gradients.
+    /// The capacity without slots for gradients, so that pictures need no memory for gradients.
     pub(crate) capacity_for_drawing: Buffer,
     pub(crate) projected_splats: Buffer,
     pub(crate) tile_counts: Buffer,
@@ -379,7 +380,7 @@ pub(crate) struct Scratch {
     pub(crate) tile_bits: Buffer,
     pub(crate) gradients: Buffer,
     pub(crate) camera_sums: Buffer,
-    /// Parts of the tiles' lists that `backward` processes; see shared/segment.wgsl.
+    /// Parts of the tiles' lists that `backward` processes. See shared/segment.wgsl.
     pub(crate) segments: Buffer,
     pub(crate) segment_counts: Buffer,
     pub(crate) segment_states: Buffer,
@@ -394,7 +395,7 @@ pub(crate) struct ScratchSize {
     pub(crate) n_splats: u32,
     /// Entries in the bin lists.
     pub(crate) n_entries: u32,
-    /// Intersections of splats with tiles; 0 for drawing only.
+    /// Intersections of splats with tiles. It is 0 if the buffers are only for drawing.
     pub(crate) n_slots: u32,
     pub(crate) n_bins: u32,
 }
@@ -421,7 +422,7 @@ impl Scratch {
         };
         // The first segment and two pieces of each tile.
         let n_of_tiles = 3 * TILES_PER_BIN * n_bins;
-        // 16 bytes: four words of `Segment`.
+        // A `Segment` has four words, which are 16 bytes.
         let segment_bytes =
             16 * (u64::from(n_segments[0]) + u64::from(n_segments[1]) + u64::from(n_of_tiles));
         // A float for each part of the state of each pixel of a tile.
@@ -466,7 +467,7 @@ impl Scratch {
             bin_totals: words("splat.bin_totals", n_bins)?,
             bin_starts: words("splat.bin_starts", n_bins + 1)?,
             entries: gpu.storage("splat.entries", 16 * u64::from(n_entries.max(1)))?,
-            // One bit per entry and tile of a bin: 16 words for 32 entries.
+            // There is one bit per entry and tile of a bin, which gives 16 words for 32 entries.
             tile_bits: gpu.storage(
                 "splat.tile_bits",
                 64 * u64::from(n_entries.div_ceil(32).max(1)),

@@ -1,9 +1,9 @@
-//! Per-camera parameters that are optimized together with the splats: extrinsics, time offset, lens
-//! and exposure.
+//! Per-camera parameters that are optimized together with the splats. They are extrinsics, time
+//! offset, lens and exposure.
 //!
-//! All images of a camera share its parameters. Each image can have additional ones. The parameters
-//! stay on the GPU during training: `correct_view` applies them to the view of a step, and
-//! `refine_camera` updates them.
+//! All images of a camera share its parameters. Each image can have additional parameters. The
+//! parameters stay on the GPU during training: `correct_view` applies them to the view of a step,
+//! and `refine_camera` updates them.
 
 use super::kernels::TrainPipelines;
 use super::params::{CameraRule, Lens, N_PARAMS};
@@ -40,9 +40,9 @@ const LOG_GAIN: u32 = 11;
 const ROTATION_RATE: f64 = 1e-3;
 /// Fraction of the learning rates that remains after the planned steps, as for the means of splats.
 const FINAL_FRAC: f64 = 0.01;
-/// Fraction by which each step moves the parameters of its image toward zero. Without it, all
-/// images of a camera could drift together, which cannot be distinguished from a motion of the
-/// scene.
+/// Fraction by which each step moves the parameters of its image toward zero. Without this decay,
+/// all images of a camera could drift together. Such a drift cannot be distinguished from a motion
+/// of the scene.
 const IMAGE_DECAY: f64 = 0.001;
 
 /// The camera parameters on the GPU.
@@ -58,8 +58,8 @@ pub(crate) struct CameraParams {
     n_used: u32,
 }
 
-/// Slots of each camera by name: the camera's slot, and the slots of its images by stamp in
-/// nanoseconds.
+/// Slots of each camera by name. They are the slot of the camera, and the slots of its images by
+/// stamp in nanoseconds.
 #[derive(Clone, Debug, Default, PartialEq, serde::Serialize, serde::Deserialize)]
 pub(crate) struct CameraSlots(BTreeMap<String, (u32, BTreeMap<i64, u32>)>);
 
@@ -186,7 +186,7 @@ impl CameraParams {
         Ok(self.n_used - 1)
     }
 
-    /// Uploads the learning rates; `progress` is the completed fraction of the planned steps.
+    /// Uploads the learning rates. `progress` is the completed fraction of the planned steps.
     pub(crate) fn write_rule(&self, gpu: &Gpu, progress: f64, scene_size_m: f64) {
         let rate = ROTATION_RATE * FINAL_FRAC.powf(progress.clamp(0.0, 1.0));
         let rule = CameraRule {
@@ -412,9 +412,10 @@ impl ParamValues {
             .collect()
     }
 
-    /// Value of a parameter; 0 if the mask of optimized parameters does not contain it.
+    /// Value of a parameter. It is 0 if the mask of optimized parameters does not contain the
+    /// parameter.
     fn value(&self, slot: u32, param: u32, mask: u32) -> f64 {
-        // Kernels do not apply such a parameter, either, even if a trial has changed it.
+        // Kernels also do not apply such a parameter, even if a trial has changed it.
         if mask & (1 << param) == 0 {
             return 0.0;
         }
@@ -422,7 +423,8 @@ impl ParamValues {
     }
 }
 
-/// One part of the velocity of a keyframe's camera, padded to `vec4f`; zeros if it is unknown.
+/// One part of the velocity of a keyframe's camera, padded to `vec4f`. It is zero if the velocity
+/// is unknown.
 fn twist_part(keyframe: &Keyframe, of: fn(&Twist) -> Vector3<f64>) -> [f32; 4] {
     let [x, y, z] = keyframe
         .twist

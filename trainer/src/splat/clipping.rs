@@ -44,7 +44,7 @@ impl Clipper {
         })
     }
 
-    /// Prepares a picture of up to `n_splats` splats; `None` if nothing is clipped.
+    /// Prepares a picture of up to `n_splats` splats. Returns `None` if nothing is clipped.
     pub(crate) fn prepare(
         &mut self,
         gpu: &Gpu,
@@ -63,8 +63,8 @@ impl Clipper {
         let clips = match self.clips.take().filter(|clips| clips.bytes() >= n_bytes) {
             Some(clips) => clips,
             None => {
-                // Cached bindings hold the previous buffer. Without this call, it would not be
-                // freed.
+                // Cached bindings hold the previous buffer. Without this call, the previous buffer
+                // would not be freed.
                 passes.clear_bindings();
                 gpu.storage("splat.clips", n_bytes)?
             }

@@ -1,8 +1,8 @@
 //! Finds small parts of a splat model that are not connected to its large parts.
 //!
 //! Space is divided into cells. A cell is occupied if its splats, together, are about half opaque.
-//! Groups of adjacent occupied cells are the parts of the model; a splat that is half opaque also
-//! connects the cells that it covers. Splats that are too faint to occupy a cell are floaters, too,
+//! Groups of adjacent occupied cells are the parts of the model. A splat that is half opaque also
+//! connects the cells that it covers. Splats that are too faint to occupy a cell are also floaters,
 //! unless they are next to a large part.
 
 use super::bounds::bounds;
@@ -24,10 +24,10 @@ const REACH: f64 = 2.0;
 /// Maximum number of sampled points of one splat. It bounds the time that a single huge splat can
 /// take.
 const MAX_SAMPLES: f64 = 16_384.0;
-/// Maximum number of sampled points of all splats: some seconds on one core.
+/// Maximum number of sampled points of all splats. They take some seconds on one core.
 const MAX_TOTAL_SAMPLES: f64 = 5e7;
 
-/// The small parts of a splat model; `None` if there are none.
+/// The small parts of a splat model. `None` if there are none.
 pub(super) fn floaters(splats: &SplatArrays) -> Option<Floaters> {
     let Bounds {
         center_m, radius_m, ..
@@ -68,7 +68,7 @@ fn occupied(splats: &SplatArrays, visible: &[usize], grid: &CellGrid) -> (CellMa
         .map(|ix| n_steps(splats, *ix, grid))
         .collect();
     // Large models with many large splats would take minutes. The largest splats are therefore
-    // sampled more coarsely, which loses least, because they still have many points.
+    // sampled more coarsely. This loses least, because they still have many points.
     let mut max_samples = MAX_SAMPLES;
     while max_samples > 1.0 && n_samples_of_all(&steps, max_samples) > MAX_TOTAL_SAMPLES {
         max_samples /= 2.0;
@@ -124,7 +124,7 @@ fn n_samples_of_all(steps: &[[f64; 3]], max: f64) -> f64 {
         .sum::<f64>()
 }
 
-/// The steps of a splat, fewer if it has more than `max_samples` points.
+/// The steps of a splat. They are reduced if the splat has more than `max_samples` points.
 fn limited(steps: &[f64; 3], max_samples: f64) -> [f64; 3] {
     // The excess is divided evenly among the axes along which the splat extends beyond a cell. For
     // example, a flat splat has only two of these axes and needs the square root.
@@ -135,8 +135,8 @@ fn limited(steps: &[f64; 3], max_samples: f64) -> [f64; 3] {
     steps.map(|n| ((factor * (2.0 * n + 1.0) - 1.0) / 2.0).floor().max(0.0))
 }
 
-/// Points of a splat in world, meters, those near its center first along each axis, and the falloff
-/// of opacity there.
+/// Points of a splat in world, meters, and the falloff of opacity at these points. Along each axis,
+/// points near the center of the splat come first.
 fn samples(
     splats: &SplatArrays,
     ix: usize,
@@ -168,7 +168,8 @@ fn samples(
     })
 }
 
-/// Positions along an axis of a splat, in standard deviations: 0, then alternating on both sides.
+/// Positions along an axis of a splat, in standard deviations. The first one is 0, and the others
+/// alternate between both sides.
 fn offsets(n_steps: f64) -> Vec<f64> {
     #[expect(
         clippy::cast_possible_truncation,

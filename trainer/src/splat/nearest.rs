@@ -5,7 +5,7 @@ use rayon::prelude::*;
 /// Number of nearest points whose distances are averaged, as in Kerbl et al. 2023.
 const N_NEAREST: usize = 3;
 
-/// Mean distance of each point to its three nearest ones, meters; `None` for a single point. The
+/// Mean distance of each point to the three nearest points, meters. `None` for a single point. The
 /// points must be distinct.
 pub(crate) fn mean_spacings_m(points: &[[f32; 3]]) -> Vec<Option<f64>> {
     let tree = Tree::new(points);
@@ -16,8 +16,8 @@ pub(crate) fn mean_spacings_m(points: &[[f32; 3]]) -> Vec<Option<f64>> {
 }
 
 /// A balanced tree, represented by the order of the points. In each range of `order`, the middle
-/// point separates points with smaller coordinates along one axis from points with larger ones. The
-/// axes alternate.
+/// point separates points with smaller coordinates along one axis from points with larger
+/// coordinates. The axes alternate.
 struct Tree<'a> {
     points: &'a [[f32; 3]],
     /// Indices of the points.

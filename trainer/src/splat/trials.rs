@@ -524,7 +524,7 @@ impl SplatTrials {
         self.arrival_gains.is_some()
     }
 
-    /// Adds a keyframe that was compared with a picture before training on it; see
+    /// Adds a keyframe that was compared with a picture before training on it. See
     /// [`ArrivalGains::add`]. Returns the image gains if they are needed.
     pub(crate) fn add_arrival_gains(
         &mut self,

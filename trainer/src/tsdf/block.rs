@@ -26,11 +26,11 @@ pub type Blocks = BTreeMap<GridCoord, Block>;
 /// The voxels of one block in the format of the GPU, x fastest.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Block {
-    /// Low half: signed distance as a fraction of the field's scale, times 32767; high half: weight
-    /// in 256ths, 0 if not observed.
+    /// The low half is the signed distance as a fraction of the field's scale, times 32767. The
+    /// high half is the weight in 256ths, which is 0 if the voxel was not observed.
     pub geometry: Vec<u32>,
-    /// 16 bits each, low half first: red, green; blue, weight in 256ths. Colors are scaled by
-    /// 65535.
+    /// Two words with 16 bits per value, low half first. The first word has red and green. The
+    /// second word has blue and the weight in 256ths. Colors are scaled by 65535.
     pub colors: Vec<[u32; 2]>,
 }
 
@@ -43,13 +43,13 @@ impl Block {
         }
     }
 
-    /// Distance as a fraction of the field's scale; `None` if the voxel was not observed.
+    /// Distance as a fraction of the field's scale. `None` if the voxel was not observed.
     pub fn distance(&self, voxel_ix: usize) -> Option<f64> {
         let word = self.geometry[voxel_ix];
         (word >> 16 != 0).then(|| stored_distance(word))
     }
 
-    /// Color, sRGB 0 to 1; `None` if the voxel has none.
+    /// Color as sRGB from 0 to 1. `None` if the voxel has no color.
     pub fn color_srgb(&self, voxel_ix: usize) -> Option<[f64; 3]> {
         let [low, high] = self.colors[voxel_ix];
         (high >> 16 != 0)

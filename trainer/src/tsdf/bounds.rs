@@ -4,7 +4,7 @@ use super::block::{BLOCK_EDGE, GridCoord};
 use super::chosen_grid::VoxelGrid;
 use crate::Bounds;
 
-/// Bounds around the blocks of a field; `None` without blocks.
+/// Bounds around the blocks of a field. `None` without blocks.
 pub(super) fn bounds<'a>(
     blocks: impl Iterator<Item = &'a GridCoord>,
     voxel_grid: &VoxelGrid,

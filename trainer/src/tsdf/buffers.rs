@@ -1,4 +1,4 @@
-//! GPU memory of the field: a pool of blocks, and the hash table that locates them.
+//! GPU memory of the field, which has a pool of blocks and the hash table that locates them.
 
 use super::block::GridCoord;
 use super::capacity::{BYTES_PER_BLOCK, BYTES_PER_CHUNK, Capacity};

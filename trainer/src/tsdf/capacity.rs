@@ -3,10 +3,10 @@
 use super::block::N_VOXELS;
 use gpu::Gpu;
 
-/// Bytes per block on the GPU: distances, colors, coordinates, and the flags `changed` and
+/// Bytes per block on the GPU, for distances, colors, coordinates, and the flags `changed` and
 /// `visible`.
 pub(crate) const BYTES_PER_BLOCK: u64 = 512 * (4 + 8) + 16 + 4 + 4;
-/// Bytes per chunk: a key and the slots of its blocks.
+/// Bytes per chunk, for a key and the slots of its blocks.
 pub(crate) const BYTES_PER_CHUNK: u64 = 4 + 4 * 512;
 
 /// Sizes of the pool and the table.

@@ -43,7 +43,7 @@ var<private> cached_row: u32;
 var<private> cached_block: vec3i;
 var<private> cached_slot: u32;
 
-// The row of a chunk plus one; 0 if there is no such chunk.
+// The row of a chunk plus one. It is 0 if there is no such chunk.
 fn row_of(chunk: vec3i) -> u32 {
     if any(chunk != cached_chunk) {
         cached_chunk = chunk;
@@ -52,7 +52,7 @@ fn row_of(chunk: vec3i) -> u32 {
     return cached_row;
 }
 
-// The slot of a block plus one; 0 if there is no such block.
+// The slot of a block plus one. It is 0 if there is no such block.
 fn slot_of(block: vec3i) -> u32 {
     if any(block != cached_block) {
         cached_block = block;
@@ -61,14 +61,14 @@ fn slot_of(block: vec3i) -> u32 {
     return cached_slot;
 }
 
-// Index of a voxel in the pool plus one; 0 if its block does not exist.
+// Index of a voxel in the pool plus one. It is 0 if the block of the voxel does not exist.
 fn pool_ix_of(voxel: vec3i) -> u32 {
     let slot = slot_of(voxel >> vec3u(3u));
     if slot == 0u { return 0u; }
     return (slot - 1u) * BLOCK_VOXELS + voxel_in_block(voxel) + 1u;
 }
 
-// Distance in voxels, interpolated between eight voxel centers; UNKNOWN if any of these voxels was not observed.
+// Distance in voxels, interpolated between eight voxel centers. UNKNOWN if any of these voxels was not observed.
 fn distance_at(point: vec3f) -> f32 {
     let corner = floor(point - 0.5);
     let share = point - 0.5 - corner;
@@ -95,7 +95,7 @@ fn distance_at(point: vec3f) -> f32 {
     return sum * field.scale_m / field.voxel_m;
 }
 
-// Color interpolated between those of eight voxels that have a color; gray if none of them has.
+// Color interpolated between those of eight voxels that have a color. Gray if none of them has a color.
 fn color_at(point: vec3f) -> vec3f {
     let corner = floor(point - 0.5);
     let share = point - 0.5 - corner;
@@ -139,7 +139,8 @@ fn exit_depth_m(ray: Ray, corner: vec3i, size: i32) -> f32 {
     return within_box(vec2f(0.0, 1e30), ray.origin, ray.along, vec3f(corner), vec3f(corner + size)).y;
 }
 
-// Depth of the zero crossing between a point outside and one inside; UNKNOWN if space between them was not observed.
+// Depth of the zero crossing between a point outside and a point inside.
+// UNKNOWN if space between them was not observed.
 fn crossing(ray: Ray, outside_m: f32, inside_m: f32, outside_distance: f32, inside_distance: f32, speed: f32) -> f32 {
     var low = vec2f(outside_m, outside_distance);
     var high = vec2f(inside_m, inside_distance);
@@ -155,7 +156,7 @@ fn crossing(ray: Ray, outside_m: f32, inside_m: f32, outside_distance: f32, insi
     return at_m;
 }
 
-// Depth of the first surface that faces the camera and is not erased; UNKNOWN if there is none.
+// Depth of the first surface that faces the camera and is not erased. UNKNOWN if there is none.
 fn march(ray: Ray) -> f32 {
     let speed = length(ray.along);
     var at_m = ray.begin_m;

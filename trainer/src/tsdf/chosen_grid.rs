@@ -12,8 +12,8 @@ use serde::{Deserialize, Serialize};
 /// Range of automatically chosen voxel sizes, meters. It protects against a first image that is not
 /// typical of the scene, such as one that is almost covered by a near object.
 const VOXEL_RANGE_M: [f64; 2] = [0.001, 0.2];
-/// Minimum truncation in voxels. With fewer, interpolation lacks observed voxels on both sides of
-/// slanted surfaces. With more, the two sides of thicker objects share voxels.
+/// Minimum truncation in voxels. With fewer voxels, interpolation lacks observed voxels on both
+/// sides of slanted surfaces. With more voxels, the two sides of thicker objects share voxels.
 const TRUNCATION_VOXELS: f64 = 4.0;
 /// Maximum factor by which depth noise increases the truncation. A stored distance has 16 bits for
 /// the range up to the largest truncation, so a larger factor makes its resolution coarser.
@@ -138,7 +138,7 @@ fn valid_depths<'a>(
     depths.filter(|(_, z)| *z > 0.01 && *z <= options.max_depth_m)
 }
 
-/// Depth at an index; `None` outside the image or if the reading is invalid.
+/// Depth at an index. `None` outside the image or if the reading is invalid.
 fn valid_depth(options: &TsdfOptions, depth: &DepthMap, ix: usize) -> Option<f64> {
     depth
         .depth_m
@@ -147,7 +147,7 @@ fn valid_depth(options: &TsdfOptions, depth: &DepthMap, ix: usize) -> Option<f64
         .filter(|z| *z > 0.01 && *z <= options.max_depth_m)
 }
 
-/// Standard deviation of depth at 1 m, estimated from second differences along rows; see
+/// Standard deviation of depth at 1 m, estimated from second differences along rows. See
 /// [`VoxelGrid::choose`].
 fn noise_per_m2(options: &TsdfOptions, depth: &DepthMap) -> f64 {
     let width = depth.size_px[0] as usize;

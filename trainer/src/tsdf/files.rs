@@ -1,6 +1,6 @@
 //! Names of the files of a saved field.
 
-/// The blocks: a checkpoint with deflated arrays.
+/// The file of the blocks, which is a checkpoint with deflated arrays.
 pub(super) const BLOCKS_FILE: &str = "field.blocks";
 /// The mesh, z up.
 pub(super) const MESH_PLY: &str = "mesh.ply";

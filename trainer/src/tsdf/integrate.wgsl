@@ -30,7 +30,7 @@
 @group(0) @binding(8) var<storage, read_write> colors: array<vec2u>;
 @group(0) @binding(9) var<storage, read_write> changed: array<atomic<u32>>;
 
-// Minimum cosine between ray and normal for scaling distances: normals of steeper surfaces are mostly noise.
+// Minimum cosine between ray and normal for scaling distances. Normals of steeper surfaces are mostly noise.
 const MIN_RAY_DOT_NORMAL = 0.3;
 // Number of observations of a solid voxel that one observation through it cancels. The first constant applies if the
 // surface behind the voxel is one truncation away, the second if it is at least two away. A nearer surface may be

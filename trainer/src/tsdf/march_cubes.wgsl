@@ -57,7 +57,7 @@ fn tile_ix(voxel: vec3u) -> u32 {
     return dot(voxel + 1u, TILE_STEPS);
 }
 
-// Case of a cube: bit c is set if corner c is inside. 0 if any corner was not observed.
+// Case of a cube. Bit c is set if corner c is inside. The case is 0 if any corner was not observed.
 fn case_of(cube: vec3u) -> u32 {
     let first = tile_ix(cube);
     var inside = 0u;
@@ -80,7 +80,7 @@ fn cube_of(ix: u32) -> vec3u {
     return vec3u(ix & 7u, (ix >> 3u) & 7u, ix >> 6u);
 }
 
-// Marks the edges that have a vertex; returns the number of triangles.
+// Marks the edges that have a vertex. Returns the number of triangles.
 fn mark_edges(cube_ix: u32) -> u32 {
     let cube = cube_of(cube_ix);
     let row = CASE_WORDS * case_of(cube);

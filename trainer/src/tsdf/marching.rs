@@ -106,8 +106,8 @@ impl MeshBuffers {
     }
 
     fn grow(&mut self, gpu: &Gpu, needed: &[u32]) -> Result<(), Error> {
-        // The buffers get a quarter more than needed, because the mesh of a growing field grows,
-        // too.
+        // The buffers get a quarter more than needed, because the mesh of a growing field also
+        // grows.
         let [n_vertices, n_triangles] = [needed[0], needed[1]].map(|n| n.saturating_add(n / 4));
         self.mesh_capacity.n_vertices = self.mesh_capacity.n_vertices.max(n_vertices);
         self.mesh_capacity.n_triangles = self.mesh_capacity.n_triangles.max(n_triangles);

@@ -1,4 +1,5 @@
-//! GPU memory of meshing: the list of blocks to mesh, and the triangles of a batch of them.
+//! GPU memory of meshing, for the list of blocks to mesh and the triangles of a batch of these
+//! blocks.
 
 use super::mesh::CASES;
 use super::params::{BlockMeshRange, MeshBatch, MeshVertex};
@@ -8,7 +9,7 @@ use gpu::{Buffer, Gpu};
 /// Sizes of a batch of blocks.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct MeshCapacity {
-    /// Maximum number of blocks per dispatch; a field's list may be longer.
+    /// Maximum number of blocks per dispatch. The list of a field may be longer.
     pub(crate) n_blocks: u32,
     /// Initial capacity, which grows to fit a batch.
     pub(crate) n_vertices: u32,
@@ -42,7 +43,7 @@ pub(crate) struct MeshBuffers {
     pub(crate) triangles: Buffer,
 }
 
-/// Number of words in `needed`: vertices, triangles.
+/// Number of words in `needed`, for vertices and triangles.
 pub(super) const N_NEEDED: usize = 2;
 
 impl MeshBuffers {
@@ -86,8 +87,8 @@ impl MeshBuffers {
     }
 }
 
-/// The 256 cases in the format of the kernel: number of triangles; then three edges per triangle,
-/// five bits each.
+/// The 256 cases in the format of the kernel. A case has the number of triangles, then three edges
+/// per triangle with five bits each.
 fn case_words() -> Vec<u32> {
     CASES
         .iter()

@@ -1,4 +1,4 @@
-//! The distance field as a [`Method`]: one step fuses one keyframe.
+//! The distance field as a [`Method`]. One step fuses one keyframe.
 
 mod checkpoint;
 mod drawing;
@@ -46,13 +46,14 @@ use std::time::Instant;
 /// Minimum number of blocks that the budget must allow. The voxel size is chosen so that one image
 /// takes a tenth of the budget.
 const MIN_BLOCKS: u32 = 256;
-/// Minimum budget: the initial table and the minimum number of blocks.
+/// Minimum budget, which is enough for the initial table and the minimum number of blocks.
 pub(super) const MIN_BYTES: u64 =
     INITIAL_CAPACITY.n_chunks as u64 * BYTES_PER_CHUNK + MIN_BLOCKS as u64 * BYTES_PER_BLOCK;
 
 /// A colored distance field built from keyframes with depth.
 ///
-/// Each keyframe is fused once, in the order they are pushed. Keyframes without depth are ignored.
+/// Each keyframe is fused once, in the order in which the keyframes are pushed. Keyframes without
+/// depth are ignored.
 #[derive(Debug)]
 pub struct TsdfModel {
     gpu: Arc<Gpu>,
@@ -107,7 +108,7 @@ impl TsdfModel {
         &self.options
     }
 
-    /// Voxel size and related settings; `None` before the first depth image.
+    /// Voxel size and related settings. `None` before the first depth image.
     pub fn voxel_grid(&self) -> Option<&VoxelGrid> {
         self.store.as_ref().map(|store| &store.voxel_grid)
     }
@@ -137,7 +138,7 @@ impl TsdfModel {
         })
     }
 
-    /// The current surface in world. Meshes only blocks that changed since the last call.
+    /// The current surface in world. Only blocks that changed since the last call are meshed.
     pub fn mesh(&mut self) -> Result<Mesh, Error> {
         self.mesh_without(&Edits::default())
     }
@@ -161,8 +162,8 @@ impl TsdfModel {
     }
 
     /// GPU time of meshing the blocks that changed since the last [`Self::update_mesh`]. The blocks
-    /// stay marked as changed, and nothing is read back. Empty if the adapter has no timestamps, or
-    /// if blocks are in host memory.
+    /// stay marked as changed, and nothing is read back. The list is empty if the adapter has no
+    /// timestamps, or if blocks are in host memory.
     pub fn profile_mesh(&mut self) -> Result<Vec<PassTiming>, Error> {
         self.finish_in_flight()?;
         match self
@@ -178,7 +179,7 @@ impl TsdfModel {
     }
 
     /// Chooses the voxel size from the first depth image with valid readings and discards earlier
-    /// ones. Returns whether there was one.
+    /// images. Returns whether there was such an image.
     fn begin(&mut self) -> Result<bool, Error> {
         // The maximum size of a binding limits the field, just like a budget. The voxel size must
         // fit it.
@@ -290,8 +291,8 @@ impl TsdfModel {
 
     /// Counts fused keyframes. If the buffers overflowed, grows them and returns true.
     fn apply_counters(&mut self, counters: &[u32]) -> Result<bool, Error> {
-        // The GPU decides which keyframes were fused. After an overflow, later ones of the same
-        // submit are not, so they stay pending.
+        // The GPU decides which keyframes were fused. After an overflow, later keyframes of the
+        // same submit are not fused, so they stay pending.
         for _ in 0..self.fusion.apply_counters(counters) {
             self.queue.complete_first();
         }
@@ -306,8 +307,8 @@ impl TsdfModel {
         Ok(failed)
     }
 
-    /// Grows a field that overflowed, on the GPU or by moving blocks to host memory before the next
-    /// depth image; skips the image if that is not possible.
+    /// Grows a field that overflowed. It grows on the GPU, or blocks move to host memory before the
+    /// next depth image. Skips the image if neither is possible.
     fn grow(&mut self, counters: &[u32]) -> Result<(), Error> {
         let Some(store) = &mut self.store else {
             return Ok(());
@@ -315,8 +316,8 @@ impl TsdfModel {
         // Cached bindings would keep the buffers that were replaced.
         let n_excess = store.grow(&self.gpu, &self.pipelines, counters)?;
         self.passes.clear_bindings();
-        // Only blocks that the failed image does not observe may be evicted, otherwise it would
-        // need them again at once.
+        // Only blocks that the failed image does not observe may be evicted. Otherwise, the image
+        // would need them again at once.
         if n_excess > 0
             && let Some(keyframe) = self.queue.pending.front()
             && let Some(frustum) = ViewFrustum::of_depth(keyframe, &store.voxel_grid)
@@ -342,7 +343,7 @@ impl Method for TsdfModel {
     }
 
     /// Removes a keyframe that was not fused yet. The contribution of fused keyframes stays,
-    /// because it is not stored separately; it fades as later keyframes observe the same place.
+    /// because it is not stored separately. It fades as later keyframes observe the same place.
     fn remove(&mut self, camera: &str, stamp: Stamp) -> Result<(), Error> {
         self.finish_in_flight()?;
         self.queue.remove(camera, stamp);
@@ -387,8 +388,8 @@ impl Method for TsdfModel {
             .passes
             .submit_reading(&self.gpu, &[(&field.status, 4 * status::LEN)]);
 
-        // This waits for the previous submit while the new one runs. If the previous one
-        // overflowed, the new one had no effect, and its counters need not be read.
+        // This waits for the previous submit while the new one runs. If the previous submit
+        // overflowed, the new submit had no effect, and its counters need not be read.
         let failed = self.finish_in_flight()?;
         if !failed {
             self.fusion

@@ -8,7 +8,7 @@ use serde::{Deserialize, Serialize};
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct TsdfOptions {
-    /// Edge of a voxel, meters. With `None`, it is chosen from the first depth image; see
+    /// Edge of a voxel, meters. With `None`, it is chosen from the first depth image. See
     /// [`super::VoxelGrid::choose`].
     pub voxel_m: Option<f64>,
     /// Minimum truncation distance, meters. `None` selects four voxels.

@@ -10,8 +10,8 @@ use gpu::{Buffer, Gpu, Passes};
 use keyframe::Keyframe;
 
 /// Maximum number of workgroups that share the visible blocks. It is large enough to fill any GPU.
-/// Only the GPU knows how many blocks are visible, so each group processes several if there are
-/// more, and groups without a block end at once.
+/// Only the GPU knows how many blocks are visible, so each group processes several blocks if there
+/// are more blocks than groups. Groups without a block end at once.
 const MAX_INTEGRATE_GROUPS: u32 = 8192;
 
 /// Buffers for one keyframe, and the readings derived from its depth.

@@ -11,8 +11,8 @@ use crate::Error;
 use gpu::{Gpu, Passes};
 use std::collections::BTreeSet;
 
-/// Blocks gathered at once: 12.6 MB. Larger batches need more GPU memory in addition to the field.
-/// Smaller batches wait for the GPU more often.
+/// Number of blocks that are gathered at once. They take 12.6 MB. Larger batches need more GPU
+/// memory in addition to the field. Smaller batches wait for the GPU more often.
 const GATHER_BATCH: usize = 2048;
 
 impl FieldBuffers {
@@ -28,8 +28,8 @@ impl FieldBuffers {
         let n = self.n_blocks(gpu)?;
         let mut counters = self.counters(gpu)?;
         // Slots stay the same, so blocks are copied as a whole. The table is rebuilt, because
-        // positions in it depend on its size. If it is too small again, the next attempt doubles
-        // it.
+        // positions in it depend on its size. If the table is too small again, the next attempt
+        // doubles it.
         loop {
             let resized = Self::new(gpu, voxel_grid, capacity)?;
             for (from, to, bytes) in [
@@ -68,7 +68,7 @@ impl FieldBuffers {
         blocks: &Blocks,
         mut capacity: Capacity,
     ) -> Result<Self, Error> {
-        // Slots are assigned in order of the coordinates; `Meshing` relies on this.
+        // Slots are assigned in order of the coordinates. `Meshing` relies on this order.
         let n = u32::try_from(blocks.len()).unwrap_or(u32::MAX);
         capacity.n_blocks = capacity.n_blocks.max(n);
         loop {

@@ -128,8 +128,8 @@ impl Camera {
     }
 }
 
-/// Motion of the camera during a readout, from the velocity that `velocity` selects; zero for a
-/// global shutter.
+/// Motion of the camera during a readout, from the velocity that `velocity` selects. It is zero for
+/// a global shutter.
 fn during_readout(
     shutter: Option<&Shutter>,
     velocity: fn(&Shutter) -> nalgebra::Vector3<f64>,

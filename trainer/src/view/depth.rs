@@ -11,7 +11,7 @@ use numbers::f32_of;
 use numbers::quantile::{Rank, quantile};
 use std::sync::Arc;
 
-/// Median of the depth of a keyframe, meters; `None` without depth.
+/// Median of the depth of a keyframe, meters. `None` without depth.
 pub(crate) fn median_depth_m(keyframe: &Keyframe) -> Option<f64> {
     let depth = keyframe.depth.as_ref()?;
     // A prime stride samples all columns and rows, because it has no factor in common with the
@@ -30,8 +30,8 @@ pub(crate) fn median_depth_m(keyframe: &Keyframe) -> Option<f64> {
     )
 }
 
-/// Depth along the color camera's z axis for each of its pixels; empty if the keyframe has no
-/// depth.
+/// Depth along the color camera's z axis for each of its pixels. The array is empty if the keyframe
+/// has no depth.
 ///
 /// Depth from a camera with another lens, pose or time is reprojected point by point. The nearest
 /// point wins.

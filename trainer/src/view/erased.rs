@@ -8,8 +8,8 @@ use nalgebra::{Matrix4, Vector3};
 use numbers::{f32_of, f32s_of};
 use std::sync::Arc;
 
-/// Words of an edit in [`words`], in groups of four: three rows of a transform, and two groups that
-/// depend on the kind of edit.
+/// Number of groups of four words per edit in [`words`]. Three groups are rows of a transform, and
+/// two groups depend on the kind of edit.
 const GROUPS_PER_EDIT: usize = 5;
 
 /// The buffers of shared/erased.wgsl. Views without edits have a separate buffer, so that no buffer

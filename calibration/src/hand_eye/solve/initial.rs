@@ -25,7 +25,7 @@ pub(crate) struct Consensus {
     pub(crate) solution: Solution,
     /// Candidate of each sample.
     pub(crate) choice: Vec<usize>,
-    /// Distance of each sample from the solution; see [`Metric`].
+    /// Distance of each sample from the solution. See [`Metric`].
     distances_m: Vec<f64>,
 }
 

@@ -54,8 +54,8 @@ pub(super) struct Corner {
     pub(super) px: [f64; 2],
     /// Ray through the corner with the keyframe's lens, given by x and y at a depth of 1.
     pub(super) ray: Vector2<f64>,
-    /// When the corner's row was read out, as a share of the readout time: -0.5 for the first row,
-    /// 0.5 for the last.
+    /// Time at which the corner's row was read out, as a share of the readout time. It is -0.5 for
+    /// the first row and 0.5 for the last row.
     pub(super) row_share: f64,
     /// Position in texels of the level, where the center of the first texel is 0.
     texel: [f64; 2],

@@ -440,7 +440,7 @@ impl FeatureScene {
         })
     }
 
-    /// Largest difference of an image with two corrections; see [`MovingCamera::difference`].
+    /// Largest difference of an image with two corrections. See [`MovingCamera::difference`].
     fn largest_difference(&self, one: &Corrections, other: &Corrections) -> [f64; 2] {
         let both = self
             .moving_cameras(one)

@@ -12,20 +12,22 @@ use nalgebra::{Vector2, Vector3};
 pub(super) struct MovingCamera {
     /// Pose at mid-exposure.
     pub(super) world_from_camera: Transform,
-    /// Velocity in the camera's own axes, and time from the first to the last row; zero if unknown.
+    /// Velocity in the camera's own axes, and time from the first to the last row. Both are zero if
+    /// unknown.
     twist: Twist,
     readout_secs: f64,
     focal_px: [f64; 2],
     principal_px: [f64; 2],
-    /// Focal lengths of the keyframe; offsets of the principal point are relative to them.
+    /// Focal lengths of the keyframe. Offsets of the principal point are relative to these focal
+    /// lengths.
     keyframe_focal_px: [f64; 2],
 }
 
 /// Ray of a corner, and position of the camera at the readout of its row.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Sighting {
-    /// Direction of the corner in the axes that the camera has at mid-exposure: x and y at a depth
-    /// of 1.
+    /// Direction of the corner in the axes that the camera has at mid-exposure, given by x and y at
+    /// a depth of 1.
     pub(super) ray: Vector2<f64>,
     /// Position of the camera when it read out the corner's row, in its frame at mid-exposure,
     /// meters.
@@ -61,7 +63,7 @@ impl MovingCamera {
         }
     }
 
-    /// Motion of the camera per unit of each parameter; see [`CameraParamOffsets::motions`].
+    /// Motion of the camera per unit of each parameter. See [`CameraParamOffsets::motions`].
     ///
     /// [`CameraParamOffsets::motions`]: crate::registration::layout::CameraParamOffsets::motions
     pub(super) fn motions(
@@ -72,8 +74,8 @@ impl MovingCamera {
         layout.of_camera(camera).motions(Some(&self.twist))
     }
 
-    /// How much the rays of the image differ from those of the same image with other corrections:
-    /// an angle, radians, and the distance of the camera positions, meters.
+    /// Difference of the rays of the image from those of the same image with other corrections. It
+    /// consists of an angle, radians, and the distance of the camera positions, meters.
     pub(super) fn difference(&self, other: &Self) -> [f64; 2] {
         let motion = self.world_from_camera.inverse() * other.world_from_camera;
         let of_lens = |axis: usize| {
@@ -96,8 +98,8 @@ impl MovingCamera {
         let Some(lens) = layout.of_camera(camera).lens else {
             return [None; 4];
         };
-        // A longer focal length moves rays toward the axis; an offset of the principal point moves
-        // all rays against it.
+        // A longer focal length moves rays toward the axis. An offset of the principal point moves
+        // all rays in the opposite direction.
         let offset = |axis: usize| -self.keyframe_focal_px[axis] / self.focal_px[axis];
         [
             Some((lens, Vector2::new(-ray.x, 0.0))),

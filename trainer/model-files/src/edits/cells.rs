@@ -11,8 +11,8 @@ const MAX_CELLS: u32 = 1024;
 /// in f32.
 const MIN_RADIUS_M: f64 = 1e-6;
 
-/// A grid of cells that covers all space: cubes of equal size within a radius, and larger ones
-/// outside, as in a contracted neural field (Barron et al. 2022).
+/// A grid of cells that covers all space. Within a radius, the cells are cubes of equal size.
+/// Outside, they are larger, as in a contracted neural field (Barron et al. 2022).
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct CellGrid {
@@ -78,7 +78,7 @@ impl CellGrid {
     }
 }
 
-/// A coordinate moved by `step - 1`; `None` outside the grid of `n` cells. Steps are 0 to 2,
+/// A coordinate moved by `step - 1`. `None` outside the grid of `n` cells. Steps are 0 to 2,
 /// because coordinates are unsigned.
 fn moved_by(along: u32, step: u32, n: u32) -> Option<u32> {
     (along + step).checked_sub(1).filter(|along| *along < n)
@@ -89,7 +89,8 @@ fn moved_by(along: u32, step: u32, n: u32) -> Option<u32> {
 pub struct CellSet {
     /// The grid.
     pub(super) grid: CellGrid,
-    /// Disjoint ranges of indices in increasing order: the first index, and the one after the last.
+    /// Disjoint ranges of indices in increasing order. Each range has its first index and the index
+    /// after its last one.
     pub(super) ranges: Vec<[u32; 2]>,
 }
 
@@ -113,7 +114,8 @@ impl CellSet {
         &self.grid
     }
 
-    /// Disjoint ranges of indices in increasing order: the first index, and the one after the last.
+    /// Disjoint ranges of indices in increasing order. Each range has its first index and the index
+    /// after its last one.
     pub fn ranges(&self) -> &[[u32; 2]] {
         &self.ranges
     }

@@ -1,4 +1,4 @@
-//! Edits of a model: space that an operator has erased.
+//! Edits of a model, which are regions of space that an operator has erased.
 //!
 //! Edits do not change the model. Erased space is left out of pictures, chunks and exports, and
 //! undoing an edit shows it again.
@@ -131,7 +131,7 @@ impl Edits {
         Ok(())
     }
 
-    /// Makes the edit again that was undone last.
+    /// Applies the edit that was undone last again.
     ///
     /// # Errors
     ///
@@ -184,16 +184,16 @@ impl Edits {
         })
     }
 
-    /// Reads the edits in the folder of a saved model; none if the folder has no such file, or for
-    /// a single file.
+    /// Reads the edits in the folder of a saved model. Returns no edits if the folder has no such
+    /// file, or if the model is a single file.
     ///
     /// # Errors
     ///
     /// Fails if the file cannot be read or is damaged.
     pub fn read(model: &Path) -> Result<Self, Error> {
         let path = model.join(FILE);
-        // If the name exists but cannot be read, such as a broken link, that is an error, because
-        // erased parts would otherwise reappear.
+        // It is an error if the name exists but cannot be read, as with a broken link. Otherwise,
+        // erased parts would reappear.
         if let Err(error) = path.symlink_metadata()
             && matches!(error.kind(), ErrorKind::NotFound | ErrorKind::NotADirectory)
         {

@@ -1,4 +1,4 @@
-//! Mesh simplification: vertices in the same cell of a coarse grid are merged.
+//! Mesh simplification. Vertices in the same cell of a coarse grid are merged.
 
 use super::Mesh;
 use nalgebra::Vector3;

@@ -1,4 +1,4 @@
-//! Meshes as `.glb`: glTF 2.0 (Khronos 2021), one JSON and one binary chunk.
+//! Meshes as `.glb` files of glTF 2.0 (Khronos 2021), with one JSON chunk and one binary chunk.
 
 use super::Mesh;
 use crate::Error;

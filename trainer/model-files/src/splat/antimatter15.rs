@@ -53,7 +53,7 @@ fn floats(row: &[u8; SPLAT_BYTES], start: usize) -> [f32; 3] {
     [0, 4, 8].map(|at| f32::from_le_bytes(std::array::from_fn(|ix| row[start + at + ix])))
 }
 
-/// Logarithm of a standard deviation; NaN for invalid ones.
+/// Logarithm of a standard deviation. It is NaN for invalid standard deviations.
 fn log_scale(scale: f32) -> f32 {
     // This comparison is false for NaN and negative numbers. The caller leaves out splats with NaN.
     if scale >= 0.0 {

@@ -13,13 +13,14 @@ const MIN_ALPHA: f64 = 1.0 / 255.0;
 /// Maximum absolute coordinate of a mean in a file: beyond the size of the Earth, also in
 /// millimeters.
 const MAX_MEAN: f32 = 1e11;
-/// Logarithm of the maximum standard deviation in a file, 1000 km: larger splats cover every
+/// Logarithm of the maximum standard deviation in a file, 1000 km. Larger splats cover every
 /// picture.
 const MAX_LOG_SCALE: f32 = 13.8;
-/// Maximum absolute color coefficient in a file. The sum of 16 larger ones might not be finite.
+/// Maximum absolute color coefficient in a file. The sum of 16 larger coefficients might not be
+/// finite.
 const MAX_COLOR: f32 = 1e6;
 
-/// A cloud of splats in the world frame: raw optimized values, one entry per splat.
+/// A cloud of splats in the world frame, as raw optimized values with one entry per splat.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct SplatArrays {
     /// Centers, meters.
@@ -36,8 +37,8 @@ pub struct SplatArrays {
     /// Degree of the spherical harmonics, 0 to 3.
     pub sh_degree: u32,
     /// Whether opacities are corrected for the low-pass filter (Mip-Splatting, Yu et al. 2024,
-    /// equation 12). True only for files of other programs that were trained this way; false for
-    /// splats trained by fieldrig.
+    /// equation 12). It is true only for files of other programs that were trained this way. It is
+    /// false for splats that fieldrig has trained.
     pub is_antialiased: bool,
 }
 
@@ -122,7 +123,7 @@ impl SplatArrays {
         self.filtered(|ix| self.fault(ix).is_none()).checked()
     }
 
-    /// The reason why a splat from a file cannot be used; `None` if it can be used.
+    /// The reason why a splat from a file cannot be used. `None` if it can be used.
     fn fault(&self, ix: usize) -> Option<&'static str> {
         let n_coeffs = self.n_coefficients();
         let mean = &self.means[ix];

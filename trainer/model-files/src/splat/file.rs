@@ -12,7 +12,7 @@ pub const IN_FOLDER: &str = "splats.ply";
 
 /// Extensions of the formats that can be read.
 pub const EXTENSIONS: [&str; 3] = ["ply", "spz", "splat"];
-/// Extensions of other formats, which are recognized to name them in the error.
+/// Extensions of other formats. They are recognized only to name them in the error.
 pub const UNSUPPORTED: [&str; 2] = ["ksplat", "sog"];
 
 /// Format of a written file.
@@ -47,7 +47,7 @@ pub fn read(model: &Path) -> Result<SplatArrays, Error> {
     })
 }
 
-/// Reads splats from a file; its extension determines the format.
+/// Reads splats from a file. The extension of the file determines the format.
 fn read_file(path: &Path) -> Result<SplatArrays, Error> {
     let extension = path
         .extension()

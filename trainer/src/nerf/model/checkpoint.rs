@@ -88,7 +88,7 @@ impl FieldTrainer {
 
     /// Buffers needed to continue training, by name.
     fn training_buffers(&self) -> Vec<(String, &Buffer)> {
-        // Gradients are not stored: they are zero between steps.
+        // Gradients are not stored, because they are zero between steps.
         let mut all = self.render_buffers();
         all.extend(
             [
@@ -228,7 +228,7 @@ impl NerfModel {
             }));
         }
         let state = to_json(&state)?;
-        // The copies are queued now, before later steps; waiting for them is deferred.
+        // The copies are queued now, before later steps. Waiting for the copies is deferred.
         let reads = self
             .field
             .as_ref()
@@ -283,9 +283,9 @@ impl NerfModel {
         Ok((model, state))
     }
 
-    /// Resumes training exactly where the checkpoint was taken. `keyframes` must include all that
-    /// the model was trained on. Also returns the other keyframes, to be pushed or kept for
-    /// testing.
+    /// Resumes training exactly where the checkpoint was taken. `keyframes` must include all
+    /// keyframes that the model was trained on. Also returns the other keyframes, to be pushed or
+    /// kept for testing.
     pub fn resume(
         gpu: Arc<Gpu>,
         checkpoint: &Checkpoint,

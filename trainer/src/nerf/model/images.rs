@@ -1,6 +1,6 @@
-//! Image parameters optimized with the field: pose corrections and appearance embeddings (lighting
-//! and exposure). Trials decide which of them are kept. For images that were not trained on, the
-//! parameters are interpolated.
+//! Image parameters that are optimized with the field. They are pose corrections and appearance
+//! embeddings (lighting and exposure). Trials decide which of them are kept. For images that were
+//! not trained on, the parameters are interpolated.
 //!
 //! From a fixed step on, candidates are tried one after another, unless a quick check shows no
 //! gain. The field is trained for some steps with the candidate, restored, and trained for as many
@@ -26,14 +26,15 @@ use nalgebra::{Translation3, UnitQuaternion, Vector3};
 use std::collections::{BTreeMap, VecDeque};
 use std::sync::Arc;
 
-/// Fractions (1 / divisor) of the planned steps: start of optimizing image parameters (before it,
-/// the field is too coarse), start of trials, and length of each half of a trial. With longer
-/// halves, smaller gains are detected, but a rejected variant wastes all steps of its half.
+/// This constant and the next two are fractions (1 / divisor) of the planned steps. They are the
+/// start of optimizing image parameters, the start of trials, and the length of each half of a
+/// trial. Before the first start, the field is too coarse. With longer halves, smaller gains are
+/// detected, but a rejected variant wastes all steps of its half.
 const POSE_START_DIVISOR: u64 = 32;
 const TRIAL_START_DIVISOR: u64 = 8;
 const TRIAL_LENGTH_DIVISOR: u64 = 16;
-/// Batches of rays for a comparison: some hundred rays per image. More rays reduce the noise of
-/// each image's score, but decisions are also limited by the scatter between images.
+/// Batches of rays for a comparison. They have some hundred rays per image. More rays reduce the
+/// noise of each image's score, but decisions are also limited by the scatter between images.
 const VALIDATION_BATCHES: u64 = 8;
 /// Seed for choosing the rays of a comparison. It is fixed, so that variant and baseline are
 /// compared on the same rays.
@@ -58,12 +59,11 @@ pub(super) struct Trials {
     running: Option<RunningTrial>,
 }
 
-/// A trial in progress. Its first half trains the variant, its second half the baseline.
+/// A trial in progress. Its first half trains the variant, and its second half trains the baseline.
 #[derive(Debug)]
 struct RunningTrial {
     before: FieldSnapshot,
-    /// At the end of the first half: the field, and the mean squared error of each validation
-    /// image.
+    /// The field at the end of the first half, and the mean squared error of each validation image.
     variant: Option<(FieldSnapshot, Vec<f64>)>,
 }
 
@@ -102,7 +102,7 @@ impl Trials {
         self.remaining.is_empty()
     }
 
-    /// The field before the running trial; `None` if there is none.
+    /// The field before the running trial. `None` if no trial is running.
     pub(super) fn before(&self) -> Option<&FieldSnapshot> {
         self.running.as_ref().map(|trial| &trial.before)
     }
@@ -223,8 +223,8 @@ impl NerfModel {
         self.restore(&before)
     }
 
-    /// Ends all trials. Needed when the field is recreated or loses an image, because snapshots
-    /// then do not match it.
+    /// Ends all trials. This is needed if the field is recreated or loses an image, because
+    /// snapshots then do not match the field.
     pub(super) fn abort_trials(&mut self) -> Result<(), Error> {
         let Some(before) = self.trials.before() else {
             return Ok(());
@@ -238,7 +238,7 @@ impl NerfModel {
         Ok(())
     }
 
-    /// Ends all trials; validation images become training images.
+    /// Ends all trials. Validation images become training images.
     fn end_trials(&mut self) {
         self.trials.remaining.clear();
         self.trials.running = None;
@@ -308,8 +308,8 @@ impl NerfModel {
             .collect())
     }
 
-    /// Compares images with their renderings, using these appearance embeddings (neutral ones if
-    /// empty).
+    /// Compares images with their renderings, using these appearance embeddings. If the list is
+    /// empty, neutral embeddings are used.
     fn compare(
         &mut self,
         images: &[RayImage],
@@ -345,7 +345,8 @@ impl NerfModel {
         Ok(sums)
     }
 
-    /// Optimized correction of each camera; empty if none is optimized. No submit may be in flight.
+    /// Optimized correction of each camera. It is empty if no correction is optimized. No submit
+    /// may be in flight.
     pub(super) fn learned_corrections(&self) -> Result<BTreeMap<String, CameraCorrection>, Error> {
         let Some((extent, field_trainer)) = &self.field else {
             return Ok(BTreeMap::new());
@@ -425,8 +426,8 @@ pub(super) fn embedding_of(
     })
 }
 
-/// Appearance embedding of an image, interpolated between those of its camera; neutral if the
-/// camera has none.
+/// Appearance embedding of an image, interpolated between those of its camera. It is neutral if the
+/// camera has no embeddings.
 fn interpolated_embedding(
     corrections: &BTreeMap<String, CameraCorrection>,
     image: &RayImage,
@@ -475,7 +476,7 @@ fn drift_of(
     ]
 }
 
-/// Sums over the rays of an image; products are summed over rays and color channels.
+/// Sums over the rays of an image. Products are summed over rays and color channels.
 #[derive(Clone, Copy, Debug, Default)]
 struct Comparison {
     error: f64,
@@ -498,8 +499,8 @@ impl Comparison {
 
     /// Logarithm of the gain that minimizes the squared error of the picture.
     fn log_gain(&self) -> f64 {
-        // Least squares: the derivative of |gain * rendered - target|^2 is zero. A black picture
-        // has no gain.
+        // This is the least-squares solution, at which the derivative of |gain * rendered -
+        // target|^2 is zero. A black picture has no gain.
         let gain = self.sum_rendered_target / self.sum_rendered_sq;
         if gain > 0.0 && gain.is_finite() {
             gain.ln()

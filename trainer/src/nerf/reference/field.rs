@@ -6,16 +6,16 @@ use super::space::contract_backward;
 use model_files::contraction::contract;
 use model_files::spherical_harmonics;
 
-/// Geometry features: outputs of the first network, after the density, that are inputs of the
-/// second.
+/// Number of geometry features. They are the outputs of the first network after the density, and
+/// inputs of the second network.
 pub const N_GEOMETRY_FEATURES: usize = 15;
-/// Basis functions of the direction: spherical harmonics up to degree 3.
+/// Number of basis functions of the direction, which are spherical harmonics up to degree 3.
 pub const N_DIRECTION: usize = 16;
 /// Upper limit of the logarithm of the density, to keep densities finite. At exp(12) per radius, a
 /// ray is opaque after a fraction of a step.
 pub const MAX_LOG_DENSITY: f64 = 12.0;
 
-/// Added to the network's log density. It determines the density of an untrained field.
+/// Number added to the network's log density. It determines the density of an untrained field.
 pub const LOG_DENSITY_BIAS: f64 = 0.0;
 
 /// All parameters of a field.
@@ -67,8 +67,8 @@ pub struct Point {
 }
 
 impl Field {
-    /// Layer sizes of the two networks for a hidden width: one hidden layer in the first, two in
-    /// the second.
+    /// Layer sizes of the two networks for a hidden width. The first network has one hidden layer,
+    /// and the second has two.
     pub fn sizes(shape: &GridShape, width: usize, embedding_dim: usize) -> [Vec<usize>; 2] {
         [
             vec![shape.n_outputs(), width, 1 + N_GEOMETRY_FEATURES],
@@ -103,8 +103,8 @@ impl Field {
         }
     }
 
-    /// Backpropagates gradients of density and color. Adds the parameter gradients to `gradient`;
-    /// returns the gradients of the point and of the appearance embedding.
+    /// Backpropagates gradients of density and color. Adds the parameter gradients to `gradient`.
+    /// Returns the gradients of the point and of the appearance embedding.
     pub fn point_backward(
         &self,
         at: [f64; 3],

@@ -1,4 +1,4 @@
-//! The hash grid: levels of cubic cells whose corners hold two numbers each.
+//! The hash grid, which has levels of cubic cells whose corners hold two numbers each.
 
 /// Features per corner of a level.
 pub const N_FEATURES: usize = 2;
@@ -9,7 +9,7 @@ pub struct GridShape {
     /// Cells along an axis, from the coarsest level to the finest.
     pub n_cells: Vec<u32>,
     /// Maximum number of entries of a level, as log2. A level with fewer corners has one entry per
-    /// corner; in larger levels, corners share entries by a hash.
+    /// corner. In larger levels, corners share entries by a hash.
     pub log2_entries: u32,
 }
 
@@ -58,7 +58,7 @@ impl GridShape {
     pub fn entry(&self, level: usize, corner: [u32; 3]) -> u32 {
         let side = self.n_cells[level] + 1;
         let [x, y, z] = corner;
-        // The primes of Mueller et al. 2022, equation 4; the first one is 1.
+        // The primes of Mueller et al. 2022, equation 4. The first one is 1.
         let is_dense = u64::from(side).pow(3) <= 1u64 << self.log2_entries;
         let offset = if is_dense {
             x + side * (y + side * z)
@@ -121,8 +121,8 @@ fn corners(shape: &GridShape, level: usize, at: [f64; 3]) -> [Corner; 8] {
     })
 }
 
-/// Interpolates the features at a point of the unit cube: two per level, from the eight corners of
-/// its cell.
+/// Interpolates the features at a point of the unit cube. There are two per level, from the eight
+/// corners of the cell.
 pub fn interpolate(shape: &GridShape, table: &[[f64; N_FEATURES]], at: [f64; 3]) -> Vec<f64> {
     let mut features = Vec::with_capacity(shape.n_outputs());
     for level in 0..shape.n_cells.len() {
@@ -137,7 +137,7 @@ pub fn interpolate(shape: &GridShape, table: &[[f64; N_FEATURES]], at: [f64; 3])
     features
 }
 
-/// Backpropagates gradients of the features. Adds the entry gradients to `v_table`; returns the
+/// Backpropagates gradients of the features. Adds the entry gradients to `v_table`. Returns the
 /// gradient of the point.
 pub fn interpolate_backward(
     shape: &GridShape,

@@ -1,11 +1,11 @@
 //! Walks a ray through the occupied parts of the scene.
 //!
-//! Source: occupancy of Mueller et al. 2022, appendix C; steps outside the inner cube grow to match
-//! the contraction.
+//! The source of the occupancy is Mueller et al. 2022, appendix C. Steps outside the inner cube
+//! grow to match the contraction.
 
 use model_files::contraction::contract;
 
-/// Parameters for walking rays; lengths are in units of the scene radius.
+/// Parameters for walking rays. Lengths are in units of the scene radius.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct March {
     /// Length of a step inside the inner cube.
@@ -42,8 +42,8 @@ impl RaySegment {
     }
 }
 
-/// Components of a direction that are smaller than this are replaced by it, so that divisions by
-/// them stay finite.
+/// Components of a direction that are smaller than this value are replaced by it, so that divisions
+/// by the components stay finite.
 const MIN_DIRECTION: f64 = 1e-9;
 
 /// The part of a ray inside the inner cube, and its number of steps.
@@ -176,8 +176,8 @@ impl March {
         path
     }
 
-    /// The spans of the samples selected from the segments: at most `max_samples`. Each represents
-    /// the same number of segments.
+    /// The spans of at most `max_samples` samples that are selected from the segments. Each sample
+    /// represents the same number of segments.
     pub fn spans(&self, segments: &[RaySegment], jitter: f64) -> Vec<[f64; 2]> {
         let stride = segments.len().div_ceil(self.max_samples).max(1);
         #[expect(

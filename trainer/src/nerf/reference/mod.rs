@@ -1,4 +1,4 @@
-//! Plain CPU version of the field in f64: the twin of every kernel of `nerf`.
+//! Plain CPU version of the field in f64. It contains the twin of every kernel of `nerf`.
 //!
 //! A point is contracted to the unit cube (`model_files::contraction`, with its gradient in `space`)
 //! and looked up in a hash grid (`grid`). Two networks (`network`) map its features to density and

@@ -1,4 +1,4 @@
-//! A small fully connected network without biases. Hidden layers have a `ReLU`; the last layer has
+//! A small fully connected network without biases. Hidden layers have a `ReLU`. The last layer has
 //! none.
 
 /// Weights of a network.
@@ -42,7 +42,7 @@ impl Network {
         layers
     }
 
-    /// Backpropagates gradients of the output. Adds the weight gradients to `v_weights`; returns
+    /// Backpropagates gradients of the output. Adds the weight gradients to `v_weights`. Returns
     /// the gradient of the input.
     pub fn backward(
         &self,

@@ -1,4 +1,4 @@
-//! Correction of rays by the pose of their image: rotation about their origin, and translation.
+//! Correction of rays by the pose of their image. A ray is rotated about its origin and translated.
 
 use nalgebra::{UnitQuaternion, Vector3};
 

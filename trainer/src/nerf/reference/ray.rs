@@ -104,8 +104,8 @@ fn weight_gradient(sample: &Sample, upstream: &Upstream, ix: usize) -> f64 {
     color + upstream.distance * sample.middle() + upstream.weights[ix]
 }
 
-/// Distortion loss: spread of the weights along a ray. Also returns its gradient with respect to
-/// each weight. Zero if all weight is at one position.
+/// Distortion loss, which is the spread of the weights along a ray. Also returns its gradient with
+/// respect to each weight. The loss is zero if all weight is at one position.
 ///
 /// Distances are normalized to `1 - near / t`, so that spread at large distances has a smaller
 /// loss. Source: Barron et al. 2022, equation 15, summed in one pass as in Sun et al. 2022.
@@ -151,7 +151,7 @@ pub fn distortion(samples: &[Sample], weights: &[f64], near: f64) -> (f64, Vec<f
 pub struct Target {
     /// 0 to 1.
     pub rgb: [f64; 3],
-    /// Distance along the ray; 0 where unknown.
+    /// Distance along the ray. It is 0 where unknown.
     pub distance: f64,
 }
 

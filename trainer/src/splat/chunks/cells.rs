@@ -7,23 +7,23 @@ use std::ops::Range;
 /// Number of levels below the root. Ids of the smallest cells have 52 bits, so a page can hold them
 /// as JavaScript numbers.
 const N_LEVELS: u32 = 17;
-/// Edge of the root, meters; the smallest cells have edges of 8 mm. Splats outside belong to the
-/// nearest cell.
+/// Edge of the root, meters. The smallest cells have edges of 8 mm. Splats outside of the root
+/// belong to the nearest cell.
 const ROOT_M: f64 = 1024.0;
 /// Maximum number of splats in a cell. They take tens of kilobytes, so that a chunk does not delay
 /// pictures for long.
 const MAX_SPLATS: usize = 2048;
-/// A cell of the last version is divided only above this number. If it were equal to
-/// [`MAX_SPLATS`], a cell with about this many splats would be repeatedly divided and merged, and
-/// sent each time.
+/// A cell of the last version is divided only above this number of splats. If the number were equal
+/// to [`MAX_SPLATS`], a cell with about this many splats would be repeatedly divided and merged,
+/// and sent each time.
 const MAX_SPLATS_KEPT: usize = 2560;
 /// Cells of the last version are merged only if they have at most this many splats together.
 const MAX_SPLATS_MERGED: usize = 1024;
 /// Levels between a cell and its parts.
 const PART_LEVELS: u32 = 2;
 
-/// A cell: the location code of its first smallest cell, and its level. Cells are ordered along the
-/// curve of location codes (Morton 1966).
+/// A cell, given by its level and by the location code of the first smallest cell in it. Cells are
+/// ordered along the curve of location codes (Morton 1966).
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub(super) struct Cell {
     first: u64,
@@ -71,7 +71,7 @@ pub(super) fn location_codes(means: &[[f32; 3]], members: &[u32]) -> Vec<(u64, u
     codes
 }
 
-/// Position of a point along the curve: the bits of its coordinates, interleaved.
+/// Position of a point along the curve, which consists of the interleaved bits of its coordinates.
 #[expect(
     clippy::cast_possible_truncation,
     clippy::cast_sign_loss,
@@ -89,8 +89,8 @@ fn location_code(mean: [f32; 3]) -> u64 {
     })
 }
 
-/// Cells with some splats each, and the ranges of their splats in `sorted`. Prefers the cells of
-/// the last version.
+/// Cells that contain splats, and the ranges of their splats in `sorted`. The cells of the last
+/// version are preferred.
 pub(super) fn leaves<T>(
     sorted: &[(u64, u32)],
     last: &BTreeMap<Cell, T>,

@@ -1,4 +1,4 @@
-//! Encodes splats in 16 bytes each, and their view-dependent color in another 16.
+//! Encodes each splat in 16 bytes, and its view-dependent color in another 16 bytes.
 
 use crate::model_chunks::{ChunkData, ChunkLayout};
 use model_files::splat::arrays::SplatArrays;
@@ -125,8 +125,8 @@ impl Ranges {
         ]
     }
 
-    /// Coefficients of degree 1 and 2, six in each word: red, green and blue of one basis function,
-    /// then of the next.
+    /// Coefficients of degree 1 and 2, with six in each word. Red, green and blue of one basis
+    /// function come before those of the next one.
     fn sh_words(&self, splats: &SplatArrays, splat_ix: u32) -> [u32; 4] {
         let mut words = [0; 4];
         for function in 0..N_DEGREE_2 {
@@ -161,7 +161,8 @@ fn sh_range(splats: &SplatArrays, members: &[u32], functions: Range<usize>) -> f
     f32_of(largest.min(MAX_SH_DEVIATIONS * rms))
 }
 
-/// Red, green and blue of a basis function after the constant one; zero if the splats have none.
+/// Red, green and blue of a basis function after the constant one. They are zero if the splats have
+/// no such function.
 fn higher_coefficient(splats: &SplatArrays, splat_ix: u32, function: usize) -> [f64; 3] {
     let n_coefficients = splats.n_coefficients();
     let is_present = function + 1 < n_coefficients;
@@ -203,8 +204,9 @@ fn sh_count(share: f64) -> u32 {
             .clamp(-MAX_SH_COUNT, MAX_SH_COUNT)) as u32
 }
 
-/// A rotation in 32 bits: the index of the component with the largest magnitude in the upper two
-/// bits, then the other three, 10 bits each. The largest component is made positive.
+/// A rotation in 32 bits. The upper two bits are the index of the component with the largest
+/// magnitude. The other three components follow with 10 bits each. The largest component is made
+/// positive.
 ///
 /// Source of the idea: Fiedler 2015, "Snapshot compression".
 fn rotation_word(wxyz: [f32; 4]) -> u32 {

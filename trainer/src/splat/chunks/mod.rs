@@ -1,8 +1,8 @@
 //! Splats in spatial chunks, for viewers that draw them.
 //!
-//! A chunk is a cell of an octree. Splats have no stable identity in training, because growing
-//! reorders them, but cells have. Within a chunk, the most visible splats come first, and the first
-//! few of them, enlarged, approximate the chunk.
+//! A chunk is a cell of an octree. Splats have no stable identity in training, because growth
+//! reorders them. Cells have a stable identity. Within a chunk, the most visible splats come first,
+//! and the first few of them, enlarged, approximate the chunk.
 
 mod cells;
 mod codec;
@@ -17,20 +17,20 @@ use std::hash::{DefaultHasher, Hasher};
 
 pub(super) use self::codec::MAX_SH_DEGREE;
 
-/// The coarse form of a chunk has one of this many splats. More splats look better, but delay the
-/// first picture of the whole scene.
+/// The coarse form of a chunk has one splat for every `COARSE_STRIDE` splats of the chunk. More
+/// splats look better, but delay the first picture of the whole scene.
 const COARSE_STRIDE: usize = 8;
-/// The maximum factor by which coarse splats are enlarged. Beyond it, they would blur into blobs
-/// that hide other chunks.
+/// The maximum factor by which coarse splats are enlarged. With a larger factor, they would blur
+/// into blobs that hide other chunks.
 const MAX_SCALE_FACTOR: f64 = 2.0;
-/// Changes are measured in `N_PARTS` parts of a cell: 4 x 4 x 4.
+/// Changes are measured in `N_PARTS` parts of a cell, which are 4 x 4 x 4.
 const N_PARTS: usize = 64;
 /// A change that does not affect the sums of all parts counts as this fraction of the sums.
 /// Otherwise, a chunk whose splats only exchange positions would never be sent.
 const MIN_CHANGE_FRAC: f64 = 1e-3;
 
-/// Sums over the splats in each part of a cell: visible area, and the same times red, green and
-/// blue.
+/// Sums over the splats in each part of a cell. They are the visible area, and the visible area
+/// times red, green and blue.
 type Sums = [[f64; 4]; N_PARTS];
 
 /// Divides the splats of successive versions of a model into chunks.
@@ -48,7 +48,7 @@ struct Content {
 }
 
 impl Chunker {
-    /// The chunks of these splats, or those that differ from the last call.
+    /// The chunks of these splats, or only the chunks that differ from the last call.
     pub(super) fn chunks(&mut self, splats: &SplatArrays, only_changed: bool) -> ModelChunks {
         if !only_changed {
             self.last.clear();
@@ -64,7 +64,8 @@ impl Chunker {
                 (cell, content, chunk)
             })
             .collect();
-        // Cells that remain in `last` no longer exist: they were divided, merged or emptied.
+        // Cells that remain in `last` no longer exist, because they were divided, merged or
+        // emptied.
         let mut last = std::mem::take(&mut self.last);
         let mut chunks = Vec::new();
         for (cell, content, chunk) in made {
@@ -96,7 +97,8 @@ fn encoded(
     // The most visible splats come first, because the coarse form consists of the first ones.
     members.sort_by(|a, b| area(splats, *b).total_cmp(&area(splats, *a)));
     let fine = encode(splats, &members, 1.0, splats.sh_degree);
-    // A hash is stored instead of the bytes, which would double the memory of the model.
+    // A hash is stored instead of the bytes, because the bytes would double the memory of the
+    // model.
     let mut hasher = DefaultHasher::new();
     hasher.write(&fine.bytes);
     // The bytes are relative to the box and the ranges in the layout. They stay the same if all

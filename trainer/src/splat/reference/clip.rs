@@ -16,7 +16,7 @@ use nalgebra::{Matrix3x2, Vector2, Vector3};
 pub struct Clipping {
     /// Only the inside of this box is shown.
     pub crop: Option<Aabb>,
-    /// Boxes are cut out of splats; cells remove splats whose centers they contain.
+    /// Boxes are cut out of splats. Cells remove splats whose centers they contain.
     pub edits: Edits,
 }
 
@@ -36,8 +36,8 @@ impl Clipping {
         !is_erased && self.crop.is_none_or(|crop| crop.contains(point_m))
     }
 
-    /// Smallest distance of the point at `offset_px` from a side of a box, meters; infinite without
-    /// boxes.
+    /// Smallest distance of the point at `offset_px` from a side of a box, meters. It is infinite
+    /// without boxes.
     #[cfg(test)]
     pub(super) fn margin_m(&self, points: &RayPoints, offset_px: [f64; 2]) -> f64 {
         let point_m = points.at(offset_px);

@@ -1,12 +1,13 @@
 //! Plain CPU version of splatting in f64. Tests compare every kernel of `splat` with it.
 //!
 //! `project` projects each splat onto the image plane, and `rasterize` composites the splats pixel
-//! by pixel; each has a backward function. `clip` limits splats to boxes, or cuts boxes out of them,
-//! in pictures. Discrete decisions (visibility, depth order, contributors of each pixel) are made
-//! once, in [`decide`], and kept fixed while gradients are computed.
+//! by pixel. Each of the two has a backward function. `clip` limits splats to boxes, or cuts boxes
+//! out of them, in pictures. Discrete decisions (visibility, depth order, contributors of each
+//! pixel) are made once, in [`decide`], and kept fixed while gradients are computed.
 //!
 //! Source: Kerbl et al. 2023 (3D Gaussian splatting) and Ye et al. 2024 (gsplat, appendix on
-//! gradients). We add a rolling shutter and a depth output, which is composited like a color.
+//! gradients). The rolling shutter and the depth output are additions of fieldrig. Depth is
+//! composited like a color.
 
 #[cfg(test)]
 pub(crate) mod change;
@@ -55,7 +56,7 @@ pub struct View {
     pub camera_from_world: Transform,
     /// Focal length, pixels.
     pub focal_px: [f64; 2],
-    /// Principal point, pixels; the center of pixel `(0, 0)` is `(0.5, 0.5)`.
+    /// Principal point, pixels. The center of pixel `(0, 0)` is `(0.5, 0.5)`.
     pub principal_px: [f64; 2],
     /// Width and height, pixels.
     pub size_px: [u32; 2],
@@ -67,7 +68,7 @@ pub struct View {
     /// Rotation of the camera during the whole readout in its own axes, radians: angular velocity
     /// times readout time.
     pub angular_rad: [f64; 3],
-    /// Whether opacities are lowered where [`BLUR_PX2`](project::BLUR_PX2) enlarges splats; see
+    /// Whether opacities are lowered where [`BLUR_PX2`](project::BLUR_PX2) enlarges splats. See
     /// [`SplatArrays::is_antialiased`](model_files::splat::arrays::SplatArrays::is_antialiased).
     /// Gradients ignore this.
     pub is_antialiased: bool,
@@ -91,8 +92,8 @@ impl View {
 /// Gradient of a loss with respect to a view.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct ViewGrad {
-    /// With respect to a small motion `exp(pose) * camera_from_world`: translation in meters, then
-    /// rotation in radians.
+    /// Gradient with respect to a small motion `exp(pose) * camera_from_world`. The translation in
+    /// meters comes before the rotation in radians.
     pub pose: [f64; 6],
     /// With respect to [`View::linear_m`].
     pub linear_m: [f64; 3],
@@ -123,7 +124,8 @@ pub struct Projected {
 pub struct ProjectedGrad {
     /// With respect to the center.
     pub mean_px: [f64; 2],
-    /// With respect to the three numbers of the conic. `b` represents both off-diagonal entries.
+    /// Gradient with respect to the three numbers of the conic. `b` represents both off-diagonal
+    /// entries.
     pub conic: [f64; 3],
     /// With respect to the opacity.
     pub opacity: f64,
@@ -136,9 +138,9 @@ pub struct ProjectedGrad {
 /// Gradient of a loss with respect to all inputs of a render.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct RenderGrad {
-    /// With respect to the raw values of each splat; zero for invisible splats.
+    /// Gradient with respect to the raw values of each splat. It is zero for invisible splats.
     pub splats: Vec<SplatGrad>,
-    /// With respect to each projected splat; zero for invisible splats.
+    /// Gradient with respect to each projected splat. It is zero for invisible splats.
     pub projected: Vec<ProjectedGrad>,
     /// With respect to the view.
     pub view: ViewGrad,
@@ -187,7 +189,7 @@ pub fn render_backward(view: &View, splats: &[Splat], upstream: &Upstream) -> Re
 }
 
 fn project_decided(view: &View, splats: &[Splat], decisions: &Decisions) -> Vec<Projected> {
-    // Invisible splats keep their place, so that indices stay those of the splats.
+    // Invisible splats keep their position in the list, so that indices stay those of the splats.
     let project_one = |(splat, row_share): (&Splat, &Option<f64>)| {
         row_share
             .map(|row_share| project::project_at(view, splat, row_share))

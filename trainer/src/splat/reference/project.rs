@@ -10,15 +10,15 @@ use nalgebra::{Matrix2, Matrix2x3, Matrix3, Matrix3x2, Vector2, Vector3};
 
 /// Minimum alpha that is drawn.
 pub const MIN_ALPHA: f64 = 1.0 / 255.0;
-/// Added to both variances on the image plane, in square pixels, so that no splat falls between
-/// pixels.
+/// Number added to both variances on the image plane, in square pixels, so that no splat falls
+/// between pixels.
 pub const BLUR_PX2: f64 = 0.3;
 /// Margin around the image beyond which the Jacobian is clamped, as a fraction of half the image
 /// size. The value is that of gsplat. Far outside the image, the linear approximation of the
 /// projection would stretch splats across the whole image.
 const MARGIN_FRAC: f64 = 0.3;
 
-/// Projects a splat; `None` if it is nearer than `near_m` or too transparent to draw.
+/// Projects a splat. Returns `None` if it is nearer than `near_m` or too transparent to draw.
 ///
 /// Splats outside the image are also projected, but do not contribute to any pixel.
 pub fn project(view: &View, splat: &Splat) -> Option<Projected> {
@@ -27,8 +27,8 @@ pub fn project(view: &View, splat: &Splat) -> Option<Projected> {
     (projected.depth >= view.near_m && projected.opacity >= MIN_ALPHA).then_some(projected)
 }
 
-/// Time at which the splat's row is read, as a share of the readout: -0.5 for the first row, 0.5
-/// for the last.
+/// Time at which the splat's row is read, as a share of the readout. It is -0.5 for the first row
+/// and 0.5 for the last row.
 ///
 /// The row is determined with the camera's pose at the middle row, without motion. The share is 0
 /// for splats that are nearer than `near_m` in that pose.
@@ -55,9 +55,9 @@ pub fn project_at(view: &View, splat: &Splat, row_share: f64) -> Projected {
         1.0
     };
     let opacity = sigmoid(splat.opacity_logit) * compensation;
-    // Standard deviations until alpha is MIN_ALPHA: `opacity * exp(-reach^2 / 2) = MIN_ALPHA`.
-    // Along an axis of the image, the ellipse extends by this number times the square root of the
-    // variance.
+    // Number of standard deviations at which alpha is MIN_ALPHA, from `opacity * exp(-reach^2 / 2)
+    // = MIN_ALPHA`. Along an axis of the image, the ellipse extends by this number times the square
+    // root of the variance.
     let reach = (2.0 * (opacity / MIN_ALPHA).ln()).max(0.0).sqrt();
     Projected {
         mean_px: [fx * point.x / point.z + cx, fy * point.y / point.z + cy],
@@ -173,8 +173,8 @@ struct Parts {
 }
 
 impl Parts {
-    /// Opacity factor: area of the ellipse without the blur / area with it (Yu et al. 2024,
-    /// equation 12).
+    /// Opacity factor, which is the area of the ellipse without the blur divided by its area with
+    /// the blur (Yu et al. 2024, equation 12).
     fn compensation(&self) -> f64 {
         let without = self.cov_px2 - Matrix2::from_diagonal_element(BLUR_PX2);
         (without.determinant().max(0.0) / self.cov_px2.determinant()).sqrt()
@@ -190,7 +190,7 @@ impl Parts {
         let angular_rad = Vector3::from(view.angular_rad);
 
         // With a rolling shutter, the point moves relative to the camera while the rows are read.
-        // The computation is first order in the motion; see docs/design/splats.md, section
+        // The computation is of first order in the motion. See docs/design/splats.md, section
         // "Rendering an image".
         let still_point = camera_from_world * Vector3::from(splat.mean)
             + view.camera_from_world.translation.vector;
@@ -279,7 +279,8 @@ fn jacobian_backward(view: &View, parts: &Parts, v_jacobian: &Matrix2x3<f64>) ->
         let f_per_z2 = view.focal_px[axis] / (z * z);
         // The first part is through the factors 1 / z, with a fixed ratio.
         v_point.z += f_per_z2 * (ratio * v_last - v_diagonal);
-        // The second part is through the ratio. A clamped ratio does not depend on the point.
+        // The second part of the gradient is through the ratio. A clamped ratio does not depend on
+        // the point.
         if !clamped {
             v_point[axis] -= f_per_z2 * v_last;
             v_point.z += f_per_z2 * ratio * v_last;

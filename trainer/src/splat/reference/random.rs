@@ -13,7 +13,7 @@ pub(crate) fn hash3(key: [u32; 3]) -> [u32; 3] {
     v
 }
 
-/// One round of the permutation: each part depends on both others.
+/// One round of the permutation. Each part depends on both other parts.
 fn mix(v: &mut [u32; 3]) {
     v[0] = v[0].wrapping_add(v[1].wrapping_mul(v[2]));
     v[1] = v[1].wrapping_add(v[2].wrapping_mul(v[0]));

@@ -16,10 +16,10 @@ pub const MIN_TRANSMITTANCE: f64 = 1e-4;
 /// Results of all comparisons, stored so that forward and backward passes agree.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Decisions {
-    /// Share of the readout at which each splat is read out (see [`row_share`]); `None` for splats
+    /// Share of the readout at which each splat is read out (see [`row_share`]). `None` for splats
     /// that are not drawn.
     pub row_shares: Vec<Option<f64>>,
-    /// Indices of the splats that contribute to each pixel, front to back; pixels row by row.
+    /// Indices of the splats that contribute to each pixel, front to back. Pixels are row by row.
     pub contributors: Vec<Vec<usize>>,
 }
 

@@ -39,7 +39,7 @@ const WITHOUT_DEPTH: f64 = 1e-4;
 /// Parameters of single images, which stay enabled. Shared parameters are part of the alignment.
 const IMAGE_PARAMS: ParamSet = ParamSet::IMAGE_POSES.union(ParamSet::IMAGE_GAINS);
 
-/// Moves the splats with their keyframes; see [`Method::recalibrate`](crate::Method::recalibrate).
+/// Moves the splats with their keyframes. See [`Method::recalibrate`](crate::Method::recalibrate).
 /// No steps may be in flight, and no trial may be running.
 pub(super) fn move_with_keyframes(
     training: &mut Training,

@@ -7,14 +7,14 @@
 
 use std::sync::LazyLock;
 
-/// A cube's edge: the corner where it begins, as bits x, y, z, and its axis.
+/// An edge of a cube. It has the corner where it begins, as bits x, y, z, and its axis.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(in crate::tsdf) struct Edge {
     pub(in crate::tsdf) corner: usize,
     pub(in crate::tsdf) axis: usize,
 }
 
-/// Triangles of each case, as edges; bit c of a case's number is set if corner c is inside.
+/// Triangles of each case, as edges. Bit c of the number of a case is set if corner c is inside.
 pub(in crate::tsdf) static CASES: LazyLock<[Vec<[Edge; 3]>; 256]> =
     LazyLock::new(|| std::array::from_fn(triangles));
 
@@ -39,7 +39,7 @@ fn triangles(case: usize) -> Vec<[Edge; 3]> {
     let mut segments = segments(case);
     let mut triangles = Vec::new();
     // Every edge that the surface cuts belongs to two faces, so the segments form closed loops. A
-    // case may have several.
+    // case may have several loops.
     while let Some((first, mut end)) = segments.pop() {
         let mut corners = vec![first];
         while end != first {

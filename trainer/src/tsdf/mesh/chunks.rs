@@ -54,7 +54,7 @@ impl ChangedChunks {
         for block in changed.unwrap_or_else(|| mesher.blocks().keys().copied().collect()) {
             chunks.entry(chunk_of(block)).or_default().n_changed += 1;
         }
-        // A chunk is encoded as a whole, so its unchanged blocks are needed, too.
+        // A chunk is encoded as a whole, so its unchanged blocks are also needed.
         for (block, mesh) in mesher.blocks() {
             if let Some(chunk) = chunks.get_mut(&chunk_of(*block)) {
                 chunk.blocks.push((*block, Arc::clone(mesh)));
@@ -190,8 +190,8 @@ impl VertexWriter {
     }
 }
 
-/// Indices of the corners as differences to the previous index: 16 bits each if all indices fit,
-/// otherwise 32.
+/// Indices of the corners as differences to the previous index. Each has 16 bits if all indices
+/// fit, and otherwise 32 bits.
 #[expect(
     clippy::cast_possible_truncation,
     reason = "the low half, if the indices fit"

@@ -13,7 +13,7 @@ const CELL_VOXELS: f64 = 2.0;
 /// Number of these cells along an axis, half of which cover the larger part of the mesh.
 const N_CELLS_RANGE: [f64; 2] = [64.0, 1024.0];
 
-/// The small parts of a mesh; `None` if there are none.
+/// The small parts of a mesh. `None` if there are none.
 pub(in crate::tsdf) fn floaters(mesh: &Mesh, voxel_m: f64) -> Option<Floaters> {
     let part_sizes = part_sizes(mesh);
     let positions_m: Vec<[f64; 3]> = mesh

@@ -1,4 +1,4 @@
-//! An incrementally updated mesh: triangles per block, joined on request.
+//! An incrementally updated mesh. Triangles are stored per block and joined on request.
 
 use crate::tsdf::block::{BLOCK_EDGE, GridCoord};
 use crate::tsdf::chosen_grid::VoxelGrid;
@@ -79,7 +79,7 @@ pub(in crate::tsdf) struct Mesher {
     meshes: BlockMeshes,
     /// Edits with which viewers last received the mesh.
     edits: Arc<Edits>,
-    /// Blocks replaced since the last [`Self::take_changed`]; `None` before the first.
+    /// Blocks replaced since the last [`Self::take_changed`]. `None` before the first call.
     changed: Option<BTreeSet<GridCoord>>,
 }
 
@@ -106,7 +106,7 @@ impl Mesher {
         &self.meshes
     }
 
-    /// The blocks replaced since the last call; `None` in the first call, for all blocks.
+    /// The blocks replaced since the last call. `None` in the first call, for all blocks.
     pub(in crate::tsdf) fn take_changed(&mut self) -> Option<BTreeSet<GridCoord>> {
         self.changed.replace(BTreeSet::new())
     }

@@ -15,8 +15,8 @@ use crate::tsdf::params::status;
 use gpu::Gpu;
 use std::collections::BTreeSet;
 
-/// Initial capacity: 26 MB. Growing copies the field, so a much smaller capacity would slow down
-/// the first images. A larger capacity would exceed small budgets.
+/// Initial capacity, which takes 26 MB. Growing copies the field, so a much smaller capacity would
+/// slow down the first images. A larger capacity would exceed small budgets.
 pub(super) const INITIAL_CAPACITY: Capacity = Capacity {
     n_blocks: 4096,
     n_chunks: 512,
@@ -160,8 +160,8 @@ impl FieldStore {
         Ok(n_evicted >= n as usize)
     }
 
-    /// Loads visible blocks from host memory. If not all fit, loads the nearest ones if
-    /// `allows_partial`; otherwise loads none and returns false.
+    /// Loads visible blocks from host memory. If not all fit, loads the nearest blocks with
+    /// `allows_partial`. Without `allows_partial`, loads none and returns false.
     pub(super) fn load_visible(
         &mut self,
         gpu: &Gpu,
@@ -206,7 +206,7 @@ impl FieldStore {
         Ok(true)
     }
 
-    /// Evicts up to `n` blocks outside the frustum to host memory, farthest first; then adds
+    /// Evicts up to `n` blocks outside the frustum to host memory, farthest first. Then adds
     /// `added`. Returns the number of evicted blocks.
     fn swap_blocks(
         &mut self,
@@ -225,7 +225,7 @@ impl FieldStore {
             .filter(|(_, block)| !frustum.may_be_visible(*block))
             .collect();
         // Slots depend on scheduling on the GPU. Ties are broken by coordinates, so that the choice
-        // does not.
+        // of blocks does not depend on scheduling.
         invisible_slots.sort_by(|(_, a), (_, b)| {
             frustum
                 .distance_m(*b)

@@ -23,7 +23,7 @@ pub(super) struct ViewFrustum {
 }
 
 impl ViewFrustum {
-    /// The frustum of a keyframe's depth camera; `None` if its depth image changes no block.
+    /// The frustum of a keyframe's depth camera. `None` if its depth image changes no block.
     pub(super) fn of_depth(keyframe: &Keyframe, voxel_grid: &VoxelGrid) -> Option<Self> {
         let depth = keyframe.depth.as_ref()?;
         // This is the same condition as for recording the passes. Without a depth view, nothing is

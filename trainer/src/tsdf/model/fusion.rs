@@ -79,7 +79,7 @@ impl Fusion {
         Ok(())
     }
 
-    /// Applies the counters of the GPU; returns the number of keyframes fused since the last call.
+    /// Applies the counters of the GPU. Returns the number of keyframes fused since the last call.
     pub(super) fn apply_counters(&mut self, counters: &[u32]) -> u32 {
         let n_before = std::mem::replace(&mut self.n_fused_on_gpu, counters[status::N_FUSED]);
         self.n_outside = counters[status::N_OUTSIDE];

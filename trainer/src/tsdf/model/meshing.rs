@@ -1,4 +1,4 @@
-//! Incremental meshing: only blocks that changed are meshed again.
+//! Incremental meshing. Only blocks that changed are meshed again.
 
 use super::field_store::FieldStore;
 use crate::Error;
@@ -45,7 +45,7 @@ impl Meshing {
         ChangedChunks::take(&mut self.mesher, edits, only_changed)
     }
 
-    /// Meshes the blocks that changed since the last call; returns their number. No submit may be
+    /// Meshes the blocks that changed since the last call. Returns their number. No submit may be
     /// in flight.
     pub(super) fn update(
         &mut self,
@@ -98,8 +98,8 @@ impl Meshing {
         Ok(block_meshes)
     }
 
-    /// Meshes changed blocks if some blocks are in host memory: loads them and their neighbors, a
-    /// batch at a time, into a small temporary field.
+    /// Meshes changed blocks if some blocks are in host memory. Loads the changed blocks and their
+    /// neighbors, one batch at a time, into a small temporary field.
     fn mesh_in_batches(
         &mut self,
         gpu: &Gpu,
@@ -143,7 +143,7 @@ impl Meshing {
             };
             let batch_field =
                 FieldBuffers::with_blocks(gpu, pipelines, voxel_grid, &blocks, capacity)?;
-            // `with_blocks` assigns slots in order. Only the blocks of this part are meshed; their
+            // `with_blocks` assigns slots in order. Only the blocks of this part are meshed. Their
             // neighbors belong to other parts, or are unchanged.
             let batch_slots: BTreeMap<GridCoord, u32> = blocks.into_keys().zip(0..).collect();
             let part: Vec<u32> = part

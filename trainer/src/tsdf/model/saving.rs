@@ -1,4 +1,4 @@
-//! Saved fields in folders: the mesh for other programs, and the blocks for resuming.
+//! Saved fields in folders, with the mesh for other programs and the blocks for resuming.
 
 use super::TsdfModel;
 use super::checkpoint::{METHOD, invalid_state};

@@ -1,5 +1,5 @@
-//! Twin of `allocate_blocks.wgsl`. Uses a different method to find the blocks that a ray crosses:
-//! the sorted positions at which the ray passes block faces.
+//! Twin of `allocate_blocks.wgsl`. The twin finds the blocks that a ray crosses by a different
+//! method. It sorts the positions at which the ray passes block faces.
 
 use super::readings::{Reading, ray_of};
 use crate::tsdf::block::GridCoord;

@@ -1,4 +1,4 @@
-//! Twin of `cast_rays.wgsl`: finds the first crossing from outside to inside with small constant
+//! Twin of `cast_rays.wgsl`. Finds the first crossing from outside to inside with small constant
 //! steps.
 
 use crate::tsdf::block::{Blocks, block_of, voxel_ix};
@@ -89,7 +89,7 @@ fn around(point: &Vector3<f64>) -> impl Iterator<Item = ([i32; 3], f64)> {
     })
 }
 
-/// Distance as a fraction of the field's scale; `None` if one of the eight voxels was not observed.
+/// Distance as a fraction of the field's scale. `None` if one of the eight voxels was not observed.
 fn distance_at(blocks: &Blocks, point: &Vector3<f64>) -> Option<f64> {
     around(point).try_fold(0.0, |sum, (voxel, part)| {
         Some(sum + part * blocks.get(&block_of(voxel))?.distance(voxel_ix(voxel))?)
@@ -97,8 +97,8 @@ fn distance_at(blocks: &Blocks, point: &Vector3<f64>) -> Option<f64> {
 }
 
 fn color_at(blocks: &Blocks, point: &Vector3<f64>) -> [f64; 3] {
-    // Unlike distances, colors may be missing, because only voxels near the surface store one. The
-    // weights of the available colors are normalized.
+    // Unlike distances, colors may be missing, because only voxels near the surface store a color.
+    // The weights of the available colors are normalized.
     let mut sum = Vector3::zeros();
     let mut weight = 0.0;
     for (voxel, part) in around(point) {

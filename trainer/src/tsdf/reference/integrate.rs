@@ -13,7 +13,7 @@ use std::collections::BTreeMap;
 pub struct Voxel {
     /// Signed distance to the surface, meters.
     pub distance_m: f64,
-    /// Weight in 256ths, an integer; 0 if not observed.
+    /// Weight in 256ths, which is an integer. It is 0 if the voxel was not observed.
     pub weight: f64,
     /// sRGB, 0 to 1.
     pub color_srgb: [f64; 3],
@@ -28,9 +28,9 @@ pub type VoxelBlocks = BTreeMap<GridCoord, Vec<Voxel>>;
 /// mostly noise.
 const MIN_RAY_DOT_NORMAL: f64 = 0.3;
 /// Number of observations of a solid voxel that one observation through it cancels, if the surface
-/// behind it is one truncation away, and if it is at least two away. With larger numbers, surfaces
-/// that are only displaced by pose errors would be carved away; see "Carving" in
-/// `docs/benchmarks/2026-11-23-tsdf.md`.
+/// behind it is one truncation away. The next constant is the number for a surface that is at least
+/// two truncations away. With larger numbers, surfaces that are only displaced by pose errors would
+/// be carved away. See "Carving" in `docs/benchmarks/2026-11-23-tsdf.md`.
 const CARVING_NEAR: f64 = 1.0;
 const CARVING_FAR: f64 = 4.0;
 /// Colors are stored up to this distance from the surface, in voxels. Pictures and meshes do not
@@ -144,7 +144,7 @@ fn fuse_color(
         return;
     };
     let [red, green, blue, alpha] = color_near(keyframe, position_px);
-    // Near a masked pixel, the interpolated color would contain its color.
+    // Near a masked pixel, the interpolated color would contain the color of the masked pixel.
     if alpha <= 0.999 {
         return;
     }

@@ -11,7 +11,8 @@ const GRAY: f64 = 0.5;
 /// A vertex of a block's triangles.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Vertex {
-    /// The edge of the vertex: its first voxel, relative to the block's first voxel, and its axis.
+    /// The edge of the vertex. It has its first voxel, relative to the block's first voxel, and its
+    /// axis.
     pub between: (GridCoord, usize),
     /// Relative to the field's anchor, along the world's axes, meters.
     pub position_m: [f64; 3],
@@ -81,8 +82,8 @@ impl<'a> BlockNeighborhood<'a> {
         self.at(voxel).and_then(|(block, ix)| block.color_srgb(ix))
     }
 
-    /// Case of the cube that begins at `voxel`: bit c is set if corner c is inside; `None` if any
-    /// was not observed.
+    /// Case of the cube that begins at `voxel`. Bit c is set if corner c is inside. `None` if any
+    /// corner was not observed.
     fn case_of(&self, voxel: GridCoord) -> Option<usize> {
         (0..8).try_fold(0, |case, corner| {
             let is_inside = self.distance(moved(voxel, corner))? < 0.0;

@@ -7,7 +7,7 @@ use nalgebra::Vector3;
 /// A pixel's depth and surface orientation.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Reading {
-    /// Meters along z; 0 for invalid pixels.
+    /// Meters along z. It is 0 for invalid pixels.
     pub depth_m: f64,
     /// Dot product of the ray (z = 1) and the unit surface normal.
     pub ray_dot_normal: f64,
@@ -22,8 +22,8 @@ const WIDE_STEP: i64 = 3;
 const MAX_FLAT_NOISES: f64 = 6.0;
 /// Minimum valid depth, meters. Nearer readings are errors of the sensor.
 const MIN_DEPTH_M: f64 = 0.01;
-/// Maximum slope of a valid surface: change of depth over lateral distance. Steeper surfaces count
-/// as edges.
+/// Maximum slope of a valid surface, which is the change of depth over lateral distance. Steeper
+/// surfaces count as edges.
 const MAX_SLOPE: f64 = 6.0;
 
 /// The ray through a position in the image, scaled to z = 1.

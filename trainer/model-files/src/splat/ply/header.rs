@@ -23,7 +23,7 @@ struct Element<'a> {
     properties: Vec<Property>,
     /// The list properties, such as the corners of a face. They are skipped.
     lists: Vec<List>,
-    /// The rows, little-endian; an error if they are not in the file.
+    /// The little-endian rows, or an error if they are not in the file.
     rows: Result<Cow<'a, [u8]>, String>,
 }
 
@@ -33,7 +33,7 @@ struct Property {
     offset: usize,
 }
 
-/// A list property: a length, followed by as many numbers.
+/// A list property, which is a length followed by as many numbers.
 struct List {
     length: NumberType,
     number: NumberType,
@@ -87,7 +87,7 @@ impl NumberType {
         }
     }
 
-    /// The little-endian bytes of a number in text form; `None` if it is not a number of this type.
+    /// The little-endian bytes of a number in text form. `None` if it is not a number of this type.
     fn little_endian(self, word: &str) -> Option<Vec<u8>> {
         Some(match self {
             Self::I8 => word.parse::<i8>().ok()?.to_le_bytes().to_vec(),
@@ -101,7 +101,7 @@ impl NumberType {
         })
     }
 
-    /// Decodes little-endian bytes as the length of a list; `None` for negative numbers and floats.
+    /// Decodes little-endian bytes as the length of a list. `None` for negative numbers and floats.
     fn length(self, bytes: &[u8]) -> Option<usize> {
         match self {
             Self::U8 => Some(usize::from(*bytes.first()?)),
@@ -241,7 +241,8 @@ impl<'a> Header<'a> {
         Ok(())
     }
 
-    /// Finds the rows of each element up to the first incomplete one; later ones keep their error.
+    /// Finds the rows of each element up to the first incomplete element. Later elements keep their
+    /// error.
     fn locate_binary(&mut self, mut rest: &'a [u8], format: Format) {
         for element in &mut self.elements {
             // The product is checked for overflow, because the count comes from the file and may be
@@ -330,8 +331,8 @@ fn truncated(element: &Element<'_>) -> String {
     )
 }
 
-/// Skips the lists that follow the given number of other properties in a row of text; `None` if
-/// they are not complete.
+/// Skips the lists that follow the given number of other properties in a row of text. `None` if the
+/// lists are not complete.
 fn skip_lists<'a>(
     lists: &[List],
     n_before: usize,
@@ -346,10 +347,10 @@ fn skip_lists<'a>(
     Some(())
 }
 
-/// Size of the rows of an element with lists; `None` if they are not complete.
+/// Size of the rows of an element with lists. `None` if the rows are not complete.
 fn bytes_with_lists(element: &Element<'_>, bytes: &[u8], format: Format) -> Option<usize> {
-    // Lengths come from the file, so every sum is checked. A loop over a large count ends early:
-    // each row takes at least one byte of the file.
+    // Lengths come from the file, so every sum is checked. A loop over a large count ends early,
+    // because each row takes at least one byte of the file.
     let mut at = 0_usize;
     for _ in 0..element.count {
         let mut n_passed_bytes = 0;
@@ -456,7 +457,7 @@ impl Column<'_> {
         }
     }
 
-    /// The value as a color channel from 0 to 1: integers are divided by their maximum.
+    /// The value as a color channel from 0 to 1. Integers are divided by their maximum.
     pub(super) fn channel(&self, row: usize) -> f32 {
         let max = match self.property.number_type {
             NumberType::U8 => f32::from(u8::MAX),

@@ -1,5 +1,5 @@
-//! Splats in `.ply` files: reads and writes the layout of Kerbl et al. 2023, and reads the packed
-//! layout of `SuperSplat`. Reads point clouds, too.
+//! Splats in `.ply` files. This module reads and writes the layout of Kerbl et al. 2023, and reads
+//! the packed layout of `SuperSplat`. It also reads point clouds.
 
 mod header;
 mod packed;
@@ -16,8 +16,8 @@ use std::path::Path;
 /// Constant factor of the first spherical harmonic, `1 / (2 sqrt(pi))`.
 pub(super) const SH_0: f32 = 0.282_094_8;
 /// Thickness of a flat splat (2D Gaussian splatting), relative to its smaller radius, as a
-/// logarithm. It is one thousandth: thin enough to be invisible from the side, and thick enough for
-/// a covariance that is invertible in f32.
+/// logarithm. It corresponds to one thousandth. This is thin enough to be invisible from the side,
+/// and thick enough for a covariance that is invertible in f32.
 const LOG_FLATNESS: f32 = -7.0;
 /// Properties of splats that are not used: normals, which are zero in these files, and names of
 /// other programs for numbers that do not affect pictures.
@@ -26,8 +26,8 @@ const UNUSED: [&str; 5] = ["nx", "ny", "nz", "label", "id"];
 /// Reads a `.ply` file of splats. Properties may have any order and number type, and the file any
 /// format. The number of `f_rest_*` properties determines the SH degree.
 ///
-/// Splats with invalid numbers are left out, and properties that are not used are named, both with
-/// a warning.
+/// Warnings report splats with invalid numbers, which are left out, and properties that are not
+/// used.
 pub fn read(path: &Path) -> Result<SplatArrays, Error> {
     super::read_with(path, from_bytes)
 }
@@ -150,9 +150,9 @@ fn is_used(name: &str, color: &ColorColumns<'_>) -> bool {
             .any(|start| name.starts_with(start))
 }
 
-/// Applies the 3D filter of Mip-Splatting (Yu et al. 2024), as its renderer does: adds the filter's
-/// variance to the variance along each axis, and multiplies the opacity by the ratio of the old
-/// volume to the new.
+/// Applies the 3D filter of Mip-Splatting (Yu et al. 2024), as its renderer does. Adds the variance
+/// of the filter to the variance along each axis. Multiplies the opacity by the ratio of the old
+/// volume to the new volume.
 fn widen(splats: &mut SplatArrays, row: usize, filter_m: f32) {
     let variances = splats.log_scales[row].map(|log_scale| (2.0 * log_scale).exp());
     let widened = variances.map(|variance| variance + filter_m * filter_m);
@@ -171,7 +171,7 @@ fn widen(splats: &mut SplatArrays, row: usize, filter_m: f32) {
 /// The columns of the scales.
 enum Scales<'a> {
     Solid([Column<'a>; 3]),
-    /// Disks, of 2D Gaussian splatting (Huang et al. 2024). Their normal is the third axis.
+    /// Disks of 2D Gaussian splatting (Huang et al. 2024). Their normal is the third axis.
     Flat([Column<'a>; 2]),
 }
 

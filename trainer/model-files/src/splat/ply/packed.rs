@@ -1,5 +1,5 @@
-//! The packed `.ply` layout of `SuperSplat`. A splat takes 16 bytes; each chunk of 256 splats has
-//! common bounds. Higher color coefficients have 8 bits each.
+//! The packed `.ply` layout of `SuperSplat`. A splat takes 16 bytes. The splats of each chunk of
+//! 256 splats have common bounds. Higher color coefficients have 8 bits each.
 
 use super::header::{Column, Header, Table};
 use super::{SH_0, rest_columns};

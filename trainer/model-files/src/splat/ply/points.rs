@@ -6,13 +6,12 @@ use crate::{Error, InitialPoints};
 use files::Budget;
 use std::path::Path;
 
-/// Larger coordinates, in meters, are assumed to be mistakes. The positions of cameras have the
-/// same limit.
+/// Larger coordinates, in meters, count as mistakes. The positions of cameras have the same limit.
 const MAX_COORDINATE_M: f32 = 1e4;
 const COORDINATES: [&str; 3] = ["x", "y", "z"];
 const CHANNELS: [&str; 3] = ["red", "green", "blue"];
 
-/// Reads a `.ply` file of points, in any format of PLY. The vertices of a mesh are points, too.
+/// Reads a `.ply` file of points, in any format of PLY. The vertices of a mesh are also points.
 /// Also returns notes for the user about everything that is not used.
 ///
 /// Reads the properties `x`, `y`, `z`, `red`, `green` and `blue`, which may have any number type.
@@ -36,7 +35,7 @@ fn points_from_bytes(bytes: &[u8]) -> Result<(InitialPoints, Vec<String>), Strin
     let header = Header::parse(bytes)?;
     let vertices = header.table("vertex")?;
     let names: Vec<&str> = vertices.names().collect();
-    // Splats have positions, too, but a user who gives a model instead of points has mixed up the
+    // Splats also have positions, but a user who gives a model instead of points has mixed up the
     // files.
     if header.has_element("chunk") || names.iter().any(|name| is_of_splat(name)) {
         return Err("it is a splat model, expected a point cloud".to_owned());

@@ -4,8 +4,8 @@
 
 /// Type of the extension that names the axes (`SPZ_ADOBE_coordinate_system`).
 const COORDINATE_SYSTEM: u32 = 0xadbe_0003;
-/// For each higher basis function of the spherical harmonics, the axes in which it is odd: 0 for x,
-/// 1 for y, 2 for z.
+/// For each higher basis function of the spherical harmonics, the axes in which it is odd. The axes
+/// are 0 for x, 1 for y and 2 for z.
 const ODD_AXES: [&[usize]; 15] = [
     &[1],
     &[2],
@@ -27,7 +27,7 @@ const ODD_AXES: [&[usize]; 15] = [
 /// The axes of a file, as factors 1 or -1 of x, y and z that convert vectors between the file and a
 /// `.ply`.
 ///
-/// The axes of a `.ply`, which are also our axes, are right, down, front.
+/// The axes of a `.ply`, which are also fieldrig's axes, are right, down, front.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) struct Axes([f32; 3]);
 
@@ -58,7 +58,7 @@ impl Axes {
         }
     }
 
-    /// Converts a vector between the axes of the file and ours.
+    /// Converts a vector between the axes of the file and fieldrig's axes.
     pub(super) fn vector(self, [x, y, z]: [f32; 3]) -> [f32; 3] {
         let [x_sign, y_sign, z_sign] = self.0;
         [x_sign * x, y_sign * y, z_sign * z]

@@ -1,4 +1,4 @@
-//! Header and containers of `.spz` files. Versions 2 and 3 are a gzip stream, or not compressed; in
+//! Header and containers of `.spz` files. Versions 2 and 3 are a gzip stream or not compressed. In
 //! version 4, each attribute is a Zstandard stream.
 
 use files::Budget;
@@ -13,7 +13,7 @@ const GZIP: [u8; 2] = [0x1f, 0x8b];
 pub(super) const HEADER_BYTES: usize = 16;
 /// Size of the header of version 4.
 pub(super) const LONG_HEADER_BYTES: usize = 32;
-/// Size of a row of the table of streams: compressed and uncompressed size.
+/// Size of a row of the table of streams, which has the compressed and the uncompressed size.
 const ROW_BYTES: usize = 16;
 /// Oldest supported version. Version 1, with means as 16-bit floats, was never released.
 const MIN_VERSION: u32 = 2;
@@ -21,9 +21,9 @@ const MIN_VERSION: u32 = 2;
 const FIRST_ZSTD_VERSION: u32 = 4;
 /// Newest supported version.
 const MAX_VERSION: u32 = 4;
-/// Header flag: the splats were trained with the opacity correction of Mip-Splatting.
+/// Header flag of splats that were trained with the opacity correction of Mip-Splatting.
 pub(super) const IS_ANTIALIASED: u8 = 1;
-/// Header flag: the file has extensions.
+/// Header flag of files that have extensions.
 pub(super) const HAS_EXTENSIONS: u8 = 2;
 /// Maximum degree of the spherical harmonics in a file.
 const MAX_SH_DEGREE: u8 = 4;

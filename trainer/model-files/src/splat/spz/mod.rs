@@ -1,14 +1,14 @@
-//! Splats in `.spz` files (Niantic): reads versions 2 to 4, writes version 3, which more programs
-//! read than version 4.
+//! Splats in `.spz` files (Niantic). This module reads versions 2 to 4. It writes version 3, which
+//! more programs read than version 4.
 //!
 //! The file contains a header and the means, opacities, constant colors, scales, rotations and
 //! higher color coefficients of all splats, compressed (`container.rs`). Each value is quantized to
 //! a few bits (`quantize.rs`).
 //!
 //! The axes of `.spz` are right, up, back, unless an extension names other axes (`axes.rs`). Other
-//! programs interpret the axes of a `.ply`, which are also our axes, as right, down, front. Like
-//! those programs, we flip the signs of y and z. Viewers then show both kinds of files in the same
-//! way.
+//! programs interpret the axes of a `.ply`, which are also fieldrig's axes, as right, down, front.
+//! Like those programs, this module flips the signs of y and z. Viewers then show both kinds of
+//! files in the same way.
 //!
 //! Source: "SPZ file format", Niantic, versions 2 to 4, <https://github.com/nianticlabs/spz>.
 
@@ -38,7 +38,7 @@ pub fn read(path: &Path) -> Result<SplatArrays, Error> {
 
 /// Writes a `.spz` file of splats. A failed write leaves no partial file at `path`.
 ///
-/// Values outside the range of the format are clamped, except for means: coordinates beyond 8388 km
+/// Values outside the range of the format are clamped, except for means. Coordinates beyond 8388 km
 /// are an error.
 pub fn write(path: &Path, splats: &SplatArrays) -> Result<(), Error> {
     let uncompressed = uncompressed_bytes(&splats.clone().checked()?)?;
@@ -126,13 +126,13 @@ fn splats(header: &Header, axes: Axes, body: &[u8]) -> SplatArrays {
     }
 }
 
-/// Decodes a mean: three signed 24-bit numbers.
+/// Decodes a mean, which is three signed 24-bit numbers.
 fn mean(axes: Axes, fractional_bits: u8, bytes: &[u8; 9]) -> [f32; 3] {
     let [x, y, z] = [0, 3, 6].map(|at| [bytes[at], bytes[at + 1], bytes[at + 2]]);
     axes.vector([x, y, z].map(|fixed| quantize::mean_from_fixed(fixed, fractional_bits)))
 }
 
-/// Converts a decoded rotation to our axes and order.
+/// Converts a decoded rotation to fieldrig's axes and order.
 fn rotation_wxyz(axes: Axes, xyzw: [f32; 4]) -> [f32; 4] {
     let [x, y, z] = axes.rotation_xyz([xyzw[0], xyzw[1], xyzw[2]]);
     [xyzw[3], x, y, z]
@@ -153,7 +153,8 @@ fn uncompressed_bytes(splats: &SplatArrays) -> Result<Vec<u8>, Error> {
     let fractional_bits = fractional_bits(&splats.means)?;
     let axes = Axes::RIGHT_UP_BACK;
     let sh_signs = axes.sh_signs();
-    // The header: signature, version, number of splats, degree, fractional bits, flags, reserved.
+    // The fields of the header are: signature, version, number of splats, degree, fractional bits,
+    // flags, reserved.
     let mut bytes = MAGIC.to_vec();
     bytes.extend(
         [WRITTEN_VERSION, n_splats]

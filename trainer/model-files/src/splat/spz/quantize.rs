@@ -115,8 +115,8 @@ pub(super) fn rotation_from_smallest(bytes: [u8; 4]) -> [f32; 4] {
     xyzw.map(|part| part as f32)
 }
 
-/// Decodes a rotation of version 2: one byte each for x, y and z. w is positive and follows from
-/// the unit length.
+/// Decodes a rotation of version 2. It has one byte each for x, y and z. w is positive and follows
+/// from the unit length.
 pub(super) fn rotation_from_three(bytes: [u8; 3]) -> [f32; 4] {
     let [x, y, z] = bytes.map(|byte| f64::from(byte) / 127.5 - 1.0);
     [x, y, z, (1.0 - x * x - y * y - z * z).max(0.0).sqrt()].map(|part| part as f32)
