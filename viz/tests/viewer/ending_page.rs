@@ -376,7 +376,9 @@ fn check_frozen_server(browser: &mut Browser, proxy: &Proxy) {
     });
     wait_for(browser, "attempts to reconnect", |browser| {
         let banner = browser.text("banner");
-        banner.to_lowercase().contains("connection lost, reconnecting")
+        banner
+            .to_lowercase()
+            .contains("connection lost, reconnecting")
     });
     assert!(
         !browser.text("connection").contains("has stopped"),

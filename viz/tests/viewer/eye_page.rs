@@ -392,7 +392,12 @@ fn the_eye_stays_in_front_of_walls() {
         eyes.len()
     );
     assert!(traveled > 5.0, "the eye moved only {traveled} m");
-    assert!(closest > NEAR_M, "an eye was {closest} m from a wall");
+    /// Depths in pictures have half precision: about a millimeter at 2 m.
+    const DEPTH_STEP_M: f64 = 0.001;
+    assert!(
+        closest > NEAR_M - DEPTH_STEP_M,
+        "an eye was {closest} m from a wall"
+    );
     page.close();
 }
 

@@ -437,6 +437,9 @@ fn check_follow(browser: &mut Browser, run: &Run) {
     let eye = |request: &RenderRequest| request.world_from_camera.translation.vector;
     let before = eye(&full_request(browser, run, "a full picture", |_| true));
     browser.click("toggle-follow");
+    // The view keeps its pose relative to the frame as it is in the next frame.
+    browser.next_frame();
+    browser.next_frame();
     run.rotate_to(0.2);
     std::thread::sleep(Duration::from_millis(300));
     let resting = eye(&full_request(browser, run, "a full picture", |_| true));

@@ -77,7 +77,8 @@ export function keyOf({ key, code }: Pick<Press, "key" | "code">): string {
 
 /**
  * Whether the focused element needs this key. Fields need the keys of text. Sliders and lists need
- * only the keys that change their value. No element needs Escape, which always closes something. /
+ * only the keys that change their value. No element needs Escape, which always closes something.
+ */
 export function keepsKey({ tag, type, isEditable }: Focus, key: string): boolean {
   if (key === "escape") return false;
   const isText = isEditable || tag === "textarea" || (tag === "input" && !NOT_TEXT.includes(type));

@@ -57,7 +57,8 @@ export class ChunkArrival {
   /**
    * Whether all chunks have arrived that the server counts as sent. A message for an earlier
    * subscription may arrive after the page has discarded its chunks. Such a message counts chunks
-   * that the page does not have. /
+   * that the page does not have.
+   */
   private get hasAllSent(): boolean {
     return this.nChunks > 0 && this.received.size >= this.nChunks - this.nMissing;
   }

@@ -97,7 +97,8 @@ export class LocalCopy {
 
   /**
    * Prepares to draw a copy that is not shown yet, if enough has arrived. Returns whether the copy
-   * can be shown. Splats can be drawn only after a worker has sorted them. /
+   * can be shown. Splats can be drawn only after a worker has sorted them.
+   */
   prepare(isReady: boolean, view: View, sizePx: [number, number]): boolean {
     if (!isReady) {
       this.readyVersion = null;

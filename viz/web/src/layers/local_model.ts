@@ -78,7 +78,8 @@ export class LocalModel {
 
   /**
    * Begins a new copy, because a new subscription or connection begins with all chunks. The drawn
-   * copy stays until the new copy can replace it. /
+   * copy stays until the new copy can replace it.
+   */
   renew(): void {
     this.next?.dispose();
     this.next = this.requested === null ? null : new LocalCopy(this.requested, this.observations, this.changed);

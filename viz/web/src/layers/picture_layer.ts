@@ -185,7 +185,8 @@ export class PictureLayer {
 
   /**
    * Shows a picture, unless a newer picture arrives before it is decoded. Returns whether the
-   * picture was shown. A picture may consist of depth only. /
+   * picture was shown. A picture may consist of depth only.
+   */
   show(header: PictureHeader, payload: Uint8Array<ArrayBuffer>, emptyDepth: number): Promise<boolean> {
     return new Promise((resolve, reject) => {
       this.waiting?.resolve(false);

@@ -62,7 +62,8 @@ const MIN_DETAIL = 0.004;
 const N_BLOCKS = 8;
 /**
  * A region is mentioned if its error is at least the first value, and at least the second value
- * times the median error of the blocks. /
+ * times the median error of the blocks.
+ */
 const MIN_REGION_ERROR = 0.1;
 const MIN_REGION_RATIO = 3;
 /** Shifts are estimated on images of at most this width, so that shifts of some pixels are below one pixel. */

@@ -29,7 +29,8 @@ export function orderedKeyframes(
 /**
  * The keyframe `step` places after the shown keyframe. Beyond the ends, this is the first or the
  * last keyframe. A shown keyframe that has been removed meanwhile counts as between its neighbors
- * in time. /
+ * in time.
+ */
 export function neighborKeyframe(
   ordered: readonly NumberedKeyframe[],
   shown: NumberedKeyframe,
@@ -45,7 +46,8 @@ export function neighborKeyframe(
 
 /**
  * The keyframe closest to a view. A distance of `radiusM` counts as much as an angle of 1 rad
- * between the viewing directions. Poses are 16 numbers, row major. /
+ * between the viewing directions. Poses are 16 numbers, row major.
+ */
 export function nearestKeyframe(
   keyframes: readonly NumberedKeyframe[],
   worldFromCamera: readonly number[],

@@ -18,7 +18,8 @@ export type DrawnHeader = Pick<PictureHeader, "id" | "method" | "step" | "scale"
 /**
  * `current`: the picture shows the wanted view and model. `waiting`: the view has changed since, or
  * there is no picture. `old`: a complete picture of the wanted view has been missing for more than
- * a second, or the picture shows another model. /
+ * a second, or the picture shows another model.
+ */
 export type PictureState = "current" | "waiting" | "old";
 
 export interface PictureStatus {

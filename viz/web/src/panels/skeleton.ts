@@ -56,7 +56,8 @@ export class Skeleton {
 
   /**
    * To be called after a reconnection, and after the browser has discarded the drawing. The shown
-   * picture is then out of date until the next one arrives. /
+   * picture is then out of date until the next one arrives.
+   */
   awaitPicture(): void {
     this.isAwaiting = this.shown.hasPicture;
     this.show();

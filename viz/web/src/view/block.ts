@@ -4,7 +4,8 @@ import type { Vector3 } from "three";
 
 /**
  * What stopped the eye, or what hides the robot. The eye can be stopped by a surface, by space that
- * is not known yet, or by the shortest or longest distance to the target. /
+ * is not known yet, or by the shortest or longest distance to the target.
+ */
 export type Block =
   | { by: "surface" | "unknown space"; direction: Direction }
   | { by: "near end" | "far end" | "model before robot" };

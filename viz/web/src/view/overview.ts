@@ -71,7 +71,8 @@ export function frontDirection(robotHeadingRad: number | null): Vector3 {
 /**
  * The closest viewpoint from which all points are in the picture. The direction is given for a
  * world that is z up. If another direction points up, the given direction is rotated accordingly.
- * The target is in the middle of the points. /
+ * The target is in the middle of the points.
+ */
 export function viewOf(points: Vector3[], direction: Vector3, { fovDegrees, aspect, up: upInWorld }: Lens): Viewpoint {
   const forward = direction.clone().normalize().applyQuaternion(uprightRotation(upInWorld));
   const right = forward.clone().cross(upInWorld).normalize();
