@@ -224,14 +224,15 @@ fn client(address: SocketAddr, received: Received) -> JoinHandle<()> {
 /// Waits until the client has received how many test images are scored.
 fn waits_for_scoring((received, changed): &(Mutex<BTreeSet<String>>, Condvar)) -> bool {
     let guard = received.lock().expect("no panic");
-    let is_missing = |received: &mut BTreeSet<String>| !received.iter().any(is_scoring);
+    let is_missing =
+        |received: &mut BTreeSet<String>| !received.iter().any(|state| is_scoring(state));
     let (_guard, waited) = changed
         .wait_timeout_while(guard, TIMEOUT, is_missing)
         .expect("no panic");
     !waited.timed_out()
 }
 
-fn is_scoring(state: &String) -> bool {
+fn is_scoring(state: &str) -> bool {
     state.starts_with("scoring, ") && state.contains(" of 4 ")
 }
 

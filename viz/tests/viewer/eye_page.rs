@@ -391,6 +391,10 @@ fn the_eye_stays_in_front_of_walls() {
         "{} pictures on a way of {traveled:.1} m, at least {closest:.3} m from the walls",
         eyes.len()
     );
+    let cut = page
+        .browser
+        .evaluate("document.getElementById('toggle-cut').getAttribute('aria-pressed')");
+    assert_eq!(cut, "false", "the walls are not cut away");
     assert!(traveled > 5.0, "the eye moved only {traveled} m");
     /// Depths in pictures have half precision: about a millimeter at 2 m.
     const DEPTH_STEP_M: f64 = 0.001;

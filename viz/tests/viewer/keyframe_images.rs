@@ -208,7 +208,7 @@ fn keyframes_that_are_not_in_memory_are_read_or_reported() {
 fn a_client_gets_one_photograph_at_a_time() {
     let (hub, server) = start();
     hub.set_keyframes(vec![listed(&photographed(7))]);
-    let (release, released) = std::sync::mpsc::channel::<()>();
+    let (release, released) = std::sync::mpsc::sync_channel::<()>(1);
     let released = std::sync::Mutex::new(released);
     hub.set_keyframe_reader(Arc::new(move |_: &str, _: Stamp| {
         // Returns when the test allows it, or has failed.
