@@ -127,10 +127,11 @@ fn shown_db(browser: &mut Browser) -> Vec<f64> {
     serde_json::from_value(browser.evaluate(expression)).expect("numbers")
 }
 
-/// Mean difference of the middle of two shots of the view, which nothing covers.
+/// Mean difference of a part of two shots of the view that shows the model, and that nothing covers.
 fn difference(a: &image::RgbImage, b: &image::RgbImage) -> f64 {
     assert_eq!(a.dimensions(), b.dimensions());
-    let [columns, rows] = [a.width(), a.height()].map(|n| 2 * n / 5..3 * n / 5);
+    let columns = 2 * a.width() / 5..3 * a.width() / 5;
+    let rows = 3 * a.height() / 5..4 * a.height() / 5; // Above are the background and buttons.
     let (mut sum, mut n) = (0.0, 0.0);
     for (x, y) in rows.flat_map(|y| columns.clone().map(move |x| (x, y))) {
         for (a, b) in a.get_pixel(x, y).0.iter().zip(b.get_pixel(x, y).0) {
@@ -652,7 +653,8 @@ fn check_incomplete_map(browser: &mut Browser, hub: &Hub) {
         });
         // Drawn with the next frame.
         wait_for(browser, "the tint", |browser| {
-            let difference = difference(&without, &canvas_shot(browser));
+            let shot = canvas_shot(browser);
+            let difference = difference(&without, &shot);
             difference > MAX_SAME && tints.last().is_none_or(|last| difference > 1.5 * last)
         });
         tints.push(difference(&without, &canvas_shot(browser)));

@@ -17,7 +17,7 @@ use test_support::browser::{Browser, NO_DRAWING, browser_for_page, wait_for};
 use trainer::{Picture, Projection, RenderRequest};
 use viz::{Hub, ModelStatus, SceneHint, Server, ServerConfig, Status};
 
-const WINDOW_PX: [u32; 2] = [900, 440];
+const WINDOW_PX: [u32; 2] = [900, 502];
 /// Inner sides of the walls, and a pillar in the room: corners, meters.
 pub(crate) const ROOM: [[f64; 3]; 2] = [[-2.0, -1.5, 0.0], [2.0, 1.5, 2.4]];
 const PILLAR: [[f64; 3]; 2] = [[0.4, -0.3, 0.0], [0.8, 0.3, 2.4]];
@@ -262,6 +262,19 @@ impl Page {
         self.browser.next_frame();
     }
 
+    /// Orbits, zooms and pans.
+    fn move_at_random(&mut self, seed: u64) {
+        let mut random = Random(seed);
+        for round in 0..24 {
+            match round % 4 {
+                0 => self.pivot([290 + random.within(250), 220 + random.within(100)]),
+                1 => (0..4).for_each(|_| self.wheel(if round % 3 == 0 { 300 } else { -300 })),
+                2 => self.drag("left", [random.within(300), random.within(120)]),
+                _ => self.drag("right", [random.within(200), random.within(150)]),
+            }
+        }
+    }
+
     fn key(&mut self, kind: &str, code: &str) {
         let key = code.trim_start_matches("Key").to_lowercase();
         let key = if code.starts_with("Key") {
@@ -368,19 +381,14 @@ fn the_eye_stays_in_front_of_walls() {
         "the eye can move away"
     );
 
-    page.browser.click("reset-view");
-    page.rest();
     let n_before = page.renderer.n_requests();
-    let mut random = Random(7);
-    for round in 0..36 {
-        match round % 4 {
-            0 => page.pivot([290 + random.within(250), 220 + random.within(100)]),
-            1 => (0..4).for_each(|_| page.wheel(if round % 3 == 0 { 300 } else { -300 })),
-            2 => page.drag("left", [random.within(300), random.within(120)]),
-            _ => page.drag("right", [random.within(200), random.within(150)]),
-        }
+    // A motion can end in a corner, in which later ones hardly move the eye.
+    for seed in [7, 8, 9] {
+        page.browser.click("reset-view");
+        page.rest();
+        page.move_at_random(seed);
+        page.rest();
     }
-    page.rest();
     let eyes = page.renderer.eyes_since(n_before);
     let traveled: f64 = eyes.windows(2).map(|pair| (pair[1] - pair[0]).norm()).sum();
     let closest = eyes
