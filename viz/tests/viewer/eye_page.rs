@@ -17,7 +17,7 @@ use test_support::browser::{Browser, NO_DRAWING, browser_for_page, wait_for};
 use trainer::{Picture, Projection, RenderRequest};
 use viz::{Hub, ModelStatus, SceneHint, Server, ServerConfig, Status};
 
-const WINDOW_PX: [u32; 2] = [900, 502];
+const WINDOW_PX: [u32; 2] = [900, 440];
 /// Inner sides of the walls, and a pillar in the room: corners, meters.
 pub(crate) const ROOM: [[f64; 3]; 2] = [[-2.0, -1.5, 0.0], [2.0, 1.5, 2.4]];
 const PILLAR: [[f64; 3]; 2] = [[0.4, -0.3, 0.0], [0.8, 0.3, 2.4]];
@@ -400,14 +400,8 @@ fn the_eye_stays_in_front_of_walls() {
         .browser
         .evaluate("document.getElementById('toggle-cut').getAttribute('aria-pressed')");
     assert_eq!(cut, "false", "the walls are not cut away");
-    // How far it comes depends on which surfaces it knows when.
-    assert!(traveled > 1.5, "the eye moved only {traveled} m");
-    /// Depths in pictures have half precision: about a millimeter at 2 m.
-    const DEPTH_STEP_M: f64 = 0.001;
-    assert!(
-        closest > NEAR_M - DEPTH_STEP_M,
-        "an eye was {closest} m from a wall"
-    );
+    assert!(traveled > 5.0, "the eye moved only {traveled} m");
+    assert!(closest > NEAR_M, "an eye was {closest} m from a wall");
     page.close();
 }
 

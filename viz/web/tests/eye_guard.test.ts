@@ -1,7 +1,7 @@
 import assert from "node:assert/strict";
 import { test } from "node:test";
 import { Matrix4, Vector3 } from "three";
-import { PictureDepthMap } from "../src/layers/depth_map";
+import { PanoramaDepthMap, PictureDepthMap } from "../src/layers/depth_map";
 import { EyeGuard, type HitMesh, type Viewpoint } from "../src/view/eye_guard";
 import { assertClose } from "./close";
 
@@ -43,6 +43,28 @@ test("a motion ends in front of a known wall", () => {
   const eye = guard.limit(new Vector3(0, 0, 5), false);
   assertClose([eye.x, eye.y], [0, 0], 1e-9);
   assert.ok(eye.z <= 2 - MARGIN_M && eye.z > 2 - MARGIN_M - 2 * STEP_M, `the eye is at z = ${eye.z}`);
+});
+
+/** A wall at this y, in a coarse panorama from the origin. Everything else is 20 m away. */
+function wallBeside(yM: number): PanoramaDepthMap {
+  const [width, height] = [128, 64];
+  const depth = Float32Array.from({ length: width * height }, (_, ix) => {
+    const up = Math.sin(((Math.floor(ix / width) + 0.5) / height - 0.5) * Math.PI);
+    return Math.min(20, up > 0 ? yM / up : Infinity);
+  });
+  return new PanoramaDepthMap(new Matrix4(), depth, [width, height]);
+}
+
+test("a motion ends in front of a wall that was seen at a small angle", () => {
+  const wallM = 0.57;
+  for (let alongM = 0.5; alongM < 3; alongM += 0.1) {
+    const guard = guardOf(NO_MESH);
+    guard.jump(at(0, 0, 0), true);
+    guard.see("surroundings", wallBeside(wallM));
+    guard.moved(at(alongM, 0, 0));
+    const eye = guard.limit(new Vector3(alongM, 0.8, 0), false);
+    assert.ok(eye.y > 0.1 && eye.y < wallM - NEAR_M, `at x = ${alongM}, the eye is at y = ${eye.y}`);
+  }
 });
 
 test("a motion that stays in front of the wall is not changed", () => {

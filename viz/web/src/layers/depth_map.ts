@@ -21,6 +21,8 @@ export interface DepthMap {
    * certainly behind a surface.
    */
   largestClearance(point: Vector3): number;
+  /** The smallest clearance within the resolution of the map. If it is positive, the point is certainly in front. */
+  smallestClearance(point: Vector3): number;
   /** Whether most surfaces around the origin are closer than this. */
   isWithin(distanceM: number): boolean;
 }
@@ -45,10 +47,14 @@ export class PictureDepthMap implements DepthMap {
     return this.behind(point, 1);
   }
 
-  private behind(point: Vector3, reach: number): number {
+  smallestClearance(point: Vector3): number {
+    return this.behind(point, 1, Math.min);
+  }
+
+  private behind(point: Vector3, reach: number, choose = Math.max): number {
     const inPicture = point.clone().applyMatrix4(this.pictureFromWorld);
     const pixel = pixelAt(this.posed, inPicture);
-    return pixel ? surface(this.posed.depth, this.posed.depthSizePx, pixel, reach) - inPicture.z : Infinity;
+    return pixel ? surface(this.posed.depth, this.posed.depthSizePx, pixel, reach, choose) - inPicture.z : Infinity;
   }
 
   isWithin(): boolean {
@@ -81,14 +87,18 @@ export class PanoramaDepthMap implements DepthMap {
     return this.behind(point, 1);
   }
 
-  private behind(point: Vector3, reach: number): number {
+  smallestClearance(point: Vector3): number {
+    return this.behind(point, 1, Math.min);
+  }
+
+  private behind(point: Vector3, reach: number, choose = Math.max): number {
     const { x, y, z } = point.clone().applyMatrix4(this.pictureFromWorld);
     const distance = Math.hypot(x, y, z);
     if (distance === 0) return Infinity;
     const [width, height] = this.sizePx;
     const column = Math.min(width - 1, Math.floor((0.5 + Math.atan2(x, z) / (2 * Math.PI)) * width));
     const row = Math.min(height - 1, Math.floor((0.5 + Math.asin(y / distance) / Math.PI) * height));
-    return surface(this.depth, this.sizePx, [column, row], reach) - distance;
+    return surface(this.depth, this.sizePx, [column, row], reach, choose) - distance;
   }
 
   isWithin(distanceM: number): boolean {
@@ -104,13 +114,19 @@ export class PanoramaDepthMap implements DepthMap {
   }
 }
 
-/** Largest depth of a pixel and of its neighbors at this distance; infinite without a surface. */
-function surface(depth: Float32Array, [width, height]: [number, number], [x, y]: [number, number], reach: number): number {
-  let largest = 0;
+/** Largest or smallest depth of a pixel and of its neighbors at this distance; without a surface, depth is infinite. */
+function surface(
+  depth: Float32Array,
+  [width, height]: [number, number],
+  [x, y]: [number, number],
+  reach: number,
+  choose: (a: number, b: number) => number,
+): number {
+  let chosen = depth[y * width + x] || Infinity;
   for (let row = Math.max(0, y - reach); row <= Math.min(height - 1, y + reach); row++) {
     for (let column = Math.max(0, x - reach); column <= Math.min(width - 1, x + reach); column++) {
-      largest = Math.max(largest, depth[row * width + column] || Infinity);
+      chosen = choose(chosen, depth[row * width + column] || Infinity);
     }
   }
-  return largest;
+  return chosen;
 }

@@ -157,7 +157,8 @@ export class EyeGuard {
   /** Whether a point is visible from the origin of a map in all directions, or in front of a surface in a picture. */
   private isKnown(point: Vector3): boolean {
     return [...this.maps.values()].some((map) => {
-      const clearance = map.clearance(point);
+      // A surface that was seen from far away at a small angle is known only coarsely.
+      const clearance = map.smallestClearance(point);
       return clearance > 0 && (map.isComplete || clearance < Infinity);
     });
   }
