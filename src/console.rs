@@ -7,7 +7,6 @@ use messages::counted;
 use parking_lot::Mutex;
 use serde::Serialize;
 use session::next_commands::{self, SavedModel};
-use session::verdict::{self, Findings, ModelScore};
 use session::{FinishedModel, FinishedRun, Limits, Observer, ReadProgress, SessionEvent};
 use std::time::{Duration, Instant};
 use viz::Verdict;
@@ -170,21 +169,6 @@ pub(crate) fn print_end(models: &[FinishedModel], verdict: &Verdict) {
     if let Some(first) = commands.first() {
         print::report(format_args!("{}. Next: {}", verdict.text, first.command));
     }
-}
-
-/// The verdict on models whose images come from a dataset, which loses no images.
-pub(crate) fn verdict_of(models: &[FinishedModel]) -> Verdict {
-    let n_tests = models.iter().map(|model| model.saved().n_tests).max();
-    let score = |model: &'_ FinishedModel| ModelScore {
-        method: model.kind.name(),
-        psnr_db: model.scores.psnr,
-    };
-    verdict::verdict(&Findings {
-        models: models.iter().map(score).collect(),
-        n_tests: n_tests.unwrap_or_default(),
-        n_received: 0,
-        n_lost: 0,
-    })
 }
 
 /// Prints that the run to be continued has already reached its limits.

@@ -142,7 +142,7 @@ fn is_number(text: &str) -> bool {
     text.parse::<f64>().is_ok()
 }
 
-/// The value of `--holdout` as it is stored. A number is stored as given, and a file with its
+/// The stored value of `--holdout`. A number is stored unchanged, and a file with its
 /// absolute path.
 fn holdout_value(text: &str) -> String {
     if is_number(text) {

@@ -48,6 +48,7 @@ mod live_loop;
 mod method_options;
 pub mod methods;
 mod model_source;
+mod models_verdict;
 pub mod next_commands;
 mod observations;
 mod observer;

@@ -66,8 +66,8 @@ impl Scan {
         let started =
             START_SECS * (ramp.powi(3) - 0.5 * ramp.powi(4)) + (secs - START_SECS).max(0.0);
         let uniform_secs = started * self.speed;
-        // This is the integral of a speed that oscillates about 1. The cosine starts with zero
-        // slope, so the motion starts smoothly.
+        // This is the integral of a speed that oscillates about 1. Its derivative is continuous at
+        // the start, where the cosine has zero derivative.
         uniform_secs + share * period_secs / TAU * (1.0 - (uniform_secs * TAU / period_secs).cos())
     }
 

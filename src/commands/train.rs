@@ -1,7 +1,7 @@
 //! `fieldrig train`: trains models on a dataset folder or a recording.
 
 use crate::checkpoint_args::CheckpointArgs;
-use crate::console::{Console, OutputMode, ReadBar, print_end, print_finished_run, verdict_of};
+use crate::console::{Console, OutputMode, ReadBar, print_end, print_finished_run};
 use crate::data_args::DataArgs;
 use crate::exit::{self, Exit};
 use crate::open_gpu::open_gpu;
@@ -88,7 +88,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
         TrainOutcome::Trained(trained) => trained,
     };
     if !args.json {
-        print_end(&trained.models, &verdict_of(&trained.models));
+        print_end(&trained.models, &trained.verdict());
     }
     trained.write_rig()?;
     Ok(exit::from_losses(&trained.data_losses))

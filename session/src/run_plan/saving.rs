@@ -5,12 +5,13 @@ use super::no_model::no_model_reason;
 use crate::error::is_rejection;
 use crate::latency::Latency;
 use crate::live_loop::{EndedLoop, LiveLoop};
+use crate::models_verdict::verdict_of;
 use crate::next_commands::DataSource;
 use crate::run_folder::{self, CreatedFolders};
 use crate::session::{self, EndViewers, EndingSession, FinishedModel, Session};
-use crate::verdict::{Findings, ModelScore};
+use crate::verdict::ImageLoss;
 use crate::viewer::ServedModel;
-use crate::{corrected_rig, recovery, served_files, verdict};
+use crate::{corrected_rig, recovery, served_files};
 use capture::config::Rig;
 use capture::{Counts, InputResult, SampleUse, StationReport};
 use keyframe::{Keyframe, Split};
@@ -34,9 +35,8 @@ pub struct SavedRun {
     pub models: Vec<FinishedModel>,
     hub: Hub,
     data_losses: Vec<String>,
-    /// Number of received color images, and number of color images that were dropped before.
-    n_received: u64,
-    n_lost: u64,
+    /// The color images that were received, and those that were dropped before.
+    loss: ImageLoss,
     /// Whether the keyframe lists were written.
     listed: anyhow::Result<()>,
     /// The rig files of the models whose cameras were corrected.
@@ -86,18 +86,7 @@ impl SavedRun {
 
     /// How good the models are, in one sentence.
     pub fn verdict(&self) -> Verdict {
-        let score = |model: &FinishedModel| {
-            let (method, psnr_db) = (model.kind.name(), model.scores.psnr);
-            (model.n_tests(), ModelScore { method, psnr_db })
-        };
-        let (n_tests, models): (Vec<usize>, Vec<ModelScore<'_>>) =
-            self.models.iter().map(score).unzip();
-        verdict::verdict(&Findings {
-            models,
-            n_tests: n_tests.into_iter().max().unwrap_or_default(),
-            n_received: self.n_received,
-            n_lost: self.n_lost,
-        })
+        verdict_of(&self.models, self.loss)
     }
 
     /// Errors that ended the run, and descriptions of lost data.
@@ -243,8 +232,10 @@ pub(super) fn save(
         models,
         hub,
         data_losses,
-        n_received: counts.images,
-        n_lost: counts.color_skipped,
+        loss: ImageLoss {
+            n_received: counts.images,
+            n_lost: counts.color_skipped,
+        },
         listed,
         corrected_rigs,
         input_error: input_result.input_error,

@@ -9,12 +9,14 @@ use crate::checkpoints::CheckpointOptions;
 use crate::data::DataOptions;
 use crate::depth_from::{self, DepthSource};
 use crate::error::is_rejection;
+use crate::models_verdict::verdict_of;
 use crate::previous_run::{FinishedRun, PreviousRun, limit_flags, out_folder};
 use crate::read_progress::OnReadProgress;
 use crate::run_folder::{self, CreatedFolders};
 use crate::session::{FinishedModel, Limits};
 use crate::session_setup::Services;
 use crate::training_options::TrainingOptions;
+use crate::verdict::ImageLoss;
 use crate::{corrected_rig, next_commands, training};
 use capture::config::Rig;
 use messages::Setting;
@@ -24,6 +26,7 @@ use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use std::time::Instant;
 use train_run::TrainRun;
+use viz::Verdict;
 
 /// Training time if there is no limit, seconds.
 const DEFAULT_SECONDS: f64 = 120.0;
@@ -86,6 +89,11 @@ pub struct Trained {
 }
 
 impl Trained {
+    /// How good the models are, in one sentence.
+    pub fn verdict(&self) -> Verdict {
+        verdict_of(&self.models, ImageLoss::default())
+    }
+
     /// Writes the rig with the estimated calibration, if the plan names a file for it.
     pub fn write_rig(&mut self) -> anyhow::Result<()> {
         if let Some(corrected) = self.corrected_rig.take() {

@@ -367,7 +367,7 @@ fn check_phone(browser: &mut Browser) {
     wait_for_full_picture(browser);
 }
 
-/// A server that does not answer is told from one that has stopped, also after the run.
+/// The page distinguishes a server that does not answer from one that has stopped, also after the run.
 fn check_frozen_server(browser: &mut Browser, proxy: &Proxy) {
     proxy.cut();
     wait_for(browser, "the silence", |browser| {

@@ -72,7 +72,7 @@ test("a moved object is named by its place", () => {
   }
 });
 
-test("blur of the photograph and of the model are told apart", () => {
+test("a blurred photograph differs from a blurred model", () => {
   assert.ok(compared(blurred, scene).detailRatio! < 0.5);
   assert.ok(compared(scene, blurred).detailRatio! > 2);
   assert.equal(compared(() => 90, () => 91).detailRatio, null, "without texture, nothing can be said");

@@ -19,7 +19,7 @@ export interface SkeletonText {
   doneFrac: number | null;
 }
 
-/** States in which the first picture will follow as soon as it is drawn. */
+/** In these states, the server is drawing the first picture. */
 const DRAWS_AT_ONCE = ["training", "viewing", "paused", "finished"];
 
 export function skeletonText({ connection, status, isContextLost }: Knowledge): SkeletonText {
