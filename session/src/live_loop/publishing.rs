@@ -187,25 +187,15 @@ impl LiveLoop {
             self.publishing
                 .publish_moved_keyframes(&self.accepted.list, &self.models.sessions[0]);
         }
-        let rejected = self.rejected();
-        for session in &mut self.models.sessions {
-            session.persistence().set_rejected(&rejected);
-        }
         self.publish_status();
         Ok(())
     }
 
-    /// Number of images that did not become keyframes since the start of the first part of the run,
-    /// by reason.
-    fn rejected(&self) -> BTreeMap<String, u64> {
-        let mut rejected = self.earlier_rejected.clone();
-        for (reason, n) in self.feed.rejected() {
-            *rejected.entry(reason).or_default() += n;
-        }
-        rejected
-    }
-
     pub(super) fn publish_status(&mut self) {
+        let rejected = sum_by_reason(&self.earlier_rejected, &self.feed.rejected());
+        for session in &mut self.models.sessions {
+            session.persistence().set_rejected(&rejected);
+        }
         self.requests.update_checkpoint(&mut self.models);
         let operator = self.operator_status();
         let sessions = &self.models.sessions;
@@ -218,7 +208,7 @@ impl LiveLoop {
             progress: self.state_progress(),
             seconds: sessions[0].time().secs(),
             keyframes: self.accepted.list.len() as u64,
-            rejected: self.rejected(),
+            rejected,
             model: models.next().unwrap_or_default(),
             others: models.collect(),
             edit_revision: self.requests.edit_revision,
@@ -278,6 +268,19 @@ impl LiveLoop {
             ..OperatorStatus::default()
         }
     }
+}
+
+/// Adds the numbers of rejected images of the earlier parts of a run and of the present one, by
+/// reason.
+fn sum_by_reason(
+    earlier: &BTreeMap<String, u64>,
+    present: &BTreeMap<String, u64>,
+) -> BTreeMap<String, u64> {
+    let mut sums = earlier.clone();
+    for (reason, n) in present {
+        *sums.entry(reason.clone()).or_default() += n;
+    }
+    sums
 }
 
 /// Name of a keyframe's camera, and the correction of its pose: the corrected camera in the frame

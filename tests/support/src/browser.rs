@@ -335,7 +335,11 @@ fn bytes_from_base64(text: &str) -> Vec<u8> {
 pub fn wait_for(browser: &mut Browser, what: &str, mut is_there: impl FnMut(&mut Browser) -> bool) {
     let started = Instant::now();
     while !is_there(browser) {
-        assert!(started.elapsed() < TIMEOUT, "timed out waiting for {what}");
+        if started.elapsed() >= TIMEOUT {
+            let shot = std::env::temp_dir().join("fieldrig_page_timed_out.png");
+            let _ = std::fs::write(&shot, browser.screenshot());
+            panic!("timed out waiting for {what}; the page is shown in {shot:?}");
+        }
         std::thread::sleep(Duration::from_millis(50));
     }
 }

@@ -48,6 +48,24 @@ impl Page {
         found.expect("the condition holds")
     }
 
+    /// Waits until the page shows the view that it requested last. The first pictures have other
+    /// sizes, because panels appear.
+    fn shown_view(&mut self) -> RenderRequest {
+        let last = Arc::clone(&self.last);
+        let mut shown = None;
+        wait_for(&mut self.browser, "the full picture", |browser| {
+            let [.., width, height] = canvas_bounds(browser);
+            let text = browser.text("picture-text");
+            let is_shown = text.starts_with(&format!("{width} × {height} (100 %)"));
+            shown = last
+                .lock()
+                .clone()
+                .filter(|request| is_shown && request.size_px == [width, height]);
+            shown.is_some()
+        });
+        shown.expect("the condition holds")
+    }
+
     fn is_hidden(&mut self, id: &str) -> bool {
         self.browser
             .evaluate(&format!("document.getElementById('{id}')?.hidden ?? true"))
@@ -185,12 +203,8 @@ fn operators_crop_edit_and_measure() {
         hub,
         last,
     };
-    let first = page.request("a full picture", |request| request.crop.is_none());
-    wait_for(&mut page.browser, "the full picture", |browser| {
-        browser.text("picture-text").contains("100 %")
-    });
-
-    check_measurements(&mut page, &first);
+    let view = page.shown_view();
+    check_measurements(&mut page, &view);
     check_numbers_of_box(&mut page);
     check_handles(&mut page);
     std::fs::write(scratch.join("edits-box.png"), page.browser.screenshot()).expect("written");
