@@ -98,7 +98,7 @@ impl ServedPage {
 
     fn print_lines(&self) -> anyhow::Result<()> {
         self.lines().iter().for_each(print::report);
-        // The code is for phones. Phones cannot reach a page that only this computer can open.
+        // The QR code is for phones, which cannot reach a page that only this computer can open.
         if self.shared.is_some() && std::io::stdout().is_terminal() {
             print::report_styled(qr_code(&self.url())?);
         }

@@ -36,8 +36,9 @@ impl GapEstimator {
         let late_periods = stamp.secs_since(due) / self.period_secs;
         let lost_periods = (late_periods - LATE_PERIODS).ceil().max(0.0);
         let delayed_secs = (late_periods - lost_periods) * self.period_secs;
-        // Images are never early. If an image arrives before its due time, all earlier images were
-        // delayed, so the whole difference is corrected.
+        // Images are never early. If an image arrives before its due time, the due time is too
+        // late: earlier images were delayed, or the actual frame rate is higher than the nominal
+        // rate. The whole difference is therefore corrected.
         let correction_secs = if delayed_secs < 0.0 {
             delayed_secs
         } else {

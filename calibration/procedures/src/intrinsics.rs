@@ -63,8 +63,8 @@ impl IntrinsicsTask {
         self.report.as_ref().map_or(Ok(()), ReportOptions::check)?;
         let mut rig = self.rig.open(&self.input)?;
         let detected = self.detect(host, rig.as_mut())?;
-        // The size is checked before the calibration, because a result for another size could not
-        // be written.
+        // The size of the images is checked before the calibration, because the result for another
+        // image size could not be written to the rig file.
         if let (Some(rig), Some(size_px)) = (&rig, detected.sizes_px.first()) {
             rig.expect_size(*size_px)?;
         }
@@ -114,7 +114,8 @@ impl IntrinsicsTask {
             sizes_px.push(board.size_px);
         }
         let mut warnings = warnings;
-        // If the other size prevails, `calibrate` refuses with this text instead.
+        // If more images show a board of the other size than of the target's size, `calibrate`
+        // fails with this text, so a warning is not needed.
         if let Some(size) = other_size.as_ref().filter(|size| !size.prevails) {
             log::warn!("{}", size.text);
             warnings.push(size.text.clone());

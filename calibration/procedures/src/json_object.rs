@@ -88,7 +88,7 @@ pub(crate) struct JsonObject<'a> {
 }
 
 impl<'a> JsonObject<'a> {
-    /// Rejects other values, and keys other than `known`.
+    /// Rejects values that are not objects, and objects with keys other than `known`.
     pub(crate) fn new(
         file: &'a str,
         path: String,

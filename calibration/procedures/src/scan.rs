@@ -33,7 +33,7 @@ const DEFAULT_SECS: f64 = 30.0;
 /// of slow motions. A larger value accepts blurred corners.
 const MAX_SHIFT_PX: f64 = 3.0;
 
-/// Images of one camera in which a target was searched.
+/// Images of one camera that were searched for a target.
 pub(crate) struct Scan {
     rig: Rig,
     camera: Camera,
@@ -257,7 +257,8 @@ impl Scan {
         Self::new(rig, camera, images, photos)
     }
 
-    /// Images in which the target was searched, with the state of the arm.
+    /// A scan of images that were searched for the target. If there is an arm, each image comes
+    /// with the state of the arm.
     pub(crate) fn new(
         rig: Rig,
         camera: Camera,
@@ -318,7 +319,7 @@ impl Scan {
             .map_err(|error| BadInput(format!("camera.{name}.intrinsics_covariance: {error}")))
     }
 
-    /// The size of a board that the images show instead of that of the target.
+    /// A board size that differs from the target's, if several images show it.
     pub(crate) fn other_size(&self, target: &TargetSpec) -> Option<OtherSize> {
         images::other_size(self.images.iter().map(|(image, _)| image), target)
     }
@@ -339,8 +340,8 @@ impl Scan {
             .map_or(Ok(()), |reason| Err(InsufficientData(reason)))
     }
 
-    /// `parent_from_camera` of the rig file for an estimated pose, which is relative to the flange
-    /// or base.
+    /// Converts an estimated pose of the camera, relative to the flange or base, to the
+    /// `parent_from_camera` of the rig file, where the parent may also be the world.
     pub(crate) fn rig_pose(&self, parent_from_camera: &Transform) -> Transform {
         corrected_rig::parent_from_camera(&self.rig.base, self.camera.parent, parent_from_camera)
     }

@@ -1,4 +1,4 @@
-//! Coarse-to-fine estimation of the shared parameters.
+//! Coarse-to-fine estimation of the parameters that images share, such as the extrinsics.
 
 use super::corrections::Corrections;
 use super::layout::Layout;
@@ -34,14 +34,16 @@ pub(super) struct Fit {
 }
 
 impl Fit {
-    /// Adds the discretization error to the covariance. It is estimated by the change of the
-    /// estimate between the finest level and the next one. All pairs share this error, so their
-    /// scatter does not contain it. At half the pixel size, an error of first or higher order in
-    /// the pixel size is at most as large as this change. Its direction may be different, because
-    /// the error is a sum of several errors, some of which depend on the pixel size in another way.
+    /// Adds the discretization error to the covariance. All pairs share this error, so the scatter
+    /// between pairs does not contain it. The size of the error is estimated from the change of the
+    /// result if the parameters are estimated at the next coarser level instead of the finest one.
+    /// There, pixels are twice as large. If the error grows at least linearly with the pixel size,
+    /// the error at the finest level is at most as large as the change. The error may have another
+    /// direction than the change, because it is a sum of errors that grow with different powers of
+    /// the pixel size.
     pub(super) fn add_discretization_error(&mut self, images: &[PreparedImage], pairs: &[Pair]) {
-        // The estimate converges at level 1, starting from the result of level 0. The change is the
-        // difference of both results.
+        // Steps at level 1 start from the result of level 0 and continue until they are small. The
+        // change is the sum of these steps.
         const LEVEL: usize = 1;
         if images.iter().all(|image| image.levels.len() <= LEVEL) {
             return;

@@ -12,7 +12,8 @@ pub struct DatagramCounts {
     pub n_received: u64,
     /// Number of datagrams with a wrong format, another device name, or an impossible stamp.
     pub n_rejected: u64,
-    /// Number of values whose sequence number is missing, plus the number of missing parts of scans.
+    /// Number of joint states, poses or scans that did not arrive, according to gaps in the
+    /// sequence numbers, plus the number of missing parts of scans that arrived in part.
     pub n_lost: u64,
     /// Number of joint states that name none of the arm's joints.
     pub n_other: u64,
@@ -27,7 +28,7 @@ pub struct DatagramCounts {
     /// Number of times that the sequence numbers of the sender restarted.
     pub n_restarts: u64,
     /// Number of times that the clock of the sender restarted or jumped. If this keeps increasing,
-    /// the clock does not count nanoseconds.
+    /// the sender's stamps are probably in a unit other than nanoseconds.
     pub n_clock_restarts: u64,
 }
 
@@ -59,7 +60,7 @@ impl DatagramMonitor {
         &self.device
     }
 
-    /// Address on which it listens.
+    /// Local address on which fieldrig listens for the datagrams of the device.
     pub fn address(&self) -> SocketAddr {
         self.address
     }

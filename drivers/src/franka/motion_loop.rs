@@ -216,8 +216,8 @@ impl MotionLoop {
     fn run(&mut self, mut active: Box<ActiveMotion>, stamped: &StampedState<'_>) -> MotionState {
         let NumberedState { number, state } = stamped.numbered;
         let n_states = number.saturating_sub(active.number);
-        // The first step determines what the robot did with the last command. The next command must
-        // continue from the resulting state. Otherwise, the robot would see a jump.
+        // What the robot did with the last command is determined first, because the next command
+        // must continue from the resulting state. Otherwise, the robot would see a jump.
         let fate = match n_states {
             0 => CommandFate::Followed,
             n => active.tracker.advance(active.sent, n, state),
@@ -269,8 +269,8 @@ impl MotionLoop {
         let is_at_rest = active.generator.is_at_rest() && command.is_none();
         active.n_at_rest = if is_at_rest { active.n_at_rest + 1 } else { 0 };
         if is_at_rest && (active.n_at_rest > MAX_AT_REST || mailbox_state.is_shutting_down) {
-            // The flag is set under the same lock under which the command was taken above. A motion
-            // that ends can therefore not accept a command that arrives in between.
+            // The lock under which the command was taken above is still held. No command can
+            // therefore be accepted in between and then be lost.
             active.is_ending = true;
             mailbox_state.accepts_commands = false;
         }
@@ -309,8 +309,9 @@ impl MotionLoop {
         let desired = desired
             .try_into()
             .map_err(|_| "the setpoint has the wrong number of joints".to_owned())?;
-        // The generator respects its limits, but a missed command or a displaced reference adds to
-        // them. The position that is sent must always be within the limits of the robot.
+        // While the robot follows the setpoints of the generator, their rates are within the
+        // generator's limits. After a missed command or with a displaced reference, rates may be
+        // higher. The position that is sent must always be within the limits of the robot.
         let (position_rad, is_limited) = self.robot.limited(desired, reference)?;
         if is_limited {
             // The generator continues from the position that was sent instead of its own setpoint.

@@ -105,7 +105,7 @@ struct Sender {
     socket: UdpSocket,
     n_joints_sent: u64,
     n_poses_sent: u64,
-    /// Datagrams sent per scanner.
+    /// Number of scans sent, for each scanner. A scan may take several datagrams.
     n_sent: Vec<u64>,
     stop: Arc<AtomicBool>,
 }
@@ -180,7 +180,8 @@ impl Sender {
         script_entries
     }
 
-    /// Repeatedly sends the joints and base at one end of the script, until shortly before a time.
+    /// Repeatedly sends the first (`end` is 0) or last (`end` is `usize::MAX`) joint state and base
+    /// pose of the script, until shortly before `until`.
     fn resend_end_state(&mut self, end: usize, until: Stamp) {
         let last = |n: usize| n.checked_sub(1).map(|last| last.min(end));
         let joints_ix = last(self.script.joints.len());

@@ -34,7 +34,7 @@ pub(super) struct FieldStore {
     pub(super) host_blocks: Blocks,
     /// Blocks that changed since the mesh was updated, in addition to those flagged on the GPU.
     pub(super) stale: BTreeSet<GridCoord>,
-    /// Number of blocks on the GPU when it was last read.
+    /// Number of blocks on the GPU when this number was last read from the GPU.
     pub(super) n_resident: u32,
     max_bytes: Option<u64>,
 }
@@ -100,7 +100,7 @@ impl FieldStore {
         u64::from(self.n_resident) + self.host_blocks.len() as u64
     }
 
-    /// Maximum number of blocks on the GPU, in addition to the table.
+    /// Maximum number of blocks that fit on the GPU, if the hash table keeps its present size.
     pub(super) fn max_blocks(&self, gpu: &Gpu) -> u32 {
         capacity::max_blocks_within(gpu, self.max_bytes, self.buffers.capacity.n_chunks)
     }
@@ -160,8 +160,9 @@ impl FieldStore {
         Ok(n_evicted >= n as usize)
     }
 
-    /// Loads visible blocks from host memory. If not all fit, loads the nearest blocks with
-    /// `allows_partial`. Without `allows_partial`, loads none and returns false.
+    /// Loads visible blocks from host memory. If not all of them fit, `allows_partial` decides: if
+    /// it is true, the nearest blocks are loaded; otherwise, none are loaded, and false is
+    /// returned.
     pub(super) fn load_visible(
         &mut self,
         gpu: &Gpu,

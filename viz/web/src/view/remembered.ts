@@ -39,7 +39,7 @@ export interface Remembered {
 
 export const NOTHING: Remembered = { view: null, switched: [], crop: null, method: null, path: [] };
 
-/** The parameter with the text in the fragment of an address. */
+/** Name of the parameter, in the fragment of an address, whose value is the text. */
 const PARAMETER = "view";
 const VERSION = "1";
 const MAX_TEXT_LENGTH = 8192;
@@ -60,7 +60,7 @@ const NUMBER = /^-?\d{1,6}(\.\d{1,6})?$/;
 /** Names of switches, which are ids of buttons. */
 const NAME = /^[a-z0-9-]{1,32}$/;
 const METHOD = /^[a-z0-9_-]{1,32}$/;
-/** Names of links and cameras with other characters are left out. */
+/** Names of robot links and cameras. Names with other characters are left out. */
 const FRAME = /^[\w.-]{1,64}$/;
 const UPRIGHT: Point = [0, 0, 1];
 /** Most views orbit, so their texts do not contain the mode. */
@@ -72,7 +72,7 @@ export function encoded({ view, switched, crop, method, path }: Remembered): str
   if (view) {
     parts.push(`p${numbers(view.position, VIEW_DECIMALS)}`, `t${numbers(view.target, VIEW_DECIMALS)}`);
     const { mode, attachedTo, fovDegrees } = view;
-    // All other views are upright.
+    // Only a view that rides on a camera may be tilted sideways.
     if (mode === "ride") parts.push(`u${numbers(view.up, VIEW_DECIMALS)}`);
     const isNamed = attachedTo !== undefined && FRAME.test(attachedTo);
     if (mode !== DEFAULT_MODE) parts.push(`m${mode}`);
@@ -92,7 +92,8 @@ export function decoded(text: string): Remembered | null {
   if (text.length > MAX_TEXT_LENGTH) return null;
   const [version, ...parts] = text.split("~");
   if (version !== VERSION) return null;
-  // The first part with a letter counts. Letters of newer versions of the page are ignored.
+  // If several parts begin with the same letter, the first one counts. Letters of newer versions of
+  // the page are ignored.
   const part = (letter: string): string => parts.find((each) => each.startsWith(letter))?.slice(1) ?? "";
   const method = part("s");
   const remembered = {
@@ -115,7 +116,10 @@ export function fragmentWith(text: string): string {
   return `#${PARAMETER}=${text}`;
 }
 
-/** The fragment with only the view, whose text needs no escapes. */
+/**
+ * The fragment without its other parameters, such as a token. Empty if it contains no valid text of
+ * a view.
+ */
 export function onlyView(fragment: string): string {
   const remembered = decoded(textInFragment(fragment) ?? "");
   return remembered ? fragmentWith(encoded(remembered)) : "";
@@ -156,7 +160,10 @@ function pathNumbers({ position, target, fovDegrees }: RememberedPathView): numb
   return [...position, ...target, fovDegrees];
 }
 
-/** The views of a path. If any view is missing or invalid, there are none, because the rest would be another path. */
+/**
+ * The views of a path. Empty if any view is missing or invalid, because the remaining views would
+ * be another path.
+ */
 function pathOf(text: string): RememberedPathView[] {
   const [count = ""] = text.split("_", 1);
   const nViews = /^\d{1,2}$/.test(count) ? Number(count) : 0;
