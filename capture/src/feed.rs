@@ -236,6 +236,7 @@ impl Pump {
                     // The failure is reported at once, because training on the queued keyframes may
                     // take long.
                     self.shared.source_failed.store(true, Ordering::Relaxed);
+                    log::warn!("the run ends, because a device failed: {error}");
                     input_error = Some(error);
                     break;
                 }

@@ -15,6 +15,9 @@ const MAX_WAIT_SECS: f64 = 10.0;
 /// Maximum difference between a share and the simple fraction, such as 7 of 8, by which it is
 /// described.
 const MAX_SHARE_ERROR: f64 = 0.01;
+/// The same if no fraction with a denominator of at most 10 is that close. Tenths are always this
+/// close.
+const MAX_ROUGH_ERROR: f64 = 0.05;
 /// Larger shares than this are not expressed as a fraction with a denominator of at most 10.
 const NEARLY_ALL: f64 = 0.95;
 
@@ -148,7 +151,7 @@ fn state_text(situation: &Situation) -> String {
 /// Why most of the recent images are of no use, and what to do.
 fn problem(recent: &ImageFlow) -> Option<String> {
     let n_sent = recent.received + recent.dropped;
-    // Losses of less than half are common on slow computers, and the next image replaces each.
+    // Smaller losses are common on slow computers and are no problem: see `hint`.
     if n_sent >= MIN_IMAGES && 2 * recent.dropped >= n_sent {
         let share = share_text(recent.dropped, n_sent);
         return Some(format!("{share} lost: lower rate_hz of the cameras"));
@@ -170,7 +173,14 @@ fn hint(situation: &Situation) -> Option<String> {
     let n_not_moved = recent.rejected.get(Rejection::NotMoved.name());
     let is_still = n_not_moved.is_some_and(|n| 2 * n >= recent.received);
     if recent.received >= MIN_IMAGES && recent.accepted == 0 && is_still {
-        return Some("The cameras see nothing new: move the robot".to_owned());
+        return Some(
+            "The cameras see nothing new: move them to places that they have not seen".to_owned(),
+        );
+    }
+    let n_sent = recent.received + recent.dropped;
+    if n_sent >= MIN_IMAGES && 4 * recent.dropped >= n_sent {
+        let share = share_text(recent.dropped, n_sent);
+        return Some(format!("{share} dropped, and the next ones replace them"));
     }
     store.is_full().then(|| {
         format!(
@@ -194,12 +204,17 @@ fn share_text(n: u64, n_all: u64) -> String {
         return "More than 9 of 10 images are".to_owned();
     }
     let fraction = |denominator: u32| {
-        let numerator = (share * f64::from(denominator)).round();
+        let numerator = (share * f64::from(denominator))
+            .round()
+            .min(f64::from(denominator - 1));
         let error = (numerator / f64::from(denominator) - share).abs();
         (numerator, error)
     };
-    let denominator = (2..10)
-        .find(|denominator| fraction(*denominator).1 < MAX_SHARE_ERROR)
+    // The simplest of the fractions that are close, or else of those that are at most half a tenth
+    // away.
+    let simplest = |max_error: f64| (2..=10).find(|n_parts| fraction(*n_parts).1 <= max_error);
+    let denominator = simplest(MAX_SHARE_ERROR)
+        .or_else(|| simplest(MAX_ROUGH_ERROR))
         .unwrap_or(10);
     format!("{} of {denominator} images are", fraction(denominator).0)
 }
@@ -258,6 +273,11 @@ mod tests {
             (flow(1, 6, &[]), "Scanning", false),
             (flow(20, 5, &[]), "Scanning", false),
             (
+                flow(12, 8, &[]),
+                "Scanning. 2 of 5 images are dropped, and the next ones replace them",
+                false,
+            ),
+            (
                 flow(10, 0, &[(Rejection::Blur, 3), (Rejection::Shear, 2)]),
                 "Scanning. Most images are blurred by motion: move more slowly, or shorten the exposure",
                 true,
@@ -270,7 +290,7 @@ mod tests {
             ),
             (
                 flow(40, 0, &[(Rejection::NotMoved, 40)]),
-                "Scanning. The cameras see nothing new: move the robot",
+                "Scanning. The cameras see nothing new: move them to places that they have not seen",
                 false,
             ),
             (flow(40, 0, &[(Rejection::NotMoved, 39)]), "Scanning", false),
@@ -351,7 +371,9 @@ mod tests {
             (1, 2, "1 of 2 images are"),
             (667, 1000, "2 of 3 images are"),
             (745, 1000, "3 of 4 images are"),
+            (48, 100, "1 of 2 images are"),
             (94, 100, "9 of 10 images are"),
+            (95, 100, "9 of 10 images are"),
             (999, 1000, "More than 9 of 10 images are"),
             (5, 5, "All images are"),
         ] {
