@@ -237,7 +237,7 @@ pub(super) fn short_frame() -> Frame {
 #[cfg(any(test, fuzzing))]
 pub(super) const LIMITS: Limits = Limits::of(12.5, 30.0, 10.0);
 /// A command to move away stiffly.
-#[cfg(test)]
+#[cfg(any(test, fuzzing))]
 pub(super) const STIFF_COMMAND: Command = Command {
     position_rad: 1.0,
     velocity_rad_s: 0.0,
@@ -255,16 +255,12 @@ pub struct FamilyFuzzing {
     /// Runs the family's codecs on a frame.
     pub run_codecs: fn(&Frame),
     /// Frames with which the driver makes the motor report.
-    #[cfg(test)]
     pub set_up: Vec<Frame>,
     /// A motion command with high stiffness. It does not enable the motor.
-    #[cfg(test)]
     pub command: Frame,
     /// Expected conversation of the driver with the motor.
-    #[cfg(test)]
     pub transcript: &'static str,
     /// For a motor that replies only to commands, a frame with which another master makes it
     /// report.
-    #[cfg(test)]
     pub other_master: Option<Frame>,
 }

@@ -18,22 +18,17 @@ pub(super) fn fuzzing() -> FamilyFuzzing {
             },
         }),
         run_codecs,
-        #[cfg(test)]
         set_up: set_up(node),
-        #[cfg(test)]
         command: {
             use crate::wire::can::canopen::{Direction, Pdo};
             Frame::classic(Pdo::First.id(Direction::Receive, node), &[0, 0, 0, 4, 0, 0])
                 .expect("the example can be encoded")
         },
-        #[cfg(test)]
         transcript: include_str!("transcript.txt"),
-        #[cfg(test)]
         other_master: None,
     }
 }
 
-#[cfg(test)]
 fn set_up(node: Node) -> Vec<Frame> {
     use crate::wire::can::canopen::{Direction, Nmt, Pdo, encode_nmt, encode_write};
     let pdo = Pdo::First;

@@ -16,7 +16,6 @@ pub(super) fn fuzzing() -> FamilyFuzzing {
     FamilyFuzzing {
         motor: Arc::new(MOTOR),
         run_codecs,
-        #[cfg(test)]
         set_up: [codec::Register::PositionLimit, codec::Register::Timeout]
             .map(|register| codec::RegisterMessage {
                 motor: MOTOR.motor,
@@ -27,12 +26,9 @@ pub(super) fn fuzzing() -> FamilyFuzzing {
                 codec::encode_register(message, None).expect("the example can be encoded")
             })
             .collect(),
-        #[cfg(test)]
         command: codec::encode_command(MOTOR.motor, &crate::can::family::STIFF_COMMAND, &LIMITS)
             .expect("the example can be encoded"),
-        #[cfg(test)]
         transcript: include_str!("transcript.txt"),
-        #[cfg(test)]
         other_master: None,
     }
 }

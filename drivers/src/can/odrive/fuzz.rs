@@ -14,9 +14,7 @@ pub(super) fn fuzzing() -> FamilyFuzzing {
             endpoints: None,
         }),
         run_codecs,
-        #[cfg(test)]
         set_up: Vec::new(),
-        #[cfg(test)]
         command: {
             let request = codec::Request::SetPosition {
                 position_rad: 1.0,
@@ -25,9 +23,7 @@ pub(super) fn fuzzing() -> FamilyFuzzing {
             };
             codec::encode_request(node, &request).expect("the example can be encoded")
         },
-        #[cfg(test)]
         transcript: include_str!("transcript.txt"),
-        #[cfg(test)]
         other_master: None,
     }
 }

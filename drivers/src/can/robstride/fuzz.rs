@@ -12,7 +12,6 @@ const MOTOR: Robstride = Robstride {
 };
 
 pub(super) fn fuzzing() -> FamilyFuzzing {
-    #[cfg(test)]
     let encode = |request| {
         codec::encode_request(HOST, MOTOR.motor, &request, &MOTOR.model.limits())
             .expect("the example can be encoded")
@@ -20,13 +19,9 @@ pub(super) fn fuzzing() -> FamilyFuzzing {
     FamilyFuzzing {
         motor: Arc::new(MOTOR),
         run_codecs,
-        #[cfg(test)]
         set_up: vec![encode(codec::Request::ReportActively(true))],
-        #[cfg(test)]
         command: encode(codec::Request::Move(crate::can::family::STIFF_COMMAND)),
-        #[cfg(test)]
         transcript: include_str!("transcript.txt"),
-        #[cfg(test)]
         other_master: None,
     }
 }

@@ -15,18 +15,14 @@ pub(super) fn fuzzing() -> FamilyFuzzing {
     FamilyFuzzing {
         motor: Arc::new(MOTOR),
         run_codecs,
-        #[cfg(test)]
         set_up: Vec::new(),
-        #[cfg(test)]
         command: codec::encode_command(
             MOTOR.motor,
             &crate::can::family::STIFF_COMMAND,
             &MOTOR.model.limits(),
         )
         .expect("the example can be encoded"),
-        #[cfg(test)]
         transcript: include_str!("transcript.txt"),
-        #[cfg(test)]
         other_master: crate::wire::can::Id::standard(MOTOR.motor.into())
             .and_then(|id| Frame::classic(id, &[0; 8]))
             .ok(),
