@@ -459,6 +459,23 @@ fn check_local_drawing_after_the_end(browser: &mut Browser, served: Served) {
     browser.click("reset-view");
     wait_for(browser, "the first view", shows_square);
     save_screenshot(browser, "ended");
+    check_end_on_phone(browser);
+}
+
+/// On a phone, where the panel is one line, a banner says that the program has ended. The button of the
+/// result stays within reach.
+fn check_end_on_phone(browser: &mut Browser) {
+    browser.resize(PHONE_PX);
+    wait_for(browser, "the sentence on a phone", |browser| {
+        browser.text("banner").starts_with("The program has ended")
+    });
+    wait_until(
+        browser,
+        "the banner below the header",
+        "document.getElementById('banner')?.getBoundingClientRect().top \
+         >= document.getElementById('show-result')?.getBoundingClientRect().bottom - 0.5",
+    );
+    save_screenshot(browser, "ended-phone");
 }
 
 fn source(kind: SourceKind) -> ModelSource {

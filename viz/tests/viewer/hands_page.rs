@@ -594,8 +594,12 @@ fn the_page_can_be_used_with_a_thumb() {
         check_legend(&mut page, size_px);
         check_touch_help(&mut page, size_px);
         check_hold(&mut page);
+        check_touch_words(&mut page);
+        check_keyframe_sheet(&mut page, size_px);
         page.check_accessibility("on a phone");
     }
+    check_follow(&mut page);
+    check_overview_after_top(&mut page);
     page.browser.resize(DESKTOP_PX);
     page.wait_until(
         "the side panel",
@@ -681,6 +685,13 @@ fn check_legend(page: &mut Page, size_px: [u32; 2]) {
     };
     let is_beside = legend[0] >= view[2] - 0.5 || legend[1] >= view[3] - 0.5;
     assert!(is_beside, "{size_px:?}: legend {legend:?}, view {view:?}");
+    if size_px != DESKTOP_PX {
+        let labels = "document.getElementById('legend-labels')?.offsetHeight";
+        assert_eq!(page.browser.evaluate(labels), 0, "one line");
+        page.browser.click("legend");
+        assert!(page.is(&format!("{labels} > 0")), "a tap shows the labels");
+        page.browser.click("legend");
+    }
     page.browser.click("toggle-age");
 }
 
@@ -727,4 +738,68 @@ fn check_hold(page: &mut Page) {
     page.touch("touchEnd", "toggle-layers");
     page.wait_until("the layers", &format!("{is_open} === 'true'"));
     page.browser.click("toggle-layers");
+}
+
+/// Hints name gestures of fingers, and what is at the bottom covers at most a third of the view.
+fn check_touch_words(page: &mut Page) {
+    page.browser.click("toggle-measure");
+    page.wait("the hint", |browser| {
+        browser
+            .text("measure-hint")
+            .starts_with("Tap on two points")
+    });
+    assert!(!page.browser.text("gesture-hint").contains("Scroll"));
+    let share = "document.getElementById('view-bottom')?.offsetHeight \
+                 / document.getElementById('view')?.offsetHeight";
+    assert!(page.is(&format!("{share} < 0.34")));
+    page.browser.click("toggle-measure");
+}
+
+/// The sheet of the keyframes fits on the screen, scrolls, and closes when another sheet is opened.
+fn check_keyframe_sheet(page: &mut Page, [width, _]: [u32; 2]) {
+    page.browser.click("show-more");
+    page.browser.click("look-nearest");
+    assert!(page.is_visible("keyframe-browser"));
+    assert_eq!(boxes(page, "#toolbar button").len(), 6, "one sheet");
+    let [([left, top, right, _], fits)] = boxes(page, "#keyframe-browser")[..] else {
+        panic!("one sheet")
+    };
+    let [([_, _, _, header], _)] = boxes(page, "body > header")[..] else {
+        panic!("one header")
+    };
+    assert!(
+        left >= 0.0 && right <= f64::from(width) && top >= header && fits,
+        "{left} {right}, {top} below {header}"
+    );
+    let scrolls = "getComputedStyle(document.getElementById('keyframe-browser')).overflowY === 'auto' \
+                   && getComputedStyle(document.querySelector('.wiped')).touchAction === 'pan-y'";
+    assert!(page.is(scrolls));
+    page.browser.click("show-more");
+    page.wait_until(
+        "the closed sheet",
+        "document.getElementById('keyframe-browser')?.hidden === true",
+    );
+    assert!(boxes(page, "#toolbar button").len() > 6, "the list is open");
+    page.browser.click("show-more");
+}
+
+/// A view that follows the robot says so, also while its button is in the list of "More".
+fn check_follow(page: &mut Page) {
+    page.browser.click("toggle-follow");
+    page.wait("what is followed", |browser| {
+        browser.text("follow-text") == "following base"
+    });
+    assert!(page.is_pressed("toggle-follow"));
+    page.browser.click("toggle-follow");
+    page.wait("the end", |browser| browser.text("follow-text").is_empty());
+}
+
+/// The overview replaces the view from above.
+fn check_overview_after_top(page: &mut Page) {
+    for button in ["look-top", "look-overview"] {
+        page.rest();
+        let before = page.last_request();
+        page.browser.click(button);
+        page.motion_since(&before);
+    }
 }

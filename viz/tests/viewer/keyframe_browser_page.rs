@@ -430,9 +430,22 @@ fn check_click(browser: &mut Browser, requests: &Mutex<Vec<RenderRequest>>) {
     let point = corrected_pose(CASES[4].x_m) * Point3::new(corner[0], corner[1], depth);
     let [x, y] = pixel_of(&request, &point);
     let at = [x + f64::from(left), y + f64::from(top)].map(rounded);
-    for kind in ["mouseMoved", "mousePressed", "mouseReleased"] {
-        browser.mouse(kind, at);
-    }
+    let click = |browser: &mut Browser| {
+        for kind in ["mouseMoved", "mousePressed", "mouseReleased"] {
+            browser.mouse(kind, at);
+        }
+    };
+    // A tool that takes clicks comes first.
+    browser.click("toggle-measure");
+    let hint = browser.text("measure-hint");
+    click(browser);
+    wait_for(browser, "an answer of the tool", |browser| {
+        browser.text("measure-hint") != hint
+    });
+    browser.next_frame();
+    assert!(!is_open(browser), "the tool takes the click");
+    browser.click("toggle-measure");
+    click(browser);
     wait_for_keyframe(browser, CASES.len());
     browser.click("toggle-keyframes");
 }

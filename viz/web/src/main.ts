@@ -17,6 +17,7 @@ import { ConnectionState } from "./panels/connection_state";
 import { CoverageHint } from "./panels/coverage_hint";
 import { EditControls } from "./panels/edit_controls";
 import { element } from "./panels/element";
+import { setUpFolding } from "./panels/folding";
 import { showGestureHint } from "./panels/gesture_hint";
 import { showGuidance } from "./panels/guidance";
 import { Header } from "./panels/header";
@@ -206,6 +207,7 @@ setUpPanels([
 setUpHelp();
 setUpToolbar();
 setUpSidePanel();
+setUpFolding();
 announceStates();
 showGestureHint();
 new Tooltip();

@@ -13,6 +13,10 @@ import {
   viewOf,
 } from "../src/view/overview";
 import { type Heading, OverviewKeeper } from "../src/view/overview_keeper";
+import type { Scene } from "../src/connection/protocol";
+import type { RobotLayer } from "../src/layers/robot_layer";
+import type { ScanLayer } from "../src/layers/scan_layer";
+import { SceneViews } from "../src/view/scene_views";
 import { assertClose } from "./close";
 
 const UP = new Vector3(0, 0, 1);
@@ -120,4 +124,16 @@ test("the overview follows growth, but neither small changes nor a robot that tu
   assert.equal(keeper.update([scene, robot], AHEAD, lens), null, "it comes back");
   keeper.refit();
   assert.ok(keeper.update([scene, robot], AHEAD, lens), "the window has another shape");
+});
+
+test("an overview that is asked for is there at once, also shortly after the last check", () => {
+  const robot = { isVisible: false, namedLinks: null } as unknown as RobotLayer;
+  const views = new SceneViews(new PerspectiveCamera(50, 0.5), robot, { pathBox: new Box3() } as ScanLayer);
+  views.scene = { center_m: [0, 0, 0], radius_m: 1, world_from_camera: [1, 0, 0, 0, 0, 0, 1, -2, 0, -1, 0, 0, 0, 0, 0, 1] } as Scene;
+  const first = views.overview();
+  assert.ok(first);
+  assert.equal(views.overview(), null, "it shows everything");
+  assert.ok(views.along("top"));
+  views.restartOverview();
+  assert.deepEqual(views.overview(), first);
 });

@@ -1,6 +1,6 @@
 import assert from "node:assert/strict";
 import { test } from "node:test";
-import { basicGestures, devicesOf } from "../src/panels/gestures";
+import { basicGestures, devicesOf, inTouchWords, isTouchDevice } from "../src/panels/gestures";
 import { viewStep, type ViewStep } from "../src/view/view_keys";
 
 function step(key: string, shiftKey = false, ctrlKey = false): ViewStep | null {
@@ -25,6 +25,22 @@ test("the help is about the devices of the user", () => {
   assert.deepEqual(devicesOf({ ...none, hasCoarsePointer: true }), ["touch"]);
   assert.deepEqual(devicesOf({ ...none, hasCoarsePointer: true, hasPressedKey: true }), ["touch", "keyboard"]);
   assert.deepEqual(devicesOf({ ...none, hasFinePointer: true, hasCoarsePointer: true }), ["mouse", "touch", "keyboard"]);
+});
+
+test("texts are about a finger on devices with a touch screen, and after a touch", () => {
+  assert.ok(isTouchDevice(null, true, true), "a phone with a mouse");
+  assert.ok(isTouchDevice(null, false, false));
+  assert.ok(!isTouchDevice(null, false, true), "a laptop with a touch screen");
+  assert.ok(isTouchDevice("touch", false, true));
+  assert.ok(!isTouchDevice("mouse", true, true));
+});
+
+test("texts for a finger have neither clicks nor keys", () => {
+  assert.equal(inTouchWords("Click on two points. Delete removes the last distance."), "Tap on two points.");
+  assert.equal(inTouchWords("Click on the second point. Esc cancels."), "Tap on the second point.");
+  assert.equal(inTouchWords("Show the model. Double-click on it (M)"), "Show the model. Double-tap on it");
+  assert.equal(inTouchWords("double-click on another point, or fly (Y)"), "double-tap on another point, or fly");
+  assert.equal(inTouchWords("Delete “front”"), "Delete “front”");
 });
 
 test("each pointing device has three basic gestures", () => {

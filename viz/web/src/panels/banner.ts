@@ -4,7 +4,10 @@ import type { ConnectionState } from "../connection/connection";
 import { element } from "./element";
 import { setText } from "./html";
 import { capitalized } from "./sentence";
+import { PHONE } from "./windows";
 import type { Guidance, Status } from "../connection/protocol";
+
+const phones = matchMedia(PHONE);
 
 export class Banner {
   private connection: ConnectionState = "connecting";
@@ -14,6 +17,10 @@ export class Banner {
   private hasEnded = false;
   private guidance: Guidance | null = null;
   private graphics = "";
+
+  constructor() {
+    phones.addEventListener("change", () => this.show());
+  }
 
   /** Sets the reason why the scene cannot be drawn; empty if it can. */
   setGraphics(text: string): void {
@@ -49,7 +56,8 @@ export class Banner {
   private show(): void {
     const { guidance, hasEnded } = this;
     const hasProblem = ["silent", "lost", "refused"].includes(this.connection) && !hasEnded;
-    const isUnexplained = hasEnded && !this.isResultShown && guidance === null;
+    // On phones, the panel of the result is one line without this sentence.
+    const isUnexplained = hasEnded && guidance === null && (!this.isResultShown || phones.matches);
     const text = hasProblem
       ? capitalized(this.connectionText)
       : isUnexplained
@@ -57,6 +65,7 @@ export class Banner {
         : (guidance?.text ?? this.graphics);
     const banner = element("banner");
     setText(banner, text);
+    banner.style.setProperty("--header-height", `${document.querySelector("header")?.offsetHeight ?? 0}px`);
     banner.dataset.kind = hasProblem ? this.connection : text === "" ? "open" : this.kindOfNotice(isUnexplained);
     element("view").classList.toggle("stale", hasProblem);
   }

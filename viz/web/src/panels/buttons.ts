@@ -35,6 +35,8 @@ export function setUpButtons(parts: ButtonParts): void {
   setUpViewpoints(parts);
   setUpLayers(parts);
   setUpTools(parts);
+  // Safari shows that a finger presses a button only if the page listens to touches.
+  document.addEventListener("touchstart", () => undefined, { passive: true });
   action("full-screen", () => {
     if (document.fullscreenElement) void document.exitFullscreen();
     else void document.documentElement.requestFullscreen();

@@ -1,6 +1,6 @@
 // At the first visit, the three basic gestures are shown over the view until the user has made one.
 
-import { devices } from "./devices";
+import { isTouched } from "./devices";
 import { element } from "./element";
 import { basicGestures } from "./gestures";
 import { child } from "./html";
@@ -17,13 +17,13 @@ const FADE_MILLIS = 1500;
 export function showGestureHint(): void {
   if (stored(SEEN_KEY) !== null) return;
   const hint = element("gesture-hint");
-  const kinds = devices().filter((device) => device !== "keyboard");
-  const gestures = basicGestures(kinds.includes("touch") && !kinds.includes("mouse") ? "touch" : "mouse");
-  hint.replaceChildren(...gestures.map(phrase));
+  const showWords = (): void => hint.replaceChildren(...basicGestures(isTouched() ? "touch" : "mouse").map(phrase));
+  showWords();
   hint.hidden = false;
   const used = new AbortController();
   const use = (): void => {
     used.abort();
+    showWords(); // Now, the device is known.
     window.setTimeout(() => fade(hint), AFTER_GESTURE_MILLIS);
   };
   for (const kind of ["pointerdown", "wheel", "keydown"] as const) {

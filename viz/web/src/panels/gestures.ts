@@ -28,6 +28,14 @@ export const GESTURES: Record<"mouse" | "touch", Gesture[]> = {
   ],
 };
 
+/**
+ * Whether texts are about a finger: if the user last touched the page or, before the first press,
+ * if fingers are the main pointers of the device.
+ */
+export function isTouchDevice(lastPointer: string | null, isMainPointerCoarse: boolean, hasMouse: boolean): boolean {
+  return lastPointer === null ? isMainPointerCoarse || !hasMouse : lastPointer === "touch";
+}
+
 /** Answers to media queries, and what the user has done so far. */
 export interface Signs {
   hasFinePointer: boolean;
@@ -43,6 +51,15 @@ export function devicesOf({ hasFinePointer, hasCoarsePointer, hasPressedKey }: S
     ...(hasCoarsePointer ? (["touch"] as const) : []),
     ...(hasMouse || hasPressedKey ? (["keyboard"] as const) : []),
   ];
+}
+
+/** A text for a finger instead of mouse and keys. Sentences about keys, and keys in parentheses at the end, are left out. */
+export function inTouchWords(text: string): string {
+  return text
+    .replace(/ \([^()]*\)$/, "")
+    .replace(/ ?\b(?:Esc|Delete) [a-z][^.]*\./g, "")
+    .replace(/\bclick\b/g, "tap")
+    .replace(/\bClick\b/g, "Tap");
 }
 
 /** The three gestures of a device in a few words: how and what. */

@@ -1,7 +1,7 @@
 // The help: gestures and keys in groups, for the devices of this user only.
 
 import { action, keyBindings, keysLabel } from "../keys";
-import { devices } from "./devices";
+import { devices, isTouched } from "./devices";
 import { element } from "./element";
 import { GESTURES } from "./gestures";
 import { child, make } from "./html";
@@ -56,7 +56,8 @@ export function setUpHelp(): void {
 
 function groups(): Group[] {
   const present = devices();
-  const gestures = (["mouse", "touch"] as const)
+  const pointers: ("mouse" | "touch")[] = isTouched() ? ["touch", "mouse"] : ["mouse", "touch"];
+  const gestures = pointers
     .filter((device) => present.includes(device))
     .map((device) => ({
       title: device === "mouse" ? "Mouse" : "Touch screen",

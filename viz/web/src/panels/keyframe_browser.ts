@@ -8,7 +8,7 @@ import { pickFrustum } from "../layers/frustum_picker";
 import { SideView } from "../layers/side_view";
 import type { KeyframesTopic } from "../topics/keyframes";
 import type { OrbitView } from "../view/orbit_view";
-import { closesWithEscape, isPageCovered, isPressed } from "../keys";
+import { closesWithEscape, isPageCovered } from "../keys";
 import { element } from "./element";
 import { closePanel } from "./focus";
 import { type CommonRequest, type Comparison, type DecodedPhoto, KeyframeComparer } from "./keyframe_comparison";
@@ -311,8 +311,8 @@ export class KeyframeBrowser {
     canvas.addEventListener("pointerdown", (event) => (pressedAt = [event.clientX, event.clientY]));
     canvas.addEventListener("click", (event) => {
       const moved = Math.hypot(event.clientX - pressedAt[0], event.clientY - pressedAt[1]);
-      if (moved > MAX_CLICK_PX || isPressed("toggle-measure")) return;
       const { view } = this.sources;
+      if (moved > MAX_CLICK_PX || view.isToolInUse) return;
       const { keyframes, depthM } = view.overlays.drawnKeyframes;
       const numbered = keyframes.filter((keyframe): keyframe is NumberedKeyframe => "id" in keyframe);
       const windowPx: [number, number] = [canvas.clientWidth, canvas.clientHeight];

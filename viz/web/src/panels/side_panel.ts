@@ -16,23 +16,25 @@ export function setUpSidePanel(): void {
   action("toggle-run", () => show(panel.hidden === true));
   const close = (): void => closePanel(panel, element("toggle-run"), () => show(false));
   closesWithEscape("panel", () => phones.matches && !panel.hidden, close, panel);
-  // On phones, there is space for one panel.
-  element("toolbar").addEventListener("click", (event) => {
-    if (!phones.matches || !(event.target instanceof Element)) return;
-    const opener = event.target.closest("[aria-controls]");
-    if (!opener || opener.id === "show-more") return;
-    const isRunOpen = opener.id === "toggle-run" && !panel.hidden;
-    const isOpened = opener.getAttribute("aria-expanded") === "true";
-    for (const other of openPanels()) if (isOpened && other !== opener) other.click();
-    show(isRunOpen);
-  });
+  // On phones, there is space for one sheet: a panel, the values of the run, or the list of "More". Panels are also opened
+  // from the view and with keys, so that this depends on the states of the buttons and not on clicks.
+  new MutationObserver((changes) => {
+    const opened = changes.map(({ target }) => target as HTMLElement).filter(isExpanded).at(-1);
+    if (opened && phones.matches) closeOthers(opened);
+  }).observe(element("toolbar"), { subtree: true, attributeFilter: ["aria-expanded"] });
   phones.addEventListener("change", () => show(!phones.matches));
   show(!phones.matches);
 }
 
-/** The buttons of the panels of the toolbar that are open. */
-function openPanels(): NodeListOf<HTMLElement> {
-  return document.querySelectorAll<HTMLElement>(
-    "#toolbar [aria-controls][aria-expanded='true']:not(#toggle-run, #show-more)",
-  );
+function isExpanded(opener: HTMLElement): boolean {
+  return opener.getAttribute("aria-expanded") === "true";
+}
+
+/** Closes all sheets except for the one of this button of the toolbar. */
+function closeOthers(opened: HTMLElement): void {
+  const openers = [...document.querySelectorAll<HTMLElement>("#toolbar [aria-controls]")];
+  for (const opener of openers.filter((other) => other !== opened && isExpanded(other))) {
+    // The toolbar closes the list of "More" after each click that it sees, but this list may be the one that was opened.
+    opener.dispatchEvent(new MouseEvent("click", { bubbles: opener.id === "show-more" }));
+  }
 }

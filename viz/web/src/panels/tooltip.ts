@@ -2,9 +2,10 @@
 // finger holds it. The title is removed meanwhile; otherwise, the browser would show it a second time.
 
 import { element } from "./element";
+import { inTouchWords } from "./gestures";
+import { HOLD_MILLIS, isHold } from "./hold";
 
 const HOVER_MILLIS = 400;
-const HOLD_MILLIS = 500;
 /** Time in which the mouse can move from the control to the tooltip. */
 const LEAVE_MILLIS = 150;
 /** A finger that moves farther than this is dragging. */
@@ -15,8 +16,9 @@ const MARGIN_PX = 8;
 export class Tooltip {
   private readonly tooltip = element("tooltip");
   private owner: HTMLElement | null = null;
+  private ownerTitle = "";
   private timer = 0;
-  private heldAt: [x: number, y: number] | null = null;
+  private held: { pointer: number; x: number; y: number; pressedMillis: number; isAnswered: boolean } | null = null;
   /** Whether the end of the touch must not cause a click, because the touch only requested the tooltip. */
   private ignoresClick = false;
 
@@ -31,10 +33,10 @@ export class Tooltip {
     document.addEventListener("pointerdown", (event) => this.press(event), { capture: true });
     document.addEventListener("pointermove", (event) => this.move(event), { capture: true });
     for (const kind of ["pointerup", "pointercancel"] as const) {
-      document.addEventListener(kind, () => this.endHold(), { capture: true });
+      document.addEventListener(kind, (event) => this.release(event), { capture: true });
     }
     document.addEventListener("click", (event) => this.click(event), { capture: true });
-    document.addEventListener("contextmenu", (event) => this.ignoresClick && event.preventDefault(), { capture: true });
+    document.addEventListener("contextmenu", (event) => this.openMenu(event), { capture: true });
     document.addEventListener("keydown", (event) => event.key === "Escape" && this.hide(), { capture: true });
     window.addEventListener("resize", () => this.hide());
   }
@@ -58,40 +60,56 @@ export class Tooltip {
     this.ignoresClick = false;
     const titled = event.pointerType === "touch" ? titledAt(event.target) : null;
     if (!titled) return;
-    this.heldAt = [event.clientX, event.clientY];
+    const { pointerId: pointer, clientX: x, clientY: y, timeStamp: pressedMillis } = event;
+    const held = { pointer, x, y, pressedMillis, isAnswered: false };
+    this.held = held;
     this.timer = window.setTimeout(() => {
-      this.show(titled);
-      this.ignoresClick = true;
+      this.show(titled, true);
+      held.isAnswered = this.owner !== null;
     }, HOLD_MILLIS);
   }
 
-  private move(event: PointerEvent): void {
-    if (!this.heldAt) return;
-    const [x, y] = this.heldAt;
-    if (Math.hypot(event.clientX - x, event.clientY - y) > MAX_HOLD_PX) this.endHold();
+  private move({ pointerId, clientX, clientY }: PointerEvent): void {
+    if (this.held?.pointer !== pointerId) return;
+    // A tooltip that is shown stays until the next touch.
+    if (!this.held.isAnswered && Math.hypot(clientX - this.held.x, clientY - this.held.y) > MAX_HOLD_PX) this.endHold();
+  }
+
+  private release({ type, pointerId, timeStamp: releasedMillis }: PointerEvent): void {
+    const { held } = this;
+    if (held?.pointer !== pointerId) return;
+    this.endHold();
+    if (type === "pointerup") this.ignoresClick = isHold({ ...held, releasedMillis });
   }
 
   private endHold(): void {
-    if (!this.heldAt) return;
-    this.heldAt = null;
+    this.held = null;
     this.stopTimer();
   }
 
+  /** A touch that shows a tooltip opens no menu of the browser. */
+  private openMenu(event: Event): void {
+    if (this.ignoresClick || this.held?.isAnswered) event.preventDefault();
+  }
+
   private click(event: MouseEvent): void {
-    if (!this.ignoresClick) {
+    // Clicks by keys and by scripts have no count.
+    const isIgnored = this.ignoresClick && event.detail > 0;
+    this.ignoresClick = false;
+    if (!isIgnored) {
       this.hide();
       return;
     }
-    this.ignoresClick = false;
     event.preventDefault();
     event.stopImmediatePropagation();
   }
 
-  private show(owner: HTMLElement): void {
+  private show(owner: HTMLElement, isTouched = false): void {
     this.hide();
-    const text = owner.title;
+    const text = isTouched ? (owner.dataset.touchTitle ?? inTouchWords(owner.title)) : owner.title;
     if (!text || !owner.isConnected) return;
     this.owner = owner;
+    this.ownerTitle = owner.title;
     owner.removeAttribute("title");
     owner.setAttribute("aria-describedby", "tooltip");
     this.tooltip.textContent = text;
@@ -116,7 +134,7 @@ export class Tooltip {
     this.owner = null;
     this.tooltip.hidden = true;
     owner.removeAttribute("aria-describedby");
-    if (!owner.title) owner.title = this.tooltip.textContent; // Unless it has a newer one.
+    if (!owner.title) owner.title = this.ownerTitle; // Unless it has a newer one.
   }
 
   private stopTimer(): void {

@@ -54,6 +54,8 @@ export class CropBox {
   private readonly handles: Handle[] = [];
   private radius = 1;
   private dragged: Drag | null = null;
+  /** Whether a handle was pressed last, and not the rest of the view. */
+  hasTakenPress = false;
   private hasUserChanged = false;
   private sceneCenter = new THREE.Vector3();
   private crops = false;
@@ -221,11 +223,13 @@ export class CropBox {
   }
 
   private begin(event: PointerEvent): void {
+    this.hasTakenPress = false;
     if (!this.root.visible || event.button !== 0) return;
     const reach = event.pointerType === "touch" ? REACH_PX.touch : REACH_PX.mouse;
     const distance = ({ place }: Handle): number => Math.hypot(place.x - event.offsetX, place.y - event.offsetY);
     const [nearest] = this.handles.filter((handle) => distance(handle) < reach).sort((a, b) => distance(a) - distance(b));
     if (!nearest) return;
+    this.hasTakenPress = true;
     this.dragged = {
       handle: nearest,
       unrotated: this.box.unrotated.clone(),

@@ -15,6 +15,11 @@ export function linkOf(frame: string, robot: RobotLayer): string | null {
   return frame === TOOL_FRAME ? named.tool : frame;
 }
 
+/** The name of a frame for the user. */
+export function frameName(frame: string): string {
+  return frame === BASE_FRAME ? "base" : frame === TOOL_FRAME ? "tool" : frame;
+}
+
 export class FrameChooser {
   private readonly list = element("follow-frame", HTMLSelectElement);
   private listed = "";

@@ -2,8 +2,10 @@
 
 import * as THREE from "three";
 import { isKeptByFocus, isPageCovered } from "../keys";
+import { inDeviceWords } from "../panels/devices";
 import { element } from "../panels/element";
 import { child, make } from "../panels/html";
+import { clearBottomPx } from "./clear_part";
 import { placeLabel } from "./label_places";
 
 const COLOR = 0xe3b341;
@@ -62,6 +64,10 @@ export class MeasureTool {
     this.update();
   }
 
+  get enabled(): boolean {
+    return this.root.visible;
+  }
+
   /** Places the labels, and gives the points their size on the screen. */
   update(): void {
     if (!this.root.visible) return;
@@ -76,7 +82,7 @@ export class MeasureTool {
       label.hidden = !from || !to;
       if (!from || !to) continue;
       const size = { width: label.offsetWidth, height: label.offsetHeight };
-      const view = { left: 0, top: 0, right: this.canvas.clientWidth, bottom: this.canvas.clientHeight };
+      const view = { left: 0, top: 0, right: this.canvas.clientWidth, bottom: clearBottomPx(this.canvas) };
       const { x, y } = placeLabel([from, to], size, view, inView);
       label.style.left = `${x.toFixed(1)}px`;
       label.style.top = `${y.toFixed(1)}px`;
@@ -103,7 +109,7 @@ export class MeasureTool {
     if (Math.hypot(event.offsetX - pressed[0], event.offsetY - pressed[1]) > MAX_CLICK_PX) return;
     const point = this.surfaceAt(event.offsetX, event.offsetY);
     if (point) this.addPoint(point);
-    else this.hint.textContent = NO_SURFACE;
+    else this.hint.textContent = inDeviceWords(NO_SURFACE);
   }
 
   private addPoint(point: THREE.Vector3): void {
@@ -179,8 +185,8 @@ export class MeasureTool {
   }
 
   private showHint(): void {
-    if (this.begun) this.hint.textContent = SECOND_POINT;
-    else this.hint.textContent = this.measurements.length > 0 ? NEXT_POINT : FIRST_POINT;
+    const text = this.begun ? SECOND_POINT : this.measurements.length > 0 ? NEXT_POINT : FIRST_POINT;
+    this.hint.textContent = inDeviceWords(text);
   }
 }
 

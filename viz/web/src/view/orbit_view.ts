@@ -127,7 +127,7 @@ export class OrbitView {
     this.camera.add(light);
     this.world.add(this.camera, new THREE.HemisphereLight(0xffffff, 0x5a6472, 1.7), this.overlays.root, this.robot.root);
     this.world.add(this.points.root, this.scans.root, this.frames.root);
-    canvas.addEventListener("dblclick", (event) => this.pivotAt(event.offsetX, event.offsetY));
+    canvas.addEventListener("dblclick", (event) => !this.isToolInUse && this.pivotAt(event.offsetX, event.offsetY));
     new ResizeObserver(() => {
       this.fit();
       onMove();
@@ -166,12 +166,19 @@ export class OrbitView {
     return this.sceneViews.scene;
   }
 
-  /** Shows everything: the scene, the robot and its path. The view stays so until the user moves it. */
+  /** Shows everything at once: the scene, the robot and its path. The view stays so until the user moves it. */
   showOverview(): void {
     this.attachment.end();
     this.hasUserMoved = false;
     this.hasAskedForOverview = true;
     this.sceneViews.restartOverview();
+    this.keepOverview();
+  }
+
+  /** Moves the view to the overview if that has begun, or no longer shows everything. */
+  private keepOverview(): void {
+    const overview = this.keepsOverview ? this.sceneViews.overview() : null;
+    if (overview) this.motion.jump(overview);
   }
 
   /** Whether the view shows everything until the user moves it. */
@@ -407,6 +414,11 @@ export class OrbitView {
     this.attachment.startRide(camera);
   }
 
+  /** Whether clicks on the view belong to a tool: to the measurement, or to a handle of the box. */
+  get isToolInUse(): boolean {
+    return this.measure.enabled || this.crop.hasTakenPress;
+  }
+
   /** Whether the view moves with the robot. */
   set follows(follows: boolean) {
     this.flies = false;
@@ -455,8 +467,7 @@ export class OrbitView {
     this.fly.update();
     this.motion.moveBack();
     this.attachment.update();
-    const overview = this.keepsOverview ? this.sceneViews.overview() : null;
-    if (overview) this.motion.jump(overview);
+    this.keepOverview();
     if (!this.isStale) return;
     this.isStale = false;
     const view = this.view();

@@ -2,6 +2,7 @@
 
 import { type Box3, type PerspectiveCamera, Vector3 } from "three";
 import { element } from "../panels/element";
+import { clearBottomPx } from "./clear_part";
 
 /** Distance of the arrow's center from the edges of the view, pixels. Toolbars and images must not cover the arrow. */
 const INSET_PX = { x: 34, top: 96, bottom: 84 };
@@ -54,7 +55,8 @@ export class RobotArrow {
   show(place: ArrowPlace | null): void {
     this.button.hidden = place === null;
     if (!place) return;
-    this.button.style.translate = `${Math.round(place.x)}px ${Math.round(place.y)}px`;
+    const lowest = clearBottomPx(element("canvas")) - INSET_PX.x;
+    this.button.style.translate = `${Math.round(place.x)}px ${Math.round(Math.min(place.y, lowest))}px`;
     this.button.style.setProperty("--angle", `${place.angleRad.toFixed(3)}rad`);
   }
 }

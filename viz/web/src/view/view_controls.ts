@@ -2,8 +2,9 @@
 // the eye stops, and where the robot is.
 
 import { blockText, canBeCut } from "./block";
+import { inDeviceWords } from "../panels/devices";
 import { element } from "../panels/element";
-import { FrameChooser } from "./frame_chooser";
+import { FrameChooser, frameName } from "./frame_chooser";
 import { setText } from "../panels/html";
 import type { LiveImages } from "../panels/live_images";
 import type { OrbitView } from "./orbit_view";
@@ -66,6 +67,7 @@ export class ViewControls {
     this.shownMode = mode;
     this.showFlying(view.mode === "fly");
     press("toggle-follow", view.mode === "chase");
+    setText(element("follow-text"), view.mode === "chase" ? `following ${frameName(frame)}` : "");
     press("look-live", view.mode === "ride");
     press("toggle-cut", view.isCut);
     this.frames.show(view.robot, frame);
@@ -91,8 +93,7 @@ export class ViewControls {
     const hasWaited = block !== null && (!isUnknown || this.lastStop - this.stoppedSince > WAIT_MILLIS);
     const isShown = hasWaited && now - this.lastStop < BLOCKED_MILLIS && !this.view.isCut;
     if (isShown) {
-      const text = blockText(block.what);
-      setText(element("blocked-text"), text);
+      setText(element("blocked-text"), inDeviceWords(blockText(block.what)));
       element("cut-away").hidden = !canBeCut(block.what);
     }
     if (this.blocked.hidden === isShown) this.blocked.hidden = !isShown;
