@@ -556,7 +556,14 @@ fn check_saved_picture(browser: &mut Browser) {
     let name = browser.evaluate("window.savedName");
     let name = name.as_str().expect("a name");
     assert!(
-        name.starts_with("fieldrig-20") && name.ends_with(".png"),
+        name.starts_with("fieldrig-")
+            && name.contains("splat-20")
+            && name.ends_with(".png")
+            && !name.contains(' '),
         "{name}"
     );
+    let note = format!("Saved {name}");
+    wait_for(browser, "the name of the file", |browser| {
+        browser.text("toast") == note
+    });
 }

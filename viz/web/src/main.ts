@@ -185,7 +185,7 @@ const viewControls = new ViewControls(view, images);
 const timeSlider = new TimeSlider(keyframes, view, new TimePhoto(browser.photos));
 const settings = new ViewSettings(view, scheduler, sides[1]);
 new BoxPanel(view.crop);
-setUpSavePicture(view);
+setUpSavePicture(view, pictureInfo, () => model.status?.identity);
 setUpKeys(() => view.changed());
 setUpButtons({
   view,
