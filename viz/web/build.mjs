@@ -44,7 +44,10 @@ await build({
 });
 await build({
   ...options,
-  entryPoints: [join(here, "src/layers/mesh_loaders.ts")],
+  entryPoints: {
+    mesh_loaders: join(here, "src/layers/mesh_loaders.ts"),
+    coverage: join(here, "src/panels/coverage.ts"),
+  },
   format: "esm",
   plugins: [withoutRenderer],
 });

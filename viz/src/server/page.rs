@@ -58,6 +58,12 @@ pub(crate) const FILES: &[PageFile] = &[
         "mesh_loaders.js"
     ),
     page_file!(
+        "/coverage.js",
+        "text/javascript; charset=utf-8",
+        "../../web/dist/",
+        "coverage.js"
+    ),
+    page_file!(
         "/app.css",
         "text/css; charset=utf-8",
         "../../web/dist/",

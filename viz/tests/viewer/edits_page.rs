@@ -131,6 +131,20 @@ impl Page {
         self.browser.mouse("mouseReleased", at);
     }
 
+    /// Moves the pointer without pressing it, and waits until the page shows whether there is a
+    /// surface.
+    fn hover(&mut self, request: &RenderRequest, point: Point3<f64>, has_surface: bool) {
+        let [x, y] = self.in_window(pixel_of(request, point));
+        self.browser.evaluate(&format!(
+            "void document.getElementById('canvas')?.dispatchEvent(new PointerEvent('pointermove', \
+             {{ clientX: {x}, clientY: {y}, pointerType: 'mouse', bubbles: true }}))"
+        ));
+        wait_for(&mut self.browser, "the point at the pointer", |browser| {
+            browser.evaluate("document.getElementById('canvas')?.dataset.surface ?? ''")
+                == json!(has_surface.to_string())
+        });
+    }
+
     /// A point of the canvas in pixels of the window.
     fn in_window(&mut self, [x, y]: [f64; 2]) -> [i32; 2] {
         let [left, top, ..] = canvas_bounds(&mut self.browser);
@@ -222,7 +236,8 @@ fn operators_crop_edit_and_measure() {
     std::fs::remove_dir_all(&profile).expect("the browser has left its profile");
 }
 
-/// Several distances are shown, without covering their points, until they are removed.
+/// Several distances are shown, without covering their points, until they are removed. They are
+/// hidden while the tool is off.
 fn check_measurements(page: &mut Page, view: &RenderRequest) {
     const N_LABELS: &str = "document.querySelectorAll('.distance').length";
     let points = [
@@ -244,6 +259,8 @@ fn check_measurements(page: &mut Page, view: &RenderRequest) {
     assert!(page.browser.text("measure-hint").contains("two points"));
     let cursor = "getComputedStyle(document.getElementById('canvas')).cursor";
     assert_eq!(page.browser.evaluate(cursor), json!("crosshair"));
+    page.hover(view, points[0], true);
+    page.hover(view, Point3::new(0.0, 50.0, 12.0), false);
 
     page.click_on(view, points[0]);
     page.click_on(view, points[1]);
@@ -268,6 +285,11 @@ fn check_measurements(page: &mut Page, view: &RenderRequest) {
         ));
         assert_eq!(covering, json!(0), "a label covers {point}");
     }
+    page.press("Escape", "");
+    assert!(page.is_hidden("measure-hint") && page.is_hidden("distances"));
+    page.browser.click("toggle-measure");
+    assert!(!page.is_hidden("distances"));
+    n_labels(page, 2);
     page.press("Delete", "");
     n_labels(page, 1);
     page.browser

@@ -241,7 +241,7 @@ fn the_keyframe_browser_says_what_is_wrong_with_each_keyframe() {
     check_look(&mut browser, &requests);
     check_click(&mut browser, &requests);
     check_missing_photograph(&mut browser, &hub);
-    check_coverage(&mut browser, &hub);
+    check_coverage(&mut browser, &hub, &requests);
     check_saved_picture(&mut browser);
 
     drop(browser);
@@ -485,9 +485,11 @@ fn check_missing_photograph(browser: &mut Browser, hub: &Hub) {
     assert!(!is_open(browser));
 }
 
-/// The page says where to look next, relative to the live camera.
-fn check_coverage(browser: &mut Browser, hub: &Hub) {
+/// The page says where to look next, in world and relative to the live camera, and moves the eye to
+/// this camera, because no keyframe shows the place.
+fn check_coverage(browser: &mut Browser, hub: &Hub, requests: &Mutex<Vec<RenderRequest>>) {
     const N_CELLS: u32 = 20;
+    const PLACE_M: [f64; 3] = [0.55, -0.45, 0.05];
     wait_for(browser, "the button", |browser| {
         browser.evaluate("document.getElementById('toggle-coverage').hidden") == false
     });
@@ -515,7 +517,7 @@ fn check_coverage(browser: &mut Browser, hub: &Hub) {
     wait_for(browser, "the place", |browser| {
         browser.text("coverage-text").contains("not determined")
     });
-    // The corner is around (0.55, -0.45).
+    assert!(browser.text("coverage-text").contains("place 1 at x 0."));
     let camera = Translation3::new(0.05, 1.05, 0.0) * looking_along_y();
     hub.set_live_image(LiveImage {
         camera: "wrist".into(),
@@ -531,6 +533,17 @@ fn check_coverage(browser: &mut Browser, hub: &Hub) {
         let text = browser.text("coverage-text");
         text.contains("from wrist: turn right 45 degrees") && text.contains("m down")
     });
+    browser.click("coverage-look");
+    let [_, _, width_px, _] = canvas_bounds(browser);
+    wait_for(browser, "the view of the place", |_| {
+        main_request(requests, width_px).is_some_and(|request| {
+            let moved = request.world_from_camera.translation.vector - camera.translation.vector;
+            let [x, y] = pixel_of(&request, &Point3::from(PLACE_M));
+            let [width, height] = request.size_px.map(f64::from);
+            // The place is known to about a cell.
+            moved.norm() < 1e-4 && (x / width - 0.5).abs() < 0.2 && (y / height - 0.5).abs() < 0.2
+        })
+    });
     browser.click("toggle-coverage");
     assert_eq!(
         browser.evaluate("document.getElementById('coverage').hidden"),
@@ -539,7 +552,7 @@ fn check_coverage(browser: &mut Browser, hub: &Hub) {
     wait_for(browser, "no subscription", |_| !hub.needs_observations());
 }
 
-/// The saved file is a picture of the size of the view.
+/// The saved file is a picture of the size of the view, and the page says its name.
 fn check_saved_picture(browser: &mut Browser) {
     browser.evaluate(
         "(() => { HTMLAnchorElement.prototype.click = function () { window.savedName = this.download; }; \
@@ -556,7 +569,14 @@ fn check_saved_picture(browser: &mut Browser) {
     let name = browser.evaluate("window.savedName");
     let name = name.as_str().expect("a name");
     assert!(
-        name.starts_with("fieldrig-20") && name.ends_with(".png"),
+        name.starts_with("fieldrig-")
+            && name.contains("splat-20")
+            && name.ends_with(".png")
+            && !name.contains(' '),
         "{name}"
     );
+    let note = format!("Saved {name}");
+    wait_for(browser, "the name of the file", |browser| {
+        browser.text("toast") == note
+    });
 }

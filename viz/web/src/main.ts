@@ -176,12 +176,17 @@ const picture = new MainPicture({
 });
 
 // What the user controls.
-const coverage = new CoverageHint({ view, topic: observations, live: () => liveImages.latest });
+const coverage = new CoverageHint({
+  view,
+  topic: observations,
+  live: () => liveImages.current,
+  keyframes: () => keyframes.list.keyframes,
+});
 const viewControls = new ViewControls(view, images);
 const timeSlider = new TimeSlider(keyframes, view, new TimePhoto(browser.photos));
 const settings = new ViewSettings(view, scheduler, sides[1]);
 new BoxPanel(view.crop);
-setUpSavePicture(view);
+setUpSavePicture(view, pictureInfo, () => model.status?.identity);
 setUpKeys(() => view.changed());
 setUpButtons({
   view,

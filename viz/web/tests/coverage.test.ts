@@ -1,7 +1,7 @@
 import assert from "node:assert/strict";
 import { test } from "node:test";
 import type { ObservationsHeader } from "../src/connection/protocol";
-import { directionText, directionTo, type ObservationCodes, reasonText, worstPlace } from "../src/panels/coverage";
+import { directionText, directionTo, type ObservationCodes, placeText, reasonText, worstPlace } from "../src/panels/coverage";
 import { assertClose } from "./close";
 
 const CELL_M = 0.05;
@@ -89,6 +89,29 @@ test("places out of reach, and scenes that are seen well, lead to nothing", () =
   assert.equal(worstPlace(floor(true, []), SCENE), null);
   const truncated = floor(true, [patch]);
   assert.equal(worstPlace({ ...truncated, codes: truncated.codes.slice(1) }, SCENE), null);
+});
+
+test("a place stays until it is covered or clearly not the worst any more", () => {
+  const first: Patch = { from: [28, 12], to: [34, 18], sigma: 160 };
+  const other: Patch = { from: [8, 8], to: [14, 14], sigma: 150 };
+  const search = (patches: Patch[], found: ReturnType<typeof worstPlace> = null) => worstPlace(floor(false, patches), SCENE, found);
+  const found = search([first, other]);
+  assert.ok(found && found.pointM[0] > 0);
+  // It is seen a little better now, and the other one is the worst.
+  const better = { ...first, sigma: 145 };
+  assert.ok(search([better, other])!.pointM[0] < 0);
+  const kept = search([better, other], found);
+  assert.deepEqual([kept!.pointM, kept!.centerM], [found.pointM, found.centerM]);
+  assert.ok(kept!.sigmaM! < found.sigmaM!, "its numbers are those of the new map");
+  const covered = search([{ ...first, sigma: 90 }, other], found);
+  assert.ok(covered!.pointM[0] < 0);
+  assert.equal(search([], found), null);
+  // Nothing is known of the place in a map of another region.
+  assert.ok(search([other], { ...found, centerM: [50, 0, 0], pointM: [50, 0, 0] })!.pointM[0] < 0);
+});
+
+test("the text of a place does not depend on the robot", () => {
+  assert.equal(placeText([1.24, -0.4, 0.62]), "x 1.2, y -0.4, height 0.6 m");
 });
 
 /** A camera at (1, 2, 1) that looks along the world's y axis: its x axis is that of the world. */

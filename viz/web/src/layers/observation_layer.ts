@@ -10,6 +10,13 @@ import { inflated } from "./zlib";
 /** What the tint shows. */
 export type Quantity = "age" | "uncertainty";
 
+/** The color scale, as text and colors from the best to the worst value. */
+export interface Legend {
+  title: string;
+  labels: readonly string[];
+  colors: readonly string[];
+}
+
 /** Colors of plasma (matplotlib), from the best to the worst value. */
 const COLORS = ["#f0f921", "#fdb42f", "#ed7953", "#cc4778", "#9c179e", "#5b02a3"] as const;
 /** The best and the worst value of the color scale: seconds, meters. */
@@ -100,6 +107,12 @@ export class ObservationLayer {
     if (nAll === this.nAll) return;
     this.nAll = nAll;
     if (this.quantity) this.update();
+  }
+
+  /** The legend of the tint; null without a tint. */
+  get legend(): Legend | null {
+    const title = element("legend-title").textContent;
+    return this.quantity && { title, labels: LABELS[this.quantity], colors: COLORS };
   }
 
   /** Sets what the tint shows; null: no tint. */

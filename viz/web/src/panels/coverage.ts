@@ -1,6 +1,9 @@
-// Finds the place of the model that is seen worst, and describes how to turn and move a camera toward it.
+// Finds the place of the model that is seen worst, and describes how to turn and move a camera toward it. The page loads
+// this script when the operator asks for the place.
 
 import type { ObservationsHeader, Scene } from "../connection/protocol";
+
+export { cameraToTurn, eyeFor } from "./coverage_cameras";
 
 /** When and how precisely each cell of a grid was observed: codes of ages, then codes of standard deviations. */
 export interface ObservationCodes {
@@ -9,6 +12,8 @@ export interface ObservationCodes {
 }
 
 export interface WorstPlace {
+  /** Center of the part of the model whose cells were compared with those of other parts, in world. */
+  centerM: [number, number, number];
   pointM: [number, number, number];
   /** Standard deviation of the position of the surface, meters; null if it is not determined. */
   sigmaM: number | null;
@@ -36,25 +41,43 @@ const OLD_SECS = 600;
 const AGE_WEIGHT = 0.5;
 /** Size of the compared places, in radii of the scene. It is about the area that a camera sees from nearby. */
 const PLACE_RADII = 0.12;
+/**
+ * A place is kept until its cells are seen better, in sum, than this share of the worst ones. Otherwise, the place would
+ * change while the operator drives to it.
+ */
+const KEPT_SHARE = 0.5;
 /** Cells farther from the center of the scene than this, in its radii, are out of reach. */
 const REACH_RADII = 1;
 const UNOBSERVED = 0;
 const UNDETERMINED = 255;
 
-/** The place whose cells are seen worst in sum; null if all cells are seen well. */
-export function worstPlace({ header, codes }: ObservationCodes, scene: Pick<Scene, "center_m" | "radius_m">): WorstPlace | null {
+/**
+ * The place whose cells are seen worst in sum; null if all cells are seen well. The place that was found before stays
+ * as long as it is hardly better than the worst one.
+ */
+export function worstPlace(
+  { header, codes }: ObservationCodes,
+  scene: Pick<Scene, "center_m" | "radius_m">,
+  found: WorstPlace | null = null,
+): WorstPlace | null {
   const [width, height, depth] = header.n_cells;
   const nCells = width * height * depth;
   if (codes.length < 2 * nCells) return null;
   const weights = cellWeights({ header, codes }, scene);
   const reachCells = Math.max(1, Math.round((PLACE_RADII * scene.radius_m) / header.cell_m));
   const sums = boxSums(weights, header.n_cells, reachCells);
-  const center = indexOfMax(sums);
-  if (!(sums[center]! > 0)) return null;
-  const ix = weightedCell(weights, header.n_cells, center, reachCells);
+  const worst = indexOfMax(sums);
+  if (!(sums[worst]! > 0)) return null;
+  const foundIx = found && cellAt(header, found.centerM);
+  const isKept = foundIx !== null && sums[foundIx]! >= KEPT_SHARE * sums[worst]!;
+  const center = isKept ? foundIx : worst;
+  const pointIx = isKept ? cellAt(header, found!.pointM) : null;
+  const isPointKept = pointIx !== null && weights[pointIx]! > 0;
+  const ix = isPointKept ? pointIx : weightedCell(weights, header.n_cells, center, reachCells);
   const sigmaCode = codes[nCells + ix]!;
   return {
-    pointM: cellCenter(header, ix),
+    centerM: isKept ? found!.centerM : cellCenter(header, center),
+    pointM: isPointKept ? found!.pointM : cellCenter(header, ix),
     sigmaM: sigmaCode === UNDETERMINED ? null : decoded(header.min_sigma_m, header.log_step, sigmaCode),
     ageSecs: decoded(header.min_age_secs, header.log_step, codes[ix]!),
   };
@@ -102,6 +125,13 @@ function cellCenter({ min_m, cell_m, n_cells }: ObservationsHeader, ix: number):
   const [width, height] = n_cells;
   const [x, y, z] = [ix % width, Math.floor(ix / width) % height, Math.floor(ix / (width * height))];
   return [min_m[0] + cell_m * (x + 0.5), min_m[1] + cell_m * (y + 0.5), min_m[2] + cell_m * (z + 0.5)];
+}
+
+/** The cell that contains a point in world; null outside of the grid. */
+function cellAt({ min_m, cell_m, n_cells }: ObservationsHeader, pointM: [number, number, number]): number | null {
+  const [x, y, z] = pointM.map((value, axis) => Math.floor((value - min_m[axis]!) / cell_m)) as [number, number, number];
+  const isInside = [x, y, z].every((at, axis) => at >= 0 && at < n_cells[axis]!);
+  return isInside ? (z * n_cells[1] + y) * n_cells[0] + x : null;
 }
 
 /** Sums over cubes of `2 * reach + 1` cells around each cell, one axis after the other. */
@@ -178,10 +208,15 @@ function heading(pose: readonly number[]): [number, number] {
   return [sign * pose[1]!, sign * pose[5]!];
 }
 
-/** The direction as text, such as "turn right 40 degrees, 0.6 m up, 1.3 m away". */
+/** Where a place is in world, such as "x 1.2, y -0.4, height 0.6 m". It does not change while the robot moves. */
+export function placeText([x, y, z]: readonly [number, number, number]): string {
+  return `x ${x.toFixed(1)}, y ${y.toFixed(1)}, height ${z.toFixed(1)} m`;
+}
+
+/** The direction, to 5 degrees, as text, such as "turn right 40 degrees, 0.6 m up, 1.3 m away". */
 export function directionText({ rightRad, upM, distanceM }: Direction): string {
   const parts: string[] = [];
-  const degrees = rightRad === null ? 0 : Math.round((rightRad * 180) / Math.PI);
+  const degrees = rightRad === null ? 0 : 5 * Math.round((rightRad * 36) / Math.PI);
   if (rightRad !== null) {
     parts.push(Math.abs(degrees) < 5 ? "straight ahead" : `turn ${degrees > 0 ? "right" : "left"} ${Math.abs(degrees)} degrees`);
   }

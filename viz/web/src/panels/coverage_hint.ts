@@ -1,11 +1,11 @@
 // Shows where to look next: an arrow in the scene, and the direction relative to the live camera.
 
 import { Vector3 } from "three";
-import type { LiveImageHeader, ObservationsHeader, Scene } from "../connection/protocol";
+import type { LiveImageHeader, ObservationsHeader, PosedCamera, Scene } from "../connection/protocol";
 import { CoverageMarker } from "../layers/coverage_marker";
 import type { ObservationsTopic } from "../topics/observations";
 import type { OrbitView } from "../view/orbit_view";
-import { directionText, directionTo, reasonText, type WorstPlace, worstPlace } from "./coverage";
+import type { WorstPlace } from "./coverage";
 import { element } from "./element";
 import { make, setText } from "./html";
 
@@ -16,18 +16,25 @@ const UPDATE_MILLIS = 250;
 export interface CoverageSources {
   view: OrbitView;
   topic: ObservationsTopic;
-  /** The newest live image with a pose. */
-  live(): LiveImageHeader | null;
+  /** The newest live images with poses, one of each camera. */
+  live(): (LiveImageHeader & PosedCamera)[];
+  keyframes(): readonly PosedCamera[];
 }
 
 export class CoverageHint {
   private readonly marker = new CoverageMarker();
   private readonly root = make("div", { id: "coverage", className: "coverage", hidden: true });
   private readonly text = make("span", { id: "coverage-text" });
-  private readonly look = make("button", { id: "coverage-look", textContent: "Look", title: "Turn the view toward this place" });
+  private readonly look = make("button", { id: "coverage-look", textContent: "Look", title: "Look at this place, from where a camera was close to it" });
+  /** The script that searches; null until it is loaded. */
+  private search: typeof import("./coverage") | null = null;
   private scene: Scene | null = null;
   private map: { header: ObservationsHeader; codes: Uint8Array } | null = null;
   private place: WorstPlace | null = null;
+  /** Number of the place among those that were shown. */
+  private nPlaces = 0;
+  /** The camera whose direction to the place is shown. */
+  private camera: string | null = null;
   private isEnabled = false;
 
   constructor(private readonly sources: CoverageSources) {
@@ -38,7 +45,10 @@ export class CoverageHint {
       this.update();
     };
     this.look.addEventListener("click", () => {
-      if (this.place) view.turnTo(new Vector3(...this.place.pointM));
+      if (!this.place || !this.search) return;
+      const { pointM } = this.place;
+      const eye = this.search.eyeFor([...sources.keyframes(), ...sources.live()], pointM);
+      view.lookAt(new Vector3(...pointM), eye && new Vector3(...eye));
     });
     this.root.append(this.text, this.look);
     element("view").querySelector(".bottom")?.prepend(this.root);
@@ -52,6 +62,16 @@ export class CoverageHint {
     this.isEnabled = isEnabled;
     this.root.hidden = !isEnabled;
     this.sources.topic.searched = isEnabled;
+    this.update();
+    if (isEnabled && !this.search) void this.load();
+  }
+
+  private async load(): Promise<void> {
+    try {
+      this.search = await import("./coverage");
+    } catch {
+      return; // There is no connection, and so no map. The next attempt loads it.
+    }
     this.update();
   }
 
@@ -67,8 +87,10 @@ export class CoverageHint {
   }
 
   private update(): void {
-    const { map, scene } = this;
-    this.place = this.isEnabled && map && scene ? worstPlace(map, scene) : null;
+    const { map, scene, search } = this;
+    const before = this.place;
+    this.place = this.isEnabled && map && scene && search ? search.worstPlace(map, scene, before) : null;
+    if (this.place && this.place.centerM !== before?.centerM) this.nPlaces += 1;
     this.marker.show(this.place?.pointM ?? null, scene?.radius_m ?? 1);
     this.sources.view.changed();
     if (this.isEnabled) this.showText();
@@ -80,12 +102,15 @@ export class CoverageHint {
   }
 
   private hint(): string {
-    if (!this.map) return "Look here next: waiting for the map of observations";
+    const { search } = this;
+    if (!this.map || !search) return "Look here next: waiting for the map of observations";
     if (!this.place) return "Look here next: everything within reach was seen well";
-    const reason = reasonText(this.place, this.map.header.newest_millis !== null);
-    const live = this.sources.live();
-    if (!live?.world_from_camera) return `Look here next: ${reason}`;
-    const direction = directionText(directionTo(this.place.pointM, live.world_from_camera));
-    return `Look here next, from ${live.camera}: ${direction} (${reason})`;
+    const { pointM } = this.place;
+    const reason = search.reasonText(this.place, this.map.header.newest_millis !== null);
+    const place = `Look here next: place ${this.nPlaces} at ${search.placeText(pointM)} (${reason})`;
+    const camera = search.cameraToTurn(this.sources.live(), pointM, this.camera);
+    this.camera = camera?.camera ?? null;
+    if (!camera) return place;
+    return `${place}; from ${camera.camera}: ${search.directionText(search.directionTo(pointM, camera.world_from_camera))}`;
   }
 }

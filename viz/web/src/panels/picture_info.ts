@@ -6,6 +6,7 @@ import type { OrbitView } from "../view/orbit_view";
 import type { ChunkArrival } from "../layers/chunk_arrival";
 import { element } from "./element";
 import { setText } from "./html";
+import { ageText } from "./quantities";
 import { type DrawnHeader, labelText, PictureLabel, type PictureStatus } from "./picture_label";
 
 export class PictureInfo {
@@ -27,6 +28,25 @@ export class PictureInfo {
     private readonly stages: () => number[],
   ) {
     view.picture.accepts = (header) => this.label.accepts(header);
+  }
+
+  /** Whether the view shows the full picture of the wanted view and model. */
+  get isComplete(): boolean {
+    return this.info.dataset.state === "current";
+  }
+
+  /** The drawn model; empty if there is none. */
+  get method(): string {
+    return this.info.dataset.method ?? "";
+  }
+
+  /** The drawn model, and how old its picture is if something has changed since, such as "splat, step 1200, 3 s old". */
+  get summary(): string {
+    const { step, shownRequest } = this.info.dataset;
+    const { header } = this.label;
+    const age = header && shownRequest ? this.ageMillis(header, this.label.status(performance.now())) : null;
+    const state = age !== null ? ageText(age) : this.isComplete ? "current" : "incomplete";
+    return [this.method, step ? `step ${step}` : "", state].filter((part) => part !== "").join(", ");
   }
 
   /** Another view is wanted. */

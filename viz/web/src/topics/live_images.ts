@@ -3,7 +3,7 @@
 import { element } from "../panels/element";
 import type { LiveImages } from "../panels/live_images";
 import type { OrbitView } from "../view/orbit_view";
-import type { LiveImageHeader } from "../connection/protocol";
+import type { LiveImageHeader, PosedCamera } from "../connection/protocol";
 import { on, type Subscription, type Topic } from "./topic";
 
 /** An image is labeled live for half a second. */
@@ -15,6 +15,8 @@ const IMAGE_HEIGHT = { min: 90, max: 190, ofWindow: 0.22 };
 const MAX_IMAGE_WIDTH_PX = 640;
 /** Maximum size of images that are enlarged or fill the view. */
 const ENLARGED_PX: [number, number] = [1280, 960];
+/** The pose of a camera is not current if the newest image of any camera is newer by this. */
+const CURRENT_MILLIS = 5000;
 /** The server rounds image sizes down to multiples of this. */
 const IMAGE_STEP_PX = 16;
 
@@ -22,6 +24,7 @@ export class LiveImagesTopic implements Topic {
   readonly name = "live_images";
   /** The newest image with a pose. */
   latest: LiveImageHeader | null = null;
+  private readonly posed = new Map<string, LiveImageHeader & PosedCamera>();
   readonly receivers = [
     on<LiveImageHeader>("live_image", (header, payload) => {
       this.images.show(header, payload);
@@ -29,6 +32,7 @@ export class LiveImagesTopic implements Topic {
       this.latest = header;
       element("look-live", HTMLButtonElement).disabled = false;
       const posed = { ...header, world_from_camera: header.world_from_camera };
+      this.posed.set(header.camera, posed);
       this.view.attachment.seen(posed);
       const hasMoved = this.view.overlays.setLiveCamera(posed, header.captured_millis);
       if (hasMoved) this.view.changed();
@@ -42,6 +46,13 @@ export class LiveImagesTopic implements Topic {
     private readonly images: LiveImages,
     private readonly changed: () => void,
   ) {}
+
+  /** The newest images with poses, one of each camera. */
+  get current(): (LiveImageHeader & PosedCamera)[] {
+    const all = [...this.posed.values()];
+    const newest = Math.max(...all.map(({ captured_millis }) => captured_millis));
+    return all.filter(({ captured_millis }) => captured_millis > newest - CURRENT_MILLIS);
+  }
 
   /** Whether camera images are shown. If not, small images are requested, because their poses are still needed. */
   set shown(shown: boolean) {
@@ -73,6 +84,7 @@ export class LiveImagesTopic implements Topic {
 
   restart(): void {
     this.latest = null;
+    this.posed.clear();
     element("look-live", HTMLButtonElement).disabled = true;
     this.images.forget();
     this.view.overlays.forgetLive();

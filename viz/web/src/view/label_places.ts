@@ -4,8 +4,12 @@ import type { Point, Rect } from "./handle_places";
 
 /** Distance of a label from a point, pixels. */
 const GAP_PX = 12;
+/** Distance of a label from the middle of its line, pixels. */
+const LINE_GAP_PX = 8;
+/** A label that crosses its line is placed as if it were farther away by this, pixels. */
+const CROSSING_PX = 30;
 
-/** Center of a label of this size for the line between two points, so that it covers none of `points`. Pixels. */
+/** Center of a label of this size close to the middle of the line between two points, so that it covers none of `points`. Pixels. */
 export function placeLabel(
   [from, to]: [Point, Point],
   size: { width: number; height: number },
@@ -13,23 +17,27 @@ export function placeLabel(
   points: Point[],
 ): Point {
   const middle = { x: 0.5 * (from.x + to.x), y: 0.5 * (from.y + to.y) };
-  const length = Math.hypot(to.x - from.x, to.y - from.y);
-  // The label is moved across the line, or upward if the direction of the line is undefined.
-  const across = length > 0 ? { x: (from.y - to.y) / length, y: (to.x - from.x) / length } : { x: 0, y: -1 };
-  const away = 0.5 * (Math.abs(across.x) * size.width + Math.abs(across.y) * size.height) + GAP_PX;
-  const halfWidth = 0.5 * Math.abs(to.x - from.x) + 0.5 * size.width + GAP_PX;
-  const halfHeight = 0.5 * Math.abs(to.y - from.y) + 0.5 * size.height + GAP_PX;
-  const offsets = [
-    { x: across.x * away, y: across.y * away },
-    { x: -across.x * away, y: -across.y * away },
-    { x: 0, y: -halfHeight },
-    { x: 0, y: halfHeight },
-    { x: -halfWidth, y: 0 },
-    { x: halfWidth, y: 0 },
-  ];
-  const candidates = offsets.map((offset) => clamped({ x: middle.x + offset.x, y: middle.y + offset.y }, size, view));
+  // Beside the middle of the line and, if points are in the way there, beside the whole line.
+  const [near, far] = [[0, 0], [Math.abs(to.x - from.x), Math.abs(to.y - from.y)]].map(([width, height], ix) => {
+    const gap = ix === 0 ? LINE_GAP_PX : GAP_PX;
+    const [x, y] = [0.5 * (width! + size.width) + gap, 0.5 * (height! + size.height) + gap];
+    return [[0, -y], [0, y], [x, 0], [-x, 0], [x, -y], [-x, -y], [x, y], [-x, y]];
+  }) as [[number, number][], [number, number][]];
+  const candidates = [...near, ...far].map(([x, y]) => clamped({ x: middle.x + x, y: middle.y + y }, size, view));
   const isClear = (center: Point): boolean => points.every((point) => !covers(center, size, point));
-  return candidates.find(isClear) ?? candidates[0]!;
+  const crosses = (center: Point): boolean =>
+    [0.1, 0.3, 0.5, 0.7, 0.9].some((share) => {
+      const point = { x: from.x + share * (to.x - from.x), y: from.y + share * (to.y - from.y) };
+      return distance(center, size, point) === 0;
+    });
+  const cost = (center: Point): number => distance(center, size, middle) + (crosses(center) ? CROSSING_PX : 0);
+  return candidates.filter(isClear).sort((a, b) => cost(a) - cost(b))[0] ?? candidates[0]!;
+}
+
+/** Distance of a point from a label, pixels; 0 inside of it. */
+export function distance(center: Point, size: { width: number; height: number }, point: Point): number {
+  const beyond = (away: number, side: number): number => Math.max(0, Math.abs(away) - 0.5 * side);
+  return Math.hypot(beyond(point.x - center.x, size.width), beyond(point.y - center.y, size.height));
 }
 
 /** Whether a label covers a point or is close to it. */

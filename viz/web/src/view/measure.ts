@@ -33,11 +33,16 @@ export class MeasureTool {
   private readonly sphere = new THREE.SphereGeometry(1, 16, 12);
   // The material is always visible, like the handles of the crop box.
   private readonly pointMaterial = new THREE.MeshBasicMaterial({ color: COLOR, depthTest: false, transparent: true });
+  private readonly previewMaterial = new THREE.MeshBasicMaterial({ color: COLOR, depthTest: false, transparent: true, opacity: 0.6 });
   private readonly lineMaterial = new THREE.LineBasicMaterial({ color: COLOR, depthTest: false, transparent: true });
   private readonly measurements: Measurement[] = [];
   /** The first point of the next measurement. */
   private begun: THREE.Mesh | null = null;
   private pressed: [number, number] | null = null;
+  /** Where the pointer is, in pixels of the canvas; null if it is elsewhere or drags. */
+  private pointer: [number, number] | null = null;
+  /** Shows which point a click would set. */
+  private readonly preview: THREE.Mesh;
 
   constructor(
     private readonly camera: THREE.PerspectiveCamera,
@@ -46,21 +51,31 @@ export class MeasureTool {
     private readonly changed: () => void,
   ) {
     this.root.visible = false;
+    this.preview = this.pointAt(new THREE.Vector3());
+    this.preview.material = this.previewMaterial;
+    this.root.add(this.preview);
     canvas.addEventListener("pointerdown", (event) => {
       this.pressed = event.isPrimary && event.button === 0 ? [event.offsetX, event.offsetY] : null;
     });
+    canvas.addEventListener("pointermove", (event) => {
+      // A finger covers the point, and does not move before it presses.
+      const isFree = event.buttons === 0 && event.pointerType !== "touch";
+      this.moveTo(isFree ? [event.offsetX, event.offsetY] : null);
+    });
+    canvas.addEventListener("pointerleave", () => this.moveTo(null));
     canvas.addEventListener("pointerup", (event) => this.release(event));
     // This listener runs before other listeners, so that Delete has only one effect.
     window.addEventListener("keydown", (event) => this.keyDown(event), { capture: true });
   }
 
-  /** Whether clicks set points. Switching the tool off removes all measurements. */
+  /** Whether clicks set points, and whether the measurements are shown. */
   set enabled(enabled: boolean) {
     this.root.visible = enabled;
     this.canvas.classList.toggle("measuring", enabled);
     this.hint.hidden = !enabled;
+    this.labels.hidden = !enabled;
+    this.pointer = null;
     this.cancel();
-    while (this.measurements.length > 0) this.remove(this.measurements[0]!);
     this.update();
   }
 
@@ -68,14 +83,29 @@ export class MeasureTool {
     return this.root.visible;
   }
 
+  private moveTo(pointer: [number, number] | null): void {
+    if (!this.root.visible || pointer === this.pointer) return;
+    this.pointer = pointer;
+    this.changed();
+  }
+
+  /** Moves the preview to the surface at the pointer, which changes with the view and the picture, too. */
+  private showPreview(): void {
+    const point = this.pointer && this.surfaceAt(...this.pointer);
+    this.preview.visible = point !== null;
+    if (point) this.preview.position.copy(point);
+    this.canvas.dataset.surface = String(point !== null);
+  }
+
   /** Places the labels, and gives the points their size on the screen. */
   update(): void {
     if (!this.root.visible) return;
     this.camera.updateMatrixWorld();
-    const points = this.spheres().map((sphere) => {
+    this.showPreview();
+    for (const sphere of [...this.spheres(), this.preview]) {
       sphere.scale.setScalar(POINT_SIZE * sphere.position.distanceTo(this.camera.position));
-      return this.onScreen(sphere.position);
-    });
+    }
+    const points = this.spheres().map(({ position }) => this.onScreen(position));
     const inView = points.filter((point) => point !== null);
     for (const { ends, label } of this.measurements) {
       const [from, to] = ends.map(({ position }) => this.onScreen(position));

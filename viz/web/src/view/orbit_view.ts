@@ -234,10 +234,11 @@ export class OrbitView {
     this.lookFrom(world_from_camera);
   }
 
-  /** Turns toward a point in world, which becomes the center of the orbit. */
-  turnTo(point: THREE.Vector3): void {
+  /** Looks at a point in world, which becomes the center of the orbit, from another place or from the present one. */
+  lookAt(point: THREE.Vector3, eye: THREE.Vector3 | null): void {
+    if (eye && this.isCut) this.isCut = false; // It was for the present place.
     this.hasUserMoved = true;
-    this.jump({ eye: this.camera.position.clone(), target: point });
+    this.jump({ eye: eye ?? this.camera.position.clone(), target: point });
   }
 
   /** Shows a view of the camera path. */

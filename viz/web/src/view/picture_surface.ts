@@ -2,7 +2,7 @@
 
 import * as THREE from "three";
 import type { PictureLayer } from "../layers/picture_layer";
-import { surfacePoint } from "./surface_picker";
+import { nearestSurface, surfacePoint } from "./surface_picker";
 
 export class PictureSurface {
   constructor(
@@ -11,12 +11,15 @@ export class PictureSurface {
     private readonly canvas: HTMLCanvasElement,
   ) {}
 
-  /** The point at a pixel of the canvas; null if there is none. */
+  /** The point at a pixel of the canvas, or a few pixels beside it if it has none; null if there is none. */
   at(x: number, y: number): THREE.Vector3 | null {
     const { clientWidth, clientHeight } = this.canvas;
     const raycaster = new THREE.Raycaster();
-    raycaster.setFromCamera(new THREE.Vector2((2 * x) / clientWidth - 1, 1 - (2 * y) / clientHeight), this.camera);
-    return this.on(raycaster.ray);
+    const onPixel = (u: number, v: number): THREE.Vector3 | null => {
+      raycaster.setFromCamera(new THREE.Vector2((2 * u) / clientWidth - 1, 1 - (2 * v) / clientHeight), this.camera);
+      return this.on(raycaster.ray);
+    };
+    return nearestSurface(onPixel, x, y);
   }
 
   /** The point at the middle of the canvas; null if there is none. */
