@@ -74,7 +74,6 @@ export class LiveImagesTopic implements Topic {
   restart(): void {
     this.latest = null;
     element("look-live", HTMLButtonElement).disabled = true;
-    this.images.forget();
     this.view.overlays.forgetLive();
     this.view.attachment.forgetCameras();
   }

@@ -57,9 +57,14 @@ export class MeasureTool {
     this.root.visible = enabled;
     this.canvas.classList.toggle("measuring", enabled);
     this.hint.hidden = !enabled;
+    this.clear();
+    this.update();
+  }
+
+  /** Removes all measurements. */
+  clear(): void {
     this.cancel();
     while (this.measurements.length > 0) this.remove(this.measurements[0]!);
-    this.update();
   }
 
   /** Places the labels, and gives the points their size on the screen. */
