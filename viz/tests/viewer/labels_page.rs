@@ -624,7 +624,7 @@ fn n_violet(browser: &mut Browser) -> usize {
 /// Number of pixels of a color, away from the toolbar and the images.
 fn n_pixels(browser: &mut Browser, is_color: impl Fn([u8; 3]) -> bool) -> usize {
     let shot = canvas_shot(browser);
-    let rows = 80..shot.height().saturating_sub(240);
+    let rows = 80..shot.height().saturating_sub(260);
     let pixels = shot.enumerate_pixels();
     pixels
         .filter(|(_, row, pixel)| rows.contains(row) && is_color(pixel.0))
