@@ -742,41 +742,8 @@ fn check_touch_help(page: &mut Page, [width, height]: [u32; 2]) {
             "{selector}: {left} {top} {right} {bottom}"
         );
     }
-    // In a field with a text, browsers only clear the text.
-    page.key("Escape", "Escape", 0);
-    page.wait_until(
-        "the end of the help",
-        "document.getElementById('help')?.open === false",
-    );
-    page.key("?", "Slash", 8);
-    page.wait_until("the help", "document.getElementById('help')?.open === true");
     page.browser.click("close-help");
     assert!(!page.is_visible("help"));
-}
-
-/// A button that was clicked has no ring when a key of another button is pressed.
-fn check_ring(page: &mut Page) {
-    let center = page.browser.evaluate(
-        "(() => { const b = document.getElementById('look-overview').getBoundingClientRect(); \
-         return [Math.round(b.x + b.width / 2), Math.round(b.y + b.height / 2)]; })()",
-    );
-    let center: [i32; 2] = serde_json::from_value(center).expect("a point");
-    for kind in ["mousePressed", "mouseReleased"] {
-        page.browser.mouse(kind, center);
-    }
-    page.wait_until(
-        "the focus",
-        "document.activeElement?.id === 'look-overview'",
-    );
-    page.letter('t');
-    let ring = "getComputedStyle(document.activeElement).outlineStyle";
-    assert_eq!(page.browser.evaluate(ring), "none");
-    page.key("ArrowRight", "ArrowRight", 0);
-    assert_eq!(
-        page.browser.evaluate(ring),
-        "solid",
-        "the focus was moved by a key"
-    );
 }
 
 /// A finger that holds a button reads what it does, and does not press it.
