@@ -57,7 +57,12 @@ pub(crate) enum ServerMessage<'a> {
     /// Joint positions and base pose of the robot.
     RobotState(RobotStateMessage),
     /// Positions of a moving base so far.
-    BasePath { points_m: Vec<[f64; 3]> },
+    BasePath {
+        /// In world, oldest first.
+        points_m: Vec<[f64; 3]>,
+        /// Indices of the points to which the base has not driven from the previous point.
+        line_starts: Vec<usize>,
+    },
     /// The message of the topic in `topics/test_topic.rs`.
     #[cfg(test)]
     Weather { celsius: f64 },

@@ -40,10 +40,11 @@ impl Hub {
 
     /// Sets the current state of the robot.
     pub fn set_robot_state(&self, state: RobotState) {
+        let position_m = state.world_from_base.translation.vector.into();
         self.latest::<BasePath>()
             // `push` leaves out positions close to the last one. They must not cause a new message
             // with the whole path.
-            .send_if_modified(|path| path.push(state.world_from_base.translation.vector.into()));
+            .send_if_modified(|path| path.push(position_m, state.stamp));
         self.latest::<Option<Arc<RobotState>>>()
             .send_replace(Some(Arc::new(state)));
     }

@@ -447,6 +447,18 @@ fn check_local_drawing_after_the_end(browser: &mut Browser, served: Served) {
         "[...document.querySelectorAll('#run-end .files a')].length === 2 \
          && [...document.querySelectorAll('#run-end .files a')].every((link) => !link.href)",
     );
+    wait_until(
+        browser,
+        "where the files are",
+        &format!(
+            "[...document.querySelectorAll('#run-end .files a')].every(({{ title }}) => title.includes('{FOLDER}'))"
+        ),
+    );
+    wait_until(
+        browser,
+        "nothing that only a server knows",
+        "document.getElementById('clients')?.hidden",
+    );
     assert_eq!(
         browser.evaluate("document.getElementById('view')?.classList.contains('stale')"),
         false

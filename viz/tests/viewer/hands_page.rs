@@ -269,6 +269,7 @@ fn the_page_can_be_used_with_keys_alone() {
     check_titles(&mut page);
     check_tooltip_of_focus(&mut page);
     check_help(&mut page);
+    check_ring(&mut page);
     check_switches(&mut page);
     check_full_screen(&mut page);
     check_announcements(&mut page);
@@ -323,6 +324,11 @@ fn check_buttons_stay(page: &mut Page) {
     for (id, place) in before.as_object().expect("places") {
         assert_eq!(&after[id], place, "the button {id} has moved");
     }
+    // Their order does not depend on which of them appears first.
+    assert_eq!(
+        page.strings("[...document.querySelectorAll('#late-tools button')].map(({ id }) => id)"),
+        ["toggle-edit", "toggle-follow", "toggle-history"]
+    );
 }
 
 /// Keys work after a slider, a list or a button was used; text fields and sliders keep their own.
@@ -504,8 +510,41 @@ fn check_help(page: &mut Page) {
         !shown.is_empty() && shown.iter().all(|text| text.contains("grid")),
         "{shown:?}"
     );
+    // In a field with a text, browsers only clear the text.
+    page.key("Escape", "Escape", 0);
+    page.wait_until(
+        "the end of the help",
+        "document.getElementById('help')?.open === false",
+    );
+    page.key("?", "Slash", 8);
+    page.wait_until("the help", "document.getElementById('help')?.open === true");
     page.browser.click("close-help");
     assert!(!page.is_visible("help"));
+}
+
+/// A button that was clicked has no ring when a key of another button is pressed.
+fn check_ring(page: &mut Page) {
+    let center = page.browser.evaluate(
+        "(() => { const b = document.getElementById('look-overview').getBoundingClientRect(); \
+         return [Math.round(b.x + b.width / 2), Math.round(b.y + b.height / 2)]; })()",
+    );
+    let center: [i32; 2] = serde_json::from_value(center).expect("a point");
+    for kind in ["mousePressed", "mouseReleased"] {
+        page.browser.mouse(kind, center);
+    }
+    page.wait_until(
+        "the focus",
+        "document.activeElement?.id === 'look-overview'",
+    );
+    page.letter('t');
+    let ring = "getComputedStyle(document.activeElement).outlineStyle";
+    assert_eq!(page.browser.evaluate(ring), "none");
+    page.key("ArrowRight", "ArrowRight", 0);
+    assert_eq!(
+        page.browser.evaluate(ring),
+        "solid",
+        "the focus was moved by a key"
+    );
 }
 
 /// The state of a switch is visible by a contrast of 3:1 between its knob positions and tracks.

@@ -378,6 +378,8 @@ fn the_header_and_the_panels_answer_the_questions_of_an_operator() {
     check_pause(&mut page);
     check_end(&mut page);
     check_ages(&mut page);
+    check_stable_images(&mut page);
+    check_new_run(&mut page);
     check_saved_model(&mut page);
     check_training_panel(&mut page.browser);
     page.close();
@@ -398,6 +400,9 @@ fn check_identity(browser: &mut Browser) {
     );
     let advice = "Scanning. 7 of 8 images are lost: lower rate_hz of the cameras";
     assert_eq!(browser.text("advice"), advice);
+    let lines = "(() => { const { webkitLineClamp, whiteSpace } = getComputedStyle(document.getElementById('advice')); \
+                 return [webkitLineClamp, whiteSpace, document.getElementById('advice').title]; })()";
+    assert_eq!(browser.evaluate(lines), json!(["2", "normal", advice]));
     let kind = "document.getElementById('advice').dataset.kind";
     assert_eq!(browser.evaluate(kind), "warning");
     assert_eq!(browser.text("n-clients"), "1 client");
@@ -538,6 +543,69 @@ fn check_ages(page: &mut Page) {
     browser.click("toggle-model");
 }
 
+/// Longer texts at the bottom do not move the camera images, and the button that is pressed is
+/// legible.
+fn check_stable_images(page: &mut Page) {
+    let Page { browser, hub, .. } = page;
+    wait_for(browser, "a camera image", |browser| {
+        hub.set_live_image(live_image());
+        browser.evaluate("document.querySelector('#live figure button.ride') !== null")
+            == json!(true)
+    });
+    let moved_px = browser.evaluate(
+        "(() => {
+            const bottom = () => document.getElementById('live').getBoundingClientRect().bottom;
+            const before = bottom();
+            const age = document.getElementById('robot-age');
+            const { hidden, textContent } = age;
+            age.hidden = false;
+            age.textContent = 'robot 12 min old';
+            const moved = bottom() - before;
+            Object.assign(age, { hidden, textContent });
+            return moved;
+        })()",
+    );
+    assert_eq!(moved_px.as_f64(), Some(0.0));
+    let colors = browser.evaluate(
+        "(() => {
+            const button = document.querySelector('#live figure button.ride');
+            const { ariaPressed } = button;
+            button.ariaPressed = 'true';
+            const { color, backgroundColor } = getComputedStyle(button);
+            button.ariaPressed = ariaPressed;
+            return [color, backgroundColor];
+        })()",
+    );
+    assert_ne!(colors[0], colors[1], "the icon is visible");
+}
+
+/// Another run on the server is announced, and the picture of the old run disappears until there is
+/// a new one.
+fn check_new_run(page: &mut Page) {
+    let Page {
+        browser,
+        hub,
+        models,
+        ..
+    } = page;
+    hub.set_status(lossy_status());
+    wait_for(browser, "a complete picture", is_current);
+    models.pause(true);
+    let mut status = lossy_status();
+    if let Some(identity) = &mut status.operator.identity {
+        identity.run = Some("20261129-151503".to_owned());
+    }
+    hub.set_status(status);
+    wait_for(browser, "the news", |browser| {
+        browser.text("toast") == "A new run has started: 20261129-151503"
+    });
+    wait_for(browser, "no picture of the old run", |browser| {
+        browser.text("picture-text").starts_with("no picture yet")
+    });
+    models.pause(false);
+    wait_for(browser, "a picture of the new run", is_current);
+}
+
 /// Number of pixels in the color of live cameras.
 fn n_live(browser: &mut Browser) -> usize {
     n_pixels(browser, |[red, green, blue]| {
@@ -556,7 +624,7 @@ fn n_violet(browser: &mut Browser) -> usize {
 /// Number of pixels of a color, away from the toolbar and the images.
 fn n_pixels(browser: &mut Browser, is_color: impl Fn([u8; 3]) -> bool) -> usize {
     let shot = canvas_shot(browser);
-    let rows = 80..shot.height().saturating_sub(240);
+    let rows = 80..shot.height().saturating_sub(260);
     let pixels = shot.enumerate_pixels();
     pixels
         .filter(|(_, row, pixel)| rows.contains(row) && is_color(pixel.0))

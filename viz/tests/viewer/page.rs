@@ -645,7 +645,7 @@ fn drag(browser: &mut Browser) {
 
 /// Columns and rows of a view away from its edges, which the toolbar and the inset cover.
 fn uncovered([width, height]: [u32; 2]) -> [std::ops::Range<i64>; 2] {
-    [4..i64::from(width) - 4, 80..i64::from(height) - 240]
+    [4..i64::from(width) - 4, 80..i64::from(height) - 260]
 }
 
 /// While dragging, the page requests small pictures; at rest, full ones. The camera rotates around

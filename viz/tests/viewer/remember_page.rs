@@ -162,6 +162,17 @@ fn check_reload(browser: &mut Browser, requests: &Requests, first: &Transform) -
     wait_for(browser, "the same view", |browser| {
         distance(&full_view(browser, requests), &front) < MAX_ERROR
     });
+    // The panel beside the view changes the shape of the view, and thus its requests.
+    for is_hidden in [true, false] {
+        browser.click("toggle-run");
+        reload(browser);
+        wait_for(browser, "the panel as before", |browser| {
+            browser.evaluate("document.getElementById('run')?.hidden") == json!(is_hidden)
+        });
+    }
+    wait_for(browser, "the same view again", |browser| {
+        distance(&full_view(browser, requests), &front) < MAX_ERROR
+    });
     assert_eq!(pressed(browser, "toggle-grid"), json!("false"));
     assert_eq!(pressed(browser, "toggle-crop"), json!("true"));
     assert_eq!(pressed(browser, "toggle-robot"), json!("true"));

@@ -2,6 +2,7 @@
 
 import { keepToken, showRole } from "./connection/access";
 import { Connection } from "./connection/connection";
+import { Flow } from "./connection/flow";
 import { LinkReadout } from "./connection/link_readout";
 import type { BinaryHeader, Status, TextMessage } from "./connection/protocol";
 import { RenderScheduler } from "./connection/render_scheduler";
@@ -20,6 +21,7 @@ import { element } from "./panels/element";
 import { setUpFolding } from "./panels/folding";
 import { showGestureHint } from "./panels/gesture_hint";
 import { showGuidance } from "./panels/guidance";
+import { markClickedButtons } from "./panels/focus";
 import { Header } from "./panels/header";
 import { setUpHelp } from "./panels/help";
 import { KeyframeBrowser } from "./panels/keyframe_browser";
@@ -27,18 +29,20 @@ import { LiveImages } from "./panels/live_images";
 import { ModelSourceCard } from "./panels/model_source";
 import { ModelSwitch } from "./panels/model_switch";
 import { NamedViews } from "./panels/named_views";
+import { NewRun } from "./panels/new_run";
 import { OverlayAges } from "./panels/overlay_ages";
 import { setUpPanels } from "./panels/panels";
 import { PictureInfo } from "./panels/picture_info";
 import { Readouts } from "./panels/readouts";
 import { RobotAge } from "./panels/robot_age";
-import { RunControls } from "./panels/run_controls";
+import { CONTROLLABLE, RunControls } from "./panels/run_controls";
 import { RunEnd } from "./panels/run_end";
 import { ShownModel } from "./panels/shown_model";
 import { setUpSidePanel } from "./panels/side_panel";
 import { Skeleton } from "./panels/skeleton";
 import { TimePhoto } from "./panels/time_photo";
 import { TimeSlider } from "./panels/time_slider";
+import { showToast } from "./panels/toast";
 import { setUpToolbar } from "./panels/toolbar";
 import { Tooltip } from "./panels/tooltip";
 import { TrainingPanel } from "./panels/training_panel";
@@ -79,6 +83,7 @@ const view = openView(banner, {
   },
 });
 const skeleton = new Skeleton(element("view"), element("canvas"));
+const flow = new Flow();
 const connectionState = new ConnectionState({
   hasEnded: () => connection.hasStopped && banner.isFinished,
   show({ state, text, hasEnded }) {
@@ -88,9 +93,13 @@ const connectionState = new ConnectionState({
     modelSource.setEnded(hasEnded);
     skeleton.setConnection(state);
     view.overlays.setLive(state === "open");
+    pictureInfo.isConnected = connection.isOpen;
+    if (!connection.isOpen) header.disconnected();
   },
   restart,
   changed: () => view.changed(),
+  // The skeleton says what is missing before the first picture.
+  problem: () => flow.problem(skeleton.isVisible ? null : pictureInfo.waitingMillis),
 });
 const connection: Connection = new Connection(
   `${location.protocol === "https:" ? "wss" : "ws"}://${location.host}/ws`,
@@ -213,6 +222,7 @@ setUpHelp();
 setUpToolbar();
 setUpSidePanel();
 setUpFolding();
+markClickedButtons();
 announceStates();
 showGestureHint();
 new Tooltip();
@@ -226,10 +236,24 @@ function restart(): void {
   skeleton.awaitPicture();
   shownLatency.forget();
   model.forgetSurfaces();
-  for (const part of [scheduler, ...sides, edits, browser, coverage, topics]) part.restart();
+  for (const part of [flow, scheduler, ...sides, edits, browser, coverage, topics]) part.restart();
 }
 
+/** Forgets what only belongs to the run that was shown before. */
+const newRun = new NewRun((sentence) => {
+  view.picture.remove();
+  view.local.forgetRun();
+  view.measure.clear();
+  skeleton.forgetPicture();
+  images.clear();
+  view.robot.forgetRun();
+  scheduler.restart();
+  view.changed();
+  showToast(sentence);
+});
+
 function receiveStatus(status: Status): void {
+  newRun.show(status);
   skeleton.setStatus(status);
   model.receive(status);
   for (const part of [runControls, header, trainingPanel, runEnd, modelSource]) part.show(status);
@@ -237,9 +261,11 @@ function receiveStatus(status: Status): void {
   showGuidance(status.guidance, banner, liveImages);
   for (const ages of [robotAge, overlayAges]) ages.hasEnded = banner.isFinished;
   namedViews.runIs(status);
+  flow.isReading = CONTROLLABLE.includes(status.state);
 }
 
 function receiveText(message: TextMessage): void {
+  flow.received(message.type);
   if (topics.receive(message)) return;
   switch (message.type) {
     case "hello":
@@ -262,6 +288,7 @@ function receiveText(message: TextMessage): void {
 }
 
 function receiveBinary(header: BinaryHeader, payload: Uint8Array<ArrayBuffer>): void {
+  flow.received(header.type);
   if (browser.receive(header, payload)) return;
   if (header.type !== "picture") topics.receive(header, payload);
   else if (!sides.some((side) => side.receive(header, payload))) void picture.receive(header, payload);

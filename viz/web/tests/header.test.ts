@@ -2,7 +2,7 @@ import assert from "node:assert/strict";
 import { test } from "node:test";
 import { freshness } from "../src/layers/freshness";
 import { detailsOf, hueOf, iconOf, letterOf, nameOf } from "../src/panels/identity";
-import { bytesText, countText, stepTimeText } from "../src/panels/quantities";
+import { bytesText, countText, latencyText, stepTimeText } from "../src/panels/quantities";
 
 test("a page is named after the rig, or else the robot or the run", () => {
   const all = { rig: "static-arm", robot: "panda", run: "2026-11-28-kitchen" };
@@ -37,6 +37,10 @@ test("numbers have the units of the terminal", () => {
     "1.6 s",
     "25 s",
   ]);
+});
+
+test("long latencies are in seconds", () => {
+  assert.deepEqual([0.4, 812.4, 9999, 53_762].map(latencyText), ["0 ms", "812 ms", "9999 ms", "54 s"]);
 });
 
 test("what devices have reported fades with its age", () => {

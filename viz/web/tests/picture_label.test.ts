@@ -18,7 +18,7 @@ function drawnAt(now: number, ...headers: DrawnHeader[]): PictureLabel {
 
 test("before the first picture, the label shows the time since the first request", () => {
   const label = new PictureLabel();
-  assert.deepEqual(label.status(50), { state: "waiting", isOfView: false, waitingMillis: null, request: null });
+  assert.deepEqual(label.status(50), { state: "waiting", isOfView: false, waitingMillis: null, isConnected: true, request: null });
   assert.equal(labelText(null, label.status(50), 0, null), "no picture yet");
   label.requested(1, 100);
   label.requested(2, 900);
@@ -28,7 +28,7 @@ test("before the first picture, the label shows the time since the first request
 test("a complete picture of the wanted view stays current, and says what it is", () => {
   const label = drawnAt(0, header(1));
   const status = label.status(60_000);
-  assert.deepEqual(status, { state: "current", isOfView: true, waitingMillis: null, request: 1 });
+  assert.deepEqual(status, { state: "current", isOfView: true, waitingMillis: null, isConnected: true, request: 1 });
   assert.equal(labelText(label.header, status, 35.2, null), "splat · 1000 × 500 (100 %) in 35 ms");
   assert.equal(labelText(label.header, status, 35.2, 4000), "splat, 4.0 s old · 1000 × 500 (100 %) in 35 ms");
 });
@@ -43,7 +43,31 @@ test("from the moment another view is wanted, the picture is not current, and af
   assert.equal(label.status(6001).state, "old");
   assert.equal(labelText(label.header, label.status(6200), 35, 6200), "splat, 6.2 s old · waiting 1.2 s");
   label.show(header(2, 0.1), 6300);
-  assert.deepEqual(label.status(6300), { state: "current", isOfView: true, waitingMillis: 0, request: 2 });
+  assert.deepEqual(label.status(6300), { state: "current", isOfView: true, waitingMillis: 0, isConnected: true, request: 2 });
+});
+
+test("without a connection, nothing is awaited, and the age stays", () => {
+  const label = drawnAt(0, header(1));
+  label.viewChanged(5000);
+  label.setConnected(true, 6000);
+  assert.equal(label.status(7000).waitingMillis, 2000, "the connection has not changed");
+  label.setConnected(false, 8000);
+  const lost = label.status(60_000);
+  assert.deepEqual([lost.state, lost.waitingMillis, lost.isConnected], ["old", null, false]);
+  assert.equal(labelText(label.header, lost, 35, 60_000), "splat, 60 s old · no connection");
+  label.setConnected(true, 70_000);
+  assert.equal(labelText(label.header, label.status(72_500), 35, 72_500), "splat, 73 s old · waiting 2.5 s");
+});
+
+test("a current picture and a missing picture say that there is no connection", () => {
+  const label = drawnAt(0, header(1));
+  label.setConnected(false, 100);
+  const text = labelText(label.header, label.status(9000), 35, 9000);
+  assert.equal(text, "splat, 9.0 s old · 1000 × 500 (100 %) in 35 ms · no connection");
+  const empty = new PictureLabel();
+  empty.requested(1, 0);
+  empty.setConnected(false, 100);
+  assert.equal(labelText(null, empty.status(9000), 0, null), "no picture yet · no connection");
 });
 
 test("a coarse stage that is not followed by a finer one becomes old", () => {

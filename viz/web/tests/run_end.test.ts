@@ -2,7 +2,7 @@ import assert from "node:assert/strict";
 import { test } from "node:test";
 import type { ModelSource, Status } from "../src/connection/protocol";
 import { factsOf } from "../src/panels/model_source";
-import { verdictText } from "../src/panels/run_end";
+import { stateText, verdictText } from "../src/panels/run_end";
 
 const STATUS: Status = {
   type: "status",
@@ -44,6 +44,12 @@ test("the verdict of a run is one sentence, also of older servers", () => {
   assert.equal(verdictText({ ...result, scores: "PSNR 26.76 dB" }), "The run has ended: PSNR 26.76 dB");
   const verdict = { grade: "good", text: "Good: 31.2 dB on 12 test images" } as const;
   assert.equal(verdictText({ ...result, scores: "PSNR 31.24 dB", verdict }), "Good: 31.2 dB on 12 test images");
+});
+
+test("when the program has ended, the page says where its files are", () => {
+  assert.doesNotMatch(stateText(false, true), /folder/);
+  assert.match(stateText(true, true), /^The program has ended.* Its files are in the folder of the run\.$/);
+  assert.doesNotMatch(stateText(true, false), /folder/);
 });
 
 test("a file has no facts of a training", () => {

@@ -7,7 +7,7 @@ test("nothing is known before the first answer", (context) => {
   fakeClock(context);
   const clock = new ServerClock();
   clock.observeMessage(5000);
-  assert.deepEqual([clock.serverMillis(0), clock.age(5000)], [null, null]);
+  assert.deepEqual([clock.serverMillis(0), clock.ageOf(5000)()], [null, null]);
 });
 
 test("the fastest answer gives the bound", (context) => {
@@ -21,7 +21,7 @@ test("the fastest answer gives the bound", (context) => {
   clock.observePong(300, 5250);
   assert.equal(clock.serverMillis(200), 5150);
   now.millis = 400;
-  assert.equal(clock.age(5000), 350);
+  assert.equal(clock.ageOf(5000)(), 350);
 });
 
 test("samples that contradict a message are dropped", (context) => {
@@ -32,6 +32,22 @@ test("samples that contradict a message are dropped", (context) => {
   now.millis = 400;
   clock.observeMessage(5370); // Ahead by at least 4970 ms.
   assert.equal(clock.serverMillis(0), 5000);
+});
+
+test("events of an old server keep their ages, and those of a new server have none before its first answer", (context) => {
+  const now = fakeClock(context);
+  const clock = new ServerClock();
+  clock.observePong(100, 5100);
+  const old = clock.ageOf(5000);
+  now.millis = 400;
+  assert.equal(old(), 400);
+  clock.restart();
+  const recent = clock.ageOf(90);
+  assert.deepEqual([old(), recent()], [400, null]);
+  now.millis = 60_000;
+  clock.observePong(60_000, 100);
+  now.millis = 60_500;
+  assert.deepEqual([old(), recent()], [60_500, 510]);
 });
 
 test("samples expire after 30 s, and forget drops all", (context) => {

@@ -35,7 +35,7 @@ function setUp(capabilities: string[], extra: Topic[] = []) {
   const layer = { clear: () => undefined, renew: () => undefined };
   const attachment = { forgetCameras: () => undefined };
   const view = { overlays: { forgetLive: () => undefined }, attachment, scans: layer, points: layer, local: layer };
-  const images = { resized: new Map<string, boolean>(), forget: () => undefined };
+  const images = { resized: new Map<string, boolean>() };
   const changed = (): void => topics.update();
   const given = <T>(value: unknown): T => value as T;
   const liveImages = new LiveImagesTopic(given<OrbitView>(view), given<LiveImages>(images), changed);

@@ -65,7 +65,8 @@ export class Connection {
     this.open();
     window.setInterval(() => {
       const late = performance.now() - this.checkedAt;
-      if (late > SUSPENDED_MILLIS) this.clock.forget();
+      // Without a connection, no answer would make the ages known again.
+      if (late > SUSPENDED_MILLIS && this.isOpen) this.clock.forget();
       if (late > LATE_MILLIS) window.setTimeout(() => this.check(), 0);
       else this.check();
     }, CHECK_MILLIS);
@@ -104,7 +105,6 @@ export class Connection {
     this.hasHello = false;
     this.parts.forget();
     this.receivedAt = performance.now();
-    this.clock.forget();
     this.roundTripMillis = null;
   }
 
@@ -194,6 +194,7 @@ export class Connection {
         this.hasStopped = false;
         this.refusal = "";
         this.hasHello = true;
+        this.clock.restart();
         const agreement = agree(message, this.topicCapabilities());
         if (typeof agreement === "string") {
           this.goodbye = agreement;

@@ -287,7 +287,10 @@ export interface Robot {
 /** Positions of a moving base so far. */
 export interface BasePath {
   type: "base_path";
+  /** In world, oldest first. */
   points_m: [number, number, number][];
+  /** Indices of the points to which the base has not driven from the previous point; missing on older servers. */
+  line_starts?: number[];
 }
 
 /** Joint positions and base pose of the robot. */

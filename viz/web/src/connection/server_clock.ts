@@ -3,9 +3,17 @@
 /** Maximum age of samples, because clocks drift. */
 const MAX_SAMPLE_AGE_MILLIS = 30_000;
 
-export class ServerClock {
+/** Upper bound on the age of an event, milliseconds; null if it is not known. */
+export type Age = () => number | null;
+
+/** What is known about the clock of one server. */
+interface Estimate {
   /** Send time of each ping, and the server's clock at its answer minus this send time. */
-  private samples: { sentAt: number; ahead: number }[] = [];
+  samples: { sentAt: number; ahead: number }[];
+}
+
+export class ServerClock {
+  private estimate: Estimate = { samples: [] };
 
   /**
    * Adds the answer to a ping. The server read its clock after the ping was sent, so the difference
@@ -13,8 +21,9 @@ export class ServerClock {
    */
   observePong(sentAt: number, clockMillis: number): void {
     const oldest = performance.now() - MAX_SAMPLE_AGE_MILLIS;
-    this.samples = this.samples.filter((sample) => sample.sentAt > oldest);
-    this.samples.push({ sentAt, ahead: clockMillis - sentAt });
+    const { estimate } = this;
+    estimate.samples = estimate.samples.filter((sample) => sample.sentAt > oldest);
+    estimate.samples.push({ sentAt, ahead: clockMillis - sentAt });
   }
 
   /**
@@ -24,23 +33,35 @@ export class ServerClock {
   observeMessage(clockMillis: number): void {
     const ahead = clockMillis - performance.now();
     // Samples below the lower bound were taken before one of the computers was suspended.
-    this.samples = this.samples.filter((sample) => sample.ahead >= ahead);
+    this.estimate.samples = this.estimate.samples.filter((sample) => sample.ahead >= ahead);
   }
 
-  /** Discards all samples, because a new server has a new clock. */
+  /** Discards all samples, because the page or the computer was suspended. */
   forget(): void {
-    this.samples = [];
+    this.estimate.samples = [];
   }
 
-  /** Upper bound on the age of an event, milliseconds; null until the server has answered a ping. */
-  age(clockMillis: number): number | null {
-    const now = this.serverMillis(performance.now());
-    return now === null ? null : now - clockMillis;
+  /** Begins anew, because a new server has a new clock. Ages of events of the old server stay known. */
+  restart(): void {
+    this.estimate = { samples: [] };
+  }
+
+  /** The age of an event of the present server, which stays valid after the connection has ended. */
+  ageOf(clockMillis: number): Age {
+    const { estimate } = this;
+    return () => {
+      const now = serverMillis(estimate, performance.now());
+      return now === null ? null : now - clockMillis;
+    };
   }
 
   /** Upper bound on the server's clock at a time of this page; null until the server has answered a ping. */
   serverMillis(pageMillis: number): number | null {
-    if (this.samples.length === 0) return null;
-    return pageMillis + Math.min(...this.samples.map((sample) => sample.ahead));
+    return serverMillis(this.estimate, pageMillis);
   }
+}
+
+function serverMillis({ samples }: Estimate, pageMillis: number): number | null {
+  if (samples.length === 0) return null;
+  return pageMillis + Math.min(...samples.map((sample) => sample.ahead));
 }

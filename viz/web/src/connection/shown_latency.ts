@@ -6,7 +6,9 @@
 // not latency.
 
 import type { Connection } from "./connection";
+import { SLOW_MILLIS } from "./flow";
 import { element } from "../panels/element";
+import { latencyText } from "../panels/quantities";
 import type { PictureHeader } from "./protocol";
 
 /** Time window of the statistics. */
@@ -104,9 +106,10 @@ export class ShownLatency {
     label.hidden = this.samples.length === 0;
     if (label.hidden) return;
     const millis = (part: (sample: Sample) => number, frac = 0.5): string =>
-      `${Math.round(quantile(this.samples.map(part), frac))} ms`;
+      latencyText(quantile(this.samples.map(part), frac));
     const total = (sample: Sample): number => sample.total;
     label.textContent = `camera to screen ${millis(total)}`;
+    label.classList.toggle("late", quantile(this.samples.map(total), 0.5) > SLOW_MILLIS);
     label.title = [
       `Time from mid-exposure of a keyframe to its first picture on this screen, in the last minute (${this.samples.length}):`,
       `median ${millis(total)}, 99 % below ${millis(total, 0.99)}.`,

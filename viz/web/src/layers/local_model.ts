@@ -88,6 +88,14 @@ export class LocalModel {
     this.changed();
   }
 
+  /** Drops the copy of another run. To be called after `renew`. */
+  forgetRun(): void {
+    // Without a next copy, the present one has already been replaced by that of the new run.
+    if (!this.next && this.requested) return;
+    this.shown?.dispose();
+    this.shown = null;
+  }
+
   /** To be called when the WebGL context is restored. */
   contextRestored(): void {
     this.shown?.contextRestored();

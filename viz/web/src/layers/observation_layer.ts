@@ -168,7 +168,7 @@ export class ObservationLayer {
     uniforms.observedQuantity.value = !this.hasMap || quantity === null ? 0 : quantity === "age" ? 1 : 2;
     if (quantity !== null) {
       uniforms.observationRange.value.fromArray(RANGES[quantity].map(Math.log));
-      const age = this.newestMillis === null ? null : this.clock().age(this.newestMillis);
+      const age = this.newestMillis === null ? null : this.clock().ageOf(this.newestMillis)();
       uniforms.observationAge.value = Math.max(0, (age ?? 0) / 1000);
       uniforms.observationOpacity.value = this.isComplete ? 1 : FAINT_OPACITY;
       const isSaved = quantity === "age" && this.newestMillis === null;

@@ -256,6 +256,14 @@ export class PictureLayer {
     this.waiting = null;
     this.shown = null;
   }
+
+  /** Removes the picture, because it belongs to another run. */
+  remove(): void {
+    this.forget();
+    this.hasColor = false;
+    this.mesh.visible = false;
+    this.posedDepth = null;
+  }
 }
 
 /** Points from (0, 0) at the picture's top left to (1, 1) at its bottom right. */

@@ -30,6 +30,8 @@ export class RobotLayer {
   private isOutdated = false;
   private isEnabled = true;
   private hasState = false;
+  /** Whether the present server has not described this robot. */
+  isOld = false;
 
   constructor(private readonly occlusion: Occlusion, private readonly changed: () => void) {
     this.root.visible = false;
@@ -49,6 +51,7 @@ export class RobotLayer {
 
   /** Creates the links of a robot. */
   setRobot(robot: Robot): void {
+    this.isOld = false;
     const described = JSON.stringify(robot);
     if (described === this.described) return;
     this.described = described;
@@ -150,6 +153,14 @@ export class RobotLayer {
     this.isOutdated = isOutdated;
     for (const look of this.looks.values()) look.outdated = isOutdated;
     this.changed();
+  }
+
+  /** Removes the robot of another run. */
+  forgetRun(): void {
+    if (!this.isOld) return;
+    this.clear();
+    this.robot = null;
+    this.described = "";
   }
 
   private clear(): void {

@@ -3,6 +3,7 @@
 import * as THREE from "three";
 import { freshness } from "./freshness";
 import { type Occlusion, ON_SURFACE } from "./occlusion";
+import { pathSegments } from "./path_segments";
 import type { RangeScanHeader } from "../connection/protocol";
 
 const SIZE_PX = 3;
@@ -23,12 +24,12 @@ export class ScanLayer {
   /** A material for each scanner, because scans of different ages have different opacities. */
   private readonly materials = new Map<string, THREE.PointsMaterial>();
   private readonly byScanner = new Map<string, Scan>();
-  private readonly path: THREE.Line;
+  private readonly path: THREE.LineSegments;
   private hasPath = false;
 
   constructor(private readonly occlusion: Occlusion) {
     const line = new THREE.LineBasicMaterial({ color: PATH_COLOR });
-    this.path = new THREE.Line(new THREE.BufferGeometry(), occlusion.apply(line, ON_SURFACE));
+    this.path = new THREE.LineSegments(new THREE.BufferGeometry(), occlusion.apply(line, ON_SURFACE));
     this.path.frustumCulled = false;
     this.root.add(this.scans, this.path);
   }
@@ -91,11 +92,12 @@ export class ScanLayer {
     return material;
   }
 
-  /** Shows the path of the base, in world. */
-  setPath(points: [number, number, number][]): void {
+  /** Shows the path of the base, in world. `lineStarts`: indices of the points at which a new line begins. */
+  setPath(points: [number, number, number][], lineStarts: number[] = []): void {
     this.hasPath = points.length > 1;
     this.path.geometry.dispose();
     this.path.geometry = new THREE.BufferGeometry().setFromPoints(points.map((point) => new THREE.Vector3(...point)));
+    this.path.geometry.setIndex(pathSegments(points.length, lineStarts));
   }
 
   /** A box around the path, in world; empty without a path. */

@@ -2,14 +2,17 @@
 
 import type { FileLink } from "../connection/protocol";
 
-/** Links to files. If there is a reason why the files cannot be opened, the links have no addresses. */
-export function fileLinks(files: readonly FileLink[], unavailable: string): HTMLAnchorElement[] {
+/**
+ * Links to files. When the program has ended, the links have no addresses, and say where the files
+ * are: in `folder`, which is null before.
+ */
+export function fileLinks(files: readonly FileLink[], folder: string | null): HTMLAnchorElement[] {
   return files.map((file) => {
     const link = document.createElement("a");
     link.textContent = file.label;
-    if (unavailable) {
+    if (folder !== null) {
       link.setAttribute("aria-disabled", "true");
-      link.title = unavailable;
+      link.title = `The program has ended. Its files are in ${folder}`;
       return link;
     }
     link.href = file.path;

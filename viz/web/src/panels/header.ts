@@ -23,6 +23,12 @@ export class Header {
     closesWithEscape("panel", () => clients.open, close, clients);
   }
 
+  /** Without a connection, nobody knows who is connected, and the advice cannot be followed. */
+  disconnected(): void {
+    element("clients").hidden = true;
+    text("advice", "");
+  }
+
   show(status: Status): void {
     this.showIdentity(status);
     this.showState(status);

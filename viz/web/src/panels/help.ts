@@ -49,6 +49,12 @@ export function setUpHelp(): void {
   });
   filter.addEventListener("input", () => search(filter.value));
   element("close-help").addEventListener("click", () => dialog.close());
+  // In a search field with a text, browsers only clear the text.
+  dialog.addEventListener("keydown", (event) => {
+    if (event.key !== "Escape") return;
+    event.preventDefault();
+    dialog.close();
+  });
   dialog.addEventListener("click", (event) => {
     if (event.target === dialog && isOutside(dialog, event)) dialog.close();
   });

@@ -253,7 +253,7 @@ export class KeyframeBrowser {
    */
   private age({ stamp_nanos: stampNanos }: NumberedKeyframe): { secs: number; text: string } {
     const live = this.sources.live();
-    const liveMillis = live ? this.sources.connection.clock.age(live.captured_millis) : null;
+    const liveMillis = live ? this.sources.connection.clock.ageOf(live.captured_millis)() : null;
     const secsBefore = (nanos: number): number => (nanos - stampNanos) * 1e-9;
     if (live && liveMillis !== null && secsBefore(live.stamp_nanos) >= 0) {
       const secs = secsBefore(live.stamp_nanos) + liveMillis / 1000;

@@ -6,7 +6,7 @@ import { child, make, setText } from "./html";
 import { ageText } from "./quantities";
 import type { LiveImageHeader } from "../connection/protocol";
 import { markRidden, rideButton } from "./ride_button";
-import type { ServerClock } from "../connection/server_clock";
+import type { Age, ServerClock } from "../connection/server_clock";
 import { store, stored } from "./storage";
 
 /** Images older than this are not labeled live. */
@@ -20,10 +20,11 @@ interface Slot {
   figure: HTMLElement;
   canvas: HTMLCanvasElement;
   caption: HTMLElement;
-  age: HTMLElement;
+  ageText: HTMLElement;
   dock: HTMLButtonElement;
-  capturedMillis: number;
-  waiting: { header: LiveImageHeader; jpeg: Uint8Array<ArrayBuffer> } | null;
+  /** Age of the shown image. */
+  age: Age;
+  waiting: { jpeg: Uint8Array<ArrayBuffer>; age: Age } | null;
   isDecoding: boolean;
 }
 
@@ -49,7 +50,7 @@ export class LiveImages {
   /** Shows an image, unless a newer one of its camera arrives before it is decoded. */
   show(header: LiveImageHeader, jpeg: Uint8Array<ArrayBuffer>): void {
     const slot = this.slots.get(header.camera) ?? this.add(header.camera);
-    slot.waiting = { header, jpeg };
+    slot.waiting = { jpeg, age: this.clock().ageOf(header.captured_millis) };
     if (!slot.isDecoding) void this.decode(slot);
   }
 
@@ -59,7 +60,7 @@ export class LiveImages {
       slot.waiting = null;
       try {
         drawBitmap(slot.canvas, await decodeJpeg(next.jpeg));
-        slot.capturedMillis = next.header.captured_millis;
+        slot.age = next.age;
       } catch {
         // The caption shows that the image is outdated.
       }
@@ -68,10 +69,12 @@ export class LiveImages {
     slot.isDecoding = false;
   }
 
-  /** Marks all images as not live, because a new server has a new clock. */
-  forget(): void {
-    for (const slot of this.slots.values()) slot.capturedMillis = -Infinity;
-    this.showAges();
+  /** Removes all images, because another run may have other cameras. */
+  clear(): void {
+    this.reduce();
+    for (const { figure } of this.slots.values()) figure.remove();
+    this.slots.clear();
+    this.showDock();
   }
 
   /** Whether the images are shown. */
@@ -129,9 +132,9 @@ export class LiveImages {
     const figure = make("figure");
     const canvas = make("canvas");
     const caption = make("figcaption");
-    const age = make("span");
+    const ageText = make("span");
     const dock = make("button");
-    caption.append(child("b", camera), age, dock, rideButton(camera, this.ridden === camera, () => this.ride(camera)));
+    caption.append(child("b", camera), ageText, dock, rideButton(camera, this.ridden === camera, () => this.ride(camera)));
     figure.append(canvas, caption);
     figure.dataset.camera = camera;
     figure.addEventListener("click", () => {
@@ -144,7 +147,7 @@ export class LiveImages {
       this.place(slot);
     });
     makeButton(canvas, `Enlarge the image of ${camera}`);
-    const slot: Slot = { figure, canvas, caption, age, dock, capturedMillis: -Infinity, waiting: null, isDecoding: false };
+    const slot: Slot = { figure, canvas, caption, ageText, dock, age: () => null, waiting: null, isDecoding: false };
     this.place(slot);
     this.slots.set(camera, slot);
     return slot;
@@ -165,11 +168,11 @@ export class LiveImages {
   }
 
   private showAges(): void {
-    for (const { figure, caption, age, capturedMillis } of this.slots.values()) {
-      const millis = this.clock().age(capturedMillis) ?? Infinity;
+    for (const { figure, caption, ageText: label, age } of this.slots.values()) {
+      const millis = age() ?? Infinity;
       caption.classList.toggle("stale", millis > LIVE_MILLIS);
       figure.classList.toggle("dimmed", millis > DIM_MILLIS);
-      setText(age, millis > LIVE_MILLIS ? ageText(millis) : "live");
+      setText(label, millis > LIVE_MILLIS ? ageText(millis) : "live");
     }
   }
 }

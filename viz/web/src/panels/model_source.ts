@@ -8,8 +8,6 @@ import { fileLinks } from "./file_links";
 import { child, descriptions, make } from "./html";
 import { bytesText, countText, timeText } from "./quantities";
 
-const ENDED = "The program has ended";
-
 export class ModelSourceCard {
   private readonly card = element("source-card");
   /** Where the controls are in a run. */
@@ -49,7 +47,7 @@ export class ModelSourceCard {
     this.shown = shown;
     const links = child("p");
     links.className = "files";
-    links.append(...fileLinks(files, this.hasEnded ? ENDED : ""));
+    links.append(...fileLinks(files, this.hasEnded ? source.path : null));
     const title = child("h2", source.kind === "file" ? "File" : "Saved model");
     const name = child("p", source.name);
     name.className = "source-name";

@@ -20,7 +20,7 @@ export class OverlayAges {
   }
 
   private show(): void {
-    const ageMillis = (capturedMillis: number): number => this.clock().age(capturedMillis) ?? Infinity;
+    const ageMillis = (capturedMillis: number): number => this.clock().ageOf(capturedMillis)() ?? Infinity;
     const haveCamerasChanged = this.view.overlays.showAges(ageMillis);
     const haveScansChanged = this.view.scans.showAges(ageMillis);
     if (haveCamerasChanged || haveScansChanged) this.view.changed();

@@ -1,7 +1,7 @@
 // Shows the model, the stage and the age of the drawn picture, and removes the colors of an
 // outdated picture.
 
-import type { ServerClock } from "../connection/server_clock";
+import type { Age, ServerClock } from "../connection/server_clock";
 import type { OrbitView } from "../view/orbit_view";
 import type { ChunkArrival } from "../layers/chunk_arrival";
 import { element } from "./element";
@@ -12,6 +12,8 @@ import { type DrawnHeader, labelText, PictureLabel, type PictureStatus } from ".
 export class PictureInfo {
   private readonly label = new PictureLabel();
   private answerMillis = 0;
+  /** Age of the drawn picture. */
+  private age: Age = () => null;
   private readonly info = element("picture-info");
   private readonly text = element("picture-text");
   private readonly localText = element("local-text");
@@ -44,9 +46,27 @@ export class PictureInfo {
   get summary(): string {
     const { step, shownRequest } = this.info.dataset;
     const { header } = this.label;
-    const age = header && shownRequest ? this.ageMillis(header, this.label.status(performance.now())) : null;
+    const age = header && shownRequest ? this.ageMillis(header, this.status) : null;
     const state = age !== null ? ageText(age) : this.isComplete ? "current" : "incomplete";
     return [this.method, step ? `step ${step}` : "", state].filter((part) => part !== "").join(", ");
+  }
+
+  /** Whether pictures can arrive. */
+  set isConnected(isConnected: boolean) {
+    this.label.setConnected(isConnected, performance.now());
+  }
+
+  /** How long a picture has been awaited, milliseconds; null if none is. */
+  get waitingMillis(): number | null {
+    return this.isLocal ? null : this.status.waitingMillis;
+  }
+
+  private get status(): PictureStatus {
+    return this.label.status(performance.now());
+  }
+
+  private get isLocal(): boolean {
+    return this.view.local.root.visible && this.view.local.isShown;
   }
 
   /** Another view is wanted. */
@@ -76,12 +96,14 @@ export class PictureInfo {
   /** Shows the present state. To be called for every display refresh, and after every event. */
   update(): void {
     const now = performance.now();
-    this.label.show(this.view.picture.header, now);
-    const status = this.label.status(now);
+    const drawn = this.view.picture.header;
+    if (drawn && drawn !== this.label.header) this.age = this.clock().ageOf(drawn.sent_millis);
+    this.label.show(drawn, now);
+    const { status } = this;
     if (this.view.picture.setFaded(status.state === "old")) this.view.changed();
     const { loading } = this.view.local;
-    setText(this.localText, loading ? `loading ${loading.method}: ${partsText(loading.arrival)}` : "");
-    if (this.view.local.root.visible && this.view.local.isShown) {
+    setText(this.localText, loading && status.isConnected ? `loading ${loading.method}: ${partsText(loading.arrival)}` : "");
+    if (this.isLocal) {
       this.showLocal(status);
       return;
     }
@@ -113,11 +135,11 @@ export class PictureInfo {
     this.showStages(isComplete ? 1 : 0);
   }
 
-  /** Age of the picture, if the model or the view has changed since. */
+  /** Age of the picture, if the model or the view has changed since, or may have. */
   private ageMillis(header: DrawnHeader, status: PictureStatus): number | null {
     const latestStep = this.latestStep(header.method);
     const isOutdated = latestStep !== undefined && header.step !== undefined && latestStep > header.step;
-    return isOutdated || !status.isOfView ? this.clock().age(header.sent_millis) : null;
+    return isOutdated || !status.isOfView || !status.isConnected ? this.age() : null;
   }
 
   private set(values: Record<string, string>): void {

@@ -26,8 +26,10 @@ export interface PictureStatus {
   state: PictureState;
   /** Whether view and model are the wanted ones, possibly at a lower resolution. */
   isOfView: boolean;
-  /** How long the operator has been waiting for another picture; null if it is complete. */
+  /** How long the operator has been waiting for another picture; null if it is complete or there is no connection. */
   waitingMillis: number | null;
+  /** Whether pictures can arrive. */
+  isConnected: boolean;
   /** Newest request. */
   request: number | null;
 }
@@ -42,6 +44,13 @@ export class PictureLabel {
   /** When the drawn picture, or a finer stage of it, was drawn. */
   private drawnAt = 0;
   private drawn: DrawnHeader | null = null;
+  /** When the present connection was opened; null without a connection. */
+  private connectedAt: number | null = -Infinity;
+
+  /** Nothing is awaited without a connection, and the wait begins anew with the next one. */
+  setConnected(isConnected: boolean, now: number): void {
+    this.connectedAt = isConnected ? (this.connectedAt ?? now) : null;
+  }
 
   /** Another view is wanted. */
   viewChanged(now: number): void {
@@ -85,6 +94,15 @@ export class PictureLabel {
   }
 
   status(now: number): PictureStatus {
+    const wanted = this.wanted(now);
+    const { connectedAt } = this;
+    const isConnected = connectedAt !== null;
+    const waitingMillis = isConnected ? wanted.waitingMillis && Math.min(wanted.waitingMillis, now - connectedAt) : null;
+    return { ...wanted, waitingMillis, isConnected };
+  }
+
+  /** The status, with the time since another picture is wanted, whether or not there is a connection. */
+  private wanted(now: number): Omit<PictureStatus, "isConnected"> {
     const request = this.newest;
     if (!this.drawn) {
       const waitingMillis = this.firstRequestAt === null ? null : now - this.firstRequestAt;
@@ -104,11 +122,12 @@ export class PictureLabel {
 /** The label of a picture. `answerMillis`: time from its request to its arrival. `ageMillis`: null if it is not old. */
 export function labelText(
   header: DrawnHeader | null,
-  { isOfView, waitingMillis, state }: PictureStatus,
+  { isOfView, waitingMillis, state, isConnected }: PictureStatus,
   answerMillis: number,
   ageMillis: number | null,
 ): string {
-  if (!header) return `no picture yet${waitingText(waitingMillis)}`;
+  const wait = isConnected ? waitingText(waitingMillis) : " · no connection";
+  if (!header) return `no picture yet${wait}`;
   const age = ageMillis !== null && ageMillis > OLD_MILLIS ? ageText(ageMillis) : "";
   const what = [header.method ?? "", age].filter((part) => part !== "").join(", ");
   const [width, height] = header.size_px;
@@ -116,7 +135,7 @@ export function labelText(
   const isLate = state !== "current";
   const details = isOfView ? (isLate ? size : `${size} in ${answerMillis.toFixed(0)} ms`) : "";
   const text = [what, details].filter((part) => part !== "").join(" · ");
-  return isLate ? `${text}${waitingText(waitingMillis)}`.replace(/^ · /, "") : text;
+  return isLate || !isConnected ? `${text}${wait}`.replace(/^ · /, "") : text;
 }
 
 function waitingText(millis: number | null): string {

@@ -20,6 +20,11 @@ export function stepTimeText(millis: number | null): string {
   return `${millis >= 100 ? millis.toFixed(0) : millis.toPrecision(3)} ms`;
 }
 
+/** A latency, milliseconds. Long ones are in seconds. */
+export function latencyText(millis: number): string {
+  return millis < 10_000 ? `${Math.round(millis)} ms` : durationText(millis / 1000);
+}
+
 /** How long something has taken, to the second. */
 export function timeText(seconds: number): string {
   if (seconds < 120) return `${Number(seconds.toFixed(seconds < 10 ? 1 : 0))} s`;

@@ -6,7 +6,7 @@ import type { Status } from "../connection/protocol";
 import { setTitle, titleOf } from "./title";
 
 /** States in which a run can be controlled. */
-const CONTROLLABLE = ["waiting for images", "collecting keyframes", "training", "paused"];
+export const CONTROLLABLE = ["waiting for images", "collecting keyframes", "training", "paused"];
 /** States in which there is a saved model, whose edits can be saved. */
 const SAVED = ["viewing", "finished"];
 

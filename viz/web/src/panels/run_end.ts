@@ -66,11 +66,12 @@ export class RunEnd {
     summary.id = "run-verdict";
     const links = child("p");
     links.className = "files";
-    links.append(...fileLinks(files, this.hasEnded ? ENDED : ""));
+    const folder = result.folder ?? "the folder of the run";
+    links.append(...fileLinks(files, this.hasEnded ? folder : null));
     const problems = child("ul");
     problems.className = "problems";
     problems.append(...(result.problems ?? []).map((problem) => child("li", problem)));
-    const state = child("p", stateText(this.hasEnded));
+    const state = child("p", stateText(this.hasEnded, files.length > 0));
     state.id = "run-end-state";
     details.append(summary, problems, descriptions(rows(result)), links, state);
     this.panel.dataset.grade = result.verdict?.grade ?? "unknown";
@@ -97,8 +98,9 @@ function rows(result: RunResult): [string, string][] {
   return [...folder, ...time];
 }
 
-function stateText(hasEnded: boolean): string {
-  return hasEnded
-    ? "The program has ended. The page keeps the last picture, and the parts of the model that it has received."
-    : "You can still look at the model, until the program is stopped in its terminal.";
+/** What is still possible. `hasFiles`: whether the page has offered files. */
+export function stateText(hasEnded: boolean, hasFiles: boolean): string {
+  if (!hasEnded) return "You can still look at the model, until the program is stopped in its terminal.";
+  const kept = "The program has ended. The page keeps the last picture, and the parts of the model that it has received.";
+  return hasFiles ? `${kept} Its files are in the folder of the run.` : kept;
 }

@@ -3,9 +3,12 @@
 import { action, closesWithEscape } from "../keys";
 import { element } from "./element";
 import { closePanel } from "./focus";
+import { store, stored } from "./storage";
 import { PHONE } from "./windows";
 
 const phones = matchMedia(PHONE);
+/** Key under which the tab stores whether the user has hidden the panel. */
+const HIDDEN_KEY = "side-panel-hidden";
 
 export function setUpSidePanel(): void {
   const panel = element("run");
@@ -13,7 +16,11 @@ export function setUpSidePanel(): void {
     panel.hidden = !isOpen;
     element("toggle-run").setAttribute("aria-expanded", String(isOpen));
   };
-  action("toggle-run", () => show(panel.hidden === true));
+  action("toggle-run", () => {
+    show(panel.hidden === true);
+    // A phone has no space for the panel, which says nothing about what the user wants beside a view.
+    if (!phones.matches) store(HIDDEN_KEY, String(panel.hidden), "sessionStorage");
+  });
   const close = (): void => closePanel(panel, element("toggle-run"), () => show(false));
   closesWithEscape("panel", () => phones.matches && !panel.hidden, close, panel);
   // On phones, there is space for one sheet: a panel, the values of the run, or the list of "More". Panels are also opened
@@ -22,8 +29,9 @@ export function setUpSidePanel(): void {
     const opened = changes.map(({ target }) => target as HTMLElement).filter(isExpanded).at(-1);
     if (opened && phones.matches) closeOthers(opened);
   }).observe(element("toolbar"), { subtree: true, attributeFilter: ["aria-expanded"] });
-  phones.addEventListener("change", () => show(!phones.matches));
-  show(!phones.matches);
+  const showFirst = (): void => show(!phones.matches && stored(HIDDEN_KEY, "sessionStorage") !== "true");
+  phones.addEventListener("change", showFirst);
+  showFirst();
 }
 
 function isExpanded(opener: HTMLElement): boolean {

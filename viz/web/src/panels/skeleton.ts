@@ -63,6 +63,13 @@ export class Skeleton {
     this.show();
   }
 
+  /** To be called when the picture was removed, because it belongs to another run. */
+  forgetPicture(): void {
+    this.shown.hasPicture = false;
+    this.shown.hasContent = false;
+    this.show();
+  }
+
   /** To be called when a picture is shown; `depth` is 0 where it shows the background. */
   pictureShown(depth: Float32Array | null): void {
     this.isAwaiting = false;

@@ -1,13 +1,15 @@
-// The toolbar. Its buttons keep their places when other buttons appear. On phones, "More" shows the
+// The toolbar. Buttons that appear late are behind all others, so that these keep their places. On phones, "More" shows the
 // buttons that do not fit in the bar.
 
 import { closesWithEscape } from "../keys";
 import { element } from "./element";
 
+/** Buttons that depend on the model or the robot, in their order, which is that in which they usually appear. */
+const LATE_BUTTONS = ["toggle-edit", "toggle-follow", "toggle-history"];
 const STEPS: Record<string, number> = { ArrowLeft: -1, ArrowRight: 1 };
 
 export function setUpToolbar(): void {
-  appendLateButtons();
+  moveLateButtons();
   const [toolbar, more] = [element("toolbar"), element("show-more")];
   const isOpen = (): boolean => toolbar.classList.contains("is-open");
   const show = (isMore: boolean): void => {
@@ -33,16 +35,7 @@ function moveFocus(toolbar: HTMLElement, step: number): boolean {
   return true;
 }
 
-/** Moves buttons that depend on the model or the robot behind all others, in the order in which they appear. */
-function appendLateButtons(): void {
-  const group = element("late-tools");
-  const append = (button: HTMLElement): void => {
-    if (!button.hidden && button !== group.lastElementChild) group.append(button);
-  };
-  const observer = new MutationObserver((changes) => {
-    for (const { target } of changes) append(target as HTMLElement);
-  });
-  for (const button of document.querySelectorAll("#toolbar button[hidden]")) {
-    observer.observe(button, { attributeFilter: ["hidden"] });
-  }
+/** Moves the late buttons behind all others. While they are hidden, they take no space. */
+function moveLateButtons(): void {
+  element("late-tools").append(...LATE_BUTTONS.map((id) => element(id)));
 }

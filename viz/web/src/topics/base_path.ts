@@ -12,7 +12,7 @@ export function basePathTopic(view: OrbitView): Topic {
     capability: "base_path",
     receivers: [
       on<BasePath>("base_path", (message) => {
-        view.scans.setPath(message.points_m);
+        view.scans.setPath(message.points_m, message.line_starts);
         view.changed();
       }),
     ],

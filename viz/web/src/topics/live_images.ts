@@ -86,7 +86,6 @@ export class LiveImagesTopic implements Topic {
     this.latest = null;
     this.posed.clear();
     element("look-live", HTMLButtonElement).disabled = true;
-    this.images.forget();
     this.view.overlays.forgetLive();
     this.view.attachment.forgetCameras();
   }

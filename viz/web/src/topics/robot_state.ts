@@ -1,6 +1,5 @@
 // The robot: its description, which comes once, and its joint positions.
 
-import { element } from "../panels/element";
 import type { OrbitView } from "../view/orbit_view";
 import type { Robot, RobotState } from "../connection/protocol";
 import type { RobotAge } from "../panels/robot_age";
@@ -15,8 +14,6 @@ export function robotTopic(view: OrbitView, age: RobotAge): Topic {
     receivers: [
       on<Robot>("robot", (message) => {
         view.robot.setRobot(message);
-        element("toggle-robot").hidden = false;
-        element("toggle-follow").hidden = false;
       }),
       on<RobotState>("robot_state", (message) => {
         view.robot.setState(message);
@@ -24,6 +21,8 @@ export function robotTopic(view: OrbitView, age: RobotAge): Topic {
       }),
     ],
     subscriptions: (isHidden) => [{ rate_hz: isHidden ? 0 : HZ }],
-    restart: () => age.forget(),
+    restart: () => {
+      view.robot.isOld = true;
+    },
   };
 }

@@ -79,6 +79,12 @@ export class MeasureTool {
     this.update();
   }
 
+  /** Removes all measurements. */
+  clear(): void {
+    this.cancel();
+    while (this.measurements.length > 0) this.remove(this.measurements[0]!);
+  }
+
   get enabled(): boolean {
     return this.root.visible;
   }

@@ -71,6 +71,7 @@ export class ViewControls {
     press("look-live", view.mode === "ride");
     press("toggle-cut", view.isCut);
     this.frames.show(view.robot, frame);
+    for (const id of ["toggle-robot", "toggle-follow"]) element(id).hidden = !view.robot.namedLinks;
     this.images.ridden = riddenCamera;
     element("cut-chip").hidden = !view.isCut;
   }
