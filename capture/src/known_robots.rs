@@ -178,6 +178,18 @@ mod tests {
     }
 
     #[test]
+    fn the_reference_lists_all_robots() {
+        let reference = include_str!("../../docs/reference/rig.md");
+        for robot in KNOWN_ROBOTS {
+            let row = format!(
+                "| `{}` | {} | `{}` | `{}` |",
+                robot.name, robot.title, robot.base_link, robot.flange_link
+            );
+            assert!(reference.contains(&row), "{row}");
+        }
+    }
+
+    #[test]
     fn references_name_robots() {
         let names: BTreeSet<&str> = KNOWN_ROBOTS.iter().map(|robot| robot.name).collect();
         assert_eq!(names.len(), KNOWN_ROBOTS.len());
