@@ -112,7 +112,7 @@ pub const KNOWN_ROBOTS: &[KnownRobot] = &[
 #[derive(Debug, thiserror::Error)]
 #[error(
     "no known robot is named {name:?}{}; known robots: {}",
-    nearest_robot(name).map(|nearest| format!(", did you mean {nearest:?}?")).unwrap_or_default(),
+    nearest_robot(.name).map(|nearest| format!(", did you mean {nearest:?}?")).unwrap_or_default(),
     known_names().join(", ")
 )]
 pub struct UnknownRobot {
@@ -210,13 +210,17 @@ mod tests {
 
     #[test]
     fn an_unknown_name_lists_the_known_ones() {
-        let error = KnownRobot::named_by("builtin:ur5").unwrap_err().to_string();
+        let error = KnownRobot::named_by("builtin:ur5")
+            .expect_err("unknown")
+            .to_string();
         assert_eq!(
             error,
             "no known robot is named \"ur5\", did you mean \"ur5e\"?; \
              known robots: panda, fr3, ur3e, ur5e, ur10e, so101"
         );
-        let error = KnownRobot::named_by("builtin:xyz").unwrap_err().to_string();
+        let error = KnownRobot::named_by("builtin:xyz")
+            .expect_err("unknown")
+            .to_string();
         assert!(
             error.contains("is named \"xyz\"; known robots: panda"),
             "{error}"

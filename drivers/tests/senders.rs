@@ -43,7 +43,7 @@ const SO101_JOINTS: [&str; 5] = [
 const SO101_READINGS: [f64; 5] = [2048.0, 1024.0, 3000.0, 2100.0, 2047.0];
 const SO101_MIDDLES: [f64; 5] = [2048.0, 2050.0, 1950.0, 2050.0, 2047.5];
 
-/// Steps of a servo per turn, as LeRobot counts them.
+/// Steps of a servo per turn, as `lerobot` counts them.
 const STEPS_PER_TURN: f64 = 4095.0;
 
 fn repository() -> PathBuf {
