@@ -124,7 +124,8 @@ fn a_known_robot_needs_no_file() {
         "wrist_2_joint",
         "wrist_3_joint",
     ];
-    let joints = json!({"joint_names": names, "configurations": [[0.0; 6]]});
+    let zero = [0.0; 6];
+    let joints = json!({"joint_names": names, "configurations": [zero]});
     let flags = ["--tip", "tool0", "--base", "base"];
     let pose = &poses(Path::new("builtin:ur5e"), &flags, &joints)[0];
     // The arm is stretched along -x, and its flange points along -y.
