@@ -182,8 +182,8 @@ mod tests {
         let reference = include_str!("../../docs/reference/rig.md");
         for robot in KNOWN_ROBOTS {
             let row = format!(
-                "| `{}` | {} | `{}` | `{}` |",
-                robot.name, robot.title, robot.base_link, robot.flange_link
+                "| {} | `{}` | `{}` | `{}` |",
+                robot.title, robot.name, robot.base_link, robot.flange_link
             );
             assert!(reference.contains(&row), "{row}");
         }
