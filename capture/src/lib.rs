@@ -43,6 +43,7 @@ mod feed;
 mod found_devices;
 mod input_counts;
 mod join;
+pub mod known_robots;
 mod memory;
 mod nearest_name;
 mod notes;

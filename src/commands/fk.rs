@@ -2,6 +2,7 @@
 
 use crate::print;
 use anyhow::{Context, bail, ensure};
+use capture::known_robots::KnownRobot;
 use kinematics::urdf::{JointKind, Robot};
 use kinematics::{Chain, transform};
 use serde::{Deserialize, Serialize};
@@ -10,7 +11,7 @@ use std::path::{Path, PathBuf};
 /// Flags of `fk`.
 #[derive(Debug, clap::Args)]
 pub(crate) struct Args {
-    /// Robot description (URDF, already expanded from xacro; meshes are not read)
+    /// Robot description (URDF, already expanded from xacro; meshes are not read), or builtin:NAME
     urdf: PathBuf,
     /// Link whose pose is computed
     #[arg(long, value_name = "LINK")]
@@ -44,7 +45,7 @@ struct Poses<'a> {
 
 /// Prints the poses of all configurations as one JSON object.
 pub(crate) fn run(args: Args) -> anyhow::Result<()> {
-    let urdf = read(&args.urdf)?;
+    let urdf = read_urdf(&args.urdf)?;
     let robot = Robot::parse(&urdf).with_context(|| args.urdf.display().to_string())?;
     let chain = chain(&robot, &args).with_context(|| args.urdf.display().to_string())?;
     for note in robot.notes() {
@@ -57,6 +58,14 @@ pub(crate) fn run(args: Args) -> anyhow::Result<()> {
         tip: &args.tip,
         poses,
     })
+}
+
+/// The text of a URDF file, or of a known robot that is named as in rig files.
+fn read_urdf(urdf: &Path) -> anyhow::Result<String> {
+    match KnownRobot::named_by(&urdf.to_string_lossy())? {
+        Some(robot) => Ok(robot.urdf.to_owned()),
+        None => read(urdf),
+    }
 }
 
 fn read(path: &Path) -> anyhow::Result<String> {

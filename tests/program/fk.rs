@@ -115,6 +115,30 @@ fn stretched_panda_matches_published_pose() {
 }
 
 #[test]
+fn a_known_robot_needs_no_file() {
+    let names = [
+        "shoulder_pan_joint",
+        "shoulder_lift_joint",
+        "elbow_joint",
+        "wrist_1_joint",
+        "wrist_2_joint",
+        "wrist_3_joint",
+    ];
+    let zero = [0.0; 6];
+    let joints = json!({"joint_names": names, "configurations": [zero]});
+    let flags = ["--tip", "tool0", "--base", "base"];
+    let pose = &poses(Path::new("builtin:ur5e"), &flags, &joints)[0];
+    // The arm is stretched along -x, and its flange points along -y.
+    let position_m = [-0.425 - 0.3922, -0.1333 - 0.0996, 0.1625 - 0.0997];
+    for (at, expected_m) in [3, 7, 11].into_iter().zip(position_m) {
+        assert!((pose[at] - expected_m).abs() < TOLERANCE, "{pose:?}");
+    }
+    let (code, _, errors) = fk(Path::new("builtin:ur5"), &flags, &joints.to_string());
+    assert_eq!(code, 1, "{errors}");
+    assert!(errors.contains("did you mean \"ur5e\"?"), "{errors}");
+}
+
+#[test]
 fn poses_match_an_independent_library() {
     let Some(robots) = test_support::data_folder("robots") else {
         return;

@@ -5,9 +5,10 @@ use super::error::ConfigError;
 use super::key::{Keys, choices, entry, keys};
 use super::motion::ArmMotion;
 use super::section::Section;
+use crate::known_robots::{BUILTIN_PREFIX, KnownRobot};
 use drivers::can::{BusConfig, MotorConfig};
 use kinematics::Chain;
-use toml::Table;
+use toml::{Table, Value};
 
 /// Maximum joint offset, rad or m. A larger offset is probably in degrees, or has the wrong sign.
 const MAX_JOINT_OFFSET: f64 = 1.0;
@@ -78,24 +79,28 @@ choices! {
     }
 }
 
-/// Reads the arm without its robot description. Also returns the path of the robot description,
-/// which is empty if there is none.
+/// Reads the arm. Also returns the path of the robot description. The path is empty if there is no
+/// robot description, or if it is that of a known robot, which is then part of the arm.
 pub(super) fn read(mut keys: Section<'_>) -> Option<(Arm, String)> {
     let has_flange_link = keys.has("flange_link");
     let arm = Arm::read_keys(&mut keys);
     let urdf = keys.get::<String>("urdf", ());
+    let is_reference = urdf
+        .as_deref()
+        .is_some_and(|urdf| urdf.starts_with(BUILTIN_PREFIX));
+    let known_robot = urdf.as_deref().and_then(|urdf| known_robot(&keys, urdf));
     // An invalid driver counts as an arm, so that the keys that an arm needs are checked in the
     // same pass.
     let has_arm = arm.as_ref().is_none_or(|arm| arm.driver != ArmDriver::None);
     if has_arm && urdf.is_none() {
         keys.missing(
             "urdf",
-            "path of the robot description, relative to the rig file",
+            "path of the robot description, relative to the rig file, or \"builtin:NAME\" of a known robot",
         );
     }
     // Without an arm and a robot description, the robot has a single link.
     let has_single_link = !has_arm && urdf.is_none();
-    if !has_flange_link && !has_single_link {
+    if !has_flange_link && !has_single_link && !is_reference {
         keys.missing(
             "flange_link",
             "link to which cameras with the parent flange are attached",
@@ -108,10 +113,33 @@ pub(super) fn read(mut keys: Section<'_>) -> Option<(Arm, String)> {
         motors,
         ..arm?
     };
+    if let Some(robot) = known_robot {
+        arm.urdf_text = robot.urdf.to_owned();
+        if arm.base_link.is_empty() {
+            arm.base_link = robot.base_link.to_owned();
+        }
+        if !has_flange_link {
+            arm.flange_link = robot.flange_link.to_owned();
+        }
+        return Some((arm, String::new()));
+    }
     if !has_flange_link {
         arm.flange_link = "base".to_owned();
     }
     Some((arm, urdf.unwrap_or_default()))
+}
+
+/// The known robot that a value of `urdf` names; `None` if the value is a path. An unknown name is
+/// reported.
+fn known_robot(keys: &Section<'_>, urdf: &str) -> Option<&'static KnownRobot> {
+    KnownRobot::named_by(urdf).unwrap_or_else(|unknown| {
+        let got = Value::String(urdf.to_owned());
+        keys.invalid(
+            "urdf",
+            &got,
+            &format!("a path, or a known robot; {unknown}"),
+        )
+    })
 }
 
 pub(super) fn write(arm: &Arm) -> Table {

@@ -13,6 +13,8 @@ mod can;
 mod error;
 mod join;
 mod key;
+#[cfg(test)]
+mod known_robot_tests;
 mod lens;
 mod motion;
 mod pose;
@@ -99,7 +101,12 @@ impl Rig {
             |name| name.to_string_lossy().into_owned(),
         );
         let folder = path.parent().unwrap_or(Path::new("")).to_owned();
-        let read_urdf = |urdf: &str| read_file("the robot description", &folder.join(urdf));
+        let read_urdf = |urdf: &str| {
+            let path = folder.join(urdf);
+            // An absolute path shows the folder in the message if the file does not exist.
+            let path = std::path::absolute(&path).unwrap_or(path);
+            read_file("the robot description", &path)
+        };
         let mut rig = rig_file::read(&file, &text, overrides, Some(&folder), read_urdf)?;
         if let Some(motion) = rig
             .arm

@@ -23,11 +23,11 @@ pub(super) fn read(
         return Err(problem);
     }
     let (mut rig, urdf_path) = rig.expect("without problems, there is a rig");
-    rig.arm.urdf_text = if urdf_path.is_empty() {
-        EMPTY_URDF.to_owned()
-    } else {
-        read_urdf(&urdf_path)?
-    };
+    if !urdf_path.is_empty() {
+        rig.arm.urdf_text = read_urdf(&urdf_path)?;
+    } else if rig.arm.urdf_text.is_empty() {
+        rig.arm.urdf_text = EMPTY_URDF.to_owned();
+    }
     arm::resolve_joints(file, &mut rig.arm)?;
     Ok(rig)
 }

@@ -55,17 +55,22 @@ pub(super) fn received(monitor: &DatagramMonitor, has_data: bool) -> Option<Find
     finding(
         monitor.device(),
         &monitor.counts(),
-        monitor.last_rejection().as_deref(),
+        &reason(monitor, has_data),
         has_data,
     )
 }
 
-fn finding(
-    device: &str,
-    counts: &DatagramCounts,
-    last_rejection: Option<&str>,
-    has_data: bool,
-) -> Option<Finding> {
+/// Why datagrams were not used, as the end of a sentence; may be empty.
+fn reason(monitor: &DatagramMonitor, has_data: bool) -> String {
+    match (monitor.last_rejection(), monitor.unmatched_names()) {
+        (Some(reason), _) => format!("; the last rejection: {reason}"),
+        // Beside states of the arm, states of other joints are expected.
+        (None, Some(names)) if !has_data => format!("; {names}"),
+        _ => String::new(),
+    }
+}
+
+fn finding(device: &str, counts: &DatagramCounts, reason: &str, has_data: bool) -> Option<Finding> {
     let DatagramCounts {
         n_received,
         n_rejected,
@@ -88,9 +93,6 @@ fn finding(
         .map(|(n, what)| format!("{n} {what}"))
         .collect();
     let listed = listed.join(", ");
-    let reason = last_rejection.map_or(String::new(), |reason| {
-        format!("; the last rejection: {reason}")
-    });
     let remedy = match (n_rejected, n_foreign, n_other, n_uncertain) {
         (0, 0, 1.., _) => "correct arm.joints, or the joint names that the sender uses",
         (0, 0, 0, 1..) => {
@@ -148,7 +150,7 @@ mod tests {
         let none = DatagramCounts::default();
         let of = |counts, reason, has_data| finding("arm", &counts, reason, has_data);
         assert_eq!(
-            of(none, None, false),
+            of(none, "", false),
             None,
             "a silent device has another finding"
         );
@@ -160,7 +162,7 @@ mod tests {
                     n_late: 1,
                     ..none
                 },
-                None,
+                "",
                 true
             ),
             None
@@ -175,7 +177,10 @@ mod tests {
             ),
             (
                 DatagramCounts { n_other: 9, ..none },
-                ["9 without any joint", "arm.joints"],
+                [
+                    "9 without any joint of the arm; names has left, and",
+                    "correct arm.joints",
+                ],
             ),
             (
                 DatagramCounts {
@@ -193,7 +198,11 @@ mod tests {
                 ["9 too uncertain", "base.max_sigma_m"],
             ),
         ] {
-            let reason = (counts.n_rejected > 0).then_some("version is 2");
+            let reason = match (counts.n_rejected, counts.n_other) {
+                (1.., _) => "; the last rejection: version is 2",
+                (_, 1..) => "; names has left, and arm.joints has a, b",
+                _ => "",
+            };
             let counts = DatagramCounts {
                 n_received: 9,
                 ..counts

@@ -44,6 +44,7 @@ pub struct DatagramMonitor {
 struct MonitorState {
     counts: DatagramCounts,
     last_rejection: Option<String>,
+    unmatched_names: Option<String>,
 }
 
 impl DatagramMonitor {
@@ -73,6 +74,16 @@ impl DatagramMonitor {
     /// Reason for the last rejection; `None` if no datagram was rejected.
     pub fn last_rejection(&self) -> Option<String> {
         self.state.lock().last_rejection.clone()
+    }
+
+    /// Names of the first joint state that names none of the arm's joints, beside those of the arm;
+    /// `None` if there was no such state.
+    pub fn unmatched_names(&self) -> Option<String> {
+        self.state.lock().unmatched_names.clone()
+    }
+
+    pub(crate) fn set_unmatched_names(&self, names: String) {
+        self.state.lock().unmatched_names = Some(names);
     }
 
     pub(crate) fn set_counts(&self, counts: DatagramCounts) {

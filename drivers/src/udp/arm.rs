@@ -18,9 +18,11 @@ pub struct UdpArm {
 impl UdpArm {
     /// Listens for states of these joints. With port 0, a free port is used.
     pub fn open(joint_names: &[String], address: SocketAddr) -> Result<Self, Error> {
+        let mut states = DatagramReader::open(device_names::ARM, "joint states", address)?;
+        states.joint_names = joint_names.to_vec();
         Ok(Self {
             names: joint_names.to_vec(),
-            states: DatagramReader::open(device_names::ARM, "joint states", address)?,
+            states,
         })
     }
 

@@ -6,7 +6,7 @@ use crate::datagrams::counts::{CLOCK_RESTARTED, DatagramCounts, DatagramMonitor,
 use crate::datagrams::receiver::{ReceivedDatagram, Receiver};
 use crate::datagrams::senders::Senders;
 use crate::wire::Malformed;
-use crate::wire::datagram::DatagramHeader;
+use crate::wire::datagram::{DatagramHeader, unmatched_names};
 use kinematics::Stamp;
 use std::net::SocketAddr;
 use std::time::{Duration, Instant};
@@ -16,6 +16,8 @@ use std::time::{Duration, Instant};
 pub(super) struct DatagramReader {
     /// Name of the values in messages, in the plural.
     plural: &'static str,
+    /// Joints of the arm; empty for values of other devices.
+    pub(super) joint_names: Vec<String>,
     receiver: Receiver,
     pub(super) sequence: SequenceTracker,
     pub(super) counts: DatagramCounts,
@@ -34,6 +36,7 @@ impl DatagramReader {
         let monitor = DatagramMonitor::new(device, receiver.address());
         Ok(Self {
             plural,
+            joint_names: Vec::new(),
             receiver,
             sequence: SequenceTracker::default(),
             counts: DatagramCounts::default(),
@@ -122,7 +125,7 @@ impl DatagramReader {
         // The value is checked after the sequence number, so that states of other joints do not
         // count as lost.
         let Some(reading) = reading else {
-            self.count_other();
+            self.count_other(&datagram.bytes);
             return None;
         };
         let stamp = self.stamp(&header, datagram.at)?;
@@ -161,12 +164,15 @@ impl DatagramReader {
 
     /// Counts a state that names none of the joints, and explains the first one in the log. Such
     /// states come from a gripper on the same port, or from an arm whose joints are named wrongly.
-    fn count_other(&mut self) {
-        if self.counts.n_other == 0 {
+    fn count_other(&mut self, bytes: &[u8]) {
+        if self.counts.n_other == 0
+            && let Ok(names) = unmatched_names(bytes, &self.joint_names)
+        {
             let device = self.receiver.device();
             log::info!(
-                "{device}: ignoring states that name none of the arm's joints; if these are its joints, correct arm.joints"
+                "{device}: ignoring states that name none of the arm's joints: {names}; if these are its joints, correct arm.joints"
             );
+            self.monitor.set_unmatched_names(names);
         }
         self.counts.n_other += 1;
     }

@@ -338,6 +338,12 @@ fn joint_states_are_ordered_and_other_joints_ignored() {
         ..DatagramCounts::default()
     };
     assert_eq!(arm.counts(), expected);
+    let unmatched_names = arm.monitor().unmatched_names().unwrap();
+    let of_arm = names.join(", ");
+    assert_eq!(
+        unmatched_names,
+        format!("names has left, right, and arm.joints has {of_arm}")
+    );
 }
 
 #[test]

@@ -429,6 +429,17 @@ pub fn decode_joints(
     ))
 }
 
+/// Why a valid state is not one of these joints: the names in the datagram, and ours.
+pub fn unmatched_names(bytes: &[u8], joints: &[String]) -> Result<String, Malformed> {
+    let state: WireJoints<Option<f64>> = parse_json(bytes)?;
+    let reported = state.names.unwrap_or_default();
+    Ok(format!(
+        "names has {}, and arm.joints has {}",
+        shown(&reported),
+        shown(joints)
+    ))
+}
+
 /// Positions of our joints in the lists of a datagram.
 struct JointLayout {
     /// Index of each of our joints in the lists.

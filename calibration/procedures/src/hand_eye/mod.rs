@@ -16,6 +16,7 @@ use calibration::hand_eye::{
     HandEyeCalibration, HandEyeInput, HandEyeOptions, NextPose, NextPoseOptions, Setup,
     calibrate_hand_eye, suggest_next_poses,
 };
+use capture::known_robots::KnownRobot;
 use kinematics::urdf::Robot;
 use kinematics::{Chain, Intrinsics, Lens, Transform};
 use messages::{BadInput, ErrorClass, InsufficientData, Setting};
@@ -293,7 +294,13 @@ impl HandEyeTask {
             return Ok(None);
         };
         let of_file = || urdf.display().to_string();
-        let robot = Robot::parse(&outputs::read_text(urdf)?).with_context(of_file)?;
+        let known_robot = KnownRobot::named_by(&urdf.to_string_lossy())
+            .map_err(|unknown| BadInput(unknown.to_string()))?;
+        let text = match known_robot {
+            Some(known) => known.urdf.to_owned(),
+            None => outputs::read_text(urdf)?,
+        };
+        let robot = Robot::parse(&text).with_context(of_file)?;
         let root = robot.root().with_context(of_file)?.to_owned();
         Ok(Some(Chain::new(&robot, &root, tip).with_context(of_file)?))
     }

@@ -1,0 +1,1 @@
+raise ImportError("No module named 'rtde_receive'", name="rtde_receive")
