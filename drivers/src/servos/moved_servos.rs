@@ -317,10 +317,15 @@ impl MovedServos {
         match on_loss {
             OnLoss::Release => self.release(),
             OnLoss::Hold | OnLoss::Damp => {
-                if is_blocked && let Some(positions) = self.positions() {
-                    let _ = self.send_goals(&positions);
+                let here = self.positions().filter(|_| is_blocked);
+                if let Some(positions) = &here {
+                    let _ = self.send_goals(positions);
                 }
                 self.stop_watchdogs();
+                // A servo whose watchdog had expired has refused the first goal.
+                if let Some(positions) = &here {
+                    let _ = self.send_goals(positions);
+                }
                 Vec::new()
             }
         }

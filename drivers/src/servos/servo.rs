@@ -67,8 +67,7 @@ impl Servo {
         // The encoder jumps by one turn at the end of its range, wherever that is in the range of
         // the joint. A joint without a gear turns by at most half a turn from its zero.
         let is_single_turn = (0..COUNTS_PER_TURN).contains(&counts);
-        #[expect(clippy::float_cmp, reason = "the default is exactly 1")]
-        let has_gear = self.config.gear_ratio != 1.0;
+        let has_gear = (self.config.gear_ratio - 1.0).abs() > f64::EPSILON;
         let turned = if is_single_turn && !has_gear {
             let half = COUNTS_PER_TURN / 2;
             (turned + half).rem_euclid(COUNTS_PER_TURN) - half

@@ -28,6 +28,8 @@ pub(super) mod register {
     pub(crate) const FIRMWARE: u16 = 6;
     /// Drive mode (1) and operating mode (1).
     pub(crate) const DRIVE_MODE: u16 = 10;
+    /// Largest velocity (4).
+    pub(crate) const VELOCITY_LIMIT: u16 = 44;
     /// Maximum (4) and minimum (4) position in position mode.
     pub(crate) const LIMITS: u16 = 48;
     /// 1 if the servo is enabled.
@@ -217,6 +219,8 @@ impl ServoProtocol for DynamixelProtocol {
     ) -> Result<(), ServoError> {
         // After the watchdog has expired, goals are refused until it is set to 0.
         self.set_watchdog(bus, id, None)?;
+        // A velocity above this limit is refused.
+        let limit = number_at(&read(bus, id, register::VELOCITY_LIMIT, 4)?, 0).max(1);
         let is_time_based = read(bus, id, register::DRIVE_MODE, 1)?[0] & TIME_BASED != 0;
         #[expect(
             clippy::cast_possible_truncation,
@@ -230,7 +234,7 @@ impl ServoProtocol for DynamixelProtocol {
         } else {
             (max_counts_s / info.velocity_unit_counts_s)
                 .ceil()
-                .clamp(1.0, 32_767.0) as u32
+                .clamp(1.0, f64::from(limit)) as u32
         };
         // An acceleration of 0 does not limit the setpoints, which are smooth.
         let profile = [0_u32.to_le_bytes(), velocity.to_le_bytes()].concat();

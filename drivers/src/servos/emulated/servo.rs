@@ -81,6 +81,7 @@ impl EmulatedServo {
                 servo.set(dynamixel::FIRMWARE, &[46, id]);
                 // Velocity-based profiles, position mode.
                 servo.set(dynamixel::DRIVE_MODE, &[0, 3]);
+                servo.set(dynamixel::VELOCITY_LIMIT, &265_u32.to_le_bytes());
                 servo.set(dynamixel::LIMITS, &4095_u32.to_le_bytes());
             }
         }

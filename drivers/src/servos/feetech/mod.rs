@@ -14,7 +14,7 @@ use super::bus::ServoBus;
 use super::packet::{PacketFormat, Status};
 use super::protocol::{
     Block, COUNTS_PER_TURN, Feedback, FoundServo, LossReactions, ServoError, ServoInfo,
-    ServoProtocol, bit_names, read, write,
+    ServoProtocol, bit_names, no_answer, read,
 };
 use crate::Error;
 use crate::motion::OnLoss;
@@ -168,7 +168,8 @@ impl ServoProtocol for FeetechProtocol {
         info: &ServoInfo,
         max_counts_s: f64,
     ) -> Result<(), ServoError> {
-        write(bus, id, register::ACCELERATION, &[MAX_ACCELERATION])?;
+        // A servo may keep a lower limit, which only makes it lag its setpoints.
+        bus.write(id, register::ACCELERATION, &[MAX_ACCELERATION])?;
         #[expect(
             clippy::cast_possible_truncation,
             clippy::cast_sign_loss,
@@ -178,7 +179,16 @@ impl ServoProtocol for FeetechProtocol {
         let speed = (max_counts_s / info.velocity_unit_counts_s)
             .ceil()
             .clamp(1.0, f64::from(SIGN - 1)) as u16;
-        write(bus, id, register::SPEED, &speed.to_le_bytes())
+        // The servo may also limit the speed further.
+        let contents = bus.write(id, register::SPEED, &speed.to_le_bytes())?;
+        let contents = contents.ok_or_else(|| no_answer(id))?;
+        let accepted = u16::from_le_bytes(contents.try_into().unwrap_or_default());
+        if (1..=speed).contains(&accepted) {
+            return Ok(());
+        }
+        Err(ServoError::Servo(format!(
+            "the servo with ID {id} did not accept the speed limit {speed}: it contains {accepted}"
+        )))
     }
 
     fn goal_address(&self) -> u16 {
