@@ -1,6 +1,6 @@
 //! Tests of the emulated servos against independent implementations of their protocols: the clients
-//! of the makers, Feetech's `scservo_sdk` and ROBOTIS's `dynamixel_sdk`. Both are installed once from
-//! the Python Package Index into a virtual environment. If that is not possible, the tests are
+//! of the makers, Feetech's `scservo_sdk` and ROBOTIS's `dynamixel_sdk`. Both are installed once
+//! from the Python Package Index into a virtual environment. If that is not possible, the tests are
 //! skipped.
 
 #![cfg(target_os = "linux")]

@@ -1,9 +1,10 @@
 //! Reads the calibration files of LeRobot, which give the IDs and zeros of servos.
 //!
 //! Source: `MotorCalibration` in LeRobot's `motors/motors_bus.py`. A file is an object with one
-//! entry per motor: `{"shoulder_pan": {"id": 1, "drive_mode": 0, "homing_offset": -1024, "range_min":
-//! 740, "range_max": 3420}, ...}`. LeRobot stores `homing_offset` in the servo, so the servo reports
-//! positions that include it. In LeRobot, as in its URDFs, the angle 0 is the middle of the range.
+//! entry per motor: `{"shoulder_pan": {"id": 1, "drive_mode": 0, "homing_offset": -1024,
+//! "range_min": 740, "range_max": 3420}, ...}`. LeRobot stores `homing_offset` in the servo, so the
+//! servo reports positions that include it. In LeRobot, as in its URDFs, the angle 0 is the middle
+//! of the range.
 
 use super::ConfigError;
 use super::section::ParseContext;

@@ -265,9 +265,10 @@ impl ServoBus {
                     self.received.drain(..n_bytes);
                     self.counts.n_garbage_bytes += n_bytes as u64;
                 }
-                // After the deadline, the rest of this packet no longer arrives. Its header may have
-                // been noise in front of an answer, so the search continues in the other bytes. The
-                // time is checked here, because noise that never ends must not delay the caller.
+                // After the deadline, the rest of this packet no longer arrives. Its header may
+                // have been noise in front of an answer, so the search continues in the other
+                // bytes. The time is checked here, because noise that never ends must not delay the
+                // caller.
                 Scan::Incomplete if Instant::now() >= deadline => {
                     if self.received.is_empty() {
                         break;

@@ -24,9 +24,9 @@ use std::time::Duration;
 const SILENCE_FRAC: f64 = 0.8;
 /// Interval at which an idle thread checks for requests.
 const POLL: Duration = Duration::from_millis(20);
-/// Additional time in which an arm must come to rest on shutdown. It covers late cycles and a target
-/// that was set just before the shutdown. Without a limit, an arm that never comes to rest would
-/// keep the program from ending.
+/// Additional time in which an arm must come to rest on shutdown. It covers late cycles and a
+/// target that was set just before the shutdown. Without a limit, an arm that never comes to rest
+/// would keep the program from ending.
 const STOP_MARGIN: Duration = Duration::from_secs(1);
 /// Maximum time, in addition to the watchdog timeout, in which the fail-safe is repeated until each
 /// servo has confirmed it.
@@ -272,8 +272,8 @@ impl MotionLoop {
         self.arm_state = ArmState::Stopped { reason };
     }
 
-    /// Applies `on_loss`. Repeats it for a limited time until each servo has confirmed it, because a
-    /// servo that misses it would keep its last goal.
+    /// Applies `on_loss`. Repeats it for a limited time until each servo has confirmed it, because
+    /// a servo that misses it would keep its last goal.
     fn apply_fail_safe(&mut self, is_blocked: bool) {
         let on_loss = self.config.motion.on_loss;
         let Some(servos) = &mut self.servos else {

@@ -49,8 +49,8 @@ impl MovableServoArm {
     /// Finds the servos, sets their speed limits and watchdogs, and enables them.
     ///
     /// # Errors
-    /// If another program moves servos on the port. In this case, nothing is sent. If any later step
-    /// fails. In this case, no servo stays enabled that was disabled before.
+    /// If another program moves servos on the port. In this case, nothing is sent. If any later
+    /// step fails. In this case, no servo stays enabled that was disabled before.
     pub fn open(config: &MovableServoArmConfig) -> Result<Self, Error> {
         let (sender, states) = sync_channel(MAX_WAITING);
         // Only one request waits at a time, because the owner waits for each reply.

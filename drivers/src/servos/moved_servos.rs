@@ -13,8 +13,8 @@ use crate::{Error, clock};
 use kinematics::{JointState, Stamp};
 use std::time::Duration;
 
-/// Largest speed of a servo, relative to the speed limit of its joint. The servo must be faster than
-/// its setpoints, so that it can catch up. Any larger speed would be a fault of the command.
+/// Largest speed of a servo, relative to the speed limit of its joint. The servo must be faster
+/// than its setpoints, so that it can catch up. Any larger speed would be a fault of the command.
 const SPEED_RESERVE: f64 = 2.0;
 /// Part of a cycle that is left for delays of adapter and computer.
 const MAX_BUS_LOAD_FRAC: f64 = 0.7;
@@ -41,7 +41,6 @@ pub(super) struct MovedServos {
     /// Last commanded position of each joint.
     sent_rad: Vec<f64>,
     cycle_ix: u64,
-    has_watchdog: bool,
 }
 
 impl MovedServos {
@@ -73,7 +72,6 @@ impl MovedServos {
             faulty: None,
             sent_rad: vec![0.0; n],
             cycle_ix: 0,
-            has_watchdog: plan::has_watchdog(config),
         };
         found.measure()?;
         Ok(found)
@@ -126,8 +124,8 @@ impl MovedServos {
         Err(self.fault(silent, "the servo reported no position".to_owned()))
     }
 
-    /// Enables the servos, which hold their positions. If a servo cannot be enabled, those that this
-    /// call has enabled are disabled again.
+    /// Enables the servos, which hold their positions. If a servo cannot be enabled, those that
+    /// this call has enabled are disabled again.
     ///
     /// # Errors
     /// If a servo does not accept a value.
@@ -179,7 +177,9 @@ impl MovedServos {
             // While they were disabled, some servos ignore goals.
             self.send_goals(&positions)?;
         }
-        if self.has_watchdog {
+        // A watchdog that holds is also started if the arm is to be released: holding is better
+        // than following an old command.
+        if self.protocol.watchdog_address().is_some() {
             // The watchdogs are started last, because enabling the servos may take longer than
             // their timeout.
             for ix in 0..self.servos.len() {
@@ -193,8 +193,8 @@ impl MovedServos {
         Ok(())
     }
 
-    /// Reads all servos, and checks that they answer, follow, and report no fault. Returns the state
-    /// if all joints were read.
+    /// Reads all servos, and checks that they answer, follow, and report no fault. Returns the
+    /// state if all joints were read.
     ///
     /// # Errors
     /// If a check fails, or the port was disconnected.
@@ -337,23 +337,28 @@ impl MovedServos {
         // joints that are still held.
         let off: Vec<_> = self.ids.iter().map(|id| (*id, vec![0])).collect();
         let _ = self.bus.sync_write(self.protocol.torque_address(), &off);
-        let unconfirmed = (0..self.servos.len()).filter(|ix| self.set_torque(*ix, false).is_err());
-        let unconfirmed: Vec<_> = unconfirmed.collect();
+        let mut unconfirmed = Vec::new();
+        for (servo, id) in self.servos.iter().zip(&self.ids) {
+            let contents = self.bus.read_once(*id, self.protocol.torque_address(), 1);
+            if !contents.is_ok_and(|status| status.is_some_and(|status| status.data == [0])) {
+                unconfirmed.push(servo.config.joint.clone());
+            }
+        }
         self.stop_watchdogs();
         unconfirmed
-            .into_iter()
-            .map(|ix| self.servos[ix].config.joint.clone())
-            .collect()
     }
 
     /// Stops the watchdogs, so that other programs can command the servos afterwards. An expired
     /// watchdog makes a servo refuse all goals.
     fn stop_watchdogs(&mut self) {
-        if self.has_watchdog {
-            for id in &self.ids {
-                // A servo that no longer answers holds when its watchdog expires.
-                let _ = self.protocol.set_watchdog(&mut self.bus, *id, None);
-            }
+        let Some(address) = self.protocol.watchdog_address() else {
+            return;
+        };
+        let off: Vec<_> = self.ids.iter().map(|id| (*id, vec![0])).collect();
+        // Servos do not confirm this instruction, so it is sent twice. A servo that misses both
+        // holds when its watchdog expires.
+        for _ in 0..2 {
+            let _ = self.bus.sync_write(address, &off);
         }
     }
 

@@ -61,13 +61,6 @@ fn check_loss(config: &MovableServoArmConfig) -> Result<(), String> {
     ))
 }
 
-/// Whether the servos apply `on_loss` without this computer.
-pub(super) fn has_watchdog(config: &MovableServoArmConfig) -> bool {
-    // A watchdog that holds is also started if the arm is to be released: holding is better than
-    // following an old command.
-    !config.arm.protocol.loss_reactions().by_servo.is_empty()
-}
-
 /// Whether `on_loss` must be confirmed by each servo before this program ends.
 pub(super) fn needs_confirmation(on_loss: OnLoss) -> bool {
     on_loss == OnLoss::Release

@@ -134,6 +134,11 @@ pub trait ServoProtocol: Debug + Sync {
     fn goal(&self, counts: i32) -> Vec<u8>;
     /// Address of the register that enables a servo with 1 and disables it with 0.
     fn torque_address(&self) -> u16;
+    /// Address of the register that stops the watchdog with 0; `None` if the servos have no
+    /// watchdog.
+    fn watchdog_address(&self) -> Option<u16> {
+        None
+    }
     /// Starts the watchdog of an enabled servo, or stops it if `timeout` is `None`.
     ///
     /// # Errors

@@ -1,9 +1,9 @@
-//! Tests of the drivers against emulated servos on a pseudo terminal. They wait for conditions, with
-//! a time limit that only a failure reaches.
+//! Tests of the drivers against emulated servos on a pseudo terminal. They wait for conditions,
+//! with a time limit that only a failure reaches.
 
 use super::emulated::{Disturbance, EmulatedServo, EmulatedServoBus, ServoKind};
 use super::{
-    DynamixelProtocol, FeetechProtocol, MovableServoArm, MovableServoArmConfig, PortConfig,
+    DynamixelProtocol, FeetechProtocol, MovableServoArm, MovableServoArmConfig, PortConfig, Scan,
     ServoArm, ServoArmConfig, ServoConfig, ServoProtocol, servos_on,
 };
 use crate::can::FollowingLimits;
@@ -333,6 +333,40 @@ fn servos_are_found_by_ping() {
             .map(|servo| (servo.id, servo.model.as_str()))
             .collect();
         assert_eq!(servos, [(1, model), (2, model), (7, model)]);
+    }
+}
+
+#[test]
+fn arbitrary_bytes_are_consumed_without_a_panic() {
+    // A linear congruential generator, so that the bytes are always the same. Half of the bytes are
+    // those of headers, which makes packets likely.
+    let mut state = 1_u32;
+    let mut next_byte = move || {
+        state = state.wrapping_mul(1_664_525).wrapping_add(1_013_904_223);
+        let [_, _, choice, byte] = state.to_le_bytes();
+        match choice % 8 {
+            0..=2 => 0xFF,
+            3 => 0xFD,
+            4 => byte % 12,
+            _ => byte,
+        }
+    };
+    let bytes: Vec<u8> = (0..20_000).map(|_| next_byte()).collect();
+    for protocol in [&FeetechProtocol as &dyn ServoProtocol, &DynamixelProtocol] {
+        for len in [0, 4] {
+            let mut rest = &bytes[..];
+            loop {
+                let n_bytes = match protocol.format().decode(rest, len) {
+                    Scan::Packet { n_bytes, .. }
+                    | Scan::Corrupt { n_bytes }
+                    | Scan::Garbage { n_bytes } => n_bytes,
+                    Scan::Incomplete if rest.is_empty() => break,
+                    Scan::Incomplete => 1,
+                };
+                assert!((1..=rest.len()).contains(&n_bytes));
+                rest = &rest[n_bytes..];
+            }
+        }
     }
 }
 

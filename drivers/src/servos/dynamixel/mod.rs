@@ -1,5 +1,5 @@
-//! Dynamixel servos of the X series, and MX servos with protocol 2.0, such as the XL330 and XL430 of
-//! the Koch arm, and the XM430 and XM540 of ALOHA.
+//! Dynamixel servos of the X series, and MX servos with protocol 2.0, such as the XL330 and XL430
+//! of the Koch arm, and the XM430 and XM540 of ALOHA.
 //!
 //! Source: ROBOTIS e-Manual, control tables of the X series; model numbers: `dynamixel_easy_sdk`.
 //! Numbers are little endian. Negative numbers are in two's complement.
@@ -251,6 +251,10 @@ impl ServoProtocol for DynamixelProtocol {
 
     fn torque_address(&self) -> u16 {
         register::TORQUE
+    }
+
+    fn watchdog_address(&self) -> Option<u16> {
+        Some(register::WATCHDOG)
     }
 
     fn set_watchdog(

@@ -1,8 +1,8 @@
 //! The packet format of Dynamixel protocol 2.0.
 //!
 //! Source: ROBOTIS e-Manual, "DYNAMIXEL Protocol 2.0": `FF FF FD 00 ID LENGTH INSTRUCTION
-//! PARAMETERS CRC`, little endian. The CRC is CRC-16/BUYPASS (polynomial 0x8005, initial value 0) of
-//! all bytes before it.
+//! PARAMETERS CRC`, little endian. The CRC is CRC-16/BUYPASS (polynomial 0x8005, initial value 0)
+//! of all bytes before it.
 
 use crate::servos::packet::{
     BROADCAST, Instruction, PacketFormat, Scan, Status, bytes_before_header,
@@ -117,8 +117,8 @@ fn answer_of(id: u8, answer: &[u8]) -> Vec<Status> {
 }
 
 /// The answers in the packet of a fast sync read. Each consists of an error, an ID and `len` bytes.
-/// Between two answers is the CRC of the packet up to there. These CRCs are not checked, because the
-/// last one covers all bytes.
+/// Between two answers is the CRC of the packet up to there. These CRCs are not checked, because
+/// the last one covers all bytes.
 fn fast_answers(answers: &[u8], len: usize) -> Vec<Status> {
     let is_whole = (answers.len() + 2).is_multiple_of(len + N_STATUS_FRAME);
     if !is_whole {

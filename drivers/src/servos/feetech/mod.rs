@@ -1,8 +1,8 @@
 //! Feetech STS and SMS servos, such as the STS3215 of the SO-100 and SO-101.
 //!
 //! Sources: Feetech, "Memory table of magnetic encoder STS servos"; model numbers and the encoding
-//! of signs: LeRobot, `motors/feetech/tables.py`. Numbers are little endian. A negative number is its
-//! absolute value with an additional sign bit.
+//! of signs: LeRobot, `motors/feetech/tables.py`. Numbers are little endian. A negative number is
+//! its absolute value with an additional sign bit.
 
 mod packet;
 
@@ -64,8 +64,8 @@ const POSITION_MODE: u8 = 0;
 const MAX_ACCELERATION: u8 = 254;
 /// Range of a servo whose limits are both 0: seven turns in each direction.
 const MULTI_TURN_COUNTS: i32 = 7 * COUNTS_PER_TURN;
-/// IDs that are searched. Each ID that does not answer takes 40 ms, so a search of all 254 IDs would
-/// take 10 s. Arms have their servos numbered from 1.
+/// IDs that are searched. Each ID that does not answer takes 40 ms, so a search of all 254 IDs
+/// would take 10 s. Arms have their servos numbered from 1.
 const SEARCHED_IDS: std::ops::RangeInclusive<u8> = 1..=12;
 
 /// The protocol of Feetech STS and SMS servos.
