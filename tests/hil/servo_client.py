@@ -53,6 +53,15 @@ class Dynamixel(Feetech):
         return group.fastSyncRead() if self.is_fast else group.txRxPacket()
 
 
+def retry(call, is_good):
+    """Repeats a call until its result is good. The libraries wait only 34 ms, which is short for a busy computer."""
+    for _ in range(50):
+        result = call()
+        if is_good(result):
+            return result
+    raise RuntimeError(f"failed: {result}")
+
+
 def main():
     kind, port, *ids = sys.argv[1:]
     ids = [int(ident) for ident in ids]
@@ -60,22 +69,22 @@ def main():
     assert client.port.openPort() and client.port.setBaudRate(BAUD_HZ)
     models = []
     for ident in ids:
-        model, result, error = client.packets.ping(client.port, ident)
-        assert (result, error) == (0, 0), client.packets.getTxRxResult(result)
+        model, _, _ = retry(lambda: client.packets.ping(client.port, ident), lambda answer: answer[1:] == (0, 0))
         models.append(model)
     _, absent, _ = client.packets.ping(client.port, 100)
     group, _ = client.reader(ids)
 
     def positions():
-        result = client.read(group)
-        assert result == 0, client.packets.getTxRxResult(result)
+        retry(lambda: client.read(group), lambda result: result == 0)
         return [group.getData(ident, client.POSITION, client.SIZE) for ident in ids]
 
     start = positions()
     goals = [position + BY_COUNTS for position in start]
     for ident in ids:
-        result, error = client.packets.write1ByteTxRx(client.port, ident, client.TORQUE, 1)
-        assert (result, error) == (0, 0), client.packets.getTxRxResult(result)
+        retry(
+            lambda: client.packets.write1ByteTxRx(client.port, ident, client.TORQUE, 1),
+            lambda answer: answer == (0, 0),
+        )
     writer = client.writer()
     for ident, goal in zip(ids, goals):
         writer.addParam(ident, list(goal.to_bytes(client.SIZE, "little")))

@@ -1,7 +1,7 @@
 //! Lists serial ports on USB, and the servos that answer on adapters for servos.
 
 use super::DeviceInfo;
-use drivers::servos::{FoundPort, FoundServos, found_ports, servos_on};
+use drivers::servos::{FoundPort, FoundServos, PortConfig, found_ports, servos_on};
 use std::path::Path;
 
 /// The serial ports, with the lines of a rig file for servos that were found.
@@ -33,7 +33,7 @@ fn describe(port: FoundPort) -> DeviceInfo {
 
 /// Searches a port for servos. Returns whether the port can be used, and what was found.
 fn search(path: &Path) -> (bool, String) {
-    match servos_on(path) {
+    match servos_on(path, PortConfig::MAX_ANSWER_DELAY) {
         Ok(Some(found)) => (true, describe_servos(&found)),
         Ok(None) => (
             true,

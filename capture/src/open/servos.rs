@@ -33,6 +33,7 @@ pub(crate) fn servo_config(rig: &Rig) -> ServoArmConfig {
             device: device.into(),
             baud_hz: *baud_hz,
             reconnect_for: Duration::from_secs_f64(*reconnect_secs),
+            max_answer_delay: PortConfig::MAX_ANSWER_DELAY,
         },
         servos: rig.arm.servos.iter().map(servo).collect(),
         rate_hz: rig.arm.rate_hz,

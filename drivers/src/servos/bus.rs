@@ -7,10 +7,6 @@ use kinematics::Stamp;
 use std::path::Path;
 use std::time::{Duration, Instant};
 
-/// Time that an answer may take in addition to its transmission. FTDI adapters hold received bytes
-/// for up to 16 ms by default. The rest is for a busy computer. With a longer wait, a servo that
-/// misses an instruction would delay the commands of the others.
-const MAX_ANSWER_DELAY: Duration = Duration::from_millis(40);
 /// Start bit, eight data bits and stop bit.
 const BITS_PER_BYTE: f64 = 10.0;
 /// Default time between an instruction and the answer of a servo (registers "Return Delay Time").
@@ -63,6 +59,7 @@ pub struct ServoBus {
     port: SerialPort,
     format: &'static dyn PacketFormat,
     baud_hz: u32,
+    max_answer_delay: Duration,
     /// Received bytes that were not decoded yet.
     received: Vec<u8>,
     counts: BusCounts,
@@ -80,6 +77,7 @@ impl ServoBus {
             port: SerialPort::open(config)?,
             format,
             baud_hz: config.baud_hz,
+            max_answer_delay: config.max_answer_delay,
             received: Vec::new(),
             counts: BusCounts::default(),
             is_fast: false,
@@ -235,7 +233,7 @@ impl ServoBus {
         ids: &[u8],
     ) -> Result<Vec<Option<Status>>, Error> {
         self.send(id, instruction)?;
-        let deadline = Instant::now() + self.duration(&[*instruction]) + MAX_ANSWER_DELAY;
+        let deadline = Instant::now() + self.duration(&[*instruction]) + self.max_answer_delay;
         let len = match instruction {
             Instruction::Read { len, .. }
             | Instruction::SyncRead { len, .. }

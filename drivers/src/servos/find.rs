@@ -100,18 +100,21 @@ pub struct FoundServos {
     pub servos: Vec<FoundServo>,
 }
 
-/// Searches a port for servos with the IDs 1 to 12. Takes about two seconds if there are none.
-/// Nothing moves.
+/// Searches a port for servos with the IDs 1 to 12. Takes about two seconds if there are none and
+/// the delay is [`PortConfig::MAX_ANSWER_DELAY`]. Nothing moves.
+///
+/// * `max_answer_delay`: time that each answer may take.
 ///
 /// # Errors
 /// If the port cannot be opened or is in use.
-pub fn servos_on(path: &Path) -> Result<Option<FoundServos>, Error> {
+pub fn servos_on(path: &Path, max_answer_delay: Duration) -> Result<Option<FoundServos>, Error> {
     for baud_hz in SEARCHED_BAUD_HZ {
         for protocol in PROTOCOLS {
             let config = PortConfig {
                 device: path.to_owned(),
                 baud_hz,
                 reconnect_for: Duration::ZERO,
+                max_answer_delay,
             };
             let mut bus = ServoBus::open(&config, protocol.format())?;
             let servos = protocol.find(&mut bus)?;

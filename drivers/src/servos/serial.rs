@@ -28,6 +28,15 @@ pub struct PortConfig {
     pub baud_hz: u32,
     /// How long the driver tries to reconnect after the adapter or the servos were disconnected.
     pub reconnect_for: Duration,
+    /// Time that an answer may take in addition to its transmission.
+    pub max_answer_delay: Duration,
+}
+
+impl PortConfig {
+    /// The usual [`max_answer_delay`](Self::max_answer_delay). FTDI adapters hold received bytes for
+    /// up to 16 ms by default. The rest is for a busy computer. With a longer wait, a servo that
+    /// misses an instruction would delay the commands of the others.
+    pub const MAX_ANSWER_DELAY: Duration = Duration::from_millis(40);
 }
 
 /// An open serial port: 8 data bits, no parity, 1 stop bit, no flow control. Dropping it releases

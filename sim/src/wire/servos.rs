@@ -77,6 +77,7 @@ mod tests {
                     device: folder.path().join("arm"),
                     baud_hz: 1_000_000,
                     reconnect_for: LIMIT,
+                    max_answer_delay: LIMIT,
                 },
                 servos: vec![servo(1, false), servo(2, true)],
                 rate_hz: 200.0,
