@@ -1,6 +1,9 @@
 //! Lists connected devices, as reported by the kernel, with the values to use in a rig file.
 
 #[cfg(target_os = "linux")]
+mod serial_ports;
+
+#[cfg(target_os = "linux")]
 use drivers::v4l2;
 use messages::Setting;
 use serde::Serialize;
@@ -13,7 +16,7 @@ const INTEL_USB_VENDOR: &str = "8086";
 /// A device that was found.
 #[derive(Debug, PartialEq, Eq, Serialize)]
 pub struct DeviceInfo {
-    /// `gpu`, `camera`, `can` or `simulation`.
+    /// `gpu`, `camera`, `can`, `serial` or `simulation`.
     pub kind: &'static str,
     /// Value for a rig file, or text for display.
     pub address: String,
@@ -25,7 +28,7 @@ pub struct DeviceInfo {
     pub note: String,
 }
 
-/// The simulation, the cameras and the CAN interfaces that are found.
+/// The simulation, the cameras, the CAN interfaces and the serial ports that are found.
 #[must_use]
 pub fn found_devices() -> Vec<DeviceInfo> {
     let mut found = vec![simulation()];
@@ -34,6 +37,8 @@ pub fn found_devices() -> Vec<DeviceInfo> {
     found.extend(video_devices(v4l2::cameras()));
     found.extend(realsense_cameras(sys));
     found.extend(can_interfaces(sys));
+    #[cfg(target_os = "linux")]
+    found.extend(serial_ports::serial_ports(sys, Path::new("/dev")));
     found
 }
 

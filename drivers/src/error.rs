@@ -131,7 +131,7 @@ pub enum Error {
     Motor {
         /// Joint that the motor moves.
         joint: String,
-        /// Name of its CAN interface.
+        /// Name of its CAN interface, or path of its serial port.
         interface: String,
         /// Description of the problem and how to fix it.
         reason: String,
@@ -141,6 +141,22 @@ pub enum Error {
     Motion {
         /// Description of the problem.
         reason: String,
+    },
+    /// A serial port cannot be opened, or was disconnected.
+    #[error("serial port {device:?}: {reason}")]
+    SerialPort {
+        /// Path of the port.
+        device: PathBuf,
+        /// Description of the problem and how to fix it.
+        reason: String,
+    },
+    /// An arm was disconnected and the driver is trying to reconnect. A later call may succeed.
+    #[error("arm on {device:?}: disconnected for {waited:?}, trying to reconnect")]
+    ArmReconnecting {
+        /// Path of its port.
+        device: PathBuf,
+        /// Time since the arm was disconnected.
+        waited: Duration,
     },
     /// A Franka arm refused the connection, does not match the rig file, or was disconnected.
     #[error("arm at {address}: {reason}")]

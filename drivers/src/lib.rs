@@ -42,6 +42,8 @@ mod repeating;
 mod sample;
 #[cfg(test)]
 mod scripted;
+#[cfg(target_os = "linux")]
+pub mod servos;
 pub mod tags;
 pub mod udp;
 pub mod v4l2;

@@ -6,6 +6,7 @@ use super::key::{Keys, choices, entry, keys};
 use super::motion::ArmMotion;
 use super::section::Section;
 use crate::known_robots::{BUILTIN_PREFIX, KnownRobot};
+use super::servos::{self, ArmSerial, ArmServo};
 use drivers::can::{BusConfig, MotorConfig};
 use kinematics::Chain;
 use toml::{Table, Value};
@@ -18,7 +19,7 @@ keys! {
     #[derive(Clone, Debug, PartialEq)]
     pub struct Arm {
         /// Source of the joint states.
-        pub driver: ArmDriver, required "none, franka, can, udp or sim";
+        pub driver: ArmDriver, required "none, franka, can, feetech, dynamixel, udp or sim";
         /// Network address of the device; empty if the driver needs none.
         pub address: String = String::new();
         /// The URDF text.
@@ -37,12 +38,16 @@ keys! {
         pub flange_link: String = String::new();
         /// Speed limit for all joints when the arm is moved, rad/s or m/s.
         pub max_speed_rad_s: f64 = 0.5, in 0.001..=10.0;
-        /// Rate at which motors on CAN buses are polled and commanded, Hz.
+        /// Rate at which motors on CAN buses and servos are polled and commanded, Hz.
         pub rate_hz: f64 = 200.0, in 1.0..=2000.0;
         /// CAN buses.
         pub buses: Vec<BusConfig> => Vec::new();
         /// Motors on the buses, in the order of `joints`.
         pub motors: Vec<MotorConfig> => Vec::new();
+        /// Serial port of servos.
+        pub serial: ArmSerial;
+        /// Servos on the serial port, in the order of `joints`.
+        pub servos: Vec<ArmServo> => Vec::new();
         /// How the arm may be moved; `None` if it is only read.
         pub motion: Option<ArmMotion>;
     }
@@ -66,6 +71,10 @@ pub enum ArmDriver {
     Franka,
     /// Motors on CAN buses.
     Can,
+    /// Feetech STS servos on a serial bus.
+    Feetech,
+    /// Dynamixel servos on a serial bus.
+    Dynamixel,
     /// Datagrams from another program.
     Udp,
     /// The simulator.
@@ -74,7 +83,8 @@ pub enum ArmDriver {
 
 choices! {
     ArmDriver {
-        None = "none", Franka = "franka", Can = "can", Udp = "udp", Sim = "sim";
+        None = "none", Franka = "franka", Can = "can", Feetech = "feetech", Dynamixel = "dynamixel", Udp = "udp",
+        Sim = "sim";
         else "for another arm, use \"udp\" and send its joint states from another program, see docs/guide/arms.md"
     }
 }
@@ -107,10 +117,12 @@ pub(super) fn read(mut keys: Section<'_>) -> Option<(Arm, String)> {
         );
     }
     let (buses, motors) = can::read(&mut keys);
+    let servos = servos::read(&mut keys);
     keys.end();
     let mut arm = Arm {
         buses,
         motors,
+        servos,
         ..arm?
     };
     if let Some(robot) = known_robot {
@@ -146,6 +158,7 @@ pub(super) fn write(arm: &Arm) -> Table {
     let mut table = arm.write_keys();
     table.extend(entry("urdf", &drivers::recording::URDF_FILE.to_owned()));
     table.extend(can::write(&arm.buses, &arm.motors));
+    table.extend(servos::write(&arm.servos));
     table
 }
 
@@ -177,6 +190,9 @@ pub(super) fn resolve_joints(file: &str, arm: &mut Arm) -> Result<(), ConfigErro
         .order_in(&arm.joints)
         .map_err(|e| robot("arm.joints", e))?;
     resolve_motors(file, arm)?;
+    if matches!(arm.driver, ArmDriver::Feetech | ArmDriver::Dynamixel) {
+        servos::resolve(file, &arm.serial, &arm.joints, &mut arm.servos)?;
+    }
     // Offsets are checked against the resolved joints, because the rig file may leave the list of
     // joints to the URDF.
     check_offsets(

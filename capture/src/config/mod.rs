@@ -21,6 +21,8 @@ mod pose;
 mod rig_file;
 mod scanner;
 mod section;
+mod servo_calibration_file;
+mod servos;
 mod sim;
 #[cfg(test)]
 mod tests;
@@ -35,6 +37,7 @@ pub use error::{ConfigError, SourceLocation};
 pub use join::JoinConfig;
 pub use motion::ArmMotion;
 pub use scanner::{Scanner, ScannerDriver, ScannerSim};
+pub use servos::{ArmSerial, ArmServo};
 pub use sim::{Sim, SimTarget};
 pub use train::{DEFAULT_SEED, MAX_BYTES_RANGE, MAX_SPLATS_RANGE, Methods, SEED_RANGE, Train};
 

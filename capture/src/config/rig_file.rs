@@ -2,7 +2,10 @@
 
 use super::key::entry;
 use super::section::{ParseContext, Section};
-use super::{ConfigError, Override, Rig, arm, base, camera, camera_info_file, scanner, sim};
+use super::{
+    ConfigError, Override, Rig, arm, base, camera, camera_info_file, scanner,
+    servo_calibration_file, sim,
+};
 use std::path::Path;
 use toml::{Table, Value};
 
@@ -58,6 +61,7 @@ pub(super) fn keys(
     }
     if let Some(folder) = folder {
         camera_info_file::insert_contents(&mut table, folder, &context)?;
+        servo_calibration_file::insert_contents(&mut table, folder, &context)?;
     }
     let root = Section::root(&context, table);
     Ok((rig(root), context))

@@ -58,6 +58,9 @@ family = "cia402"
 bus = "can0"
 id = 3
 counts_per_turn = 65536
+[arm.serial]
+[arm.servo.first]
+id = 1
 [arm.motion]
 on_loss = "release"
 [base.tag.7]
@@ -131,6 +134,16 @@ const KEYS: &[(&str, &str, &str)] = &[
         "[1, 1, 1, 1, 1, 1, 1]",
     ),
     ("arm.motion.odrive_endpoints", "'flat_endpoints.json'", "7"),
+    ("arm.serial.device", "'/dev/ttyACM0'", "7"),
+    ("arm.serial.baud_hz", "57_600", "1"),
+    ("arm.serial.reconnect_secs", "5", "-1"),
+    ("arm.serial.calibration", "'so101.json'", "7"),
+    ("arm.servo.first.id", "3", "253"),
+    ("arm.servo.first.zero_counts", "1024", "1.5"),
+    ("arm.servo.first.reversed", "true", "-1"),
+    ("arm.servo.first.gear_ratio", "2.5", "0"),
+    ("arm.servo.first.max_following_error_rad", "0.05", "0"),
+    ("arm.servo.first.accept_following_errors", "true", "1"),
     ("arm.driver", "'franka'", "'frankka'"),
     ("arm.driver", "'none'", "'nothing'"),
     ("arm.address", "'172.16.0.2'", "7"),
@@ -511,7 +524,12 @@ fn documentation_lists_exactly_the_existing_keys() {
                 "base.tag.7",
                 "sim.target.board",
             ];
-            let motors = ["arm.motor.first", "arm.motor.second", "arm.motor.third"];
+            let motors = [
+                "arm.motor.first",
+                "arm.motor.second",
+                "arm.motor.third",
+                "arm.servo.first",
+            ];
             names
                 .iter()
                 .chain(&motors)
@@ -677,15 +695,15 @@ fn invalid_value_error_names_line_or_flag() {
 #[test]
 fn unknown_arm_driver_error_names_the_driver_for_other_arms() {
     let message = parse(
-        &RIG.replacen("driver = \"sim\"", "driver = \"feetech\"", 1),
+        &RIG.replacen("driver = \"sim\"", "driver = \"xarm\"", 1),
         &[],
     )
     .expect_err("no such driver")
     .to_string();
     assert!(
-        message.contains(
-            "arm.driver is \"feetech\", allowed: \"none\", \"franka\", \"can\", \"udp\", \"sim\"; for another arm, use \"udp\""
-        ) && message.contains("docs/guide/arms.md"),
+        message.contains("arm.driver is \"xarm\", allowed: \"none\", \"franka\", \"can\", \"feetech\", \"dynamixel\"")
+            && message.contains("; for another arm, use \"udp\"")
+            && message.contains("docs/guide/arms.md"),
         "{message}"
     );
     // Cameras have other drivers.

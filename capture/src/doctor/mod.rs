@@ -14,6 +14,8 @@ mod motion;
 mod realsense;
 mod realtime;
 #[cfg(target_os = "linux")]
+mod servos;
+#[cfg(target_os = "linux")]
 mod usb;
 mod video_devices;
 
@@ -125,6 +127,8 @@ pub fn check(rig: Option<&Rig>) -> Vec<Finding> {
     findings.extend(realsense::realsense(rig));
     #[cfg(target_os = "linux")]
     findings.extend(can::can(rig));
+    #[cfg(target_os = "linux")]
+    findings.extend(rig.into_iter().flat_map(servos::servos));
     findings.extend(franka::franka(rig));
     findings.extend(rig.and_then(motion::motion));
     findings.extend(rig.into_iter().flat_map(calibration::calibration));

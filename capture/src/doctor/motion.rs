@@ -9,7 +9,9 @@ use crate::open;
 pub(super) fn motion(rig: &Rig) -> Option<Finding> {
     rig.arm.motion.as_ref()?;
     let verdict = match rig.arm.driver {
-        ArmDriver::Can | ArmDriver::Franka => Verdict::Fail,
+        ArmDriver::Can | ArmDriver::Franka | ArmDriver::Feetech | ArmDriver::Dynamixel => {
+            Verdict::Fail
+        }
         ArmDriver::Udp => Verdict::Warn, // It can still be read.
         ArmDriver::None | ArmDriver::Sim => return None,
     };
@@ -52,9 +54,7 @@ mod tests {
         let finding = motion(&rig).expect("this driver only reads");
         assert_eq!(finding.verdict, Verdict::Warn, "{finding:?}");
         assert!(
-            finding
-                .message
-                .contains("arm.driver = \"can\" or \"franka\""),
+            finding.message.contains("arm.driver = \"can\", \"franka\""),
             "{finding:?}"
         );
     }

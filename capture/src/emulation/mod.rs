@@ -9,12 +9,13 @@ use anyhow::{Context, bail};
 use camera_files::CameraFiles;
 use drivers::franka::FciVersion;
 use drivers::franka::emulated::{EmulatedRobot, Limits, RobotConfig};
+use drivers::servos::emulated::{EmulatedServoBus, ServoKind};
 use drivers::{Sample, Source, can, clock};
 use kinematics::{Stamp, Transform};
 use messages::BadInput;
 use sim::wire::{
     DatagramTargets, DeviceScript, EmulatedMotors, EmulatedSenders, JointTrack, PlaybackClock,
-    emulate_fci,
+    emulate_fci, emulate_servos,
 };
 use std::net::{SocketAddr, TcpListener, ToSocketAddrs};
 use std::path::{Path, PathBuf};
@@ -22,6 +23,8 @@ use std::time::Duration;
 
 /// Recording of the simulation, next to the rig file.
 const SIMULATION_FILE: &str = "script.mcap";
+/// Serial port of emulated servos, next to the rig file.
+const SERIAL_PORT: &str = "servos";
 
 /// Scenes with a bundled rig file for emulated devices.
 const SCENES: [(&str, &str, &str); 2] = [
@@ -104,6 +107,11 @@ impl EmulationPlan {
             .unwrap_or_else(|| PathBuf::from(format!("sim-{name}")));
         std::fs::create_dir_all(&folder)
             .with_context(|| format!("cannot create the folder {}", folder.display()))?;
+        if matches!(rig.arm.driver, ArmDriver::Feetech | ArmDriver::Dynamixel) {
+            // The port of the rig file belongs to a real adapter.
+            let port = std::path::absolute(folder.join(SERIAL_PORT))?;
+            rig.arm.serial.device = port.display().to_string();
+        }
         // All samples are prepared before the playback, because simulating and encoding are slower
         // than real time.
         let recording = match &self.recording {
@@ -264,7 +272,7 @@ fn load(rig_or_scene: &str) -> anyhow::Result<(String, Rig)> {
 fn check(rig: &Rig) -> Result<(), BadInput> {
     if rig.arm.driver == ArmDriver::Sim {
         return Err(BadInput(
-            "arm.driver is sim, which `fieldrig run` simulates itself; drivers that can be emulated: franka, can, udp"
+            "arm.driver is sim, which `fieldrig run` simulates itself; drivers that can be emulated: franka, can, feetech, dynamixel, udp"
                 .to_owned(),
         ));
     }
@@ -286,6 +294,7 @@ fn write_rig(folder: &Path, rig: &Rig) -> anyhow::Result<PathBuf> {
 struct EmulatedDevices {
     _robot: Option<EmulatedRobot>,
     _motors: Option<EmulatedMotors>,
+    _servos: Option<EmulatedServoBus>,
     _senders: EmulatedSenders,
     /// One description per device.
     descriptions: Vec<String>,
@@ -304,6 +313,7 @@ impl EmulatedDevices {
         };
         let mut robot = None;
         let mut motors = None;
+        let mut servos = None;
         let mut datagram_targets = DatagramTargets::default();
         let mut descriptions = Vec::new();
         match rig.arm.driver {
@@ -329,6 +339,19 @@ impl EmulatedDevices {
                     "arm: {} motors on {}",
                     rig.arm.motors.len(),
                     buses.join(", ")
+                ));
+            }
+            ArmDriver::Feetech | ArmDriver::Dynamixel => {
+                let kind = match rig.arm.driver {
+                    ArmDriver::Feetech => ServoKind::Feetech,
+                    _ => ServoKind::Dynamixel,
+                };
+                let config = open::servo_config(rig);
+                servos = Some(emulate_servos(track()?, &config, kind)?);
+                descriptions.push(format!(
+                    "arm: {} servos at {}",
+                    config.servos.len(),
+                    config.port.device.display()
                 ));
             }
             ArmDriver::Udp => {
@@ -359,6 +382,7 @@ impl EmulatedDevices {
         Ok(Self {
             _robot: robot,
             _motors: motors,
+            _servos: servos,
             _senders: senders,
             descriptions,
         })

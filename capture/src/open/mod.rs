@@ -5,6 +5,7 @@ mod emulated;
 mod movable;
 mod real;
 mod realsense;
+mod servos;
 #[cfg(feature = "sim")]
 mod simulated;
 #[cfg(all(test, feature = "sim"))]
@@ -16,6 +17,8 @@ pub use movable::{Movable, movable};
 #[cfg(target_os = "linux")]
 pub use real::franka_chain;
 pub use real::{check_motion, motion_of, movable_arm, udp_arm_address};
+#[cfg(target_os = "linux")]
+pub(crate) use servos::servo_config;
 
 use crate::config::{ArmDriver, BaseDriver, CameraDriver, Override, Parent, Rig, ScannerDriver};
 use crate::notes::Notes;

@@ -1,5 +1,6 @@
 //! Opens the devices of a rig that are not simulated.
 
+use super::servos;
 #[cfg(target_os = "linux")]
 use crate::config::Depth;
 use crate::config::{ArmDriver, ArmMotion, BaseDriver, Camera, CameraDriver, Rig, ScannerDriver};
@@ -25,7 +26,7 @@ use std::time::Duration;
 const DEFAULT_ARM_ADDRESS: SocketAddr = SocketAddr::new(IpAddr::V4(Ipv4Addr::LOCALHOST), 7011);
 
 /// Error for an arm that this program cannot move.
-const READ_ONLY: &str = "arms with this driver can only be read; to move the arm, set arm.driver = \"can\" or \"franka\"";
+const READ_ONLY: &str = "arms with this driver can only be read; to move the arm, set arm.driver = \"can\", \"franka\", \"feetech\" or \"dynamixel\"";
 
 /// Opens all real devices of a rig. There may be none. Also returns monitors of the devices that
 /// receive datagrams. Fills in calibration that is stored in a camera.
@@ -45,6 +46,7 @@ pub(super) fn open(rig: &mut Rig) -> anyhow::Result<(Devices, Vec<DatagramMonito
     devices.arm = match rig.arm.driver {
         ArmDriver::None | ArmDriver::Sim => None,
         ArmDriver::Can => Some(can_arm(rig)?),
+        ArmDriver::Feetech | ArmDriver::Dynamixel => Some(servos::servo_arm(rig)?),
         ArmDriver::Franka => Some(franka_arm(rig)?),
         ArmDriver::Udp => {
             let arm = udp_arm(rig)?;
@@ -91,6 +93,10 @@ pub fn movable_arm(rig: &Rig) -> anyhow::Result<Box<dyn MovableArm>> {
     let motion = motion_of(rig)?;
     match rig.arm.driver {
         ArmDriver::Can => movable_can_arm(rig, motion),
+        #[cfg(target_os = "linux")]
+        ArmDriver::Feetech | ArmDriver::Dynamixel => {
+            servos::movable_servo_arm(rig, motion_config(rig, motion)?)
+        }
         ArmDriver::Franka => movable_franka_arm(rig, motion),
         _ => bail!("{READ_ONLY}"),
     }
@@ -121,6 +127,10 @@ pub fn check_motion(rig: &Rig) -> anyhow::Result<()> {
     match rig.arm.driver {
         #[cfg(target_os = "linux")]
         ArmDriver::Can => Ok(MovableCanArm::check(&movable_config(rig, motion)?)?),
+        #[cfg(target_os = "linux")]
+        ArmDriver::Feetech | ArmDriver::Dynamixel => {
+            servos::check_motion(rig, motion_config(rig, motion)?)
+        }
         #[cfg(target_os = "linux")]
         ArmDriver::Franka => {
             MovableFrankaArm::check(&motion_config(rig, motion)?).map_err(anyhow::Error::msg)

@@ -133,7 +133,7 @@ impl Default for FollowingLimits {
 
 impl FollowingLimits {
     /// Describes the exceeded limit; `None` if there is none.
-    pub(super) fn violation(
+    pub(crate) fn violation(
         &self,
         commanded_rad: f64,
         position_rad: f64,

@@ -11,9 +11,10 @@ static N_COMMANDED: AtomicUsize = AtomicUsize::new(0);
 /// plus 2 s. The largest timeout is 2 s. The remaining second is a reserve for a busy computer.
 const MAX_WAIT: Duration = Duration::from_secs(5);
 
-/// Sends the fail-safe command to all arms with CAN motors that this process moves. The arms are
-/// not brought to rest first. Waits until their threads have ended, for at most 5 s. These arms
-/// accept no further commands. Call this function before the process ends without an orderly stop.
+/// Sends the fail-safe command to all arms with CAN motors or servos that this process moves. The
+/// arms are not brought to rest first. Waits until their threads have ended, for at most 5 s. These
+/// arms accept no further commands. Call this function before the process ends without an orderly
+/// stop.
 ///
 /// Franka arms brake when the connection ends.
 pub fn apply_fail_safe() {

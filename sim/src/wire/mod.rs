@@ -1,5 +1,5 @@
 //! Emulates the devices of a recorded rig on the wire: a Franka controller, motors on CAN buses,
-//! datagrams.
+//! servos on a serial bus, datagrams.
 //!
 //! A [`DeviceScript`] holds the samples of a simulated or recorded rig. [`PlaybackClock`] maps
 //! their stamps to playback times. Images are not played back here. To play back images, use a file
@@ -9,12 +9,16 @@
 mod can;
 #[cfg(target_os = "linux")]
 mod fci;
+#[cfg(target_os = "linux")]
+mod servos;
 mod udp;
 
 #[cfg(target_os = "linux")]
 pub use can::EmulatedMotors;
 #[cfg(target_os = "linux")]
 pub use fci::emulate_fci;
+#[cfg(target_os = "linux")]
+pub use servos::emulate_servos;
 pub use udp::{DatagramTargets, EmulatedSenders};
 
 use drivers::{BasePose, RangeScan, Sample};
