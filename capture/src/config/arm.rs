@@ -5,6 +5,7 @@ use super::error::ConfigError;
 use super::key::{Keys, choices, entry, keys};
 use super::motion::ArmMotion;
 use super::section::Section;
+use super::urdf_folder::UrdfFolder;
 use drivers::can::{BusConfig, MotorConfig};
 use kinematics::Chain;
 use toml::Table;
@@ -22,6 +23,8 @@ keys! {
         pub address: String = String::new();
         /// The URDF text.
         pub urdf_text: String => String::new();
+        /// Folder of the URDF.
+        pub urdf_folder: UrdfFolder => UrdfFolder::default();
         /// Moving joints in the order of the joint states.
         pub joints: Vec<String> = Vec::new();
         /// Offsets that are added to the joint positions, in the order of `joints`, rad or m. Each

@@ -23,6 +23,7 @@ mod sim;
 #[cfg(test)]
 mod tests;
 mod train;
+mod urdf_folder;
 
 pub use arm::{Arm, ArmDriver};
 pub use base::{Base, BaseDriver, BaseSim};
@@ -35,6 +36,7 @@ pub use motion::ArmMotion;
 pub use scanner::{Scanner, ScannerDriver, ScannerSim};
 pub use sim::{Sim, SimTarget};
 pub use train::{DEFAULT_SEED, MAX_BYTES_RANGE, MAX_SPLATS_RANGE, Methods, SEED_RANGE, Train};
+pub use urdf_folder::UrdfFolder;
 
 use std::path::{Path, PathBuf};
 
@@ -99,8 +101,14 @@ impl Rig {
             |name| name.to_string_lossy().into_owned(),
         );
         let folder = path.parent().unwrap_or(Path::new("")).to_owned();
-        let read_urdf = |urdf: &str| read_file("the robot description", &folder.join(urdf));
+        let mut urdf_folder = UrdfFolder::default();
+        let read_urdf = |urdf: &str| {
+            let path = folder.join(urdf);
+            urdf_folder = UrdfFolder::of(&path);
+            read_file("the robot description", &path)
+        };
         let mut rig = rig_file::read(&file, &text, overrides, Some(&folder), read_urdf)?;
+        rig.arm.urdf_folder = urdf_folder;
         if let Some(motion) = rig
             .arm
             .motion
