@@ -37,7 +37,7 @@ pub mod config;
 pub mod dataset;
 pub mod doctor;
 pub mod downscale;
-#[cfg(all(feature = "sim", feature = "realsense", target_os = "linux"))]
+#[cfg(all(feature = "sim", target_os = "linux"))]
 pub mod emulation;
 mod feed;
 mod found_devices;
