@@ -126,6 +126,14 @@ impl TwinModel {
         &self.base_from_root
     }
 
+    /// Whether the robot stands on its base link. Otherwise, the base link is part of a body, such
+    /// as a torso.
+    pub(crate) fn stands_on_base(&self) -> bool {
+        self.links
+            .first()
+            .is_some_and(|root| root.link == self.chain.base_link())
+    }
+
     /// Number of joints of the arm.
     pub(crate) fn n_joints(&self) -> usize {
         self.ranges.len()

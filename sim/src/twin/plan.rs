@@ -93,7 +93,7 @@ fn pedestal(
     robot: &RobotConfig,
     world_from_scene: &Transform,
 ) -> Option<Pedestal> {
-    if model.n_joints() == 0 || model.links().first()?.link != robot.base_link {
+    if model.n_joints() == 0 || !model.stands_on_base() {
         return None;
     }
     let base = robot.world_from_base.translation.vector;

@@ -183,8 +183,9 @@ fn plan_scan(
     for place in apart(places) {
         let world_from_scene = world_from_scene(&place.center, place.yaw_rad);
         let target_in_base = robot.world_from_base.inverse_transform_point(&place.center);
+        let posture = middle_posture(robot, &place, &viewpoints);
         for size in TOUR_SIZES {
-            let (shape, posture) = tour_of(&place.views, &viewpoints, size);
+            let shape = tour_shape(&place.views, size);
             let tour = TableTour {
                 scan: Scan::new(config.speed, config.azimuth_only).with_shape(shape),
                 base_from_scene: robot.world_from_base.inverse() * world_from_scene,
@@ -266,7 +267,8 @@ fn rated_places(
         let in_front = viewpoint.world_from_camera * Point3::new(0.0, 0.0, distance_m);
         let from_base = in_front.coords - base;
         let away_m = from_base.xy().norm();
-        let Some(center) = with_room_for_base(in_front, away_m, lowest_m) else {
+        let is_at_base = robot.model.stands_on_base() && away_m < TABLE_EDGE_M + BASE_HALF_M;
+        let Some(center) = with_room_for_base(in_front, is_at_base, lowest_m) else {
             continue;
         };
         // Close to the base's axis, the direction to the place says nothing.
@@ -298,11 +300,15 @@ fn rated_places(
     places
 }
 
-/// The place, lowered if the table would otherwise be inside the robot; `None` if the table is too
+/// The place, lowered if the table would otherwise be inside the base; `None` if the table is too
 /// high.
-fn with_room_for_base(mut center: Point3<f64>, away_m: f64, lowest_m: f64) -> Option<Point3<f64>> {
+fn with_room_for_base(
+    mut center: Point3<f64>,
+    is_at_base: bool,
+    lowest_m: f64,
+) -> Option<Point3<f64>> {
     let table_z_m = center.z - LOOK_AT_HEIGHT_M;
-    if away_m < TABLE_EDGE_M + BASE_HALF_M && table_z_m > lowest_m {
+    if is_at_base && table_z_m > lowest_m {
         // The robot stands on the table.
         center.z -= table_z_m - lowest_m;
     }
@@ -326,18 +332,22 @@ fn apart(places: Vec<Place>) -> Vec<Place> {
     kept
 }
 
-/// Shape of a tour through most of the views, scaled by `size`, and the posture at its middle.
-fn tour_of(views: &[View], viewpoints: &[Viewpoint], size: f64) -> (ScanShape, Joints) {
-    let spans = [
+/// Azimuth, elevation and distance of most views, each as middle and half width.
+fn spans(views: &[View]) -> [[f64; 2]; 3] {
+    [
         |view: &View| view.azimuth_degrees,
         |view: &View| view.elevation_degrees,
         |view: &View| view.distance_m,
     ]
-    .map(|quantity| span(views, quantity));
-    let [azimuth, elevation, distance] = spans;
+    .map(|quantity| span(views, quantity))
+}
+
+/// Shape of a tour through most of the views, scaled by `size`.
+fn tour_shape(views: &[View], size: f64) -> ScanShape {
+    let [azimuth, elevation, distance] = spans(views);
     let default = ScanShape::default();
     let [max_azimuth, max_elevation, max_distance_frac] = MAX_AMPLITUDES;
-    let shape = ScanShape {
+    ScanShape {
         azimuth_degrees: default
             .azimuth_degrees
             .over(azimuth[0], size * azimuth[1].min(max_azimuth)),
@@ -348,17 +358,46 @@ fn tour_of(views: &[View], viewpoints: &[Viewpoint], size: f64) -> (ScanShape, J
             distance[0],
             size * distance[1].min(max_distance_frac * distance[0]),
         ),
-    };
-    let off_center = |view: &View| {
-        (view.azimuth_degrees - azimuth[0]).abs() / 30.0
+    }
+}
+
+/// The sampled posture with which the tour begins: its view is close to the middle of all views, and
+/// as few links as possible are inside the table.
+fn middle_posture(robot: &PlacedRobot<'_>, place: &Place, viewpoints: &[Viewpoint]) -> Joints {
+    /// A link inside the table outweighs any view.
+    const INSIDE_PENALTY: f64 = 10.0;
+    let [azimuth, elevation, distance] = spans(&place.views);
+    let penalty = |view: &View| {
+        let off_center = (view.azimuth_degrees - azimuth[0]).abs() / 30.0
             + (view.elevation_degrees - elevation[0]).abs() / 20.0
-            + (view.distance_m - distance[0]).abs() / distance[0]
+            + (view.distance_m - distance[0]).abs() / distance[0];
+        let position = &viewpoints[view.viewpoint_ix].position;
+        off_center + INSIDE_PENALTY * n_links_inside(robot, place, position) as f64
     };
-    let middle = views
+    let (_, best) = place
+        .views
         .iter()
-        .min_by(|a, b| off_center(a).total_cmp(&off_center(b)))
+        .map(|view| (penalty(view), view))
+        .min_by(|(a, _), (b, _)| a.total_cmp(b))
         .expect("a place has views");
-    (shape, viewpoints[middle.viewpoint_ix].position.clone())
+    viewpoints[best.viewpoint_ix].position.clone()
+}
+
+/// Number of links whose origin is below the top of the table and close to its objects. The scan
+/// does not check collisions, so its first posture decides on which side the links are.
+fn n_links_inside(robot: &PlacedRobot<'_>, place: &Place, position: &Joints) -> usize {
+    const MARGIN_M: f64 = 0.02; // A robot that stands on the table touches it.
+    const NEAR_M: f64 = 0.55;
+    let table_z_m = place.center.z - LOOK_AT_HEIGHT_M;
+    let links = robot.model.base_from_links(position);
+    links
+        .iter()
+        .filter(|base_from_link| {
+            let origin = (robot.world_from_base * *base_from_link).translation.vector;
+            let away = origin.xy() - place.center.coords.xy();
+            origin.z < table_z_m - MARGIN_M && away.norm() < NEAR_M
+        })
+        .count()
 }
 
 /// Middle and half width of the range that contains most values.
