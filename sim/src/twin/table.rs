@@ -55,6 +55,12 @@ const MAX_AMPLITUDES: [f64; 3] = [45.0, 20.0, 0.28];
 /// robot needs in front of it, meters.
 const TABLE_EDGE_M: f64 = 0.34;
 const BASE_HALF_M: f64 = 0.14;
+/// A small arm prefers a distance of at most this fraction of its reach.
+const DISTANCE_REACH_FRAC: f64 = 0.75;
+/// Height difference between table and robot that costs a place most of its rating, meters, and this
+/// part of the rating.
+const HEIGHT_TOLERANCE_M: f64 = 0.3;
+const HEIGHT_WEIGHT: f64 = 0.6;
 /// Largest height of the table above the lowest point of the robot, meters. The floor is 0.87 m
 /// below the table.
 const MAX_TABLE_HEIGHT_M: f64 = 0.8;
@@ -165,7 +171,10 @@ fn plan_scan(
         &robot.world_from_base,
         &camera.parent_from_camera,
     );
-    let preferred_m = preferred_distance_m(&camera.intrinsics);
+    let within_reach_m = DISTANCE_REACH_FRAC * reach_m(robot, &viewpoints);
+    let preferred_m = preferred_distance_m(&camera.intrinsics)
+        .min(within_reach_m)
+        .max(DISTANCE_RANGE_M[0]);
     let nearest_depth_m = camera.depth.as_ref().map_or(0.0, |depth| depth.min_m);
     let limits = ViewLimits {
         distance_m: [
@@ -236,6 +245,17 @@ fn plan_scan(
     }
 }
 
+/// Distance from the base within which nearly all sampled cameras are, meters.
+fn reach_m(robot: &PlacedRobot<'_>, viewpoints: &[Viewpoint]) -> f64 {
+    let base = robot.world_from_base.translation.vector;
+    let mut distances: Vec<f64> = viewpoints
+        .iter()
+        .map(|viewpoint| (viewpoint.world_from_camera.translation.vector - base).norm())
+        .collect();
+    distances.sort_by(f64::total_cmp);
+    distances[distances.len() * 49 / 50]
+}
+
 /// Largest angle between the optical axis and the center of the objects, so that most of them are
 /// in the image.
 fn off_axis_rad(intrinsics: &Intrinsics) -> f64 {
@@ -285,9 +305,17 @@ fn rated_places(
         // Places in front of the robot are preferred to those beside and behind it, and places at
         // some distance to those on its base.
         let turn_frac = direction.xy().angle(&base_forward.xy()) / std::f64::consts::PI;
+        // A robot usually stands on the table or at its height. One with a torso stands on the floor.
+        let height_m = (center.z - LOOK_AT_HEIGHT_M - lowest_m).abs();
+        let height_frac = if robot.model.stands_on_base() {
+            (height_m / HEIGHT_TOLERANCE_M).min(1.0)
+        } else {
+            0.0
+        };
         let many_views = (views.len() as f64 / 40.0).min(1.0);
         let rating = (f64::from(n_directions(&views)) + many_views)
             * (1.0 - 0.25 * turn_frac)
+            * (1.0 - HEIGHT_WEIGHT * height_frac)
             * (away_m / 0.2).clamp(0.3, 1.0);
         places.push(Place {
             center,
