@@ -37,7 +37,7 @@ pub mod config;
 pub mod dataset;
 pub mod doctor;
 pub mod downscale;
-#[cfg(all(feature = "sim", feature = "realsense", target_os = "linux"))]
+#[cfg(all(feature = "sim", target_os = "linux"))]
 pub mod emulation;
 mod feed;
 mod found_devices;
@@ -45,6 +45,7 @@ mod input_counts;
 mod join;
 pub mod known_robots;
 mod memory;
+mod mesh_files;
 mod nearest_name;
 mod notes;
 pub mod open;
@@ -64,6 +65,7 @@ pub use feed::{Feed, FeedItem, Input, InputObserver, InputResult, InputTimes};
 pub use found_devices::{DeviceInfo, found_devices};
 pub use input_counts::InputCounts;
 pub use join::{Change, Counts, Join, JoinEvent, PosedImage, Rejection, SampleUse, StoreUse};
+pub use mesh_files::mesh_file_candidates;
 pub use nearest_name::nearest_name;
 pub use notes::Notes;
 pub use record::{RecordPlan, Recorded, WrittenRecording};

@@ -33,6 +33,7 @@ pub mod chain;
 pub mod device_clock;
 mod error;
 pub mod history;
+pub mod inertial;
 mod inverse;
 pub mod joints;
 mod lens;

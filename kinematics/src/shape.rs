@@ -1,6 +1,7 @@
 //! Visual and collision shapes of the links in a URDF.
 
 use crate::Transform;
+use crate::inertial::{self, Inertial};
 use crate::urdf::element::{Element, Notes, Problem};
 use crate::urdf::joint::{ORIGIN_ATTRIBUTES, origin};
 use std::collections::{HashMap, HashSet};
@@ -56,6 +57,7 @@ pub enum Geometry {
 pub(crate) struct LinkShapes {
     pub(crate) visuals: Vec<Shape>,
     pub(crate) collisions: Vec<Shape>,
+    pub(crate) inertial: Option<Inertial>,
 }
 
 /// Reads the shapes of all links that have any. Invalid shapes and colors are noted and left out.
@@ -84,7 +86,9 @@ pub(crate) fn read_all(robot: Element<'_>, notes: &mut Notes) -> HashMap<String,
             &["visual", "collision", "inertial"],
             notes,
         );
-        check_inertials(link, &of_link, notes);
+        if let Some(inertial) = read_inertial(link, &of_link, notes) {
+            by_link.entry(name.to_owned()).or_default().inertial = Some(inertial);
+        }
         for collision in link.all("collision") {
             if let Some(shape) = noted(
                 shape(collision, notes),
@@ -193,33 +197,20 @@ fn own_color(material: Element<'_>) -> Result<Option<[f64; 4]>, Problem> {
     }
 }
 
-/// Masses are not used, but an invalid one shows that the file is damaged or unfinished.
-fn check_inertials(link: Element<'_>, of_link: &str, notes: &mut Notes) {
-    for inertial in link.all("inertial") {
-        if let Err(Problem { line, why }) = check_inertial(inertial) {
-            notes.add(
+/// The first valid mass and inertia of a link. Only a simulation uses them, but an invalid one shows
+/// that the file is damaged or unfinished.
+fn read_inertial(link: Element<'_>, of_link: &str, notes: &mut Notes) -> Option<Inertial> {
+    let mut first = None;
+    for element in link.all("inertial") {
+        match inertial::read(element) {
+            Ok(inertial) => first = first.or(Some(inertial)),
+            Err(Problem { line, why }) => notes.add(
                 line,
                 &format!("the inertia of {of_link} is invalid (it is not used): {why}"),
-            );
+            ),
         }
     }
-}
-
-/// Reads all numbers of an `<inertial>` element.
-fn check_inertial(inertial: Element<'_>) -> Result<(), Problem> {
-    required_child(inertial, "mass")?.number("value")?;
-    let inertia = required_child(inertial, "inertia")?;
-    for moment in ["ixx", "ixy", "ixz", "iyy", "iyz", "izz"] {
-        inertia.number(moment)?;
-    }
-    Ok(())
-}
-
-/// The only child with this tag.
-fn required_child<'a>(parent: Element<'a>, tag: &'static str) -> Result<Element<'a>, Problem> {
-    parent
-        .only(tag)?
-        .ok_or_else(|| parent.problem(format!("it has no <{tag}>")))
+    first
 }
 
 /// Reads a visual or collision shape, without its color.
@@ -229,7 +220,7 @@ fn shape(element: Element<'_>, notes: &mut Notes) -> Result<Shape, Problem> {
         &["origin", "geometry", "material", "verbose"],
         notes,
     );
-    let geometry = required_child(element, "geometry")?;
+    let geometry = element.required_child("geometry")?;
     // This only notes unknown attributes. Problems of the element are reported when the pose is
     // read below.
     if let Ok(Some(origin)) = element.only("origin") {

@@ -2,10 +2,11 @@
 
 use anyhow::Context;
 use capture::config::{ArmDriver, Rig};
+use capture::mesh_file_candidates;
 use files::Budget;
 use kinematics::shape::Geometry;
 use kinematics::urdf::Robot;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 use viz::{MeshFormat, RobotDescription, RobotMesh};
 
 /// The robot of a rig; `None` if the rig has neither an arm nor a moving base. A shape that cannot
@@ -61,7 +62,7 @@ fn meshes(robot: &Robot, urdf_folder: &Path) -> Vec<RobotMesh> {
 fn read(file: &str, urdf_folder: &Path, left: Budget) -> Result<RobotMesh, String> {
     let format = MeshFormat::of_file(file)
         .ok_or("its type is not supported, convert it to .stl, .dae or .obj")?;
-    let candidates = candidates(file, urdf_folder);
+    let candidates = mesh_file_candidates(file, urdf_folder);
     let Some(path) = candidates.iter().find(|path| path.is_file()) else {
         let tried: Vec<_> = candidates
             .iter()
@@ -88,30 +89,6 @@ fn read(file: &str, urdf_folder: &Path, left: Budget) -> Result<RobotMesh, Strin
         format,
         bytes: bytes.into(),
     })
-}
-
-/// Paths where a mesh file may be. The folder of a package has the name of the package. It is a
-/// parent folder of the URDF, or a folder beside such a parent.
-fn candidates(file: &str, urdf_folder: &Path) -> Vec<PathBuf> {
-    let package_path = file
-        .strip_prefix("package://")
-        .or_else(|| file.strip_prefix("model://"));
-    let Some((package, rest)) = package_path.and_then(|path| path.split_once('/')) else {
-        return vec![urdf_folder.join(file.strip_prefix("file://").unwrap_or(file))];
-    };
-    let above = urdf_folder
-        .ancestors()
-        .filter(|folder| !folder.as_os_str().is_empty());
-    // Without ROS, there is no index of packages. The folders around the URDF are searched, because
-    // a copy of a robot description keeps the layout of its packages.
-    let mut candidates = Vec::new();
-    for folder in above {
-        if folder.file_name().is_some_and(|name| name == package) {
-            candidates.push(folder.join(rest));
-        }
-        candidates.push(folder.join(package).join(rest));
-    }
-    candidates
 }
 
 #[cfg(test)]

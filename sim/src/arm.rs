@@ -1,10 +1,13 @@
-//! The moving arm: MuJoCo's dynamics, and a controller that follows the scan or commands at 1 kHz.
+//! The moving arm. The scene's own arm has MuJoCo's dynamics and a controller that follows the scan
+//! or commands at 1 kHz. The arm of a rig file follows them exactly.
 
 use crate::Error;
 use crate::commands::Commands;
 use crate::config::N_JOINTS;
 use crate::follower::Follower;
-use crate::panda::{self, Joints};
+use crate::joints::Joints;
+use crate::panda;
+use crate::twin::{Efforts, TwinFollower};
 use mujoco_rs::prelude::{MjData, MjModel};
 use std::collections::VecDeque;
 use std::sync::Arc;
@@ -21,17 +24,21 @@ const STIFFNESS: [f64; N_JOINTS] = [2000.0, 2000.0, 1600.0, 1600.0, 600.0, 600.0
 const DAMPING: [f64; N_JOINTS] = [120.0, 120.0, 90.0, 90.0, 35.0, 35.0, 18.0];
 
 /// State of the joints at one step.
-#[derive(Clone, Copy, Debug)]
+#[derive(Clone, Debug)]
 pub(crate) struct JointReading {
     pub(crate) nanos: i64,
-    pub(crate) position_rad: Joints,
-    pub(crate) velocity_rad_s: Joints,
-    pub(crate) torque_nm: Joints,
+    /// Radians, or meters for prismatic joints.
+    pub(crate) position: Joints,
+    /// The same per second.
+    pub(crate) velocity: Joints,
+    /// Newton meters, or newtons for prismatic joints.
+    pub(crate) effort: Joints,
 }
 
-/// What the controller follows.
+/// What the arm follows.
 enum Reference {
     Scan(Box<Follower>),
+    Tour(Box<TwinFollower>),
     Commands(JointCommands),
 }
 
@@ -43,41 +50,61 @@ struct JointCommands {
     /// Offsets that are added to reported positions to get the true positions; empty if there are
     /// none.
     joint_offsets: Vec<f64>,
-    position_rad: Joints,
-    velocity_rad_s: Joints,
+    position: Joints,
+    velocity: Joints,
 }
 
 impl JointCommands {
     fn advance(&mut self) {
         let setpoint = self.commands.next_setpoint();
         for (value_ix, joint_ix) in self.joint_ixs.iter().enumerate() {
-            // Commands are reported positions, but the dynamics need true positions.
+            // Commands are reported positions, but the arm needs true positions.
             let offset = self.joint_offsets.get(value_ix).copied().unwrap_or(0.0);
-            self.position_rad[*joint_ix] = setpoint.position[value_ix] + offset;
-            self.velocity_rad_s[*joint_ix] = setpoint.velocity[value_ix];
+            self.position[*joint_ix] = setpoint.position[value_ix] + offset;
+            self.velocity[*joint_ix] = setpoint.velocity[value_ix];
         }
     }
 }
 
 impl Reference {
-    fn position_rad(&self) -> &Joints {
+    fn position(&self) -> Joints {
         match self {
-            Self::Scan(follower) => follower.position_rad(),
-            Self::Commands(commands) => &commands.position_rad,
+            Self::Scan(follower) => Joints::from_column_slice(follower.position_rad().as_slice()),
+            Self::Tour(follower) => follower.position().clone(),
+            Self::Commands(commands) => commands.position.clone(),
         }
     }
 
-    fn velocity_rad_s(&self) -> &Joints {
+    fn velocity(&self) -> Joints {
         match self {
-            Self::Scan(follower) => follower.velocity_rad_s(),
-            Self::Commands(commands) => &commands.velocity_rad_s,
+            Self::Scan(follower) => Joints::from_column_slice(follower.velocity_rad_s().as_slice()),
+            Self::Tour(follower) => follower.velocity().clone(),
+            Self::Commands(commands) => commands.velocity.clone(),
+        }
+    }
+
+    /// Advances to a time one step after the previous one.
+    fn advance(&mut self, secs: f64) {
+        match self {
+            Self::Scan(follower) => follower.advance(secs, STEP_SECS),
+            Self::Tour(follower) => follower.advance(secs, STEP_SECS),
+            Self::Commands(commands) => commands.advance(),
         }
     }
 }
 
+/// How the joints follow the reference.
+enum Drive {
+    /// The dynamics of the scene's own arm, with a controller.
+    Dynamics(MjData<Arc<MjModel>>),
+    /// The arm of a rig file is at the reference, and its efforts are those of inverse dynamics.
+    /// Masses in robot descriptions are too often wrong for a stable controller.
+    Exact(Box<Efforts>),
+}
+
 /// The arm with its controller and its recent readings.
 pub(crate) struct Arm {
-    data: MjData<Arc<MjModel>>,
+    drive: Drive,
     reference: Reference,
     n_steps: i64,
     readings: VecDeque<JointReading>,
@@ -85,7 +112,7 @@ pub(crate) struct Arm {
 }
 
 impl Arm {
-    /// Places the arm at rest at the start of the scan. Readings are kept for
+    /// Places the scene's own arm at rest at the start of the scan. Readings are kept for
     /// `history_duration_nanos`.
     pub(crate) fn new(
         model: Arc<MjModel>,
@@ -105,18 +132,44 @@ impl Arm {
             .copy_from_slice(follower.position_rad().as_slice());
         data.forward();
         let reference = Reference::Scan(Box::new(follower));
-        Ok(Self {
-            data,
+        Ok(Self::at_start(
+            Drive::Dynamics(data),
+            reference,
+            history_duration_nanos,
+        ))
+    }
+
+    /// Places the arm of a rig file at rest at the start of its tour. Readings are kept for
+    /// `history_duration_nanos`.
+    pub(crate) fn exact(
+        efforts: Efforts,
+        follower: TwinFollower,
+        history_duration_nanos: i64,
+    ) -> Self {
+        let reference = Reference::Tour(Box::new(follower));
+        Self::at_start(
+            Drive::Exact(Box::new(efforts)),
+            reference,
+            history_duration_nanos,
+        )
+    }
+
+    fn at_start(drive: Drive, reference: Reference, history_duration_nanos: i64) -> Self {
+        Self {
+            drive,
             reference,
             n_steps: 0,
             readings: VecDeque::new(),
             history_duration_nanos,
-        })
+        }
     }
 
     /// Position of the joints.
-    pub(crate) fn position_rad(&self) -> Joints {
-        Joints::from_column_slice(self.data.qpos())
+    pub(crate) fn position(&self) -> Joints {
+        match &self.drive {
+            Drive::Dynamics(data) => Joints::from_column_slice(data.qpos()),
+            Drive::Exact(_) => self.reference.position(),
+        }
     }
 
     /// Follows commands from now on, starting at rest at the current position. `joint_ixs` and
@@ -127,40 +180,35 @@ impl Arm {
         joint_ixs: &[usize],
         joint_offsets: &[f64],
     ) {
+        let position = self.position();
         self.reference = Reference::Commands(JointCommands {
             commands,
             joint_ixs: joint_ixs.to_vec(),
             joint_offsets: joint_offsets.to_vec(),
-            position_rad: self.position_rad(),
-            velocity_rad_s: Joints::zeros(),
+            velocity: Joints::zeros(position.len()),
+            position,
         });
     }
 
     /// Reads the joints, then advances by one step.
     pub(crate) fn step(&mut self) -> JointReading {
-        let position_rad = self.position_rad();
-        let velocity_rad_s = Joints::from_column_slice(self.data.qvel());
-        // The reading, the torque and the step belong to the same instant. The reading contains the
-        // state before the step and the torque that is applied during the step.
-        let torque_nm = self.control(&position_rad, &velocity_rad_s);
-        let reading = JointReading {
-            nanos: self.n_steps * STEP_NANOS,
-            position_rad,
-            velocity_rad_s,
-            torque_nm,
-        };
-        self.data
-            .qfrc_applied_mut()
-            .copy_from_slice(torque_nm.as_slice());
-        self.data.step();
-        self.n_steps += 1;
-        match &mut self.reference {
-            Reference::Scan(follower) => {
-                follower.advance(self.n_steps as f64 * STEP_SECS, STEP_SECS)
+        let nanos = self.n_steps * STEP_NANOS;
+        let reading = match &mut self.drive {
+            Drive::Dynamics(data) => step_dynamics(data, &self.reference, nanos),
+            Drive::Exact(efforts) => {
+                let position = self.reference.position();
+                let velocity = self.reference.velocity();
+                JointReading {
+                    nanos,
+                    effort: efforts.at(&position, &velocity, STEP_SECS),
+                    position,
+                    velocity,
+                }
             }
-            Reference::Commands(commands) => commands.advance(),
-        }
-        self.readings.push_back(reading);
+        };
+        self.n_steps += 1;
+        self.reference.advance(self.n_steps as f64 * STEP_SECS);
+        self.readings.push_back(reading.clone());
         while self
             .readings
             .front()
@@ -169,24 +217,6 @@ impl Arm {
             self.readings.pop_front();
         }
         reading
-    }
-
-    /// Gravity compensation, plus spring and damper torques toward the reference.
-    fn control(&self, position_rad: &Joints, velocity_rad_s: &Joints) -> Joints {
-        let position_error = self.reference.position_rad() - position_rad;
-        let velocity_error = self.reference.velocity_rad_s() - velocity_rad_s;
-        // `bias` contains the torques that gravity and velocities cause. They are added to the
-        // command, so that the controller only has to overcome the inertia.
-        let bias = self.data.qfrc_bias();
-        Joints::from_fn(|ix, _| {
-            let torque = bias[ix]
-                + STIFFNESS[ix] * position_error[ix]
-                + DAMPING[ix] * velocity_error[ix]
-                // The joints of the model have a damping of 1 N m s/rad (`panda::mjcf`), which this
-                // term compensates.
-                + self.reference.velocity_rad_s()[ix];
-            torque.clamp(-panda::MAX_TORQUE_NM[ix], panda::MAX_TORQUE_NM[ix])
-        })
     }
 
     /// Joint positions at a time, by cubic interpolation of the two neighboring readings; `None` if
@@ -200,7 +230,7 @@ impl Arm {
         }
         let before = self.readings.get(ix)?;
         if nanos == before.nanos {
-            return Some(before.position_rad);
+            return Some(before.position.clone());
         }
         let after = self.readings.get(ix + 1)?;
         let share = (nanos - before.nanos) as f64 / STEP_NANOS as f64;
@@ -209,10 +239,55 @@ impl Arm {
         let square = share * share;
         let cube = share * share * share;
         Some(
-            before.position_rad * (2.0 * cube - 3.0 * square + 1.0)
-                + before.velocity_rad_s * (STEP_SECS * (cube - 2.0 * square + share))
-                + after.position_rad * (3.0 * square - 2.0 * cube)
-                + after.velocity_rad_s * (STEP_SECS * (cube - square)),
+            &before.position * (2.0 * cube - 3.0 * square + 1.0)
+                + &before.velocity * (STEP_SECS * (cube - 2.0 * square + share))
+                + &after.position * (3.0 * square - 2.0 * cube)
+                + &after.velocity * (STEP_SECS * (cube - square)),
         )
     }
+}
+
+/// Reads the joints of the scene's own arm, applies the torques of its controller, and steps.
+fn step_dynamics(
+    data: &mut MjData<Arc<MjModel>>,
+    reference: &Reference,
+    nanos: i64,
+) -> JointReading {
+    let position = Joints::from_column_slice(data.qpos());
+    let velocity = Joints::from_column_slice(data.qvel());
+    // The reading, the torque and the step belong to the same instant. The reading contains the
+    // state before the step and the torque that is applied during the step.
+    let effort = control(data, reference, &position, &velocity);
+    data.qfrc_applied_mut().copy_from_slice(effort.as_slice());
+    data.step();
+    JointReading {
+        nanos,
+        position,
+        velocity,
+        effort,
+    }
+}
+
+/// Gravity compensation, plus spring and damper torques toward the reference, newton meters.
+fn control(
+    data: &MjData<Arc<MjModel>>,
+    reference: &Reference,
+    position_rad: &Joints,
+    velocity_rad_s: &Joints,
+) -> Joints {
+    let reference_velocity_rad_s = reference.velocity();
+    let position_error = reference.position() - position_rad;
+    let velocity_error = &reference_velocity_rad_s - velocity_rad_s;
+    // `bias` contains the torques that gravity and velocities cause. They are added to the command,
+    // so that the controller only has to overcome the inertia.
+    let bias = data.qfrc_bias();
+    Joints::from_fn(N_JOINTS, |ix, _| {
+        let torque = bias[ix]
+            + STIFFNESS[ix] * position_error[ix]
+            + DAMPING[ix] * velocity_error[ix]
+            // The joints of the model have a damping of 1 N m s/rad (`panda::mjcf`), which this
+            // term compensates.
+            + reference_velocity_rad_s[ix];
+        torque.clamp(-panda::MAX_TORQUE_NM[ix], panda::MAX_TORQUE_NM[ix])
+    })
 }

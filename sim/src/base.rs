@@ -1,4 +1,4 @@
-//! Motion of the robot's base: fixed, walking around a pedestal, or walking from one station to the
+//! Motion of the robot's base: fixed, moving around a pedestal, or walking from one station to the
 //! next.
 
 use crate::config::Scene;
@@ -12,9 +12,18 @@ use std::f64::consts::TAU;
 pub(crate) enum BaseMotion {
     /// The base is at the world's origin.
     Fixed,
+    /// The base is at this pose in the world.
+    FixedAt(Transform),
     /// A quadruped walks sideways around the origin, facing mostly inward. The value scales its
     /// speed.
     Lap(f64),
+    /// A base on wheels drives the same lap.
+    Rolling {
+        /// Factor on the speed.
+        speed: f64,
+        /// Height of the base link above the floor, meters.
+        height_m: f64,
+    },
     /// The base stands at a far station, then walks to a near one. The value scales its speed.
     Stations(f64),
 }
@@ -70,8 +79,8 @@ impl BaseMotion {
     /// last. The fraction is above 1 in later laps.
     pub(crate) fn walked_frac(&self, secs: f64) -> f64 {
         match self {
-            Self::Fixed => 0.0,
-            Self::Lap(speed) => lap_secs(secs, *speed) / LAP_SECS,
+            Self::Fixed | Self::FixedAt(_) => 0.0,
+            Self::Lap(speed) | Self::Rolling { speed, .. } => lap_secs(secs, *speed) / LAP_SECS,
             Self::Stations(speed) => smooth((secs * speed - DEPARTURE_SECS) / WALK_DURATION_SECS),
         }
     }
@@ -80,7 +89,15 @@ impl BaseMotion {
     pub(crate) fn world_from_base(&self, secs: f64) -> Transform {
         match self {
             Self::Fixed => Transform::identity(),
+            Self::FixedAt(world_from_base) => *world_from_base,
             Self::Lap(speed) => lap_pose(lap_secs(secs, *speed), secs * speed),
+            Self::Rolling { speed, height_m } => {
+                let [x, y, yaw] = lap_position(lap_secs(secs, *speed));
+                Transform::from_parts(
+                    Translation3::new(x, y, *height_m),
+                    UnitQuaternion::from_axis_angle(&Vector3::z_axis(), yaw),
+                )
+            }
             Self::Stations(_) => {
                 let share = self.walked_frac(secs);
                 let [x, y, yaw] = std::array::from_fn(|ix| {
@@ -101,7 +118,7 @@ impl BaseMotion {
                 DEPARTURE_SECS / speed,
                 (DEPARTURE_SECS + WALK_DURATION_SECS) / speed,
             ],
-            Self::Fixed | Self::Lap(_) => [0.0; 2],
+            Self::Fixed | Self::FixedAt(_) | Self::Lap(_) | Self::Rolling { .. } => [0.0; 2],
         }
     }
 
@@ -109,8 +126,8 @@ impl BaseMotion {
     /// base moves. The arm scans only at stations.
     pub(crate) fn station_at(&self, secs: f64) -> Option<(usize, f64)> {
         match self {
-            Self::Fixed => Some((0, secs)),
-            Self::Lap(_) => None,
+            Self::Fixed | Self::FixedAt(_) => Some((0, secs)),
+            Self::Lap(_) | Self::Rolling { .. } => None,
             Self::Stations(speed) => {
                 let at = secs * speed;
                 if at < DEPARTURE_SECS {
@@ -139,17 +156,21 @@ fn lap_secs(secs: f64, speed: f64) -> f64 {
 }
 
 fn lap_pose(at: f64, gait_secs: f64) -> Transform {
+    gait(gait_secs, smooth(at / 2.0), lap_position(at))
+}
+
+/// Position on the lap, x and y in meters, and heading in radians.
+fn lap_position(at: f64) -> [f64; 3] {
     let around = at / LAP_SECS * TAU + std::f64::consts::PI;
     // The periods have no common multiple, so that no lap repeats the views of another lap.
     let radius_m = oscillate([2.25, 0.38, 23.0, 0.1], at);
     // The heading varies between facing the pedestal and facing past it.
     let heading_offset_rad = oscillate([0.25, 0.55, 15.7, 0.0], at);
-    let position = [
+    [
         radius_m * around.cos(),
         radius_m * around.sin(),
         around + std::f64::consts::PI + heading_offset_rad,
-    ];
-    gait(gait_secs, smooth(at / 2.0), position)
+    ]
 }
 
 /// Pose of the walking body at a position and heading, with bounce and sway.

@@ -1,6 +1,7 @@
 //! Configuration of a simulated rig: scene, cameras, sensor imperfections, and end conditions.
 
 use crate::Error;
+use crate::twin::RobotConfig;
 use kinematics::{Intrinsics, Lens, Transform, transform};
 use nalgebra::{Translation3, UnitQuaternion, Vector3};
 use targets::TargetSpec;
@@ -47,6 +48,8 @@ pub struct Config {
     pub light_inside_frac: f64,
     /// Printed calibration targets in the scene; names are unique.
     pub targets: Vec<TargetConfig>,
+    /// The robot of a rig file. `None`: the robot of the scene.
+    pub robot: Option<RobotConfig>,
 }
 
 /// A calibration target, printed on a flat plate.
@@ -406,11 +409,28 @@ impl Default for Config {
             base: BaseConfig::default(),
             light_inside_frac: 1.0,
             targets: Vec::new(),
+            robot: None,
         }
     }
 }
 
 impl Config {
+    /// Whether the robot has an arm.
+    pub(crate) fn has_arm(&self) -> bool {
+        match &self.robot {
+            Some(_) => !self.joint_names.is_empty(),
+            None => self.scene.has_arm(),
+        }
+    }
+
+    /// Whether the robot's base moves and reports its pose.
+    pub(crate) fn has_moving_base(&self) -> bool {
+        match &self.robot {
+            Some(robot) => robot.has_moving_base,
+            None => self.scene.has_moving_base(),
+        }
+    }
+
     /// Index of the joint, counted from the base, for each value of a reading.
     pub(crate) fn joint_ixs(&self) -> Result<Vec<usize>, Error> {
         self.reading_order
@@ -444,7 +464,12 @@ impl Config {
     }
 
     fn check_joints(&self) -> Result<(), Error> {
-        let expected = if self.scene.has_arm() { N_JOINTS } else { 0 };
+        let expected = match &self.robot {
+            // The robot description has as many joints as it has.
+            Some(_) => self.joint_names.len(),
+            None if self.scene.has_arm() => N_JOINTS,
+            None => 0,
+        };
         if self.joint_names.len() != expected {
             return Err(Error::NJoints {
                 got: self.joint_names.len(),
@@ -465,7 +490,8 @@ impl Config {
     }
 
     fn check_cameras(&self) -> Result<(), Error> {
-        if self.cameras.is_empty() {
+        // An arm can be brought up before its cameras.
+        if self.cameras.is_empty() && self.robot.is_none() {
             return Err(Error::NoCamera);
         }
         for (ix, camera) in self.cameras.iter().enumerate() {
@@ -481,7 +507,7 @@ impl Config {
                 });
             }
             camera.check()?;
-            if camera.parent == Parent::Flange && !self.scene.has_arm() {
+            if camera.parent == Parent::Flange && !self.has_arm() {
                 return Err(Error::NoFlange {
                     camera: camera.name.clone(),
                 });
@@ -510,7 +536,7 @@ impl Config {
         for target in &self.targets {
             target.target()?;
             check_pose(&target.name, "parent_from_board", &target.parent_from_board)?;
-            if target.parent == TargetParent::Flange && !self.scene.has_arm() {
+            if target.parent == TargetParent::Flange && !self.has_arm() {
                 return Err(Error::TargetWithoutFlange {
                     target: target.name.clone(),
                 });

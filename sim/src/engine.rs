@@ -5,11 +5,11 @@ use crate::base::Drift;
 use crate::cabinet_tour::light_frac;
 use crate::commands::Commands;
 use crate::config::{CameraConfig, Config, Parent, Scene, SensorConfig, StampConfig};
+use crate::joints::Joints;
 use crate::lidar::{self, RayCaster};
 use crate::motors::{MotorHistory, MotorizedArm};
 use crate::noise;
 use crate::optics::{Optics, RowMotion};
-use crate::panda::Joints;
 use crate::random::RandomStream;
 use crate::render::{Pending, Renderer};
 use crate::robot::{Robot, RobotPose};
@@ -198,7 +198,7 @@ impl Camera {
 
     fn world_from_camera(&self, robot: &RobotPose) -> Transform {
         match self.config.parent {
-            Parent::Flange => robot.world_from_flange() * self.config.parent_from_camera,
+            Parent::Flange => robot.world_from_flange * self.config.parent_from_camera,
             Parent::Base => robot.world_from_base * self.config.parent_from_camera,
             Parent::World => self.config.parent_from_camera,
         }
@@ -309,13 +309,13 @@ impl Engine {
 
     /// The joint positions that the arm reports now.
     pub(crate) fn reported_joints(&mut self) -> Result<Vec<f64>, Error> {
-        let position_rad = self.robot.arm_mut().ok_or(Error::NoArm)?.position_rad();
-        let zero = Joints::zeros();
+        let position = self.robot.arm_mut().ok_or(Error::NoArm)?.position();
+        let zero = Joints::zeros(position.len());
         let reading = JointReading {
             nanos: 0,
-            position_rad,
-            velocity_rad_s: zero,
-            torque_nm: zero,
+            position,
+            velocity: zero.clone(),
+            effort: zero,
         };
         Ok(self.joint_state(&reading).position)
     }
@@ -426,7 +426,7 @@ impl Engine {
     /// Queues the poses of a moving base and the scanner revolutions that have ended by now.
     fn queue_base_and_scans(&mut self, nanos: i64) {
         let due = |n_done: u64, rate_hz: f64| nanos_from_secs(n_done as f64 / rate_hz);
-        while self.config.scene.has_moving_base()
+        while self.config.has_moving_base()
             && due(self.n_base_poses, self.config.base.rate_hz) <= nanos
         {
             self.slots
@@ -541,7 +541,9 @@ impl Engine {
         };
         let view = render::View {
             is_robot_visible,
-            ..camera.optics.view(world_from_camera, robot, light_frac)
+            ..camera
+                .optics
+                .view(world_from_camera, robot.clone(), light_frac)
         };
         let depth_view = camera.depth_view(
             &world_from_camera,
@@ -689,7 +691,7 @@ impl Engine {
     fn joint_state(&self, reading: &JointReading) -> JointState {
         let ordered =
             |joints: &Joints| -> Vec<f64> { self.joint_ixs.iter().map(|ix| joints[*ix]).collect() };
-        let mut position = ordered(&reading.position_rad);
+        let mut position = ordered(&reading.position);
         position
             .iter_mut()
             .zip(&self.config.joint_offsets)
@@ -697,8 +699,8 @@ impl Engine {
         JointState {
             stamp: Stamp(self.start.0 + reading.nanos),
             position,
-            velocity: ordered(&reading.velocity_rad_s),
-            effort: ordered(&reading.torque_nm),
+            velocity: ordered(&reading.velocity),
+            effort: ordered(&reading.effort),
         }
     }
 }

@@ -38,7 +38,10 @@ pub enum Error {
     #[error("a simulated rig needs at least one camera")]
     NoCamera,
     /// A camera is attached to the flange of a robot without an arm.
-    #[error("camera {camera:?} has the parent flange, but the robot of this scene has no arm")]
+    #[error(
+        "camera {camera:?} has the parent flange, but the simulated robot has no moving joints: set its parent to base \
+         or world, or check arm.flange_link"
+    )]
     NoFlange {
         /// Name of the camera.
         camera: String,
@@ -144,6 +147,28 @@ pub enum Error {
     /// A thread cannot be started.
     #[error("cannot start a thread")]
     Thread(#[source] std::io::Error),
+    /// The robot description of a rig file cannot be simulated.
+    #[error("the robot description cannot be simulated: {0}")]
+    Robot(#[source] kinematics::Error),
+    /// The scene is made for another robot.
+    #[error(
+        "the scene {scene:?} is made for the arm in rigs/robots/mobile-arm.urdf, which differs from this robot: remove \
+         sim.scene from the rig file, or set it to \"mobile-base\""
+    )]
+    SceneOfAnotherRobot {
+        /// Name of the scene.
+        scene: &'static str,
+    },
+    /// A camera cannot see the scene.
+    #[error("camera {camera:?} cannot be simulated: {reason}; {remedy}")]
+    CannotScan {
+        /// Name of the camera.
+        camera: String,
+        /// Cause.
+        reason: String,
+        /// What to do.
+        remedy: String,
+    },
     /// The scan requires a pose that the arm cannot reach.
     #[error("the arm cannot reach the camera pose of the scan at {at_secs:.1} s")]
     Unreachable {

@@ -46,20 +46,22 @@ const REST_POSTURE_RAD: [f64; N_JOINTS] =
 const LIMIT_MARGIN_RAD: f64 = 0.05;
 /// Fraction of the maximum joint speeds that the scan uses. The rest is a reserve for the
 /// controller, which corrects errors.
-const SPEED_LIMIT_FRAC: f64 = 0.5;
+pub(crate) const SPEED_LIMIT_FRAC: f64 = 0.5;
 /// Damping of the least squares, in meters and radians. Near singular postures, it bounds the joint
 /// velocities but causes a pose error. With a larger value, tracking is less accurate everywhere.
 const DAMPING: f64 = 0.03;
 /// Rate at which pose errors and posture errors decay, per second. The posture has the lower rate,
 /// because it must not disturb the tracking of the pose.
-const POSE_GAIN_HZ: f64 = 8.0;
-const REST_POSTURE_GAIN_HZ: f64 = 0.6;
+pub(crate) const POSE_GAIN_HZ: f64 = 8.0;
+pub(crate) const REST_POSTURE_GAIN_HZ: f64 = 0.6;
 /// Frequency of the critically damped spring with which the joint velocity follows the desired
 /// velocity, radians per second. The spring keeps the motion smooth.
 const SMOOTHING_RAD_S: f64 = 40.0;
 /// Maximum speed at which a joint approaches its limit, as a fraction of the remaining distance per
 /// second.
 const LIMIT_APPROACH_HZ: f64 = 3.0;
+/// Largest rotation between camera and tour that is not reported, radians.
+const TOUR_TOLERANCE_RAD: f64 = 0.35;
 /// Fraction of the arm's maximum accelerations and jerks that the scan uses.
 const DYNAMICS_LIMIT_FRAC: f64 = 0.6;
 
@@ -87,17 +89,31 @@ impl Follower {
         if pose_error(&target_pose, &base_from_camera).norm() > TOLERANCE {
             return Err(Error::Unreachable { at_secs: 0.0 });
         }
-        // The check is done on a copy, because it moves the arm.
-        follower.clone().warn_if_tour_is_unreachable();
         Ok(follower)
     }
 
-    /// Follows half a minute of the scan without dynamics, and warns if the camera leaves the tour.
-    /// With some camera extrinsics, this happens because the arm reaches its joint limits.
-    fn warn_if_tour_is_unreachable(mut self) {
+    /// Warns if the camera leaves the tour. With some camera extrinsics, this happens because the
+    /// arm reaches its joint limits.
+    pub(crate) fn warn_if_tour_is_unreachable(&self) {
+        let worst_rad = self.clone().worst_rotation_rad();
+        if worst_rad > TOUR_TOLERANCE_RAD {
+            let degrees = worst_rad.to_degrees();
+            log::warn!(
+                "the arm cannot follow the whole scan with these camera extrinsics: off by up to {degrees:.0} degrees"
+            );
+        }
+    }
+
+    /// Whether the camera stays on the tour.
+    pub(crate) fn can_follow_tour(&self) -> bool {
+        self.clone().worst_rotation_rad() <= TOUR_TOLERANCE_RAD
+    }
+
+    /// Follows half a minute of the scan without dynamics. Returns the largest rotation of the
+    /// camera relative to the tour. The arm is moved, so this is called on a copy.
+    fn worst_rotation_rad(mut self) -> f64 {
         const CHECKED_SECS: f64 = 30.0;
         const STEP_SECS: f64 = 0.005;
-        const TOLERANCE_RAD: f64 = 0.35;
         let mut worst_rad = 0.0_f64;
         let mut secs = 0.0;
         while secs < CHECKED_SECS {
@@ -108,12 +124,7 @@ impl Follower {
             let error = pose_error(&self.scan.arm_from_camera(secs), &base_from_camera);
             worst_rad = worst_rad.max(error.fixed_rows::<3>(3).norm());
         }
-        if worst_rad > TOLERANCE_RAD {
-            let degrees = worst_rad.to_degrees();
-            log::warn!(
-                "the arm cannot follow the whole scan with these camera extrinsics: off by up to {degrees:.0} degrees"
-            );
-        }
+        worst_rad
     }
 
     pub(crate) fn position_rad(&self) -> &Joints {
@@ -133,23 +144,17 @@ impl Follower {
         let target_twist = pose_error(&target_pose, &before) / step_secs;
         let desired_velocity = self.desired_velocity(&target_pose, &target_twist);
         for ix in 0..N_JOINTS {
-            let allowed = self.allowed_speed_rad_s(ix);
+            let [slowest, fastest] = self.allowed_speed_rad_s(ix);
             let velocity_error =
-                desired_velocity[ix].clamp(allowed[0], allowed[1]) - self.velocity_rad_s[ix];
-            let acceleration = self.acceleration_rad_s2[ix];
-            // The velocity follows the desired velocity like a critically damped spring of the
-            // frequency w = `SMOOTHING_RAD_S`: jerk = w^2 * error - 2 * w * acceleration.
-            let jerk = (velocity_error * SMOOTHING_RAD_S - 2.0 * acceleration) * SMOOTHING_RAD_S;
-            let max_jerk = panda::MAX_JERK_RAD_S3[ix];
-            let max_acceleration = panda::MAX_ACCELERATION_RAD_S2[ix];
-            let acceleration = acceleration
-                + jerk.clamp(
-                    -DYNAMICS_LIMIT_FRAC * max_jerk,
-                    DYNAMICS_LIMIT_FRAC * max_jerk,
-                ) * step_secs;
-            self.acceleration_rad_s2[ix] = acceleration.clamp(
-                -DYNAMICS_LIMIT_FRAC * max_acceleration,
-                DYNAMICS_LIMIT_FRAC * max_acceleration,
+                desired_velocity[ix].clamp(slowest, fastest) - self.velocity_rad_s[ix];
+            self.acceleration_rad_s2[ix] = smooth_acceleration(
+                velocity_error,
+                self.acceleration_rad_s2[ix],
+                [
+                    DYNAMICS_LIMIT_FRAC * panda::MAX_ACCELERATION_RAD_S2[ix],
+                    DYNAMICS_LIMIT_FRAC * panda::MAX_JERK_RAD_S3[ix],
+                ],
+                step_secs,
             );
         }
         self.velocity_rad_s += self.acceleration_rad_s2 * step_secs;
@@ -160,11 +165,11 @@ impl Follower {
     /// is reduced.
     fn allowed_speed_rad_s(&self, ix: usize) -> [f64; 2] {
         let position = self.position_rad[ix];
-        let fastest = SPEED_LIMIT_FRAC * panda::MAX_SPEED_RAD_S[ix];
-        let to_lower = position - panda::LOWER_RAD[ix] - LIMIT_MARGIN_RAD;
-        let to_upper = panda::UPPER_RAD[ix] - LIMIT_MARGIN_RAD - position;
-        let towards = |distance: f64| (LIMIT_APPROACH_HZ * distance).clamp(0.0, fastest);
-        [-towards(to_lower), towards(to_upper)]
+        speeds_within(
+            position - panda::LOWER_RAD[ix] - LIMIT_MARGIN_RAD,
+            panda::UPPER_RAD[ix] - LIMIT_MARGIN_RAD - position,
+            SPEED_LIMIT_FRAC * panda::MAX_SPEED_RAD_S[ix],
+        )
     }
 
     /// Joint velocity that moves the camera toward the target pose. Null-space motion moves the
@@ -182,6 +187,27 @@ impl Follower {
     }
 }
 
+/// Acceleration after a step, within the maxima of acceleration and jerk.
+///
+/// The velocity follows the desired velocity like a critically damped spring of the frequency w =
+/// `SMOOTHING_RAD_S`: jerk = w^2 * error - 2 * w * acceleration.
+pub(crate) fn smooth_acceleration(
+    velocity_error: f64,
+    acceleration: f64,
+    [max_acceleration, max_jerk]: [f64; 2],
+    step_secs: f64,
+) -> f64 {
+    let jerk = (velocity_error * SMOOTHING_RAD_S - 2.0 * acceleration) * SMOOTHING_RAD_S;
+    let acceleration = acceleration + jerk.clamp(-max_jerk, max_jerk) * step_secs;
+    acceleration.clamp(-max_acceleration, max_acceleration)
+}
+
+/// Minimum and maximum velocity of a joint at distances to its lower and upper limit.
+pub(crate) fn speeds_within(to_lower: f64, to_upper: f64, fastest: f64) -> [f64; 2] {
+    let towards = |distance: f64| (LIMIT_APPROACH_HZ * distance).clamp(0.0, fastest);
+    [-towards(to_lower), towards(to_upper)]
+}
+
 fn damped_inverse(jacobian: &Jacobian) -> SMatrix<f64, N_JOINTS, 6> {
     // Damped least squares: J^T (J J^T + d^2 I)^-1 (Wampler 1986; Nakamura and Hanafusa 1986).
     let square = jacobian * jacobian.transpose() + Matrix6::identity() * DAMPING.powi(2);
@@ -192,7 +218,7 @@ fn damped_inverse(jacobian: &Jacobian) -> SMatrix<f64, N_JOINTS, 6> {
 }
 
 /// Translation and rotation from the actual to the target pose, in world axes.
-fn pose_error(target_pose: &Transform, actual: &Transform) -> Vector6<f64> {
+pub(crate) fn pose_error(target_pose: &Transform, actual: &Transform) -> Vector6<f64> {
     let translation_error = target_pose.translation.vector - actual.translation.vector;
     let rotation_error = (target_pose.rotation * actual.rotation.inverse()).scaled_axis();
     Vector6::new(

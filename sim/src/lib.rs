@@ -28,6 +28,7 @@ mod engine;
 mod error;
 mod follower;
 mod furniture;
+mod joints;
 mod lab;
 mod lab_texture;
 mod lidar;
@@ -52,6 +53,7 @@ mod scene;
 pub mod tag;
 mod texture;
 mod toy;
+mod twin;
 pub mod wire;
 
 /// Positions and dimensions in the scenes, for tests that check images and scans.
@@ -72,6 +74,7 @@ pub use error::Error;
 pub use live_rig::{LiveRig, LiveTruth};
 pub use lockstep::Lockstep;
 pub use motors::MotorHistory;
-pub use rig::{PANDA_URDF, Rig, open};
+pub use rig::{PANDA_URDF, Rig, has_robot_of, open, suits_own_robot};
 pub use rig_info::{CameraInfo, RigInfo};
 pub use robot_masks::{PinholeView, RobotMasks};
+pub use twin::RobotConfig;

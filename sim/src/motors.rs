@@ -1,6 +1,6 @@
 //! Emulated motors that move the simulated arm in real time, instead of MuJoCo's dynamics.
 
-use crate::panda::Joints;
+use crate::joints::Joints;
 use kinematics::{JointHistory, JointState, Stamp};
 use parking_lot::{Condvar, Mutex};
 use std::sync::Arc;
@@ -81,13 +81,13 @@ impl MotorizedArm {
             .lock()
             .at(Stamp(self.start.0 + nanos))
             .ok()?;
-        let mut position_rad = Joints::zeros();
-        for (value_ix, (joint_ix, position)) in
+        let mut position = Joints::zeros(self.joint_ixs.len());
+        for (value_ix, (joint_ix, reported)) in
             self.joint_ixs.iter().zip(&state.position).enumerate()
         {
-            position_rad[*joint_ix] =
-                position + self.joint_offsets.get(value_ix).copied().unwrap_or(0.0);
+            position[*joint_ix] =
+                reported + self.joint_offsets.get(value_ix).copied().unwrap_or(0.0);
         }
-        Some(position_rad)
+        Some(position)
     }
 }

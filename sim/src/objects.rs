@@ -9,6 +9,8 @@ use nalgebra::{Matrix3, Point3, Rotation3, Translation3, UnitQuaternion, Vector3
 
 /// Height of the table top above the robot's base, meters.
 pub const TABLE_Z_M: f64 = 0.12;
+/// Height of the floor, meters.
+pub(crate) const FLOOR_Z_M: f64 = -0.75;
 /// Center of the target area on the table, meters.
 pub const TARGET_XY_M: [f64; 2] = [0.74, 0.0];
 /// Half the side of the tag cube, meters.
@@ -272,13 +274,19 @@ fn wall() -> Mesh {
 fn floor() -> Mesh {
     let mut mesh = Mesh::default();
     mesh.rectangle(
-        Point3::new(0.5, 0.0, -0.75),
+        Point3::new(0.5, 0.0, FLOOR_Z_M),
         Vector3::x() * 3.0,
         Vector3::y() * 3.0,
         // The texture is repeated, because it would be coarse if it were stretched over the floor.
         [0.0, 0.0, 4.0, 4.0],
     );
     mesh
+}
+
+/// Whether a point is above or below the top of the table.
+pub(crate) fn is_over_table(point: &Point3<f64>) -> bool {
+    let from_center = point - table_center();
+    from_center.x.abs() < TABLE_HALF_XY_M[0] && from_center.y.abs() < TABLE_HALF_XY_M[1]
 }
 
 /// The robot's pedestal, and the table's edge and legs.
@@ -288,6 +296,13 @@ fn frame() -> Mesh {
         Mesh::cuboid([0.15, 0.15, 0.36], &[WHOLE; 6]),
         Vector3::new(-0.02, 0.0, -0.365),
     );
+    mesh.append(table_frame(), Vector3::zeros());
+    mesh
+}
+
+/// The table's edge and legs.
+pub(crate) fn table_frame() -> Mesh {
+    let mut mesh = Mesh::default();
     let slab = Mesh::cuboid(
         [
             TABLE_HALF_XY_M[0],

@@ -238,8 +238,8 @@ impl Canvas {
     fn draw_with(&mut self, view: &View, options: &MjvOption) -> Picture {
         if let Some(robot) = &view.robot {
             // Only the poses are set; velocities and forces do not affect an image.
-            if let Some(joints_rad) = &robot.joints_rad {
-                self.data.qpos_mut().copy_from_slice(joints_rad.as_slice());
+            if !robot.model_positions.is_empty() {
+                self.data.qpos_mut().copy_from_slice(&robot.model_positions);
             }
             set_base_pose(&mut self.data, &robot.world_from_base);
         }

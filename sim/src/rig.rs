@@ -4,20 +4,24 @@ use crate::arm::Arm;
 use crate::base::{BaseMotion, base_from_arm};
 use crate::cabinet_tour::CabinetTour;
 use crate::commanded::CommandedRig;
-use crate::config::{Config, Parent, Scene};
+use crate::config::{Config, N_JOINTS, Parent, Scene};
 use crate::engine::{Cameras, Engine, history_nanos};
 use crate::follower::{Follower, Tour};
 use crate::live_rig::LiveRig;
 use crate::lockstep::Lockstep;
 use crate::motors::MotorHistory;
+use crate::objects::{TABLE_Z_M, TARGET_XY_M};
 use crate::render::Renderer;
 use crate::rig_info::{CameraInfo, RigInfo};
-use crate::robot::Robot;
-use crate::scan::Scan;
+use crate::robot::{Robot, RobotKinematics};
+use crate::scan::{LOOK_AT_HEIGHT_M, Scan};
+use crate::twin::{self, Efforts, RobotConfig};
 use crate::{CameraConfig, Error, scene};
 use drivers::Camera;
 use drivers::motion::MotionLimits;
-use kinematics::{Stamp, Transform};
+use kinematics::{Chain, Stamp, Transform};
+use mujoco_rs::prelude::MjModel;
+use nalgebra::Point3;
 use std::sync::Arc;
 
 /// The simulated arm as a URDF, with the same kinematics and limits. The base is `panda_link0`, and
@@ -44,23 +48,27 @@ pub struct Rig {
     info: RigInfo,
 }
 
-/// Builds the scene and starts its render thread. Takes one to two seconds.
+/// Builds the scene and starts its render thread. Takes one to two seconds, and a second longer with
+/// the robot of a rig file.
 pub fn open(config: &Config) -> Result<Rig, Error> {
     // This check comes before anything reaches MuJoCo, which aborts the process on invalid numbers.
     config.check()?;
     let cameras = Cameras::new(config)?;
+    match &config.robot {
+        Some(robot) => open_twin(config, robot, cameras),
+        None => open_scene(config, cameras),
+    }
+}
+
+/// Opens a scene with its own robot.
+fn open_scene(config: &Config, cameras: Cameras) -> Result<Rig, Error> {
     // Dynamics, rendering and ray casting share one model, but each has its own data.
     let model = Arc::new(scene::build(config, cameras.largest_view_px())?);
-    let renderer = Renderer::start(Arc::clone(&model), scene::near_far_m(config.scene))?;
     let motion = BaseMotion::of(config.scene, config.speed);
-    let tour = match config.scene {
-        Scene::StaticArm => Some(Tour::Table(Scan::new(config.speed, config.azimuth_only))),
-        Scene::MobileBase => None,
-        Scene::MobileArm => Some(Tour::Cabinet(CabinetTour::new(motion, config.speed))),
-    };
-    let arm = match tour {
+    let arm = match tour_of(config) {
         Some(tour) => {
             let follower = Follower::new(tour, scanning_camera(config))?;
+            follower.warn_if_tour_is_unreachable();
             Some(Arm::new(
                 Arc::clone(&model),
                 follower,
@@ -74,7 +82,41 @@ pub fn open(config: &Config) -> Result<Rig, Error> {
     } else {
         Transform::identity()
     };
-    let robot = Robot::new(arm, motion, base_from_arm);
+    let kinematics = if config.scene.has_arm() {
+        RobotKinematics::Panda(base_from_arm)
+    } else {
+        RobotKinematics::NoArm(base_from_arm)
+    };
+    let robot = Robot::new(arm, motion, kinematics);
+    finish(config, cameras, (robot, model), urdf_of(config.scene))
+}
+
+/// Opens a scene with the robot of a rig file.
+fn open_twin(config: &Config, robot: &RobotConfig, cameras: Cameras) -> Result<Rig, Error> {
+    let mut plan = twin::plan(config, robot)?;
+    let follower = plan.follower.take();
+    let model = Arc::new(scene::build_twin(
+        config,
+        (robot, &plan),
+        cameras.largest_view_px(),
+    )?);
+    let arm = follower.map(|follower| {
+        let efforts = Efforts::new(Arc::clone(&model), Arc::clone(&plan.model));
+        Arm::exact(efforts, follower, history_nanos(config))
+    });
+    let moving = Robot::new(arm, plan.motion, RobotKinematics::Twin(plan.model));
+    finish(config, cameras, (moving, model), &robot.urdf)
+}
+
+/// Starts the render thread and assembles the rig.
+fn finish(
+    config: &Config,
+    cameras: Cameras,
+    (robot, model): (Robot, Arc<MjModel>),
+    urdf: &str,
+) -> Result<Rig, Error> {
+    let renderer = Renderer::start(Arc::clone(&model), scene::near_far_m(config.scene))?;
+    let world_from_base = robot.motion().world_from_base(0.0);
     let engine = Engine::new(config.clone(), robot, cameras, renderer, model)?;
     let info = RigInfo {
         cameras: config
@@ -88,12 +130,85 @@ pub fn open(config: &Config) -> Result<Rig, Error> {
             .iter()
             .map(|scanner| scanner.name.clone())
             .collect(),
-        has_moving_base: config.scene.has_moving_base(),
-        urdf: urdf_of(config.scene),
-        world_from_base: motion.world_from_base(0.0),
+        has_moving_base: config.has_moving_base(),
+        urdf: urdf.to_owned(),
+        world_from_base,
         renderer: engine.renderer_name().to_owned(),
     };
     Ok(Rig { engine, info })
+}
+
+/// The camera tour of a scene with an arm.
+fn tour_of(config: &Config) -> Option<Tour> {
+    match config.scene {
+        Scene::StaticArm => Some(Tour::Table(Scan::new(config.speed, config.azimuth_only))),
+        Scene::MobileBase => None,
+        Scene::MobileArm => {
+            let motion = BaseMotion::of(config.scene, config.speed);
+            Some(Tour::Cabinet(CabinetTour::new(motion, config.speed)))
+        }
+    }
+}
+
+/// Whether a chain from base to flange has the kinematics of a scene's own arm. The names of joints
+/// and links do not matter.
+pub fn has_robot_of(scene: Scene, chain: &Chain) -> bool {
+    /// Far below the length of any part, and above rounding in a file, meters and radians.
+    const TOLERANCE: f64 = 1e-5;
+    if !scene.has_arm() {
+        return chain.n_joints() == 0;
+    }
+    let base_from_arm = if scene.has_moving_base() {
+        base_from_arm()
+    } else {
+        Transform::identity()
+    };
+    // Positions without symmetry, at which every length and axis matters.
+    let postures = [
+        [0.0; N_JOINTS],
+        [0.4, -0.9, 1.3, -2.2, -0.7, 1.8, 0.6],
+        [-2.1, 1.1, 0.3, -0.4, 2.2, 3.1, -1.9],
+    ];
+    postures.iter().all(|position| {
+        let own =
+            base_from_arm * crate::panda::base_from_flange(&crate::panda::Joints::from(*position));
+        chain.forward(position).is_ok_and(|pose| {
+            let difference = own.inverse() * pose;
+            difference.translation.vector.norm() < TOLERANCE
+                && difference.rotation.angle() < TOLERANCE
+        })
+    })
+}
+
+/// Whether the scene's own arm can follow its tour with the cameras of a rig: the arm reaches all
+/// poses, the exposure is short enough for the speed, and fixed cameras see the scene.
+pub fn suits_own_robot(config: &Config, max_blur_px: f64) -> bool {
+    /// Image speed of the fastest camera motion in the scenes, relative to the focal length, per
+    /// second.
+    const FASTEST_PER_SEC: f64 = 0.35;
+    let Some(tour) = tour_of(config) else {
+        return true;
+    };
+    let is_followed = Follower::new(tour, scanning_camera(config))
+        .is_ok_and(|follower| follower.can_follow_tour());
+    let is_sharp = config.cameras.iter().all(|camera| {
+        let speed_px_s = FASTEST_PER_SEC * config.speed * camera.intrinsics.focal_px[0];
+        1e-6 * camera.sensor.exposure_micros * speed_px_s <= max_blur_px
+    });
+    is_followed && is_sharp && fixed_cameras_see(config)
+}
+
+/// Whether all cameras in the world see the objects on the table. Cameras in other scenes always see
+/// something.
+fn fixed_cameras_see(config: &Config) -> bool {
+    let [x, y] = TARGET_XY_M;
+    let center = Point3::new(x, y, TABLE_Z_M + LOOK_AT_HEIGHT_M);
+    config.scene != Scene::StaticArm
+        || config
+            .cameras
+            .iter()
+            .filter(|camera| camera.parent != Parent::Flange)
+            .all(|camera| twin::sees(&camera.intrinsics, &camera.parent_from_camera, &center))
 }
 
 /// `flange_from_camera` of the camera that follows the tour. This is the first camera on the

@@ -15,7 +15,7 @@ pub struct RigInfo {
     /// Whether the base moves and reports its pose.
     pub has_moving_base: bool,
     /// URDF of the robot, with its own joint names.
-    pub urdf: &'static str,
+    pub urdf: String,
     /// Pose of the robot's base at the start.
     pub world_from_base: Transform,
     /// The renderer's name as reported by OpenGL.

@@ -3,33 +3,69 @@
 use crate::Error;
 use crate::arm::{Arm, JointReading, STEP_NANOS};
 use crate::base::BaseMotion;
+use crate::joints::Joints;
 use crate::motors::MotorizedArm;
-use crate::panda::{self, Joints};
+use crate::panda;
+use crate::twin::TwinModel;
 use kinematics::Transform;
+use std::sync::Arc;
 
 /// Pose of the robot at one instant.
-#[derive(Clone, Copy, Debug)]
+#[derive(Clone, Debug)]
 pub(crate) struct RobotPose {
     pub(crate) world_from_base: Transform,
-    pub(crate) base_from_arm: Transform,
-    /// Joint positions; `None` without an arm.
-    pub(crate) joints_rad: Option<Joints>,
+    /// Pose of the flange, or of the arm's mounting point if there is no arm.
+    pub(crate) world_from_flange: Transform,
+    /// Positions of all joints of the MuJoCo model, in its order; empty without joints.
+    pub(crate) model_positions: Vec<f64>,
 }
 
-impl RobotPose {
-    /// Pose of the flange, or of the arm's mounting point if there is no arm.
-    pub(crate) fn world_from_flange(&self) -> Transform {
-        let arm_from_flange = self
-            .joints_rad
-            .as_ref()
-            .map_or_else(Transform::identity, panda::base_from_flange);
-        self.world_from_base * self.base_from_arm * arm_from_flange
+/// Where the links of the robot are.
+#[derive(Clone)]
+pub(crate) enum RobotKinematics {
+    /// The robot of a scene without an arm. Contains the pose of the mounting point on the base.
+    NoArm(Transform),
+    /// The scene's own arm. Contains its pose on the base.
+    Panda(Transform),
+    /// The robot of a rig file.
+    Twin(Arc<TwinModel>),
+}
+
+impl RobotKinematics {
+    /// The robot with its joints at `position`; `None` for the position if there is no arm.
+    fn pose(&self, world_from_base: Transform, position: Option<&Joints>) -> RobotPose {
+        let (world_from_flange, model_positions) = match (self, position) {
+            (Self::Panda(base_from_arm), Some(position)) => {
+                let arm_from_flange =
+                    panda::base_from_flange(&panda::Joints::from_column_slice(position.as_slice()));
+                (
+                    world_from_base * base_from_arm * arm_from_flange,
+                    position.as_slice().to_vec(),
+                )
+            }
+            (Self::NoArm(base_from_arm) | Self::Panda(base_from_arm), _) => {
+                (world_from_base * base_from_arm, Vec::new())
+            }
+            (Self::Twin(model), position) => {
+                let rest = Joints::zeros(0);
+                let position = position.unwrap_or(&rest);
+                (
+                    world_from_base * model.base_from_flange(position),
+                    model.model_positions(position),
+                )
+            }
+        };
+        RobotPose {
+            world_from_base,
+            world_from_flange,
+            model_positions,
+        }
     }
 }
 
 /// What moves the joints of an arm.
 enum ArmMotion {
-    /// MuJoCo's dynamics.
+    /// The simulation.
     Simulated(Box<Arm>),
     /// Emulated motors, in real time.
     Motorized(MotorizedArm),
@@ -39,17 +75,17 @@ enum ArmMotion {
 pub(crate) struct Robot {
     arm: Option<ArmMotion>,
     motion: BaseMotion,
-    base_from_arm: Transform,
+    kinematics: RobotKinematics,
     n_steps: i64,
 }
 
 impl Robot {
-    pub(crate) fn new(arm: Option<Arm>, motion: BaseMotion, base_from_arm: Transform) -> Self {
+    pub(crate) fn new(arm: Option<Arm>, motion: BaseMotion, kinematics: RobotKinematics) -> Self {
         let arm = arm.map(|arm| ArmMotion::Simulated(Box::new(arm)));
         Self {
             arm,
             motion,
-            base_from_arm,
+            kinematics,
             n_steps: 0,
         }
     }
@@ -91,16 +127,12 @@ impl Robot {
     /// The robot at a time in its recent past; `None` if the stored positions of the arm do not
     /// cover that time.
     pub(crate) fn at(&self, nanos: i64) -> Option<RobotPose> {
-        let joints_rad = match &self.arm {
+        let position = match &self.arm {
             Some(ArmMotion::Simulated(arm)) => Some(arm.position_at(nanos)?),
             Some(ArmMotion::Motorized(arm)) => Some(arm.position_at(nanos)?),
             None => None,
         };
         let world_from_base = self.motion.world_from_base(nanos as f64 * 1e-9);
-        Some(RobotPose {
-            world_from_base,
-            base_from_arm: self.base_from_arm,
-            joints_rad,
-        })
+        Some(self.kinematics.pose(world_from_base, position.as_ref()))
     }
 }

@@ -2,7 +2,6 @@
 
 use crate::config::N_JOINTS;
 use crate::egl::HeadlessContext;
-use crate::panda::Joints;
 use crate::render::{Canvas, View};
 use crate::robot::RobotPose;
 use crate::{Config, Error, Scene, scene};
@@ -75,8 +74,8 @@ impl RobotMasks {
         }
         let robot = RobotPose {
             world_from_base: *world_from_base,
-            base_from_arm: Transform::identity(), // The model contains the pose of the arm on its base.
-            joints_rad: Some(Joints::from_column_slice(joints_rad)),
+            world_from_flange: Transform::identity(), // No camera of this model is on the flange.
+            model_positions: joints_rad.to_vec(),
         };
         Ok(self.canvas.robot_mask(&drawn(view, Some(robot)), is_alone))
     }
@@ -144,8 +143,8 @@ mod tests {
             count(&visible)
         );
         // The flange is inside the body.
-        let flange =
-            crate::panda::base_from_flange(&Joints::from(joints)) * Point3::new(0.0, 0.0, -0.03);
+        let flange = crate::panda::base_from_flange(&crate::panda::Joints::from(joints))
+            * Point3::new(0.0, 0.0, -0.03);
         let in_camera = view.world_from_camera.inverse_transform_point(&flange);
         let at = |axis: usize| {
             view.focal_px[axis] * in_camera[axis] / in_camera.z + view.principal_px[axis]

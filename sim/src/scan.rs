@@ -1,4 +1,4 @@
-//! The camera tour of the static arm, which leads around the target area on the table.
+//! The camera tour around the target area on the table.
 
 use crate::objects::{TABLE_Z_M, TARGET_XY_M};
 use kinematics::Transform;
@@ -15,12 +15,40 @@ use std::f64::consts::TAU;
 pub(crate) struct Scan {
     speed: f64,
     is_azimuth_only: bool,
+    shape: ScanShape,
+}
+
+/// Where the tour leads, seen from the target area. The default is the tour of the static arm.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct ScanShape {
+    /// Direction of the camera about the vertical axis; 0 is toward the robot.
+    pub(crate) azimuth_degrees: Oscillation,
+    /// Direction of the camera above the horizontal.
+    pub(crate) elevation_degrees: Oscillation,
+    /// Distance of the camera from the look-at point.
+    pub(crate) distance_m: Oscillation,
+}
+
+impl Default for ScanShape {
+    fn default() -> Self {
+        Self {
+            azimuth_degrees: AZIMUTH_DEGREES,
+            elevation_degrees: ELEVATION_DEGREES,
+            distance_m: DISTANCE_M,
+        }
+    }
 }
 
 /// One oscillating quantity: mean, amplitude, period in seconds at speed 1, phase in turns.
-struct Oscillation(f64, f64, f64, f64);
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Oscillation(f64, f64, f64, f64);
 
 impl Oscillation {
+    /// The same oscillation about another mean, with another amplitude.
+    pub(crate) fn over(&self, mean: f64, amplitude: f64) -> Self {
+        Self(mean, amplitude, self.2, self.3)
+    }
+
     fn at(&self, secs: f64) -> f64 {
         let Self(mean, amplitude, period_secs, phase) = self;
         mean + amplitude * ((secs / period_secs + phase) * TAU).sin()
@@ -34,7 +62,7 @@ const ROLL_DEGREES: Oscillation = Oscillation(0.0, 20.0, 8.3, 0.60);
 const LOOK_AT_X_M: Oscillation = Oscillation(0.0, 0.03, 6.3, 0.0);
 const LOOK_AT_Y_M: Oscillation = Oscillation(0.0, 0.04, 7.7, 0.5);
 /// Height of the look-at point above the table, meters.
-const LOOK_AT_HEIGHT_M: f64 = 0.06;
+pub(crate) const LOOK_AT_HEIGHT_M: f64 = 0.06;
 /// The motion accelerates from rest within this time, seconds.
 const START_SECS: f64 = 0.5;
 /// The speed varies by this fraction, with this period in seconds.
@@ -47,7 +75,22 @@ impl Scan {
         Self {
             speed,
             is_azimuth_only,
+            shape: ScanShape::default(),
         }
+    }
+
+    /// The same tour in another shape.
+    pub(crate) fn with_shape(self, shape: ScanShape) -> Self {
+        Self { shape, ..self }
+    }
+
+    /// The same tour at another speed.
+    pub(crate) fn with_speed(self, speed: f64) -> Self {
+        Self { speed, ..self }
+    }
+
+    pub(crate) fn speed(&self) -> f64 {
+        self.speed
     }
 
     fn oscillation(&self, oscillation: &Oscillation, at: f64) -> f64 {
@@ -71,18 +114,35 @@ impl Scan {
         uniform_secs + share * period_secs / TAU * (1.0 - (uniform_secs * TAU / period_secs).cos())
     }
 
-    /// Target pose of the camera: x right, y down, z toward the look-at point.
-    pub(crate) fn world_from_camera(&self, secs: f64) -> Transform {
-        let at = self.progress(secs);
-        let azimuth = AZIMUTH_DEGREES.at(at).to_radians();
-        let elevation = self.oscillation(&ELEVATION_DEGREES, at).to_radians();
+    /// The point that the camera looks at.
+    pub(crate) fn look_at(&self, secs: f64) -> Vector3<f64> {
+        self.look_at_after(self.progress(secs))
+    }
+
+    fn look_at_after(&self, at: f64) -> Vector3<f64> {
         let [look_at_x_m, look_at_y_m] =
             [&LOOK_AT_X_M, &LOOK_AT_Y_M].map(|oscillation| self.oscillation(oscillation, at));
-        let target = Vector3::new(
+        Vector3::new(
             TARGET_XY_M[0] + look_at_x_m,
             TARGET_XY_M[1] + look_at_y_m,
             TABLE_Z_M + LOOK_AT_HEIGHT_M,
-        );
+        )
+    }
+
+    /// Roll of the camera about its optical axis, radians.
+    pub(crate) fn roll_rad(&self, secs: f64) -> f64 {
+        self.oscillation(&ROLL_DEGREES, self.progress(secs))
+            .to_radians()
+    }
+
+    /// Target pose of the camera: x right, y down, z toward the look-at point.
+    pub(crate) fn world_from_camera(&self, secs: f64) -> Transform {
+        let at = self.progress(secs);
+        let azimuth = self.shape.azimuth_degrees.at(at).to_radians();
+        let elevation = self
+            .oscillation(&self.shape.elevation_degrees, at)
+            .to_radians();
+        let target = self.look_at_after(at);
         let back = Vector3::new(
             -elevation.cos() * azimuth.cos(),
             -elevation.cos() * azimuth.sin(),
@@ -94,7 +154,7 @@ impl Scan {
             self.oscillation(&ROLL_DEGREES, at).to_radians(),
         );
         Transform::from_parts(
-            Translation3::from(target + back * self.oscillation(&DISTANCE_M, at)),
+            Translation3::from(target + back * self.oscillation(&self.shape.distance_m, at)),
             upright * roll,
         )
     }

@@ -4,6 +4,7 @@ use crate::base;
 use crate::config::{Config, Parent, Scene, TargetParent};
 use crate::objects::{self, Object};
 use crate::texture::Texture;
+use crate::twin::{Pedestal, RobotBody, RobotConfig, TwinPlan};
 use crate::{Error, cabinet, lab, light, panda, printed_target};
 use mujoco_rs::prelude::MjModel;
 use mujoco_rs::wrappers::mj_auxiliary::MjVfs;
@@ -37,8 +38,25 @@ fn brightness(scene: Scene) -> f64 {
     }
 }
 
-/// Builds the model for rendered images of up to `largest_px`.
+/// Builds the model with the scene's own robot, for rendered images of up to `largest_px`.
 pub(crate) fn build(config: &Config, largest_px: [u32; 2]) -> Result<MjModel, Error> {
+    build_with(config, None, largest_px)
+}
+
+/// Builds the model with the robot of a rig file, for rendered images of up to `largest_px`.
+pub(crate) fn build_twin(
+    config: &Config,
+    (robot, plan): (&RobotConfig, &TwinPlan),
+    largest_px: [u32; 2],
+) -> Result<MjModel, Error> {
+    build_with(config, Some((robot, plan)), largest_px)
+}
+
+fn build_with(
+    config: &Config,
+    twin: Option<(&RobotConfig, &TwinPlan)>,
+    largest_px: [u32; 2],
+) -> Result<MjModel, Error> {
     let mut files = MjVfs::new();
     let mut assets = format!("{MATERIALS}{}", extra_materials(config.scene));
     let mut bodies = String::new();
@@ -61,7 +79,13 @@ pub(crate) fn build(config: &Config, largest_px: [u32; 2]) -> Result<MjModel, Er
         world_from_mesh,
     } in &scene_assets.objects
     {
-        add_file(&mut files, &format!("{name}.msh"), &mesh.to_msh())?;
+        // The frame of the table includes the pedestal of the scene's own robot.
+        let msh = if twin.is_some() && config.scene == Scene::StaticArm && *name == "frame" {
+            objects::table_frame().to_msh()
+        } else {
+            mesh.to_msh()
+        };
+        add_file(&mut files, &format!("{name}.msh"), &msh)?;
         let _ = writeln!(
             assets,
             "<mesh name=\"{name}\" file=\"{name}.msh\" inertia=\"shell\"/>"
@@ -73,6 +97,15 @@ pub(crate) fn build(config: &Config, largest_px: [u32; 2]) -> Result<MjModel, Er
             "<geom type=\"mesh\" mesh=\"{name}\" material=\"{material}\" group=\"{group}\" {pose}/>"
         );
     }
+    let (lamps, ambient) = light::mjcf(brightness(config.scene));
+    // The robot of a rig file stays where it is, and the scene with its lamps is moved.
+    let mut bodies = match twin {
+        Some((_, plan)) => format!(
+            "<body name=\"scene\" {}>\n{lamps}{bodies}</body>\n",
+            panda::pose_attributes(&plan.world_from_scene)
+        ),
+        None => lamps + &bodies,
+    };
     // Then come the printed targets. Targets on the flange become part of the arm's last body.
     let mut on_flange = String::new();
     for (ix, target) in config.targets.iter().enumerate() {
@@ -104,11 +137,25 @@ pub(crate) fn build(config: &Config, largest_px: [u32; 2]) -> Result<MjModel, Er
     // baked into the textures.
     let [near, far] = near_far_m(config.scene);
     let [width, height] = largest_px;
-    let (lamps, ambient) = light::mjcf(brightness(config.scene));
-    let robot = robot(config, &on_flange);
+    let (compiler, robot) = match twin {
+        // Principal moments in a robot description may violate the triangle inequality slightly.
+        Some((robot, plan)) => (
+            "<compiler angle=\"radian\" autolimits=\"true\" balanceinertia=\"true\"/>",
+            add_twin(
+                &mut files,
+                &mut assets,
+                plan.body(robot, &(brackets(config) + &on_flange)),
+                plan.pedestal.as_ref(),
+            )?,
+        ),
+        None => (
+            "<compiler angle=\"radian\" autolimits=\"true\"/>",
+            robot(config, &on_flange),
+        ),
+    };
     let xml = format!(
         "<mujoco model=\"{}\">\n\
-         <compiler angle=\"radian\" autolimits=\"true\"/>\n\
+         {compiler}\n\
          <option timestep=\"0.001\" integrator=\"implicitfast\"><flag contact=\"disable\"/></option>\n\
          <statistic extent=\"1\" center=\"0.7 0 0.2\"/>\n\
          <visual>\n\
@@ -120,13 +167,37 @@ pub(crate) fn build(config: &Config, largest_px: [u32; 2]) -> Result<MjModel, Er
          <default><geom contype=\"0\" conaffinity=\"0\" group=\"0\"/>\n\
          <default class=\"arm\"><geom contype=\"0\" conaffinity=\"0\" group=\"{ARM_GROUP}\" mass=\"0\"/></default></default>\n\
          <asset>\n{assets}</asset>\n\
-         <worldbody>\n{lamps}{bodies}{robot}</worldbody>\n</mujoco>\n",
+         <worldbody>\n{bodies}{robot}</worldbody>\n</mujoco>\n",
         config.scene.name()
     );
     add_file(&mut files, "scene.xml", xml.as_bytes())?;
     MjModel::from_xml_vfs("scene.xml", &files).map_err(|error| Error::Scene {
         reason: error.to_string(),
     })
+}
+
+/// Adds the files and assets of a rig file's robot. Returns its elements.
+fn add_twin(
+    files: &mut MjVfs,
+    assets: &mut String,
+    body: RobotBody,
+    pedestal: Option<&Pedestal>,
+) -> Result<String, Error> {
+    for (name, bytes) in &body.files {
+        add_file(files, name, bytes)?;
+    }
+    assets.push_str(&body.assets);
+    let mut xml = body.body;
+    if let Some(Pedestal { center_m, half_m }) = pedestal {
+        let list = |numbers: &[f64; 3]| numbers.map(|number| format!("{number:e}")).join(" ");
+        let _ = writeln!(
+            xml,
+            "<geom type=\"box\" pos=\"{}\" size=\"{}\" material=\"frame\"/>",
+            list(center_m),
+            list(half_m)
+        );
+    }
+    Ok(xml)
 }
 
 /// MJCF body of the robot: an arm alone, or a base with or without an arm.

@@ -6,6 +6,7 @@ use super::key::{Keys, choices, entry, keys};
 use super::motion::ArmMotion;
 use super::section::Section;
 use super::servos::{self, ArmSerial, ArmServo};
+use super::urdf_folder::UrdfFolder;
 use crate::known_robots::{BUILTIN_PREFIX, KnownRobot};
 use drivers::can::{BusConfig, MotorConfig};
 use kinematics::Chain;
@@ -24,6 +25,8 @@ keys! {
         pub address: String = String::new();
         /// The URDF text.
         pub urdf_text: String => String::new();
+        /// Folder of the URDF.
+        pub urdf_folder: UrdfFolder => UrdfFolder::default();
         /// Moving joints in the order of the joint states.
         pub joints: Vec<String> = Vec::new();
         /// Offsets that are added to the joint positions, in the order of `joints`, rad or m. Each

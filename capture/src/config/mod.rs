@@ -27,6 +27,7 @@ mod sim;
 #[cfg(test)]
 mod tests;
 mod train;
+mod urdf_folder;
 
 pub use arm::{Arm, ArmDriver};
 pub use base::{Base, BaseDriver, BaseSim};
@@ -40,6 +41,7 @@ pub use scanner::{Scanner, ScannerDriver, ScannerSim};
 pub use servos::{ArmSerial, ArmServo};
 pub use sim::{Sim, SimTarget};
 pub use train::{DEFAULT_SEED, MAX_BYTES_RANGE, MAX_SPLATS_RANGE, Methods, SEED_RANGE, Train};
+pub use urdf_folder::UrdfFolder;
 
 use std::path::{Path, PathBuf};
 
@@ -104,13 +106,16 @@ impl Rig {
             |name| name.to_string_lossy().into_owned(),
         );
         let folder = path.parent().unwrap_or(Path::new("")).to_owned();
+        let mut urdf_folder = UrdfFolder::default();
         let read_urdf = |urdf: &str| {
             let path = folder.join(urdf);
+            urdf_folder = UrdfFolder::of(&path);
             // An absolute path shows the folder in the message if the file does not exist.
             let path = std::path::absolute(&path).unwrap_or(path);
             read_file("the robot description", &path)
         };
         let mut rig = rig_file::read(&file, &text, overrides, Some(&folder), read_urdf)?;
+        rig.arm.urdf_folder = urdf_folder;
         if let Some(motion) = rig
             .arm
             .motion

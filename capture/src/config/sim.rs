@@ -11,8 +11,9 @@ keys! {
     /// Settings of the simulator, which is used with `--sim` and by drivers named `sim`.
     #[derive(Clone, Debug, PartialEq)]
     pub struct Sim {
-        /// Name of the scene. The simulator checks it.
-        pub scene: String = "static-arm".to_owned();
+        /// Name of the scene. The simulator checks it. `None`: a scene for the robot and its
+        /// cameras.
+        pub scene: Option<String>;
         /// Random seed.
         pub seed: u64 = DEFAULT_SEED, in SEED_RANGE;
         /// Whether sensor imperfections and the drift of the base are off.

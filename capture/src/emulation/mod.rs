@@ -1,18 +1,22 @@
 //! Emulates the devices of a rig file on the wire, for the drivers of this or of other programs.
 
+#[cfg(feature = "realsense")]
 mod camera_files;
+#[cfg(not(feature = "realsense"))]
+mod without_realsense;
 
-use crate::config::{ArmDriver, BaseDriver, Rig, ScannerDriver};
+use crate::config::{ArmDriver, BaseDriver, Camera, CameraDriver, Rig, ScannerDriver};
 use crate::open::{self, Devices, FCI_PORT, Opened};
 use crate::stop::Stop;
-use anyhow::{Context, bail};
+use anyhow::{Context, anyhow, bail};
+#[cfg(feature = "realsense")]
 use camera_files::CameraFiles;
 use drivers::franka::FciVersion;
 use drivers::franka::emulated::{EmulatedRobot, Limits, RobotConfig};
 use drivers::servos::emulated::{EmulatedServoBus, ServoKind};
 use drivers::{Sample, Source, can, clock};
 use kinematics::{Stamp, Transform};
-use messages::BadInput;
+use messages::{BadInput, Setting};
 use sim::wire::{
     DatagramTargets, DeviceScript, EmulatedMotors, EmulatedSenders, JointTrack, PlaybackClock,
     emulate_fci, emulate_servos,
@@ -20,6 +24,8 @@ use sim::wire::{
 use std::net::{SocketAddr, TcpListener, ToSocketAddrs};
 use std::path::{Path, PathBuf};
 use std::time::Duration;
+#[cfg(not(feature = "realsense"))]
+use without_realsense::CameraFiles;
 
 /// Recording of the simulation, next to the rig file.
 const SIMULATION_FILE: &str = "script.mcap";
@@ -95,12 +101,10 @@ impl EmulationPlan {
     ) -> anyhow::Result<Option<Emulation>> {
         let (name, mut rig) = load(&self.rig_or_scene)?;
         check(&rig)?;
-        if rig.arm.driver == ArmDriver::Franka {
-            // The address is checked before the simulation, which takes a minute.
-            let address = fci_address(&rig.arm.address)?;
-            TcpListener::bind(address)
-                .with_context(|| format!("cannot emulate the controller at {address}"))?;
-        }
+        // Addresses and buses are checked before the simulation, which takes a minute.
+        check_arm_connection(&rig)?;
+        // The files of cameras and the simulation need the same lenses.
+        open::assume_lenses(&mut rig);
         let folder = self
             .out
             .clone()
@@ -126,6 +130,13 @@ impl EmulationPlan {
             return Ok(None);
         };
         let mut descriptions = camera_files.finish(&mut rig)?;
+        descriptions.extend(real_cameras(&rig).map(|camera| {
+            format!(
+                "camera {:?}: stays real, because cameras with this driver are not emulated; connect it, or remove it \
+                 from the rig file",
+                camera.name
+            )
+        }));
         let first = script.joints.first().map(|state| state.stamp);
         let first = first
             .or(script.poses.first().map(|pose| pose.stamp))
@@ -276,7 +287,61 @@ fn check(rig: &Rig) -> Result<(), BadInput> {
                 .to_owned(),
         ));
     }
+    #[cfg(not(feature = "realsense"))]
+    without_realsense::check(rig)?;
+    let is_any_emulated = rig.arm.driver != ArmDriver::None
+        || rig.base.driver == BaseDriver::Udp
+        || !rig.scanners.is_empty()
+        || rig
+            .cameras
+            .iter()
+            .any(|camera| camera.driver == CameraDriver::Realsense);
+    if !is_any_emulated {
+        return Err(BadInput(format!(
+            "no device of this rig can be emulated: its cameras would stay real; to simulate all devices, use \
+             `fieldrig run {}`",
+            Setting::Sim
+        )));
+    }
     Ok(())
+}
+
+/// Cameras whose driver accepts only a real device.
+fn real_cameras(rig: &Rig) -> impl Iterator<Item = &Camera> {
+    rig.cameras
+        .iter()
+        .filter(|camera| matches!(camera.driver, CameraDriver::V4l2 | CameraDriver::Nokhwa))
+}
+
+/// Checks that an emulated arm can be reached where the rig file says.
+fn check_arm_connection(rig: &Rig) -> anyhow::Result<()> {
+    match rig.arm.driver {
+        ArmDriver::Franka => {
+            let address = fci_address(&rig.arm.address)?;
+            TcpListener::bind(address).map(drop).map_err(|error| {
+                let hint = match error.kind() {
+                    std::io::ErrorKind::AddrNotAvailable => {
+                        "; it belongs to another computer: set arm.address = \"127.0.0.1\" in a copy of the rig file"
+                    }
+                    _ => "",
+                };
+                anyhow!("cannot emulate the controller at {address}: {error}{hint}")
+            })
+        }
+        ArmDriver::Can => {
+            for bus in &rig.arm.buses {
+                can::Bus::open(bus).with_context(|| {
+                    format!(
+                        "cannot emulate the motors on {:?}; a virtual bus is created with `sudo modprobe vcan && sudo ip \
+                         link add dev {} type vcan && sudo ip link set {} up`",
+                        bus.interface, bus.interface, bus.interface
+                    )
+                })?;
+            }
+            Ok(())
+        }
+        _ => Ok(()),
+    }
 }
 
 /// Writes the rig file to run against the emulated devices, and the robot description next to it.
@@ -465,5 +530,35 @@ mod tests {
         );
         assert_eq!(fci_address("127.0.0.1:5").expect("an address").port(), 5);
         assert!(fci_address("").is_err());
+    }
+
+    fn with_cameras(driver: &str, arm: &str) -> Rig {
+        let text = format!(
+            "[arm]\n{arm}\n[camera.front]\ndriver = \"{driver}\"\nsize_px = [640, 480]\nrate_hz = 15\n\
+             parent = \"base\"\nintrinsics = {{ focal_px = [600, 600], principal_px = [320, 240] }}\n"
+        );
+        let urdf = r#"<robot name="none"><link name="base"/></robot>"#;
+        Rig::parse("rig.toml", &text, urdf, &[]).expect("a rig")
+    }
+
+    #[test]
+    fn address_of_another_computer_has_a_hint() {
+        // This address is reserved for documentation (RFC 5737).
+        let mut rig = with_cameras("v4l2", "driver = \"none\"");
+        rig.arm.driver = ArmDriver::Franka;
+        rig.arm.address = "192.0.2.7".to_owned();
+        let message = format!("{:#}", check_arm_connection(&rig).expect_err("not ours"));
+        assert!(message.contains("127.0.0.1"), "{message}");
+    }
+
+    #[test]
+    fn cameras_that_stay_real_are_named() {
+        let rig = with_cameras("v4l2", "driver = \"none\"");
+        let names: Vec<_> = real_cameras(&rig).map(|camera| &*camera.name).collect();
+        assert_eq!(names, ["front"]);
+        let message = check(&rig).expect_err("nothing to emulate").to_string();
+        assert!(message.contains("no device of this rig"), "{message}");
+        let emulated = check(&with_cameras("realsense", "driver = \"none\""));
+        assert_eq!(emulated.is_ok(), cfg!(feature = "realsense"));
     }
 }

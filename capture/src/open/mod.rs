@@ -1,5 +1,6 @@
 //! Opens the devices of a rig file, or a recording, as one source of samples.
 
+mod assumed_lens;
 #[cfg(all(feature = "sim", target_os = "linux"))]
 mod emulated;
 mod movable;
@@ -12,6 +13,10 @@ mod simulated;
 mod simulated_tests;
 mod tag_check;
 mod tags;
+#[cfg(feature = "sim")]
+mod twin;
+#[cfg(all(test, feature = "sim"))]
+mod twin_tests;
 
 pub use movable::{Movable, movable};
 #[cfg(target_os = "linux")]
@@ -32,6 +37,8 @@ use messages::Setting;
 use std::path::Path;
 use std::sync::{Arc, OnceLock};
 use tags::TagBaseSource;
+
+pub(crate) use assumed_lens::assume_lenses;
 
 /// Hint in error messages about devices that cannot be opened.
 fn sim_hint() -> String {
@@ -145,9 +152,6 @@ pub(crate) fn rig_with_monitors(
         bail!("{device} cannot be opened by this version; {}", sim_hint());
     }
     check_arm(&rig)?;
-    if devices == Devices::Sim {
-        check_intrinsics(&rig)?;
-    }
     let opened = real::open(&mut rig).map_err(|error| anyhow!("{error:#}; {}", sim_hint()));
     let (real, monitors) = opened?;
     let (source, stamp_clock): (Box<dyn Source>, _) = if is_any_simulated(&rig) {
@@ -172,13 +176,18 @@ pub(crate) fn rig_with_monitors(
     ))
 }
 
-/// Replaces every device by its simulated twin.
+/// Replaces every device by its simulated twin. Calibration that only a real camera could report is
+/// assumed.
 fn use_simulated_devices(rig: &mut Rig) {
-    rig.arm.driver = ArmDriver::Sim;
+    assume_lenses(rig);
+    // A rig without an arm may describe one, which then stays at rest.
+    if rig.arm.driver != ArmDriver::None || rig.arm.joints.is_empty() {
+        rig.arm.driver = ArmDriver::Sim;
+    }
     rig.base.driver = match rig.base.driver {
         // The scene decides whether the base moves. Tags can locate a simulated base, too, because
         // the simulated cameras see the tags.
-        _ if base_moves(&rig.sim.scene) => BaseDriver::Sim,
+        _ if base_moves(rig) => BaseDriver::Sim,
         BaseDriver::Tags => BaseDriver::Tags,
         _ => BaseDriver::Fixed,
     };
@@ -379,12 +388,12 @@ fn simulate(rig: &Rig, real: drivers::Devices) -> anyhow::Result<(Box<dyn Source
 }
 
 #[cfg(feature = "sim")]
-fn base_moves(scene: &str) -> bool {
-    sim::Scene::from_name(scene).is_some_and(sim::Scene::has_moving_base)
+fn base_moves(rig: &Rig) -> bool {
+    twin::base_moves(rig)
 }
 
 #[cfg(not(feature = "sim"))]
-fn base_moves(_scene: &str) -> bool {
+fn base_moves(_rig: &Rig) -> bool {
     false
 }
 

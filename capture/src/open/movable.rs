@@ -1,9 +1,7 @@
 //! Opens a camera together with an arm that can be moved, real or simulated.
 
 use super::real;
-use super::{
-    Devices, check_arm, check_intrinsics, use_simulated_devices, without_readout_if_ideal,
-};
+use super::{Devices, check_arm, use_simulated_devices, without_readout_if_ideal};
 use crate::config::{ArmDriver, BaseDriver, Camera, CameraDriver, Rig};
 use anyhow::bail;
 use drivers::motion::MovableArm;
@@ -51,7 +49,6 @@ pub fn movable(rig: &Rig, devices: Devices, camera: &str) -> anyhow::Result<Mova
     without_readout_if_ideal(&mut rig);
     check_arm(&rig)?;
     if rig.arm.driver == ArmDriver::Sim {
-        check_intrinsics(&rig)?;
         if rig.sim.emulate_arm && arm_driver != ArmDriver::Sim {
             rig.arm.driver = arm_driver;
             return emulated(rig);

@@ -1,8 +1,9 @@
 //! Opens the simulated twin of a rig: the same cameras and joints in MuJoCo.
 
+use super::twin;
 use crate::StampClock;
 use crate::config::{
-    BaseDriver, Camera, CameraDriver, Depth, Parent, Rig, Scanner, ScannerDriver, SimTarget,
+    ArmDriver, Camera, CameraDriver, Depth, Parent, Rig, Scanner, ScannerDriver, SimTarget,
 };
 use anyhow::bail;
 use drivers::motion::MotionLimits;
@@ -50,7 +51,7 @@ pub(super) fn open(rig: &Rig, real: Devices) -> anyhow::Result<(Box<dyn Source>,
     let source = RealTime {
         live: LiveDevices::new(devices)?,
         truth,
-        first_camera: Arc::clone(&rig.cameras[0].name),
+        first_camera: rig.cameras.first().map(|camera| Arc::clone(&camera.name)),
         n_left: rig.sim.n_images,
         end: rig.sim.duration_secs.map(|secs| start.plus_secs(secs)),
     };
@@ -76,7 +77,8 @@ pub(super) fn unlimited(rig: &Rig) -> anyhow::Result<sim::Config> {
 struct RealTime {
     live: LiveDevices,
     truth: sim::LiveTruth,
-    first_camera: Arc<str>,
+    /// `None` without cameras.
+    first_camera: Option<Arc<str>>,
     n_left: Option<u64>,
     end: Option<Stamp>,
 }
@@ -95,7 +97,7 @@ impl Source for RealTime {
         // `sim.n_images` counts images of the first camera, as in lockstep.
         if let Some(Sample::Image(image)) = &sample
             && !image.is_depth()
-            && image.camera == self.first_camera
+            && Some(&image.camera) == self.first_camera.as_ref()
             && let Some(n_left) = &mut self.n_left
         {
             *n_left -= 1;
@@ -111,32 +113,7 @@ impl Source for RealTime {
 
 /// The simulator configuration of a rig.
 fn config_of(rig: &Rig) -> anyhow::Result<sim::Config> {
-    let Some(scene) = sim::Scene::from_name(&rig.sim.scene) else {
-        let known: Vec<_> = sim::Scene::ALL.iter().map(|scene| scene.name()).collect();
-        bail!(
-            "sim.scene is {:?}; known scenes: {}",
-            rig.sim.scene,
-            known.join(", ")
-        );
-    };
-    // Ground truth is in the coordinates of the scene. Another origin would make every comparison
-    // with it wrong.
-    if rig.base.world_from_base != Transform::identity() {
-        bail!("a simulated base is at the world origin: base.world_from_base must be the identity");
-    }
-    if scene.has_moving_base() != (rig.base.driver == BaseDriver::Sim) {
-        let driver = if scene.has_moving_base() {
-            "sim"
-        } else {
-            "fixed"
-        };
-        bail!(
-            "the scene {:?} needs base.driver = {driver:?}",
-            scene.name()
-        );
-    }
-    Ok(sim::Config {
-        scene,
+    let config = sim::Config {
         seed: rig.sim.seed,
         ideal: rig.sim.ideal,
         truth: rig.sim.truth,
@@ -145,8 +122,12 @@ fn config_of(rig: &Rig) -> anyhow::Result<sim::Config> {
         azimuth_only: rig.sim.azimuth_only,
         duration_secs: rig.sim.duration_secs,
         n_images: rig.sim.n_images,
-        joint_names: super::chain_of(rig)?.joint_names().to_vec(),
-        reading_order: rig.arm.joints.clone(),
+        joint_names: twin::simulated_chain(rig)?.joint_names().to_vec(),
+        reading_order: if rig.arm.driver == ArmDriver::None {
+            Vec::new()
+        } else {
+            rig.arm.joints.clone()
+        },
         joint_offsets: rig.arm.sim.true_joint_offsets.clone(),
         scanners: rig
             .scanners
@@ -172,7 +153,9 @@ fn config_of(rig: &Rig) -> anyhow::Result<sim::Config> {
             .filter(|camera| camera.driver == CameraDriver::Sim)
             .map(camera_of)
             .collect(),
-    })
+        ..sim::Config::default()
+    };
+    twin::choose(rig, config)
 }
 
 fn target_of((name, target): (&String, &SimTarget)) -> anyhow::Result<sim::TargetConfig> {

@@ -251,6 +251,12 @@ impl<'a> Element<'a> {
         }
     }
 
+    /// The only child with this tag, which must exist.
+    pub(crate) fn required_child(self, tag: &'static str) -> Result<Self, Problem> {
+        self.only(tag)?
+            .ok_or_else(|| self.problem(format!("it has no <{tag}>")))
+    }
+
     pub(crate) fn attribute(self, name: &str) -> Option<&'a str> {
         self.0.attribute(name)
     }

@@ -8,6 +8,7 @@ pub(crate) mod joint;
 mod model;
 
 use crate::Error;
+use crate::inertial::Inertial;
 use crate::shape::{self, Shape};
 use element::{Element, Notes};
 use std::collections::{HashMap, HashSet};
@@ -109,6 +110,11 @@ impl Robot {
         self.shapes
             .get(link)
             .map_or(&[], |shapes| &shapes.collisions)
+    }
+
+    /// Mass and inertia of a link; `None` if the URDF states none, or invalid ones.
+    pub fn inertial(&self, link: &str) -> Option<&Inertial> {
+        self.shapes.get(link)?.inertial.as_ref()
     }
 
     /// One sentence, with the line, for each element that was left out or is not used.

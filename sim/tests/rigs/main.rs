@@ -4,3 +4,4 @@ mod common;
 mod live_rig;
 mod mobile;
 mod rig;
+mod twin;

@@ -36,7 +36,7 @@ fn ideal(n_images: u64) -> Config {
 }
 
 fn chain(info: &RigInfo) -> Chain {
-    Chain::from_urdf(info.urdf, "panda_link0", "panda_link8").expect("the URDF is valid")
+    Chain::from_urdf(&info.urdf, "panda_link0", "panda_link8").expect("the URDF is valid")
 }
 
 /// Joint positions at a stamp, interpolated linearly between neighboring readings.

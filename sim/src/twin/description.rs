@@ -1,0 +1,28 @@
+//! The robot of a rig file, as its caller describes it.
+
+use kinematics::Transform;
+use std::collections::BTreeMap;
+use std::sync::Arc;
+
+/// The robot of a rig file, which replaces the robot of a scene. The scene is placed where the
+/// cameras of this robot see it.
+#[derive(Clone, Debug, PartialEq)]
+pub struct RobotConfig {
+    /// Text of the URDF.
+    pub urdf: String,
+    /// Link that is the base of the robot.
+    pub base_link: String,
+    /// Link to which cameras with the parent [`Parent::Flange`](crate::Parent::Flange) are attached.
+    pub flange_link: String,
+    /// Contents of mesh files, by their names in the URDF. A link without its meshes is drawn with
+    /// its collision shapes, or with bars between its joints.
+    pub meshes: BTreeMap<String, Arc<[u8]>>,
+    /// Pose of a fixed base. A moving base starts where the scene says.
+    pub world_from_base: Transform,
+    /// Whether the base moves and reports its pose.
+    pub has_moving_base: bool,
+    /// Maximum motion blur of an image that is used, pixels. The scan is slow enough for it.
+    pub max_blur_px: f64,
+    /// Maximum rolling-shutter shear of an image that is used, pixels.
+    pub max_shear_px: f64,
+}
