@@ -7,11 +7,12 @@
 //! else runs in the kernel's driver for real chips and the layers above it.
 
 use super::{run, write_script};
+use rustix::process::{Pid, Signal, WaitOptions, kill_process, waitpid};
 use std::fs;
 use std::io::Write;
 use std::os::unix::fs::FileExt;
 use std::path::{Path, PathBuf};
-use std::process::{Command, Stdio};
+use std::process::{Child, Command, Stdio};
 
 /// Paths of QEMU: the path of its installed package, and the path to which `scripts/fetch-qemu.sh`
 /// unpacks QEMU otherwise.
@@ -107,7 +108,7 @@ pub(crate) fn boot(kernel: &Path, root: &Path) -> String {
         .stdin(Stdio::piped());
     run(&mut command, |machine, line| {
         if let Some((_, request)) = line.split_once(INJECT) {
-            let answer = match inject_fault(machine.id(), request.trim()) {
+            let answer = match inject_fault(machine, request.trim()) {
                 Ok(()) => INJECTED.to_owned(),
                 Err(error) => format!("not injected: {error}"),
             };
@@ -117,19 +118,48 @@ pub(crate) fn boot(kernel: &Path, root: &Path) -> String {
     })
 }
 
+/// A machine that does not run while this value exists.
+///
+/// A running chip could change its registers between the reads and the writes of [`inject_fault`],
+/// above all on a busy host. An interrupt that the driver has just handled would then be pending
+/// again, without a cause that the driver could remove, and the machine would hang.
+struct Suspended(Pid);
+
+impl Suspended {
+    fn new(machine: &Child) -> std::io::Result<Self> {
+        let pid = Pid::from_child(machine);
+        kill_process(pid, Signal::STOP)?;
+        let suspended = Self(pid);
+        let stopped = waitpid(Some(pid), WaitOptions::UNTRACED)?;
+        match stopped {
+            Some((_, status)) if status.stopped() => Ok(suspended),
+            _ => Err(std::io::Error::other("the machine has ended")),
+        }
+    }
+}
+
+impl Drop for Suspended {
+    fn drop(&mut self) {
+        // If this fails, the machine has ended.
+        let _ = kill_process(self.0, Signal::CONT);
+    }
+}
+
 /// Sets the error bits in the status of a chip and adds pending interrupts.
 ///
 /// The chip is located by its acceptance registers, which contain the interface name. In QEMU's
 /// memory, the bytes before them are mode, status, interrupts, enabled interrupts, number of
 /// waiting messages, their position, and clock divider.
-fn inject_fault(machine: u32, request: &str) -> std::io::Result<()> {
+fn inject_fault(machine: &Child, request: &str) -> std::io::Result<()> {
     let words: Vec<&str> = request.split(' ').collect();
     let &[interface, status, interrupts] = words.as_slice() else {
         panic!("expected three words, got {request}")
     };
     let [status, interrupts] =
         [status, interrupts].map(|hex| u8::from_str_radix(hex, 16).expect("hexadecimal"));
-    let maps = fs::read_to_string(format!("/proc/{machine}/maps"))?;
+    let _suspended = Suspended::new(machine)?;
+    let id = machine.id();
+    let maps = fs::read_to_string(format!("/proc/{id}/maps"))?;
     let heap = maps
         .lines()
         .find(|line| line.ends_with("[heap]"))
@@ -142,7 +172,7 @@ fn inject_fault(machine: u32, request: &str) -> std::io::Result<()> {
     let memory = fs::OpenOptions::new()
         .read(true)
         .write(true)
-        .open(format!("/proc/{machine}/mem"))?;
+        .open(format!("/proc/{id}/mem"))?;
     let mut bytes = vec![0; usize::try_from(to - from).expect("64 bits")];
     memory.read_exact_at(&mut bytes, from)?;
     let acceptance = [interface.as_bytes(), &ACCEPT_ALL].concat();
