@@ -150,6 +150,21 @@ pub enum Error {
         /// Description of the problem and how to fix it.
         reason: String,
     },
+    /// An arm of Universal Robots refused the connection, does not match the rig file, or was
+    /// disconnected.
+    #[error("arm at {address}: {reason}")]
+    Rtde {
+        /// Address of the robot controller.
+        address: String,
+        /// Description of the problem and how to fix it.
+        reason: String,
+    },
+    /// An arm was disconnected and the driver is trying to reconnect. A later call may succeed.
+    #[error("arm: disconnected for {waited:?}, trying to reconnect")]
+    ArmReconnecting {
+        /// Time since the arm was disconnected.
+        waited: Duration,
+    },
     /// A simulated device failed.
     #[error("simulated rig: {reason}")]
     Simulation {

@@ -44,6 +44,8 @@ mod sample;
 mod scripted;
 pub mod tags;
 pub mod udp;
+#[cfg(target_os = "linux")]
+pub mod ur;
 pub mod v4l2;
 pub mod wire;
 mod yuv;

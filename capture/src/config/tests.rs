@@ -133,6 +133,7 @@ const KEYS: &[(&str, &str, &str)] = &[
     ("arm.motion.odrive_endpoints", "'flat_endpoints.json'", "7"),
     ("arm.driver", "'franka'", "'frankka'"),
     ("arm.driver", "'none'", "'nothing'"),
+    ("arm.driver", "'ur'", "'ur5e'"),
     ("arm.address", "'172.16.0.2'", "7"),
     ("arm.urdf", "'other.urdf'", "7"),
     ("arm.joints", "['j2', 'j1']", "['j1', 'j9']"),
@@ -684,7 +685,7 @@ fn unknown_arm_driver_error_names_the_driver_for_other_arms() {
     .to_string();
     assert!(
         message.contains(
-            "arm.driver is \"feetech\", allowed: \"none\", \"franka\", \"can\", \"udp\", \"sim\"; for another arm, use \"udp\""
+            "arm.driver is \"feetech\", allowed: \"none\", \"franka\", \"ur\", \"can\", \"udp\", \"sim\"; for another arm, use \"udp\""
         ) && message.contains("docs/guide/arms.md"),
         "{message}"
     );

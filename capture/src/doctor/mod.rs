@@ -14,6 +14,8 @@ mod motion;
 mod realsense;
 mod realtime;
 #[cfg(target_os = "linux")]
+mod ur;
+#[cfg(target_os = "linux")]
 mod usb;
 mod video_devices;
 
@@ -126,6 +128,8 @@ pub fn check(rig: Option<&Rig>) -> Vec<Finding> {
     #[cfg(target_os = "linux")]
     findings.extend(can::can(rig));
     findings.extend(franka::franka(rig));
+    #[cfg(target_os = "linux")]
+    findings.extend(rig.into_iter().flat_map(ur::ur));
     findings.extend(rig.and_then(motion::motion));
     findings.extend(rig.into_iter().flat_map(calibration::calibration));
     findings.extend(rig.into_iter().flat_map(|rig| {

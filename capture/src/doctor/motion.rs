@@ -10,7 +10,7 @@ pub(super) fn motion(rig: &Rig) -> Option<Finding> {
     rig.arm.motion.as_ref()?;
     let verdict = match rig.arm.driver {
         ArmDriver::Can | ArmDriver::Franka => Verdict::Fail,
-        ArmDriver::Udp => Verdict::Warn, // It can still be read.
+        ArmDriver::Udp | ArmDriver::Ur => Verdict::Warn, // It can still be read.
         ArmDriver::None | ArmDriver::Sim => return None,
     };
     Some(match open::check_motion(rig) {

@@ -336,6 +336,7 @@ impl EmulatedDevices {
                 descriptions.push(format!("arm: datagrams to {address}"));
                 datagram_targets.joints = Some((address, rig.arm.joints.clone()));
             }
+            ArmDriver::Ur => bail!("an arm with the driver ur cannot be emulated yet"),
             ArmDriver::None | ArmDriver::Sim => {}
         }
         if rig.base.driver == BaseDriver::Udp {

@@ -11,11 +11,14 @@ mod simulated;
 mod simulated_tests;
 mod tag_check;
 mod tags;
+mod ur;
 
 pub use movable::{Movable, movable};
 #[cfg(target_os = "linux")]
 pub use real::franka_chain;
 pub use real::{check_motion, motion_of, movable_arm, udp_arm_address};
+#[cfg(target_os = "linux")]
+pub use ur::arm_config as ur_config;
 
 use crate::config::{ArmDriver, BaseDriver, CameraDriver, Override, Parent, Rig, ScannerDriver};
 use crate::notes::Notes;
@@ -529,6 +532,8 @@ mod tests {
         for (driver, address, expected) in [
             ("franka", "", "arm.address"),
             ("franka", "127.0.0.1:1", "FCI"),
+            ("ur", "", "arm.address"),
+            ("ur", "127.0.0.1:1", "the arm has 6"),
             ("udp", "172.16.0.2", "arm.address"),
         ] {
             let message = error_of(driver, address);

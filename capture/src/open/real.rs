@@ -46,6 +46,7 @@ pub(super) fn open(rig: &mut Rig) -> anyhow::Result<(Devices, Vec<DatagramMonito
         ArmDriver::None | ArmDriver::Sim => None,
         ArmDriver::Can => Some(can_arm(rig)?),
         ArmDriver::Franka => Some(franka_arm(rig)?),
+        ArmDriver::Ur => Some(super::ur::arm(rig)?),
         ArmDriver::Udp => {
             let arm = udp_arm(rig)?;
             monitors.push(arm.monitor());
