@@ -43,7 +43,7 @@ fn ur_rtde_reads_the_emulated_controller() {
         velocity_rad_s: [0.1, 0.2, 0.3, 0.4, 0.5, 0.6],
         torque_nm: [0.0; 6],
     };
-    let _emulated = EmulatedController::start(config, Box::new(move |_| rest)).unwrap();
+    let _emulated = EmulatedController::start(config, Box::new(move |_, _| rest)).unwrap();
     let script = Path::new(env!("CARGO_MANIFEST_DIR")).join("../tests/hil/ur_rtde_client.py");
     let output = Command::new(python)
         .arg(script)

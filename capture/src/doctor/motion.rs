@@ -9,8 +9,8 @@ use crate::open;
 pub(super) fn motion(rig: &Rig) -> Option<Finding> {
     rig.arm.motion.as_ref()?;
     let verdict = match rig.arm.driver {
-        ArmDriver::Can | ArmDriver::Franka => Verdict::Fail,
-        ArmDriver::Udp | ArmDriver::Ur => Verdict::Warn, // It can still be read.
+        ArmDriver::Can | ArmDriver::Franka | ArmDriver::Ur => Verdict::Fail,
+        ArmDriver::Udp => Verdict::Warn, // It can still be read.
         ArmDriver::None | ArmDriver::Sim => return None,
     };
     Some(match open::check_motion(rig) {
@@ -54,7 +54,7 @@ mod tests {
         assert!(
             finding
                 .message
-                .contains("arm.driver = \"can\" or \"franka\""),
+                .contains("arm.driver = \"can\", \"franka\" or \"ur\""),
             "{finding:?}"
         );
     }

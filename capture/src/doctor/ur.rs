@@ -27,6 +27,7 @@ fn findings(address: &str, inspection: &Inspection, is_moved: bool) -> Vec<Findi
         version,
         mode,
         blocking_reason,
+        is_in_remote_control,
         flange,
     } = inspection;
     let rate_hz = version.rate_hz();
@@ -43,6 +44,13 @@ fn findings(address: &str, inspection: &Inspection, is_moved: bool) -> Vec<Findi
         ),
         _ => Finding::ok("robot", mode),
     });
+    if is_moved && *is_in_remote_control == Some(false) {
+        findings.push(Finding::warn(
+            "remote control",
+            "the controller is in local control, and ignores programs from the network",
+            "select Remote Control in the upper right corner of the pendant before you move the arm",
+        ));
+    }
     let remedy = "docs/guide/arms.md#universal-robots describes which URDF and which link to use";
     findings.push(match flange {
         FlangePose::Same => Finding::ok(
@@ -71,6 +79,7 @@ mod tests {
             },
             mode: "it is running; it is in a protective stop".to_owned(),
             blocking_reason: Some("it is in a protective stop".to_owned()),
+            is_in_remote_control: Some(false),
             flange: FlangePose::Doubtful("8 mm".to_owned()),
         };
         let verdicts = |is_moved| -> Vec<Verdict> {
@@ -78,7 +87,10 @@ mod tests {
             findings.iter().map(|finding| finding.verdict).collect()
         };
         assert_eq!(verdicts(false), [Verdict::Ok, Verdict::Ok, Verdict::Warn]);
-        assert_eq!(verdicts(true), [Verdict::Ok, Verdict::Warn, Verdict::Warn]);
+        assert_eq!(
+            verdicts(true),
+            [Verdict::Ok, Verdict::Warn, Verdict::Warn, Verdict::Warn]
+        );
         let different = Inspection {
             flange: FlangePose::Different("90 mm".to_owned()),
             ..inspection

@@ -9,12 +9,14 @@ use anyhow::{Context, bail};
 use camera_files::CameraFiles;
 use drivers::franka::FciVersion;
 use drivers::franka::emulated::{EmulatedRobot, Limits, RobotConfig};
+use drivers::ur::RTDE_PORT;
+use drivers::ur::emulated::{ControllerConfig, EmulatedController};
 use drivers::{Sample, Source, can, clock};
 use kinematics::{Stamp, Transform};
 use messages::BadInput;
 use sim::wire::{
     DatagramTargets, DeviceScript, EmulatedMotors, EmulatedSenders, JointTrack, PlaybackClock,
-    emulate_fci,
+    emulate_fci, emulate_ur,
 };
 use std::net::{SocketAddr, TcpListener, ToSocketAddrs};
 use std::path::{Path, PathBuf};
@@ -92,9 +94,14 @@ impl EmulationPlan {
     ) -> anyhow::Result<Option<Emulation>> {
         let (name, mut rig) = load(&self.rig_or_scene)?;
         check(&rig)?;
-        if rig.arm.driver == ArmDriver::Franka {
+        let controller_port = match rig.arm.driver {
+            ArmDriver::Franka => Some(FCI_PORT),
+            ArmDriver::Ur => Some(RTDE_PORT),
+            _ => None,
+        };
+        if let Some(port) = controller_port {
             // The address is checked before the simulation, which takes a minute.
-            let address = fci_address(&rig.arm.address)?;
+            let address = controller_address(&rig.arm.address, port)?;
             TcpListener::bind(address)
                 .with_context(|| format!("cannot emulate the controller at {address}"))?;
         }
@@ -264,7 +271,7 @@ fn load(rig_or_scene: &str) -> anyhow::Result<(String, Rig)> {
 fn check(rig: &Rig) -> Result<(), BadInput> {
     if rig.arm.driver == ArmDriver::Sim {
         return Err(BadInput(
-            "arm.driver is sim, which `fieldrig run` simulates itself; drivers that can be emulated: franka, can, udp"
+            "arm.driver is sim, which `fieldrig run` simulates itself; drivers that can be emulated: franka, ur, can, udp"
                 .to_owned(),
         ));
     }
@@ -285,6 +292,7 @@ fn write_rig(folder: &Path, rig: &Rig) -> anyhow::Result<PathBuf> {
 /// Devices that reply until they are dropped.
 struct EmulatedDevices {
     _robot: Option<EmulatedRobot>,
+    _controller: Option<EmulatedController>,
     _motors: Option<EmulatedMotors>,
     _senders: EmulatedSenders,
     /// One description per device.
@@ -303,6 +311,7 @@ impl EmulatedDevices {
                 .context("cannot play back the joint states")
         };
         let mut robot = None;
+        let mut controller = None;
         let mut motors = None;
         let mut datagram_targets = DatagramTargets::default();
         let mut descriptions = Vec::new();
@@ -336,7 +345,15 @@ impl EmulatedDevices {
                 descriptions.push(format!("arm: datagrams to {address}"));
                 datagram_targets.joints = Some((address, rig.arm.joints.clone()));
             }
-            ArmDriver::Ur => bail!("an arm with the driver ur cannot be emulated yet"),
+            ArmDriver::Ur => {
+                let address = controller_address(&rig.arm.address, RTDE_PORT)?;
+                let chain = open::franka_chain(rig)?;
+                let config = ControllerConfig::e_series(address, chain);
+                controller = Some(emulate_ur(track()?, config)?);
+                descriptions.push(format!(
+                    "arm: a controller of Universal Robots at {address}"
+                ));
+            }
             ArmDriver::None | ArmDriver::Sim => {}
         }
         if rig.base.driver == BaseDriver::Udp {
@@ -359,6 +376,7 @@ impl EmulatedDevices {
         let senders = EmulatedSenders::start(script, playback_clock, datagram_targets)?;
         Ok(Self {
             _robot: robot,
+            _controller: controller,
             _motors: motors,
             _senders: senders,
             descriptions,
@@ -372,7 +390,7 @@ fn robot_config(rig: &Rig, fci: &str) -> anyhow::Result<RobotConfig> {
         "5" => (FciVersion::V5, Limits::panda()),
         _ => (FciVersion::V10, Limits::fr3()),
     };
-    let address = fci_address(&rig.arm.address)?;
+    let address = controller_address(&rig.arm.address, FCI_PORT)?;
     let chain = open::franka_chain(rig)?;
     Ok(RobotConfig {
         address,
@@ -384,10 +402,10 @@ fn robot_config(rig: &Rig, fci: &str) -> anyhow::Result<RobotConfig> {
 }
 
 /// Address at which the emulated controller listens. It must belong to this computer.
-fn fci_address(text: &str) -> anyhow::Result<SocketAddr> {
+fn controller_address(text: &str, default_port: u16) -> anyhow::Result<SocketAddr> {
     let found = match text.parse() {
         Ok(address) => Some(address),
-        Err(_) => (text, FCI_PORT)
+        Err(_) => (text, default_port)
             .to_socket_addrs()
             .ok()
             .and_then(|mut all| all.next()),
@@ -437,10 +455,17 @@ mod tests {
                 .is_err_and(|error| error.to_string().contains("scenes: static-arm, mobile-arm"))
         );
         assert_eq!(
-            fci_address("127.0.0.1").expect("an address").port(),
+            controller_address("127.0.0.1", FCI_PORT)
+                .expect("an address")
+                .port(),
             FCI_PORT
         );
-        assert_eq!(fci_address("127.0.0.1:5").expect("an address").port(), 5);
-        assert!(fci_address("").is_err());
+        assert_eq!(
+            controller_address("127.0.0.1:5", FCI_PORT)
+                .expect("an address")
+                .port(),
+            5
+        );
+        assert!(controller_address("", FCI_PORT).is_err());
     }
 }

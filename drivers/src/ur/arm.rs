@@ -3,8 +3,9 @@
 use super::config::ArmConfig;
 use super::connection::{Connection, ControllerVersion, POLL, Reading};
 use super::flange_check::{FlangeCheck, check_flange};
+use super::motion_loop::{Cycle, MotionLoop};
 use super::state::RobotState;
-use super::timing::StateTiming;
+use super::timing::{StateTiming, Timed};
 use super::{N_JOINTS, StateStatistics, words};
 use crate::{Arm, Error, clock};
 use kinematics::{JointState, Stamp};
@@ -61,6 +62,24 @@ impl UrArm {
 
     /// Like [`UrArm::open`], with another time limit for reconnecting.
     pub(super) fn open_with(config: &ArmConfig, max_outage: Duration) -> Result<Self, Error> {
+        Self::open_arm(config, max_outage, None)
+    }
+
+    /// Like [`UrArm::open`], with a motion loop that is created for the rate of the controller and
+    /// then moves the arm. A lost connection is not opened again, because a person must look at an
+    /// arm that was moving.
+    pub(super) fn open_to_move(
+        config: &ArmConfig,
+        motion_loop: impl FnOnce(f64) -> MotionLoop,
+    ) -> Result<Self, Error> {
+        Self::open_arm(config, Duration::ZERO, Some(Box::new(motion_loop)))
+    }
+
+    fn open_arm(
+        config: &ArmConfig,
+        max_outage: Duration,
+        motion_loop: Option<Box<dyn FnOnce(f64) -> MotionLoop + '_>>,
+    ) -> Result<Self, Error> {
         let address = &config.address;
         let n = config.joint_names.len();
         if n != N_JOINTS || config.chain.n_joints() != N_JOINTS {
@@ -69,7 +88,7 @@ impl UrArm {
                 format!("the rig file names {n} joints, but the arm has {N_JOINTS}"),
             ));
         }
-        let opened = Connection::open(address).and_then(|mut connection| {
+        let opened = Connection::open(address, motion_loop.is_some()).and_then(|mut connection| {
             let first = first_state(&mut connection)?;
             Ok((connection, first))
         });
@@ -92,8 +111,13 @@ impl UrArm {
             timing: StateTiming::new(version.rate_hz()),
             mode: String::new(),
             max_outage,
+            motion_loop: motion_loop.map(|create| create(version.rate_hz())),
         };
         reader.log_mode(&first);
+        // A robot that is stopped already is reported at once, and not at the first target.
+        if let Some(motion_loop) = &mut reader.motion_loop {
+            motion_loop.take_mode(&first);
+        }
         let reading = Arc::clone(&shared);
         let thread = std::thread::Builder::new()
             .name("ur".to_owned())
@@ -198,6 +222,7 @@ struct StateReader {
     mode: String,
     /// Maximum time for reconnecting.
     max_outage: Duration,
+    motion_loop: Option<MotionLoop>,
 }
 
 impl StateReader {
@@ -206,7 +231,16 @@ impl StateReader {
             let Err(reason) = self.read(&mut connection, shared) else {
                 return;
             };
-            connection = match self.reconnect(connection, shared, &reason) {
+            // A caller that moves the arm must learn that the connection has ended, even if nobody
+            // reads joint states.
+            let reconnected = match &mut self.motion_loop {
+                Some(motion_loop) => {
+                    motion_loop.handle_disconnect(&reason);
+                    Err(reason)
+                }
+                None => self.reconnect(connection, shared, &reason),
+            };
+            connection = match reconnected {
                 Ok(Some(connection)) => connection,
                 Ok(None) => return,
                 Err(reason) => {
@@ -221,18 +255,38 @@ impl StateReader {
     /// Receives states until asked to stop. Returns the reason if no more states can be received.
     fn read(&mut self, connection: &mut Connection, shared: &Shared) -> Result<(), String> {
         let mut last_received = clock::now();
+        let mut last_cycle = last_received;
         loop {
             let mut reading = connection.next(POLL)?;
+            let mut n_cycles = 0;
             let mut is_newer = false;
-            // All waiting states are read, so that each gets a stamp.
+            let mut newest = None;
+            // All waiting states are read, so that each gets a stamp. Only the newest one is
+            // answered with a setpoint.
             while let Some(received) = reading {
-                is_newer |= self.take(shared, received, clock::now());
+                if let Some((state, taken)) = self.take(shared, received, clock::now()) {
+                    is_newer |= taken.is_some();
+                    n_cycles += taken.map_or(1, |timed| timed.n_skipped + 1);
+                    newest = Some(state);
+                }
                 reading = connection.next_received()?;
             }
             let now = clock::now();
             if is_newer {
                 last_received = now;
                 shared.arrived.notify_all();
+            }
+            if let (Some(motion_loop), Some(state)) = (&mut self.motion_loop, newest) {
+                let pause = now.duration_since(last_cycle);
+                last_cycle = now;
+                motion_loop.cycle(
+                    &Cycle {
+                        state: &state,
+                        n_cycles,
+                        pause,
+                    },
+                    connection,
+                )?;
             }
             if shared.state.lock().stop {
                 return Ok(());
@@ -247,13 +301,19 @@ impl StateReader {
         }
     }
 
-    /// Queues a state. Returns whether it is valid and later than all earlier ones.
-    fn take(&mut self, shared: &Shared, reading: Reading, at: Stamp) -> bool {
+    /// Queues a state if its angles are measured and it is later than all earlier ones. Returns the
+    /// state, and its time if it was queued. `None` if the package was no state.
+    fn take(
+        &mut self,
+        shared: &Shared,
+        reading: Reading,
+        at: Stamp,
+    ) -> Option<(Box<RobotState>, Option<Timed>)> {
         let state = match reading {
             Reading::State(state) => state,
             Reading::Rejected => {
                 shared.state.lock().statistics.n_rejected += 1;
-                return false;
+                return None;
             }
         };
         self.log_mode(&state);
@@ -261,11 +321,11 @@ impl StateReader {
         let statistics = &mut state_queue.statistics;
         if !words::has_joint_power(&state) {
             statistics.n_unpowered += 1;
-            return false;
+            return Some((state, None));
         }
         let Some(timed) = self.timing.time(&state, at) else {
             statistics.n_rejected += 1;
-            return false;
+            return Some((state, None));
         };
         statistics.n_lost += timed.n_skipped;
         statistics.n_restarts = self.timing.n_restarts();
@@ -284,7 +344,7 @@ impl StateReader {
                 .torque_nm
                 .map_or_else(Vec::new, |torque| torque.to_vec()),
         });
-        true
+        Some((state, Some(timed)))
     }
 
     /// Connects again after a loss. Returns `None` if asked to stop.
@@ -304,7 +364,7 @@ impl StateReader {
         let since = clock::now();
         shared.state.lock().lost_since = Some(since);
         loop {
-            let opened = Connection::open(address).and_then(|mut connection| {
+            let opened = Connection::open(address, false).and_then(|mut connection| {
                 first_state(&mut connection)?;
                 Ok(connection)
             });

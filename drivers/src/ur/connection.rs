@@ -1,5 +1,6 @@
 //! The connection to a controller: handshake, and receiving states.
 
+use super::N_JOINTS;
 use super::address::{ControllerAddress, Interface};
 use super::message::{self, PROTOCOL_VERSION, Package, PackageSplitter, PackageType, decode_text};
 use super::recipe::{Outputs, OutputsResponse};
@@ -17,6 +18,11 @@ pub(super) const POLL: Duration = Duration::from_millis(100);
 const RECEIVE_BYTES: usize = 32 * 1024;
 /// Major version of PolyScope on CB3 controllers. Those of e-Series and later are higher.
 const CB3_MAJOR: u32 = 3;
+
+/// First of the RTDE registers that the driver uses. The registers 24 to 47 belong to external
+/// clients. In our program, the input registers of numbers hold the setpoint, and those of integers
+/// its number and its session.
+pub(super) const FIRST_REGISTER: usize = 24;
 
 /// Version of the software of a controller.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -53,6 +59,18 @@ pub(super) struct Connection {
     pub(super) version: ControllerVersion,
     outputs: Outputs,
     output_id: u8,
+    /// ID of the setpoints, if the arm may be moved.
+    setpoint_id: Option<u8>,
+}
+
+/// A setpoint for the program that moves the arm.
+#[derive(Clone, Debug, PartialEq)]
+pub(super) struct Setpoint {
+    pub(super) position_rad: [f64; N_JOINTS],
+    /// Differs from that of the previous setpoint.
+    pub(super) number: i32,
+    /// The motion to which the setpoint belongs.
+    pub(super) session: i32,
 }
 
 /// A received data package.
@@ -65,23 +83,49 @@ pub(super) enum Reading {
 
 impl Connection {
     /// Connects, agrees on the protocol, requests the variables, and starts the states.
-    pub(super) fn open(address: &str) -> Result<Self, String> {
+    ///
+    /// * `is_moved`: whether setpoints will be sent
+    pub(super) fn open(address: &str, is_moved: bool) -> Result<Self, String> {
         let address = ControllerAddress::parse(address)?;
         let stream = address.connect(Interface::Rtde)?;
+        // A controller that does not read must not stop the thread that reads the states.
+        stream
+            .set_write_timeout(Some(POLL))
+            .map_err(|error| format!("cannot limit the time for sending: {error}"))?;
         let mut packages = PackageStream {
             stream,
             splitter: PackageSplitter::default(),
         };
         packages.agree_on_protocol()?;
         let version = packages.controller_version()?;
-        let (outputs, output_id) = packages.request_outputs(Outputs::all(false), version)?;
+        let (outputs, output_id) = packages.request_outputs(Outputs::all(is_moved), version)?;
+        let setpoint_id = if is_moved {
+            Some(packages.request_setpoint()?)
+        } else {
+            None
+        };
         packages.start()?;
         Ok(Self {
             packages,
             version,
             outputs,
             output_id,
+            setpoint_id,
         })
+    }
+
+    /// Sends a setpoint. Does nothing if the connection was opened only for reading.
+    pub(super) fn send_setpoint(&mut self, setpoint: &Setpoint) -> Result<(), String> {
+        let Some(id) = self.setpoint_id else {
+            return Ok(());
+        };
+        let mut payload = vec![id];
+        for position_rad in setpoint.position_rad {
+            payload.extend(position_rad.to_be_bytes());
+        }
+        payload.extend(setpoint.number.to_be_bytes());
+        payload.extend(setpoint.session.to_be_bytes());
+        self.packages.send(PackageType::Data, &payload)
     }
 
     /// Waits for the next data package; `None` if none arrives in time.
@@ -190,6 +234,30 @@ impl PackageStream {
             }
         }
         Err("it reports variables as unknown that it knew before".to_owned())
+    }
+
+    /// Requests the registers of setpoints. Returns the ID of their packages.
+    fn request_setpoint(&mut self) -> Result<u8, String> {
+        let numbers =
+            (0..N_JOINTS).map(|ix| format!("input_double_register_{}", FIRST_REGISTER + ix));
+        let integers = (0..2).map(|ix| format!("input_int_register_{}", FIRST_REGISTER + ix));
+        let names: Vec<String> = numbers.chain(integers).collect();
+        let answer = self.ask(PackageType::SetupInputs, names.join(",").as_bytes())?;
+        let Some((id, types)) = answer.split_first() else {
+            return Err("its answer to the list of registers is empty".to_owned());
+        };
+        let types = String::from_utf8_lossy(types);
+        let problem = std::iter::zip(&names, types.split(','))
+            .find(|(_, type_name)| matches!(*type_name, "IN_USE" | "NOT_FOUND"));
+        match problem {
+            None => Ok(*id),
+            Some((name, "IN_USE")) => Err(format!(
+                "another program writes its register {name}: stop that program, for example another RTDE client or a fieldbus"
+            )),
+            Some((name, _)) => Err(format!(
+                "it does not know the register {name}: update PolyScope"
+            )),
+        }
     }
 
     fn start(&mut self) -> Result<(), String> {

@@ -7,6 +7,10 @@
 //! * `arm` reads on its own thread and commands nothing. It first compares the flange poses of the
 //!   rig file and of the controller (`flange_check`), and reconnects after a loss. `inspection`
 //!   makes the same checks without opening the arm.
+//! * `movable` is an arm that may be moved. It sends a `program` to the controller, which follows
+//!   setpoints in RTDE registers. Commands pass through `mailbox` to `motion_loop`, which runs on the
+//!   reading thread and sends the setpoints. `dashboard` asks for remote control and ends protective
+//!   stops.
 //! * `emulated` is an emulated controller for tests and simulators, behind the feature `emulation`.
 //!
 //! Sources of the protocol: "Real-Time Data Exchange (RTDE) Guide" at docs.universal-robots.com for
@@ -17,11 +21,18 @@ mod address;
 mod arm;
 mod config;
 mod connection;
+mod dashboard;
 #[cfg(feature = "emulation")]
 pub mod emulated;
 mod flange_check;
 mod inspection;
+mod mailbox;
 mod message;
+mod motion_loop;
+#[cfg(test)]
+mod motion_tests;
+mod movable;
+mod program;
 mod recipe;
 mod state;
 mod statistics;
@@ -35,7 +46,8 @@ pub use arm::UrArm;
 pub use config::ArmConfig;
 pub use connection::ControllerVersion;
 pub use inspection::{FlangePose, Inspection, inspect};
-pub use statistics::StateStatistics;
+pub use movable::MovableUrArm;
+pub use statistics::{MotionStatistics, StateStatistics};
 
 /// Number of joints of every arm of Universal Robots.
 pub const N_JOINTS: usize = 6;

@@ -1,4 +1,4 @@
-//! Statistics of the received states of an arm.
+//! Statistics of the received states of an arm, and of the setpoints of its motions.
 
 use std::time::Duration;
 
@@ -63,5 +63,26 @@ impl std::fmt::Display for StateStatistics {
             }
         }
         Ok(())
+    }
+}
+
+/// Statistics of all motions of one arm.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub struct MotionStatistics {
+    /// Motions whose program ran.
+    pub n_motions: u64,
+    /// Setpoints that were computed during motions.
+    pub n_setpoints: u64,
+    /// Setpoints that were late by so much that the arm had almost come to rest.
+    pub n_pauses: u64,
+}
+
+impl std::fmt::Display for MotionStatistics {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        write!(
+            f,
+            "{} motions, {} setpoints, {} pauses of more than 50 ms",
+            self.n_motions, self.n_setpoints, self.n_pauses
+        )
     }
 }

@@ -7,8 +7,9 @@ use super::state::RobotState;
 use super::{ArmConfig, N_JOINTS, RTDE_PORT, StateStatistics, UrArm};
 use crate::{Arm, Error};
 use kinematics::{Chain, JointState, Stamp, Transform};
+use numbers::random::Random;
 use std::io::{Read, Write};
-use std::net::{Ipv4Addr, SocketAddr, TcpListener};
+use std::net::{Ipv4Addr, SocketAddr, TcpListener, TcpStream};
 use std::sync::atomic::{AtomicU8, Ordering};
 use std::time::{Duration, Instant};
 
@@ -55,7 +56,7 @@ fn swinging_joints_at(stamp: Stamp) -> Joints {
 }
 
 fn start(config: ControllerConfig) -> EmulatedController {
-    EmulatedController::start(config, Box::new(swinging_joints_at)).unwrap()
+    EmulatedController::start(config, Box::new(|stamp, _| swinging_joints_at(stamp))).unwrap()
 }
 
 fn e_series() -> EmulatedController {
@@ -301,6 +302,47 @@ fn unsupported_controllers_are_reported_with_a_remedy() {
     let silent = UrArm::open(&config(address)).unwrap_err().to_string();
     assert!(silent.contains("does not answer"), "{silent}");
     drop(listener);
+}
+
+#[test]
+fn random_bytes_stop_neither_controller_nor_driver() {
+    let mut random = Random::new(1);
+    let mut bytes = |n: usize| -> Vec<u8> { (0..n).map(|_| random.byte()).collect() };
+    let emulated = e_series();
+    let address = emulated.address();
+    // Requests with valid headers and random payloads, random requests, and random lines.
+    for ix in 0..200_usize {
+        let port = [RTDE_PORT, 30002, 29999][ix % 3];
+        let mut stream = TcpStream::connect((address.ip(), port)).unwrap();
+        let payload = bytes(ix);
+        let kinds = *b"VvMUOISP";
+        let size = u16::try_from(payload.len() + 3).unwrap().to_be_bytes();
+        let message = match ix % 2 {
+            0 => [&size, &[kinds[ix % 8]][..], &payload].concat(),
+            _ => payload,
+        };
+        // The controller may close the connection in the middle.
+        let _ = stream.write_all(&message);
+    }
+    let mut arm = UrArm::open(&config(address)).unwrap();
+    arm.read(TEST_TIMEOUT).unwrap();
+    // States with random values of the right length, and of random lengths. Few of them have
+    // plausible values by chance. They are sent in rounds that fit in the buffers of the sockets.
+    for round in 1..=5 {
+        for ix in 0..40 {
+            let n = if ix % 2 == 0 { 1 + 8 + 6 * 48 + 20 } else { ix };
+            let mut payload = bytes(n);
+            if let Some(id) = payload.first_mut() {
+                *id = 1;
+            }
+            emulated.inject(&message::encode(PackageType::Data, &payload));
+        }
+        read_until(&mut arm, |statistics| statistics.n_rejected >= 35 * round);
+    }
+    let n_received = arm.statistics().n_received;
+    read_until(&mut arm, |statistics| {
+        statistics.n_received > n_received + 100
+    });
 }
 
 #[test]

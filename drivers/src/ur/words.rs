@@ -5,11 +5,11 @@ use super::state::RobotState;
 /// Robot modes. Source: RTDE guide; names as in Universal Robots' client library.
 const IDLE: i32 = 5;
 const BACKDRIVE: i32 = 6;
-pub(super) const RUNNING: i32 = 7;
+const RUNNING: i32 = 7;
 /// Safety modes and statuses in which the robot may move.
 const NORMAL: i32 = 1;
 const REDUCED: i32 = 2;
-pub(super) const PROTECTIVE_STOP: i32 = 3;
+const PROTECTIVE_STOP: i32 = 3;
 /// Value of `runtime_state` while a program runs.
 pub(super) const PLAYING: u32 = 2;
 /// Bit of `robot_status_bits` for the freedrive button at the back of the pendant.
@@ -41,6 +41,16 @@ pub(super) fn blocking_reason(state: &RobotState) -> Option<String> {
     }
     (state.status_bits & TEACH_BUTTON != 0)
         .then(|| "its freedrive button is pressed: release it".to_owned())
+}
+
+/// Whether the safety system has stopped the robot.
+pub(super) fn is_stopped(state: &RobotState) -> bool {
+    safety_stop(state).is_some()
+}
+
+/// Whether the robot is in a protective stop, which can be ended from the network.
+pub(super) fn is_protective_stop(state: &RobotState) -> bool {
+    state.safety_mode == PROTECTIVE_STOP
 }
 
 fn robot_mode(mode: i32) -> String {

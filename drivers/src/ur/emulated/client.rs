@@ -2,12 +2,15 @@
 
 use super::super::message::{self, Package, PackageSplitter, PackageType};
 use super::ControllerConfig;
+use super::robot::Robot;
 use super::variables::{self, Values};
 use std::io::{ErrorKind, Read, Write};
 use std::net::TcpStream;
 
 /// ID of the only output recipe of a client.
 const OUTPUT_ID: u8 = 1;
+/// Maximum number of input recipes of a client.
+const MAX_INPUTS: usize = 8;
 /// Bytes to receive at once.
 const RECEIVE_BYTES: usize = 4096;
 
@@ -17,6 +20,8 @@ pub(super) struct Client {
     stream: TcpStream,
     splitter: PackageSplitter,
     outputs: Vec<String>,
+    /// Input recipes. The ID of a recipe is its index plus one.
+    inputs: Vec<Vec<String>>,
     /// Number of cycles per data package.
     n_cycles_per_package: u64,
     is_started: bool,
@@ -29,13 +34,27 @@ impl Client {
             stream,
             splitter: PackageSplitter::default(),
             outputs: Vec::new(),
+            inputs: Vec::new(),
             n_cycles_per_package: 1,
             is_started: false,
         }
     }
 
-    /// Answers the requests that have arrived. Returns whether the client is still connected.
-    pub(super) fn serve(&mut self, config: &ControllerConfig, values: &Values) -> bool {
+    /// The input variables that this client writes.
+    pub(super) fn held_inputs(&self) -> impl Iterator<Item = &String> {
+        self.inputs.iter().flatten()
+    }
+
+    /// Answers the requests that have arrived, and writes inputs to the robot. Returns whether the
+    /// client is still connected.
+    ///
+    /// * `held`: the input variables that other clients write
+    pub(super) fn serve(
+        &mut self,
+        config: &ControllerConfig,
+        robot: &mut Robot,
+        held: &[String],
+    ) -> bool {
         let mut bytes = [0; RECEIVE_BYTES];
         loop {
             match self.stream.read(&mut bytes) {
@@ -48,7 +67,7 @@ impl Client {
         loop {
             match self.splitter.next() {
                 Ok(Some(package)) => {
-                    if !self.answer(&package, config, values) {
+                    if !self.answer(&package, config, robot, held) {
                         return false;
                     }
                 }
@@ -81,7 +100,13 @@ impl Client {
         }
     }
 
-    fn answer(&mut self, package: &Package, config: &ControllerConfig, values: &Values) -> bool {
+    fn answer(
+        &mut self,
+        package: &Package,
+        config: &ControllerConfig,
+        robot: &mut Robot,
+        held: &[String],
+    ) -> bool {
         let payload = &package.payload;
         let answer = match package.package_type {
             PackageType::RequestProtocolVersion => {
@@ -95,14 +120,16 @@ impl Client {
                 let numbers = [major, minor, bugfix, 0];
                 numbers.iter().flat_map(|n| n.to_be_bytes()).collect()
             }
-            PackageType::SetupOutputs => self.set_outputs(payload, config, values),
+            PackageType::SetupOutputs => self.set_outputs(payload, config, &robot.values),
+            PackageType::SetupInputs => self.add_inputs(payload, held),
             PackageType::Start | PackageType::Pause => {
                 let is_start = package.package_type == PackageType::Start;
                 let is_accepted = !self.outputs.is_empty();
                 self.is_started = is_start && is_accepted;
                 vec![u8::from(is_accepted || !is_start)]
             }
-            PackageType::SetupInputs | PackageType::Data | PackageType::TextMessage => return true,
+            PackageType::Data => return self.write_inputs(payload, robot),
+            PackageType::TextMessage => return true,
         };
         let bytes = message::encode(package.package_type, &answer);
         self.send_or_skip(&bytes) == SentState::Sent
@@ -136,6 +163,41 @@ impl Client {
         self.n_cycles_per_package = n_cycles_per_package(config, f64::from_be_bytes(*rate));
         let id = if is_valid { OUTPUT_ID } else { 0 };
         [&[id], types.join(",").as_bytes()].concat()
+    }
+
+    /// Adds an input recipe. Returns the answer: recipe ID and types.
+    fn add_inputs(&mut self, payload: &[u8], held: &[String]) -> Vec<u8> {
+        let names = String::from_utf8_lossy(payload).into_owned();
+        let names: Vec<String> = names
+            .split(',')
+            .map(|name| name.trim().to_owned())
+            .collect();
+        let types: Vec<&str> = names
+            .iter()
+            .map(|name| match Robot::input_type(name) {
+                Some(_) if held.contains(name) => "IN_USE",
+                Some(type_name) => type_name,
+                None => "NOT_FOUND",
+            })
+            .collect();
+        let is_valid = !types.contains(&"IN_USE") && !types.contains(&"NOT_FOUND");
+        let mut id = 0;
+        if is_valid && self.inputs.len() < MAX_INPUTS {
+            self.inputs.push(names);
+            id = u8::try_from(self.inputs.len()).unwrap_or(0);
+        }
+        [&[id], types.join(",").as_bytes()].concat()
+    }
+
+    /// Writes the values of a data package. Returns false if the package is wrong; a real
+    /// controller closes the connection as well.
+    fn write_inputs(&self, payload: &[u8], robot: &mut Robot) -> bool {
+        let Some((id, values)) = payload.split_first() else {
+            return false;
+        };
+        let recipe = usize::from(*id).checked_sub(1);
+        let names = recipe.and_then(|ix| self.inputs.get(ix));
+        self.is_started && names.is_some_and(|names| robot.write_inputs(names, values))
     }
 }
 

@@ -1,6 +1,7 @@
 //! An emulated controller of Universal Robots for tests and simulators, on real TCP sockets.
 //!
-//! `variables` has the RTDE variables and their values, `client` serves one RTDE client, and
+//! `variables` has the RTDE variables and their values, and `robot` runs programs (`urscript`).
+//! `client` serves one RTDE client, `lines` the clients of the script and dashboard interfaces, and
 //! `server` has the sockets and the thread. A callback of the owner, such as a simulator or a test,
 //! returns the actual joint states once per cycle.
 //!
@@ -8,7 +9,10 @@
 //! `ur_rtde`, an independent client library, shows that both interpret these documents correctly.
 
 mod client;
+mod lines;
+mod robot;
 mod server;
+mod urscript;
 mod variables;
 
 pub use server::EmulatedController;
@@ -20,7 +24,8 @@ use std::net::SocketAddr;
 /// Configuration of an emulated controller.
 #[derive(Clone, Debug)]
 pub struct ControllerConfig {
-    /// Address of RTDE. Clients of other libraries always connect to port 30004.
+    /// Address of RTDE. Clients of other libraries always connect to port 30004. The ports of the
+    /// script and dashboard interfaces are 2 and 5 less, so the port cannot be chosen by the system.
     pub address: SocketAddr,
     /// Version of the software. Major version 3 is a CB3 controller, which sends 125 states per
     /// second instead of 500.
@@ -90,6 +95,10 @@ pub struct Modes {
     pub safety_mode: i32,
     /// Whether the freedrive button is pressed.
     pub is_teach_button_pressed: bool,
+    /// Whether programs from the network are accepted.
+    pub is_remote: bool,
+    /// Whether the controller refuses to end a protective stop, as in the first seconds.
+    pub is_unlock_refused: bool,
 }
 
 impl Default for Modes {
@@ -98,9 +107,24 @@ impl Default for Modes {
             robot_mode: 7,
             safety_mode: 1,
             is_teach_button_pressed: false,
+            is_remote: true,
+            is_unlock_refused: false,
         }
     }
 }
 
-/// Callback that returns the actual joint states. It is called once per cycle, in order.
-pub type JointSimulator = Box<dyn FnMut(Stamp) -> Joints + Send>;
+/// Joint states that the controller commands at one instant. Without a motion, the positions are
+/// those of the joints.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct CommandedJoints {
+    /// Angles, rad.
+    pub position_rad: [f64; N_JOINTS],
+    /// Velocities, rad/s.
+    pub velocity_rad_s: [f64; N_JOINTS],
+    /// Whether a program runs or the joints brake after its end.
+    pub is_moving: bool,
+}
+
+/// Callback that returns the actual joint states. It is called once per cycle, in order, with the
+/// commanded joint states.
+pub type JointSimulator = Box<dyn FnMut(Stamp, &CommandedJoints) -> Joints + Send>;

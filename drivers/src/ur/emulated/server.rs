@@ -1,8 +1,10 @@
 //! The sockets of an emulated controller, and the thread that serves them once per cycle.
 
+use super::super::address::Interface;
 use super::client::{Client, SentState};
-use super::variables::{N_REGISTERS, Values};
-use super::{ControllerConfig, JointSimulator, Modes};
+use super::lines::{LineServer, take_line, take_program};
+use super::robot::Robot;
+use super::{CommandedJoints, ControllerConfig, JointSimulator, Modes, N_JOINTS};
 use crate::{Error, clock};
 use kinematics::Stamp;
 use parking_lot::Mutex;
@@ -17,8 +19,8 @@ const MAX_LAG: Duration = Duration::from_millis(100);
 /// Time since the start of the controller at its first cycle. It is not zero, because a client
 /// always meets a controller that has been running.
 const FIRST_TIMESTAMP_SECS: f64 = 100.0;
-/// Value of `runtime_state` without a program.
-const STOPPED: u32 = 1;
+/// First line of a dashboard server.
+const GREETING: &str = "Connected: Universal Robots Dashboard Server\n";
 
 /// An emulated controller that serves clients until it is dropped.
 #[derive(Debug)]
@@ -31,7 +33,9 @@ pub struct EmulatedController {
 /// What the owner of the controller changes and reads.
 #[derive(Debug, Default)]
 struct Controls {
-    modes: Modes,
+    /// Modes to set.
+    modes: Option<Modes>,
+    commanded: CommandedJoints,
     /// Bytes to send to all clients, between two states.
     injected: Vec<u8>,
     /// Whether to close the connections of all clients.
@@ -44,23 +48,39 @@ struct Controls {
 
 impl EmulatedController {
     /// Starts listening. From then on, `joint_simulator` is called for the joint states.
-    pub fn start(config: ControllerConfig, joint_simulator: JointSimulator) -> Result<Self, Error> {
+    pub fn start(
+        config: ControllerConfig,
+        mut joint_simulator: JointSimulator,
+    ) -> Result<Self, Error> {
         let device = "emulated controller".to_owned();
-        let listen = |source| Error::Listen {
-            device: device.clone(),
-            address: config.address,
-            source,
+        let address = config.address;
+        let n = config.chain.n_joints();
+        if n != N_JOINTS {
+            return Err(Error::Rtde {
+                address: address.to_string(),
+                reason: format!("its chain has {n} joints, but an arm has {N_JOINTS}"),
+            });
+        }
+        let listen = |interface| {
+            let address = interface_address(address, interface);
+            bind(address).map_err(|source| Error::Listen {
+                device: device.clone(),
+                address,
+                source,
+            })
         };
-        let listener = TcpListener::bind(config.address).map_err(listen)?;
-        // One thread serves all sockets in every cycle, so none may block it.
-        listener.set_nonblocking(true).map_err(listen)?;
-        let address = listener.local_addr().map_err(listen)?;
+        let rtde = listen(Interface::Rtde)?;
+        let scripts = LineServer::new(listen(Interface::Script)?, "");
+        let dashboard = LineServer::new(listen(Interface::Dashboard)?, GREETING);
+        let start = joint_simulator(clock::now(), &CommandedJoints::default());
         let controls: Arc<Mutex<Controls>> = Arc::default();
         let mut server = Server {
-            values: first_values(&config),
+            robot: Robot::new(&config, start, FIRST_TIMESTAMP_SECS),
             config,
             joint_simulator,
-            listener,
+            rtde,
+            scripts,
+            dashboard,
             clients: Vec::new(),
             controls: Arc::clone(&controls),
         };
@@ -87,7 +107,12 @@ impl EmulatedController {
 
     /// Changes the modes of the robot.
     pub fn set_modes(&self, modes: Modes) {
-        self.controls.lock().modes = modes;
+        self.controls.lock().modes = Some(modes);
+    }
+
+    /// Joint states that the controller commanded in its newest cycle.
+    pub fn commanded(&self) -> CommandedJoints {
+        self.controls.lock().commanded
     }
 
     /// Closes the connections of all clients. They may connect again.
@@ -116,13 +141,28 @@ impl Drop for EmulatedController {
     }
 }
 
+/// Address of an interface beside RTDE.
+fn interface_address(rtde: SocketAddr, interface: Interface) -> SocketAddr {
+    let offset = Interface::Rtde.port() - interface.port();
+    SocketAddr::new(rtde.ip(), rtde.port().saturating_sub(offset))
+}
+
+/// One thread serves all sockets in every cycle, so none may block it.
+fn bind(address: SocketAddr) -> std::io::Result<TcpListener> {
+    let listener = TcpListener::bind(address)?;
+    listener.set_nonblocking(true)?;
+    Ok(listener)
+}
+
 /// State of the thread.
 struct Server {
     config: ControllerConfig,
     joint_simulator: JointSimulator,
-    listener: TcpListener,
+    rtde: TcpListener,
+    scripts: LineServer,
+    dashboard: LineServer,
     clients: Vec<Client>,
-    values: Values,
+    robot: Robot,
     controls: Arc<Mutex<Controls>>,
 }
 
@@ -136,30 +176,19 @@ impl Server {
             let lag = clock::now().duration_since(due);
             if lag <= MAX_LAG {
                 std::thread::sleep(due.duration_since(clock::now()));
-                self.values.timestamp_secs = FIRST_TIMESTAMP_SECS + cycle as f64 * step_secs;
+                self.robot.values.timestamp_secs = FIRST_TIMESTAMP_SECS + cycle as f64 * step_secs;
                 self.cycle(cycle, due);
             }
             cycle += 1;
         }
     }
 
-    /// Runs one cycle: accepts and answers clients, moves the joints, and sends the state.
+    /// Runs one cycle: serves all clients, moves the joints, and sends the state.
     fn cycle(&mut self, cycle: u64, due: Stamp) {
-        while let Ok((stream, _)) = self.listener.accept() {
-            if stream.set_nonblocking(true).is_ok() && stream.set_nodelay(true).is_ok() {
-                self.clients.push(Client::new(stream));
-            }
-        }
-        let (injected, is_silent) = {
-            let mut controls = self.controls.lock();
-            if std::mem::take(&mut controls.disconnects) {
-                self.clients.clear();
-            }
-            self.values.modes = controls.modes;
-            (std::mem::take(&mut controls.injected), controls.is_silent)
-        };
-        self.clients
-            .retain_mut(|client| client.serve(&self.config, &self.values));
+        let (injected, is_silent) = self.take_controls();
+        self.serve_clients();
+        self.serve_lines();
+        self.robot.advance();
         self.move_joints(due);
         if !injected.is_empty() {
             self.clients
@@ -170,33 +199,71 @@ impl Server {
         }
         let mut n_sent = 0;
         self.clients.retain_mut(|client| {
-            let sent = client.send_state(cycle, &self.values);
+            let sent = client.send_state(cycle, &self.robot.values);
             n_sent += u64::from(sent == SentState::Sent);
             sent != SentState::Disconnected
         });
         self.controls.lock().n_states_sent += n_sent;
     }
 
-    fn move_joints(&mut self, due: Stamp) {
-        let joints = (self.joint_simulator)(due);
-        self.values.joints = joints;
-        self.values.target_rad = joints.position_rad;
-        // A chain of six joints takes six angles.
-        if let Ok(base_from_flange) = self.config.chain.forward(&joints.position_rad) {
-            self.values.base_from_tool = base_from_flange * self.config.flange_from_tool;
+    /// Applies the changes of the owner. Returns the bytes to send, and whether no states are sent.
+    fn take_controls(&mut self) -> (Vec<u8>, bool) {
+        let mut controls = self.controls.lock();
+        if std::mem::take(&mut controls.disconnects) {
+            self.clients.clear();
+        }
+        if let Some(modes) = controls.modes.take() {
+            self.robot.set_modes(modes);
+        }
+        controls.commanded = self.robot.commanded();
+        (std::mem::take(&mut controls.injected), controls.is_silent)
+    }
+
+    fn serve_clients(&mut self) {
+        while let Ok((stream, _)) = self.rtde.accept() {
+            if stream.set_nonblocking(true).is_ok() && stream.set_nodelay(true).is_ok() {
+                self.clients.push(Client::new(stream));
+            }
+        }
+        let mut ix = 0;
+        while ix < self.clients.len() {
+            let mut client = self.clients.swap_remove(ix);
+            let others = self.clients.iter();
+            let held: Vec<String> = others.flat_map(Client::held_inputs).cloned().collect();
+            if client.serve(&self.config, &mut self.robot, &held) {
+                // The last client has taken the place of this one, so they change places again.
+                self.clients.push(client);
+                let last = self.clients.len() - 1;
+                self.clients.swap(ix, last);
+                ix += 1;
+            }
         }
     }
-}
 
-fn first_values(config: &ControllerConfig) -> Values {
-    Values {
-        timestamp_secs: FIRST_TIMESTAMP_SECS,
-        joints: super::Joints::default(),
-        target_rad: [0.0; super::N_JOINTS],
-        base_from_tool: config.flange_from_tool,
-        flange_from_tool: config.flange_from_tool,
-        modes: Modes::default(),
-        runtime_state: STOPPED,
-        output_ints: [0; N_REGISTERS],
+    fn serve_lines(&mut self) {
+        let robot = &mut self.robot;
+        self.scripts.serve(|received| {
+            if let Some(program) = take_program(received) {
+                robot.start_program(&program);
+            }
+            String::new()
+        });
+        self.dashboard.serve(|received| {
+            let mut answers = String::new();
+            while let Some(command) = take_line(received) {
+                answers += &robot.dashboard(command.trim());
+                answers += "\n";
+            }
+            answers
+        });
+    }
+
+    fn move_joints(&mut self, due: Stamp) {
+        let joints = (self.joint_simulator)(due, &self.robot.commanded());
+        self.robot.measure(joints);
+        // A chain of six joints takes six angles.
+        if let Ok(base_from_flange) = self.config.chain.forward(&joints.position_rad) {
+            self.robot.values.base_from_tool = base_from_flange * self.config.flange_from_tool;
+        }
     }
 }
