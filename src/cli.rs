@@ -58,7 +58,7 @@ pub(crate) enum Command {
     Devices(devices::Args),
     /// Check GPU, clocks, memory, permissions and devices; print fixes
     Doctor(doctor::Args),
-    /// Emulate the devices of a rig: Franka, CAN motors, servos, UDP, cameras
+    /// Emulate the devices of a rig: Franka, UR, CAN motors, servos, UDP, cameras
     Sim(sim::Args),
     /// Move an arm to joint positions, within its limits and under supervision
     Move(move_arm::Args),

@@ -151,16 +151,25 @@ pub enum Error {
         reason: String,
     },
     /// An arm was disconnected and the driver is trying to reconnect. A later call may succeed.
-    #[error("arm on {device:?}: disconnected for {waited:?}, trying to reconnect")]
+    #[error("{device}: disconnected for {waited:?}, trying to reconnect")]
     ArmReconnecting {
-        /// Path of its port.
-        device: PathBuf,
+        /// Name of the arm, with its port or address.
+        device: String,
         /// Time since the arm was disconnected.
         waited: Duration,
     },
     /// A Franka arm refused the connection, does not match the rig file, or was disconnected.
     #[error("arm at {address}: {reason}")]
     Fci {
+        /// Address of the robot controller.
+        address: String,
+        /// Description of the problem and how to fix it.
+        reason: String,
+    },
+    /// An arm of Universal Robots refused the connection, does not match the rig file, or was
+    /// disconnected.
+    #[error("arm at {address}: {reason}")]
+    Rtde {
         /// Address of the robot controller.
         address: String,
         /// Description of the problem and how to fix it.

@@ -46,6 +46,8 @@ mod scripted;
 pub mod servos;
 pub mod tags;
 pub mod udp;
+#[cfg(target_os = "linux")]
+pub mod ur;
 pub mod v4l2;
 pub mod wire;
 mod yuv;

@@ -151,6 +151,7 @@ impl LiveDevices {
         self.read("arm".to_owned(), policy, timeout_error, move || {
             match arm.read(POLL) {
                 Err(Error::NoJoints { .. }) => Ok(ReadOutcome::NoSample),
+                // The driver has its own time limit for reconnecting.
                 Err(Error::ArmReconnecting { .. }) => Ok(ReadOutcome::Pending),
                 state => state.map(Sample::Joints).map(ReadOutcome::Sample),
             }

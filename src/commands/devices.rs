@@ -30,7 +30,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     }
     if !args.json {
         print::line(
-            "Arms on the network (Franka's FCI) are not listed: `fieldrig doctor RIG.toml` checks the arm of a rig file.",
+            "Arms on the network (Franka's FCI, RTDE of Universal Robots) are not listed: `fieldrig doctor RIG.toml` checks the arm of a rig file.",
         )?;
     }
     Ok(Exit::Done)

@@ -10,9 +10,10 @@ use std::path::PathBuf;
 pub(crate) struct Args {
     /// Rig file to emulate (TOML), or a scene: static-arm or mobile-arm
     ///
-    /// Each device is emulated in the way that its driver in the rig file expects: `franka` as a
-    /// controller at arm.address, `can` as motors on the buses of [arm.bus], `udp` as datagrams,
-    /// `realsense` as a .bag file. Scenes include a rig file.
+    /// Each device is emulated in the way that its driver in the rig file expects: `franka` and
+    /// `ur` as a controller at arm.address, `can` as motors on the buses of [arm.bus], `feetech`
+    /// and `dynamixel` as servos on a pseudo terminal, `udp` as datagrams, `realsense` as a .bag
+    /// file. Scenes include a rig file.
     rig_or_scene: String,
     /// Folder for the rig file to run against the emulated devices, the robot description and the
     /// camera recordings [default: sim-NAME]

@@ -48,8 +48,8 @@ fn check_client(name: &str, kind: ServoKind, model: u64) {
         [output.stdout, output.stderr].map(|bytes| String::from_utf8_lossy(&bytes).into_owned());
     assert!(output.status.success(), "{reported}{errors}");
     let reported: serde_json::Value = serde_json::from_str(&reported).unwrap();
-    assert_eq!(reported["models"], serde_json::json!([model; 3]));
-    assert_eq!(reported["start"], serde_json::json!(POSITIONS));
+    assert_eq!(reported["models"], serde_json::json!(vec![model; 3]));
+    assert_eq!(reported["start"], serde_json::json!(POSITIONS.to_vec()));
     assert_ne!(reported["absent"], 0, "no servo has this ID");
     let line = bus.line();
     for (servo, start) in line.servos.iter().zip(POSITIONS) {

@@ -20,7 +20,7 @@ keys! {
     #[derive(Clone, Debug, PartialEq)]
     pub struct Arm {
         /// Source of the joint states.
-        pub driver: ArmDriver, required "none, franka, can, feetech, dynamixel, udp or sim";
+        pub driver: ArmDriver, required "none, franka, ur, can, feetech, dynamixel, udp or sim";
         /// Network address of the device; empty if the driver needs none.
         pub address: String = String::new();
         /// The URDF text.
@@ -72,6 +72,8 @@ pub enum ArmDriver {
     None,
     /// A Franka arm over FCI.
     Franka,
+    /// An arm of Universal Robots over RTDE.
+    Ur,
     /// Motors on CAN buses.
     Can,
     /// Feetech STS servos on a serial bus.
@@ -86,8 +88,8 @@ pub enum ArmDriver {
 
 choices! {
     ArmDriver {
-        None = "none", Franka = "franka", Can = "can", Feetech = "feetech", Dynamixel = "dynamixel", Udp = "udp",
-        Sim = "sim";
+        None = "none", Franka = "franka", Ur = "ur", Can = "can", Feetech = "feetech", Dynamixel = "dynamixel",
+        Udp = "udp", Sim = "sim";
         else "for another arm, use \"udp\" and send its joint states from another program, see docs/guide/arms.md"
     }
 }

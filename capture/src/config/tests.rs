@@ -146,6 +146,7 @@ const KEYS: &[(&str, &str, &str)] = &[
     ("arm.servo.first.accept_following_errors", "true", "1"),
     ("arm.driver", "'franka'", "'frankka'"),
     ("arm.driver", "'none'", "'nothing'"),
+    ("arm.driver", "'ur'", "'ur5e'"),
     ("arm.address", "'172.16.0.2'", "7"),
     ("arm.urdf", "'other.urdf'", "7"),
     ("arm.joints", "['j2', 'j1']", "['j1', 'j9']"),
@@ -701,9 +702,10 @@ fn unknown_arm_driver_error_names_the_driver_for_other_arms() {
     .expect_err("no such driver")
     .to_string();
     assert!(
-        message.contains("arm.driver is \"xarm\", allowed: \"none\", \"franka\", \"can\", \"feetech\", \"dynamixel\"")
-            && message.contains("; for another arm, use \"udp\"")
-            && message.contains("docs/guide/arms.md"),
+        message.contains(
+            "arm.driver is \"xarm\", allowed: \"none\", \"franka\", \"ur\", \"can\", \"feetech\", \"dynamixel\", \
+             \"udp\", \"sim\"; for another arm, use \"udp\""
+        ) && message.contains("docs/guide/arms.md"),
         "{message}"
     );
     // Cameras have other drivers.

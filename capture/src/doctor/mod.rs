@@ -16,6 +16,8 @@ mod realtime;
 #[cfg(target_os = "linux")]
 mod servos;
 #[cfg(target_os = "linux")]
+mod ur;
+#[cfg(target_os = "linux")]
 mod usb;
 mod video_devices;
 
@@ -125,11 +127,13 @@ pub fn check(rig: Option<&Rig>) -> Vec<Finding> {
         findings.extend(rig.into_iter().flat_map(video_devices::unstable_nodes));
     }
     findings.extend(realsense::realsense(rig));
+    findings.extend(franka::franka(rig));
+    #[cfg(target_os = "linux")]
+    findings.extend(rig.into_iter().flat_map(ur::ur));
     #[cfg(target_os = "linux")]
     findings.extend(can::can(rig));
     #[cfg(target_os = "linux")]
     findings.extend(rig.into_iter().flat_map(servos::servos));
-    findings.extend(franka::franka(rig));
     findings.extend(rig.and_then(motion::motion));
     findings.extend(rig.into_iter().flat_map(calibration::calibration));
     findings.extend(rig.into_iter().flat_map(|rig| {

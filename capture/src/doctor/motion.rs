@@ -9,9 +9,11 @@ use crate::open;
 pub(super) fn motion(rig: &Rig) -> Option<Finding> {
     rig.arm.motion.as_ref()?;
     let verdict = match rig.arm.driver {
-        ArmDriver::Can | ArmDriver::Franka | ArmDriver::Feetech | ArmDriver::Dynamixel => {
-            Verdict::Fail
-        }
+        ArmDriver::Franka
+        | ArmDriver::Ur
+        | ArmDriver::Can
+        | ArmDriver::Feetech
+        | ArmDriver::Dynamixel => Verdict::Fail,
         ArmDriver::Udp => Verdict::Warn, // It can still be read.
         ArmDriver::None | ArmDriver::Sim => return None,
     };
@@ -54,7 +56,9 @@ mod tests {
         let finding = motion(&rig).expect("this driver only reads");
         assert_eq!(finding.verdict, Verdict::Warn, "{finding:?}");
         assert!(
-            finding.message.contains("arm.driver = \"can\", \"franka\""),
+            finding
+                .message
+                .contains("arm.driver = \"franka\", \"ur\", \"can\", \"feetech\" or \"dynamixel\""),
             "{finding:?}"
         );
     }

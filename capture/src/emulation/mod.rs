@@ -14,12 +14,14 @@ use camera_files::CameraFiles;
 use drivers::franka::FciVersion;
 use drivers::franka::emulated::{EmulatedRobot, Limits, RobotConfig};
 use drivers::servos::emulated::{EmulatedServoBus, ServoKind};
+use drivers::ur::RTDE_PORT;
+use drivers::ur::emulated::{ControllerConfig, EmulatedController};
 use drivers::{Sample, Source, can, clock};
 use kinematics::{Stamp, Transform};
 use messages::{BadInput, Setting};
 use sim::wire::{
     DatagramTargets, DeviceScript, EmulatedMotors, EmulatedSenders, JointTrack, PlaybackClock,
-    emulate_fci, emulate_servos,
+    emulate_fci, emulate_servos, emulate_ur,
 };
 use std::net::{SocketAddr, TcpListener, ToSocketAddrs};
 use std::path::{Path, PathBuf};
@@ -283,7 +285,7 @@ fn load(rig_or_scene: &str) -> anyhow::Result<(String, Rig)> {
 fn check(rig: &Rig) -> Result<(), BadInput> {
     if rig.arm.driver == ArmDriver::Sim {
         return Err(BadInput(
-            "arm.driver is sim, which `fieldrig run` simulates itself; drivers that can be emulated: franka, can, feetech, dynamixel, udp"
+            "arm.driver is sim, which `fieldrig run` simulates itself; drivers that can be emulated: franka, ur, can, feetech, dynamixel, udp"
                 .to_owned(),
         ));
     }
@@ -316,18 +318,8 @@ fn real_cameras(rig: &Rig) -> impl Iterator<Item = &Camera> {
 /// Checks that an emulated arm can be reached where the rig file says.
 fn check_arm_connection(rig: &Rig) -> anyhow::Result<()> {
     match rig.arm.driver {
-        ArmDriver::Franka => {
-            let address = fci_address(&rig.arm.address)?;
-            TcpListener::bind(address).map(drop).map_err(|error| {
-                let hint = match error.kind() {
-                    std::io::ErrorKind::AddrNotAvailable => {
-                        "; it belongs to another computer: set arm.address = \"127.0.0.1\" in a copy of the rig file"
-                    }
-                    _ => "",
-                };
-                anyhow!("cannot emulate the controller at {address}: {error}{hint}")
-            })
-        }
+        ArmDriver::Franka => check_controller_address(&rig.arm.address, FCI_PORT),
+        ArmDriver::Ur => check_controller_address(&rig.arm.address, RTDE_PORT),
         ArmDriver::Can => {
             for bus in &rig.arm.buses {
                 can::Bus::open(bus).with_context(|| {
@@ -344,6 +336,20 @@ fn check_arm_connection(rig: &Rig) -> anyhow::Result<()> {
     }
 }
 
+/// Checks that an emulated controller can listen at an address.
+fn check_controller_address(text: &str, default_port: u16) -> anyhow::Result<()> {
+    let address = controller_address(text, default_port)?;
+    TcpListener::bind(address).map(drop).map_err(|error| {
+        let hint = match error.kind() {
+            std::io::ErrorKind::AddrNotAvailable => {
+                "; it belongs to another computer: set arm.address = \"127.0.0.1\" in a copy of the rig file"
+            }
+            _ => "",
+        };
+        anyhow!("cannot emulate the controller at {address}: {error}{hint}")
+    })
+}
+
 /// Writes the rig file to run against the emulated devices, and the robot description next to it.
 fn write_rig(folder: &Path, rig: &Rig) -> anyhow::Result<PathBuf> {
     let path = folder.join(drivers::recording::RIG_FILE);
@@ -358,6 +364,7 @@ fn write_rig(folder: &Path, rig: &Rig) -> anyhow::Result<PathBuf> {
 /// Devices that reply until they are dropped.
 struct EmulatedDevices {
     _robot: Option<EmulatedRobot>,
+    _controller: Option<EmulatedController>,
     _motors: Option<EmulatedMotors>,
     _servos: Option<EmulatedServoBus>,
     _senders: EmulatedSenders,
@@ -377,6 +384,7 @@ impl EmulatedDevices {
                 .context("cannot play back the joint states")
         };
         let mut robot = None;
+        let mut controller = None;
         let mut motors = None;
         let mut servos = None;
         let mut datagram_targets = DatagramTargets::default();
@@ -391,6 +399,15 @@ impl EmulatedDevices {
                     plan.fci
                 ));
                 robot = Some(open);
+            }
+            ArmDriver::Ur => {
+                let address = controller_address(&rig.arm.address, RTDE_PORT)?;
+                let chain = open::franka_chain(rig)?;
+                let config = ControllerConfig::e_series(address, chain);
+                controller = Some(emulate_ur(track()?, config)?);
+                descriptions.push(format!(
+                    "arm: a controller of Universal Robots at {address}"
+                ));
             }
             ArmDriver::Can => {
                 let config = can::ArmConfig {
@@ -446,6 +463,7 @@ impl EmulatedDevices {
         let senders = EmulatedSenders::start(script, playback_clock, datagram_targets)?;
         Ok(Self {
             _robot: robot,
+            _controller: controller,
             _motors: motors,
             _servos: servos,
             _senders: senders,
@@ -460,7 +478,7 @@ fn robot_config(rig: &Rig, fci: &str) -> anyhow::Result<RobotConfig> {
         "5" => (FciVersion::V5, Limits::panda()),
         _ => (FciVersion::V10, Limits::fr3()),
     };
-    let address = fci_address(&rig.arm.address)?;
+    let address = controller_address(&rig.arm.address, FCI_PORT)?;
     let chain = open::franka_chain(rig)?;
     Ok(RobotConfig {
         address,
@@ -472,10 +490,10 @@ fn robot_config(rig: &Rig, fci: &str) -> anyhow::Result<RobotConfig> {
 }
 
 /// Address at which the emulated controller listens. It must belong to this computer.
-fn fci_address(text: &str) -> anyhow::Result<SocketAddr> {
+fn controller_address(text: &str, default_port: u16) -> anyhow::Result<SocketAddr> {
     let found = match text.parse() {
         Ok(address) => Some(address),
-        Err(_) => (text, FCI_PORT)
+        Err(_) => (text, default_port)
             .to_socket_addrs()
             .ok()
             .and_then(|mut all| all.next()),
@@ -525,11 +543,18 @@ mod tests {
                 .is_err_and(|error| error.to_string().contains("scenes: static-arm, mobile-arm"))
         );
         assert_eq!(
-            fci_address("127.0.0.1").expect("an address").port(),
+            controller_address("127.0.0.1", FCI_PORT)
+                .expect("an address")
+                .port(),
             FCI_PORT
         );
-        assert_eq!(fci_address("127.0.0.1:5").expect("an address").port(), 5);
-        assert!(fci_address("").is_err());
+        assert_eq!(
+            controller_address("127.0.0.1:5", FCI_PORT)
+                .expect("an address")
+                .port(),
+            5
+        );
+        assert!(controller_address("", FCI_PORT).is_err());
     }
 
     fn with_cameras(driver: &str, arm: &str) -> Rig {
@@ -545,10 +570,12 @@ mod tests {
     fn address_of_another_computer_has_a_hint() {
         // This address is reserved for documentation (RFC 5737).
         let mut rig = with_cameras("v4l2", "driver = \"none\"");
-        rig.arm.driver = ArmDriver::Franka;
         rig.arm.address = "192.0.2.7".to_owned();
-        let message = format!("{:#}", check_arm_connection(&rig).expect_err("not ours"));
-        assert!(message.contains("127.0.0.1"), "{message}");
+        for driver in [ArmDriver::Franka, ArmDriver::Ur] {
+            rig.arm.driver = driver;
+            let message = format!("{:#}", check_arm_connection(&rig).expect_err("not ours"));
+            assert!(message.contains("127.0.0.1"), "{message}");
+        }
     }
 
     #[test]

@@ -17,6 +17,7 @@ mod tags;
 mod twin;
 #[cfg(all(test, feature = "sim"))]
 mod twin_tests;
+mod ur;
 
 pub use movable::{Movable, movable};
 #[cfg(target_os = "linux")]
@@ -24,6 +25,8 @@ pub use real::franka_chain;
 pub use real::{check_motion, motion_of, movable_arm, udp_arm_address};
 #[cfg(target_os = "linux")]
 pub(crate) use servos::servo_config;
+#[cfg(target_os = "linux")]
+pub use ur::arm_config as ur_config;
 
 use crate::config::{ArmDriver, BaseDriver, CameraDriver, Override, Parent, Rig, ScannerDriver};
 use crate::notes::Notes;
@@ -541,6 +544,8 @@ mod tests {
         for (driver, address, expected) in [
             ("franka", "", "arm.address"),
             ("franka", "127.0.0.1:1", "FCI"),
+            ("ur", "", "arm.address"),
+            ("ur", "127.0.0.1:1", "the arm has 6"),
             ("udp", "172.16.0.2", "arm.address"),
         ] {
             let message = error_of(driver, address);

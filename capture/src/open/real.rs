@@ -16,6 +16,8 @@ use drivers::motion::MotionConfig;
 use drivers::motion::{MotionLimits, MovableArm};
 use drivers::udp::{DatagramMonitor, UdpArm, UdpBase, UdpScanner};
 #[cfg(target_os = "linux")]
+use drivers::ur::MovableUrArm;
+#[cfg(target_os = "linux")]
 use drivers::v4l2::{Config, Settings, V4l2Camera, V4l2Format};
 use drivers::{Arm, Base, Devices, RangeScanner};
 use messages::BadInput;
@@ -26,7 +28,7 @@ use std::time::Duration;
 const DEFAULT_ARM_ADDRESS: SocketAddr = SocketAddr::new(IpAddr::V4(Ipv4Addr::LOCALHOST), 7011);
 
 /// Error for an arm that this program cannot move.
-const READ_ONLY: &str = "arms with this driver can only be read; to move the arm, set arm.driver = \"can\", \"franka\", \"feetech\" or \"dynamixel\"";
+const READ_ONLY: &str = "arms with this driver can only be read; to move the arm, set arm.driver = \"franka\", \"ur\", \"can\", \"feetech\" or \"dynamixel\"";
 
 /// Opens all real devices of a rig. There may be none. Also returns monitors of the devices that
 /// receive datagrams. Fills in calibration that is stored in a camera.
@@ -48,6 +50,7 @@ pub(super) fn open(rig: &mut Rig) -> anyhow::Result<(Devices, Vec<DatagramMonito
         ArmDriver::Can => Some(can_arm(rig)?),
         ArmDriver::Feetech | ArmDriver::Dynamixel => Some(servos::servo_arm(rig)?),
         ArmDriver::Franka => Some(franka_arm(rig)?),
+        ArmDriver::Ur => Some(super::ur::arm(rig)?),
         ArmDriver::Udp => {
             let arm = udp_arm(rig)?;
             monitors.push(arm.monitor());
@@ -98,6 +101,7 @@ pub fn movable_arm(rig: &Rig) -> anyhow::Result<Box<dyn MovableArm>> {
             servos::movable_servo_arm(rig, motion_config(rig, motion)?)
         }
         ArmDriver::Franka => movable_franka_arm(rig, motion),
+        ArmDriver::Ur => super::ur::movable_arm(rig, motion),
         _ => bail!("{READ_ONLY}"),
     }
 }
@@ -134,6 +138,10 @@ pub fn check_motion(rig: &Rig) -> anyhow::Result<()> {
         #[cfg(target_os = "linux")]
         ArmDriver::Franka => {
             MovableFrankaArm::check(&motion_config(rig, motion)?).map_err(anyhow::Error::msg)
+        }
+        #[cfg(target_os = "linux")]
+        ArmDriver::Ur => {
+            MovableUrArm::check(&motion_config(rig, motion)?).map_err(anyhow::Error::msg)
         }
         _ => bail!("{READ_ONLY}"),
     }
@@ -172,7 +180,7 @@ pub(super) fn motion_limits(
 }
 
 #[cfg(target_os = "linux")]
-fn motion_config(rig: &Rig, motion: &ArmMotion) -> anyhow::Result<MotionConfig> {
+pub(super) fn motion_config(rig: &Rig, motion: &ArmMotion) -> anyhow::Result<MotionConfig> {
     let limits = motion_limits(rig, motion.acceleration_secs, motion.jerk_secs)?;
     let timeout = Duration::from_secs_f64(motion.timeout_millis / 1000.0);
     let ArmMotion {

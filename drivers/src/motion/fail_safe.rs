@@ -16,7 +16,8 @@ const MAX_WAIT: Duration = Duration::from_secs(5);
 /// arms accept no further commands. Call this function before the process ends without an orderly
 /// stop.
 ///
-/// Franka arms brake when the connection ends.
+/// Franka arms brake when the connection ends. The program that moves an arm of Universal Robots
+/// brakes it when the setpoints end.
 pub fn apply_fail_safe() {
     // The flag is never reset, because the program is about to end. An arm that is opened after
     // this point therefore sends no commands either.

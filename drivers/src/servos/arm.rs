@@ -258,7 +258,7 @@ impl Reader {
                 return Ok(None);
             }
             let reconnecting = Error::ArmReconnecting {
-                device: self.config.port.device.clone(),
+                device: format!("arm on {}", self.config.port.device.display()),
                 waited: outage.since.elapsed(),
             };
             if let Err(TrySendError::Disconnected(_)) = self.sender.try_send(Err(reconnecting)) {

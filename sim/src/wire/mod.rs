@@ -1,5 +1,5 @@
-//! Emulates the devices of a recorded rig on the wire: a Franka controller, motors on CAN buses,
-//! servos on a serial bus, datagrams.
+//! Emulates the devices of a recorded rig on the wire: a controller of a Franka arm or of Universal
+//! Robots, motors on CAN buses, servos on a serial bus, datagrams.
 //!
 //! A [`DeviceScript`] holds the samples of a simulated or recorded rig. [`PlaybackClock`] maps
 //! their stamps to playback times. Images are not played back here. To play back images, use a file
@@ -12,6 +12,8 @@ mod fci;
 #[cfg(target_os = "linux")]
 mod servos;
 mod udp;
+#[cfg(target_os = "linux")]
+mod ur;
 
 #[cfg(target_os = "linux")]
 pub use can::EmulatedMotors;
@@ -20,6 +22,8 @@ pub use fci::emulate_fci;
 #[cfg(target_os = "linux")]
 pub use servos::emulate_servos;
 pub use udp::{DatagramTargets, EmulatedSenders};
+#[cfg(target_os = "linux")]
+pub use ur::emulate_ur;
 
 use drivers::{BasePose, RangeScan, Sample};
 use kinematics::{HistoryError, JointHistory, JointState, Stamp};

@@ -1,0 +1,414 @@
+//! The part of an arm's thread that moves the arm: for each state that arrives, it sends a
+//! setpoint.
+
+use super::N_JOINTS;
+use super::connection::{Connection, Setpoint};
+use super::mailbox::{MotionCommand, MotionMailbox};
+use super::program::{
+    ENDED_AS_REQUESTED, ENDED_BY_DISTANCE, ENDED_BY_SILENCE, ENDED_WITHOUT_SETPOINTS,
+};
+use super::state::RobotState;
+use super::words;
+use crate::motion::{self, Motion, MotionLimits, TrajectoryGenerator};
+use std::sync::Arc;
+use std::time::Duration;
+
+/// Time at rest after which a motion ends. After the end, a person may guide the arm by hand.
+/// Starting a motion takes a fraction of a second, so a caller that sends several targets in a row
+/// should not have to start a motion for each target.
+const MAX_AT_REST_SECS: f64 = 1.0;
+/// Time within which a program starts, or ends.
+const MAX_PROGRAM_SECS: f64 = 3.0;
+/// Time without a setpoint after which the arm has almost come to rest at the last one. The next
+/// trajectory then starts at rest.
+const MAX_PAUSE: Duration = Duration::from_millis(50);
+/// Maximum number of steps of the trajectory per setpoint. States may arrive in pairs, or be
+/// skipped. With more steps, setpoints would jump after a pause.
+const MAX_STEPS: u64 = 4;
+
+/// Moves an arm in response to its states.
+#[derive(Debug)]
+pub(super) struct MotionLoop {
+    device: String,
+    mailbox: Arc<MotionMailbox>,
+    limits: Vec<MotionLimits>,
+    rate_hz: f64,
+    motion_state: MotionState,
+    /// Number of the newest setpoint. The program detects silence by it.
+    number: i32,
+}
+
+/// The newest state, with what happened since the one before.
+pub(super) struct Cycle<'a> {
+    pub(super) state: &'a RobotState,
+    /// Number of cycles of the controller since the previous state.
+    pub(super) n_cycles: u64,
+    /// Time since the previous state was received.
+    pub(super) pause: Duration,
+}
+
+#[derive(Debug)]
+enum MotionState {
+    Idle,
+    /// The program of a motion is being started. Setpoints at the current position are sent.
+    Beginning {
+        session: i32,
+        n_waited: u64,
+    },
+    ActiveMotion(Box<ActiveMotion>),
+    /// The program was asked to end, or has been stopped.
+    Ending {
+        session: i32,
+        n_waited: u64,
+        reason: Option<String>,
+    },
+}
+
+#[derive(Debug)]
+struct ActiveMotion {
+    session: i32,
+    generator: TrajectoryGenerator,
+    /// The last setpoint.
+    sent_rad: [f64; N_JOINTS],
+    n_at_rest: u64,
+}
+
+impl MotionLoop {
+    pub(super) fn new(
+        device: String,
+        mailbox: Arc<MotionMailbox>,
+        limits: Vec<MotionLimits>,
+        rate_hz: f64,
+    ) -> Self {
+        Self {
+            device,
+            mailbox,
+            limits,
+            rate_hz,
+            motion_state: MotionState::Idle,
+            number: 0,
+        }
+    }
+
+    /// Processes the newest state.
+    ///
+    /// # Errors
+    /// If the setpoint cannot be sent.
+    pub(super) fn cycle(
+        &mut self,
+        cycle: &Cycle<'_>,
+        connection: &mut Connection,
+    ) -> Result<(), String> {
+        self.take_mode(cycle.state);
+        // Each state of the loop is consumed and replaced, so that a finished motion cannot be
+        // continued by mistake.
+        let (next, setpoint) = match std::mem::replace(&mut self.motion_state, MotionState::Idle) {
+            MotionState::Idle => (self.start_request(), None),
+            MotionState::Beginning { session, n_waited } => self.begin(session, n_waited, cycle),
+            MotionState::ActiveMotion(active) => self.run(active, cycle),
+            MotionState::Ending {
+                session,
+                n_waited,
+                reason,
+            } => self.end(session, n_waited, reason, cycle),
+        };
+        self.motion_state = next;
+        let Some((session, position_rad)) = setpoint else {
+            return Ok(());
+        };
+        self.number = self.number.wrapping_add(1);
+        connection.send_setpoint(&Setpoint {
+            position_rad,
+            number: self.number,
+            session,
+        })
+    }
+
+    /// Handles the loss of the connection. In this case, the program brakes the arm.
+    pub(super) fn handle_disconnect(&mut self, reason: &str) {
+        self.motion_state = MotionState::Idle;
+        self.mailbox
+            .update(|mailbox_state| mailbox_state.is_lost = true);
+        self.stop_because(format!("connection lost: {reason}"));
+    }
+
+    /// Records whether the robot is ready. Outside of a motion, also reports a stop of the safety
+    /// system. During a motion, the end of the program is reported with its reason.
+    pub(super) fn take_mode(&mut self, state: &RobotState) {
+        let blocking_reason = words::blocking_reason(state).or_else(|| self.other_program(state));
+        if self.mailbox.lock().blocking_reason == blocking_reason {
+            return;
+        }
+        self.mailbox.update(|mailbox_state| {
+            mailbox_state.blocking_reason.clone_from(&blocking_reason);
+            mailbox_state.is_protective_stop = words::is_protective_stop(state);
+        });
+        if let (MotionState::Idle, true, Some(reason)) = (
+            &self.motion_state,
+            words::is_stopped(state),
+            blocking_reason,
+        ) {
+            self.stop_because(reason);
+        }
+    }
+
+    /// The reason to start no motion while another program runs, which our program would replace.
+    fn other_program(&self, state: &RobotState) -> Option<String> {
+        let is_idle = matches!(self.motion_state, MotionState::Idle);
+        (is_idle && state.runtime_state == words::PLAYING)
+            .then(|| "another program runs: stop it at the pendant".to_owned())
+    }
+
+    fn start_request(&self) -> MotionState {
+        match self.mailbox.lock().requested_session.take() {
+            Some(session) => MotionState::Beginning {
+                session,
+                n_waited: 0,
+            },
+            None => MotionState::Idle,
+        }
+    }
+
+    /// Waits for the program of a motion.
+    fn begin(&mut self, session: i32, n_waited: u64, cycle: &Cycle<'_>) -> Step {
+        let state = cycle.state;
+        let failure = self.mailbox.lock().start_error.clone();
+        let failure = failure.or_else(|| words::blocking_reason(state));
+        if let Some(reason) = failure {
+            return self.fail_to_start(reason);
+        }
+        if state.program[0] == session && state.runtime_state == words::PLAYING {
+            return self.start_motion(session, cycle);
+        }
+        let waited_secs = n_waited as f64 / self.rate_hz;
+        if waited_secs > MAX_PROGRAM_SECS {
+            return self.fail_to_start(match state.program[1] {
+                ENDED_WITHOUT_SETPOINTS => "its program received no setpoints: another program may write the same RTDE registers".to_owned(),
+                ENDED_BY_DISTANCE => "its program refuses the first setpoint: another program may write the same RTDE registers".to_owned(),
+                _ => "it does not run the program that was sent: on an e-Series or later robot, select Remote Control at the pendant, and enable the secondary client interface (Settings, Security, Services)".to_owned(),
+            });
+        }
+        let waiting = MotionState::Beginning {
+            session,
+            n_waited: n_waited + cycle.n_cycles,
+        };
+        (waiting, Some((session, state.target_rad)))
+    }
+
+    fn start_motion(&mut self, session: i32, cycle: &Cycle<'_>) -> Step {
+        // The trajectory starts at the position that the controller commands, not at the measured
+        // one. The two differ by the sag under load, so the measured position would cause a jump.
+        let start_rad = cycle.state.target_rad;
+        let period = Duration::from_secs_f64(1.0 / self.rate_hz);
+        let generator = match TrajectoryGenerator::new(&self.limits, &start_rad, period) {
+            Ok(generator) => generator,
+            Err(reason) => return self.halt(session, start_rad, Some(reason)),
+        };
+        self.mailbox.update(|mailbox_state| {
+            mailbox_state.is_running = true;
+            mailbox_state.statistics.n_motions += 1;
+        });
+        let active = ActiveMotion {
+            session,
+            generator,
+            sent_rad: start_rad,
+            n_at_rest: 0,
+        };
+        self.run(Box::new(active), cycle)
+    }
+
+    /// Computes one setpoint of a motion.
+    fn run(&mut self, mut active: Box<ActiveMotion>, cycle: &Cycle<'_>) -> Step {
+        let ActiveMotion {
+            session, sent_rad, ..
+        } = *active;
+        if has_ended(cycle.state, session) {
+            self.mailbox
+                .update(|mailbox_state| mailbox_state.accepts_commands = false);
+            let reason = self.end_reason(cycle.state);
+            return self.halt(session, sent_rad, Some(reason));
+        }
+        let command = match self.take_command(&mut active, cycle) {
+            NextAction::Command(command) => command,
+            NextAction::End => return self.halt(session, sent_rad, None),
+        };
+        match active.next_position(command.as_ref(), cycle) {
+            Ok(position_rad) => {
+                active.sent_rad = position_rad;
+                let setpoint = Some((session, position_rad));
+                (MotionState::ActiveMotion(active), setpoint)
+            }
+            Err(reason) => self.halt(session, sent_rad, Some(reason)),
+        }
+    }
+
+    /// Takes the pending command, and decides whether the motion ends.
+    fn take_command(&self, active: &mut ActiveMotion, cycle: &Cycle<'_>) -> NextAction {
+        let mut mailbox_state = self.mailbox.lock();
+        mailbox_state.statistics.n_setpoints += 1;
+        mailbox_state.statistics.n_pauses += u64::from(cycle.pause > MAX_PAUSE);
+        let command = mailbox_state.command.take();
+        // A command that has just arrived keeps the motion alive. Otherwise, it would be lost with
+        // the end of the motion.
+        let is_at_rest = active.generator.is_at_rest() && command.is_none();
+        active.n_at_rest = if is_at_rest {
+            active.n_at_rest + cycle.n_cycles
+        } else {
+            0
+        };
+        let at_rest_secs = active.n_at_rest as f64 / self.rate_hz;
+        if is_at_rest && (at_rest_secs > MAX_AT_REST_SECS || mailbox_state.is_shutting_down) {
+            // The flag is set under the same lock under which the command was taken above. A motion
+            // that ends can therefore not accept a command that arrives in between.
+            mailbox_state.accepts_commands = false;
+            return NextAction::End;
+        }
+        let motion = if is_at_rest {
+            Motion::Holding
+        } else {
+            Motion::Moving
+        };
+        if mailbox_state.motion != motion {
+            mailbox_state.motion = motion;
+        }
+        NextAction::Command(command)
+    }
+
+    /// Asks the program to end.
+    fn halt(&self, session: i32, at_rad: [f64; N_JOINTS], reason: Option<String>) -> Step {
+        self.mailbox
+            .update(|mailbox_state| mailbox_state.accepts_commands = false);
+        let ending = MotionState::Ending {
+            session,
+            n_waited: 0,
+            reason,
+        };
+        (ending, Some((NO_SESSION, at_rad)))
+    }
+
+    /// Waits for the end of the program.
+    fn end(&self, session: i32, n_waited: u64, reason: Option<String>, cycle: &Cycle<'_>) -> Step {
+        // The registers show the end of the program shortly before the controller does. Until then,
+        // the program would look like one of another client.
+        if cycle.state.runtime_state != words::PLAYING {
+            // A stop of the safety system may arrive after our request to end.
+            let stop =
+                words::blocking_reason(cycle.state).filter(|_| words::is_stopped(cycle.state));
+            return (self.finish(reason.or(stop)), None);
+        }
+        if n_waited as f64 / self.rate_hz > MAX_PROGRAM_SECS {
+            let late = "its program does not end: stop it at the pendant".to_owned();
+            return (self.finish(Some(reason.unwrap_or(late))), None);
+        }
+        let waiting = MotionState::Ending {
+            session,
+            n_waited: n_waited + cycle.n_cycles,
+            reason,
+        };
+        (waiting, Some((NO_SESSION, cycle.state.target_rad)))
+    }
+
+    /// The reason why a program ended without a request.
+    fn end_reason(&self, state: &RobotState) -> String {
+        if let Some(reason) = words::blocking_reason(state) {
+            return reason;
+        }
+        match state.program[1] {
+            ENDED_BY_SILENCE => "setpoints arrived too late: its program braked the arm".to_owned(),
+            ENDED_AS_REQUESTED => {
+                "its program ended: another program may write the same RTDE registers".to_owned()
+            }
+            _ => "its program was stopped, at the pendant or by another program".to_owned(),
+        }
+    }
+
+    /// Gives up a motion that has not moved the arm.
+    fn fail_to_start(&self, reason: String) -> Step {
+        self.mailbox.update(|mailbox_state| {
+            mailbox_state.start_error = Some(reason);
+            mailbox_state.command = None;
+            mailbox_state.is_idle = true;
+            mailbox_state.accepts_commands = false;
+            if mailbox_state.motion == Motion::Moving {
+                mailbox_state.motion = Motion::Holding;
+            }
+        });
+        // The program may still start. Without this setpoint, it would wait for the next motion.
+        (MotionState::Idle, Some((NO_SESSION, [0.0; N_JOINTS])))
+    }
+
+    /// Ends the motion. A `reason` means that it stopped because of a problem.
+    fn finish(&self, reason: Option<String>) -> MotionState {
+        match reason {
+            Some(reason) => self.stop_because(reason),
+            None => self.mailbox.update(|mailbox_state| {
+                mailbox_state.is_idle = true;
+                mailbox_state.is_running = false;
+                mailbox_state.accepts_commands = false;
+                mailbox_state.command = None;
+                mailbox_state.motion = Motion::Holding;
+            }),
+        }
+        MotionState::Idle
+    }
+
+    fn stop_because(&self, reason: String) {
+        log::warn!("{}: {reason}", self.device);
+        self.mailbox.update(|mailbox_state| {
+            // A command from before the stop must not be executed after the recovery.
+            mailbox_state.command = None;
+            mailbox_state.is_idle = true;
+            mailbox_state.is_running = false;
+            mailbox_state.accepts_commands = false;
+            mailbox_state.motion = Motion::Stopped { reason };
+        });
+    }
+}
+
+/// The next state of the loop, and the session and position of the setpoint to send.
+type Step = (MotionState, Option<(i32, [f64; N_JOINTS])>);
+
+/// Session of a setpoint that asks a program to end.
+const NO_SESSION: i32 = 0;
+
+enum NextAction {
+    Command(Option<MotionCommand>),
+    End,
+}
+
+/// Whether the program of a motion no longer runs.
+fn has_ended(state: &RobotState, session: i32) -> bool {
+    state.program[0] != session || state.runtime_state != words::PLAYING
+}
+
+impl ActiveMotion {
+    /// Computes the next joint positions.
+    fn next_position(
+        &mut self,
+        command: Option<&MotionCommand>,
+        cycle: &Cycle<'_>,
+    ) -> Result<[f64; N_JOINTS], String> {
+        let generator = &mut self.generator;
+        if cycle.pause > MAX_PAUSE && !generator.is_at_rest() {
+            generator.resume(&motion::Setpoint {
+                position: self.sent_rad.to_vec(),
+                velocity: vec![0.0; N_JOINTS],
+                acceleration: vec![0.0; N_JOINTS],
+            })?;
+        }
+        match command {
+            Some(MotionCommand::SetTarget(target)) => drop(generator.set_target(target)?),
+            Some(MotionCommand::Stop) => generator.stop(),
+            None => {}
+        }
+        let mut position = generator.step()?.position;
+        if cycle.pause <= MAX_PAUSE {
+            for _ in 1..cycle.n_cycles.min(MAX_STEPS) {
+                position = generator.step()?.position;
+            }
+        }
+        position
+            .try_into()
+            .map_err(|_| "the setpoint has the wrong number of joints".to_owned())
+    }
+}
