@@ -329,16 +329,15 @@ fn a_program_of_another_client_is_not_replaced() {
     other
         .write_all(b"def other():\n  while True:\n    sync()\n  end\nend\n")
         .unwrap();
-    wait_until("the other program runs", || emulated.commanded().is_moving);
-    let mut message = String::new();
-    // The arm sees the program with the next state.
-    wait_until("the arm refuses", || {
-        if let Err(error) = arm.command(&target(0.0)) {
-            message = error.to_string();
-        }
-        !message.is_empty()
+    // Until the state with the program arrives, the arm would replace it.
+    wait_until("the arm sees the program", || {
+        arm.blocking_reason().is_some()
     });
-    assert!(message.contains("another program"), "{message}");
+    let error = arm.command(&target(0.0)).unwrap_err().to_string();
+    assert!(error.contains("another program runs"), "{error}");
+    wait_until("the other program still runs", || {
+        emulated.commanded().is_moving
+    });
 }
 
 #[test]
