@@ -53,7 +53,11 @@ fn ur_rtde_reads_the_emulated_controller() {
         .unwrap();
     let [reported, errors] =
         [output.stdout, output.stderr].map(|bytes| String::from_utf8_lossy(&bytes).into_owned());
-    assert!(output.status.success(), "{reported}{errors}");
+    assert!(
+        output.status.success(),
+        "{}: {reported}{errors}",
+        output.status
+    );
     let reported: serde_json::Value = serde_json::from_str(&reported).unwrap();
     let numbers = |value: &serde_json::Value| -> Vec<f64> {
         let values = value.as_array().unwrap();

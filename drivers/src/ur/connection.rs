@@ -2,7 +2,9 @@
 
 use super::N_JOINTS;
 use super::address::{ControllerAddress, Interface};
-use super::message::{self, PROTOCOL_VERSION, Package, PackageSplitter, PackageType, decode_text};
+use super::message::{
+    self, PROTOCOL_VERSION, Package, PackageSplitter, PackageType, decode_names, decode_text,
+};
 use super::recipe::{Outputs, OutputsResponse};
 use super::state::RobotState;
 use crate::clock;
@@ -246,12 +248,12 @@ impl PackageStream {
         let Some((id, types)) = answer.split_first() else {
             return Err("its answer to the list of registers is empty".to_owned());
         };
-        let types = String::from_utf8_lossy(types);
-        let problem = std::iter::zip(&names, types.split(','))
-            .find(|(_, type_name)| matches!(*type_name, "IN_USE" | "NOT_FOUND"));
+        let types = decode_names(types);
+        let problem = std::iter::zip(&names, &types)
+            .find(|(_, type_name)| matches!(type_name.as_str(), "IN_USE" | "NOT_FOUND"));
         match problem {
             None => Ok(*id),
-            Some((name, "IN_USE")) => Err(format!(
+            Some((name, type_name)) if type_name == "IN_USE" => Err(format!(
                 "another program writes its register {name}: stop that program, for example another RTDE client or a fieldbus"
             )),
             Some((name, _)) => Err(format!(

@@ -104,6 +104,16 @@ impl PackageSplitter {
     }
 }
 
+/// The names in a list of variables or types. Some clients end the list with a comma.
+pub(super) fn decode_names(list: &[u8]) -> Vec<String> {
+    let list = String::from_utf8_lossy(list);
+    let names = list.split(',').map(str::trim);
+    names
+        .filter(|name| !name.is_empty())
+        .map(str::to_owned)
+        .collect()
+}
+
 /// A text message of the controller as one line, with its source. `None` if it is malformed.
 pub(super) fn decode_text(payload: &[u8]) -> Option<String> {
     let (n_bytes, rest) = payload.split_first()?;
@@ -158,6 +168,16 @@ mod tests {
             let error = splitter.next().unwrap_err();
             assert!(error.contains(expected), "{error}");
         }
+    }
+
+    #[test]
+    fn lists_of_names_may_end_with_a_comma() {
+        // ur_rtde ends its lists of variables in this way.
+        assert_eq!(
+            decode_names(b"timestamp,actual_q,"),
+            ["timestamp", "actual_q"]
+        );
+        assert_eq!(decode_names(b""), [""; 0]);
     }
 
     #[test]

@@ -73,6 +73,12 @@ fn wait_for_rest(arm: &MovableUrArm) {
     assert_eq!(arm.motion(), Motion::Holding);
 }
 
+/// Waits until the motion ends, and the robot has received its last setpoint.
+fn wait_for_arrival(arm: &MovableUrArm, emulated: &EmulatedController, target: &JointTarget) {
+    wait_for_rest(arm);
+    wait_until("the robot arrives", || is_near(emulated, target));
+}
+
 /// The reason why an arm has stopped.
 fn stop_reason(arm: &MovableUrArm) -> String {
     let mut reason = None;
@@ -105,19 +111,16 @@ fn targets_are_reached_within_the_limits_on_both_controllers() {
             max_rad_s = max_rad_s.max(velocity);
             arm.motion() != Motion::Moving
         });
-        wait_for_rest(&arm);
-        assert!(is_near(&emulated, &goal), "{:?}", emulated.commanded());
+        wait_for_arrival(&arm, &emulated, &goal);
         // States may arrive in pairs, and a setpoint then covers two cycles of the controller.
         assert!(max_rad_s > 0.1 && max_rad_s < 4.0 * 0.5, "{max_rad_s}");
         // A second target in the same motion, and one after its end.
         arm.command(&target(0.0)).unwrap();
-        wait_for_rest(&arm);
-        assert!(is_near(&emulated, &target(0.0)));
+        wait_for_arrival(&arm, &emulated, &target(0.0));
         wait_until("the program ends", || !emulated.commanded().is_moving);
         assert_eq!(arm.motion_statistics().n_motions, 1);
         arm.command(&target(-0.1)).unwrap();
-        wait_for_rest(&arm);
-        assert!(is_near(&emulated, &target(-0.1)));
+        wait_for_arrival(&arm, &emulated, &target(-0.1));
         assert_eq!(arm.motion_statistics().n_motions, 2);
         drop(arm);
         wait_until("the program ends", || !emulated.commanded().is_moving);
@@ -134,8 +137,11 @@ fn stop_brings_the_arm_to_rest_before_its_target() {
     });
     arm.stop().unwrap();
     wait_for_rest(&arm);
+    // The robot receives the last setpoint one cycle later.
+    wait_until("the joints rest", || {
+        emulated.commanded().velocity_rad_s == [0.0; N_JOINTS]
+    });
     assert!(!is_near(&emulated, &target(2.0)));
-    assert_eq!(emulated.commanded().velocity_rad_s, [0.0; N_JOINTS]);
 }
 
 #[test]
@@ -219,8 +225,7 @@ fn protective_stop_lasts_until_the_recovery() {
         "the old program does not continue"
     );
     arm.command(&target(0.0)).unwrap();
-    wait_for_rest(&arm);
-    assert!(is_near(&emulated, &target(0.0)));
+    wait_for_arrival(&arm, &emulated, &target(0.0));
 }
 
 #[test]
@@ -324,16 +329,15 @@ fn a_program_of_another_client_is_not_replaced() {
     other
         .write_all(b"def other():\n  while True:\n    sync()\n  end\nend\n")
         .unwrap();
-    wait_until("the other program runs", || emulated.commanded().is_moving);
-    let mut message = String::new();
-    // The arm sees the program with the next state.
-    wait_until("the arm refuses", || {
-        if let Err(error) = arm.command(&target(0.0)) {
-            message = error.to_string();
-        }
-        !message.is_empty()
+    // Until the state with the program arrives, the arm would replace it.
+    wait_until("the arm sees the program", || {
+        arm.blocking_reason().is_some()
     });
-    assert!(message.contains("another program"), "{message}");
+    let error = arm.command(&target(0.0)).unwrap_err().to_string();
+    assert!(error.contains("another program runs"), "{error}");
+    wait_until("the other program still runs", || {
+        emulated.commanded().is_moving
+    });
 }
 
 #[test]

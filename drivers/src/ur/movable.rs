@@ -101,6 +101,12 @@ impl MovableUrArm {
         self.mailbox.lock().statistics.clone()
     }
 
+    /// The reason why the robot accepts no motion, according to its newest state.
+    #[cfg(test)]
+    pub(super) fn blocking_reason(&self) -> Option<String> {
+        self.mailbox.lock().blocking_reason.clone()
+    }
+
     fn fault(&self, reason: impl Into<String>) -> Error {
         fault(&self.address, reason.into())
     }

@@ -1,7 +1,7 @@
 //! The variables that a controller sends in each data package, and their decoding.
 
 use super::N_JOINTS;
-use super::message::PackageType;
+use super::message::{PackageType, decode_names};
 use super::state::RobotState;
 
 /// Maximum length of the list of variables in a request, in bytes. Source: RTDE guide.
@@ -168,8 +168,7 @@ impl Outputs {
         let Some((recipe_id, types)) = payload.split_first() else {
             return Err("its answer to the list of variables is empty".to_owned());
         };
-        let types = String::from_utf8_lossy(types).into_owned();
-        let types: Vec<&str> = types.split(',').collect();
+        let types = decode_names(types);
         if types.len() != self.0.len() {
             return Err(format!(
                 "it answered with {} types for {} variables",

@@ -145,11 +145,7 @@ impl Client {
         let Some((rate, names)) = payload.split_first_chunk() else {
             return vec![0];
         };
-        let names = String::from_utf8_lossy(names).into_owned();
-        let names: Vec<String> = names
-            .split(',')
-            .map(|name| name.trim().to_owned())
-            .collect();
+        let names = message::decode_names(names);
         let types: Vec<&str> = names
             .iter()
             .map(|name| {
@@ -167,11 +163,7 @@ impl Client {
 
     /// Adds an input recipe. Returns the answer: recipe ID and types.
     fn add_inputs(&mut self, payload: &[u8], held: &[String]) -> Vec<u8> {
-        let names = String::from_utf8_lossy(payload).into_owned();
-        let names: Vec<String> = names
-            .split(',')
-            .map(|name| name.trim().to_owned())
-            .collect();
+        let names = message::decode_names(payload);
         let types: Vec<&str> = names
             .iter()
             .map(|name| match Robot::input_type(name) {
