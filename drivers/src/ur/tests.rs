@@ -63,7 +63,7 @@ fn e_series() -> EmulatedController {
     start(ControllerConfig::e_series(free_address(), flange_chain()))
 }
 
-/// Reads states until the statistics fulfil a condition.
+/// Reads states until the statistics fulfill a condition.
 fn read_until(arm: &mut UrArm, condition: impl Fn(&StateStatistics) -> bool) {
     let deadline = Instant::now() + TEST_TIMEOUT;
     while !condition(&arm.statistics()) {

@@ -51,7 +51,7 @@ pub(super) fn tokens(line: &str) -> Result<Vec<Token>, String> {
     Ok(tokens)
 }
 
-/// Bytes of the first characters that fulfil a condition.
+/// Bytes of the first characters that fulfill a condition.
 fn length(text: &str, is_part: impl Fn(char) -> bool) -> usize {
     text.find(|c| !is_part(c)).unwrap_or(text.len())
 }
