@@ -13,7 +13,7 @@ use std::path::{Path, PathBuf};
 use std::process::Command;
 
 const URDF: &str = include_str!("../../kinematics/tests/data/ur5e-dh.urdf");
-/// The wheel of `ur_rtde` for CPython 3.11 on x86-64. It has no dependencies.
+/// The wheel of `ur_rtde` for `CPython` 3.11 on x86-64. It has no dependencies.
 const REQUIREMENT: &str = "ur-rtde==1.6.5 --hash=sha256:6f9a25c98bf77be9fe7c559b2d0e56053dca2896ad4a56fd4ef7fe331aeb749f\n";
 const REST_RAD: [f64; 6] = [0.3, -1.4, 1.6, -1.8, -1.5, 0.4];
 

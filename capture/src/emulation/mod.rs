@@ -402,7 +402,7 @@ impl EmulatedDevices {
             }
             ArmDriver::Ur => {
                 let address = controller_address(&rig.arm.address, RTDE_PORT)?;
-                let chain = open::franka_chain(rig)?;
+                let chain = open::controller_chain(rig)?;
                 let config = ControllerConfig::e_series(address, chain);
                 controller = Some(emulate_ur(track()?, config)?);
                 descriptions.push(format!(
@@ -479,7 +479,7 @@ fn robot_config(rig: &Rig, fci: &str) -> anyhow::Result<RobotConfig> {
         _ => (FciVersion::V10, Limits::fr3()),
     };
     let address = controller_address(&rig.arm.address, FCI_PORT)?;
-    let chain = open::franka_chain(rig)?;
+    let chain = open::controller_chain(rig)?;
     Ok(RobotConfig {
         address,
         version,

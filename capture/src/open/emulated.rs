@@ -1,6 +1,7 @@
 //! Opens simulated cameras on an arm whose driver is real. The driver connects to an emulated
 //! controller, whose motors move the simulated arm in real time.
 
+use super::arm_config::controller_chain;
 use super::real;
 use super::simulated::unlimited;
 use crate::config::{ArmDriver, Rig};
@@ -34,7 +35,7 @@ pub(super) fn open(rig: &mut Rig) -> anyhow::Result<(Box<dyn MovableArm>, Box<dy
         address: SocketAddr::from((Ipv4Addr::LOCALHOST, 0)),
         // This is the version of the Panda in the simulated scenes.
         version: FciVersion::V5,
-        chain: real::franka_chain(rig)?,
+        chain: controller_chain(rig)?,
         flange_from_tool: Transform::identity(),
         limits: Limits::panda(),
     };

@@ -1,5 +1,6 @@
 //! Opens the devices of a rig file, or a recording, as one source of samples.
 
+mod arm_config;
 mod assumed_lens;
 #[cfg(all(feature = "sim", target_os = "linux"))]
 mod emulated;
@@ -19,9 +20,9 @@ mod twin;
 mod twin_tests;
 mod ur;
 
-pub use movable::{Movable, movable};
 #[cfg(target_os = "linux")]
-pub use real::franka_chain;
+pub use arm_config::controller_chain;
+pub use movable::{Movable, movable};
 pub use real::{check_motion, motion_of, movable_arm, udp_arm_address};
 #[cfg(target_os = "linux")]
 pub(crate) use servos::servo_config;

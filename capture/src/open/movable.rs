@@ -1,5 +1,7 @@
 //! Opens a camera together with an arm that can be moved, real or simulated.
 
+#[cfg(feature = "sim")]
+use super::arm_config::motion_limits;
 use super::real;
 use super::{Devices, check_arm, use_simulated_devices, without_readout_if_ideal};
 use crate::config::{ArmDriver, BaseDriver, Camera, CameraDriver, Rig};
@@ -76,7 +78,7 @@ fn simulated(rig: Rig) -> anyhow::Result<Movable> {
     let [acceleration_secs, jerk_secs] = motion.map_or(DEFAULT_SECS, |motion| {
         [motion.acceleration_secs, motion.jerk_secs]
     });
-    let limits = real::motion_limits(&rig, acceleration_secs, jerk_secs)?;
+    let limits = motion_limits(&rig, acceleration_secs, jerk_secs)?;
     let sim::CommandedRig { arm, cameras, .. } = super::simulated::commanded(&rig, &limits)?;
     let Some(camera) = cameras.into_iter().next() else {
         bail!("the simulated rig has no camera");

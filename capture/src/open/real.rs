@@ -1,5 +1,7 @@
 //! Opens the devices of a rig that are not simulated.
 
+#[cfg(target_os = "linux")]
+use super::arm_config::{controller_chain, motion_config};
 use super::servos;
 #[cfg(target_os = "linux")]
 use crate::config::Depth;
@@ -11,9 +13,7 @@ use drivers::can::odrive::{self, Endpoints};
 use drivers::can::{self, CanArm, MovableArmConfig, MovableCanArm};
 #[cfg(target_os = "linux")]
 use drivers::franka::{self, FrankaArm, MovableFrankaArm};
-#[cfg(target_os = "linux")]
-use drivers::motion::MotionConfig;
-use drivers::motion::{MotionLimits, MovableArm};
+use drivers::motion::MovableArm;
 use drivers::udp::{DatagramMonitor, UdpArm, UdpBase, UdpScanner};
 #[cfg(target_os = "linux")]
 use drivers::ur::MovableUrArm;
@@ -147,55 +147,6 @@ pub fn check_motion(rig: &Rig) -> anyhow::Result<()> {
     }
 }
 
-/// Motion limits of each joint, in the order of `arm.joints`. The position limits come from the
-/// URDF, and the speed limit comes from the rig file.
-pub(super) fn motion_limits(
-    rig: &Rig,
-    acceleration_secs: f64,
-    jerk_secs: f64,
-) -> anyhow::Result<Vec<MotionLimits>> {
-    let Rig { arm, .. } = rig;
-    let chain = super::chain_of(rig)?;
-    let mut limits = Vec::new();
-    for (ix, name) in arm.joints.iter().enumerate() {
-        let joint_ix = chain.joint_names().iter().position(|known| known == name);
-        let joint = joint_ix
-            .map(|joint_ix| chain.limits()[joint_ix])
-            .context("a joint of the rig is not in its URDF")?;
-        // Invalid limits do not matter for reading. A motion needs valid limits, because they keep
-        // the arm away from its mechanical stops.
-        if !joint.is_range_valid {
-            bail!(
-                "arm.motion: the <limit> of joint {name:?} in the URDF is invalid; give finite numbers, lower at most upper"
-            );
-        }
-        let mut joint =
-            MotionLimits::new(&joint, arm.max_speed_rad_s, acceleration_secs, jerk_secs);
-        // URDF positions are device positions plus the offset.
-        let offset = arm.joint_offsets.get(ix).copied().unwrap_or(0.0);
-        joint.position = joint.position.map(|bound| bound - offset);
-        limits.push(joint);
-    }
-    Ok(limits)
-}
-
-#[cfg(target_os = "linux")]
-pub(super) fn motion_config(rig: &Rig, motion: &ArmMotion) -> anyhow::Result<MotionConfig> {
-    let limits = motion_limits(rig, motion.acceleration_secs, motion.jerk_secs)?;
-    let timeout = Duration::from_secs_f64(motion.timeout_millis / 1000.0);
-    let ArmMotion {
-        on_loss,
-        accept_no_watchdog,
-        ..
-    } = *motion;
-    Ok(MotionConfig {
-        limits,
-        on_loss,
-        timeout,
-        accept_no_watchdog,
-    })
-}
-
 #[cfg(target_os = "linux")]
 fn movable_can_arm(rig: &Rig, motion: &ArmMotion) -> anyhow::Result<Box<dyn MovableArm>> {
     Ok(Box::new(MovableCanArm::open(&movable_config(
@@ -303,27 +254,8 @@ fn franka_config(rig: &Rig) -> anyhow::Result<franka::ArmConfig> {
     Ok(franka::ArmConfig {
         address: arm.address.clone(),
         joint_names: arm.joints.clone(),
-        chain: franka_chain(rig)?,
+        chain: controller_chain(rig)?,
     })
-}
-
-/// The chain from the link in which a Franka arm reports poses to its flange.
-///
-/// # Errors
-///
-/// If the URDF of the rig has no such chain.
-#[cfg(target_os = "linux")]
-pub fn franka_chain(rig: &Rig) -> anyhow::Result<kinematics::Chain> {
-    let Rig { arm, .. } = rig;
-    let robot = kinematics::urdf::Robot::parse(&arm.urdf_text).context("the arm's URDF")?;
-    let path = robot
-        .path(&arm.base_link, &arm.flange_link)
-        .context("the arm's URDF")?;
-    // Franka reports poses in the parent link of the arm's first joint, wherever that link is on
-    // the base.
-    let first = path.iter().find(|joint| arm.joints.contains(&joint.name));
-    let arm_base_link = first.map_or(&arm.base_link, |joint| &joint.parent);
-    kinematics::Chain::new(&robot, arm_base_link, &arm.flange_link).context("the arm's URDF")
 }
 
 #[cfg(not(target_os = "linux"))]

@@ -102,10 +102,13 @@ fn suits(rig: &Rig, own: &sim::Config) -> anyhow::Result<bool> {
             .links()
             .len()
             > 1;
+    // Cameras of a rig with a printed target need not see the rest of the scene.
+    let sees_enough =
+        || !rig.sim.targets.is_empty() || sim::suits_own_robot(own, rig.join.max_blur_px);
     Ok(!has_own_body
         && rig.base.world_from_base == Transform::identity()
         && !own.cameras.is_empty()
-        && sim::suits_own_robot(own, rig.join.max_blur_px))
+        && sees_enough())
 }
 
 fn check_base(rig: &Rig, scene: Scene) -> anyhow::Result<()> {

@@ -1,7 +1,7 @@
 //! Opens arms of Universal Robots.
 
 #[cfg(target_os = "linux")]
-use super::real::{franka_chain as controller_chain, motion_config};
+use super::arm_config::{controller_chain, motion_config};
 use crate::config::{ArmMotion, Rig};
 use anyhow::bail;
 use drivers::Arm;

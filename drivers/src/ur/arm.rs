@@ -414,7 +414,10 @@ mod tests {
 
     #[test]
     fn maximum_outage_is_documented() {
-        let row = format!("| UR arm | {} s |", (MAX_SILENCE + MAX_OUTAGE).as_secs());
+        let row = format!(
+            "| arm of Universal Robots | {} s |",
+            (MAX_SILENCE + MAX_OUTAGE).as_secs()
+        );
         assert!(include_str!("../../../docs/reference/rig.md").contains(&row));
     }
 }

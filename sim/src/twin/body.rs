@@ -172,7 +172,8 @@ impl<'a> Writer<'a> {
             }
         }
         let bars = bars(self.plan.model.links(), ix);
-        if !bars.is_empty() && !(visuals.is_empty() && collisions.is_empty()) {
+        let has_shapes = !visuals.is_empty() || !collisions.is_empty();
+        if !bars.is_empty() && has_shapes {
             self.barred.push(&node.link);
         }
         bars

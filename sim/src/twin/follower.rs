@@ -14,6 +14,7 @@ use std::f64::consts::TAU;
 use std::sync::Arc;
 
 /// What the arm does.
+#[expect(clippy::large_enum_variant, reason = "there is one per arm")]
 #[derive(Clone, Debug)]
 pub(crate) enum TwinTour {
     /// Moves a camera around the target area on the table.
