@@ -87,8 +87,9 @@ const PRINTED_BY: [(&str, &[&str]); 34] = [
 ];
 
 /// Settings in messages of libraries, where the message names a command that accepts the setting.
-const NAMED_WITH_COMMAND: [(&str, Setting, &str); 11] = [
+const NAMED_WITH_COMMAND: [(&str, Setting, &str); 12] = [
     ("capture/src/dataset.rs", Setting::Scale, "train"),
+    ("capture/src/emulation/mod.rs", Setting::Sim, "run"),
     ("capture/src/found_devices.rs", Setting::Sim, "run"),
     ("capture/src/open/mod.rs", Setting::Rig, "train"),
     ("capture/src/open/mod.rs", Setting::Sim, "run"),
