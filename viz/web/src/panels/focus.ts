@@ -8,6 +8,10 @@ export function markClickedButtons(): void {
   document.addEventListener("focusin", ({ target }) => {
     if (target instanceof Element) target.toggleAttribute("data-clicked", !target.matches(":focus-visible"));
   });
+  // A button that has the focus already does not get it again by a click.
+  document.addEventListener("pointerdown", ({ target }) => {
+    if (target instanceof Element) target.closest("button")?.setAttribute("data-clicked", "");
+  });
 }
 
 /** Closes a panel. If the focus is in the panel, the element that has opened it gets it back. */
