@@ -331,13 +331,26 @@ fn check_switch(browser: &mut Browser, render_thread: &RenderThread) {
     assert_eq!(browser.text("primitives-label"), "Splats before edits");
 }
 
+/// The view without the camera images and texts that cover its lower part.
+fn shot_without_bottom(browser: &mut Browser) -> image::RgbImage {
+    let show_bottom = |browser: &mut Browser, visibility: &str| {
+        browser.evaluate(&format!(
+            "document.querySelector('.bottom').style.visibility = '{visibility}'"
+        ));
+    };
+    show_bottom(browser, "hidden");
+    let shot = canvas_shot(browser);
+    show_bottom(browser, "");
+    shot
+}
+
 /// The live camera's frustum is drawn according to the request's projection.
 fn check_live_frustum(browser: &mut Browser, hub: &Hub, request: &RenderRequest) {
     const REACH_PX: i64 = 2; // Rounding to pixels, and lines one pixel wide.
     // The frustum fades if no images arrive.
     let images = Camera::start(hub.clone());
     wait_for(browser, "a live image", |browser| label(browser) == "live");
-    let shot = canvas_shot(browser);
+    let shot = shot_without_bottom(browser);
     images.stop();
     let camera = side_camera();
     let depth = 1.6 * 0.12 * 0.8; // Depth of the drawn frustum: see web/src/layers/overlays.ts.
