@@ -18,7 +18,10 @@ use super::motor::Reading;
 use super::movable_motor::MovableMotor;
 use super::plan::watchdog_plan;
 use super::watchdog::WatchdogPlan;
-use crate::motion::{CommandedArm, JointTarget, Motion, MotionLimits, OnLoss, TrajectoryGenerator};
+use crate::motion::{
+    CommandedArm, Motion, MotionLimits, OnLoss, Reply, Request, SharedWithOwner,
+    TrajectoryGenerator,
+};
 use crate::wire::can::Frame;
 use crate::wire::can::canopen::{self, NodeState};
 use crate::{Error, clock};
@@ -56,19 +59,6 @@ const POLL: Duration = Duration::from_millis(20);
 /// limits of the arm require. It covers late cycles and a target that was set just before the
 /// shutdown. Without a limit, an arm that never comes to rest would keep the program from ending.
 const STOP_MARGIN: Duration = Duration::from_secs(1);
-
-type Reply<T> = SyncSender<Result<T, Error>>;
-
-/// A request from the owner of the arm.
-#[derive(Debug)]
-pub(super) enum Request {
-    /// Move to a target. The reply is the target that was accepted.
-    SetTarget(JointTarget, Reply<JointTarget>),
-    /// Come to rest.
-    Stop(Reply<()>),
-    /// Prepare and enable the motors. The reply comes when they are enabled.
-    Recover(Reply<()>),
-}
 
 /// State of the arm.
 #[derive(Debug)]
@@ -133,11 +123,14 @@ impl ArmLoop {
     /// If the arm cannot be moved as planned.
     pub(super) fn new(
         config: &MovableArmConfig,
-        requests: Receiver<Request>,
+        shared: SharedWithOwner,
         readings: SyncSender<Result<JointReading, Error>>,
-        motion: Arc<Mutex<Motion>>,
-        is_shutting_down: Arc<AtomicBool>,
     ) -> Result<Self, Error> {
+        let SharedWithOwner {
+            requests,
+            motion,
+            is_shutting_down,
+        } = shared;
         let plan = watchdog_plan(config)?;
         let arm_state = ArmState::stopped(clock::now(), None);
         Ok(Self {

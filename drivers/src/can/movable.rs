@@ -4,25 +4,19 @@
 //! each cycle it sends every motor its setpoint, which also resets the motors' watchdogs.
 
 use super::arm::MAX_WAITING;
-use super::arm_loop::{ArmLoop, Request};
+use super::arm_loop::ArmLoop;
 use super::config::MovableArmConfig;
 use super::joints::{JointReading, Joints};
 use super::plan::watchdog_plan;
-use crate::motion::{CommandedArm, JointTarget, Motion, MotionLock, MovableArm};
+use crate::motion::{JointTarget, Motion, MotionLock, MotionThread, MovableArm};
 use crate::{Arm, Error};
 use kinematics::JointState;
-use parking_lot::Mutex;
-use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, Ordering};
-use std::sync::mpsc::{Receiver, RecvTimeoutError, SyncSender, sync_channel};
-use std::thread::JoinHandle;
+use std::sync::mpsc::{Receiver, RecvTimeoutError, sync_channel};
 use std::time::{Duration, Instant};
 
 /// Maximum time for the arm's thread to reply. It checks for requests once per cycle, so a reply
 /// that takes longer means that the thread has ended or is stuck.
 const MAX_ANSWER: Duration = Duration::from_secs(1);
-/// Maximum time to recover. Preparing and enabling takes some hundred milliseconds per motor.
-const MAX_RECOVERY: Duration = Duration::from_secs(60);
 
 /// An arm that may be moved. After opening, it holds its current position.
 ///
@@ -31,13 +25,12 @@ const MAX_RECOVERY: Duration = Duration::from_secs(60);
 /// for a limited time.
 #[derive(Debug)]
 pub struct MovableCanArm {
+    // Fields are dropped in this order: the thread ends while its results can still be received, and
+    // before the locks are released.
+    thread: MotionThread,
     names: Vec<String>,
     readings: Receiver<Result<JointReading, Error>>,
     joints: Joints,
-    requests: SyncSender<Request>,
-    motion: Arc<Mutex<Motion>>,
-    is_shutting_down: Arc<AtomicBool>,
-    thread: Option<JoinHandle<()>>,
     /// Locks of all buses of the arm. They are held until the thread has ended.
     _locks: Vec<MotionLock>,
 }
@@ -63,21 +56,10 @@ impl MovableCanArm {
             .map(|motor| motor.joint.clone())
             .collect();
         let (sender, readings) = sync_channel(MAX_WAITING);
-        // Only one request waits at a time, because the owner waits for each reply.
-        let (requests, request_receiver) = sync_channel(1);
-        let motion = Arc::new(Mutex::new(Motion::Stopped {
-            reason: "the arm has not been enabled yet".to_owned(),
-        }));
-        let is_shutting_down = Arc::new(AtomicBool::new(false));
+        let (mut thread, shared) = MotionThread::new(MAX_ANSWER);
         // The configuration is checked before the lock is taken, so that a mistake in the rig file
         // is reported even while another program moves the arm.
-        let arm_loop = ArmLoop::new(
-            config,
-            request_receiver,
-            sender,
-            Arc::clone(&motion),
-            Arc::clone(&is_shutting_down),
-        )?;
+        let arm_loop = ArmLoop::new(config, shared, sender)?;
         // The lock is taken before the thread starts, and thus before any frame is sent. If two
         // programs commanded the same motors, the motors would alternate between two targets.
         let locks = config
@@ -86,49 +68,18 @@ impl MovableCanArm {
             .iter()
             .map(|bus| MotionLock::take(&bus.interface))
             .collect::<Result<_, _>>()?;
-        let device = "movable CAN arm".to_owned();
-        let commanded = CommandedArm::new();
-        // `apply_fail_safe` waits until `commanded` is dropped. It must therefore not be dropped
-        // before each motor has its fail-safe command.
-        let run = move || {
-            arm_loop.run();
-            drop(commanded);
-        };
-        let thread = std::thread::Builder::new().name(device.clone()).spawn(run);
-        let thread = Some(thread.map_err(|source| Error::Thread { device, source })?);
+        thread.start("movable CAN arm", move || arm_loop.run())?;
         let joints = Joints::new(names.len());
         let mut arm = Self {
             names,
             readings,
             joints,
-            requests,
-            motion,
-            is_shutting_down,
             thread,
             _locks: locks,
         };
         // If enabling fails, dropping the arm ends the thread, which disables the motors.
         arm.recover()?;
         Ok(arm)
-    }
-
-    /// Sends a request to the arm's thread, and waits for the reply.
-    fn request_and_wait<T>(
-        &self,
-        request: impl FnOnce(SyncSender<Result<T, Error>>) -> Request,
-        timeout: Duration,
-    ) -> Result<T, Error> {
-        // Each request has its own channel. A reply that comes after the timeout cannot be mistaken
-        // for the reply to the next request.
-        let (sender, answer) = sync_channel(1);
-        // Waits have a timeout, because the thread may have ended after a panic.
-        let no_answer = || Error::Motion {
-            reason: "the arm's thread does not answer".to_owned(),
-        };
-        self.requests
-            .try_send(request(sender))
-            .map_err(|_| no_answer())?;
-        answer.recv_timeout(timeout).map_err(|_| no_answer())?
     }
 }
 
@@ -163,33 +114,18 @@ impl Arm for MovableCanArm {
 
 impl MovableArm for MovableCanArm {
     fn command(&mut self, target: &JointTarget) -> Result<JointTarget, Error> {
-        self.request_and_wait(
-            |answer| Request::SetTarget(target.clone(), answer),
-            MAX_ANSWER,
-        )
+        self.thread.command(target)
     }
 
     fn motion(&self) -> Motion {
-        self.motion.lock().clone()
+        self.thread.motion()
     }
 
     fn stop(&mut self) -> Result<(), Error> {
-        self.request_and_wait(Request::Stop, MAX_ANSWER)
+        self.thread.stop()
     }
 
     fn recover(&mut self) -> Result<(), Error> {
-        self.request_and_wait(Request::Recover, MAX_RECOVERY)
-    }
-}
-
-impl Drop for MovableCanArm {
-    fn drop(&mut self) {
-        // Joining the thread waits until the arm is at rest and each motor has its fail-safe
-        // command. After that, the locks are released.
-        self.is_shutting_down.store(true, Ordering::Relaxed);
-        if let Some(thread) = self.thread.take() {
-            // A thread that panicked has already printed the panic message.
-            let _ = thread.join();
-        }
+        self.thread.recover()
     }
 }

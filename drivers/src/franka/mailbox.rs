@@ -1,18 +1,11 @@
-//! Exchanges commands and results between the caller that commands an arm and the thread that moves
-//! it.
+//! What the caller that commands a Franka arm and the thread that moves it exchange.
 
 use super::MotionStatistics;
-use crate::motion::{JointTarget, Motion};
+use crate::motion::{Mailbox, Motion, MotionCommand};
 use franka::RobotMode;
-use parking_lot::{Condvar, Mutex, MutexGuard};
-use std::time::{Duration, Instant};
 
 /// Commands to the thread, and its results.
-#[derive(Debug)]
-pub(super) struct MotionMailbox {
-    mailbox_state: Mutex<MailboxState>,
-    changed: Condvar,
-}
+pub(super) type MotionMailbox = Mailbox<MailboxState>;
 
 #[derive(Debug)]
 pub(super) struct MailboxState {
@@ -33,15 +26,9 @@ pub(super) struct MailboxState {
     pub(super) statistics: MotionStatistics,
 }
 
-#[derive(Clone, Debug, PartialEq)]
-pub(super) enum MotionCommand {
-    SetTarget(JointTarget),
-    Stop,
-}
-
-impl Default for MotionMailbox {
+impl Default for MailboxState {
     fn default() -> Self {
-        let mailbox_state = MailboxState {
+        Self {
             command: None,
             started_motion: None,
             accepts_commands: false,
@@ -51,45 +38,6 @@ impl Default for MotionMailbox {
             motion: Motion::Holding,
             mode: RobotMode::Other,
             statistics: MotionStatistics::default(),
-        };
-        Self {
-            mailbox_state: Mutex::new(mailbox_state),
-            changed: Condvar::new(),
         }
-    }
-}
-
-impl MotionMailbox {
-    /// Locks the state.
-    pub(super) fn lock(&self) -> MutexGuard<'_, MailboxState> {
-        self.mailbox_state.lock()
-    }
-
-    /// Changes the state, and wakes up all waiting callers.
-    pub(super) fn update(&self, change: impl FnOnce(&mut MailboxState)) {
-        // The lock is released at the end of this line, so that the callers that wake up do not
-        // wait for it.
-        change(&mut self.lock());
-        self.changed.notify_all();
-    }
-
-    /// Waits until a condition holds; `None` if the timeout expires first.
-    pub(super) fn wait(
-        &self,
-        timeout: Duration,
-        condition: impl Fn(&MailboxState) -> bool,
-    ) -> Option<MutexGuard<'_, MailboxState>> {
-        let deadline = Instant::now() + timeout;
-        let mut mailbox_state = self.lock();
-        // The condition is checked in a loop, because a condition variable may wake up without a
-        // change, or for a change of another field.
-        while !condition(&mailbox_state) {
-            let remaining = deadline.saturating_duration_since(Instant::now());
-            if remaining.is_zero() {
-                return None;
-            }
-            self.changed.wait_for(&mut mailbox_state, remaining);
-        }
-        Some(mailbox_state)
     }
 }

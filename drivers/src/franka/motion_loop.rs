@@ -3,13 +3,13 @@
 
 use super::connection::{Connection, error_text};
 use super::limits::RobotLimits;
-use super::mailbox::{MotionCommand, MotionMailbox};
+use super::mailbox::MotionMailbox;
 use super::recent_cycles::RecentCycles;
 use super::reference::{CommandFate, N_SUCCESS_WINDOW, Reference, ReferenceTracker};
 use super::request::{self, MotionResponse};
 use super::state::NumberedState;
 use crate::clock;
-use crate::motion::{Motion, MotionLimits, TrajectoryGenerator};
+use crate::motion::{Motion, MotionCommand, MotionLimits, TrajectoryGenerator};
 use franka::{RobotMode, RobotState};
 use kinematics::Stamp;
 use std::net::SocketAddr;

@@ -3,12 +3,12 @@
 
 use super::connection::Connection;
 use super::limits::{RobotLimits, clamp_to_range};
-use super::mailbox::{MailboxState, MotionCommand, MotionMailbox};
+use super::mailbox::{MailboxState, MotionMailbox};
 use super::motion_loop::MotionLoop;
 use super::request::{self, ContactConfig};
 use super::{ArmConfig, FrankaArm, MotionStatistics, StateStatistics};
 use crate::motion::{
-    JointTarget, Motion, MotionConfig, MotionLimits, MotionLock, MovableArm, OnLoss,
+    JointTarget, Motion, MotionCommand, MotionConfig, MotionLimits, MotionLock, MovableArm, OnLoss,
 };
 use crate::{Arm, Error};
 use franka::{FciVersion, RobotMode};

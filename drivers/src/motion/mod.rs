@@ -5,6 +5,10 @@ mod fail_safe;
 mod generator;
 #[cfg(target_os = "linux")]
 mod lock;
+#[cfg(target_os = "linux")]
+mod mailbox;
+#[cfg(target_os = "linux")]
+mod thread;
 
 #[cfg(target_os = "linux")]
 pub(crate) use fail_safe::CommandedArm;
@@ -12,6 +16,10 @@ pub use fail_safe::apply_fail_safe;
 pub use generator::{Setpoint, TrajectoryGenerator};
 #[cfg(target_os = "linux")]
 pub(crate) use lock::MotionLock;
+#[cfg(target_os = "linux")]
+pub(crate) use mailbox::{Mailbox, MotionCommand};
+#[cfg(target_os = "linux")]
+pub(crate) use thread::{MotionThread, Reply, Request, SharedWithOwner};
 
 use crate::{Arm, Error};
 use kinematics::urdf::JointLimits;

@@ -10,7 +10,9 @@
 use super::config::MovableServoArmConfig;
 use super::moved_servos::MovedServos;
 use super::plan;
-use crate::motion::{CommandedArm, JointTarget, Motion, MotionLimits, OnLoss, TrajectoryGenerator};
+use crate::motion::{
+    CommandedArm, Motion, MotionLimits, OnLoss, Request, SharedWithOwner, TrajectoryGenerator,
+};
 use crate::{Error, clock};
 use kinematics::{JointState, Stamp};
 use parking_lot::Mutex;
@@ -31,19 +33,6 @@ const STOP_MARGIN: Duration = Duration::from_secs(1);
 /// Maximum time, in addition to the watchdog timeout, in which the fail-safe is repeated until each
 /// servo has confirmed it.
 const MAX_CONFIRMATION: Duration = Duration::from_secs(2);
-
-type Reply<T> = SyncSender<Result<T, Error>>;
-
-/// A request from the owner of the arm.
-#[derive(Debug)]
-pub(super) enum Request {
-    /// Move to a target. The reply is the target that was accepted.
-    SetTarget(JointTarget, Reply<JointTarget>),
-    /// Come to rest.
-    Stop(Reply<()>),
-    /// Find and enable the servos. The reply comes when they are enabled.
-    Recover(Reply<()>),
-}
 
 /// State of the arm.
 #[derive(Debug)]
@@ -78,11 +67,14 @@ impl MotionLoop {
     /// If the arm cannot be moved as planned.
     pub(super) fn new(
         config: &MovableServoArmConfig,
-        requests: Receiver<Request>,
+        shared: SharedWithOwner,
         states: SyncSender<Result<JointState, Error>>,
-        motion: Arc<Mutex<Motion>>,
-        is_shutting_down: Arc<AtomicBool>,
     ) -> Result<Self, Error> {
+        let SharedWithOwner {
+            requests,
+            motion,
+            is_shutting_down,
+        } = shared;
         plan::check(config)?;
         Ok(Self {
             config: config.clone(),

@@ -1,17 +1,10 @@
-//! Exchanges commands and results between the caller that commands an arm and the thread that moves
-//! it.
+//! What the caller that commands an arm and the thread that moves it exchange.
 
 use super::statistics::MotionStatistics;
-use crate::motion::{JointTarget, Motion};
-use parking_lot::{Condvar, Mutex, MutexGuard};
-use std::time::{Duration, Instant};
+use crate::motion::{Mailbox, Motion, MotionCommand};
 
 /// Commands to the thread, and its results.
-#[derive(Debug, Default)]
-pub(super) struct MotionMailbox {
-    mailbox_state: Mutex<MailboxState>,
-    changed: Condvar,
-}
+pub(super) type MotionMailbox = Mailbox<MailboxState>;
 
 #[derive(Debug)]
 pub(super) struct MailboxState {
@@ -39,12 +32,6 @@ pub(super) struct MailboxState {
     pub(super) statistics: MotionStatistics,
 }
 
-#[derive(Clone, Debug, PartialEq)]
-pub(super) enum MotionCommand {
-    SetTarget(JointTarget),
-    Stop,
-}
-
 impl Default for MailboxState {
     fn default() -> Self {
         Self {
@@ -61,38 +48,5 @@ impl Default for MailboxState {
             is_protective_stop: false,
             statistics: MotionStatistics::default(),
         }
-    }
-}
-
-impl MotionMailbox {
-    /// Locks the state.
-    pub(super) fn lock(&self) -> MutexGuard<'_, MailboxState> {
-        self.mailbox_state.lock()
-    }
-
-    /// Changes the state, and wakes up all waiting callers.
-    pub(super) fn update(&self, change: impl FnOnce(&mut MailboxState)) {
-        change(&mut self.lock());
-        self.changed.notify_all();
-    }
-
-    /// Waits until a condition holds; `None` if the timeout expires first.
-    pub(super) fn wait(
-        &self,
-        timeout: Duration,
-        condition: impl Fn(&MailboxState) -> bool,
-    ) -> Option<MutexGuard<'_, MailboxState>> {
-        let deadline = Instant::now() + timeout;
-        let mut mailbox_state = self.lock();
-        // The condition is checked in a loop, because a condition variable may wake up without a
-        // change, or for a change of another field.
-        while !condition(&mailbox_state) {
-            let remaining = deadline.saturating_duration_since(Instant::now());
-            if remaining.is_zero() {
-                return None;
-            }
-            self.changed.wait_for(&mut mailbox_state, remaining);
-        }
-        Some(mailbox_state)
     }
 }

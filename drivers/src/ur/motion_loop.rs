@@ -3,13 +3,13 @@
 
 use super::N_JOINTS;
 use super::connection::{Connection, Setpoint};
-use super::mailbox::{MotionCommand, MotionMailbox};
+use super::mailbox::MotionMailbox;
 use super::program::{
     ENDED_AS_REQUESTED, ENDED_BY_DISTANCE, ENDED_BY_SILENCE, ENDED_WITHOUT_SETPOINTS,
 };
 use super::state::RobotState;
 use super::words;
-use crate::motion::{self, Motion, MotionLimits, TrajectoryGenerator};
+use crate::motion::{self, Motion, MotionCommand, MotionLimits, TrajectoryGenerator};
 use std::sync::Arc;
 use std::time::Duration;
 

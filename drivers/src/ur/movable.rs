@@ -3,13 +3,13 @@
 
 use super::address::{ControllerAddress, Interface};
 use super::arm::fault;
-use super::mailbox::{MailboxState, MotionCommand, MotionMailbox};
+use super::mailbox::{MailboxState, MotionMailbox};
 use super::motion_loop::MotionLoop;
 use super::program::{ProgramConfig, program};
 use super::statistics::MotionStatistics;
 use super::{ArmConfig, StateStatistics, UrArm, dashboard};
 use crate::motion::{
-    JointTarget, Motion, MotionConfig, MotionLimits, MotionLock, MovableArm, OnLoss,
+    JointTarget, Motion, MotionCommand, MotionConfig, MotionLimits, MotionLock, MovableArm, OnLoss,
 };
 use crate::{Arm, Error, clock};
 use kinematics::JointState;

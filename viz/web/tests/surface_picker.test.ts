@@ -47,13 +47,13 @@ test("a pixel at an edge with a mean depth belongs to one of the two surfaces", 
   }
 });
 
-test("thin objects, gaps and slopes keep their depths", () => {
+test("thin objects, gaps and oblique surfaces keep their depths", () => {
   const thin = picture((x) => (x === 20 ? 2 : 7));
   assertClose([depthOn(through(20, 10), thin)!], [2], 1e-6);
   const gap = picture((x) => (x === 20 ? 7 : 2));
   assertClose([depthOn(through(20, 10), gap)!], [7], 1e-6);
-  const slope = picture((x) => 1 / (0.6 - 0.014 * x));
-  for (const x of [2, 20, 38]) assertClose([depthOn(through(x, 10), slope)!], [1 / (0.6 - 0.014 * x)], 1e-5);
+  const oblique = picture((x) => 1 / (0.6 - 0.014 * x));
+  for (const x of [2, 20, 38]) assertClose([depthOn(through(x, 10), oblique)!], [1 / (0.6 - 0.014 * x)], 1e-5);
 });
 
 test("a hole has no point, but the closest pixel with a surface has one", () => {

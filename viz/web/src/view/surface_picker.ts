@@ -21,7 +21,7 @@ const SAME_EYE = 0.01;
 const MAX_BEHIND = 0.08;
 /** Minimum difference of depths at an edge, relative to the depth. */
 const MIN_EDGE = 0.02;
-/** An edge differs from a slope, whose depth changes beside the pixel, too, by this factor. */
+/** At an edge, the depth changes by this factor more than beside it. On an oblique surface, it changes evenly. */
 const EDGE_FACTOR = 3;
 
 /** Pixels to try around a pixel without surface, the closest first: within 8 pixels of the window. */
@@ -91,8 +91,8 @@ function unmixedDepth({ depth, depthSizePx: [width, height] }: PosedDepth, [x, y
     const [first, before, after, last] = [-2, -1, 1, 2].map((step) => at(x + step * dx, y + step * dy)) as [number, number, number, number];
     const [down, up] = [own - before, after - own];
     const edge = Math.min(Math.abs(down), Math.abs(up));
-    const slope = Math.max(Math.abs(before - first), Math.abs(last - after));
-    if (before * after > 0 && down * up > 0 && edge > MIN_EDGE * own && edge > EDGE_FACTOR * slope) {
+    const beside = Math.max(Math.abs(before - first), Math.abs(last - after));
+    if (before * after > 0 && down * up > 0 && edge > MIN_EDGE * own && edge > EDGE_FACTOR * beside) {
       return edge === Math.abs(down) ? before : after;
     }
   }
