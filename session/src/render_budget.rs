@@ -6,6 +6,7 @@
 //! a single picture takes longer than the maximum debt.
 
 use std::time::Duration;
+use viz::Hub;
 
 /// Maximum credit, seconds, which is the maximum length of a burst of pictures. After a longer
 /// slice of training, the maximum is the length of that slice. With a larger credit, a viewer that
@@ -49,6 +50,11 @@ impl RenderBudget {
     /// Restores the full credit.
     pub(crate) fn refill(&mut self) {
         self.balance_secs = self.balance_secs.max(MAX_CREDIT_SECS);
+    }
+
+    /// Whether a picture is requested and may be drawn now.
+    pub(crate) fn is_picture_due(self, hub: &Hub) -> bool {
+        self.may_render() && hub.pictures().wait_for_request(Duration::ZERO)
     }
 
     /// Whether a picture may be drawn now.

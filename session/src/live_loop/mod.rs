@@ -253,7 +253,7 @@ impl LiveLoop {
             self.hub.pictures().wait_for_request(IDLE);
             return Ok(());
         }
-        if self.is_render_pending() {
+        if self.budget.is_picture_due(&self.hub) {
             return Ok(());
         }
         self.train_slice()
@@ -280,9 +280,8 @@ impl LiveLoop {
         let step_before = self.models.sessions[0].progress().step;
         let hub = &self.hub;
         let budget = self.budget;
-        self.models.train_next(is_paced, || {
-            budget.may_render() && hub.pictures().wait_for_request(Duration::ZERO)
-        })?;
+        self.models
+            .train_next(is_paced, || budget.is_picture_due(hub))?;
         self.budget.add_training(before.elapsed());
         // Steps before this slice are complete, because at most one submit is in flight.
         self.ledger.completed(step_before);

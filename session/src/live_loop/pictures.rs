@@ -1,6 +1,8 @@
 //! Draws the pictures that viewers request.
 
+use super::models::Models;
 use super::{LiveLoop, Pace};
+use crate::ledger::Ledger;
 use crate::session::Session;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
@@ -23,6 +25,30 @@ struct QueuedRender {
 }
 
 impl QueuedRender {
+    /// Starts to draw a requested picture. A request that cannot be drawn is answered.
+    fn start(mut pending: PendingRender, models: &mut Models, ledger: &Ledger) -> Option<Self> {
+        let session_ix = match models.session_ix(pending.method()) {
+            Ok(session_ix) => session_ix,
+            Err(reason) => {
+                pending.fail(&reason);
+                return None;
+            }
+        };
+        let session = &mut models.sessions[session_ix];
+        pending.request.edits = Arc::clone(session.edits());
+        let mut model = session.viewed();
+        let queued = model.queue_picture(&pending.request, pending.packing());
+        let pending = model.label(pending);
+        // The keyframes are determined now, because steps that are queued behind the picture do not
+        // affect it.
+        let trained_on = ledger.trained_keyframes(session_ix, session.progress().step);
+        Some(Self {
+            pending: pending.of_keyframes(trained_on),
+            session_ix,
+            queued,
+        })
+    }
+
     /// Waits for the picture, whose rendering began at `began`, and sends it to its client.
     fn deliver(self, session: &mut Session, began: Instant) {
         let pending = self.pending.began_at(began);
@@ -39,18 +65,13 @@ impl QueuedRender {
 }
 
 impl LiveLoop {
-    /// Whether a picture is requested and may be drawn now.
-    pub(super) fn is_render_pending(&self) -> bool {
-        self.budget.may_render() && self.hub.pictures().wait_for_request(Duration::ZERO)
-    }
-
     /// Draws requested pictures as long as training keeps its share of the time.
     pub(super) fn render(&mut self) -> anyhow::Result<()> {
         let started = Instant::now();
         if !self.is_training() || self.models.is_idle() || self.requests.is_paused {
             self.budget.refill(); // Training is idle, so drawing does not delay it.
         }
-        while started.elapsed() < MAX_RENDER_TIME && self.is_render_pending() {
+        while started.elapsed() < MAX_RENDER_TIME && self.budget.is_picture_due(&self.hub) {
             // Work queued before the pictures counts as training time.
             let before = Instant::now();
             for session in &mut self.models.sessions {
@@ -87,7 +108,15 @@ impl LiveLoop {
     fn queue_pictures(&mut self) -> (Vec<QueuedRender>, bool) {
         let mut queued = Vec::new();
         let mut is_any_on_gpu = false;
-        while let Some(picture) = self.queue_picture() {
+        while let Some(pending) = self.hub.pictures().next_request() {
+            if self.accepted.list.is_empty() {
+                pending.fail("no keyframe yet");
+                continue;
+            }
+            let started = QueuedRender::start(pending, &mut self.models, &self.ledger);
+            let Some(picture) = started else {
+                continue;
+            };
             let is_on_gpu = picture
                 .queued
                 .as_ref()
@@ -123,40 +152,6 @@ impl LiveLoop {
             session.train_steps(u64::MAX)?;
         }
         Ok(())
-    }
-
-    /// Starts to draw the next requested picture. Requests that cannot be drawn are answered.
-    fn queue_picture(&mut self) -> Option<QueuedRender> {
-        loop {
-            let mut pending = self.hub.pictures().next_request()?;
-            if self.accepted.list.is_empty() {
-                pending.fail("no keyframe yet");
-                continue;
-            }
-            let found = self.models.session_ix(pending.method());
-            let session_ix = match found {
-                Ok(session_ix) => session_ix,
-                Err(reason) => {
-                    pending.fail(&reason);
-                    continue;
-                }
-            };
-            let session = &mut self.models.sessions[session_ix];
-            pending.request.edits = Arc::clone(session.edits());
-            let mut model = session.viewed();
-            let queued = model.queue_picture(&pending.request, pending.packing());
-            let pending = model.label(pending);
-            // The keyframes are determined now, because steps that are queued behind the picture do
-            // not affect it.
-            let trained_on = self
-                .ledger
-                .trained_keyframes(session_ix, session.progress().step);
-            return Some(QueuedRender {
-                pending: pending.of_keyframes(trained_on),
-                session_ix,
-                queued,
-            });
-        }
     }
 
     /// Records which pictures of the first model clients have shown.
