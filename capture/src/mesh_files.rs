@@ -2,8 +2,9 @@
 
 use std::path::{Path, PathBuf};
 
-/// Paths where a mesh file may be. The folder of a package has the name of the package. It is a
-/// parent folder of the URDF, or a folder beside such a parent.
+/// Paths where a mesh file may be, the most likely one first. The folder of a package is a parent
+/// folder of the URDF, or beside such a parent. Usually, it has the name of the package. A parent
+/// folder with another name may be the package, too: a checkout or a download is often renamed.
 #[must_use]
 pub fn mesh_file_candidates(file: &str, urdf_folder: &Path) -> Vec<PathBuf> {
     let package_path = file
@@ -18,11 +19,12 @@ pub fn mesh_file_candidates(file: &str, urdf_folder: &Path) -> Vec<PathBuf> {
     // Without ROS, there is no index of packages. The folders around the URDF are searched, because
     // a copy of a robot description keeps the layout of its packages.
     let mut candidates = Vec::new();
-    for folder in above {
+    for folder in above.clone() {
         if folder.file_name().is_some_and(|name| name == package) {
             candidates.push(folder.join(rest));
         }
         candidates.push(folder.join(package).join(rest));
     }
+    candidates.extend(above.map(|folder| folder.join(rest)));
     candidates
 }

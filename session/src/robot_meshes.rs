@@ -6,6 +6,7 @@ use capture::mesh_file_candidates;
 use files::Budget;
 use kinematics::shape::Geometry;
 use kinematics::urdf::Robot;
+use std::collections::BTreeSet;
 use std::path::Path;
 use viz::{MeshFormat, RobotDescription, RobotMesh};
 
@@ -32,30 +33,47 @@ pub fn description(rig: &Rig, rig_file: &Path) -> anyhow::Result<Option<RobotDes
 
 /// Reads the mesh files of all visual shapes.
 fn meshes(robot: &Robot, urdf_folder: &Path) -> Vec<RobotMesh> {
+    let shapes = robot.links().iter().flat_map(|link| robot.visuals(link));
+    let mut files: Vec<&str> = shapes
+        .filter_map(|shape| match &shape.geometry {
+            Geometry::Mesh { file, .. } => Some(file.as_str()),
+            _ => None,
+        })
+        .collect();
+    // Several links often share a mesh, such as the mesh of a joint module.
+    let mut named = BTreeSet::new();
+    files.retain(|file| named.insert(*file));
     let mut meshes: Vec<RobotMesh> = Vec::new();
     let mut budget = Budget::MESHES;
-    let shapes = robot.links().iter().flat_map(|link| robot.visuals(link));
-    let files = shapes.filter_map(|shape| match &shape.geometry {
-        Geometry::Mesh { file, .. } => Some(file),
-        _ => None,
-    });
-    for file in files {
-        // Several links often share a mesh, such as the mesh of a joint module.
-        if meshes.iter().any(|mesh| mesh.file == *file) {
-            continue;
-        }
+    let mut failures = Vec::new();
+    for file in &files {
         match read(file, urdf_folder, budget) {
             Ok(mesh) => {
                 // The total size of all meshes is limited, because every client gets them.
                 budget = budget.after(mesh.bytes.len() as u64);
                 meshes.push(mesh);
             }
-            Err(why) => {
-                log::warn!("the robot is drawn incompletely: cannot draw the mesh {file:?}: {why}")
-            }
+            Err(why) => failures.push(format!("{file:?}: {why}")),
         }
     }
+    if let Some(warning) = describe(&failures, files.len()) {
+        log::warn!("{warning}");
+    }
     meshes
+}
+
+/// One warning for all meshes that cannot be drawn, because they usually have the same cause.
+fn describe(failures: &[String], n_files: usize) -> Option<String> {
+    let first = failures.first()?;
+    let others = match failures.len() - 1 {
+        0 => String::new(),
+        n => format!("; and {}", messages::counted(n as u64, "other")),
+    };
+    Some(format!(
+        "the robot is drawn without {} of {}: {first}{others}",
+        failures.len(),
+        messages::counted(n_files as u64, "mesh file"),
+    ))
 }
 
 /// Reads a mesh file. The error is the reason, in one sentence.
@@ -64,11 +82,7 @@ fn read(file: &str, urdf_folder: &Path, left: Budget) -> Result<RobotMesh, Strin
         .ok_or("its type is not supported, convert it to .stl, .dae or .obj")?;
     let candidates = mesh_file_candidates(file, urdf_folder);
     let Some(path) = candidates.iter().find(|path| path.is_file()) else {
-        let tried: Vec<_> = candidates
-            .iter()
-            .map(|path| path.display().to_string())
-            .collect();
-        return Err(format!("no such file; tried {}", tried.join(", ")));
+        return Err(not_found(file, urdf_folder));
     };
     let shown = path.display();
     // The budget of one file, but not more than the rest of the budget of all files.
@@ -91,9 +105,24 @@ fn read(file: &str, urdf_folder: &Path, left: Budget) -> Result<RobotMesh, Strin
     })
 }
 
+/// Why a mesh file was not found. Most files are missing because only the URDF was copied.
+fn not_found(file: &str, urdf_folder: &Path) -> String {
+    let folder = urdf_folder.display();
+    let package = file
+        .strip_prefix("package://")
+        .and_then(|path| path.split_once('/'));
+    match package {
+        Some((package, rest)) => format!(
+            "no file {rest:?} in a folder {package:?} beside or above {folder}; copy the whole package of the URDF"
+        ),
+        None => format!("no such file; relative names start at {folder}"),
+    }
+}
+
 #[cfg(test)]
 mod tests {
-    use super::meshes;
+    use super::{describe, meshes, read};
+    use files::Budget;
     use kinematics::urdf::Robot;
     use std::path::Path;
     use viz::MeshFormat;
@@ -140,5 +169,33 @@ mod tests {
             (files[2], MeshFormat::Dae, b'c'),
         ];
         assert_eq!(found, expected);
+    }
+
+    #[test]
+    fn a_package_may_be_in_a_folder_with_another_name() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let root = folder.path();
+        write(&root.join("checkout/arm/meshes/a.stl"), "a");
+        let file = "package://arm_description/arm/meshes/a.stl";
+        let found = meshes(&robot(&[file]), &root.join("checkout/arm/urdf"));
+        assert_eq!(found[0].file, file);
+    }
+
+    #[test]
+    fn one_warning_describes_all_missing_meshes() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let why = |file| read(file, folder.path(), Budget::MESHES).expect_err("missing");
+        let missing = why("package://arm/meshes/a.stl");
+        assert!(
+            missing.starts_with("no file \"meshes/a.stl\" in a folder \"arm\" beside or above"),
+            "{missing}"
+        );
+        assert!(why("b.stl").starts_with("no such file"));
+        let failures = ["a".to_owned(), "b".to_owned(), "c".to_owned()];
+        assert_eq!(
+            describe(&failures, 5).expect("a warning"),
+            "the robot is drawn without 3 of 5 mesh files: a; and 2 others"
+        );
+        assert!(describe(&[], 5).is_none());
     }
 }
