@@ -878,7 +878,8 @@ mod tests {
             })
         };
         let mut stations = stations();
-        stations.corrected((18..54).map(faster).collect());
+        let released = stations.corrected((18..54).map(faster).collect());
+        assert_eq!(released.len(), 36);
         let [report] = stations.reports() else {
             panic!("{:?}", stations.reports())
         };
