@@ -189,7 +189,7 @@ mod tests {
         }
         assert_eq!(text(folder), "one\ntwo\n");
         let mut log = LogFile::new(folder);
-        let quarter = vec![b'x'; MAX_BYTES as usize / 4];
+        let quarter = vec![b'x'; usize::try_from(MAX_BYTES).expect("small") / 4];
         for _ in 0..9 {
             assert_eq!(log.write_or_describe(&quarter), None);
         }

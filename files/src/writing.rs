@@ -47,7 +47,7 @@ pub fn begin(path: &Path) -> std::io::Result<File> {
 /// # Errors
 /// If the file cannot be opened, or is not a regular file.
 pub fn append(path: &Path) -> std::io::Result<File> {
-    let flags = OFlags::WRONLY
+    let flags = OFlags::RDWR
         | OFlags::APPEND
         | OFlags::CREATE
         | OFlags::NOFOLLOW

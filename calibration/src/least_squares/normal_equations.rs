@@ -262,9 +262,8 @@ pub(super) fn dispersion(blocks: &[BlockSums], n_shared: usize, variance: f64) -
 /// `inverse(S - S_b) g_b = inverse(S) inverse(1 - S_b inverse(S)) g_b`. Blocks that determine a
 /// direction almost alone would give very large changes, so the eigenvalues of the inner inverse are
 /// limited.
-///
-/// Source: MacKinnon and White 1985 (HC3), with blocks as in Bell and McCaffrey 2002.
 pub(super) fn jackknife(blocks: &[BlockSums], n_shared: usize) -> Option<DMatrix<f64>> {
+    // Source: MacKinnon and White 1985 (HC3), with blocks as in Bell and McCaffrey 2002.
     const DAMPING: f64 = 1e-12;
     // A block with 95 % of the information about a direction.
     const MIN_REST: f64 = 0.05;
