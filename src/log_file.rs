@@ -56,6 +56,9 @@ pub(crate) fn begin(folder: &Path, header: &str) {
     let Sink::Early(early) = &*sink else { return };
     let (thread, chunks) = sync_channel(MAX_WAITING);
     let mut file = LogFile::new(folder);
+    // The file is made here and not by the thread, because a run that fails removes its folder, and
+    // a file that appears meanwhile would keep it. Errors are described at the first record.
+    file.open = OpenFile::in_folder(folder).ok();
     // The header has its own line, and follows the records of an earlier part of the run.
     let start = format!("{header}\n{early}");
     let started = output_thread::start(chunks, move |bytes| {
