@@ -4,7 +4,7 @@
 # them. Without root, they print the command that installs the system packages.
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test quick test-gpu hil check fuzz deps web cargo packages test-packages check-packages mujoco realsense open-ends \
+.PHONY: help demo check-demo test quick test-gpu hil check fuzz deps web cargo packages test-packages check-packages mujoco realsense open-ends \
 	begin-test checks lint lint-without-features doc kernels manifests licenses texts web-check linters test-build test-crates \
 	test-program test-page test-hil
 # Cargo and npm already use all processors, and two runs of apt would block each other.
@@ -26,17 +26,25 @@ TARGET_FOLDER := $(or $(CARGO_TARGET_DIR),target)
 STEPS := $(TARGET_FOLDER)/steps.tsv
 STEP := scripts/timed.sh $(STEPS)
 
-# Rig that `make demo` simulates: name of a file in the folder rigs, without extension.
+# Rig that `make demo` simulates: name of a file in the folder rigs, without extension, or the path of a rig file.
 RIG ?= static-arm
+RIG_FILE = $(if $(filter %.toml,$(RIG)),$(RIG),rigs/$(RIG).toml)
+# Port of the page of `make demo`. A variable of the environment does not count, because other programs use one with this name.
+PORT = 7007
+# Without a GPU, a run corrects the calibration only if that is requested, because it takes time from training. This rig shows it.
+REFINE = $(if $(filter uncalibrated,$(RIG)),--refine auto)
 # Duration of `make hil` in seconds.
 LISTEN_SECONDS ?= 20
 
 help: ## List the targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-12s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
 
-demo: deps web ## Simulate a rig (RIG=static-arm, mobile-arm, mobile-base-small, ...) and serve the live scene; needs no display
+demo: check-demo deps web ## Simulate a rig (RIG=static-arm, mobile-arm, uncalibrated, ...) and serve the live scene at PORT=7007; needs no display
 	cargo build --release $(FEATURES)
-	$(TARGET_FOLDER)/release/fieldrig run rigs/$(RIG).toml --sim
+	$(TARGET_FOLDER)/release/fieldrig run $(RIG_FILE) --sim --listen 127.0.0.1:$(PORT) $(REFINE)
+
+check-demo:
+	@scripts/check-demo.sh '$(RIG_FILE)' '$(PORT)'
 
 RUN_TESTS = scripts/run-tests.py --steps $(STEPS) --report $(TARGET_FOLDER)/test-times.md
 test: begin-test test-packages checks web ## Run lints, documentation and all tests that need no device
@@ -95,6 +103,8 @@ manifests: cargo
 	@cargo metadata --locked --manifest-path fuzz/Cargo.toml --format-version 1 >/dev/null || { echo "fuzz/Cargo.lock does not match fuzz/Cargo.toml; to update it, run: cargo metadata --manifest-path fuzz/Cargo.toml" >&2; exit 1; }
 
 licenses: cargo
+	@if python3 -c 'import tomllib' 2>/dev/null; then scripts/licenses.py --check; \
+	else echo "list of licenses: skipped, because Python is older than 3.11"; fi
 	@if cargo deny --version >/dev/null 2>&1; then \
 		cargo deny check licenses bans sources || exit 1; \
 		if cargo deny fetch db >/dev/null 2>&1; then cargo deny check advisories; \

@@ -3,16 +3,18 @@
 
 use crate::commands::{
     bench, calibrate, devices, doctor, eval, export, fk, metrics, move_arm, record, render, run,
-    sim, train, view,
+    runs, sim, train, view,
 };
 use crate::exit::Exit;
+use crate::version;
 use clap::{ArgAction, Parser, Subcommand};
 
 /// Turns a robot's cameras and joints into a live radiance field.
 #[derive(Debug, Parser)]
 #[command(
     name = "fieldrig",
-    version,
+    version = version::SHORT,
+    long_version = version::LONG,
     arg_required_else_help = true,
     max_term_width = 110,
     after_help = "Results go to stdout; the log and progress bars go to stderr.\n\
@@ -40,6 +42,8 @@ pub(crate) enum Command {
     Train(train::Args),
     /// Show a saved model or a splat file in the browser
     View(view::Args),
+    /// List the folders of runs, or remove them
+    Runs(runs::Args),
     /// Render images of a saved model
     Render(render::Args),
     /// Score a saved model on test images
@@ -85,6 +89,7 @@ impl Command {
             Self::Record(args) => record::run(&args),
             Self::Train(args) => train::run(&args),
             Self::View(args) => view::run(&args),
+            Self::Runs(args) => runs::run(&args),
             Self::Render(args) => render::run(&args),
             Self::Eval(args) => eval::run(&args),
             Self::Metrics(args) => metrics::run(args).map(|()| Exit::Done),

@@ -1,7 +1,8 @@
 //! Prints the reports of training sessions, and progress bars.
 
 use crate::exit::Exit;
-use crate::print;
+use crate::work_lines::WorkLines;
+use crate::{early_exit, log_file, print, version};
 use indicatif::ProgressBar;
 use messages::counted;
 use parking_lot::Mutex;
@@ -39,6 +40,8 @@ pub(crate) struct Console {
     bar: ProgressBar,
     /// Lines about the scoring in progress.
     scoring: Option<ProgressLines>,
+    /// Lines about other work in progress.
+    work: Option<WorkLines>,
 }
 
 impl Console {
@@ -59,12 +62,18 @@ impl Console {
             is_hidden,
             bar: print::bar(length, template, is_hidden),
             scoring: None,
+            work: None,
         }
+    }
+
+    /// Whether lines replace the bar, because stderr is not a terminal.
+    fn has_lines(&self) -> bool {
+        self.output == OutputMode::Lines && self.bar.is_hidden()
     }
 
     /// Prints how many test images are scored, if no bar shows it.
     fn print_scoring(&mut self, n_scored: usize, n_all: usize) {
-        let is_shown = self.output == OutputMode::Lines && self.bar.is_hidden();
+        let is_shown = self.has_lines();
         let now = Instant::now();
         let lines = (self.scoring).get_or_insert_with(|| ProgressLines::new(is_shown, now));
         if lines.is_due(n_scored, n_all, now) {
@@ -76,6 +85,13 @@ impl Console {
 impl Observer for Console {
     fn on_event(&mut self, event: &SessionEvent<'_>) {
         match (event, self.output) {
+            (SessionEvent::Started(run), _) => {
+                early_exit::remember(run);
+                log_file::begin(&run.run_folder, &log_header());
+            }
+            (SessionEvent::Working(work), _) => {
+                self.work = work.filter(|_| self.has_lines()).map(WorkLines::new);
+            }
             (SessionEvent::Progress(session), _) => {
                 let progress = &session.progress;
                 let has_steps = self.limits.steps.is_some();
@@ -149,6 +165,15 @@ impl Observer for Console {
             ) => {}
         }
     }
+}
+
+/// The first line of the log in a run folder: the version and the command.
+fn log_header() -> String {
+    format!(
+        "fieldrig {}: {}",
+        version::LONG,
+        next_commands::this_command()
+    )
 }
 
 /// Prints a JSON object as [`print::report_json`] does; an error is logged.
@@ -239,7 +264,7 @@ impl ProgressLines {
     /// line a tenth of the whole was done, or a period has passed in which anything was done.
     pub(crate) fn is_due(&mut self, n_done: usize, n_all: usize, now: Instant) -> bool {
         let elapsed = now.duration_since(self.last_at);
-        let is_tenth = 10 * n_done.saturating_sub(self.n_last) >= n_all;
+        let is_tenth = n_done.saturating_sub(self.n_last) >= n_all.div_ceil(10);
         let min_period = if is_tenth {
             Self::MIN_PERIOD
         } else {
@@ -282,8 +307,9 @@ fn wrapped(list: &str) -> Vec<String> {
 /// A progress bar for reading images. It is cleared when the value is dropped.
 pub(crate) struct ReadBar {
     is_hidden: bool,
-    /// The name of the counted items, and the bar.
-    bar: Mutex<Option<(&'static str, ProgressBar)>>,
+    /// The name of the counted items, the bar, and the lines that replace it if stderr is not a
+    /// terminal.
+    bar: Mutex<Option<(&'static str, ProgressBar, ProgressLines)>>,
 }
 
 impl ReadBar {
@@ -301,7 +327,7 @@ impl ReadBar {
         // Another kind of items has begun, for example depth images after the images.
         if current
             .as_ref()
-            .is_none_or(|(noun, _)| *noun != progress.noun)
+            .is_none_or(|(noun, ..)| *noun != progress.noun)
         {
             clear(&mut current);
             // A recording has no known number of images and keyframes, so there is no bar to fill.
@@ -312,10 +338,18 @@ impl ReadBar {
                 _ => "{spinner} {pos} keyframes",
             };
             let bar = print::bar(progress.n_all.map(|n| n as u64), template, self.is_hidden);
-            *current = Some((progress.noun, bar));
+            let lines = ProgressLines::new(bar.is_hidden() && !self.is_hidden, Instant::now());
+            *current = Some((progress.noun, bar, lines));
         }
-        if let Some((_, bar)) = &*current {
+        if let Some((noun, bar, lines)) = &mut *current {
             bar.set_position(progress.n_done as u64);
+            let n_done = progress.n_done;
+            // Without a number of all items, lines depend only on the time.
+            let n_all = progress.n_all.unwrap_or(usize::MAX);
+            if lines.is_due(n_done, n_all, Instant::now()) {
+                let of_all = (progress.n_all).map_or(String::new(), |n_all| format!(" of {n_all}"));
+                print::notice(format_args!("read {n_done}{of_all} {noun}"));
+            }
         }
     }
 
@@ -325,8 +359,8 @@ impl ReadBar {
     }
 }
 
-fn clear(bar: &mut Option<(&'static str, ProgressBar)>) {
-    if let Some((_, bar)) = bar.take() {
+fn clear(bar: &mut Option<(&'static str, ProgressBar, ProgressLines)>) {
+    if let Some((_, bar, _)) = bar.take() {
         bar.finish_and_clear();
     }
 }

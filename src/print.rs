@@ -10,6 +10,8 @@
 //! Text may come from files and other programs. A terminal may interpret control characters in this
 //! text, so they are escaped.
 
+use crate::log_file;
+use crate::output_thread::{self, OutputChunk};
 use anyhow::Context;
 use console::Term;
 use indicatif::{MultiProgress, ProgressBar, ProgressDrawTarget, ProgressStyle, TermLike};
@@ -20,7 +22,7 @@ use std::fmt::Display;
 use std::io::Write;
 use std::sync::LazyLock;
 use std::sync::atomic::{AtomicBool, Ordering};
-use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
+use std::sync::mpsc::{SyncSender, sync_channel};
 use std::time::{Duration, Instant};
 
 /// Writing to stdout failed.
@@ -44,13 +46,6 @@ const MAX_FLUSH: Duration = Duration::from_secs(5);
 /// both streams then appear in the order in which they were written, unless stderr is blocked.
 const MAX_ORDERING: Duration = Duration::from_millis(200);
 
-/// A part of the output of one stream.
-enum OutputChunk {
-    Bytes(Vec<u8>),
-    /// A request that is acknowledged once all earlier chunks have been written.
-    Flush(SyncSender<()>),
-}
-
 /// Queue of the thread that writes to stdout.
 static STDOUT: LazyLock<SyncSender<OutputChunk>> = LazyLock::new(|| {
     writer(|bytes| {
@@ -70,24 +65,10 @@ static STDERR: LazyLock<SyncSender<OutputChunk>> = LazyLock::new(|| {
 /// lost.
 fn writer(write: fn(&[u8])) -> SyncSender<OutputChunk> {
     let (sender, chunks) = sync_channel(MAX_WAITING);
-    if std::thread::Builder::new()
-        .name("output".to_owned())
-        .spawn(move || write_chunks(chunks, write))
-        .is_err()
-    {
+    if output_thread::start(chunks, write).is_err() {
         LOST_OUTPUT.store(true, Ordering::Relaxed);
     }
     sender
-}
-
-fn write_chunks(chunks: Receiver<OutputChunk>, write: fn(&[u8])) {
-    for chunk in chunks {
-        match chunk {
-            OutputChunk::Bytes(bytes) => write(&bytes),
-            // The program may have stopped waiting.
-            OutputChunk::Flush(done) => drop(done.send(())),
-        }
-    }
 }
 
 /// Queues text for a stream, and returns false if the queue is full. The progress bars are hidden
@@ -130,12 +111,17 @@ fn log_lost(reason: &str) {
 
 /// Waits until all output is written, at most [`MAX_FLUSH`].
 pub(crate) fn flush() {
-    flush_for(MAX_FLUSH);
+    flush_for(MAX_FLUSH, MAX_FLUSH);
 }
 
-/// Waits until stdout is written, for at most [`MAX_FLUSH`]. Also waits until stderr is written,
-/// for at most `max_stderr` after the call.
-fn flush_for(max_stderr: Duration) {
+/// Waits until all output is written, at most [`MAX_ORDERING`], because the program must end soon.
+pub(crate) fn flush_briefly() {
+    flush_for(MAX_ORDERING, MAX_ORDERING);
+}
+
+/// Waits until stdout is written, for at most `max_stdout`. Also waits until stderr is written, for
+/// at most `max_stderr` after the call.
+fn flush_for(max_stdout: Duration, max_stderr: Duration) {
     let began = Instant::now();
     // Both streams get the request before either is waited for, so that they are written in
     // parallel.
@@ -146,7 +132,7 @@ fn flush_for(max_stderr: Duration) {
             .ok()
             .map(|()| is_done)
     });
-    if out.is_none_or(|is_done| is_done.recv_timeout(MAX_FLUSH).is_err()) {
+    if out.is_none_or(|is_done| is_done.recv_timeout(max_stdout).is_err()) {
         LOST_OUTPUT.store(true, Ordering::Relaxed);
     }
     if let Some(is_done) = err {
@@ -243,7 +229,7 @@ impl TermLike for BarTerm {
 /// Prints one line of the result.
 pub(crate) fn line(text: impl Display) -> Result<(), StdoutError> {
     // The line is written here and not by the thread, because its errors must be returned.
-    flush_for(MAX_ORDERING);
+    flush_for(MAX_FLUSH, MAX_ORDERING);
     let text = text.to_string();
     BARS.suspend(|| {
         let mut stdout = std::io::stdout().lock();
@@ -275,10 +261,9 @@ pub(crate) fn notice(text: impl Display) {
 /// thread, so a terminal that accepts no output does not prevent the program from exiting with the
 /// right code.
 pub(crate) fn error(error: &anyhow::Error) {
-    send(
-        &STDERR,
-        format!("error: {}\n", printable(&format!("{error:#}"))),
-    );
+    let line = format!("error: {}\n", printable(&format!("{error:#}")));
+    log_file::record(&line);
+    send(&STDERR, line);
 }
 
 /// Whether any line of [`report()`] was lost.
@@ -344,7 +329,7 @@ fn of_workspace(level: &str) -> String {
         .concat()
 }
 
-/// Sends log records to stderr. `RUST_LOG` takes precedence; `verbose` counts the `-v` flags.
+/// Sends log records to stderr and to the log in the run folder. `RUST_LOG` takes precedence; `verbose` counts the `-v` flags.
 pub(crate) fn start_log(verbose: u8) {
     // Other crates log many messages that concern only their developers, so they start one level
     // later.
@@ -359,16 +344,15 @@ pub(crate) fn start_log(verbose: u8) {
         .init();
 }
 
-/// Writes to stderr above the progress bars. Records that cannot be written are dropped without an
+/// Writes to stderr above the progress bars, and to the log in the run folder. Records that cannot be written are dropped without an
 /// error.
 struct LogTarget;
 
 impl Write for LogTarget {
     fn write(&mut self, bytes: &[u8]) -> std::io::Result<usize> {
-        send(
-            &STDERR,
-            printable(&String::from_utf8_lossy(bytes)).into_owned(),
-        );
+        let text = printable(&String::from_utf8_lossy(bytes)).into_owned();
+        log_file::record(&text);
+        send(&STDERR, text);
         Ok(bytes.len())
     }
 

@@ -1,8 +1,9 @@
 //! Signals that end a command: it stops, saves, and exits.
 //!
 //! SIGINT (Ctrl-C), SIGTERM, SIGHUP (the terminal was closed) and SIGXCPU (the limit of processor
-//! time was reached) request an orderly stop. A second Ctrl-C ends the process at once. SIGQUIT
-//! also ends it at once. In both cases, arms with CAN motors first get their fail-safe command.
+//! time was reached) request an orderly stop. A second Ctrl-C ends the process at once, and prints
+//! how to continue the run. Two signals within half a second count as one. SIGQUIT also ends the
+//! process at once. In both cases, arms with CAN motors first get their fail-safe command.
 //! SIGHUP never ends the process at once, because closing a terminal sends it more than once: the
 //! kernel sends it to the foreground group, and the shell sends it to its jobs. The kernel repeats
 //! SIGXCPU every second. If the process was started with SIGHUP or SIGXCPU ignored, as `nohup` does
@@ -10,6 +11,8 @@
 //!
 //! SIGXFSZ (a file reached the limit of its size) does not end a command: the write fails instead.
 
+use crate::ctrl_c::{CtrlC, Request};
+use crate::early_exit;
 use anyhow::Context;
 use capture::Stop;
 use files::partial;
@@ -21,13 +24,10 @@ use signal_hook::{flag, low_level};
 use std::os::fd::AsFd;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
-use std::time::{Duration, Instant};
+use std::time::Instant;
 
 /// Shells report this plus the signal number as the exit code of a process that a signal ended.
 const SIGNAL_EXIT_BASE: i32 = 128;
-/// A second Ctrl-C within this time does not count, because some programs send the signal both to a
-/// process and to its group.
-const MIN_BETWEEN: Duration = Duration::from_millis(500);
 
 /// Lets a write beyond the limit of the file size (`ulimit -f`) fail with an error, as on a full
 /// disk. By default, SIGXFSZ would end the process without saving.
@@ -59,18 +59,21 @@ pub(crate) fn stop_on_signals_logging(message: &'static str) -> anyhow::Result<S
 /// Handles signals until the process ends. The signals arrive on this thread, because the fail-safe
 /// command of arms may block, which is not allowed in a signal handler.
 fn handle_signals(mut signals: Signals, signaled: &AtomicBool, interrupted: &AtomicBool) {
-    let mut interrupted_at = Instant::now();
+    let mut ctrl_c = CtrlC::default();
     for signal in signals.forever() {
         if signal == SIGQUIT {
             drivers::motion::apply_fail_safe();
             let _ = low_level::emulate_default_handler(SIGQUIT); // It does not return.
         }
         if signal == SIGINT {
-            if !interrupted.swap(true, Ordering::Relaxed) {
-                interrupted_at = Instant::now();
-            } else if interrupted_at.elapsed() >= MIN_BETWEEN {
-                drivers::motion::apply_fail_safe();
-                low_level::exit(SIGNAL_EXIT_BASE + SIGINT);
+            match ctrl_c.request(interrupted.load(Ordering::Relaxed), Instant::now()) {
+                Request::Stop => interrupted.store(true, Ordering::Relaxed),
+                Request::Nothing => continue,
+                Request::Exit => {
+                    drivers::motion::apply_fail_safe();
+                    early_exit::print_left();
+                    low_level::exit(SIGNAL_EXIT_BASE + SIGINT);
+                }
             }
         }
         // The flag is set last, because `Stop::rearm` relies on this order.

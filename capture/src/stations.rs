@@ -26,8 +26,9 @@ use std::time::{Duration, Instant};
 /// keyframes reach the trainer later. With a smaller number, the correction has fewer pairs of
 /// images and is less certain.
 const MIN_KEYFRAMES: usize = 14;
-/// Maximum time to wait for [`MIN_KEYFRAMES`] keyframes, seconds. Without a limit, a short visit or
-/// a camera without texture in view would hold its keyframes until the base leaves.
+/// Maximum time to wait for [`MIN_KEYFRAMES`] keyframes and [`MIN_VALIDATION_IMAGES`], seconds.
+/// Without a limit, a short visit or a camera without texture in view would hold its keyframes until
+/// the base leaves.
 const MAX_SCAN_SECS: f64 = 10.0;
 /// Maximum time to wait for a station while the base moves, seconds. A base that drives for longer
 /// may not stop at all. After this time, or if [`MAX_HELD`] keyframes are queued, the queued
@@ -326,13 +327,28 @@ impl Stations {
             }
             change => {
                 self.held.push(change);
-                if self.group().filter(|keyframe| is_usable(keyframe)).count() >= MIN_KEYFRAMES
-                    || self.held.len() >= MAX_HELD
-                {
+                if self.is_group_complete() || self.held.len() >= MAX_HELD {
                     self.start_search(released);
                 }
             }
         }
+    }
+
+    /// Whether there are enough keyframes to register the next station, and to decide on the result.
+    fn is_group_complete(&self) -> bool {
+        let usable = || self.group().filter(|keyframe| is_usable(keyframe));
+        if usable().count() < MIN_KEYFRAMES {
+            return false;
+        }
+        // Validation images of both stations decide. On a slow computer, which drops keyframes, the
+        // earlier stations may have only a few. A correction would then be estimated and refused.
+        // Whether the images overlap is only known after registration, so this is a lower bound.
+        let references = self.reference_keyframes.iter().map(|keyframe| &**keyframe);
+        let n_validation = references
+            .chain(usable())
+            .filter(|keyframe| keyframe.split == Split::Validation)
+            .count();
+        n_validation >= MIN_VALIDATION_IMAGES
     }
 
     /// Whether a keyframe was taken at the current station or does not depend on the base.
@@ -849,6 +865,27 @@ mod tests {
         let camera = Transform::translation(0.1, 0.2, 0.3);
         assert_ne!(stations.corrected_pose("wrist", &camera), camera);
         assert_eq!(stations.corrected_pose("of the room", &camera), camera);
+    }
+
+    #[test]
+    fn station_is_held_until_its_correction_can_be_checked() {
+        // The first station has one validation image. The 14 usable keyframes with which the next
+        // station could be registered have two. The fourth one is the 20th usable keyframe.
+        let faster = |ix: usize| {
+            Arc::new(Keyframe {
+                stamp: Stamp::from_secs(0.25 * ix as f64),
+                ..(*keyframe(ix)).clone()
+            })
+        };
+        let mut stations = stations();
+        let released = stations.corrected((18..54).map(faster).collect());
+        assert_eq!(released.len(), 36);
+        let [report] = stations.reports() else {
+            panic!("{:?}", stations.reports())
+        };
+        assert_eq!(report.n_keyframes, 20);
+        let n_validation = report.correction.as_ref().map(|of| of.n_validation_images);
+        assert!(n_validation >= Some(MIN_VALIDATION_IMAGES), "{report}");
     }
 
     #[test]

@@ -21,4 +21,6 @@ mod writing;
 pub use budget::{Budget, OverBudget};
 pub use kept::{Kept, Place};
 pub use reading::{open, read, read_text};
-pub use writing::{begin, check_no_link, create, create_folder, create_from, lock, replace, write};
+pub use writing::{
+    append, begin, check_no_link, create, create_folder, create_from, lock, replace, write,
+};

@@ -41,6 +41,28 @@ pub fn begin(path: &Path) -> std::io::Result<File> {
     }
 }
 
+/// Opens a file to add to its end, such as a log that is continued, or makes a new one. A link with
+/// this name is replaced, not followed.
+///
+/// # Errors
+/// If the file cannot be opened, or is not a regular file.
+pub fn append(path: &Path) -> std::io::Result<File> {
+    let flags = OFlags::RDWR
+        | OFlags::APPEND
+        | OFlags::CREATE
+        | OFlags::NOFOLLOW
+        | OFlags::NONBLOCK
+        | OFlags::CLOEXEC;
+    if path.is_symlink() {
+        std::fs::remove_file(path)?;
+    }
+    let file = open_unlinked(path, flags)?;
+    if !file.metadata()?.is_file() {
+        return Err(Error::new(ErrorKind::InvalidInput, "it is not a file"));
+    }
+    Ok(file)
+}
+
 /// Writes a new file.
 ///
 /// # Errors
@@ -275,13 +297,18 @@ fn is_at(file: &File, path: &Path) -> bool {
 pub fn lock(path: &Path) -> std::io::Result<Option<File>> {
     let flags =
         OFlags::RDWR | OFlags::CREATE | OFlags::NOFOLLOW | OFlags::NONBLOCK | OFlags::CLOEXEC;
-    let file = match rustix::fs::open(path, flags, Mode::from_raw_mode(0o666)) {
-        Err(rustix::io::Errno::LOOP) => {
-            return Err(Error::new(ErrorKind::InvalidInput, "it is a symbolic link"));
-        }
-        opened => File::from(opened?),
-    };
+    let file = open_unlinked(path, flags)?;
     Ok(try_lock(&file)?.then_some(file))
+}
+
+/// Opens a file with flags that include `NOFOLLOW`, and names a symbolic link in the error.
+fn open_unlinked(path: &Path, flags: OFlags) -> std::io::Result<File> {
+    match rustix::fs::open(path, flags, Mode::from_raw_mode(0o666)) {
+        Err(rustix::io::Errno::LOOP) => {
+            Err(Error::new(ErrorKind::InvalidInput, "it is a symbolic link"))
+        }
+        opened => Ok(File::from(opened?)),
+    }
 }
 
 /// Checks that a folder into which files will be written is not a symbolic link. It need not exist.

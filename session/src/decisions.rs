@@ -22,7 +22,7 @@ use trainer::ModelOptions;
 /// does not know would be missing in the replay.
 const VERSION: u64 = 5;
 /// Name of the log in the run folder.
-const FILE: &str = "decisions.jsonl";
+pub(crate) const FILE: &str = "decisions.jsonl";
 /// Maximum number of decisions that wait to be written. Training waits while this queue is full, so
 /// that no decision is lost. A live run makes a few decisions per keyframe, so the queue is long
 /// enough for a disk that does not respond for minutes. Each waiting keyframe keeps its image in
@@ -515,6 +515,18 @@ impl Decisions {
             entries.push(entry);
         }
         Ok(Self { settings, entries })
+    }
+}
+
+/// Whether a file name is that of a decision log, also of a resumed run.
+pub(crate) fn is_log(name: &str) -> bool {
+    let (stem, extension) = FILE.split_once('.').expect("the name has an extension");
+    let middle = name
+        .strip_prefix(stem)
+        .and_then(|rest| rest.strip_suffix(extension)?.strip_suffix('.'));
+    match middle.and_then(|middle| middle.strip_prefix("-from-")) {
+        Some(step) => !step.is_empty() && step.bytes().all(|byte| byte.is_ascii_digit()),
+        None => middle == Some(""),
     }
 }
 

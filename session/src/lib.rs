@@ -66,12 +66,14 @@ pub mod robot_meshes;
 pub mod run_folder;
 mod run_plan;
 mod run_state;
+pub mod runs;
 mod saved_view;
 mod scene_calibration;
 pub mod scene_hint;
 mod served_files;
 mod session;
 mod session_setup;
+mod started_run;
 mod stored_keyframes;
 mod time_slices;
 mod train_plan;
@@ -113,6 +115,7 @@ pub use session::{
     SessionOptions, TrainingOutcome, TrainingTime, finish,
 };
 pub use session_setup::{NewObserver, Services};
+pub use started_run::StartedRun;
 pub use stored_keyframes::StoredKeyframes;
 pub use train_plan::{TrainOutcome, TrainPlan, Trained};
 pub use training::{UnsavedTraining, check_before_data, limits, model_specs};

@@ -1,6 +1,7 @@
 //! Events that a session sends to the program that runs it.
 
 use crate::evaluate::Scores;
+use crate::started_run::StartedRun;
 use serde::Serialize;
 use std::path::Path;
 use trainer::Progress;
@@ -19,12 +20,16 @@ impl Observer for () {
 /// An event of a session.
 #[derive(Clone, Copy, Debug)]
 pub enum SessionEvent<'a> {
+    /// The run has a folder, and training begins.
+    Started(&'a StartedRun),
     /// The state of training, several times per second.
     Progress(&'a SessionProgress),
     /// A scheduled evaluation.
     Evaluated(&'a Evaluation),
     /// Training ended; saving and scoring follow.
     TrainingEnded,
+    /// Work that may take long and has no count has begun, such as saving; `None` after its end.
+    Working(Option<&'static str>),
     /// The saved model is being scored.
     Scoring {
         /// Number of test images scored so far.

@@ -16,15 +16,21 @@ use trainer::{AlignedModel, ModelKind};
 /// File extension of recordings.
 const RECORDING_EXTENSION: &str = "mcap";
 /// Parent folder of runs without `--out`.
-const RUNS: &str = "runs";
+pub const RUNS: &str = "runs";
 /// Base name of the temporary subfolder in which a model is saved until it is complete.
-const MODEL: &str = "model";
+pub(crate) const MODEL: &str = "model";
 /// The checkpoint in the folder of a run.
 pub const CHECKPOINT: &str = "training.ckpt";
 /// Subfolder with the keyframes of a run.
 pub(crate) const KEYFRAMES: &str = "keyframes";
+/// The report on a saved model.
+pub(crate) const REPORT: &str = "report.json";
+/// The log of a run.
+pub const LOG: &str = "log.txt";
+/// The older part of a long log.
+pub const OLDER_LOG: &str = "log.1.txt";
 /// Lock file, held while a run writes into a folder.
-const LOCK: &str = ".lock";
+pub(crate) const LOCK: &str = ".lock";
 const SECS_PER_DAY: u64 = 86_400;
 
 /// Returns an error if a folder contains any model, so that results are never mixed or overwritten.
@@ -184,7 +190,7 @@ fn is_part_of_model(kind: ModelKind, path: &Path) -> bool {
 }
 
 /// Whether a folder contains any file of a saved model.
-fn holds_model(folder: &Path) -> bool {
+pub(crate) fn holds_model(folder: &Path) -> bool {
     ModelKind::model_files().any(|name| folder.join(name).exists())
 }
 
@@ -503,14 +509,20 @@ fn name_from_time(since_epoch: Duration) -> String {
 /// Date and time of day in UTC, for readers.
 pub fn utc_now() -> String {
     #[expect(clippy::disallowed_methods, reason = "only shown; no time is measured")]
-    let secs = SystemTime::now()
+    let since_epoch = SystemTime::now()
         .duration_since(UNIX_EPOCH)
-        .unwrap_or_default()
-        .as_secs();
+        .unwrap_or_default();
+    format!("{} UTC", utc_time(since_epoch))
+}
+
+/// Date and time of day in UTC of a time since 1970, such as `2026-11-21 09:30`.
+#[must_use]
+pub fn utc_time(since_epoch: Duration) -> String {
+    let secs = since_epoch.as_secs();
     let (year, month, day) = date_from_days(secs / SECS_PER_DAY);
     let minutes = secs % SECS_PER_DAY / 60;
     format!(
-        "{year:04}-{month:02}-{day:02} {:02}:{:02} UTC",
+        "{year:04}-{month:02}-{day:02} {:02}:{:02}",
         minutes / 60,
         minutes % 60
     )

@@ -337,9 +337,12 @@ impl Session {
             // The evaluation scores the model after all steps queued so far.
             self.method.n_total_steps()?;
             self.scoreboard.begin(self.time.secs());
+            self.reporter
+                .report_working(Some("scoring test images during training"));
             while !self.scoreboard.is_stepwise() && self.scoreboard.is_scoring() {
                 self.score_next()?;
             }
+            self.reporter.report_working(None);
         }
         self.reporter
             .report_progress(self.time.secs(), self.progress(), self.scoreboard.psnr());

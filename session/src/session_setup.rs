@@ -5,11 +5,12 @@ use crate::checkpoints::{CheckpointOptions, Checkpoints, RunFlags};
 use crate::decisions::{DecisionLog, RunDescription, Settings};
 use crate::kept_folder::KeptFolder;
 use crate::next_commands::DataSource;
-use crate::observer::Observer;
+use crate::observer::{Observer, SessionEvent};
 use crate::previous_run::PreviousRun;
 use crate::recoveries::OpenGpu;
 use crate::recovery::Recovery;
 use crate::session::{Evaluators, Limits, Session, SessionOptions};
+use crate::started_run::StartedRun;
 use crate::training_clock::Clock;
 use capture::Stop;
 use gpu::Gpu;
@@ -105,6 +106,10 @@ impl SessionSetup<'_> {
         for keyframe in &known {
             decisions.restored(from_step.unwrap_or_default(), keyframe);
         }
+        let mut observer = (self.services.observer)(self.limits, self.n_models);
+        observer.on_event(&SessionEvent::Started(
+            &self.started(folder, &resume_command),
+        ));
         let kind = model_spec.kind;
         let recovery = Recovery {
             model_spec,
@@ -115,7 +120,6 @@ impl SessionSetup<'_> {
             settings,
             resume_command,
         };
-        let observer = (self.services.observer)(self.limits, self.n_models);
         Ok(Session::new(
             self.gpu.clone(),
             (kind, method),
@@ -139,6 +143,20 @@ impl SessionSetup<'_> {
                 ..SessionOptions::new(self.evaluators.clone(), self.limits, observer)
             },
         ))
+    }
+
+    /// The folders of the session that writes into `folder`.
+    fn started(&self, folder: &Path, resume_command: &str) -> StartedRun {
+        let run_folder = match self.n_models {
+            // Each of several models has a subfolder.
+            2.. => folder.parent().unwrap_or(folder),
+            _ => folder,
+        };
+        StartedRun {
+            run_folder: run_folder.to_owned(),
+            model_folder: folder.to_owned(),
+            resume_command: resume_command.to_owned(),
+        }
     }
 
     /// The settings for the decision log.

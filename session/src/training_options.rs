@@ -297,7 +297,7 @@ impl TrainingOptions {
             .map(|(name, _)| name)
             .collect();
         Some(format!(
-            "no GPU: errors of the calibration, such as a wrong camera pose, are not estimated ({}), because that takes minutes; \
+            "no GPU: errors of the calibration, such as a wrong camera pose, are not estimated ({}), because that slows training down; \
              {} auto requests it",
             names.join(", "),
             Setting::Refine

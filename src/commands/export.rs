@@ -3,6 +3,7 @@
 use crate::exit::{self, Exit};
 use crate::open_gpu::open_gpu;
 use crate::permission_args::PermissionArgs;
+use crate::work_lines::WorkLines;
 use crate::{print, signals};
 use anyhow::{Context, ensure};
 use clap::builder::{PossibleValue, PossibleValuesParser};
@@ -227,6 +228,9 @@ fn export_recording(args: &Args) -> anyhow::Result<Exit> {
         out: args.out.clone(),
     };
     let bar = print::bar(None, "{spinner} reading {pos} samples", false);
+    let _lines = bar
+        .is_hidden()
+        .then(|| WorkLines::new("reading the recording"));
     let exported = export.run(&mut || bar.inc(1));
     bar.finish_and_clear();
     let (written, data_losses) = exported?;

@@ -12,6 +12,7 @@ pub(crate) mod move_arm;
 pub(crate) mod record;
 pub(crate) mod render;
 pub(crate) mod run;
+pub(crate) mod runs;
 pub(crate) mod sim;
 pub(crate) mod train;
 pub(crate) mod view;

@@ -1,5 +1,6 @@
 //! `fieldrig render`: renders images of a saved model.
 
+use crate::console::ProgressLines;
 use crate::exit::Exit;
 use crate::open_gpu::open_gpu;
 use crate::{print, signals};
@@ -156,6 +157,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
         "{bar:30} {pos} of {len}",
         args.json,
     );
+    let mut lines = ProgressLines::new(bar.is_hidden() && !args.json, Instant::now());
     let mut covered_fracs = Vec::new();
     for (ix, request) in requests.iter().enumerate() {
         // Only the request is timed, because encoding and writing files are not part of drawing.
@@ -174,6 +176,13 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
             draw_millis,
         };
         bar.inc(1);
+        if lines.is_due(ix + 1, requests.len(), Instant::now()) {
+            print::notice(format_args!(
+                "rendered {} of {} images",
+                ix + 1,
+                requests.len()
+            ));
+        }
         if args.json {
             print::report_json(&rendered)?;
         }

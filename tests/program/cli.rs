@@ -4,11 +4,12 @@ use std::path::Path;
 use std::process::{Command, Output, Stdio};
 
 /// Commands that `fieldrig --help` must list, each with its own help.
-const COMMANDS: [&str; 15] = [
+const COMMANDS: [&str; 16] = [
     "run",
     "record",
     "train",
     "view",
+    "runs",
     "render",
     "eval",
     "metrics",

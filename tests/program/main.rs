@@ -11,6 +11,7 @@ mod calibrate_scan;
 mod cases;
 mod cli;
 mod command;
+mod demo;
 mod depth_from;
 mod edits;
 mod end_to_end;
@@ -31,6 +32,7 @@ mod resume;
 mod robot_silhouette;
 #[cfg(feature = "sim")]
 mod run_folder;
+mod runs;
 #[cfg(feature = "sim")]
 mod small_rig;
 #[cfg(feature = "sim")]

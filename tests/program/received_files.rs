@@ -98,6 +98,7 @@ fn links_in_a_received_run_are_not_followed() {
         ".training.ckpt.fieldrig.part",
         ".report.json.fieldrig.part",
         "report.html",
+        "log.txt",
         ".keyframes.txt.fieldrig.part",
         ".cameras.json.fieldrig.part",
         ".model.fieldrig.part",

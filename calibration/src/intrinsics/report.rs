@@ -30,7 +30,7 @@ pub struct IntrinsicsCalibration {
     /// pixels.
     pub noise_px: f64,
     /// Ratio of the observed variance between images to the variance expected from independent
-    /// corner errors. The covariance is multiplied by this ratio if it is above 1.
+    /// corner errors. Above 1, corners of an image share errors, which the covariance contains.
     pub dispersion: f64,
     /// The images in use.
     pub images: Vec<ImageFit>,

@@ -36,7 +36,7 @@ const EXACT: f64 = 1e-12;
 /// A fit and the images and corners that it uses.
 #[derive(Clone, Debug)]
 pub(super) struct RobustFit {
-    /// The covariance contains the dispersion if that is above 1.
+    /// The covariance contains errors that the corners of an image share.
     pub(super) fit: Fit<Bundle>,
     pub(super) coefficients: Coefficients,
     pub(super) kept: Kept,
@@ -228,7 +228,7 @@ pub(super) fn refit(
     let mut fit = squared(&kept, bundle, coefficients, EXACT)?;
     // Errors of the corners of one image are correlated, for example because of blur, a bent
     // target, or a lens that no model describes.
-    fit.covariance *= fit.dispersion.max(1.0);
+    fit.covariance = fit.covariance_with_shared_errors.clone();
     Some(RobustFit {
         fit,
         coefficients,

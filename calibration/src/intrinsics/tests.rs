@@ -215,6 +215,80 @@ fn every_model_recovers_its_camera_without_noise() {
     }
 }
 
+/// Images whose corners share smooth errors, as from a bent board, blur, or a lens that no model
+/// describes. A pose of the board cannot explain them. Each corner also has an error of its own.
+fn images_with_shared_errors(
+    camera: &Intrinsics,
+    poses: &[Transform],
+    seed: u64,
+) -> Vec<BoardView> {
+    const SHARED_PX: f64 = 0.1;
+    const OWN_PX: f64 = 0.05;
+    let mut random = Random::new(seed);
+    let mut view = |(ix, pose): (usize, &Transform)| {
+        let mut points = observe(camera, pose, &board());
+        // A random quadratic function of the position on the board, for each axis of the image.
+        let [horizontal, vertical] = [0, 1].map(|_| [0, 1, 2].map(|_| SHARED_PX * random.normal()));
+        for point in &mut points {
+            let x = point.point_in_board.x / (4.0 * SQUARE_M) - 1.0;
+            let y = point.point_in_board.y / (2.5 * SQUARE_M) - 1.0;
+            for (value, [xx, xy, yy]) in point.pixel.iter_mut().zip([horizontal, vertical]) {
+                *value += xx * x * x + xy * x * y + yy * y * y + OWN_PX * random.normal();
+            }
+        }
+        BoardView {
+            name: format!("image {ix}"),
+            points,
+        }
+    };
+    poses.iter().enumerate().map(&mut view).collect()
+}
+
+/// Squared errors of focal lengths and principal points, in units of their stated variances.
+fn squared_errors(camera: &Intrinsics, views: &[BoardView]) -> [f64; 4] {
+    let found = calibrate(camera, views, LensModel::BrownConrady5).unwrap();
+    let truth = camera.params();
+    std::array::from_fn(|ix| {
+        ((found.params[ix].value - truth[ix]) / found.params[ix].sigma).powi(2)
+    })
+}
+
+/// Mean of squared errors per parameter over many calibrations, each with other board poses. It is
+/// 1 if the stated standard deviations are right.
+fn chi_squares(n_runs: u64, errors: impl Fn(u64) -> [f64; 4]) -> [f64; 4] {
+    let mut sums = [0.0; 4];
+    for seed in 0..n_runs {
+        for (sum, square) in sums.iter_mut().zip(errors(seed)) {
+            *sum += square / n_runs as f64;
+        }
+    }
+    sums
+}
+
+#[test]
+fn squared_errors_match_stated_variances_with_own_and_with_shared_errors() {
+    const N_RUNS: u64 = 100;
+    // The mean of 100 squares of normal numbers has a standard deviation of 0.14. Variances of shared
+    // errors are estimated from 15 images, which makes the mean larger than 1 by about 0.1. With one
+    // factor for all parameters, the means of shared errors are up to 1.9.
+    const RANGE: std::ops::Range<f64> = 0.55..1.5;
+    let camera = brown_conrady_camera();
+    let own = chi_squares(N_RUNS, |seed| {
+        let poses = poses(15, 1000 + seed);
+        squared_errors(&camera, &observed_images(&camera, &poses, 0.1, seed))
+    });
+    let shared = chi_squares(N_RUNS, |seed| {
+        let poses = poses(15, 1000 + seed);
+        squared_errors(&camera, &images_with_shared_errors(&camera, &poses, seed))
+    });
+    for (kind, chi_squares) in [("own", own), ("shared", shared)] {
+        assert!(
+            chi_squares.iter().all(|value| RANGE.contains(value)),
+            "own {own:.2?}, shared {shared:.2?}: {kind}"
+        );
+    }
+}
+
 #[test]
 fn stated_uncertainty_covers_the_truth() {
     // Three binomial standard deviations of 95 % are 4.6 % for 200 runs and 6.5 % for 100 runs.

@@ -26,6 +26,9 @@ pub struct Fit<S> {
     /// Covariance of the shared parameters. Entries of unobservable parameters are very large, but
     /// finite.
     pub covariance: DMatrix<f64>,
+    /// Covariance of the shared parameters if the residuals of a block share errors. It is larger
+    /// than `covariance` as far as the solution changes more when one block is left out.
+    pub covariance_with_shared_errors: DMatrix<f64>,
     /// Orthogonal directions of the shared parameters, the least observable first.
     pub directions: Vec<Direction>,
     /// Whether the last step was negligible.
@@ -106,18 +109,38 @@ pub(super) fn fit<S>(
         let vector = direction.components.component_mul(scales) * direction.sigma;
         covariance.ger(1.0, &vector, &vector, 1.0);
     }
+    let dispersion = normal_equations::dispersion(&at.blocks, scales.len(), variance);
+    let jackknife = normal_equations::jackknife(&at.blocks, scales.len());
     Fit {
+        covariance_with_shared_errors: with_shared_errors(&covariance, dispersion, jackknife),
         state: at.state,
         cost: 0.5 * at.totals.loss,
         n_residuals: at.totals.n_scalars,
         n_params,
         variance,
-        dispersion: normal_equations::dispersion(&at.blocks, scales.len(), variance),
+        dispersion,
         information,
         covariance,
         directions,
         converged: progress.converged,
         n_steps: progress.n_steps,
+    }
+}
+
+/// Combines two covariances that allow for shared errors. The covariance times the dispersion is
+/// precise, but assumes that shared errors have the same effect on all parameters. The jackknife
+/// does not, but is an estimate from a few blocks, as if a variance were computed from so many
+/// numbers. Their mean has the right size for both kinds of errors, already with 10 to 15 blocks.
+fn with_shared_errors(
+    covariance: &DMatrix<f64>,
+    dispersion: f64,
+    jackknife: Option<DMatrix<f64>>,
+) -> DMatrix<f64> {
+    // A dispersion below 1 is chance.
+    let scaled = covariance * dispersion.max(1.0);
+    match jackknife {
+        Some(jackknife) => (scaled + jackknife) * 0.5,
+        None => scaled,
     }
 }
 

@@ -2,7 +2,7 @@
 //! complement.
 
 use super::loss::Loss;
-use nalgebra::{Cholesky, DMatrix, DVector, Dyn};
+use nalgebra::{Cholesky, DMatrix, DVector, Dyn, SymmetricEigen};
 
 /// Residuals of one block and their derivatives. [`super::Problem::evaluate`] adds them.
 #[derive(Clone, Debug)]
@@ -251,6 +251,54 @@ pub(super) fn dispersion(blocks: &[BlockSums], n_shared: usize, variance: f64) -
     } else {
         scatter / (expected * variance)
     }
+}
+
+/// Covariance of the shared parameters from the changes of the solution when one block is left out,
+/// to first order: the jackknife. Residuals of a block may share errors, which have a different
+/// effect on each parameter. `None` if there are not more blocks than parameters, or if the blocks
+/// do not determine them.
+///
+/// With the symbols of [`dispersion`], leaving out block b changes the solution by
+/// `inverse(S - S_b) g_b = inverse(S) inverse(1 - S_b inverse(S)) g_b`. Blocks that determine a
+/// direction almost alone would give very large changes, so the eigenvalues of the inner inverse are
+/// limited.
+pub(super) fn jackknife(blocks: &[BlockSums], n_shared: usize) -> Option<DMatrix<f64>> {
+    // Source: MacKinnon and White 1985 (HC3), with blocks as in Bell and McCaffrey 2002.
+    const DAMPING: f64 = 1e-12;
+    // A block with 95 % of the information about a direction.
+    const MIN_REST: f64 = 0.05;
+    // Fewer changes than parameters do not show how all of them vary.
+    if n_shared == 0 || blocks.len() <= n_shared {
+        return None;
+    }
+    let reduced: Vec<Reduced> = blocks
+        .iter()
+        .map(|block| Reduced::new(std::slice::from_ref(block), n_shared, DAMPING))
+        .collect::<Option<_>>()?;
+    let sum = reduced
+        .iter()
+        .fold(DMatrix::zeros(n_shared, n_shared), |sum, block| {
+            sum + &block.matrix
+        });
+    let factor = Cholesky::new(sum)?;
+    let lower = factor.l();
+    let mut covariance = DMatrix::zeros(n_shared, n_shared);
+    for block in &reduced {
+        let mut matrix = block.matrix.clone();
+        matrix.fill_upper_triangle_with_lower_triangle();
+        // With S = L L', the share of the block is inverse(L) S_b inverse(L)', which is symmetric.
+        let half = lower.solve_lower_triangular(&matrix)?;
+        let share = lower.solve_lower_triangular(&half.transpose())?;
+        let eigen = SymmetricEigen::new(share);
+        let whitened = lower.solve_lower_triangular(&block.gradient)?;
+        let mut along = eigen.eigenvectors.tr_mul(&whitened);
+        for (value, share) in along.iter_mut().zip(eigen.eigenvalues.iter()) {
+            *value /= (1.0 - share).max(MIN_REST);
+        }
+        let change = lower.tr_solve_lower_triangular(&(&eigen.eigenvectors * along))?;
+        covariance.ger(1.0, &change, &change, 1.0);
+    }
+    Some(covariance)
 }
 
 /// The normal equations of the shared parameters after elimination of the local ones.

@@ -123,6 +123,33 @@ fn stated_uncertainty_matches_the_scatter_of_the_errors() {
 }
 
 #[test]
+fn jackknife_is_the_change_without_each_block() {
+    // The problem is nonlinear, and the jackknife is of first order.
+    const REL: f64 = 0.05;
+    let all = Circles::new(6, 0.01, 3);
+    let fit = minimize(&all, all.start(), &Options::default()).unwrap();
+    let mut squares = 0.0;
+    for left_out in 0..all.points.len() {
+        let mut points = all.points.clone();
+        points.remove(left_out);
+        let rest = Circles { points };
+        let without = minimize(&rest, rest.start(), &Options::default()).unwrap();
+        squares += (without.state.0 - fit.state.0).powi(2);
+    }
+    let scaled = fit.covariance[(0, 0)] * fit.dispersion.max(1.0);
+    let jackknife = 2.0 * fit.covariance_with_shared_errors[(0, 0)] - scaled;
+    assert!(
+        (jackknife / squares - 1.0).abs() < REL,
+        "{jackknife} instead of {squares}"
+    );
+    // One block cannot be left out.
+    let one = Circles::new(1, 0.01, 3);
+    let fit = minimize(&one, one.start(), &Options::default()).unwrap();
+    let scaled = fit.covariance[(0, 0)] * fit.dispersion.max(1.0);
+    assert_eq!(fit.covariance_with_shared_errors[(0, 0)], scaled);
+}
+
+#[test]
 fn robust_losses_resist_outliers() {
     let mut problem = Circles::new(6, 0.01, 3);
     for circle in &mut problem.points {

@@ -10,6 +10,7 @@
 //! All functions are pure functions of keyframes. They use no clock and no I/O, and sum in a fixed
 //! order for any number of threads.
 
+mod acceleration;
 mod corrections;
 mod covariance;
 mod features;
@@ -35,6 +36,7 @@ pub use report::{Alignment, Estimate, PoseEstimate, ScalarEstimate, Unobservable
 pub use station::{StationCorrection, register_station};
 
 use crate::{CameraRefinement, Candidate, ParamSet, Trial};
+use acceleration::Velocities;
 use corrections::Corrections;
 use fit::Fit;
 use keyframe::{Keyframe, Split};
@@ -93,7 +95,7 @@ pub fn align(keyframes: &[Arc<Keyframe>], choice: &CameraRefinement) -> Option<A
     if keyframes.iter().all(|keyframe| keyframe.depth.is_none()) {
         return features::align(keyframes, choice);
     }
-    let scene = AlignmentScene::new(keyframes, includes_image_poses(choice))?;
+    let mut scene = AlignmentScene::new(keyframes, includes_image_poses(choice))?;
     let uncorrected = CalibrationModel {
         set: ParamSet::empty(),
         fit: None,
@@ -117,6 +119,7 @@ pub fn align(keyframes: &[Arc<Keyframe>], choice: &CameraRefinement) -> Option<A
             scene.select_params(&all, uncorrected, &mut trials, &mut unobservable)
         }
     };
+    kept = scene.with_accelerations(kept, keyframes);
     if let Some(fit) = &mut kept.fit {
         fit.add_discretization_error(&scene.images, &scene.pairs);
         unobservable.extend(report::unobservable(&scene, fit));
@@ -236,6 +239,24 @@ impl AlignmentScene {
             fit,
             corrections,
         })
+    }
+
+    /// Estimates the same parameters again, with velocities that make the estimated time offsets
+    /// exact also for cameras that accelerate.
+    fn with_accelerations(
+        &mut self,
+        model: CalibrationModel,
+        keyframes: &[Arc<Keyframe>],
+    ) -> CalibrationModel {
+        // Poses of single images already contain the errors of a constant velocity.
+        let is_affected =
+            model.set.contains(ParamSet::TIME_OFFSET) && !model.set.contains(ParamSet::IMAGE_POSES);
+        let velocities = Velocities::of(keyframes);
+        if is_affected && velocities.apply_to(&mut self.images, &model.corrections) {
+            self.model(model.set, &model).unwrap_or(model)
+        } else {
+            model
+        }
     }
 
     /// Also estimates individual poses of the validation images, after all decisions, because these

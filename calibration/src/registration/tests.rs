@@ -281,6 +281,83 @@ fn reported_sigmas_match_actual_errors() {
     assert!((0.25..4.0).contains(&mean), "{mean} of {squares:.1?}");
 }
 
+/// Squared errors of the extrinsics, in units of their stated variances, along and about the axes of
+/// the camera.
+fn squared_extrinsics_errors(miscalibration: &Miscalibration, set: ParamSet) -> [f64; 6] {
+    let alignment = align_given(miscalibration, set);
+    let correction = &alignment.corrections["wrist"];
+    let corrected = crate::rigid_transform(
+        correction.rotation_rad.into(),
+        correction.translation_m.into(),
+    )
+    .inverse();
+    let error = transform::log(&(miscalibration.extrinsics * corrected), 1.0);
+    let covariance = alignment.extrinsics_covariance.as_ref();
+    let sigmas = covariance
+        .and_then(|known| known.of_camera("wrist"))
+        .expect("extrinsics were estimated");
+    std::array::from_fn(|ix| {
+        let in_sigmas = match ix {
+            0..3 => error.linear_m_s[ix] / sigmas.m[ix],
+            _ => error.angular_rad_s[ix - 3] / sigmas.rad[ix - 3],
+        };
+        in_sigmas.powi(2)
+    })
+}
+
+#[test]
+fn errors_match_stated_variances_with_a_time_offset() {
+    const SEEDS: u64 = 6;
+    // Mean over 36 squares, of which only some are independent. The stated variances contain the
+    // discretization error, which is larger than the real one in small images.
+    const MAX_RATIO: f64 = 1.5;
+    let mut squares = Vec::new();
+    for seed in 0..SEEDS {
+        let miscalibration = Miscalibration {
+            extrinsics: wrong_extrinsics(),
+            time_offset_secs: 0.05,
+            seed,
+            ..Miscalibration::none()
+        };
+        let set = ParamSet::EXTRINSICS | ParamSet::TIME_OFFSET;
+        squares.extend(squared_extrinsics_errors(&miscalibration, set));
+    }
+    let mean = squares.iter().sum::<f64>() / squares.len() as f64;
+    assert!(mean < MAX_RATIO, "{mean} of {squares:.1?}");
+}
+
+#[test]
+fn accelerations_reduce_the_error_of_extrinsics_with_a_time_offset() {
+    // With this offset, constant velocities give pose errors of about 0.8 mm, which exceed the
+    // discretization error. Less than half of the error of the extrinsics may be left.
+    const OFFSET_SECS: f64 = 0.08;
+    const MAX_RATIO: f64 = 0.5;
+    let miscalibration = Miscalibration {
+        extrinsics: wrong_extrinsics(),
+        time_offset_secs: OFFSET_SECS,
+        noise: 0.1,
+        ..Miscalibration::none()
+    };
+    let keyframes = capture(&miscalibration);
+    let mut scene = AlignmentScene::new(&keyframes, false).unwrap();
+    let uncorrected = CalibrationModel {
+        set: ParamSet::empty(),
+        fit: None,
+        corrections: Corrections::none(1),
+    };
+    let set = ParamSet::EXTRINSICS | ParamSet::TIME_OFFSET;
+    let first = scene.model(set, &uncorrected).unwrap();
+    let error_mm = |model: &CalibrationModel| {
+        remaining(&model.corrections.by_camera[0], &miscalibration.extrinsics).1
+    };
+    let first_mm = error_mm(&first);
+    let second_mm = error_mm(&scene.with_accelerations(first, &keyframes));
+    assert!(
+        second_mm < MAX_RATIO * first_mm,
+        "{first_mm} mm with constant velocities, {second_mm} mm with accelerations"
+    );
+}
+
 /// The reported uncertainty contains the error that all pairs have in common.
 #[test]
 fn truth_is_within_the_stated_extrinsics() {

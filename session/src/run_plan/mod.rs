@@ -16,6 +16,7 @@ mod startup;
 pub use in_progress::{DiscardedRun, RunInProgress};
 pub use prepared::{OpenedRun, PreparedRun};
 pub use previous::PreviousLiveRun;
+pub(crate) use saving::CORRECTED_RIG;
 pub use saving::{EndedRun, SavedRun};
 
 use crate::checkpoints::CheckpointOptions;

@@ -24,7 +24,7 @@ use std::time::Duration;
 use viz::{CheckpointState, Grade, Hub, RequestedCheckpoint, RunResult, Status, Verdict};
 
 /// Name of the rig file with the corrections of a run.
-const CORRECTED_RIG: &str = "corrected-rig.toml";
+pub(crate) const CORRECTED_RIG: &str = "corrected-rig.toml";
 /// Time for which the server stays up, so that connected clients receive the last status. They are
 /// on this computer or a local network, where a message arrives within milliseconds.
 const FINAL_STATUS_TIME: Duration = Duration::from_millis(400);

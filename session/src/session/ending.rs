@@ -160,8 +160,11 @@ fn save_all<P>(
                 endings[ix].session.persistence.is_writing()
             });
         }
+        endings[ix].report_working(Some("saving the model"));
+        let result = save(endings, ix, *seconds, viewers.as_deref_mut());
+        endings[ix].report_working(None);
         // A model that cannot be saved does not prevent saving the others.
-        saved.push(match save(endings, ix, *seconds, viewers.as_deref_mut()) {
+        saved.push(match result {
             Ok(mut saved) => {
                 if let Some(error) = saved.failed.take() {
                     errors.record(error);
@@ -238,7 +241,10 @@ fn wait_for_checkpoints<P>(
         .zip(saved)
         .filter(|(_, saved)| saved.is_some())
     {
-        if let Err(error) = ending.session.persistence.wait() {
+        ending.report_working(Some("writing the last checkpoint"));
+        let written = ending.session.persistence.wait();
+        ending.report_working(None);
+        if let Err(error) = written {
             errors.record(error.context(format!(
                 "the model was saved in {}, but not the last checkpoint",
                 ending.out.display()
@@ -453,6 +459,7 @@ fn report_end(
         mut viewing,
     } = session;
     viewing.show_reporting();
+    reporter.report_working(Some("drawing and writing the report"));
     // The pictures are rendered before profiling, because profiling trains the model further.
     let pictures = reporter.draw_pictures(
         method,
@@ -462,7 +469,7 @@ fn report_end(
         |method| viewing.serve(method),
     );
     let passes = reporter.profile(method.model_mut())?;
-    reporter.report_end(ScoredModel {
+    let reported = reporter.report_end(ScoredModel {
         out: &ending.out,
         checkpoint_sha256: &saved.sha256,
         outcome: &outcome,
@@ -473,7 +480,9 @@ fn report_end(
         trials: method.model().report(),
         adapter,
         details: &ending.details,
-    })?;
+    });
+    reporter.report_working(None);
+    reported?;
     viewing.serve(method);
     Ok(ModelOutcome {
         seconds,
@@ -491,6 +500,10 @@ struct ModelOutcome {
 }
 
 impl<P> EndingSession<P> {
+    fn report_working(&mut self, work: Option<&'static str>) {
+        self.session.reporter.report_working(work);
+    }
+
     /// Saves the model. If `out` cannot be written, a temporary folder becomes `out`, and the
     /// reason is returned.
     ///

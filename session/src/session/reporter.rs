@@ -170,6 +170,11 @@ impl Reporter {
             .on_event(&SessionEvent::Scoring { n_scored, n_all });
     }
 
+    /// Reports that work without a count has begun, or that it has ended.
+    pub(super) fn report_working(&mut self, work: Option<&'static str>) {
+        self.observer.on_event(&SessionEvent::Working(work));
+    }
+
     /// Reports that training ended.
     pub(super) fn report_training_ended(&mut self) {
         self.observer.on_event(&SessionEvent::TrainingEnded);
@@ -251,7 +256,7 @@ impl Reporter {
         };
         // The page and the event follow even if the report was not written: the model is saved, and
         // its scores must not be lost. The error is returned at the end.
-        let written = run_folder::write_json(&out.join("report.json"), &report);
+        let written = run_folder::write_json(&out.join(run_folder::REPORT), &report);
         // The page is an addition, so its error is only logged.
         let page = model
             .pictures

@@ -1,0 +1,332 @@
+//! `fieldrig runs`: lists and removes the folders of runs.
+
+use crate::exit::Exit;
+use crate::number_args::number_in_range;
+use crate::print;
+use anyhow::Context;
+use messages::{BadInput, counted};
+use serde::Serialize;
+use session::run_folder::RUNS;
+use session::runs::{self, KeptModel, KeptRun, OldRuns, RemovableRun};
+use std::io::{BufRead, ErrorKind, IsTerminal};
+use std::path::PathBuf;
+use std::time::{Duration, SystemTime};
+
+/// Flags of `runs`.
+#[derive(Debug, clap::Args)]
+#[command(
+    args_conflicts_with_subcommands = true,
+    after_long_help = "Without a subcommand, the runs are listed. States: `running`: a process writes into the folder. \
+                       `done`: all models were saved and scored. `not scored`: the run ended before its scores. \
+                       `unfinished`: there is a checkpoint, from which `run --resume` or `train --resume` continues, but no model. `no model`: there is neither."
+)]
+pub(crate) struct Args {
+    #[command(subcommand)]
+    action: Option<Action>,
+    #[command(flatten)]
+    list: ListArgs,
+}
+
+/// What to do with the runs.
+#[derive(Debug, clap::Subcommand)]
+enum Action {
+    /// List the runs with their time, rig, scores, size and state, the newest last
+    List(ListArgs),
+    /// Remove runs with all their files, after a question
+    #[command(
+        after_long_help = "A folder is refused if it is in use, if it is not the folder of a run, or if it contains other \
+                           files than those of a run, such as a recording. Then nothing is removed. With --older-than or \
+                           --keep, such folders are kept and named."
+    )]
+    Remove(RemoveArgs),
+}
+
+/// The folder of the runs.
+#[derive(Debug, clap::Args)]
+struct FolderArg {
+    /// Folder of the runs
+    #[arg(long = "in", value_name = "FOLDER", default_value = RUNS)]
+    folder: PathBuf,
+}
+
+#[derive(Debug, clap::Args)]
+struct ListArgs {
+    #[command(flatten)]
+    folder: FolderArg,
+    /// Print JSON, one object per run, then one with the total
+    #[arg(long)]
+    json: bool,
+}
+
+#[derive(Debug, clap::Args)]
+#[command(group(clap::ArgGroup::new("which").required(true).multiple(true)))]
+struct RemoveArgs {
+    /// Names in the folder of the runs, or paths of runs
+    #[arg(value_name = "NAME", group = "which", conflicts_with_all = ["older_than", "keep"])]
+    names: Vec<PathBuf>,
+    #[command(flatten)]
+    folder: FolderArg,
+    /// Remove the runs that have not changed for more than DAYS
+    #[arg(long, value_name = "DAYS", group = "which", value_parser = number_in_range(0.0..=36_500.0))]
+    older_than: Option<f64>,
+    /// Keep the N newest runs, and remove the others. With --older-than, a run must meet both
+    /// conditions
+    #[arg(long, value_name = "N", group = "which")]
+    keep: Option<usize>,
+    /// Do not ask
+    #[arg(long)]
+    yes: bool,
+}
+
+/// Lists or removes runs.
+pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
+    match &args.action {
+        None => list(&args.list),
+        Some(Action::List(args)) => list(args),
+        Some(Action::Remove(args)) => remove(args),
+    }
+}
+
+/// The total of a list as JSON.
+#[derive(Debug, Serialize)]
+struct Total {
+    event: &'static str,
+    runs: usize,
+    bytes: u64,
+}
+
+/// A run as JSON.
+#[derive(Debug, Serialize)]
+struct RunEvent<'a> {
+    event: &'static str,
+    #[serde(flatten)]
+    run: &'a KeptRun,
+}
+
+fn list(args: &ListArgs) -> anyhow::Result<Exit> {
+    let folder = &args.folder.folder;
+    let runs = match runs::list(folder) {
+        Ok(runs) => runs,
+        // The folder of the runs is made by the first run.
+        Err(error) if error.kind() == ErrorKind::NotFound => Vec::new(),
+        Err(error) => {
+            return Err(error).with_context(|| format!("cannot read {}", folder.display()));
+        }
+    };
+    let bytes = runs.iter().map(|run| run.bytes).sum();
+    if args.json {
+        for run in &runs {
+            print::json(&RunEvent { event: "run", run })?;
+        }
+        print::json(&Total {
+            event: "total",
+            runs: runs.len(),
+            bytes,
+        })?;
+        return Ok(Exit::Done);
+    }
+    for line in table(&runs) {
+        print::line(line)?;
+    }
+    print::line(format_args!(
+        "{} in {}, {}",
+        counted(runs.len() as u64, "run"),
+        folder.display(),
+        size(bytes)
+    ))?;
+    Ok(Exit::Done)
+}
+
+/// The runs in columns, with a header if there are any.
+fn table(runs: &[KeptRun]) -> Vec<String> {
+    if runs.is_empty() {
+        return Vec::new();
+    }
+    let header = [
+        "NAME",
+        "CHANGED (UTC)",
+        "RIG OR DATA",
+        "MODELS",
+        "SIZE",
+        "STATE",
+    ];
+    let mut rows = vec![header.map(str::to_owned)];
+    rows.extend(runs.iter().map(row));
+    let width = |column: usize| {
+        let cells = rows.iter().map(|row| row[column].chars().count());
+        cells.max().unwrap_or_default()
+    };
+    let widths: [usize; 6] = std::array::from_fn(width);
+    rows.iter()
+        .map(|row| {
+            let cells = row.iter().zip(widths);
+            let cells = cells.map(|(cell, width)| format!("{cell:width$}"));
+            let line = cells.collect::<Vec<_>>().join("  ");
+            line.trim_end().to_owned()
+        })
+        .collect()
+}
+
+fn row(run: &KeptRun) -> [String; 6] {
+    let models: Vec<String> = run.models.iter().map(model).collect();
+    [
+        run.name.clone(),
+        session::run_folder::utc_time(Duration::from_secs(run.changed_unix_secs)),
+        run.rig.clone().unwrap_or_else(|| "-".to_owned()),
+        if models.is_empty() {
+            "-".to_owned()
+        } else {
+            models.join(", ")
+        },
+        size(run.bytes),
+        run.state.words().to_owned(),
+    ]
+}
+
+fn model(model: &KeptModel) -> String {
+    match model.psnr {
+        Some(psnr) => format!("{} {psnr:.2} dB", model.method),
+        None => model.method.clone(),
+    }
+}
+
+/// A size in units of 1000 bytes, as `ls` and disk vendors use them.
+fn size(bytes: u64) -> String {
+    let mega = bytes as f64 / 1e6;
+    if mega < 1000.0 {
+        format!("{mega:.1} MB")
+    } else {
+        format!("{:.2} GB", mega / 1e3)
+    }
+}
+
+fn remove(args: &RemoveArgs) -> anyhow::Result<Exit> {
+    let folder = &args.folder.folder;
+    let runs = if args.names.is_empty() {
+        old_runs(args)?
+    } else {
+        runs::by_name(folder, &args.names)
+            .map_err(|refused| BadInput(format!("{refused}; nothing was removed")))?
+    };
+    if runs.is_empty() {
+        print::line(format_args!("no run in {} to remove", folder.display()))?;
+        return Ok(Exit::Done);
+    }
+    let bytes = runs.iter().map(|run| run.run.bytes).sum();
+    let what = format!("{} ({})", counted(runs.len() as u64, "run"), size(bytes));
+    if !args.yes {
+        for run in &runs {
+            print::line(format_args!("{}", run.run.folder.display()))?;
+        }
+        if !is_confirmed(&what)? {
+            print::line("nothing was removed")?;
+            return Ok(Exit::Done);
+        }
+    }
+    for run in runs {
+        let folder = run.run.folder.clone();
+        run.remove()?;
+        print::line(format_args!("removed {}", folder.display()))?;
+    }
+    print::line(format_args!("removed {what}"))?;
+    Ok(Exit::Done)
+}
+
+fn old_runs(args: &RemoveArgs) -> anyhow::Result<Vec<RemovableRun>> {
+    const SECS_PER_DAY: f64 = 86_400.0;
+    let folder = &args.folder.folder;
+    let old = OldRuns {
+        older_than: args
+            .older_than
+            .map(|days| Duration::from_secs_f64(days * SECS_PER_DAY)),
+        keep: args.keep,
+    };
+    #[expect(
+        clippy::disallowed_methods,
+        reason = "files have times of the wall clock; no time is measured"
+    )]
+    let now = SystemTime::now();
+    let (runs, refused) = runs::by_age(folder, old, now)
+        .with_context(|| format!("cannot read {}", folder.display()))?;
+    for reason in refused {
+        log::warn!("kept: {reason}");
+    }
+    Ok(runs)
+}
+
+/// Asks whether to remove these runs. Only `y` and `yes` confirm.
+fn is_confirmed(what: &str) -> anyhow::Result<bool> {
+    let stdin = std::io::stdin();
+    if !stdin.is_terminal() {
+        let message = "stdin is not a terminal, so the question cannot be asked: add --yes to remove the runs";
+        return Err(BadInput(message.to_owned()).into());
+    }
+    print::notice(format_args!("Remove {what} with all files? [y/N]"));
+    print::flush();
+    let mut answer = String::new();
+    stdin
+        .lock()
+        .read_line(&mut answer)
+        .context("cannot read the answer")?;
+    Ok(is_yes(&answer))
+}
+
+fn is_yes(answer: &str) -> bool {
+    matches!(&*answer.trim().to_lowercase(), "y" | "yes")
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use session::runs::RunState;
+
+    #[test]
+    fn only_yes_confirms() {
+        for (answer, expected) in [
+            ("y\n", true),
+            ("Yes\r\n", true),
+            ("\n", false),
+            ("", false),
+            ("n\n", false),
+            ("yep\n", false),
+        ] {
+            assert_eq!(is_yes(answer), expected, "{answer:?}");
+        }
+    }
+
+    #[test]
+    fn runs_are_shown_in_columns() {
+        let run = |name: &str, models: Vec<KeptModel>, bytes| KeptRun {
+            name: name.to_owned(),
+            folder: name.into(),
+            changed_unix_secs: 1_795_000_000,
+            rig: None,
+            models,
+            bytes,
+            state: RunState::Done,
+        };
+        let scored = KeptModel {
+            method: "splat".to_owned(),
+            psnr: Some(25.254),
+        };
+        let unscored = KeptModel {
+            method: "tsdf".to_owned(),
+            psnr: None,
+        };
+        let lines = table(&[
+            run("a", vec![scored, unscored], 467_000_000),
+            run("20261129-181500", vec![], 1_500_000_000),
+        ]);
+        assert_eq!(
+            lines[1],
+            "a                2026-11-18 11:06  -            splat 25.25 dB, tsdf  467.0 MB  done"
+        );
+        assert!(
+            lines[2].ends_with("-                     1.50 GB   done"),
+            "{}",
+            lines[2]
+        );
+        assert!(lines[0].starts_with("NAME             CHANGED (UTC)     RIG OR DATA  MODELS"));
+        assert!(table(&[]).is_empty());
+    }
+}
