@@ -66,7 +66,13 @@ const PRINTED_BY: [(&str, &[&str]); 34] = [
     ("src/console.rs", &["run", "train"]),
     (
         "src/page_args.rs",
-        &["run", "view", "calibrate intrinsics", "calibrate hand-eye"],
+        &[
+            "run",
+            "view",
+            "preview",
+            "calibrate intrinsics",
+            "calibrate hand-eye",
+        ],
     ),
     (
         "targets/src/error.rs",

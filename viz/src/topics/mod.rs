@@ -22,6 +22,7 @@ pub(crate) mod model_chunks;
 pub(crate) mod observations;
 pub(crate) mod operator_status;
 mod positions;
+pub(crate) mod preview_status;
 pub(crate) mod published_data;
 pub(crate) mod range_scans;
 pub(crate) mod robot_description;

@@ -32,6 +32,7 @@ import { NamedViews } from "./panels/named_views";
 import { NewRun } from "./panels/new_run";
 import { OverlayAges } from "./panels/overlay_ages";
 import { setUpPanels } from "./panels/panels";
+import { Preview } from "./panels/preview";
 import { PictureInfo } from "./panels/picture_info";
 import { Readouts } from "./panels/readouts";
 import { RobotAge } from "./panels/robot_age";
@@ -99,7 +100,7 @@ const connectionState = new ConnectionState({
   restart,
   changed: () => view.changed(),
   // The skeleton says what is missing before the first picture.
-  problem: () => flow.problem(skeleton.isVisible ? null : pictureInfo.waitingMillis),
+  problem: () => flow.problem(skeleton.isVisible || preview.isOn ? null : pictureInfo.waitingMillis),
 });
 const connection: Connection = new Connection(
   `${location.protocol === "https:" ? "wss" : "ws"}://${location.host}/ws`,
@@ -175,6 +176,7 @@ const browser = new KeyframeBrowser({
   radiusM: () => sceneRadiusM,
 });
 const model = new ShownModel({ view, models, readouts, edits, scheduler, browser, surroundings, topics, chunks });
+const preview = new Preview(model, skeleton, liveImages);
 const picture = new MainPicture({
   view,
   scheduler,
@@ -259,6 +261,7 @@ function receiveStatus(status: Status): void {
   for (const part of [runControls, header, trainingPanel, runEnd, modelSource]) part.show(status);
   banner.setStatus(status);
   showGuidance(status.guidance, banner, liveImages);
+  preview.show(status);
   for (const ages of [robotAge, overlayAges]) ages.hasEnded = banner.isFinished;
   namedViews.runIs(status);
   flow.isReading = CONTROLLABLE.includes(status.state);
@@ -299,7 +302,7 @@ function frame(): void {
   settings.tick();
   // Until the chunks in view have arrived, pictures of the server are shown.
   scheduler.drawsLocally = view.local.replacesPictures;
-  scheduler.tick();
+  if (!preview.isOn) scheduler.tick();
   pictureInfo.update();
   if (!view.usesSurroundings || settings.isPlaying) {
     surroundings.forget();
