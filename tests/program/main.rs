@@ -24,6 +24,7 @@ mod page_replay;
 mod page_server;
 mod paths;
 mod photos;
+mod preview;
 #[cfg(feature = "realsense")]
 mod realsense;
 mod received_files;

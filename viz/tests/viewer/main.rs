@@ -22,6 +22,7 @@ mod negotiation;
 mod page;
 mod page_latency;
 mod page_tasks;
+mod preview_page;
 mod protocol;
 mod proxy;
 mod remember_page;

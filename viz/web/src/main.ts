@@ -285,7 +285,7 @@ function receiveText(message: TextMessage): void {
     case "error":
       if ([edits, ...sides, browser].some((part) => part.fail(message))) break;
       // The skeleton already shows what is missing.
-      picture.failed(message.id, skeleton.isVisible && !model.status?.keyframes ? "" : message.message);
+      picture.failed(message.id, preview.isOn || (skeleton.isVisible && !model.status?.keyframes) ? "" : message.message);
       break;
   }
 }
