@@ -61,6 +61,7 @@ mod supervised_arm;
 pub use arm_capture::ArmCapture;
 pub use calibration_images::{
     ArmDuringImage, CalibrationImage, CalibrationImages, calibration_images,
+    chosen_calibration_images,
 };
 pub use config::{ConfigError, Override, Rig};
 pub use feed::{Feed, FeedItem, Input, InputObserver, InputResult, InputTimes};

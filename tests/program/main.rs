@@ -5,6 +5,7 @@ mod arrows;
 mod bench;
 mod calibrate;
 mod calibrate_eye_to_hand;
+mod calibrate_guided;
 mod calibrate_mistakes;
 mod calibrate_page;
 mod calibrate_scan;

@@ -31,7 +31,7 @@ const DEFAULT_SECS: f64 = 30.0;
 /// exposure time and the uncertainty of the stamp. Corners are corrected for the motion during the
 /// readout, but the correction is only as accurate as the velocity. A smaller value rejects images
 /// of slow motions. A larger value accepts blurred corners.
-const MAX_SHIFT_PX: f64 = 3.0;
+pub(crate) const MAX_SHIFT_PX: f64 = 3.0;
 
 /// Images of one camera that were searched for a target.
 pub(crate) struct Scan {

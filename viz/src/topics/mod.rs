@@ -21,6 +21,7 @@ pub(crate) mod live_images;
 pub(crate) mod model_chunks;
 pub(crate) mod observations;
 pub(crate) mod operator_status;
+pub(crate) mod photograph_coverage;
 mod positions;
 pub(crate) mod preview_status;
 pub(crate) mod published_data;

@@ -33,6 +33,7 @@ import { NewRun } from "./panels/new_run";
 import { OverlayAges } from "./panels/overlay_ages";
 import { setUpPanels } from "./panels/panels";
 import { Preview } from "./panels/preview";
+import { CoverageOverlay } from "./panels/photograph_coverage";
 import { PictureInfo } from "./panels/picture_info";
 import { Readouts } from "./panels/readouts";
 import { RobotAge } from "./panels/robot_age";
@@ -176,6 +177,7 @@ const browser = new KeyframeBrowser({
   radiusM: () => sceneRadiusM,
 });
 const model = new ShownModel({ view, models, readouts, edits, scheduler, browser, surroundings, topics, chunks });
+const photographCoverage = new CoverageOverlay();
 const preview = new Preview(model, skeleton, liveImages);
 const picture = new MainPicture({
   view,
@@ -261,6 +263,7 @@ function receiveStatus(status: Status): void {
   for (const part of [runControls, header, trainingPanel, runEnd, modelSource]) part.show(status);
   banner.setStatus(status);
   showGuidance(status.guidance, banner, liveImages);
+  photographCoverage.show(status.guidance?.coverage);
   preview.show(status);
   for (const ages of [robotAge, overlayAges]) ages.hasEnded = banner.isFinished;
   namedViews.runIs(status);

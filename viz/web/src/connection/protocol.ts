@@ -169,6 +169,22 @@ export interface SavedEdits {
 export interface Guidance {
   text: string;
   is_finished: boolean;
+  /** What the photographs for a lens cover; missing for other calibrations, and on older servers. */
+  coverage?: PhotographCoverage;
+}
+
+/** What the photographs of a target cover so far. */
+export interface PhotographCoverage {
+  camera: string;
+  size_px: [number, number];
+  /** Number of columns and rows of equal cells of the image. */
+  cells: [number, number];
+  /** Whether each cell contains corners of the target, row by row from the upper left. */
+  is_covered: boolean[];
+  /** Parts of the image that need corners, 3 rows of 3, from the upper left. */
+  parts: { is_covered: boolean; is_next: boolean }[];
+  /** Everything else that photographs must show. */
+  items: { label: string; n_done: number; n_needed: number; is_next: boolean }[];
 }
 
 /** What a preview shows besides images and the robot. */
