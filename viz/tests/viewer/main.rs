@@ -5,6 +5,7 @@ mod admission;
 mod analytic_scene;
 mod black_page;
 mod client;
+mod coverage_page;
 mod downloads;
 mod edits_page;
 mod ending_page;
