@@ -7,22 +7,20 @@ use serde_json::json;
 use session::Preview;
 use std::path::PathBuf;
 
-const LONG_ABOUT: &str = "Show live images, the moving robot and the devices of a rig, without training\n\n\
-    The page shows the images of every camera that opens, and the robot of the URDF, which moves with its joints. It \
-    lists every device with its rate and the age of its newest sample. A device that cannot be opened is listed with \
-    the reason, and is opened again every two seconds, so that you can plug it in while the page is open. Nothing is \
-    trained, nothing is moved, and nothing is written.\n\n\
+const DETAILS: &str = "The page shows the images of every camera that opens, and the robot of the URDF, which moves \
+    with its joints. It lists every device with its rate and the age of its newest sample. A device that cannot be \
+    opened is listed with the reason, and is opened again every two seconds, so that you can plug it in while the page \
+    is open. Nothing is trained, nothing is moved, and nothing is written.\n\n\
     The rig file may be incomplete: a camera without intrinsics or without its pose on the robot is shown as an image \
-    only, and a rig without an arm shows images only.";
-
-const EXAMPLES: &str = "Examples:\n  \
+    only, and a rig without an arm shows images only.\n\n\
+    Examples:\n  \
     fieldrig preview rig.toml                 devices of a rig, at http://127.0.0.1:7007\n  \
     fieldrig preview rig.toml --sim           the same rig, simulated\n  \
     fieldrig preview rig.toml --share         for other machines, encrypted and with a token";
 
 /// Flags of `preview`.
 #[derive(Debug, clap::Args)]
-#[command(long_about = LONG_ABOUT, after_long_help = EXAMPLES)]
+#[command(after_long_help = DETAILS)]
 pub(crate) struct Args {
     /// Rig file: cameras and arm (TOML)
     rig_file: PathBuf,

@@ -26,7 +26,6 @@ struct Device {
     name: String,
     group_ix: usize,
     expected_hz: Option<f64>,
-    is_open: bool,
     has_ended: bool,
     /// Why it failed last; empty if it has not failed since it delivered a sample.
     reason: String,
@@ -59,7 +58,6 @@ impl DeviceTable {
     /// The devices of a group are open.
     pub(super) fn opened(&mut self, group_ix: usize) {
         for device in self.of_group(group_ix) {
-            device.is_open = true;
             device.has_ended = false;
         }
     }
@@ -69,7 +67,6 @@ impl DeviceTable {
         let mut is_news = false;
         for device in self.of_group(group_ix) {
             is_news |= device.reason != reason;
-            device.is_open = false;
             reason.clone_into(&mut device.reason);
         }
         is_news
@@ -78,14 +75,13 @@ impl DeviceTable {
     /// The samples of a group have ended.
     pub(super) fn ended(&mut self, group_ix: usize) {
         for device in self.of_group(group_ix) {
-            device.is_open = false;
             device.has_ended = true;
         }
     }
 
     /// A sample arrived now that was captured at the given time.
     pub(super) fn received(&mut self, sample: &Sample, captured_at: Instant) {
-        let Some(name) = device_of(sample) else {
+        let Some(name) = device_names::of_sample(sample) else {
             return;
         };
         if let Some(device) = self.devices.iter_mut().find(|device| device.name == name) {
@@ -107,7 +103,6 @@ impl Device {
             name,
             group_ix,
             expected_hz,
-            is_open: false,
             has_ended: false,
             reason: String::new(),
             arrivals: VecDeque::new(),
@@ -211,18 +206,6 @@ pub(super) fn summary(devices: &[DeviceStatus]) -> Option<String> {
             first.reason
         )),
     }
-}
-
-/// Name of the device that delivered a sample. `None` for ground truth, which no device delivers.
-fn device_of(sample: &Sample) -> Option<String> {
-    Some(match sample {
-        Sample::Image(image) if image.is_depth() => device_names::camera_depth(&image.camera),
-        Sample::Image(image) => device_names::camera(&image.camera),
-        Sample::Joints(_) => device_names::ARM.to_owned(),
-        Sample::Base(_) => device_names::BASE.to_owned(),
-        Sample::Range(scan) => device_names::range_scanner(&scan.scanner),
-        Sample::Truth(_) | Sample::BaseTruth(_) => return None,
-    })
 }
 
 /// Rate of a device according to the rig file, Hz.

@@ -4,7 +4,6 @@
 use super::camera_poses::CameraPoses;
 use crate::scene_hint::SceneView;
 use capture::config::Rig;
-use kinematics::Transform;
 use nalgebra::Vector3;
 use viz::{Hub, SceneBounds};
 
@@ -24,8 +23,7 @@ pub(super) fn publish(hub: &Hub, rig: &Rig, cameras: &CameraPoses) {
 
 /// A box around the base and all cameras that do not move with the arm.
 fn bounds(rig: &Rig, cameras: &CameraPoses) -> SceneBounds {
-    let Transform { translation, .. } = rig.base.world_from_base;
-    let base = translation.vector;
+    let base = rig.base.world_from_base.translation.vector;
     let half = Vector3::repeat(HALF_SIDE_M);
     let (mut min, mut max) = (base - half, base + half);
     for position in cameras.fixed_positions() {

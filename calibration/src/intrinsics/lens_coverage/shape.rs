@@ -20,8 +20,8 @@ pub(super) struct ViewShape {
     center_frac: Vector2<f64>,
     /// Square root of the fraction of the image that the corners span.
     pub(super) span_frac: f64,
-    /// Rotation of the target about the x and the y axis of the camera relative to facing it,
-    /// degrees; zero if the pose of the target is not determined.
+    /// Rotation of the target about the x and the y axis of the camera, degrees; zero if it is
+    /// parallel to the image, or if its pose is not determined.
     tilt_deg: [f64; 2],
 }
 
@@ -67,9 +67,12 @@ impl ViewShape {
     }
 }
 
-/// Rotation of the target about the x and the y axis of the camera relative to facing it, degrees.
-/// With a positive angle about y, the left side is farther away. With a positive angle about x, the
-/// lower side is farther away.
+/// Rotation of the target about the x and the y axis of the camera, degrees: zero if it is parallel
+/// to the image. With a positive angle about y, the left side is farther away. With a positive angle
+/// about x, the lower side is farther away.
+///
+/// The angle is relative to the optical axis and not to the line of sight, because parallel targets
+/// add no constraints, wherever they are in the image.
 fn tilt_deg(view: &BoardView, intrinsics: &Intrinsics) -> Option<[f64; 2]> {
     let pose = board_pose(intrinsics, &view.points)?.camera_from_board;
     let center = view
@@ -88,7 +91,7 @@ fn tilt_deg(view: &BoardView, intrinsics: &Intrinsics) -> Option<[f64; 2]> {
     } else {
         normal
     };
-    let tilt = sight.cross(&normal);
+    let tilt = Vector3::z().cross(&normal);
     let angle = tilt.norm().clamp(0.0, 1.0).asin().to_degrees();
     let axis = tilt.try_normalize(0.0).unwrap_or_default();
     Some([angle * axis.x, angle * axis.y])
