@@ -156,6 +156,10 @@ impl Shown {
     }
 
     fn publish_robot(&mut self, rig: &Rig) -> anyhow::Result<()> {
+        // The simulation of a rig without an arm reads an arm without joints.
+        if rig.arm.joints.is_empty() && !rig.has_moving_base() {
+            return Ok(());
+        }
         if let Some(robot) = robot_meshes::description(rig, &self.rig_file)? {
             self.identity.robot = Some(robot.robot.name().to_owned());
             self.hub.set_robot(robot);
