@@ -62,14 +62,18 @@ impl DeviceTable {
         }
     }
 
-    /// The devices of a group failed. Returns whether this is news.
-    pub(super) fn failed(&mut self, group_ix: usize, reason: &str) -> bool {
-        let mut is_news = false;
+    /// The devices of a group failed. Logs this if it is news.
+    pub(super) fn failed(&mut self, group_ix: usize, reason: &str) {
         for device in self.of_group(group_ix) {
-            is_news |= device.reason != reason;
+            // Some reasons begin with the name of the device.
+            let reason = reason
+                .strip_prefix(&format!("{}: ", device.name))
+                .unwrap_or(reason);
+            if device.reason != reason {
+                log::warn!("{}: {reason}; trying again until it works", device.name);
+            }
             reason.clone_into(&mut device.reason);
         }
-        is_news
     }
 
     /// The samples of a group have ended.
@@ -111,6 +115,9 @@ impl Device {
     }
 
     fn received(&mut self, now: Instant, captured_at: Instant) {
+        if self.newest.is_none() || !self.reason.is_empty() {
+            log::info!("{}: data arrive", self.name);
+        }
         self.reason.clear();
         self.arrivals.push_back(now);
         self.forget_old(now);
@@ -276,8 +283,7 @@ mod tests {
         let mut table = DeviceTable {
             devices: vec![device()],
         };
-        assert!(table.failed(0, "not connected"));
-        assert!(!table.failed(0, "not connected"), "that is known");
+        table.failed(0, "camera \"front\": not connected");
         table.opened(0);
         let now = Instant::now();
         let statuses = table.statuses(now);

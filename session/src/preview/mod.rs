@@ -183,10 +183,8 @@ impl Shown {
             DeviceEvent::Sample(sample) => self.show(group_ix, &sample),
             DeviceEvent::Failed(error) if self.is_simulated[group_ix] => return Err(error),
             DeviceEvent::Failed(error) => {
-                let reason = open::without_sim_hint(&error);
-                if self.devices.failed(group_ix, &reason) {
-                    log::warn!("{reason}; trying again until it works");
-                }
+                self.devices
+                    .failed(group_ix, &open::without_sim_hint(&error));
             }
             DeviceEvent::Ended => self.devices.ended(group_ix),
         }
