@@ -79,12 +79,8 @@ impl LensCoverage {
     /// Adds a photograph.
     pub fn add(&mut self, view: &BoardView) {
         self.shapes.push(ViewShape::of(view, &self.intrinsics));
-        for (n, new) in self
-            .cells
-            .values
-            .iter_mut()
-            .zip(&self.cells_of(view).values)
-        {
+        let cells = self.cells_of(view);
+        for (n, new) in self.cells.values.iter_mut().zip(&cells.values) {
             *n += new;
         }
     }
