@@ -73,8 +73,8 @@ struct Guide<'a> {
     taken: Vec<DetectedImage>,
     failures: Vec<DetectedImage>,
     saved: Option<SavedImages>,
-    /// The error of saving an image.
-    error: Option<anyhow::Error>,
+    /// The error of saving a photograph.
+    save_error: Option<anyhow::Error>,
     /// The text that is shown, and when its remark was made.
     text: String,
     remarked_secs: f64,
@@ -105,7 +105,7 @@ impl<'a> Guide<'a> {
             taken: Vec::new(),
             failures: Vec::new(),
             saved,
-            error: None,
+            save_error: None,
             text: String::new(),
             remarked_secs: f64::NEG_INFINITY,
         };
@@ -113,14 +113,9 @@ impl<'a> Guide<'a> {
         guide
     }
 
-    /// Whether no more photographs are needed, or can be taken.
-    fn is_over(&self) -> bool {
-        self.coverage.is_enough() || self.error.is_some()
-    }
-
     /// Decides about an image. Returns whether it is a photograph.
     fn judge(&mut self, image: &CalibrationImage) -> bool {
-        if self.is_over() {
+        if self.coverage.is_enough() {
             return false;
         }
         let detected = images::detect_in_image(image, self.target);
@@ -140,19 +135,25 @@ impl<'a> Guide<'a> {
             self.show_remark(image.secs, remark.text());
             return false;
         }
-        if let Some(saved) = &mut self.saved
-            && let Err(error) = saved.save(image.size_px, &image.gray)
-        {
-            // The photographs so far are still used.
-            self.error = Some(error);
-            return false;
-        }
+        self.save(image);
         self.shown
             .show_searched(image.size_px, &image.gray, Some(&view));
         self.coverage.add(&view);
         self.taken.push(detected);
         self.show_progress();
         true
+    }
+
+    /// Saves a photograph, if this was requested. After an error, no more photographs are saved, but
+    /// the lens is calibrated.
+    fn save(&mut self, image: &CalibrationImage) {
+        if let Some(saved) = &mut self.saved
+            && let Err(error) = saved.save(image.size_px, &image.gray)
+        {
+            log::error!("{error:#}; the next photographs are not saved");
+            self.save_error.get_or_insert(error);
+            self.saved = None;
+        }
     }
 
     /// Why an image that shows the target is not taken; `None` if it is taken.
@@ -267,12 +268,9 @@ impl RigOptions {
         }
         let rig = devices.rig.clone();
         let camera = self.camera_of(&rig)?.clone();
-        let (found, mut guide) = photographs(devices, &camera, target, options.host, saved)?;
+        let (found, guide) = photographs(devices, &camera, target, options.host, saved)?;
         if let Some(saved) = &guide.saved {
             saved.report();
-        }
-        if let Some(error) = guide.error.take() {
-            return Err(error);
         }
         log::info!(
             "{} of {} taken",
@@ -343,7 +341,7 @@ fn photographs<'a>(
             let since_first = sample
                 .stamp()
                 .secs_since(*first.get_or_insert(sample.stamp()));
-            if guide.is_over() || since_first > MAX_SECS || stop.requested() {
+            if guide.coverage.is_enough() || since_first > MAX_SECS || stop.requested() {
                 ControlFlow::Break(())
             } else {
                 ControlFlow::Continue(())
@@ -379,7 +377,9 @@ fn scan(
     if images.is_empty() {
         images.extend(guide.failures.into_iter().map(|failure| (failure, None)));
     }
-    Scan::new(rig, camera, images, photos)
+    let mut scan = Scan::new(rig, camera, images, photos)?;
+    scan.save_error = guide.save_error;
+    Ok(scan)
 }
 
 #[cfg(test)]

@@ -38,7 +38,7 @@ pub struct IntrinsicsOutcome {
     /// Images that cannot be read or do not show the target.
     pub unused: Vec<Unused>,
     rig: Option<RigOutput>,
-    /// The result of writing the report.
+    /// The result of writing the report and of saving the images.
     written: anyhow::Result<()>,
 }
 
@@ -53,6 +53,8 @@ struct Detected {
     no_images: Option<String>,
     other_size: Option<OtherSize>,
     warnings: Vec<String>,
+    /// Whether the images were saved as requested.
+    saved: anyhow::Result<()>,
 }
 
 impl IntrinsicsTask {
@@ -80,7 +82,7 @@ impl IntrinsicsTask {
             calibration,
             unused: detected.unused,
             rig,
-            written,
+            written: written.and(detected.saved),
         })
     }
 
@@ -123,13 +125,17 @@ impl IntrinsicsTask {
             keeps_photos: self.report.is_some(),
             purpose: Purpose::Lens,
         };
+        let mut saved = Ok(());
         let (images, photos, no_images, warnings) = match self.scan(options, output)? {
-            Some(mut scan) => (
-                scan.detected(),
-                scan.take_photos(),
-                scan.no_images,
-                scan.warnings,
-            ),
+            Some(mut scan) => {
+                saved = scan.save_error.take().map_or(Ok(()), Err);
+                (
+                    scan.detected(),
+                    scan.take_photos(),
+                    scan.no_images,
+                    scan.warnings,
+                )
+            }
             None => {
                 let files = images::files(&self.input)?;
                 let images = images::detect(&files, &self.target, host)?;
@@ -159,6 +165,7 @@ impl IntrinsicsTask {
             no_images,
             other_size,
             warnings,
+            saved,
         })
     }
 
@@ -251,7 +258,7 @@ impl IntrinsicsOutcome {
     /// Writes the rig file, if it was requested. This is called after the result was printed.
     ///
     /// # Errors
-    /// Fails if the rig file or the report cannot be written.
+    /// Fails if the rig file or the report cannot be written, or if images were not saved.
     pub fn finish(self) -> anyhow::Result<()> {
         if let Some(mut rig) = self.rig {
             rig.set_intrinsics(
@@ -260,8 +267,8 @@ impl IntrinsicsOutcome {
             )?;
             rig.write()?;
         }
-        // The error of the report is returned last, so that the rig file is written even if the
-        // report could not be written.
+        // This error is returned last, so that the rig file is written even if the report could not be
+        // written.
         self.written
     }
 }

@@ -48,6 +48,8 @@ pub(crate) struct Scan {
     pub(crate) no_images: Option<String>,
     /// Damage of the recording.
     pub(crate) warnings: Vec<String>,
+    /// Why images were not saved, although this was requested.
+    pub(crate) save_error: Option<anyhow::Error>,
 }
 
 /// What to do while images are read.
@@ -292,6 +294,7 @@ impl Scan {
             photos,
             no_images: None,
             warnings: Vec::new(),
+            save_error: None,
         })
     }
 
