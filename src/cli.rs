@@ -2,8 +2,8 @@
 //! own file.
 
 use crate::commands::{
-    bench, calibrate, devices, doctor, eval, export, fk, metrics, move_arm, record, render, run,
-    runs, sim, train, view,
+    bench, calibrate, devices, doctor, eval, export, fk, metrics, move_arm, preview, record,
+    render, run, runs, sim, train, view,
 };
 use crate::exit::Exit;
 use crate::version;
@@ -36,6 +36,8 @@ pub(crate) struct Cli {
 pub(crate) enum Command {
     /// Train on live devices, a simulation or a recording; show the scene
     Run(run::Args),
+    /// Show live images, the moving robot and the devices of a rig, without training
+    Preview(preview::Args),
     /// Record all devices of a rig to an MCAP file
     Record(record::Args),
     /// Train a scene model on a dataset folder or a recording
@@ -86,6 +88,7 @@ impl Command {
     pub(crate) fn run(self) -> anyhow::Result<Exit> {
         match self {
             Self::Run(args) => run::run(&args),
+            Self::Preview(args) => preview::run(&args),
             Self::Record(args) => record::run(&args),
             Self::Train(args) => train::run(&args),
             Self::View(args) => view::run(&args),

@@ -39,6 +39,7 @@ pub(crate) fn flag(setting: Setting) -> &'static str {
         Setting::Rig => "--rig",
         Setting::Samples => "--samples",
         Setting::Scale => "--scale",
+        Setting::SaveImages => "--save-images",
         Setting::Seconds => "--seconds",
         Setting::SettleSeconds => "--settle-seconds",
         Setting::Share => "--share",

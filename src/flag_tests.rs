@@ -14,7 +14,7 @@ use syn::{Attribute, Item, LitStr, Macro, Meta};
 /// Source files or folders, and the commands that print their messages. If a message contains a
 /// flag or setting, all these commands must accept it. The exception is a message that names a
 /// command that accepts the flag.
-const PRINTED_BY: [(&str, &[&str]); 34] = [
+const PRINTED_BY: [(&str, &[&str]); 35] = [
     ("bench/src", &["bench"]),
     (
         "calibration/procedures/src/hand_eye",
@@ -31,6 +31,10 @@ const PRINTED_BY: [(&str, &[&str]); 34] = [
     (
         "calibration/procedures/src/outputs.rs",
         &["calibrate intrinsics", "calibrate hand-eye"],
+    ),
+    (
+        "calibration/procedures/src/saved_images.rs",
+        &["calibrate intrinsics"],
     ),
     (
         "calibration/procedures/src/scan.rs",
@@ -66,7 +70,13 @@ const PRINTED_BY: [(&str, &[&str]); 34] = [
     ("src/console.rs", &["run", "train"]),
     (
         "src/page_args.rs",
-        &["run", "view", "calibrate intrinsics", "calibrate hand-eye"],
+        &[
+            "run",
+            "view",
+            "preview",
+            "calibrate intrinsics",
+            "calibrate hand-eye",
+        ],
     ),
     (
         "targets/src/error.rs",
@@ -79,7 +89,13 @@ const PRINTED_BY: [(&str, &[&str]); 34] = [
     ("trainer/src/splat/trainer", &["run", "train", "bench"]),
     (
         "viz/src/error.rs",
-        &["run", "view", "calibrate intrinsics", "calibrate hand-eye"],
+        &[
+            "run",
+            "view",
+            "preview",
+            "calibrate intrinsics",
+            "calibrate hand-eye",
+        ],
     ),
     // These build command lines for another command.
     ("src/commands/bench/live.rs", &["run"]),

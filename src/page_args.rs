@@ -12,7 +12,7 @@ use viz::{Certificate, Hub, Server, ServerConfig, Sharing, Tokens};
 #[derive(Clone, Debug, clap::Args)]
 pub(crate) struct PageArgs {
     /// Address of the page: numeric IP address and port [default: 127.0.0.1:7007, with --share
-    /// 0.0.0.0:7007; `view` and `calibrate` take a free port if this port is in use]
+    /// 0.0.0.0:7007; `view`, `preview` and `calibrate` take a free port if this port is in use]
     #[arg(long, value_name = "ADDRESS", value_parser = address)]
     listen: Option<SocketAddr>,
     /// Serve the page to other machines over TLS. The printed addresses contain the required token

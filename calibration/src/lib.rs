@@ -50,9 +50,9 @@ pub use correction::{
 };
 pub use error::Error;
 pub use intrinsics::{
-    BoardPose, EstimatedParam, ImageFit, ImageGrid, ImageRegion, IntrinsicsAdvice,
-    IntrinsicsCalibration, IntrinsicsGuidance, IntrinsicsInput, LensModel, LensTrial, NextView,
-    PointFit, RECOMMENDED_IMAGES, Rejected, RejectionReason, Side, board_pose,
+    BoardPose, CoverageGoal, EstimatedParam, GoalProgress, ImageFit, ImageGrid, ImagePart,
+    IntrinsicsCalibration, IntrinsicsInput, LensCoverage, LensModel, LensTrial, NextPhotograph,
+    NextView, PointFit, RECOMMENDED_IMAGES, Rejected, RejectionReason, Side, board_pose,
     calibrate_intrinsics,
 };
 pub use params::ParamSet;

@@ -9,6 +9,7 @@ mod tests;
 
 use crate::config::{ArmDriver, Camera, Rig};
 use crate::open::{Opened, chain_of};
+use crate::stamp_clock::StampClock;
 use anyhow::bail;
 use drivers::{Image, Sample};
 use image::{DynamicImage, RgbImage};
@@ -29,6 +30,9 @@ const MAX_IMAGES: usize = 300;
 /// Interval between images of a robot without an arm, seconds. With a shorter interval, consecutive
 /// images of a target that is held by hand show nearly the same view.
 const INTERVAL_SECS: f64 = 0.5;
+/// Maximum age of an image that the caller may choose. It is longer than the latency of cameras and
+/// shorter than the time in which a person notices that the decision is about an earlier moment.
+const MAX_AGE: Duration = Duration::from_millis(250);
 /// Assumed standard deviation of image stamps, seconds. The check of the speed uses it. With a
 /// larger value, only images of slower motions are kept.
 const STAMP_SIGMA_SECS: f64 = 0.002;
@@ -126,15 +130,52 @@ pub fn calibration_images(
     opened: Opened,
     camera: &str,
     max_shift_px: f64,
+    on_sample: impl FnMut(&Sample, &[CalibrationImage]) -> ControlFlow<()>,
+) -> anyhow::Result<CalibrationImages> {
+    read(opened, camera, max_shift_px, on_sample, None)
+}
+
+/// Reads the images of a camera until `on_sample` breaks or the samples end, and keeps those that
+/// the caller chooses.
+///
+/// Images during a fast motion of the arm are not offered. If the caller is slower than a real
+/// camera, images that have become too old are not offered either, so that a person who moves a
+/// target sees what is decided now.
+///
+/// * `max_shift_px`, `on_sample`: as for [`calibration_images`].
+/// * `choose`: is called with each image, and returns whether it is kept.
+///
+/// # Errors
+///
+/// As for [`calibration_images`].
+pub fn chosen_calibration_images(
+    opened: Opened,
+    camera: &str,
+    max_shift_px: f64,
+    on_sample: impl FnMut(&Sample, &[CalibrationImage]) -> ControlFlow<()>,
+    choose: &mut dyn FnMut(&CalibrationImage) -> bool,
+) -> anyhow::Result<CalibrationImages> {
+    read(opened, camera, max_shift_px, on_sample, Some(choose))
+}
+
+fn read(
+    opened: Opened,
+    camera: &str,
+    max_shift_px: f64,
     mut on_sample: impl FnMut(&Sample, &[CalibrationImage]) -> ControlFlow<()>,
+    choose: Option<&mut dyn FnMut(&CalibrationImage) -> bool>,
 ) -> anyhow::Result<CalibrationImages> {
     let Opened {
         rig,
         mut source,
         damage,
-        ..
+        stamp_clock,
     } = opened;
     let mut reader = Reader::new(&rig, camera, max_shift_px)?;
+    reader.choose = choose.map(|accepts| Choose {
+        accepts,
+        stamp_clock,
+    });
     while let Some(sample) = source.next_sample()? {
         if on_sample(&sample, &reader.found.images).is_break() {
             break;
@@ -156,6 +197,20 @@ pub(crate) fn gray_of(image: &Image) -> Option<Vec<u8>> {
     Some(DynamicImage::from(rgb).into_luma8().into_raw())
 }
 
+/// How the caller chooses images.
+struct Choose<'a> {
+    accepts: &'a mut dyn FnMut(&CalibrationImage) -> bool,
+    stamp_clock: StampClock,
+}
+
+impl Choose<'_> {
+    /// Whether an image is recent. Images of simulations and recordings wait for the caller.
+    fn is_current(&self, stamp: Stamp) -> bool {
+        let captured = self.stamp_clock.instant_of(stamp);
+        captured.is_none_or(|captured| captured.elapsed() <= MAX_AGE)
+    }
+}
+
 struct Reader<'a> {
     rig: &'a Rig,
     camera: &'a Camera,
@@ -165,6 +220,8 @@ struct Reader<'a> {
     /// Images whose last row is exposed after the newest joint reading.
     waiting: VecDeque<Image>,
     found: CalibrationImages,
+    /// `None` if images are kept that differ from all images kept before.
+    choose: Option<Choose<'a>>,
 }
 
 /// Recent joint positions.
@@ -201,6 +258,7 @@ impl<'a> Reader<'a> {
             first: None,
             waiting: VecDeque::new(),
             found: CalibrationImages::default(),
+            choose: None,
         })
     }
 
@@ -266,7 +324,11 @@ impl<'a> Reader<'a> {
             .first
             .map_or(0.0, |first| image.stamp.secs_since(first));
         // Cheap tests come first, so the pose is compared before the image is decoded.
-        if self.found.images.len() >= MAX_IMAGES || !self.is_different(secs, arm.as_ref()) {
+        let is_candidate = match &self.choose {
+            Some(choose) => choose.is_current(image.stamp),
+            None => self.is_different(secs, arm.as_ref()),
+        };
+        if self.found.images.len() >= MAX_IMAGES || !is_candidate {
             return;
         }
         if arm
@@ -280,12 +342,19 @@ impl<'a> Reader<'a> {
             self.found.n_unusable += 1;
             return;
         };
-        self.found.images.push(CalibrationImage {
+        let image = CalibrationImage {
             secs,
             size_px: image.size_px,
             gray,
             arm,
-        });
+        };
+        let is_kept = match &mut self.choose {
+            Some(choose) => (choose.accepts)(&image),
+            None => true,
+        };
+        if is_kept {
+            self.found.images.push(image);
+        }
     }
 
     /// Whether the pose differs from the poses of all images kept. Without an arm, returns whether

@@ -3,14 +3,15 @@
 
 use crate::input_counts::InputCounts;
 use crate::join::{Change, Join, JoinEvent, PosedImage};
+use crate::live_pixels::live_pixels;
 use crate::robot_motion::RobotMotion;
 use crate::stamp_clock::StampClock;
 use crate::stations::Stations;
 use crate::stop::Stop;
 use anyhow::{Context, anyhow};
 use drivers::recording::Recorder;
-use drivers::{PixelFormat, Sample, Source};
-use keyframe::{LiveImage, LivePixels, RangePoints, RangeScan, RobotState};
+use drivers::{Sample, Source};
+use keyframe::{LiveImage, RangePoints, RangeScan, RobotState};
 use kinematics::{Stamp, Transform};
 use parking_lot::Mutex;
 use std::collections::{BTreeMap, HashMap, VecDeque};
@@ -410,22 +411,10 @@ impl Pump {
             return;
         }
         let image = &posed_image.image;
-        let pixels = match image.format {
-            PixelFormat::Rgb8 => LivePixels::Rgb(image.data.clone()),
-            // Some cameras send JPEG without tables, which browsers cannot show.
-            PixelFormat::Jpeg => match drivers::jpeg::first_image(&image.data) {
-                Ok(jpeg) => LivePixels::Jpeg(jpeg.as_ref().into()),
-                Err(_) => return,
-            },
-            PixelFormat::Bgr8 | PixelFormat::Gray8 | PixelFormat::Yuv { .. } | PixelFormat::Png => {
-                match image.decode_rgb() {
-                    Ok(rgb) => LivePixels::Rgb(rgb.into()),
-                    // The join counts images that do not decode.
-                    Err(_) => return,
-                }
-            }
-            // Only color images are posed; depth becomes a part of their keyframes.
-            PixelFormat::DepthU16 { .. } => return,
+        // Only color images are posed; depth becomes a part of their keyframes. The join counts
+        // images that do not decode.
+        let Some(pixels) = live_pixels(image) else {
+            return;
         };
         let Some(&(focal_px, principal_px)) = self.input.camera_intrinsics.get(&image.camera)
         else {

@@ -44,6 +44,7 @@ mod found_devices;
 mod input_counts;
 mod join;
 pub mod known_robots;
+mod live_pixels;
 mod memory;
 mod mesh_files;
 mod nearest_name;
@@ -51,6 +52,7 @@ mod notes;
 pub mod open;
 mod record;
 mod robot_motion;
+mod separate_devices;
 mod stamp_clock;
 mod stations;
 mod stop;
@@ -59,17 +61,20 @@ mod supervised_arm;
 pub use arm_capture::ArmCapture;
 pub use calibration_images::{
     ArmDuringImage, CalibrationImage, CalibrationImages, calibration_images,
+    chosen_calibration_images,
 };
 pub use config::{ConfigError, Override, Rig};
 pub use feed::{Feed, FeedItem, Input, InputObserver, InputResult, InputTimes};
 pub use found_devices::{DeviceInfo, found_devices};
 pub use input_counts::InputCounts;
 pub use join::{Change, Counts, Join, JoinEvent, PosedImage, Rejection, SampleUse, StoreUse};
+pub use live_pixels::live_pixels;
 pub use mesh_files::mesh_file_candidates;
 pub use nearest_name::nearest_name;
 pub use notes::Notes;
 pub use record::{RecordPlan, Recorded, WrittenRecording};
 pub use robot_motion::RobotMotion;
+pub use separate_devices::{DeviceEvent, DeviceGroup, SeparateDevices};
 pub use stamp_clock::StampClock;
 pub use stations::{StationReport, Stations};
 pub use stop::Stop;

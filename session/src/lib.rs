@@ -54,6 +54,7 @@ mod observations;
 mod observer;
 mod pending_evaluation;
 mod photographs;
+mod preview;
 mod previous_run;
 mod read_progress;
 mod recent_images;
@@ -100,6 +101,7 @@ pub use methods::methods_of;
 pub use observer::{
     DoneEvent, Evaluation, FinishedReport, Observer, ProfileEvent, SessionEvent, SessionProgress,
 };
+pub use preview::Preview;
 pub use previous_run::FinishedRun;
 pub use read_progress::{OnReadProgress, ReadProgress, ignore_progress};
 pub use recoveries::OpenGpu;

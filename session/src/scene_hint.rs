@@ -91,16 +91,31 @@ impl SceneView {
         })
     }
 
+    /// A view of a whole box from outside and slightly above, z up.
+    #[must_use]
+    pub fn outside(bounds: &SceneBounds) -> Transform {
+        let radius_m = radius_m(bounds);
+        outside(&Bounds {
+            center_m: center_m(bounds),
+            radius_m,
+            outer_radius_m: radius_m,
+        })
+    }
+
     /// Sends the extent and the view to clients.
     pub fn publish(&self, hub: &Hub) {
-        let SceneBounds { min_m, max_m } = self.bounds;
         let hint = SceneHint {
-            center_m: [0, 1, 2].map(|axis| 0.5 * (min_m[axis] + max_m[axis])),
+            center_m: center_m(&self.bounds),
             radius_m: radius_m(&self.bounds),
             world_from_camera: self.world_from_camera,
         };
         hub.set_scene(hint, self.bounds);
     }
+}
+
+/// The center of a box.
+fn center_m(SceneBounds { min_m, max_m }: &SceneBounds) -> [f64; 3] {
+    [0, 1, 2].map(|axis| 0.5 * (min_m[axis] + max_m[axis]))
 }
 
 /// Half the diagonal of a box, meters.

@@ -72,6 +72,12 @@ pub enum TargetParent {
     World,
     /// The arm's flange: the arm carries the target.
     Flange,
+    /// A hand that holds the target at many places in front of a camera, one after the other. The
+    /// pose of the board is that of the hand, and not [`TargetConfig::parent_from_board`].
+    Hand {
+        /// Index of the camera in [`Config::cameras`].
+        camera_ix: usize,
+    },
 }
 
 impl Config {
@@ -532,10 +538,23 @@ impl Config {
         Ok(())
     }
 
+    /// A target in a hand needs its camera. Range scanners would see it at another place.
+    fn check_hand(&self, target: &str, camera_ix: usize) -> Result<(), Error> {
+        if camera_ix < self.cameras.len() && self.scanners.is_empty() {
+            return Ok(());
+        }
+        Err(Error::TargetInHand {
+            target: target.to_owned(),
+        })
+    }
+
     fn check_targets(&self) -> Result<(), Error> {
         for target in &self.targets {
             target.target()?;
             check_pose(&target.name, "parent_from_board", &target.parent_from_board)?;
+            if let TargetParent::Hand { camera_ix } = target.parent {
+                self.check_hand(&target.name, camera_ix)?;
+            }
             if target.parent == TargetParent::Flange && !self.has_arm() {
                 return Err(Error::TargetWithoutFlange {
                     target: target.name.clone(),

@@ -4,7 +4,8 @@ use crate::arm::{JointReading, STEP_NANOS};
 use crate::base::Drift;
 use crate::cabinet_tour::light_frac;
 use crate::commands::Commands;
-use crate::config::{CameraConfig, Config, Parent, Scene, SensorConfig, StampConfig};
+use crate::config::{CameraConfig, Config, Parent, Scene, SensorConfig, StampConfig, TargetParent};
+use crate::hand::Hand;
 use crate::joints::Joints;
 use crate::lidar::{self, RayCaster};
 use crate::motors::{MotorHistory, MotorizedArm};
@@ -35,6 +36,8 @@ pub(crate) struct Engine {
     n_base_poses: u64,
     n_scans: Vec<u64>,
     cameras: Vec<Camera>,
+    /// The targets that are moved by hand, with the camera before which each is moved.
+    hands: Vec<(CameraConfig, Hand)>,
     renderer: Renderer,
     /// Stamp of simulated time zero.
     start: Stamp,
@@ -197,11 +200,7 @@ impl Camera {
     }
 
     fn world_from_camera(&self, robot: &RobotPose) -> Transform {
-        match self.config.parent {
-            Parent::Flange => robot.world_from_flange * self.config.parent_from_camera,
-            Parent::Base => robot.world_from_base * self.config.parent_from_camera,
-            Parent::World => self.config.parent_from_camera,
-        }
+        world_from_camera_of(&self.config, robot)
     }
 
     /// View of the depth sensor, if it is separate from the color sensor.
@@ -221,6 +220,29 @@ impl Camera {
     fn random(&self, seed: u64, image_ix: u64, stream: u64) -> RandomStream {
         RandomStream::new(seed, &[self.ix, image_ix, stream])
     }
+}
+
+/// Pose of a camera.
+fn world_from_camera_of(camera: &CameraConfig, robot: &RobotPose) -> Transform {
+    match camera.parent {
+        Parent::Flange => robot.world_from_flange * camera.parent_from_camera,
+        Parent::Base => robot.world_from_base * camera.parent_from_camera,
+        Parent::World => camera.parent_from_camera,
+    }
+}
+
+/// The targets that are moved by hand, in the order of the configuration.
+fn hands(config: &Config) -> Result<Vec<(CameraConfig, Hand)>, Error> {
+    let mut hands = Vec::new();
+    for target in &config.targets {
+        if let TargetParent::Hand { camera_ix } = target.parent {
+            // `Config::check` has checked the index.
+            let camera = config.cameras[camera_ix].clone();
+            let hand = Hand::new(&camera, &target.target()?);
+            hands.push((camera, hand));
+        }
+    }
+    Ok(hands)
 }
 
 /// Time from the first exposure of a camera's image to its arrival.
@@ -287,6 +309,7 @@ impl Engine {
             rays: (!config.scanners.is_empty()).then(|| RayCaster::new(model)),
             n_base_poses: 0,
             n_scans: vec![0; config.scanners.len()],
+            hands: hands(&config)?,
             config,
             robot,
             cameras: cameras.0,
@@ -521,6 +544,14 @@ impl Engine {
         let robot = robot_at(stamp_nanos)?;
         let world_from_camera = camera.world_from_camera(&robot);
         let camera_from_world = world_from_camera.inverse();
+        let world_from_boards: Vec<Transform> = self
+            .hands
+            .iter()
+            .map(|(camera, hand)| {
+                let camera_from_board = hand.camera_from_board(stamp_nanos as f64 * 1e-9);
+                world_from_camera_of(camera, &robot) * camera_from_board
+            })
+            .collect();
         let mut row_motions = Vec::new();
         // The scene is rendered once, at the stamp. The poses of the rows are needed to move the
         // pixels to the positions at which each row sees them.
@@ -541,6 +572,7 @@ impl Engine {
         };
         let view = render::View {
             is_robot_visible,
+            world_from_boards: world_from_boards.clone(),
             ..camera
                 .optics
                 .view(world_from_camera, robot.clone(), light_frac)
@@ -549,6 +581,10 @@ impl Engine {
             &world_from_camera,
             robot.filter(|_| self.config.has_carried_target()),
         );
+        let depth_view = depth_view.map(|view| render::View {
+            world_from_boards,
+            ..view
+        });
         let n_skipped = std::mem::take(&mut camera.n_skipped);
         // Rendering continues on its thread while the robot moves on.
         let picture = self.renderer.submit(view)?;

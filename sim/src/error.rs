@@ -46,6 +46,15 @@ pub enum Error {
         /// Name of the camera.
         camera: String,
     },
+    /// A target that is moved by hand has no camera, or the rig has range scanners.
+    #[error(
+        "{target}.moved_before: a target that is moved by hand needs a simulated camera, and a rig without range \
+         scanners"
+    )]
+    TargetInHand {
+        /// Name of the target.
+        target: String,
+    },
     /// The robot of the scene has no arm to move.
     #[error("the robot of this scene has no arm")]
     NoArm,

@@ -28,6 +28,7 @@ mod engine;
 mod error;
 mod follower;
 mod furniture;
+mod hand;
 mod joints;
 mod lab;
 mod lab_texture;

@@ -156,6 +156,7 @@ impl Optics {
             robot,
             is_robot_visible: false,
             light_frac,
+            world_from_boards: Vec::new(),
         }
     }
 

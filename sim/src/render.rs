@@ -34,6 +34,8 @@ pub(crate) struct View {
     pub(crate) is_robot_visible: bool,
     /// Brightness of all lamps; 1 is nominal.
     pub(crate) light_frac: f64,
+    /// Poses of the targets that are moved by hand, in the order of the configuration.
+    pub(crate) world_from_boards: Vec<Transform>,
 }
 
 impl View {
@@ -47,6 +49,7 @@ impl View {
             robot: None,
             is_robot_visible: false,
             light_frac: 1.0,
+            world_from_boards: Vec::new(),
         }
     }
 }
@@ -243,6 +246,12 @@ impl Canvas {
             }
             set_base_pose(&mut self.data, &robot.world_from_base);
         }
+        // A moving base comes before the targets, so that they are the last moved bodies.
+        let n_moved = self.data.mocap_pos_mut().len();
+        let first = n_moved.saturating_sub(view.world_from_boards.len());
+        for (ix, world_from_board) in view.world_from_boards.iter().enumerate() {
+            set_moved_pose(&mut self.data, first + ix, world_from_board);
+        }
         self.data.forward_kinematics();
         self.scene.update(
             &mut self.data,
@@ -348,11 +357,17 @@ fn meters_from_depth(depth: f32, near_far_m: [f64; 2]) -> f32 {
 
 /// Sets the pose of a moving base; does nothing for a fixed one.
 pub(crate) fn set_base_pose<M: ModelType>(data: &mut MjData<M>, world_from_base: &Transform) {
-    if let Some(position) = data.mocap_pos_mut().first_mut() {
-        *position = world_from_base.translation.vector.into();
+    set_moved_pose(data, 0, world_from_base);
+}
+
+/// Sets the pose of a body that is moved from outside of the physics, by its index; does nothing if
+/// there is no such body.
+fn set_moved_pose<M: ModelType>(data: &mut MjData<M>, moved_ix: usize, pose: &Transform) {
+    if let Some(position) = data.mocap_pos_mut().get_mut(moved_ix) {
+        *position = pose.translation.vector.into();
     }
-    if let Some(rotation_wxyz) = data.mocap_quat_mut().first_mut() {
-        let q = world_from_base.rotation.coords;
+    if let Some(rotation_wxyz) = data.mocap_quat_mut().get_mut(moved_ix) {
+        let q = pose.rotation.coords;
         *rotation_wxyz = [q.w, q.x, q.y, q.z];
     }
 }

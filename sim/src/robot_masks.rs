@@ -96,6 +96,7 @@ fn drawn(view: &PinholeView, robot: Option<RobotPose>) -> View {
         is_robot_visible: robot.is_some(),
         robot,
         light_frac: 1.0,
+        world_from_boards: Vec::new(),
     }
 }
 

@@ -108,10 +108,15 @@ fn build_with(
     };
     // Then come the printed targets. Targets on the flange become part of the arm's last body.
     let mut on_flange = String::new();
+    let mut in_hand = String::new();
     for (ix, target) in config.targets.iter().enumerate() {
         let printed_target::Printed { png, mesh, plate } = printed_target::print(target)?;
         let name = format!("target{ix}");
-        let pose = panda::pose_attributes(&target.parent_from_board);
+        // A hand moves the whole body of the target.
+        let pose = match target.parent {
+            TargetParent::Hand { .. } => String::new(),
+            _ => panda::pose_attributes(&target.parent_from_board),
+        };
         add_file(&mut files, &format!("{name}.png"), &png)?;
         add_file(&mut files, &format!("{name}.msh"), &mesh.to_msh())?;
         add_file(&mut files, &format!("{name}_plate.msh"), &plate.to_msh())?;
@@ -122,16 +127,18 @@ fn build_with(
              <mesh name=\"{name}\" file=\"{name}.msh\" inertia=\"shell\"/>\n\
              <mesh name=\"{name}_plate\" file=\"{name}_plate.msh\" inertia=\"shell\"/>"
         );
-        let parent = match target.parent {
-            TargetParent::World => &mut bodies,
-            TargetParent::Flange => &mut on_flange,
-        };
         // The target is visible even if the arm is hidden, and it has no mass.
-        let _ = writeln!(
-            parent,
+        let geoms = format!(
             "<geom type=\"mesh\" mesh=\"{name}\" material=\"{name}\" group=\"0\" mass=\"0\" {pose}/>\n\
-             <geom type=\"mesh\" mesh=\"{name}_plate\" material=\"frame\" group=\"0\" mass=\"0\" {pose}/>"
+             <geom type=\"mesh\" mesh=\"{name}_plate\" material=\"frame\" group=\"0\" mass=\"0\" {pose}/>\n"
         );
+        match target.parent {
+            TargetParent::World => bodies += &geoms,
+            TargetParent::Flange => on_flange += &geoms,
+            TargetParent::Hand { .. } => {
+                let _ = writeln!(in_hand, "<body mocap=\"true\">\n{geoms}</body>");
+            }
+        }
     }
     // Contacts are off, because no objects touch each other. Shadows are off, because they are
     // baked into the textures.
@@ -167,7 +174,7 @@ fn build_with(
          <default><geom contype=\"0\" conaffinity=\"0\" group=\"0\"/>\n\
          <default class=\"arm\"><geom contype=\"0\" conaffinity=\"0\" group=\"{ARM_GROUP}\" mass=\"0\"/></default></default>\n\
          <asset>\n{assets}</asset>\n\
-         <worldbody>\n{bodies}{robot}</worldbody>\n</mujoco>\n",
+         <worldbody>\n{bodies}{robot}{in_hand}</worldbody>\n</mujoco>\n",
         config.scene.name()
     );
     add_file(&mut files, "scene.xml", xml.as_bytes())?;

@@ -9,6 +9,7 @@ pub(crate) mod export;
 pub(crate) mod fk;
 pub(crate) mod metrics;
 pub(crate) mod move_arm;
+pub(crate) mod preview;
 pub(crate) mod record;
 pub(crate) mod render;
 pub(crate) mod run;

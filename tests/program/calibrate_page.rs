@@ -15,6 +15,8 @@ struct Received {
     texts: Vec<String>,
     /// Size of each image, pixels.
     images_px: Vec<Value>,
+    /// What the photographs for a lens cover; null for other calibrations.
+    coverage: Value,
     is_finished: bool,
 }
 
@@ -42,6 +44,7 @@ fn receive(url: &str) -> Received {
                         received
                             .texts
                             .push(guidance["text"].as_str().expect("guidance").to_owned());
+                        received.coverage = guidance["coverage"].clone();
                         received.is_finished =
                             guidance["is_finished"].as_bool().expect("a boolean");
                     }
@@ -129,6 +132,11 @@ fn images_and_instructions_of_a_scan_reach_a_client() {
         received.texts
     );
     assert!(!received.images_px.is_empty(), "{log}");
+    let Value::Array(is_covered) = &received.coverage["is_covered"] else {
+        panic!("no coverage: {}", received.coverage);
+    };
+    assert_eq!(received.coverage["camera"], "wrist");
+    assert!(is_covered.len() == 144 && is_covered.contains(&json!(true)));
     // The page shows the same text as the terminal.
     let shown = received
         .texts
@@ -158,4 +166,5 @@ fn poses_of_a_moving_arm_reach_a_client() {
         received.texts
     );
     assert!(!received.images_px.is_empty());
+    assert_eq!(received.coverage, Value::Null, "it is not about the lens");
 }

@@ -5,6 +5,7 @@ mod arrows;
 mod bench;
 mod calibrate;
 mod calibrate_eye_to_hand;
+mod calibrate_guided;
 mod calibrate_mistakes;
 mod calibrate_page;
 mod calibrate_scan;
@@ -25,6 +26,7 @@ mod page_replay;
 mod page_server;
 mod paths;
 mod photos;
+mod preview;
 #[cfg(feature = "realsense")]
 mod realsense;
 mod received_files;

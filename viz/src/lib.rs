@@ -48,6 +48,8 @@ pub use topics::operator_status::{
     Advice, CheckpointState, ConnectedClient, Identity, ImageCounts, KeyframeStore, OperatorStatus,
     RequestedCheckpoint,
 };
+pub use topics::photograph_coverage::{CoverageItem, ImagePartCoverage, PhotographCoverage};
+pub use topics::preview_status::{DeviceState, DeviceStatus, PreviewStatus};
 pub use topics::published_data::{
     FileLink, Grade, Guidance, KeyframePose, ModelSource, ModelStatus, RunResult, SceneBounds,
     SceneHint, SourceKind, StateProgress, Status, Verdict,

@@ -2,8 +2,9 @@
 
 use crate::host::CameraView;
 use crate::images::{self, DetectedImage};
+use crate::lens_devices::approximate_lens;
+use calibration::LensCoverage;
 use calibration::hand_eye::{HandEyeAdvice, HandEyeGuidance, Setup};
-use calibration::{BoardView, IntrinsicsAdvice, IntrinsicsGuidance};
 use capture::CalibrationImage;
 use capture::config::{Camera, Parent};
 use drivers::Sample;
@@ -25,7 +26,7 @@ pub(crate) struct Guide<'a> {
     camera: &'a Camera,
     purpose: Purpose,
     shown: Box<dyn CameraView>,
-    views: Vec<BoardView>,
+    coverage: LensCoverage,
     base_from_flange: Vec<Transform>,
     detected: Vec<DetectedImage>,
 }
@@ -42,10 +43,11 @@ impl<'a> Guide<'a> {
             camera,
             purpose,
             shown,
-            views: Vec::new(),
+            coverage: LensCoverage::new(&approximate_lens(camera)),
             base_from_flange: Vec::new(),
             detected: Vec::new(),
         };
+        guide.show_coverage();
         // The first advice appears before any image, so that it describes how to begin.
         let advice = guide.advice();
         guide.shown.advise(&advice);
@@ -70,10 +72,10 @@ impl<'a> Guide<'a> {
             self.shown.show_searched(image.size_px, &image.gray, view);
             let text = match &detected.board {
                 Ok(board) => {
-                    // The view is copied, because the detection itself is kept for the estimate.
-                    self.views.push(board.view.clone());
+                    self.coverage.add(&board.view);
                     self.base_from_flange
                         .extend(image.arm.as_ref().map(|arm| arm.base_from_flange));
+                    self.show_coverage();
                     self.advice()
                 }
                 // The reason replaces the advice, while the target can still be moved.
@@ -92,19 +94,25 @@ impl<'a> Guide<'a> {
         self.detected
     }
 
+    /// Shows what is covered. The pose of a camera does not depend on it.
+    fn show_coverage(&mut self) {
+        if self.purpose == Purpose::Lens {
+            self.shown.show_coverage(&self.coverage);
+        }
+    }
+
     fn advice(&self) -> String {
         let (so_far, advice, is_enough) = match self.purpose {
             Purpose::Lens => {
-                let guidance = IntrinsicsGuidance::new(&self.views, &self.camera.intrinsics);
-                let percent = 100.0 * guidance.covered_frac;
-                let so_far = match guidance.n_images {
+                let percent = 100.0 * self.coverage.covered_frac();
+                let so_far = match self.coverage.n_images() {
                     1 => format!("1 image of the target covers {percent:.0} % of the image"),
                     n => format!("{n} images of the target cover {percent:.0} % of the image"),
                 };
                 (
                     so_far,
-                    guidance.advice.to_string(),
-                    guidance.advice == IntrinsicsAdvice::Enough,
+                    self.coverage.next().to_string(),
+                    self.coverage.is_enough(),
                 )
             }
             Purpose::HandEye => {

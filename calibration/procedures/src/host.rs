@@ -1,7 +1,7 @@
 //! The interface between a calibration and the program that runs it. It covers stop requests,
 //! progress, and views of camera images.
 
-use calibration::BoardView;
+use calibration::{BoardView, LensCoverage};
 use capture::Stop;
 use capture::config::Camera;
 use drivers::Image;
@@ -50,6 +50,9 @@ pub trait CameraView {
 
     /// Shows a gray image in which the target was searched, with the corners that were found.
     fn show_searched(&mut self, size_px: [u32; 2], gray: &[u8], view: Option<&BoardView>);
+
+    /// Shows what the photographs of the target cover so far.
+    fn show_coverage(&mut self, coverage: &LensCoverage);
 
     /// Shows an instruction or a status.
     fn advise(&mut self, text: &str);

@@ -4,12 +4,12 @@ use crate::guide::Purpose;
 use crate::host::Host;
 use crate::images::{self, OtherSize};
 use crate::lens::LensFile;
-use crate::outputs::{self, ReportOptions, RigOptions, RigOutput};
-use crate::scan::ScanOptions;
+use crate::outputs::{self, ReportOptions, RigOptions, RigOutput, is_rig_file};
+use crate::scan::{Scan, ScanOptions};
 use calibration::{
     BoardView, IntrinsicsCalibration, IntrinsicsInput, LensModel, calibrate_intrinsics,
 };
-use messages::{InsufficientData, Setting};
+use messages::{BadInput, InsufficientData, Setting};
 use report::calibration_report::{IntrinsicsReport, Photos, Unused};
 use std::path::PathBuf;
 use targets::TargetSpec;
@@ -27,6 +27,8 @@ pub struct IntrinsicsTask {
     pub rig: RigOptions,
     /// The report to write.
     pub report: Option<ReportOptions>,
+    /// Folder for the images of the devices of a rig that show the target.
+    pub save_images: Option<PathBuf>,
 }
 
 /// The outcome of an intrinsic calibration.
@@ -36,7 +38,7 @@ pub struct IntrinsicsOutcome {
     /// Images that cannot be read or do not show the target.
     pub unused: Vec<Unused>,
     rig: Option<RigOutput>,
-    /// The result of writing the report.
+    /// The result of writing the report and of saving the images.
     written: anyhow::Result<()>,
 }
 
@@ -51,6 +53,8 @@ struct Detected {
     no_images: Option<String>,
     other_size: Option<OtherSize>,
     warnings: Vec<String>,
+    /// Whether the images were saved as requested.
+    saved: anyhow::Result<()>,
 }
 
 impl IntrinsicsTask {
@@ -61,6 +65,7 @@ impl IntrinsicsTask {
     pub fn run(&self, host: &dyn Host) -> anyhow::Result<IntrinsicsOutcome> {
         // The paths are checked first, so that a wrong path does not cost a calibration.
         self.report.as_ref().map_or(Ok(()), ReportOptions::check)?;
+        self.check_save_images()?;
         let mut rig = self.rig.open(&self.input)?;
         let detected = self.detect(host, rig.as_mut())?;
         // The size of the images is checked before the calibration, because the result for another
@@ -77,8 +82,40 @@ impl IntrinsicsTask {
             calibration,
             unused: detected.unused,
             rig,
-            written,
+            written: written.and(detected.saved),
         })
+    }
+
+    /// Takes or reads the images of a rig or recording. Returns `None` if the input is a folder.
+    /// `output` gets the calibration that devices report.
+    fn scan(
+        &self,
+        options: ScanOptions<'_>,
+        mut output: Option<&mut RigOutput>,
+    ) -> anyhow::Result<Option<Scan>> {
+        let save = self.save_images.as_deref();
+        let target = &self.target;
+        let photographs =
+            self.rig
+                .take_photographs(&self.input, target, options, output.as_deref_mut(), save)?;
+        match photographs {
+            Some(scan) => Ok(Some(scan)),
+            None => self.rig.read(&self.input, Some(target), options, output),
+        }
+    }
+
+    /// Photographs are only saved while they are taken with guidance.
+    fn check_save_images(&self) -> Result<(), BadInput> {
+        let is_guided = self.rig.seconds.is_none() && is_rig_file(&self.input);
+        match &self.save_images {
+            Some(folder) if !is_guided => Err(BadInput(format!(
+                "{} {}: needs a rig file (.toml) as input, without {}",
+                Setting::SaveImages,
+                folder.display(),
+                Setting::Seconds
+            ))),
+            _ => Ok(()),
+        }
     }
 
     /// Reads the images and detects the target. `output` gets the calibration that devices report.
@@ -88,23 +125,23 @@ impl IntrinsicsTask {
             keeps_photos: self.report.is_some(),
             purpose: Purpose::Lens,
         };
-        let (images, photos, no_images, warnings) =
-            match self
-                .rig
-                .read(&self.input, Some(&self.target), options, output)?
-            {
-                Some(mut scan) => (
+        let mut saved = Ok(());
+        let (images, photos, no_images, warnings) = match self.scan(options, output)? {
+            Some(mut scan) => {
+                saved = scan.save_error.take().map_or(Ok(()), Err);
+                (
                     scan.detected(),
                     scan.take_photos(),
                     scan.no_images,
                     scan.warnings,
-                ),
-                None => {
-                    let files = images::files(&self.input)?;
-                    let images = images::detect(&files, &self.target, host)?;
-                    (images, images::photos(&files), None, Vec::new())
-                }
-            };
+                )
+            }
+            None => {
+                let files = images::files(&self.input)?;
+                let images = images::detect(&files, &self.target, host)?;
+                (images, images::photos(&files), None, Vec::new())
+            }
+        };
         let unused = images::unused(&images);
         let other_size = images::other_size(images.iter(), &self.target);
         let mut views = Vec::new();
@@ -128,6 +165,7 @@ impl IntrinsicsTask {
             no_images,
             other_size,
             warnings,
+            saved,
         })
     }
 
@@ -220,7 +258,7 @@ impl IntrinsicsOutcome {
     /// Writes the rig file, if it was requested. This is called after the result was printed.
     ///
     /// # Errors
-    /// Fails if the rig file or the report cannot be written.
+    /// Fails if the rig file or the report cannot be written, or if images were not saved.
     pub fn finish(self) -> anyhow::Result<()> {
         if let Some(mut rig) = self.rig {
             rig.set_intrinsics(
@@ -229,8 +267,8 @@ impl IntrinsicsOutcome {
             )?;
             rig.write()?;
         }
-        // The error of the report is returned last, so that the rig file is written even if the
-        // report could not be written.
+        // This error is returned last, so that the rig file is written even if the report could not be
+        // written.
         self.written
     }
 }

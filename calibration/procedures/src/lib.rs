@@ -12,13 +12,17 @@
 //! and shows the progress.
 
 mod guide;
+mod guided;
 mod hand_eye;
 mod host;
 mod images;
 mod intrinsics;
 mod json_object;
 mod lens;
+mod lens_devices;
 mod outputs;
+mod photograph_quality;
+mod saved_images;
 mod scan;
 mod scene;
 mod scene_report;

@@ -31,7 +31,7 @@ const DEFAULT_SECS: f64 = 30.0;
 /// exposure time and the uncertainty of the stamp. Corners are corrected for the motion during the
 /// readout, but the correction is only as accurate as the velocity. A smaller value rejects images
 /// of slow motions. A larger value accepts blurred corners.
-const MAX_SHIFT_PX: f64 = 3.0;
+pub(crate) const MAX_SHIFT_PX: f64 = 3.0;
 
 /// Images of one camera that were searched for a target.
 pub(crate) struct Scan {
@@ -48,6 +48,8 @@ pub(crate) struct Scan {
     pub(crate) no_images: Option<String>,
     /// Damage of the recording.
     pub(crate) warnings: Vec<String>,
+    /// Why images were not saved, although this was requested.
+    pub(crate) save_error: Option<anyhow::Error>,
 }
 
 /// What to do while images are read.
@@ -292,6 +294,7 @@ impl Scan {
             photos,
             no_images: None,
             warnings: Vec::new(),
+            save_error: None,
         })
     }
 

@@ -9,9 +9,9 @@ mod bundle;
 mod check;
 mod coefficients;
 mod grid;
-mod guidance;
 pub(crate) mod homography;
 mod initial;
+mod lens_coverage;
 mod next_view;
 mod report;
 mod robust;
@@ -21,7 +21,9 @@ mod tests;
 
 pub use board_pose::{BoardPose, board_pose};
 pub use grid::ImageGrid;
-pub use guidance::{ImageRegion, IntrinsicsAdvice, IntrinsicsGuidance, RECOMMENDED_IMAGES, Side};
+pub use lens_coverage::{
+    CoverageGoal, GoalProgress, ImagePart, LensCoverage, NextPhotograph, RECOMMENDED_IMAGES, Side,
+};
 pub use next_view::NextView;
 pub(crate) use report::point_fits;
 pub use report::{

@@ -1,7 +1,6 @@
 //! Images that are kept for calibration, of a simulated sequence of samples.
 
 use super::*;
-use crate::stamp_clock::StampClock;
 use drivers::{PixelFormat, Source};
 use std::sync::Arc;
 
@@ -244,4 +243,33 @@ fn summary_names_only_reasons_that_occurred() {
             .summary()
             .ends_with("1 similar to a used image or beyond the maximum of 300")
     );
+}
+
+#[test]
+fn the_caller_chooses_among_all_images_of_an_arm_that_is_slow() {
+    let images = (0..20).map(|ix| image(0.05 + 0.1 * f64::from(ix)));
+    let opened = Opened {
+        rig: arm_rig(),
+        source: Box::new(Samples(with_readings(images).into_iter())),
+        damage: Default::default(),
+        stamp_clock: StampClock::Unrelated,
+    };
+    let mut offered = Vec::new();
+    let mut choose = |image: &CalibrationImage| {
+        offered.push(image.secs);
+        offered.len().is_multiple_of(2)
+    };
+    let found = chosen_calibration_images(
+        opened,
+        "wrist",
+        3.0,
+        |_, _| ControlFlow::Continue(()),
+        &mut choose,
+    )
+    .expect("a rig with an arm");
+    assert_eq!(found.n_read, 20);
+    // Without a choice, only the first image of a pose is kept.
+    assert_eq!(offered.len() + found.n_fast + found.n_unusable, 20);
+    assert!(offered.len() > 10 && found.n_fast > 0, "{offered:?}");
+    assert_eq!(found.images.len(), offered.len() / 2);
 }

@@ -53,6 +53,8 @@ keys! {
         pub world_from_board: Option<Transform>;
         /// Pose of the board frame relative to the flange, for a board that the arm carries.
         pub flange_from_board: Option<Transform>;
+        /// Camera in front of which a hand moves the board, as a person does who calibrates a lens.
+        pub moved_before: Option<String>;
     }
 }
 

@@ -203,16 +203,11 @@ pub fn listen(rig: &Rig, secs: f64, stop: &Stop) -> anyhow::Result<ListenResult>
 /// Name of the device that delivered a sample, and the number of its images that were dropped
 /// before the sample. `None` for ground truth, which no device delivers.
 fn device_of(sample: &Sample) -> Option<(String, u64)> {
-    Some(match sample {
-        Sample::Image(image) if image.is_depth() => {
-            (device_names::camera_depth(&image.camera), image.n_skipped)
-        }
-        Sample::Image(image) => (device_names::camera(&image.camera), image.n_skipped),
-        Sample::Joints(_) => (device_names::ARM.to_owned(), 0),
-        Sample::Base(_) => (device_names::BASE.to_owned(), 0),
-        Sample::Range(scan) => (device_names::range_scanner(&scan.scanner), 0),
-        Sample::Truth(_) | Sample::BaseTruth(_) => return None,
-    })
+    let n_dropped = match sample {
+        Sample::Image(image) => image.n_skipped,
+        _ => 0,
+    };
+    Some((device_names::of_sample(sample)?, n_dropped))
 }
 
 /// Lists the reasons why images did not become keyframes. Rejected images are normal, for example

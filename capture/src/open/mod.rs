@@ -52,6 +52,15 @@ fn sim_hint() -> String {
     )
 }
 
+/// The text of an error of [`rig()`], without the hint that devices can be simulated. It is for
+/// lists of devices, where the hint would be repeated.
+#[must_use]
+pub fn without_sim_hint(error: &anyhow::Error) -> String {
+    let text = format!("{error:#}");
+    let hint = format!("; {}", sim_hint());
+    text.strip_suffix(&hint).unwrap_or(&text).to_owned()
+}
+
 /// The port of a Franka controller.
 pub const FCI_PORT: u16 = 1337;
 

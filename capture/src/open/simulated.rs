@@ -145,7 +145,7 @@ fn config_of(rig: &Rig) -> anyhow::Result<sim::Config> {
             .sim
             .targets
             .iter()
-            .map(target_of)
+            .map(|target| target_of(target, rig))
             .collect::<anyhow::Result<_>>()?,
         cameras: rig
             .cameras
@@ -158,8 +158,20 @@ fn config_of(rig: &Rig) -> anyhow::Result<sim::Config> {
     twin::choose(rig, config)
 }
 
-fn target_of((name, target): (&String, &SimTarget)) -> anyhow::Result<sim::TargetConfig> {
+fn target_of(
+    (name, target): (&String, &SimTarget),
+    rig: &Rig,
+) -> anyhow::Result<sim::TargetConfig> {
     let (parent, parent_from_board) = match (target.world_from_board, target.flange_from_board) {
+        (None, None) if target.moved_before.is_some() => {
+            (in_hand(name, target, rig)?, Transform::identity())
+        }
+        _ if target.moved_before.is_some() => {
+            bail!(
+                "sim.target.{name}: a board that is moved by hand (moved_before) has no world_from_board or \
+                 flange_from_board: remove one of them"
+            )
+        }
         (Some(_), Some(_)) => {
             bail!("sim.target.{name}: give either world_from_board or flange_from_board, not both")
         }
@@ -175,6 +187,25 @@ fn target_of((name, target): (&String, &SimTarget)) -> anyhow::Result<sim::Targe
         parent,
         parent_from_board,
     })
+}
+
+/// A hand that moves a target in front of a camera.
+fn in_hand(name: &str, target: &SimTarget, rig: &Rig) -> anyhow::Result<sim::TargetParent> {
+    let camera = target.moved_before.as_deref().unwrap_or_default();
+    let mut simulated = rig
+        .cameras
+        .iter()
+        .filter(|camera| camera.driver == CameraDriver::Sim);
+    match simulated.position(|other| &*other.name == camera) {
+        Some(camera_ix) => Ok(sim::TargetParent::Hand { camera_ix }),
+        None => {
+            let names: Vec<&str> = rig.cameras.iter().map(|camera| &*camera.name).collect();
+            bail!(
+                "sim.target.{name}.moved_before is {camera:?}, but the simulated cameras are: {}",
+                names.join(", ")
+            )
+        }
+    }
 }
 
 fn scanner_of(scanner: &Scanner) -> sim::ScannerConfig {

@@ -103,6 +103,8 @@ settings! {
     Samples = "n_samples",
     /// Fraction to which images are scaled.
     Scale = "scale",
+    /// Folder for the photographs of a calibration.
+    SaveImages = "save_images",
     /// Duration.
     Seconds = "seconds",
     /// Time at the start of a run that is not evaluated.

@@ -24,7 +24,8 @@ pub(super) struct RigFlags {
     /// With a rig file: simulate all devices
     #[arg(long)]
     sim: bool,
-    /// With a rig file: read the devices for S seconds [default: 30]
+    /// With a rig file: read the devices for S seconds [default: 30; for a lens, until the photographs
+    /// cover everything]
     #[arg(long, value_name = "S", value_parser = number_in_range(1.0..=3600.0))]
     seconds: Option<f64>,
     /// With a rig file: the page that shows the camera images and the next instruction.

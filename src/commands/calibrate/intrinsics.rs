@@ -16,8 +16,19 @@ use targets::TargetSpec;
 
 const TARGET_HELP: &str = "The target, such as chessboard:9x6:25mm, charuco:5x7:34mm:26mm:5X5_100 or aprilgrid:6x6:20mm:0.3";
 
+const DETAILS: &str = "With a rig file, the photographs are taken for you. Move the target in front of the camera, or \
+    let the arm move the camera. A photograph is taken when the target is still and sharp and shows something new. The \
+    terminal and the page show what is missing next, such as another tilt or a corner of the image. It ends when \
+    everything is covered, or with Ctrl-C, and then estimates the lens. Only this camera is opened, and also the arm if \
+    it carries the camera. With --seconds, all images of that time are used instead.\n\n\
+    Examples:\n  \
+    fieldrig calibrate target --target charuco:5x7:34mm:26mm:5X5_100 --out target.pdf\n  \
+    fieldrig calibrate intrinsics rig.toml --target charuco:5x7:34mm:26mm:5X5_100 --write-rig rig.toml\n  \
+    fieldrig calibrate intrinsics photographs/ --target chessboard:9x6:25mm";
+
 /// Flags of `calibrate intrinsics`.
 #[derive(Debug, clap::Args)]
+#[command(after_long_help = DETAILS)]
 pub(crate) struct Args {
     /// Folder of images (.jpg, .png) of the target, all from one camera and of one size. Or a
     /// recording (.mcap) or rig file (.toml) whose camera sees the target
@@ -30,6 +41,10 @@ pub(crate) struct Args {
     model: ModelArg,
     #[command(flatten)]
     rig: RigFlags,
+    /// With a rig file: save the photographs in this folder (PNG), which must be new or empty.
+    /// `calibrate intrinsics FOLDER` repeats the calibration
+    #[arg(long, value_name = "FOLDER")]
+    save_images: Option<PathBuf>,
     #[command(flatten)]
     report: ReportFlag,
     /// Print one JSON object
@@ -132,6 +147,7 @@ impl Args {
             model: self.model.into(),
             rig: self.rig.options()?,
             report: self.report.options(),
+            save_images: self.save_images.clone(),
         })
     }
 }

@@ -1,6 +1,7 @@
 //! `fieldrig calibrate`: calibrates cameras, with a printed target or from images of any static
 //! scene.
 
+mod coverage;
 mod flags;
 mod hand_eye;
 mod intrinsics;

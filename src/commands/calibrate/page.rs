@@ -1,16 +1,17 @@
 //! The web page while images of a target are taken. It shows the camera image, the corners found so
 //! far, and the next instruction.
 
+use super::coverage::published;
 use crate::page_args::PageArgs;
 use crate::print;
 use crate::served_page::ServedPage;
-use calibration::BoardView;
+use calibration::{BoardView, LensCoverage};
 use capture::config::Camera;
 use drivers::Image;
 use kinematics::Stamp;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
-use viz::{Guidance, Hub, LiveImage, LivePixels, Status};
+use viz::{Guidance, Hub, LiveImage, LivePixels, PhotographCoverage, Status};
 
 /// Interval between live images.
 const INTERVAL: Duration = Duration::from_millis(200);
@@ -34,6 +35,10 @@ pub(super) struct GuidancePage {
     n_views: u64,
     /// Corners of all images so far, pixels.
     corners_px: Vec<[f64; 2]>,
+    /// What the photographs for a lens cover; `None` for other calibrations.
+    coverage: Option<PhotographCoverage>,
+    /// The instruction that is shown.
+    text: String,
 }
 
 impl GuidancePage {
@@ -56,16 +61,30 @@ impl GuidancePage {
             next_live: began,
             n_views: 0,
             corners_px: Vec::new(),
+            coverage: None,
+            text: String::new(),
         })
     }
 
     /// Shows the next instruction.
-    pub(super) fn guide(&self, text: &str) {
+    pub(super) fn guide(&mut self, text: &str) {
+        text.clone_into(&mut self.text);
+        self.show_guidance();
+    }
+
+    /// Shows what the photographs cover.
+    pub(super) fn set_coverage(&mut self, coverage: &LensCoverage) {
+        self.coverage = Some(published(&self.camera, coverage));
+        self.show_guidance();
+    }
+
+    fn show_guidance(&self) {
         self.set_status(
             "calibrating",
             Guidance {
-                text: text.to_owned(),
+                text: self.text.clone(),
                 is_finished: false,
+                coverage: self.coverage.clone(),
             },
         );
     }
@@ -81,6 +100,7 @@ impl GuidancePage {
             Guidance {
                 text,
                 is_finished: true,
+                coverage: self.coverage.clone(),
             },
         );
     }

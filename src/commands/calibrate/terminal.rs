@@ -6,7 +6,7 @@ use crate::page_args::PageArgs;
 use crate::{print, signals};
 use anyhow::Context;
 use calibrate::{Activity, CameraView, Host};
-use calibration::BoardView;
+use calibration::{BoardView, LensCoverage};
 use capture::Stop;
 use capture::config::Camera;
 use drivers::Image;
@@ -91,6 +91,10 @@ impl CameraView for TerminalView {
 
     fn show_searched(&mut self, size_px: [u32; 2], gray: &[u8], view: Option<&BoardView>) {
         self.page.show_searched(size_px, gray, view);
+    }
+
+    fn show_coverage(&mut self, coverage: &LensCoverage) {
+        self.page.set_coverage(coverage);
     }
 
     fn advise(&mut self, text: &str) {

@@ -7,6 +7,8 @@
 
 use crate::topics::edit_status::{ErasedBox, LastEdit, SavedEdits};
 use crate::topics::operator_status::OperatorStatus;
+use crate::topics::photograph_coverage::PhotographCoverage;
+use crate::topics::preview_status::PreviewStatus;
 use kinematics::{Stamp, Transform};
 use model_files::Edits;
 use serde::Serialize;
@@ -58,6 +60,9 @@ pub struct Status {
     /// What the operator should do, for commands that take images without training.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub guidance: Option<Guidance>,
+    /// The devices, for a preview, which trains nothing.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub preview: Option<PreviewStatus>,
     /// What the operator's header shows.
     #[serde(flatten)]
     pub operator: OperatorStatus,
@@ -102,6 +107,9 @@ pub struct Guidance {
     pub text: String,
     /// Whether nothing is left to do, so that the server may stop.
     pub is_finished: bool,
+    /// What the photographs of a target cover so far, for the calibration of a lens.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub coverage: Option<PhotographCoverage>,
 }
 
 /// Result of a run that has ended.

@@ -32,6 +32,8 @@ import { NamedViews } from "./panels/named_views";
 import { NewRun } from "./panels/new_run";
 import { OverlayAges } from "./panels/overlay_ages";
 import { setUpPanels } from "./panels/panels";
+import { Preview } from "./panels/preview";
+import { CoverageOverlay } from "./panels/photograph_coverage";
 import { PictureInfo } from "./panels/picture_info";
 import { Readouts } from "./panels/readouts";
 import { RobotAge } from "./panels/robot_age";
@@ -99,7 +101,7 @@ const connectionState = new ConnectionState({
   restart,
   changed: () => view.changed(),
   // The skeleton says what is missing before the first picture.
-  problem: () => flow.problem(skeleton.isVisible ? null : pictureInfo.waitingMillis),
+  problem: () => flow.problem(skeleton.isVisible || preview.isOn ? null : pictureInfo.waitingMillis),
 });
 const connection: Connection = new Connection(
   `${location.protocol === "https:" ? "wss" : "ws"}://${location.host}/ws`,
@@ -175,6 +177,8 @@ const browser = new KeyframeBrowser({
   radiusM: () => sceneRadiusM,
 });
 const model = new ShownModel({ view, models, readouts, edits, scheduler, browser, surroundings, topics, chunks });
+const photographCoverage = new CoverageOverlay();
+const preview = new Preview(model, skeleton, liveImages);
 const picture = new MainPicture({
   view,
   scheduler,
@@ -259,6 +263,8 @@ function receiveStatus(status: Status): void {
   for (const part of [runControls, header, trainingPanel, runEnd, modelSource]) part.show(status);
   banner.setStatus(status);
   showGuidance(status.guidance, banner, liveImages);
+  photographCoverage.show(status.guidance?.coverage);
+  preview.show(status);
   for (const ages of [robotAge, overlayAges]) ages.hasEnded = banner.isFinished;
   namedViews.runIs(status);
   flow.isReading = CONTROLLABLE.includes(status.state);
@@ -282,7 +288,7 @@ function receiveText(message: TextMessage): void {
     case "error":
       if ([edits, ...sides, browser].some((part) => part.fail(message))) break;
       // The skeleton already shows what is missing.
-      picture.failed(message.id, skeleton.isVisible && !model.status?.keyframes ? "" : message.message);
+      picture.failed(message.id, preview.isOn || (skeleton.isVisible && !model.status?.keyframes) ? "" : message.message);
       break;
   }
 }
@@ -299,7 +305,7 @@ function frame(): void {
   settings.tick();
   // Until the chunks in view have arrived, pictures of the server are shown.
   scheduler.drawsLocally = view.local.replacesPictures;
-  scheduler.tick();
+  if (!preview.isOn) scheduler.tick();
   pictureInfo.update();
   if (!view.usesSurroundings || settings.isPlaying) {
     surroundings.forget();

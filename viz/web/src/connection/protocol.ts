@@ -93,6 +93,8 @@ export interface Status extends ModelStatus {
   notes: string[];
   result: RunResult | null;
   guidance?: Guidance;
+  /** The devices of a preview, which trains nothing. */
+  preview?: PreviewStatus;
   /** These fields are for the operator's header; older servers have none of them. */
   identity?: Identity;
   advice?: Advice;
@@ -167,6 +169,42 @@ export interface SavedEdits {
 export interface Guidance {
   text: string;
   is_finished: boolean;
+  /** What the photographs for a lens cover; missing for other calibrations, and on older servers. */
+  coverage?: PhotographCoverage;
+}
+
+/** What the photographs of a target cover so far. */
+export interface PhotographCoverage {
+  camera: string;
+  size_px: [number, number];
+  /** Number of columns and rows of equal cells of the image. */
+  cells: [number, number];
+  /** Whether each cell contains corners of the target, row by row from the upper left. */
+  is_covered: boolean[];
+  /** Parts of the image that need corners, 3 rows of 3, from the upper left. */
+  parts: { is_covered: boolean; is_next: boolean }[];
+  /** Everything else that photographs must show. */
+  items: { label: string; n_done: number; n_needed: number; is_next: boolean }[];
+}
+
+/** What a preview shows besides images and the robot. */
+export interface PreviewStatus {
+  devices: DeviceStatus[];
+}
+
+/** A device that is read, or that cannot be read. */
+export interface DeviceStatus {
+  /** For display, such as `camera "wrist"`. */
+  name: string;
+  state: "opening" | "delivering" | "silent" | "failed" | "ended";
+  /** Samples per second over the last seconds; null if too few samples arrived. */
+  rate_hz: number | null;
+  /** The same according to the rig file; null if the rig file does not say. */
+  expected_hz: number | null;
+  /** Time since the newest sample was captured; null before the first sample. */
+  age_millis: number | null;
+  /** Why there are no samples; empty if samples arrive. */
+  reason: string;
 }
 
 /** Result of a run that has ended. */

@@ -12,6 +12,8 @@ const HZ = 4;
 const RIDDEN_HZ = 12;
 /** Limits of the height of camera images, in CSS pixels: see `.live canvas` in styles/page.css. */
 const IMAGE_HEIGHT = { min: 90, max: 190, ofWindow: 0.22 };
+/** The same in a preview: see styles/preview.css. */
+const ROOMY_HEIGHT = { min: 120, max: 420, ofWindow: 0.34 };
 const MAX_IMAGE_WIDTH_PX = 640;
 /** Maximum size of images that are enlarged or fill the view. */
 const ENLARGED_PX: [number, number] = [1280, 960];
@@ -39,6 +41,7 @@ export class LiveImagesTopic implements Topic {
     }),
   ];
   private isShown = true;
+  private isRoomy = false;
   private fillsView = false;
 
   constructor(
@@ -68,6 +71,12 @@ export class LiveImagesTopic implements Topic {
     this.changed();
   }
 
+  /** Whether there is no model that larger images would hide. */
+  set roomy(isRoomy: boolean) {
+    this.isRoomy = isRoomy;
+    this.changed();
+  }
+
   subscriptions(isHidden: boolean): Subscription[] {
     const cameras = [...this.images.resized];
     if (isHidden) return [{ rate_hz: 0 }, ...cameras.map(([camera]) => ({ camera, rate_hz: 0 }))];
@@ -92,8 +101,8 @@ export class LiveImagesTopic implements Topic {
 
   private thumbnailPx(): [number, number] {
     if (!this.isShown) return [IMAGE_STEP_PX, IMAGE_STEP_PX];
-    const { min, max, ofWindow } = IMAGE_HEIGHT;
+    const { min, max, ofWindow } = this.isRoomy ? ROOMY_HEIGHT : IMAGE_HEIGHT;
     const height = Math.min(max, Math.max(min, ofWindow * window.innerHeight)) * Math.min(devicePixelRatio, 2);
-    return [MAX_IMAGE_WIDTH_PX, IMAGE_STEP_PX * Math.ceil(height / IMAGE_STEP_PX)];
+    return [this.isRoomy ? ENLARGED_PX[0] : MAX_IMAGE_WIDTH_PX, IMAGE_STEP_PX * Math.ceil(height / IMAGE_STEP_PX)];
   }
 }

@@ -1,0 +1,134 @@
+//! The devices of a rig that the calibration of a lens needs.
+//!
+//! The lens of a camera can be calibrated before the rest of the robot is connected: only the
+//! camera is opened. The exception is a camera that an arm carries, because the images during fast
+//! motions of the arm are not used.
+
+use capture::config::{ArmDriver, BaseDriver, Camera, Parent, Rig};
+use capture::open::{self, Devices, Opened};
+use kinematics::{Intrinsics, Lens};
+
+/// Focal length of a webcam relative to the image diagonal. Common webcams have a diagonal field of
+/// view of about 70 degrees. It is only used to estimate how far a target is tilted.
+const WEBCAM_FOCAL: f64 = 0.714;
+
+/// Open devices, and the whole rig with the calibration that the camera reports.
+pub(crate) struct LensDevices {
+    /// The devices. In the rig of the devices, the arm has no driver if it is not used.
+    pub(crate) opened: Opened,
+    pub(crate) rig: Rig,
+}
+
+/// Opens a camera of a rig, and the arm if it carries the camera.
+///
+/// # Errors
+/// If a device cannot be opened.
+pub(crate) fn open(rig: Rig, camera: &str, devices: Devices) -> anyhow::Result<LensDevices> {
+    let is_carried = is_carried(&rig, camera);
+    // One simulation moves all devices.
+    let is_simulated = devices == Devices::Sim || open::is_any_simulated(&rig);
+    if is_carried || is_simulated {
+        let mut opened = open::rig(rig, devices)?;
+        let rig = opened.rig.clone();
+        if !is_carried {
+            without_arm(&mut opened.rig);
+        }
+        return Ok(LensDevices { opened, rig });
+    }
+    let mut part = rig.clone();
+    part.cameras.retain(|other| &*other.name == camera);
+    part.scanners.clear();
+    without_arm(&mut part);
+    let opened = open::rig(part, devices)?;
+    let mut rig = rig;
+    for known in &mut rig.cameras {
+        let reported = opened
+            .rig
+            .cameras
+            .iter()
+            .find(|other| other.name == known.name);
+        if let Some(reported) = reported {
+            // Everything but the parent, which `without_arm` may have changed, is as reported.
+            *known = Camera {
+                parent: known.parent,
+                ..reported.clone()
+            };
+        }
+    }
+    Ok(LensDevices { opened, rig })
+}
+
+/// Whether an arm that is read carries the camera.
+fn is_carried(rig: &Rig, camera: &str) -> bool {
+    let is_on_flange = rig
+        .cameras
+        .iter()
+        .any(|other| &*other.name == camera && other.parent == Parent::Flange);
+    is_on_flange && rig.arm.driver != ArmDriver::None
+}
+
+/// Lets the rig look as if it had neither an arm nor a moving base.
+fn without_arm(rig: &mut Rig) {
+    rig.arm.driver = ArmDriver::None;
+    rig.base.driver = BaseDriver::Fixed;
+    for camera in &mut rig.cameras {
+        if camera.parent == Parent::Flange {
+            camera.parent = Parent::Base;
+        }
+    }
+}
+
+/// An approximate lens of a camera, with the size of its images. If the rig file has no intrinsics,
+/// it is that of a common webcam.
+pub(crate) fn approximate_lens(camera: &Camera) -> Intrinsics {
+    if !camera.realsense.unknown.intrinsics {
+        return camera.intrinsics.clone();
+    }
+    let size_px = camera.intrinsics.size_px;
+    let [width, height] = size_px.map(f64::from);
+    Intrinsics {
+        size_px,
+        focal_px: [WEBCAM_FOCAL * width.hypot(height); 2],
+        principal_px: [0.5 * width, 0.5 * height],
+        lens: Lens::Pinhole,
+        rectified: false,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use std::path::Path;
+
+    fn rig() -> Rig {
+        let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../rigs/two-cameras.toml");
+        Rig::load(&path, &[]).expect("a bundled rig file")
+    }
+
+    #[test]
+    fn only_a_camera_on_an_arm_needs_the_arm() {
+        let mut rig = rig();
+        let name = rig.cameras[0].name.to_string();
+        rig.cameras[0].parent = Parent::Flange;
+        assert!(is_carried(&rig, &name));
+        rig.arm.driver = ArmDriver::None;
+        assert!(!is_carried(&rig, &name), "the arm is not read");
+        rig.arm.driver = ArmDriver::Udp;
+        rig.cameras[0].parent = Parent::World;
+        assert!(!is_carried(&rig, &name));
+    }
+
+    #[test]
+    fn an_unknown_lens_is_that_of_a_webcam() {
+        let mut camera = rig().cameras[0].clone();
+        assert_eq!(approximate_lens(&camera), camera.intrinsics);
+        camera.realsense.unknown.intrinsics = true;
+        camera.intrinsics.size_px = [1280, 720];
+        let lens = approximate_lens(&camera);
+        let diagonal_fov = 2.0 * (0.5 * 1280.0_f64.hypot(720.0) / lens.focal_px[0]).atan();
+        assert!(
+            (diagonal_fov.to_degrees() - 70.0).abs() < 1.0,
+            "{diagonal_fov}"
+        );
+    }
+}
