@@ -20,6 +20,7 @@
 //! size_px = [640, 480]
 //! rate_hz = 30
 //! parent = "base"
+//! parent_from_camera = { xyz_m = [0.3, 0.0, 0.2], quat_xyzw = [-0.5, 0.5, -0.5, 0.5] }
 //! intrinsics = { focal_px = [600, 600], principal_px = [320, 240] }
 //! "#;
 //! let urdf = r#"<robot name="none"><link name="base"/></robot>"#;

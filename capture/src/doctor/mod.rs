@@ -135,6 +135,7 @@ pub fn check(rig: Option<&Rig>) -> Vec<Finding> {
     #[cfg(target_os = "linux")]
     findings.extend(rig.into_iter().flat_map(servos::servos));
     findings.extend(rig.and_then(motion::motion));
+    findings.extend(rig.into_iter().flat_map(calibration::missing));
     findings.extend(rig.into_iter().flat_map(calibration::calibration));
     findings.extend(rig.into_iter().flat_map(|rig| {
         datagrams::senders(rig)

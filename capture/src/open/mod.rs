@@ -33,6 +33,7 @@ use crate::config::{ArmDriver, BaseDriver, CameraDriver, Override, Parent, Rig, 
 use crate::notes::Notes;
 use crate::stamp_clock::StampClock;
 use anyhow::{Context, anyhow, bail};
+use assumed_lens::assume_calibration_of_simulated;
 use drivers::recording::{RIG_FILE, Recorder, Recording, RecordingMetadata, URDF_FILE};
 use drivers::udp::DatagramMonitor;
 use drivers::{LiveDevices, Playback, Repeating, Sample, Source};
@@ -42,7 +43,8 @@ use std::path::Path;
 use std::sync::{Arc, OnceLock};
 use tags::TagBaseSource;
 
-pub(crate) use assumed_lens::assume_lenses;
+pub use assumed_lens::approximate_intrinsics;
+pub(crate) use assumed_lens::assume_calibration;
 
 /// Hint in error messages about devices that cannot be opened.
 fn sim_hint() -> String {
@@ -149,6 +151,7 @@ pub(crate) fn rig_with_monitors(
     if devices == Devices::Sim {
         use_simulated_devices(&mut rig);
     }
+    assume_calibration_of_simulated(&mut rig);
     without_readout_if_ideal(&mut rig);
     // The settings are checked before any device is opened, so that an error of the rig file does
     // not start cameras.
@@ -183,7 +186,7 @@ pub(crate) fn rig_with_monitors(
 /// Replaces every device by its simulated twin. Calibration that only a real camera could report is
 /// assumed.
 fn use_simulated_devices(rig: &mut Rig) {
-    assume_lenses(rig);
+    assume_calibration(rig);
     // A rig without an arm may describe one, which then stays at rest.
     if rig.arm.driver != ArmDriver::None || rig.arm.joints.is_empty() {
         rig.arm.driver = ArmDriver::Sim;
@@ -226,8 +229,6 @@ pub fn recording(path: &Path, rig: Option<Rig>, overrides: &[Override]) -> anyho
         [rig.arm.joint_offsets, rig.arm.sim.true_joint_offsets] = offsets;
         rig.arm.joints = recorded.to_vec();
     }
-    // The cameras are no longer available, so the intrinsics must be known.
-    check_intrinsics(&rig)?;
     without_readout_if_ideal(&mut rig);
     let damage = Arc::default();
     let source = Box::new(RecordingSource {
@@ -269,6 +270,7 @@ pub fn recorder(path: &Path, rig: &Rig) -> anyhow::Result<Recorder> {
     let cameras: Vec<_> = rig
         .cameras
         .iter()
+        .filter(|camera| !camera.unknown.intrinsics)
         .map(|camera| (&*camera.name, &camera.intrinsics))
         .collect();
     // All settings of the rig are stored, including the calibration that cameras report. The
@@ -338,22 +340,6 @@ fn check_arm(rig: &Rig) -> anyhow::Result<()> {
     if let (ArmDriver::None, Some(camera)) = (rig.arm.driver, on_flange) {
         bail!(
             "camera {:?} has the parent flange, but arm.driver is none: the parent must be base or world",
-            camera.name
-        );
-    }
-    Ok(())
-}
-
-/// Checks that all intrinsics are known. Intrinsics that are stored in the camera are unknown
-/// unless the camera is opened.
-fn check_intrinsics(rig: &Rig) -> anyhow::Result<()> {
-    if let Some(camera) = rig
-        .cameras
-        .iter()
-        .find(|camera| camera.realsense.unknown.intrinsics)
-    {
-        bail!(
-            "camera.{}.intrinsics is missing: it is stored in the camera, which this command does not open",
             camera.name
         );
     }

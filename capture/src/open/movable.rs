@@ -2,6 +2,7 @@
 
 #[cfg(feature = "sim")]
 use super::arm_config::motion_limits;
+use super::assumed_lens::assume_calibration_of_simulated;
 use super::real;
 use super::{Devices, check_arm, use_simulated_devices, without_readout_if_ideal};
 use crate::config::{ArmDriver, BaseDriver, Camera, CameraDriver, Rig};
@@ -48,6 +49,7 @@ pub fn movable(rig: &Rig, devices: Devices, camera: &str) -> anyhow::Result<Mova
             "base.driver: the base must be fixed; use a copy of the rig file with base.driver = \"fixed\""
         );
     }
+    assume_calibration_of_simulated(&mut rig);
     without_readout_if_ideal(&mut rig);
     check_arm(&rig)?;
     if rig.arm.driver == ArmDriver::Sim {

@@ -1,7 +1,7 @@
 //! Locates the base from tags that its cameras see: estimates base poses from images and adds them
 //! to the samples.
 
-use crate::config::{BaseDriver, Camera, Parent, Rig};
+use crate::config::{BaseDriver, Camera, Need, Parent, Rig};
 use crate::join::{CameraPose, Motion};
 use anyhow::bail;
 use drivers::tags::{
@@ -68,6 +68,8 @@ impl TagBaseSource {
                 "base.driver is tags, but no camera is on the base or the arm: set camera.NAME.parent to base or flange"
             );
         }
+        arm.cameras.clone_from(&cameras);
+        arm.require(Need::PosedImages)?;
         Ok(Self {
             source,
             detector: TagDetector::start(rig.base.tag_family)?,
