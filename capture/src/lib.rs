@@ -63,7 +63,7 @@ pub use calibration_images::{
 };
 pub use config::{ConfigError, Override, Rig};
 pub use feed::{Feed, FeedItem, Input, InputObserver, InputResult, InputTimes};
-pub use found_devices::{DeviceInfo, found_devices};
+pub use found_devices::{ChangeKind, DeviceChange, DeviceInfo, DeviceWatch, found_devices};
 pub use input_counts::InputCounts;
 pub use join::{Change, Counts, Join, JoinEvent, PosedImage, Rejection, SampleUse, StoreUse};
 pub use mesh_files::mesh_file_candidates;
