@@ -51,6 +51,7 @@ mod nearest_name;
 mod notes;
 pub mod open;
 mod record;
+pub mod rig_facts;
 mod robot_motion;
 mod stamp_clock;
 mod stations;

@@ -47,11 +47,10 @@ fn problems(camera: &Camera) -> Vec<(String, String)> {
     let mut report = |message: String, remedy: &str| {
         problems.push((format!("camera {name:?}: {message}"), remedy.to_owned()))
     };
-    if camera.parent == Parent::Flange {
+    // A missing pose is reported separately.
+    if camera.parent == Parent::Flange && !camera.unknown.parent_from_camera {
         let distance_m = camera.parent_from_camera.translation.vector.norm();
-        if camera.unknown.parent_from_camera {
-            // It is reported as missing.
-        } else if camera.parent_from_camera == Transform::identity() {
+        if camera.parent_from_camera == Transform::identity() {
             report(
                 "parent_from_camera is the identity: the camera would be exactly in the flange frame"
                     .to_owned(),

@@ -4,6 +4,7 @@ mod arm_config;
 mod assumed_lens;
 #[cfg(all(feature = "sim", target_os = "linux"))]
 mod emulated;
+mod listening;
 mod movable;
 mod real;
 mod realsense;
@@ -22,6 +23,7 @@ mod ur;
 
 #[cfg(target_os = "linux")]
 pub use arm_config::controller_chain;
+pub(crate) use listening::{DeviceFailure, Listening, for_listening};
 pub use movable::{Movable, movable};
 pub use real::{check_motion, motion_of, movable_arm, udp_arm_address};
 #[cfg(target_os = "linux")]
@@ -35,7 +37,6 @@ use crate::stamp_clock::StampClock;
 use anyhow::{Context, anyhow, bail};
 use assumed_lens::assume_calibration_of_simulated;
 use drivers::recording::{RIG_FILE, Recorder, Recording, RecordingMetadata, URDF_FILE};
-use drivers::udp::DatagramMonitor;
 use drivers::{LiveDevices, Playback, Repeating, Sample, Source};
 use kinematics::Chain;
 use messages::Setting;
@@ -139,15 +140,7 @@ fn open_recording(
 ///
 /// If a device cannot be opened, a driver is not part of this build, or the rig file lacks a
 /// setting that a driver needs.
-pub fn rig(rig: Rig, devices: Devices) -> anyhow::Result<Opened> {
-    rig_with_monitors(rig, devices).map(|(opened, _)| opened)
-}
-
-/// Like [`rig()`], with monitors of the devices that receive datagrams.
-pub(crate) fn rig_with_monitors(
-    mut rig: Rig,
-    devices: Devices,
-) -> anyhow::Result<(Opened, Vec<DatagramMonitor>)> {
+pub fn rig(mut rig: Rig, devices: Devices) -> anyhow::Result<Opened> {
     if devices == Devices::Sim {
         use_simulated_devices(&mut rig);
     }
@@ -159,8 +152,8 @@ pub(crate) fn rig_with_monitors(
         bail!("{device} cannot be opened by this version; {}", sim_hint());
     }
     check_arm(&rig)?;
-    let opened = real::open(&mut rig).map_err(|error| anyhow!("{error:#}; {}", sim_hint()));
-    let (real, monitors) = opened?;
+    let opened = real::open(&mut rig, &mut real::end_on_failure);
+    let (real, _) = opened.map_err(|error| anyhow!("{error:#}; {}", sim_hint()))?;
     let (source, stamp_clock): (Box<dyn Source>, _) = if is_any_simulated(&rig) {
         simulate(&rig, real)?
     } else {
@@ -172,15 +165,12 @@ pub(crate) fn rig_with_monitors(
         BaseDriver::Tags => Box::new(TagBaseSource::new(&rig, source)?),
         _ => source,
     };
-    Ok((
-        Opened {
-            rig,
-            source,
-            damage: Arc::default(),
-            stamp_clock,
-        },
-        monitors,
-    ))
+    Ok(Opened {
+        rig,
+        source,
+        damage: Arc::default(),
+        stamp_clock,
+    })
 }
 
 /// Replaces every device by its simulated twin. Calibration that only a real camera could report is

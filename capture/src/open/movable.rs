@@ -62,7 +62,7 @@ pub fn movable(rig: &Rig, devices: Devices, camera: &str) -> anyhow::Result<Mova
     // The camera is opened first, so that the arm is enabled only if everything else works. With
     // the driver `none`, the arm is not opened for reading here. It is opened for motion below.
     let driver = std::mem::replace(&mut rig.arm.driver, ArmDriver::None);
-    let opened = real::open(&mut rig);
+    let opened = real::open(&mut rig, &mut real::end_on_failure);
     rig.arm.driver = driver;
     let (opened, _) = opened?;
     let Some(camera) = opened.cameras.into_iter().next() else {
