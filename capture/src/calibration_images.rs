@@ -8,7 +8,7 @@
 mod tests;
 
 use crate::config::{ArmDriver, Camera, Rig};
-use crate::open::{Opened, chain_of};
+use crate::open::{Opened, approximate_intrinsics, chain_of};
 use crate::stamp_clock::StampClock;
 use anyhow::bail;
 use drivers::{Image, Sample};
@@ -215,6 +215,8 @@ struct Reader<'a> {
     rig: &'a Rig,
     camera: &'a Camera,
     arm: Option<Arm>,
+    /// Focal length, approximate if the lens is unknown.
+    focal_px: f64,
     max_shift_px: f64,
     first: Option<Stamp>,
     /// Images whose last row is exposed after the newest joint reading.
@@ -236,11 +238,14 @@ impl<'a> Reader<'a> {
     fn new(rig: &'a Rig, camera: &str, max_shift_px: f64) -> anyhow::Result<Self> {
         let Some(camera) = rig.cameras.iter().find(|other| &*other.name == camera) else {
             let names: Vec<&str> = rig.cameras.iter().map(|camera| &*camera.name).collect();
-            return Err(BadInput(format!(
-                "the rig has no camera {camera:?}; it has {}",
+            let names = if names.is_empty() {
+                "none".to_owned()
+            } else {
                 names.join(", ")
-            ))
-            .into());
+            };
+            return Err(
+                BadInput(format!("the rig has no camera {camera:?}; it has {names}")).into(),
+            );
         };
         if rig.has_moving_base() {
             bail!(
@@ -254,6 +259,7 @@ impl<'a> Reader<'a> {
             rig,
             camera,
             arm,
+            focal_px: approximate_intrinsics(camera).focal_px[0],
             max_shift_px,
             first: None,
             waiting: VecDeque::new(),
@@ -416,7 +422,7 @@ impl<'a> Reader<'a> {
         // A rotation moves every pixel by about the focal length times its angle. A translation
         // acts like a rotation by the translation divided by the distance. The sum is an upper
         // bound for both.
-        let focal_px = self.camera.intrinsics.focal_px[0];
+        let focal_px = self.focal_px;
         let angle = motion.rotation.angle()
             + motion.translation.vector.norm() / self.rig.join.default_depth_m;
         // The speed in pixels per second is multiplied by the time span in which a pixel may have

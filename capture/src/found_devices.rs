@@ -2,6 +2,9 @@
 
 #[cfg(target_os = "linux")]
 mod serial_ports;
+mod watch;
+
+pub use watch::{ChangeKind, DeviceChange, DeviceWatch};
 
 #[cfg(target_os = "linux")]
 use drivers::v4l2;
@@ -14,7 +17,7 @@ use std::path::Path;
 const INTEL_USB_VENDOR: &str = "8086";
 
 /// A device that was found.
-#[derive(Debug, PartialEq, Eq, Serialize)]
+#[derive(Clone, Debug, PartialEq, Eq, Serialize)]
 pub struct DeviceInfo {
     /// `gpu`, `camera`, `can`, `serial` or `simulation`.
     pub kind: &'static str,
@@ -28,9 +31,23 @@ pub struct DeviceInfo {
     pub note: String,
 }
 
+impl DeviceInfo {
+    /// Whether another list has this device, perhaps in another state.
+    fn is_same_as(&self, other: &Self) -> bool {
+        self.kind == other.kind && self.address == other.address
+    }
+}
+
 /// The simulation, the cameras, the CAN interfaces and the serial ports that are found.
 #[must_use]
 pub fn found_devices() -> Vec<DeviceInfo> {
+    devices_with(&[])
+}
+
+/// Like [`found_devices`], but serial ports in `known` are not searched for servos again.
+fn devices_with(known: &[DeviceInfo]) -> Vec<DeviceInfo> {
+    #[cfg(not(target_os = "linux"))]
+    let _ = known;
     let mut found = vec![simulation()];
     let sys = Path::new("/sys");
     #[cfg(target_os = "linux")]
@@ -38,7 +55,7 @@ pub fn found_devices() -> Vec<DeviceInfo> {
     found.extend(realsense_cameras(sys));
     found.extend(can_interfaces(sys));
     #[cfg(target_os = "linux")]
-    found.extend(serial_ports::serial_ports(sys, Path::new("/dev")));
+    found.extend(serial_ports::serial_ports(sys, Path::new("/dev"), known));
     found
 }
 
@@ -175,7 +192,6 @@ fn can_interfaces(sys: &Path) -> Vec<DeviceInfo> {
 }
 
 /// Names in a sysfs folder, sorted; empty if the folder is absent.
-#[cfg(any(not(feature = "realsense"), test))]
 fn children(folder: &Path) -> Vec<String> {
     let mut names: Vec<String> = std::fs::read_dir(folder)
         .into_iter()

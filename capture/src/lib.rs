@@ -20,6 +20,7 @@
 //! size_px = [640, 480]
 //! rate_hz = 30
 //! parent = "base"
+//! parent_from_camera = { xyz_m = [0.3, 0.0, 0.2], quat_xyzw = [-0.5, 0.5, -0.5, 0.5] }
 //! intrinsics = { focal_px = [600, 600], principal_px = [320, 240] }
 //! "#;
 //! let urdf = r#"<robot name="none"><link name="base"/></robot>"#;
@@ -51,6 +52,7 @@ mod nearest_name;
 mod notes;
 pub mod open;
 mod record;
+pub mod rig_facts;
 mod robot_motion;
 mod separate_devices;
 mod stamp_clock;
@@ -65,7 +67,7 @@ pub use calibration_images::{
 };
 pub use config::{ConfigError, Override, Rig};
 pub use feed::{Feed, FeedItem, Input, InputObserver, InputResult, InputTimes};
-pub use found_devices::{DeviceInfo, found_devices};
+pub use found_devices::{ChangeKind, DeviceChange, DeviceInfo, DeviceWatch, found_devices};
 pub use input_counts::InputCounts;
 pub use join::{Change, Counts, Join, JoinEvent, PosedImage, Rejection, SampleUse, StoreUse};
 pub use live_pixels::live_pixels;

@@ -20,6 +20,7 @@ pub mod dataset;
 mod decode;
 pub mod device_names;
 mod error;
+mod flange_difference;
 #[cfg(target_os = "linux")]
 pub mod franka;
 #[cfg(any(test, fuzzing))]
@@ -53,6 +54,7 @@ pub mod wire;
 mod yuv;
 
 pub use error::{Error, RecordedSpan};
+pub use flange_difference::FlangeDifference;
 pub use live_devices::{Devices, LiveDevices};
 pub use motion::MovableArm;
 pub use playback::{Playback, PlaybackClock};
@@ -96,6 +98,11 @@ pub trait Arm: Send {
     fn joint_names(&self) -> &[String];
     /// Waits for the next joint state that was not returned yet.
     fn read(&mut self, timeout: Duration) -> Result<JointState, Error>;
+    /// Difference between the flange poses of the robot description and of the controller, when the
+    /// arm was opened. `None` if the device reports only joints.
+    fn flange_difference(&self) -> Option<FlangeDifference> {
+        None
+    }
 }
 
 /// A source of poses of the robot's base.

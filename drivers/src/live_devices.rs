@@ -45,8 +45,8 @@ pub struct Devices {
 /// the next image of the same kind counts the dropped images. [`Source::n_other_samples_dropped`]
 /// counts all other dropped samples. A camera that waits for its caller is blocked instead.
 ///
-/// The first error of a device ends the source; [`Source::next_sample`] returns it once. If all
-/// cameras are played back from files, the source also ends at the end of the last file. All
+/// The first error of a device ends the source, unless it was created with
+/// [`LiveDevices::continuing_after_errors`]; [`Source::next_sample`] returns it once. If all cameras are played back from files, the source also ends at the end of the last file. All
 /// samples that were read until then are returned first. Dropping the source stops the threads.
 #[derive(Debug)]
 pub struct LiveDevices {
@@ -69,8 +69,12 @@ struct State {
     /// Dropped images that are not reported yet, by device: color and depth.
     dropped: Vec<[u64; 2]>,
     n_other_samples_dropped: u64,
-    error: Option<Error>,
+    /// Errors that the caller has not received.
+    errors: VecDeque<Error>,
+    /// Whether an error has ended the source.
     failed: bool,
+    /// Whether the other devices are still read after an error.
+    continues_after_errors: bool,
     n_running: usize,
     /// Number of cameras whose images have not ended.
     n_cameras: usize,
@@ -80,7 +84,27 @@ struct State {
 
 impl LiveDevices {
     /// Starts reading.
+    ///
+    /// # Errors
+    ///
+    /// If a thread cannot be started.
     pub fn new(devices: Devices) -> Result<Self, Error> {
+        Self::start(devices, false)
+    }
+
+    /// Like [`LiveDevices::new`], but a device that fails does not end the source: its error is
+    /// returned, and the other devices are still read. A silent device is also still read, and its
+    /// error is returned again every few seconds, so that the caller never waits for long. The
+    /// source ends when no device is left.
+    ///
+    /// # Errors
+    ///
+    /// If a thread cannot be started.
+    pub fn continuing_after_errors(devices: Devices) -> Result<Self, Error> {
+        Self::start(devices, true)
+    }
+
+    fn start(devices: Devices, continues_after_errors: bool) -> Result<Self, Error> {
         let Devices {
             cameras,
             arm,
@@ -96,6 +120,7 @@ impl LiveDevices {
             dropped: vec![[0; 2]; n_devices],
             n_running: n_devices,
             n_cameras: cameras.len(),
+            continues_after_errors,
             ..State::default()
         };
         let mut live = Self {
@@ -298,20 +323,33 @@ fn read_until_stopped(
                 waited += POLL;
                 continue;
             }
+            Ok(ReadOutcome::NoSample) if state.continues_after_errors => {
+                state.fail(timeout_error(waited + POLL));
+                shared.arrived.notify_all();
+                waited = Duration::ZERO;
+                continue;
+            }
             Ok(ReadOutcome::NoSample) => timeout_error(waited + POLL),
             Err(error) => error,
         };
-        // Only the first error is reported, because later ones often have the same cause. For
-        // example, two devices may be connected to the same unplugged hub.
-        if !state.failed {
-            state.failed = true;
-            state.error = Some(error);
-        }
+        state.fail(error);
         return;
     }
 }
 
 impl State {
+    /// Reports that a device has failed.
+    fn fail(&mut self, error: Error) {
+        if self.continues_after_errors {
+            self.errors.push_back(error);
+        } else if !self.failed {
+            // Only the first error is reported, because later ones often have the same cause. For
+            // example, two devices may be connected to the same unplugged hub.
+            self.failed = true;
+            self.errors.push_back(error);
+        }
+    }
+
     /// Queues a sample. If the queue is full, the oldest sample of this device is dropped and
     /// counted.
     fn put(&mut self, device_ix: usize, capacity: usize, mut sample: Sample) {
@@ -364,7 +402,7 @@ impl Source for LiveDevices {
         loop {
             // The error is returned before queued samples. The samples are useless without the
             // device, and waiting would delay the message.
-            if let Some(error) = state.error.take() {
+            if let Some(error) = state.errors.pop_front() {
                 return Err(error);
             }
             if let Some(sample) = state.take() {
@@ -515,6 +553,37 @@ mod tests {
             n_skipped,
             [47, 46],
             "51 color images with 4 delivered, 50 depth images with 4 delivered"
+        );
+    }
+
+    #[test]
+    fn other_devices_are_read_after_one_has_failed_or_is_silent() {
+        let devices = Devices {
+            cameras: vec![fast_camera(0)],
+            arm: Some(Box::new(SlowArm { next: 0 })),
+            ..Devices::default()
+        };
+        let mut live = LiveDevices::continuing_after_errors(devices).expect("threads start");
+        let mut n_joint_states = 0;
+        let mut errors = Vec::new();
+        // The camera fails at once. The arm sends three states, is then silent, and is still read.
+        while errors.len() < 2 || n_joint_states < 3 {
+            match live.next_sample() {
+                Ok(Some(Sample::Joints(_))) => n_joint_states += 1,
+                Ok(_) => panic!("the source must not end, and only the arm sends samples"),
+                Err(error) => errors.push(error.to_string()),
+            }
+        }
+        assert!(errors[0].contains("cable pulled"), "{errors:?}");
+        let silent = Error::NoJoints {
+            waited: MAX_SILENCE,
+        }
+        .to_string();
+        assert_eq!(errors[1], silent);
+        assert_eq!(
+            live.shared.state.lock().n_running,
+            1,
+            "the arm is still read"
         );
     }
 

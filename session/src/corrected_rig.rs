@@ -118,7 +118,9 @@ pub fn with_intrinsics(
     {
         let before = std::mem::replace(&mut camera.intrinsics, intrinsics.clone());
         // The intrinsics are known now, so they are no longer read from the device.
-        camera.realsense.unknown.intrinsics = false;
+        camera.unknown.intrinsics = false;
+        // Depth of cameras that store no lenses shares the lens below.
+        camera.unknown.depth_intrinsics &= camera.reports_lenses();
         // The matrix is symmetric, so the order of rows and columns does not matter.
         camera.intrinsics_covariance =
             covariance.map_or_else(Vec::new, |covariance| covariance.as_slice().to_vec());
@@ -157,7 +159,9 @@ pub fn with_extrinsics(
     }
     let mut rig = rig.clone();
     let camera = rig.cameras.iter_mut().find(|camera| *camera.name == *name);
-    camera.expect("checked above").parent_from_camera = parent_from_camera(&rig.base, given, pose);
+    let camera = camera.expect("checked above");
+    camera.parent_from_camera = parent_from_camera(&rig.base, given, pose);
+    camera.unknown.parent_from_camera = false;
     Ok(rig)
 }
 

@@ -75,7 +75,7 @@ pub use error::Error;
 pub use live_rig::{LiveRig, LiveTruth};
 pub use lockstep::Lockstep;
 pub use motors::MotorHistory;
-pub use rig::{PANDA_URDF, Rig, has_robot_of, open, suits_own_robot};
+pub use rig::{PANDA_URDF, Rig, difference_to_robot_of, has_robot_of, open, suits_own_robot};
 pub use rig_info::{CameraInfo, RigInfo};
 pub use robot_masks::{PinholeView, RobotMasks};
 pub use twin::RobotConfig;

@@ -17,8 +17,8 @@ use crate::robot::{Robot, RobotKinematics};
 use crate::scan::{LOOK_AT_HEIGHT_M, Scan};
 use crate::twin::{self, Efforts, RobotConfig};
 use crate::{CameraConfig, Error, scene};
-use drivers::Camera;
 use drivers::motion::MotionLimits;
+use drivers::{Camera, FlangeDifference};
 use kinematics::{Chain, Stamp, Transform};
 use mujoco_rs::prelude::MjModel;
 use nalgebra::Point3;
@@ -158,6 +158,17 @@ pub fn has_robot_of(scene: Scene, chain: &Chain) -> bool {
     if !scene.has_arm() {
         return chain.n_joints() == 0;
     }
+    difference_to_robot_of(scene, chain)
+        .is_some_and(|difference| difference.is_within(TOLERANCE, TOLERANCE))
+}
+
+/// The largest differences between the flange poses of a chain from base to flange and of a scene's
+/// own arm, over several postures. `None` if the scene has no arm, or the chain has another number
+/// of joints.
+pub fn difference_to_robot_of(scene: Scene, chain: &Chain) -> Option<FlangeDifference> {
+    if !scene.has_arm() {
+        return None;
+    }
     let base_from_arm = if scene.has_moving_base() {
         base_from_arm()
     } else {
@@ -169,15 +180,18 @@ pub fn has_robot_of(scene: Scene, chain: &Chain) -> bool {
         [0.4, -0.9, 1.3, -2.2, -0.7, 1.8, 0.6],
         [-2.1, 1.1, 0.3, -0.4, 2.2, 3.1, -1.9],
     ];
-    postures.iter().all(|position| {
+    let mut largest = FlangeDifference {
+        translation_m: 0.0,
+        rotation_rad: 0.0,
+    };
+    for position in postures {
         let own =
-            base_from_arm * crate::panda::base_from_flange(&crate::panda::Joints::from(*position));
-        chain.forward(position).is_ok_and(|pose| {
-            let difference = own.inverse() * pose;
-            difference.translation.vector.norm() < TOLERANCE
-                && difference.rotation.angle() < TOLERANCE
-        })
-    })
+            base_from_arm * crate::panda::base_from_flange(&crate::panda::Joints::from(position));
+        let difference = FlangeDifference::between(&own, &chain.forward(&position).ok()?);
+        largest.translation_m = largest.translation_m.max(difference.translation_m);
+        largest.rotation_rad = largest.rotation_rad.max(difference.rotation_rad);
+    }
+    Some(largest)
 }
 
 /// Whether the scene's own arm can follow its tour with the cameras of a rig: the arm reaches all

@@ -3,22 +3,47 @@
 
 use crate::exit::Exit;
 use crate::open_gpu::open_gpu;
-use crate::print;
-use capture::{DeviceInfo, found_devices};
+use crate::{print, signals};
+use capture::{ChangeKind, DeviceChange, DeviceInfo, DeviceWatch, found_devices};
+use std::time::Duration;
+
+/// Time between two looks at the kernel's lists of devices, which takes less than a millisecond. A
+/// change is printed within two intervals.
+const LOOK_INTERVAL: Duration = Duration::from_millis(500);
 
 /// Flags of `devices`.
 #[derive(Debug, clap::Args)]
 pub(crate) struct Args {
+    /// Keep running, and print a line for every device that is connected or disconnected, until
+    /// Ctrl-C
+    #[arg(
+        long,
+        long_help = "Keep running, and print a line for every device that is connected or disconnected, until Ctrl-C. With \
+                     --json, each line has the key \"change\", \"connected\" or \"disconnected\", in addition to those of the \
+                     device. Serial ports are searched for servos only when they appear"
+    )]
+    watch: bool,
     /// Print JSON, one object per line
     #[arg(long)]
     json: bool,
 }
 
-/// Prints the devices.
+/// Prints the devices, and then the changes if they are watched.
 pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
-    for device in std::iter::once(gpu()).chain(found_devices()) {
+    if args.watch {
+        let mut watch = DeviceWatch::start();
+        print_devices(watch.known(), args)?;
+        print_changes(&mut watch, args.json)?;
+    } else {
+        print_devices(&found_devices(), args)?;
+    }
+    Ok(Exit::Done)
+}
+
+fn print_devices(devices: &[DeviceInfo], args: &Args) -> anyhow::Result<()> {
+    for device in std::iter::once(&gpu()).chain(devices) {
         if args.json {
-            print::json(&device)?;
+            print::json(device)?;
         } else {
             let label = if device.usable { "yes" } else { "no " };
             print::line(format_args!(
@@ -33,7 +58,38 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
             "Arms on the network (Franka's FCI, RTDE of Universal Robots) are not listed: `fieldrig doctor RIG.toml` checks the arm of a rig file.",
         )?;
     }
-    Ok(Exit::Done)
+    Ok(())
+}
+
+/// Prints devices that appear or disappear until a signal requests a stop or the output is closed.
+fn print_changes(watch: &mut DeviceWatch, as_json: bool) -> anyhow::Result<()> {
+    let stop = signals::stop_on_signals_logging("stopping")?;
+    signals::stop_when_output_closes(&stop)?;
+    // This goes to stderr, so that stdout has only devices.
+    print::notice("watching for devices that are connected or disconnected; Ctrl-C ends");
+    while !stop.requested() {
+        std::thread::sleep(LOOK_INTERVAL);
+        for change in watch.look() {
+            if as_json {
+                print::json(&change)?;
+            } else {
+                print_change(&change)?;
+            }
+        }
+    }
+    Ok(())
+}
+
+fn print_change(DeviceChange { change, device }: &DeviceChange) -> anyhow::Result<()> {
+    let change = match change {
+        ChangeKind::Connected => "connected",
+        ChangeKind::Disconnected => "disconnected",
+    };
+    print::line(format_args!(
+        "{change:12}  {:10} {:14} {}; {}",
+        device.kind, device.address, device.name, device.note
+    ))?;
+    Ok(())
 }
 
 fn gpu() -> DeviceInfo {

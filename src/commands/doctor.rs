@@ -7,9 +7,12 @@ mod page_address;
 use crate::exit::Exit;
 use crate::number_args::number_in_range;
 use crate::{print, signals};
+use anyhow::Context;
 use capture::Rig;
 use capture::doctor::{self, Finding, Verdict};
-use std::path::PathBuf;
+use capture::rig_facts::{self, RigFacts};
+use messages::BadInput;
+use std::path::{Path, PathBuf};
 
 /// Default address of the page that `run` serves.
 const DEFAULT_ADDRESS: &str = "127.0.0.1:7007";
@@ -23,6 +26,18 @@ pub(crate) struct Args {
     /// nothing is moved
     #[arg(long, value_name = "S", requires = "rig", value_parser = number_in_range(1.0..=3600.0))]
     listen: Option<f64>,
+    /// Write a picture of the rig to FILE.svg: side view and top view to scale, with the joints at
+    /// rest
+    #[arg(
+        long,
+        value_name = "FILE.svg",
+        requires = "rig",
+        long_help = "Write a picture of the rig to FILE.svg: side view and top view to scale, with the joints at rest. It \
+                     shows the links of the robot, the positions that the flange reaches, the axes of world and flange (x \
+                     red, y green, z blue), and the field of view of each camera. A camera that looks into the flange is \
+                     red. An existing picture is replaced"
+    )]
+    picture: Option<PathBuf>,
     /// Print JSON, one object per line
     #[arg(long)]
     json: bool,
@@ -37,7 +52,14 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
         .as_ref()
         .map(|path| Rig::load(path, &[]))
         .transpose()?;
-    let mut findings = gpu::gpu();
+    let mut findings = Vec::new();
+    if let Some(rig) = &rig {
+        findings.extend(doctor::meaning(rig)?);
+    }
+    if let (Some(rig), Some(file)) = (&rig, &args.picture) {
+        write_picture(rig, file)?;
+    }
+    findings.extend(gpu::gpu());
     findings.push(simulation());
     findings.push(page_address::page_address(DEFAULT_ADDRESS));
     findings.extend(doctor::check(rig.as_ref()));
@@ -62,6 +84,16 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
         .iter()
         .any(|finding| finding.verdict == Verdict::Fail);
     Ok(if failed { Exit::Failed } else { Exit::Done })
+}
+
+/// Draws the rig.
+fn write_picture(rig: &Rig, file: &Path) -> anyhow::Result<()> {
+    if file.extension().is_none_or(|ending| ending != "svg") {
+        let reason = format!("--picture {}: must have the extension .svg", file.display());
+        return Err(BadInput(reason).into());
+    }
+    let picture = rig_facts::svg(&RigFacts::of(rig)?);
+    files::write(file, picture).with_context(|| format!("cannot write {}", file.display()))
 }
 
 fn print_findings(findings: &[Finding], as_json: bool) -> anyhow::Result<()> {

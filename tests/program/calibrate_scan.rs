@@ -128,6 +128,52 @@ fn lens_and_hand_eye_of_a_moving_arm_are_found_from_a_printed_target() {
     assert!(folder.join("result.toml.old").exists());
 }
 
+/// A rig file without lens and without extrinsics becomes complete, with no key written by hand.
+#[test]
+fn missing_lens_and_extrinsics_are_found_one_after_the_other() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let folder = folder.path();
+    write_rig(folder, "rig.toml", |rig| {
+        let camera = rig["camera"]["wrist"].as_table_mut().expect("a table");
+        camera.insert("driver".into(), "v4l2".into());
+        camera.remove("intrinsics").expect("it was there");
+        camera.remove("parent_from_camera").expect("it was there");
+    });
+    let calibrate = |what: &str, input: &str, output: &str| {
+        let args = [
+            "calibrate",
+            what,
+            input,
+            "--sim",
+            "--seconds",
+            "24.5",
+            "--target",
+            TARGET,
+            "--json",
+            "--write-rig",
+            output,
+        ];
+        let result = fieldrig(folder, &args);
+        assert!(result.status.success(), "{what}: {}", stderr(&result));
+        result
+    };
+    let missing = |rig: &str| {
+        let run = fieldrig(folder, &["run", rig]);
+        assert!(!run.status.success());
+        let log = stderr(&run);
+        ["intrinsics", "parent_from_camera"]
+            .map(|key| log.contains(&format!("camera.wrist.{key} is missing")))
+    };
+    assert_eq!(missing("rig.toml"), [true, true]);
+    let lens = json_of(&calibrate("intrinsics", "rig.toml", "lens.toml"));
+    let focal_px = lens["focal_px"][0].as_f64().expect("a number");
+    assert!((focal_px - 614.6).abs() < 1.0, "{lens}");
+    assert_eq!(missing("lens.toml"), [false, true]);
+    let pose = calibrate("hand-eye", "lens.toml", "rig-calibrated.toml");
+    check_pose(&json_of(&pose), MAX_DEG);
+    assert_eq!(missing("rig-calibrated.toml"), [false, false]);
+}
+
 /// Whether a report contains at least one image.
 fn is_report_with_photo(folder: &Path, file: &str) -> bool {
     std::fs::read_to_string(folder.join(file))

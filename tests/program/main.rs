@@ -3,6 +3,7 @@
 
 mod arrows;
 mod bench;
+mod bring_up;
 mod calibrate;
 mod calibrate_eye_to_hand;
 mod calibrate_guided;

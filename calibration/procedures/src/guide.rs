@@ -2,11 +2,11 @@
 
 use crate::host::CameraView;
 use crate::images::{self, DetectedImage};
-use crate::lens_devices::approximate_lens;
 use calibration::LensCoverage;
 use calibration::hand_eye::{HandEyeAdvice, HandEyeGuidance, Setup};
 use capture::CalibrationImage;
 use capture::config::{Camera, Parent};
+use capture::open::approximate_intrinsics;
 use drivers::Sample;
 use kinematics::Transform;
 use targets::TargetSpec;
@@ -43,7 +43,7 @@ impl<'a> Guide<'a> {
             camera,
             purpose,
             shown,
-            coverage: LensCoverage::new(&approximate_lens(camera)),
+            coverage: LensCoverage::new(&approximate_intrinsics(camera)),
             base_from_flange: Vec::new(),
             detected: Vec::new(),
         };

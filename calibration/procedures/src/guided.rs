@@ -4,7 +4,7 @@
 
 use crate::host::{Activity, CameraView, Host};
 use crate::images::{self, DetectedImage, NoBoard};
-use crate::lens_devices::{self, LensDevices, approximate_lens};
+use crate::lens_devices::{self, LensDevices};
 use crate::outputs::{InputKind, RigOptions, RigOutput};
 use crate::photograph_quality::{is_sharp, motion_px};
 use crate::saved_images::SavedImages;
@@ -12,6 +12,7 @@ use crate::scan::{MAX_SHIFT_PX, Scan, ScanOptions};
 use calibration::{BoardView, LensCoverage};
 use capture::config::{ArmDriver, Camera, Override, Rig};
 use capture::open::Devices;
+use capture::open::approximate_intrinsics;
 use capture::{CalibrationImage, CalibrationImages, chosen_calibration_images};
 use drivers::Sample;
 use kinematics::Stamp;
@@ -96,7 +97,7 @@ impl<'a> Guide<'a> {
             });
         let mut guide = Self {
             target,
-            coverage: LensCoverage::new(&approximate_lens(camera)),
+            coverage: LensCoverage::new(&approximate_intrinsics(camera)),
             shown,
             is_carried,
             readout_secs,

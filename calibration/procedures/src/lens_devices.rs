@@ -6,11 +6,6 @@
 
 use capture::config::{ArmDriver, BaseDriver, Camera, Parent, Rig};
 use capture::open::{self, Devices, Opened};
-use kinematics::{Intrinsics, Lens};
-
-/// Focal length of a webcam relative to the image diagonal. Common webcams have a diagonal field of
-/// view of about 70 degrees. It is only used to estimate how far a target is tilted.
-const WEBCAM_FOCAL: f64 = 0.714;
 
 /// Open devices, and the whole rig with the calibration that the camera reports.
 pub(crate) struct LensDevices {
@@ -78,23 +73,6 @@ fn without_arm(rig: &mut Rig) {
     }
 }
 
-/// An approximate lens of a camera, with the size of its images. If the rig file has no intrinsics,
-/// it is that of a common webcam.
-pub(crate) fn approximate_lens(camera: &Camera) -> Intrinsics {
-    if !camera.realsense.unknown.intrinsics {
-        return camera.intrinsics.clone();
-    }
-    let size_px = camera.intrinsics.size_px;
-    let [width, height] = size_px.map(f64::from);
-    Intrinsics {
-        size_px,
-        focal_px: [WEBCAM_FOCAL * width.hypot(height); 2],
-        principal_px: [0.5 * width, 0.5 * height],
-        lens: Lens::Pinhole,
-        rectified: false,
-    }
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -116,19 +94,5 @@ mod tests {
         rig.arm.driver = ArmDriver::Udp;
         rig.cameras[0].parent = Parent::World;
         assert!(!is_carried(&rig, &name));
-    }
-
-    #[test]
-    fn an_unknown_lens_is_that_of_a_webcam() {
-        let mut camera = rig().cameras[0].clone();
-        assert_eq!(approximate_lens(&camera), camera.intrinsics);
-        camera.realsense.unknown.intrinsics = true;
-        camera.intrinsics.size_px = [1280, 720];
-        let lens = approximate_lens(&camera);
-        let diagonal_fov = 2.0 * (0.5 * 1280.0_f64.hypot(720.0) / lens.focal_px[0]).atan();
-        assert!(
-            (diagonal_fov.to_degrees() - 70.0).abs() < 1.0,
-            "{diagonal_fov}"
-        );
     }
 }

@@ -149,6 +149,11 @@ impl RigOptions {
         match (&self.camera, &rig.cameras[..]) {
             (Some(name), _) => corrected_rig::camera(rig, name),
             (None, [only]) => Ok(only),
+            (None, []) => Err(BadInput(
+                "the rig has no camera: add a table [camera.NAME]; `fieldrig devices` lists the connected cameras"
+                    .to_owned(),
+            )
+            .into()),
             (None, cameras) => {
                 let names: Vec<&str> = cameras.iter().map(|camera| &*camera.name).collect();
                 let names = listed(&names, "or");

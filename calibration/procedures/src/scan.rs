@@ -10,7 +10,7 @@ use calibration::BoardView;
 use calibration::hand_eye::{
     BoardObservation, FlangeMotion, HandEyeSample, Setup, corners_at_mid_exposure,
 };
-use capture::config::{ArmDriver, Camera, Override, Parent, Rig};
+use capture::config::{ArmDriver, Camera, Need, Override, Parent, Rig};
 use capture::open::{self, Devices, Opened};
 use capture::{
     ArmDuringImage, CalibrationImage, CalibrationImages, StampClock, calibration_images,
@@ -90,7 +90,7 @@ impl RigOptions {
             .into());
         };
         let opened = match kind {
-            InputKind::Rig => self.open_devices(input)?,
+            InputKind::Rig => self.open_devices(input, options.purpose)?,
             InputKind::Recording | InputKind::Files => {
                 let rig = self
                     .rig
@@ -115,7 +115,12 @@ impl RigOptions {
         if let Some(output) = output.filter(|_| kind == InputKind::Rig && !self.sim) {
             output.set_rig(&rig);
         }
-        let camera = self.camera_of(&rig)?.clone();
+        let mut camera = self.camera_of(&rig)?.clone();
+        match options.purpose {
+            // Advice about the next image needs only an approximate lens.
+            Purpose::Lens => camera.intrinsics = open::approximate_intrinsics(&camera),
+            Purpose::HandEye => rig.require(Need::Intrinsics(&camera.name))?,
+        }
         let (found, detected) = self.images(opened, &camera, target, options)?;
         let warnings = Vec::from_iter(found.damage.clone());
         for warning in &warnings {
@@ -140,7 +145,7 @@ impl RigOptions {
         }))
     }
 
-    fn open_devices(&self, rig_file: &Path) -> anyhow::Result<Opened> {
+    fn open_devices(&self, rig_file: &Path, purpose: Purpose) -> anyhow::Result<Opened> {
         // In lockstep, the result does not depend on the speed of this computer.
         let overrides = if self.sim {
             vec![Override::new("sim.lockstep", true)]
@@ -148,6 +153,11 @@ impl RigOptions {
             Vec::new()
         };
         let rig = Rig::load(rig_file, &overrides)?;
+        let camera = &self.camera_of(&rig)?.name;
+        // A missing lens is reported before the devices start. The simulator assumes one.
+        if purpose == Purpose::HandEye && !self.sim {
+            rig.require_before_opening(Need::Intrinsics(camera))?;
+        }
         open::rig(
             rig,
             if self.sim {

@@ -3,7 +3,7 @@
 use crate::host::{Activity, Host};
 use crate::outputs::{self, ReportOptions, is_rig_file};
 use crate::scene_report::SceneReport;
-use capture::config::{Override, Rig};
+use capture::config::{Need, Override, Rig};
 use capture::open::{self, Devices};
 use kinematics::Stamp;
 use messages::{BadInput, InsufficientData, Setting};
@@ -202,6 +202,9 @@ impl SceneTask {
             Vec::new()
         };
         let rig = Rig::load(&self.input, &overrides)?;
+        if !self.sim {
+            rig.require_before_opening(Need::PosedImages)?;
+        }
         let opened = open::rig(
             rig,
             if self.sim {

@@ -45,6 +45,8 @@ keys! {
         pub intrinsics_covariance: Vec<f64> = Vec::new();
         /// Depth images, if the camera delivers them.
         pub depth: Option<Depth> => None;
+        /// Calibration that the rig file omits.
+        pub unknown: UnknownCalibration => UnknownCalibration::default();
         /// Settings of [`CameraDriver::V4l2`] and [`CameraDriver::Nokhwa`].
         pub v4l2: V4l2;
         /// Settings of [`CameraDriver::Realsense`].
@@ -95,8 +97,6 @@ keys! {
         pub filters: Vec<Filter> = Vec::new();
         /// How long to search for a disconnected camera, seconds.
         pub reconnect_secs: f64 = 30.0, in 0.0..=86_400.0;
-        /// Calibration values that are unknown until the camera is opened and reports them.
-        pub unknown: UnknownCalibration => UnknownCalibration::default();
     }
 
     /// A measured time offset.
@@ -178,6 +178,12 @@ keys! {
 }
 
 impl Camera {
+    /// Whether the camera stores its lenses and reports them when it is opened.
+    #[must_use]
+    pub fn reports_lenses(&self) -> bool {
+        self.driver == CameraDriver::Realsense
+    }
+
     /// Mid-exposure time of an image with this device stamp.
     pub(crate) fn mid_exposure(&self, device_stamp: Stamp) -> Stamp {
         let offset = self.stamp_to_mid_exposure.as_ref();
@@ -211,11 +217,14 @@ pub enum Parent {
     World,
 }
 
-/// Calibration values that are missing in the rig file and not yet reported by the camera. Until
-/// then, the rig contains placeholders that must not be used.
+/// Calibration values that are missing in the rig file. RealSense cameras report their lenses when
+/// they are opened, and calibration finds the rest. Until then, the rig contains placeholders that
+/// must not be used. [`Rig::require`](super::Rig::require) rejects them.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct UnknownCalibration {
-    /// Whether [`Camera::intrinsics`] are unknown, except for the size.
+    /// Whether [`Camera::parent_from_camera`] is unknown. The placeholder is the identity.
+    pub parent_from_camera: bool,
+    /// Whether [`Camera::intrinsics`] are unknown, except for the size and `rectified`.
     pub intrinsics: bool,
     /// Whether [`Depth::intrinsics`] are unknown, except for the size.
     pub depth_intrinsics: bool,
@@ -244,6 +253,7 @@ fn period_micros(rate_hz: Option<f64>) -> f64 {
 pub(super) fn read(name: &str, mut keys: Section<'_>) -> Option<Camera> {
     keys.check_name(name);
     let mut unknown = UnknownCalibration {
+        parent_from_camera: !keys.has("parent_from_camera"),
         intrinsics: !keys.has("intrinsics"),
         ..UnknownCalibration::default()
     };
@@ -252,26 +262,12 @@ pub(super) fn read(name: &str, mut keys: Section<'_>) -> Option<Camera> {
     let size_px = keys.required::<[u32; 2]>("size_px", (), "width and height of the images");
     let rectified = keys.get("rectified", ()).unwrap_or(false);
     let camera = Camera::read_keys(&mut keys);
-    // RealSense cameras report their intrinsics.
-    let reports_intrinsics = camera
-        .as_ref()
-        .is_some_and(|camera| camera.driver == CameraDriver::Realsense);
-    if unknown.intrinsics && !reports_intrinsics {
-        keys.missing(
-            "intrinsics",
-            "focal_px, principal_px and, for a lens with distortion, lens and distortion",
-        );
-    }
     let lens = camera
         .as_ref()
         .map_or(PLACEHOLDER_INTRINSICS, |camera| camera.intrinsics.clone());
     let intrinsics = Intrinsics {
         size_px: size_px.unwrap_or(lens.size_px),
-        rectified: if unknown.intrinsics {
-            lens.rectified
-        } else {
-            rectified
-        },
+        rectified,
         ..lens
     };
     let depth = keys
@@ -289,9 +285,12 @@ pub(super) fn read(name: &str, mut keys: Section<'_>) -> Option<Camera> {
         lens.size_px = camera.intrinsics.size_px;
         lens.rectified = camera.intrinsics.rectified;
     }
-    if reports_intrinsics {
-        camera.realsense.unknown = unknown;
+    if !camera.reports_lenses() {
+        // Depth of other cameras is registered to the color images unless the rig file has values.
+        unknown.depth_intrinsics &= unknown.intrinsics;
+        unknown.camera_from_depth = false;
     }
+    camera.unknown = unknown;
     Some(camera)
 }
 
@@ -326,28 +325,25 @@ fn depth(
     })
 }
 
-/// Writes the keys of a camera, without calibration that only the camera reports.
+/// Writes the keys of a camera, without unknown calibration.
 pub(super) fn write(camera: &Camera) -> Table {
     let Camera {
         intrinsics,
-        realsense,
+        unknown,
         ..
     } = camera;
     let mut table = camera.write_keys();
     table.extend(entry("size_px", &intrinsics.size_px));
-    table.extend(entry(
-        "rectified",
-        &(intrinsics.rectified && !realsense.unknown.intrinsics),
-    ));
+    table.extend(entry("rectified", &intrinsics.rectified));
     // A placeholder in the effective rig file would look like a calibration.
-    if realsense.unknown.intrinsics {
+    if unknown.intrinsics {
         table.remove("intrinsics");
     }
+    if unknown.parent_from_camera {
+        table.remove("parent_from_camera");
+    }
     if let Some(depth) = &camera.depth {
-        table.insert(
-            "depth".to_owned(),
-            write_depth(depth, realsense.unknown).into(),
-        );
+        table.insert("depth".to_owned(), write_depth(depth, *unknown).into());
     }
     table
 }

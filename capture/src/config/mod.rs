@@ -18,6 +18,7 @@ mod known_robot_tests;
 mod lens;
 mod motion;
 mod pose;
+mod required;
 mod rig_file;
 mod scanner;
 mod section;
@@ -37,6 +38,7 @@ pub use camera::{
 pub use error::{ConfigError, SourceLocation};
 pub use join::JoinConfig;
 pub use motion::ArmMotion;
+pub use required::{MissingKey, Need};
 pub use scanner::{Scanner, ScannerDriver, ScannerSim};
 pub use servos::{ArmSerial, ArmServo};
 pub use sim::{Sim, SimTarget};
@@ -229,6 +231,7 @@ fn is_calibrated_equally(one: &Camera, other: &Camera) -> bool {
         && one.parent == other.parent
         && difference.translation.vector.norm() < TOLERANCE
         && difference.rotation.angle() < TOLERANCE
+        && one.unknown == other.unknown
         && one.intrinsics == other.intrinsics
         && one.stamp_to_mid_exposure == other.stamp_to_mid_exposure
         && one.readout_micros == other.readout_micros

@@ -3,8 +3,8 @@
 use super::key::entry;
 use super::section::{ParseContext, Section};
 use super::{
-    ConfigError, Override, Rig, arm, base, camera, camera_info_file, scanner,
-    servo_calibration_file, sim,
+    Arm, ArmDriver, Base, BaseDriver, ConfigError, Override, Rig, arm, base, camera,
+    camera_info_file, scanner, servo_calibration_file, sim,
 };
 use std::path::Path;
 use toml::{Table, Value};
@@ -72,11 +72,8 @@ fn rig(mut root: Section<'_>) -> Option<(Rig, String)> {
     // at once.
     let arm = arm::read(root.section("arm"));
     let base = base::read(root.section("base"));
-    let cameras = root.named_sections("camera");
-    if cameras.is_empty() {
-        root.missing("camera", "at least one table [camera.NAME]");
-    }
-    let cameras: Vec<_> = cameras
+    let cameras: Vec<_> = root
+        .named_sections("camera")
         .into_iter()
         .map(|(name, keys)| camera::read(&name, keys))
         .collect();
@@ -85,6 +82,19 @@ fn rig(mut root: Section<'_>) -> Option<(Rig, String)> {
         .into_iter()
         .map(|(name, keys)| scanner::read(&name, keys))
         .collect();
+    // A rig needs no camera until it makes keyframes, but a file without any device is a mistake.
+    let is_arm_none = |(arm, _): &(Arm, String)| arm.driver == ArmDriver::None;
+    let is_base_fixed = |base: &Base| base.driver == BaseDriver::Fixed;
+    if cameras.is_empty()
+        && scanners.is_empty()
+        && arm.as_ref().is_some_and(is_arm_none)
+        && base.as_ref().is_some_and(is_base_fixed)
+    {
+        root.missing(
+            "camera",
+            "at least one table [camera.NAME], because the rig has no other device",
+        );
+    }
     let join = root.get_optional("join", ());
     let train = root.get_optional("train", ());
     let sim = sim::read(root.section("sim"));

@@ -662,12 +662,9 @@ fn missing_keys_and_syntax_errors_are_reported() {
         .expect_err("no closing quote")
         .to_string();
     assert!(message.starts_with("rig.toml line 2: "), "{message}");
-    let message = parse(
-        "[arm]\ndriver = \"sim\"\nurdf = \"u\"\nflange_link = \"c\"\n",
-        &[],
-    )
-    .expect_err("no camera")
-    .to_string();
+    let message = parse("[arm]\ndriver = \"none\"\n", &[])
+        .expect_err("no device")
+        .to_string();
     assert!(message.contains("[camera.NAME]"), "{message}");
     let missing = Rig::load(Path::new("no/such/rig.toml"), &[])
         .expect_err("no file")

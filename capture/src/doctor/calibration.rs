@@ -2,7 +2,7 @@
 //! another unit, or were left at the default.
 
 use super::Finding;
-use crate::config::{Camera, Parent, Rig};
+use crate::config::{Camera, Need, Parent, Rig};
 use kinematics::{Lens, Transform};
 
 const CHECK: &str = "calibration";
@@ -24,6 +24,22 @@ pub(super) fn calibration(rig: &Rig) -> Vec<Finding> {
         .collect()
 }
 
+/// What a run would miss, with the commands that find it. These are warnings, because a robot is
+/// brought up piece by piece.
+pub(super) fn missing(rig: &Rig) -> Vec<Finding> {
+    rig.missing_keys(Need::PosedImages)
+        .into_iter()
+        .filter(|missing| !missing.is_reported)
+        .map(|missing| {
+            let message = format!(
+                "{} is missing: it is not needed for `doctor` and `record`, but for `run` and `train`",
+                missing.key
+            );
+            Finding::warn(CHECK, message, missing.remedy)
+        })
+        .collect()
+}
+
 /// Implausible values of a camera: messages with remedies.
 fn problems(camera: &Camera) -> Vec<(String, String)> {
     let name = &camera.name;
@@ -31,11 +47,12 @@ fn problems(camera: &Camera) -> Vec<(String, String)> {
     let mut report = |message: String, remedy: &str| {
         problems.push((format!("camera {name:?}: {message}"), remedy.to_owned()))
     };
-    if camera.parent == Parent::Flange {
+    // A missing pose is reported separately.
+    if camera.parent == Parent::Flange && !camera.unknown.parent_from_camera {
         let distance_m = camera.parent_from_camera.translation.vector.norm();
         if camera.parent_from_camera == Transform::identity() {
             report(
-                "parent_from_camera is missing or the identity: the camera would be exactly in the flange frame"
+                "parent_from_camera is the identity: the camera would be exactly in the flange frame"
                     .to_owned(),
                 "set the pose of its optical frame (x right, y down, z forward), from a hand-eye calibration or a drawing",
             );
@@ -48,7 +65,7 @@ fn problems(camera: &Camera) -> Vec<(String, String)> {
     }
     let intrinsics = &camera.intrinsics;
     // Placeholders of unknown intrinsics are implausible, but not an error of the user.
-    if !camera.realsense.unknown.intrinsics {
+    if !camera.unknown.intrinsics {
         let size_px = intrinsics.size_px.map(f64::from);
         let field_of_view_deg = 2.0
             * (0.5 * size_px[0] / intrinsics.focal_px[0])
@@ -93,7 +110,30 @@ fn problems(camera: &Camera) -> Vec<(String, String)> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::doctor::Verdict;
     use crate::doctor::testing::bundled_rig;
+
+    #[test]
+    fn missing_calibration_is_a_warning_with_the_command_that_finds_it() {
+        let mut rig = bundled_rig::<&str>("static-arm.toml", &[("camera.wrist.driver", "v4l2")]);
+        assert_eq!(missing(&rig), []);
+        rig.cameras[0].unknown.intrinsics = true;
+        rig.cameras[0].unknown.parent_from_camera = true;
+        let findings = missing(&rig);
+        let words = |finding: &Finding, words: &str| {
+            finding.verdict == Verdict::Warn
+                && finding
+                    .remedy
+                    .as_ref()
+                    .is_some_and(|remedy| remedy.contains(words))
+        };
+        assert_eq!(findings.len(), 2, "{findings:?}");
+        assert!(words(&findings[0], "calibrate intrinsics"), "{findings:?}");
+        assert!(words(&findings[1], "calibrate hand-eye"), "{findings:?}");
+        // Values that are not there are not implausible.
+        rig.cameras[0].parent_from_camera = Transform::identity();
+        assert_eq!(calibration(&rig), []);
+    }
 
     #[test]
     fn values_in_other_units_are_reported() {

@@ -1,16 +1,16 @@
 //! Measures rates, latencies and losses of a rig's devices, with the drivers of `run`. Nothing is
 //! moved.
 
-use super::{Finding, datagrams};
-use crate::config::{ArmDriver, BaseDriver, Rig};
-use crate::open::{self, Devices, Opened};
+use super::{Finding, datagrams, flange, remedies};
+use crate::config::{ArmDriver, BaseDriver, Need, Rig};
+use crate::open::{self, DeviceFailure, Listening};
 use crate::{Join, JoinEvent, Rejection, Stop};
 use drivers::udp::DatagramMonitor;
 use drivers::{Error, Sample, clock, device_names};
 use kinematics::Stamp;
 use numbers::quantile::{Rank, quantile};
 use serde::Serialize;
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::time::{Duration, Instant};
 
 /// A device is reported if its rate is below this fraction of the rate in the rig file. The margin
@@ -125,20 +125,28 @@ impl Track {
 }
 
 /// Reads the rig's devices with the drivers of a run for `secs` seconds, or until `stop` is
-/// requested.
+/// requested. Devices that cannot be opened are findings, and the others are read.
 ///
 /// # Errors
-/// A device cannot be opened.
+/// The simulation of a simulated device cannot be started.
 pub fn listen(rig: &Rig, secs: f64, stop: &Stop) -> anyhow::Result<ListenResult> {
-    let (
-        Opened {
-            rig, mut source, ..
-        },
+    let Listening {
+        rig,
+        mut source,
         monitors,
-    ) = open::rig_with_monitors(rig.clone(), Devices::Real)?;
-    let mut join = Join::new(&rig)?;
+        failures,
+        flange_difference,
+    } = open::for_listening(rig.clone())?;
+    let mut join = join_of(&rig, &failures)?;
     let mut tracks: BTreeMap<String, Track> = BTreeMap::new();
-    let mut findings = Vec::new();
+    let mut findings: Vec<Finding> = failures
+        .iter()
+        .map(|failure| not_opened(failure, &rig))
+        .chain(flange_difference.as_ref().map(flange::of_controller))
+        .collect();
+    // Devices whose problem is reported.
+    let mut reported: BTreeSet<String> =
+        failures.into_iter().map(|failure| failure.device).collect();
     let began = Instant::now();
     let cpu_before = clock::process_cpu_time();
     while !stop.requested() && began.elapsed().as_secs_f64() < secs {
@@ -146,12 +154,17 @@ pub fn listen(rig: &Rig, secs: f64, stop: &Stop) -> anyhow::Result<ListenResult>
             Ok(Some(sample)) => sample,
             Ok(None) => break,
             Err(error) => {
-                findings.push(Finding::fail(
+                let finding = Finding::fail(
                     "devices",
                     error.to_string(),
-                    remedy(&error, &monitors),
-                ));
-                break;
+                    remedy(&error, &rig, &monitors),
+                );
+                reported.extend(silent_device(&error));
+                // Silent devices are reported again and again.
+                if !findings.contains(&finding) {
+                    findings.push(finding);
+                }
+                continue;
             }
         };
         // The time of arrival is taken before any work on the sample, so that the latency is that
@@ -164,7 +177,10 @@ pub fn listen(rig: &Rig, secs: f64, stop: &Stop) -> anyhow::Result<ListenResult>
         track.note(sample.stamp(), now);
         track.dropped += dropped;
         // The samples are joined as in a run, because missing poses are found only in the join.
-        for event in join.push(sample) {
+        let events = join
+            .as_mut()
+            .map_or_else(Vec::new, |join| join.push(sample));
+        for event in events {
             if let JoinEvent::Accepted(keyframe) = event {
                 let track = tracks
                     .entry(format!("keyframes of {:?}", keyframe.camera))
@@ -181,7 +197,8 @@ pub fn listen(rig: &Rig, secs: f64, stop: &Stop) -> anyhow::Result<ListenResult>
     }
     // A simulation has its own clock.
     let is_simulated = open::is_any_simulated(&rig);
-    let expected = expected(&rig);
+    let mut expected = expected(&rig);
+    expected.retain(|device, _| !reported.contains(device));
     findings.extend(missing(&rig, &expected, &tracks, &monitors));
     let of_datagrams = |monitor: &DatagramMonitor| {
         datagrams::received(monitor, tracks.contains_key(monitor.device()))
@@ -196,8 +213,22 @@ pub fn listen(rig: &Rig, secs: f64, stop: &Stop) -> anyhow::Result<ListenResult>
         .collect();
     findings.extend(devices.iter().filter_map(problem));
     findings.extend(devices.iter().filter_map(wrong_unit));
-    findings.extend(join_finding(&join));
+    findings.extend(join.as_ref().and_then(join_finding));
     Ok(ListenResult { devices, findings })
+}
+
+/// The join of a run. `None` if images cannot get poses, because calibration or a device is
+/// missing. This is reported elsewhere.
+fn join_of(rig: &Rig, failures: &[DeviceFailure]) -> anyhow::Result<Option<Join>> {
+    let can_join = failures.is_empty() && rig.require(Need::PosedImages).is_ok();
+    can_join.then(|| Join::new(rig)).transpose()
+}
+
+/// The finding about a device that could not be opened.
+fn not_opened(failure: &DeviceFailure, rig: &Rig) -> Finding {
+    let DeviceFailure { device, error } = failure;
+    let message = format!("{device} cannot be opened: {error:#}");
+    Finding::fail("devices", message, remedies::not_opened(device, rig))
 }
 
 /// Name of the device that delivered a sample, and the number of its images that were dropped
@@ -255,6 +286,8 @@ fn expected(rig: &Rig) -> BTreeMap<String, Option<f64>> {
     }
     match rig.arm.driver {
         ArmDriver::None => {}
+        // A robot without joints by design, such as a base with a fixed mast, sends none.
+        _ if rig.arm.joints.is_empty() => {}
         ArmDriver::Franka => drop(expected.insert(device_names::ARM.to_owned(), Some(1000.0))),
         // Motors that report without polling choose their own rates.
         _ => drop(expected.insert(device_names::ARM.to_owned(), None)),
@@ -274,6 +307,7 @@ fn expected(rig: &Rig) -> BTreeMap<String, Option<f64>> {
 /// The device that sent no data, if the error is about such a device.
 fn silent_device(error: &Error) -> Option<String> {
     match error {
+        Error::NoImage { camera, .. } => Some(device_names::camera(camera)),
         Error::NoJoints { .. } => Some(device_names::ARM.to_owned()),
         Error::NoBasePose { .. } => Some(device_names::BASE.to_owned()),
         Error::NoScan { scanner, .. } => Some(device_names::range_scanner(scanner)),
@@ -282,16 +316,21 @@ fn silent_device(error: &Error) -> Option<String> {
 }
 
 /// What to do about an error of a device.
-fn remedy(error: &Error, monitors: &[DatagramMonitor]) -> &'static str {
-    let device = silent_device(error);
-    let has_monitor = monitors
-        .iter()
-        .any(|monitor| Some(monitor.device()) == device.as_deref());
-    if has_monitor {
-        "check its sender: docs/reference/udp.md describes the format"
-    } else {
-        "check the device and its cable"
+fn remedy(error: &Error, rig: &Rig, monitors: &[DatagramMonitor]) -> String {
+    let Some(device) = silent_device(error) else {
+        return "check the device and its cable".to_owned();
+    };
+    match monitors.iter().find(|monitor| monitor.device() == device) {
+        Some(monitor) if monitor.counts().n_received > 0 => {
+            "correct its sender: docs/reference/udp.md describes the format".to_owned()
+        }
+        Some(monitor) => start_sender(monitor),
+        None => remedies::silent(&device, rig).to_owned(),
     }
+}
+
+fn start_sender(monitor: &DatagramMonitor) -> String {
+    format!("start its sender, and let it send to {}", monitor.address())
 }
 
 /// A finding for each device that sent nothing. Devices whose datagrams cannot be used get a
@@ -309,12 +348,12 @@ fn missing(
     {
         let remedy = match monitors.iter().find(|monitor| monitor.device() == device) {
             Some(monitor) if monitor.counts().n_received > 0 => continue,
-            Some(monitor) => format!("start its sender, and let it send to {}", monitor.address()),
+            Some(monitor) => start_sender(monitor),
             None if rig.base.driver == BaseDriver::Tags && device == device_names::BASE => {
                 "no image gave its pose: check base.tag_family, and the sizes and poses of the tags"
                     .to_owned()
             }
-            None => "check it and its cable".to_owned(),
+            None => remedies::silent(device, rig).to_owned(),
         };
         findings.push(Finding::fail(
             "silent",
@@ -347,11 +386,7 @@ fn problem(statistics: &DeviceStatistics) -> Option<Finding> {
             )
         }
     };
-    Some(Finding::warn(
-        "rate",
-        message,
-        "usual causes: low light with automatic exposure, a slow bus, a busy CPU",
-    ))
+    Some(Finding::warn("rate", message, remedies::slow(device)))
 }
 
 /// Reports stamps that advance faster or slower than the clock of this computer. Usually, such
@@ -438,6 +473,83 @@ mod tests {
     }
 
     #[test]
+    fn devices_that_open_are_read_although_others_do_not() {
+        const URDF: &str = r#"<robot name="one"><link name="base"/><link name="tool"/>
+            <joint name="j" type="revolute"><parent link="base"/><child link="tool"/><axis xyz="0 0 1"/>
+            <limit lower="-1" upper="1" effort="1" velocity="1"/></joint></robot>"#;
+        let camera = "[camera.wrist]\ndriver = \"v4l2\"\ndevice = \"no such camera\"\nsize_px = [640, 480]\n\
+                      rate_hz = 30\nparent = \"flange\"\n";
+        let scanner = "[range.lidar]\ndriver = \"udp\"\naddress = \"127.0.0.1:0\"\n";
+        let occupied = std::net::UdpSocket::bind("127.0.0.1:0").expect("a free port");
+        let base = format!(
+            "[base]\ndriver = \"udp\"\naddress = \"{}\"\n",
+            occupied.local_addr().expect("bound")
+        );
+        // The arm listens on a port that was free a moment ago.
+        let address = std::net::UdpSocket::bind("127.0.0.1:0")
+            .and_then(|socket| socket.local_addr())
+            .expect("a free port");
+        let text = format!(
+            "[arm]\ndriver = \"udp\"\naddress = \"{address}\"\nurdf = \"one.urdf\"\nflange_link = \"tool\"\n\
+             {base}{camera}{scanner}"
+        );
+        let rig = Rig::parse("rig.toml", &text, URDF, &[]).expect("a valid rig");
+        let sender = std::net::UdpSocket::bind("127.0.0.1:0").expect("a free port");
+        let is_done = std::sync::atomic::AtomicBool::new(false);
+        let result = std::thread::scope(|scope| {
+            scope.spawn(|| {
+                let mut seq = 0;
+                while !is_done.load(std::sync::atomic::Ordering::Relaxed) {
+                    let stamp = clock::now().0;
+                    let state = format!(
+                        r#"{{"kind":"joints","version":1,"seq":{seq},"clock":"monotonic","stamp_nanos":{stamp},"names":["j"],"position":[0.1]}}"#
+                    );
+                    seq += 1;
+                    sender
+                        .send_to(state.as_bytes(), address)
+                        .expect("a local socket");
+                    std::thread::sleep(Duration::from_millis(5));
+                }
+            });
+            let result = listen(&rig, 2.0, &Stop::default());
+            is_done.store(true, std::sync::atomic::Ordering::Relaxed);
+            result.expect("some devices open")
+        });
+        let arm = result.devices.iter().find(|device| device.device == "arm");
+        assert!(arm.is_some_and(|arm| arm.samples > 0), "{result:?}");
+        let finding_of = |words: &str| {
+            let found = result
+                .findings
+                .iter()
+                .find(|finding| finding.message.contains(words));
+            found.unwrap_or_else(|| panic!("{words}: {result:?}"))
+        };
+        let camera = finding_of("camera \"wrist\" cannot be opened: ");
+        assert!(
+            camera.verdict == crate::doctor::Verdict::Fail
+                && camera.to_string().contains("fieldrig devices"),
+            "{camera}"
+        );
+        let base = finding_of("base cannot be opened: ");
+        assert!(base.to_string().contains("another program"), "{base}");
+        // A device with a problem is reported once.
+        let n_base = result
+            .findings
+            .iter()
+            .filter(|finding| finding.message.contains("base"))
+            .count();
+        assert_eq!(n_base, 1, "{result:?}");
+    }
+
+    #[test]
+    fn a_robot_without_joints_by_design_is_expected_to_send_none() {
+        let rig = crate::doctor::testing::bundled_rig::<&str>("mobile-base-small.toml", &[]);
+        assert!(!expected(&rig).contains_key(device_names::ARM));
+        let arm = crate::doctor::testing::bundled_rig::<&str>("static-arm.toml", &[]);
+        assert!(expected(&arm).contains_key(device_names::ARM));
+    }
+
+    #[test]
     fn doctor_reports_rates_latencies_and_losses() {
         let summarize = track(301, 100, 0).summarize("camera \"wrist\"".into(), Some(10.0), false);
         assert!((summarize.rate_hz - 10.0).abs() < 1e-9);
@@ -474,6 +586,9 @@ mod tests {
             assert!(finding.message.contains(expected), "{}", finding.message);
         }
         assert_eq!(wrong_unit(&lossy), None);
+        let lidar = track(301, 100, 0).summarize("range scanner \"top\"".into(), Some(15.0), false);
+        let finding = problem(&lidar).expect("slow");
+        assert!(!finding.to_string().contains("light"), "{finding}");
         let nothing = Track::default().summarize("arm".into(), None, true);
         assert_eq!((nothing.rate_hz, &nothing.latency), (0.0, &None));
         assert!(!nothing.to_string().contains("latency"), "{nothing}");

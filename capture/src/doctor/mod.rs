@@ -6,13 +6,16 @@ mod calibration;
 mod can;
 mod clock;
 mod datagrams;
+mod flange;
 mod franka;
 mod governor;
 mod listen;
+mod meaning;
 mod memory;
 mod motion;
 mod realsense;
 mod realtime;
+mod remedies;
 #[cfg(target_os = "linux")]
 mod servos;
 #[cfg(target_os = "linux")]
@@ -22,6 +25,7 @@ mod usb;
 mod video_devices;
 
 pub use listen::{DeviceStatistics, Latency, ListenResult, listen};
+pub use meaning::meaning;
 
 use crate::config::Rig;
 use serde::Serialize;
@@ -134,7 +138,9 @@ pub fn check(rig: Option<&Rig>) -> Vec<Finding> {
     findings.extend(can::can(rig));
     #[cfg(target_os = "linux")]
     findings.extend(rig.into_iter().flat_map(servos::servos));
+    findings.extend(rig.and_then(flange::simulator));
     findings.extend(rig.and_then(motion::motion));
+    findings.extend(rig.into_iter().flat_map(calibration::missing));
     findings.extend(rig.into_iter().flat_map(calibration::calibration));
     findings.extend(rig.into_iter().flat_map(|rig| {
         datagrams::senders(rig)

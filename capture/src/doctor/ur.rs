@@ -1,7 +1,7 @@
 //! Checks the controller of a rig with an arm of Universal Robots. The check reads one state, and
 //! does not disturb other clients of the controller.
 
-use super::Finding;
+use super::{Finding, flange as flange_pose};
 use crate::config::{ArmDriver, Rig};
 use crate::open;
 use drivers::ur::{FlangePose, Inspection, inspect};
@@ -53,12 +53,9 @@ fn findings(address: &str, inspection: &Inspection, is_moved: bool) -> Vec<Findi
     }
     let remedy = "docs/guide/arms.md#universal-robots describes which URDF and which link to use";
     findings.push(match flange {
-        FlangePose::Same => Finding::ok(
-            "flange pose",
-            "the URDF and the controller agree within 2 mm and 0.5 degrees",
-        ),
-        FlangePose::Doubtful(reason) => Finding::warn("flange pose", reason, remedy),
-        FlangePose::Different(reason) => Finding::fail("flange pose", reason, remedy),
+        FlangePose::Same(difference) => flange_pose::of_controller(difference),
+        FlangePose::Doubtful(reason) => Finding::warn(flange_pose::CHECK, reason, remedy),
+        FlangePose::Different(reason) => Finding::fail(flange_pose::CHECK, reason, remedy),
     });
     findings
 }
@@ -67,6 +64,7 @@ fn findings(address: &str, inspection: &Inspection, is_moved: bool) -> Vec<Findi
 mod tests {
     use super::*;
     use crate::doctor::Verdict;
+    use drivers::FlangeDifference;
     use drivers::ur::ControllerVersion;
 
     #[test]
@@ -91,6 +89,15 @@ mod tests {
             verdicts(true),
             [Verdict::Ok, Verdict::Warn, Verdict::Warn, Verdict::Warn]
         );
+        let same = Inspection {
+            flange: FlangePose::Same(FlangeDifference {
+                translation_m: 0.0004,
+                rotation_rad: 0.0,
+            }),
+            ..inspection.clone()
+        };
+        let message = &findings("192.168.1.10", &same, false)[2].message;
+        assert!(message.contains("0.4 mm and 0.00 degrees"), "{message}");
         let different = Inspection {
             flange: FlangePose::Different("90 mm".to_owned()),
             ..inspection

@@ -106,7 +106,7 @@ impl EmulationPlan {
         // Addresses and buses are checked before the simulation, which takes a minute.
         check_arm_connection(&rig)?;
         // The files of cameras and the simulation need the same lenses.
-        open::assume_lenses(&mut rig);
+        open::assume_calibration(&mut rig);
         let folder = self
             .out
             .clone()

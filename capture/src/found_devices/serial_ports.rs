@@ -4,9 +4,22 @@ use super::DeviceInfo;
 use drivers::servos::{FoundPort, FoundServos, PortConfig, found_ports, servos_on};
 use std::path::Path;
 
-/// The serial ports, with the lines of a rig file for servos that were found.
-pub(super) fn serial_ports(sys: &Path, dev: &Path) -> Vec<DeviceInfo> {
-    found_ports(sys, dev).into_iter().map(describe).collect()
+const KIND: &str = "serial";
+
+/// The serial ports, with the lines of a rig file for servos that were found. Ports in `known` are
+/// copied from there, because a search disturbs a program that uses the port.
+pub(super) fn serial_ports(sys: &Path, dev: &Path, known: &[DeviceInfo]) -> Vec<DeviceInfo> {
+    let describe_once = |port: FoundPort| {
+        let address = port.path.display().to_string();
+        let same = known
+            .iter()
+            .find(|device| device.kind == KIND && device.address == address);
+        same.cloned().unwrap_or_else(|| describe(port))
+    };
+    found_ports(sys, dev)
+        .into_iter()
+        .map(describe_once)
+        .collect()
 }
 
 fn describe(port: FoundPort) -> DeviceInfo {
@@ -23,7 +36,7 @@ fn describe(port: FoundPort) -> DeviceInfo {
         }
     };
     DeviceInfo {
-        kind: "serial",
+        kind: KIND,
         address: port.path.display().to_string(),
         name: port.product,
         usable,
@@ -65,12 +78,19 @@ mod tests {
     fn other_serial_ports_are_listed_but_not_opened() {
         let sys = tempfile::tempdir().expect("a folder");
         std::fs::create_dir_all(sys.path().join("class/tty/ttyUSB0")).expect("a folder");
-        let found = serial_ports(sys.path(), Path::new("/dev"));
+        let found = serial_ports(sys.path(), Path::new("/dev"), &[]);
         assert_eq!(found.len(), 1);
         assert_eq!(
             (found[0].kind, found[0].address.as_str()),
             ("serial", "/dev/ttyUSB0")
         );
         assert!(found[0].note.contains("not searched"), "{}", found[0].note);
+        // A known port keeps what was found before.
+        let known = DeviceInfo {
+            note: "six servos".to_owned(),
+            ..found[0].clone()
+        };
+        let again = serial_ports(sys.path(), Path::new("/dev"), std::slice::from_ref(&known));
+        assert_eq!(again, [known]);
     }
 }

@@ -22,7 +22,7 @@ pub use change::Change;
 pub use rejection::{Counts, Rejection, SampleUse};
 pub use store::StoreUse;
 
-use crate::config::{self, BaseDriver, CameraDriver, Parent, Rig};
+use crate::config::{self, BaseDriver, CameraDriver, Need, Parent, Rig};
 use accept::Acceptance;
 use anyhow::Context;
 use assemble::Undistorter;
@@ -118,9 +118,10 @@ impl Join {
     ///
     /// # Errors
     ///
-    /// If the robot description does not match the rig, or the scaled training images would be too
-    /// small.
+    /// If calibration is missing, the robot description does not match the rig, or the scaled
+    /// training images would be too small.
     pub fn new(rig: &Rig) -> anyhow::Result<Self> {
+        rig.require(Need::PosedImages)?;
         let join = &rig.join;
         let spacing = Spacing {
             translation_m: join.min_translation_m,

@@ -1,4 +1,5 @@
-//! Lenses of simulated cameras whose rig file leaves them to the camera.
+//! Calibration that is assumed for a camera whose rig file omits it: in a simulation, and for advice
+//! during a calibration.
 
 use crate::config::{Camera, CameraDriver, Rig};
 use drivers::realsense::Stream;
@@ -16,32 +17,53 @@ const D435_INFRARED_FOCAL_NARROW: f64 = 0.652;
 /// view of about 70 degrees.
 const WEBCAM_FOCAL: f64 = 0.714;
 
-/// Fills in the calibration that only a real camera could report, and logs it. The simulated camera
-/// has exactly this calibration.
-pub(crate) fn assume_lenses(rig: &mut Rig) {
-    for camera in &mut rig.cameras {
-        assume_lens(camera);
+/// Fills in the calibration that the rig file omits, and logs it. The simulated cameras have exactly
+/// this calibration.
+pub(crate) fn assume_calibration(rig: &mut Rig) {
+    rig.cameras.iter_mut().for_each(assume);
+}
+
+/// Like [`assume_calibration`], only for the cameras with the driver `sim`.
+pub(super) fn assume_calibration_of_simulated(rig: &mut Rig) {
+    rig.cameras
+        .iter_mut()
+        .filter(|camera| camera.driver == CameraDriver::Sim)
+        .for_each(assume);
+}
+
+/// The intrinsics in the rig file. If they are unknown, those of a typical camera with this driver.
+/// They are good enough for advice and for limits of image motion, but not for images with poses.
+#[must_use]
+pub fn approximate_intrinsics(camera: &Camera) -> Intrinsics {
+    if camera.unknown.intrinsics {
+        typical_lens(camera).1
+    } else {
+        camera.intrinsics.clone()
     }
 }
 
-fn assume_lens(camera: &mut Camera) {
-    let unknown = std::mem::take(&mut camera.realsense.unknown);
-    let size_px = camera.intrinsics.size_px;
-    if unknown.intrinsics {
-        let (model, focal_px) = typical(camera);
-        camera.intrinsics = Intrinsics {
-            size_px,
-            focal_px: [focal_px; 2],
-            principal_px: size_px.map(|side| 0.5 * f64::from(side)),
-            lens: Lens::Pinhole,
-            rectified: false,
-        };
+fn assume(camera: &mut Camera) {
+    let unknown = std::mem::take(&mut camera.unknown);
+    if unknown.parent_from_camera {
+        // The placeholder is used: the optical frame is the frame of the parent.
         log::info!(
-            "camera {:?}: the rig file has no intrinsics, so it is simulated with those of {model} at {}x{}: focal \
-             length {focal_px:.0} px",
-            camera.name,
-            size_px[0],
-            size_px[1]
+            "camera {:?}: the rig file has no parent_from_camera, so it is simulated in the frame of its parent, looking \
+             along z",
+            camera.name
+        );
+    }
+    if unknown.intrinsics {
+        let (model, intrinsics) = typical_lens(camera);
+        let Intrinsics {
+            size_px: [width, height],
+            focal_px: [focal_px, _],
+            ..
+        } = intrinsics;
+        camera.intrinsics = intrinsics;
+        log::info!(
+            "camera {:?}: the rig file has no intrinsics, so it is simulated with those of {model} at {width}x{height}: \
+             focal length {focal_px:.0} px",
+            camera.name
         );
     }
     let color = camera.intrinsics.clone();
@@ -60,7 +82,21 @@ fn assume_lens(camera: &mut Camera) {
     }
 }
 
-/// A typical camera for a driver, and its focal length in pixels.
+/// A typical camera for the driver, and its lens for images of the size in the rig file.
+fn typical_lens(camera: &Camera) -> (&'static str, Intrinsics) {
+    let (model, focal_px) = typical(camera);
+    let size_px = camera.intrinsics.size_px;
+    let intrinsics = Intrinsics {
+        size_px,
+        focal_px: [focal_px; 2],
+        principal_px: size_px.map(|side| 0.5 * f64::from(side)),
+        lens: Lens::Pinhole,
+        rectified: false,
+    };
+    (model, intrinsics)
+}
+
+/// A typical camera for the driver, and its focal length in pixels.
 fn typical(camera: &Camera) -> (&'static str, f64) {
     let [width, height] = camera.intrinsics.size_px.map(f64::from);
     match (camera.driver, camera.realsense.stream) {
@@ -82,6 +118,7 @@ fn typical(camera: &Camera) -> (&'static str, f64) {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::config::UnknownCalibration;
 
     fn rig(camera: &str) -> Rig {
         let text = format!(
@@ -94,10 +131,10 @@ mod tests {
     #[test]
     fn missing_intrinsics_are_those_of_a_typical_camera() {
         let mut rig = rig("size_px = [1280, 720]\n[camera.front.depth]\nsize_px = [848, 480]\n");
-        assert!(rig.cameras[0].realsense.unknown.intrinsics);
-        assume_lenses(&mut rig);
+        assert!(rig.cameras[0].unknown.intrinsics);
+        assume_calibration(&mut rig);
         let camera = &rig.cameras[0];
-        assert!(!camera.realsense.unknown.intrinsics);
+        assert_eq!(camera.unknown, UnknownCalibration::default());
         let [width, _] = camera.intrinsics.size_px.map(f64::from);
         let horizontal_fov = 2.0 * (0.5 * width / camera.intrinsics.focal_px[0]).atan();
         assert!(
@@ -114,7 +151,7 @@ mod tests {
             "size_px = [640, 480]\nintrinsics = { focal_px = [600, 601], principal_px = [320, 240] }\n",
         );
         let before = rig.clone();
-        assume_lenses(&mut rig);
+        assume_calibration(&mut rig);
         assert_eq!(rig.cameras[0].intrinsics, before.cameras[0].intrinsics);
     }
 }

@@ -4,6 +4,7 @@ mod arm_config;
 mod assumed_lens;
 #[cfg(all(feature = "sim", target_os = "linux"))]
 mod emulated;
+mod listening;
 mod movable;
 mod real;
 mod realsense;
@@ -22,6 +23,7 @@ mod ur;
 
 #[cfg(target_os = "linux")]
 pub use arm_config::controller_chain;
+pub(crate) use listening::{DeviceFailure, Listening, for_listening};
 pub use movable::{Movable, movable};
 pub use real::{check_motion, motion_of, movable_arm, udp_arm_address};
 #[cfg(target_os = "linux")]
@@ -33,8 +35,8 @@ use crate::config::{ArmDriver, BaseDriver, CameraDriver, Override, Parent, Rig, 
 use crate::notes::Notes;
 use crate::stamp_clock::StampClock;
 use anyhow::{Context, anyhow, bail};
+use assumed_lens::assume_calibration_of_simulated;
 use drivers::recording::{RIG_FILE, Recorder, Recording, RecordingMetadata, URDF_FILE};
-use drivers::udp::DatagramMonitor;
 use drivers::{LiveDevices, Playback, Repeating, Sample, Source};
 use kinematics::Chain;
 use messages::Setting;
@@ -42,7 +44,8 @@ use std::path::Path;
 use std::sync::{Arc, OnceLock};
 use tags::TagBaseSource;
 
-pub(crate) use assumed_lens::assume_lenses;
+pub use assumed_lens::approximate_intrinsics;
+pub(crate) use assumed_lens::assume_calibration;
 
 /// Hint in error messages about devices that cannot be opened.
 fn sim_hint() -> String {
@@ -146,18 +149,11 @@ fn open_recording(
 ///
 /// If a device cannot be opened, a driver is not part of this build, or the rig file lacks a
 /// setting that a driver needs.
-pub fn rig(rig: Rig, devices: Devices) -> anyhow::Result<Opened> {
-    rig_with_monitors(rig, devices).map(|(opened, _)| opened)
-}
-
-/// Like [`rig()`], with monitors of the devices that receive datagrams.
-pub(crate) fn rig_with_monitors(
-    mut rig: Rig,
-    devices: Devices,
-) -> anyhow::Result<(Opened, Vec<DatagramMonitor>)> {
+pub fn rig(mut rig: Rig, devices: Devices) -> anyhow::Result<Opened> {
     if devices == Devices::Sim {
         use_simulated_devices(&mut rig);
     }
+    assume_calibration_of_simulated(&mut rig);
     without_readout_if_ideal(&mut rig);
     // The settings are checked before any device is opened, so that an error of the rig file does
     // not start cameras.
@@ -165,8 +161,8 @@ pub(crate) fn rig_with_monitors(
         bail!("{device} cannot be opened by this version; {}", sim_hint());
     }
     check_arm(&rig)?;
-    let opened = real::open(&mut rig).map_err(|error| anyhow!("{error:#}; {}", sim_hint()));
-    let (real, monitors) = opened?;
+    let opened = real::open(&mut rig, &mut real::end_on_failure);
+    let (real, _) = opened.map_err(|error| anyhow!("{error:#}; {}", sim_hint()))?;
     let (source, stamp_clock): (Box<dyn Source>, _) = if is_any_simulated(&rig) {
         simulate(&rig, real)?
     } else {
@@ -178,21 +174,18 @@ pub(crate) fn rig_with_monitors(
         BaseDriver::Tags => Box::new(TagBaseSource::new(&rig, source)?),
         _ => source,
     };
-    Ok((
-        Opened {
-            rig,
-            source,
-            damage: Arc::default(),
-            stamp_clock,
-        },
-        monitors,
-    ))
+    Ok(Opened {
+        rig,
+        source,
+        damage: Arc::default(),
+        stamp_clock,
+    })
 }
 
 /// Replaces every device by its simulated twin. Calibration that only a real camera could report is
 /// assumed.
 fn use_simulated_devices(rig: &mut Rig) {
-    assume_lenses(rig);
+    assume_calibration(rig);
     // A rig without an arm may describe one, which then stays at rest.
     if rig.arm.driver != ArmDriver::None || rig.arm.joints.is_empty() {
         rig.arm.driver = ArmDriver::Sim;
@@ -235,8 +228,6 @@ pub fn recording(path: &Path, rig: Option<Rig>, overrides: &[Override]) -> anyho
         [rig.arm.joint_offsets, rig.arm.sim.true_joint_offsets] = offsets;
         rig.arm.joints = recorded.to_vec();
     }
-    // The cameras are no longer available, so the intrinsics must be known.
-    check_intrinsics(&rig)?;
     without_readout_if_ideal(&mut rig);
     let damage = Arc::default();
     let source = Box::new(RecordingSource {
@@ -278,6 +269,7 @@ pub fn recorder(path: &Path, rig: &Rig) -> anyhow::Result<Recorder> {
     let cameras: Vec<_> = rig
         .cameras
         .iter()
+        .filter(|camera| !camera.unknown.intrinsics)
         .map(|camera| (&*camera.name, &camera.intrinsics))
         .collect();
     // All settings of the rig are stored, including the calibration that cameras report. The
@@ -347,22 +339,6 @@ fn check_arm(rig: &Rig) -> anyhow::Result<()> {
     if let (ArmDriver::None, Some(camera)) = (rig.arm.driver, on_flange) {
         bail!(
             "camera {:?} has the parent flange, but arm.driver is none: the parent must be base or world",
-            camera.name
-        );
-    }
-    Ok(())
-}
-
-/// Checks that all intrinsics are known. Intrinsics that are stored in the camera are unknown
-/// unless the camera is opened.
-fn check_intrinsics(rig: &Rig) -> anyhow::Result<()> {
-    if let Some(camera) = rig
-        .cameras
-        .iter()
-        .find(|camera| camera.realsense.unknown.intrinsics)
-    {
-        bail!(
-            "camera.{}.intrinsics is missing: it is stored in the camera, which this command does not open",
             camera.name
         );
     }

@@ -2,6 +2,7 @@
 
 #[cfg(feature = "sim")]
 use super::arm_config::motion_limits;
+use super::assumed_lens::assume_calibration_of_simulated;
 use super::real;
 use super::{Devices, check_arm, use_simulated_devices, without_readout_if_ideal};
 use crate::config::{ArmDriver, BaseDriver, Camera, CameraDriver, Rig};
@@ -48,6 +49,7 @@ pub fn movable(rig: &Rig, devices: Devices, camera: &str) -> anyhow::Result<Mova
             "base.driver: the base must be fixed; use a copy of the rig file with base.driver = \"fixed\""
         );
     }
+    assume_calibration_of_simulated(&mut rig);
     without_readout_if_ideal(&mut rig);
     check_arm(&rig)?;
     if rig.arm.driver == ArmDriver::Sim {
@@ -60,7 +62,7 @@ pub fn movable(rig: &Rig, devices: Devices, camera: &str) -> anyhow::Result<Mova
     // The camera is opened first, so that the arm is enabled only if everything else works. With
     // the driver `none`, the arm is not opened for reading here. It is opened for motion below.
     let driver = std::mem::replace(&mut rig.arm.driver, ArmDriver::None);
-    let opened = real::open(&mut rig);
+    let opened = real::open(&mut rig, &mut real::end_on_failure);
     rig.arm.driver = driver;
     let (opened, _) = opened?;
     let Some(camera) = opened.cameras.into_iter().next() else {

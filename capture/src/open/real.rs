@@ -5,7 +5,9 @@ use super::arm_config::{controller_chain, motion_config};
 use super::servos;
 #[cfg(target_os = "linux")]
 use crate::config::Depth;
-use crate::config::{ArmDriver, ArmMotion, BaseDriver, Camera, CameraDriver, Rig, ScannerDriver};
+use crate::config::{
+    ArmDriver, ArmMotion, BaseDriver, Camera, CameraDriver, Rig, Scanner, ScannerDriver,
+};
 use anyhow::{Context, bail};
 #[cfg(target_os = "linux")]
 use drivers::can::odrive::{self, Endpoints};
@@ -19,7 +21,7 @@ use drivers::udp::{DatagramMonitor, UdpArm, UdpBase, UdpScanner};
 use drivers::ur::MovableUrArm;
 #[cfg(target_os = "linux")]
 use drivers::v4l2::{Config, Settings, V4l2Camera, V4l2Format};
-use drivers::{Arm, Base, Devices, RangeScanner};
+use drivers::{Arm, Base, Devices, RangeScanner, device_names};
 use messages::BadInput;
 use std::net::{IpAddr, Ipv4Addr, SocketAddr};
 use std::time::Duration;
@@ -30,22 +32,68 @@ const DEFAULT_ARM_ADDRESS: SocketAddr = SocketAddr::new(IpAddr::V4(Ipv4Addr::LOC
 /// Error for an arm that this program cannot move.
 const READ_ONLY: &str = "arms with this driver can only be read; to move the arm, set arm.driver = \"franka\", \"ur\", \"can\", \"feetech\" or \"dynamixel\"";
 
+/// Decides what happens after a device could not be opened: an error ends the opening, `Ok` leaves
+/// the device out. It gets the name of the device, as in [`drivers::device_names`].
+pub(super) type OnFailure<'a> = &'a mut dyn FnMut(String, anyhow::Error) -> anyhow::Result<()>;
+
+/// The first device that cannot be opened ends the opening.
+pub(super) fn end_on_failure(_device: String, error: anyhow::Error) -> anyhow::Result<()> {
+    Err(error)
+}
+
 /// Opens all real devices of a rig. There may be none. Also returns monitors of the devices that
 /// receive datagrams. Fills in calibration that is stored in a camera.
-pub(super) fn open(rig: &mut Rig) -> anyhow::Result<(Devices, Vec<DatagramMonitor>)> {
+pub(super) fn open(
+    rig: &mut Rig,
+    on_failure: OnFailure<'_>,
+) -> anyhow::Result<(Devices, Vec<DatagramMonitor>)> {
     let mut devices = Devices::default();
     let mut monitors = Vec::new();
     // Cameras are opened first. Some of them store intrinsics, which are copied to the rig before
     // anything uses them.
     for camera in &mut rig.cameras {
-        match camera.driver {
-            CameraDriver::V4l2 => devices.cameras.extend(v4l2_cameras(camera)?),
-            CameraDriver::Nokhwa => devices.cameras.push(nokhwa_camera(camera)?),
-            CameraDriver::Realsense => devices.cameras.push(super::realsense::open(camera)?),
-            CameraDriver::Sim => {}
+        match cameras_of(camera) {
+            Ok(opened) => devices.cameras.extend(opened),
+            Err(error) => on_failure(device_names::camera(&camera.name), error)?,
         }
     }
-    devices.arm = match rig.arm.driver {
+    match arm(rig, &mut monitors) {
+        Ok(arm) => devices.arm = arm,
+        Err(error) => on_failure(device_names::ARM.to_owned(), error)?,
+    }
+    if rig.base.driver == BaseDriver::Udp {
+        match udp_base(rig, &mut monitors) {
+            Ok(base) => devices.base = Some(base),
+            Err(error) => on_failure(device_names::BASE.to_owned(), error)?,
+        }
+    }
+    for scanner in rig
+        .scanners
+        .iter()
+        .filter(|scanner| scanner.driver == ScannerDriver::Udp)
+    {
+        match udp_scanner(scanner, &mut monitors) {
+            Ok(open) => devices.scanners.push(open),
+            Err(error) => on_failure(device_names::range_scanner(&scanner.name), error)?,
+        }
+    }
+    Ok((devices, monitors))
+}
+
+/// Opens a camera. The depth images of a V4L2 camera come from a second device. A simulated camera
+/// has no device.
+fn cameras_of(camera: &mut Camera) -> anyhow::Result<Vec<Box<dyn drivers::Camera>>> {
+    match camera.driver {
+        CameraDriver::V4l2 => v4l2_cameras(camera),
+        CameraDriver::Nokhwa => Ok(vec![nokhwa_camera(camera)?]),
+        CameraDriver::Realsense => Ok(vec![super::realsense::open(camera)?]),
+        CameraDriver::Sim => Ok(Vec::new()),
+    }
+}
+
+/// Opens the arm for reading, if there is a real one.
+fn arm(rig: &Rig, monitors: &mut Vec<DatagramMonitor>) -> anyhow::Result<Option<Box<dyn Arm>>> {
+    Ok(match rig.arm.driver {
         ArmDriver::None | ArmDriver::Sim => None,
         ArmDriver::Can => Some(can_arm(rig)?),
         ArmDriver::Feetech | ArmDriver::Dynamixel => Some(servos::servo_arm(rig)?),
@@ -56,33 +104,33 @@ pub(super) fn open(rig: &mut Rig) -> anyhow::Result<(Devices, Vec<DatagramMonito
             monitors.push(arm.monitor());
             Some(Box::new(arm) as Box<dyn Arm>)
         }
-    };
-    if rig.base.driver == BaseDriver::Udp {
-        let base = UdpBase::open(
-            rig.base.address,
-            [rig.base.max_sigma_m, rig.base.max_sigma_rad],
-        )?;
-        log::info!("base: listening on {}", base.address());
-        monitors.push(base.monitor());
-        devices.base = Some(Box::new(base) as Box<dyn Base>);
-    }
-    for scanner in rig
-        .scanners
-        .iter()
-        .filter(|scanner| scanner.driver == ScannerDriver::Udp)
-    {
-        let open = UdpScanner::open(&scanner.name, scanner.address)?;
-        log::info!(
-            "range scanner {:?}: listening on {}",
-            scanner.name,
-            open.address()
-        );
-        monitors.push(open.monitor());
-        devices
-            .scanners
-            .push(Box::new(open) as Box<dyn RangeScanner>);
-    }
-    Ok((devices, monitors))
+    })
+}
+
+/// Opens a base whose poses are sent by another program.
+fn udp_base(rig: &Rig, monitors: &mut Vec<DatagramMonitor>) -> anyhow::Result<Box<dyn Base>> {
+    let base = UdpBase::open(
+        rig.base.address,
+        [rig.base.max_sigma_m, rig.base.max_sigma_rad],
+    )?;
+    log::info!("base: listening on {}", base.address());
+    monitors.push(base.monitor());
+    Ok(Box::new(base))
+}
+
+/// Opens a range scanner whose scans are sent by another program.
+fn udp_scanner(
+    scanner: &Scanner,
+    monitors: &mut Vec<DatagramMonitor>,
+) -> anyhow::Result<Box<dyn RangeScanner>> {
+    let open = UdpScanner::open(&scanner.name, scanner.address)?;
+    log::info!(
+        "range scanner {:?}: listening on {}",
+        scanner.name,
+        open.address()
+    );
+    monitors.push(open.monitor());
+    Ok(Box::new(open))
 }
 
 /// Opens the arm for motion: enables it and holds its position. Positions of the returned arm do

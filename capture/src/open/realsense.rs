@@ -37,9 +37,13 @@ mod with_sdk {
             intrinsics,
             depth_intrinsics,
             camera_from_depth,
-            // The marks are reset, so that nothing counts as unknown any more and the rig can be
-            // stored in a recording.
-        } = std::mem::take(&mut camera.realsense.unknown);
+            parent_from_camera,
+        } = camera.unknown;
+        // The marks are reset, so that the rig with these lenses can be stored in a recording.
+        camera.unknown = UnknownCalibration {
+            parent_from_camera,
+            ..UnknownCalibration::default()
+        };
         apply_known(
             "intrinsics",
             &camera.name,

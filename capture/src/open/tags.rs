@@ -1,7 +1,7 @@
 //! Locates the base from tags that its cameras see: estimates base poses from images and adds them
 //! to the samples.
 
-use crate::config::{BaseDriver, Camera, Parent, Rig};
+use crate::config::{BaseDriver, Camera, Need, Parent, Rig};
 use crate::join::{CameraPose, Motion};
 use anyhow::bail;
 use drivers::tags::{
@@ -55,24 +55,37 @@ struct TagCounts {
     n_without_joints: u64,
 }
 
+/// The rig without cameras that do not move with the base.
+fn with_cameras_on_robot(rig: &Rig) -> Rig {
+    let mut rig = rig.clone();
+    rig.cameras
+        .retain(|camera: &Camera| camera.parent != Parent::World);
+    rig
+}
+
 impl TagBaseSource {
-    pub(super) fn new(rig: &Rig, source: Box<dyn Source>) -> anyhow::Result<Self> {
-        // With the base at the origin, `Motion` returns poses of cameras relative to the base.
-        let mut arm = rig.clone();
-        arm.base.driver = BaseDriver::Fixed;
-        arm.base.world_from_base = Transform::identity();
-        let is_on_robot = |camera: &&Camera| camera.parent != Parent::World;
-        let cameras: Vec<_> = rig.cameras.iter().filter(is_on_robot).cloned().collect();
-        if cameras.is_empty() {
+    /// Checks that the cameras of a rig can locate the base.
+    pub(super) fn check(rig: &Rig) -> anyhow::Result<()> {
+        let on_robot = with_cameras_on_robot(rig);
+        if on_robot.cameras.is_empty() {
             bail!(
                 "base.driver is tags, but no camera is on the base or the arm: set camera.NAME.parent to base or flange"
             );
         }
+        Ok(on_robot.require(Need::PosedImages)?)
+    }
+
+    pub(super) fn new(rig: &Rig, source: Box<dyn Source>) -> anyhow::Result<Self> {
+        Self::check(rig)?;
+        // With the base at the origin, `Motion` returns poses of cameras relative to the base.
+        let mut arm = with_cameras_on_robot(rig);
+        arm.base.driver = BaseDriver::Fixed;
+        arm.base.world_from_base = Transform::identity();
         Ok(Self {
             source,
             detector: TagDetector::start(rig.base.tag_family)?,
             is_lockstep: rig.sim.lockstep,
-            cameras,
+            cameras: arm.cameras.clone(),
             tags: rig.base.tags.clone(),
             arm: Motion::new(&arm)?,
             pending: VecDeque::new(),

@@ -7,11 +7,12 @@ use super::connection::{Connection, error_text, fault};
 use super::motion_loop::{MotionLoop, StampedState};
 use super::state::{MAX_STATE_BYTES, NumberedState, decode, pose};
 use super::{N_JOINTS, StateStatistics, realtime};
+use crate::flange_difference::FlangePoses;
 use crate::udp::sequence::{SequencePosition, SequenceTracker};
 use crate::wire::datagram::{Clock, DatagramHeader};
-use crate::{Arm, Error, clock};
+use crate::{Arm, Error, FlangeDifference, clock};
 use franka::{FciVersion, RobotMode, RobotState};
-use kinematics::{Chain, JointState, Stamp, Transform};
+use kinematics::{Chain, JointState, Stamp};
 use parking_lot::{Condvar, Mutex};
 use std::collections::VecDeque;
 use std::net::SocketAddr;
@@ -54,6 +55,7 @@ pub struct FrankaArm {
     device: String,
     names: Vec<String>,
     version: FciVersion,
+    flange_difference: FlangeDifference,
     shared: Arc<Shared>,
     thread: Option<JoinHandle<()>>,
 }
@@ -99,7 +101,8 @@ impl FrankaArm {
         // A wrong robot description would give every image a wrong pose, and the error would look
         // like a bad calibration. The description is therefore checked before anything is read or
         // moved.
-        check_kinematics(config, &first).map_err(|reason| fault(address, reason))?;
+        let flange_difference =
+            check_kinematics(config, &first).map_err(|reason| fault(address, reason))?;
         let motion_loop =
             motion_loop(&connection, &first).map_err(|reason| fault(address, reason))?;
         let mut reader = StateReader::new(address.clone(), version, motion_loop);
@@ -123,6 +126,7 @@ impl FrankaArm {
             device,
             names: config.joint_names.clone(),
             version,
+            flange_difference,
             shared,
             thread: Some(thread),
         })
@@ -162,6 +166,10 @@ impl Arm for FrankaArm {
             }
             self.shared.arrived.wait_for(&mut state, remaining);
         }
+    }
+
+    fn flange_difference(&self) -> Option<FlangeDifference> {
+        Some(self.flange_difference)
     }
 }
 
@@ -207,69 +215,39 @@ fn first_state(address: &str, connection: &Connection) -> Result<(SocketAddr, Ro
 }
 
 /// Compares the flange pose according to the rig file with the pose that the robot reports.
-fn check_kinematics(config: &ArmConfig, state: &RobotState) -> Result<(), String> {
-    let chain = &config.chain;
-    let chain_error = |error: kinematics::Error| error.to_string();
-    let sequence = chain.order_in(&config.joint_names).map_err(chain_error)?;
-    // The chain may list the joints in another order than the robot.
-    let q: Vec<f64> = sequence.iter().map(|ix| state.q[*ix]).collect();
-    let ours = chain.forward(&q).map_err(chain_error)?;
+fn check_kinematics(config: &ArmConfig, state: &RobotState) -> Result<FlangeDifference, String> {
     let matrix = |name, matrix| {
         pose(matrix).map_err(|error| format!("its {name} is not a valid pose: {error}"))
     };
-    let base_from_tool = matrix("O_T_EE", &state.O_T_EE)?;
-    let flange_from_tool = matrix("F_T_EE", &state.F_T_EE)?;
-    // The robot reports its tool, whose pose depends on settings in Desk. Without the tool's pose,
-    // the result is the pose of the flange, which depends only on the joints.
-    let reported = base_from_tool * flange_from_tool.inverse();
-    let (error_m, error_rad) = difference(&ours, &reported);
-    if error_m <= MAX_POSE_ERROR_M && error_rad <= MAX_POSE_ERROR_RAD {
-        return Ok(());
+    // The robot reports its tool, whose pose depends on settings in Desk.
+    let poses = FlangePoses::new(
+        &config.chain,
+        &config.joint_names,
+        &state.q,
+        matrix("O_T_EE", &state.O_T_EE)?,
+        &matrix("F_T_EE", &state.F_T_EE)?,
+    )?;
+    let difference = FlangeDifference::between(&poses.described, &poses.reported);
+    if difference.is_within(MAX_POSE_ERROR_M, MAX_POSE_ERROR_RAD) {
+        return Ok(difference);
     }
     // If the rig file agrees with the pose of the tool instead, it names the hand as the flange.
     // The error reports this mistake separately.
-    let (tool_error_m, tool_error_rad) = difference(&ours, &base_from_tool);
-    let tip = chain.tip_link();
-    let likely_cause = if tool_error_m <= MAX_POSE_ERROR_M && tool_error_rad <= MAX_POSE_ERROR_RAD {
+    let tip = config.chain.tip_link();
+    let from_tool = FlangeDifference::between(&poses.described, &poses.base_from_tool);
+    let likely_cause = if from_tool.is_within(MAX_POSE_ERROR_M, MAX_POSE_ERROR_RAD) {
         format!(
             "{tip:?} is at the robot's end effector: arm.flange_link must name the flange, which differs from it by F_T_EE"
         )
     } else {
         format!(
             "likely causes: arm.flange_link is not the flange (panda_link8, fr3_link8), the end effector was changed in Desk, \
-             arm.joints is in the wrong order, or arm.urdf is of another robot; {tip:?} is {} from the robot's end effector",
-            format_difference(tool_error_m, tool_error_rad)
+             arm.joints is in the wrong order, or arm.urdf is of another robot; {tip:?} is {from_tool} from the robot's end effector"
         )
     };
-    Err(format!(
-        "the rig file puts {tip:?} at {}, but the robot reports its flange (O_T_EE without F_T_EE) at {}, {} away; {likely_cause}",
-        format_pose(&ours),
-        format_pose(&reported),
-        format_difference(error_m, error_rad)
-    ))
-}
-
-fn difference(a: &Transform, b: &Transform) -> (f64, f64) {
-    let a_from_b = a.inverse() * b;
-    (
-        a_from_b.translation.vector.norm(),
-        a_from_b.rotation.angle(),
-    )
-}
-
-fn format_difference(error_m: f64, error_rad: f64) -> String {
-    format!(
-        "{:.1} mm and {:.2} degrees",
-        error_m * 1e3,
-        error_rad.to_degrees()
-    )
-}
-
-fn format_pose(pose: &Transform) -> String {
-    let [x, y, z] = pose.translation.vector.into();
-    let (roll, pitch, yaw) = pose.rotation.euler_angles();
-    let [roll, pitch, yaw] = [roll, pitch, yaw].map(f64::to_degrees);
-    format!("({x:.4}, {y:.4}, {z:.4}) m, roll {roll:.2}, pitch {pitch:.2}, yaw {yaw:.2} degrees")
+    let source = "the robot reports its flange (O_T_EE without F_T_EE)";
+    let described = poses.describe(tip, source, &difference);
+    Err(format!("{described}; {likely_cause}"))
 }
 
 /// State of the reading thread.

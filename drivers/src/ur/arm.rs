@@ -2,12 +2,12 @@
 
 use super::config::ArmConfig;
 use super::connection::{Connection, ControllerVersion, POLL, Reading};
-use super::flange_check::{FlangeCheck, check_flange};
+use super::flange_check::check_flange;
 use super::motion_loop::{Cycle, MotionLoop};
 use super::state::RobotState;
 use super::timing::{StateTiming, Timed};
 use super::{N_JOINTS, StateStatistics, words};
-use crate::{Arm, Error, clock};
+use crate::{Arm, Error, FlangeDifference, clock};
 use kinematics::{JointState, Stamp};
 use parking_lot::{Condvar, Mutex};
 use std::collections::VecDeque;
@@ -33,6 +33,7 @@ pub struct UrArm {
     device: String,
     names: Vec<String>,
     version: ControllerVersion,
+    flange_difference: FlangeDifference,
     shared: Arc<Shared>,
     thread: Option<JoinHandle<()>>,
 }
@@ -96,9 +97,9 @@ impl UrArm {
         let device = format!("arm at {address}");
         // A wrong robot description would give every image a wrong pose, and the error would look
         // like a bad calibration.
-        match check_flange(config, &first).map_err(|reason| fault(address, reason))? {
-            FlangeCheck::Same => {}
-            FlangeCheck::Doubtful(reason) => log::warn!("{device}: {reason}"),
+        let flange = check_flange(config, &first).map_err(|reason| fault(address, reason))?;
+        if let Some(doubt) = &flange.doubt {
+            log::warn!("{device}: {doubt}");
         }
         let version = connection.version;
         log::info!(
@@ -130,6 +131,7 @@ impl UrArm {
             device,
             names: config.joint_names.clone(),
             version,
+            flange_difference: flange.difference,
             shared,
             thread: Some(thread),
         })
@@ -176,6 +178,10 @@ impl Arm for UrArm {
             }
             self.shared.arrived.wait_for(&mut state, remaining);
         }
+    }
+
+    fn flange_difference(&self) -> Option<FlangeDifference> {
+        Some(self.flange_difference)
     }
 }
 

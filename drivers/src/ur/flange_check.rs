@@ -2,6 +2,8 @@
 
 use super::config::ArmConfig;
 use super::state::{RobotState, transform};
+use crate::FlangeDifference;
+use crate::flange_difference::FlangePoses;
 use kinematics::Transform;
 use nalgebra::UnitQuaternion;
 use std::f64::consts::PI;
@@ -19,12 +21,12 @@ const MAX_NOMINAL_ERROR_RAD: f64 = 2.0 / 180.0 * PI;
 
 /// Result of the comparison, if the poses do not contradict each other.
 #[derive(Clone, Debug, PartialEq)]
-pub(super) enum FlangeCheck {
-    /// The poses agree.
-    Same,
-    /// The difference does not prove that the description is wrong. The text describes it, with the
-    /// likely cause and the remedy.
-    Doubtful(String),
+pub(super) struct FlangeCheck {
+    /// The difference of the poses.
+    pub(super) difference: FlangeDifference,
+    /// Why the poses differ, with both poses, the likely cause and the remedy. The description may
+    /// still be right. `None` if the poses agree.
+    pub(super) doubt: Option<String>,
 }
 
 /// Compares the two poses.
@@ -32,58 +34,47 @@ pub(super) enum FlangeCheck {
 /// # Errors
 /// If the rig file describes another robot or another link. The text states both poses.
 pub(super) fn check_flange(config: &ArmConfig, state: &RobotState) -> Result<FlangeCheck, String> {
-    let chain = &config.chain;
-    let chain_error = |error: kinematics::Error| error.to_string();
-    let sequence = chain.order_in(&config.joint_names).map_err(chain_error)?;
-    // The chain may list the joints in another order than the robot.
-    let q: Vec<f64> = sequence.iter().map(|ix| state.position_rad[*ix]).collect();
-    let ours = chain.forward(&q).map_err(chain_error)?;
-    let base_from_tool = transform(&state.base_from_tool);
     let flange_from_tool = state.flange_from_tool.as_ref().map(transform);
-    // The controller reports its tool, whose pose is set in the installation. Without the tool, the
-    // result depends only on the joints.
-    let reported = base_from_tool * flange_from_tool.unwrap_or_default().inverse();
-    let error = Difference::between(&ours, &reported);
-    if error.is_within(MAX_POSE_ERROR_M, MAX_POSE_ERROR_RAD) {
-        return Ok(FlangeCheck::Same);
+    // The controller reports its tool, whose pose is set in the installation.
+    let poses = FlangePoses::new(
+        &config.chain,
+        &config.joint_names,
+        &state.position_rad,
+        transform(&state.base_from_tool),
+        &flange_from_tool.unwrap_or_default(),
+    )?;
+    let difference = difference(&poses.described, &poses.reported);
+    let with_doubt = |doubt: Option<String>| Ok(FlangeCheck { difference, doubt });
+    if difference.is_within(MAX_POSE_ERROR_M, MAX_POSE_ERROR_RAD) {
+        return with_doubt(None);
     }
-    let tip = chain.tip_link();
-    let difference = format!(
-        "the rig file puts {tip:?} at {}, but the controller reports its flange at {}, {} away",
-        format_pose(&ours),
-        format_pose(&reported),
-        error
-    );
-    if error.is_within(MAX_NOMINAL_ERROR_M, MAX_NOMINAL_ERROR_RAD) {
-        return Ok(FlangeCheck::Doubtful(format!(
-            "{difference}; the likely cause is a URDF with nominal dimensions: export one with the calibration of this robot, see docs/guide/arms.md"
+    let tip = config.chain.tip_link();
+    let described = poses.describe(tip, "the controller reports its flange", &difference);
+    if difference.is_within(MAX_NOMINAL_ERROR_M, MAX_NOMINAL_ERROR_RAD) {
+        return with_doubt(Some(format!(
+            "{described}; the likely cause is a URDF with nominal dimensions: export one with the calibration of this robot, see docs/guide/arms.md"
         )));
     }
     if flange_from_tool.is_none() {
-        return Ok(FlangeCheck::Doubtful(format!(
-            "{difference}; this controller does not report the tool of its installation, so the difference may be that tool"
+        return with_doubt(Some(format!(
+            "{described}; this controller does not report the tool of its installation, so the difference may be that tool"
         )));
     }
     Err(format!(
-        "{difference}; {}",
-        likely_cause(tip, &ours, &base_from_tool, &error)
+        "{described}; {}",
+        likely_cause(tip, &poses, &difference)
     ))
 }
 
 /// The likely cause of a large difference.
-fn likely_cause(
-    tip: &str,
-    ours: &Transform,
-    base_from_tool: &Transform,
-    error: &Difference,
-) -> String {
-    let from_tool = Difference::between(ours, base_from_tool);
+fn likely_cause(tip: &str, poses: &FlangePoses, flange: &FlangeDifference) -> String {
+    let from_tool = difference(&poses.described, &poses.base_from_tool);
     if from_tool.is_within(MAX_NOMINAL_ERROR_M, MAX_NOMINAL_ERROR_RAD) {
         return format!(
             "{tip:?} is at the tool center point: arm.flange_link must name the flange (tool0), without the tool"
         );
     }
-    if error.translation_m <= MAX_NOMINAL_ERROR_M {
+    if flange.translation_m <= MAX_NOMINAL_ERROR_M {
         return format!(
             "only the orientation differs: arm.flange_link must name the frame of the controller (tool0, not flange), {tip:?} is another one"
         );
@@ -92,60 +83,22 @@ fn likely_cause(
         .to_owned()
 }
 
-/// Difference between two poses.
-struct Difference {
-    translation_m: f64,
-    rotation_rad: f64,
-}
-
-impl Difference {
-    /// The difference for the base frame that fits better: the one of the controller, or one that
-    /// is rotated by half a turn about the vertical axis. ROS descriptions rotate `base_link` in
-    /// this way, so that its x axis points forward. The poses of cameras do not depend on it.
-    fn between(ours: &Transform, reported: &Transform) -> Self {
-        let half_turn = Transform::from_parts(
-            nalgebra::Translation3::identity(),
-            UnitQuaternion::from_euler_angles(0.0, 0.0, PI),
-        );
-        let [same, turned] = [*ours, half_turn * ours].map(|ours| {
-            let ours_from_reported = ours.inverse() * reported;
-            Self {
-                translation_m: ours_from_reported.translation.vector.norm(),
-                rotation_rad: ours_from_reported.rotation.angle(),
-            }
-        });
-        if turned.size() < same.size() {
-            turned
-        } else {
-            same
-        }
+/// The difference for the base frame that fits better: the one of the controller, or one that is
+/// rotated by half a turn about the vertical axis. ROS descriptions rotate `base_link` in this way,
+/// so that its x axis points forward. The poses of cameras do not depend on it.
+fn difference(described: &Transform, reported: &Transform) -> FlangeDifference {
+    let half_turn = Transform::from_parts(
+        nalgebra::Translation3::identity(),
+        UnitQuaternion::from_euler_angles(0.0, 0.0, PI),
+    );
+    let same = FlangeDifference::between(described, reported);
+    let turned = FlangeDifference::between(&(half_turn * described), reported);
+    // Both parts are compared as one number. A straight arm has its flange above the base, so that
+    // half a turn of the base changes only the orientation.
+    let size = |of: &FlangeDifference| of.translation_m + of.rotation_rad;
+    if size(&turned) < size(&same) {
+        turned
+    } else {
+        same
     }
-
-    /// Both parts in one number. A straight arm has its flange above the base, so that half a turn
-    /// of the base changes only the orientation.
-    fn size(&self) -> f64 {
-        self.translation_m + self.rotation_rad
-    }
-
-    fn is_within(&self, max_m: f64, max_rad: f64) -> bool {
-        self.translation_m <= max_m && self.rotation_rad <= max_rad
-    }
-}
-
-impl std::fmt::Display for Difference {
-    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        write!(
-            f,
-            "{:.1} mm and {:.2} degrees",
-            self.translation_m * 1e3,
-            self.rotation_rad.to_degrees()
-        )
-    }
-}
-
-fn format_pose(pose: &Transform) -> String {
-    let [x, y, z] = pose.translation.vector.into();
-    let (roll, pitch, yaw) = pose.rotation.euler_angles();
-    let [roll, pitch, yaw] = [roll, pitch, yaw].map(f64::to_degrees);
-    format!("({x:.4}, {y:.4}, {z:.4}) m, roll {roll:.2}, pitch {pitch:.2}, yaw {yaw:.2} degrees")
 }

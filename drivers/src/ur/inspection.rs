@@ -4,9 +4,9 @@ use super::address::ControllerAddress;
 use super::arm::{fault, first_state};
 use super::config::ArmConfig;
 use super::connection::{Connection, ControllerVersion};
-use super::flange_check::{FlangeCheck, check_flange};
+use super::flange_check::check_flange;
 use super::{dashboard, words};
-use crate::Error;
+use crate::{Error, FlangeDifference};
 
 /// What a controller reports.
 #[derive(Clone, Debug, PartialEq)]
@@ -25,10 +25,10 @@ pub struct Inspection {
 }
 
 /// Comparison of two flange poses.
-#[derive(Clone, Debug, PartialEq, Eq)]
+#[derive(Clone, Debug, PartialEq)]
 pub enum FlangePose {
     /// The poses agree within 2 mm and 0.5 degrees.
-    Same,
+    Same(FlangeDifference),
     /// The poses differ, and the description may still be right. The text has both poses and the
     /// likely cause.
     Doubtful(String),
@@ -51,8 +51,9 @@ pub fn inspect(config: &ArmConfig) -> Result<Inspection, Error> {
         blocking_reason: words::blocking_reason(&state),
         is_in_remote_control: dashboard::is_in_remote_control(&controller).unwrap_or(None),
         flange: match check_flange(config, &state) {
-            Ok(FlangeCheck::Same) => FlangePose::Same,
-            Ok(FlangeCheck::Doubtful(reason)) => FlangePose::Doubtful(reason),
+            Ok(check) => check
+                .doubt
+                .map_or(FlangePose::Same(check.difference), FlangePose::Doubtful),
             Err(reason) => FlangePose::Different(reason),
         },
     })

@@ -1,7 +1,7 @@
 //! Tests over loopback sockets: our driver against emulated controllers.
 
 use super::emulated::{ControllerConfig, EmulatedController, Joints, Modes};
-use super::flange_check::{FlangeCheck, check_flange};
+use super::flange_check::check_flange;
 use super::message::{self, PackageType};
 use super::state::RobotState;
 use super::{ArmConfig, N_JOINTS, RTDE_PORT, StateStatistics, UrArm};
@@ -439,14 +439,21 @@ fn nominal_dimensions_and_unknown_tools_only_cause_a_warning() {
     // The measured upper arm of this robot is longer than the nominal one.
     let longer = |by_m: f64| URDF.replace("-0.425", &format!("{}", -0.425 - by_m));
     let checked = |state: RobotState| check_flange(&config, &state);
-    assert_eq!(checked(state(URDF, tool, true)), Ok(FlangeCheck::Same));
-    assert_eq!(
-        checked(state(&longer(1e-3), identity, true)),
-        Ok(FlangeCheck::Same)
+    let same = |state: RobotState| {
+        let check = checked(state).expect("the same robot");
+        assert_eq!(check.doubt, None);
+        check.difference
+    };
+    let exact = same(state(URDF, tool, true));
+    assert!(exact.is_within(1e-9, 1e-6), "{exact}");
+    let longer_by_1_mm = same(state(&longer(1e-3), identity, true));
+    assert!(
+        longer_by_1_mm.to_string().starts_with("1.0 mm"),
+        "{longer_by_1_mm}"
     );
-    let doubtful = |state: RobotState| match checked(state) {
-        Ok(FlangeCheck::Doubtful(reason)) => reason,
-        other => panic!("{other:?}"),
+    let doubtful = |state: RobotState| {
+        let check = checked(state).expect("perhaps the same robot");
+        check.doubt.expect("the difference is large")
     };
     let nominal = doubtful(state(&longer(8e-3), identity, true));
     assert!(

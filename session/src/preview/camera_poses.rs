@@ -1,7 +1,5 @@
-//! Lenses and poses of the cameras of a preview, as far as they are known.
-//!
-//! All assumptions about missing keys of a rig file are here: a camera without intrinsics or
-//! without a pose is shown as an image only.
+//! Lenses and poses of the cameras of a preview, as far as they are known. A camera without
+//! intrinsics or without a pose is shown as an image only.
 
 use capture::config::{Camera, Parent, Rig};
 use capture::open;
@@ -36,7 +34,7 @@ impl CameraPoses {
                 .find(|opened| opened.name == camera.name)
             {
                 camera.intrinsics = opened.intrinsics.clone();
-                camera.realsense.unknown = opened.realsense.unknown;
+                camera.unknown.intrinsics = opened.unknown.intrinsics;
             }
         }
     }
@@ -61,7 +59,7 @@ impl CameraPoses {
     pub(super) fn pose(&self, camera: &str, robot: Option<&RobotState>) -> Option<Transform> {
         let camera = self
             .camera(camera)
-            .filter(|camera| has_intrinsics(camera) && has_pose(camera))?;
+            .filter(|camera| has_intrinsics(camera) && !camera.unknown.parent_from_camera)?;
         let world_from_base = || robot.map_or(self.world_from_base, |robot| robot.world_from_base);
         let world_from_parent = match camera.parent {
             Parent::World => Transform::identity(),
@@ -102,13 +100,7 @@ fn arm_of(rig: &Rig) -> Option<(Chain, Vec<usize>)> {
 
 /// Whether the intrinsics of a camera are in the rig file, or were reported by the camera.
 fn has_intrinsics(camera: &Camera) -> bool {
-    !camera.realsense.unknown.intrinsics
-}
-
-/// Whether the pose of a camera on its parent is known. A rig file without the pose has the
-/// identity, which would put the camera into the flange or into the base.
-fn has_pose(camera: &Camera) -> bool {
-    camera.parent == Parent::World || camera.parent_from_camera != Transform::identity()
+    !camera.unknown.intrinsics
 }
 
 #[cfg(test)]
@@ -159,7 +151,7 @@ mod tests {
     #[test]
     fn a_camera_whose_lens_or_pose_is_unknown_has_only_images() {
         let mut without_lens = rig(&[]);
-        without_lens.cameras[0].realsense.unknown.intrinsics = true;
+        without_lens.cameras[0].unknown.intrinsics = true;
         let joints = state(Transform::identity(), vec![0.0; 7]);
         let mut cameras = CameraPoses::new(&without_lens);
         assert_eq!(cameras.pose("wrist", Some(&joints)), None);
@@ -171,7 +163,7 @@ mod tests {
         cameras.adopt(&rig(&[]));
         assert!(cameras.pose("wrist", Some(&joints)).is_some());
         let mut without_pose = rig(&[]);
-        without_pose.cameras[0].parent_from_camera = Transform::identity();
+        without_pose.cameras[0].unknown.parent_from_camera = true;
         let cameras = CameraPoses::new(&without_pose);
         assert_eq!(cameras.pose("wrist", Some(&joints)), None);
     }

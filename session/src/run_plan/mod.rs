@@ -30,7 +30,7 @@ use crate::run_folder;
 use crate::session::Limits;
 use crate::session_setup::Services;
 use crate::training_options::{AvailableData, REALIGN, RefineSettings, TrainingOptions};
-use capture::config::{ArmDriver, Override, Rig};
+use capture::config::{ArmDriver, Need, Override, Rig};
 use capture::open::{self, Devices, Opened};
 use gpu::Gpu;
 use messages::{BadInput, Setting};
@@ -133,6 +133,7 @@ impl RunPlan {
         let mut overrides = plan.overrides();
         overrides.extend(previous.iter().flat_map(PreviousLiveRun::overrides));
         let rig = Rig::load(&plan.rig_file, &overrides)?;
+        plan.require_calibration(&rig)?;
         log::info!("{}", opening::describe(&plan.rig_name(), &rig, &plan.input));
         let kinds = methods_of(&rig)?;
         let available = available_data(&rig);
@@ -157,6 +158,17 @@ impl RunPlan {
             models,
         };
         Ok(PreparedRun::new(rig, parts))
+    }
+
+    /// Checks that the rig file has what keyframes need. Simulated devices assume what is missing.
+    fn require_calibration(&self, rig: &Rig) -> Result<(), BadInput> {
+        match self.input {
+            RunInput::Devices {
+                is_simulated: true, ..
+            } if !rig.cameras.is_empty() => Ok(()),
+            RunInput::Devices { .. } => rig.require_before_opening(Need::PosedImages),
+            RunInput::Recording { .. } => rig.require(Need::PosedImages),
+        }
     }
 
     /// Rejects options for training that are invalid for this rig.

@@ -11,7 +11,7 @@ use calibration::hand_eye::{
     ArmPlan, ArmPlanOptions, ArmStep, BoardObservation, FirstView, HandEyeInput, HandEyeOptions,
     HandEyeSample, Reach, Setup, calibrate_hand_eye,
 };
-use capture::config::{ArmDriver, Camera, Parent, Rig};
+use capture::config::{ArmDriver, Camera, Need, Parent, Rig};
 use capture::open::{self, Devices};
 use capture::{ArmCapture, ArmDuringImage, CalibrationImage, HOLDING, Stop};
 use drivers::motion::OnLoss;
@@ -150,6 +150,16 @@ impl MotionOptions {
         }
         let is_simulated = flags.sim || given.arm.driver == ArmDriver::Sim;
         if !is_simulated {
+            given.require_before_opening(Need::Intrinsics(camera))?;
+            // Without the pose, the motion could lead anywhere.
+            if given_camera.unknown.parent_from_camera {
+                return Err(BadInput(format!(
+                    "camera.{camera}.parent_from_camera is missing: {} plans the motion with it; measure it to about 5 degrees and 25 mm, or calibrate without {}",
+                    Setting::Move,
+                    Setting::Move
+                ))
+                .into());
+            }
             open::motion_of(&given)?;
             open::check_motion(&given)?;
             if !self.is_confirmed {
