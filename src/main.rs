@@ -3,6 +3,8 @@
 mod allocator;
 mod checkpoint_args;
 mod cli;
+#[cfg(test)]
+mod cli_page_tests;
 mod commands;
 mod console;
 mod data_args;
@@ -10,6 +12,8 @@ mod exit;
 mod flag_names;
 #[cfg(test)]
 mod flag_tests;
+#[cfg(test)]
+mod guide_tests;
 mod number_args;
 mod open_gpu;
 mod page_args;
