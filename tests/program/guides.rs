@@ -80,6 +80,7 @@ const ONLY_PARSED: [(&str, &[&str]); 9] = [
         &[
             "calibrate hand-eye my-robot.toml",
             "calibrate intrinsics my-robot.toml",
+            "devices --watch",
             "doctor RIG.toml",
             "doctor my-robot.toml",
             "record RIG.toml",
