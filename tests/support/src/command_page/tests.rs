@@ -1,5 +1,4 @@
 //! Tests of the page with a small program.
-#![expect(dead_code, reason = "only the parser of the program is used")]
 
 use super::{CommandPage, LINE_CHARS, SharedFlags, table, wrapped};
 use clap::{Args, CommandFactory, Parser, Subcommand, ValueEnum};
