@@ -4,7 +4,7 @@
 # them. Without root, they print the command that installs the system packages.
 
 .DEFAULT_GOAL := help
-.PHONY: help demo check-demo test quick test-gpu hil check fuzz deps web cargo packages test-packages check-packages mujoco realsense open-ends \
+.PHONY: help demo check-demo test quick test-gpu hil check docs fuzz deps web cargo packages test-packages check-packages mujoco realsense open-ends \
 	begin-test checks lint lint-without-features doc kernels manifests licenses texts web-check linters test-build test-crates \
 	test-program test-page test-hil
 # Cargo and npm already use all processors, and two runs of apt would block each other.
@@ -95,6 +95,10 @@ lint-without-features: lint
 
 doc: lint
 	@RUSTDOCFLAGS="-D warnings" $(STEP) documentation cargo doc --workspace --no-deps $(TEST_FEATURES)
+
+docs: deps realsense web ## Rewrite docs/reference/cli.md and the table of keys from the source
+	FIELDRIG_WRITE_DOCS=1 cargo test --package fieldrig --bin fieldrig $(TEST_FEATURES) -- cli_page
+	scripts/install-web.sh check && cd viz/web && FIELDRIG_WRITE_DOCS=1 npm run --silent test -- key_page
 
 kernels: deps realsense
 	cargo test --workspace $(TEST_FEATURES) --lib every_kernel_is_valid

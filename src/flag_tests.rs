@@ -119,7 +119,7 @@ const NAMED_WITH_COMMAND: [(&str, Setting, &str); 12] = [
 ];
 
 /// Long flags of a command such as `train` or `bench curve`, and of its subcommands.
-fn flags_of(path: &str) -> BTreeSet<String> {
+pub(crate) fn flags_of(path: &str) -> BTreeSet<String> {
     let cli = Cli::command();
     let command = path.split(' ').fold(&cli, |command, name| {
         command
@@ -166,13 +166,13 @@ fn accepted_in(file: &str) -> Vec<BTreeSet<String>> {
 
 /// A flag in a text, and the text before it.
 #[derive(Clone, Copy, Debug)]
-struct NamedFlag<'a> {
-    name: &'a str,
+pub(crate) struct NamedFlag<'a> {
+    pub(crate) name: &'a str,
     before: &'a str,
 }
 
 /// The flags that a text names, such as `--seconds`.
-fn flags_in(text: &str) -> Vec<NamedFlag<'_>> {
+pub(crate) fn flags_in(text: &str) -> Vec<NamedFlag<'_>> {
     let named = text.match_indices("--").filter_map(|(at, dashes)| {
         let (before, rest) = (&text[..at], &text[at + dashes.len()..]);
         let is_part = |c: char| c.is_ascii_lowercase() || c.is_ascii_digit() || c == '-';
@@ -189,7 +189,7 @@ fn flags_in(text: &str) -> Vec<NamedFlag<'_>> {
 
 /// Whether a text names a command that accepts a flag: as `` `train` ``, `fieldrig train`, or
 /// directly before the flag.
-fn names_a_command_with(text: &str, flag: NamedFlag<'_>) -> bool {
+pub(crate) fn names_a_command_with(text: &str, flag: NamedFlag<'_>) -> bool {
     let is_named = |name: &str| {
         text.contains(&format!("fieldrig {name}"))
             || text.contains(&format!("`{name}`"))
@@ -201,11 +201,10 @@ fn names_a_command_with(text: &str, flag: NamedFlag<'_>) -> bool {
         || commands.any(|name| is_named(name) && flags_of(name).contains(flag.name))
 }
 
-/// Whether a flag belongs to another program that the text names: to cargo, or to nerfstudio.
+/// Whether a flag belongs to another program that the text names: to cargo.
 fn is_of_other_program(text: &str, flag: NamedFlag<'_>) -> bool {
     match flag.name {
         "features" | "release" => text.contains("build"),
-        "skip-colmap" => text.contains("ns-process-data"),
         _ => false,
     }
 }

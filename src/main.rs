@@ -3,6 +3,8 @@
 mod allocator;
 mod checkpoint_args;
 mod cli;
+#[cfg(test)]
+mod cli_page_tests;
 mod commands;
 mod console;
 mod ctrl_c;
@@ -12,6 +14,8 @@ mod exit;
 mod flag_names;
 #[cfg(test)]
 mod flag_tests;
+#[cfg(test)]
+mod guide_tests;
 mod log_file;
 mod number_args;
 mod open_gpu;

@@ -20,6 +20,8 @@ mod end_to_end;
 mod file_cycles;
 mod fk;
 mod gpu_loss;
+#[cfg(feature = "sim")]
+mod guides;
 mod metrics_export;
 mod output;
 mod page_replay;

@@ -2,6 +2,8 @@
 
 mod arm_config;
 mod assumed_lens;
+#[cfg(all(test, feature = "sim"))]
+mod documented_rigs_tests;
 #[cfg(all(feature = "sim", target_os = "linux"))]
 mod emulated;
 mod listening;

@@ -1,10 +1,8 @@
-//! The choice of the simulated scene and robot, and the rig files of README and guides in
-//! simulation.
+//! The choice of the simulated scene and robot.
 
 use super::simulated::unlimited;
-use super::{Devices, use_simulated_devices};
+use super::use_simulated_devices;
 use crate::config::{BaseDriver, Override, Rig};
-use drivers::Sample;
 use sim::Scene;
 use std::path::{Path, PathBuf};
 
@@ -106,61 +104,4 @@ fn base_without_an_arm_moves_in_the_laboratory() {
     let config = unlimited(&rig).expect("a scene");
     assert_eq!(config.scene, Scene::MobileBase);
     assert!(config.robot.is_none());
-}
-
-/// The complete rig files in a page: TOML blocks with an arm and a camera.
-fn rig_files_in(page: &str) -> Vec<String> {
-    let blocks = page.split("```toml\n").skip(1);
-    blocks
-        .filter_map(|block| block.split("```").next())
-        .filter(|block| block.contains("[arm]") && block.contains("[camera."))
-        .map(str::to_owned)
-        .collect()
-}
-
-/// A URDF with the joints `joint1` to `joint6`, as in the guide to CAN arms.
-fn can_arm_urdf() -> String {
-    let mut urdf = include_str!("../../../sim/tests/robots/bench6.urdf").to_owned();
-    for number in 1..=6 {
-        urdf = urdf.replace(
-            &format!("name=\"j{number}\""),
-            &format!("name=\"joint{number}\""),
-        );
-    }
-    urdf
-}
-
-#[test]
-fn rig_files_in_the_documentation_are_simulated() {
-    let folder = tempfile::tempdir().expect("a folder");
-    let robots = folder.path().join("robots");
-    std::fs::create_dir(&robots).expect("a new folder");
-    std::fs::copy(
-        rigs_folder().join("robots/panda.urdf"),
-        robots.join("panda.urdf"),
-    )
-    .expect("copied");
-    std::fs::write(folder.path().join("my-arm.urdf"), can_arm_urdf()).expect("written");
-    let pages = [
-        include_str!("../../../README.md"),
-        include_str!("../../../docs/guide/your-robot.md"),
-    ];
-    let files: Vec<String> = pages.iter().flat_map(|page| rig_files_in(page)).collect();
-    assert!(files.len() >= 4, "{files:?}");
-    for (ix, text) in files.iter().enumerate() {
-        let path = folder.path().join(format!("rig{ix}.toml"));
-        std::fs::write(&path, text).expect("written");
-        let overrides = [
-            Override::new("sim.lockstep", true),
-            Override::new("sim.n_images", 2),
-        ];
-        let rig = Rig::load(&path, &overrides).expect("a good rig file");
-        let mut opened =
-            super::rig(rig, Devices::Sim).unwrap_or_else(|error| panic!("{error:#}: {text}"));
-        let mut n_images = 0;
-        while let Some(sample) = opened.source.next_sample().expect("the rig runs") {
-            n_images += usize::from(matches!(&sample, Sample::Image(image) if !image.is_depth()));
-        }
-        assert!(n_images >= 2, "{text}");
-    }
 }

@@ -40,7 +40,7 @@ static OTHER_FORMATS: [OtherFormat; 7] = [
         name: "a ROS bag",
         members: &["metadata.yaml"],
         extensions: &["bag", "db3"],
-        remedy: "write its images and camera poses as a TUM RGB-D folder, or as transforms.json",
+        remedy: "convert its images and camera poses with scripts/datasets/ros_bag_to_tum.py",
     },
     OtherFormat {
         name: "a COLMAP model",
@@ -52,7 +52,7 @@ static OTHER_FORMATS: [OtherFormat; 7] = [
             "database.db",
         ],
         extensions: &[],
-        remedy: "convert it with `ns-process-data images --skip-colmap` of nerfstudio",
+        remedy: "convert it with scripts/datasets/colmap_to_transforms.py",
     },
     OtherFormat {
         name: "a video without camera poses",
@@ -73,7 +73,7 @@ static OTHER_FORMATS: [OtherFormat; 7] = [
 pub(super) fn hint(path: &Path) -> Option<String> {
     let format = OTHER_FORMATS.iter().find(|format| format.matches(path))?;
     Some(format!(
-        "; it looks like {}: {} (see docs/reference/datasets.md)",
+        "; it looks like {}: {} (see docs/guide/data-from-elsewhere.md)",
         format.name, format.remedy
     ))
 }
@@ -136,10 +136,10 @@ mod tests {
             ),
             ("scan.r3d", "Record3D", "ns-process-data record3d"),
             ("meta/info.json", "LeRobot", "fieldrig record"),
-            ("metadata.yaml", "ROS bag", "TUM RGB-D"),
-            ("day.bag", "ROS bag", "TUM RGB-D"),
-            ("sparse/0/cameras.bin", "COLMAP", "--skip-colmap"),
-            ("cameras.txt", "COLMAP", "--skip-colmap"),
+            ("metadata.yaml", "ROS bag", "ros_bag_to_tum.py"),
+            ("day.bag", "ROS bag", "ros_bag_to_tum.py"),
+            ("sparse/0/cameras.bin", "COLMAP", "colmap_to_transforms.py"),
+            ("cameras.txt", "COLMAP", "colmap_to_transforms.py"),
             ("walk.MP4", "video", "ns-process-data video"),
             ("images/1.jpg", "photos", "ns-process-data images"),
             ("1.JPG", "photos", "ns-process-data images"),
@@ -149,7 +149,8 @@ mod tests {
             assert!(
                 text.contains("expected transforms.json")
                     && text.contains(name)
-                    && text.contains(remedy),
+                    && text.contains(remedy)
+                    && text.contains("docs/guide/data-from-elsewhere.md"),
                 "{file}: {text}"
             );
         }
@@ -168,7 +169,7 @@ mod tests {
 
     #[test]
     fn formats_are_documented() {
-        let page = include_str!("../../../docs/reference/datasets.md");
+        let page = include_str!("../../../docs/guide/data-from-elsewhere.md");
         for format in &OTHER_FORMATS {
             assert!(
                 page.contains(&format!("| {} |", format.name)),

@@ -145,7 +145,10 @@ impl Recording {
         match &self.damage_kind {
             Some(kind) => format!("; it {kind}"),
             None if unused.is_empty() => String::new(),
-            None => format!("; it contains {}", unused.join(", ")),
+            None => format!(
+                "; it contains {} (see docs/guide/data-from-elsewhere.md)",
+                unused.join(", ")
+            ),
         }
     }
 

@@ -1000,7 +1000,7 @@ fn files_without_samples_name_their_contents() {
     let (_, _, refused) = read(&other);
     let refused = refused.expect("no samples");
     assert!(
-        refused.ends_with("recorded by this program; it contains topic \"/scan\", topic \"/tf\""),
+        refused.contains("recorded by this program; it contains topic \"/scan\", topic \"/tf\" (see docs/guide/data"),
         "{refused}"
     );
 }
