@@ -73,7 +73,7 @@ fn follow(next: NextPhotograph, random: &mut Random) -> ([f64; 3], [f64; 3]) {
             [about(0.0, 9.0), about(0.0, 9.0), rotation_z],
         ),
         CoverageGoal::Far => (
-            [about(0.0, 0.1), about(0.0, 0.1), about(0.6, 0.05)],
+            [about(0.0, 0.1), about(0.0, 0.1), about(0.8, 0.08)],
             [about(0.0, 9.0), 0.0, rotation_z],
         ),
         CoverageGoal::Part(part) => {
