@@ -103,7 +103,17 @@ const PRINTED_BY: [(&str, &[&str]); 35] = [
 ];
 
 /// Settings in messages of libraries, where the message names a command that accepts the setting.
-const NAMED_WITH_COMMAND: [(&str, Setting, &str); 12] = [
+const NAMED_WITH_COMMAND: [(&str, Setting, &str); 14] = [
+    (
+        "capture/src/config/required.rs",
+        Setting::Target,
+        "calibrate",
+    ),
+    (
+        "capture/src/config/required.rs",
+        Setting::WriteRig,
+        "calibrate",
+    ),
     ("capture/src/dataset.rs", Setting::Scale, "train"),
     ("capture/src/emulation/mod.rs", Setting::Sim, "run"),
     ("capture/src/found_devices.rs", Setting::Sim, "run"),
