@@ -4,7 +4,7 @@ use std::path::Path;
 use std::process::{Command, Output, Stdio};
 
 /// Commands that `fieldrig --help` must list, each with its own help.
-const COMMANDS: [&str; 15] = [
+const COMMANDS: [&str; 17] = [
     "run",
     "record",
     "train",
@@ -16,8 +16,10 @@ const COMMANDS: [&str; 15] = [
     "calibrate",
     "export",
     "fk",
+    "init",
     "devices",
     "doctor",
+    "schema",
     "sim",
     "move",
 ];

@@ -17,6 +17,7 @@ mod end_to_end;
 mod file_cycles;
 mod fk;
 mod gpu_loss;
+mod init;
 mod metrics_export;
 mod output;
 mod page_replay;
@@ -31,6 +32,7 @@ mod resume;
 mod robot_silhouette;
 #[cfg(feature = "sim")]
 mod run_folder;
+mod schema;
 #[cfg(feature = "sim")]
 mod small_rig;
 #[cfg(feature = "sim")]

@@ -20,10 +20,14 @@ mod motion;
 mod pose;
 mod rig_file;
 mod scanner;
+mod schema;
+#[cfg(test)]
+pub(crate) mod schema_tests;
 mod section;
 mod servo_calibration_file;
 mod servos;
 mod sim;
+mod table_schema;
 #[cfg(test)]
 mod tests;
 mod train;
