@@ -2,8 +2,8 @@
 //! own file.
 
 use crate::commands::{
-    bench, calibrate, devices, doctor, eval, export, fk, metrics, move_arm, preview, record,
-    render, run, runs, sim, train, view,
+    bench, calibrate, devices, doctor, eval, export, fk, init, metrics, move_arm, preview, record,
+    render, run, runs, schema, sim, train, view,
 };
 use crate::exit::Exit;
 use crate::version;
@@ -60,10 +60,14 @@ pub(crate) enum Command {
     Fk(fk::Args),
     /// Measure speed, accuracy, robustness and memory; draws charts
     Bench(bench::Args),
+    /// Find the devices and the robot, and write a first rig file
+    Init(init::Args),
     /// List the connected devices and whether this build can use them
     Devices(devices::Args),
     /// Check GPU, clocks, memory, permissions and devices; print fixes
     Doctor(doctor::Args),
+    /// Print the JSON schema of rig files, for editors
+    Schema(schema::Args),
     /// Emulate the devices of a rig: Franka, UR, CAN motors, servos, UDP, cameras
     Sim(sim::Args),
     /// Move an arm to joint positions, within its limits and under supervision
@@ -100,8 +104,10 @@ impl Command {
             Self::Calibrate(args) => calibrate::run(&args),
             Self::Fk(args) => fk::run(args).map(|()| Exit::Done),
             Self::Bench(args) => bench::run(&args),
+            Self::Init(args) => init::run(&args),
             Self::Devices(args) => devices::run(&args),
             Self::Doctor(args) => doctor::run(&args),
+            Self::Schema(args) => schema::run(&args).map(|()| Exit::Done),
             Self::Sim(args) => sim::run(&args),
             Self::Move(args) => move_arm::run(&args),
         }

@@ -5,6 +5,7 @@ use messages::Setting;
 /// The flag of a setting.
 pub(crate) fn flag(setting: Setting) -> &'static str {
     match setting {
+        Setting::BaseLink => "--base-link",
         Setting::Camera => "--camera",
         Setting::Count => "--count",
         Setting::Crop => "--crop",
@@ -12,6 +13,7 @@ pub(crate) fn flag(setting: Setting) -> &'static str {
         Setting::Disturb => "--disturb",
         Setting::DriftPpm => "--drift-ppm",
         Setting::EnableMotion => "--enable-motion",
+        Setting::FieldOfView => "--fov",
         Setting::FixedMillis => "--fixed-millis",
         Setting::From => "--from",
         Setting::Holdout => "--holdout",
@@ -37,6 +39,7 @@ pub(crate) fn flag(setting: Setting) -> &'static str {
         Setting::Report => "--report",
         Setting::Resume => "--resume",
         Setting::Rig => "--rig",
+        Setting::Robot => "--robot",
         Setting::Samples => "--samples",
         Setting::Scale => "--scale",
         Setting::SaveImages => "--save-images",

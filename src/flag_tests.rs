@@ -14,7 +14,7 @@ use syn::{Attribute, Item, LitStr, Macro, Meta};
 /// Source files or folders, and the commands that print their messages. If a message contains a
 /// flag or setting, all these commands must accept it. The exception is a message that names a
 /// command that accepts the flag.
-const PRINTED_BY: [(&str, &[&str]); 35] = [
+const PRINTED_BY: [(&str, &[&str]); 36] = [
     ("bench/src", &["bench"]),
     (
         "calibration/procedures/src/hand_eye",
@@ -42,6 +42,7 @@ const PRINTED_BY: [(&str, &[&str]); 35] = [
     ),
     ("calibration/procedures/src/scene.rs", &["calibrate scene"]),
     ("calibration/src/hand_eye", &["calibrate hand-eye"]),
+    ("capture/src/init", &["init"]),
     ("capture/src/record.rs", &["record"]),
     ("keyframe/src/error.rs", &["train", "eval", "bench"]),
     ("session/src/camera_path.rs", &["render"]),
@@ -103,7 +104,7 @@ const PRINTED_BY: [(&str, &[&str]); 35] = [
 ];
 
 /// Settings in messages of libraries, where the message names a command that accepts the setting.
-const NAMED_WITH_COMMAND: [(&str, Setting, &str); 14] = [
+const NAMED_WITH_COMMAND: [(&str, Setting, &str); 16] = [
     (
         "capture/src/config/required.rs",
         Setting::Target,
@@ -117,6 +118,8 @@ const NAMED_WITH_COMMAND: [(&str, Setting, &str); 14] = [
     ("capture/src/dataset.rs", Setting::Scale, "train"),
     ("capture/src/emulation/mod.rs", Setting::Sim, "run"),
     ("capture/src/found_devices.rs", Setting::Sim, "run"),
+    ("capture/src/init/rig_text.rs", Setting::Sim, "run"),
+    ("capture/src/init/rig_text.rs", Setting::Target, "calibrate"),
     ("capture/src/open/mod.rs", Setting::Rig, "train"),
     ("capture/src/open/mod.rs", Setting::Sim, "run"),
     ("capture/src/supervised_arm.rs", Setting::Recover, "move"),

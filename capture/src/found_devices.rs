@@ -165,7 +165,7 @@ fn realsense_on_usb(sys: &Path) -> Vec<DeviceInfo> {
 }
 
 #[cfg(not(feature = "realsense"))]
-fn realsense_cameras(sys: &Path) -> Vec<DeviceInfo> {
+pub(crate) fn realsense_cameras(sys: &Path) -> Vec<DeviceInfo> {
     realsense_on_usb(sys)
 }
 

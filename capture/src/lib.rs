@@ -42,6 +42,7 @@ pub mod downscale;
 pub mod emulation;
 mod feed;
 mod found_devices;
+pub mod init;
 mod input_counts;
 mod join;
 pub mod known_robots;

@@ -4,11 +4,12 @@ use std::path::Path;
 use std::process::{Command, Output, Stdio};
 
 /// Commands that `fieldrig --help` must list, each with its own help.
-const COMMANDS: [&str; 16] = [
+const COMMANDS: [&str; 19] = [
     "run",
     "record",
     "train",
     "view",
+    "preview",
     "runs",
     "render",
     "eval",
@@ -17,8 +18,10 @@ const COMMANDS: [&str; 16] = [
     "calibrate",
     "export",
     "fk",
+    "init",
     "devices",
     "doctor",
+    "schema",
     "sim",
     "move",
 ];

@@ -22,6 +22,7 @@ mod fk;
 mod gpu_loss;
 #[cfg(feature = "sim")]
 mod guides;
+mod init;
 mod metrics_export;
 mod output;
 mod page_replay;
@@ -38,6 +39,7 @@ mod robot_silhouette;
 #[cfg(feature = "sim")]
 mod run_folder;
 mod runs;
+mod schema;
 #[cfg(feature = "sim")]
 mod small_rig;
 #[cfg(feature = "sim")]

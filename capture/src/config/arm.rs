@@ -2,14 +2,16 @@
 
 use super::can;
 use super::error::ConfigError;
-use super::key::{Keys, choices, entry, keys};
+use super::key::{Keys, choices, entry, keys, table_of};
 use super::motion::ArmMotion;
 use super::section::Section;
 use super::servos::{self, ArmSerial, ArmServo};
+use super::table_schema::TableSchema;
 use super::urdf_folder::UrdfFolder;
-use crate::known_robots::{BUILTIN_PREFIX, KnownRobot};
+use crate::known_robots::{BUILTIN_PREFIX, KNOWN_ROBOTS, KnownRobot};
 use drivers::can::{BusConfig, MotorConfig};
 use kinematics::Chain;
+use serde_json::json;
 use toml::{Table, Value};
 
 /// Maximum joint offset, rad or m. A larger offset is probably in degrees, or has the wrong sign.
@@ -21,7 +23,8 @@ keys! {
     pub struct Arm {
         /// Source of the joint states.
         pub driver: ArmDriver, required "none, franka, ur, can, feetech, dynamixel, udp or sim";
-        /// Network address of the device; empty if the driver needs none.
+        /// Network address. For `franka` and `ur`, that of the controller. For `udp`, the address on which
+        /// joint states are received.
         pub address: String = String::new();
         /// The URDF text.
         pub urdf_text: String => String::new();
@@ -30,14 +33,13 @@ keys! {
         /// Moving joints in the order of the joint states.
         pub joints: Vec<String> = Vec::new();
         /// Offsets that are added to the joint positions, in the order of `joints`, rad or m. Each
-        /// is from -1 to 1. The list is empty if there are no offsets.
+        /// is from -1 to 1. An empty list means no offsets.
         pub joint_offsets: Vec<f64> = Vec::new();
         /// Settings of a simulated arm.
         pub sim: ArmSim;
         /// Link of the URDF that is the base of the robot.
         pub base_link: String = String::new();
-        /// Link of the URDF to which cameras with the parent
-        /// [`Parent::Flange`](super::Parent::Flange) are attached.
+        /// Link of the URDF to which cameras with the parent `flange` are attached.
         pub flange_link: String = String::new();
         /// Speed limit for all joints when the arm is moved, rad/s or m/s.
         pub max_speed_rad_s: f64 = 0.5, in 0.001..=10.0;
@@ -51,7 +53,7 @@ keys! {
         pub serial: ArmSerial;
         /// Servos on the serial port, in the order of `joints`.
         pub servos: Vec<ArmServo> => Vec::new();
-        /// How the arm may be moved; `None` if it is only read.
+        /// How the arm may be moved. Without this table, it is only read.
         pub motion: Option<ArmMotion>;
     }
 
@@ -59,8 +61,7 @@ keys! {
     #[derive(Clone, Debug, Default, PartialEq)]
     pub struct ArmSim {
         /// Offsets that must be added to the simulated readings to get the true joint positions, in
-        /// the order of `joints`, rad. Each is from -1 to 1. The list is empty if the readings are
-        /// right.
+        /// the order of `joints`, rad. Each is from -1 to 1. An empty list means right readings.
         pub true_joint_offsets: Vec<f64> = Vec::new();
     }
 }
@@ -144,6 +145,22 @@ pub(super) fn read(mut keys: Section<'_>) -> Option<(Arm, String)> {
         arm.flange_link = "base".to_owned();
     }
     Some((arm, urdf.unwrap_or_default()))
+}
+
+/// Schema of the table.
+pub(super) fn schema() -> TableSchema {
+    let mut arm = table_of::<Arm>();
+    let about = "Robot description: path of a URDF file, relative to the rig file, or builtin:NAME of a known robot.";
+    arm.add("urdf", about, urdf_schema());
+    can::describe(&mut arm);
+    servos::describe(&mut arm);
+    arm
+}
+
+/// Schema of the key `urdf`: editors offer the known robots.
+fn urdf_schema() -> serde_json::Value {
+    let known: Vec<String> = KNOWN_ROBOTS.iter().map(KnownRobot::reference).collect();
+    json!({ "type": "string", "examples": known })
 }
 
 /// The known robot that a value of `urdf` names; `None` if the value is a path. An unknown name is

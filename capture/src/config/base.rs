@@ -1,7 +1,8 @@
 //! The keys in `[base]`, and the tags that locate a base.
 
-use super::key::{Keys, choices, entry, keys};
+use super::key::{Keys, choices, entry, keys, table_of};
 use super::section::Section;
+use super::table_schema::TableSchema;
 use drivers::tags::{Family, TagPlacement};
 use kinematics::Transform;
 use std::collections::BTreeMap;
@@ -17,7 +18,7 @@ keys! {
     pub struct Base {
         /// Source of the base pose.
         pub driver: BaseDriver = BaseDriver::Fixed;
-        /// Address on which [`BaseDriver::Udp`] listens.
+        /// Address on which the driver `udp` receives base poses.
         pub address: SocketAddr = DEFAULT_ADDRESS;
         /// Pose of a fixed base; the identity in simulation.
         pub world_from_base: Transform = Transform::identity();
@@ -31,7 +32,7 @@ keys! {
         /// Maximum root mean square orientation error of a measured pose, radians. Poses with a
         /// larger error are discarded.
         pub max_sigma_rad: f64 = 0.03, in 0.0001..=3.2;
-        /// Family of the tags that [`BaseDriver::Tags`] detects.
+        /// Family of the AprilTags.
         pub tag_family: Family = Family::Tag36h11;
         /// Sizes and poses of the tags in the world, by ID.
         pub tags: BTreeMap<u32, TagPlacement> => BTreeMap::new();
@@ -50,7 +51,9 @@ keys! {
 
     /// The keys in `[base.tag.ID]`.
     struct TagKeys {
+        /// Side length of the tag's border, where black meets white, meters.
         size_m: f64, in 0.001..=10.0, required "side length of the tag's border, where black meets white, m";
+        /// Pose of the tag: x to the right of the print, y down, z into it.
         world_from_tag: Transform = Transform::identity();
     }
 }
@@ -76,6 +79,15 @@ choices! {
         Tag36h11 = "tag36h11", Tag25h9 = "tag25h9", Tag16h5 = "tag16h5", Standard41h12 = "tagStandard41h12",
         Standard52h13 = "tagStandard52h13"
     }
+}
+
+/// Schema of the table.
+pub(super) fn schema() -> TableSchema {
+    let mut base = table_of::<Base>();
+    let about =
+        "AprilTags at known places. The name of a table is the ID of its tag: [base.tag.7].";
+    base.named("tag", about, "^[0-9]+$", table_of::<TagKeys>());
+    base
 }
 
 pub(super) fn read(mut keys: Section<'_>) -> Option<Base> {

@@ -1,11 +1,13 @@
 //! The keys in `[camera.NAME]`.
 
-use super::key::{Choice, Keys, choices, entry, keys};
+use super::key::{Choice, Key, Keys, choices, entry, keys, table_of};
 use super::lens::PLACEHOLDER_INTRINSICS;
 use super::section::Section;
+use super::table_schema::TableSchema;
 use drivers::realsense::{Filter, Pace, Stream};
 use drivers::v4l2::{Delivery, V4l2Format};
 use kinematics::{Intrinsics, Stamp, Transform};
+use serde_json::json;
 use std::ops::RangeInclusive;
 use std::path::PathBuf;
 use std::sync::Arc;
@@ -22,17 +24,17 @@ keys! {
         pub name: Arc<str> => "".into();
         /// Driver of the camera.
         pub driver: CameraDriver, required "realsense, v4l2, nokhwa or sim";
-        /// Path or serial number of the camera. It is empty if the driver needs neither.
+        /// Path or serial number of the camera, as `fieldrig devices` prints it.
         pub device: String = String::new();
-        /// Frame rate, Hz.
+        /// Images per second.
         pub rate_hz: f64, in 0.01..=1000.0, required "images per second";
-        /// Exposure time, microseconds, at most one frame period. `None` means automatic exposure.
-        /// The exposure time of each image is then known only if the camera reports it.
-        pub exposure_micros: Option<f64>, in 0.0..=period_micros(rate_hz);
+        /// Exposure time, microseconds, at most one frame period. Without this key, the exposure is
+        /// automatic, and known only if the camera reports it with each image.
+        pub exposure_micros: Option<f64>, in 0.0..=period_micros(rate_hz), within 0.0..=LONGEST_PERIOD_MICROS;
         /// Time from the exposure of the first row to that of the last row, microseconds, at most
-        /// one frame period. It is 0 for a global shutter. `None` if the time is unknown.
-        pub readout_micros: Option<f64>, in 0.0..=period_micros(rate_hz);
-        /// Time that is added to a stamp to get mid-exposure. `None` if the time is unknown.
+        /// one frame period. It is 0 for a global shutter. Without this key, it is unknown.
+        pub readout_micros: Option<f64>, in 0.0..=period_micros(rate_hz), within 0.0..=LONGEST_PERIOD_MICROS;
+        /// Time that is added to a stamp to get mid-exposure. Without this table, it is unknown.
         pub stamp_to_mid_exposure: Option<TimeOffset> as "stamp_to_mid_exposure_millis";
         /// Frame to which the camera is attached.
         pub parent: Parent, required "flange, base or world";
@@ -40,31 +42,31 @@ keys! {
         pub parent_from_camera: Transform = Transform::identity();
         /// Lens and size of the color images.
         pub intrinsics: Intrinsics = PLACEHOLDER_INTRINSICS;
-        /// Covariance of [`Intrinsics::params`], row by row. The list is empty if the covariance is
-        /// unknown.
+        /// Covariance of focal lengths, principal point and distortion coefficients, row by row. An
+        /// empty list means that it is unknown.
         pub intrinsics_covariance: Vec<f64> = Vec::new();
         /// Depth images, if the camera delivers them.
         pub depth: Option<Depth> => None;
         /// Calibration that the rig file omits.
         pub unknown: UnknownCalibration => UnknownCalibration::default();
-        /// Settings of [`CameraDriver::V4l2`] and [`CameraDriver::Nokhwa`].
+        /// Settings of cameras with the driver `v4l2` or `nokhwa`.
         pub v4l2: V4l2;
-        /// Settings of [`CameraDriver::Realsense`].
+        /// Settings of cameras with the driver `realsense`.
         pub realsense: Realsense;
-        /// Imperfections of [`CameraDriver::Sim`].
+        /// Imperfections of a simulated camera.
         pub sim: CameraSim;
     }
 
     /// Settings of a camera with the driver `v4l2`, besides its exposure.
     #[derive(Clone, Debug, PartialEq)]
     pub struct V4l2 {
-        /// Pixel format. `None`: the best available format.
+        /// Pixel format. Without this key, the best available format.
         pub format: Option<V4l2Format>;
-        /// Gain in counts of the camera. `None`: automatic.
+        /// Gain in counts of the camera. Without this key, automatic.
         pub gain: Option<i32>, in CONTROL_RANGE;
-        /// Brightness in counts of the camera. `None`: unchanged.
+        /// Brightness in counts of the camera. Without this key, unchanged.
         pub brightness: Option<i32>, in CONTROL_RANGE;
-        /// Color temperature, kelvin. `None`: automatic.
+        /// Color temperature, kelvin. Without this key, automatic.
         pub white_balance_kelvin: Option<i32>, in 1000..=20_000;
         /// Which of the waiting images is delivered next.
         pub delivery: Delivery = Delivery::Every;
@@ -75,23 +77,23 @@ keys! {
     /// Settings of a camera with the driver `realsense`, besides its exposure.
     #[derive(Clone, Debug, PartialEq)]
     pub struct Realsense {
-        /// Recorded file that is played back instead of a camera; empty for a camera.
+        /// Recorded file that is played back instead of a camera.
         pub file: PathBuf = PathBuf::new();
         /// Speed and stamps of the playback.
         pub pace: Pace = Pace::default();
-        /// Offset added to the stamps of the file with [`Pace::Clock`], nanoseconds.
+        /// Offset added to the stamps of the file with the pace `clock`, nanoseconds.
         pub clock_offset_nanos: i64 = 0, in -i64::MAX..=i64::MAX;
         /// Stream of the images that are not depth.
         pub stream: Stream = Stream::default();
-        /// Gain in counts of the camera. `None`: automatic.
+        /// Gain in counts of the camera. Without this key, automatic.
         pub gain: Option<i32>, in CONTROL_RANGE;
-        /// Brightness in counts of the camera. `None`: unchanged.
+        /// Brightness in counts of the camera. Without this key, unchanged.
         pub brightness: Option<i32>, in CONTROL_RANGE;
-        /// Color temperature, kelvin. `None`: automatic.
+        /// Color temperature, kelvin. Without this key, automatic.
         pub white_balance_kelvin: Option<i32>, in 1000..=20_000;
-        /// Name of a preset of the depth camera. `None`: unchanged.
+        /// Name of a preset of the depth camera. Without this key, unchanged.
         pub preset: Option<String>;
-        /// Power of the projector or laser in units of the camera. `None`: unchanged.
+        /// Power of the projector or laser in units of the camera. Without this key, unchanged.
         pub laser_power: Option<f64>, in 0.0..=1000.0;
         /// Depth filters in the order of their application, without duplicates.
         pub filters: Vec<Filter> = Vec::new();
@@ -106,15 +108,14 @@ keys! {
         pub value_millis: f64 as "value", in -1000.0..=1000.0, required "milliseconds from the stamp to mid-exposure";
         /// Standard deviation of the value, milliseconds.
         pub sigma_millis: f64 as "sigma" = 0.0, in 0.0..=1000.0;
-        /// Description of how the offset was measured; may be empty.
+        /// Description of how the offset was measured.
         pub source: String = String::new();
     }
 
     /// Depth images of a camera.
     #[derive(Clone, Debug, PartialEq)]
     pub struct Depth {
-        /// Device of the depth images with the driver `v4l2`. It is empty if the driver needs no
-        /// such device.
+        /// Device of the depth images with the driver `v4l2`.
         pub device: String = String::new();
         /// Meters per count if the device does not report it.
         pub meters_per_count: Option<f64>, in 1e-6..=0.1;
@@ -127,7 +128,7 @@ keys! {
         /// Minimum depth after scaling, meters. Smaller readings are discarded.
         pub min_m: f64 = 0.1, in 0.0..=100.0;
         /// Maximum depth after scaling, meters. Larger readings are discarded.
-        pub max_m: f64 = 6.0, in min_m..=1000.0;
+        pub max_m: f64 = 6.0, in min_m..=1000.0, within 0.0..=1000.0;
     }
 
     /// Errors of a simulated camera.
@@ -160,7 +161,7 @@ keys! {
     /// rig file is true.
     #[derive(Clone, Debug, Default, PartialEq)]
     pub struct CameraTruth {
-        /// True [`Camera::parent_from_camera`].
+        /// True `parent_from_camera`.
         pub parent_from_camera: Option<Transform>;
         /// True lens of the color images. The size of the images is that of the rig file.
         pub intrinsics: Option<Intrinsics>;
@@ -168,11 +169,11 @@ keys! {
         pub stamp_to_mid_exposure_millis: f64 = 0.0, in -1000.0..=1000.0;
         /// Rate error of the clock that stamps the images, parts per million.
         pub clock_drift_ppm: f64 = 0.0, in -10_000.0..=10_000.0;
-        /// True [`Camera::readout_micros`].
+        /// True `readout_micros`.
         pub readout_micros: Option<f64>, in 0.0..=1e6;
-        /// True [`Depth::camera_from_depth`].
+        /// True `depth.camera_from_depth`.
         pub camera_from_depth: Option<Transform>;
-        /// True [`Depth::factor`].
+        /// True `depth.factor`.
         pub depth_factor: f64 = 1.0, in 0.5..=2.0;
     }
 }
@@ -245,9 +246,31 @@ impl Choice for V4l2Format {
     const NAMES: &'static [(&'static str, Self)] = &Self::COLOR_FORMATS;
 }
 
+/// The time from one image to the next at the lowest frame rate.
+const LONGEST_PERIOD_MICROS: f64 = 1e8;
+
 /// The time from one image to the next at this frame rate.
 fn period_micros(rate_hz: Option<f64>) -> f64 {
     1e6 / rate_hz.unwrap_or(1.0)
+}
+
+/// Schema of the table of a camera.
+pub(super) fn schema() -> TableSchema {
+    let mut camera = table_of::<Camera>();
+    let mut depth = table_of::<Depth>();
+    for (table, images) in [(&mut camera, "color images"), (&mut depth, "depth images")] {
+        let about = format!("Width and height of the {images}, pixels.");
+        table.add("size_px", &about, <[u32; 2]>::schema(()));
+        let about = format!("Whether the {images} are already undistorted.");
+        table.add_with_default("rectified", &about, bool::schema(()), false.write());
+        let about =
+            format!("Lens of the {images}: a table, or the path of a camera info file of ROS.");
+        let alternatives = json!({ "anyOf": [Intrinsics::schema(()), String::schema(())] });
+        table.add("intrinsics", &about, alternatives);
+    }
+    camera.require("size_px");
+    camera.table("depth", "Depth images of the camera.", depth);
+    camera
 }
 
 pub(super) fn read(name: &str, mut keys: Section<'_>) -> Option<Camera> {

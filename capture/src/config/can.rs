@@ -1,12 +1,15 @@
 //! The keys of arms on CAN buses: `[arm.bus.NAME]` and `[arm.motor.NAME]`.
 
-use super::key::{Key, Keys, entry, keys};
+use super::key::{Key, Keys, entry, keys, table_of};
 use super::section::Section;
+use super::table_schema::TableSchema;
 use drivers::can::{
     AllowedValues, BusConfig, FAMILIES, FollowingLimits, Gains, MotorConfig, MotorFamily, MotorKey,
     MotorProtocol, MotorSettings, SettingValue,
 };
+use serde_json::json;
 use std::collections::BTreeMap;
+use std::ops::RangeInclusive;
 use std::sync::Arc;
 use toml::{Table, Value};
 
@@ -16,28 +19,43 @@ const MAX_INTERFACE_BYTES: usize = 15;
 keys! {
     /// The keys of a bus.
     struct BusKeys {
+        /// Nominal bit rate, bit/s. The interface must be configured for this rate.
         bitrate_hz: u32 = 1_000_000, in 10_000..=1_000_000;
+        /// Bit rate of the data phase of CAN FD frames, bit/s. Without this key, classic CAN.
         data_bitrate_hz: Option<u32>, in 10_000..=8_000_000;
+        /// Whether an interface without `restart-ms` is accepted.
         accept_no_restart: bool = false;
     }
 
     /// The keys of every motor. The motor's family adds further keys.
     struct MotorKeys {
+        /// Motor protocol.
         family: &'static dyn MotorFamily, required family_names();
+        /// Interface to which the motor is connected. It has a table [arm.bus.NAME].
         bus: String, required "interface of the motor, which has a table [arm.bus.NAME]";
-        id: u64, in family.map_or(0..=u64::MAX, MotorFamily::ids), required "ID of the motor, axis or node";
-        /// Ratios outside this range are considered typing errors.
+        /// CAN ID of the motor, axis or node.
+        id: u64, in family.map_or(0..=u64::MAX, MotorFamily::ids), within all_ids(), required "ID of the motor, axis or node";
+        /// Revolutions that the motor reports per revolution of the joint.
         gear_ratio: f64 = 1.0, in 0.001..=10_000.0;
+        /// Whether the motor turns opposite to the joint.
         reversed: bool = false;
+        /// Joint angle at which the motor reports 0, radians.
         offset_rad: f64 = 0.0, in -100.0..=100.0;
+        /// Largest allowed difference between the commanded and the reported position of the joint,
+        /// rad or m. If the difference is larger, a moved arm stops.
         max_following_error_rad: f64 = FollowingLimits::default().max_error_rad, in 0.001..=10.0;
+        /// Largest allowed torque or force at the joint, N m or N. Without this key, the effort limit
+        /// in the URDF.
         max_effort_nm: Option<f64>, in 0.01..=1e6;
+        /// Whether following error and effort are not checked.
         accept_following_errors: bool = false;
     }
 
     /// The gains of motors whose commands include them. Either both keys or none must be set.
     struct GainKeys {
+        /// Position gain at the joint, N m/rad.
         stiffness_nm_rad: Option<f64>, in 0.0..=1e6;
+        /// Velocity gain at the joint, N m s/rad.
         damping_nm_s_rad: Option<f64>, in 0.0..=1e5;
     }
 }
@@ -51,6 +69,63 @@ impl Key for &'static dyn MotorFamily {
 
     fn write(&self) -> Option<Value> {
         Some(self.name().into())
+    }
+
+    fn schema((): ()) -> serde_json::Value {
+        let names: Vec<_> = FAMILIES.iter().map(|family| family.name()).collect();
+        json!({ "type": "string", "enum": names })
+    }
+}
+
+/// IDs that a motor of some family can have.
+fn all_ids() -> RangeInclusive<u64> {
+    let ids = || FAMILIES.iter().map(|family| family.ids());
+    let first = ids().map(|ids| *ids.start()).min().unwrap_or(0);
+    let last = ids().map(|ids| *ids.end()).max().unwrap_or(0);
+    first..=last
+}
+
+/// Adds buses and motors to the schema of the arm.
+pub(super) fn describe(arm: &mut TableSchema) {
+    let about =
+        "CAN buses of the motors. The name of a table is the interface, such as [arm.bus.can0].";
+    let bus = table_of::<BusKeys>();
+    arm.named("bus", about, "^[^/\\s]{1,15}$", bus);
+    let mut motor = table_of::<MotorKeys>();
+    GainKeys::describe(&mut motor);
+    for family in FAMILIES {
+        describe_family(*family, &mut motor);
+    }
+    let about = "Motors on the CAN buses. The name of a table is the joint of its motor.";
+    arm.named("motor", about, "", motor);
+}
+
+/// Adds the keys of a family to the schema of motors, with a rule for motors of this family.
+fn describe_family(family: &dyn MotorFamily, motor: &mut TableSchema) {
+    let mut values = serde_json::Map::new();
+    values.insert("id".to_owned(), u64::schema(family.ids()));
+    let mut required = Vec::new();
+    for key in family.keys() {
+        let about = match key.required {
+            Some(meaning) => format!("Required for {} motors: {meaning}.", family.title()),
+            None => format!("Optional for {} motors.", family.title()),
+        };
+        // Families may have keys of the same name with other values, so the values are in the rule.
+        motor.add(key.name, &about, json!({}));
+        values.insert(key.name.to_owned(), allowed_schema(&key.allowed));
+        required.extend(key.required.map(|_| key.name));
+    }
+    motor.condition(json!({
+        "if": { "properties": { "family": { "const": family.name() } }, "required": ["family"] },
+        "then": { "properties": values, "required": required },
+    }));
+}
+
+fn allowed_schema(allowed: &AllowedValues) -> serde_json::Value {
+    match allowed {
+        AllowedValues::Whole(range) => u64::schema(range.clone()),
+        AllowedValues::Number(range) => f64::schema(range.clone()),
+        AllowedValues::Words(words) => json!({ "type": "string", "enum": words }),
     }
 }
 

@@ -6,8 +6,8 @@ keys! {
     /// Which images become keyframes, and how many are kept.
     #[derive(Clone, Debug, PartialEq)]
     pub struct JoinConfig {
-        /// Number of keyframes with which training starts; `None` for
-        /// [`Self::start_keyframes_or_default`].
+        /// Number of keyframes with which training starts. Without this key, 1 in real time with depth,
+        /// otherwise 5.
         pub start_keyframes: Option<usize>, in 1..=100_000;
         /// Maximum number of keyframes in the store.
         pub max_keyframes: usize = 400, in 8..=1_000_000;

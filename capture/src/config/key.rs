@@ -6,6 +6,8 @@
 //! correct key as missing.
 
 use super::section::Section;
+use super::table_schema::{TableSchema, one_or_more};
+use serde_json::json;
 use std::borrow::Cow;
 use std::net::SocketAddr;
 use std::ops::RangeInclusive;
@@ -23,6 +25,9 @@ pub(super) trait Key: Sized {
 
     /// The value in a rig file; `None` if the key is omitted.
     fn write(&self) -> Option<Value>;
+
+    /// JSON schema of the allowed values.
+    fn schema(limits: Self::Limits) -> serde_json::Value;
 }
 
 /// A type that has a value for any absent key.
@@ -39,6 +44,9 @@ pub(super) trait Keys: Sized {
 
     /// Writes the fields to a table.
     fn write_keys(&self) -> Table;
+
+    /// Adds the keys to the schema of a table.
+    fn describe(table: &mut TableSchema);
 }
 
 /// A type whose values have names in rig files, defined by [`choices!`].
@@ -64,14 +72,18 @@ pub(super) use choices;
 /// read and write its key:
 ///
 /// ```text
-/// pub name: Type as "key" = default, in limits, required "meaning" => initial;
+/// /// Description of the key
+/// pub name: Type as "key" = default, in limits, within widest, required "meaning" => initial;
 /// ```
 ///
+/// - The documentation of the field is also the description of the key in the JSON schema of rig
+///   files. It is therefore written for users of rig files.
 /// - `as "key"`: the key, if it differs from the name of the field.
 /// - `= default`: the value if the key is absent. The default may use earlier fields. Without a
 ///   default, the key must be required, or its type must be [`Optional`].
 /// - `in limits`: the allowed values, [`Key::Limits`]. The limits may use earlier fields. An
 ///   earlier field without a default is an option.
+/// - `within widest`: the union of all limits, if the limits use earlier fields.
 /// - `required "meaning"`: an absent key is reported, with its meaning.
 /// - `=> initial`: the field is not a key. The code that reads the struct sets the field
 ///   afterwards.
@@ -79,15 +91,16 @@ macro_rules! keys {
     ($(
         $(#[$attribute:meta])*
         $vis:vis struct $Name:ident {$(
-            $(#[$field_attribute:meta])*
+            $(#[doc = $about:literal])*
             $field_vis:vis $field:ident: $Type:ty
-                $(as $key:literal)? $(= $default:expr)? $(, in $limits:expr)? $(, required $meaning:expr)?
+                $(as $key:literal)? $(= $default:expr)? $(, in $limits:expr)? $(, within $widest:expr)?
+                $(, required $meaning:expr)?
                 $(=> $initial:expr)?;
         )*}
     )*) => {$(
         $(#[$attribute])*
         $vis struct $Name {$(
-            $(#[$field_attribute])*
+            $(#[doc = $about])*
             $(#[doc = concat!("\n\nDefault: `", stringify!($default), "`.")])?
             $(#[doc = concat!("\n\nAllowed: `", stringify!($limits), "`.")])?
             $field_vis $field: $Type,
@@ -107,6 +120,16 @@ macro_rules! keys {
                 $(keys!(@write table, keys!(@key $field $($key)?), &self.$field $(, initial $initial)?);)*
                 table
             }
+
+            fn describe(table: &mut $crate::config::table_schema::TableSchema) {
+                $(
+                    // Defaults may use earlier fields. The widest limits may not.
+                    let $field = keys!(@describe table, $Type, keys!(@key $field $($key)?), concat!($($about, "\n"),*),
+                        keys!(@widest $($limits)?; $($widest)?)
+                        $(, default $default)? $(, required $meaning)? $(, initial $initial)?);
+                    let _ = &$field;
+                )*
+            }
         }
 
         impl $crate::config::key::Key for $Name {
@@ -118,6 +141,10 @@ macro_rules! keys {
 
             fn write(&self) -> Option<toml::Value> {
                 Some(toml::Value::Table($crate::config::key::Keys::write_keys(self)))
+            }
+
+            fn schema((): ()) -> serde_json::Value {
+                $crate::config::key::table_of::<Self>().into_json()
             }
         }
 
@@ -143,8 +170,43 @@ macro_rules! keys {
     (@value $field:ident, $with:ident $value:expr) => { $field };
     (@write $table:ident, $key:expr, $value:expr) => { $table.extend($crate::config::key::entry($key, $value)) };
     (@write $table:ident, $key:expr, $value:expr, initial $initial:expr) => {};
+    (@widest ;) => { () };
+    (@widest $limits:expr;) => { $limits };
+    (@widest $limits:expr; $widest:expr) => { $widest };
+    (@describe $table:ident, $Type:ty, $key:expr, $about:expr, $limits:expr) => {{
+        // A function cannot use earlier fields.
+        fn limits() -> <$Type as $crate::config::key::Key>::Limits { $limits }
+        $table.add($key, $about, <$Type as $crate::config::key::Key>::schema(limits()));
+        None::<$Type>
+    }};
+    (@describe $table:ident, $Type:ty, $key:expr, $about:expr, $limits:expr, default $default:expr) => {{
+        fn limits() -> <$Type as $crate::config::key::Key>::Limits { $limits }
+        let default: $Type = $default;
+        $table.add_with_default(
+            $key,
+            $about,
+            <$Type as $crate::config::key::Key>::schema(limits()),
+            $crate::config::key::Key::write(&default),
+        );
+        default
+    }};
+    (@describe $table:ident, $Type:ty, $key:expr, $about:expr, $limits:expr, required $meaning:expr) => {{
+        $table.require($key);
+        keys!(@describe $table, $Type, $key, $about, $limits)
+    }};
+    (@describe $table:ident, $Type:ty, $key:expr, $about:expr, $limits:expr, initial $initial:expr) => {{
+        let initial: $Type = $initial;
+        initial
+    }};
 }
 pub(super) use keys;
+
+/// Schema of the table whose keys are the fields of a struct.
+pub(super) fn table_of<T: Keys>() -> TableSchema {
+    let mut table = TableSchema::default();
+    T::describe(&mut table);
+    table
+}
 
 /// The key with its value, unless it is omitted.
 pub(super) fn entry(key: &str, value: &impl Key) -> Option<(String, Value)> {
@@ -198,6 +260,10 @@ impl<T: Key> Key for Option<T> {
     fn write(&self) -> Option<Value> {
         self.as_ref().and_then(T::write)
     }
+
+    fn schema(limits: T::Limits) -> serde_json::Value {
+        T::schema(limits)
+    }
 }
 
 impl<T: Key> Optional for Option<T> {
@@ -225,6 +291,10 @@ impl Key for f64 {
 
     fn write(&self) -> Option<Value> {
         Some((*self).into())
+    }
+
+    fn schema(limits: Self::Limits) -> serde_json::Value {
+        json!({ "type": "number", "minimum": limits.start(), "maximum": limits.end() })
     }
 }
 
@@ -262,6 +332,10 @@ impl<const N: usize> Key for [f64; N] {
     fn write(&self) -> Option<Value> {
         Some(self.to_vec().into())
     }
+
+    fn schema(limits: Self::Limits) -> serde_json::Value {
+        json!({ "type": "array", "items": f64::schema(limits), "minItems": N, "maxItems": N })
+    }
 }
 
 impl Key for Vec<f64> {
@@ -277,6 +351,10 @@ impl Key for Vec<f64> {
 
     fn write(&self) -> Option<Value> {
         Some(self.clone().into())
+    }
+
+    fn schema((): ()) -> serde_json::Value {
+        json!({ "type": "array", "items": { "type": "number" } })
     }
 }
 
@@ -300,13 +378,17 @@ macro_rules! whole_number {
                 // Rig files contain no larger numbers.
                 Some(i64::try_from(*self).unwrap_or(i64::MAX).into())
             }
+
+            fn schema(limits: Self::Limits) -> serde_json::Value {
+                json!({ "type": "integer", "minimum": limits.start(), "maximum": limits.end() })
+            }
         }
     )*};
 }
 whole_number!(u8, u16, u32, u64, usize, i32, i64);
 
 macro_rules! plain {
-    ($($Type:ty: $allowed:literal,)*) => {$(
+    ($($Type:ty: $allowed:literal, $schema:tt;)*) => {$(
         impl Key for $Type {
             type Limits = ();
 
@@ -317,15 +399,19 @@ macro_rules! plain {
             fn write(&self) -> Option<Value> {
                 Value::try_from(self).ok()
             }
+
+            fn schema((): ()) -> serde_json::Value {
+                json!($schema)
+            }
         }
     )*};
 }
 plain! {
-    bool: "true or false",
-    String: "text in quotes",
-    PathBuf: "a path in quotes",
-    Vec<String>: "a list of strings in quotes",
-    SocketAddr: "an IP address and a port in quotes, such as \"127.0.0.1:7010\"",
+    bool: "true or false", { "type": "boolean" };
+    String: "text in quotes", { "type": "string" };
+    PathBuf: "a path in quotes", { "type": "string" };
+    Vec<String>: "a list of strings in quotes", { "type": "array", "items": { "type": "string" } };
+    SocketAddr: "an IP address and a port in quotes, such as \"127.0.0.1:7010\"", { "type": "string", "pattern": ":[0-9]+$" };
 }
 
 impl<T: Choice> Key for T {
@@ -340,6 +426,11 @@ impl<T: Choice> Key for T {
             .iter()
             .find(|(_, choice)| choice == self)
             .map(|(name, _)| (*name).into())
+    }
+
+    fn schema((): ()) -> serde_json::Value {
+        let names: Vec<_> = T::NAMES.iter().map(|(name, _)| *name).collect();
+        json!({ "type": "string", "enum": names })
     }
 }
 
@@ -377,6 +468,10 @@ impl<T: Choice> Key for Vec<T> {
 
     fn write(&self) -> Option<Value> {
         Some(Value::Array(self.iter().filter_map(T::write).collect()))
+    }
+
+    fn schema((): ()) -> serde_json::Value {
+        json!({ "anyOf": one_or_more(&T::schema(()), 0) })
     }
 }
 

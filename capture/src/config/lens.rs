@@ -4,6 +4,7 @@ use super::key::{Key, choices, keys};
 use super::pose::MAX_COORDINATE;
 use super::section::Section;
 use kinematics::{Intrinsics, Lens};
+use serde_json::json;
 use toml::Value;
 
 /// Placeholder until the camera reports its intrinsics. It is also used in a rig with missing keys,
@@ -19,10 +20,15 @@ pub(super) const PLACEHOLDER_INTRINSICS: Intrinsics = Intrinsics {
 keys! {
     /// The keys in tables named `intrinsics`.
     struct LensKeys {
+        /// Focal lengths along x and y, pixels.
         focal_px: [f64; 2], in 1.0..=1e6, required "focal length along x and y in pixels";
+        /// Principal point, pixels; the center of the first pixel is (0.5, 0.5).
         principal_px: [f64; 2], in -MAX_COORDINATE..=3.0 * MAX_COORDINATE,
             required "principal point in pixels; the center of the first pixel is (0.5, 0.5)";
+        /// Lens model.
         lens: LensModel = LensModel::Pinhole;
+        /// Distortion coefficients in the order of OpenCV: k1, k2, p1, p2, k3 and optionally k4, k5,
+        /// k6 for brown_conrady; k1, k2, k3, k4 for kannala_brandt; none for a pinhole.
         distortion: Vec<f64> = Vec::new();
     }
 }
@@ -108,6 +114,10 @@ impl Key for Intrinsics {
         }
         .write()
     }
+
+    fn schema((): ()) -> serde_json::Value {
+        LensKeys::schema(())
+    }
 }
 
 /// Width and height in pixels.
@@ -129,5 +139,10 @@ impl Key for [u32; 2] {
 
     fn write(&self) -> Option<Value> {
         Some(self.map(i64::from).to_vec().into())
+    }
+
+    fn schema((): ()) -> serde_json::Value {
+        let side = u32::schema(8..=16384);
+        json!({ "type": "array", "items": side, "minItems": 2, "maxItems": 2 })
     }
 }

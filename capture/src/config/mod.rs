@@ -21,10 +21,14 @@ mod pose;
 mod required;
 mod rig_file;
 mod scanner;
+mod schema;
+#[cfg(test)]
+pub(crate) mod schema_tests;
 mod section;
 mod servo_calibration_file;
 mod servos;
 mod sim;
+mod table_schema;
 #[cfg(test)]
 mod tests;
 mod train;

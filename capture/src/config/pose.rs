@@ -15,7 +15,9 @@ const UNIT_NORM_TOLERANCE: f64 = 1e-12;
 keys! {
     /// The keys of a pose.
     struct PoseKeys {
+        /// Position, meters.
         xyz_m: [f64; 3] = [0.0; 3], in -MAX_COORDINATE..=MAX_COORDINATE;
+        /// Orientation as a unit quaternion. Its real part comes last.
         quat_xyzw: [f64; 4] = [0.0, 0.0, 0.0, 1.0], in -1.001..=1.001;
     }
 }
@@ -55,5 +57,9 @@ impl Key for Transform {
             quat_xyzw: coords.into(),
         }
         .write()
+    }
+
+    fn schema((): ()) -> serde_json::Value {
+        PoseKeys::schema(())
     }
 }

@@ -1,7 +1,8 @@
 //! The keys in `[range.NAME]`.
 
-use super::key::{Keys, choices, keys};
+use super::key::{Keys, choices, keys, table_of};
 use super::section::Section;
+use super::table_schema::TableSchema;
 use kinematics::Transform;
 use std::net::{IpAddr, Ipv4Addr, SocketAddr};
 use std::sync::Arc;
@@ -17,7 +18,7 @@ keys! {
         pub name: Arc<str> => "".into();
         /// Source of the scans.
         pub driver: ScannerDriver, required "udp or sim";
-        /// Address on which [`ScannerDriver::Udp`] listens.
+        /// Address on which the driver `udp` receives scans.
         pub address: SocketAddr = DEFAULT_ADDRESS;
         /// Rotations per second.
         pub rate_hz: f64 = 10.0, in 0.1..=50.0;
@@ -26,7 +27,7 @@ keys! {
         /// Shorter ranges are discarded, meters.
         pub min_m: f64 = 0.4, in 0.0..=100.0;
         /// Longer ranges are discarded, meters.
-        pub max_m: f64 = min_m.max(50.0), in min_m..=1000.0;
+        pub max_m: f64 = min_m.max(50.0), in min_m..=1000.0, within 0.0..=1000.0;
         /// Scan pattern and errors in simulation.
         pub sim: ScannerSim;
     }
@@ -41,7 +42,7 @@ keys! {
         /// Elevation of the lowest ring, radians.
         pub min_elevation_rad: f64 = -0.2618, in -1.57..=1.57;
         /// Elevation of the highest ring, radians.
-        pub max_elevation_rad: f64 = min_elevation_rad.max(0.2618), in min_elevation_rad..=1.57;
+        pub max_elevation_rad: f64 = min_elevation_rad.max(0.2618), in min_elevation_rad..=1.57, within -1.57..=1.57;
         /// Standard deviation of the range, meters.
         pub noise_sigma_m: f64 = 0.02, in 0.0..=1.0;
         /// Fraction of returns that are lost.
@@ -60,6 +61,11 @@ pub enum ScannerDriver {
 
 choices! {
     ScannerDriver { Udp = "udp", Sim = "sim" }
+}
+
+/// Schema of the table of a scanner.
+pub(super) fn schema() -> TableSchema {
+    table_of::<Scanner>()
 }
 
 pub(super) fn read(name: &str, mut keys: Section<'_>) -> Option<Scanner> {

@@ -1,8 +1,9 @@
 //! The keys of arms with servos on a serial bus: `[arm.serial]` and `[arm.servo.NAME]`.
 
 use super::error::ConfigError;
-use super::key::{Keys, keys};
+use super::key::{Keys, keys, table_of};
 use super::section::Section;
+use super::table_schema::TableSchema;
 use drivers::can::FollowingLimits;
 use toml::{Table, Value};
 
@@ -13,25 +14,30 @@ keys! {
     /// The serial port of an arm with servos.
     #[derive(Clone, Debug, PartialEq)]
     pub struct ArmSerial {
-        /// Path of the port; empty if the arm has none.
+        /// Path of the port, preferably in /dev/serial/by-id.
         pub device: String = String::new();
         /// Baud rate, bit/s.
         pub baud_hz: u32 = 1_000_000, in 9_600..=4_500_000;
         /// Time in which a disconnected arm must reconnect, seconds.
         pub reconnect_secs: f64 = 30.0, in 0.0..=86_400.0;
-        /// Calibration file of LeRobot. Its values are copied to the servos when a rig file is
-        /// loaded, so the loaded rig has no such file.
+        /// Calibration file of LeRobot, which gives `id` and `zero_counts` of the servos.
         pub calibration: Option<String>;
     }
 
     /// The keys of a servo.
     struct ServoKeys {
+        /// ID of the servo on the bus.
         id: u8, in 0..=252, required "ID of the servo on the bus";
+        /// Position that the servo reports at joint angle 0, in counts of 1/4096 revolution.
         zero_counts: i32 = MIDDLE_COUNTS, in -1_048_576..=1_048_576;
+        /// Whether the servo turns opposite to the joint.
         reversed: bool = false;
-        /// Ratios outside this range are considered typing errors.
+        /// Revolutions of the servo per revolution of the joint.
         gear_ratio: f64 = 1.0, in 0.001..=10_000.0;
+        /// Largest allowed difference between the commanded and the reported position of the joint,
+        /// rad or m. If the difference is larger, a moved arm stops.
         max_following_error_rad: f64 = FollowingLimits::default().max_error_rad, in 0.001..=10.0;
+        /// Whether the following error is not checked.
         accept_following_errors: bool = false;
     }
 }
@@ -51,6 +57,15 @@ pub struct ArmServo {
     pub gear_ratio: f64,
     /// Following limits of the joint.
     pub following: FollowingLimits,
+}
+
+/// Adds the servos to the schema of the arm.
+pub(super) fn describe(arm: &mut TableSchema) {
+    let mut servo = table_of::<ServoKeys>();
+    // A calibration file may give the ID.
+    servo.accept_absent("id");
+    let about = "Servos on the serial port. The name of a table is the joint of its servo.";
+    arm.named("servo", about, "", servo);
 }
 
 /// Reads the servos, ordered by name.

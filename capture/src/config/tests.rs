@@ -6,7 +6,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::path::Path;
 use toml::Value;
 
-const URDF: &str = r#"<robot name="two"><link name="a"/><link name="b"/><link name="c"/><link name="tool"/>
+pub(super) const URDF: &str = r#"<robot name="two"><link name="a"/><link name="b"/><link name="c"/><link name="tool"/>
 <joint name="j1" type="revolute"><parent link="a"/><child link="b"/><axis xyz="0 0 1"/>
 <limit lower="-1" upper="1" effort="1" velocity="1"/></joint>
 <joint name="j2" type="revolute"><parent link="b"/><child link="c"/><axis xyz="0 1 0"/>
@@ -14,7 +14,7 @@ const URDF: &str = r#"<robot name="two"><link name="a"/><link name="b"/><link na
 <joint name="fix" type="fixed"><parent link="c"/><child link="tool"/></joint></robot>"#;
 
 /// A rig file with every table, so that each key can be changed separately.
-const RIG: &str = r#"
+pub(super) const RIG: &str = r#"
 [arm]
 driver = "sim"
 urdf = "two.urdf"
@@ -86,7 +86,7 @@ fn with(key: &'static str, value: &str) -> Result<Rig, ConfigError> {
 }
 
 /// Key, a valid value that differs from the current one, and an invalid value.
-const KEYS: &[(&str, &str, &str)] = &[
+pub(super) const KEYS: &[(&str, &str, &str)] = &[
     ("arm.rate_hz", "500", "0"),
     ("arm.bus.can0.bitrate_hz", "500_000", "1"),
     ("arm.bus.can0.data_bitrate_hz", "5_000_000", "9_000_000"),
@@ -555,7 +555,7 @@ fn documentation_lists_exactly_the_existing_keys() {
 }
 
 /// An effective rig file, which has every table.
-fn full() -> String {
+pub(super) fn full() -> String {
     let measured = Override::new("base.world_from_base.xyz_m", Value::from(vec![0.0; 3]));
     parse(RIG, &[measured]).expect("a good rig file").to_toml()
 }

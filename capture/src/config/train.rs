@@ -3,6 +3,8 @@
 use super::error::{ConfigError, SourceLocation};
 use super::key::{Key, Optional, distinct, keys};
 use super::section::Section;
+use super::table_schema::one_or_more;
+use serde_json::json;
 use std::ops::RangeInclusive;
 use toml::Value;
 
@@ -21,13 +23,13 @@ keys! {
     /// How the model is trained.
     #[derive(Clone, Debug, PartialEq)]
     pub struct Train {
-        /// Names of the scene models to train. [`Methods::resolve`] checks them.
+        /// Scene model to train, or a list of models that are trained at once.
         pub methods: Methods as "method";
-        /// Maximum number of splats. `None`: the trainer's default.
+        /// Maximum number of splats. Without this key, the method's default.
         pub max_splats: Option<u64>, in MAX_SPLATS_RANGE;
-        /// Maximum GPU memory of the model, bytes. `None`: unlimited.
+        /// Maximum GPU memory of the model, bytes. Without this key, unlimited.
         pub max_bytes: Option<u64>, in MAX_BYTES_RANGE;
-        /// Random seed.
+        /// Random seed of training.
         pub seed: u64 = DEFAULT_SEED, in SEED_RANGE;
         /// Maximum degree of the spherical harmonics.
         pub sh_degree: u32 = 3, in 0..=3;
@@ -116,6 +118,10 @@ impl Key for Methods {
             [one] => one.write(),
             _ => self.names.write(),
         }
+    }
+
+    fn schema((): ()) -> serde_json::Value {
+        json!({ "anyOf": one_or_more(&String::schema(()), 1) })
     }
 }
 

@@ -43,6 +43,16 @@ pub trait MotorFamily: Debug + Sync {
     fn has_gains(&self) -> bool;
     /// Creates the motor with these settings. Returns `None` if a required setting is missing.
     fn motor(&self, settings: &MotorSettings) -> Option<Arc<dyn MotorProtocol>>;
+    /// Frames to which motors of this family answer with their ID, and which have no other effect
+    /// on any motor. Empty if the family has no such requests.
+    fn identification_requests(&self) -> Vec<Frame> {
+        Vec::new()
+    }
+    /// The ID and other settings of the motor that sent a frame. `None` if the frame does not show
+    /// that its sender belongs to this family.
+    fn identify(&self, _frame: &Frame) -> Option<MotorSettings> {
+        None
+    }
     /// Data for fuzzing and its tests.
     #[cfg(any(test, fuzzing))]
     fn fuzzing(&self) -> FamilyFuzzing;

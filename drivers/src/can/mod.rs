@@ -27,6 +27,7 @@ pub mod damiao;
 #[cfg(feature = "emulation")]
 pub mod emulated;
 mod family;
+mod find;
 mod frame_io;
 #[cfg(all(target_os = "linux", any(test, fuzzing)))]
 pub(crate) mod fuzz;
@@ -63,6 +64,7 @@ pub use family::FamilyFuzzing;
 pub use family::{
     Health, MotionProtocol, MotorFamily, MotorProtocol, MotorReading, Reports, Traffic,
 };
+pub use find::{FoundMotor, SearchTimes, motors_on};
 pub use frame_io::{BusEvent, FrameIo, WireErrors};
 pub use interfaces::interfaces;
 #[cfg(target_os = "linux")]

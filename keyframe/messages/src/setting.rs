@@ -35,7 +35,9 @@ macro_rules! settings {
 }
 
 settings! {
-    /// Camera of a rig file to calibrate.
+    /// Base link of a robot description.
+    BaseLink = "base_link",
+    /// Camera of a rig file to calibrate, or place of a camera.
     Camera = "camera",
     /// Rule for the number of splats.
     Count = "count",
@@ -49,6 +51,8 @@ settings! {
     DriftPpm = "drift_ppm",
     /// Confirmation that an arm may move.
     EnableMotion = "is_confirmed",
+    /// Horizontal field of view of a camera.
+    FieldOfView = "field_of_view_deg",
     /// Constant latency of a camera.
     FixedMillis = "fixed_millis",
     /// Recording that replaces the devices.
@@ -99,6 +103,8 @@ settings! {
     Resume = "resume",
     /// Rig file that replaces the one stored in a recording.
     Rig = "rig",
+    /// Known robot.
+    Robot = "robot",
     /// Numbers of samples of a neural field.
     Samples = "n_samples",
     /// Fraction to which images are scaled.

@@ -87,6 +87,12 @@ impl MotorFamily for Cia402Family {
         }))
     }
 
+    /// Any CANopen node with a heartbeat may be a drive.
+    fn identify(&self, frame: &Frame) -> Option<MotorSettings> {
+        let (node, _) = canopen::decode_heartbeat(frame).ok()?;
+        Some(MotorSettings::new(node.number()))
+    }
+
     #[cfg(any(test, fuzzing))]
     fn fuzzing(&self) -> super::family::FamilyFuzzing {
         fuzz::fuzzing()

@@ -90,6 +90,9 @@ impl EmulatedDamiao {
             Frame::classic(answer_id, &[low, high, code, register, a, b, c, d])
         };
         match code {
+            0x33 if register == Register::FeedbackId as u8 => {
+                Ok(vec![reply(feedback.into(), code)?])
+            }
             0x33 => register_value(drive, register)
                 .map(|value| reply(value, code))
                 .into_iter()

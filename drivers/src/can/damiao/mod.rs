@@ -30,6 +30,8 @@ use std::sync::Arc;
 /// Maximum ID of a motor and of its answers. The next higher ID is that of register messages.
 const MAX_ID: u64 = 0x7FE;
 const FEEDBACK_ID: &str = "feedback_id";
+/// IDs of motors that are searched. New motors have the ID 1, and arms number their motors.
+const SEARCHED_IDS: RangeInclusive<u16> = 1..=32;
 
 /// The family.
 #[derive(Debug)]
@@ -66,10 +68,32 @@ impl MotorFamily for DamiaoFamily {
         Some(Arc::new(Damiao { motor, feedback }))
     }
 
+    fn identification_requests(&self) -> Vec<Frame> {
+        SEARCHED_IDS.filter_map(feedback_id_request).collect()
+    }
+
+    /// Reads the answer to [`feedback_id_request`]: it has the CAN ID that it reports.
+    fn identify(&self, frame: &Frame) -> Option<MotorSettings> {
+        let message = codec::decode_register(frame).ok()?;
+        let Access::Reported(Register::FeedbackId, Value::Integer(feedback)) = message.access
+        else {
+            return None;
+        };
+        let is_from_motor = frame.id() == Id::standard(feedback).ok()?;
+        let feedback = SettingValue::Whole(feedback.into());
+        is_from_motor.then(|| MotorSettings::new(message.motor).with(FEEDBACK_ID, feedback))
+    }
+
     #[cfg(any(test, fuzzing))]
     fn fuzzing(&self) -> super::family::FamilyFuzzing {
         fuzz::fuzzing()
     }
+}
+
+/// The request for the feedback ID of a motor.
+fn feedback_id_request(motor: u16) -> Option<Frame> {
+    let access = Access::Read(Register::FeedbackId);
+    codec::encode_register(&RegisterMessage { motor, access }, None).ok()
 }
 
 /// A Damiao motor.

@@ -64,6 +64,13 @@ impl MotorFamily for OdriveFamily {
         }))
     }
 
+    fn identify(&self, frame: &Frame) -> Option<MotorSettings> {
+        let (node, answer) = codec::decode_answer(frame).ok()?;
+        let is_axis = matches!(answer, Answer::Heartbeat { .. })
+            && self.ids().contains(&node.number().into());
+        is_axis.then(|| MotorSettings::new(node.number()))
+    }
+
     #[cfg(any(test, fuzzing))]
     fn fuzzing(&self) -> super::family::FamilyFuzzing {
         fuzz::fuzzing()

@@ -30,6 +30,10 @@ impl EmulatedProtocol for EmulatedRobstride {
         let [low, high, _, _, a, b, c, d] = bytes;
         let parameter = u32::from(u16::from_le_bytes([low, high]));
         match kind {
+            0 => {
+                let id = Id::extended(u32::from(self.motor) << 8 | 0xFE)?;
+                return Ok(vec![Frame::classic(id, &[self.motor; 8])?]);
+            }
             1 => {
                 // In other modes, the motor ignores motion commands. Motion mode is the factory
                 // setting.

@@ -82,6 +82,20 @@ impl MotorFamily for RobstrideFamily {
         Some(Arc::new(Robstride { motor, model }))
     }
 
+    /// Asks for serial numbers. New motors have the ID 127.
+    fn identification_requests(&self) -> Vec<Frame> {
+        let limits = Model::Rs00.limits(); // The request contains no scaled values.
+        let request = |id| codec::encode_request(HOST, id, &Request::Identify, &limits).ok();
+        (1..=127).filter_map(request).collect()
+    }
+
+    fn identify(&self, frame: &Frame) -> Option<MotorSettings> {
+        match codec::decode_answer(frame, HOST, &Model::Rs00.limits()) {
+            Ok(Answer::Identity { motor, .. }) => Some(MotorSettings::new(motor)),
+            _ => None,
+        }
+    }
+
     #[cfg(any(test, fuzzing))]
     fn fuzzing(&self) -> super::family::FamilyFuzzing {
         fuzz::fuzzing()

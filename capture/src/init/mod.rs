@@ -1,0 +1,25 @@
+//! A first rig file for the devices of this computer, as `fieldrig init` writes it.
+//!
+//! [`search`] finds devices, and moves none. [`RigPlan::new`] decides on the contents of the rig
+//! file, from the findings and from what the user wants. [`RigPlan::to_toml`] writes the plan. The
+//! last two steps do no I/O.
+
+mod arm_plan;
+mod camera_guess;
+mod findings;
+mod links;
+mod plan;
+mod rig_text;
+mod search;
+#[cfg(test)]
+mod tests;
+mod wishes;
+
+pub use arm_plan::likely_robot;
+pub use findings::{
+    ControllerKind, Findings, FoundBus, FoundCamera, FoundController, FoundMotor, FoundServos,
+};
+pub use links::ArmLinks;
+pub use plan::RigPlan;
+pub use search::{SearchPlan, controller_at, search};
+pub use wishes::{RobotChoice, WantedCamera, Wishes};

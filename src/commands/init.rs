@@ -1,0 +1,269 @@
+//! `fieldrig init`: finds devices, and writes a first rig file.
+
+mod questions;
+mod urdf_path;
+
+use crate::exit::Exit;
+use crate::number_args::number_in_range;
+use crate::print;
+use anyhow::Context;
+use capture::Rig;
+use capture::config::Parent;
+use capture::init::{Findings, RigPlan, RobotChoice, SearchPlan, WantedCamera, Wishes, search};
+use capture::known_robots::{BUILTIN_PREFIX, KNOWN_ROBOTS, KnownRobot};
+use messages::BadInput;
+use questions::Questions;
+use std::path::{Path, PathBuf};
+
+/// Flags of `init`.
+#[derive(Debug, clap::Args)]
+#[command(after_long_help = "\
+    Nothing moves, no setting of a device is changed, and no network is scanned. Found are: V4L2 and RealSense cameras; \
+    motors on CAN interfaces that are up (by their heartbeats, or by requests that only ask for an ID); Feetech and \
+    Dynamixel servos with IDs from 1 to 12 on USB adapters for servos; a Franka controller at 172.16.0.2, and one of \
+    Universal Robots at 192.168.56.101. Give other addresses with --franka and --ur.\n\n\
+    Without any device, the rig file describes a UR5e with a webcam at its wrist. `fieldrig run RIG.toml --sim` simulates \
+    it.\n\n\
+    The flange of a URDF is found from its chain with the most moving joints, without the joints of a gripper. It is the \
+    link that the last joint moves, or a link fixed to it that is named tool0, flange, link8, ee_link or tool_link. \
+    --base-link and --tip choose other links.\n\n\
+    On a terminal, the command asks for the robot, the address of its controller and the places of the cameras, unless \
+    flags answer these questions.")]
+pub(crate) struct Args {
+    /// Rig file to write
+    #[arg(value_name = "RIG.toml", default_value = "rig.toml")]
+    rig: PathBuf,
+    /// Replace the file if it exists
+    #[arg(long)]
+    force: bool,
+    /// Known robot, or `none` for a rig without an arm; `list` prints the known robots
+    #[arg(long, value_name = "NAME", conflicts_with = "urdf")]
+    robot: Option<String>,
+    /// Robot description (URDF, already expanded from xacro)
+    #[arg(long, value_name = "FILE")]
+    urdf: Option<PathBuf>,
+    /// Link that is the base of the robot [default: the root link, or the base of the known robot]
+    #[arg(long, value_name = "LINK")]
+    base_link: Option<String>,
+    /// Link to which cameras on the arm are attached [default: the end of the arm, see below]
+    #[arg(long, value_name = "LINK")]
+    tip: Option<String>,
+    /// Place of a camera: flange, base or world; once for each camera
+    ///
+    /// The first flag is for the first camera that was found, and so on. `flange=/dev/video2` names
+    /// the device of a camera. By default, the first camera is on the arm, and the others are fixed
+    /// in the room.
+    #[arg(long, value_name = "PLACE[=DEVICE]", value_parser = wanted_camera)]
+    camera: Vec<WantedCamera>,
+    /// Horizontal field of view of webcams in degrees, from their data sheet
+    #[arg(long, value_name = "DEG", default_value_t = 65.0, value_parser = number_in_range(10.0..=160.0))]
+    fov: f64,
+    /// The base of the robot moves, and another program sends its pose
+    #[arg(long)]
+    moving_base: bool,
+    /// Address of a Franka controller, with the port if it is not 1337
+    #[arg(long, value_name = "ADDRESS")]
+    franka: Option<String>,
+    /// Address of a controller of Universal Robots, with the port if it is not 30004
+    #[arg(long, value_name = "ADDRESS")]
+    ur: Option<String>,
+    /// Serial port to search for servos [default: the ports of USB adapters for servos]
+    #[arg(long, value_name = "PORT")]
+    serial: Option<PathBuf>,
+    /// Ask no questions: use the defaults
+    #[arg(short, long)]
+    yes: bool,
+}
+
+/// Reads `PLACE` or `PLACE=DEVICE`.
+fn wanted_camera(text: &str) -> Result<WantedCamera, String> {
+    let (place, device) = match text.split_once('=') {
+        Some((place, device)) => (place, Some(device.to_owned())),
+        None => (text, None),
+    };
+    Ok(WantedCamera {
+        parent: parent(place)?,
+        device,
+    })
+}
+
+/// The parent frame with this name.
+fn parent(place: &str) -> Result<Parent, String> {
+    match place {
+        "flange" => Ok(Parent::Flange),
+        "base" => Ok(Parent::Base),
+        "world" => Ok(Parent::World),
+        other => Err(format!("{other:?} is not flange, base or world")),
+    }
+}
+
+/// Writes a rig file for the devices that are found.
+pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
+    if args.robot.as_deref() == Some("list") {
+        list_robots()?;
+        return Ok(Exit::Done);
+    }
+    // Whatever can be wrong in the arguments is checked before the search, which takes seconds.
+    check_new(&args.rig, args.force)?;
+    let robot = robot(args)?;
+    print::notice("searching for cameras, CAN motors, servos and controllers");
+    let mut findings = search(&SearchPlan {
+        franka: args.franka.clone(),
+        ur: args.ur.clone(),
+        serial: args.serial.clone(),
+    });
+    report_findings(&findings);
+    let mut wishes = Wishes {
+        robot,
+        base_link: args.base_link.clone(),
+        tip: args.tip.clone(),
+        cameras: args.camera.clone(),
+        field_of_view_deg: args.fov,
+        has_moving_base: args.moving_base,
+    };
+    Questions::new(args.yes).ask(&mut wishes, &mut findings, &args.rig)?;
+    let plan = RigPlan::new(&wishes, &findings).map_err(|error| BadInput(format!("{error:#}")))?;
+    write(args, &wishes, &plan)?;
+    report_plan(&args.rig, &plan);
+    Ok(Exit::Done)
+}
+
+fn list_robots() -> anyhow::Result<()> {
+    for robot in KNOWN_ROBOTS {
+        print::line(format_args!("{:8} {}", robot.name, robot.title))?;
+    }
+    Ok(())
+}
+
+fn check_new(rig: &Path, force: bool) -> Result<(), BadInput> {
+    if !force && rig.symlink_metadata().is_ok() {
+        let rig = rig.display();
+        return Err(BadInput(format!(
+            "{rig} exists: choose another name, or replace it with --force"
+        )));
+    }
+    Ok(())
+}
+
+/// The robot that the flags name.
+fn robot(args: &Args) -> anyhow::Result<RobotChoice> {
+    match (&args.robot, &args.urdf) {
+        (Some(name), _) => known_robot(name),
+        (None, Some(urdf)) => urdf_path::urdf(urdf, &args.rig),
+        (None, None) => Ok(RobotChoice::Automatic),
+    }
+}
+
+/// The known robot with this name, or no robot.
+fn known_robot(name: &str) -> anyhow::Result<RobotChoice> {
+    if name == "none" {
+        return Ok(RobotChoice::None);
+    }
+    let name = name.strip_prefix(BUILTIN_PREFIX).unwrap_or(name);
+    let robot = KnownRobot::named_by(&format!("{BUILTIN_PREFIX}{name}"));
+    let robot = robot.map_err(|unknown| BadInput(format!("--robot: {unknown}, none")))?;
+    Ok(robot.map_or(RobotChoice::None, RobotChoice::Known))
+}
+
+/// Writes the rig file, after it was read like any other rig file.
+fn write(args: &Args, wishes: &Wishes, plan: &RigPlan) -> anyhow::Result<()> {
+    let path = args.rig.display();
+    let text = plan.to_toml(&path.to_string());
+    let urdf = match &wishes.robot {
+        RobotChoice::Urdf { text, .. } => text,
+        _ => "",
+    };
+    Rig::parse(&path.to_string(), &text, urdf, &[])
+        .context("the rig file would be invalid, so it was not written")?;
+    // Another program may have written it during the search.
+    check_new(&args.rig, args.force)?;
+    files::write(&args.rig, text).with_context(|| format!("cannot write {path}"))
+}
+
+fn report_findings(findings: &Findings) {
+    let Findings {
+        cameras,
+        buses,
+        servos,
+        controllers,
+        notes,
+    } = findings;
+    print::report("Found");
+    let rows = [
+        ("camera", texts(cameras)),
+        ("CAN", texts(buses)),
+        ("servos", texts(servos)),
+        ("controller", texts(controllers)),
+    ];
+    if rows.iter().all(|(_, found)| found.is_empty()) {
+        print::report("  no cameras, motors, servos or controllers");
+    }
+    for (kind, found) in rows {
+        for device in found {
+            print::report(format_args!("  {kind:10} {device}"));
+        }
+    }
+    for note in notes {
+        print::report(format_args!("  not used   {note}"));
+    }
+}
+
+fn texts(devices: &[impl ToString]) -> Vec<String> {
+    devices.iter().map(ToString::to_string).collect()
+}
+
+fn report_plan(rig: &Path, plan: &RigPlan) {
+    print::report("Assumed");
+    for assumption in &plan.assumptions {
+        print::report(format_args!("  {assumption}"));
+    }
+    let rig = rig.display();
+    print::report(format_args!("Wrote {rig}. Next"));
+    print::report(format_args!("  fieldrig doctor {rig}"));
+    print::report(format_args!("  fieldrig run {rig} --sim"));
+    for camera in plan.cameras_without_lens() {
+        print::report(format_args!(
+            "  fieldrig calibrate intrinsics {rig} --camera {camera} --target charuco:5x7:34mm:26mm:5X5_100 --write-rig {rig}"
+        ));
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn places_of_cameras_are_read() {
+        let camera = |text| wanted_camera(text).expect(text);
+        assert_eq!(
+            camera("world"),
+            WantedCamera {
+                parent: Parent::World,
+                device: None
+            }
+        );
+        assert_eq!(
+            camera("flange=/dev/video2"),
+            WantedCamera {
+                parent: Parent::Flange,
+                device: Some("/dev/video2".to_owned())
+            }
+        );
+        let error = wanted_camera("wrist").expect_err("no place");
+        assert!(error.contains("flange, base or world"), "{error}");
+    }
+
+    #[test]
+    fn robots_are_named_with_or_without_prefix() {
+        for name in ["ur5e", "builtin:ur5e", "UR5e"] {
+            let robot = known_robot(name).expect(name);
+            assert!(matches!(robot, RobotChoice::Known(robot) if robot.name == "ur5e"));
+        }
+        assert_eq!(known_robot("none").expect("no arm"), RobotChoice::None);
+        let error = known_robot("ur5").expect_err("unknown").to_string();
+        assert!(
+            error.contains("did you mean \"ur5e\"") && error.ends_with("so101, none"),
+            "{error}"
+        );
+    }
+}

@@ -1,0 +1,152 @@
+//! The questions of `fieldrig init` on a terminal. Each has a default and a flag.
+
+use super::{known_robot, parent, urdf_path};
+use crate::print;
+use anyhow::Context;
+use capture::config::Parent;
+use capture::init::{
+    ControllerKind, Findings, RobotChoice, WantedCamera, Wishes, controller_at, likely_robot,
+};
+use capture::known_robots::KNOWN_ROBOTS;
+use std::io::IsTerminal;
+use std::path::Path;
+
+/// Maximum number of cameras whose places are asked for. The others get their defaults.
+const MAX_CAMERAS: usize = 3;
+/// Number of invalid answers after which the default is used.
+const MAX_ATTEMPTS: usize = 3;
+
+/// Asks for what flags leave open.
+#[derive(Debug)]
+pub(super) struct Questions {
+    is_asking: bool,
+}
+
+impl Questions {
+    /// Questions that are asked on a terminal, unless the user accepts all defaults.
+    pub(super) fn new(accepts_defaults: bool) -> Self {
+        Self {
+            is_asking: !accepts_defaults && std::io::stdin().is_terminal(),
+        }
+    }
+
+    /// Asks all questions. Answers become part of the wishes and findings.
+    pub(super) fn ask(
+        &self,
+        wishes: &mut Wishes,
+        findings: &mut Findings,
+        rig: &Path,
+    ) -> anyhow::Result<()> {
+        if !self.is_asking {
+            return Ok(());
+        }
+        if wishes.robot == RobotChoice::Automatic {
+            wishes.robot = ask_robot(findings, rig)?;
+        }
+        if let Some(kind) = missing_controller(wishes, findings) {
+            let question =
+                format!("Address of the {kind} controller, or empty to simulate the arm");
+            let address = answer(&question, "", |text| Ok(text.to_owned()))?;
+            if !address.is_empty() {
+                findings.controllers.push(controller_at(kind, &address));
+            }
+        }
+        if wishes.cameras.is_empty() {
+            wishes.cameras = ask_places(wishes, findings)?;
+        }
+        Ok(())
+    }
+}
+
+fn ask_robot(findings: &Findings, rig: &Path) -> anyhow::Result<RobotChoice> {
+    let names: Vec<_> = KNOWN_ROBOTS.iter().map(|robot| robot.name).collect();
+    let question = format!("Robot: {}, none, or the path of a URDF", names.join(", "));
+    let likely = likely_robot(findings).map_or("", |robot| robot.name);
+    answer(&question, likely, |text| {
+        if text.is_empty() {
+            return Ok(RobotChoice::Automatic);
+        }
+        if text.contains(['/', '.']) {
+            return urdf_path::urdf(Path::new(text), rig);
+        }
+        known_robot(text)
+    })
+}
+
+/// The maker of the controller that a known robot needs, if none was found.
+fn missing_controller(wishes: &Wishes, findings: &Findings) -> Option<ControllerKind> {
+    let RobotChoice::Known(robot) = &wishes.robot else {
+        return None;
+    };
+    let kinds = [ControllerKind::Franka, ControllerKind::Ur];
+    let kind = kinds.into_iter().find(|kind| kind.controls(robot))?;
+    let is_found = findings
+        .controllers
+        .iter()
+        .any(|controller| controller.kind == kind);
+    (!is_found).then_some(kind)
+}
+
+fn ask_places(wishes: &Wishes, findings: &Findings) -> anyhow::Result<Vec<WantedCamera>> {
+    let has_arm = wishes.robot != RobotChoice::None;
+    let n_found = findings.cameras.len();
+    if n_found > MAX_CAMERAS {
+        return Ok(Vec::new());
+    }
+    let mut cameras = Vec::new();
+    for ix in 0..n_found.max(1) {
+        let name = findings
+            .cameras
+            .get(ix)
+            .map_or("the camera".to_owned(), ToString::to_string);
+        let (places, default) = match (has_arm, wishes.has_moving_base) {
+            (true, _) if ix == 0 => ("flange, base or world", "flange"),
+            (true, false) => ("flange, base or world", "world"),
+            (true, true) => ("flange, base or world", "base"),
+            (false, true) => ("base or world", "base"),
+            (false, false) => ("base or world", "world"),
+        };
+        let question = format!("Where is {name}: {places}");
+        let place = answer(&question, default, |text| {
+            let parent = parent(text).map_err(anyhow::Error::msg)?;
+            anyhow::ensure!(has_arm || parent != Parent::Flange, "the robot has no arm");
+            Ok(parent)
+        })?;
+        cameras.push(WantedCamera {
+            parent: place,
+            device: None,
+        });
+    }
+    Ok(cameras)
+}
+
+/// Asks one question on stderr. An empty answer, or the end of the input, is the default. After an
+/// invalid answer, the question is repeated.
+fn answer<T>(
+    question: &str,
+    default: &str,
+    read: impl Fn(&str) -> anyhow::Result<T>,
+) -> anyhow::Result<T> {
+    for _ in 0..MAX_ATTEMPTS {
+        if default.is_empty() {
+            print::notice(format_args!("{question}:"));
+        } else {
+            print::notice(format_args!("{question} [{default}]:"));
+        }
+        // The question must be visible before the program waits.
+        print::flush();
+        let mut line = String::new();
+        std::io::stdin()
+            .read_line(&mut line)
+            .context("cannot read the answer")?;
+        let text = match line.trim() {
+            "" => default,
+            text => text,
+        };
+        match read(text) {
+            Ok(value) => return Ok(value),
+            Err(error) => print::notice(format_args!("{error:#}")),
+        }
+    }
+    read(default)
+}
