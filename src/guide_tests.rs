@@ -8,13 +8,14 @@ use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 
 /// Flags of other programs that the prose names: cargo, curl, pkg-config, converters and senders.
-const OF_OTHER_PROGRAMS: [&str; 7] = [
+const OF_OTHER_PROGRAMS: [&str; 8] = [
     "cacert",
     "calibration",
     "camera-in-body",
     "features",
     "insecure",
     "modversion",
+    "release",
     "topic",
 ];
 

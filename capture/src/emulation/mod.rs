@@ -524,6 +524,7 @@ mod tests {
                 camera.stamp_to_mid_exposure = on_wire.stamp_to_mid_exposure.clone();
                 // Rig files for emulated devices omit values that a RealSense camera reports.
                 camera.realsense = on_wire.realsense.clone();
+                camera.unknown = on_wire.unknown;
             }
             assert!(plain == wire, "{name}");
             assert!(
