@@ -3,8 +3,10 @@
 use calibration::BoardView;
 use std::collections::HashMap;
 
-/// Half the side of the square around a corner in which its edges are measured, pixels.
-const WINDOW_PX: i64 = 4;
+/// Half the side of the square around a corner in which its edges are measured, pixels. It is larger
+/// than the widest accepted edge: around a corner whose edges are wider than the square, the slopes
+/// and the contrast shrink together.
+const WINDOW_PX: i64 = 8;
 /// Corners with a smaller difference between ink and paper are not measured, gray levels.
 const MIN_CONTRAST: f64 = 24.0;
 /// Minimum number of measured corners.
