@@ -289,6 +289,11 @@ pub(super) fn jackknife(blocks: &[BlockSums], n_shared: usize) -> Option<DMatrix
         // With S = L L', the share of the block is inverse(L) S_b inverse(L)', which is symmetric.
         let half = lower.solve_lower_triangular(&matrix)?;
         let share = lower.solve_lower_triangular(&half.transpose())?;
+        // Rounding may leave nothing of a block that determines almost nothing. The decomposition of
+        // a matrix that is not finite would not end.
+        if !share.iter().all(|value| value.is_finite()) {
+            return None;
+        }
         let eigen = SymmetricEigen::new(share);
         let whitened = lower.solve_lower_triangular(&block.gradient)?;
         let mut along = eigen.eigenvectors.tr_mul(&whitened);
