@@ -130,7 +130,7 @@ pub(super) fn fit<S>(
 /// Combines two covariances that allow for shared errors. The covariance times the dispersion is
 /// precise, but assumes that shared errors have the same effect on all parameters. The jackknife
 /// does not, but is an estimate from a few blocks, as if a variance were computed from so many
-/// numbers. Their mean has the right size for both kinds of errors, already with 10 to 15 blocks.
+/// numbers. Their mean has the right size for both kinds of errors.
 fn with_shared_errors(
     covariance: &DMatrix<f64>,
     dispersion: f64,

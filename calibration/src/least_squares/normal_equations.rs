@@ -255,8 +255,8 @@ pub(super) fn dispersion(blocks: &[BlockSums], n_shared: usize, variance: f64) -
 
 /// Covariance of the shared parameters from the changes of the solution when one block is left out,
 /// to first order: the jackknife. Residuals of a block may share errors, which have a different
-/// effect on each parameter. `None` if there are not more blocks than parameters, or if the blocks
-/// do not determine them.
+/// effect on each parameter. `None` if there are not 1.5 times as many blocks as parameters, or if
+/// the blocks do not determine them.
 ///
 /// With the symbols of [`dispersion`], leaving out block b changes the solution by
 /// `inverse(S - S_b) g_b = inverse(S) inverse(1 - S_b inverse(S)) g_b`. Blocks that determine a
@@ -267,8 +267,9 @@ pub(super) fn jackknife(blocks: &[BlockSums], n_shared: usize) -> Option<DMatrix
     const DAMPING: f64 = 1e-12;
     // A block with 95 % of the information about a direction.
     const MIN_REST: f64 = 0.05;
-    // Fewer changes than parameters do not show how all of them vary.
-    if n_shared == 0 || blocks.len() <= n_shared {
+    // With 10 blocks and 9 parameters, each block is indispensable for some direction, and the
+    // variances of directions that are hardly determined become twice as large as they are.
+    if n_shared == 0 || 2 * blocks.len() <= 3 * n_shared {
         return None;
     }
     let reduced: Vec<Reduced> = blocks
@@ -289,6 +290,11 @@ pub(super) fn jackknife(blocks: &[BlockSums], n_shared: usize) -> Option<DMatrix
         // With S = L L', the share of the block is inverse(L) S_b inverse(L)', which is symmetric.
         let half = lower.solve_lower_triangular(&matrix)?;
         let share = lower.solve_lower_triangular(&half.transpose())?;
+        // Rounding may leave nothing of a block that determines almost nothing. The decomposition of
+        // a matrix that is not finite would not end.
+        if !share.iter().all(|value| value.is_finite()) {
+            return None;
+        }
         let eigen = SymmetricEigen::new(share);
         let whitened = lower.solve_lower_triangular(&block.gradient)?;
         let mut along = eigen.eigenvectors.tr_mul(&whitened);
