@@ -106,10 +106,11 @@ fn describe_family(family: &dyn MotorFamily, motor: &mut TableSchema) {
     values.insert("id".to_owned(), u64::schema(family.ids()));
     let mut required = Vec::new();
     for key in family.keys() {
-        let about = match key.required {
-            Some(meaning) => format!("Required for {} motors: {meaning}.", family.title()),
-            None => format!("Optional for {} motors.", family.title()),
-        };
+        let about = format!(
+            "{}: {}.",
+            families_with(key.name).join(" and "),
+            key.required.unwrap_or("optional")
+        );
         // Families may have keys of the same name with other values, so the values are in the rule.
         motor.add(key.name, &about, json!({}));
         values.insert(key.name.to_owned(), allowed_schema(&key.allowed));
@@ -119,6 +120,15 @@ fn describe_family(family: &dyn MotorFamily, motor: &mut TableSchema) {
         "if": { "properties": { "family": { "const": family.name() } }, "required": ["family"] },
         "then": { "properties": values, "required": required },
     }));
+}
+
+/// Titles of the families whose motors have a key.
+fn families_with(key: &str) -> Vec<&'static str> {
+    FAMILIES
+        .iter()
+        .filter(|family| family.keys().iter().any(|own| own.name == key))
+        .map(|family| family.title())
+        .collect()
 }
 
 fn allowed_schema(allowed: &AllowedValues) -> serde_json::Value {
