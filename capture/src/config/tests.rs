@@ -418,6 +418,7 @@ pub(super) const KEYS: &[(&str, &str, &str)] = &[
         "[0, 1, 0, 0]",
         "[0, 0, 0, 0]",
     ),
+    ("sim.target.board.moved_before", "'wrist'", "5"),
     // These are the same settings as whole tables, because a flag may also replace a table.
     ("base.world_from_base", "{ xyz_m = [1, 2, 3] }", "3"),
     (

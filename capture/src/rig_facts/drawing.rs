@@ -15,6 +15,8 @@ const MIN_RADIUS_M: f64 = 0.3;
 const AXIS_FRAC: f64 = 0.12;
 /// Depth to which fields of view are drawn, relative to the radius of the scene.
 const FRUSTUM_FRAC: f64 = 0.35;
+/// Space that a label needs, pixels.
+const LABEL_PX: [f64; 2] = [60.0, 14.0];
 /// Colors of the cameras, in their order.
 const CAMERA_COLORS: [&str; 6] = [
     "#0a6ebd", "#b35900", "#1b7f3b", "#8a2be2", "#b0006d", "#00767a",
@@ -84,6 +86,7 @@ pub fn svg(facts: &RigFacts) -> String {
             view,
             scene: &scene,
             left_px: panel_px * ix as f64 + MARGIN_PX,
+            labels_px: Vec::new(),
             svg: &mut svg,
         };
         panel.draw();
@@ -203,6 +206,8 @@ struct Panel<'a> {
     view: &'a View,
     scene: &'a Scene,
     left_px: f64,
+    /// Where labels are.
+    labels_px: Vec<[f64; 2]>,
     svg: &'a mut String,
 }
 
@@ -353,11 +358,21 @@ impl Panel<'_> {
 
     fn label(&mut self, at: &Point3<f64>, text: &str, color: &str) {
         let [x, y] = self.at(at);
+        let [x, mut y] = [x + 7.0, y - 6.0];
+        // Frames at the same place, such as base and flange from above, would hide each other's name.
+        let covers = |y: f64| {
+            let is_near = |[other_x, other_y]: &[f64; 2]| {
+                (other_x - x).abs() < LABEL_PX[0] && (other_y - y).abs() < LABEL_PX[1]
+            };
+            self.labels_px.iter().any(is_near)
+        };
+        while covers(y) {
+            y -= LABEL_PX[1];
+        }
+        self.labels_px.push([x, y]);
         let text = escaped(text);
         self.push(&format!(
-            "<text x=\"{:.1}\" y=\"{:.1}\" fill=\"{color}\">{text}</text>",
-            x + 7.0,
-            y - 6.0
+            "<text x=\"{x:.1}\" y=\"{y:.1}\" fill=\"{color}\">{text}</text>"
         ));
     }
 
