@@ -7,6 +7,7 @@ use crate::config::N_JOINTS;
 use crate::panda::{self, Jacobian, Joints};
 use crate::scan::Scan;
 use kinematics::Transform;
+use kinematics::inverse::pose_error;
 use nalgebra::{Matrix6, SMatrix, Vector6};
 
 /// Tour of an arm's camera.
@@ -215,20 +216,6 @@ fn damped_inverse(jacobian: &Jacobian) -> SMatrix<f64, N_JOINTS, 6> {
         .try_inverse()
         .expect("a damped square is positive definite");
     jacobian.transpose() * inverse
-}
-
-/// Translation and rotation from the actual to the target pose, in world axes.
-pub(crate) fn pose_error(target_pose: &Transform, actual: &Transform) -> Vector6<f64> {
-    let translation_error = target_pose.translation.vector - actual.translation.vector;
-    let rotation_error = (target_pose.rotation * actual.rotation.inverse()).scaled_axis();
-    Vector6::new(
-        translation_error.x,
-        translation_error.y,
-        translation_error.z,
-        rotation_error.x,
-        rotation_error.y,
-        rotation_error.z,
-    )
 }
 
 fn clamp_to_limits(position_rad: Joints) -> Joints {
