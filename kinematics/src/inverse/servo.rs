@@ -61,9 +61,8 @@ impl InverseSolver {
     /// * `joints`: present joint values, radians or meters.
     /// * `next`: output, the next joint values. It is unchanged on error.
     ///
-    /// Near singularities, only the directions that the arm loses are damped (see
-    /// [`InverseSolver`]'s module). A joint that is too fast slows all others, so that the tip stays
-    /// on its path.
+    /// Near singularities, only motions in the directions that the arm loses are damped. A joint that
+    /// is too fast slows all others, so that the tip stays on its path.
     ///
     /// # Errors
     /// If numbers are not finite, speeds or times are not positive, or lists do not have one value
