@@ -33,6 +33,10 @@ pub struct FrankaArm {
     /// the axis of joint 6, and x leads away from that axis if joint 7 is at 0.
     seven_from_tip: Transform,
     lengths: Lengths,
+    /// Lengths of upper arm and forearm, and the value of joint 4 at which they coincide. They are
+    /// derived from `lengths`, because each test of the search needs them.
+    segments_m: [f64; 2],
+    folded_q4: f64,
 }
 
 /// Lengths in meters, in the posture with all joints at 0.
@@ -120,6 +124,8 @@ impl FrankaArm {
             shoulder_from_base,
             seven_from_tip: shoulder_from_seven.inverse() * shoulder_from_base * base_from_tip,
             lengths,
+            segments_m: lengths.segments(),
+            folded_q4: lengths.folded_q4(),
         };
         let deviates = in_shoulder
             .iter()
@@ -143,10 +149,11 @@ impl FrankaArm {
     }
 
     fn joints(&self, wrist: &Wrist, branch: Branch, last_rad: f64) -> Option<[f64; 7]> {
-        let elbow = self.elbow(wrist, branch)?;
+        let q4 = self.q4(wrist, branch);
+        let elbow = self.elbow(wrist, q4)?;
         let forearm = elbow.forearm(wrist, branch)?;
         let [q1, q2, q3] = forearm.shoulder(branch);
-        Some([q1, q2, q3, elbow.q4, forearm.q5, forearm.q6, last_rad])
+        Some([q1, q2, q3, q4, forearm.q5, forearm.q6, last_rad])
     }
 
     /// The branch of a configuration. `None` if the pose does not belong to the configuration.
@@ -155,15 +162,15 @@ impl FrankaArm {
     pub fn branch(&self, joints: &[f64; 7], base_from_tip: &Transform) -> Option<Branch> {
         let wrist = self.wrist(&self.shoulder_from_seven(base_from_tip), joints[6])?;
         Some(Branch {
-            is_elbow_bent: wrap(joints[3] - self.lengths.folded_q4()) > 0.0,
-            is_wrist_outward: wrap(joints[5] - wrist.middle_q6()) > 0.0,
+            is_elbow_bent: wrap(joints[3] - self.folded_q4) > 0.0,
+            is_wrist_outward: wrap(joints[5] - wrist.middle_q6) > 0.0,
             is_shoulder_forward: wrap(joints[1]) >= 0.0,
         })
     }
 
     /// The angle of joint 4 at which the arm is longest.
     pub(super) fn stretched_q4(&self) -> f64 {
-        wrap(self.lengths.folded_q4() + std::f64::consts::PI)
+        wrap(self.folded_q4 + std::f64::consts::PI)
     }
 
     /// The pose of the frame of joint 7.
@@ -182,12 +189,10 @@ impl FrankaArm {
             shoulder_from_seven.translation.vector - x_of_six * self.lengths.flange_offset;
         let distance_m = position.norm();
         let toward_shoulder = -position / distance_m;
-        let along = [
-            toward_shoulder.dot(&x_of_six),
-            toward_shoulder.dot(&y_of_six),
-        ];
+        let along_x = toward_shoulder.dot(&x_of_six);
+        let along_y = toward_shoulder.dot(&y_of_six);
         // Law of cosines for the angle at the elbow.
-        let [upper_m, fore_m] = self.lengths.segments();
+        let [upper_m, fore_m] = self.segments_m;
         let cosine = (upper_m * upper_m + fore_m * fore_m - distance_m * distance_m)
             / (2.0 * upper_m * fore_m);
         let is_reachable = cosine.abs() <= 1.0 && distance_m > MIN_LENGTH_M;
@@ -195,27 +200,32 @@ impl FrankaArm {
             x_of_six,
             y_of_six,
             toward_shoulder,
-            along,
+            distance_m,
+            middle_q6: along_x.atan2(along_y),
+            largest_cosine: (along_x * along_x + along_y * along_y).sqrt(),
             elbow_angle: cosine.acos(),
         })
     }
 
-    /// The elbow of a branch and the forearm's angle to the shoulder.
-    pub(super) fn elbow(&self, wrist: &Wrist, branch: Branch) -> Option<Elbow> {
+    /// Joint 4 of a branch.
+    pub(super) fn q4(&self, wrist: &Wrist, branch: Branch) -> f64 {
         let sign = if branch.is_elbow_bent { 1.0 } else { -1.0 };
-        let q4 = wrap(self.lengths.folded_q4() + sign * wrist.elbow_angle);
+        wrap(self.folded_q4 + sign * wrist.elbow_angle)
+    }
+
+    /// The elbow for a value of joint 4, which gives the wrist its distance. `None` if the plane of
+    /// the arm is undetermined.
+    pub(super) fn elbow(&self, wrist: &Wrist, q4: f64) -> Option<Elbow> {
         let (sin, cos) = q4.sin_cos();
         // The wrist in the plane of the arm, in the axes of the upper arm. Joint 4 rotates about -y.
         let [x, z] = self.lengths.wrist_from_elbow;
         let wrist_x = self.lengths.elbow[0] + x * cos - z * sin;
         let wrist_z = self.lengths.elbow[1] + z * cos + x * sin;
-        let distance_m = wrist_x.hypot(wrist_z);
-        let toward_shoulder = [-wrist_x / distance_m, -wrist_z / distance_m];
+        let toward_shoulder = [-wrist_x / wrist.distance_m, -wrist_z / wrist.distance_m];
         // The axis of joint 5 has the direction (-sin, cos) in these axes.
         let cosine = cos * toward_shoulder[1] - sin * toward_shoulder[0];
         let sine = cos * toward_shoulder[0] + sin * toward_shoulder[1];
         (sine.abs() > MIN_SINE).then_some(Elbow {
-            q4,
             sin_q4: sin,
             cos_q4: cos,
             cosine,
@@ -231,15 +241,19 @@ pub(super) struct Wrist {
     x_of_six: Vector3<f64>,
     y_of_six: Vector3<f64>,
     toward_shoulder: Vector3<f64>,
-    /// Components of `toward_shoulder` along x and y.
-    along: [f64; 2],
+    /// Distance from the shoulder.
+    distance_m: f64,
+    /// Angle of joint 6 at which the forearm points most toward the shoulder. It is between the two
+    /// solutions.
+    middle_q6: f64,
+    /// Cosine of the angle between the two at this value.
+    largest_cosine: f64,
     /// Angle between upper arm and forearm.
     elbow_angle: f64,
 }
 
 /// An elbow, without its direction in space.
 pub(super) struct Elbow {
-    pub(super) q4: f64,
     sin_q4: f64,
     cos_q4: f64,
     /// Cosine and sine of the angle from the axis of joint 5 to the direction toward the shoulder,
@@ -257,25 +271,18 @@ pub(super) struct Forearm {
     z_of_three: Vector3<f64>,
 }
 
-impl Wrist {
-    /// The angle of joint 6 between its two solutions.
-    fn middle_q6(&self) -> f64 {
-        self.along[0].atan2(self.along[1])
-    }
-}
-
 impl Elbow {
     /// The forearm of a branch. `None` if joint 6 cannot give it the angle to the shoulder.
     pub(super) fn forearm(&self, wrist: &Wrist, branch: Branch) -> Option<Forearm> {
         // Joint 6 rotates the axis of joint 5, `sin(q6) x + cos(q6) y`. Its dot product with the
         // direction toward the shoulder must be the cosine.
-        let ratio = self.cosine / wrist.along[0].hypot(wrist.along[1]);
+        let ratio = self.cosine / wrist.largest_cosine;
         let is_possible = ratio.abs() <= 1.0;
         if !is_possible {
             return None;
         }
         let sign = if branch.is_wrist_outward { 1.0 } else { -1.0 };
-        let q6 = wrap(wrist.middle_q6() + sign * ratio.acos());
+        let q6 = wrap(wrist.middle_q6 + sign * ratio.acos());
         let (sin, cos) = q6.sin_cos();
         let z_of_five = wrist.x_of_six * sin + wrist.y_of_six * cos;
         let normal = z_of_five.cross(&wrist.toward_shoulder) / self.sine;
@@ -303,7 +310,7 @@ impl Forearm {
         };
         let z = self.z_of_three;
         let x = self.x_of_three;
-        let sideways = z.x.hypot(z.y);
+        let sideways = (z.x * z.x + z.y * z.y).sqrt();
         let q1 = if sideways > 0.0 {
             (sign * z.y).atan2(sign * z.x)
         } else {

@@ -142,8 +142,12 @@ impl FrankaSearch<'_> {
         let mut joints = [0.0; 7];
         let mut cost = 0.0;
         joints[6] = self.place(6, last_rad, &mut cost)?;
-        let elbow = self.arm.elbow(wrist, branch)?;
-        joints[3] = self.place(3, elbow.q4, &mut cost)?;
+        let q4 = self.arm.q4(wrist, branch);
+        joints[3] = self.place(3, q4, &mut cost)?;
+        if cost > most {
+            return None;
+        }
+        let elbow = self.arm.elbow(wrist, q4)?;
         let forearm = elbow.forearm(wrist, branch)?;
         joints[5] = self.place(5, forearm.q6, &mut cost)?;
         joints[4] = self.place(4, forearm.q5, &mut cost)?;
