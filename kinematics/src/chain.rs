@@ -2,7 +2,7 @@
 
 use crate::urdf::{Joint, JointKind, JointLimits, Mimic, Robot};
 use crate::{Error, Transform, Twist};
-use nalgebra::{Matrix6xX, Quaternion, Translation3, Unit, UnitQuaternion, Vector3};
+use nalgebra::{Matrix6xX, Quaternion, Translation3, Unit, UnitQuaternion, Vector3, Vector6};
 use std::collections::HashMap;
 
 /// The joints between two links of a robot, ready to compute poses.
@@ -176,31 +176,80 @@ impl Chain {
     /// tip's origin (rows 0 to 2) and the angular velocity of the tip (rows 3 to 5), both in the
     /// base frame.
     pub fn jacobian(&self, q: &[f64]) -> Result<Matrix6xX<f64>, Error> {
-        // The velocity of the tip depends on its distance from each axis, so the tip comes first.
-        let tip_in_base = self.forward(q)?.translation.vector;
-        let mut jacobian = Matrix6xX::zeros(self.n_joints());
+        self.check(q)?;
+        let mut columns = vec![Vector6::zeros(); self.n_joints()];
+        self.forward_with_columns(q, &mut columns);
+        Ok(Matrix6xX::from_fn(self.n_joints(), |row, column| {
+            columns[column][row]
+        }))
+    }
+
+    /// The pose of [`Chain::forward`], and the columns of [`Chain::jacobian`] in one pass without
+    /// allocation. `q` must be finite, and both slices must have one element per joint.
+    pub(crate) fn forward_with_columns(
+        &self,
+        q: &[f64],
+        columns: &mut [Vector6<f64>],
+    ) -> Transform {
+        columns.fill(Vector6::zeros());
         let mut pose = RigidMotion::IDENTITY;
         for segment in &self.segments {
             pose.compose(&segment.before);
-            let axis_in_base = rotate(&pose.rotation, &Vector3::z());
+            let axis_in_base = rotate(&pose.rotation, &Vector3::z()) * segment.multiplier;
+            // The velocity of the point that coincides with the base's origin. The tip is not known
+            // yet, and the velocities of two points of a body differ only by a lever arm.
             let (linear, angular) = if segment.is_prismatic {
                 (axis_in_base, Vector3::zeros())
             } else {
-                let lever_in_base = tip_in_base - pose.translation;
-                (axis_in_base.cross(&lever_in_base), axis_in_base)
+                (pose.translation.cross(&axis_in_base), axis_in_base)
             };
             // A joint and its mimic joints share one column, so their motions add up. A mimic joint
             // moves `multiplier` times as fast as the joint that it follows.
-            let mut column = jacobian.column_mut(segment.joint_ix);
+            let column = &mut columns[segment.joint_ix];
             for axis in 0..3 {
-                column[axis] += segment.multiplier * linear[axis];
-                column[3 + axis] += segment.multiplier * angular[axis];
+                column[axis] += linear[axis];
+                column[3 + axis] += angular[axis];
             }
             // The axis was computed before the joint motion, which is correct because the motion
             // does not change it.
             pose.move_joint(segment, q);
         }
-        Ok(jacobian)
+        pose.compose(&self.last_from_tip);
+        for column in columns {
+            let angular = Vector3::new(column[3], column[4], column[5]);
+            let lever = angular.cross(&pose.translation);
+            for axis in 0..3 {
+                column[axis] += lever[axis];
+            }
+        }
+        pose.transform()
+    }
+
+    /// Whether a joint gives the same pose after a full turn.
+    pub(crate) fn is_periodic(&self, joint_ix: usize) -> bool {
+        self.segments
+            .iter()
+            .filter(|segment| segment.joint_ix == joint_ix)
+            .all(|segment| !segment.is_prismatic && segment.multiplier.fract() == 0.0)
+    }
+
+    /// Whether no joint is followed by a mimic joint of this chain, and none moves another way than
+    /// its value.
+    pub(crate) fn has_one_segment_per_joint(&self) -> bool {
+        let mut segments = self.segments.iter().enumerate();
+        segments.all(|(ix, segment)| {
+            segment.joint_ix == ix && segment.multiplier == 1.0 && segment.offset == 0.0
+        })
+    }
+
+    /// Sum of the distances between neighboring joints, meters: an upper bound of the tip's distance
+    /// from the base without prismatic joints.
+    pub(crate) fn length_m(&self) -> f64 {
+        let befores = self.segments.iter().map(|segment| &segment.before);
+        befores
+            .chain([&self.last_from_tip])
+            .map(|motion| motion.translation.norm())
+            .sum()
     }
 
     /// Velocity of the tip relative to the base, in the tip frame, when the joints are at `q` and
@@ -234,7 +283,7 @@ impl Chain {
             .collect())
     }
 
-    fn check(&self, values: &[f64]) -> Result<(), Error> {
+    pub(crate) fn check(&self, values: &[f64]) -> Result<(), Error> {
         if values.len() != self.n_joints() {
             return Err(Error::JointCount {
                 got: values.len(),

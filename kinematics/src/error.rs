@@ -180,6 +180,26 @@ pub enum Error {
         /// Names of the moving joints in order.
         joints: Vec<String>,
     },
+    /// The range of a joint contains no value.
+    #[error("joint {joint:?}: its range from {lower} to {upper} contains no value")]
+    JointRange {
+        /// The joint.
+        joint: String,
+        /// Lower end of the range.
+        lower: f64,
+        /// Upper end of the range.
+        upper: f64,
+    },
+    /// A setting of inverse kinematics is out of its range.
+    #[error("inverse kinematics: {what} is {value}, must be {allowed}")]
+    InverseSetting {
+        /// Name of the value.
+        what: &'static str,
+        /// Value found.
+        value: f64,
+        /// Accepted values.
+        allowed: &'static str,
+    },
     /// A joint position or velocity is NaN or infinite.
     #[error("joint {joint:?}: {value} is not a finite number")]
     JointNotFinite {

@@ -34,7 +34,7 @@ pub mod device_clock;
 mod error;
 pub mod history;
 pub mod inertial;
-mod inverse;
+pub mod inverse;
 pub mod joints;
 mod lens;
 mod polynomial;

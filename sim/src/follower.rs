@@ -4,10 +4,11 @@
 use crate::Error;
 use crate::cabinet_tour::CabinetTour;
 use crate::config::N_JOINTS;
-use crate::panda::{self, Jacobian, Joints};
+use crate::panda::{self, Joints};
 use crate::scan::Scan;
 use kinematics::Transform;
-use nalgebra::{Matrix6, SMatrix, Vector6};
+use kinematics::inverse::{damped_change, pose_error};
+use nalgebra::Vector6;
 
 /// Tour of an arm's camera.
 #[derive(Clone, Copy, Debug)]
@@ -180,10 +181,19 @@ impl Follower {
         let twist = target_twist + pose_error(target_pose, &base_from_camera) * POSE_GAIN_HZ;
         let rest_posture_velocity =
             (Joints::from(REST_POSTURE_RAD) - self.position_rad) * REST_POSTURE_GAIN_HZ;
-        let inverse = damped_inverse(&jacobian);
         // The posture velocity is applied in full, and the least squares correct its effect on the
         // camera. As a result, only its projection to the null space remains.
-        rest_posture_velocity + inverse * (twist - jacobian * rest_posture_velocity)
+        let missing = twist - jacobian * rest_posture_velocity;
+        let columns: [Vector6<f64>; N_JOINTS] =
+            std::array::from_fn(|ix| jacobian.column(ix).into_owned());
+        let mut correction = Joints::zeros();
+        damped_change(
+            &columns,
+            &missing,
+            DAMPING.powi(2),
+            correction.as_mut_slice(),
+        );
+        rest_posture_velocity + correction
     }
 }
 
@@ -206,29 +216,6 @@ pub(crate) fn smooth_acceleration(
 pub(crate) fn speeds_within(to_lower: f64, to_upper: f64, fastest: f64) -> [f64; 2] {
     let towards = |distance: f64| (LIMIT_APPROACH_HZ * distance).clamp(0.0, fastest);
     [-towards(to_lower), towards(to_upper)]
-}
-
-fn damped_inverse(jacobian: &Jacobian) -> SMatrix<f64, N_JOINTS, 6> {
-    // Damped least squares: J^T (J J^T + d^2 I)^-1 (Wampler 1986; Nakamura and Hanafusa 1986).
-    let square = jacobian * jacobian.transpose() + Matrix6::identity() * DAMPING.powi(2);
-    let inverse = square
-        .try_inverse()
-        .expect("a damped square is positive definite");
-    jacobian.transpose() * inverse
-}
-
-/// Translation and rotation from the actual to the target pose, in world axes.
-pub(crate) fn pose_error(target_pose: &Transform, actual: &Transform) -> Vector6<f64> {
-    let translation_error = target_pose.translation.vector - actual.translation.vector;
-    let rotation_error = (target_pose.rotation * actual.rotation.inverse()).scaled_axis();
-    Vector6::new(
-        translation_error.x,
-        translation_error.y,
-        translation_error.z,
-        rotation_error.x,
-        rotation_error.y,
-        rotation_error.z,
-    )
 }
 
 fn clamp_to_limits(position_rad: Joints) -> Joints {

@@ -3,13 +3,13 @@
 
 use super::model::TwinModel;
 use crate::follower::{
-    POSE_GAIN_HZ, REST_POSTURE_GAIN_HZ, SPEED_LIMIT_FRAC, pose_error, smooth_acceleration,
-    speeds_within,
+    POSE_GAIN_HZ, REST_POSTURE_GAIN_HZ, SPEED_LIMIT_FRAC, smooth_acceleration, speeds_within,
 };
 use crate::joints::Joints;
 use crate::scan::{Scan, looking_along};
 use kinematics::Transform;
-use nalgebra::{Matrix6, Matrix6xX, UnitQuaternion, Vector3, Vector6};
+use kinematics::inverse::{damped_change, pose_error};
+use nalgebra::{UnitQuaternion, Vector3, Vector6};
 use std::f64::consts::TAU;
 use std::sync::Arc;
 
@@ -188,17 +188,21 @@ impl TwinFollower {
         }
         let (jacobian, twist) = self.in_camera_axes(tour, &base_from_camera, &twist);
         let posture_velocity = (&self.posture - &self.position) * REST_POSTURE_GAIN_HZ;
-        let missing = twist - &jacobian * &posture_velocity;
-        posture_velocity + damped_least_squares(&jacobian, &missing)
+        let moves = jacobian.iter().zip(&posture_velocity);
+        let missing = moves.fold(twist, |rest, (column, velocity)| rest - column * *velocity);
+        let mut change = Joints::zeros(jacobian.len());
+        damped_change(&jacobian, &missing, DAMPING.powi(2), change.as_mut_slice());
+        posture_velocity + change
     }
 
-    /// Jacobian of the camera and a twist in base axes, both as weighted rows in camera axes.
+    /// Jacobian of the camera and a twist in base axes, both weighted and in camera axes. The
+    /// Jacobian has one column per joint.
     fn in_camera_axes(
         &self,
         tour: &TableTour,
         base_from_camera: &Transform,
         twist: &Vector6<f64>,
-    ) -> (Matrix6xX<f64>, Vector6<f64>) {
+    ) -> (Vec<Vector6<f64>>, Vector6<f64>) {
         let flange = self
             .model
             .chain()
@@ -222,12 +226,12 @@ impl TwinFollower {
                 ROLL_WEIGHT * angular.z,
             )
         };
-        let mut jacobian = Matrix6xX::zeros(flange.ncols());
-        for (ix, column) in flange.column_iter().enumerate() {
+        let columns = flange.column_iter().map(|column| {
             let angular: Vector3<f64> = column.fixed_rows::<3>(3).into();
             let linear: Vector3<f64> = column.fixed_rows::<3>(0).into();
-            jacobian.set_column(ix, &weighted(linear + angular.cross(&lever), angular));
-        }
+            weighted(linear + angular.cross(&lever), angular)
+        });
+        let jacobian = columns.collect();
         let linear: Vector3<f64> = twist.fixed_rows::<3>(0).into();
         let angular: Vector3<f64> = twist.fixed_rows::<3>(3).into();
         (jacobian, weighted(linear, angular))
@@ -267,13 +271,4 @@ fn toward(
     }
     UnitQuaternion::rotation_between(&(present * Vector3::z()), forward)
         .map_or(*present, |rotation| rotation * present)
-}
-
-/// Damped least squares: J^T (J J^T + d^2 I)^-1 (Wampler 1986; Nakamura and Hanafusa 1986).
-fn damped_least_squares(jacobian: &Matrix6xX<f64>, twist: &Vector6<f64>) -> Joints {
-    let square = jacobian * jacobian.transpose() + Matrix6::identity() * DAMPING.powi(2);
-    let inverse = square
-        .try_inverse()
-        .expect("a damped square is positive definite");
-    jacobian.transpose() * (inverse * twist)
 }

@@ -10,6 +10,7 @@ use super::super::report::HandEyeCalibration;
 use super::super::samples::used;
 use super::super::solve::{self, Measurement};
 use super::super::{HandEyeInput, Setup};
+use kinematics::inverse::{InverseSolver, Target};
 use kinematics::{Chain, Intrinsics, Transform};
 use nalgebra::{DMatrix, Matrix6, Point3, Translation3, UnitQuaternion, Vector3, Vector6};
 use numbers::random::Random;
@@ -59,10 +60,9 @@ impl Reach<'_> {
                 ]
             })
             .collect();
-        let joints = self
-            .chain
-            .inverse(base_from_flange, self.start, &bounds)
-            .ok()??;
+        let mut solver = InverseSolver::within(self.chain.clone(), bounds).ok()?;
+        let target = Target::pose(*base_from_flange);
+        let joints = solver.solve_near(&target, self.start).ok()?;
         // The way back is also checked. An arm that cannot return to its start would have to be
         // moved by hand.
         let is_allowed = current.len() == joints.len()

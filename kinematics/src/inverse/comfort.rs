@@ -1,0 +1,63 @@
+//! Which of several joint values for the same pose are preferred: those that are far from the ends
+//! of the ranges and close to a posture.
+
+use super::bounds::Bounds;
+
+/// Width of the zone at each end of a range that is avoided, as a fraction of the range.
+const ZONE_FRAC: f64 = 0.1;
+/// Cost at the end of a range. The posture costs as much at a distance of one radian from one joint.
+const LIMIT_WEIGHT: f64 = 1.0;
+/// Cost of the squared distance from the posture, per rad^2 or m^2.
+const POSTURE_WEIGHT: f64 = 1.0;
+
+/// A preference among joint values (Liegeois 1977, with zones instead of the whole range, so that
+/// joints in the middle are not pulled).
+#[derive(Clone, Debug, Default)]
+pub(super) struct Comfort {
+    /// Preferred joint values. Empty without a posture.
+    pub(super) posture: Vec<f64>,
+}
+
+impl Comfort {
+    /// The cost of one joint value, at least 0.
+    pub(super) fn cost_of(&self, bounds: &Bounds, joint_ix: usize, value: f64) -> f64 {
+        let depth = zone_depth(bounds.range(joint_ix), value);
+        let off_posture = self.off_posture(joint_ix, value);
+        LIMIT_WEIGHT * depth * depth + POSTURE_WEIGHT * off_posture * off_posture
+    }
+
+    pub(super) fn cost(&self, bounds: &Bounds, joints: &[f64]) -> f64 {
+        let values = joints.iter().enumerate();
+        values
+            .map(|(joint_ix, value)| self.cost_of(bounds, joint_ix, *value))
+            .sum()
+    }
+
+    /// The change of one joint value that decreases the cost. Alone, the posture would be reached
+    /// and the zone left with this change.
+    pub(super) fn descent_of(&self, bounds: &Bounds, joint_ix: usize, value: f64) -> f64 {
+        let range = bounds.range(joint_ix);
+        let zone = ZONE_FRAC * (range[1] - range[0]);
+        let depth = zone_depth(range, value);
+        let push = if depth == 0.0 { 0.0 } else { depth * zone };
+        -LIMIT_WEIGHT * push - POSTURE_WEIGHT * self.off_posture(joint_ix, value)
+    }
+
+    fn off_posture(&self, joint_ix: usize, value: f64) -> f64 {
+        self.posture
+            .get(joint_ix)
+            .map_or(0.0, |posture| value - posture)
+    }
+}
+
+/// How far a value is inside a zone: 0 outside, 1 at the upper end of the range, -1 at the lower.
+fn zone_depth([lower, upper]: [f64; 2], value: f64) -> f64 {
+    let zone = ZONE_FRAC * (upper - lower);
+    // A range of a single value, and one without ends, have no zones.
+    if !(zone > 0.0 && zone.is_finite()) {
+        return 0.0;
+    }
+    let above = (value - (upper - zone)) / zone;
+    let below = (lower + zone - value) / zone;
+    above.max(0.0) - below.max(0.0)
+}

@@ -1,0 +1,465 @@
+//! Closed form for arms with the geometry of a Franka arm (Panda, FR3).
+//!
+//! If the last joint is given, a pose has at most eight solutions. Two circles about the shoulder
+//! and the wrist intersect in two elbows, the wrist is bent to either side, and the shoulder reaches
+//! each upper arm in two ways.
+//!
+//! Source: He and Liu 2021, "Analytical inverse kinematics for Franka Emika Panda - a geometrical
+//! solver for 7-DOF manipulators with unconventional design", section III. Differences: both elbows
+//! are computed (the paper omits one that is rarely within the ranges), angles come from `atan2`
+//! instead of arc sines, and the lengths are measured in the chain.
+
+use crate::{Chain, Transform};
+use nalgebra::{Rotation3, Translation3, UnitQuaternion, Vector3};
+
+/// Largest distance between the axes of a chain and those of a Franka arm, meters and radians.
+/// Calibrated arms deviate by about a millimeter. The rest is corrected by least squares.
+const MAX_DEVIATION: f64 = 3e-3;
+/// Shortest lengths of the parts of an arm for which the closed form is accurate, meters.
+const MIN_LENGTH_M: f64 = 0.01;
+/// Sine of the angle between forearm and shoulder-wrist line below which the plane of the arm is
+/// undetermined.
+const MIN_SINE: f64 = 1e-6;
+
+/// The geometry of an arm whose axes are arranged like those of a Franka arm.
+///
+/// All computations use the frame of the shoulder: its origin is where the axes of joints 1 and 2
+/// meet, z is the axis of joint 1, and y is the axis of joint 2 if joint 1 is at 0. With all joints
+/// at 0, the axes are parallel to y or z and lie in the plane of x and z.
+#[derive(Clone, Debug)]
+pub struct FrankaArm {
+    shoulder_from_base: Transform,
+    /// From the frame of joint 7 to the tip. The origin is the point of its axis that is closest to
+    /// the axis of joint 6, and x leads away from that axis if joint 7 is at 0.
+    seven_from_tip: Transform,
+    lengths: Lengths,
+    /// Lengths of upper arm and forearm, and the value of joint 4 at which they coincide. They are
+    /// derived from `lengths`, because each test of the search needs them.
+    segments_m: [f64; 2],
+    folded_q4: f64,
+}
+
+/// Lengths in meters, in the posture with all joints at 0.
+#[derive(Clone, Copy, Debug)]
+struct Lengths {
+    /// Position of the elbow (the axis of joint 4) relative to the shoulder, x and z.
+    elbow: [f64; 2],
+    /// Position of the wrist (where the axes of joints 5 and 6 meet) relative to the elbow.
+    wrist_from_elbow: [f64; 2],
+    /// Distance between the axes of joints 6 and 7.
+    flange_offset: f64,
+}
+
+/// Which of the eight solutions for a given last joint.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Branch {
+    /// Joint 4 is below the angle at which the arm is longest, which is -0.47 rad. This is so for
+    /// most values within the range of joint 4.
+    pub is_elbow_bent: bool,
+    /// The wrist is bent to the side of larger angles of joint 6.
+    pub is_wrist_outward: bool,
+    /// Joint 2 is positive.
+    pub is_shoulder_forward: bool,
+}
+
+impl Branch {
+    /// All branches. Neighbors share as much as possible.
+    pub const ALL: [Self; 8] = {
+        let mut branches = [Self {
+            is_elbow_bent: true,
+            is_wrist_outward: true,
+            is_shoulder_forward: true,
+        }; 8];
+        let mut ix = 0;
+        while ix < 8 {
+            branches[ix] = Self {
+                is_elbow_bent: ix & 4 == 0,
+                is_wrist_outward: ix & 2 == 0,
+                is_shoulder_forward: ix & 1 == 0,
+            };
+            ix += 1;
+        }
+        branches
+    };
+
+    fn ix(self) -> usize {
+        4 * usize::from(!self.is_elbow_bent)
+            + 2 * usize::from(!self.is_wrist_outward)
+            + usize::from(!self.is_shoulder_forward)
+    }
+}
+
+/// All solutions for a pose and a given last joint.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct FrankaSolutions {
+    joints_by_branch: [Option<[f64; 7]>; 8],
+}
+
+impl FrankaSolutions {
+    /// The joints of a branch, radians in -pi to pi (the last joint as given). `None` if the branch
+    /// does not reach the pose.
+    pub fn on_branch(&self, branch: Branch) -> Option<[f64; 7]> {
+        self.joints_by_branch[branch.ix()]
+    }
+
+    /// The branches that reach the pose, with their joints.
+    pub fn iter(&self) -> impl Iterator<Item = (Branch, [f64; 7])> {
+        let branches = Branch::ALL.iter().zip(self.joints_by_branch);
+        branches.filter_map(|(branch, joints)| Some((*branch, joints?)))
+    }
+}
+
+impl FrankaArm {
+    /// Measures the geometry of a chain. `None` if its axes are not arranged like those of a Franka
+    /// arm with the same directions and zeros. Base and tip may be any links.
+    pub fn of(chain: &Chain) -> Option<Self> {
+        let axes = axes_at_zero(chain)?;
+        let base_from_shoulder = shoulder_frame(&axes)?;
+        let shoulder_from_base = base_from_shoulder.inverse();
+        let in_shoulder: [Axis; 7] = axes.map(|axis| axis.moved_by(&shoulder_from_base));
+        let lengths = Lengths::measure(&in_shoulder)?;
+        let base_from_tip = chain.forward(&[0.0; 7]).ok()?;
+        let shoulder_from_seven = lengths.shoulder_from_seven();
+        let arm = Self {
+            shoulder_from_base,
+            seven_from_tip: shoulder_from_seven.inverse() * shoulder_from_base * base_from_tip,
+            lengths,
+            segments_m: lengths.segments(),
+            folded_q4: lengths.folded_q4(),
+        };
+        let deviates = in_shoulder
+            .iter()
+            .zip(lengths.axes())
+            .any(|(actual, model)| actual.deviation(&model) > MAX_DEVIATION);
+        (!deviates).then_some(arm)
+    }
+
+    /// All solutions for a pose of the tip and a value of the last joint. Ranges are not considered.
+    ///
+    /// If joint 2 is at 0, joints 1 and 3 have the same axis, and only their sum is determined.
+    /// Joint 1 is then 0.
+    pub fn solutions(&self, base_from_tip: &Transform, last_rad: f64) -> FrankaSolutions {
+        let mut joints_by_branch = [None; 8];
+        if let Some(wrist) = self.wrist(&self.shoulder_from_seven(base_from_tip), last_rad) {
+            for branch in Branch::ALL {
+                joints_by_branch[branch.ix()] = self.joints(&wrist, branch, last_rad);
+            }
+        }
+        FrankaSolutions { joints_by_branch }
+    }
+
+    fn joints(&self, wrist: &Wrist, branch: Branch, last_rad: f64) -> Option<[f64; 7]> {
+        let q4 = self.q4(wrist, branch);
+        let elbow = self.elbow(wrist, q4)?;
+        let forearm = elbow.forearm(wrist, branch)?;
+        let [q1, q2, q3] = forearm.shoulder(branch);
+        Some([q1, q2, q3, q4, forearm.q5, forearm.q6, last_rad])
+    }
+
+    /// The branch of a configuration. `None` if the pose does not belong to the configuration.
+    ///
+    /// * `base_from_tip`: pose of the tip for these joints.
+    pub fn branch(&self, joints: &[f64; 7], base_from_tip: &Transform) -> Option<Branch> {
+        let wrist = self.wrist(&self.shoulder_from_seven(base_from_tip), joints[6])?;
+        Some(Branch {
+            is_elbow_bent: wrap(joints[3] - self.folded_q4) > 0.0,
+            is_wrist_outward: wrap(joints[5] - wrist.middle_q6) > 0.0,
+            is_shoulder_forward: wrap(joints[1]) >= 0.0,
+        })
+    }
+
+    /// The angle of joint 4 at which the arm is longest.
+    pub(super) fn stretched_q4(&self) -> f64 {
+        wrap(self.folded_q4 + std::f64::consts::PI)
+    }
+
+    /// The pose of the frame of joint 7.
+    pub(super) fn shoulder_from_seven(&self, base_from_tip: &Transform) -> Transform {
+        self.shoulder_from_base * base_from_tip * self.seven_from_tip.inverse()
+    }
+
+    /// The wrist for a given last joint. `None` if it is farther from the shoulder than the arm is
+    /// long, or too close.
+    pub(super) fn wrist(&self, shoulder_from_seven: &Transform, last_rad: f64) -> Option<Wrist> {
+        let rotation = shoulder_from_seven.rotation;
+        let (sin, cos) = last_rad.sin_cos();
+        let x_of_six = rotation * Vector3::new(cos, -sin, 0.0);
+        let y_of_six = -(rotation * Vector3::z());
+        let position =
+            shoulder_from_seven.translation.vector - x_of_six * self.lengths.flange_offset;
+        let distance_m = position.norm();
+        let toward_shoulder = -position / distance_m;
+        let along_x = toward_shoulder.dot(&x_of_six);
+        let along_y = toward_shoulder.dot(&y_of_six);
+        // Law of cosines for the angle at the elbow.
+        let [upper_m, fore_m] = self.segments_m;
+        let cosine = (upper_m * upper_m + fore_m * fore_m - distance_m * distance_m)
+            / (2.0 * upper_m * fore_m);
+        let is_reachable = cosine.abs() <= 1.0 && distance_m > MIN_LENGTH_M;
+        is_reachable.then(|| Wrist {
+            x_of_six,
+            y_of_six,
+            toward_shoulder,
+            distance_m,
+            middle_q6: along_x.atan2(along_y),
+            largest_cosine: (along_x * along_x + along_y * along_y).sqrt(),
+            elbow_angle: cosine.acos(),
+        })
+    }
+
+    /// Joint 4 of a branch.
+    pub(super) fn q4(&self, wrist: &Wrist, branch: Branch) -> f64 {
+        let sign = if branch.is_elbow_bent { 1.0 } else { -1.0 };
+        wrap(self.folded_q4 + sign * wrist.elbow_angle)
+    }
+
+    /// The elbow for a value of joint 4, which gives the wrist its distance. `None` if the plane of
+    /// the arm is undetermined.
+    pub(super) fn elbow(&self, wrist: &Wrist, q4: f64) -> Option<Elbow> {
+        let (sin, cos) = q4.sin_cos();
+        // The wrist in the plane of the arm, in the axes of the upper arm. Joint 4 rotates about -y.
+        let [x, z] = self.lengths.wrist_from_elbow;
+        let wrist_x = self.lengths.elbow[0] + x * cos - z * sin;
+        let wrist_z = self.lengths.elbow[1] + z * cos + x * sin;
+        let toward_shoulder = [-wrist_x / wrist.distance_m, -wrist_z / wrist.distance_m];
+        // The axis of joint 5 has the direction (-sin, cos) in these axes.
+        let cosine = cos * toward_shoulder[1] - sin * toward_shoulder[0];
+        let sine = cos * toward_shoulder[0] + sin * toward_shoulder[1];
+        (sine.abs() > MIN_SINE).then_some(Elbow {
+            sin_q4: sin,
+            cos_q4: cos,
+            cosine,
+            sine,
+        })
+    }
+}
+
+/// The wrist of a pose, in the frame of the shoulder.
+pub(super) struct Wrist {
+    /// Axes x and y of the frame of joint 6: x leads to the axis of joint 7, z is the axis of joint
+    /// 6, and y is opposite to the axis of joint 7.
+    x_of_six: Vector3<f64>,
+    y_of_six: Vector3<f64>,
+    toward_shoulder: Vector3<f64>,
+    /// Distance from the shoulder.
+    distance_m: f64,
+    /// Angle of joint 6 at which the forearm points most toward the shoulder. It is between the two
+    /// solutions.
+    middle_q6: f64,
+    /// Cosine of the angle between the two at this value.
+    largest_cosine: f64,
+    /// Angle between upper arm and forearm.
+    elbow_angle: f64,
+}
+
+/// An elbow, without its direction in space.
+pub(super) struct Elbow {
+    sin_q4: f64,
+    cos_q4: f64,
+    /// Cosine and sine of the angle from the axis of joint 5 to the direction toward the shoulder,
+    /// about the y axis of the arm's plane.
+    cosine: f64,
+    sine: f64,
+}
+
+/// A forearm and an upper arm in space.
+pub(super) struct Forearm {
+    pub(super) q5: f64,
+    pub(super) q6: f64,
+    /// Axes x and z of the frame of joint 3: z leads along the upper arm, x to the elbow.
+    x_of_three: Vector3<f64>,
+    z_of_three: Vector3<f64>,
+}
+
+impl Elbow {
+    /// The forearm of a branch. `None` if joint 6 cannot give it the angle to the shoulder.
+    pub(super) fn forearm(&self, wrist: &Wrist, branch: Branch) -> Option<Forearm> {
+        // Joint 6 rotates the axis of joint 5, `sin(q6) x + cos(q6) y`. Its dot product with the
+        // direction toward the shoulder must be the cosine.
+        let ratio = self.cosine / wrist.largest_cosine;
+        let is_possible = ratio.abs() <= 1.0;
+        if !is_possible {
+            return None;
+        }
+        let sign = if branch.is_wrist_outward { 1.0 } else { -1.0 };
+        let q6 = wrap(wrist.middle_q6 + sign * ratio.acos());
+        let (sin, cos) = q6.sin_cos();
+        let z_of_five = wrist.x_of_six * sin + wrist.y_of_six * cos;
+        let normal = z_of_five.cross(&wrist.toward_shoulder) / self.sine;
+        // Joint 5 rotates about `z_of_five`, from the axis of joint 4 (opposite to the normal of the
+        // arm's plane) to the axis of joint 6.
+        let z_of_six = wrist.x_of_six.cross(&wrist.y_of_six);
+        let q5 = (-z_of_six.dot(&z_of_five.cross(&normal))).atan2(-z_of_six.dot(&normal));
+        let z_of_three = z_of_five * self.cos_q4 + normal.cross(&z_of_five) * self.sin_q4;
+        Some(Forearm {
+            q5,
+            q6,
+            x_of_three: normal.cross(&z_of_three),
+            z_of_three,
+        })
+    }
+}
+
+impl Forearm {
+    /// Joints 1 to 3 of a branch: `Rz(q1) Ry(q2) Rz(q3)` is the rotation of the upper arm.
+    pub(super) fn shoulder(&self, branch: Branch) -> [f64; 3] {
+        let sign = if branch.is_shoulder_forward {
+            1.0
+        } else {
+            -1.0
+        };
+        let z = self.z_of_three;
+        let x = self.x_of_three;
+        let sideways = (z.x * z.x + z.y * z.y).sqrt();
+        let q1 = if sideways > 0.0 {
+            (sign * z.y).atan2(sign * z.x)
+        } else {
+            0.0
+        };
+        let q2 = (sign * sideways).atan2(z.z);
+        let (sin_q1, cos_q1) = q1.sin_cos();
+        let q3 = (cos_q1 * x.y - sin_q1 * x.x)
+            .atan2(z.z * (cos_q1 * x.x + sin_q1 * x.y) - sign * sideways * x.z);
+        [q1, q2, q3]
+    }
+}
+
+impl Lengths {
+    /// Measures the lengths between axes that are at their places. `None` if a part is too short.
+    fn measure(axes: &[Axis; 7]) -> Option<Self> {
+        let elbow = [axes[3].point.x, axes[3].point.z];
+        let wrist = [axes[4].point.x, axes[5].point.z];
+        let lengths = Self {
+            elbow,
+            wrist_from_elbow: [wrist[0] - elbow[0], wrist[1] - elbow[1]],
+            flange_offset: axes[6].point.x - wrist[0],
+        };
+        let are_long = lengths
+            .segments()
+            .iter()
+            .all(|length_m| *length_m > MIN_LENGTH_M);
+        are_long.then_some(lengths)
+    }
+
+    /// Distances from shoulder to elbow and from elbow to wrist.
+    fn segments(&self) -> [f64; 2] {
+        [self.elbow, self.wrist_from_elbow].map(|[x, z]| x.hypot(z))
+    }
+
+    /// The angle of joint 4 at which shoulder and wrist are in the same direction from the elbow. The
+    /// angle between the two directions counts from here.
+    fn folded_q4(&self) -> f64 {
+        let [elbow_x, elbow_z] = self.elbow;
+        let [wrist_x, wrist_z] = self.wrist_from_elbow;
+        wrist_x.atan2(wrist_z) - (-elbow_x).atan2(-elbow_z)
+    }
+
+    /// The axes of the arm with all joints at 0.
+    fn axes(&self) -> [Axis; 7] {
+        let [elbow_x, elbow_z] = self.elbow;
+        let wrist_x = elbow_x + self.wrist_from_elbow[0];
+        let wrist_z = elbow_z + self.wrist_from_elbow[1];
+        let axis = |direction: Vector3<f64>, x: f64, z: f64| Axis {
+            direction,
+            point: Vector3::new(x, 0.0, z),
+        };
+        [
+            axis(Vector3::z(), 0.0, 0.0),
+            axis(Vector3::y(), 0.0, 0.0),
+            axis(Vector3::z(), 0.0, 0.0),
+            axis(-Vector3::y(), elbow_x, elbow_z),
+            axis(Vector3::z(), wrist_x, 0.0),
+            axis(-Vector3::y(), wrist_x, wrist_z),
+            axis(-Vector3::z(), wrist_x + self.flange_offset, 0.0),
+        ]
+    }
+
+    /// The frame of joint 7 with all joints at 0.
+    fn shoulder_from_seven(&self) -> Transform {
+        let x = self.elbow[0] + self.wrist_from_elbow[0] + self.flange_offset;
+        let z = self.elbow[1] + self.wrist_from_elbow[1];
+        let half_turn = UnitQuaternion::from_axis_angle(&Vector3::x_axis(), std::f64::consts::PI);
+        Transform::from_parts(Translation3::new(x, 0.0, z), half_turn)
+    }
+}
+
+/// The axis of a joint.
+#[derive(Clone, Copy, Debug)]
+struct Axis {
+    direction: Vector3<f64>,
+    /// The point of the axis that is closest to the origin.
+    point: Vector3<f64>,
+}
+
+impl Axis {
+    fn moved_by(&self, motion: &Transform) -> Self {
+        let direction = motion.rotation * self.direction;
+        let point = motion.rotation * self.point + motion.translation.vector;
+        Self {
+            direction,
+            point: point - direction * direction.dot(&point),
+        }
+    }
+
+    /// Largest difference between two axes, meters and radians.
+    fn deviation(&self, other: &Self) -> f64 {
+        let directions = (self.direction - other.direction).norm();
+        directions.max((self.point - other.point).norm())
+    }
+}
+
+/// The axes of a chain of seven revolute joints with all joints at 0. `None` for other chains.
+fn axes_at_zero(chain: &Chain) -> Option<[Axis; 7]> {
+    let zeros = [0.0; 7];
+    if chain.n_joints() != zeros.len() {
+        return None;
+    }
+    let tip = chain.forward(&zeros).ok()?.translation.vector;
+    let jacobian = chain.jacobian(&zeros).ok()?;
+    let mut axes = [Axis {
+        direction: Vector3::z(),
+        point: Vector3::zeros(),
+    }; 7];
+    for (axis, column) in axes.iter_mut().zip(jacobian.column_iter()) {
+        let linear: Vector3<f64> = column.fixed_rows::<3>(0).into();
+        let direction: Vector3<f64> = column.fixed_rows::<3>(3).into();
+        // Prismatic joints do not rotate, and joints that mimic joints follow rotate the tip about a
+        // moving axis or at another rate.
+        let is_rotation = (direction.norm() - 1.0).abs() < 1e-9
+            && direction.dot(&linear).abs() < 1e-9
+            && chain.has_one_segment_per_joint();
+        if !is_rotation {
+            return None;
+        }
+        let point = tip + direction.cross(&linear);
+        *axis = Axis {
+            direction,
+            point: point - direction * direction.dot(&point),
+        };
+    }
+    Some(axes)
+}
+
+/// The frame of the shoulder in the base. `None` if the first two axes are nearly parallel.
+fn shoulder_frame(axes: &[Axis; 7]) -> Option<Transform> {
+    let z = axes[0].direction;
+    let y = (axes[1].direction - z * z.dot(&axes[1].direction)).try_normalize(0.5)?;
+    let rotation = Rotation3::from_basis_unchecked(&[y.cross(&z), y, z]);
+    // The point of the first axis that is closest to the second.
+    let between = axes[1].point - axes[0].point;
+    let across = z.cross(&axes[1].direction);
+    let along = between.cross(&axes[1].direction).dot(&across) / across.norm_squared();
+    Some(Transform::from_parts(
+        (axes[0].point + z * along).into(),
+        UnitQuaternion::from_rotation_matrix(&rotation),
+    ))
+}
+
+/// The angle in -pi to pi that differs by full turns.
+fn wrap(angle_rad: f64) -> f64 {
+    use std::f64::consts::{PI, TAU};
+    if angle_rad.abs() <= PI {
+        return angle_rad;
+    }
+    angle_rad - TAU * (angle_rad / TAU).round()
+}
