@@ -1,0 +1,267 @@
+//! Turns targets that expire into setpoints: the last part of the chain, which belongs into the
+//! thread that moves the arm.
+//!
+//! It needs nothing but targets and the time. The arm therefore brakes whatever happens to the
+//! program that sends the targets.
+
+use crate::check::check;
+use crate::error::Error;
+use crate::target::{Output, Target};
+use drivers::motion::{MotionLimits, Setpoint, TrajectoryGenerator};
+use kinematics::Stamp;
+use std::time::Duration;
+
+/// Why a target was not followed.
+#[derive(Clone, Debug, PartialEq, thiserror::Error)]
+pub enum NotFollowed {
+    /// The target arrived after its expiry.
+    #[error("target {serial} expired {late_secs:.3} s before it arrived")]
+    Expired {
+        /// Number of the target.
+        serial: u64,
+        /// Time since its expiry.
+        late_secs: f64,
+    },
+    /// The target was repeated or overtaken by a newer one.
+    #[error("target {serial} came after target {newest}")]
+    OutOfOrder {
+        /// Number of the target.
+        serial: u64,
+        /// Greatest number received.
+        newest: u64,
+    },
+    /// The arm braked during this motion, or still brakes.
+    #[error("motion {motion} ended when the arm braked: it moves again with a new grip")]
+    MotionEnded {
+        /// Number of the motion.
+        motion: u64,
+    },
+    /// The generator cannot use the target. The arm brakes.
+    #[error("the arm brakes: {why}")]
+    Generator {
+        /// Message of the generator.
+        why: String,
+    },
+}
+
+/// Generates one setpoint per cycle, and brakes when targets expire.
+#[derive(Debug)]
+pub struct Follower {
+    generator: TrajectoryGenerator,
+    /// Generator with the brake limits, while the arm brakes.
+    brake: Option<TrajectoryGenerator>,
+    limits: Vec<MotionLimits>,
+    brake_limits: Vec<MotionLimits>,
+    period: Duration,
+    setpoint: Setpoint,
+    newest_serial: u64,
+    /// Number of the motion whose targets are followed.
+    motion: u64,
+    /// The greatest number of a motion that has ended.
+    ended_motion: u64,
+    /// When the newest target expires; `None` if no target is followed.
+    expires_at: Option<Stamp>,
+}
+
+impl Follower {
+    /// A follower at rest at `position`.
+    ///
+    /// * `limits`: limits of motions.
+    /// * `brake_limits`: limits of braking; at least as high.
+    ///
+    /// # Errors
+    /// If a brake limit is lower than the limit of motions, because the arm could then be in a state
+    /// from which it cannot brake within its limits; or for the reasons of
+    /// [`TrajectoryGenerator::new`].
+    pub fn new(
+        limits: &[MotionLimits],
+        brake_limits: &[MotionLimits],
+        position: &[f64],
+        period: Duration,
+    ) -> Result<Self, Error> {
+        check_brake_limits(limits, brake_limits)?;
+        let generator = TrajectoryGenerator::new(limits, position, period)
+            .map_err(|why| Error::Generator { why })?;
+        let zero = vec![0.0; position.len()];
+        Ok(Self {
+            generator,
+            brake: None,
+            limits: limits.to_vec(),
+            brake_limits: brake_limits.to_vec(),
+            period,
+            setpoint: Setpoint {
+                position: position.to_vec(),
+                velocity: zero.clone(),
+                acceleration: zero,
+            },
+            newest_serial: 0,
+            motion: 0,
+            ended_motion: 0,
+            expires_at: None,
+        })
+    }
+
+    /// Takes the output of the chain of decisions.
+    ///
+    /// # Errors
+    /// If the target is not followed. Unless the error is [`NotFollowed::Generator`], the motion
+    /// does not change.
+    pub fn obey(&mut self, now: Stamp, output: &Output) -> Result<(), NotFollowed> {
+        match output {
+            Output::Follow(target) => self.follow(now, target),
+            Output::Brake => {
+                self.start_brake();
+                Ok(())
+            }
+        }
+    }
+
+    /// The setpoint of the next cycle.
+    ///
+    /// # Errors
+    /// If not even braking succeeds. The arm must then apply its fail-safe.
+    pub fn step(&mut self, now: Stamp) -> Result<Setpoint, Error> {
+        // Written so that a target without expiry counts as expired.
+        let is_fresh = self.expires_at.is_some_and(|expires_at| now <= expires_at);
+        if !is_fresh {
+            self.start_brake();
+        }
+        if self.brake.is_none() {
+            match self.generator.step() {
+                Ok(setpoint) => {
+                    self.setpoint = setpoint.clone();
+                    return Ok(setpoint);
+                }
+                // A plan that fails must not keep the arm moving.
+                Err(_) => self.start_brake(),
+            }
+        }
+        self.step_brake()
+    }
+
+    /// The last setpoint.
+    pub fn setpoint(&self) -> &Setpoint {
+        &self.setpoint
+    }
+
+    /// Whether all joints are at rest.
+    pub fn is_at_rest(&self) -> bool {
+        let is_zero = |values: &[f64]| values.iter().all(|value| *value == 0.0);
+        is_zero(&self.setpoint.velocity) && is_zero(&self.setpoint.acceleration)
+    }
+
+    /// The greatest number of a motion that ended because the arm braked; 0 at first.
+    pub fn braked_motion(&self) -> u64 {
+        self.ended_motion
+    }
+
+    fn follow(&mut self, now: Stamp, target: &Target) -> Result<(), NotFollowed> {
+        let serial = target.serial;
+        if serial <= self.newest_serial {
+            let newest = self.newest_serial;
+            return Err(NotFollowed::OutOfOrder { serial, newest });
+        }
+        if now > target.expires_at {
+            let late_secs = now.secs_since(target.expires_at);
+            return Err(NotFollowed::Expired { serial, late_secs });
+        }
+        let motion = target.motion;
+        let is_braking = self.brake.is_some() && !self.is_at_rest();
+        if motion <= self.ended_motion || motion < self.motion || is_braking {
+            return Err(NotFollowed::MotionEnded { motion });
+        }
+        if self.brake.is_some() || self.expires_at.is_none() {
+            self.restart()
+                .map_err(|why| NotFollowed::Generator { why })?;
+        }
+        self.newest_serial = serial;
+        self.motion = motion;
+        if let Err(why) = self.generator.set_target(&target.joint_target()) {
+            self.start_brake();
+            return Err(NotFollowed::Generator { why });
+        }
+        self.expires_at = Some(target.expires_at);
+        Ok(())
+    }
+
+    /// A new generator at the position at which the arm rests.
+    fn restart(&mut self) -> Result<(), String> {
+        let position = &self.setpoint.position;
+        self.generator = TrajectoryGenerator::new(&self.limits, position, self.period)?;
+        self.brake = None;
+        Ok(())
+    }
+
+    /// Ends the motion. The arm continues from its state of motion with the brake limits.
+    fn start_brake(&mut self) {
+        self.expires_at = None;
+        self.ended_motion = self.ended_motion.max(self.motion);
+        if self.brake.is_some() || self.is_at_rest() {
+            return;
+        }
+        let planned = brake_from(&self.setpoint, &self.brake_limits, self.period);
+        match planned {
+            Ok(brake) => self.brake = Some(brake),
+            // Without a plan for the brake limits, the arm brakes with the limits of motions.
+            Err(_) => self.generator.stop(),
+        }
+    }
+
+    fn step_brake(&mut self) -> Result<Setpoint, Error> {
+        if !self.is_at_rest() {
+            let generator = self.brake.as_mut().unwrap_or(&mut self.generator);
+            self.setpoint = generator.step().map_err(|why| Error::Generator { why })?;
+        }
+        Ok(self.setpoint.clone())
+    }
+}
+
+/// A generator that brings the arm to rest from a state of motion.
+fn brake_from(
+    setpoint: &Setpoint,
+    brake_limits: &[MotionLimits],
+    period: Duration,
+) -> Result<TrajectoryGenerator, String> {
+    let mut brake = TrajectoryGenerator::new(brake_limits, &setpoint.position, period)?;
+    brake.resume(setpoint)?;
+    brake.stop();
+    Ok(brake)
+}
+
+fn check_brake_limits(limits: &[MotionLimits], brake_limits: &[MotionLimits]) -> Result<(), Error> {
+    if brake_limits.len() != limits.len() {
+        return Err(Error::JointCount {
+            what: "the list of brake limits",
+            got: brake_limits.len(),
+            expected: limits.len(),
+        });
+    }
+    for (ix, (limits, brake)) in limits.iter().zip(brake_limits).enumerate() {
+        for (what, limit, brake) in [
+            ("velocity", limits.velocity, brake.velocity),
+            ("acceleration", limits.acceleration, brake.acceleration),
+            ("jerk", limits.jerk, brake.jerk),
+        ] {
+            check(
+                format!("the {what} of joint {} for braking", ix + 1),
+                brake,
+                brake >= limit,
+                "at least that of its motions",
+            )?;
+        }
+    }
+    Ok(())
+}
+
+/// Brake limits from motion limits: the same velocity, and `factor` times the acceleration and the
+/// jerk.
+pub fn brake_limits(limits: &[MotionLimits], factor: f64) -> Vec<MotionLimits> {
+    limits
+        .iter()
+        .map(|joint| MotionLimits {
+            acceleration: joint.acceleration * factor,
+            jerk: joint.jerk * factor,
+            ..*joint
+        })
+        .collect()
+}
