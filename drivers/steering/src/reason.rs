@@ -243,7 +243,7 @@ pub enum Reason {
         step: f64,
     },
     /// Two parts of the robot are close to each other.
-    #[error("{} and {} are {:.0} mm apart", .parts[0], .parts[1], 1000.0 * distance_m)]
+    #[error("{} and {} are {:.0} mm apart", .parts[0], .parts[1], 1000.0 * .distance_m)]
     SelfCollision {
         /// Both links.
         parts: [String; 2],
@@ -253,7 +253,7 @@ pub enum Reason {
         place: [f64; 3],
     },
     /// A surface of the scene is near.
-    #[error("{part} is {:.0} mm from a surface, which was seen {age_secs:.0} s ago", 1000.0 * distance_m)]
+    #[error("{part} is {:.0} mm from a surface, which was seen {age_secs:.0} s ago", 1000.0 * .distance_m)]
     Near {
         /// Link of the robot.
         part: String,

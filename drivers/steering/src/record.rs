@@ -74,7 +74,7 @@ impl Record {
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
 #[error(
     "the replay differs at {:.3} s: it decided {replayed}, the record says {recorded}; the rig, the program or the record changed",
-    at.secs()
+    .at.secs()
 )]
 pub struct Difference {
     /// Time of the entry.
