@@ -34,8 +34,7 @@ impl Default for SelfCollisionConfig {
 /// Number of postures in which all pairs are tried.
 const N_POSTURES: u32 = 500;
 /// Pairs that are close in this share of postures are shaped like this, and are not checked. The
-/// same rule and share as in `MoveIt` (`moveit_setup_assistant`,
-/// `compute_default_collisions.cpp`).
+/// set-up assistant of `MoveIt` selects pairs by the same rule.
 const ALWAYS_CLOSE_FRAC: f64 = 0.95;
 /// Range of a joint without limits, radians or meters, from which postures are drawn.
 const UNLIMITED: f64 = std::f64::consts::PI;
