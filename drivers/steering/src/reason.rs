@@ -108,8 +108,8 @@ pub enum Reason {
         /// What is wrong.
         report: String,
     },
-    /// The arm braked because no target arrived in time.
-    #[error("the arm braked because its target expired: grip again")]
+    /// The arm braked by itself.
+    #[error("the arm braked, because its target expired or had no trajectory: grip again")]
     ArmBraked,
     /// The time went back.
     #[error("the clock went back by {secs:.3} s")]

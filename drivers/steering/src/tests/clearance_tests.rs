@@ -181,7 +181,8 @@ fn surface_that_appears_at_the_target_brakes_the_arm() {
     sim.send(Some(1), pose_intent(&to)).unwrap_err();
     sim.rest();
     // A new grip may leave the surface, but not approach it.
-    let (ball, _) = ball_below(&sim, 0.05);
+    // The ball reaches 3 cm into the tool.
+    let (ball, _) = ball_below(&sim, -0.03);
     sim.scene = Box::new(scene(vec![ball]));
     let down = Transform::translation(0.0, 0.0, -0.1) * sim.tip();
     let start = sim.arm().position;
