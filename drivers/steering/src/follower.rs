@@ -54,6 +54,8 @@ pub struct Follower {
     brake_limits: Vec<MotionLimits>,
     period: Duration,
     setpoint: Setpoint,
+    /// Target of the generator, before it was clamped.
+    target: Vec<f64>,
     newest_serial: u64,
     /// Number of the motion whose targets are followed.
     motion: u64,
@@ -94,6 +96,7 @@ impl Follower {
                 velocity: zero.clone(),
                 acceleration: zero,
             },
+            target: position.to_vec(),
             newest_serial: 0,
             motion: 0,
             ended_motion: 0,
@@ -166,21 +169,27 @@ impl Follower {
             return Err(NotFollowed::Expired { serial, late_secs });
         }
         let motion = target.motion;
-        let is_braking = self.brake.is_some() && !self.is_at_rest();
+        let is_braking = self.expires_at.is_none() && !self.is_at_rest();
         if motion <= self.ended_motion || motion < self.motion || is_braking {
             return Err(NotFollowed::MotionEnded { motion });
         }
-        if self.brake.is_some() || self.expires_at.is_none() {
+        if self.expires_at.is_none() {
             self.restart()
                 .map_err(|why| NotFollowed::Generator { why })?;
         }
         self.newest_serial = serial;
         self.motion = motion;
+        self.expires_at = Some(target.expires_at);
+        // An equal target only lasts longer. Planning again from a state on the way to it could fail
+        // because of rounding, and an arm that holds its position would plan in every cycle.
+        if target.position == self.target {
+            return Ok(());
+        }
         if let Err(why) = self.generator.set_target(&target.joint_target()) {
             self.start_brake();
             return Err(NotFollowed::Generator { why });
         }
-        self.expires_at = Some(target.expires_at);
+        self.target.clone_from(&target.position);
         Ok(())
     }
 
@@ -188,6 +197,7 @@ impl Follower {
     fn restart(&mut self) -> Result<(), String> {
         let position = &self.setpoint.position;
         self.generator = TrajectoryGenerator::new(&self.limits, position, self.period)?;
+        self.target.clone_from(position);
         self.brake = None;
         Ok(())
     }
