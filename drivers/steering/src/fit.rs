@@ -157,11 +157,8 @@ mod tests {
             let shape = shape(Geometry::Box { size_m });
             let capsules = enclosing_capsules(&shape, &|_| None);
             for _ in 0..2000 {
-                let mut point = Vector3::zeros();
-                for axis in 0..3 {
-                    let side = random.uniform(-0.5, 0.5) * size_m[axis];
-                    point[axis] = shape.link_from_shape.translation.vector[axis] + side;
-                }
+                let in_box = Vector3::from(size_m.map(|size| random.uniform(-0.5, 0.5) * size));
+                let point = shape.link_from_shape.translation.vector + in_box;
                 assert!(encloses(&capsules, point), "{size_m:?}");
             }
             let thickest = capsules

@@ -129,8 +129,8 @@ impl Limits {
             )?;
         }
         if let Some([low, high]) = config.workspace_m {
-            for axis in 0..3 {
-                let side_m = high[axis] - low[axis];
+            for (low, high) in low.iter().zip(&high) {
+                let side_m = high - low;
                 let what = "a side of limits.workspace_m";
                 check(what, side_m, side_m > 0.0, "a positive number")?;
             }
