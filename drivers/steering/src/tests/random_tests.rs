@@ -215,7 +215,7 @@ impl Permission {
 
 fn random_request(sim: &mut Sim, random: &mut Random, grips: &mut [u64; 3]) -> Request {
     let operator = if random.below(8) == 0 { BEN } else { ANA };
-    match random.below(60) {
+    match random.below(200) {
         0 => Request::TakeLease(BEN),
         1 => Request::TakeLease(Operator(3)),
         2 => Request::ReleaseLease(operator),
@@ -224,8 +224,8 @@ fn random_request(sim: &mut Sim, random: &mut Random, grips: &mut [u64; 3]) -> R
             to: BEN,
         },
         4 => Request::Stop { by: Some(operator) },
-        5..=8 => Request::Rearm(operator),
-        9..=14 => Request::TakeLease(ANA),
+        5..=14 => Request::Rearm(operator),
+        15..=30 => Request::TakeLease(ANA),
         _ => {
             let ix = if random.below(10) == 0 {
                 random.below(3)
