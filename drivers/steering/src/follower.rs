@@ -11,6 +11,11 @@ use drivers::motion::{MotionLimits, Setpoint, TrajectoryGenerator};
 use kinematics::Stamp;
 use std::time::Duration;
 
+/// Rounding of a setpoint, relative to its limits.
+const TOLERANCE: f64 = 1.0 + 1e-6;
+/// Fractions of the jerk with which the brake is planned if its plan cannot be used.
+const BRAKE_JERK_FRACS: [f64; 5] = [1.0, 1.0 - 1e-6, 1.0 - 1e-4, 0.99, 0.9];
+
 /// Why a target was not followed.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
 pub enum NotFollowed {
@@ -130,13 +135,14 @@ impl Follower {
             self.start_brake();
         }
         if self.brake.is_none() {
-            match self.generator.step() {
-                Ok(setpoint) => {
-                    self.setpoint = setpoint.clone();
-                    return Ok(setpoint);
+            let next = self.generator.step();
+            match next {
+                Ok(next) if self.continues(&next, &self.limits) => {
+                    self.setpoint = next.clone();
+                    return Ok(next);
                 }
                 // A plan that fails must not keep the arm moving.
-                Err(_) => self.start_brake(),
+                _ => self.start_brake(),
             }
         }
         self.step_brake()
@@ -209,21 +215,66 @@ impl Follower {
         if self.brake.is_some() || self.is_at_rest() {
             return;
         }
-        let planned = brake_from(&self.setpoint, &self.brake_limits, self.period);
-        match planned {
-            Ok(brake) => self.brake = Some(brake),
-            // Without a plan for the brake limits, the arm brakes with the limits of motions.
-            Err(_) => self.generator.stop(),
-        }
+        self.brake = brake_from(&self.setpoint, &self.brake_limits, self.period).ok();
     }
 
     fn step_brake(&mut self) -> Result<Setpoint, Error> {
-        if !self.is_at_rest() {
-            let generator = self.brake.as_mut().unwrap_or(&mut self.generator);
-            self.setpoint = generator.step().map_err(|why| Error::Generator { why })?;
+        if self.is_at_rest() {
+            return Ok(self.setpoint.clone());
         }
-        Ok(self.setpoint.clone())
+        let planned = self.brake.as_mut().map(TrajectoryGenerator::step);
+        let next = match planned {
+            Some(Ok(next)) if self.continues(&next, &self.brake_limits) => next,
+            _ => self.brake_anew()?,
+        };
+        self.setpoint = next.clone();
+        Ok(next)
     }
+
+    /// Plans the brake again with slightly less jerk, and returns the next setpoint.
+    fn brake_anew(&mut self) -> Result<Setpoint, Error> {
+        let mut why = String::new();
+        for jerk_frac in BRAKE_JERK_FRACS {
+            let limits = with_jerk(&self.brake_limits, jerk_frac);
+            let planned = brake_from(&self.setpoint, &limits, self.period)
+                .and_then(|mut brake| brake.step().map(|next| (brake, next)));
+            match planned {
+                Ok((brake, next)) if self.continues(&next, &self.brake_limits) => {
+                    self.brake = Some(brake);
+                    return Ok(next);
+                }
+                Ok((_, next)) => why = format!("the setpoint {next:?} exceeds the brake limits"),
+                Err(error) => why = error,
+            }
+        }
+        Err(Error::Generator { why })
+    }
+
+    /// Whether a setpoint continues from the last one within velocity, acceleration and jerk. Plans
+    /// are checked because their sources of errors, such as rounding near degenerate profiles, are
+    /// not all known, and because a robot's controller would stop at such a setpoint.
+    fn continues(&self, next: &Setpoint, limits: &[MotionLimits]) -> bool {
+        let secs = self.period.as_secs_f64();
+        let last = &self.setpoint;
+        limits.iter().enumerate().all(|(ix, joint)| {
+            let moved = (next.position[ix] - last.position[ix]).abs();
+            let accelerated = (next.velocity[ix] - last.velocity[ix]).abs();
+            let jerked = (next.acceleration[ix] - last.acceleration[ix]).abs();
+            moved <= joint.velocity * secs * TOLERANCE
+                && accelerated <= joint.acceleration * secs * TOLERANCE
+                && jerked <= joint.jerk * secs * TOLERANCE
+        })
+    }
+}
+
+fn with_jerk(limits: &[MotionLimits], frac: f64) -> Vec<MotionLimits> {
+    limits
+        .iter()
+        .map(|joint| MotionLimits {
+            jerk: joint.jerk * frac,
+            ..*joint
+        })
+        .collect()
 }
 
 /// A generator that brings the arm to rest from a state of motion.

@@ -212,10 +212,9 @@ fn check_setpoints(before: &Setpoint, after: &Setpoint, limits: &[MotionLimits])
             accelerated <= acceleration * secs * tolerance,
             "acceleration of joint {ix}: {accelerated}"
         );
-        // The last setpoint of a trajectory sets the remaining acceleration to zero.
         assert!(
-            jerked <= jerk * secs * tolerance + 1e-6,
-            "jerk of joint {ix}: {jerked}"
+            jerked <= jerk * secs * tolerance,
+            "jerk of joint {ix}: {jerked} from {before:?} to {after:?}"
         );
         let [lower, upper] = joint.position;
         let q = after.position[ix];
