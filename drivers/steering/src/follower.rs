@@ -11,8 +11,9 @@ use drivers::motion::{MotionLimits, Setpoint, TrajectoryGenerator};
 use kinematics::Stamp;
 use std::time::Duration;
 
-/// Rounding of a setpoint, relative to its limits.
-const TOLERANCE: f64 = 1.0 + 1e-6;
+/// Rounding of a setpoint, relative to its limits. The generator sets velocities of up to 1e-8 to
+/// zero at the end of a trajectory.
+const TOLERANCE: f64 = 1.0 + 1e-4;
 /// Fractions of the jerk with which the brake is planned if its plan cannot be used.
 const BRAKE_JERK_FRACS: [f64; 5] = [1.0, 1.0 - 1e-6, 1.0 - 1e-4, 0.99, 0.9];
 
@@ -134,7 +135,7 @@ impl Follower {
         if !is_fresh {
             self.start_brake();
         }
-        if self.brake.is_none() {
+        if self.expires_at.is_some() {
             let next = self.generator.step();
             match next {
                 Ok(next) if self.continues(&next, &self.limits) => {

@@ -25,7 +25,7 @@ const BEN: Operator = Operator(2);
 const PAD: Device = Device(10);
 const BRAKE_FACTOR: f64 = 2.0;
 /// Rounding of differences of setpoints, relative to a limit.
-const ROUNDING: f64 = 1e-6;
+const ROUNDING: f64 = 1e-4;
 
 fn panda() -> (Urdf, Chain) {
     let urdf = Urdf::parse(PANDA).unwrap();
