@@ -14,6 +14,7 @@ const ALLOWED: &str = "
     test-features ->
     kinematics    -> messages numbers
     drivers       -> files kinematics messages numbers
+    steering      -> drivers kinematics numbers
     test-support  -> drivers kinematics numbers
     gpu           -> messages test-support
     keyframe      -> files kinematics messages numbers

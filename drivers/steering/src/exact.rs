@@ -1,0 +1,85 @@
+//! Serialization without loss, for records that are replayed bit for bit.
+//!
+//! JSON has no NaN and no infinity, but commands may contain them, and a replay must refuse the same
+//! commands. These numbers are written as texts.
+
+use serde::{Deserialize, Deserializer, Serialize, Serializer};
+
+#[derive(Serialize, Deserialize)]
+#[serde(untagged)]
+enum Written {
+    Finite(f64),
+    Other(String),
+}
+
+impl From<f64> for Written {
+    fn from(value: f64) -> Self {
+        if value.is_finite() {
+            Self::Finite(value)
+        } else {
+            Self::Other(value.to_string())
+        }
+    }
+}
+
+impl Written {
+    fn read<E: serde::de::Error>(self) -> Result<f64, E> {
+        match self {
+            Self::Finite(value) => Ok(value),
+            Self::Other(text) => text
+                .parse()
+                .map_err(|_| E::custom(format!("{text:?} is not a number, NaN, inf or -inf"))),
+        }
+    }
+}
+
+/// A list of numbers of any length.
+pub(crate) mod list {
+    use super::{Deserialize, Deserializer, Serializer, Written};
+
+    pub(crate) fn serialize<S: Serializer>(values: &[f64], to: S) -> Result<S::Ok, S::Error> {
+        to.collect_seq(values.iter().map(|value| Written::from(*value)))
+    }
+
+    pub(crate) fn deserialize<'de, D: Deserializer<'de>>(from: D) -> Result<Vec<f64>, D::Error> {
+        let written = Vec::<Written>::deserialize(from)?;
+        written.into_iter().map(Written::read).collect()
+    }
+}
+
+/// A list of a known number of numbers.
+pub(crate) mod array {
+    use super::{Deserializer, Serializer, list};
+    use serde::de::Error;
+
+    pub(crate) fn serialize<S: Serializer, const N: usize>(
+        values: &[f64; N],
+        to: S,
+    ) -> Result<S::Ok, S::Error> {
+        list::serialize(values, to)
+    }
+
+    pub(crate) fn deserialize<'de, D: Deserializer<'de>, const N: usize>(
+        from: D,
+    ) -> Result<[f64; N], D::Error> {
+        let values = list::deserialize(from)?;
+        let n = values.len();
+        values
+            .try_into()
+            .map_err(|_| D::Error::custom(format!("{n} numbers instead of {N}")))
+    }
+}
+
+/// A stamp as nanoseconds.
+pub(crate) mod stamp {
+    use super::{Deserialize, Deserializer, Serializer};
+    use kinematics::Stamp;
+
+    pub(crate) fn serialize<S: Serializer>(stamp: &Stamp, to: S) -> Result<S::Ok, S::Error> {
+        to.serialize_i64(stamp.0)
+    }
+
+    pub(crate) fn deserialize<'de, D: Deserializer<'de>>(from: D) -> Result<Stamp, D::Error> {
+        i64::deserialize(from).map(Stamp)
+    }
+}

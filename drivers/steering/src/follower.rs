@@ -1,0 +1,329 @@
+//! Turns targets that expire into setpoints: the last part of the chain, which belongs into the
+//! thread that moves the arm.
+//!
+//! It needs nothing but targets and the time. The arm therefore brakes whatever happens to the
+//! program that sends the targets.
+
+use crate::check::check;
+use crate::error::Error;
+use crate::target::{Output, Target};
+use drivers::motion::{MotionLimits, Setpoint, TrajectoryGenerator};
+use kinematics::Stamp;
+use std::time::Duration;
+
+/// Rounding of a setpoint, relative to its limits. The generator sets velocities of up to 1e-8 to
+/// zero at the end of a trajectory.
+const TOLERANCE: f64 = 1.0 + 1e-4;
+/// Fractions of the jerk with which the brake is planned if its plan cannot be used.
+const BRAKE_JERK_FRACS: [f64; 5] = [1.0, 1.0 - 1e-6, 1.0 - 1e-4, 0.99, 0.9];
+
+/// Why a target was not followed.
+#[derive(Clone, Debug, PartialEq, thiserror::Error)]
+pub enum NotFollowed {
+    /// The target arrived after its expiry.
+    #[error("target {serial} expired {late_secs:.3} s before it arrived")]
+    Expired {
+        /// Number of the target.
+        serial: u64,
+        /// Time since its expiry.
+        late_secs: f64,
+    },
+    /// The target was repeated or overtaken by a newer one.
+    #[error("target {serial} came after target {newest}")]
+    OutOfOrder {
+        /// Number of the target.
+        serial: u64,
+        /// Greatest number received.
+        newest: u64,
+    },
+    /// The arm braked during this motion, or still brakes.
+    #[error("motion {motion} ended when the arm braked: it moves again with a new grip")]
+    MotionEnded {
+        /// Number of the motion.
+        motion: u64,
+    },
+    /// The generator cannot use the target. The arm brakes.
+    #[error("the arm brakes: {why}")]
+    Generator {
+        /// Message of the generator.
+        why: String,
+    },
+}
+
+/// Generates one setpoint per cycle, and brakes when targets expire.
+#[derive(Debug)]
+pub struct Follower {
+    generator: TrajectoryGenerator,
+    /// Generator with the brake limits, while the arm brakes.
+    brake: Option<TrajectoryGenerator>,
+    limits: Vec<MotionLimits>,
+    brake_limits: Vec<MotionLimits>,
+    period: Duration,
+    setpoint: Setpoint,
+    /// Target of the generator, before it was clamped.
+    target: Vec<f64>,
+    newest_serial: u64,
+    /// Number of the motion whose targets are followed.
+    motion: u64,
+    /// The greatest number of a motion that has ended.
+    ended_motion: u64,
+    /// When the newest target expires; `None` if no target is followed.
+    expires_at: Option<Stamp>,
+}
+
+impl Follower {
+    /// A follower at rest at `position`.
+    ///
+    /// * `limits`: limits of motions.
+    /// * `brake_limits`: limits of braking; at least as high.
+    ///
+    /// # Errors
+    /// If a brake limit is lower than the limit of motions, because the arm could then be in a state
+    /// from which it cannot brake within its limits; or for the reasons of
+    /// [`TrajectoryGenerator::new`].
+    pub fn new(
+        limits: &[MotionLimits],
+        brake_limits: &[MotionLimits],
+        position: &[f64],
+        period: Duration,
+    ) -> Result<Self, Error> {
+        check_brake_limits(limits, brake_limits)?;
+        let generator = TrajectoryGenerator::new(limits, position, period)
+            .map_err(|why| Error::Generator { why })?;
+        let zero = vec![0.0; position.len()];
+        Ok(Self {
+            generator,
+            brake: None,
+            limits: limits.to_vec(),
+            brake_limits: brake_limits.to_vec(),
+            period,
+            setpoint: Setpoint {
+                position: position.to_vec(),
+                velocity: zero.clone(),
+                acceleration: zero,
+            },
+            target: position.to_vec(),
+            newest_serial: 0,
+            motion: 0,
+            ended_motion: 0,
+            expires_at: None,
+        })
+    }
+
+    /// Takes the output of the chain of decisions.
+    ///
+    /// # Errors
+    /// If the target is not followed. Unless the error is [`NotFollowed::Generator`], the motion
+    /// does not change.
+    pub fn obey(&mut self, now: Stamp, output: &Output) -> Result<(), NotFollowed> {
+        match output {
+            Output::Follow(target) => self.follow(now, target),
+            Output::Brake => {
+                self.start_brake();
+                Ok(())
+            }
+        }
+    }
+
+    /// The setpoint of the next cycle.
+    ///
+    /// # Errors
+    /// If not even braking succeeds. The arm must then apply its fail-safe.
+    pub fn step(&mut self, now: Stamp) -> Result<Setpoint, Error> {
+        // Written so that a target without expiry counts as expired.
+        let is_fresh = self.expires_at.is_some_and(|expires_at| now <= expires_at);
+        if !is_fresh {
+            self.start_brake();
+        }
+        if self.expires_at.is_some() {
+            let next = self.generator.step();
+            match next {
+                Ok(next) if self.continues(&next, &self.limits) => {
+                    self.setpoint = next.clone();
+                    return Ok(next);
+                }
+                // A plan that fails must not keep the arm moving.
+                _ => self.start_brake(),
+            }
+        }
+        self.step_brake()
+    }
+
+    /// The last setpoint.
+    pub fn setpoint(&self) -> &Setpoint {
+        &self.setpoint
+    }
+
+    /// Whether all joints are at rest.
+    pub fn is_at_rest(&self) -> bool {
+        let is_zero = |values: &[f64]| values.iter().all(|value| *value == 0.0);
+        is_zero(&self.setpoint.velocity) && is_zero(&self.setpoint.acceleration)
+    }
+
+    /// The greatest number of a motion that ended because the arm braked; 0 at first.
+    pub fn braked_motion(&self) -> u64 {
+        self.ended_motion
+    }
+
+    fn follow(&mut self, now: Stamp, target: &Target) -> Result<(), NotFollowed> {
+        let serial = target.serial;
+        if serial <= self.newest_serial {
+            let newest = self.newest_serial;
+            return Err(NotFollowed::OutOfOrder { serial, newest });
+        }
+        if now > target.expires_at {
+            let late_secs = now.secs_since(target.expires_at);
+            return Err(NotFollowed::Expired { serial, late_secs });
+        }
+        let motion = target.motion;
+        let is_braking = self.expires_at.is_none() && !self.is_at_rest();
+        if motion <= self.ended_motion || motion < self.motion || is_braking {
+            return Err(NotFollowed::MotionEnded { motion });
+        }
+        if self.expires_at.is_none() {
+            self.restart()
+                .map_err(|why| NotFollowed::Generator { why })?;
+        }
+        self.newest_serial = serial;
+        self.motion = motion;
+        self.expires_at = Some(target.expires_at);
+        // An equal target only lasts longer. Planning again from a state on the way to it could fail
+        // because of rounding, and an arm that holds its position would plan in every cycle.
+        if target.position == self.target {
+            return Ok(());
+        }
+        if let Err(why) = self.generator.set_target(&target.joint_target()) {
+            self.start_brake();
+            return Err(NotFollowed::Generator { why });
+        }
+        self.target.clone_from(&target.position);
+        Ok(())
+    }
+
+    /// A new generator at the position at which the arm rests.
+    fn restart(&mut self) -> Result<(), String> {
+        let position = &self.setpoint.position;
+        self.generator = TrajectoryGenerator::new(&self.limits, position, self.period)?;
+        self.target.clone_from(position);
+        self.brake = None;
+        Ok(())
+    }
+
+    /// Ends the motion. The arm continues from its state of motion with the brake limits.
+    fn start_brake(&mut self) {
+        self.expires_at = None;
+        self.ended_motion = self.ended_motion.max(self.motion);
+        if self.brake.is_some() || self.is_at_rest() {
+            return;
+        }
+        self.brake = brake_from(&self.setpoint, &self.brake_limits, self.period).ok();
+    }
+
+    fn step_brake(&mut self) -> Result<Setpoint, Error> {
+        if self.is_at_rest() {
+            return Ok(self.setpoint.clone());
+        }
+        let planned = self.brake.as_mut().map(TrajectoryGenerator::step);
+        let next = match planned {
+            Some(Ok(next)) if self.continues(&next, &self.brake_limits) => next,
+            _ => self.brake_anew()?,
+        };
+        self.setpoint = next.clone();
+        Ok(next)
+    }
+
+    /// Plans the brake again with slightly less jerk, and returns the next setpoint.
+    fn brake_anew(&mut self) -> Result<Setpoint, Error> {
+        let mut why = String::new();
+        for jerk_frac in BRAKE_JERK_FRACS {
+            let limits = with_jerk(&self.brake_limits, jerk_frac);
+            let planned = brake_from(&self.setpoint, &limits, self.period)
+                .and_then(|mut brake| brake.step().map(|next| (brake, next)));
+            match planned {
+                Ok((brake, next)) if self.continues(&next, &self.brake_limits) => {
+                    self.brake = Some(brake);
+                    return Ok(next);
+                }
+                Ok((_, next)) => why = format!("the setpoint {next:?} exceeds the brake limits"),
+                Err(error) => why = error,
+            }
+        }
+        Err(Error::Generator { why })
+    }
+
+    /// Whether a setpoint continues from the last one within velocity, acceleration and jerk. Plans
+    /// are checked because their sources of errors, such as rounding near degenerate profiles, are
+    /// not all known, and because a robot's controller would stop at such a setpoint.
+    fn continues(&self, next: &Setpoint, limits: &[MotionLimits]) -> bool {
+        let secs = self.period.as_secs_f64();
+        let last = &self.setpoint;
+        limits.iter().enumerate().all(|(ix, joint)| {
+            let moved = (next.position[ix] - last.position[ix]).abs();
+            let accelerated = (next.velocity[ix] - last.velocity[ix]).abs();
+            let jerked = (next.acceleration[ix] - last.acceleration[ix]).abs();
+            moved <= joint.velocity * secs * TOLERANCE
+                && accelerated <= joint.acceleration * secs * TOLERANCE
+                && jerked <= joint.jerk * secs * TOLERANCE
+        })
+    }
+}
+
+fn with_jerk(limits: &[MotionLimits], frac: f64) -> Vec<MotionLimits> {
+    limits
+        .iter()
+        .map(|joint| MotionLimits {
+            jerk: joint.jerk * frac,
+            ..*joint
+        })
+        .collect()
+}
+
+/// A generator that brings the arm to rest from a state of motion.
+fn brake_from(
+    setpoint: &Setpoint,
+    brake_limits: &[MotionLimits],
+    period: Duration,
+) -> Result<TrajectoryGenerator, String> {
+    let mut brake = TrajectoryGenerator::new(brake_limits, &setpoint.position, period)?;
+    brake.resume(setpoint)?;
+    brake.stop();
+    Ok(brake)
+}
+
+fn check_brake_limits(limits: &[MotionLimits], brake_limits: &[MotionLimits]) -> Result<(), Error> {
+    if brake_limits.len() != limits.len() {
+        return Err(Error::JointCount {
+            what: "the list of brake limits",
+            got: brake_limits.len(),
+            expected: limits.len(),
+        });
+    }
+    for (ix, (limits, brake)) in limits.iter().zip(brake_limits).enumerate() {
+        for (what, limit, brake) in [
+            ("velocity", limits.velocity, brake.velocity),
+            ("acceleration", limits.acceleration, brake.acceleration),
+            ("jerk", limits.jerk, brake.jerk),
+        ] {
+            check(
+                format!("the {what} of joint {} for braking", ix + 1),
+                brake,
+                brake >= limit,
+                "at least that of its motions",
+            )?;
+        }
+    }
+    Ok(())
+}
+
+/// Brake limits from motion limits: the same velocity, and `factor` times the acceleration and the
+/// jerk.
+pub fn brake_limits(limits: &[MotionLimits], factor: f64) -> Vec<MotionLimits> {
+    limits
+        .iter()
+        .map(|joint| MotionLimits {
+            acceleration: joint.acceleration * factor,
+            jerk: joint.jerk * factor,
+            ..*joint
+        })
+        .collect()
+}

@@ -1,0 +1,93 @@
+//! The arm does not touch itself.
+
+use super::{START, Sim, ageless, joint_limits, panda, words};
+use crate::{Body, Effect, Intent, Link, Reason, SelfCollision, SelfCollisionConfig};
+
+fn selected() -> (Body, SelfCollision) {
+    let (urdf, chain) = panda();
+    let body = Body::new(&urdf, &chain, &|_| None).unwrap();
+    let limits = joint_limits(&chain);
+    let ranges: Vec<[f64; 2]> = limits.iter().map(|joint| joint.position).collect();
+    let config = SelfCollisionConfig::default();
+    let selected = SelfCollision::new(config, &body, &ranges, Some(&START)).unwrap();
+    (body, selected)
+}
+
+/// Invariant: no target brings two checked parts closer than the stop distance.
+#[test]
+fn folding_the_arm_into_its_base_is_refused_with_both_parts() {
+    let mut sim = Sim::ready(ageless());
+    let (body, selected) = selected();
+    let folded = vec![0.0, 1.2, 0.0, -2.9, 0.0, 1.0, 0.8];
+    let mut refusal = None;
+    for _ in 0..1500 {
+        let intent = Intent::Joints {
+            position: folded.clone(),
+        };
+        let verdict = sim.drive(Some(1), intent);
+        let target = &verdict.target().unwrap().position;
+        for pair in selected.close_pairs(&body.capsules(target)) {
+            let (scale, reason) = selected.speed(&[pair], &body);
+            let Some(Reason::SelfCollision { distance_m, .. }) = reason else {
+                panic!("{reason:?}");
+            };
+            assert!(distance_m >= 0.01 && scale > 0.0, "{reason:?}");
+        }
+        let found = verdict
+            .limits
+            .iter()
+            .find(|limit| limit.link == Link::SelfCollision && limit.effect == Effect::Refused);
+        refusal = found.cloned().or(refusal);
+    }
+    let refusal = refusal.expect("the arm cannot fold into itself");
+    assert!(refusal.reason.place().is_some());
+    assert!(words(&sim.drive(Some(1), Intent::Joints { position: folded })).contains("mm apart"));
+    // The way back is free.
+    for _ in 0..1500 {
+        sim.drive(
+            Some(1),
+            Intent::Joints {
+                position: START.to_vec(),
+            },
+        );
+    }
+    let reached = sim.arm().position;
+    let error = reached
+        .iter()
+        .zip(START)
+        .map(|(a, b)| (a - b).abs())
+        .fold(0.0, f64::max);
+    assert!(error < 1e-6, "{reached:?}");
+}
+
+#[test]
+fn pairs_are_selected_and_usual_postures_are_free() {
+    let (body, selected) = selected();
+    assert!(selected.n_pairs() > 50, "{}", selected.n_pairs());
+    // Postures in which the arm is used, and its transport posture.
+    for q in [
+        START,
+        [0.0, -0.785, 0.0, -2.356, 0.0, 1.571, 0.785],
+        [1.0, 0.3, -0.5, -1.5, 0.4, 1.9, -0.6],
+    ] {
+        let close = selected.close_pairs(&body.capsules(&q));
+        let (_, reason) = selected.speed(&close, &body);
+        if let Some(Reason::SelfCollision {
+            distance_m, parts, ..
+        }) = reason
+        {
+            assert!(distance_m > 0.01, "{parts:?} {distance_m}");
+        }
+    }
+}
+
+#[test]
+fn wrong_numbers_of_joints_are_refused() {
+    let (body, _) = selected();
+    let config = SelfCollisionConfig::default();
+    let error = SelfCollision::new(config, &body, &[[0.0, 1.0]], None).unwrap_err();
+    assert!(
+        error.to_string().contains("has 1 joints, the arm has 7"),
+        "{error}"
+    );
+}
