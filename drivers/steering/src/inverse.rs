@@ -1,5 +1,6 @@
 //! Inverse kinematics as the chain of decisions needs it.
 
+use kinematics::inverse::{InverseSolver, Target};
 use kinematics::{Chain, Transform};
 
 /// Finds joint values for a pose.
@@ -27,7 +28,9 @@ impl InverseKinematics for Chain {
         start: &[f64],
         bounds: &[[f64; 2]],
     ) -> Option<Vec<f64>> {
-        // The numbers of values are correct, so an error only means that there is no solution.
-        self.inverse(base_from_tip, start, bounds).ok().flatten()
+        // The bounds are valid, so an error only means that there is no solution.
+        let mut solver = InverseSolver::within(self.clone(), bounds.to_vec()).ok()?;
+        let target = Target::pose(*base_from_tip);
+        solver.solve_near(&target, start).ok()
     }
 }
