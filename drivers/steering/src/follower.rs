@@ -307,7 +307,19 @@ fn brake_from(
     brake_limits: &[MotionLimits],
     period: Duration,
 ) -> Result<TrajectoryGenerator, String> {
-    let mut brake = TrajectoryGenerator::new(brake_limits, &setpoint.position, period)?;
+    // A stop is the shortest way to rest, wherever it ends, so it needs no ranges. With ranges,
+    // `rsruckig` 3.0.1 checks a target position in velocity control, too. It is 0 in a new
+    // generator. For a joint whose range does not contain 0, such as joint 4 of a Panda, it then
+    // replaces the plan with one of unlimited jerk (`repair_profile_step2`, and `time_none` of
+    // `velocity_third_step2.rs`).
+    let without_ranges: Vec<MotionLimits> = brake_limits
+        .iter()
+        .map(|joint| MotionLimits {
+            position: [f64::NEG_INFINITY, f64::INFINITY],
+            ..*joint
+        })
+        .collect();
+    let mut brake = TrajectoryGenerator::new(&without_ranges, &setpoint.position, period)?;
     brake.resume(setpoint)?;
     brake.stop();
     Ok(brake)
