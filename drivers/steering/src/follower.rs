@@ -78,8 +78,8 @@ impl Follower {
     /// * `brake_limits`: limits of braking; at least as high.
     ///
     /// # Errors
-    /// If a brake limit is lower than the limit of motions, because the arm could then be in a state
-    /// from which it cannot brake within its limits; or for the reasons of
+    /// If a brake limit is lower than the limit of motions, because the arm could then be in a
+    /// state from which it cannot brake within its limits; or for the reasons of
     /// [`TrajectoryGenerator::new`].
     pub fn new(
         limits: &[MotionLimits],
@@ -187,8 +187,8 @@ impl Follower {
         self.newest_serial = serial;
         self.motion = motion;
         self.expires_at = Some(target.expires_at);
-        // An equal target only lasts longer. Planning again from a state on the way to it could fail
-        // because of rounding, and an arm that holds its position would plan in every cycle.
+        // An equal target only lasts longer. Planning again from a state on the way to it could
+        // fail because of rounding, and an arm that holds its position would plan in every cycle.
         if target.position == self.target {
             return Ok(());
         }
@@ -253,10 +253,10 @@ impl Follower {
         Err(Error::Generator { why })
     }
 
-    /// Returns what is wrong with a setpoint that does not continue from the last one within velocity,
-    /// acceleration and jerk. Plans are checked because their sources of errors, such as rounding
-    /// near degenerate profiles, are not all known, and because a robot's controller would stop at
-    /// such a setpoint.
+    /// Returns what is wrong with a setpoint that does not continue from the last one within
+    /// velocity, acceleration and jerk. Plans are checked because their sources of errors, such as
+    /// rounding near degenerate profiles, are not all known, and because a robot's controller would
+    /// stop at such a setpoint.
     fn excess(&self, next: &Setpoint, limits: &[MotionLimits]) -> Option<String> {
         let secs = self.period.as_secs_f64();
         let last = &self.setpoint;

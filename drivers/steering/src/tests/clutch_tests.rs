@@ -361,8 +361,8 @@ fn brake_limits_below_motion_limits_are_refused() {
     );
 }
 
-/// Invariant: braking respects its limits also for a joint whose range does not contain 0. The state
-/// of joint 4 is one in which the library once planned with more than twice the jerk.
+/// Invariant: braking respects its limits also for a joint whose range does not contain 0. The
+/// state of joint 4 is one in which the library once planned with more than twice the jerk.
 #[test]
 fn joint_whose_range_does_not_contain_zero_brakes_within_its_limits() {
     let (_, chain) = super::panda();
