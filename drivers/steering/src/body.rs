@@ -12,7 +12,8 @@ use nalgebra::{Translation3, Unit, UnitQuaternion, Vector3};
 /// be.
 const OTHER_JOINT_FRACS: [f64; 3] = [0.0, 0.5, 1.0];
 
-/// Capsules around all links that are rigidly joined to the base of a chain or move with its joints.
+/// Capsules around all links that are rigidly joined to the base of a chain or move with its
+/// joints.
 #[derive(Clone, Debug)]
 pub struct Body {
     frames: Vec<Frame>,
@@ -64,8 +65,8 @@ impl Body {
     /// Encloses the collision shapes of each link, or the visual shapes if a link has no collision
     /// shapes.
     ///
-    /// * `vertices_of`: vertices of a mesh file in the frame of the mesh, meters; `None` if it cannot
-    ///   be read. Meshes of unknown size are not part of the body; see [`Body::notes`].
+    /// * `vertices_of`: vertices of a mesh file in the frame of the mesh, meters; `None` if it
+    ///   cannot be read. Meshes of unknown size are not part of the body; see [`Body::notes`].
     ///
     /// # Errors
     /// If no link has a shape, because the arm would then not be protected.

@@ -1,9 +1,9 @@
 //! Capsules, which enclose the parts of a robot, and the distance between two of them.
 //!
-//! Capsules instead of meshes or convex hulls: the distance of two capsules is that of two segments,
-//! in closed form, without iterations that could fail, and bit-identical on every machine. A library
-//! such as `parry3d-f64` would add hulls and meshes (and seven crates), but arms are round and long:
-//! capsules around the parts of a Panda are a few millimeters larger than the parts.
+//! Capsules instead of meshes or convex hulls: the distance of two capsules is that of two
+//! segments, in closed form, without iterations that could fail, and bit-identical on every
+//! machine. A library such as `parry3d-f64` would add hulls and meshes (and seven crates), but arms
+//! are round and long. Capsules follow their parts closely, except at flat ends.
 
 use kinematics::Transform;
 use nalgebra::{Point3, Vector3};
@@ -65,7 +65,8 @@ impl Capsule {
         })
     }
 
-    /// Points on the segment, and the radius of spheres around them that together cover the capsule.
+    /// Points on the segment, and the radius of spheres around them that together cover the
+    /// capsule.
     pub(crate) fn spheres(&self, max_spacing_m: f64) -> (Vec<Vector3<f64>>, f64) {
         /// Bounds the number of points of a thin and long part.
         const MAX_SPANS: u32 = 64;

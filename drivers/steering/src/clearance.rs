@@ -24,8 +24,8 @@ pub struct Seen {
 
 /// A model of the scene around the arm.
 ///
-/// The model must not contain the robot itself. The volume that the robot occupies now is free, also
-/// if no camera ever saw it: otherwise, an arm in an unseen region could not leave it.
+/// The model must not contain the robot itself. The volume that the robot occupies now is free,
+/// also if no camera ever saw it: otherwise, an arm in an unseen region could not leave it.
 pub trait Clearance {
     /// What is known about each point at a time; `None` if the region has never been seen. A model
     /// that cannot answer in time returns an empty list, which counts as never seen.
@@ -230,8 +230,8 @@ impl ClearancePoints {
         })
     }
 
-    /// Why the arm may not move to a close posture, if it may not. A motion away from a surface, and
-    /// out of a region that was never seen, is permitted.
+    /// Why the arm may not move to a close posture, if it may not. A motion away from a surface,
+    /// and out of a region that was never seen, is permitted.
     pub(crate) fn refusal(
         &self,
         here: &[Restriction],

@@ -1,7 +1,8 @@
 //! Second link: the arm follows a device only while its dead-man switch is held.
 //!
 //! A grip moves the arm only if it was seen to begin: the device was heard with an open switch, or
-//! with an earlier grip, while motion was permitted. Everything that stops the arm uses the grip up.
+//! with an earlier grip, while motion was permitted. Everything that stops the arm uses the grip
+//! up.
 
 use crate::reason::Reason;
 use crate::request::{Command, Device, Intent};
@@ -48,8 +49,8 @@ impl Default for ClutchConfig {
 /// forgotten first; it is then treated like a new one, which must be seen with an open switch.
 const MAX_DEVICES: usize = 8;
 
-/// Two samples of a hand are treated as if this time was between them, if it was less. The stamps of
-/// a browser are rounded to as much as a tenth of a millisecond, some to a millisecond.
+/// Two samples of a hand are treated as if this time was between them, if it was less. The stamps
+/// of a browser are rounded to as much as a tenth of a millisecond, some to a millisecond.
 const MIN_SAMPLE_SECS: f64 = 1e-3;
 
 #[derive(Clone, Copy, Debug)]
@@ -212,8 +213,8 @@ impl Clutch {
             base_from_hand: pose,
             base_from_tip: *base_from_tip,
         });
-        // Translation and rotation act separately, in axes of the base. The rigid motion of the hand
-        // as a whole would swing the tip about the origin of the hand's frame.
+        // Translation and rotation act separately, in axes of the base. The rigid motion of the
+        // hand as a whole would swing the tip about the origin of the hand's frame.
         let translation = pose.translation.vector - anchor.base_from_hand.translation.vector;
         let rotation = pose.rotation * anchor.base_from_hand.rotation.inverse();
         let scaled =

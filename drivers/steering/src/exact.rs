@@ -1,7 +1,7 @@
 //! Serialization without loss, for records that are replayed bit for bit.
 //!
-//! JSON has no NaN and no infinity, but commands may contain them, and a replay must refuse the same
-//! commands. These numbers are written as texts.
+//! JSON has no NaN and no infinity, but commands may contain them, and a replay must refuse the
+//! same commands. These numbers are written as texts.
 
 use serde::{Deserialize, Deserializer, Serialize, Serializer};
 

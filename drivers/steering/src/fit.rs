@@ -108,8 +108,8 @@ fn around_points(points: &[Vector3<f64>]) -> Option<Capsule> {
         .map(|point| split(point).1)
         .fold(0.0, f64::max);
     // A point at `along` and `across` is inside if the segment comes within `reach` of it along the
-    // axis. The segment must therefore start at or before the smallest `along + reach`, and end at or
-    // after the largest `along - reach`.
+    // axis. The segment must therefore start at or before the smallest `along + reach`, and end at
+    // or after the largest `along - reach`.
     let mut start_m = f64::INFINITY;
     let mut end_m = f64::NEG_INFINITY;
     for point in points {

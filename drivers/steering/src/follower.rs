@@ -78,8 +78,8 @@ impl Follower {
     /// * `brake_limits`: limits of braking; at least as high.
     ///
     /// # Errors
-    /// If a brake limit is lower than the limit of motions, because the arm could then be in a state
-    /// from which it cannot brake within its limits; or for the reasons of
+    /// If a brake limit is lower than the limit of motions, because the arm could then be in a
+    /// state from which it cannot brake within its limits; or for the reasons of
     /// [`TrajectoryGenerator::new`].
     pub fn new(
         limits: &[MotionLimits],
@@ -138,7 +138,7 @@ impl Follower {
         if self.expires_at.is_some() {
             let next = self.generator.step();
             match next {
-                Ok(next) if self.continues(&next, &self.limits) => {
+                Ok(next) if self.excess(&next, &self.limits).is_none() => {
                     self.setpoint = next.clone();
                     return Ok(next);
                 }
@@ -187,8 +187,8 @@ impl Follower {
         self.newest_serial = serial;
         self.motion = motion;
         self.expires_at = Some(target.expires_at);
-        // An equal target only lasts longer. Planning again from a state on the way to it could fail
-        // because of rounding, and an arm that holds its position would plan in every cycle.
+        // An equal target only lasts longer. Planning again from a state on the way to it could
+        // fail because of rounding, and an arm that holds its position would plan in every cycle.
         if target.position == self.target {
             return Ok(());
         }
@@ -225,7 +225,7 @@ impl Follower {
         }
         let planned = self.brake.as_mut().map(TrajectoryGenerator::step);
         let next = match planned {
-            Some(Ok(next)) if self.continues(&next, &self.brake_limits) => next,
+            Some(Ok(next)) if self.excess(&next, &self.brake_limits).is_none() => next,
             _ => self.brake_anew()?,
         };
         self.setpoint = next.clone();
@@ -240,30 +240,53 @@ impl Follower {
             let planned = brake_from(&self.setpoint, &limits, self.period)
                 .and_then(|mut brake| brake.step().map(|next| (brake, next)));
             match planned {
-                Ok((brake, next)) if self.continues(&next, &self.brake_limits) => {
-                    self.brake = Some(brake);
-                    return Ok(next);
-                }
-                Ok((_, next)) => why = format!("the setpoint {next:?} exceeds the brake limits"),
+                Ok((brake, next)) => match self.excess(&next, &self.brake_limits) {
+                    None => {
+                        self.brake = Some(brake);
+                        return Ok(next);
+                    }
+                    Some(excess) => why = excess,
+                },
                 Err(error) => why = error,
             }
         }
         Err(Error::Generator { why })
     }
 
-    /// Whether a setpoint continues from the last one within velocity, acceleration and jerk. Plans
-    /// are checked because their sources of errors, such as rounding near degenerate profiles, are
-    /// not all known, and because a robot's controller would stop at such a setpoint.
-    fn continues(&self, next: &Setpoint, limits: &[MotionLimits]) -> bool {
+    /// Returns what is wrong with a setpoint that does not continue from the last one within
+    /// velocity, acceleration and jerk. Plans are checked because their sources of errors, such as
+    /// rounding near degenerate profiles, are not all known, and because a robot's controller would
+    /// stop at such a setpoint.
+    fn excess(&self, next: &Setpoint, limits: &[MotionLimits]) -> Option<String> {
         let secs = self.period.as_secs_f64();
         let last = &self.setpoint;
-        limits.iter().enumerate().all(|(ix, joint)| {
-            let moved = (next.position[ix] - last.position[ix]).abs();
-            let accelerated = (next.velocity[ix] - last.velocity[ix]).abs();
-            let jerked = (next.acceleration[ix] - last.acceleration[ix]).abs();
-            moved <= joint.velocity * secs * TOLERANCE
-                && accelerated <= joint.acceleration * secs * TOLERANCE
-                && jerked <= joint.jerk * secs * TOLERANCE
+        limits.iter().enumerate().find_map(|(ix, joint)| {
+            let changes = [
+                ("position", &last.position, &next.position, joint.velocity),
+                (
+                    "velocity",
+                    &last.velocity,
+                    &next.velocity,
+                    joint.acceleration,
+                ),
+                (
+                    "acceleration",
+                    &last.acceleration,
+                    &next.acceleration,
+                    joint.jerk,
+                ),
+            ];
+            let (what, last, next, _) = changes.into_iter().find(|(_, last, next, limit)| {
+                // Written so that NaN is an excess.
+                let is_within = (next[ix] - last[ix]).abs() <= limit * secs * TOLERANCE;
+                !is_within
+            })?;
+            Some(format!(
+                "the {what} of joint {} would change from {} to {} in one cycle",
+                ix + 1,
+                last[ix],
+                next[ix]
+            ))
         })
     }
 }
@@ -284,7 +307,19 @@ fn brake_from(
     brake_limits: &[MotionLimits],
     period: Duration,
 ) -> Result<TrajectoryGenerator, String> {
-    let mut brake = TrajectoryGenerator::new(brake_limits, &setpoint.position, period)?;
+    // A stop is the shortest way to rest, wherever it ends, so it needs no ranges. With ranges,
+    // `rsruckig` 3.0.1 checks a target position in velocity control, too. It is 0 in a new
+    // generator. For a joint whose range does not contain 0, such as joint 4 of a Panda, it then
+    // replaces the plan with one of unlimited jerk (`repair_profile_step2`, and `time_none` of
+    // `velocity_third_step2.rs`).
+    let without_ranges: Vec<MotionLimits> = brake_limits
+        .iter()
+        .map(|joint| MotionLimits {
+            position: [f64::NEG_INFINITY, f64::INFINITY],
+            ..*joint
+        })
+        .collect();
+    let mut brake = TrajectoryGenerator::new(&without_ranges, &setpoint.position, period)?;
     brake.resume(setpoint)?;
     brake.stop();
     Ok(brake)

@@ -1,24 +1,25 @@
 //! Decisions between an operator's hand and the setpoints of an arm.
 //!
-//! Each link of the chain can only slow the arm down or refuse, and gives its reason ([`Reason`]) in
-//! words and, if there is one, with its place:
+//! Each link of the chain can only slow the arm down or refuse, and gives its reason ([`Reason`])
+//! in words and, if there is one, with its place:
 //!
 //! 1. *lease*: one operator at a time may move the arm; the lease is handed over explicitly, and
 //!    expires;
-//! 2. *clutch*: the arm follows while a dead-man switch is held. Every grip starts where the tip is.
-//!    A device that was silent must grip again, and after a stop, an operator must permit motion;
+//! 2. *clutch*: the arm follows while a dead-man switch is held. Every grip starts where the tip
+//!    is. A device that was silent must grip again, and after a stop, an operator must permit
+//! motion;
 //! 3. *limits*: speed of the tip, of all parts and of the joints, workspace, ranges;
 //! 4. *self-collision*: distance between parts of the robot;
 //! 5. *clearance*: distance from the scene, with the age of what is known about it. What was never
 //!    seen counts as occupied.
 //!
-//! The result ([`Output`]) is a target that expires, or the order to brake. The arm's thread turns it
-//! into setpoints with [`Follower`], which brakes when targets expire, whatever happens to the rest
-//! of the program. Acceleration and jerk are limited there, by the generator of
+//! The result ([`Output`]) is a target that expires, or the order to brake. The arm's thread turns
+//! it into setpoints with [`Follower`], which brakes when targets expire, whatever happens to the
+//! rest of the program. Acceleration and jerk are limited there, by the generator of
 //! [`drivers::motion`].
 //!
-//! Nothing here has a clock, a thread or a connection: every function takes the time. The same calls
-//! give the same decisions, bit for bit, so [`Steering::take_record`] gives records that
+//! Nothing here has a clock, a thread or a connection: every function takes the time. The same
+//! calls give the same decisions, bit for bit, so [`Steering::take_record`] gives records that
 //! [`Steering::replay`] repeats.
 //!
 //! ```

@@ -3,8 +3,8 @@
 //! The target moves in small steps from the last one toward the goal. Each step is limited in the
 //! speed of the tip, of every joint and of every part of the robot, so an elbow cannot swing fast
 //! while the tip moves slowly. Acceleration and jerk are limits of the generator of the setpoints.
-//! Near a singular posture, joints move far for small motions of the tip. Their limit then slows the
-//! tip down.
+//! Near a singular posture, joints move far for small motions of the tip. Their limit then slows
+//! the tip down.
 
 use crate::body::Body;
 use crate::check::{check, positive};
@@ -29,8 +29,8 @@ pub struct LimitConfig {
     /// Distance of targets from the ends of the ranges of the joints, radians or meters.
     pub joint_margin: f64,
     /// How far the target may be ahead of the arm: the distance that a joint moves in this time at
-    /// its maximum velocity. The generator moves all joints in a straight line to the target. With a
-    /// larger lead, this line could leave the path that was checked.
+    /// its maximum velocity. The generator moves all joints in a straight line to the target. With
+    /// a larger lead, this line could leave the path that was checked.
     pub max_lead_secs: f64,
 }
 
@@ -47,8 +47,9 @@ impl Default for LimitConfig {
     }
 }
 
-/// Maximum distance of a joint between two targets, before the step is shortened. A longer one means
-/// that the posture found is another branch of solutions. The way to it would not follow the pose.
+/// Maximum distance of a joint between two targets, before the step is shortened. A longer one
+/// means that the posture found is another branch of solutions. The way to it would not follow the
+/// pose.
 const MAX_POSTURE_STEP: f64 = 0.3;
 /// Step lengths that are tried if no posture is found for the whole step.
 const STEP_FRACS: [f64; 3] = [1.0, 0.5, 0.25];

@@ -3,8 +3,8 @@
 use crate::check::check;
 use crate::error::Error;
 
-/// Speed as a fraction of full speed: 1 at `slow_m` and beyond, decreasing linearly to 0 at `stop_m`,
-/// but at least `creep`, so that the stop distance is reached and left again.
+/// Speed as a fraction of full speed: 1 at `slow_m` and beyond, decreasing linearly to 0 at
+/// `stop_m`, but at least `creep`, so that the stop distance is reached and left again.
 pub(crate) fn speed_scale(distance_m: f64, stop_m: f64, slow_m: f64, creep: f64) -> f64 {
     ((distance_m - stop_m) / (slow_m - stop_m)).clamp(creep, 1.0)
 }

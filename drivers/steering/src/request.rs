@@ -1,8 +1,8 @@
 //! What operators ask for.
 //!
-//! All poses and velocities are in axes of the arm's base, because a correction of the map or of the
-//! base's pose must not move a goal. A caller that maps a hand into these axes, for example "as seen
-//! by the camera", must keep the map while the dead-man switch is held.
+//! All poses and velocities are in axes of the arm's base, because a correction of the map or of
+//! the base's pose must not move a goal. A caller that maps a hand into these axes, for example "as
+//! seen by the camera", must keep the map while the dead-man switch is held.
 
 use crate::exact;
 use kinematics::{Stamp, Transform, transform};
@@ -82,8 +82,8 @@ pub struct Command {
 pub enum Intent {
     /// The tip follows the hand: it makes the same motion as the hand since the start of the grip.
     Hand {
-        /// Pose of the hand in axes of the base: x, y, z in meters, and a quaternion x, y, z, w. The
-        /// origin is arbitrary.
+        /// Pose of the hand in axes of the base: x, y, z in meters, and a quaternion x, y, z, w.
+        /// The origin is arbitrary.
         #[serde(with = "exact::array")]
         base_from_hand: [f64; 7],
     },

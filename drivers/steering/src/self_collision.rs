@@ -56,12 +56,12 @@ pub(crate) struct ClosePair {
 
 impl SelfCollision {
     /// Selects the pairs: parts that move relative to each other, except neighbors along the chain,
-    /// and except parts that are close in nearly every posture, because they are shaped like this or
-    /// because their capsules are larger than they are.
+    /// and except parts that are close in nearly every posture, because they are shaped like this
+    /// or because their capsules are larger than they are.
     ///
     /// * `ranges`: range of each joint.
-    /// * `free_posture`: a posture in which no parts touch, if one is known. Pairs whose capsules are
-    ///   too close there are not checked.
+    /// * `free_posture`: a posture in which no parts touch, if one is known. Pairs whose capsules
+    ///   are too close there are not checked.
     ///
     /// # Errors
     /// If the configuration is invalid or the numbers of joints differ.
@@ -146,8 +146,8 @@ impl SelfCollision {
         (scale, Some(self.reason(nearest, body)))
     }
 
-    /// Why the arm may not move from one posture to a close one, if it may not. A motion away from a
-    /// contact is permitted.
+    /// Why the arm may not move from one posture to a close one, if it may not. A motion away from
+    /// a contact is permitted.
     pub(crate) fn refusal(
         &self,
         here: &[ClosePair],

@@ -227,9 +227,9 @@ impl Steering {
         verdict
     }
 
-    /// Takes the entries since the last call, and the number of older ones that were dropped because
-    /// this function was called too rarely. Together with the configuration and the robot, all
-    /// entries since the start make a replay.
+    /// Takes the entries since the last call, and the number of older ones that were dropped
+    /// because this function was called too rarely. Together with the configuration and the robot,
+    /// all entries since the start make a replay.
     pub fn take_record(&mut self) -> (Vec<Entry>, u64) {
         self.record.take()
     }

@@ -74,8 +74,8 @@ pub struct ArmState {
     /// Time of the report.
     #[serde(with = "exact::stamp")]
     pub reported_at: Stamp,
-    /// Position of each joint that the generator commands now, radians or meters. Measured positions
-    /// sag under load: with them, each grip would lower the arm.
+    /// Position of each joint that the generator commands now, radians or meters. Measured
+    /// positions sag under load: with them, each grip would lower the arm.
     #[serde(with = "exact::list")]
     pub position: Vec<f64>,
     /// Whether the generator is at rest.

@@ -360,3 +360,32 @@ fn brake_limits_below_motion_limits_are_refused() {
         "{error}"
     );
 }
+
+/// Invariant: braking respects its limits also for a joint whose range does not contain 0. The
+/// state of joint 4 is one in which the library once planned with more than twice the jerk.
+#[test]
+fn joint_whose_range_does_not_contain_zero_brakes_within_its_limits() {
+    let (_, chain) = super::panda();
+    let limits = super::joint_limits(&chain);
+    let brake = crate::brake_limits(&limits, super::BRAKE_FACTOR);
+    let mut sim = Sim::ready(ageless());
+    let mut random = Random::new(5);
+    for grip in 1..200 {
+        // Back and forth, so that joint 4 is stopped in many states of motion.
+        let n_cycles = 5 + random.below(30);
+        let to = random.uniform(-2.6, -1.8);
+        for _ in 0..n_cycles {
+            let position = vec![0.0, -0.5, 0.0, to, 0.0, 1.8, 0.8];
+            sim.drive(Some(grip), Intent::Joints { position });
+        }
+        let before = sim.follower.setpoint().clone();
+        sim.drive(None, hand(0.0, 0.0, 0.0));
+        let after = sim.follower.setpoint().clone();
+        let jerked = (after.acceleration[3] - before.acceleration[3]).abs();
+        assert!(
+            jerked <= brake[3].jerk * CYCLE.as_secs_f64() * 1.0001,
+            "{before:?} {after:?}"
+        );
+        sim.rest();
+    }
+}

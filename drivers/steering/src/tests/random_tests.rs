@@ -120,8 +120,8 @@ fn hundred_thousand_random_targets_break_no_limit_and_end_nowhere() {
     );
 }
 
-/// Whether the arm gets back to its first posture. The straight way may lead through the arm itself,
-/// so an operator goes around.
+/// Whether the arm gets back to its first posture. The straight way may lead through the arm
+/// itself, so an operator goes around.
 fn returns(sim: &mut Sim, random: &mut Random, grip: u64) -> bool {
     const MAX_ATTEMPTS: u32 = 40;
     for _ in 0..MAX_ATTEMPTS {
@@ -250,8 +250,8 @@ fn random_request(sim: &mut Sim, random: &mut Random, grips: &mut [u64; 3]) -> R
     }
 }
 
-/// Invariants: the arm moves only with a lease, with a grip that was heard within the silence limit,
-/// and not during a stop; every motion after braking has a new number; targets expire.
+/// Invariants: the arm moves only with a lease, with a grip that was heard within the silence
+/// limit, and not during a stop; every motion after braking has a new number; targets expire.
 #[test]
 fn random_events_never_move_an_arm_without_permission() {
     let mut sim = Sim::ready(ageless());
