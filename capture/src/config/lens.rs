@@ -28,7 +28,7 @@ keys! {
         /// Lens model.
         lens: LensModel = LensModel::Pinhole;
         /// Distortion coefficients in the order of OpenCV: k1, k2, p1, p2, k3 and optionally k4, k5,
-        /// k6 for brown_conrady; k1, k2, k3, k4 for kannala_brandt; none for a pinhole.
+        /// k6 for `brown_conrady`; k1, k2, k3, k4 for `kannala_brandt`; none for a pinhole.
         distortion: Vec<f64> = Vec::new();
     }
 }

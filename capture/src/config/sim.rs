@@ -46,7 +46,7 @@ keys! {
     /// The keys in `[sim.target.NAME]`.
     #[derive(Clone, Debug, PartialEq)]
     pub struct SimTarget {
-        /// Specification of the target, such as charuco:5x7:34mm:26mm:5X5_100.
+        /// Specification of the target, such as `charuco:5x7:34mm:26mm:5X5_100`.
         pub spec: String, required "the target, such as \"charuco:5x7:34mm:26mm:5X5_100\"";
         /// Pose of the board frame: x points right on the print, y down, z into the board. Without
         /// this key, the target is on the flange.

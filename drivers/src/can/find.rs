@@ -84,11 +84,12 @@ fn receive_for(
         let remaining = deadline.duration_since(clock::now());
         match bus.receive(remaining)? {
             Some((_, BusEvent::Frame(frame))) => found.extend(new_motor(&frame, found)),
-            Some((_, BusEvent::Errors(errors))) => {
-                if errors.n_unacknowledged + errors.n_passive + errors.n_bus_off > 0 {
-                    return Ok(false);
-                }
+            Some((_, BusEvent::Errors(errors)))
+                if errors.n_unacknowledged + errors.n_passive + errors.n_bus_off > 0 =>
+            {
+                return Ok(false);
             }
+            Some((_, BusEvent::Errors(_))) => {}
             None if remaining.is_zero() => return Ok(true),
             None => {}
         }
@@ -200,7 +201,7 @@ mod tests {
                 ..WireErrors::default()
             };
             let is_sent = *self.n_sent.borrow() > 0;
-            Ok(is_sent.then(|| (Stamp(0), BusEvent::Errors(errors))))
+            Ok(is_sent.then_some((Stamp(0), BusEvent::Errors(errors))))
         }
     }
 

@@ -137,11 +137,11 @@ fn states_have_the_rate_of_the_controller_and_stamps_on_our_clock() {
         let statistics = arm.statistics();
         assert!(max_error < MAX_ERROR_RAD, "{max_error} rad; {statistics}");
         // Every state that is missing must be counted. A busy machine may skip some.
-        let n_queued = statistics.n_received - statistics.n_dropped;
-        while (states.len() as u64) < n_queued {
+        let n_queued = usize::try_from(statistics.n_received - statistics.n_dropped).unwrap();
+        while states.len() < n_queued {
             states.push(arm.read(TEST_TIMEOUT).unwrap());
         }
-        let n_missing: f64 = states[..n_queued as usize]
+        let n_missing: f64 = states[..n_queued]
             .array_windows()
             .map(|pair| (secs_between(pair) / period_secs).round() - 1.0)
             .sum();

@@ -7,7 +7,7 @@
 //!    expires;
 //! 2. *clutch*: the arm follows while a dead-man switch is held. Every grip starts where the tip
 //!    is. A device that was silent must grip again, and after a stop, an operator must permit
-//! motion;
+//!    motion;
 //! 3. *limits*: speed of the tip, of all parts and of the joints, workspace, ranges;
 //! 4. *self-collision*: distance between parts of the robot;
 //! 5. *clearance*: distance from the scene, with the age of what is known about it. What was never

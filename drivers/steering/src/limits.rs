@@ -206,7 +206,7 @@ impl Limits {
             place: pose.translation.vector.into(),
         };
         let tip = model.chain.forward(q).map_err(|_| unreachable(goal))?;
-        let goal = self.into_workspace(&tip, goal, limits);
+        let goal = self.clamp_to_workspace(&tip, goal, limits);
         let frac = self.tip_frac(&tip, &goal, pace);
         if frac < 1.0 {
             limits.push(Limit {
@@ -226,7 +226,7 @@ impl Limits {
     }
 
     /// Moves a goal into the workspace box. A tip outside the box may stay there and come back.
-    fn into_workspace(
+    fn clamp_to_workspace(
         &self,
         tip: &Transform,
         goal: &Transform,

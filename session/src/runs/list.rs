@@ -134,7 +134,7 @@ impl KeptModel {
         let is_there = |file: &&str| folder.join(file).is_file();
         let kind = ModelKind::ALL
             .iter()
-            .find(|kind| kind.entry().files.iter().any(|file| is_there(file)));
+            .find(|kind| kind.entry().files.iter().any(is_there));
         let psnr = report(folder).and_then(|report| report["done"]["psnr"].as_f64());
         Self {
             method: kind.map_or("unknown", |kind| kind.name()).to_owned(),

@@ -72,7 +72,7 @@ impl MotorFamily for DamiaoFamily {
         SEARCHED_IDS.filter_map(feedback_id_request).collect()
     }
 
-    /// Reads the answer to [`feedback_id_request`]: it has the CAN ID that it reports.
+    /// Reads the answer to a request for the feedback ID: it has the CAN ID that it reports.
     fn identify(&self, frame: &Frame) -> Option<MotorSettings> {
         let message = codec::decode_register(frame).ok()?;
         let Access::Reported(Register::FeedbackId, Value::Integer(feedback)) = message.access

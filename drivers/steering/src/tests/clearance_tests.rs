@@ -230,7 +230,8 @@ fn readings_that_are_no_numbers_are_no_knowledge() {
 
 #[test]
 fn invalid_configurations_are_refused_by_name() {
-    let spoiled: [(&str, fn(&mut ClearanceConfig)); 4] = [
+    type Change = fn(&mut ClearanceConfig);
+    let spoiled: [(&str, Change); 4] = [
         ("clearance.stop_m", |config| config.stop_m = f64::NAN),
         ("clearance.slow_m", |config| config.slow_m = 0.01),
         ("clearance.stale_frac", |config| config.stale_frac = 0.0),
