@@ -74,12 +74,13 @@ const RUN: [Run; 11] = [
 ];
 
 /// Beginnings of commands that are not run here, and the reason.
-const ONLY_PARSED: [(&str, &[&str]); 9] = [
+const ONLY_PARSED: [(&str, &[&str]); 10] = [
     (
         "they open the devices of a robot",
         &[
             "calibrate hand-eye my-robot.toml",
             "calibrate intrinsics my-robot.toml",
+            "calibrate intrinsics rig.toml",
             "devices --watch",
             "doctor RIG.toml",
             "doctor my-robot.toml",
@@ -100,6 +101,10 @@ const ONLY_PARSED: [(&str, &[&str]); 9] = [
     (
         "they serve until Ctrl-C: view.rs, preview.rs and wire.rs run them",
         &["preview", "sim", "view"],
+    ),
+    (
+        "it takes a minute: calibrate_guided.rs runs it",
+        &["calibrate intrinsics rigs/webcam-lens.toml"],
     ),
     (
         "they calibrate from long scans: calibrate.rs and calibrate_scan.rs run them",

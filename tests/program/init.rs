@@ -167,7 +167,7 @@ fn written_files_run_in_the_simulation() {
     for (robot, cameras) in CAMERAS {
         let folder = tempfile::tempdir().expect("a folder");
         init(folder.path(), &[&["--robot", robot], cameras].concat());
-        let args = "run rig.toml --sim --lockstep --steps 5 --scale 0.25 --out run";
+        let args = "run rig.toml --sim --lockstep --steps 5 --listen 127.0.0.1:0 --out run";
         let args: Vec<&str> = args.split(' ').collect();
         let output = fieldrig(folder.path(), &args);
         assert!(output.status.success(), "{robot}: {}", stderr(&output));

@@ -14,6 +14,8 @@ const FRANKA_ADDRESS: &str = "172.16.0.2";
 /// Address of a controller in the documentation of the ROS driver of Universal Robots, and of their
 /// simulator in a container.
 const UR_ADDRESS: &str = "192.168.56.101";
+/// A port that no controller uses. Its service, TCPMUX, is historic (RFC 7805).
+const UNUSED_PORT: u16 = 1;
 /// Time for an address that nobody has given. A controller in the same network answers within
 /// milliseconds.
 const QUICK: Duration = Duration::from_millis(300);
@@ -31,12 +33,18 @@ pub(super) fn find(plan: &SearchPlan, findings: &mut Findings) {
     for (kind, given, usual) in searched {
         match given {
             Some(address) => findings.controllers.push(controller_at(kind, address)),
-            None if is_usual && answers(usual, port(kind), QUICK) => {
+            None if is_usual && is_only_port(port(kind), |port| answers(usual, port, QUICK)) => {
                 findings.controllers.push(controller_at(kind, usual));
             }
             None => {}
         }
     }
+}
+
+/// Whether something answers on the port of a controller, and not on every port. Some networks have
+/// a proxy that accepts connections to any address, whether or not there is a computer.
+fn is_only_port(port: u16, answers: impl Fn(u16) -> bool) -> bool {
+    answers(port) && !answers(UNUSED_PORT)
 }
 
 /// The controller at an address, whether or not it answers.
@@ -133,6 +141,13 @@ mod tests {
             .find(|controller| controller.kind == ControllerKind::Franka)
             .expect("it was given");
         assert_eq!((&*franka.address, franka.answers), (&*address, false));
+    }
+
+    #[test]
+    fn a_proxy_that_accepts_everything_is_no_controller() {
+        assert!(is_only_port(FCI_PORT, |port| port == FCI_PORT));
+        assert!(!is_only_port(FCI_PORT, |_| false));
+        assert!(!is_only_port(FCI_PORT, |_| true));
     }
 
     #[test]
