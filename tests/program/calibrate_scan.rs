@@ -10,9 +10,11 @@ use std::path::Path;
 
 const TARGET: &str = "charuco:5x7:24mm:18mm:5X5_100";
 
-/// Limit of the rotation error, degrees. It also holds with a lens from the same few images, whose
-/// principal point is less certain.
+/// Limit of the position error, millimeters.
+const MAX_MM: f64 = 0.2;
+/// Limit of the rotation error, degrees.
 const MAX_DEG: f64 = 0.03;
+/// The same with a lens from the same few images, whose principal point is less certain.
 const MAX_DEG_WITH_LENS: f64 = 0.06;
 
 fn numbers(value: &Value) -> Vec<f64> {
@@ -105,7 +107,7 @@ fn lens_and_hand_eye_of_a_moving_arm_are_found_from_a_printed_target() {
         let output = fieldrig(folder, &args);
         assert!(output.status.success(), "{input:?}: {}", stderr(&output));
         assert!(is_report_with_photo(folder, "hand-eye.html"), "{input:?}");
-        check_pose(&json_of(&output), MAX_DEG);
+        check_pose(&json_of(&output), MAX_MM, MAX_DEG);
         // The program prints guidance for devices, but not for recordings.
         let log = stderr(&output);
         let is_guided = log.contains("0 poses with the target")
@@ -177,7 +179,8 @@ fn missing_lens_and_extrinsics_are_found_one_after_the_other() {
     );
     assert_eq!(missing("lens.toml"), [false, true]);
     let pose = calibrate("hand-eye", "lens.toml", "rig-calibrated.toml");
-    check_pose(&json_of(&pose), MAX_DEG);
+    // The scan is planned with the assumed pose of the camera, so that it sees the target less well.
+    check_pose(&json_of(&pose), 1.0, 0.3);
     assert_eq!(missing("rig-calibrated.toml"), [false, false]);
 }
 
@@ -188,7 +191,7 @@ fn is_report_with_photo(folder: &Path, file: &str) -> bool {
         .contains("data:image/jpeg")
 }
 
-fn check_pose(result: &Value, max_deg: f64) {
+fn check_pose(result: &Value, max_mm: f64, max_deg: f64) {
     const MAX_SIGMAS: f64 = 4.0;
     let found = numbers(&result["flange_from_camera"])
         .try_into()
@@ -197,7 +200,7 @@ fn check_pose(result: &Value, max_deg: f64) {
     let errors_mm = error.translation.vector * 1e3;
     let errors_deg = error.rotation.scaled_axis().map(f64::to_degrees);
     assert!(
-        errors_mm.norm() < 0.2 && errors_deg.norm() < max_deg,
+        errors_mm.norm() < max_mm && errors_deg.norm() < max_deg,
         "{errors_mm} mm, {errors_deg} degrees"
     );
     for (errors, key) in [(errors_mm, "sigma_mm"), (errors_deg, "sigma_deg")] {
@@ -238,7 +241,7 @@ fn arm_moves_around_a_target_until_its_camera_is_calibrated() {
     let log = stderr(&output);
     assert!(output.status.success(), "{log}");
     let result = json_of(&output);
-    check_pose(&result, MAX_DEG_WITH_LENS);
+    check_pose(&result, MAX_MM, MAX_DEG_WITH_LENS);
     let n_samples = result["samples"].as_array().map_or(0, Vec::len);
     assert!((10..=20).contains(&n_samples), "{n_samples} poses: {log}");
     assert!(
@@ -332,7 +335,9 @@ fn joint_offsets_are_estimated_and_written() {
 /// camera in real time. Only the images and the motors are simulated.
 #[cfg(target_os = "linux")]
 mod emulated_controller {
-    use super::{MAX_DEG_WITH_LENS, TARGET, check_pose, fieldrig, json_of, stderr, write_rig};
+    use super::{
+        MAX_DEG_WITH_LENS, MAX_MM, TARGET, check_pose, fieldrig, json_of, stderr, write_rig,
+    };
     use std::io::{BufRead, BufReader, Read};
     use std::path::Path;
     use std::process::{Command, Stdio};
@@ -386,7 +391,7 @@ mod emulated_controller {
             log.contains("an emulated Franka controller") && log.contains("returning to the start"),
             "{log}"
         );
-        check_pose(&json_of(&output), MAX_DEG_WITH_LENS);
+        check_pose(&json_of(&output), MAX_MM, MAX_DEG_WITH_LENS);
     }
 
     #[test]
@@ -474,7 +479,7 @@ fn interrupted_arm_is_calibrated_with_the_images_so_far() {
         text.contains("bringing the arm to rest") && !text.contains("returning to the start"),
         "{text}"
     );
-    check_pose(&json_of(&output), MAX_DEG_WITH_LENS);
+    check_pose(&json_of(&output), MAX_MM, MAX_DEG_WITH_LENS);
 }
 
 #[test]
