@@ -245,8 +245,8 @@ impl Chain {
     /// Sum of the distances between neighboring joints, meters: an upper bound of the tip's distance
     /// from the base without prismatic joints.
     pub(crate) fn length_m(&self) -> f64 {
-        let befores = self.segments.iter().map(|segment| &segment.before);
-        befores
+        let before_each = self.segments.iter().map(|segment| &segment.before);
+        before_each
             .chain([&self.last_from_tip])
             .map(|motion| motion.translation.norm())
             .sum()
