@@ -50,14 +50,14 @@
 //! let (operator, device) = (Operator(1), Device(1));
 //! steering.handle(Stamp(0), &Request::TakeLease(operator))?;
 //! let mut now = Stamp(0);
-//! for cycle in 0..500 {
+//! for cycle in 0..500_u32 {
 //!     now += period;
 //!     if cycle % 10 == 0 {
 //!         // The switch is closed after the first sample. The hand then moves down.
 //!         let grip = (cycle > 0).then_some(1);
 //!         let base_from_hand = [0.0, 0.0, -1e-4 * f64::from(cycle), 0.0, 0.0, 0.0, 1.0];
 //!         let intent = Intent::Hand { base_from_hand };
-//!         let sequence = u64::from(cycle.unsigned_abs());
+//!         let sequence = u64::from(cycle);
 //!         let command = Command { operator, device, sequence, captured_at: now, grip, intent };
 //!         steering.handle(now, &Request::Command(command))?;
 //!     }
