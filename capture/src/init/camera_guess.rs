@@ -27,11 +27,11 @@ pub(super) fn parent_from_camera(parent: Parent, links: Option<&ArmLinks>) -> Tr
             let rotation = upright(Vector3::x_axis());
             Transform::from_parts(Translation3::from(CAMERA_ON_BASE_M), rotation)
         }
-        // It stands on the other side of the table, and looks down at the place in front of the
-        // robot.
+        // It stands beside the robot, and looks down at the place in front of it. Simulated scenes
+        // have walls on the other side.
         Parent::World => {
             let reach_m = links.map_or(DEFAULT_REACH_M, |links| links.reach_m);
-            let position = Vector3::new(1.6, 0.0, 1.1) * reach_m;
+            let position = Vector3::new(0.25, 1.1, 0.9) * reach_m;
             let target = Vector3::new(0.55, 0.0, 0.1) * reach_m;
             let rotation = upright(Unit::new_normalize(target - position));
             Transform::from_parts(Translation3::from(position), rotation)

@@ -74,9 +74,16 @@ impl RigPlan {
             Parent::World => "world",
         };
         text.key("parent", quoted(parent), &about);
+        let commands = if self.arm.is_some() {
+            let target = Setting::Target;
+            format!(
+                "`fieldrig calibrate hand-eye {rig} {target} SPEC` or `fieldrig calibrate scene {rig}` measures it."
+            )
+        } else {
+            format!("`fieldrig calibrate scene {rig}` measures it if the base moves.")
+        };
         let about = format!(
-            "Guess: pose of the camera (x right, y down, z forward) in that frame. `fieldrig calibrate hand-eye {rig} {} SPEC` or `fieldrig calibrate scene {rig}` measures it.",
-            Setting::Target
+            "Guess: pose of the camera (x right, y down, z forward) in that frame. {commands}"
         );
         text.key(
             "parent_from_camera",
