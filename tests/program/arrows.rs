@@ -29,8 +29,8 @@ const ALLOWED: &str = "
     viz           -> files keyframe kinematics messages model-files numbers trainer
     session       -> background calibration capture drivers files gpu keyframe kinematics messages \
                      model-files numbers report trainer viz
-    calibrate     -> calibration capture drivers files keyframe kinematics messages report session \
-                     targets
+    calibrate     -> calibration capture drivers files keyframe kinematics messages numbers report \
+                     session targets
     bench         -> calibration capture files gpu keyframe kinematics messages model-files numbers \
                      report session trainer
     fieldrig      -> background bench calibrate calibration capture drivers files gpu keyframe \

@@ -1,10 +1,11 @@
 //! Whether a photograph of a target is sharp, and whether the target was still.
 
 use calibration::BoardView;
+use numbers::quantile::median;
 use std::collections::HashMap;
 
 /// Half the side of the square around a corner in which its edges are measured, pixels. It is larger
-/// than the widest accepted edge: around a corner whose edges are wider than the square, the slopes
+/// than the widest accepted edge: around a corner whose edges are wider than the square, the image gradients
 /// and the contrast shrink together.
 const WINDOW_PX: i64 = 8;
 /// Corners with a smaller difference between ink and paper are not measured, gray levels.
@@ -25,15 +26,15 @@ pub(crate) fn is_sharp(size_px: [u32; 2], gray: &[u8], view: &BoardView) -> bool
 }
 
 /// Width of the edges at the corners of a target, pixels: the difference between ink and paper
-/// divided by the steepest slope, median over the corners. It is 2 for a perfect step, because a
+/// divided by the largest image gradient, median over the corners. It is 2 for a perfect step, because a
 /// central difference spans two pixels, and 2.5 times the standard deviation of a large blur.
 fn edge_width_px(size_px: [u32; 2], gray: &[u8], view: &BoardView) -> Option<f64> {
-    let mut widths: Vec<f64> = view
+    let widths: Vec<f64> = view
         .points
         .iter()
         .filter_map(|point| edge_width_at(size_px, gray, point.pixel))
         .collect();
-    (widths.len() >= MIN_CORNERS).then(|| median(&mut widths))
+    (widths.len() >= MIN_CORNERS).then(|| median(&widths))?
 }
 
 /// The same at one corner. `None` at the border of the image, or without contrast.
@@ -82,7 +83,7 @@ pub(crate) fn motion_px(earlier: &BoardView, later: &BoardView) -> Option<f64> {
         .iter()
         .map(|point| (key(point), point.pixel))
         .collect();
-    let mut distances: Vec<f64> = later
+    let distances: Vec<f64> = later
         .points
         .iter()
         .filter_map(|point| {
@@ -90,13 +91,7 @@ pub(crate) fn motion_px(earlier: &BoardView, later: &BoardView) -> Option<f64> {
             Some((point.pixel[0] - x).hypot(point.pixel[1] - y))
         })
         .collect();
-    (distances.len() >= MIN_CORNERS).then(|| median(&mut distances))
-}
-
-/// The middle value of at least one value.
-fn median(values: &mut [f64]) -> f64 {
-    values.sort_by(f64::total_cmp);
-    values[values.len() / 2]
+    (distances.len() >= MIN_CORNERS).then(|| median(&distances))?
 }
 
 #[cfg(test)]

@@ -83,26 +83,26 @@ impl<'a> Velocities<'a> {
 
     /// Change of the velocity of a camera at one of its images, per second. It is the derivative of
     /// the parabola through the velocities at this image and its two neighbors. At the end of a
-    /// sequence, it is the slope to the only neighbor.
+    /// sequence, it is the difference quotient to the only neighbor.
     fn rate_at(&self, camera: &str, stamp: Stamp) -> Option<Twist> {
         let velocities = self.by_camera.get(camera)?;
         let ix = velocities
             .binary_search_by_key(&stamp, |(stamp, _)| *stamp)
             .ok()?;
-        let slope_from = |first: Option<usize>| {
+        let quotient_from = |first: Option<usize>| {
             let first = first?;
             let (start, before) = velocities.get(first)?;
             let (end, after) = velocities.get(first + 1)?;
             let secs = end.secs_since(*start);
             (secs <= MAX_GAP_SECS).then(|| (secs, weighted(after, 1.0 / secs, before, -1.0 / secs)))
         };
-        match (slope_from(ix.checked_sub(1)), slope_from(Some(ix))) {
+        match (quotient_from(ix.checked_sub(1)), quotient_from(Some(ix))) {
             (Some((before_secs, before)), Some((after_secs, after))) => {
                 // The nearer neighbor has more weight.
                 let share = after_secs / (before_secs + after_secs);
                 Some(weighted(&before, share, &after, 1.0 - share))
             }
-            (Some((_, slope)), None) | (None, Some((_, slope))) => Some(slope),
+            (Some((_, quotient)), None) | (None, Some((_, quotient))) => Some(quotient),
             (None, None) => None,
         }
     }

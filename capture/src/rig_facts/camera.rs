@@ -191,10 +191,10 @@ fn distance_to_segment_m(point: &Point3<f64>, end: &Point3<f64>) -> f64 {
 /// Distance along the optical axis to the plane z = 0.
 fn ground_at_m(world_from_camera: &Transform) -> Option<f64> {
     /// Flatter axes meet the ground far away, if at all.
-    const MIN_SLOPE: f64 = 0.02;
+    const MIN_DESCENT_FRAC: f64 = 0.02;
     let height_m = world_from_camera.translation.z;
-    let slope = -(world_from_camera.rotation * Vector3::z()).z;
-    (slope > MIN_SLOPE && height_m > 0.0).then(|| height_m / slope)
+    let descent_frac = -(world_from_camera.rotation * Vector3::z()).z;
+    (descent_frac > MIN_DESCENT_FRAC && height_m > 0.0).then(|| height_m / descent_frac)
 }
 
 /// Fraction of points that are inside the image.

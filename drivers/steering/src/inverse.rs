@@ -2,6 +2,7 @@
 
 use kinematics::inverse::{InverseSolver, Target};
 use kinematics::{Chain, Transform};
+use std::cell::RefCell;
 
 /// Finds joint values for a pose.
 pub trait InverseKinematics {
@@ -21,16 +22,38 @@ pub trait InverseKinematics {
     ) -> Option<Vec<f64>>;
 }
 
-impl InverseKinematics for Chain {
+/// Short steps of damped least squares, for any chain.
+#[derive(Debug)]
+pub struct NearestPosture {
+    chain: Chain,
+    /// The solver for the newest bounds. They rarely change, and a new solver allocates.
+    solver: RefCell<Option<(Vec<[f64; 2]>, InverseSolver)>>,
+}
+
+impl NearestPosture {
+    /// * `chain`: chain from the base to the tip.
+    pub fn new(chain: Chain) -> Self {
+        Self {
+            chain,
+            solver: RefCell::new(None),
+        }
+    }
+}
+
+impl InverseKinematics for NearestPosture {
     fn solve(
         &self,
         base_from_tip: &Transform,
         start: &[f64],
         bounds: &[[f64; 2]],
     ) -> Option<Vec<f64>> {
+        let mut kept = self.solver.borrow_mut();
+        if kept.as_ref().is_none_or(|(of, _)| of != bounds) {
+            let solver = InverseSolver::within(self.chain.clone(), bounds.to_vec()).ok()?;
+            *kept = Some((bounds.to_vec(), solver));
+        }
+        let (_, solver) = kept.as_mut()?;
         // The bounds are valid, so an error only means that there is no solution.
-        let mut solver = InverseSolver::within(self.clone(), bounds.to_vec()).ok()?;
-        let target = Target::pose(*base_from_tip);
-        solver.solve_near(&target, start).ok()
+        solver.solve_near(&Target::pose(*base_from_tip), start).ok()
     }
 }

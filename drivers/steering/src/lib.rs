@@ -35,7 +35,7 @@
 //! let joints: Vec<MotionLimits> =
 //!     chain.limits().iter().map(|joint| MotionLimits::new(joint, 1.0, 0.5, 0.1)).collect();
 //! let robot = Robot {
-//!     inverse: Box::new(chain.clone()),
+//!     inverse: Box::new(NearestPosture::new(chain.clone())),
 //!     chain,
 //!     body,
 //!     joints: &joints,
@@ -106,7 +106,7 @@ pub use clearance::{Clearance, ClearanceConfig, ClearancePoints, Restriction, Se
 pub use clutch::ClutchConfig;
 pub use error::Error;
 pub use follower::{Follower, NotFollowed, brake_limits};
-pub use inverse::InverseKinematics;
+pub use inverse::{InverseKinematics, NearestPosture};
 pub use lease::LeaseConfig;
 pub use limits::LimitConfig;
 pub use reason::{Effect, Limit, Link, Reason};

@@ -108,7 +108,7 @@ pub enum Reason {
         /// What is wrong.
         report: String,
     },
-    /// The arm braked by itself.
+    /// The arm braked without an order, because its target expired or had no trajectory.
     #[error("the arm braked, because its target expired or had no trajectory: grip again")]
     ArmBraked,
     /// The time went back.

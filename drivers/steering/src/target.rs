@@ -80,7 +80,7 @@ pub struct ArmState {
     pub position: Vec<f64>,
     /// Whether the generator is at rest.
     pub is_at_rest: bool,
-    /// The highest number of a motion after which the arm braked by itself; 0 if it never did.
+    /// The highest number of a motion after which the arm braked without an order; 0 if it never did.
     pub braked_motion: u64,
     /// Why the arm accepts no targets, if it does not.
     pub stopped: Option<String>,

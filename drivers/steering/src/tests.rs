@@ -44,7 +44,7 @@ fn new_steering(config: SteeringConfig) -> Steering {
     let (urdf, chain) = panda();
     let body = Body::new(&urdf, &chain, &|_| None).unwrap();
     let robot = Robot {
-        inverse: Box::new(chain.clone()),
+        inverse: Box::new(crate::NearestPosture::new(chain.clone())),
         joints: &joint_limits(&chain),
         chain,
         body,

@@ -279,7 +279,7 @@ impl InverseSolver {
     }
 
     /// Called with the nearest configuration in `joints`: tries to reach the target without ranges,
-    /// which tells ranges that are in the way from a pose that is out of reach.
+    /// to distinguish a pose beyond the ranges from a pose that is out of reach.
     ///
     /// * `n_starts`: number of configurations from which the target is searched.
     ///

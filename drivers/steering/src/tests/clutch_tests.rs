@@ -267,7 +267,7 @@ fn arm_that_reports_nothing_usable_brakes() {
     }
 }
 
-/// Invariant: the arm's thread brakes by itself when targets expire, and does not move again with
+/// Invariant: the arm's thread brakes when targets expire, and does not move again with
 /// the same grip.
 #[test]
 fn arm_brakes_without_the_chain_and_needs_a_new_grip() {
