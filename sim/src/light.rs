@@ -84,13 +84,44 @@ pub(crate) fn mjcf(gain: f64) -> (String, String) {
 
 /// Geometry that blocks light.
 pub(crate) struct Occluders {
-    /// Boxes: inverse pose of the center, and half sizes.
-    boxes: Vec<(Transform, Vector3<f64>)>,
+    boxes: Vec<SolidBox>,
     ellipsoids: Vec<Ellipsoid>,
     /// Sphere around all ellipsoids.
     bounds: (Point3<f64>, f64),
     /// Maximum distance at which an object blocks ambient light, meters.
     ambient_reach_m: f64,
+}
+
+struct SolidBox {
+    box_from_world: Transform,
+    half_m: Vector3<f64>,
+    center: Point3<f64>,
+    /// Distance of the corners from the center.
+    radius_m: f64,
+}
+
+impl SolidBox {
+    fn blocks(&self, from: &Point3<f64>, direction: &Vector3<f64>, max_distance_m: f64) -> bool {
+        hits_box(
+            &(self.box_from_world * from).coords,
+            &(self.box_from_world * direction),
+            &self.half_m,
+            max_distance_m,
+        )
+    }
+
+    /// Whether a box can block a ray of a cone: rays from a point within a tangent of `spread`
+    /// around a unit vector.
+    fn is_in_cone(&self, from: &Point3<f64>, axis: &Vector3<f64>, spread: f64) -> bool {
+        let offset = self.center - from;
+        let along_m = offset.dot(axis);
+        let across_m = (offset - axis * along_m).norm();
+        along_m > -self.radius_m && across_m <= self.radius_m + spread * (along_m + self.radius_m)
+    }
+
+    fn is_within(&self, from: &Point3<f64>, reach_m: f64) -> bool {
+        (self.center - from).norm() <= reach_m + self.radius_m
+    }
 }
 
 struct Ellipsoid {
@@ -112,8 +143,13 @@ impl Occluders {
     }
 
     pub(crate) fn add_box(&mut self, world_from_box: Transform, half_m: [f64; 3]) {
-        self.boxes
-            .push((world_from_box.inverse(), Vector3::from(half_m)));
+        let half_m = Vector3::from(half_m);
+        self.boxes.push(SolidBox {
+            box_from_world: world_from_box.inverse(),
+            half_m,
+            center: world_from_box.translation.vector.into(),
+            radius_m: half_m.norm(),
+        });
     }
 
     /// Adds ellipsoids, given by center and half axes, that lie inside a bounding sphere.
@@ -133,21 +169,21 @@ impl Occluders {
         self.bounds = bounds;
     }
 
+    /// Whether anything blocks a ray.
+    ///
+    /// * `boxes`: those that can block it. They are chosen once for all rays of a point, because
+    ///   most boxes are far away from most points.
     fn is_occluded(
         &self,
+        boxes: &[&SolidBox],
         from: &Point3<f64>,
         direction: &Vector3<f64>,
         max_distance_m: f64,
     ) -> bool {
-        let is_behind_box = self.boxes.iter().any(|(box_from_world, half_m)| {
-            hits_box(
-                &(box_from_world * from).coords,
-                &(box_from_world * direction),
-                half_m,
-                max_distance_m,
-            )
-        });
-        if is_behind_box {
+        if boxes
+            .iter()
+            .any(|solid| solid.blocks(from, direction, max_distance_m))
+        {
             return true;
         }
         // Most rays miss the sphere around all ellipsoids. For these rays, the single ellipsoids
@@ -197,14 +233,15 @@ impl Occluders {
         let to_lamp = KEY.to_lamp();
         let side = to_lamp.cross(&Vector3::x()).normalize();
         let across = to_lamp.cross(&side);
+        let can_block = |solid: &&SolidBox| solid.is_in_cone(from, &to_lamp, KEY_SIZE);
+        let boxes: Vec<&SolidBox> = self.boxes.iter().filter(can_block).collect();
+        let rotation_rad = random.between(0, 0.0, std::f64::consts::TAU);
         let n_free = (0..N_KEY_RAYS).filter(|ray| {
             // The rays are spread evenly over the lamp's disc, with a random rotation (Vogel 1979).
             let radius = KEY_SIZE * ((*ray as f64 + 0.5) / N_KEY_RAYS as f64).sqrt();
-            let (sin, cos) = (*ray as f64 * GOLDEN_ANGLE_RAD
-                + random.between(0, 0.0, std::f64::consts::TAU))
-            .sin_cos();
+            let (sin, cos) = (*ray as f64 * GOLDEN_ANGLE_RAD + rotation_rad).sin_cos();
             let direction = (to_lamp + side * (radius * cos) + across * (radius * sin)).normalize();
-            !self.is_occluded(from, &direction, 10.0)
+            !self.is_occluded(&boxes, from, &direction, 10.0)
         });
         n_free.count() as f64 / N_KEY_RAYS as f64
     }
@@ -218,17 +255,18 @@ impl Occluders {
         }
         .normalize();
         let across = normal.cross(&side);
+        let can_block = |solid: &&SolidBox| solid.is_within(from, self.ambient_reach_m);
+        let boxes: Vec<&SolidBox> = self.boxes.iter().filter(can_block).collect();
+        let rotation_rad = random.between(1, 0.0, std::f64::consts::TAU);
         let n_free = (0..N_AMBIENT_RAYS).filter(|ray| {
             // Cosine-weighted directions around the normal, by Malley's method: points are spread
             // evenly over a disc and projected up to the hemisphere. Each ray then carries the same
             // light.
             let square = (*ray as f64 + random.unit(2 + ray)) / N_AMBIENT_RAYS as f64;
-            let (sin, cos) = (*ray as f64 * GOLDEN_ANGLE_RAD
-                + random.between(1, 0.0, std::f64::consts::TAU))
-            .sin_cos();
+            let (sin, cos) = (*ray as f64 * GOLDEN_ANGLE_RAD + rotation_rad).sin_cos();
             let direction =
                 normal * (1.0 - square).sqrt() + (side * cos + across * sin) * square.sqrt();
-            !self.is_occluded(from, &direction, self.ambient_reach_m)
+            !self.is_occluded(&boxes, from, &direction, self.ambient_reach_m)
         });
         n_free.count() as f64 / N_AMBIENT_RAYS as f64
     }

@@ -33,6 +33,9 @@ pub mod reference;
 mod schedule;
 mod seed;
 mod snapshot;
+mod stereo;
+#[cfg(test)]
+mod stereo_tests;
 mod trainer;
 #[cfg(test)]
 mod training_tests;

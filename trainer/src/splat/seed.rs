@@ -11,6 +11,7 @@ use keyframe::{DepthMap, Keyframe};
 use model_files::InitialPoints;
 use model_files::splat::arrays::SplatArrays;
 use nalgebra::{Matrix3, Point3, Rotation3, UnitQuaternion, Vector3};
+use numbers::quantile::{Rank, quantile};
 use numbers::random::Random;
 use numbers::{f32_of, f32s_of};
 use rayon::prelude::*;
@@ -33,6 +34,9 @@ const THICKNESS: f64 = 0.15;
 const SEED_OPACITY: f64 = 0.7;
 /// Number of initial splats if there is no depth.
 const N_RANDOM: usize = 50_000;
+/// Maximum number of them per image. The first image of a live scan does not tell how far the scene
+/// is away, so it gets only some of them.
+const N_RANDOM_PER_IMAGE: usize = 10_000;
 /// Most positions of a random cloud are wrong. Low opacity lets the gradients reach splats behind
 /// them.
 const RANDOM_OPACITY: f64 = 0.1;
@@ -328,6 +332,22 @@ impl Seeder {
         }
     }
 
+    /// Median distance of the discs from cameras. `None` if there are no discs or no cameras.
+    pub(crate) fn median_distance_m(&self, cameras: &[Vector3<f64>]) -> Option<f64> {
+        // A sample is enough for a median.
+        const N_SAMPLES: usize = 2000;
+        let every = self.positions.len().div_ceil(N_SAMPLES).max(1);
+        let sample = self
+            .positions
+            .iter()
+            .step_by(every)
+            .zip(cameras.iter().cycle());
+        let mut distances: Vec<f64> = sample
+            .map(|(position, camera)| (position.coords - camera).norm())
+            .collect();
+        quantile(&mut distances, 0.5, Rank::Upper)
+    }
+
     fn is_occupied(&self, position: &Point3<f64>, spacing_m: f64) -> bool {
         // Discs of half and twice the size count as similar. A keyframe from much closer adds finer
         // discs on the same surface.
@@ -505,13 +525,29 @@ fn color_of_point(points: &InitialPoints, ix: usize, keyframes: &[&Keyframe]) ->
         .unwrap_or(GRAY)
 }
 
-/// Creates a random cloud along the rays of all keyframes, densest around their common focus.
-pub(crate) fn random_cloud(keyframes: &[&Keyframe], seed: u64, n_max: usize) -> SplatArrays {
+/// Maximum number of splats in random clouds after so many images. A scan has clouds only at its
+/// beginning, because later images show surfaces together with earlier ones.
+pub(crate) fn n_random_left(n_images: usize) -> usize {
+    N_RANDOM.saturating_sub(N_RANDOM_PER_IMAGE * n_images)
+}
+
+/// Creates a random cloud along the rays of keyframes, densest around a point that they are
+/// expected to show.
+pub(crate) fn random_cloud(
+    keyframes: &[&Keyframe],
+    focus: Vector3<f64>,
+    seed: u64,
+    n_max: usize,
+) -> SplatArrays {
     let mut seeds = Seeds::new();
-    let focus = common_focus(keyframes);
+    if keyframes.is_empty() {
+        return seeds.arrays;
+    }
     // The constant separates these random numbers from others that are drawn with the same seed.
     let mut random = Random::new(seed ^ 0x5eed_5eed);
-    let n = N_RANDOM.min(n_max);
+    let n = N_RANDOM
+        .min(N_RANDOM_PER_IMAGE * keyframes.len())
+        .min(n_max);
     for _ in 0..n {
         // A random pixel of a random image gives a color, and a ray that is certainly in view. The
         // minimum is needed because the product may round up to the number of images.

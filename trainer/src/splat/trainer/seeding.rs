@@ -3,8 +3,9 @@
 use super::view_set::ViewSet;
 use crate::model_options::ModelOptions;
 use crate::splat::options::SplatOptions;
-use crate::splat::seed::{Density, Seeder};
+use crate::splat::seed::{self, Density, Seeder};
 use crate::splat::snapshot::ObservedScene;
+use crate::splat::stereo;
 use keyframe::Keyframe;
 use model_files::InitialPoints;
 use model_files::splat::arrays::SplatArrays;
@@ -26,6 +27,9 @@ const SOFTWARE_SEEDS_PER_IMAGE: f64 = 4_000.0;
 /// Minimum scale of the scene. With a scale of zero, which a single camera without depth would
 /// give, the means could not move.
 const MIN_SCENE_SIZE_M: f64 = 1e-3;
+/// Fraction of an image without depth in which other images must show where the surfaces are. With
+/// less, the depths in between are guesses.
+const MIN_KNOWN_FRAC: f64 = 0.1;
 
 /// Creates the initial splats for new keyframes.
 #[derive(Debug)]
@@ -87,9 +91,7 @@ impl Seeding {
         if arrived.is_empty() {
             return None;
         }
-        // All views are used, not only the new ones, because the learning rate must fit the whole
-        // scene.
-        self.scene.size_m = scene_size_m(views);
+        self.update_size(views);
         let discs = self.scene.seeder.discs(&arrived, self.density);
         self.unseeded.extend(
             arrived
@@ -110,6 +112,10 @@ impl Seeding {
             .iter_mut()
             .chain(&mut self.unseeded)
             .for_each(correct);
+        // Surfaces that were found in images without depth have moved by less than a disc's size.
+        if !self.scene.has_depth {
+            return;
+        }
         let seeded: Vec<_> = views
             .keyframes()
             .filter(|keyframe| !self.is_pending(keyframe))
@@ -132,6 +138,44 @@ impl Seeding {
     /// Keyframes with areas that depth does not cover.
     pub(super) fn take_unseeded(&mut self) -> Vec<Arc<Keyframe>> {
         std::mem::take(&mut self.unseeded)
+    }
+
+    /// Discs on the surfaces that several images show, for keyframes that arrived without depth,
+    /// and discs in between at depths like those around them. Also returns the keyframes for which
+    /// hardly any surface was found.
+    pub(super) fn discs_from_images(
+        &mut self,
+        arrived: &[Arc<Keyframe>],
+        views: &ViewSet,
+    ) -> (Vec<SplatArrays>, Vec<Arc<Keyframe>>) {
+        let all: Vec<&Keyframe> = views.keyframes().map(AsRef::as_ref).collect();
+        let with_depth = |keyframe: &Arc<Keyframe>| {
+            let depth = stereo::depth_from_images(keyframe, &all)?;
+            let keyframe = Arc::new(Keyframe {
+                depth: Some(depth),
+                ..(**keyframe).clone()
+            });
+            (known_frac(&keyframe) >= MIN_KNOWN_FRAC).then_some(keyframe)
+        };
+        let found: Vec<Option<Arc<Keyframe>>> = arrived.iter().map(with_depth).collect();
+        let poor = std::iter::zip(arrived, &found).filter(|(_, found)| found.is_none());
+        let poor = poor.map(|(keyframe, _)| keyframe.clone()).collect();
+        let found: Vec<Arc<Keyframe>> = found.into_iter().flatten().collect();
+        let mut discs = vec![self.scene.seeder.discs(&found, self.density)];
+        self.update_size(views);
+        let (density, default_m) = (self.density, self.scene.size_m);
+        let seeder = &mut self.scene.seeder;
+        discs.extend(
+            found
+                .iter()
+                .map(|keyframe| seeder.discs_without_depth(keyframe, density, default_m)),
+        );
+        (discs, poor)
+    }
+
+    /// The learning rate must fit the whole scene.
+    fn update_size(&mut self, views: &ViewSet) {
+        self.scene.size_m = scene_size_m(views, &self.scene.seeder);
     }
 
     /// Discs for the areas of a keyframe that depth does not cover. `None` if there is no depth at
@@ -157,9 +201,17 @@ impl Seeding {
     }
 }
 
-/// Scale of the scene, from the spread of the cameras and their median depth. The learning rate of
+/// Fraction of the pixels of a keyframe's depth that are known.
+fn known_frac(keyframe: &Keyframe) -> f64 {
+    keyframe.depth.as_ref().map_or(0.0, |depth| {
+        let n_known = depth.depth_m.iter().filter(|z| **z > 0.0).count();
+        n_known as f64 / depth.depth_m.len().max(1) as f64
+    })
+}
+
+/// Scale of the scene, from the spread of the cameras and their typical depth. The learning rate of
 /// the means is proportional to it.
-fn scene_size_m(views: &ViewSet) -> f64 {
+fn scene_size_m(views: &ViewSet, seeder: &Seeder) -> f64 {
     let centers: Vec<_> = views
         .keyframes()
         .map(|keyframe| keyframe.world_from_camera.translation.vector)
@@ -174,9 +226,15 @@ fn scene_size_m(views: &ViewSet) -> f64 {
         .filter_map(|view| view.median_depth_m)
         .collect();
     // Kerbl et al. 2023 use 1.1 times the spread of the cameras. It is too small if the cameras
-    // hardly move, so half of the median depth is a lower limit.
-    let median_depth_m = quantile(&mut depths, 0.5, Rank::Upper).unwrap_or(spread);
+    // hardly move, as at the beginning of a scan, so half of the typical depth is a lower limit.
+    // Without depth and without surfaces, the point at which the cameras look gives the depth.
+    let typical_depth_m = quantile(&mut depths, 0.5, Rank::Upper)
+        .or_else(|| seeder.median_distance_m(&centers))
+        .unwrap_or_else(|| {
+            let keyframes: Vec<&Keyframe> = views.keyframes().map(AsRef::as_ref).collect();
+            (seed::common_focus(&keyframes) - middle).norm()
+        });
     (1.1 * spread)
-        .max(0.5 * median_depth_m)
+        .max(0.5 * typical_depth_m)
         .max(MIN_SCENE_SIZE_M)
 }

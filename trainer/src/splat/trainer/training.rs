@@ -111,15 +111,22 @@ impl Training {
     }
 
     /// Seeds the areas that depth does not cover. If any keyframe has depth, discs are used.
-    /// Otherwise, balls at the initial points (if there are any) and a random cloud are used.
+    /// Otherwise, discs are used on surfaces that several images show, and a random cloud where
+    /// there are none. If initial points are given, balls at these points and a random cloud are
+    /// used.
     pub(super) fn prepare_model(&mut self) -> Result<(), Error> {
         // Depth comes first, because discs without depth readings take their depths from the discs
         // with depth.
         self.seed_from_depth()?;
-        for keyframe in self.seeding.take_unseeded() {
-            if let Some(discs) = self.seeding.discs_without_depth(&keyframe) {
-                self.add(&discs)?;
+        let unseeded = self.seeding.take_unseeded();
+        if self.seeding.scene.has_depth {
+            for keyframe in &unseeded {
+                if let Some(discs) = self.seeding.discs_without_depth(keyframe) {
+                    self.add(&discs)?;
+                }
             }
+        } else if self.seeding.points.is_none() && !unseeded.is_empty() {
+            self.seed_from_images(&unseeded)?;
         }
         if !self.model.cameras.set.is_empty() {
             self.views
@@ -133,7 +140,8 @@ impl Training {
             let balls = points
                 .map(|points| seed::balls(points, &keyframes, n_max))
                 .unwrap_or_default();
-            let cloud = seed::random_cloud(&keyframes, self.options.common.seed, n_max);
+            let focus = seed::common_focus(&keyframes);
+            let cloud = seed::random_cloud(&keyframes, focus, self.options.common.seed, n_max);
             // Structure from motion finds no points where images have no texture. A random cloud is
             // therefore added, so that there are at least as many splats as without points.
             let n_random = cloud.n_splats().saturating_sub(balls.n_splats());
@@ -141,6 +149,20 @@ impl Training {
             self.add(&cloud.filtered(|ix| ix < n_random))?;
         }
         Ok(())
+    }
+
+    /// Seeds the keyframes that arrived without depth, from what they and other images show.
+    fn seed_from_images(&mut self, arrived: &[Arc<Keyframe>]) -> Result<(), Error> {
+        let (discs, poor) = self.seeding.discs_from_images(arrived, &self.views);
+        discs.iter().try_for_each(|discs| self.add(discs))?;
+        let all: Vec<&Keyframe> = self.views.keyframes().map(AsRef::as_ref).collect();
+        let poor: Vec<&Keyframe> = poor.iter().map(AsRef::as_ref).collect();
+        let n_before = all.len() - arrived.len();
+        // Another seed for each arrival, so that no two clouds are alike.
+        let seed = self.options.common.seed ^ n_before as u64;
+        let n_max = seed::n_random_left(n_before).min(self.options.cap() as usize);
+        let cloud = seed::random_cloud(&poor, seed::common_focus(&all), seed, n_max);
+        self.add(&cloud)
     }
 
     /// Queues at most `n` steps in one submit, see [`Method::step`](crate::Method::step). Returns
