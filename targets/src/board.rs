@@ -1,8 +1,8 @@
 //! Board geometry: frame, positions of corners, symmetry.
 //!
 //! # Board frame
-//! The frame is that of OpenCV: as seen by a viewer of the printed target, x points right, y down
-//! and z into the board, away from the viewer. All corners have z = 0.
+//! The board frame is the frame that OpenCV uses. For a viewer of the printed target, x points
+//! right, y points down, and z points into the board, away from the viewer. All corners have z = 0.
 //!
 //! | target | origin | corner ids |
 //! |---|---|---|
@@ -62,8 +62,8 @@ impl TargetSpec {
         Some(Vector3::new(x, y, 0.0))
     }
 
-    /// Corners of the pattern's bounding rectangle in the board frame: smallest x and y, largest x
-    /// and y, meters.
+    /// Two opposite corners of the pattern's bounding rectangle in the board frame, meters: the
+    /// smallest x and y, then the largest x and y.
     pub fn bounds_m(&self) -> [[f64; 2]; 2] {
         match self.pattern {
             // The origin is the first inner corner, one square inside.
@@ -129,8 +129,8 @@ impl TargetSpec {
     }
 }
 
-/// Smallest and largest x and y of a board of squares whose upper left corner is at
-/// `(first_m, first_m)`.
+/// The smallest x and y, then the largest x and y, of a board of squares whose upper left corner is
+/// at `(first_m, first_m)`.
 fn bounds_of_squares(squares: [u32; 2], square_m: f64, first_m: f64) -> [[f64; 2]; 2] {
     [
         [first_m; 2],

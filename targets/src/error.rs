@@ -217,7 +217,7 @@ pub enum NotDetected {
         /// Number of markers.
         n: usize,
     },
-    /// The markers are of the right dictionary, but their ids are not on this target.
+    /// The markers belong to the right dictionary, but their ids are not on this target.
     #[error("found markers with ids {found}, expected {expected}; this is another target")]
     OtherIds {
         /// Ids in the image.
@@ -233,14 +233,14 @@ pub enum NotDetected {
         /// Ids in the image.
         found: Ids,
     },
-    /// The markers are larger or smaller relative to the squares.
+    /// Relative to the squares, the markers are larger or smaller than on the target.
     #[error(
         "the markers are about {:.2} times as wide as the squares, expected {:.2}; measure both on the print: if a square has {square}, a marker has about {marker}",
         found_frac,
         expected_frac
     )]
     MarkerSize {
-        /// Side of a marker in the image relative to that of a square.
+        /// Side of a marker in the image relative to the side of a square.
         found_frac: f64,
         /// The same of the target.
         expected_frac: f64,

@@ -143,7 +143,7 @@ fn confirmed(layout: &Layout, markers: &[Marker]) -> (Vec<Marker>, usize) {
             .map(|other| (distance(center_m(marker), center_m(other)), *other))
             .collect();
         others.sort_by(|a, b| a.0.total_cmp(&b.0));
-        // The number of neighbors that a marker inside the board has at the same distance.
+        // This is the number of neighbors that a marker inside the board has at the same distance.
         const N_NEIGHBORS: usize = 4;
         let nearest = others.first().map_or(0.0, |other| other.0);
         let close = others

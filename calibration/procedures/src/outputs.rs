@@ -16,8 +16,8 @@ pub struct RigOptions {
     /// Name of the camera to calibrate in a recording or rig file. With images, it is the camera to
     /// change in the rig file for `write_rig`. `None` selects the only camera.
     pub camera: Option<String>,
-    /// With a recording, the rig file that replaces the one stored in it. With image files, the rig
-    /// file into which the result is written.
+    /// With a recording, this rig file replaces the rig file that is stored in the recording. With
+    /// image files, the result is written into this rig file.
     pub rig: Option<PathBuf>,
     /// The rig file to write, with the result.
     pub write_rig: Option<PathBuf>,
@@ -195,7 +195,7 @@ impl RigOutput {
         }
     }
 
-    /// Rejects images of another size than those of the camera.
+    /// Rejects images whose size differs from the size in the rig file.
     pub(crate) fn expect_size(&self, size_px: [u32; 2]) -> anyhow::Result<()> {
         corrected_rig::expect_size(corrected_rig::camera(&self.rig, &self.camera)?, size_px)
     }
@@ -232,7 +232,8 @@ impl RigOutput {
         Ok(())
     }
 
-    /// Warns if a pose was estimated with other intrinsics than those of the rig file.
+    /// Warns if a pose was estimated with intrinsics that differ from the intrinsics of the rig
+    /// file.
     pub(crate) fn warn_if_intrinsics_differ(&self, used: &Intrinsics) -> anyhow::Result<()> {
         const MAX_PX: f64 = 0.01;
         let given = &corrected_rig::camera(&self.rig, &self.camera)?.intrinsics;
@@ -265,8 +266,8 @@ fn parent_of(setup: Setup) -> Parent {
     }
 }
 
-/// A report to write: an HTML page with the result, its uncertainty and the errors of all samples.
-/// It is also written if the calibration is refused.
+/// A report to write. The report is an HTML page with the result, its uncertainty and the errors of
+/// all samples. It is also written if the calibration is refused.
 #[derive(Clone, Debug)]
 pub struct ReportOptions {
     /// The file, with the extension `.html`. An existing report is replaced.
@@ -313,8 +314,8 @@ impl ReportOptions {
         Ok(())
     }
 
-    /// The heading of the report on a result. `None` for errors other than a refusal, because no
-    /// report is written for such errors.
+    /// The heading of the report on a result. `None` for errors other than a refusal, because these
+    /// errors have no report.
     pub(crate) fn heading<T>(
         &self,
         input: &Path,

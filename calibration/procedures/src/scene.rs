@@ -14,7 +14,7 @@ use session::{
 use std::collections::BTreeMap;
 use std::path::PathBuf;
 
-/// Time for which devices are read if no flag limits it, seconds.
+/// Time for which devices are read if no flag limits this time, seconds.
 const DEFAULT_SECS: f64 = 30.0;
 
 /// Input and options of a calibration from a scene.
@@ -24,7 +24,8 @@ pub struct SceneTask {
     pub input: PathBuf,
     /// The list of the keyframes to use. This requires a recording or a folder as input.
     pub keyframes: Option<PathBuf>,
-    /// The rig file to read a recording with, instead of the one stored in it.
+    /// The rig file for reading a recording. It replaces the rig file that is stored in the
+    /// recording.
     pub rig: Option<PathBuf>,
     /// What to estimate.
     pub params: Vec<Refine>,
@@ -133,7 +134,7 @@ impl SceneTask {
             });
             heading
                 .warnings
-                // If all cameras are refused, the heading has the reasons already.
+                // If all cameras are refused, the heading already contains the reasons.
                 .extend(kept.filter(|_| heading.refused.is_none()));
         }
         let mut n_images: BTreeMap<String, usize> = BTreeMap::new();

@@ -13,7 +13,8 @@ use std::path::{Path, PathBuf};
 /// Input and options of the estimation of a time offset.
 #[derive(Clone, Debug)]
 pub struct TimeOffsetTask {
-    /// Poses of the first body as rows t,x,y,z,qx,qy,qz,qw (seconds, meters).
+    /// File with the poses of the first body. Its rows are t,x,y,z,qx,qy,qz,qw in seconds and
+    /// meters.
     pub a: PathBuf,
     /// Poses of the second body, which is rigidly attached to the first.
     pub b: PathBuf,
@@ -91,7 +92,7 @@ fn read(path: &Path) -> anyhow::Result<Vec<PoseSample>> {
             .split([',', ' ', ';', '\t'])
             .filter(|field| !field.is_empty())
             .map(str::parse::<f64>);
-        // Any line that is not all numbers counts as a comment or header.
+        // A line that contains anything but numbers counts as a comment or header.
         let Ok(numbers) = parsed.collect::<Result<Vec<f64>, _>>() else {
             continue;
         };

@@ -16,15 +16,15 @@ pub struct BoardPose {
 
 /// Estimates the pose of a flat target by minimizing the reprojection error.
 ///
-/// The initial value is the pose of a homography. If the normal of a flat target is mirrored at the
-/// line of sight, the target looks almost the same from far away or at a small angle. The
+/// The initial value is the pose of a homography. A second pose, whose normal is mirrored at the
+/// line of sight, looks almost the same if the target is far away or its tilt is small. The
 /// minimization therefore also starts from the mirrored pose, and the better minimum is returned.
 ///
 /// * `points`: at least four points that are not on a line, with the same z coordinate in the frame
 ///   of the target.
 ///
-/// Returns `None` if the points do not determine a pose, or if the lens cannot image the target
-/// there.
+/// Returns `None` if the points do not determine a pose, or if the lens cannot image the target at
+/// this pose.
 pub fn board_pose(intrinsics: &Intrinsics, points: &[BoardPoint]) -> Option<BoardPose> {
     let first = refine(intrinsics, points, initial_pose(intrinsics, points)?)?;
     let mirrored = refine(
@@ -43,7 +43,8 @@ pub fn board_pose(intrinsics: &Intrinsics, points: &[BoardPoint]) -> Option<Boar
 pub(super) fn initial_pose(intrinsics: &Intrinsics, points: &[BoardPoint]) -> Option<Transform> {
     /// 68 degrees from the optical axis.
     const MAX_RADIUS: f64 = 2.5;
-    /// Twice the minimum of a homography, so that a few wrong points do not spoil the initial pose.
+    /// A homography needs at least four points. Twice this number is required, so that a few wrong
+    /// points do not spoil the initial pose.
     const MIN_ACCURATE: usize = 8;
     // Points beyond the lens model are left out.
     let mut pairs = Vec::with_capacity(points.len());
@@ -153,7 +154,7 @@ pub(super) fn refine(
                     break;
                 }
             }
-            // Steps as short as this one change nothing. The pose is at a minimum.
+            // A step that is so strongly damped changes nothing, so the pose is at a minimum.
             None if damping > 1e6 => break,
             None => damping *= 10.0,
         }

@@ -74,7 +74,8 @@ pub(super) fn refine(
     least_squares::minimize(&problem, start, &options)
 }
 
-/// One block per image, whose local parameters are the pose of the target.
+/// The least-squares problem. Each image is one block, whose local parameters are the pose of the
+/// target.
 struct Reprojection<'a> {
     images: &'a [&'a [BoardPoint]],
     /// Indices of the estimated parameters in [`Intrinsics::params`].
@@ -165,7 +166,7 @@ mod tests {
                 Vector3::new(0.4, -0.3, 0.6),
             );
             let mut points = observe(&camera, &pose, &board());
-            // Residuals of some pixels, so that the gradient is not zero.
+            // The residuals are a few pixels, so that the gradient is not zero.
             points
                 .iter_mut()
                 .enumerate()

@@ -185,7 +185,8 @@ pub(super) fn check_observable(fit: &Fit<Bundle>) -> Result<(), Error> {
             });
         }
         let sigma_px = fit.sigma(2 + axis);
-        // A shift of the principal point of a long lens is almost a rotation of the camera.
+        // For a long focal length, a change of the principal point has almost the same effect as a
+        // rotation of the camera.
         if sigma_px.is_nan() || sigma_px >= MAX_SIGMA_FRAC * side_px.max(focal_px) {
             return Err(Error::PrincipalPointUnobservable {
                 sigma_px: format!("{:.0}", sigma_px.min(side_px)),

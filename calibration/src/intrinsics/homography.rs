@@ -115,7 +115,8 @@ impl Normalization {
 /// The pose `camera_from_plane` of the plane z = 0 from its homography to the plane `z = 1` of the
 /// camera.
 ///
-/// Source: Zhang 2000, section 3.1. The rotation is the one nearest to the matrix (appendix C).
+/// Source: Zhang 2000, section 3.1. The result is the rotation that is nearest to the matrix
+/// (appendix C).
 pub(super) fn pose(homography: &Matrix3<f64>) -> Option<Transform> {
     // The first two columns are the columns of the rotation, up to the scale. With noise, their
     // lengths differ a little.

@@ -19,7 +19,8 @@ pub struct NextView {
     pub predicted_sigma_px: f64,
 }
 
-/// Parts of the image: horizontal and vertical position from -1 (left, top) to 1, and words.
+/// Parts of the image, each with its horizontal and vertical position from -1 (left, top) to 1, and
+/// with its name.
 const REGIONS: [([f64; 2], &str); 9] = [
     ([0.0, 0.0], "at the center of the image"),
     ([-1.0, -1.0], "at the upper left of the image"),
@@ -55,7 +56,7 @@ pub(super) struct Known<'a> {
     pub(super) intrinsics: &'a Intrinsics,
     /// Indices of the estimated parameters in [`Intrinsics::params`].
     pub(super) params: &'a [usize],
-    /// Information about them for residuals of unit variance.
+    /// Information about the estimated parameters for residuals of unit variance.
     pub(super) information: &'a DMatrix<f64>,
     /// Variance of a residual, including the dispersion, px².
     pub(super) variance: f64,
@@ -166,7 +167,8 @@ impl Board {
         })
     }
 
-    /// Pose with the center of the target in a region of the image, tilted from facing the camera.
+    /// Pose with the center of the target in a region of the image. The target faces the camera and
+    /// is then tilted.
     fn pose(
         &self,
         intrinsics: &Intrinsics,

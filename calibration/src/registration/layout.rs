@@ -105,8 +105,8 @@ impl CameraParamOffsets {
 }
 
 impl Layout {
-    /// The parameters of a set that apply to keyframes, which are given with the index of their
-    /// camera. A static camera has no time offset, and a camera without joints has no joint
+    /// The parameters of a set that apply to some keyframes. Each keyframe is given with the index
+    /// of its camera. A static camera has no time offset, and a camera without joints has no joint
     /// offsets.
     pub(super) fn new(set: ParamSet, images: &[(usize, &Keyframe)], n_cameras: usize) -> Self {
         let mut layout = Self::default();

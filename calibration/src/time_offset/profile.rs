@@ -1,4 +1,5 @@
-//! Rotation rates of two streams and their correlation, to show what an estimate is based on.
+//! Rotation rates of two streams and their correlation, for charts that show the basis of an
+//! estimate.
 
 use super::coarse::Grid;
 use super::stream::Stream;

@@ -116,8 +116,8 @@ impl SamplesFile {
             setup,
             entries,
         };
-        // These two are optional keys, because samples may contain poses of the board instead of
-        // images.
+        // The target and the intrinsics are optional keys, because samples may contain poses of the
+        // board instead of images.
         if read.has_images() && read.target.is_none() {
             return Err(file.invalid(
                 "target",
@@ -237,7 +237,8 @@ impl SamplesFile {
 
     /// An error if no image shows the target.
     pub(super) fn check_detected(&self, samples: &Samples) -> Result<(), InsufficientData> {
-        // Without any image, the samples are poses, and the calibration itself checks their number.
+        // Without any image, the samples are poses. The calibration itself checks the number of
+        // poses.
         if samples.used.is_empty() && !samples.unused.is_empty() {
             Err(InsufficientData(format!(
                 "{}: no image shows the target",
@@ -355,7 +356,7 @@ impl Entry {
                     sample.invalid("image", "missing; give \"image\" or \"camera_from_board\"")
                 );
             }
-            // Two sources for one value may contradict each other, so this is an error.
+            // Two sources for one value are an error, because they may contradict each other.
             (Some(_), Some(_)) => {
                 return Err(sample.invalid(
                     "image",

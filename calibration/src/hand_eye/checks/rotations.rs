@@ -87,8 +87,8 @@ impl RotationExcitation {
 /// RMS rotations about three orthogonal axes of the body, radians, the largest first, and the axes
 /// as columns.
 fn rotation_spread(poses: &[Transform]) -> Option<([f64; 3], Matrix3<f64>)> {
-    // Rotation vectors relative to the mean rotation are small, so that their covariance describes
-    // the spread.
+    // Rotation vectors relative to the mean rotation are small. Their covariance therefore
+    // describes the spread of the rotations.
     let mean = nearest_rotation(&rotation_sum(poses))
         .or_else(|| poses.first().map(|pose| pose.rotation))?;
     let vectors: Vec<Vector3<f64>> = poses
@@ -132,7 +132,8 @@ pub(crate) fn axis_name(axis: &Vector3<f64>, body: &str) -> String {
     )
 }
 
-/// Describes the missing rotations, which are about the axes perpendicular to an axis of a body.
+/// Describes the missing rotations. These are rotations about the axes that are perpendicular to
+/// `axis`.
 pub(super) fn rotations_across(axis: &Vector3<f64>, body: &str) -> String {
     let [first, second] = [["y", "z"], ["x", "z"], ["x", "y"]][axis.iamax()];
     format!(
@@ -156,8 +157,8 @@ const ROTATED_DEG: f64 = 10.0;
 pub struct HandEyeGuidance {
     /// Number of poses at which the target was seen.
     pub n_poses: usize,
-    /// Range of the rotations about the x, y and z axis, degrees. With the eye in hand, these are
-    /// the axes of the camera, otherwise of the flange.
+    /// Range of the rotations about the x, y and z axis, degrees. With the eye in hand, these axes
+    /// are the axes of the camera. With the eye to hand, they are the axes of the flange.
     pub span_deg: [f64; 3],
     /// What to do next.
     pub advice: HandEyeAdvice,

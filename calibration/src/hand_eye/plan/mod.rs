@@ -31,10 +31,11 @@ pub const MIN_POSES: usize = 10;
 /// wrong.
 const MAX_UNSEEN: usize = 8;
 
-/// As long as small rotations remain, an estimate selects poses only if the standard deviation of
-/// the position is at most this, millimeters. If the error of the camera pose is larger, the target
-/// may not be visible at suggested poses. With a smaller limit, the arm makes more small rotations,
-/// which add little information.
+/// Maximum standard deviation of the position, millimeters, at which an estimate selects the next
+/// pose. With a larger standard deviation, the plan continues with the small rotations as long as
+/// some remain. If the error of the camera pose is larger than this value, the target may not be
+/// visible at suggested poses. With a smaller limit, the arm makes more small rotations, which add
+/// little information.
 const MAX_EARLY_SIGMA_MM: f64 = 20.0;
 
 /// What an arm does next.
@@ -80,7 +81,7 @@ pub struct ArmPlan<'a> {
     reach: Reach<'a>,
     poses: NextPoseOptions<'a>,
     options: ArmPlanOptions,
-    /// Flange poses that remain to be tried before there is an estimate, with their purpose.
+    /// Flange poses that are tried before an estimate is available, with their purpose.
     first: VecDeque<(Transform, String)>,
     n_unseen: usize,
     n_refined: usize,
@@ -221,9 +222,10 @@ fn purpose(verb: &str, (sign, axis): (f64, usize), degrees: f64, body: &str) -> 
     )
 }
 
-/// Rotations about the center of the target according to the approximate pose of the camera, which
-/// keep the target in view. If that pose has a large error, the target leaves the view. Therefore,
-/// small rotations about the flange follow.
+/// Rotations about the center of the target, followed by small rotations about the flange. The
+/// center follows from the approximate pose of the camera, so that the rotations about it keep the
+/// target in view. If the approximate pose has a large error, these rotations move the target out
+/// of view. The rotations about the flange are for this case.
 fn first_poses(
     reach: &Reach<'_>,
     first: &FirstView<'_>,
@@ -232,8 +234,9 @@ fn first_poses(
     /// Rotation about the target, degrees. It is large enough for a first estimate, and small
     /// enough to be reached almost everywhere.
     const ABOUT_TARGET_DEG: f64 = 15.0;
-    /// Rotations about the flange, degrees. They move the target in the image by the same angle, so
-    /// it stays in view only if they are much smaller than half the field of view.
+    /// Rotations about the flange, degrees. They move the target in the image by the same angle.
+    /// The target therefore stays in view only if they are much smaller than half the field of
+    /// view.
     const ABOUT_FLANGE_DEG: [f64; 2] = [6.0, 10.0];
     const DIRECTIONS: [(f64, usize); 6] = [
         (1.0, 0),

@@ -153,9 +153,9 @@ impl CornerProblem<'_> {
         let corrected = corrected_joints(&view.joints, offsets);
         let tip_from_flange = chain.forward(&view.joints).ok()?.inverse() * view.base_from_flange;
         let twists = chain.tip_twists_by_joint(&corrected).ok()?;
-        // An offset of the first joint has the same effect as a motion of the base, and an offset
-        // of the last joint the same as a motion of the flange. The other parameters already
-        // contain both motions.
+        // An offset of the first joint has the same effect as a motion of the base. An offset of
+        // the last joint has the same effect as a motion of the flange. The other parameters
+        // already contain both motions.
         let inner = twists[1..twists.len() - 1]
             .iter()
             .map(|twist| twist.of_attached(&tip_from_flange))
@@ -425,14 +425,15 @@ pub(super) fn propagated(
         .view((0, 0), (N_PARAMS, N_PARAMS))
         .into_owned();
     let shared = free.information.view((0, N_PARAMS), (N_PARAMS, n_others));
-    // `A` above. Its sign does not matter, because it enters squared.
+    // This is the matrix `A` of the documentation. Its sign does not matter, because `A` enters
+    // squared.
     let by_others = own.cholesky()?.solve(&shared.into_owned());
     let of_fit = free
         .covariance
         .view((N_PARAMS, N_PARAMS), (n_others, n_others))
         .into_owned();
     let covariance = covariance.unwrap_or(&of_fit);
-    // A covariance of another lens model has another size.
+    // The covariance has another size if it belongs to another lens model.
     (covariance.shape() == (n_others, n_others))
         .then(|| &by_others * covariance * by_others.transpose())
 }

@@ -43,8 +43,8 @@ pub(crate) struct Refined {
 impl Refined {
     /// The result of a fit that estimates only the hand-eye transform and the board pose.
     fn new(samples: Vec<Sample>, fit: PoseFit, intrinsics: Option<Intrinsics>) -> Self {
-        // The 95 % quantile of F with 6 and n degrees of freedom relative to that of chi squared /
-        // 6, to first order.
+        // This is the ratio of two 95 % quantiles, to first order: F with 6 and n degrees of
+        // freedom, and chi squared with 6 degrees of freedom divided by 6.
         const CHI_SQUARED_95: f64 = 12.59;
         let enlarged = 1.0 + (CHI_SQUARED_95 - 4.0) / (2.0 * fit.n_free);
         Self {
@@ -80,8 +80,9 @@ pub(crate) fn refine(
     let Some(given) = input.intrinsics.clone().filter(|_| corner_px.is_some()) else {
         return Ok(Refined::new(samples, fit, input.intrinsics.clone()));
     };
-    // For a board that faces the camera, the pose that fits one image best is biased. Steps from
-    // the predicted poses are not biased, so outliers are searched again with these steps.
+    // For a board that faces the camera, the pose that fits one image best is biased. Single
+    // Gauss-Newton steps from the predicted poses are not biased, so outliers are searched again
+    // with these steps.
     relinearize(input, &mut samples, &fit.solution, &given);
     let fit = reject_and_fit(input, &mut samples, fit.solution, fit.noise)?;
     // Then from corners.
@@ -100,8 +101,8 @@ fn refine_with_given(
     given: Intrinsics,
 ) -> Result<Refined, Error> {
     // A fit with free intrinsics shows whether the given intrinsics are right, and how their
-    // uncertainty changes the result. With few images, this fit may fail. In that case, neither is
-    // known.
+    // uncertainty changes the result. With few images, this fit may fail. In that case, both
+    // answers are unknown.
     let start = Start {
         input,
         samples: &samples,
@@ -291,7 +292,7 @@ fn corner_noise(samples: &[Sample]) -> Option<f64> {
     Some((squares / f64::max(n_free, 1.0)).sqrt().max(MIN_PX))
 }
 
-/// Replaces the poses of the samples by steps from the predicted ones.
+/// Replaces the board pose of each sample by one Gauss-Newton step from the predicted pose.
 fn relinearize(
     input: &HandEyeInput<'_>,
     samples: &mut [Sample],
