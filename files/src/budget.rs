@@ -1,4 +1,4 @@
-//! Limits for the readers of all formats, and checks that come before memory is allocated.
+//! Limits for the readers of all formats, which are checked before memory is allocated.
 
 use std::fmt;
 
@@ -7,8 +7,8 @@ use std::fmt;
 /// memory.
 const FREE_BYTES: u64 = 64 << 20;
 
-/// Limits for one input. The input declares its sizes. These sizes are checked against the limits
-/// before memory is allocated.
+/// Limits for one input. The sizes that the input declares are checked against the limits before
+/// memory is allocated.
 ///
 /// Nesting is not limited here. The parsers of JSON and TOML stop at 128 levels or fewer. Robot
 /// descriptions are parsed without recursion, with the limits of `kinematics::urdf`. Time is not

@@ -1,4 +1,4 @@
-//! A file or folder of this program that somebody may remove or rename while it is in use.
+//! A file or folder of this program that another program may remove or rename while it is in use.
 
 use std::fs::File;
 use std::io::ErrorKind;
@@ -53,8 +53,8 @@ impl Kept {
         moved.map_or(Place::Removed, Place::MovedTo)
     }
 
-    /// Whether a path leads to this file or folder. Device and inode identify it: another program
-    /// may have put a different file at the path.
+    /// Whether a path leads to this file or folder. Device and inode identify it, because another
+    /// program may have put a different file at the path.
     fn is_at(&self, path: &Path) -> bool {
         let Ok(named) = path.metadata() else {
             return false;

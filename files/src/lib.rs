@@ -1,4 +1,4 @@
-//! Reads and writes the files of users, with the same guards everywhere.
+//! Reads and writes the files of users. All readers and writers have the same protections.
 //!
 //! - Only regular files are read, within a [`Budget`]. Opening a pipe may block forever, and a
 //!   device may have no end.

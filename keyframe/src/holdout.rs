@@ -49,8 +49,8 @@ impl Holdout {
     /// The split of each photo, in the order of `names`.
     ///
     /// Validation photos lie halfway between test photos. If the test photos are named, every 8th
-    /// of the other photos, starting with the 5th, is for validation. Names match with or without
-    /// folder and extension.
+    /// of the other photos, starting with the 5th, is for validation. A name matches with or
+    /// without its folder and its extension.
     ///
     /// # Errors
     ///

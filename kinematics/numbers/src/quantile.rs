@@ -1,15 +1,16 @@
 //! Medians and quantiles of finite numbers.
 //!
-//! Except for [`median`], every result is one of the given values; [`Rank`] selects which one.
+//! Except for [`median`], every result is one of the given values. [`Rank`] selects this value.
 
 /// Selects the value that is returned if the quantile falls between two of `n` sorted values.
 /// Indices start at 0.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Rank {
-    /// The smallest value that at least the fraction `frac` of the values do not exceed: index
-    /// `ceil(frac n) - 1`.
+    /// The smallest value that at least the fraction `frac` of the values do not exceed. Its index
+    /// is `ceil(frac n) - 1`.
     ///
-    /// This is the inverse of the empirical distribution function: type 1 of Hyndman and Fan 1996.
+    /// This is the inverse of the empirical distribution function, which is type 1 of Hyndman and
+    /// Fan 1996.
     Lower,
     /// The value at index `round(frac (n - 1))`.
     Nearest,

@@ -1,4 +1,5 @@
-//! The pose that inverse kinematics has to reach, which parts of it count, and the distance from it.
+//! The target of inverse kinematics: a pose, the parts of its orientation that count, and the
+//! distance of other poses from it.
 
 use crate::{Error, Transform};
 use nalgebra::{Unit, Vector3, Vector6};
@@ -94,7 +95,7 @@ impl Target {
         }
     }
 
-    /// Removes from columns of a Jacobian the velocities that do not count.
+    /// Removes the velocities that do not count from the columns of a Jacobian.
     ///
     /// * `columns`: linear velocity (rows 0 to 2) and angular velocity (3 to 5) in base axes.
     pub(super) fn remove_free(&self, actual: &Transform, columns: &mut [Vector6<f64>]) {
@@ -128,8 +129,8 @@ impl PoseGap {
     }
 }
 
-/// Translation (rows 0 to 2, meters) and rotation (rows 3 to 5, a vector along the axis of the
-/// rotation, radians) from the actual pose to the target, in base axes.
+/// Translation and rotation from the actual pose to the target, in base axes. Rows 0 to 2 are the
+/// translation in meters. Rows 3 to 5 are the rotation vector in radians.
 pub fn pose_error(target: &Transform, actual: &Transform) -> Vector6<f64> {
     let translation = target.translation.vector - actual.translation.vector;
     let rotation = (target.rotation * actual.rotation.inverse()).scaled_axis();
