@@ -117,8 +117,8 @@ pub trait Method {
         Err(Error::CannotFindFloaters)
     }
     /// PSNR of the requested picture against a keyframe's image of the same size, dB, computed on
-    /// the GPU. Bit-identical to [`crate::eval::psnr`] of the 8-bit picture. `None` if the model
-    /// cannot compute the PSNR, or cannot compute it yet.
+    /// the GPU. The result is bit-identical to [`crate::eval::psnr`] of the 8-bit picture. `None`
+    /// if the model cannot compute the PSNR, or cannot compute it yet.
     fn psnr(
         &mut self,
         _request: &RenderRequest,
@@ -131,8 +131,8 @@ pub trait Method {
     fn background_srgb(&self) -> [f32; 3] {
         [0.0; 3]
     }
-    /// Pixel stride along both axes for depth images that are compared with measured ones. It is
-    /// odd. It is above 1 if rendering a ray is expensive.
+    /// Pixel stride along both axes for rendered depth images that are compared with measured depth
+    /// images. It is odd. It is above 1 if rendering a ray is expensive.
     fn depth_stride(&self) -> u32 {
         1
     }

@@ -28,7 +28,7 @@ pub struct MethodEntry {
     pub model: &'static str,
     /// The items that [`crate::Progress::primitives`] counts, in the singular.
     pub primitive: &'static str,
-    /// Label of the primitive count: plural and capitalized.
+    /// Label of the primitive count, in the plural and capitalized.
     pub primitives_label: &'static str,
     /// Files of a saved model besides `model.json`, in the order in which they are moved into
     /// place. A folder that contains the last file contains the complete model.
@@ -113,6 +113,7 @@ pub struct Exported {
     pub n_items: u64,
     /// Name of an item, in the singular.
     pub item: &'static str,
-    /// Additional properties to print after the items, such as `of SH degree 3`; may be empty.
+    /// Additional properties to print after the items, such as `of SH degree 3`. The text may be
+    /// empty.
     pub detail: String,
 }

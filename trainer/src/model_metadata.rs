@@ -73,7 +73,7 @@ fn difference(what: &str, stated: Option<u64>, actual: u64) -> Option<String> {
     ))
 }
 
-/// Reads the file in the folder of a saved model. If the file does not exist, everything is empty.
+/// Reads the file in the folder of a saved model. If the file does not exist, all fields are empty.
 ///
 /// # Errors
 ///

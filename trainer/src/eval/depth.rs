@@ -44,8 +44,8 @@ impl SurfaceError {
 /// same camera.
 ///
 /// Only measured pixels with a known surface normal count: all four neighbors must have a reading,
-/// and none may differ by more than 4 % (an edge). Returns `None` if there is no such pixel. Fails
-/// if the images differ in size.
+/// and no neighbor may differ by more than 4 %, which would be an edge. Returns `None` if there is
+/// no such pixel. Fails if the images differ in size.
 pub fn surface_error(
     rendered_m: &[f32],
     measured: &DepthMap,

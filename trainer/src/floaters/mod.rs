@@ -56,8 +56,7 @@ impl CellLabels {
         }
     }
 
-    /// Divides occupied cells into groups, after connecting adjacent ones. Groups with few cells
-    /// are floaters.
+    /// Divides occupied cells into groups of connected cells. Groups with few cells are floaters.
     pub(crate) fn of_occupied(grid: &CellGrid, occupied: &CellMask, mut groups: Groups) -> Self {
         // Cells that touch only at a corner also count as adjacent, so that a thin slanted surface
         // stays connected.

@@ -29,7 +29,7 @@ const RATE: f32 = 1e-5;
 
 /// Depth that the images of [`Losses::Training`] show, meters.
 const DEPTH_M: f32 = 3.2;
-/// Number of images; large enough to turn off few-image regularization.
+/// Number of images. It is large enough to turn off the regularization for few images.
 const N_IMAGES: usize = 1000;
 
 /// Results for one image size and cloud.
@@ -42,7 +42,7 @@ pub struct KernelFigures {
     /// timestamps are unavailable.
     pub render_millis: f64,
     /// Median GPU time of a picture that is also packed as JPEG and depth for a viewer,
-    /// milliseconds; `None` on the CPU, where pictures are not packed.
+    /// milliseconds. `None` on the CPU, where pictures are not packed.
     pub packed_millis: Option<f64>,
     /// Median GPU time of a step that updates every splat, milliseconds.
     pub step_millis: f64,
@@ -67,9 +67,11 @@ pub struct KernelFigures {
 /// Position of the camera on the z axis, meters.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Eye {
-    /// -3.2, as in the peer's benchmark. The whole cloud is visible.
+    /// The z coordinate of the camera is -3.2, as in the peer's benchmark. The whole cloud is
+    /// visible.
     Outside,
-    /// 0, inside the cloud, as in a room. Part of the cloud is visible.
+    /// The z coordinate of the camera is 0, inside the cloud, as in a room. Only a part of the
+    /// cloud is visible.
     Inside,
 }
 
@@ -270,8 +272,8 @@ impl KernelBench {
                 n_slots: with_headroom(counters[status::NEED_SLOTS]),
                 n_bins: n_bins(self.size_px),
             };
-            // A minimal buffer frees the previous one before the larger one is allocated, so that
-            // both do not count toward the peak of memory.
+            // A minimal buffer replaces the previous buffer before the larger buffer is allocated.
+            // Otherwise, both would count toward the peak of memory.
             drop(passes);
             self.scratch = Scratch::new(
                 &self.gpu,
@@ -385,8 +387,8 @@ impl KernelBench {
         repeats: Repeats,
         record: Recorded,
     ) -> Result<(f64, f64), Error> {
-        // Warm up, because some GPUs stay busy for tenths of a second after large buffers are
-        // freed.
+        // The warm-up is needed, because some GPUs stay busy for tenths of a second after large
+        // buffers are freed.
         let warming = Instant::now();
         let mut n_warm = 0;
         while n_warm < repeats.n_warm_up

@@ -14,7 +14,8 @@ pub struct GridShape {
 }
 
 impl GridShape {
-    /// Levels with numbers of cells between two values, evenly spaced on a logarithmic scale.
+    /// A grid whose numbers of cells per level are between two values, evenly spaced on a
+    /// logarithmic scale.
     pub fn between(coarsest: u32, finest: u32, n_levels: u32, log2_entries: u32) -> Self {
         let growth =
             (f64::from(finest) / f64::from(coarsest)).ln() / f64::from(n_levels.max(2) - 1);
@@ -101,8 +102,8 @@ fn corners(shape: &GridShape, level: usize, at: [f64; 3]) -> [Corner; 8] {
         let step: [u32; 3] =
             std::array::from_fn(|axis| u32::try_from(ix >> axis & 1).expect("0 or 1"));
         let part = |axis: usize| part_of(share[axis], step[axis]);
-        // The derivative of a product of three linear factors. It is zero outside the cube, where
-        // points are clamped.
+        // This is the derivative of a product of three linear factors. It is zero outside the cube,
+        // where points are clamped.
         let weight_gradient = std::array::from_fn(|axis| {
             let sign = if step[axis] == 1 { n_cells } else { -n_cells };
             let inside = at[axis] >= 0.0 && at[axis] <= 1.0;
