@@ -1,4 +1,4 @@
-//! Trains radiance fields on wgpu. The input are keyframes, and the output are pictures.
+//! Trains radiance fields on wgpu. The inputs are keyframes, and the outputs are pictures.
 //!
 //! ```
 //! use trainer::eval::{PixelPair, psnr};

@@ -107,7 +107,7 @@ fn divide<T>(
     last: &BTreeMap<Cell, T>,
     leaves: &mut Vec<(Cell, Range<usize>)>,
 ) {
-    // The cells of the last version do not overlap, so the first one in this cell shows whether
+    // The cells of the last version do not overlap, so the first of them in this cell shows whether
     // this cell was divided.
     let first_last = last
         .range(
@@ -131,7 +131,7 @@ fn divide<T>(
         leaves.push((cell, range));
         return;
     }
-    // The splats are sorted by location code, so those of each child are consecutive.
+    // The splats are sorted by location code, so the splats of each child are consecutive.
     let mut begin = range.start;
     for child in cell.children() {
         let n = sorted[begin..range.end].partition_point(|(code, _)| *code < child.end());

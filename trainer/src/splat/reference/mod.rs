@@ -1,9 +1,10 @@
 //! Plain CPU version of splatting in f64. Tests compare every kernel of `splat` with it.
 //!
 //! `project` projects each splat onto the image plane, and `rasterize` composites the splats pixel
-//! by pixel. Each of the two has a backward function. `clip` limits splats to boxes, or cuts boxes
-//! out of them, in pictures. Discrete decisions (visibility, depth order, contributors of each
-//! pixel) are made once, in [`decide`], and kept fixed while gradients are computed.
+//! by pixel. Each of the two has a backward function. In pictures, `clip` limits splats to boxes or
+//! cuts boxes out of them. [`decide`] makes the discrete decisions once, which are visibility,
+//! depth order and the contributors of each pixel. These decisions are kept fixed while gradients
+//! are computed.
 //!
 //! Source: Kerbl et al. 2023 (3D Gaussian splatting) and Ye et al. 2024 (gsplat, appendix on
 //! gradients). The rolling shutter and the depth output are additions of fieldrig. Depth is
@@ -62,11 +63,11 @@ pub struct View {
     pub size_px: [u32; 2],
     /// Splats nearer than this along z are not drawn, meters.
     pub near_m: f64,
-    /// Translation of the camera during the whole readout in its own axes, meters: linear velocity
-    /// times readout time.
+    /// Translation of the camera during the whole readout in its own axes, meters. This is the
+    /// linear velocity times the readout time.
     pub linear_m: [f64; 3],
-    /// Rotation of the camera during the whole readout in its own axes, radians: angular velocity
-    /// times readout time.
+    /// Rotation of the camera during the whole readout in its own axes, radians. This is the
+    /// angular velocity times the readout time.
     pub angular_rad: [f64; 3],
     /// Whether opacities are lowered where [`BLUR_PX2`](project::BLUR_PX2) enlarges splats. See
     /// [`SplatArrays::is_antialiased`](model_files::splat::arrays::SplatArrays::is_antialiased).
