@@ -240,8 +240,8 @@ pub(crate) const KERNELS: &[Kernel] = &[
     kernel!("gather"),
 ];
 
-/// Creates `Self` from given fields and from pipelines. The pipelines are compiled while the fields
-/// are computed.
+/// Creates `Self` from given fields and from pipelines. The pipelines are compiled while the given
+/// fields are computed.
 macro_rules! compile {
     ($gpu:expr, { $($given:ident: $value:expr),* $(,)? }, { $($field:ident: $kernel:expr, $overrides:expr);* $(;)? }) => {{
         // The values may contain `?`, so they are computed in a closure. The fields and the

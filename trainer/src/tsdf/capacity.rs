@@ -32,7 +32,7 @@ pub(crate) fn max_blocks_within(gpu: &Gpu, max_bytes: Option<u64>, n_chunks: u32
     let by_bytes = max_bytes.map_or(u64::MAX, |bytes| {
         bytes.saturating_sub(table_bytes) / BYTES_PER_BLOCK
     });
-    // At least one block, because empty buffers cannot be bound.
+    // The result is at least one block, because empty buffers cannot be bound.
     max_blocks(gpu)
         .min(u32::try_from(by_bytes).unwrap_or(u32::MAX))
         .max(1)

@@ -87,8 +87,8 @@ impl MeshBuffers {
     }
 }
 
-/// The 256 cases in the format of the kernel. A case has the number of triangles, then three edges
-/// per triangle with five bits each.
+/// The 256 cases in the format of the kernel. A case consists of the number of triangles, then
+/// three edges per triangle with five bits each.
 fn case_words() -> Vec<u32> {
     CASES
         .iter()

@@ -138,7 +138,8 @@ impl TsdfModel {
         })
     }
 
-    /// The current surface in world. Only blocks that changed since the last call are meshed.
+    /// The current surface in world coordinates. Only blocks that changed since the last call are
+    /// meshed.
     pub fn mesh(&mut self) -> Result<Mesh, Error> {
         self.mesh_without(&Edits::default())
     }
@@ -240,8 +241,8 @@ impl TsdfModel {
 
     /// Fuses the first pending keyframe after loading the blocks that it could change.
     fn step_with_host_blocks(&mut self, n: u64) -> Result<u64, Error> {
-        // Only one keyframe is fused at a time. Only the host knows which blocks the next keyframe
-        // needs, and these may have to replace other blocks.
+        // Only one keyframe is fused at a time. The host determines which blocks the next keyframe
+        // needs, and these blocks may have to replace other blocks.
         if n == 0 || self.queue.pending.is_empty() {
             return Ok(0);
         }
@@ -356,8 +357,8 @@ impl Method for TsdfModel {
             self.finish_in_flight()?;
             return Ok(self.queue.step() - before);
         }
-        // If some blocks are in host memory, the host must load those that the image could change
-        // first.
+        // If some blocks are in host memory, the host must first load the blocks that the image
+        // could change.
         if self.n_host_blocks() > 0 {
             self.finish_in_flight()?;
             return self.step_with_host_blocks(n);

@@ -16,8 +16,8 @@ use nalgebra::{Matrix3x2, Vector2, Vector3};
 pub struct Clipping {
     /// Only the inside of this box is shown.
     pub crop: Option<Aabb>,
-    /// The erased space. Boxes are cut out of splats. Cells remove splats whose centers they
-    /// contain.
+    /// The space that is erased from pictures. Boxes are cut out of splats. Cells remove splats
+    /// whose centers they contain.
     pub edits: Edits,
 }
 

@@ -53,8 +53,8 @@ pub(super) fn move_with_keyframes(
     let gpu = training.recorder.gpu.clone();
     let motions = motions(keyframes, |camera| learned.get(camera));
     move_splats(&gpu, &training.model.splats, &motions)?;
-    // Then everything that refers to the keyframes is replaced. Views come before seeding, which
-    // takes the corrected depth from them.
+    // Then everything that refers to the keyframes is replaced. Views come before seeding, because
+    // seeding takes the corrected depth from the views.
     let corrected = replacement(keyframes);
     training.recorder.passes.clear_bindings();
     training.views.replace_cameras(&gpu, &corrected);
@@ -168,7 +168,7 @@ impl Motion {
     /// the splats, if any.
     fn of(keyframe: &CorrectedKeyframe, learned: Option<&CameraCorrection>) -> Self {
         let CorrectedKeyframe { before, after } = keyframe;
-        // The splats were fitted to the learned cameras, not to those of the keyframes.
+        // The splats were fitted to the learned cameras, not to the cameras of the keyframes.
         let before = learned.map_or_else(
             || before.clone(),
             |learned| Arc::new(learned.corrected(before)),
@@ -195,8 +195,8 @@ impl Motion {
             let reading = reading_m(depth, px);
             (reading > 0.0).then_some((reading - z) / z)
         });
-        // The weight falls with the square of the error, like that of a robust mean, so that one
-        // keyframe in good agreement outweighs many others.
+        // The weight falls with the square of the error, as in a robust mean. One keyframe in good
+        // agreement therefore outweighs many others.
         let weight = match known {
             Some(error_frac) if error_frac.abs() > SURFACE_FRAC => return None,
             Some(error_frac) => 1.0 / (1.0 + (error_frac / AGREEMENT_FRAC).powi(2)),
@@ -208,7 +208,7 @@ impl Motion {
 }
 
 /// The motions of a subset of the keyframes. `learned` returns the correction of a camera that was
-/// learned with the splats on top of those in the keyframes.
+/// learned with the splats. It is applied after the corrections in the keyframes.
 fn motions<'a>(
     keyframes: &[CorrectedKeyframe],
     learned: impl Fn(&str) -> Option<&'a CameraCorrection>,
