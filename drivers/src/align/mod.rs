@@ -2,11 +2,11 @@
 //!
 //! Source: the processing block `align` of librealsense (`src/proc/align.cpp`). A depth pixel is a
 //! square. Two opposite corners are projected to the color image at the depth of the pixel, and
-//! each color pixel keeps the nearest square that covers it. We clip squares at the edge of the
-//! image, whereas librealsense drops them. The SSE path of librealsense
-//! (`src/proc/sse/sse-align.cpp`) rounds half a pixel further to the right and down. It uses only
-//! the upper left corner if the color image has fewer pixels per angle than the depth image. We
-//! follow the scalar path of librealsense.
+//! each color pixel keeps the nearest square that covers it. This module clips squares at the edge
+//! of the image, whereas librealsense drops them. The SSE path of librealsense
+//! (`src/proc/sse/sse-align.cpp`) rounds half a pixel further to the right and down. It also uses
+//! only the upper left corner if the color image has fewer pixels per angle than the depth image.
+//! This module follows the scalar path of librealsense, which does neither.
 
 mod cover;
 
@@ -21,8 +21,8 @@ use std::sync::Arc;
 pub struct DepthAlignment {
     depth_px: [u32; 2],
     color: ColorCamera,
-    /// Rays of the pixel corners, `z` = 1 in the depth camera, rotated to the axes of the color
-    /// camera: `[height + 1, width + 1]`.
+    /// Rays of the pixel corners, `[height + 1, width + 1]`. They have `z` = 1 in the depth camera,
+    /// and are rotated to the axes of the color camera.
     corners: [Vec<f32>; 3],
     /// Position of the depth camera in the frame of the color camera, meters.
     depth_in_color: [f64; 3],
@@ -35,8 +35,8 @@ struct ColorCamera {
     focal_px: [f32; 2],
     principal_px: [f32; 2],
     lens: ColorLens,
-    /// Square of the largest valid radius on the plane `z` = 1. Beyond it, distortion polynomials
-    /// may not be monotonic.
+    /// Square of the largest valid radius on the plane `z` = 1. Beyond this radius, distortion
+    /// polynomials may not be monotonic.
     max_radius_squared: f32,
 }
 
@@ -138,7 +138,8 @@ impl DepthAlignment {
     /// pixels with a count of 0 or with the largest count are invalid and are skipped.
     ///
     /// # Errors
-    /// If the image contains no depth or its size differs from that of the depth camera.
+    /// Fails if the image contains no depth, or if its size differs from the size of the depth
+    /// camera.
     pub fn align(&self, depth: &Image) -> Result<Image, Error> {
         let PixelFormat::DepthU16 { meters_per_count } = depth.format else {
             return Err(depth.wrong_kind("depth"));
@@ -497,7 +498,7 @@ mod tests {
             .collect()
     }
 
-    /// CPU twin: the same squares in f64 with the lenses of `kinematics`.
+    /// The twin of the alignment. It draws the same squares in f64 with the lenses of `kinematics`.
     fn twin(
         depth: &Intrinsics,
         color: &Intrinsics,

@@ -1,6 +1,6 @@
 //! Points on the surfaces of a scene, from which a model starts if there is no depth.
 
-/// Points of another program, such as those of structure from motion.
+/// Points from another program, for example from structure from motion.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct InitialPoints {
     /// Positions in world, meters. All are finite.

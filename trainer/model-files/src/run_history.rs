@@ -14,8 +14,8 @@ pub struct RunHistory {
 }
 
 impl RunHistory {
-    /// The history with these scores and numbers of rejected images. Scores that are not finite,
-    /// such as that of a perfect picture, are left out, because JSON cannot express them.
+    /// The history with these scores and numbers of rejected images. Scores that are not finite are
+    /// left out, because JSON cannot express them. An example is the score of a perfect picture.
     #[must_use]
     pub fn new(psnr: &[(f64, f64)], rejected: BTreeMap<String, u64>) -> Self {
         let is_finite = |(secs, psnr): &&(f64, f64)| secs.is_finite() && psnr.is_finite();

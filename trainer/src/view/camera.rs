@@ -49,9 +49,9 @@ pub(crate) struct Camera {
     pub(crate) low_pass_px2: f64,
 }
 
-/// Variance of the low-pass at full size, pixels squared, as in Kerbl et al. 2023. With it, a splat
-/// covers at least about one pixel. A larger value blurs the picture. With a smaller value, splats
-/// fall between pixel centers.
+/// Variance of the low-pass at full size, pixels squared, as in Kerbl et al. 2023. With this value,
+/// a splat covers at least about one pixel. A larger value blurs the picture. With a smaller value,
+/// splats fall between pixel centers.
 pub(crate) const LOW_PASS_PX2: f64 = 0.3;
 
 impl Camera {

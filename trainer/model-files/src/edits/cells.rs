@@ -55,7 +55,7 @@ impl CellGrid {
         4.0 * self.radius_m / f64::from(self.n_cells) * largest * largest / (2.0 * largest - 1.0)
     }
 
-    /// Indices of the cells around a cell, itself excluded.
+    /// Indices of the cells around a cell, without the cell itself.
     pub fn neighbors(&self, index: u32) -> impl Iterator<Item = u32> + use<> {
         let grid = *self;
         let n = self.n_cells;

@@ -76,7 +76,8 @@ impl Axes {
         ]
     }
 
-    /// Factors of the higher color coefficients: -1 for basis functions that change sign.
+    /// Factors of the higher color coefficients. The factor is -1 for basis functions that change
+    /// sign.
     pub(super) fn sh_signs(self) -> [f32; 15] {
         ODD_AXES.map(|odd| odd.iter().map(|axis| self.0[*axis]).product())
     }
