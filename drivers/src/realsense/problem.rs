@@ -23,7 +23,7 @@ pub enum Problem {
         else { connected.join(", ") }
     )]
     NoDevice {
-        /// Serial number in the rig file; may be empty.
+        /// Serial number in the rig file. It may be empty.
         serial: String,
         /// Names and serial numbers of the connected cameras.
         connected: Vec<String>,

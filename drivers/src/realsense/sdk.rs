@@ -1,5 +1,5 @@
-//! Safe calls to the part of librealsense2 that `realsense-rust` lacks: opening sensors
-//! individually into one queue, files as devices, and names of presets.
+//! Safe calls to the part of librealsense2 that `realsense-rust` lacks. They open sensors
+//! individually into one queue, open files as devices, and read names of presets.
 
 #![expect(unsafe_code, reason = "FFI to a C library")]
 
@@ -56,9 +56,9 @@ pub(super) struct Context(NonNull<sys::rs2_context>);
 // SAFETY: the library may be called from any thread, and we hold the only pointer.
 unsafe impl Send for Context {}
 
-/// Locked while a device is created. The library keeps the relative poses of its streams in one
-/// list per process, and two threads that add to it concurrently write to freed memory
-/// (librealsense 2.56.5, `extrinsics_graph::register_extrinsics`).
+/// A lock that is held while a device is created. The library keeps the relative poses of its
+/// streams in one list per process. Two threads that add to this list concurrently write to freed
+/// memory (librealsense 2.56.5, `extrinsics_graph::register_extrinsics`).
 static DEVICE_CREATION: Mutex<()> = Mutex::new(());
 
 /// Prevents other threads from creating devices at the same time.
@@ -70,7 +70,7 @@ impl Context {
     pub(super) fn new() -> Result<Self, Problem> {
         const WHAT: &str = "start";
         // The library rejects programs compiled for another minor version, although its interface
-        // has only grown. We therefore pass the library's own version. SAFETY: only numbers are
+        // has only grown. The library's own version is therefore passed. SAFETY: only numbers are
         // passed.
         let context = unsafe {
             let version = call(WHAT, |error| sys::rs2_get_api_version(error))?;

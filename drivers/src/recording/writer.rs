@@ -38,8 +38,8 @@ pub struct RecordingMetadata<'a> {
 /// removed.
 pub struct Recorder {
     path: PathBuf,
-    /// The file, which somebody may remove or rename while it is written; `None` if it cannot be
-    /// watched.
+    /// The file, which another program may remove or rename while it is written. `None` if it
+    /// cannot be watched.
     kept: Option<Kept>,
     /// Location of the file at the last check.
     place: Place,
@@ -49,7 +49,8 @@ pub struct Recorder {
     cameras: Vec<(String, Intrinsics)>,
     joint_names: String,
     n_messages: u32,
-    /// Number of samples written, including those in the open chunk, and the range of their stamps.
+    /// Number of samples written, including the samples in the open chunk. The next fields are the
+    /// range of their stamps.
     n_samples: u64,
     stamps: Option<[Stamp; 2]>,
     /// Span of the samples in closed chunks.
@@ -65,8 +66,8 @@ impl Recorder {
     /// Starts a recording in a new file.
     ///
     /// # Errors
-    /// If the file cannot be created, or already exists, because it may be the recording that is
-    /// being replayed.
+    /// Fails if the file cannot be created. Also fails if it already exists, because it may be the
+    /// recording that is being replayed.
     pub fn create(path: &Path, recording_metadata: &RecordingMetadata<'_>) -> Result<Self, Error> {
         let file = File::create_new(path).map_err(|source| match source.kind() {
             ErrorKind::AlreadyExists => Error::Exists {
@@ -98,12 +99,12 @@ impl Recorder {
         };
         let options = mcap::WriteOptions::new()
             .profile("fieldrig")
-            // Noisy images hardly compress (docs/benchmarks/2026-11-23-reference-figures.md), and
-            // only in uncompressed chunks are all complete records readable after a crash.
+            // Noisy images hardly compress (docs/benchmarks/2026-11-23-reference-figures.md). In
+            // uncompressed chunks, all complete records remain readable after a crash.
             .compression(None)
             .chunk_size(Some(CHUNK_BYTES))
-            // Nothing is patched later, so that whatever has been written is readable after a
-            // crash.
+            // The writer never changes earlier parts of the file, so that everything already
+            // written is readable after a crash.
             .disable_seeking(true);
         let mut mcap = options.create(sink).map_err(recorder)?;
         for (name, data) in recording_metadata.files {
@@ -169,7 +170,7 @@ impl Recorder {
         Ok(self.recorded)
     }
 
-    /// Warns if somebody has removed or renamed the file since the last check.
+    /// Warns if the file was removed or renamed since the last check.
     fn check_place(&mut self) {
         let Some(kept) = &self.kept else { return };
         let place = kept.place();

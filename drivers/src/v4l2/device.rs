@@ -1,5 +1,5 @@
-//! An open V4L2 device: safe calls for the requests of the kernel, and images in memory shared with
-//! the kernel.
+//! An open V4L2 device, with safe calls for the requests of the kernel, and with images in memory
+//! that is shared with the kernel.
 
 use super::abi::{self, Plain, Request};
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
@@ -37,7 +37,7 @@ pub(super) struct FilledBuffer {
     n_bytes: usize,
     /// Sequence number since the stream started, including lost images.
     pub(super) sequence: u32,
-    /// Stamp in nanoseconds; its clock depends on `is_monotonic`.
+    /// Stamp in nanoseconds. Its clock depends on `is_monotonic`.
     pub(super) stamp_nanos: i64,
     /// Whether the device reports that its stamps come from the kernel's monotonic clock.
     pub(super) is_monotonic: bool,
@@ -102,8 +102,8 @@ impl Device {
         })
     }
 
-    /// Enumerates entries with increasing indices until the device has no more. The list is empty
-    /// if the device lacks the request.
+    /// Enumerates entries with increasing indices until the device has no more entries. The list is
+    /// empty if the device does not support the request.
     fn list<T: Plain>(&self, request: &Request<T>, mut request_at: impl FnMut(u32) -> T) -> Vec<T> {
         // This limit ends the loop even if a driver never ends its list.
         const MAX_ENTRIES: u32 = 1000;
@@ -117,8 +117,8 @@ impl Device {
     pub(super) fn identity(&self) -> rustix::io::Result<Identity> {
         let mut reported = abi::Capability::default();
         self.ioctl(&abi::QUERYCAP, &mut reported)?;
-        // `capabilities` covers all nodes of a device, `device_caps` only this one. Old drivers
-        // report just the first.
+        // `capabilities` covers all nodes of a device, and `device_caps` covers only this node. Old
+        // drivers report only `capabilities`.
         let of_node = if reported.capabilities & abi::CAP_DEVICE_CAPS == 0 {
             reported.capabilities
         } else {
@@ -228,7 +228,7 @@ impl Device {
             && input.capabilities & abi::INPUT_DV_TIMINGS != 0
     }
 
-    /// Description of a control; `None` if the device has no writable control of this id.
+    /// Description of a control. `None` if the device has no writable control with this id.
     pub(super) fn control(&self, id: u32) -> Option<abi::QueryControl> {
         let mut control = abi::QueryControl {
             id,

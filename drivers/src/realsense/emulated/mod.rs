@@ -21,8 +21,8 @@ use std::ptr::NonNull;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::{Duration, Instant};
 
-/// Maximum number of images that the library still has to write. If there are more, the writer
-/// waits, because the library drops images that it cannot store.
+/// Maximum number of images that the library still has to write. If this number is reached, the
+/// writer waits, because the library drops images that it cannot store.
 const MAX_QUEUED_IMAGES: usize = 16;
 /// If no image is written for this long, the disk is assumed to be full or disconnected.
 const MAX_WAIT: Duration = Duration::from_secs(30);
@@ -150,7 +150,7 @@ impl BagWriter {
     /// clock, in whole microseconds.
     ///
     /// # Errors
-    /// If the format or size of the image differs from that of the emulated camera, or the disk
+    /// Fails if the format or size of the image differs from the emulated camera, or if the disk
     /// accepts no more data.
     pub fn write(&mut self, image: &Image) -> Result<(), Problem> {
         let file_problem = |reason: String| Problem::File {
@@ -185,13 +185,13 @@ impl BagWriter {
         self.recorder.sensors.iter().for_each(Sensor::stop);
         let path = self.path.clone();
         let number = self.number;
-        // Dropping the recorder makes the library write what it still holds.
+        // When the recorder is dropped, the library writes the images that it still holds.
         drop(self);
         wait_until_written(&path, number, 0, || Ok(()))
     }
 }
 
-/// A device that records the images of another one in a new file.
+/// A device that records the images of another device in a new file.
 fn recorder(device: &Device, path: &Path) -> Result<Device, Problem> {
     let file_problem = |reason: String| Problem::File {
         path: path.to_owned(),
@@ -478,7 +478,7 @@ fn stream(
 /// Images by address, each with the number of its file.
 type LentPixels = BTreeMap<usize, (u64, Box<[u8]>)>;
 
-/// Images that the library currently uses. It returns only their address.
+/// Images that the library currently uses. The library returns only the addresses of images.
 static LENT_PIXELS: Mutex<LentPixels> = Mutex::new(BTreeMap::new());
 /// Number of files started so far.
 static N_FILES: AtomicU64 = AtomicU64::new(0);
