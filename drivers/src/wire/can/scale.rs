@@ -1,9 +1,9 @@
 //! Linear map between SI values and unsigned integers, shared by MIT packing and Robstride.
 //!
 //! Source: `float_to_uint` and `uint_to_float` of Ben Katz's mini cheetah firmware, as in
-//! `cmjang/DM_Control_Python`: 0 is the lower end of the range, the maximum integer the upper end.
-//! These sources truncate. We round to the nearest integer. Halves are rounded down, so that 0 in a
-//! symmetric range is encoded as in these sources.
+//! `cmjang/DM_Control_Python`. The integer 0 is the lower end of the range, and the maximum integer
+//! is the upper end. These sources truncate, but this module rounds to the nearest integer. Halves
+//! are rounded down, so that 0 in a symmetric range is encoded as in these sources.
 
 use super::CanError;
 
@@ -42,7 +42,7 @@ impl Scale {
         (self.upper - self.lower) / self.max_raw()
     }
 
-    /// Converts to the nearest raw value. Values outside the range are clamped; NaN is an error
+    /// Converts to the nearest raw value. Values outside the range are clamped. NaN is an error
     /// that names `field`.
     #[expect(
         clippy::cast_possible_truncation,
