@@ -10,8 +10,8 @@ use targets::TargetSpec;
 /// motion.
 const HOLD_SECS: f64 = 1.2;
 const MOVE_SECS: f64 = 0.9;
-/// Amplitude of the slow wavering of a hand that holds something still. The next constants are its
-/// frequencies along the axes.
+/// Amplitude of the slow wavering of a hand that holds something still, meters. The next constants
+/// are the amplitude in radians and the frequencies along the axes.
 const WAVER_M: f64 = 0.0003;
 const WAVER_RAD: f64 = 0.001;
 const WAVER_HZ: [f64; 3] = [0.7, 0.9, 0.5];

@@ -1,4 +1,5 @@
-//! Where the robot is visible in a view of a scene, for tests of programs that draw the robot.
+//! Pixels at which the robot is visible in a view of a scene, for tests of programs that draw the
+//! robot.
 
 use crate::config::N_JOINTS;
 use crate::egl::HeadlessContext;
