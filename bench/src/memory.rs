@@ -47,7 +47,7 @@ impl MemoryRun {
     ///
     /// # Errors
     ///
-    /// If the system does not report the memory of this process.
+    /// Fails if the system does not report the memory of this process.
     pub fn add_sample(&mut self, live: &LiveLoop, gpu: &Gpu, viewers: &[Viewer]) -> Result<Sample> {
         let (sample, gpu_buffers) = sample(live, gpu, viewers)?;
         self.gpu_buffers = gpu_buffers;
@@ -59,7 +59,7 @@ impl MemoryRun {
     ///
     /// # Errors
     ///
-    /// If the system does not report the memory of this process.
+    /// Fails if the system does not report the memory of this process.
     pub fn findings(&self) -> Result<Findings> {
         let samples = &self.samples;
         let growths = self.growths();

@@ -9,7 +9,7 @@ use crate::findings::Findings;
 use report::Table;
 use report::chart::{Axis, Chart, Line, Point, Scale};
 
-/// Conditions of the sweeps in the charts; each chart varies one of them.
+/// Conditions of the sweeps in the charts. Each chart varies one of the conditions.
 const BASE_SPREAD_DEG: f64 = 20.0;
 const BASE_POSES: usize = 12;
 
@@ -325,7 +325,7 @@ impl Sweep {
     }
 }
 
-/// For each sweep and method: refused and failed results at each level.
+/// The table of refused and failed results at each level, for each sweep and method.
 fn limits_table(cells: &[Cell]) -> Table {
     let mut rows = Vec::new();
     for sweep in sweeps() {

@@ -227,7 +227,8 @@ fn images_with_shared_errors(
     let mut random = Random::new(seed);
     let mut view = |(ix, pose): (usize, &Transform)| {
         let mut points = observe(camera, pose, &board());
-        // A random quadratic function of the position on the board, for each axis of the image.
+        // The shared error of each axis of the image is a random quadratic function of the position
+        // on the board.
         let [horizontal, vertical] = [0, 1].map(|_| [0, 1, 2].map(|_| SHARED_PX * random.normal()));
         for point in &mut points {
             let x = point.point_in_board.x / (4.0 * SQUARE_M) - 1.0;
@@ -291,7 +292,8 @@ fn squared_errors_match_stated_variances_with_own_and_with_shared_errors() {
 
 #[test]
 fn stated_uncertainty_covers_the_truth() {
-    // Three binomial standard deviations of 95 % are 4.6 % for 200 runs and 6.5 % for 100 runs.
+    // The expected fraction is 95 %. Three binomial standard deviations are 4.6 % for 200 runs and
+    // 6.5 % for 100 runs.
     for (camera, model, poses, n_runs) in [
         (
             brown_conrady_camera(),
@@ -550,7 +552,7 @@ fn images_without_tilt_are_refused_with_the_remedy() {
             "{model:?}: {error}"
         );
     }
-    // Many images, all with the same tilt, do not determine the principal point.
+    // Many images with the same tilt do not determine the principal point.
     let same_tilt = |ix: u32| {
         Transform::new(
             Vector3::new(-0.12 + 0.005 * f64::from(ix), -0.05, 0.4),

@@ -39,7 +39,8 @@ pub(super) fn panda_tool() -> Chain {
     chain(PANDA_WITH_HAND, "link0", "tcp")
 }
 
-/// The tip has a prismatic joint that follows another, and there are eight joints.
+/// A Panda whose tip is a finger. The chain has eight joints, and a prismatic joint that follows
+/// another joint.
 pub(super) fn panda_finger() -> Chain {
     chain(PANDA_WITH_HAND, "link0", "finger_right")
 }

@@ -79,7 +79,7 @@ fn a_moving_target_is_followed_one_step_behind() {
         let mut follower = Follower::new(chain, ready);
         let start = follower.pose();
         for step in 0..2000 {
-            // A circle of 10 cm at 0.16 m/s, with a rotation of 0.2 rad.
+            // The target moves along a circle of 10 cm at 0.16 m/s, with a rotation of 0.2 rad.
             let angle = TAU * f64::from(step) * STEP_SECS / 4.0;
             let offset = Vector3::new(angle.sin(), 1.0 - angle.cos(), 0.0) * 0.1;
             let target = Target::pose(

@@ -40,7 +40,7 @@ pub fn data_uri(rgb: &[u8], [width, height]: [u32; 2], quality: u8) -> anyhow::R
 fn write_base64(bytes: &[u8], to: &mut String) {
     const SYMBOLS: &[u8; 64] = b"ABCDEFGHIJKLMNOPQRSTUVWXYZabcdefghijklmnopqrstuvwxyz0123456789+/";
     for group in bytes.chunks(3) {
-        // Three bytes are 24 bits, that is four symbols of 6 bits. A shorter group at the end is
+        // Three bytes are 24 bits, which are four symbols of 6 bits. A shorter group at the end is
         // filled with zero bits, and its unused symbols are `=`.
         let bits = group
             .iter()

@@ -22,7 +22,7 @@ use std::sync::Arc;
 const SIZE_PX: [u32; 2] = [96, 80];
 const FOCAL_PX: f64 = 90.0;
 
-/// The inside of a colorful sphere: a closed surface with well-defined depth.
+/// The inside of a colorful sphere, which is a closed surface with well-defined depth.
 pub(super) fn scene() -> SplatArrays {
     const N_DISCS: usize = 400;
     let mut arrays = synthetic_cloud(N_DISCS, 3);

@@ -9,7 +9,7 @@ pub(super) type Column = (&'static str, usize);
 /// A row of a table with bars.
 pub(super) struct BarRow {
     pub(super) name: String,
-    /// Tag of the row, such as `outlier`; may be empty.
+    /// Tag of the row, such as `outlier`. It may be empty.
     pub(super) tag: String,
     /// One value per column.
     pub(super) values: Vec<Option<f64>>,
@@ -60,9 +60,11 @@ struct ShownColumn {
     largest: f64,
 }
 
-/// Largest value of a column in rows without a tag; of all rows if there is none.
+/// Largest value of a column in rows without a tag. If all rows have a tag, it is the largest value
+/// of all rows.
 fn largest(rows: &[BarRow], ix: usize) -> f64 {
-    // An outlier may be hundreds of times larger than the other values, whose bars would disappear.
+    // An outlier may be hundreds of times larger than the other values. If outliers determined the
+    // scale, the bars of the other values would disappear.
     let used = largest_of(rows.iter().filter(|row| row.tag.is_empty()), ix);
     if used > 0.0 {
         used
@@ -71,7 +73,7 @@ fn largest(rows: &[BarRow], ix: usize) -> f64 {
     }
 }
 
-/// Largest finite value of a column; 0 if there is none.
+/// Largest finite value of a column. It is 0 if there is none.
 fn largest_of<'a>(rows: impl Iterator<Item = &'a BarRow>, ix: usize) -> f64 {
     rows.filter_map(|row| row.value(ix))
         .filter(|value| value.is_finite())
