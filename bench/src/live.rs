@@ -271,7 +271,7 @@ fn millis(duration: Duration) -> f64 {
     duration.as_secs_f64() * 1e3
 }
 
-/// A row of a table: the name of a quantity, and its value in each run.
+/// A row of a table, with the name of a quantity and its value in each run.
 fn row(name: &str, runs: &[LiveRun], value: &dyn Fn(&LiveRun) -> String) -> Vec<String> {
     std::iter::once(name.to_owned())
         .chain(runs.iter().map(value))

@@ -256,7 +256,7 @@ impl NamedData {
         }
     }
 
-    /// The training options of splats, for a bench that measures splats only.
+    /// The training options of splats, for a bench that measures only splats.
     ///
     /// # Errors
     ///
@@ -549,8 +549,8 @@ fn difference(cached: &RunSettings, requested: &RunSettings) -> Result<Option<St
     Ok(first_difference(&fields(cached)?, &fields(requested)?))
 }
 
-/// Description of the first value of an object that differs. If that value is itself an object, the
-/// description names the first value inside it that differs.
+/// Description of the first value of an object that differs. If this value is an object, the
+/// description names the first value inside the object that differs.
 fn first_difference(cached: &Value, requested: &Value) -> Option<String> {
     let (key, value) = requested
         .as_object()?

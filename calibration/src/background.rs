@@ -96,7 +96,7 @@ impl AlignmentTask {
 
     /// Starts alignment of uncorrected keyframes on its own thread.
     pub fn begin(&mut self, keyframes: &[Arc<Keyframe>], choice: &CameraRefinement) {
-        // Alignment does not estimate movements of cameras, but it must apply known ones.
+        // Alignment does not estimate movements of cameras, but it must apply known movements.
         // Otherwise, images before and after a movement would contradict each other.
         let choice = choice.clone();
         let with_movements = |keyframe: &Arc<Keyframe>| match &self.result {
@@ -178,9 +178,9 @@ impl AlignmentTask {
 const COLOR_ACCURACY_RAD: f64 = 1.75e-3;
 const COLOR_ACCURACY_M: f64 = 3e-3;
 
-/// Whether the latest corrections are as good as newer ones. Without depth, this is the case if
-/// both agree within their accuracy, or if the newer estimate was rejected. Without this check, the
-/// estimated poses of cameras would alternate between similar values.
+/// Whether the latest corrections are as good as newer corrections. Without depth, this is the case
+/// if both agree within their accuracy, or if the newer estimate was rejected. Without this check,
+/// the estimated poses of cameras would alternate between similar values.
 fn is_as_good(latest: &Alignment, newer: &Alignment, keyframes: &[Arc<Keyframe>]) -> bool {
     if !latest.has_corrections() || keyframes.iter().any(|keyframe| keyframe.depth.is_some()) {
         return false;

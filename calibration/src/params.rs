@@ -27,7 +27,7 @@ bitflags::bitflags! {
         /// Gains of red, green and blue of each image.
         const IMAGE_GAINS = 1 << 4;
         /// Offset added to the readings of each joint that carries a camera. This parameter and the
-        /// following ones are estimated only by alignment.
+        /// following parameters are estimated only by alignment.
         const JOINTS = 1 << 5;
         /// Pose of the depth frame in the camera frame.
         const DEPTH_POSE = 1 << 6;

@@ -139,7 +139,7 @@ pub struct Miscalibration {
     pub azimuth_only: bool,
     /// Whether rows are exposed one after the other.
     pub has_rolling_shutter: bool,
-    /// Image noise relative to that of a real camera.
+    /// Image noise relative to the noise of a real camera.
     pub noise: f64,
     /// Seed of the noise.
     pub seed: u64,

@@ -215,7 +215,7 @@ fn norm_with_sigma(
     Some([part.norm(), sigma_of(variance)])
 }
 
-/// Whether an image adds nothing to an earlier one.
+/// Whether an image adds nothing to an earlier image.
 fn is_same_view(a: &TagObservation, b: &TagObservation) -> bool {
     let motion = a.calibrated.inverse() * b.calibrated;
     motion.translation.vector.norm() < MIN_STEP_M
@@ -306,8 +306,8 @@ mod tests {
     const SIGMA_M: f64 = 0.0005;
     const SIGMA_RAD: f64 = 0.002;
 
-    /// Runs a check with poses around a tag. `seen` gives the true camera pose for a calibrated
-    /// one.
+    /// Runs a check with poses around a tag. `seen` returns the true camera pose for a calibrated
+    /// camera pose.
     fn run(
         n: usize,
         moves: bool,

@@ -28,7 +28,7 @@ impl Kept {
     /// Opens a file or folder for reading.
     ///
     /// # Errors
-    /// If it cannot be opened.
+    /// Fails if the file or folder cannot be opened.
     pub fn open(path: &Path) -> std::io::Result<Self> {
         Ok(Self {
             path: path.to_owned(),
@@ -67,7 +67,7 @@ impl Kept {
     /// Writes the contents of a removed file to its path again, unless the path is taken.
     ///
     /// # Errors
-    /// If it cannot be written, or if the path is taken.
+    /// Fails if the file cannot be written, or if the path is taken.
     pub fn restore(&self) -> std::io::Result<()> {
         // The file is opened again, because another user of `file` may share its position. Systems
         // without /proc, such as macOS, use a duplicate of `file` instead.

@@ -67,7 +67,7 @@ pub fn read(path: &Path, budget: Budget) -> std::io::Result<Vec<u8>> {
 /// Reads a text in UTF-8 within [`Budget::TEXT`], without its byte order mark.
 ///
 /// # Errors
-/// As [`read`], and if the file is not UTF-8.
+/// Fails like [`read`], and also if the file is not UTF-8.
 pub fn read_text(path: &Path) -> std::io::Result<String> {
     let bytes = read(path, Budget::TEXT)?;
     // Windows editors offer UTF-16 under the name "Unicode". Its byte order mark shows that a text

@@ -24,7 +24,7 @@ pub fn replace(
 /// Like [`replace`], but with contents that are already in memory.
 ///
 /// # Errors
-/// As [`replace`].
+/// Fails like [`replace`].
 pub fn write(path: &Path, contents: impl AsRef<[u8]>) -> std::io::Result<()> {
     replace(path, |file| file.write_all(contents.as_ref()))
 }
@@ -33,7 +33,7 @@ pub fn write(path: &Path, contents: impl AsRef<[u8]>) -> std::io::Result<()> {
 /// removed first.
 ///
 /// # Errors
-/// If the file cannot be created.
+/// Fails if the file cannot be created.
 pub fn begin(path: &Path) -> std::io::Result<File> {
     match std::fs::remove_file(path) {
         Err(error) if error.kind() != ErrorKind::NotFound => Err(error),
@@ -315,7 +315,7 @@ fn open_unlinked(path: &Path, flags: OFlags) -> std::io::Result<File> {
 /// not exist.
 ///
 /// # Errors
-/// If it is a symbolic link.
+/// Fails if the folder is a symbolic link.
 pub fn check_no_link(folder: &Path) -> std::io::Result<()> {
     match std::fs::read_link(folder) {
         Ok(target) => Err(Error::new(

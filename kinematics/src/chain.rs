@@ -82,7 +82,7 @@ impl Chain {
             };
             // Rotates the frame so that the joint's axis is z. A motion along or about z has a
             // closed form that is cheaper than a product. The rotation is undone after the joint,
-            // so that later frames are those of the URDF.
+            // so that later frames are the frames of the URDF.
             let joint_from_aligned = rotation_from_z_to(&joint.axis);
             let rule = follow_mimics(robot, joint, &mut rules)?;
             // Two mimic joints may follow the same joint, which has one value in a configuration.

@@ -13,7 +13,7 @@ use std::collections::VecDeque;
 #[derive(Clone, Debug)]
 pub struct ClockMap {
     /// Device stamp and arrival of the first message since the start or the last restart. Device
-    /// times are relative to it.
+    /// times are relative to this stamp.
     origin: Option<Origin>,
     /// For each bucket of device time, the message with the smallest delay.
     buckets: VecDeque<Bucket>,
@@ -121,8 +121,9 @@ impl ClockMap {
         if has_line && lateness_secs < -MAX_EARLY_SECS {
             return self.restart(device_nanos, arrival);
         }
-        // The line follows early arrivals at once, but never late ones. If the clock jumped back,
-        // all stamps would therefore be too early until the old arrivals have left the window.
+        // The line follows early arrivals at once, but it never follows late arrivals. If the clock
+        // jumped back, all stamps would therefore be too early until the old arrivals have left the
+        // window.
         if self.late_for_too_long(lateness_secs, arrival) {
             return self.restart(device_nanos, arrival);
         }
@@ -244,8 +245,8 @@ impl ClockMap {
         // full span, it amounts to 12.5 ppm.
         let max_drift = MAX_DRIFT * (span_secs / FULL_DRIFT_SECS).min(1.0);
         let drift = self.hull_slope().clamp(-max_drift, max_drift);
-        // The slope may have been limited, so the offset may differ from that of the hull's edge.
-        // The line must always touch the arrivals from below.
+        // The slope may have been limited, so the offset may differ from the offset of the hull's
+        // edge. The line must always touch the arrivals from below.
         let offset_secs = self
             .buckets
             .iter()

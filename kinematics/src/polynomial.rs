@@ -68,7 +68,7 @@ pub(crate) fn solve_rising(
     (is_rising_to(x) && value(x).abs() <= CLOSE * target.max(1.0)).then_some(x)
 }
 
-/// Value of the polynomial with these coefficients, the constant one first.
+/// Value of the polynomial with these coefficients. The constant coefficient comes first.
 pub(crate) fn evaluate<const N: usize>(p: &[f64; N], s: f64) -> f64 {
     p.iter()
         .rev()

@@ -4,8 +4,8 @@ use crate::camera::{Intrinsics, Lens};
 use crate::lens;
 use nalgebra::{Matrix2x3, SMatrix, Vector2, Vector3};
 
-/// Maximum number of parameters of a camera: two focal lengths, the principal point, and eight
-/// coefficients.
+/// Maximum number of parameters of a camera, which are two focal lengths, the principal point, and
+/// eight coefficients.
 pub const MAX_INTRINSICS_PARAMS: usize = 12;
 
 /// A projected point and the derivatives of its pixel.

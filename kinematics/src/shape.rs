@@ -69,8 +69,8 @@ pub(crate) fn read_all(robot: Element<'_>, notes: &mut Notes) -> HashMap<String,
         read_material(material, "the robot", &mut materials, notes);
     }
     let mut by_link = HashMap::<String, LinkShapes>::new();
-    // Visual shapes are added after all links have been read. A material that a link defines may be
-    // used by all other links, including earlier ones.
+    // Visual shapes are added after all links have been read. All other links, including earlier
+    // links, may use a material that a link defines.
     let mut visuals = Vec::new();
     let mut seen = HashSet::new();
     for link in robot.all("link") {

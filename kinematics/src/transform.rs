@@ -118,8 +118,8 @@ pub fn to_rows(transform: &Transform) -> [f64; 16] {
     std::array::from_fn(|at| matrix[(at / 4, at % 4)])
 }
 
-/// The seven numbers of a pose in files: the position x, y, z in meters, then the quaternion x, y,
-/// z, w.
+/// The seven numbers of a pose in files. They are the position x, y, z in meters, then the
+/// quaternion x, y, z, w.
 pub fn to_xyz_xyzw(transform: &Transform) -> [f64; 7] {
     let [x, y, z] = transform.translation.vector.into();
     let [i, j, k, w] = transform.rotation.coords.into();

@@ -14,8 +14,8 @@ pub struct Undistortion {
     taps: Vec<Tap>,
 }
 
-/// Source of one output pixel: the upper left of four neighbors, and the weights of the right and
-/// the lower neighbors.
+/// Source of one output pixel. It consists of the upper left of four neighbors, and of the weights
+/// of the right and the lower neighbors.
 #[derive(Clone, Copy, Debug)]
 struct Tap {
     upper_left: u32,
@@ -241,8 +241,8 @@ fn tap_along(source_px: f64, size_px: u32) -> (u32, u16) {
     // The position is converted from integer pixel edges to integer pixel centers, because the
     // samples are at pixel centers.
     let position = (source_px - 0.5).clamp(0.0, last);
-    // The last pixel is read as the right neighbor of the one before it, so that no read goes past
-    // the end.
+    // The last pixel is read as the right neighbor of the pixel before it, so that no read goes
+    // past the end.
     let start = position.floor().min((last - 1.0).max(0.0));
     let share = (position - start) * f64::from(ONE);
     (start as u32, share.round() as u16)

@@ -48,7 +48,7 @@ const WALK_DURATION_SECS: f64 = 5.0;
 const FAR_STATION: [f64; 3] = [0.0, 0.15, -0.06];
 const NEAR_STATION: [f64; 3] = [1.15, 0.0, 0.02];
 
-/// Pose of the arm's base on the quadruped's back; link `top_plate` in the URDFs.
+/// Pose of the arm's base on the quadruped's back. In the URDFs, this is the link `top_plate`.
 pub(crate) fn base_from_arm() -> Transform {
     Transform::translation(0.12, 0.0, 0.10)
 }

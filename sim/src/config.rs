@@ -70,9 +70,9 @@ pub struct TargetConfig {
 /// Frame that a printed target is attached to.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum TargetParent {
-    /// The world: the target is stationary.
+    /// The world. The target is stationary.
     World,
-    /// The arm's flange: the arm carries the target.
+    /// The arm's flange. The arm carries the target.
     Flange,
     /// A hand that holds the target at many places in front of a camera, one after the other. The
     /// pose of the board follows from the hand, and [`TargetConfig::parent_from_board`] is not
@@ -212,11 +212,11 @@ impl Scene {
 /// Frame that a camera is attached to.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Parent {
-    /// The arm's flange: the camera moves with it.
+    /// The arm's flange. The camera moves with the arm.
     Flange,
     /// The robot's base.
     Base,
-    /// The world: the camera is stationary.
+    /// The world. The camera is stationary.
     World,
 }
 
@@ -626,7 +626,7 @@ impl CameraConfig {
         let sensor = &self.sensor;
         check(&self.name, "noise_sigma", sensor.noise_sigma, 0.0, 100.0)?;
         check(&self.name, "shot_frac", sensor.shot_frac, 0.0, 1.0)?;
-        // An exposure ends before the next one begins.
+        // An exposure ends before the next exposure begins.
         check(
             &self.name,
             "exposure_micros",

@@ -136,7 +136,7 @@ impl Follower {
         &self.velocity_rad_s
     }
 
-    /// Advances to a time `step_secs` after the previous one.
+    /// Advances to a time that is `step_secs` after the previous time.
     pub(crate) fn advance(&mut self, secs: f64, step_secs: f64) {
         let target_pose = self.scan.arm_from_camera(secs);
         let before = self.scan.arm_from_camera(secs - step_secs);

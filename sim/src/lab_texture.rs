@@ -129,7 +129,7 @@ fn curves(own: f64, u: f64, v: f64) -> Color {
             0.5 - 0.36 * (-(2.0 + k) * u).exp() * ((9.0 + 4.0 * k) * (u + own)).cos() - 0.05 * k;
         ((v - y).abs(), hue(0.27 * k + own, 0.05, 0.85))
     });
-    // If curves overlap, the first one is on top.
+    // If curves overlap, the first curve is on top.
     near.filter(|(distance, _)| *distance < 0.013)
         .map(|(_, color)| color)
         .next()

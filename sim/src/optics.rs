@@ -201,7 +201,7 @@ impl Optics {
     ///
     /// `row_motions` holds all motions of the first row, then all motions of the second row, and so
     /// on. Each pixel's ray is traced into the rendered image with the rendered depth, so surfaces
-    /// have the correct positions. There is one exception: a strip next to each depth edge repeats
+    /// have the correct positions. The exception is a strip next to each depth edge, which repeats
     /// the adjacent content. The strip is as wide as the parallax during the readout.
     pub(crate) fn motion_blurred(&self, picture: &Picture, row_motions: &[RowMotion]) -> Vec<f32> {
         let n_samples = row_motions.len() / self.intrinsics.size_px[1] as usize;

@@ -45,7 +45,7 @@ impl Default for ScanShape {
 pub(crate) struct Oscillation(f64, f64, f64, f64);
 
 impl Oscillation {
-    /// The same oscillation about another mean, with another amplitude.
+    /// This oscillation with another mean and another amplitude.
     pub(crate) fn over(&self, mean: f64, amplitude: f64) -> Self {
         Self(mean, amplitude, self.2, self.3)
     }
@@ -80,12 +80,12 @@ impl Scan {
         }
     }
 
-    /// The same tour in another shape.
+    /// This tour with another shape.
     pub(crate) fn with_shape(self, shape: ScanShape) -> Self {
         Self { shape, ..self }
     }
 
-    /// The same tour at another speed.
+    /// This tour at another speed.
     pub(crate) fn with_speed(self, speed: f64) -> Self {
         Self { speed, ..self }
     }

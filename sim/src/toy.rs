@@ -258,8 +258,8 @@ pub(crate) fn body(light: Light<'_>) -> Mesh {
     let mut mesh = Mesh::default();
     for part in &PARTS {
         let [tip, root] = part.band.rows();
-        // Skin under hair has a color close to that of the roots. Bare skin has the middle color of
-        // the band.
+        // Skin under hair has a color close to the color of the roots. Bare skin has the middle
+        // color of the band.
         let texture_y = if part.n_hairs > 0 {
             0.3 * tip + 0.7 * root
         } else {

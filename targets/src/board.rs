@@ -93,8 +93,8 @@ impl TargetSpec {
         }
     }
 
-    /// Rotations `board_from_rotated_board` of the board that give the same picture. The first one
-    /// is the identity.
+    /// Rotations `board_from_rotated_board` of the board that give the same picture. The first
+    /// rotation is the identity.
     ///
     /// A pose of such a board is ambiguous: `camera_from_board * rotation` fits the image equally
     /// well for every rotation of this list. A chessboard whose numbers of inner corners are both

@@ -36,7 +36,7 @@ pub(crate) struct Match {
 }
 
 /// Names in OpenCV's order, without its prefix `DICT_`. Smaller dictionaries are the beginnings of
-/// larger ones.
+/// larger dictionaries.
 const ARUCO: [&str; 16] = [
     "4X4_50", "4X4_100", "4X4_250", "4X4_1000", "5X5_50", "5X5_100", "5X5_250", "5X5_1000",
     "6X6_50", "6X6_100", "6X6_250", "6X6_1000", "7X7_50", "7X7_100", "7X7_250", "7X7_1000",

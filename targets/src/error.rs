@@ -181,7 +181,7 @@ pub enum NotDetected {
         /// Columns and rows of the target.
         expected: Counts,
     },
-    /// The markers are those of a board with other counts.
+    /// The markers belong to a board with other counts.
     #[error(
         "the markers form a board of {found} {what} (or more rows), not {expected}; correct {}",
         Setting::Target
@@ -242,7 +242,7 @@ pub enum NotDetected {
     MarkerSize {
         /// Side of a marker in the image relative to the side of a square.
         found_frac: f64,
-        /// The same of the target.
+        /// Side of a marker of the target relative to the side of a square.
         expected_frac: f64,
         /// Side of a square of the target.
         square: String,

@@ -216,8 +216,8 @@ struct Buckets {
 
 impl Buckets {
     fn new(saddles: &[Saddle]) -> Self {
-        // The size is about that of a square in a common image, so that the nearest neighbor is
-        // found in the first rings.
+        // The buckets are about as large as a square in a common image, so that the nearest
+        // neighbor is found in the first rings.
         const SIDE_PX: f64 = 24.0;
         let bucket = |pixel: [f64; 2]| pixel.map(|value| index(value, SIDE_PX));
         let mut counts = [1, 1];

@@ -232,7 +232,7 @@ impl Lattice {
         }
     }
 
-    /// Refines all corners and removes those that are no saddles.
+    /// Refines all corners, and removes corners that are not saddles.
     pub(crate) fn refine(&mut self, plane: &Plane, refinement: Refinement) {
         let refined = self.corners.iter().filter_map(|(&cell, &pixel)| {
             let spacing_px = self

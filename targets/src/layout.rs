@@ -96,7 +96,7 @@ fn charuco(squares: [u32; 2], square_m: f64, marker_m: f64, is_legacy: bool) -> 
 pub(crate) struct Fit {
     pub(crate) layout: Layout,
     pub(crate) markers: Vec<Marker>,
-    /// Number of markers confirmed by another one.
+    /// Number of markers that another marker confirms.
     pub(crate) n_confirmed: usize,
 }
 
@@ -113,8 +113,8 @@ pub(crate) fn fit(layouts: Vec<Layout>, markers: &[Marker]) -> Option<Fit> {
             n_confirmed,
         }
     });
-    // If several arrangements are equally good, the first one is kept, which is the standard
-    // arrangement.
+    // If several arrangements are equally good, the first arrangement is kept, which is the
+    // standard arrangement.
     let best = fits.reduce(|best, next| {
         if next.n_confirmed > best.n_confirmed {
             next
@@ -176,7 +176,7 @@ fn agrees(layout: &Layout, a: &Marker, b: &Marker) -> bool {
     predicts(layout, a, b) || predicts(layout, b, a)
 }
 
-/// Whether the homography of a marker predicts the corners of another one.
+/// Whether the homography of a marker predicts the corners of another marker.
 fn predicts(layout: &Layout, from: &Marker, to: &Marker) -> bool {
     let corners_m = &layout.corners_m[from.id as usize];
     let origin = center(corners_m);

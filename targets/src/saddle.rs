@@ -86,7 +86,7 @@ fn response_at([above, here, below]: [&[f32]; 3], x: usize) -> f32 {
     xy * xy - xx * yy
 }
 
-/// Whether a response is the largest within two pixels. If responses are equal, the first one
+/// Whether a response is the largest within two pixels. If responses are equal, the first response
 /// counts as larger.
 fn is_maximum(response: &[f32], width: usize, x: usize, y: usize) -> bool {
     let value = response[y * width + x];

@@ -11,7 +11,7 @@ const GRID_TAG_BORDER: usize = 2;
 /// Border of single tags and ArUco markers.
 const BORDER: usize = 1;
 
-/// A black or white shape in the board frame, meters. Later shapes cover earlier ones.
+/// A black or white shape in the board frame, meters. Later shapes cover earlier shapes.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(crate) enum Shape {
     /// Black rectangle, given by its smallest x and y and its largest x and y.
@@ -192,7 +192,8 @@ fn is_black_on_aprilgrid(tags: [u32; 2], spacing_frac: f64, in_tags: [f64; 2]) -
     // and above the first tag, each period begins with the gap.
     let pitch = 1.0 + spacing_frac;
     let position = in_tags.map(|value| (value + spacing_frac) / pitch);
-    // There is one more column and row, because the last one consists of small squares only.
+    // There is one more column and one more row, because the last column and the last row consist
+    // only of small squares.
     let Some([column, row]) = square(position, tags.map(|count| count + 1)) else {
         return false;
     };
@@ -347,8 +348,8 @@ fn is_black_cell(dictionary: &Dictionary, id: u32, border: usize, point: [f64; 2
     !(is_inside(column) && is_inside(row)) || dictionary.is_black(id, row - border, column - border)
 }
 
-/// Appends a marker: one rectangle per run of black cells in a row, and one for each part of the
-/// border.
+/// Appends a marker. It has one rectangle per run of black cells in a row, and one rectangle for
+/// each part of the border.
 fn marker(
     dictionary: &Dictionary,
     id: u32,

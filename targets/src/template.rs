@@ -314,8 +314,9 @@ impl Template {
             // Far from the solution, the linear model overshoots.
             let limited = step.map(|value| value.clamp(-0.7, 0.7));
             center = [center[0] - limited[0], center[1] - limited[1]];
-            // The start is the best whole pixel, so the solution is within a pixel of it, with some
-            // reserve. The comparison is written so that NaN does not count as near.
+            // The start is the best whole pixel, so the solution is within a pixel of the start.
+            // The limit has some reserve. The comparison is written so that NaN does not count as
+            // near.
             let is_near = (center[0] - start[0]).hypot(center[1] - start[1]) < 2.0;
             if !is_near {
                 return None;

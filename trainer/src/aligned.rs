@@ -187,7 +187,7 @@ impl AlignedModel {
             .collect();
         let original = |id: (&str, i64)| originals.get(&id).map(|keyframe| Arc::clone(keyframe));
         // After recovery, evicted keyframes have no pixels. They are removed from the model, like
-        // missing ones.
+        // missing keyframes.
         let with_pixels = |(camera, nanos): &(String, i64)| {
             original((camera, *nanos))
                 .filter(|keyframe: &Arc<Keyframe>| !keyframe.rgba_srgb.is_empty())
@@ -319,8 +319,8 @@ impl AlignedModel {
         Ok(is_ready)
     }
 
-    /// Waits for queued updates and returns the total number of updates, including those before a
-    /// restart and those of rejected trials. Unlike [`Progress::step`](crate::Progress::step), it
+    /// Waits for queued updates and returns the total number of updates, including updates before a
+    /// restart and updates of rejected trials. Unlike [`Progress::step`](crate::Progress::step), it
     /// never decreases.
     pub fn n_total_steps(&mut self) -> Result<u64, Error> {
         Ok(self.state.n_steps_before_restart + self.model.n_total_steps()?)
@@ -591,8 +591,8 @@ fn invalid_state(error: serde_json::Error) -> Error {
 
 /// Index of the first keyframe that is among the last `n` of its camera.
 fn first_recent(keyframes: &[Arc<Keyframe>], n: usize) -> usize {
-    // Keyframes of each camera are counted from the newest one backwards. Cameras have different
-    // rates, so the last keyframes of a slow camera may be far from the end of the list.
+    // Keyframes of each camera are counted backwards from the newest keyframe. Cameras have
+    // different rates, so the last keyframes of a slow camera may be far from the end of the list.
     let mut n_later = BTreeMap::<&str, usize>::new();
     let mut first = keyframes.len();
     for (ix, keyframe) in keyframes.iter().enumerate().rev() {
@@ -605,8 +605,8 @@ fn first_recent(keyframes: &[Arc<Keyframe>], n: usize) -> usize {
     first
 }
 
-/// Number of keyframes at which the next alignment of a live run begins, if the previous one used
-/// `n` keyframes.
+/// Number of keyframes at which the next alignment of a live run begins, if the previous alignment
+/// used `n` keyframes.
 #[expect(
     clippy::cast_possible_truncation,
     clippy::cast_sign_loss,

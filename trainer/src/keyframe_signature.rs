@@ -35,7 +35,7 @@ impl KeyframeSignature {
         }
     }
 
-    /// A keyframe without pixels that stands for the recorded one.
+    /// A keyframe without pixels that stands for the recorded keyframe.
     fn placeholder(&self) -> Keyframe {
         let world_from_camera = from_xyz_xyzw(self.world_from_camera);
         let depth = self.depth_size_px.map(|size_px| DepthMap {

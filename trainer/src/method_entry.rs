@@ -12,8 +12,8 @@ use std::sync::Arc;
 
 /// Creates an untrained model.
 pub type StartModel = fn(Arc<Gpu>, &ModelOptions) -> Result<Box<dyn Method>, Error>;
-/// Restores a model from a checkpoint. The keyframes must include those that the model was trained
-/// on.
+/// Restores a model from a checkpoint. The keyframes must include the keyframes that the model was
+/// trained on.
 pub type ResumeModel = fn(Arc<Gpu>, &Checkpoint, &[Arc<Keyframe>]) -> Result<ResumedModel, Error>;
 /// Loads a saved model from a folder or a single file.
 pub type LoadModel = fn(Arc<Gpu>, &Path) -> Result<Box<dyn Method>, Error>;

@@ -113,8 +113,8 @@ impl ModelSpec {
     }
 }
 
-/// Restores a model from a checkpoint. `keyframes` must include those that the model was trained
-/// on.
+/// Restores a model from a checkpoint. `keyframes` must include the keyframes that the model was
+/// trained on.
 ///
 /// # Errors
 ///

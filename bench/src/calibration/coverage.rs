@@ -87,8 +87,8 @@ pub(super) fn measure(scenes: CoverageScenes) -> Vec<Coverage> {
         estimate_intrinsics: true,
         ..default
     };
-    // The kinds of calibration differ in the source of uncertainty: the corners, the robot poses,
-    // the given lens, or a lens that is estimated together with the pose.
+    // The kinds of calibration differ in the source of uncertainty. The sources are the corners,
+    // the robot poses, the given lens, and a lens that is estimated together with the pose.
     let hand_eye = |name, noise, given, options| hand_eye(scenes, name, noise, given, options);
     let lens = |name, lens, model| intrinsics_coverage(scenes, name, lens, model);
     vec![

@@ -269,7 +269,7 @@ const BROWN_CONRADY_NAMES: [&str; 8] = ["k1", "k2", "p1", "p2", "k3", "k4", "k5"
 const KANNALA_BRANDT_NAMES: [&str; 4] = ["k1", "k2", "k3", "k4"];
 
 /// Names of the parameters of a lens model, in the order of [`Intrinsics::params`]. A lens may have
-/// only the first ones.
+/// only the first of these parameters.
 pub(crate) fn param_names(model: Option<&str>) -> Vec<&'static str> {
     let coefficients: &[&str] = if model == Some(KANNALA_BRANDT) {
         &KANNALA_BRANDT_NAMES

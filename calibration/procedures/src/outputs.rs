@@ -51,7 +51,7 @@ impl InputKind {
     }
 }
 
-/// Whether a path is that of a rig file.
+/// Whether a path leads to a rig file.
 pub(crate) fn is_rig_file(path: &Path) -> bool {
     path.extension()
         .is_some_and(|extension| extension == "toml")
@@ -144,7 +144,7 @@ impl RigOptions {
         }))
     }
 
-    /// The camera with the given name, or the only one.
+    /// The camera with the given name. Without a name, the only camera.
     pub(crate) fn camera_of<'a>(&self, rig: &'a Rig) -> anyhow::Result<&'a Camera> {
         match (&self.camera, &rig.cameras[..]) {
             (Some(name), _) => corrected_rig::camera(rig, name),
@@ -181,7 +181,7 @@ impl RigOutput {
         self.rig = rig.clone();
     }
 
-    /// Adds offsets to those in the rig file.
+    /// Adds offsets to the offsets in the rig file.
     pub(crate) fn add_joint_offsets(&mut self, offsets: &[JointOffset]) {
         let arm = &mut self.rig.arm;
         // The rig file may have no offsets, or fewer than joints.
@@ -238,8 +238,8 @@ impl RigOutput {
         const MAX_PX: f64 = 0.01;
         let given = &corrected_rig::camera(&self.rig, &self.camera)?.intrinsics;
         let pairs = given.params().into_iter().zip(used.params());
-        // Lens models differ in their number of parameters, and `zip` would compare only the first
-        // ones.
+        // Lens models differ in their number of parameters, and `zip` would ignore the additional
+        // parameters of the longer list.
         let differ = given.params().len() != used.params().len()
             || pairs.into_iter().any(|(a, b)| (a - b).abs() > MAX_PX);
         if differ {
@@ -328,7 +328,7 @@ impl ReportOptions {
             Err(error) if session::class(error) == ErrorClass::InsufficientData => {
                 let text = format!("{error:#}");
                 Some(
-                    // The heading already says that the calibration was refused.
+                    // The heading already states that the calibration was refused.
                     text.strip_prefix("calibration refused: ")
                         .map_or(text.clone(), str::to_owned),
                 )

@@ -115,7 +115,7 @@ mod tests {
             let sum: f64 = (0..n)
                 .map(|ix| {
                     let quantile = (f64::from(ix) + 0.5) / f64::from(n);
-                    // The logistic distribution approximates the normal one.
+                    // The logistic distribution approximates the normal distribution.
                     let offset = sigma_px * (quantile / (1.0 - quantile)).ln() / 1.7;
                     ((at + offset) / SQUARE_PX).floor().rem_euclid(2.0) * 2.0 - 1.0
                 })

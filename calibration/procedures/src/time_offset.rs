@@ -26,7 +26,7 @@ pub struct TimeOffsetTask {
 
 /// The outcome of an estimation.
 pub struct TimeOffsetOutcome {
-    /// The result, or the reason why there is none.
+    /// The result, or the reason why there is no result.
     pub result: anyhow::Result<TimeOffset>,
     /// The result of writing the report.
     pub written: anyhow::Result<()>,
@@ -47,7 +47,7 @@ impl TimeOffsetTask {
         let written = match &self.report {
             Some(report) => self.write_report(
                 report,
-                // A report without the profile is better than none.
+                // A report without the profile is better than no report.
                 motion_profile(&a, &b, &self.options).ok().as_ref(),
                 &result,
             ),

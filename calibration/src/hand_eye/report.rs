@@ -38,7 +38,7 @@ pub struct HandEyeCalibration {
     /// RMS length of the reprojection error of the used corners, pixels. The robot poses are taken
     /// as exact.
     pub rms_px: Option<f64>,
-    /// The same for held-out samples.
+    /// RMS length of the reprojection error of held-out samples, pixels.
     pub held_out_rms_px: Option<f64>,
     /// Estimated measurement errors.
     pub noise: HandEyeNoise,
@@ -96,7 +96,7 @@ pub struct SampleReport {
     /// RMS reprojection error, pixels.
     pub rms_px: Option<f64>,
     /// Origin of the board according to this sample minus the origin according to the result,
-    /// millimeters. The axes are those of the base (eye in hand) or the flange (eye to hand).
+    /// millimeters. It is along the axes of the base (eye in hand) or the flange (eye to hand).
     pub board_offset_mm: Option<[f64; 3]>,
     /// Corners without outliers, with their reprojection errors. Empty for given poses.
     pub points: Vec<PointFit>,
@@ -109,7 +109,7 @@ const MAX_JOINT_SIGMA: f64 = 0.0175;
 
 /// Evaluates a refined solution.
 ///
-/// * `repeated`: indices of the samples that are identical to an earlier one. They are not used.
+/// * `repeated`: indices of the samples that are identical to an earlier sample. They are not used.
 pub(super) fn report(
     input: &HandEyeInput<'_>,
     refined: &Refined,
@@ -353,7 +353,8 @@ const MAX_SCATTER: Scatter = Scatter { mm: 5.0, deg: 0.5 };
 /// lens, the residual is at most a few tenths of a pixel.
 const MAX_RESIDUAL_PX: f64 = 0.7;
 
-/// A sentence on the likely cause if the errors are larger than those of usual arms and cameras.
+/// A sentence on the likely cause, if the errors are larger than the errors of usual arms and
+/// cameras.
 ///
 /// If each single image fits the board, the lens and the board are right. In that case, the robot
 /// poses do not belong to the images.

@@ -65,7 +65,7 @@ struct Normalization {
     scale: f64,
 }
 
-/// `None` if all points are the same, or one is not finite.
+/// `None` if all points are the same, or if a point is not finite.
 fn normalization(points: impl Iterator<Item = Vector2<f64>> + Clone) -> Option<Normalization> {
     let n = points.clone().count() as f64;
     let mean = points.clone().sum::<Vector2<f64>>() / n;

@@ -15,7 +15,8 @@ pub struct NextView {
     pub instruction: String,
     /// Root mean square over the image of the current projection uncertainty, pixels.
     pub sigma_px: f64,
-    /// The same, predicted with the suggested image.
+    /// Predicted projection uncertainty with the suggested image, as the same root mean square,
+    /// pixels.
     pub predicted_sigma_px: f64,
 }
 
@@ -63,7 +64,7 @@ pub(super) struct Known<'a> {
 }
 
 /// Evaluates poses of the target in a fixed set of regions, tilts and distances, and returns the
-/// one with the smallest predicted projection uncertainty. `None` if the target does not fit into
+/// pose with the smallest predicted projection uncertainty. `None` if the target does not fit into
 /// the image or the information is singular.
 ///
 /// Source: A-optimal design (Pukelsheim 1993, chapter 6) with the projection uncertainty as the

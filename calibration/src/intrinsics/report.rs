@@ -130,7 +130,7 @@ pub enum RejectionReason {
         /// Minimum number.
         min_points: usize,
     },
-    /// The image repeats an earlier one.
+    /// The image repeats an earlier image.
     Repeated {
         /// Median distance of the points in the two images, pixels.
         distance_px: f64,

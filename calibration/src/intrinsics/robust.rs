@@ -23,7 +23,7 @@ const MAX_SIGMAS: f64 = 6.0;
 /// images. Blurred images have larger errors, but still contribute.
 const MAX_MEDIAN_RATIO: f64 = 6.0;
 /// An image is rejected if more than this fraction of its corners is rejected. In that case, the
-/// rejected corners may be the correct ones.
+/// rejected corners may be the correct corners.
 const MAX_OUTLIER_FRAC: f64 = 0.5;
 /// The norm of a normal error has a Rayleigh distribution. This is the ratio of the median of the
 /// norm to the standard deviation per axis.
@@ -126,8 +126,8 @@ pub(super) fn fit(
 /// The points of each image that are consistent with one homography, up to a smooth distortion. For
 /// most images, these are all points.
 ///
-/// Half of the points may be wrong, because the homography is the one with the least median of
-/// errors over random samples (Rousseeuw 1984).
+/// Half of the points may be wrong, because the homography with the least median of errors over
+/// random samples is used (Rousseeuw 1984).
 pub(super) fn without_gross_errors(images: &[&[BoardPoint]]) -> Vec<Vec<BoardPoint>> {
     images
         .iter()

@@ -41,8 +41,8 @@ struct Scored {
     errors_px: Vec<f64>,
 }
 
-/// Adds coefficients one group at a time, and keeps those that lower the error on held-out corners
-/// significantly. Returns the selected model with its parameters, and all comparisons.
+/// Adds coefficients one group at a time, and keeps the groups that lower the error on held-out
+/// corners significantly. Returns the selected model with its parameters, and all comparisons.
 ///
 /// The selection of Brown-Conrady coefficients starts with a pinhole. It adds k1, then k2, then p1
 /// and p2, then k3. If k3 was needed, it adds the rational terms. If k1 alone is not significant,
@@ -110,7 +110,7 @@ pub(super) fn select(
     {
         let mut trial = best.as_ref().map(|baseline| compare(baseline, &variant));
         if let (Some(trial), Some(baseline)) = (&mut trial, &best) {
-            // A fisheye lens with four coefficients is simpler than a rational one.
+            // A fisheye lens with four coefficients is simpler than a rational model.
             trial.kept |= baseline.coefficients.family == Family::RationalBrownConrady
                 && trial.gain_db >= 0.0;
         }

@@ -395,7 +395,7 @@ fn simplest_sufficient_model_is_selected() {
 fn wrong_images_and_corners_are_rejected_and_named() {
     let camera = brown_conrady_camera();
     let mut views = observed_images(&camera, &poses(12, 7), 0.1, 8);
-    // If columns and rows are exchanged, the positions are those of another layout.
+    // If columns and rows are exchanged, the positions belong to another layout.
     let transposed: Vec<_> = (0..9)
         .flat_map(|row| (0..6).map(move |column| [column, row]))
         .collect();
@@ -679,7 +679,7 @@ fn suggested_images_lower_the_uncertainty_as_predicted() {
         .unwrap();
     let ratio = better.sigma_px / next.predicted_sigma_px;
     assert!((ratio - 1.0).abs() < REL, "{ratio}");
-    // Another image like the first one helps less.
+    // Another image like the first image helps less.
     poses[6] = poses[0];
     let other = calibrate(
         &camera,

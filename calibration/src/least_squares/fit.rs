@@ -33,7 +33,7 @@ pub struct Fit<S> {
     pub directions: Vec<Direction>,
     /// Whether the last step was negligible.
     pub converged: bool,
-    /// Number of steps, including rejected ones.
+    /// Number of steps, including rejected steps.
     pub n_steps: usize,
 }
 

@@ -59,7 +59,7 @@ pub trait Problem {
 pub struct Options {
     /// Loss of the residual vectors.
     pub loss: Loss,
-    /// Maximum number of steps, including rejected ones.
+    /// Maximum number of steps, including rejected steps.
     pub max_steps: usize,
     /// The minimization ends if a step is predicted to decrease the cost by less than this
     /// fraction.

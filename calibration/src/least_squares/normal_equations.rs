@@ -14,7 +14,8 @@ pub struct BlockSums {
     /// residual. They are stored until [`Self::summed`], because one product of the whole matrix is
     /// several times faster than one update per residual.
     weighted_derivatives: Vec<f64>,
-    /// Weighted products of the derivatives with respect to all parameters, shared ones first.
+    /// Weighted products of the derivatives with respect to all parameters. Shared parameters come
+    /// first.
     products: DMatrix<f64>,
     /// Gradient of half the sum of the losses.
     gradient: DVector<f64>,

@@ -98,7 +98,7 @@ impl ExtrinsicsCovariance {
     ) -> Option<PoseSigmas> {
         let first = self.ix(first)?;
         let other = self.ix(other)?;
-        // A motion of the first camera moves the other one in the opposite direction.
+        // A motion of the first camera moves the other camera in the opposite direction.
         let mut by_first = Matrix6::zeros();
         for part in 0..6 {
             let unit =

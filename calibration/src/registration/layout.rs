@@ -63,7 +63,7 @@ pub(super) struct Layout {
     joints: Option<usize>,
 }
 
-/// For each kind of parameter of a camera, the index of the first one.
+/// For each kind of parameter of a camera, the index of the first parameter.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub(super) struct CameraParamOffsets {
     pub(super) extrinsics: Option<usize>,

@@ -74,7 +74,7 @@ struct AlignmentScene {
     validation_pairs: Vec<Pair>,
 }
 
-/// All parameter sets that alignment can estimate, the more likely ones first.
+/// All parameter sets that alignment can estimate. The more likely sets come first.
 pub fn candidates() -> Vec<ParamSet> {
     vec![
         ParamSet::EXTRINSICS,

@@ -215,7 +215,7 @@ pub(super) fn of_free_pairs(
         .collect()
 }
 
-/// Contribution of a pair to the motion of its second camera, with the first one fixed.
+/// Contribution of a pair to the motion of its second camera, if the first camera is fixed.
 pub(super) fn of_second(sides: [Side<'_>; 2], options: &ResidualOptions) -> PairSums {
     let param_columns = [
         ParamColumns::still(sides[0].view),

@@ -451,7 +451,7 @@ fn max_jacobian_errors(has_rolling_shutter: bool) -> Vec<(layout::CalibrationPar
     let all: ParamSet = candidates().into_iter().collect();
     let layout = scene.layout(all);
     let mut here = Corrections::none(1);
-    // Joint offsets are zero. To first order, their columns are those at the measured joint
+    // Joint offsets are zero. To first order, their columns are the columns at the measured joint
     // positions.
     let displaced = layout
         .params

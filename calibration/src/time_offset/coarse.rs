@@ -288,8 +288,8 @@ impl Correlation {
     }
 }
 
-/// Whether a correlation is larger than both neighbors. If correlations are equal, the last one
-/// counts as larger.
+/// Whether a correlation is larger than both neighbors. If correlations are equal, the last
+/// correlation counts as larger.
 fn is_maximum(correlations: &[Correlation], ix: usize) -> bool {
     let value = correlations[ix].value;
     ix > 0

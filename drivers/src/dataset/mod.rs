@@ -169,7 +169,7 @@ impl SkippedImages {
     ) -> Result<Dataset, Error> {
         let n_missing = self.missing.len();
         let n_unusable = self.unusable.len() + self.broken.len();
-        // One example says more about the cause than the counts.
+        // One example shows more about the cause than the counts.
         if images.is_empty() {
             let first_broken = self.broken.iter().chain(&self.unusable).next();
             let first_broken = first_broken.map(|(name, reason)| format!(" ({name}: {reason})"));

@@ -265,7 +265,7 @@ impl Reading<'_> {
     /// Adds notes about everything that was left out, and builds the dataset.
     ///
     /// # Errors
-    /// If it has no images.
+    /// Fails if the dataset has no images.
     fn finish(mut self) -> Result<Dataset, Error> {
         let absent = self.absent();
         self.note_splits(&absent);

@@ -212,7 +212,7 @@ impl Reading<'_> {
     /// Adds notes about depth images that are not used, and builds the dataset.
     ///
     /// # Errors
-    /// If it has no photos.
+    /// Fails if the dataset has no photos.
     fn finish(self, repeated_depth: &[String]) -> Result<Dataset, Error> {
         let mut notes = match self.n_without_depth {
             0 => Vec::new(),
@@ -267,7 +267,7 @@ fn remove_repeated(entries: &mut Vec<(Stamp, String)>) -> Vec<String> {
 }
 
 /// Lens parameters of a folder, and the image size for which they are valid, if it is known. The
-/// caller sets the size in the lens parameters to that of each photo.
+/// caller sets the size in the lens parameters to the size of each photo.
 fn camera_of(folder: &Path) -> Result<(Intrinsics, Option<[u32; 2]>), Error> {
     let path = folder.join(CAMERA_FILE);
     let (numbers, lens_px) = if exists(&path) {
@@ -363,7 +363,7 @@ fn words(line: &str) -> impl Iterator<Item = &str> {
 /// Lines of a list, sorted by time. Invalid lines are skipped.
 ///
 /// # Errors
-/// If the file cannot be read, or no line is valid.
+/// Fails if the file cannot be read, or if no line is valid.
 fn stamped_lines(
     folder: &Path,
     list: &str,
@@ -406,7 +406,7 @@ fn stamped_lines(
     }
     skipped.lines(list, &invalid);
     // Lists that were merged or edited may be out of order, and stamps are searched by bisection.
-    // The sort is stable, so that if two lines have the same time, the first one is used.
+    // The sort is stable. If two lines have the same time, the first line is therefore used.
     lines.sort_by_key(|line| line.stamp);
     Ok(lines)
 }

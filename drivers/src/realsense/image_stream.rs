@@ -201,8 +201,8 @@ impl ImageStream {
         match counter.last_number.replace(number) {
             // The library sometimes returns the last image of a stream again.
             Some(last) if last == number => return Ok(None),
-            // If a number is lower than the last one, the stream was restarted. A restart loses no
-            // images.
+            // If a number is lower than the previous number, the stream was restarted. A restart
+            // loses no images.
             Some(last) if number > last => counter.n_unreported += number - last - 1,
             _ => {}
         }

@@ -17,7 +17,7 @@ const MAX_FIT_ERROR_PX: f64 = 0.5;
 /// maximum error at the points.
 const N_FIT_POINTS: u32 = 24;
 
-/// Converts intrinsics of the library to ours.
+/// Converts intrinsics of the library to intrinsics of fieldrig.
 ///
 /// Brown-Conrady and Kannala-Brandt are the same models in both. "Modified" and "inverse"
 /// Brown-Conrady are different polynomials, so the Brown-Conrady model of fieldrig is fitted to

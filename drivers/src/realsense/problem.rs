@@ -15,7 +15,7 @@ pub enum Problem {
         /// Error of the library.
         reason: String,
     },
-    /// No camera is connected, or not the requested one.
+    /// No camera is connected, or the requested camera is not connected.
     #[error(
         "no RealSense camera {}is connected; found: {}",
         if serial.is_empty() { String::new() } else { format!("with the serial number {serial:?} ") },
@@ -28,7 +28,7 @@ pub enum Problem {
         /// Names and serial numbers of the connected cameras.
         connected: Vec<String>,
     },
-    /// Several cameras are connected and the rig file does not select one.
+    /// Several cameras are connected, and the rig file does not select one of them.
     #[error("several RealSense cameras are connected: set device = \"SERIAL\" in the rig file to one of {}", connected.join(", "))]
     Ambiguous {
         /// Names and serial numbers of the connected cameras.

@@ -164,7 +164,7 @@ impl Recording {
         self.joint_names.as_deref()
     }
 
-    /// Describes the damage of the file and how much of it could be read. The description is
+    /// Describes the damage of the file, and how much of the file could be read. The description is
     /// available after the last sample.
     pub fn damage(&self) -> Option<&str> {
         self.damage.as_deref()
@@ -513,7 +513,7 @@ fn other_channel(id: u16) -> String {
 struct Notes(BTreeMap<(String, &'static str), String>);
 
 impl Notes {
-    /// Logs a difference in a topic. For each subject, logs only the first one.
+    /// Logs a difference in a topic. For each subject, only the first difference is logged.
     fn add(&mut self, topic: &str, subject: &'static str, difference: impl FnOnce() -> String) {
         self.add_at(format!("topic {topic:?}"), subject, difference);
     }

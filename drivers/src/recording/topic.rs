@@ -138,7 +138,7 @@ impl Encoding {
         }
     }
 
-    /// Joint states in JSON with our schema.
+    /// Joint states in JSON with the schema of fieldrig.
     pub(super) fn joint_state() -> Self {
         Self {
             schema_name: joint_state::SCHEMA_NAME,

@@ -25,7 +25,7 @@ const FLUSH_NANOS: i64 = 1_000_000_000;
 /// Description of the rig, written before the first sample.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct RecordingMetadata<'a> {
-    /// Files to attach, by name: the complete rig file and the robot description.
+    /// Files to attach, by name. They are the complete rig file and the robot description.
     pub files: &'a [(&'a str, &'a [u8])],
     /// Cameras and their lens parameters.
     pub cameras: &'a [(&'a str, &'a Intrinsics)],
@@ -206,7 +206,7 @@ impl Recorder {
             .ok_or_else(|| McapError::Io(std::io::Error::other("an earlier write failed")))
     }
 
-    /// Closes the file after a failure. The error reports how much of it is readable. A file
+    /// Closes the file after a failure. The error reports how much of the file is readable. A file
     /// without samples is removed.
     fn fail(&mut self, error: McapError) -> Error {
         if self.mcap.take().is_some() {
@@ -254,8 +254,8 @@ impl Recorder {
         Ok(())
     }
 
-    /// Writes what readers and viewers need before the first sample: the joint names, and the lens
-    /// parameters with the stamp of that sample. Later calls write nothing.
+    /// Writes the joint names and the lens parameters, which readers and viewers need before the
+    /// first sample. The lens parameters have the stamp of this sample. Later calls write nothing.
     fn announce_rig(&mut self, stamp: Stamp) -> mcap::McapResult<()> {
         if self.n_messages == 0 && !self.joint_names.is_empty() {
             // The channel is announced before all samples, so that readers know the joints

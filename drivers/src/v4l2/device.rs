@@ -76,8 +76,8 @@ impl Device {
     /// Opens a node in nonblocking mode.
     pub(super) fn open(path: &Path) -> rustix::io::Result<Self> {
         // The node is opened in nonblocking mode, so that a device that stops sending cannot block
-        // the thread. `wait` has a timeout, but `DQBUF` has none. The descriptor is closed in child
-        // processes, which would otherwise keep the device busy.
+        // the thread. `wait` has a timeout, but `DQBUF` has no timeout. The descriptor is closed in
+        // child processes, which would otherwise keep the device busy.
         let flags = OFlags::RDWR | OFlags::NONBLOCK | OFlags::CLOEXEC;
         Ok(Self {
             fd: rustix::fs::open(path, flags, Mode::empty())?,

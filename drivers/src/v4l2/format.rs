@@ -76,7 +76,7 @@ impl V4l2Format {
     }
 }
 
-/// A mode of a device: a format with its sizes and rates.
+/// A mode of a device, which is a format with its sizes and rates.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Mode {
     /// Kernel code of the format.

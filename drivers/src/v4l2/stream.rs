@@ -18,8 +18,8 @@ use std::time::{Duration, Instant};
 /// buffers, images are lost when the caller pauses. More buffers take more kernel memory.
 const N_BUFFERS: u32 = 8;
 /// Maximum time by which a stamp may be earlier than the start of the stream, or later than the
-/// current time. A stamp outside these limits comes from another clock, even if its flag says
-/// otherwise.
+/// current time. A stamp outside these limits comes from another clock, even if its flag states
+/// that it is monotonic.
 const MAX_STAMP_ERROR_SECS: f64 = 1.0;
 /// Maximum duration of an exposure query, as a fraction of the time between two images. Some
 /// cameras answer so slowly that images would be lost in the meantime.

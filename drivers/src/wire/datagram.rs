@@ -376,7 +376,7 @@ fn covariance(numbers: Vec<f64>) -> Result<Box<[f64; 36]>, Malformed> {
 }
 
 /// Decodes the state of joints with these names. `None` if the datagram names only other joints,
-/// such as those of a gripper.
+/// such as the joints of a gripper.
 ///
 /// Joints are found by their names. Without names, the numbers must be in the order of `names`.
 /// Velocities and efforts count as not reported if one of them is null or NaN.
@@ -442,9 +442,9 @@ pub fn unmatched_names(bytes: &[u8], joints: &[String]) -> Result<String, Malfor
     ))
 }
 
-/// Positions of our joints in the lists of a datagram.
+/// Positions of the requested joints in the lists of a datagram.
 struct JointLayout {
-    /// Index of each of our joints in the lists.
+    /// Index of each requested joint in the lists.
     order: Vec<usize>,
     /// Length of the lists.
     n: usize,

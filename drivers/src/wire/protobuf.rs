@@ -175,7 +175,7 @@ impl<'a> Iterator for Fields<'a> {
             return None;
         }
         let field = self.field();
-        // Without the length of a field, the next one cannot be found.
+        // Without the length of a field, the next field cannot be found.
         if field.is_err() {
             self.0 = &[];
         }

@@ -46,7 +46,7 @@ pub fn quantile(values: &mut [f64], frac: f64, rank: Rank) -> Option<f64> {
     let last_ix = values.len().checked_sub(1)?;
     let n = values.len() as f64;
     let ix = match rank {
-        // At a fraction of zero, this index is below the first one, so it is clamped below.
+        // At a fraction of zero, this index is below the first index, so it is clamped below.
         Rank::Lower => (frac * n).ceil() - 1.0,
         Rank::Nearest => (frac * (n - 1.0)).round(),
         Rank::Upper => (frac * n).floor(),

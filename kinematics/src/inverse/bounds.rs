@@ -17,7 +17,8 @@ pub(super) struct Bounds {
 
 impl Bounds {
     /// # Errors
-    /// If there is not one range per joint, or a range contains no value. Ranges may be infinite.
+    /// Fails if there is not one range per joint, or if a range contains no value. Ranges may be
+    /// infinite.
     pub(super) fn new(chain: &Chain, ranges: Vec<[f64; 2]>) -> Result<Self, Error> {
         if ranges.len() != chain.n_joints() {
             return Err(Error::JointCount {

@@ -143,7 +143,7 @@ impl Descent {
             self.try_change(problem.bounds, joints, effort.max_change);
             let pose = problem.linearize(&self.trial, &mut self.trial_columns);
             let trial_error = problem.error(&pose);
-            // The factor on the damping comes from Levenberg and Marquardt: a step that increases
+            // The factor on the damping comes from Levenberg and Marquardt. A step that increases
             // the error is discarded and tried again with more damping. The lower bound keeps the
             // factor large enough to react. The upper bound ends the search if no step improves the
             // pose.

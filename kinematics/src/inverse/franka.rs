@@ -24,7 +24,7 @@ const MIN_LENGTH_M: f64 = 0.01;
 /// undetermined.
 const MIN_SINE: f64 = 1e-6;
 
-/// The geometry of an arm whose axes are arranged like those of a Franka arm.
+/// The geometry of an arm whose axes are arranged like the axes of a Franka arm.
 ///
 /// All computations use the frame of the shoulder. Its origin is the point where the axes of joints
 /// 1 and 2 meet. Its z axis is the axis of joint 1, and its y axis is the axis of joint 2 if joint

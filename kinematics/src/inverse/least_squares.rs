@@ -81,7 +81,7 @@ impl SelectiveInverse {
         let values = self.eigen.eigenvalues.iter();
         values
             .zip(self.eigen.eigenvectors.column_iter())
-            // Rounding can make the smallest ones negative.
+            // Rounding can make the smallest eigenvalues negative.
             .map(|(value, direction)| (value.max(0.0), direction.into_owned()))
     }
 }

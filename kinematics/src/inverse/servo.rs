@@ -1,4 +1,4 @@
-//! Servo steps: one step of the joints toward a moving pose at bounded speeds.
+//! Servo steps. A servo step moves the joints once toward a moving pose, at bounded speeds.
 
 use super::descent::Problem;
 use super::least_squares::SelectiveInverse;
@@ -68,8 +68,8 @@ impl InverseSolver {
     /// too fast, all joints are slowed by the same factor, so that the tip stays on its path.
     ///
     /// # Errors
-    /// If numbers are not finite, speeds or times are not positive, or lists do not have one value
-    /// per joint.
+    /// Fails if numbers are not finite, if speeds or times are not positive, or if lists do not
+    /// have one value per joint.
     pub fn servo(
         &mut self,
         target: &Target,

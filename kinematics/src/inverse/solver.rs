@@ -64,7 +64,7 @@ impl InverseSolver {
     /// * `ranges`: lower and upper end for each joint. The ends may be infinite.
     ///
     /// # Errors
-    /// If there is not one range per joint, or a range contains no value.
+    /// Fails if there is not one range per joint, or if a range contains no value.
     pub fn within(chain: Chain, ranges: Vec<[f64; 2]>) -> Result<Self, Error> {
         let n_joints = chain.n_joints();
         let bounds = Bounds::new(&chain, ranges)?;
@@ -93,7 +93,7 @@ impl InverseSolver {
     /// Sets preferred joint values. Joints that a pose leaves free are moved toward them.
     ///
     /// # Errors
-    /// If there is not one finite value per joint.
+    /// Fails if there is not one finite value per joint.
     pub fn with_posture(mut self, posture: &[f64]) -> Result<Self, Error> {
         self.chain.check(posture)?;
         self.comfort.posture = posture.to_vec();

@@ -93,7 +93,8 @@ fn the_solution_turns_toward_the_seed() {
 fn singular_poses_are_found_from_singular_seeds() {
     let chain = ur5e();
     let mut solver = InverseSolver::new(chain.clone()).unwrap();
-    // The arm is stretched, has parallel wrist axes, and has the wrist above the base.
+    // In the first posture, the arm is stretched. In the second posture, two axes of the wrist are
+    // parallel. In the third posture, the wrist is above the base.
     for joints in [
         [0.0; 6],
         [0.3, -1.2, 1.5, -1.4, 0.0, 0.3],

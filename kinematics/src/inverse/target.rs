@@ -17,12 +17,12 @@ pub struct Target {
 /// poses only if a part is free.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Orientation {
-    /// All of it.
+    /// The complete orientation.
     Full,
     /// The direction of an axis of the tip, in the frame of the tip. The rotation about the axis is
     /// free.
     Axis(Unit<Vector3<f64>>),
-    /// None of it: only the position counts.
+    /// No part of the orientation, so that only the position counts.
     Free,
 }
 
@@ -59,7 +59,7 @@ impl Target {
     }
 
     /// # Errors
-    /// If the pose or the axis contains NaN or infinity.
+    /// Fails if the pose or the axis contains NaN or infinity.
     pub(super) fn check(&self) -> Result<(), Error> {
         let rows = crate::transform::to_rows(&self.base_from_tip);
         if let Some(at) = rows.iter().position(|value| !value.is_finite()) {

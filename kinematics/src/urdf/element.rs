@@ -1,4 +1,4 @@
-//! Elements and attributes of a robot description, and notes about those that are not used.
+//! Elements and attributes of a robot description, and notes about unused elements and attributes.
 
 use crate::Error;
 use roxmltree::{Document, Node, ParsingOptions};
@@ -14,8 +14,8 @@ const MAX_NODES: u32 = 1 << 20;
 /// cube of the number of nested namespaces.
 const MAX_ATTRIBUTES: usize = 2000;
 const MAX_NAMESPACES: usize = 100;
-/// Maximum number of notes. Notes are printed, and a longer list would hide the first ones, whose
-/// problems often cause the others.
+/// Maximum number of notes. Notes are printed, and a longer list would hide the first notes. The
+/// problems in the first notes often cause the others.
 const MAX_NOTES: usize = 100;
 
 /// Repairs two mistakes that the parsers of other programs accept: white space before the XML
@@ -223,7 +223,7 @@ impl<'a> Element<'a> {
 
     pub(crate) fn children(self) -> impl Iterator<Item = Element<'a>> {
         let namespace = self.0.document().root_element().tag_name().namespace();
-        // An element of another namespace, such as that of xacro, has a different meaning.
+        // An element of another namespace, such as the namespace of xacro, has a different meaning.
         self.0
             .children()
             .filter(move |node| node.is_element() && node.tag_name().namespace() == namespace)

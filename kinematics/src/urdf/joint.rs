@@ -37,7 +37,7 @@ const MIN_QUATERNION_NORM: f64 = 1e-6;
 /// because only chains through this joint need it.
 ///
 /// # Errors
-/// If its name or its links are missing.
+/// Fails if the name of the joint or one of its links is missing.
 pub(super) fn read(element: Element<'_>, notes: &mut Notes) -> Result<Joint, Error> {
     let invalid =
         |what: String| move |Problem { line, why }| Error::UrdfElement { line, what, why };

@@ -32,8 +32,8 @@ pub struct Robot {
 }
 
 impl Robot {
-    /// Parses and checks URDF text. Elements that kinematics do not depend on are left out if they
-    /// are invalid; see [`Robot::notes`].
+    /// Parses and checks URDF text. Invalid elements are left out if kinematics do not depend on
+    /// them, see [`Robot::notes`].
     ///
     /// # Errors
     /// Fails if the text is not the XML of a robot, or is larger than [`MAX_BYTES`]. Also fails if
@@ -100,12 +100,12 @@ impl Robot {
         &self.joints
     }
 
-    /// Visual shapes of a link, without invalid ones.
+    /// Valid visual shapes of a link.
     pub fn visuals(&self, link: &str) -> &[Shape] {
         self.shapes.get(link).map_or(&[], |shapes| &shapes.visuals)
     }
 
-    /// Collision shapes of a link, without invalid ones.
+    /// Valid collision shapes of a link.
     pub fn collisions(&self, link: &str) -> &[Shape] {
         self.shapes
             .get(link)
@@ -127,7 +127,7 @@ impl Robot {
         self.joints_by_name.get(name).map(|ix| &self.joints[*ix])
     }
 
-    /// The root link: the ancestor of all other links.
+    /// The root link, which is the ancestor of all other links.
     pub fn root(&self) -> Result<&str, Error> {
         let roots: Vec<&String> = self
             .links

@@ -105,7 +105,7 @@ impl TwinFollower {
         self.model.base_from_flange(&self.position) * flange_from_camera
     }
 
-    /// Advances to a time `step_secs` after the previous one.
+    /// Advances to a time that is `step_secs` after the previous time.
     pub(crate) fn advance(&mut self, secs: f64, step_secs: f64) {
         let desired = self.desired_velocity(secs, Some(step_secs));
         for ix in 0..self.position.len() {

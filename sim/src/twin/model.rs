@@ -26,7 +26,7 @@ const ESTIMATED_HALF_STROKE_M: f64 = 0.25;
 /// Speed of a joint without a speed limit, rad/s. It is also the largest speed of a scan, because
 /// many URDFs state the speed of the motor without its gear.
 const MAX_SPEED_RAD_S: f64 = 1.5;
-/// The same of a prismatic joint, m/s.
+/// Speed of a prismatic joint without a speed limit, and largest speed of a scan, m/s.
 const MAX_SPEED_M_S: f64 = 0.3;
 
 /// A link with the joint above it.

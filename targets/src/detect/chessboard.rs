@@ -13,7 +13,7 @@ use crate::spec::TargetSpec;
 /// pixels. Corners are always refined in the full image.
 const HALVE_ABOVE_PX: usize = 3_000_000;
 /// Number of resolutions that are searched. The ring around saddles has a fixed radius. Squares
-/// must not be smaller than the ring, and their blur must not be much larger than it. Three
+/// must not be smaller than the ring, and their blur must not be much larger than the ring. Three
 /// resolutions cover a factor of four.
 const N_LEVELS: usize = 3;
 /// A row or column belongs to the board if it has at least this fraction of its corners. False
@@ -126,7 +126,7 @@ fn is_complete_and_larger(grid: &Lattice, inner: [u32; 2]) -> bool {
         && grid.corners.len() * 100 >= n * MIN_PERCENT
 }
 
-/// Refines a grid and renumbers its corners as those of the board.
+/// Refines a grid, and gives its corners the numbers of the board's corners.
 fn matching(lattice: &mut Lattice, inner: [u32; 2], plane: &Plane) -> Result<Lattice, NotDetected> {
     // Lines at the edge of the board may have been missed.
     const GROWN_LINES: i32 = 1;

@@ -46,8 +46,8 @@ pub(super) fn marker_size(
         return None;
     };
     let expected_frac = marker_m / square_m;
-    // If the markers are not where the layout says, their distances scatter. The first layout in
-    // which most pairs agree is the right one.
+    // If the markers are not at the places of the layout, their distances scatter. The first layout
+    // in which most pairs agree is the right layout.
     let mut measured = None;
     for layout in layouts(&target.pattern) {
         let mut fracs = neighbor_fracs(&layout, markers, square_m, marker_m);
@@ -262,7 +262,7 @@ pub(super) fn markers(
     // All other dictionaries are tried last, because this takes the longest.
     let others = Dictionary::all().filter(|other| other != dictionary);
     let read = others.map(|other| (read_exactly(plane, quads, &other, false), other));
-    // If several dictionaries are equally good, the first one is used. It is the smallest
+    // If several dictionaries are equally good, the first dictionary is used. It is the smallest
     // dictionary that contains all markers.
     let best = read.reduce(|best, next| {
         if next.0.ids.len() > best.0.ids.len() {

@@ -614,7 +614,7 @@ impl Gpu {
             .unwrap_or_else(|| Error::internal(internal))
     }
 
-    /// The recorded failure, or [`Error::DeviceLost`] if there is none.
+    /// The recorded failure. If there is no recorded failure, it is [`Error::DeviceLost`].
     fn failure(&self) -> Error {
         self.check().err().unwrap_or(Error::DeviceLost)
     }

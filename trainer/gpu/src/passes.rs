@@ -64,7 +64,7 @@ impl Passes {
     ///
     /// # Panics
     ///
-    /// Panics if the names differ from those in the kernel, which is a bug in the caller. The
+    /// Panics if the names differ from the names in the kernel, which is a bug in the caller. The
     /// message lists both.
     pub fn dispatch(
         &mut self,

@@ -85,7 +85,7 @@ impl CellLabels {
         labels
     }
 
-    /// Also keeps the cells around those of large parts.
+    /// Also keeps the cells around the cells of large parts.
     pub(crate) fn keep_around(&mut self, grid: &CellGrid) {
         // The neighbors are taken from a copy. Otherwise, cells that were just added would also add
         // their neighbors.

@@ -82,7 +82,7 @@ pub fn time_steps(
     let since = Instant::now();
     let mut before = None;
     for _ in 0..n_submits {
-        // As in training, encode the next submit while the previous one runs.
+        // As in training, the next submit is encoded while the previous submit runs.
         if let Some(before) = before.replace(timed_field.submit()?) {
             before.finish::<u32>(gpu)?;
         }

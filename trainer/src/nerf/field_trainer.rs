@@ -803,7 +803,7 @@ impl FieldTrainer {
             canvas.n_pixels >= n_pixels && slot.n_rays >= n_rays
         };
         if !self.picture.as_ref().is_some_and(fits) {
-            // The old buffers are freed before the larger ones are allocated.
+            // The old buffers are freed before the larger buffers are allocated.
             self.passes.clear_bindings();
             self.picture = None;
             let samples = SampleBuffers::new(gpu, SAMPLES_PER_ROUND * n_rays)?;
@@ -921,8 +921,8 @@ fn next_rounds(n_rounds: u32, needed: u32, is_complete: bool) -> u32 {
     n_next.min(MAX_ROUNDS)
 }
 
-/// Reproducible random numbers. Each one depends only on seed, stream and index, so they can be
-/// computed in parallel, and in any order.
+/// Reproducible random numbers. Each number depends only on seed, stream and index, so the numbers
+/// can be computed in parallel, and in any order.
 #[derive(Clone, Copy, Debug)]
 struct RandomStream {
     seed: u64,
@@ -1065,8 +1065,8 @@ fn rule(options: &ModelOptions<NerfOptions>, weight_decay: f32) -> AdamRule {
     AdamRule {
         rate: f32_of(options.specific.rate),
         final_rate_frac: f32_of(options.specific.final_rate_frac),
-        // The values are those of Mueller et al. 2022, section 4. Gradients of grid entries are
-        // small and rare, so epsilon must be far below them.
+        // The values are from Mueller et al. 2022, section 4. Gradients of grid entries are small
+        // and rare, so epsilon must be far below them.
         betas: [0.9, 0.99],
         epsilon: 1e-15,
         weight_decay,

@@ -384,7 +384,7 @@ impl Method for NerfModel {
         let Some((_, field_trainer)) = &mut self.field else {
             return Err(no_field());
         };
-        // This waits for the previous submit while the new one runs.
+        // This waits for the previous submit while the new submit runs.
         let batch = field_trainer.submit(&self.gpu);
         self.finish_in_flight()?;
         self.submits.begin(batch, n_steps, since);

@@ -128,7 +128,7 @@ impl Panorama {
             .as_ref()
             .is_none_or(|panorama| panorama.n_pixels < n_pixels)
         {
-            // The old panorama is freed before the larger one is allocated.
+            // The old panorama is freed before the larger panorama is allocated.
             passes.clear_bindings();
             *panorama = None;
             *panorama = Some(Self::new(gpu, n_pixels)?);

@@ -859,7 +859,7 @@ fn camera_params_start_at_zero_and_step_by_their_rate() {
         view_passes.update(&mut passes, &fixture.train.update_with_camera, &rule, true);
         cameras.refine(&view_passes, &mut passes, &fixture.train, &lens);
         passes.submit(gpu);
-        // Phase 1: the view was corrected before the step, with parameters of zero.
+        // Phase 1 checks that the view was corrected before the step, with parameters of zero.
         let corrected: Vec<f32> = gpu.read(&cameras.corrected, 20).unwrap();
         let base = camera_of(&view).view();
         for (ix, (got, expected)) in corrected
@@ -872,7 +872,7 @@ fn camera_params_start_at_zero_and_step_by_their_rate() {
                 "word {ix}: {got}, expected {expected}"
             );
         }
-        // Phase 2: only the lens is enabled among the parameters of the camera.
+        // Phase 2 checks the steps. Among the parameters of the camera, only the lens is enabled.
         let steps: Vec<f64> = cameras.param_values(gpu);
         for (param, step) in steps.iter().enumerate() {
             let rate = if (7..11).contains(&param) { 1e-3 } else { 0.0 };

@@ -69,7 +69,7 @@ mod tests {
     use super::*;
 
     /// Number of keyframes up to the decision, if the keyframes have these log gains and the model
-    /// has none. The picture matches up to 30 dB.
+    /// has no gains. The picture matches up to 30 dB.
     fn n_until_decision(log_gains: impl IntoIterator<Item = f64>) -> Option<usize> {
         let mut arrivals = ArrivalGains::default();
         let is_decided = |log_gain: f64| {

@@ -155,7 +155,7 @@ pub fn time_kernels(
         bench.time(&mut passes, repeats, KernelBench::record_picture)?;
     let (step_millis, step_wall_millis) =
         bench.time(&mut passes, repeats, KernelBench::record_step)?;
-    // Timestamps around every pass slow down a step, so passes are timed in an additional one.
+    // Timestamps around every pass slow down a step, so passes are timed in an additional step.
     bench.record_step(&mut passes)?;
     let mut timings = passes.submit_timed(gpu)?;
     let mut packed_millis = None;
@@ -238,8 +238,8 @@ impl KernelBench {
             supervision: gpu.uniform_with("bench.supervision", &supervision),
             gains: gpu.storage_with("bench.gains", bytemuck::cast_slice(&[1.0f32; 4]))?,
             rule: gpu.uniform_with("bench.rule", &rule()),
-            // There are two rules instead of one that is rewritten, so that no upload is part of
-            // the timing.
+            // There are two rules, because rewriting a single rule would add an upload to the
+            // timing.
             rule_visible: gpu.uniform_with(
                 "bench.rule_touched",
                 &Rule {
@@ -455,7 +455,7 @@ fn camera(size_px: [u32; 2], eye: Eye) -> Camera {
     }
 }
 
-/// Opaque color of a pixel of noise: a hash of its index.
+/// Opaque color of a pixel of noise, which is a hash of its index.
 fn noise_pixel(pixel: u32) -> u32 {
     pixel
         .wrapping_mul(2_654_435_761)

@@ -7,7 +7,7 @@ use gpu::sort::SortBuffers;
 use gpu::{Buffer, Gpu, Passes, PendingRead};
 use model_files::splat::arrays::SplatArrays;
 
-/// Splats per block, consecutive in depth. This constant and the next two equal those of
+/// Splats per block, consecutive in depth. This constant and the next two equal the constants of
 /// shared/bins.wgsl.
 pub(crate) const BLOCK: u32 = 256;
 /// Bins per workgroup.

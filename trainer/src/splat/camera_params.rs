@@ -374,7 +374,7 @@ impl ParamValues {
         } else {
             BTreeMap::new()
         };
-        // The indices are those of `shared/camera_params.wgsl`.
+        // The indices are the same as in `shared/camera_params.wgsl`.
         CameraCorrection {
             rotation_rad: [0, 1, 2].map(camera_value),
             translation_m: [3, 4, 5].map(camera_value),

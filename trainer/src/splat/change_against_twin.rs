@@ -241,7 +241,7 @@ fn growth_matches_the_twin() {
     let n_children = expected.parents.iter().flatten().count();
     assert_eq!(n_children, 204, "the number of dead and new splats");
 
-    // Moments that differ everywhere show which ones are reset.
+    // If all moments differ, the test shows which moments are reset.
     gpu.write(&fixture.splats.error_sums, 0, bytemuck::cast_slice(&errors));
     let n_planes = 6 * growth.capacity as usize;
     let moments: Vec<[f32; 4]> = (0..n_planes)

@@ -111,7 +111,7 @@ impl ModelOptions<SplatOptions> {
 mod tests {
     use super::SplatOptions;
 
-    /// The options that every checkpoint contains. Do not add new ones.
+    /// The options that every checkpoint contains. Do not add new options.
     const REQUIRED: [&str; 12] = [
         "max_splats",
         "count",

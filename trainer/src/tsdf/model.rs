@@ -214,8 +214,8 @@ impl TsdfModel {
         Ok(!self.queue.pending.is_empty())
     }
 
-    /// Fuses one keyframe if none was fused yet, so that there is something to render. Fuses only
-    /// one, because rendering must not train the model.
+    /// Fuses one keyframe if none was fused yet, so that there is something to render. Only one
+    /// keyframe is fused, because rendering must not train the model.
     fn fuse_one(&mut self) -> Result<(), Error> {
         while self.queue.step() == 0 && !self.queue.pending.is_empty() {
             self.step(1)?;
@@ -364,8 +364,8 @@ impl Method for TsdfModel {
             return self.step_with_host_blocks(n);
         }
 
-        // Otherwise, the next submit is recorded while the previous one runs. Keyframes in flight
-        // are still pending, but must not be recorded again.
+        // Otherwise, the next submit is recorded while the previous submit runs. Keyframes in
+        // flight are still pending, but must not be recorded again.
         let n_in_flight =
             usize::try_from(self.fusion.submits.n_steps_in_flight()).expect("few keyframes");
         let n_left = self.queue.pending.len().saturating_sub(n_in_flight) as u64;
@@ -389,7 +389,7 @@ impl Method for TsdfModel {
             .passes
             .submit_reading(&self.gpu, &[(&field.status, 4 * status::LEN)]);
 
-        // This waits for the previous submit while the new one runs. If the previous submit
+        // This waits for the previous submit while the new submit runs. If the previous submit
         // overflowed, the new submit had no effect, and its counters need not be read.
         let failed = self.finish_in_flight()?;
         if !failed {

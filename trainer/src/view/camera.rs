@@ -75,8 +75,8 @@ impl Camera {
         }
     }
 
-    /// The same camera with an image smaller by `2^level`. Leftover rows and columns at the far
-    /// edges are cropped.
+    /// This camera with an image that is smaller by the factor `2^level`. Leftover rows and columns
+    /// at the far edges are cropped.
     pub(crate) fn at_level(&self, level: u32) -> Self {
         let share = 0.5f64.powi(i32::try_from(level).expect("a few levels"));
         Self {

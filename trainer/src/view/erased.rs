@@ -46,7 +46,8 @@ impl ErasedSpace {
         })
     }
 
-    /// The buffer of these edits. Replaces the previous one if the edits or the frame have changed.
+    /// The buffer of these edits. Replaces the previous buffer if the edits or the frame have
+    /// changed.
     ///
     /// * `world_from_drawn`: maps points of the kernel to world, meters.
     pub(crate) fn set(
@@ -86,8 +87,8 @@ fn buffer(gpu: &Gpu, edits: &Edits, world_from_drawn: &Matrix4<f64>) -> Result<B
     )?)
 }
 
-/// The data of shared/erased.wgsl, for kernels whose frame and units differ from those of the
-/// world.
+/// The data of shared/erased.wgsl, for kernels whose frame and units differ from the frame and
+/// units of the world.
 ///
 /// * `world_from_drawn`: maps points of the kernel to world, meters.
 fn words(edits: &Edits, world_from_drawn: &Matrix4<f64>) -> Vec<[u32; 4]> {

@@ -79,7 +79,7 @@ pub struct CalibratedHandEye {
 
 /// The outcome of a hand-eye calibration.
 pub struct HandEyeOutcome {
-    /// The result, or the reason why there is none.
+    /// The result, or the reason why there is no result.
     pub result: anyhow::Result<CalibratedHandEye>,
     source: Source,
     samples: Samples,
@@ -381,7 +381,7 @@ impl HandEyeOutcome {
                 (None, Some(given)) => rig.warn_if_intrinsics_differ(&given)?,
                 (None, None) => (),
             }
-            // The joints of a samples file need not be those of the rig.
+            // The joints of a samples file need not be the joints of the rig.
             match self.source {
                 Source::Scan { .. } => rig.add_joint_offsets(&calibration.joint_offsets),
                 Source::File(_) if !calibration.joint_offsets.is_empty() => {

@@ -283,9 +283,9 @@ fn contradiction(refined: &Refined, scatter_mm: f64) -> Option<Refusal> {
     })
 }
 
-/// Explains the disagreement by lists of robot poses and images that are off by one. This is the
-/// case if pairing each image with the robot pose of the next or the previous sample makes the
-/// samples agree.
+/// Explains the disagreement by a shift of one entry between the lists of robot poses and images.
+/// This is the case if pairing each image with the robot pose of the next or the previous sample
+/// makes the samples agree.
 fn shift_mistake(
     input: &HandEyeInput<'_>,
     samples: &[Sample],
@@ -428,7 +428,7 @@ fn explain_scale(scale: f64, sigma: f64) -> (String, String) {
     }
 }
 
-/// A sentence about positions whose unit differs from that of another body.
+/// A sentence about positions of a body whose unit differs from the unit of another body.
 fn wrong_unit(body: &str, other: &str, unit: &str, per_m: f64) -> String {
     format!(
         "the positions of {body} are {per_m} times too large relative to those of {other}: they are probably in {unit}"

@@ -124,7 +124,7 @@ pub(crate) fn axis_name(axis: &Vector3<f64>, body: &str) -> String {
     if axis[largest].abs() >= CLOSE_RAD.cos() {
         return format!("the {body}'s {} axis", ["x", "y", "z"][largest]);
     }
-    // Adding zero turns a negative zero into a positive one.
+    // Adding zero changes a negative zero to a positive zero.
     let signed = axis.map(|value| (100.0 * value * axis[largest].signum()).round() / 100.0 + 0.0);
     format!(
         "the axis [{:.2}, {:.2}, {:.2}] of the {body}",

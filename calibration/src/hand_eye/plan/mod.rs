@@ -20,7 +20,7 @@ pub struct ArmPlanOptions {
     /// Standard deviation of the position along each axis at which the result is accurate,
     /// millimeters.
     pub goal_mm: f64,
-    /// The same limit for the rotation, degrees.
+    /// Standard deviation of the rotation about each axis at which the result is accurate, degrees.
     pub goal_deg: f64,
 }
 
@@ -90,7 +90,7 @@ pub struct ArmPlan<'a> {
 impl<'a> ArmPlan<'a> {
     /// Plans motions around the configuration at which the target is seen.
     ///
-    /// * `poses`: the board's size and the visibility limits for [`suggest_next_poses`]; `n_poses`,
+    /// * `poses`: the board's size and the visibility limits for [`suggest_next_poses`]. `n_poses`,
     ///   `reach` and `seed` are ignored.
     pub fn new(
         reach: &Reach<'a>,
@@ -135,7 +135,7 @@ impl<'a> ArmPlan<'a> {
     /// The next step.
     ///
     /// * `input`: the samples so far.
-    /// * `estimate`: the calibration from these samples, or the reason why there is none.
+    /// * `estimate`: the calibration from these samples, or the reason why there is no calibration.
     /// * `current`: the current joint values, in the order of the chain.
     pub fn next(
         &mut self,
@@ -398,7 +398,7 @@ mod tests {
             goal_mm: 0.3,
             goal_deg: 0.05,
         };
-        // A given pose that is wrong by 4 degrees and 30 mm, and one that is useless.
+        // One given pose is wrong by 4 degrees and 30 mm, and another given pose is useless.
         let wrong = Transform::new(
             Vector3::new(0.02, -0.02, 0.01),
             Vector3::new(0.04, 0.05, -0.03),

@@ -161,8 +161,8 @@ pub fn suggest_next_poses(
     };
     let candidates = scene.candidates();
     let mut suggested: Vec<NextPose> = Vec::new();
-    // Poses are selected greedily: first the best pose, then the best pose given the first one, and
-    // so on. Comparing all sets of poses would take far longer.
+    // Poses are selected greedily. The best pose comes first, then the pose that is best together
+    // with the first pose, and so on. Comparing all sets of poses would take far longer.
     for _ in 0..options.n_poses {
         let Some(before) = log_volume(&information) else {
             break;
@@ -298,7 +298,7 @@ impl Scene<'_> {
             .map(|sum| sum / n)
     }
 
-    /// A random pose near that of a sample.
+    /// A random pose near the pose of a sample.
     fn moved(
         &self,
         sample_ix: usize,
@@ -423,7 +423,7 @@ impl Scene<'_> {
             Setup::EyeInHand => x.rotation.inverse() * old_from_new.translation.vector,
             Setup::EyeToHand => old_from_new.translation.vector,
         };
-        // Adding zero turns a negative zero into a positive one.
+        // Adding zero changes a negative zero to a positive zero.
         let [right, down, forward]: [f64; 3] =
             moved.map(|meters| (1e3 * meters).round() + 0.0).into();
         let relation = format!(

@@ -118,7 +118,7 @@ impl CornerStatistics {
 pub(crate) struct Sorted {
     /// Samples with candidates.
     pub(crate) usable: Vec<Sample>,
-    /// Indices of samples that are identical to an earlier one. They contain no further
+    /// Indices of samples that are identical to an earlier sample. They contain no further
     /// information.
     pub(crate) repeated: Vec<usize>,
 }

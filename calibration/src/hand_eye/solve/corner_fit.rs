@@ -148,8 +148,8 @@ impl CornerProblem<'_> {
         let Some(chain) = self.chain else {
             return Some((view.base_from_flange, Vec::new()));
         };
-        // The reported pose may differ from that of the chain's tip, because a tool frame may be
-        // set in the controller. This difference is kept.
+        // The reported pose may differ from the pose of the chain's tip, because a tool frame may
+        // be set in the controller. This difference is kept.
         let corrected = corrected_joints(&view.joints, offsets);
         let tip_from_flange = chain.forward(&view.joints).ok()?.inverse() * view.base_from_flange;
         let twists = chain.tip_twists_by_joint(&corrected).ok()?;
@@ -374,7 +374,7 @@ impl PointChain {
                 )
             }
         };
-        // `x` moves in the axes of the camera, and `y` in the axes of the board; see
+        // `x` moves in the axes of the camera, and `y` moves in the axes of the board, see
         // `Solution::moved`. A motion of the camera moves the point in the opposite direction.
         let mut by_solution = SMatrix::<f64, 3, 12>::zeros();
         let camera_from_board = camera_from_y * matrix(self.y.rotation);
@@ -397,7 +397,7 @@ impl PointChain {
     }
 }
 
-/// The columns of a rotation, then those of a translation.
+/// The columns of a rotation, then the columns of a translation.
 fn joined(rotation: Matrix3<f64>, translation: Matrix3<f64>) -> SMatrix<f64, 3, 6> {
     let mut both = SMatrix::<f64, 3, 6>::zeros();
     both.fixed_view_mut::<3, 3>(0, 0).copy_from(&rotation);
@@ -521,7 +521,7 @@ fn squared_change(
     Some(change.dot(&total.cholesky()?.solve(&change)))
 }
 
-/// The changes of focal length and principal point, the larger one first.
+/// The changes of focal length and principal point, the larger change first.
 fn change_of_intrinsics(given: &Intrinsics, free: &Intrinsics) -> String {
     let largest = |a: [f64; 2], b: [f64; 2]| f64::max((a[0] - b[0]).abs(), (a[1] - b[1]).abs());
     let [x, y] = [0, 1].map(|axis| free.principal_px[axis] - given.principal_px[axis]);

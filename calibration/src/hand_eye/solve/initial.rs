@@ -49,8 +49,9 @@ impl Consensus {
     }
 }
 
-/// Number of samples whose agreement decides. For solutions of `p = 3` samples, the value `(n + p + 1)
-/// / 2` tolerates the largest number of wrong samples (Rousseeuw 1984).
+/// Number of samples whose agreement is compared between solutions. For solutions of `p = 3`
+/// samples, the value `(n + p + 1) / 2` tolerates the largest number of wrong samples (Rousseeuw
+/// 1984).
 fn n_deciding(n: usize) -> usize {
     (n + 4).div_ceil(2).min(n)
 }
@@ -81,7 +82,7 @@ impl Metric {
     }
 }
 
-/// The best solution found. `None` if no three samples determine one.
+/// The best solution found. `None` if no three samples determine a solution.
 pub(crate) fn consensus(samples: &[Sample]) -> Option<Consensus> {
     /// If two fifths of the samples are wrong, this number of trials draws three good samples with
     /// a probability of 99 %. Each draw must also select the right one of the four poses of each

@@ -242,7 +242,7 @@ fn reject_and_fit(
     let mut n_rounds = 0;
     loop {
         n_rounds += 1;
-        // If only a minority agrees, another group of samples may be the right one.
+        // If only a minority agrees, another group of samples may be right.
         let n_used = used(samples).count();
         if 2 * n_used < samples.len() || samples::n_stops(samples) < MIN_SAMPLES {
             let refusal = Refusal::new(

@@ -91,7 +91,7 @@ impl LensCoverage {
     }
 
     /// The goal that a photograph would help to reach. `None` if it would add nothing. A photograph
-    /// that looks like an earlier one adds nothing.
+    /// that looks like an earlier photograph adds nothing.
     pub fn value_of(&self, view: &BoardView) -> Option<CoverageGoal> {
         let shape = ViewShape::of(view, &self.intrinsics);
         if self.shapes.iter().any(|other| !shape.differs_from(other)) {

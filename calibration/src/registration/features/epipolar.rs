@@ -105,7 +105,7 @@ pub(super) struct PairMatches {
 }
 
 impl PairMatches {
-    /// Pose of the first camera in the frame of the second one.
+    /// Pose of the first camera in the frame of the second camera.
     fn to_from_from(&self, cameras: &[MovingCamera]) -> Transform {
         cameras[self.pair.to].world_from_camera.inverse()
             * cameras[self.pair.from].world_from_camera

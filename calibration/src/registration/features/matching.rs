@@ -35,7 +35,7 @@ pub(super) fn essential(rotation: &Matrix3<f64>, translation_m: &Vector3<f64>) -
     translation_m.cross_matrix() * rotation
 }
 
-/// Matches corners of one image with those of another.
+/// Matches corners of one image with corners of another image.
 ///
 /// * `cameras`: approximate poses of the two images.
 /// * `tolerance_rad`: maximum distance of a match from its epipolar line.
@@ -82,7 +82,7 @@ pub(super) fn matches(
                 best_of_to[other_ix] = (correlation, ix);
             }
         }
-        // If several are equal, the first one is taken.
+        // If several matches are equal, the first match is used.
         let Some(best) = candidates
             .iter()
             .copied()
@@ -120,8 +120,8 @@ pub(super) fn matches(
     matches
 }
 
-/// Cosine and sine of the angle from the axes of the second image at a ray to those of the first
-/// image.
+/// Cosine and sine of the angle, at a ray, from the axes of the second image to the axes of the
+/// first image.
 fn roll(to_from_from: &Matrix3<f64>, ray: &Vector2<f64>) -> Option<[f64; 2]> {
     // The axes of the first image as seen in the second image are derivatives of the projection.
     let project = |axis: Vector3<f64>| axis.xy() - ray * axis.z;

@@ -43,7 +43,8 @@ const SCALE: f64 = 2.0;
 /// may be less accurate than the given extrinsics.
 const MIN_IMAGES_PER_CAMERA: usize = 10;
 
-/// Minimum gain in cross-validation, dB. Errors of single poses also cause gains, but smaller ones.
+/// Minimum gain in cross-validation, dB. Errors of single poses also cause gains, but these gains
+/// are smaller.
 const MIN_GAIN_DB: f64 = 0.1;
 
 /// Minimum gain that a variant must reach with the matches of the baseline before it is tried with

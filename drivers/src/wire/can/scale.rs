@@ -56,7 +56,8 @@ impl Scale {
         let unit_interval =
             (value.clamp(self.lower, self.upper) - self.lower) / (self.upper - self.lower);
         // `ceil(x - 0.5)` rounds halves down. The largest integer is odd, so 0 of a symmetric range
-        // is half of it, rounded down. The sources truncate it to the same integer.
+        // is encoded as half of the largest integer, rounded down. The sources truncate it to the
+        // same integer.
         Ok((unit_interval * self.max_raw() - 0.5)
             .ceil()
             .clamp(0.0, self.max_raw()) as u16)

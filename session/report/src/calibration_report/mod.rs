@@ -19,7 +19,7 @@ pub use time_offset::TimeOffsetReport;
 /// Heading of every report.
 #[derive(Clone, Debug)]
 pub struct Heading {
-    /// The input: a folder or file.
+    /// The input, which is a folder or file.
     pub input: String,
     /// Date and time in UTC, for readers.
     pub utc: String,

@@ -83,7 +83,7 @@ fn check_box(
 #[serde(try_from = "Vec<StoredEdit>", into = "Vec<StoredEdit>")]
 pub struct Edits {
     made: Vec<Edit>,
-    /// The edit that was undone last is the last one.
+    /// The edit that was undone last is at the end.
     undone: Vec<Edit>,
 }
 
@@ -124,7 +124,7 @@ impl Edits {
     ///
     /// # Errors
     ///
-    /// Fails if there is none.
+    /// Fails if there is no edit.
     pub fn undo(&mut self) -> Result<(), Error> {
         let edit = self.made.pop().ok_or(Error::NothingToUndo)?;
         self.undone.push(edit);

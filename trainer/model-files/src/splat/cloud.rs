@@ -1,4 +1,5 @@
-//! Splats for kernel benchmarks: a synthetic cloud, or a file written by a peer implementation.
+//! Splats for kernel benchmarks. They are a synthetic cloud, or come from a file of a peer
+//! implementation.
 
 use crate::Error;
 use crate::splat::arrays::SplatArrays;
@@ -89,8 +90,8 @@ pub fn scan_cloud(n_splats: usize, seed: u64) -> SplatArrays {
         ..SplatArrays::default()
     };
     for splat_ix in 0..n_splats {
-        // The random number is drawn for every splat, even for huge ones, so that their number does
-        // not change the others.
+        // The random number is drawn for every splat, even for huge splats, so that the number of
+        // huge splats does not change the other splats.
         let kind = random.unit();
         let (xy_m, size_m, depth_m) = if splat_ix < N_HUGE {
             ([0.2 * random.normal(), 0.2 * random.normal()], 3.0, 0.0)

@@ -161,8 +161,8 @@ fn sh_range(splats: &SplatArrays, members: &[u32], functions: Range<usize>) -> f
     f32_of(largest.min(MAX_SH_DEVIATIONS * rms))
 }
 
-/// Red, green and blue of a basis function after the constant one. They are zero if the splats have
-/// no such function.
+/// Red, green and blue of a basis function after the constant function. They are zero if the splats
+/// have no such function.
 fn higher_coefficient(splats: &SplatArrays, splat_ix: u32, function: usize) -> [f64; 3] {
     let n_coefficients = splats.n_coefficients();
     let is_present = function + 1 < n_coefficients;

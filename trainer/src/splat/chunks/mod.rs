@@ -94,7 +94,7 @@ fn encoded(
 ) -> (Content, ModelChunk) {
     let sums = sums(splats, cell, members);
     let mut members: Vec<u32> = members.iter().map(|(_, splat_ix)| *splat_ix).collect();
-    // The most visible splats come first, because the coarse form consists of the first ones.
+    // The most visible splats come first, because the coarse form consists of the first splats.
     members.sort_by(|a, b| area(splats, *b).total_cmp(&area(splats, *a)));
     let fine = encode(splats, &members, 1.0, splats.sh_degree);
     // A hash is stored instead of the bytes, because the bytes would double the memory of the

@@ -145,7 +145,7 @@ pub(crate) struct Grown {
     pub(crate) margin: f64,
 }
 
-/// Replaces dead splats and creates new ones as children of parents that are chosen by error. A
+/// Replaces dead splats and creates new splats, as children of parents that are chosen by error. A
 /// child gets a position within its parent and a share of its parent's opacity.
 pub(crate) fn grow(splats: &[Splat], errors: &[f64], growth: &Growth) -> Grown {
     // Dead splats are replaced, so they cannot be parents.

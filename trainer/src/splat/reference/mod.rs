@@ -116,7 +116,7 @@ pub struct Projected {
     /// Depth of the center along the camera's z axis, meters.
     pub depth: f64,
     /// Half width and height of the bounding box around `mean_px`, pixels. The splat contributes
-    /// nothing outside of it.
+    /// nothing outside of this box.
     pub extent_px: [f64; 2],
 }
 
@@ -190,7 +190,8 @@ pub fn render_backward(view: &View, splats: &[Splat], upstream: &Upstream) -> Re
 }
 
 fn project_decided(view: &View, splats: &[Splat], decisions: &Decisions) -> Vec<Projected> {
-    // Invisible splats keep their position in the list, so that indices stay those of the splats.
+    // Invisible splats keep their position in the list, so that indices remain the indices of the
+    // splats.
     let project_one = |(splat, row_share): (&Splat, &Option<f64>)| {
         row_share
             .map(|row_share| project::project_at(view, splat, row_share))

@@ -72,7 +72,7 @@ struct InitialGains {
     known: LogGains,
     /// The mean gains, to which the initial values are relative.
     mean: [f64; 3],
-    /// The first view to initialize, besides those in `known`.
+    /// The first view to initialize, besides the views in `known`.
     first_ix: usize,
 }
 

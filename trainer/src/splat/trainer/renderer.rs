@@ -462,7 +462,7 @@ pub(super) fn write_n_splats(gpu: &Gpu, status: &Buffer, n_splats: u32) {
 
 /// Clears the failure flag and the requested buffer sizes.
 pub(super) fn clear_failure(gpu: &Gpu, status: &Buffer) {
-    // Three adjacent words: the flag and the two needs.
+    // This clears three adjacent words, which are the flag and the two required sizes.
     gpu.write(status, 4 * status::FAILED as u64, &[0; 12]);
 }
 

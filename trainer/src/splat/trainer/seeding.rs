@@ -87,8 +87,8 @@ impl Seeding {
         if arrived.is_empty() {
             return None;
         }
-        // All views are used, not only the new ones, because the learning rate must fit the whole
-        // scene.
+        // All views are used and not only the new views, because the learning rate must fit the
+        // whole scene.
         self.scene.size_m = scene_size_m(views);
         let discs = self.scene.seeder.discs(&arrived, self.density);
         self.unseeded.extend(

@@ -163,7 +163,8 @@ impl Training {
         }
         let counters = self.optimizer.submit(&mut self.recorder);
         self.schedule.step += n_steps;
-        // This waits for the previous submit while the new one runs, so that the GPU never idles.
+        // This waits for the previous submit while the new submit runs, so that the GPU never
+        // idles.
         let failed = self.finish_in_flight()?;
         // After a failure, the failure flag also turns this submit into a no-op. Its steps are
         // repeated, so its counters are not needed.
@@ -388,8 +389,8 @@ impl Training {
         self.model.splats.read(&self.recorder.gpu)
     }
 
-    /// Current corrections of each camera, including those of a running trial. They apply to
-    /// keyframes that alignment has already corrected.
+    /// Current corrections of each camera, including the corrections of a running trial. They apply
+    /// to keyframes that alignment has already corrected.
     pub(super) fn learned_corrections(&self) -> Result<BTreeMap<String, CameraCorrection>, Error> {
         let cameras = &self.model.cameras;
         if cameras.set.is_empty() {
@@ -442,7 +443,7 @@ struct SkippedSteps {
 }
 
 impl SkippedSteps {
-    /// Adds a step. Returns the number of consecutive skipped steps up to this one.
+    /// Adds a step. Returns the number of consecutive skipped steps up to this step.
     fn add(&mut self, step: u64) -> u64 {
         // This is logged once per run of skipped steps, because the number is at least 1 after the
         // first skipped step.

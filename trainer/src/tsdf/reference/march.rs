@@ -1,11 +1,11 @@
-//! Twin of `march_cubes`: the triangles of one block.
+//! Twin of `march_cubes`, which extracts the triangles of one block.
 
 use crate::tsdf::block::{BLOCK_EDGE, Block, Blocks, GridCoord, voxel_ix};
 use crate::tsdf::mesh::CASES;
 use nalgebra::Vector3;
 use std::collections::HashMap;
 
-/// Color of voxels without one.
+/// Color of voxels without a color.
 const GRAY: f64 = 0.5;
 
 /// A vertex of a block's triangles.

@@ -107,7 +107,7 @@ impl Header {
         self.version == 2
     }
 
-    /// Color coefficients per splat and channel without the constant one.
+    /// Number of color coefficients per splat and channel, without the constant coefficient.
     pub(super) fn n_higher_coefficients(&self) -> usize {
         (self.sh_degree as usize + 1).pow(2) - 1
     }
