@@ -161,7 +161,7 @@ pub(crate) struct RunningTrial {
 pub(crate) struct SecondHalf {
     /// The state to restore.
     pub(crate) from: Snapshot,
-    /// The change that the trial tests.
+    /// The change to apply to the restored state.
     pub(crate) candidate: Candidate,
     /// Keyframes to remove, because the second half adds them again.
     pub(crate) arrived: Vec<Arc<Keyframe>>,

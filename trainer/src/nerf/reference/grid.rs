@@ -59,7 +59,7 @@ impl GridShape {
     pub fn entry(&self, level: usize, corner: [u32; 3]) -> u32 {
         let side = self.n_cells[level] + 1;
         let [x, y, z] = corner;
-        // The primes of Mueller et al. 2022, equation 4. The first prime is replaced by 1.
+        // The primes of Mueller et al. 2022, equation 4. The first factor is 1.
         let is_dense = u64::from(side).pow(3) <= 1u64 << self.log2_entries;
         let offset = if is_dense {
             x + side * (y + side * z)
