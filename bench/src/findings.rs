@@ -55,7 +55,7 @@ impl Findings {
     ///
     /// # Errors
     ///
-    /// If a file cannot be written.
+    /// Fails if a file cannot be written.
     pub fn write(&self, folder: &Path) -> Result<PathBuf> {
         // The numbers are written first, because they are the only part that cannot be recreated
         // from another part.

@@ -243,7 +243,7 @@ impl NamedData {
     ///
     /// # Errors
     ///
-    /// If there are several methods.
+    /// Fails if there are several methods.
     pub(crate) fn single_model_spec(&self) -> Result<&ModelSpec> {
         match &self.model_specs[..] {
             [one] => Ok(one),

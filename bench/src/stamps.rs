@@ -93,7 +93,7 @@ pub fn run(options: &StampsOptions) -> Result<BenchResult> {
 ///
 /// # Errors
 ///
-/// If an option is out of range.
+/// Fails if an option is out of range.
 pub fn measure(options: &StampsOptions) -> Result<Vec<StampErrors>> {
     check(options)?;
     let mut results = Vec::new();

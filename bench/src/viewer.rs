@@ -94,7 +94,7 @@ impl Viewer {
     ///
     /// # Errors
     ///
-    /// If the server does not accept the connection.
+    /// Fails if the server does not accept the connection.
     pub fn connect(address: SocketAddr, options: ViewerOptions) -> Result<Self> {
         let stream =
             TcpStream::connect(address).with_context(|| format!("cannot connect to {address}"))?;

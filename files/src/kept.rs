@@ -16,9 +16,9 @@ pub struct Kept {
 /// Where a kept file or folder is now.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum Place {
-    /// At its path.
+    /// The file or folder is at its original path.
     Here,
-    /// At this path.
+    /// The file or folder is at this other path.
     MovedTo(PathBuf),
     /// Removed, or moved to an unknown place.
     Removed,

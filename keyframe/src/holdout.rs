@@ -25,7 +25,7 @@ impl Holdout {
     ///
     /// # Errors
     ///
-    /// If the file cannot be read or contains no name.
+    /// Fails if the file cannot be read or contains no name.
     pub fn from_list(path: &Path) -> Result<Self, Error> {
         let text = files::read_text(path).map_err(|error| Error::Read {
             path: path.to_owned(),
@@ -54,7 +54,7 @@ impl Holdout {
     ///
     /// # Errors
     ///
-    /// If a name matches no photo.
+    /// Fails if a name matches no photo.
     pub fn splits(&self, names: &[&str]) -> Result<Vec<Split>, Error> {
         match self {
             Self::Every(every) => Ok((0..names.len()).map(|ix| every_nth(ix, *every)).collect()),

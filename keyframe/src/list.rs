@@ -57,7 +57,7 @@ impl KeyframeList {
     ///
     /// # Errors
     ///
-    /// If no listed keyframe is in the data.
+    /// Fails if no listed keyframe is in the data.
     pub fn check_found<'a>(
         &self,
         found: impl Iterator<Item = (&'a str, Stamp)>,

@@ -36,7 +36,7 @@ impl Intrinsics {
     /// These intrinsics with other parameters, in the order of [`Intrinsics::params`].
     ///
     /// # Panics
-    /// If the number of parameters differs.
+    /// Panics if `params` has another length than [`Intrinsics::params`].
     #[must_use]
     pub fn with_params(&self, params: &[f64]) -> Self {
         assert_eq!(params.len(), self.params().len(), "one value per parameter");

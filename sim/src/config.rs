@@ -290,8 +290,8 @@ impl Default for SensorConfig {
     }
 }
 
-/// Imperfections and limits of depth images, which have the stamp of the color image and a global
-/// shutter.
+/// Imperfections and limits of depth images. A depth image has the stamp of the color image. All
+/// its pixels are exposed at the same time.
 #[derive(Clone, Debug, PartialEq)]
 pub struct DepthConfig {
     /// Factor that must be applied to the readings to get the true depth.
@@ -475,7 +475,7 @@ impl Config {
 
     fn check_joints(&self) -> Result<(), Error> {
         let expected = match &self.robot {
-            // The robot description has as many joints as it has.
+            // A robot description may have any number of joints.
             Some(_) => self.joint_names.len(),
             None if self.scene.has_arm() => N_JOINTS,
             None => 0,
@@ -641,7 +641,7 @@ impl CameraConfig {
             1.0,
             64.0,
         )?;
-        // So does a readout.
+        // The readout must also fit between two images.
         check(
             &self.name,
             "readout_micros",

@@ -36,7 +36,7 @@ impl RobotMasks {
     ///
     /// # Errors
     ///
-    /// If OpenGL cannot be used, or the scene is invalid.
+    /// Fails if OpenGL cannot be used, or the scene is invalid.
     pub fn open(scene: Scene, largest_px: [u32; 2]) -> Result<Self, Error> {
         let config = Config {
             scene,
@@ -59,7 +59,7 @@ impl RobotMasks {
     ///
     /// # Errors
     ///
-    /// If the arm has another number of joints.
+    /// Fails if the arm has another number of joints.
     pub fn mask(
         &mut self,
         view: &PinholeView,

@@ -31,7 +31,7 @@ const BIT_Y: [usize; 36] = [
 /// white.
 ///
 /// # Panics
-/// When the id is 6 or more.
+/// Panics if the id is 6 or more.
 pub fn cells(id: usize) -> [[bool; N_CELLS]; N_CELLS] {
     let last = N_CELLS - 1;
     let mut cells = [[false; N_CELLS]; N_CELLS];

@@ -186,7 +186,7 @@ fn predicts(layout: &Layout, from: &Marker, to: &Marker) -> bool {
         return false;
     };
     let to_m = centered(&layout.corners_m[to.id as usize]);
-    // From the diagonal.
+    // The side is the diagonal divided by the square root of 2.
     let side_px = distance(to.corners_px[0], to.corners_px[2]) / 2_f64.sqrt();
     // Farther markers are predicted less accurately, in particular through a fisheye lens.
     let steps =

@@ -17,7 +17,7 @@ pub(crate) struct LensDevices {
 /// Opens a camera of a rig, and the arm if it carries the camera.
 ///
 /// # Errors
-/// If a device cannot be opened.
+/// Fails if a device cannot be opened.
 pub(crate) fn open(rig: Rig, camera: &str, devices: Devices) -> anyhow::Result<LensDevices> {
     let is_carried = is_carried(&rig, camera);
     // One simulation moves all devices.

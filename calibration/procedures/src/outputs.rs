@@ -144,7 +144,7 @@ impl RigOptions {
         }))
     }
 
-    /// The camera with the given name. Without a name, the only camera.
+    /// The camera with the given name. If no name is given, the rig's only camera is returned.
     pub(crate) fn camera_of<'a>(&self, rig: &'a Rig) -> anyhow::Result<&'a Camera> {
         match (&self.camera, &rig.cameras[..]) {
             (Some(name), _) => corrected_rig::camera(rig, name),

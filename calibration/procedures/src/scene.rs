@@ -61,7 +61,8 @@ impl SceneTask {
     /// Fails if the options contradict each other, or if the data cannot be read or are not
     /// sufficient.
     pub fn run(&self, host: &dyn Host) -> anyhow::Result<SceneOutcome> {
-        // `auto` chooses the parameters itself, so a list contradicts it.
+        // With `auto`, the calibration chooses the parameters, so `auto` cannot be combined with a
+        // list.
         if self.params.len() > 1 && self.params.contains(&Refine::Auto) {
             return Err(BadInput(format!(
                 "{}: auto cannot be combined with other values",
@@ -69,10 +70,11 @@ impl SceneTask {
             ))
             .into());
         }
-        // The paths are checked first, so that a wrong path does not cost a calibration.
+        // The paths are checked first, because a wrong path would otherwise fail only after the
+        // long calibration.
         self.report.as_ref().map_or(Ok(()), ReportOptions::check)?;
         let given = self.rig_as_given()?;
-        // Checked before data is read, which may take long.
+        // The rig file is checked before data is read, because reading may take long.
         if let Some(file) = &self.write_rig {
             let Some(rig) = &given else {
                 let input = self.input.display();

@@ -127,9 +127,10 @@ pub const MIN_SAMPLES: usize = 3;
 /// Estimates the pose of the camera on the flange (eye in hand) or in the base (eye to hand). Also
 /// estimates the pose of the board.
 ///
-/// # Errors Returns [`Error::Refused`] if the samples do not determine the result or contain a
-/// mistake. The message names the reason and the remedy. Returns [`Error::HandEyeInput`] if the
-/// input is invalid.
+/// # Errors
+/// Returns [`Error::Refused`] if the samples do not determine the result or contain a mistake. The
+/// message names the reason and the remedy. Returns [`Error::HandEyeInput`] if the input is
+/// invalid.
 ///
 /// ```
 /// use calibration::hand_eye::{BoardObservation, HandEyeInput, HandEyeOptions, HandEyeSample, Setup, calibrate_hand_eye};

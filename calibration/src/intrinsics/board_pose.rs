@@ -41,7 +41,8 @@ pub fn board_pose(intrinsics: &Intrinsics, points: &[BoardPoint]) -> Option<Boar
 
 /// The pose of the homography from the target to the plane `z = 1`.
 pub(super) fn initial_pose(intrinsics: &Intrinsics, points: &[BoardPoint]) -> Option<Transform> {
-    /// 68 degrees from the optical axis.
+    /// Maximum distance of a point from the optical axis in the plane `z = 1`. It corresponds to an
+    /// angle of 68 degrees from the axis.
     const MAX_RADIUS: f64 = 2.5;
     /// A homography needs at least four points. Twice this number is required, so that a few wrong
     /// points do not spoil the initial pose.
@@ -130,7 +131,8 @@ pub(super) fn refine(
     initial: Transform,
 ) -> Option<BoardPose> {
     const MAX_STEPS: usize = 30;
-    // Of the squared error.
+    // The iteration ends when the decrease of the squared error is at most this fraction of the
+    // squared error.
     const CONVERGED: f64 = 1e-9;
     let mut at = NormalEquations::new(intrinsics, points, &initial)?;
     let mut pose = initial;

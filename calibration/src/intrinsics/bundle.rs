@@ -52,7 +52,8 @@ impl Bundle {
 /// * `images`: points of each image, in the order of the poses.
 /// * `tolerance`: see [`Options::tolerance`].
 ///
-/// # Errors Fails as [`least_squares::minimize`] does.
+/// # Errors
+/// Fails as [`least_squares::minimize`] does.
 pub(super) fn refine(
     images: &[&[BoardPoint]],
     start: Bundle,

@@ -162,7 +162,8 @@ struct Evaluation<S> {
 }
 
 impl<S: Clone> Evaluation<S> {
-    /// # Errors Returns the block with a residual that is not defined.
+    /// # Errors
+    /// Returns the block with a residual that is not defined.
     fn new<P: Problem<State = S>>(problem: &P, state: S, loss: Loss) -> Result<Self, usize> {
         let n_shared = problem.scales().len();
         let mut blocks = Vec::with_capacity(problem.n_blocks());

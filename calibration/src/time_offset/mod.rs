@@ -97,7 +97,8 @@ pub struct BodyTransform {
 /// The streams may have different rates, gaps, outliers and clocks with different zeros, but must
 /// overlap in time.
 ///
-/// # Errors Returns [`Error::Refused`] if the motion does not determine the offset, and
+/// # Errors
+/// Returns [`Error::Refused`] if the motion does not determine the offset, and
 /// [`Error::TimeOffsetInput`] if a stream is invalid.
 ///
 /// ```
@@ -225,7 +226,8 @@ fn estimate(
 
 /// The refined offset with the smallest residuals, and the offset from which it started.
 ///
-/// # Errors Fails if no offset fits, or if another offset fits equally well.
+/// # Errors
+/// Fails if no offset fits, or if another offset fits equally well.
 fn refine_best(
     interpolated: &Stream,
     points: &Stream,

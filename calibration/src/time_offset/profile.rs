@@ -19,7 +19,8 @@ pub struct MotionProfile {
 /// The rotation rates that [`super::estimate_time_offset`] compares. They are available even if the
 /// estimate is refused.
 ///
-/// # Errors Returns [`Error::TimeOffsetInput`] if a stream is invalid.
+/// # Errors
+/// Returns [`Error::TimeOffsetInput`] if a stream is invalid.
 pub fn motion_profile(
     a: &[PoseSample],
     b: &[PoseSample],

@@ -148,7 +148,7 @@ impl Recorder {
     /// Writes the index for viewers, completes the file, and returns the recorded span.
     ///
     /// # Errors
-    /// If some data could not be written.
+    /// Fails if some data could not be written.
     pub fn finish(mut self) -> Result<RecordedSpan, Error> {
         let closed = self
             .close_chunk()

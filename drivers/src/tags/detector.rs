@@ -83,7 +83,7 @@ impl TagDetector {
     /// Starts the thread, which ends when this value is dropped.
     ///
     /// # Errors
-    /// If the thread cannot be started.
+    /// Fails if the thread cannot be started.
     pub fn start(family: Family) -> Result<Self, Error> {
         // The channel has a capacity of 0, so a busy thread accepts no images.
         let (images, incoming) = sync_channel(0);

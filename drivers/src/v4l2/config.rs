@@ -34,7 +34,7 @@ pub struct Config {
 /// Tests use it to provoke faults.
 ///
 /// # Errors
-/// If the kernel rejects the value.
+/// Fails if the kernel rejects the value.
 pub fn set_control(node: &Path, id: u32, value: i32) -> std::io::Result<()> {
     Ok(device::Device::open(node)?.set_control(id, value)?)
 }

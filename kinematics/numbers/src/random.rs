@@ -52,7 +52,7 @@ impl Random {
     /// A number in `0..bound`. All numbers are equally likely up to a factor of `1 + bound / 2^64`.
     ///
     /// # Panics
-    /// If `bound` is 0.
+    /// Panics if `bound` is 0.
     pub fn below(&mut self, bound: usize) -> usize {
         // The bias of the modulo is accepted. If values were rejected, the number of draws, and
         // thus all later numbers, would depend on the values.

@@ -52,7 +52,7 @@ impl InverseSolver {
     /// A solver within the joint ranges of the URDF.
     ///
     /// # Errors
-    /// If a range contains no value.
+    /// Fails if a range contains no value.
     pub fn new(chain: Chain) -> Result<Self, Error> {
         let limits = chain.limits().iter();
         let ranges = limits.map(|limit| [limit.lower, limit.upper]).collect();

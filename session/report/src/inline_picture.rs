@@ -25,7 +25,7 @@ pub fn fit_size(size_px: [u32; 2], max_side_px: u32) -> [u32; 2] {
 /// * `rgb`: three bytes per pixel, row by row.
 ///
 /// # Errors
-/// If the picture cannot be encoded.
+/// Fails if the picture cannot be encoded.
 pub fn data_uri(rgb: &[u8], [width, height]: [u32; 2], quality: u8) -> anyhow::Result<String> {
     let mut bytes = Vec::new();
     let mut encoder = JpegEncoder::new_with_quality(&mut bytes, quality);

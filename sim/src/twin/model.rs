@@ -47,7 +47,7 @@ pub(crate) struct LinkNode {
 pub(crate) struct LinkMotion {
     /// Axis in the frame of the link.
     pub(crate) axis: Vector3<f64>,
-    /// Whether the link slides along the axis. Otherwise, it rotates about it.
+    /// Whether the link slides along the axis. If not, the link rotates about the axis.
     pub(crate) is_prismatic: bool,
     source: MotionSource,
 }

@@ -75,7 +75,7 @@ const MIN_SLOWDOWN: f64 = 0.02;
 ///
 /// # Errors
 ///
-/// If a camera cannot see the table.
+/// Fails if a camera cannot see the table.
 pub(crate) fn plan(config: &Config, robot: &PlacedRobot<'_>) -> Result<TablePlan, Error> {
     let n_joints = robot.model.n_joints();
     let on_flange = config

@@ -274,7 +274,7 @@ pub(crate) struct FieldPipelines {
     pub(crate) picture_densities: Pipeline,
     pub(crate) picture_colors: Pipeline,
     pub(crate) forward: Pipeline,
-    /// Only with f16 cooperative matrices.
+    /// `None` if the GPU has no cooperative matrices of f16.
     pub(crate) weights_to_half: Option<Pipeline>,
     pub(crate) pack_grid: Pipeline,
     pub(crate) composite: Pipeline,

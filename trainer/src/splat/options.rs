@@ -69,7 +69,7 @@ impl Default for SplatOptions {
             cost_images: 13.0,
             // This is twice the growth fraction of 3DGS-MCMC.
             growth_frac: 0.1,
-            // As in 3DGS-MCMC.
+            // This is the value of 3DGS-MCMC.
             noise: 5e5,
             // With 6 and 11 images, 10 % gained less
             // (docs/benchmarks/2026-11-25-few-images.md, section "Single changes").

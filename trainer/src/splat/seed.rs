@@ -36,7 +36,7 @@ const N_RANDOM: usize = 50_000;
 /// Most positions of a random cloud are wrong. Low opacity lets the gradients reach splats behind
 /// them.
 const RANDOM_OPACITY: f64 = 0.1;
-/// As in Kerbl et al. 2023.
+/// This is the value of Kerbl et al. 2023.
 const POINT_OPACITY: f64 = 0.1;
 /// Value of the constant spherical harmonic: `1 / (2 sqrt(pi))`.
 const SH_0: f64 = 0.282_094_791_773_878_14;

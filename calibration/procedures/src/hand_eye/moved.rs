@@ -72,7 +72,7 @@ impl MovedArm {
         match (held, failure) {
             (Err(error), None) if result.is_ok() => Err(error),
             (held, Some(failure)) => {
-                // Why the motion was not completed has been logged.
+                // The log already contains the reason why the motion was not completed.
                 outputs::log_failure(held);
                 if self.holds_on_exit {
                     outputs::log_failure(result.map(|_| ()));
@@ -152,7 +152,7 @@ impl MotionOptions {
         let is_simulated = flags.sim || given.arm.driver == ArmDriver::Sim;
         if !is_simulated {
             given.require_before_opening(Need::Intrinsics(camera))?;
-            // Without the pose, the motion could lead anywhere.
+            // Without the approximate pose of the camera, the planned motion would be arbitrary.
             if given_camera.unknown.parent_from_camera {
                 return Err(BadInput(format!(
                     "camera.{camera}.parent_from_camera is missing: {} plans the motion with it; measure it to about 5 degrees and 25 mm, or calibrate without {}",
@@ -179,7 +179,8 @@ impl MotionOptions {
         } else {
             Devices::Real
         };
-        // The page is opened before the arm, because the user must see the planned motion.
+        // The page is opened before the arm is connected, because the user must see the planned
+        // motion.
         let view = request.host.open_view(&given_camera, activity)?;
         let mut capture = ArmCapture::new(open::movable(&given, devices, camera)?)?;
         let rig = resolved(&given, capture.rig());

@@ -19,8 +19,9 @@ use nalgebra::{DMatrix, SymmetricEigen, Vector3};
 
 /// Finds an initial solution, and reports mistakes in the samples.
 ///
-/// # Errors Returns [`Error::Refused`] if the samples contain a known mistake, do not determine the
-/// result, or disagree.
+/// # Errors
+/// Returns [`Error::Refused`] if the samples contain a known mistake, do not determine the result,
+/// or disagree.
 pub(crate) fn find_consensus(
     input: &HandEyeInput<'_>,
     sorted: &Sorted,
@@ -67,7 +68,8 @@ pub(crate) fn find_consensus(
 
 /// Checks that the samples that were used determine the result.
 ///
-/// # Errors Returns [`Error::Refused`] with the likely cause of a result that is too uncertain.
+/// # Errors
+/// Returns [`Error::Refused`] with the likely cause of a result that is too uncertain.
 pub(crate) fn check_result(
     input: &HandEyeInput<'_>,
     refined: &Refined,
@@ -107,7 +109,8 @@ const MUCH_BETTER: f64 = 5.0;
 
 /// Checks that the positions can be meters.
 ///
-/// # Errors Fails if most of the positions are too large.
+/// # Errors
+/// Fails if most of the positions are too large.
 fn check_magnitudes(samples: &[HandEyeSample]) -> Result<(), Refusal> {
     let robot: Vec<f64> = samples
         .iter()
@@ -437,7 +440,8 @@ fn wrong_unit(body: &str, other: &str, unit: &str, per_m: f64) -> String {
 
 /// Checks the predicted uncertainty of position and rotation along every direction.
 ///
-/// # Errors The error names the direction that is determined worst.
+/// # Errors
+/// The error names the direction that is determined worst.
 fn check_uncertainty(input: &HandEyeInput<'_>, refined: &Refined) -> Result<(), Refusal> {
     let [max_sigma_m, max_sigma_rad] = [input.options.max_sigma_m, input.options.max_sigma_rad];
     let (sigma_rad, rotation_axis) = worst_direction(&refined.covariance, 0);

@@ -1,9 +1,9 @@
 //! Checks whether the rotations of the robot determine all parameters, and which rotations are
 //! missing.
 //!
-//! A rotation about one axis leaves the position along it and the rotation around it undetermined
-//! (Tsai and Lenz 1989, section III). Errors of the robot poses are amplified by the reciprocal of
-//! the rotation about the second axis.
+//! If the robot rotates about only one axis, the position along this axis and the rotation around
+//! it remain undetermined (Tsai and Lenz 1989, section III). Errors of the robot poses are
+//! amplified by the reciprocal of the rotation about the second axis.
 
 use super::super::geometry::{nearest_rotation, rotation_sum};
 use super::super::{Refusal, Setup};
@@ -22,7 +22,8 @@ const RECOMMENDED_DEG: f64 = 20.0;
 
 /// Checks that the rotations span at least two directions.
 ///
-/// # Errors The error names the only axis of rotation.
+/// # Errors
+/// The error names the only axis of rotation.
 pub(super) fn check_rotations(base_from_flange: &[Transform]) -> Result<(), Refusal> {
     let Some((spreads, axes)) = rotation_spread(base_from_flange) else {
         return Err(Refusal::new(
@@ -141,12 +142,13 @@ pub(super) fn rotations_across(axis: &Vector3<f64>, body: &str) -> String {
     )
 }
 
-/// Number of poses that are sufficient, if their rotations suffice.
+/// Recommended number of poses. It is sufficient if the poses also have sufficient rotations.
 pub const RECOMMENDED_POSES: usize = 12;
 /// Rotation about each axis that the poses should span, degrees. It corresponds to 20 degrees in
 /// both directions.
 const MIN_SPAN_DEG: f64 = 40.0;
-/// Number of poses that are requested at a time. There are two in each direction.
+/// Number of poses that are requested at a time. Two poses are rotated in one direction, and two in
+/// the opposite direction.
 const POSES_AT_A_TIME: usize = 4;
 /// A pose counts as rotated about an axis if the angle is at least this, degrees. The limit is half
 /// of the requested angle, because people estimate rotations by eye.

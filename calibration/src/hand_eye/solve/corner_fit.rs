@@ -305,7 +305,7 @@ struct PointAt {
     by_solution: SMatrix<f64, 3, 12>,
     /// Derivatives with respect to a motion of the corrected flange pose, in flange axes.
     by_flange: SMatrix<f64, 3, 6>,
-    /// By the pose error.
+    /// Derivatives with respect to the pose error.
     by_error: SMatrix<f64, 3, 6>,
 }
 

@@ -107,10 +107,10 @@ impl GoalProgress {
 /// The photograph to take next.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum NextPhotograph {
-    /// Any with the whole target.
+    /// Any view that shows the whole target.
     ShowTarget,
-    /// One that helps to reach this goal.
+    /// A view that helps to reach this goal.
     Toward(GoalProgress),
-    /// None: everything is covered.
+    /// No view is needed, because everything is covered.
     Enough,
 }

@@ -105,9 +105,9 @@ pub enum Pdo {
 /// Direction of a PDO, from the node's point of view.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Direction {
-    /// To the node.
+    /// From the host to the node.
     Receive,
-    /// From the node.
+    /// From the node to the host.
     Transmit,
 }
 
@@ -233,7 +233,7 @@ pub fn encode_read(node: Node, object: Object) -> Frame {
 /// Encodes a request to write an object of a node. Negative values are encoded as two's complement.
 ///
 /// # Errors
-/// If the value does not fit into the object.
+/// Fails if the value does not fit into the object.
 pub fn encode_write(node: Node, object: Object, value: i64) -> Result<Frame, CanError> {
     let n_bits = 8 * u32::from(object.n_bytes);
     let command = match object.n_bytes {

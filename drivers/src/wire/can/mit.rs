@@ -105,7 +105,7 @@ impl Scales {
 /// Encodes a command. Values outside the limits are clamped.
 ///
 /// # Errors
-/// If a value is NaN.
+/// Fails if a value is NaN.
 pub fn encode(command: &Command, limits: &Limits) -> Result<[u8; 8], CanError> {
     let scales = Scales::of(limits);
     let position = scales

@@ -21,7 +21,7 @@ pub enum CanError {
     IdRange {
         /// The number.
         id: u32,
-        /// 11 or 29.
+        /// Number of bits of the identifier, 11 or 29.
         bits: u8,
     },
     /// The frame format does not allow this payload length.

@@ -50,7 +50,7 @@ impl Page {
         }
     }
 
-    /// Adds a section. Without content, adds nothing.
+    /// Adds a section. If the content is empty, nothing is added.
     ///
     /// * `legend`: what the section shows, as text.
     /// * `content`: HTML.

@@ -59,13 +59,13 @@ pub fn composite(samples: &[Sample]) -> RenderedRay {
 /// Gradients of a loss with respect to the outputs of compositing.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Upstream {
-    /// With respect to the premultiplied color.
+    /// Gradient with respect to the premultiplied color.
     pub rgb: [f64; 3],
-    /// With respect to the transmittance.
+    /// Gradient with respect to the transmittance.
     pub transmittance: f64,
-    /// With respect to the distance.
+    /// Gradient with respect to the distance.
     pub distance: f64,
-    /// With respect to each weight directly.
+    /// Gradient with respect to each weight directly.
     pub weights: Vec<f64>,
 }
 

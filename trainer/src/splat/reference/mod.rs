@@ -96,9 +96,9 @@ pub struct ViewGrad {
     /// Gradient with respect to a small motion `exp(pose) * camera_from_world`. The translation in
     /// meters comes before the rotation in radians.
     pub pose: [f64; 6],
-    /// With respect to [`View::linear_m`].
+    /// Gradient with respect to [`View::linear_m`].
     pub linear_m: [f64; 3],
-    /// With respect to [`View::angular_rad`].
+    /// Gradient with respect to [`View::angular_rad`].
     pub angular_rad: [f64; 3],
 }
 
@@ -123,16 +123,16 @@ pub struct Projected {
 /// Gradient of a loss with respect to a [`Projected`]. The extent has no gradient.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct ProjectedGrad {
-    /// With respect to the center.
+    /// Gradient with respect to the center.
     pub mean_px: [f64; 2],
     /// Gradient with respect to the three numbers of the conic. `b` represents both off-diagonal
     /// entries.
     pub conic: [f64; 3],
-    /// With respect to the opacity.
+    /// Gradient with respect to the opacity.
     pub opacity: f64,
-    /// With respect to the color.
+    /// Gradient with respect to the color.
     pub color: [f64; 3],
-    /// With respect to the depth.
+    /// Gradient with respect to the depth.
     pub depth: f64,
 }
 
@@ -143,7 +143,7 @@ pub struct RenderGrad {
     pub splats: Vec<SplatGrad>,
     /// Gradient with respect to each projected splat. It is zero for invisible splats.
     pub projected: Vec<ProjectedGrad>,
-    /// With respect to the view.
+    /// Gradient with respect to the view.
     pub view: ViewGrad,
 }
 

@@ -25,16 +25,17 @@ use std::sync::Arc;
 /// all keyframes. Every splat is projected into each of them, so the time is proportional to their
 /// number.
 const MAX_KEYFRAMES: usize = 64;
-/// A splat belongs to the surface of a depth reading if it is at most this fraction of its depth
-/// away. Otherwise, the surface hides it, or it floats in front.
+/// Maximum distance of a splat from the surface that a depth reading shows, as a fraction of the
+/// depth of the splat. A splat that is farther away is hidden by the surface or floats in front of
+/// the surface. It then does not belong to the surface.
 const SURFACE_FRAC: f64 = 0.05;
 /// Depth error, as a fraction of the depth, at which the weight of a keyframe is halved. With wrong
 /// cameras, keyframes disagree about a surface. The keyframe from which a splat was seeded agrees
 /// best, and should determine its motion.
 const AGREEMENT_FRAC: f64 = 0.001;
 /// Weight of a keyframe without a depth reading. Such a keyframe shows the splat unless something
-/// hides it. The weight matters only if no keyframe has depth there, because the weight with depth
-/// is at least 4e-4 (at an error of [`SURFACE_FRAC`]).
+/// hides it. The weight of a keyframe with depth is at least 4e-4, at an error of [`SURFACE_FRAC`].
+/// The weight without depth is smaller, so it matters only if no keyframe has depth at the splat.
 const WITHOUT_DEPTH: f64 = 1e-4;
 /// Parameters of single images, which stay enabled. Shared parameters are part of the alignment.
 const IMAGE_PARAMS: ParamSet = ParamSet::IMAGE_POSES.union(ParamSet::IMAGE_GAINS);
@@ -67,8 +68,8 @@ pub(super) fn move_with_keyframes(
         .for_each(|image| corrected(&mut image.keyframe));
     // Camera parameters start at zero again, because the keyframes now contain the correction.
     let mut params = training.model.cameras.set & IMAGE_PARAMS;
-    // Image poses from depth are accurate to a few millimeters. Training the splats refines them,
-    // without a trial.
+    // Image poses from depth are accurate to a few millimeters. They are refined together with the
+    // splats. No trial has to show first that the refinement is useful.
     if alignment.has_image_poses() && trials.remove_candidate(ParamSet::IMAGE_POSES) {
         params |= ParamSet::IMAGE_POSES;
     }

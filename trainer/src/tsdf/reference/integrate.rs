@@ -17,7 +17,7 @@ pub struct Voxel {
     pub weight: f64,
     /// sRGB, 0 to 1.
     pub color_srgb: [f64; 3],
-    /// In 256ths, an integer.
+    /// Weight of the color in 256ths, which is an integer.
     pub color_weight: f64,
 }
 

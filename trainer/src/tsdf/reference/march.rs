@@ -25,7 +25,7 @@ pub struct Vertex {
 /// The triangles of the cubes whose lowest corner is in one block.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct BlockTriangles {
-    /// In the order in which triangles first use them.
+    /// Vertices in the order in which triangles first use them.
     pub vertices: Vec<Vertex>,
     /// Vertex indices, counterclockwise when viewed from outside. Triangles are in the order of the
     /// cubes, x fastest.

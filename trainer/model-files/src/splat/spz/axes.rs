@@ -38,7 +38,7 @@ impl Axes {
     /// The axes for a number in the extension.
     fn from_number(number: u32) -> Result<Self, String> {
         match number {
-            // Not specified.
+            // The file does not specify its axes.
             0 => Ok(Self::RIGHT_UP_BACK),
             // The bits stand for right instead of left, up instead of down, and front instead of
             // back.
