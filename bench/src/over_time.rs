@@ -36,7 +36,7 @@ struct Moment {
     seconds: f64,
     step: u64,
     psnr: Option<f64>,
-    /// `None` if the system does not report it.
+    /// Resident memory. `None` if the system does not report it.
     host_bytes: Option<f64>,
 }
 

@@ -27,7 +27,7 @@ pub enum Error {
         /// Number of parameters.
         n_params: usize,
     },
-    /// There is not one size per image.
+    /// The number of sizes differs from the number of images.
     #[error("calibration from targets: {n_images} images, but {n_sizes} image sizes")]
     ImageSizes {
         /// Number of images.

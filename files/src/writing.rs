@@ -81,7 +81,7 @@ pub fn create(
 /// Calls `write` with a path in a temporary folder, then moves the result to `path`.
 ///
 /// # Errors
-/// The errors of `write`, and those of [`create`].
+/// Returns the errors of `write` and the errors of [`create`].
 pub fn create_from<T, E: From<Error>>(
     path: &Path,
     write: impl FnOnce(&Path) -> Result<T, E>,
@@ -105,8 +105,8 @@ pub fn create_from<T, E: From<Error>>(
 /// entries. The last entry should therefore be the entry by which readers recognize the folder.
 ///
 /// # Errors
-/// The errors of `write`, and those of [`create`]. Entries that have already been moved are removed
-/// again.
+/// Returns the errors of `write` and the errors of [`create`]. Entries that have already been moved
+/// are removed again.
 pub fn create_folder<T, E: From<Error>>(
     path: &Path,
     entries: &[&str],

@@ -235,8 +235,9 @@ impl Chain {
             .all(|segment| !segment.is_prismatic && segment.multiplier.fract() == 0.0)
     }
 
-    /// Whether each joint moves exactly one segment, at the rate of its value. This is not so if a
-    /// mimic joint of the chain follows a joint.
+    /// Whether each joint moves exactly one segment, at the rate of its value. The result is false
+    /// if several segments follow one joint, or if a mimic joint scales or shifts the value that it
+    /// follows.
     pub(crate) fn has_one_segment_per_joint(&self) -> bool {
         let mut segments = self.segments.iter().enumerate();
         segments.all(|(ix, segment)| {

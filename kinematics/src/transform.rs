@@ -137,8 +137,9 @@ pub fn from_xyz_xyzw([x, y, z, i, j, k, w]: [f64; 7]) -> Transform {
     )
 }
 
-/// A smaller motion of a camera is noticeable neither in a picture nor in a map of the scene. At a
-/// focal length of 600 pixels, both bounds move a point at a distance of 1 m by 0.3 pixels.
+/// A motion of a camera below these two bounds is noticeable neither in a picture nor in a map of
+/// the scene. At a focal length of 600 pixels, each of the two bounds moves a point at a distance
+/// of 1 m by 0.3 pixels.
 const NOTICEABLE_M: f64 = 5e-4;
 const NOTICEABLE_RAD: f64 = 5e-4;
 

@@ -56,7 +56,7 @@ pub enum SpecError {
         /// Largest count.
         max: u32,
     },
-    /// A length has no unit or an unknown one.
+    /// A length has no unit, or its unit is unknown.
     #[error(
         "target {spec:?}: {what} {value:?} has no unit, expected a number with mm, cm or m, such as 25mm"
     )]

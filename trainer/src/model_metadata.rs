@@ -97,7 +97,7 @@ pub(crate) fn read_metadata(folder: &Path) -> Result<ModelMetadata, Error> {
 fn parse(bytes: &[u8]) -> Result<ModelMetadata, String> {
     let metadata: ModelMetadata =
         serde_json::from_slice(bytes).map_err(|error| error.to_string())?;
-    // Written so that a NaN is refused.
+    // The condition is written so that a NaN is refused.
     let background = metadata.background_srgb;
     if background
         .iter()

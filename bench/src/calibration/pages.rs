@@ -313,7 +313,7 @@ impl Sweep {
         }
     }
 
-    /// The refused and failed results of a cell.
+    /// Describes how many results of a cell were refused or failed.
     fn describe_failures(&self, cell: &Cell) -> String {
         let rest = match (cell.n_refused, cell.n_failed) {
             (0, 0) => "ok".to_owned(),
@@ -348,7 +348,7 @@ fn limits_table(cells: &[Cell]) -> Table {
     }
 }
 
-/// The row of a method: sums over all conditions.
+/// The table row of a method, which contains sums over all conditions.
 fn totals_row(cells: &[Cell], method: Method) -> Vec<String> {
     let own: Vec<&Cell> = cells
         .iter()

@@ -176,7 +176,7 @@ pub(super) fn check_observable(fit: &Fit<Bundle>) -> Result<(), Error> {
     });
     let max_tilt_deg = max_tilt_deg.fold(0.0, f64::max);
     for (axis, focal_px) in intrinsics.focal_px.into_iter().enumerate() {
-        // Written so that NaN is refused.
+        // The condition is written so that NaN is refused.
         let sigma_frac = fit.sigma(axis) / focal_px.abs();
         if !(sigma_frac < MAX_SIGMA_FRAC && FOCAL_FRACS.contains(&(focal_px / side_px))) {
             return Err(Error::FocalLengthUnobservable {

@@ -28,8 +28,8 @@ const MAX_OUTLIER_FRAC: f64 = 0.5;
 /// The norm of a normal error has a Rayleigh distribution. This is the ratio of the median of the
 /// norm to the standard deviation per axis.
 const MEDIAN_PER_SIGMA: f64 = 1.177_410_022_515_474_7;
-/// The tolerance of the fits between which outliers are searched, and the tolerance of the last
-/// fit. The first tolerance corresponds to a tenth of a standard deviation of the parameters.
+/// Tolerance of the fits that alternate with the search for outliers. It corresponds to a tenth of
+/// a standard deviation of the parameters. The next constant is the tolerance of the last fit.
 const ROUGH: f64 = 1e-5;
 const EXACT: f64 = 1e-12;
 

@@ -66,7 +66,7 @@ pub(super) fn select(
     let mut best = polynomial
         .as_ref()
         .and_then(|start| score(kept, start, Coefficients::PINHOLE));
-    // The start of all comparisons.
+    // All comparisons start from this model.
     if best.is_none() {
         // A pinhole may not be able to image all points.
         best = polynomial

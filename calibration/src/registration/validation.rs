@@ -75,10 +75,10 @@ impl PairedComparison<'_> {
     /// the training images are misaligned, no single pose of the validation image fits the
     /// predictions from all of them. The test must not depend on anything else. The individual pose
     /// is therefore estimated for the baseline and for the variant, with the same residuals, prior,
-    /// number of steps and partners. Both are evaluated at samples that both show. As a result,
-    /// both have the same freedom, and the accuracy of the validation image's own pose does not
-    /// matter. Overfitting to noise lowers the score on the other half. The correction itself was
-    /// not estimated from the validation images.
+    /// number of steps and partners. Baseline and variant are evaluated at the samples that both of
+    /// them show. As a result, both have the same freedom, and the accuracy of the validation
+    /// image's own pose does not matter. Overfitting to noise lowers the score on the other half.
+    /// The correction itself was not estimated from the validation images.
     pub(super) fn scores_with_free_poses(&self) -> Vec<ImageScore> {
         let views = self.views();
         let mut by_image: BTreeMap<usize, Vec<Pair>> = BTreeMap::new();

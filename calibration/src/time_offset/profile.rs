@@ -40,7 +40,7 @@ pub fn motion_profile(
     })
 }
 
-/// Times and rates of one stream of a grid. Gaps are left out.
+/// Times and rates of one of the two streams, sampled on the grid. Gaps are left out.
 fn curve(stream: &Stream, grid: &Grid, stream_ix: usize) -> Vec<[f64; 2]> {
     let values = grid.rates[stream_ix].values.iter().enumerate();
     values

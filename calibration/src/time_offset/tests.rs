@@ -306,7 +306,7 @@ fn stamps_that_advance_at_another_rate_or_repeat_are_named() {
     twice.iter_mut().for_each(|sample| sample.secs *= 2.0);
     let text = message(&a, &twice);
     assert!(text.contains("twice as fast"), "{text}");
-    // Whole seconds.
+    // The stamps are rounded to whole seconds.
     let mut rounded = b.clone();
     rounded
         .iter_mut()

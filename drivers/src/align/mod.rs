@@ -6,7 +6,7 @@
 //! of the image, whereas librealsense drops them. The SSE path of librealsense
 //! (`src/proc/sse/sse-align.cpp`) rounds half a pixel further to the right and down. It also uses
 //! only the upper left corner if the color image has fewer pixels per angle than the depth image.
-//! This module follows the scalar path of librealsense, which does neither.
+//! This module follows the scalar path of librealsense, which has neither of these two deviations.
 
 mod cover;
 
@@ -51,9 +51,9 @@ enum ColorLens {
 /// A corner of the pixels of one row of depth.
 #[derive(Clone, Copy)]
 enum Corner {
-    /// Upper left corner. Hidden corners get a position after the image.
+    /// Upper left corner. The column of a hidden corner is set beyond the right edge of the image.
     First,
-    /// Lower right corner. Hidden corners get a position before the image.
+    /// Lower right corner. The column of a hidden corner is set beyond the left edge of the image.
     Last,
 }
 
@@ -81,7 +81,7 @@ struct Row {
 /// Work that runs with vector instructions.
 struct Task<'a> {
     alignment: &'a DepthAlignment,
-    /// Two bytes each, little endian.
+    /// The counts of the depth image. Each count has two bytes, little endian.
     counts: &'a [u8],
     meters_per_count: f64,
 }
@@ -166,8 +166,8 @@ impl DepthAlignment {
         })
     }
 
-    /// Nearest count minus one of each color pixel. The invalid count 0 wraps to the largest number
-    /// and never wins.
+    /// Nearest count minus one of each color pixel. The invalid count 0 wraps to the largest
+    /// number, so every valid count is nearer.
     #[inline(always)]
     fn align_counts(&self, counts: &[[u8; 2]], meters_per_count: f64) -> Vec<u16> {
         let depth_width = self.depth_px[0] as usize;
@@ -310,8 +310,9 @@ fn project_by(
     }
 }
 
-/// Converts positions to pixel indices that start at 1, clipped to the image and one index after it
-/// ([`Corner::First`]) or before it ([`Corner::Last`]).
+/// Converts positions to pixel indices, which start at 1, and clips them. [`Corner::First`] also
+/// allows the index after the last pixel of the image. [`Corner::Last`] also allows the index
+/// before the first pixel.
 #[expect(
     clippy::cast_possible_truncation,
     reason = "the low 16 bits are the index"

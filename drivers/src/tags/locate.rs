@@ -317,7 +317,8 @@ fn equations(
         // The chain rule multiplies three derivatives. The first is the derivative of the pixel by
         // the point at the time of its row. The second is the derivative of this point by the point
         // at mid-exposure. The third is the derivative of the point at mid-exposure by the pose.
-        // The motion during the exposure is known, so its derivative is its rotation.
+        // The motion during the exposure is known, so the second derivative is the rotation of this
+        // motion.
         let jacobian = d_pixel_d_point
             * row_from_mid_exposure.rotation.to_rotation_matrix().matrix()
             * d_point_d_pose;

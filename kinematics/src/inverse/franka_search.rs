@@ -96,7 +96,7 @@ impl FrankaSearch<'_> {
         let Some(wrist) = self.arm.wrist(&self.shoulder_from_seven, last_rad) else {
             return;
         };
-        // Pairs of branches that share elbow and wrist are neighbors.
+        // Two consecutive branches have the same elbow and wrist, and differ only in the shoulder.
         for branches in Branch::ALL.chunks(2) {
             let most = best.map_or(f64::INFINITY, |best| best.cost);
             for candidate in self.on_branches(&wrist, last_rad, branches, most) {
@@ -132,8 +132,9 @@ impl FrankaSearch<'_> {
         })
     }
 
-    /// The joints from the elbow outward with their cost. Each joint is checked before the next
-    /// joint is computed, because most combinations leave a range.
+    /// The values of the joints from the elbow to the last joint, and their cost. Each joint is
+    /// checked before the next joint is computed, because most combinations of joint values leave a
+    /// range.
     fn outer_joints(
         &self,
         wrist: &Wrist,
@@ -200,7 +201,8 @@ impl FrankaSearch<'_> {
                 inner = [inner[1], low + RATIO * (high - low)];
                 found = [found[1], at(inner[1])];
             }
-            // The better of the two is never discarded before.
+            // The better of the two inner values is kept in every step, so no better candidate is
+            // missed.
             for candidate in found.into_iter().flatten() {
                 keep_better(&mut best, candidate);
             }

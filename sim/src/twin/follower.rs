@@ -157,8 +157,9 @@ impl TwinFollower {
         })
     }
 
-    /// Joint velocity toward the tour at a time. With `step_secs`, it includes the velocity of the
-    /// tour since the previous step. Without this feedforward, the camera would lag behind.
+    /// Joint velocity that leads toward the position of the tour at a time. If `step_secs` is
+    /// given, the velocity of the tour since the previous step is added. Without this feedforward,
+    /// the camera would lag behind.
     fn desired_velocity(&self, secs: f64, step_secs: Option<f64>) -> Joints {
         match &self.tour {
             TwinTour::Table(tour) => self.velocity_along_table(tour, secs, step_secs),
@@ -166,7 +167,7 @@ impl TwinFollower {
         }
     }
 
-    /// Position of the sway at a time at speed 1.
+    /// Joint positions of the sway at a time, if the sway has speed 1.
     fn sway(&self, at: f64) -> Joints {
         let mut period_secs = SWAY_PERIOD_SECS;
         Joints::from_fn(self.posture.len(), |ix, _| {
@@ -198,8 +199,8 @@ impl TwinFollower {
         posture_velocity + change
     }
 
-    /// Jacobian of the camera and a twist in base axes, both weighted and in camera axes. The
-    /// Jacobian has one column per joint.
+    /// Computes the Jacobian of the camera in camera axes, and converts `twist` from base axes to
+    /// camera axes. Both results are weighted. The Jacobian has one column per joint.
     fn in_camera_axes(
         &self,
         tour: &TableTour,

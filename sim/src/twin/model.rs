@@ -127,8 +127,8 @@ impl TwinModel {
         &self.base_from_root
     }
 
-    /// Whether the robot stands on its base link. Otherwise, the base link is part of a body, such
-    /// as a torso.
+    /// Whether the robot stands on its base link. If not, the base link is part of a body, such as
+    /// a torso.
     pub(crate) fn stands_on_base(&self) -> bool {
         self.links
             .first()

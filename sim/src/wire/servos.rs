@@ -52,7 +52,7 @@ mod tests {
     use drivers::servos::{DynamixelProtocol, FeetechProtocol, PortConfig, ServoArm};
     use std::time::Duration;
 
-    /// Time limit that only a failure reaches.
+    /// Time limit, which is reached only if the test fails.
     const LIMIT: Duration = Duration::from_secs(60);
 
     #[test]
@@ -87,7 +87,7 @@ mod tests {
             let mut arm = ServoArm::open(&config).expect("two servos");
             let state = arm.read(LIMIT).expect("a state");
             for (got, expected) in state.position.iter().zip(&position) {
-                // Half a count.
+                // The tolerance is half a count.
                 assert!((got - expected).abs() <= TAU / 8192.0 + 1e-9, "{state:?}");
             }
         }

@@ -258,7 +258,7 @@ fn blurred_along(Axis { stride, side }: Axis, plane: &[f64]) -> Vec<f64> {
         .collect()
 }
 
-/// -1, 0 or 1.
+/// Sign of a value: -1, 0 or 1.
 fn sign(value: f64) -> f64 {
     if value == 0.0 { 0.0 } else { value.signum() }
 }

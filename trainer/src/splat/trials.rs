@@ -108,7 +108,7 @@ pub(crate) enum CountState {
     Growing,
     /// Trials halve the number until one of them is rejected.
     Halving,
-    /// The number is final.
+    /// The number of splats is final.
     Finished,
 }
 

@@ -33,7 +33,7 @@ pub(crate) struct TrainView {
     /// Mean color of the pixels that are not masked, sRGB. `None` if all pixels are masked.
     mean_srgb: Option<[f64; 3]>,
     levels: [Option<Level>; 3],
-    /// Present once camera parameters are optimized.
+    /// `None` until camera parameters are optimized.
     lens: Option<Buffer>,
 }
 

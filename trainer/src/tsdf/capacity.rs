@@ -13,7 +13,7 @@ pub(crate) const BYTES_PER_CHUNK: u64 = 4 + 4 * 512;
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) struct Capacity {
     pub(crate) n_blocks: u32,
-    /// A power of two.
+    /// Number of chunks in the hash table, which is a power of two.
     pub(crate) n_chunks: u32,
 }
 

@@ -183,7 +183,7 @@ impl TsdfModel {
     /// images. Returns whether there was such an image.
     fn begin(&mut self) -> Result<bool, Error> {
         // The maximum size of a binding limits the field, just like a budget. The voxel size must
-        // fit it.
+        // suit this limit.
         let max_blocks = capacity::max_blocks_within(
             &self.gpu,
             self.options.common.max_bytes,

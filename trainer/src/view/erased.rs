@@ -31,7 +31,8 @@ struct Erased {
 impl Erased {
     /// Whether the buffer holds these edits in this frame.
     fn is_of(&self, edits: &Arc<Edits>, world_from_drawn: &Matrix4<f64>) -> bool {
-        // Requests of one client share the edits, so most comparisons end at the address.
+        // All requests of one client point to the same edits, so comparing the addresses is usually
+        // sufficient.
         let has_same_edits = Arc::ptr_eq(&self.edits, edits) || self.edits == *edits;
         has_same_edits && self.world_from_drawn == *world_from_drawn
     }

@@ -446,7 +446,7 @@ fn check_uncertainty(input: &HandEyeInput<'_>, refined: &Refined) -> Result<(), 
     let [max_sigma_m, max_sigma_rad] = [input.options.max_sigma_m, input.options.max_sigma_rad];
     let (sigma_rad, rotation_axis) = worst_direction(&refined.covariance, 0);
     let (sigma_m, direction) = worst_direction(&refined.covariance, 3);
-    // Written so that NaN is refused.
+    // The condition is written so that NaN is refused.
     if sigma_m <= max_sigma_m && sigma_rad <= max_sigma_rad {
         return Ok(());
     }

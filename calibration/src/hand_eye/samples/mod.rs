@@ -22,7 +22,7 @@ pub(crate) struct Sample {
     pub(crate) stop_ix: usize,
     /// See [`geometry::Solution`].
     pub(crate) a: Transform,
-    /// Poses of the board, the most likely first. Not empty.
+    /// Poses of the board, the most likely first. The list is not empty.
     pub(crate) candidates: Vec<Candidate>,
     /// Index of the candidate that fits the solution.
     pub(crate) choice: usize,

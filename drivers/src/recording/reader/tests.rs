@@ -52,7 +52,7 @@ struct Part {
 #[derive(Clone)]
 struct Chunk {
     compression: &'static str,
-    /// `None`: the correct checksum.
+    /// The checksum to write. If it is `None`, the correct checksum is written.
     checksum: Option<u32>,
 }
 
@@ -332,7 +332,8 @@ impl Contents {
             .expect("a known topic")
     }
 
-    /// Appends fields to a message. The last field of each number counts.
+    /// Appends fields to a message. If several fields have the same number, readers use the last of
+    /// them.
     fn append(&mut self, topic: &str, fields: &Message) {
         self.part(topic).message.extend(fields.clone().into_bytes());
     }

@@ -52,11 +52,11 @@ pub(super) fn table(head: &str, columns: &[Column], rows: &[BarRow]) -> String {
 
 /// A column that has values.
 struct ShownColumn {
-    /// Its index among the values of a row.
+    /// Index of the column among the values of a row.
     ix: usize,
     name: &'static str,
     digits: usize,
-    /// The value with a full bar.
+    /// The largest value of the column, whose bar has the full length.
     largest: f64,
 }
 

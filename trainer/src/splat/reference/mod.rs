@@ -71,7 +71,7 @@ pub struct View {
     pub angular_rad: [f64; 3],
     /// Whether opacities are lowered where [`BLUR_PX2`](project::BLUR_PX2) enlarges splats. See
     /// [`SplatArrays::is_antialiased`](model_files::splat::arrays::SplatArrays::is_antialiased).
-    /// Gradients ignore this.
+    /// Gradients do not include this effect.
     pub is_antialiased: bool,
 }
 
