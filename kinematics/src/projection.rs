@@ -145,9 +145,9 @@ mod tests {
     #[test]
     fn derivatives_with_respect_to_intrinsics_match_central_differences() {
         const NUDGE: f64 = 1e-6;
-        // The projection is linear in all parameters except those of the denominator. Rounding
-        // errors of 1e-13 / 1e-6 remain. For the denominator, there are also truncation errors of
-        // 1e-12 times the focal length.
+        // The projection is linear in all parameters except the parameters of the denominator.
+        // Rounding errors of 1e-13 / 1e-6 remain. For the denominator, there are also truncation
+        // errors of 1e-12 times the focal length.
         const CLOSE: f64 = 1e-6;
         for camera in cameras() {
             let params = camera.params();

@@ -178,8 +178,8 @@ impl Canvas {
         model: &Arc<MjModel>,
         near_far_m: [f64; 2],
     ) -> Self {
-        // SAFETY: an OpenGL context is current on this thread until after the canvas is dropped;
-        // only this model is drawn.
+        // SAFETY: an OpenGL context is current on this thread until after the canvas is dropped.
+        // Only this model is drawn.
         let mut context = unsafe { MjrContext::new(model) };
         context.offscreen();
         Self {

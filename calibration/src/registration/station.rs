@@ -223,7 +223,8 @@ impl StationScene {
             images,
         };
         // Validation images of the new station are predicted from training images of earlier
-        // stations, and vice versa.
+        // stations. Validation images of earlier stations are predicted from training images of the
+        // new station.
         scene.pairs = scene.pairs_across([Split::Train, Split::Train]);
         scene.validation_pairs = [
             scene.pairs_across([Split::Train, Split::Validation]),

@@ -52,7 +52,7 @@ struct Exchange<'a, T> {
 }
 
 // SAFETY: the kernel writes at most the structure whose size is in the code, and `Request` pairs
-// each code with its structure; the sizes are asserted in `abi`. The structures consist of
+// each code with its structure. The sizes are asserted in `abi`. The structures consist of
 // integers, so any written bytes are valid.
 #[expect(unsafe_code, reason = "system call")]
 unsafe impl<T: Plain> Ioctl for Exchange<'_, T> {
@@ -88,7 +88,7 @@ impl Device {
     fn ioctl<T: Plain>(&self, request: &Request<T>, value: &mut T) -> rustix::io::Result<()> {
         rustix::io::retry_on_intr(|| {
             // SAFETY: the code belongs to the structure `T` (see `Exchange`), which outlives the
-            // call; none of the structures contains a pointer that the kernel follows.
+            // call. None of the structures contains a pointer that the kernel follows.
             #[expect(unsafe_code, reason = "system call")]
             unsafe {
                 rustix::ioctl::ioctl(
@@ -406,7 +406,8 @@ unsafe impl Send for Mapped {}
 impl Mapped {
     fn new(fd: impl AsFd, buffer: &abi::Buffer) -> rustix::io::Result<Self> {
         let n_bytes = buffer.length as usize;
-        // SAFETY: a new read-only mapping placed by the kernel; it lives until `drop`.
+        // SAFETY: the kernel chooses the address of this new read-only mapping. The mapping lives
+        // until `drop`.
         #[expect(unsafe_code, reason = "system call")]
         let start = unsafe {
             rustix::mm::mmap(
@@ -435,7 +436,7 @@ impl Mapped {
 
 impl Drop for Mapped {
     fn drop(&mut self) {
-        // SAFETY: mapped in `new` with this length; no slice of it outlives `self`.
+        // SAFETY: `new` mapped the memory with this length. No slice of the memory outlives `self`.
         #[expect(unsafe_code, reason = "system call")]
         let unmapped = unsafe { rustix::mm::munmap(self.start, self.n_bytes) };
         debug_assert!(unmapped.is_ok(), "unmapping failed: {unmapped:?}");

@@ -632,7 +632,7 @@ fn check_kind(bytes: &[u8], expected: &'static str) -> Result<(), Malformed> {
     Ok(())
 }
 
-/// Parses JSON in which `NaN` and `Infinity`, which Python writes, are read as null.
+/// Parses JSON. `NaN` and `Infinity`, which Python writes, are read as null.
 fn parse_json<T: DeserializeOwned>(bytes: &[u8]) -> Result<T, Malformed> {
     let parse =
         |bytes: &[u8]| serde_json::from_slice(bytes).map_err(|error| invalid(reported(&error)));

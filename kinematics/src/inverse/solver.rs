@@ -154,8 +154,8 @@ impl InverseSolver {
     /// found.
     ///
     /// # Errors
-    /// The errors are the same as those of [`InverseSolver::solve`]. The nearest configuration is
-    /// the configuration at which the steps end.
+    /// The errors are the errors of [`InverseSolver::solve`]. The nearest configuration is the
+    /// configuration at which the steps end.
     pub fn solve_near(&mut self, target: &Target, seed: &[f64]) -> Result<Vec<f64>, Unsolved> {
         self.check(target, seed)?;
         self.place_at(seed);

@@ -7,7 +7,8 @@ use std::collections::BTreeMap;
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct RunHistory {
-    /// Training time in seconds and mean PSNR of the test images in dB, in order. All are finite.
+    /// Training time in seconds and mean PSNR of the test images in dB, in order. All numbers are
+    /// finite.
     psnr: Vec<(f64, f64)>,
     /// Number of images that did not become keyframes, by reason.
     rejected: BTreeMap<String, u64>,

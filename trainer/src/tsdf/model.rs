@@ -194,8 +194,8 @@ impl TsdfModel {
             let Some(first) = self.queue.pending.front() else {
                 return Ok(false);
             };
-            // An image without valid readings, such as the first one of a sensor that is starting,
-            // contains no information about the scene.
+            // An image without valid readings, such as the first image of a sensor that is
+            // starting, contains no information about the scene.
             match first
                 .depth
                 .as_ref()

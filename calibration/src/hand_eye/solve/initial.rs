@@ -85,8 +85,8 @@ impl Metric {
 /// The best solution found. `None` if no three samples determine a solution.
 pub(crate) fn consensus(samples: &[Sample]) -> Option<Consensus> {
     /// If two fifths of the samples are wrong, this number of trials draws three good samples with
-    /// a probability of 99 %. Each draw must also select the right one of the four poses of each
-    /// sample.
+    /// a probability of 99 %. Each sample has four poses, and each draw must also select the right
+    /// pose of each sample.
     const TRIALS: usize = 1500;
     /// If each sample has only one pose, this number is sufficient.
     const TRIALS_WITHOUT_CHOICE: usize = 200;
@@ -410,9 +410,9 @@ fn with_translation(motions: &[Motion], rotation: UnitQuaternion<f64>) -> Option
     ))
 }
 
-/// Scale of the translations of `b` relative to those of `a`, estimated together with the
-/// translation, and its standard deviation. The scale is 1 if both have the same unit, and 1000 if
-/// only the translations of `a` are in millimeters.
+/// Scale of the translations of `b` relative to the translations of `a`, and the standard deviation
+/// of this scale. The scale is estimated together with the translation. The scale is 1 if both have
+/// the same unit, and 1000 if only the translations of `a` are in millimeters.
 pub(crate) fn relative_scale(
     motions: &[Motion],
     rotation: UnitQuaternion<f64>,

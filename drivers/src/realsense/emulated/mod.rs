@@ -104,7 +104,7 @@ impl BagWriter {
         // The file usually does not exist. If removing it fails, the library reports an error.
         let _ = std::fs::remove_file(path);
         let _guard = device_creation_lock();
-        // SAFETY: the device is checked and then owned here; sensors and profiles live as long as
+        // SAFETY: the device is checked and then owned here. Sensors and profiles live as long as
         // the device.
         let device = unsafe {
             let device = call("create a software device", |error| {
@@ -113,7 +113,7 @@ impl BagWriter {
             register(device, camera)?;
             device
         };
-        // SAFETY: as above; added sensors live in the device.
+        // SAFETY: as above. Added sensors live in the device.
         let (color, depth) = unsafe { EmulatedStream::all(device, camera)? };
         // SAFETY: the device is not freed elsewhere.
         let device = unsafe { Device::new(device)? };
@@ -198,7 +198,7 @@ fn recorder(device: &Device, path: &Path) -> Result<Device, Problem> {
         reason,
     };
     let name = path_name(path).map_err(file_problem)?;
-    // SAFETY: device and name are alive; the recorder is then owned here and keeps the device
+    // SAFETY: device and name are alive. The recorder is then owned here and keeps the device
     // alive.
     unsafe {
         let recorder = call("create a recorder", |error| {
@@ -254,7 +254,7 @@ impl EmulatedStream {
         device: *mut sys::rs2_device,
         camera: &EmulatedCamera,
     ) -> Result<(Self, Option<Self>), Problem> {
-        // SAFETY: guaranteed by the caller; profiles live as long as the device.
+        // SAFETY: guaranteed by the caller. Profiles live as long as the device.
         unsafe {
             let depth = camera
                 .depth
@@ -347,7 +347,7 @@ impl EmulatedStream {
         let format = PixelFormat::DepthU16 {
             meters_per_count: depth.meters_per_count,
         };
-        // SAFETY: guaranteed by the caller; the sensor lives in the device.
+        // SAFETY: guaranteed by the caller. The sensor lives in the device.
         unsafe {
             let emulated = Self::add(device, DEPTH_SENSOR, stream, format, DEPTH_EXPOSURE_SECS)?;
             let units = sys::rs2_option_RS2_OPTION_DEPTH_UNITS;
@@ -374,7 +374,7 @@ impl EmulatedStream {
         exposure_secs_per_count: f64,
     ) -> Result<Self, Problem> {
         const WHAT: &str = "create a stream";
-        // SAFETY: device and name are alive; added sensors and streams live in the device.
+        // SAFETY: device and name are alive. Added sensors and streams live in the device.
         unsafe {
             let sensor = call(WHAT, |error| {
                 abi::rs2_software_device_add_sensor(device, name.as_ptr(), error)
@@ -439,7 +439,7 @@ impl EmulatedStream {
                 _ => 0.0,
             },
         };
-        // SAFETY: the sensor lives in the device; the pixels live until the library returns them to
+        // SAFETY: the sensor lives in the device. The pixels live until the library returns them to
         // `reclaim_pixels`.
         call("write an image", |error| unsafe {
             abi::rs2_software_sensor_on_video_frame(self.sensor.as_ptr(), frame, error);

@@ -49,7 +49,7 @@ impl Cell {
         usize::try_from(code >> shift & ((1 << (3 * PART_LEVELS)) - 1)).unwrap_or(0)
     }
 
-    /// Location code after the last one of the cell.
+    /// First location code after the cell.
     fn end(self) -> u64 {
         self.first + (1 << (3 * (N_LEVELS - self.level)))
     }
