@@ -89,8 +89,8 @@ fn moved_by(along: u32, step: u32, n: u32) -> Option<u32> {
 pub struct CellSet {
     /// The grid.
     pub(super) grid: CellGrid,
-    /// Disjoint ranges of indices in increasing order. A range consists of its first index and of the
-    /// index after its last index.
+    /// Disjoint ranges of indices in increasing order. A range consists of its first index and of
+    /// the index after its last index.
     pub(super) ranges: Vec<[u32; 2]>,
 }
 
@@ -114,8 +114,8 @@ impl CellSet {
         &self.grid
     }
 
-    /// Disjoint ranges of indices in increasing order. A range consists of its first index and of the
-    /// index after its last index.
+    /// Disjoint ranges of indices in increasing order. A range consists of its first index and of
+    /// the index after its last index.
     pub fn ranges(&self) -> &[[u32; 2]] {
         &self.ranges
     }
