@@ -48,8 +48,8 @@ pub struct Rig {
     info: RigInfo,
 }
 
-/// Builds the scene and starts its render thread. Takes one to two seconds, and a second longer with
-/// the robot of a rig file.
+/// Builds the scene and starts its render thread. Takes one to two seconds, and a second longer
+/// with the robot of a rig file.
 pub fn open(config: &Config) -> Result<Rig, Error> {
     // This check comes before anything reaches MuJoCo, which aborts the process on invalid numbers.
     config.check()?;
@@ -214,8 +214,8 @@ pub fn suits_own_robot(config: &Config, max_blur_px: f64) -> bool {
     is_followed && is_sharp && fixed_cameras_see(config)
 }
 
-/// Whether all cameras in the world see the objects on the table. Cameras in other scenes always see
-/// something.
+/// Whether all cameras in the world see the objects on the table. Cameras in other scenes always
+/// see something.
 fn fixed_cameras_see(config: &Config) -> bool {
     let [x, y] = TARGET_XY_M;
     let center = Point3::new(x, y, TABLE_Z_M + LOOK_AT_HEIGHT_M);

@@ -147,8 +147,8 @@ impl<'a> Guide<'a> {
         true
     }
 
-    /// Saves a photograph, if this was requested. After an error, no more photographs are saved, but
-    /// the lens is calibrated.
+    /// Saves a photograph, if this was requested. After an error, no more photographs are saved,
+    /// but the lens is calibrated.
     fn save(&mut self, image: &CalibrationImage) {
         if let Some(saved) = &mut self.saved
             && let Err(error) = saved.save(image.size_px, &image.gray)

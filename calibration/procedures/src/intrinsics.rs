@@ -267,8 +267,8 @@ impl IntrinsicsOutcome {
             )?;
             rig.write()?;
         }
-        // This error is returned last, so that the rig file is written even if the report could not be
-        // written.
+        // This error is returned last, so that the rig file is written even if the report could not
+        // be written.
         self.written
     }
 }

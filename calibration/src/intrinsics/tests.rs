@@ -269,9 +269,9 @@ fn chi_squares(n_runs: u64, errors: impl Fn(u64) -> [f64; 4]) -> [f64; 4] {
 #[test]
 fn squared_errors_match_stated_variances_with_own_and_with_shared_errors() {
     const N_RUNS: u64 = 100;
-    // The mean of 100 squares of normal numbers has a standard deviation of 0.14. Variances of shared
-    // errors are estimated from 15 images, which makes the mean larger than 1 by about 0.1. With one
-    // factor for all parameters, the means of shared errors are up to 1.9.
+    // The mean of 100 squares of normal numbers has a standard deviation of 0.14. Variances of
+    // shared errors are estimated from 15 images, which makes the mean larger than 1 by about 0.1.
+    // With one factor for all parameters, the means of shared errors are up to 1.9.
     const RANGE: std::ops::Range<f64> = 0.55..1.7;
     let camera = brown_conrady_camera();
     let own = chi_squares(N_RUNS, |seed| {

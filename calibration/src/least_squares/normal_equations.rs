@@ -259,10 +259,9 @@ pub(super) fn dispersion(blocks: &[BlockSums], n_shared: usize, variance: f64) -
 /// errors, which have a different effect on each parameter. `None` if the number of blocks is below
 /// 1.5 times the number of parameters, or if the blocks do not determine the parameters.
 ///
-/// With the symbols of [`dispersion`], leaving out block b changes the solution by
-/// `inverse(S - S_b) g_b = inverse(S) inverse(1 - S_b inverse(S)) g_b`. Blocks that determine a
-/// direction almost alone would give very large changes, so the eigenvalues of the inner inverse are
-/// limited.
+/// With the symbols of [`dispersion`], leaving out block b changes the solution by `inverse(S -
+/// S_b) g_b = inverse(S) inverse(1 - S_b inverse(S)) g_b`. Blocks that determine a direction almost
+/// alone would give very large changes, so the eigenvalues of the inner inverse are limited.
 pub(super) fn jackknife(blocks: &[BlockSums], n_shared: usize) -> Option<DMatrix<f64>> {
     // Source: MacKinnon and White 1985 (HC3), with blocks as in Bell and McCaffrey 2002.
     const DAMPING: f64 = 1e-12;

@@ -282,8 +282,8 @@ fn reported_sigmas_match_actual_errors() {
     assert!((0.25..4.0).contains(&mean), "{mean} of {squares:.1?}");
 }
 
-/// Squared errors of the extrinsics, in units of their stated variances, along and about the axes of
-/// the camera.
+/// Squared errors of the extrinsics, in units of their stated variances, along and about the axes
+/// of the camera.
 fn squared_extrinsics_errors(miscalibration: &Miscalibration, set: ParamSet) -> [f64; 6] {
     let alignment = align_given(miscalibration, set);
     let correction = &alignment.corrections["wrist"];

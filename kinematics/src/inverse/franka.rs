@@ -140,7 +140,8 @@ impl FrankaArm {
         (!deviates).then_some(arm)
     }
 
-    /// All solutions for a pose of the tip and a value of the last joint. Ranges are not considered.
+    /// All solutions for a pose of the tip and a value of the last joint. Ranges are not
+    /// considered.
     ///
     /// If joint 2 is at 0, joints 1 and 3 have the same axis, and only their sum is determined. In
     /// this case, joint 1 is set to 0.
@@ -293,8 +294,8 @@ impl Elbow {
         let (sin, cos) = q6.sin_cos();
         let z_of_five = wrist.x_of_six * sin + wrist.y_of_six * cos;
         let normal = z_of_five.cross(&wrist.toward_shoulder) / self.sine;
-        // Joint 5 rotates about `z_of_five`, from the axis of joint 4 (opposite to the normal of the
-        // arm's plane) to the axis of joint 6.
+        // Joint 5 rotates about `z_of_five`, from the axis of joint 4 (opposite to the normal of
+        // the arm's plane) to the axis of joint 6.
         let z_of_six = wrist.x_of_six.cross(&wrist.y_of_six);
         let q5 = (-z_of_six.dot(&z_of_five.cross(&normal))).atan2(-z_of_six.dot(&normal));
         let z_of_three = z_of_five * self.cos_q4 + normal.cross(&z_of_five) * self.sin_q4;

@@ -166,8 +166,8 @@ impl InverseSolver {
         }
     }
 
-    /// Preferred velocity of a joint, at most a quarter of its speed limit, so that most of the speed
-    /// is left to the motion of the tip.
+    /// Preferred velocity of a joint, at most a quarter of its speed limit, so that most of the
+    /// speed is left to the motion of the tip.
     fn comfort_velocity(&self, joint_ix: usize, value: f64, limits: &ServoLimits) -> f64 {
         let wanted = self.comfort.descent_of(&self.bounds, joint_ix, value);
         let most = 0.25 * limits.joint_speeds[joint_ix];

@@ -116,7 +116,8 @@ fn distant_targets_are_approached_straight_and_at_the_speeds_of_the_tip() {
     assert!((last - start - offset).norm() < 1e-6);
 }
 
-/// Moves the tip to the mirrored angle of the wrist, through the angle at which two axes are in line.
+/// Moves the tip to the mirrored angle of the wrist, through the angle at which two axes are in
+/// line.
 #[test]
 fn singularities_are_passed_at_bounded_speeds() {
     for chain in [ur3e(), ur5e(), ur10e()] {

@@ -143,8 +143,8 @@ fn stack(linear: &Vector3<f64>, angular: &Vector3<f64>) -> Vector6<f64> {
     )
 }
 
-/// The smallest rotation from one direction to another, as a vector along its axis. Between opposite
-/// directions, it is half a turn about any perpendicular axis.
+/// The smallest rotation from one direction to another, as a vector along its axis. Between
+/// opposite directions, it is half a turn about any perpendicular axis.
 fn rotation_between(from: &Unit<Vector3<f64>>, to: &Unit<Vector3<f64>>) -> Vector3<f64> {
     let cross = from.cross(to.as_ref());
     let angle = cross.norm().atan2(from.dot(to.as_ref()));

@@ -12,7 +12,8 @@ pub struct RobotConfig {
     pub urdf: String,
     /// Link that is the base of the robot.
     pub base_link: String,
-    /// Link to which cameras with the parent [`Parent::Flange`](crate::Parent::Flange) are attached.
+    /// Link to which cameras with the parent [`Parent::Flange`](crate::Parent::Flange) are
+    /// attached.
     pub flange_link: String,
     /// Contents of mesh files, by their names in the URDF. A link without its meshes is drawn with
     /// its collision shapes, or with bars between its joints.

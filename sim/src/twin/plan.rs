@@ -88,8 +88,8 @@ pub(crate) fn plan(config: &Config, robot: &RobotConfig) -> Result<TwinPlan, Err
     }
 }
 
-/// A pedestal for a robot beside the table. A robot whose base link is not the root has a body below
-/// it.
+/// A pedestal for a robot beside the table. A robot whose base link is not the root has a body
+/// below it.
 fn pedestal(
     model: &TwinModel,
     robot: &RobotConfig,

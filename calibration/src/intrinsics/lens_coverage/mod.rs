@@ -47,7 +47,8 @@ use shape::ViewShape;
 pub const RECOMMENDED_IMAGES: usize = 15;
 /// A part of the image is covered if this fraction of its cells has corners.
 const MIN_COVERED_FRAC: f64 = 0.5;
-/// A tilt counts if the angle between the target and the image is at least this value. The value is below the requested 20 degrees, because people estimate tilts by eye.
+/// A tilt counts if the angle between the target and the image is at least this value. The value is
+/// below the requested 20 degrees, because people estimate tilts by eye.
 const MIN_TILT_DEG: f64 = 15.0;
 /// Number of photographs with each tilt, with a near target, and with a far target.
 const MIN_EACH: usize = 2;
