@@ -82,7 +82,8 @@ pub struct AblationOptions {
     pub steps: Option<u64>,
     /// Runs of each variant, with consecutive seeds.
     pub seeds: u64,
-    /// Measures only the variants whose names contain one of these words; all variants if empty.
+    /// Measures only the variants whose names contain one of these words. If the list is empty,
+    /// measures all variants.
     pub only: Vec<String>,
     /// Models, images and folder.
     pub runs: RunsOptions,
@@ -98,9 +99,9 @@ struct VariantResult {
     lpips: Option<f64>,
     depth_rmse_m: Option<f64>,
     primitives: f64,
-    /// PSNR of the baseline minus PSNR of the variant, median over the seeds, dB.
+    /// Median over the seeds of the PSNR of the baseline minus the PSNR of the variant, dB.
     gain_db: f64,
-    /// Standard deviation of these gains; `None` with a single seed.
+    /// Standard deviation of these gains. `None` with a single seed.
     gain_std_db: Option<f64>,
     runs: Vec<Run>,
 }
@@ -109,7 +110,7 @@ struct VariantResult {
 ///
 /// # Errors
 ///
-/// If an option is invalid, the data cannot be read or scored, or training fails.
+/// Fails if an option is invalid, if the data cannot be read or scored, or if training fails.
 pub fn run(options: &AblationOptions, host: &Host<'_>) -> Result<BenchResult> {
     let limits = session::limits(options.seconds, options.steps, DEFAULT_SECONDS)?;
     let mut runs = Runs::open(&options.runs, host)?;

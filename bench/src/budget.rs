@@ -1,4 +1,5 @@
-//! Accuracy over the number of splats, compared with the number that the trainer chooses.
+//! Measures the accuracy over the number of splats, and compares it with the number that the
+//! trainer chooses.
 
 use crate::findings::{BenchResult, Findings};
 use crate::runs::{Host, Job, NamedData, Run, Runs, RunsOptions};
@@ -41,7 +42,7 @@ pub struct BudgetOptions {
 /// The runs with one limit on the number of splats.
 #[derive(Clone, Debug, Serialize)]
 struct Capped {
-    /// The limit; `None` if the trainer chooses the number.
+    /// The limit. `None` if the trainer chooses the number.
     cap: Option<u32>,
     /// Median number of splats at the end.
     primitives: f64,
@@ -60,11 +61,11 @@ struct Gain {
     db_per_doubling: f64,
 }
 
-/// Trains splats with each limit on their number, and without one.
+/// Trains splats with each limit on their number, and without a limit.
 ///
 /// # Errors
 ///
-/// If an option is invalid, the data cannot be read or scored, or training fails.
+/// Fails if an option is invalid, if the data cannot be read or scored, or if training fails.
 pub fn run(options: &BudgetOptions, host: &Host<'_>) -> Result<BenchResult> {
     let limits = session::limits(options.seconds, options.steps, DEFAULT_SECONDS)?;
     if options.runs.training.max_splats.is_some() || options.runs.training.count.is_some() {
@@ -149,8 +150,8 @@ impl Capped {
     }
 }
 
-/// Gains per doubling between neighboring limits, if the number of splats grew from one to the
-/// next.
+/// Gains per doubling between neighboring limits, if the number of splats grew from one limit to
+/// the next.
 fn gains(by_cap: &[&Capped]) -> Vec<Gain> {
     by_cap
         .windows(2)
@@ -158,7 +159,8 @@ fn gains(by_cap: &[&Capped]) -> Vec<Gain> {
         .collect()
 }
 
-/// Gain from more splats; `None` if their number hardly grew, because the cap was not reached.
+/// Gain from more splats. `None` if the number of splats hardly grew, because the cap was not
+/// reached.
 fn gain_between(fewer: &Capped, more: &Capped) -> Option<Gain> {
     let db_per_doubling =
         db_per_doubling((fewer.primitives, fewer.psnr), (more.primitives, more.psnr))?;
@@ -198,7 +200,7 @@ fn accuracy_chart(subtitle: &str, by_cap: &[&Capped], chosen: Option<&Capped>) -
         ),
         line_ix: 1,
     });
-    // If neither of two caps is reached, the larger one may give fewer splats.
+    // If neither of two caps is reached, the larger cap may give fewer splats.
     let mut points: Vec<Point> = by_cap.iter().map(|capped| capped.point()).collect();
     points.sort_by(|a, b| a.x.total_cmp(&b.x));
     Chart {

@@ -1,4 +1,4 @@
-//! Accuracy over time, with several seeds, compared with other trainers.
+//! Measures the accuracy over time with several seeds, and compares it with other trainers.
 
 use crate::findings::{BenchResult, Findings};
 use crate::peer::Peer;
@@ -23,7 +23,7 @@ pub const DEFAULT_SECONDS: f64 = 60.0;
 /// Options of [`run`].
 #[derive(Clone, Debug)]
 pub struct CurveOptions {
-    /// Folders or recordings; each gives one line per method.
+    /// Folders or recordings. Each gives one line per method.
     pub data: Vec<PathBuf>,
     /// Training time of each run, seconds.
     pub seconds: f64,
@@ -100,7 +100,8 @@ struct TimeToQuality {
 ///
 /// # Errors
 ///
-/// If an option or a file of a peer is invalid, data cannot be read or scored, or training fails.
+/// Fails if an option or a file of a peer is invalid, if data cannot be read or scored, or if
+/// training fails.
 pub fn run(options: &CurveOptions, host: &Host<'_>) -> Result<BenchResult> {
     let limits = session::limits(Some(options.seconds), None, DEFAULT_SECONDS)?;
     if options.seconds == 0.0 {
@@ -125,7 +126,7 @@ pub fn run(options: &CurveOptions, host: &Host<'_>) -> Result<BenchResult> {
         let data = runs.load(path, &mut names)?;
         data_losses.extend(data.data.data_losses.iter().cloned());
         // The methods of later data sets are not known yet. The estimated number of runs assumes
-        // that each of them has as many methods as this data set. Each data set corrects the
+        // that each later data set has as many methods as this data set. Each data set corrects the
         // estimate.
         let model_specs = bench.applicable(&data);
         runs.expect((n_left * model_specs.len()) as u64 * options.seeds);
@@ -375,7 +376,8 @@ fn time_chart(n_seeds: u64, all: &[&CurveResult]) -> Chart {
         x: Axis {
             label: "seconds of training (log)".into(),
             scale: Scale::Log,
-            // The last evaluation begins slightly late. The margin includes the tick of its time.
+            // The last evaluation begins slightly late. The factor 1.1 ensures that its time still
+            // has a tick.
             ticks: evaluation_schedule::up_to(1.1 * last_secs).collect(),
         },
         y: psnr_axis(),

@@ -1,7 +1,7 @@
 //! Disturbs keyframes, for example with pose noise or a clock offset of a given size.
 //!
 //! A clock offset and an exposure step affect all images, including test images, as they do on a
-//! robot. Pose noise does not affect test images: they keep their true poses, so that the scores
+//! robot. Pose noise does not affect test images. They keep their true poses, so that the scores
 //! measure the model.
 //!
 //! A disturbance is a pure function of its size, a seed and the keyframes. Its effect on a keyframe
@@ -86,7 +86,7 @@ impl Disturbance {
         }
     }
 
-    /// How a break point between two sizes is interpolated; see
+    /// The interpolation of a break point between two sizes, see
     /// [`break_point`](crate::statistics::break_point).
     pub(crate) fn interpolation(self) -> Interpolation {
         match self {
@@ -168,7 +168,7 @@ fn six_normals(seed: u64, camera: &str, stamp: Stamp) -> [f64; 6] {
         hash.update([ix]);
         hash.update(camera.as_bytes());
         let bytes = hash.finalize();
-        // Two uniform numbers give two independent normal ones.
+        // Two uniform numbers give two independent normal numbers.
         let radius = (-2.0 * uniform(&bytes[..8]).ln()).sqrt();
         let (sine, cosine) = (std::f64::consts::TAU * uniform(&bytes[8..16])).sin_cos();
         pair.copy_from_slice(&[radius * cosine, radius * sine]);
@@ -178,7 +178,7 @@ fn six_normals(seed: u64, camera: &str, stamp: Stamp) -> [f64; 6] {
 
 /// A number between 0 and 1, both exclusive, from eight bytes.
 fn uniform(bytes: &[u8]) -> f64 {
-    // 53 bits fill the fraction of a f64; the offset of 0.5 keeps the logarithm finite.
+    // 53 bits fill the fraction of an f64. The offset of 0.5 keeps the logarithm finite.
     let bits = u64::from_le_bytes(bytes.try_into().expect("eight bytes")) >> 11;
     (bits as f64 + 0.5) / (1_u64 << 53) as f64
 }
@@ -255,7 +255,7 @@ fn exposure_step(keyframes: &[Arc<Keyframe>], step_ev: f64) -> Vec<Arc<Keyframe>
     })
 }
 
-/// Replaces the colors of an image by those of the table.
+/// Replaces each color value of an image by its value in the table.
 pub(crate) fn expose(keyframe: &mut Keyframe, table: &[u8; 256]) {
     let pixels = keyframe.rgba_srgb.chunks_exact(4);
     keyframe.rgba_srgb = pixels
@@ -308,7 +308,7 @@ fn subsample(keyframes: &[Arc<Keyframe>], n: f64) -> Vec<Arc<Keyframe>> {
             kept.push(keyframe.clone());
             continue;
         }
-        // Keeps the keyframe in the middle of each of n equal segments.
+        // This keeps the keyframe in the middle of each of n equal segments.
         let before = (n_visited * fraction + 0.5).floor();
         n_visited += 1.0;
         if (n_visited * fraction + 0.5).floor() > before {
@@ -324,8 +324,8 @@ pub(crate) mod tests {
 
     const TOLERANCE: f64 = 1e-9; // Rounding errors of products of poses with elements near 1.
 
-    /// A camera that moves along a line and rotates: 0.1 m and 0.02 rad per keyframe, 10 keyframes
-    /// per second, gray images.
+    /// A camera that moves along a line and rotates, by 0.1 m and 0.02 rad per keyframe. There are
+    /// 10 keyframes per second, with gray images.
     pub(crate) fn capture(n: i64) -> Vec<Arc<Keyframe>> {
         let keyframe = |ix: i64| {
             let along = ix as f64;

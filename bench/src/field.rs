@@ -11,7 +11,7 @@ use trainer::nerf::bench::time_steps;
 const DEFAULT_SAMPLES: [u32; 2] = [1 << 17, 1 << 18];
 /// Default samples per step on the CPU, where a step would otherwise take many seconds.
 const DEFAULT_SAMPLES_ON_CPU: [u32; 1] = [1 << 14];
-/// Default number of timed steps, on a GPU and on the CPU.
+/// Default number of timed steps on a GPU. The next constant is the default on the CPU.
 const DEFAULT_REPEATS: u32 = 100;
 const DEFAULT_REPEATS_ON_CPU: u32 = 3;
 
@@ -20,9 +20,9 @@ const DEFAULT_REPEATS_ON_CPU: u32 = 3;
 pub struct FieldOptions {
     /// Rays per step.
     pub n_rays: u32,
-    /// Samples per step. Each value gives one row; an empty list stands for the defaults. Each
-    /// value is rounded down to a multiple of the number of rays. At least one sample per ray is
-    /// used.
+    /// Samples per step. Each value gives one row, and an empty list stands for the defaults. Each
+    /// value is rounded down to a multiple of the number of rays, but there is at least one sample
+    /// per ray.
     pub n_samples: Vec<u32>,
     /// Number of timed steps, of which the median is reported. If `None`, 100 steps are timed on a
     /// GPU and 3 on the CPU.
@@ -57,7 +57,7 @@ pub struct FieldRow {
 ///
 /// # Errors
 ///
-/// If the GPU cannot be opened or its memory is insufficient.
+/// Fails if the GPU cannot be opened, or if its memory is insufficient.
 pub fn measure(
     options: &FieldOptions,
     open_gpu: OpenGpu,

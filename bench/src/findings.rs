@@ -1,4 +1,5 @@
-//! Writes the results of a bench: JSON with every number, charts as SVG and PNG, and an HTML page.
+//! Writes the results of a bench as JSON with every number, as charts in SVG and PNG, and as an
+//! HTML page.
 
 use anyhow::{Context, Result, anyhow};
 use report::Table;
@@ -10,7 +11,7 @@ use std::path::{Path, PathBuf};
 
 /// Results of a bench so far.
 pub struct Findings {
-    /// Base name of the files: `curve`, `budget`, `stability`.
+    /// Base name of the files, such as `curve`, `budget` or `stability`.
     pub name: &'static str,
     /// Title of the page.
     pub title: String,
@@ -50,11 +51,11 @@ impl BenchResult {
 }
 
 impl Findings {
-    /// Writes all files; returns the path of the page.
+    /// Writes all files, and returns the path of the page.
     ///
     /// # Errors
     ///
-    /// If a file cannot be written.
+    /// Fails if a file cannot be written.
     pub fn write(&self, folder: &Path) -> Result<PathBuf> {
         // The numbers are written first, because they are the only part that cannot be recreated
         // from another part.

@@ -1,4 +1,5 @@
-//! Memory of this process over time, and its growth rate once the keyframe store is full.
+//! Memory of this process over time, and the growth rate of this memory after the keyframe store is
+//! full.
 
 use crate::statistics::theil_sen;
 use crate::viewer::ReceivedPicture;
@@ -30,7 +31,7 @@ pub struct Sample {
     pub gpu_reserved_bytes: Option<u64>,
     /// Size of the models, included in `gpu_bytes`.
     pub model_bytes: u64,
-    /// Images of keyframes on the GPU, included in `gpu_bytes`.
+    /// Images of keyframes on the GPU. They are also included in `gpu_bytes`.
     pub gpu_image_bytes: u64,
     /// Host memory of the keyframes.
     pub keyframe_bytes: u64,
@@ -49,7 +50,7 @@ pub struct Sample {
 /// Part of the resident memory that is excluded from the growth rate.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Excluded {
-    /// Nothing; GPU buffers are in separate memory.
+    /// Nothing is excluded, because GPU buffers are in separate memory.
     Nothing,
     /// The models.
     Model,
@@ -83,7 +84,7 @@ pub struct Growth {
     pub to_seconds: f64,
     /// Median resident memory in that time.
     pub resident_bytes: f64,
-    /// Theil-Sen estimate: the median of the rates of change between all pairs of samples.
+    /// Theil-Sen estimate, which is the median of the rates of change between all pairs of samples.
     pub bytes_per_hour: f64,
     /// The rate as a percentage of `resident_bytes`.
     pub percent_per_hour: f64,
@@ -139,7 +140,7 @@ fn medians(group: &[&Sample], excluded: Excluded) -> Option<(f64, f64)> {
 ///
 /// # Errors
 ///
-/// If the system does not report the resident memory, which only Linux does.
+/// Fails if the system does not report the resident memory. Only Linux reports it.
 pub fn resident_bytes() -> Result<(u64, u64)> {
     const STATUS: &str = "/proc/self/status";
     let status = std::fs::read_to_string(STATUS).with_context(|| {

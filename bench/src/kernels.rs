@@ -47,11 +47,11 @@ const SCAN_DEFAULTS_ON_CPU: Defaults = Defaults {
 /// Options of [`measure`].
 #[derive(Clone, Debug)]
 pub struct KernelsOptions {
-    /// An `.npz` file with splats; a synthetic cloud if `None`.
+    /// An `.npz` file with splats. `None` selects a synthetic cloud.
     pub cloud: Option<PathBuf>,
-    /// Image sizes, pixels; the defaults if empty.
+    /// Image sizes, pixels. An empty list selects the defaults.
     pub sizes_px: Vec<[u32; 2]>,
-    /// Numbers of splats of the synthetic cloud; the defaults if empty.
+    /// Numbers of splats of the synthetic cloud. An empty list selects the defaults.
     pub n_splats: Vec<u32>,
     /// Number of timed images and steps, of which the median is reported. If `None`, 30 are timed
     /// on a GPU and 3 on the CPU.
@@ -87,7 +87,8 @@ pub struct KernelsRow {
 ///
 /// # Errors
 ///
-/// If the file of the cloud is invalid, the GPU cannot be opened, or its memory is insufficient.
+/// Fails if the file of the cloud is invalid, if the GPU cannot be opened, or if its memory is
+/// insufficient.
 pub fn measure(
     options: &KernelsOptions,
     open_gpu: OpenGpu,
@@ -141,7 +142,8 @@ pub fn measure(
         synthetic_cloud
     };
     // The warm-up has a minimum duration, because drivers are slow for a while after large buffers
-    // were allocated. A number of steps would not be enough, because the steps of a GPU are short.
+    // were allocated. A minimum number of steps would not be sufficient, because the steps of a GPU
+    // are short.
     let repeats = Repeats {
         n_warm_up: n_repeats.div_ceil(3),
         warm_up: Duration::from_millis(300),

@@ -1,5 +1,5 @@
-//! The experiments of `fieldrig bench`. They train many models, or measure a part of the program,
-//! and draw charts.
+//! The experiments of `fieldrig bench`. They train many models, or measure a part of the program.
+//! They draw charts of the results.
 //!
 //! [`curve`], [`budget`], [`ablation`] and [`stability`] train models. They save each finished run
 //! to a file, so that a bench restarted in the same folder does not repeat it. [`kernels`] and

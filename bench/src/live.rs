@@ -1,5 +1,5 @@
-//! Measures a live run: latency of pictures and keyframes, training speed, and accuracy over time,
-//! with correct and wrong calibration.
+//! Measures a live run with correct and wrong calibration. The measurements are the latency of
+//! pictures and keyframes, the training speed, and the accuracy over time.
 //!
 //! All times are on the clock of this process, from mid-exposure of an image to the arrival of a
 //! picture at its viewer.
@@ -104,7 +104,7 @@ pub struct LiveRun {
     pub latencies: Vec<(String, Latency)>,
     /// Training seconds and PSNR in dB at the scheduled evaluations.
     pub psnr: Vec<(f64, f64)>,
-    /// PSNR of each camera at the last scheduled evaluation, dB; empty with one camera.
+    /// PSNR of each camera at the last scheduled evaluation, dB. The map is empty with one camera.
     pub psnr_per_camera: BTreeMap<String, f64>,
     /// The run over time.
     pub over_time: OverTime,
@@ -151,7 +151,7 @@ impl LiveRun {
         viewers: &[Viewer],
         timeline: &Timeline,
     ) -> Self {
-        // Only the first model is measured, because it is the one that viewers see.
+        // Only the first model is measured, because viewers see this model.
         let session = &live.sessions()[0];
         let progress = session.progress();
         let seconds = session.time().secs();
@@ -258,7 +258,7 @@ fn shutter_to_picture<'a>(
     keyframes: &'a [KeyframeTimes],
 ) -> impl Iterator<Item = f64> + 'a {
     // The number of keyframes in a picture never falls, so the search for the next keyframe
-    // continues where the last one ended.
+    // continues where the previous search ended.
     let mut rest = pictures;
     (1..).zip(keyframes).filter_map(move |(n, keyframe)| {
         let first = rest.iter().position(|picture| picture.n_keyframes >= n)?;
@@ -271,7 +271,7 @@ fn millis(duration: Duration) -> f64 {
     duration.as_secs_f64() * 1e3
 }
 
-/// A row of a table: the name of a quantity, and its value in each run.
+/// A row of a table, with the name of a quantity and its value in each run.
 fn row(name: &str, runs: &[LiveRun], value: &dyn Fn(&LiveRun) -> String) -> Vec<String> {
     std::iter::once(name.to_owned())
         .chain(runs.iter().map(value))
@@ -314,7 +314,7 @@ fn rows(runs: &[LiveRun]) -> Vec<Vec<String>> {
     if is_any(|input| input.stations > 0) {
         add("stations registered", &|run| run.input.stations.to_string());
     }
-    // Every run has the same schedule, but some may have ended earlier.
+    // Every run has the same schedule, but some runs may have ended earlier.
     let marks = runs
         .iter()
         .map(|run| &run.psnr)

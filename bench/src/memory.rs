@@ -47,7 +47,7 @@ impl MemoryRun {
     ///
     /// # Errors
     ///
-    /// If the system does not report the memory of this process.
+    /// Fails if the system does not report the memory of this process.
     pub fn add_sample(&mut self, live: &LiveLoop, gpu: &Gpu, viewers: &[Viewer]) -> Result<Sample> {
         let (sample, gpu_buffers) = sample(live, gpu, viewers)?;
         self.gpu_buffers = gpu_buffers;
@@ -59,7 +59,7 @@ impl MemoryRun {
     ///
     /// # Errors
     ///
-    /// If the system does not report the memory of this process.
+    /// Fails if the system does not report the memory of this process.
     pub fn findings(&self) -> Result<Findings> {
         let samples = &self.samples;
         let growths = self.growths();
@@ -84,8 +84,8 @@ impl MemoryRun {
             .filter(|line| !line.points.is_empty())
             .collect();
         let full = samples.iter().find(|sample| sample.evicted > 0);
-        // Until the store is full, keyframes are the part that grows. The marker has the color of
-        // their line.
+        // Until the store is full, keyframes are the part that grows. The marker therefore has the
+        // color of the line of the keyframes.
         let markers = full.map(|sample| Marker {
             x: sample.seconds / SECS_PER_MINUTE,
             label: format!("store full: {} keyframes", sample.keyframes),
@@ -162,7 +162,7 @@ impl MemoryRun {
             .collect()
     }
 
-    /// The rows of the table: memory at the end, counts, growth rates.
+    /// The rows of the table, which are the memory at the end, the counts, and the growth rates.
     fn rows(&self, growths: &[(&str, Growth)]) -> Result<Vec<Vec<String>>> {
         let mut rows = Vec::new();
         let mut add = |name: &str, value: String| rows.push(vec![name.to_owned(), value]);
@@ -274,7 +274,7 @@ const COMPONENTS: [MemoryComponent; 6] = [
     },
 ];
 
-/// The line of one component: median and range of each group of samples.
+/// The line of one component, with the median and range of each group of samples.
 fn line(component: &MemoryComponent, samples: &[Sample]) -> Line {
     let n_each = samples.len().div_ceil(MAX_POINTS).max(1);
     Line {
@@ -288,7 +288,7 @@ fn line(component: &MemoryComponent, samples: &[Sample]) -> Line {
 }
 
 impl MemoryComponent {
-    /// Median and range of a group of samples; `None` if the backend does not report this memory.
+    /// Median and range of a group of samples. `None` if the backend does not report this memory.
     fn point(&self, group: &[Sample]) -> Option<Point> {
         let mut mb: Vec<f64> = group
             .iter()

@@ -36,7 +36,7 @@ struct Moment {
     seconds: f64,
     step: u64,
     psnr: Option<f64>,
-    /// `None` if the system does not report it.
+    /// Resident memory. `None` if the system does not report it.
     host_bytes: Option<f64>,
 }
 
@@ -118,9 +118,9 @@ impl Timeline {
 pub struct Bucket {
     /// Middle of the interval, seconds of training.
     pub seconds: f64,
-    /// Time from a request to the complete picture, milliseconds; `None` without pictures.
+    /// Time from a request to the complete picture, milliseconds. `None` without pictures.
     pub picture_millis: Option<f64>,
-    /// Mean of the latest PSNR of all test images, dB; `None` before the first score.
+    /// Mean of the latest PSNR of all test images, dB. `None` before the first score.
     pub psnr: Option<f64>,
     /// Training steps per second.
     pub steps_per_sec: f64,
@@ -161,7 +161,7 @@ impl Bucket {
 pub struct Trend {
     /// Median over the buckets.
     pub median: f64,
-    /// Theil-Sen estimate: the median of the rates of change between all pairs of buckets.
+    /// Theil-Sen estimate, which is the median of the rates of change between all pairs of buckets.
     pub per_hour: f64,
     /// The rate as a percentage of the median.
     pub percent_per_hour: f64,
@@ -185,7 +185,7 @@ impl Trend {
 pub struct OverTime {
     /// Consecutive intervals, at most 60.
     pub buckets: Vec<Bucket>,
-    /// Trends of the second half by name; empty if the run took less than two minutes.
+    /// Trends of the second half by name. The list is empty if the run took less than two minutes.
     pub trends: Vec<(&'static str, Trend)>,
 }
 
@@ -248,7 +248,7 @@ impl OverTime {
         rows
     }
 
-    /// Median and change of a quantity as text; `None` if they are unknown.
+    /// Median and change of a quantity as text. `None` if they are unknown.
     fn cell(&self, quantity: &Quantity) -> Option<String> {
         let n_decimals = quantity.n_decimals;
         let (_, trend) = self
@@ -273,7 +273,7 @@ impl OverTime {
             .collect()
     }
 
-    /// The line of one quantity; `None` for an unknown name.
+    /// The line of one quantity. `None` for an unknown name.
     fn line(&self, name: &str, trend: &Trend) -> Option<Line> {
         let quantity = QUANTITIES.iter().find(|quantity| quantity.name == name)?;
         // The unit at the end of the name does not apply to percentages.
@@ -306,8 +306,8 @@ fn percent_point(seconds: f64, value: f64, median: f64) -> Point {
 mod tests {
     use super::*;
 
-    /// A run of `n` seconds whose memory grows by 36 MB per hour, with ten pictures per second of
-    /// 20 ms at the start and 10 ms more per hour.
+    /// A run of `n` seconds whose memory grows by 36 MB per hour. It has ten pictures per second,
+    /// which take 20 ms at the start and 10 ms more per hour.
     fn over_time(n: u32) -> OverTime {
         let began = Instant::now();
         let moment = |ix: u32| Moment {

@@ -35,7 +35,7 @@ impl Peer {
     ///
     /// # Errors
     ///
-    /// If the file is unreadable or has another format.
+    /// Fails if the file is unreadable or has another format.
     pub(crate) fn load(path: &Path) -> Result<Self> {
         let invalid =
             |reason: &str| BadInput(format!("{} {}: {reason}", Setting::Peer, path.display()));

@@ -30,7 +30,7 @@ pub struct RunsOptions {
     pub training: TrainingOptions,
     /// Which images are used.
     pub images: DataOptions,
-    /// Folder for runs, charts and the page; a new folder in `runs` if `None`.
+    /// Folder for runs, charts and the page. `None` selects a new folder in `runs`.
     pub out: Option<PathBuf>,
 }
 
@@ -96,9 +96,9 @@ pub struct RunSettings {
     pub method: String,
     /// Random seed.
     pub seed: u64,
-    /// Maximum number of splats; `None` if the method has no such limit.
+    /// Maximum number of splats. `None` if the method has no such limit.
     pub max_splats: Option<u64>,
-    /// Maximum GPU memory of the model, bytes; `None`: no limit.
+    /// Maximum GPU memory of the model, bytes. `None` if there is no limit.
     pub max_bytes: Option<u64>,
     /// All options of the model, including those above.
     #[serde(default)]
@@ -140,14 +140,14 @@ pub struct Disturbed {
     pub rate_hz: Option<f64>,
 }
 
-/// Scores and size at one time; `None` if unknown.
+/// Scores and size at one time. Unknown values are `None`.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct RunScores {
     /// Training time, seconds.
     pub seconds: f64,
     /// Number of optimizer steps.
     pub step: u64,
-    /// Mean PSNR of the test images, dB; `None` also if it is infinite.
+    /// Mean PSNR of the test images, dB. It is also `None` if it is infinite.
     pub psnr: Option<f64>,
     /// Mean SSIM of the test images.
     pub ssim: Option<f64>,
@@ -222,8 +222,8 @@ pub(crate) struct Job<'a> {
     pub(crate) variant: Option<String>,
     /// Returns the keyframes. Called only if the run is not saved yet.
     pub(crate) keyframes: &'a dyn Fn() -> Vec<Arc<Keyframe>>,
-    /// Whether scheduled evaluations compute all scores instead of PSNR only. The final evaluation
-    /// computes all scores.
+    /// Whether scheduled evaluations compute all scores instead of only the PSNR. The final
+    /// evaluation always computes all scores.
     pub(crate) is_thorough: bool,
 }
 
@@ -243,7 +243,7 @@ impl NamedData {
     ///
     /// # Errors
     ///
-    /// If there are several methods.
+    /// Fails if there are several methods.
     pub(crate) fn single_model_spec(&self) -> Result<&ModelSpec> {
         match &self.model_specs[..] {
             [one] => Ok(one),
@@ -256,11 +256,11 @@ impl NamedData {
         }
     }
 
-    /// The training options of splats, for a bench that measures splats only.
+    /// The training options of splats, for a bench that measures only splats.
     ///
     /// # Errors
     ///
-    /// If another method, or several methods, are selected.
+    /// Fails if another method, or if several methods are selected.
     pub(crate) fn splats(&self) -> Result<ModelOptions<SplatOptions>> {
         let options = match &self.model_specs[..] {
             [one] => one.options_of()?,
@@ -437,7 +437,7 @@ impl<'a> Runs<'a> {
             observer: &|limits, _n_sessions| self.host.observer.training(limits),
         };
         let session = training.run(self.gpu.clone(), services)?;
-        // An interrupted run is not saved, because it would count as a complete one.
+        // An interrupted run is not saved, because it would count as a complete run.
         ensure!(
             session.is_over() || !self.host.stop.requested(),
             "stopped early; to continue the bench, run the same command with {} {}",
@@ -507,11 +507,12 @@ fn path_of(out: &Path, name: &str) -> PathBuf {
     out.join(RUNS).join(format!("{}.json", file_name(name)))
 }
 
-/// The run with this name that is saved in the folder of a bench; `None` if there is none.
+/// The run with this name that is saved in the folder of a bench. `None` if there is no such run.
 ///
 /// # Errors
 ///
-/// If its settings differ. Such a run must not appear among the results of the other runs.
+/// Fails if the settings of the saved run differ. Such a run must not appear among the results of
+/// the other runs.
 fn saved_run(out: &Path, name: &str, settings: &RunSettings) -> Result<Option<Run>> {
     let path = path_of(out, name);
     if !path.exists() {
@@ -548,8 +549,8 @@ fn difference(cached: &RunSettings, requested: &RunSettings) -> Result<Option<St
     Ok(first_difference(&fields(cached)?, &fields(requested)?))
 }
 
-/// Description of the first value of an object that differs. If that value is itself an object, the
-/// description names the first value inside it that differs.
+/// Description of the first value of an object that differs. If this value is an object, the
+/// description names the first value inside the object that differs.
 fn first_difference(cached: &Value, requested: &Value) -> Option<String> {
     let (key, value) = requested
         .as_object()?

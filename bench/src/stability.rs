@@ -1,4 +1,4 @@
-//! Accuracy over the size of a disturbance, and its break points.
+//! Measures the accuracy over the size of a disturbance, and the break points.
 
 use crate::disturb::Disturbance;
 use crate::findings::{BenchResult, Findings};
@@ -27,7 +27,7 @@ const NANOS_PER_SEC: f64 = 1e9;
 /// Difference between consecutive stamps that only count images, nanoseconds.
 const NANOS_PER_COUNT: f64 = 1e6;
 
-/// All variants are trained on the same disturbed data; each gives one line per chart.
+/// All variants are trained on the same disturbed data. Each variant gives one line per chart.
 const VARIANTS: &[Variant] = &[REFINED, Variant::CAMERAS_AS_GIVEN];
 
 /// The cameras are refined as requested. [`name_of`] adds the name of the setting.
@@ -45,7 +45,7 @@ pub struct StabilityOptions {
     pub disturbances: Vec<Disturbance>,
     /// Whether a clock offset is skipped instead of rejected if the images have no times.
     pub can_skip_clock_offset: bool,
-    /// Sizes of a single disturbance, in its unit; the defaults if empty.
+    /// Sizes of a single disturbance, in its unit. An empty list selects the defaults.
     pub levels: Vec<f64>,
     /// Images per second, for images without times.
     pub rate_hz: Option<f64>,
@@ -96,7 +96,7 @@ struct Level {
     runs: Vec<Run>,
 }
 
-/// Size at which the PSNR has fallen by `drop_db` from the undisturbed PSNR; `None` if it does not
+/// Size at which the PSNR has fallen by `drop_db` from the undisturbed PSNR. `None` if it does not
 /// fall that far.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 struct Break {
@@ -108,7 +108,7 @@ struct Break {
 ///
 /// # Errors
 ///
-/// If an option is invalid, the data cannot be read or scored, or training fails.
+/// Fails if an option is invalid, if the data cannot be read or scored, or if training fails.
 pub fn run(options: &StabilityOptions, host: &Host<'_>) -> Result<BenchResult> {
     let limits = session::limits(options.seconds, options.steps, DEFAULT_SECONDS)?;
     options.check()?;
@@ -149,7 +149,7 @@ pub fn run(options: &StabilityOptions, host: &Host<'_>) -> Result<BenchResult> {
 }
 
 /// The variants that differ for these options. If no camera parameters are refined, there is only
-/// one.
+/// one variant.
 fn distinguished(options: &ModelOptions) -> Vec<&'static Variant> {
     let mut distinguished: Vec<&Variant> = Vec::new();
     for variant in VARIANTS {
@@ -412,7 +412,7 @@ impl DisturbanceResult {
         let (scale, ticks) = match self.disturbance.interpolation() {
             Interpolation::Log => (Scale::Log, self.levels()),
             // The levels are evenly spaced. On a linear scale, small levels would be on top of each
-            // other, and a logarithmic scale has no 0.
+            // other. A logarithmic scale would have no 0.
             Interpolation::Linear => (Scale::Levels(self.levels()), Vec::new()),
         };
         let curves = self.variants.iter().enumerate();
@@ -465,7 +465,7 @@ impl DisturbanceResult {
         levels
     }
 
-    /// The marker of a break point; `None` if it was not reached.
+    /// The marker of a break point. `None` if the break point was not reached.
     fn marker(&self, line_ix: usize, at: &Break) -> Option<Marker> {
         let level = at.level?;
         let label = format!(

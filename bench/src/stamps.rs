@@ -35,11 +35,13 @@ pub struct StampsOptions {
     pub fixed_millis: f64,
     /// Maximum random latency added to each image, 0 to 1000 ms.
     pub jitter_millis: f64,
-    /// How much faster this computer's clock runs than the camera's, -200 to 200 parts per million.
+    /// Rate of this computer's clock relative to the camera's clock, as a difference of -200 to 200
+    /// parts per million. It is positive if this computer's clock runs faster.
     pub drift_ppm: f64,
     /// Length of a run, 1 to 3600 s.
     pub seconds: f64,
-    /// Time at the start of a run that is ignored; at least half a second less than `seconds`.
+    /// Time at the start of a run that is ignored. It must be at least half a second less than
+    /// `seconds`.
     pub settle_seconds: f64,
     /// Runs per rate.
     pub seeds: u64,
@@ -72,7 +74,7 @@ pub struct StampErrors {
 ///
 /// # Errors
 ///
-/// If an option is out of range or the folder cannot be written.
+/// Fails if an option is out of range, or if the folder cannot be written.
 pub fn run(options: &StampsOptions) -> Result<BenchResult> {
     let results = measure(options)?;
     std::fs::create_dir_all(&options.out)
@@ -91,7 +93,7 @@ pub fn run(options: &StampsOptions) -> Result<BenchResult> {
 ///
 /// # Errors
 ///
-/// If an option is out of range.
+/// Fails if an option is out of range.
 pub fn measure(options: &StampsOptions) -> Result<Vec<StampErrors>> {
     check(options)?;
     let mut results = Vec::new();
@@ -153,8 +155,9 @@ fn check(options: &StampsOptions) -> Result<()> {
     }
 }
 
-/// The stamp error of each image after the settling time. It is the time of the joint state at the
-/// stamp of the image, minus the time of its shutter. The error includes the fixed latency.
+/// The stamp error of each image after the settling time. It is the time at which the joint was at
+/// the angle that belongs to the stamp, minus the time of the shutter. The error includes the fixed
+/// latency.
 #[expect(
     clippy::cast_possible_truncation,
     reason = "times of an hour at most, in nanoseconds"
@@ -246,7 +249,7 @@ impl StampErrors {
 
     /// The histogram as a line.
     fn line(&self) -> Line {
-        // Draws one empty bin on either side of the nonempty ones.
+        // One empty bin is drawn on either side of the nonempty bins.
         let first = self
             .bars
             .iter()

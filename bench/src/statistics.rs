@@ -1,4 +1,4 @@
-//! Statistics over runs: spreads, times to a PSNR level, break points.
+//! Statistics over runs, which are spreads, times to a PSNR level, and break points.
 
 use numbers::quantile::median;
 
@@ -10,7 +10,7 @@ pub(crate) fn extent(values: &[f64]) -> Option<[f64; 2]> {
     }))
 }
 
-/// Sample standard deviation (divided by n - 1); `None` for fewer than two values.
+/// Sample standard deviation (divided by n - 1). `None` for fewer than two values.
 pub(crate) fn sample_std(values: &[f64]) -> Option<f64> {
     if values.len() < 2 {
         return None;
@@ -43,8 +43,9 @@ pub(crate) fn secs_to(curve: &[(f64, f64)], target_db: f64) -> Option<f64> {
     Some(previous_secs * (secs / previous_secs).powf(frac))
 }
 
-/// Slope of a line through `(x, y)` by the Theil-Sen estimator: the median of the slopes between
-/// all pairs of points, which is robust to outliers. `None` with fewer than two values of x.
+/// Slope of a line through `(x, y)` by the Theil-Sen estimator. It is the median of the slopes
+/// between all pairs of points, which is robust to outliers. `None` with fewer than two values of
+/// x.
 ///
 /// Source: Theil 1950, Sen 1968.
 pub(crate) fn theil_sen(points: &[(f64, f64)]) -> Option<f64> {
@@ -59,7 +60,7 @@ pub(crate) fn theil_sen(points: &[(f64, f64)]) -> Option<f64> {
     median(&rates)
 }
 
-/// How values between two levels of a disturbance are interpolated.
+/// Interpolation of values between two levels of a disturbance.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Interpolation {
     /// Linear in the level.
@@ -68,8 +69,8 @@ pub(crate) enum Interpolation {
     Log,
 }
 
-/// The level at which a curve of `(level, dB)` has first fallen by `drop_db` from its first point;
-/// `None` if it never does.
+/// The level at which a curve of `(level, dB)` has first fallen by `drop_db` from its first point.
+/// `None` if it never falls that far.
 pub(crate) fn break_point(
     curve: &[(f64, f64)],
     drop_db: f64,
@@ -90,7 +91,7 @@ pub(crate) fn break_point(
 /// Minimum growth of a count. For less growth, the gain per doubling would be mostly noise.
 const MIN_GROWTH: f64 = 1.05;
 
-/// Gain per doubling of the count between two points `(count, dB)`; `None` if the count grew by
+/// Gain per doubling of the count between two points `(count, dB)`. `None` if the count grew by
 /// less than [`MIN_GROWTH`].
 pub(crate) fn db_per_doubling(fewer: (f64, f64), more: (f64, f64)) -> Option<f64> {
     let growth = more.0 / fewer.0;

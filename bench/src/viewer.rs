@@ -1,4 +1,5 @@
-//! A viewer for benches: a WebSocket client that requests images back to back and discards them.
+//! A viewer for benches. It is a WebSocket client that requests images back to back and discards
+//! them.
 //!
 //! The viewer uses the capabilities that the web page uses for pictures, and runs in the measured
 //! process. To affect the measurement little, it decodes only the first picture with each new
@@ -23,9 +24,9 @@ const STEP_RAD: f64 = 0.05;
 const MAX_SILENCE: Duration = Duration::from_secs(120);
 /// Time after the connection during which the server may have no picture yet.
 const MAX_START: Duration = Duration::from_secs(2);
-/// Maximum length of a text message; the list of keyframes is the longest.
+/// Maximum length of a text message. The longest text message is the list of keyframes.
 const MAX_TEXT_BYTES: u64 = 16 << 20;
-/// Maximum length of a binary message; a panorama is the longest.
+/// Maximum length of a binary message. The longest binary message is a panorama.
 const MAX_BINARY_BYTES: u64 = 256 << 20;
 
 /// Protocol version of this client.
@@ -42,8 +43,8 @@ const PONG: u8 = 10;
 pub struct ViewerOptions {
     /// Width and height, pixels.
     pub size_px: [u32; 2],
-    /// All directions around a point in the scene (equirectangular) instead of a pinhole view from
-    /// outside.
+    /// Whether the viewer requests panoramas instead of pinhole views from outside. A panorama
+    /// shows all directions around a point in the scene (equirectangular).
     pub is_panorama: bool,
     /// Minimum time between two requests. If it is zero, each request follows the previous picture
     /// at once.
@@ -80,7 +81,7 @@ pub struct ReceivedPicture {
     pub n_keyframes: u64,
 }
 
-/// A connected viewer; it disconnects when dropped.
+/// A connected viewer. It disconnects when dropped.
 #[derive(Debug)]
 pub struct Viewer {
     stream: TcpStream,
@@ -93,7 +94,7 @@ impl Viewer {
     ///
     /// # Errors
     ///
-    /// If the server does not accept the connection.
+    /// Fails if the server does not accept the connection.
     pub fn connect(address: SocketAddr, options: ViewerOptions) -> Result<Self> {
         let stream =
             TcpStream::connect(address).with_context(|| format!("cannot connect to {address}"))?;
@@ -294,8 +295,8 @@ impl Client {
         if header["type"] != "part" {
             return self.handle_picture(&header, payload);
         }
-        // The server sends large messages in parts, so that others do not wait for them. The parts
-        // of one message arrive in order.
+        // The server sends large messages in parts, so that other messages do not wait for them.
+        // The parts of one message arrive in order.
         if header["offset"] == 0 {
             self.parts.clear();
         }
@@ -360,7 +361,7 @@ impl Client {
     fn request_picture(&mut self) -> Result<()> {
         let angle = self.n_requested as f64 * STEP_RAD;
         let is_panorama = self.options.is_panorama;
-        // A panorama is taken near the center, a pinhole view from outside and above.
+        // A panorama is taken near the center, and a pinhole view is taken from outside and above.
         let distance_m = if is_panorama { 0.2 } else { 1.5 } * self.radius_m;
         let offset = Vector3::new(angle.cos(), angle.sin(), 0.7) * distance_m;
         // The y axis of `face_towards` points up, but the y axis of a camera points down.
@@ -386,7 +387,7 @@ impl Client {
         self.send(TEXT, request.to_string().as_bytes())
     }
 
-    /// Opcode and length of the next frame; the server sends each message as one frame.
+    /// Opcode and length of the next frame. The server sends each message as one frame.
     fn next_frame(&mut self) -> Result<(u8, u64)> {
         let mut head = [0; 2];
         self.reader.read_exact(&mut head)?;
@@ -461,7 +462,7 @@ fn scene_number(value: &Value) -> Result<f64> {
         .ok_or_else(|| anyhow!("a scene message lacks a number"))
 }
 
-/// An index or a length; `None` if it is not a whole number that this computer can address.
+/// An index or a length. `None` if it is not a whole number that this computer can address.
 fn index(value: &Value) -> Option<usize> {
     usize::try_from(value.as_u64()?).ok()
 }
@@ -561,7 +562,7 @@ mod tests {
         }
     }
 
-    /// Seconds from one time to another; negative if the other one is earlier.
+    /// Seconds from `from` to `to`. The result is negative if `to` is earlier.
     fn secs_between(from: Instant, to: Instant) -> f64 {
         to.duration_since(from).as_secs_f64() - from.duration_since(to).as_secs_f64()
     }

@@ -10,8 +10,9 @@ use std::sync::Arc;
 
 /// Step at which training waits for the result and applies it.
 ///
-/// With a later step, training waits less for alignment, but trains longer with wrong poses. The
-/// step is smaller on software adapters, where one step takes as long as the whole alignment.
+/// At a later step, training would wait less for alignment, but it would train longer with wrong
+/// poses. On software adapters, the step is smaller, because one training step takes as long as the
+/// whole alignment there.
 const ALIGNMENT_STEP: u64 = 400;
 const SOFTWARE_ALIGNMENT_STEP: u64 = 50;
 
@@ -22,11 +23,11 @@ pub fn alignment_step(is_software: bool, n_planned_steps: u64) -> u64 {
     } else {
         ALIGNMENT_STEP
     };
-    // Short trainings must have steps left to use the result.
+    // A short training must still have steps left after the result is applied.
     default_step.min(n_planned_steps / 4).max(1)
 }
 
-/// Alignment in the background, once or several times with more keyframes.
+/// Alignment in the background. It runs once, or again whenever more keyframes are available.
 #[derive(Debug)]
 pub struct AlignmentTask {
     state: TaskState,
@@ -95,7 +96,7 @@ impl AlignmentTask {
 
     /// Starts alignment of uncorrected keyframes on its own thread.
     pub fn begin(&mut self, keyframes: &[Arc<Keyframe>], choice: &CameraRefinement) {
-        // Alignment does not estimate movements of cameras, but it must apply known ones.
+        // Alignment does not estimate movements of cameras, but it must apply known movements.
         // Otherwise, images before and after a movement would contradict each other.
         let choice = choice.clone();
         let with_movements = |keyframe: &Arc<Keyframe>| match &self.result {
@@ -131,7 +132,8 @@ impl AlignmentTask {
         if let Some(latest) = &self.result {
             result.movements.clone_from(&latest.movements);
         }
-        // Correcting keyframes again moves the model, so it is avoided for negligible changes.
+        // New corrections move the model, so keyframes are not corrected again for negligible
+        // changes.
         let is_changed = match &self.result {
             None => result.has_corrections(),
             Some(latest) => keyframes
@@ -176,9 +178,9 @@ impl AlignmentTask {
 const COLOR_ACCURACY_RAD: f64 = 1.75e-3;
 const COLOR_ACCURACY_M: f64 = 3e-3;
 
-/// Whether the latest corrections are as good as newer ones. Without depth, this is the case if
-/// both agree within their accuracy, or if the newer estimate was rejected. Without this check,
-/// cameras would move back and forth.
+/// Whether the latest corrections are as good as newer corrections. Without depth, this is the case
+/// if both agree within their accuracy, or if the newer estimate was rejected. Without this check,
+/// the estimated poses of cameras would alternate between similar values.
 fn is_as_good(latest: &Alignment, newer: &Alignment, keyframes: &[Arc<Keyframe>]) -> bool {
     if !latest.has_corrections() || keyframes.iter().any(|keyframe| keyframe.depth.is_some()) {
         return false;

@@ -21,8 +21,8 @@ pub struct CameraCorrection {
     pub log_focal: [f64; 2],
     /// Offset of the principal point, in focal lengths.
     pub principal_offset_focals: [f64; 2],
-    /// Offsets added to the readings of the joints that carry the camera, radians or meters; may be
-    /// empty.
+    /// Offsets added to the readings of the joints that carry the camera, radians or meters. The
+    /// list may be empty.
     pub joint_offsets: Vec<f64>,
     /// Rotation vector in the camera's own axes, radians. The rotation is applied after
     /// `color_from_depth`, and the translation after the rotation.
@@ -134,7 +134,7 @@ impl CameraCorrection {
         }
     }
 
-    /// The corrected camera of a keyframe; [`CalibratedCamera::of`] is the uncorrected one.
+    /// The corrected camera of a keyframe. [`CalibratedCamera::of`] returns the uncorrected camera.
     pub fn apply(&self, keyframe: &Keyframe) -> CalibratedCamera {
         let lens = CalibratedCamera::of(keyframe);
         // Each correction is a motion in camera axes, from the raw to the corrected camera.
@@ -151,8 +151,9 @@ impl CameraCorrection {
             Vector3::new(rotation_x, rotation_y, rotation_z),
             Vector3::new(x, y, z),
         );
-        // The factors from right to left follow the order of the causes: the time of the exposure,
-        // the joints, the pose of this image, and the extrinsics of the camera.
+        // From right to left, the factors correct the time of the exposure, the joints, the pose of
+        // this image, and the extrinsics of the camera. This is the order in which the errors
+        // arise.
         let world_from_camera =
             (extrinsics * drift * joints * time_offset * lens.world_from_camera.inverse())
                 .inverse();
@@ -180,8 +181,9 @@ impl CameraCorrection {
         }
     }
 
-    /// Drift of an image. If the image has an entry, this is its entry. Otherwise, it is the
-    /// interpolation between its neighbors in time, multiplied by `drift_weight`.
+    /// Drift of an image. An image with an entry in `drift` has the drift of this entry. For other
+    /// images, the drift is interpolated between the neighbors in time and multiplied by
+    /// `drift_weight`.
     pub fn drift_at(&self, stamp: Stamp) -> [f64; 6] {
         let share = if self.drift.contains_key(&stamp.0) {
             1.0

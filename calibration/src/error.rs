@@ -27,7 +27,7 @@ pub enum Error {
         /// Number of parameters.
         n_params: usize,
     },
-    /// There is not one size per image.
+    /// The number of sizes differs from the number of images.
     #[error("calibration from targets: {n_images} images, but {n_sizes} image sizes")]
     ImageSizes {
         /// Number of images.
@@ -169,7 +169,7 @@ pub struct Refusal {
     /// What is missing or wrong, with values.
     pub why: String,
     /// Unit vector in the flange frame. It is the only observed axis of rotation, or the direction
-    /// that is not observable. `None` if the reason is not about an axis.
+    /// that is not observable. It is `None` if the reason does not concern an axis.
     pub axis: Option<[f64; 3]>,
     /// The motion or correction that would help.
     pub motion: String,

@@ -2,12 +2,12 @@
 //!
 //! A [`CameraCorrection`] holds the estimated errors of one camera: extrinsics (hand-eye), time
 //! offset, intrinsics, joint offsets, and the pose, scale and timing of its depth camera. A
-//! [`ParamSet`] selects which of them are estimated. [`align`] estimates them by registering
-//! keyframes with depth, keeps those that improve validation images ([`Trial`]), and reports their
-//! uncertainty. Without depth, it estimates extrinsics from matched features. [`AlignmentTask`]
-//! runs [`align`] in parallel with training. [`register_station`] estimates the pose of a mobile
-//! base at one station. [`hand_eye`] calibrates a camera with a target, and [`time_offset`] finds
-//! the offset between the clocks of two pose streams.
+//! [`ParamSet`] selects which of them are estimated. [`align`] estimates the selected parameters by
+//! registering keyframes with depth. It keeps the estimates that improve validation images
+//! ([`Trial`]), and reports their uncertainty. Without depth, it estimates extrinsics from matched
+//! features. [`AlignmentTask`] runs [`align`] in parallel with training. [`register_station`]
+//! estimates the pose of a mobile base at one station. [`hand_eye`] calibrates a camera with a
+//! target, and [`time_offset`] finds the offset between the clocks of two pose streams.
 //!
 //! [`calibrate_intrinsics`] estimates focal length, principal point and lens of one camera from
 //! images of a flat calibration target.

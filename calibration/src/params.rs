@@ -15,8 +15,8 @@ bitflags::bitflags! {
     /// ```
     #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
     pub struct ParamSet: u16 {
-        /// Extrinsics of each camera: rotation and translation relative to its parent (hand-eye if
-        /// the parent is the flange).
+        /// Extrinsics of each camera: rotation and translation relative to its parent. If the
+        /// parent is the flange, they are the hand-eye transform.
         const EXTRINSICS = 1;
         /// Time by which the poses of each camera lag behind its images.
         const TIME_OFFSET = 1 << 1;
@@ -27,13 +27,13 @@ bitflags::bitflags! {
         /// Gains of red, green and blue of each image.
         const IMAGE_GAINS = 1 << 4;
         /// Offset added to the readings of each joint that carries a camera. This parameter and the
-        /// following ones are estimated only by alignment.
+        /// following parameters are estimated only by alignment.
         const JOINTS = 1 << 5;
         /// Pose of the depth frame in the camera frame.
         const DEPTH_POSE = 1 << 6;
         /// Factor on depth readings.
         const DEPTH_SCALE = 1 << 7;
-        /// Time from the exposure of the first row to that of the last row.
+        /// Time from the exposure of the first row to the exposure of the last row.
         const READOUT = 1 << 8;
     }
 }

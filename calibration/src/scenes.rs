@@ -1,5 +1,5 @@
-//! Keyframes with known calibration errors, from a simulated room of textured planes that a camera
-//! on an arm with four joints observes.
+//! Keyframes with known calibration errors. They show a simulated room of textured planes, and the
+//! camera is on an arm with four joints.
 
 use crate::{CameraCorrection, rigid_transform};
 use keyframe::{DepthMap, Keyframe, Split};
@@ -53,7 +53,8 @@ pub fn camera_at(joints: Joints) -> Transform {
     base_from_flange(joints) * flange_from_camera()
 }
 
-/// Joint positions of a scan at a time in seconds, in which all joints move or only the azimuth.
+/// Joint positions of a scan at a time in seconds. Either all joints move, or only the azimuth
+/// moves.
 pub fn joints_at(secs: f64, azimuth_only: bool) -> Joints {
     let wave = |size: f64, hz: f64, phase: f64| {
         size * (2.0 * std::f64::consts::PI * hz * secs + phase).sin()
@@ -95,8 +96,8 @@ fn cast(from: Point3<f64>, ray: Vector3<f64>) -> (f64, f64) {
     for (normal, offset) in planes {
         let along = normal.dot(&ray);
         let distance = (offset - normal.dot(&from.coords)) / along;
-        // Planes behind the camera do not count, and neither do planes that are seen from outside
-        // the room.
+        // Planes behind the camera do not count. Planes that are seen from outside the room do not
+        // count either.
         if along > 0.0 && distance > 0.0 {
             nearest = nearest.min(distance);
         }
@@ -138,7 +139,7 @@ pub struct Miscalibration {
     pub azimuth_only: bool,
     /// Whether rows are exposed one after the other.
     pub has_rolling_shutter: bool,
-    /// Image noise relative to that of a real camera.
+    /// Image noise relative to the noise of a real camera.
     pub noise: f64,
     /// Seed of the noise.
     pub seed: u64,
@@ -163,7 +164,7 @@ impl Miscalibration {
     }
 }
 
-/// Normally distributed noise that depends only on the key.
+/// Normally distributed noise. The same key always gives the same value.
 fn noise(key: u64) -> f64 {
     Random::new(key).normal()
 }

@@ -1,10 +1,10 @@
-//! Checks whether tags at known poses contradict the calibrated pose of a camera while a robot
-//! works.
+//! Compares the calibrated pose of a camera with tags at known poses while a robot works, and
+//! reports contradictions.
 //!
-//! Each image with a tag gives the pose of the camera relative to the world. If the camera has
-//! moved relative to its mount, this pose differs from the calibrated pose by a motion that is the
-//! same in the frame of the camera for all robot poses. If the tag has moved, the motion is the
-//! same in the world.
+//! Each image with a tag gives the pose of the camera relative to the world. A constant motion
+//! separates this pose from the calibrated pose if the camera or the tag has moved. If the camera
+//! has moved relative to its mount, the motion is constant in the frame of the camera. If the tag
+//! has moved, the motion is constant in the world.
 
 use crate::least_squares::sigma_of;
 use kinematics::{Stamp, Transform, Twist, transform};
@@ -20,19 +20,20 @@ const MAX_IMAGES: usize = 24;
 /// Smaller differences are not reported, because measured tags and robots are rarely more accurate.
 const MIN_TRANSLATION_M: f64 = 0.005;
 const MIN_ROTATION_RAD: f64 = 0.0087;
-/// A difference is significant if it is at least this multiple of its standard deviation. The
-/// multiple is larger than in a single test, because the check is repeated with every image for
-/// hours and the errors of images are not normally distributed.
+/// A difference is significant if it is at least this multiple of its standard deviation. A single
+/// test would need a smaller multiple. This check is repeated with every image for hours, and the
+/// errors of images are not normally distributed.
 const MIN_SIGMAS: f64 = 5.0;
-/// If a camera moves less than these limits between two images, both show the same errors. They
-/// count once, unless this time has passed between them.
+/// If a camera moves less than these limits between two images, both images have the same errors.
+/// The two images then count once, unless at least `MIN_STEP_SECS` have passed between them.
 const MIN_STEP_M: f64 = 0.02;
 const MIN_STEP_RAD: f64 = 0.05;
 const MIN_STEP_SECS: f64 = 2.0;
 /// Length that makes a rotation comparable with a translation, meters. It is a usual distance of a
 /// tag.
 const ARM_M: f64 = 0.4;
-/// One explanation is better than the other if its residuals are smaller by this factor.
+/// An explanation counts as better than the other explanation if its residuals are smaller by this
+/// factor.
 const CLEARER: f64 = 2.0;
 
 /// Observation of the pose of a camera in one image.
@@ -71,7 +72,8 @@ pub struct TagContradiction {
     /// Angle between the calibrated and the observed camera pose and its standard deviation,
     /// radians.
     pub rotation_rad: [f64; 2],
-    /// Distance between them and its standard deviation, meters.
+    /// Distance between the calibrated and the observed camera position and its standard deviation,
+    /// meters.
     pub translation_m: [f64; 2],
     /// What has moved.
     pub cause: ContradictionCause,
@@ -131,7 +133,8 @@ impl TagCheck {
         if n < MIN_IMAGES {
             return None;
         }
-        // Two explanations: a constant motion in the frame of the camera, or in the world.
+        // There are two explanations: the motion is constant in the frame of the camera, or in the
+        // world.
         let in_camera =
             |observation: &TagObservation| observation.calibrated.inverse() * observation.seen;
         let in_world =
@@ -212,7 +215,7 @@ fn norm_with_sigma(
     Some([part.norm(), sigma_of(variance)])
 }
 
-/// Whether an image adds nothing to an earlier one.
+/// Whether an image adds nothing to an earlier image.
 fn is_same_view(a: &TagObservation, b: &TagObservation) -> bool {
     let motion = a.calibrated.inverse() * b.calibrated;
     motion.translation.vector.norm() < MIN_STEP_M
@@ -303,8 +306,8 @@ mod tests {
     const SIGMA_M: f64 = 0.0005;
     const SIGMA_RAD: f64 = 0.002;
 
-    /// Runs a check with poses around a tag. `seen` gives the true camera pose for a calibrated
-    /// one.
+    /// Runs a check with poses around a tag. `seen` returns the true camera pose for a calibrated
+    /// camera pose.
     fn run(
         n: usize,
         moves: bool,

@@ -1,5 +1,5 @@
-//! Results of A/B trials: the gain of a change of a model on validation images, and whether it is
-//! significant.
+//! Results of A/B trials. A result contains the gain of a change of a model on validation images,
+//! and states whether the gain is significant.
 
 use crate::ParamSet;
 use serde::{Deserialize, Serialize};

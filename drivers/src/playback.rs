@@ -6,18 +6,19 @@ use std::collections::BTreeMap;
 use std::sync::{Arc, OnceLock};
 use std::time::{Duration, Instant};
 
-/// An image that is returned later than its due time by more than this is dropped. A camera at 30
-/// Hz fills its queue in [`LiveDevices`](crate::LiveDevices) in the same time. A slow caller
-/// therefore loses images just as it would with devices.
+/// An image is dropped if it is late by more than this time. A camera at 30 Hz fills its queue in
+/// [`LiveDevices`](crate::LiveDevices) in the same time. A slow caller therefore loses images in
+/// the same way as with devices.
 const MAX_DELAY: Duration = Duration::from_millis(270);
 
 /// A source that returns each sample when it is due. Stamps and order of the samples determine when
 /// they are due.
 ///
-/// A sample is due as long after the first sample as the difference of their stamps. A sample is
-/// never due before the samples in front of it. This rule preserves the latency of cameras. For
-/// example, an image that was recorded after the joint states of the following 30 ms is returned 30
-/// ms after its stamp. If the caller is too slow, images are dropped and counted, as with devices.
+/// The time from the first sample to the due time of a sample equals the difference of their
+/// stamps. A sample is never due before the samples in front of it. This rule preserves the latency
+/// of cameras. For example, an image that was recorded after the joint states of the following 30
+/// ms is returned 30 ms after its stamp. If the caller is too slow, images are dropped and counted,
+/// as with devices.
 pub struct Playback {
     source: Box<dyn Source>,
     clock: PlaybackClock,
@@ -63,7 +64,7 @@ impl Playback {
         }
     }
 
-    /// The clock of this playback; it starts with the first sample.
+    /// The clock of this playback. It starts with the first sample.
     #[must_use]
     pub fn clock(&self) -> PlaybackClock {
         self.clock.clone()

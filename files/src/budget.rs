@@ -1,4 +1,4 @@
-//! Limits for the readers of all formats, and checks that come before memory is allocated.
+//! Limits for the readers of all formats, which are checked before memory is allocated.
 
 use std::fmt;
 
@@ -7,8 +7,8 @@ use std::fmt;
 /// memory.
 const FREE_BYTES: u64 = 64 << 20;
 
-/// Limits for one input. The input declares its sizes. These sizes are checked against the limits
-/// before memory is allocated.
+/// Limits for one input. The sizes that the input declares are checked against the limits before
+/// memory is allocated.
 ///
 /// Nesting is not limited here. The parsers of JSON and TOML stop at 128 levels or fewer. Robot
 /// descriptions are parsed without recursion, with the limits of `kinematics::urdf`. Time is not
@@ -91,7 +91,7 @@ impl Budget {
     /// Checks the size of an input.
     ///
     /// # Errors
-    /// If the input is larger.
+    /// Fails if the input is larger.
     pub fn check_bytes(&self, n_bytes: u64) -> Result<(), OverBudget> {
         if n_bytes > self.max_bytes {
             return Err(OverBudget::Bytes {
@@ -105,7 +105,7 @@ impl Budget {
     /// Checks a number of elements that an input declares.
     ///
     /// # Errors
-    /// If there are more.
+    /// Fails if there are more elements.
     pub fn check_elements(&self, n: u64) -> Result<(), OverBudget> {
         if n > self.max_elements {
             return Err(OverBudget::Elements {
@@ -119,7 +119,7 @@ impl Budget {
     /// Checks the size of decoded data that an input of `n_input_bytes` declares.
     ///
     /// # Errors
-    /// If an input of this size cannot contain as much.
+    /// Fails if an input of this size cannot contain as much data.
     pub fn check_decoded(
         &self,
         n_decoded_bytes: u64,
@@ -135,7 +135,7 @@ impl Budget {
         Ok(())
     }
 
-    /// The budget for the rest of the input after a part of it.
+    /// The budget for the rest of the input after a part with `n_bytes`.
     #[must_use]
     pub fn after(&self, n_bytes: u64) -> Self {
         Self {
@@ -162,7 +162,7 @@ pub enum OverBudget {
         /// Maximum number.
         max: u64,
     },
-    /// It declares more decoded data than it can contain.
+    /// The input declares more decoded data than it can contain.
     Decoded {
         /// Size of the decoded data.
         n_decoded_bytes: u64,

@@ -1,4 +1,4 @@
-//! A file or folder of this program that somebody may remove or rename while it is in use.
+//! A file or folder of this program that another program may remove or rename while it is in use.
 
 use std::fs::File;
 use std::io::ErrorKind;
@@ -16,9 +16,9 @@ pub struct Kept {
 /// Where a kept file or folder is now.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum Place {
-    /// At its path.
+    /// The file or folder is at its original path.
     Here,
-    /// At this path.
+    /// The file or folder is at this other path.
     MovedTo(PathBuf),
     /// Removed, or moved to an unknown place.
     Removed,
@@ -28,7 +28,7 @@ impl Kept {
     /// Opens a file or folder for reading.
     ///
     /// # Errors
-    /// If it cannot be opened.
+    /// Fails if the file or folder cannot be opened.
     pub fn open(path: &Path) -> std::io::Result<Self> {
         Ok(Self {
             path: path.to_owned(),
@@ -53,8 +53,8 @@ impl Kept {
         moved.map_or(Place::Removed, Place::MovedTo)
     }
 
-    /// Whether a path leads to this file or folder. Device and inode identify it: another program
-    /// may have put a different file at the path.
+    /// Whether a path leads to this file or folder. Device and inode identify it, because another
+    /// program may have put a different file at the path.
     fn is_at(&self, path: &Path) -> bool {
         let Ok(named) = path.metadata() else {
             return false;
@@ -67,7 +67,7 @@ impl Kept {
     /// Writes the contents of a removed file to its path again, unless the path is taken.
     ///
     /// # Errors
-    /// If it cannot be written, or if the path is taken.
+    /// Fails if the file cannot be written, or if the path is taken.
     pub fn restore(&self) -> std::io::Result<()> {
         // The file is opened again, because another user of `file` may share its position. Systems
         // without /proc, such as macOS, use a duplicate of `file` instead.

@@ -1,10 +1,10 @@
-//! Reads and writes the files of users, with the same guards everywhere.
+//! Reads and writes the files of users. All readers and writers have the same protections.
 //!
 //! - Only regular files are read, within a [`Budget`]. Opening a pipe may block forever, and a
 //!   device may have no end.
 //! - Whole files and folders are written under a [temporary name](partial::path_of) that no user
-//!   would choose, and are then renamed. They are therefore complete or absent. [`begin`] is the
-//!   exception: it starts a growing log under its final name.
+//!   would choose, and are then renamed. They are therefore complete or absent. Only [`begin`]
+//!   starts a file, which is a growing log, under its final name.
 //! - Symbolic links are followed when reading. When writing, a link that has the temporary or the
 //!   final name of an output is not followed.
 //! - A file or folder that stays in use for a whole run can be [`Kept`] open. [`Kept::place`] then

@@ -83,11 +83,11 @@ pub fn remove_all() -> NoNewFiles {
 }
 
 /// Removes the temporary file or folder that a killed program left at a path of [`path_of`], if
-/// there is one. A folder is removed only if all its entries have one of these names or the
-/// temporary path of one.
+/// there is one. A folder is removed only if each of its entries has one of the paths in
+/// `own_paths`, or the temporary path of one of them.
 ///
 /// # Errors
-/// If the folder has other entries, or cannot be removed.
+/// Fails if the folder has other entries, or cannot be removed.
 pub fn remove_leftover(unfinished: &Path, names: &[&OsStr]) -> std::io::Result<()> {
     if is_folder(unfinished) {
         let own_paths: Vec<PathBuf> = names.iter().map(|name| unfinished.join(name)).collect();

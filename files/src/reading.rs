@@ -9,7 +9,7 @@ use std::path::Path;
 /// Opens a regular file for reading.
 ///
 /// # Errors
-/// If the file cannot be opened, or is a folder, a pipe, a socket or a device.
+/// Fails if the file cannot be opened, or if it is a folder, a pipe, a socket or a device.
 pub fn open(path: &Path) -> std::io::Result<File> {
     // Opening a pipe waits for its writer, and opening a device may start the device. The type is
     // therefore also checked before opening.
@@ -48,7 +48,7 @@ fn check_type(kind: &std::fs::FileType) -> std::io::Result<()> {
 /// Reads a regular file within a budget.
 ///
 /// # Errors
-/// If the file cannot be opened or read, is not a regular file, or is larger than the budget.
+/// Fails if the file cannot be opened or read, is not a regular file, or is larger than the budget.
 pub fn read(path: &Path, budget: Budget) -> std::io::Result<Vec<u8>> {
     let file = open(path)?;
     let n_bytes = file.metadata()?.len();
@@ -67,7 +67,7 @@ pub fn read(path: &Path, budget: Budget) -> std::io::Result<Vec<u8>> {
 /// Reads a text in UTF-8 within [`Budget::TEXT`], without its byte order mark.
 ///
 /// # Errors
-/// As [`read`], and if the file is not UTF-8.
+/// Fails like [`read`], and also if the file is not UTF-8.
 pub fn read_text(path: &Path) -> std::io::Result<String> {
     let bytes = read(path, Budget::TEXT)?;
     // Windows editors offer UTF-16 under the name "Unicode". Its byte order mark shows that a text

@@ -7,11 +7,11 @@ use std::io::{Error, ErrorKind, Write};
 use std::os::unix::fs::MetadataExt;
 use std::path::{Path, PathBuf};
 
-/// Replaces a file, or writes a new one. A link with this name is replaced, not followed.
+/// Replaces a file, or writes a new file. A link with this name is replaced and not followed.
 ///
 /// # Errors
-/// If the file cannot be written, or another program is writing it. The previous file is kept after
-/// an error.
+/// Fails if the file cannot be written, or if another program is writing it. After an error, the
+/// previous file is kept.
 pub fn replace(
     path: &Path,
     contents: impl FnOnce(&mut File) -> std::io::Result<()>,
@@ -24,7 +24,7 @@ pub fn replace(
 /// Like [`replace`], but with contents that are already in memory.
 ///
 /// # Errors
-/// As [`replace`].
+/// Fails like [`replace`].
 pub fn write(path: &Path, contents: impl AsRef<[u8]>) -> std::io::Result<()> {
     replace(path, |file| file.write_all(contents.as_ref()))
 }
@@ -33,7 +33,7 @@ pub fn write(path: &Path, contents: impl AsRef<[u8]>) -> std::io::Result<()> {
 /// removed first.
 ///
 /// # Errors
-/// If the file cannot be created.
+/// Fails if the file cannot be created.
 pub fn begin(path: &Path) -> std::io::Result<File> {
     match std::fs::remove_file(path) {
         Err(error) if error.kind() != ErrorKind::NotFound => Err(error),
@@ -41,11 +41,11 @@ pub fn begin(path: &Path) -> std::io::Result<File> {
     }
 }
 
-/// Opens a file to add to its end, such as a log that is continued, or makes a new one. A link with
-/// this name is replaced, not followed.
+/// Opens a file to append to it, such as a log that is continued. If the file does not exist, it is
+/// created. A link with this name is replaced and not followed.
 ///
 /// # Errors
-/// If the file cannot be opened, or is not a regular file.
+/// Fails if the file cannot be opened, or is not a regular file.
 pub fn append(path: &Path) -> std::io::Result<File> {
     let flags = OFlags::RDWR
         | OFlags::APPEND
@@ -66,8 +66,8 @@ pub fn append(path: &Path) -> std::io::Result<File> {
 /// Writes a new file.
 ///
 /// # Errors
-/// If the file cannot be written, a file or symbolic link with this name exists, or another program
-/// is writing it.
+/// Fails if the file cannot be written, if a file or symbolic link with this name exists, or if
+/// another program is writing it.
 pub fn create(
     path: &Path,
     contents: impl FnOnce(&mut File) -> std::io::Result<()>,
@@ -81,7 +81,7 @@ pub fn create(
 /// Calls `write` with a path in a temporary folder, then moves the result to `path`.
 ///
 /// # Errors
-/// The errors of `write`, and those of [`create`].
+/// Returns the errors of `write` and the errors of [`create`].
 pub fn create_from<T, E: From<Error>>(
     path: &Path,
     write: impl FnOnce(&Path) -> Result<T, E>,
@@ -105,8 +105,8 @@ pub fn create_from<T, E: From<Error>>(
 /// entries. The last entry should therefore be the entry by which readers recognize the folder.
 ///
 /// # Errors
-/// The errors of `write`, and those of [`create`]. Entries that have already been moved are removed
-/// again.
+/// Returns the errors of `write` and the errors of [`create`]. Entries that have already been moved
+/// are removed again.
 pub fn create_folder<T, E: From<Error>>(
     path: &Path,
     entries: &[&str],
@@ -143,8 +143,8 @@ fn write_and_publish(
 ) -> std::io::Result<()> {
     let mut unfinished = Unfinished::file(path)?;
     contents(&mut unfinished.file)?;
-    // The contents must be on the disk before the name is. Otherwise, the name could lead to an
-    // empty file after a power failure.
+    // The contents must be on the disk before the file gets its name. Otherwise, the name could
+    // lead to an empty file after a power failure.
     unfinished.file.sync_all()?;
     publish(&unfinished.path)?;
     // From here on, the temporary name may belong to another program.
@@ -293,7 +293,7 @@ fn is_at(file: &File, path: &Path) -> bool {
 /// `None` if another program holds the lock. The lock is released when the file is closed.
 ///
 /// # Errors
-/// If the file cannot be created, or is a symbolic link.
+/// Fails if the file cannot be created, or is a symbolic link.
 pub fn lock(path: &Path) -> std::io::Result<Option<File>> {
     let flags =
         OFlags::RDWR | OFlags::CREATE | OFlags::NOFOLLOW | OFlags::NONBLOCK | OFlags::CLOEXEC;
@@ -311,10 +311,11 @@ fn open_unlinked(path: &Path, flags: OFlags) -> std::io::Result<File> {
     }
 }
 
-/// Checks that a folder into which files will be written is not a symbolic link. It need not exist.
+/// Checks that a folder into which files will be written is not a symbolic link. The folder need
+/// not exist.
 ///
 /// # Errors
-/// If it is a symbolic link.
+/// Fails if the folder is a symbolic link.
 pub fn check_no_link(folder: &Path) -> std::io::Result<()> {
     match std::fs::read_link(folder) {
         Ok(target) => Err(Error::new(
@@ -422,8 +423,8 @@ mod tests {
         let path = folder.path().join("scene.ply");
         std::fs::write(partial::path_of(&path), "of a program that was killed").expect("written");
         replace(&path, |file| {
-            // The test takes the lock as another program would. Locks of one process conflict in
-            // the same way as locks of two.
+            // The test takes the lock in place of another program. Two locks of one process
+            // conflict in the same way as locks of two processes.
             let refused = replace(&path, text("other")).expect_err("it is being written");
             assert_eq!(refused.to_string(), "another program is writing it");
             assert_eq!(

@@ -17,7 +17,7 @@ pub fn fingerprint(keyframe: &Keyframe) -> u64 {
         .chain(keyframe.joint_twists.iter())
         .for_each(|twist| hash.twist(twist));
     hash.bytes(&keyframe.rgba_srgb);
-    // The pattern names every field, so that a new one cannot be forgotten here.
+    // The pattern names every field, so that a new field cannot be forgotten here.
     if let Some(DepthMap {
         size_px,
         focal_px,

@@ -25,7 +25,7 @@ impl Holdout {
     ///
     /// # Errors
     ///
-    /// If the file cannot be read or contains no name.
+    /// Fails if the file cannot be read or contains no name.
     pub fn from_list(path: &Path) -> Result<Self, Error> {
         let text = files::read_text(path).map_err(|error| Error::Read {
             path: path.to_owned(),
@@ -49,12 +49,12 @@ impl Holdout {
     /// The split of each photo, in the order of `names`.
     ///
     /// Validation photos lie halfway between test photos. If the test photos are named, every 8th
-    /// of the other photos, starting with the 5th, is for validation. Names match with or without
-    /// folder and extension.
+    /// of the other photos, starting with the 5th, is for validation. A name matches with or
+    /// without its folder and its extension.
     ///
     /// # Errors
     ///
-    /// If a name matches no photo.
+    /// Fails if a name matches no photo.
     pub fn splits(&self, names: &[&str]) -> Result<Vec<Split>, Error> {
         match self {
             Self::Every(every) => Ok((0..names.len()).map(|ix| every_nth(ix, *every)).collect()),

@@ -1,4 +1,4 @@
-//! Posed images accepted for training: plain arrays, no driver types.
+//! Posed images for training, as plain arrays without driver types.
 
 use crate::Error;
 use kinematics::{Stamp, Transform, Twist, transform};
@@ -58,7 +58,7 @@ pub struct Keyframe {
     /// For each joint that carries the camera, the twist of the camera, in its own axes, when only
     /// that joint moves at unit speed. Empty if unknown.
     pub joint_twists: Arc<[Twist]>,
-    /// State of the base that carries the camera; `None` if the base is fixed.
+    /// State of the base that carries the camera. `None` if the base is fixed.
     pub base: Option<BaseState>,
     /// How the keyframe may be used.
     pub split: Split,
@@ -181,7 +181,7 @@ pub struct DepthMap {
     pub focal_px: [f64; 2],
     /// Principal point, pixels.
     pub principal_px: [f64; 2],
-    /// `[height, width]`, meters along z; 0 for pixels without a reading.
+    /// `[height, width]`, meters along z. Pixels without a reading are 0.
     pub depth_m: Arc<[f32]>,
     /// Pose at the stamp of the depth image.
     pub world_from_camera: Transform,

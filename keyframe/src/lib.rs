@@ -4,7 +4,7 @@
 //! have a [`DepthMap`], the motion of a rolling shutter and, from a simulator, the [`Truth`].
 //! [`RangePoints`] is one revolution of a range scanner. All these types are plain arrays without
 //! driver or GPU types. A [`KeyframeList`] or [`Holdout`] selects keyframes and assigns their
-//! splits. Cameras are x right, y down, z forward; the world is z up.
+//! splits. Camera axes are x right, y down, z forward. In the world, z is up.
 //!
 //! ```
 //! use keyframe::{Keyframe, Split};

@@ -25,7 +25,7 @@ impl KeyframeList {
     ///
     /// # Errors
     ///
-    /// If the file cannot be read, lists no keyframe, or has an invalid line.
+    /// Fails if the file cannot be read, lists no keyframe, or has an invalid line.
     pub fn load(path: &Path) -> Result<Self, Error> {
         let read = files::read_text(path);
         let text = read.map_err(|error| Error::Read {
@@ -57,7 +57,7 @@ impl KeyframeList {
     ///
     /// # Errors
     ///
-    /// If no listed keyframe is in the data.
+    /// Fails if no listed keyframe is in the data.
     pub fn check_found<'a>(
         &self,
         found: impl Iterator<Item = (&'a str, Stamp)>,

@@ -24,7 +24,7 @@ pub enum TestShape {
         /// Radius, meters.
         radius_m: f64,
     },
-    /// Points whose dot product with the unit normal is the offset.
+    /// The points whose dot product with the unit normal equals the offset.
     Plane {
         /// Unit normal.
         normal: Vector3<f64>,
@@ -34,8 +34,8 @@ pub enum TestShape {
 }
 
 impl TestShape {
-    /// Depth of the first surface along a ray: a multiple of `direction`, whose z is 1 in the
-    /// camera.
+    /// Depth of the first surface along a ray. The depth is a multiple of `direction`, whose z is 1
+    /// in the camera.
     fn depth_m(&self, origin: &Point3<f64>, direction: &Vector3<f64>) -> Option<f64> {
         let depth_m = match self {
             Self::Sphere { center_m, radius_m } => {
@@ -53,7 +53,8 @@ impl TestShape {
         (depth_m > 0.0).then_some(depth_m)
     }
 
-    /// Distance to the surface: signed and positive outside for spheres, unsigned for planes.
+    /// Distance to the surface. It is unsigned for planes. For spheres, it is signed, and positive
+    /// outside.
     pub fn distance_m(&self, point: &Point3<f64>) -> f64 {
         match self {
             Self::Sphere { center_m, radius_m } => (point - center_m).norm() - radius_m,
@@ -69,14 +70,15 @@ pub fn color_srgb(point: &Point3<f64>) -> [f64; 3] {
 
 /// Pose of a camera at `eye` that faces `target`, z up.
 pub fn look_at(eye: Point3<f64>, target: Point3<f64>) -> Transform {
-    // Straight up or down, z does not determine the rotation about the line of sight.
+    // If the camera faces straight up or down, z does not determine the rotation about the line of
+    // sight.
     let up = if (target - eye).xy().norm() < 1e-9 {
         Vector3::y()
     } else {
         Vector3::z()
     };
     Transform::face_towards(&eye, &target, &up)
-        // nalgebra looks along z with y up; a camera has y down.
+        // nalgebra looks along z with y up, but a camera has y down.
         * UnitQuaternion::from_axis_angle(&Vector3::z_axis(), PI)
 }
 
@@ -214,8 +216,8 @@ pub fn all_around(shapes: &[TestShape], target: Point3<f64>, n: usize) -> Vec<Ar
     (0..n)
         .map(|ix| {
             let height = 1.0 - (2 * ix + 1) as f64 / n as f64;
-            // The golden angle, pi (3 - sqrt 5), which spreads neighbors in height as far apart as
-            // possible.
+            // This is the golden angle, pi (3 - sqrt 5). It separates views of similar height as
+            // far as possible.
             let angle = ix as f64 * 2.399_963;
             let radius = (1.0 - height * height).sqrt();
             let eye =

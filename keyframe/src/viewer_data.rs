@@ -12,7 +12,7 @@ pub enum LivePixels {
     Jpeg(Arc<[u8]>),
     /// `[height, width, 3]`.
     Rgb(Arc<[u8]>),
-    /// `[height, width, 4]`; alpha is ignored.
+    /// `[height, width, 4]`. Alpha is ignored.
     Rgba(Arc<[u8]>),
 }
 

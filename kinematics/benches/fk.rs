@@ -1,5 +1,5 @@
-//! Benchmarks of the per-image and per-reading operations: poses, Jacobians, projection and
-//! undistortion.
+//! Benchmarks of the operations per image and per reading, which are poses, Jacobians, projection
+//! and undistortion.
 
 use criterion::{Criterion, criterion_group, criterion_main};
 use kinematics::{Chain, Intrinsics, Lens, Transform, Undistortion};

@@ -1,4 +1,5 @@
-//! Benchmarks of inverse kinematics: time per pose over random reachable poses, and per servo step.
+//! Benchmarks of inverse kinematics. They measure the time per pose over random reachable poses,
+//! and the time per servo step.
 
 use criterion::{Criterion, criterion_group, criterion_main};
 use kinematics::Chain;
@@ -72,7 +73,7 @@ fn samples(chain: &Chain) -> Vec<Sample> {
     (0..N_POSES).map(sample).collect()
 }
 
-/// From the middle of the ranges, which is far from most of the poses.
+/// Solves poses from the middle of the ranges, which is far from most of the poses.
 fn solve(criterion: &mut Criterion) {
     for (name, urdf, base, tip) in ROBOTS {
         let chain = Chain::from_urdf(urdf, base, tip).expect("the file is sound");
@@ -92,7 +93,7 @@ fn solve(criterion: &mut Criterion) {
     }
 }
 
-/// One step from a random configuration toward the next one.
+/// Takes one step from a random configuration toward the next configuration.
 fn servo(criterion: &mut Criterion) {
     for (name, urdf, base, tip) in ROBOTS {
         let chain = Chain::from_urdf(urdf, base, tip).expect("the file is sound");

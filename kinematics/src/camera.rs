@@ -1,4 +1,4 @@
-//! Camera models. Pixel `(0, 0)` covers `[0,1) x [0,1)`; camera axes are x right, y down, z
+//! Camera models. Pixel `(0, 0)` covers `[0,1) x [0,1)`. Camera axes are x right, y down, z
 //! forward.
 
 use crate::Error;
@@ -12,7 +12,7 @@ pub struct Intrinsics {
     pub size_px: [u32; 2],
     /// Focal length along x and y, pixels.
     pub focal_px: [f64; 2],
-    /// Principal point, pixels; the center of pixel `(0, 0)` is `(0.5, 0.5)`.
+    /// Principal point, pixels. The center of pixel `(0, 0)` is `(0.5, 0.5)`.
     pub principal_px: [f64; 2],
     /// Lens distortion.
     pub lens: Lens,
@@ -43,8 +43,8 @@ pub enum Lens {
     /// Radial (k1, k2, k3) and tangential (p1, p2) coefficients in the order of OpenCV: k1, k2, p1,
     /// p2, k3.
     BrownConrady([f64; 5]),
-    /// Fisheye: coefficients k1, k2, k3, k4 of the equidistant polynomial (Kannala and Brandt 2006,
-    /// as in OpenCV's fisheye model).
+    /// Fisheye lens with the coefficients k1, k2, k3, k4 of the equidistant polynomial (Kannala and
+    /// Brandt 2006, as in OpenCV's fisheye model).
     KannalaBrandt([f64; 4]),
     /// Brown-Conrady with a rational radial part, in the order of OpenCV's rational model: k1, k2,
     /// p1, p2, k3, k4, k5, k6. The radial factor is `(1 + k1 r2 + k2 r4 + k3 r6) / (1 + k4 r2 + k5
@@ -53,7 +53,7 @@ pub enum Lens {
 }
 
 impl Lens {
-    /// The distortion coefficients; none for a pinhole.
+    /// The distortion coefficients. A pinhole has none.
     pub fn coefficients(&self) -> &[f64] {
         match self {
             Self::Pinhole => &[],
@@ -121,7 +121,7 @@ impl Intrinsics {
     }
 
     /// Back-projects a pixel to the point on its ray with `z = 1`. This is the inverse of
-    /// [`Intrinsics::project`], accurate to 1e-12.
+    /// [`Intrinsics::project`]. The result is accurate to 1e-12.
     ///
     /// Returns `None` if the pixel is not finite or if no direction in front of the camera projects
     /// to it.
@@ -169,7 +169,7 @@ impl Intrinsics {
     /// Whether the lens coefficients are plausible at a pixel.
     fn is_lens_plausible_at(&self, pixel: [f64; 2]) -> bool {
         // Pincushion distortion of real lenses stays below 1.2. Barrel distortion has no such
-        // limit: wide lenses compress the edge of the image.
+        // limit, because wide lenses compress the edge of the image.
         const MAX_STRETCH: f64 = 1.5;
         // Position of a point at almost 90 degrees from the axis.
         const SIDEWAYS: Vector2<f64> = Vector2::new(1e9, 0.0);
@@ -218,8 +218,8 @@ impl Intrinsics {
         }
     }
 
-    /// Pinhole camera with the same size, focal length and principal point: the camera of the
-    /// images that [`crate::Undistortion`] returns.
+    /// Pinhole camera with the same size, focal length and principal point. This is the camera of
+    /// the images that [`crate::Undistortion`] returns.
     pub fn undistorted(&self) -> Self {
         Self {
             lens: Lens::Pinhole,
@@ -228,8 +228,8 @@ impl Intrinsics {
         }
     }
 
-    /// Whether the pinhole model describes the image: the image is rectified, the lens is a
-    /// pinhole, or all coefficients of a Brown-Conrady lens are zero.
+    /// Whether the pinhole model describes the image. This is the case if the image is rectified,
+    /// if the lens is a pinhole, or if all coefficients of a Brown-Conrady lens are zero.
     pub fn is_pinhole(&self) -> bool {
         match self.lens_in_use() {
             Lens::Pinhole => true,
@@ -389,9 +389,10 @@ mod tests {
         };
         assert_eq!(wide.implausible_lens_frac(), 0.0);
         for lens in [
-            // Monotonic, but the edge of the image shows directions near the optical axis.
+            // These lenses are monotonic, but the edge of the image shows directions near the
+            // optical axis.
             Lens::BrownConrady([10.0, 0.0, 0.0, 0.0, 0.0]),
-            // Monotonic only within a circle that is smaller than the image.
+            // These lenses are monotonic only within a circle that is smaller than the image.
             Lens::BrownConrady([-3.0, 0.0, 0.0, 0.0, 0.0]),
             Lens::RationalBrownConrady([0.0, 0.0, 0.0, 0.0, 0.0, 10.0, 0.0, 0.0]),
             Lens::KannalaBrandt([-10.0, 0.0, 0.0, 0.0]),

@@ -7,9 +7,9 @@ use std::collections::HashMap;
 
 /// The joints between two links of a robot, ready to compute poses.
 ///
-/// Configurations are slices in the order of [`Chain::joint_names`]: radians for revolute joints,
-/// meters for prismatic ones. Mimic joints are not part of a configuration. Their positions are
-/// computed from the joints that they follow.
+/// A configuration is a slice with one value per joint, in the order of [`Chain::joint_names`].
+/// Values are radians for revolute joints and meters for prismatic joints. Mimic joints are not
+/// part of a configuration. Their positions are computed from the joints that they follow.
 #[derive(Clone, Debug)]
 pub struct Chain {
     base_link: String,
@@ -56,14 +56,15 @@ impl Chain {
             segments: Vec::new(),
             last_from_tip: RigidMotion::new(&Transform::identity()),
         };
-        // The fixed transforms since the last moving joint. They become part of the next segment,
-        // so that poses take one product per moving joint.
+        // The product of the fixed transforms since the last moving joint. It becomes part of the
+        // next segment, so that a pose takes one product per moving joint.
         let mut constant = Transform::identity();
         let mut rules = MimicRules::new();
         let mut indices = HashMap::new();
         for joint in robot.path(base_link, tip_link)? {
-            // Invalid joints are accepted in the file, because only chains through them need their
-            // poses. This chain leads through the joint, so its problem is an error here.
+            // A file may contain invalid joints, because only chains through such joints need their
+            // poses. This chain leads through the joint, so the problem of the joint is an error
+            // here.
             if let Some(problem) = &joint.problem {
                 return Err(problem.clone());
             }
@@ -81,7 +82,7 @@ impl Chain {
             };
             // Rotates the frame so that the joint's axis is z. A motion along or about z has a
             // closed form that is cheaper than a product. The rotation is undone after the joint,
-            // so that later frames are those of the URDF.
+            // so that later frames are the frames of the URDF.
             let joint_from_aligned = rotation_from_z_to(&joint.axis);
             let rule = follow_mimics(robot, joint, &mut rules)?;
             // Two mimic joints may follow the same joint, which has one value in a configuration.
@@ -196,8 +197,9 @@ impl Chain {
         for segment in &self.segments {
             pose.compose(&segment.before);
             let axis_in_base = rotate(&pose.rotation, &Vector3::z()) * segment.multiplier;
-            // The velocity of the point that coincides with the base's origin. The tip is not known
-            // yet, and the velocities of two points of a body differ only by a lever arm.
+            // This is the velocity of the point that coincides with the base's origin, because the
+            // position of the tip is not known yet. The velocity of the tip is computed from it
+            // later, with the lever arm between the two points.
             let (linear, angular) = if segment.is_prismatic {
                 (axis_in_base, Vector3::zeros())
             } else {
@@ -233,8 +235,9 @@ impl Chain {
             .all(|segment| !segment.is_prismatic && segment.multiplier.fract() == 0.0)
     }
 
-    /// Whether no joint is followed by a mimic joint of this chain, and none moves another way than
-    /// its value.
+    /// Whether each joint moves exactly one segment, at the rate of its value. The result is false
+    /// if several segments follow one joint, or if a mimic joint scales or shifts the value that it
+    /// follows.
     pub(crate) fn has_one_segment_per_joint(&self) -> bool {
         let mut segments = self.segments.iter().enumerate();
         segments.all(|(ix, segment)| {
@@ -242,8 +245,8 @@ impl Chain {
         })
     }
 
-    /// Sum of the distances between neighboring joints, meters: an upper bound of the tip's distance
-    /// from the base without prismatic joints.
+    /// Sum of the distances between neighboring joints, meters. For a chain without prismatic
+    /// joints, the tip's distance from the base never exceeds this sum.
     pub(crate) fn length_m(&self) -> f64 {
         let before_each = self.segments.iter().map(|segment| &segment.before);
         before_each
@@ -359,8 +362,8 @@ fn follow_mimics<'a>(
         followers.push((current, mimic));
         current = source;
     };
-    // Back down: substitute each rule into the rule of the joint that follows, and remember the
-    // result. With `source = a x + b`, the follower is `m (a x + b) + c = (m a) x + (m b + c)`.
+    // Back down: substitute each rule into the rule of its follower, and remember the result. With
+    // `source = a x + b`, the follower is `m (a x + b) + c = (m a) x + (m b + c)`.
     while let Some((follower, mimic)) = followers.pop() {
         let MimicRule {
             source,
@@ -432,8 +435,8 @@ impl RigidMotion {
             self.translation += rotate(&self.rotation, &Vector3::new(0.0, 0.0, value));
             return;
         }
-        // Multiplies by the quaternion (cos, 0, 0, sin) of half the angle without the terms that
-        // are zero.
+        // This multiplies by the quaternion (cos, 0, 0, sin) of half the angle. Terms that are zero
+        // are left out.
         let (sin, cos) = (0.5 * value).sin_cos();
         let r = &self.rotation;
         self.rotation = Quaternion::new(
@@ -493,8 +496,8 @@ mod tests {
         (a - b).abs().max()
     }
 
-    /// Every joint type, non-standard axes, and mimic joints with offsets, one of which follows a
-    /// joint outside the path.
+    /// A robot with every joint type, non-standard axes, and mimic joints with offsets. One of the
+    /// mimic joints follows a joint outside the path.
     const ODD: &str = r#"<robot name="odd">
         <link name="a"/><link name="b"/><link name="c"/><link name="d"/><link name="e"/><link name="f"/><link name="g"/>
         <link name="off"/><link name="soft"/>

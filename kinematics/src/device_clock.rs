@@ -9,11 +9,11 @@ use std::collections::VecDeque;
 /// minimum and is often much larger. All arrivals therefore lie above a line. The map is the line
 /// below all arrivals that is closest to them. It is the edge of the lower convex hull at the mean
 /// device time (Moon, Skelly and Towsley 1999, section 4). Late arrivals do not move the line. The
-/// minimum latency cannot be observed and remains in the result; calibration estimates it.
+/// minimum latency cannot be observed and remains in the result. Calibration estimates it.
 #[derive(Clone, Debug)]
 pub struct ClockMap {
     /// Device stamp and arrival of the first message since the start or the last restart. Device
-    /// times are relative to it.
+    /// times are relative to this stamp.
     origin: Option<Origin>,
     /// For each bucket of device time, the message with the smallest delay.
     buckets: VecDeque<Bucket>,
@@ -48,11 +48,11 @@ struct Line {
 /// Each bucket keeps one arrival. Longer buckets take less memory and time, but have fewer points
 /// near the line. Shorter buckets keep more late arrivals, which never touch the line.
 const BUCKET_NANOS: i64 = 250_000_000;
-/// Arrivals older than this are discarded, so that the map follows a drift that changes with
-/// temperature. A longer window averages the latency of more messages. A shorter window follows
-/// changes of temperature faster. With [`BUCKET_NANOS`], the window has at most 481 buckets.
+/// Older arrivals are discarded, so that the map follows a drift that changes with temperature. A
+/// longer window averages the latency of more messages. A shorter window follows changes of
+/// temperature faster. With [`BUCKET_NANOS`], the window has at most 481 buckets.
 const WINDOW_SECS: f64 = 120.0;
-/// Maximum drift. It exceeds the drift of all common crystals. Steeper slopes are caused by
+/// Maximum drift. The drift of all common crystals is smaller. Steeper slopes are caused by
 /// latency.
 const MAX_DRIFT: f64 = 200e-6;
 /// Observed time span at which the estimated drift is applied in full. For shorter spans, a
@@ -105,9 +105,9 @@ impl ClockMap {
             return self.restart(device_nanos, arrival);
         }
         self.newest_nanos = self.newest_nanos.max(device_nanos);
-        // Differences are taken in integers before the conversion to f64. As f64, absolute
-        // nanoseconds since 1970 have a resolution of only 256 ns, and a delay is the difference of
-        // two such numbers.
+        // A delay is the difference of two absolute times. The difference is taken in integers
+        // before the conversion to f64, because nanoseconds since 1970 have a resolution of only
+        // 256 ns in f64.
         let since_nanos = device_nanos.saturating_sub(origin.device_nanos);
         let device_secs = since_nanos as f64 / NANOS_PER_SEC;
         let delay_secs = arrival
@@ -121,8 +121,9 @@ impl ClockMap {
         if has_line && lateness_secs < -MAX_EARLY_SECS {
             return self.restart(device_nanos, arrival);
         }
-        // The line follows early arrivals at once, but never late ones. If the clock jumped back,
-        // all stamps would therefore be too early until the old arrivals have left the window.
+        // The line follows early arrivals at once, but it never follows late arrivals. If the clock
+        // jumped back, all stamps would therefore be too early until the old arrivals have left the
+        // window.
         if self.late_for_too_long(lateness_secs, arrival) {
             return self.restart(device_nanos, arrival);
         }
@@ -164,8 +165,8 @@ impl ClockMap {
             .map_or(arrival, |mapped| mapped.min(arrival))
     }
 
-    /// Relative rate difference: positive if the host clock runs faster than the device clock (1e-6
-    /// is one part per million).
+    /// Relative difference of the clock rates. It is positive if the host clock runs faster than
+    /// the device clock. A value of 1e-6 is one part per million.
     pub fn drift(&self) -> f64 {
         self.line.drift
     }
@@ -244,8 +245,8 @@ impl ClockMap {
         // full span, it amounts to 12.5 ppm.
         let max_drift = MAX_DRIFT * (span_secs / FULL_DRIFT_SECS).min(1.0);
         let drift = self.hull_slope().clamp(-max_drift, max_drift);
-        // The slope may have been limited, so the offset may differ from that of the hull's edge.
-        // The line must always touch the arrivals from below.
+        // The slope may have been limited, so the offset may differ from the offset of the hull's
+        // edge. The line must always touch the arrivals from below.
         let offset_secs = self
             .buckets
             .iter()
@@ -275,9 +276,9 @@ impl ClockMap {
             }
             hull.push(bucket);
         }
-        // Of all lines below the points, this edge minimizes the sum of the distances to the
-        // points. The reason is that this sum depends only on the height of the line at the mean
-        // time.
+        // For lines below the points, the sum of the distances to the points depends only on the
+        // height of the line at the mean time. The edge at the mean time therefore minimizes this
+        // sum.
         let edge = hull
             .windows(2)
             .find(|edge| edge[1].device_secs >= mean_secs);
@@ -308,7 +309,7 @@ impl WrappingMicros {
         Self::default()
     }
 
-    /// Returns the count as monotonic nanoseconds, assuming that it lies within 35 minutes of the
+    /// Returns the count as monotonic nanoseconds. The count must lie within 35 minutes of the
     /// previous count.
     pub fn nanos(&mut self, micros: u32) -> i64 {
         const NANOS_PER_MICRO: i64 = 1000;
@@ -380,9 +381,10 @@ mod tests {
 
     #[test]
     fn jitter_and_drift_are_filtered_to_a_millisecond() {
-        // Rate, run length, settling time, maximum error after settling, and number of runs whose
-        // error may be up to twice the maximum. At a low rate, messages with a low latency are
-        // rare: the fastest of n messages in a window has about 75 ms / n of jitter.
+        // Each entry contains the rate, the run length, the settling time, the maximum error after
+        // settling, and the number of runs whose error may be up to twice the maximum. At a low
+        // rate, messages with a low latency are rare. The fastest of n messages in a window has a
+        // jitter of about 75 ms / n.
         const RUNS: [(f64, f64, f64, i64, usize); 4] = [
             (1000.0, 30.0, 2.0, 300_000, 0),
             (200.0, 60.0, 6.0, 700_000, 0),

@@ -14,7 +14,7 @@ pub enum Error {
         /// Value found.
         value: f64,
     },
-    /// The upper left 3x3 block is not a rotation: it is scaled, sheared or mirrored.
+    /// The upper left 3x3 block is not a rotation, but is scaled, sheared or mirrored.
     #[error(
         "transform: not rigid: its axes deviate from unit length or right angles by {off:.2e} (at most {allowed:.0e}), and its determinant is {determinant:.4}; {}",
         rotation_advice(*.off, *.determinant)
@@ -76,7 +76,7 @@ pub enum Error {
         "urdf: robot {robot:?} has no <link> (an export that failed or was never expanded from xacro?)"
     )]
     NoLinks {
-        /// Name of the robot; may be empty.
+        /// Name of the robot. It may be empty.
         robot: String,
     },
     /// Two links or two joints share a name.

@@ -1,4 +1,4 @@
-//! Histories of joints and base poses: interpolate between readings, never extrapolate.
+//! Histories of joints and base poses. They interpolate between readings and never extrapolate.
 
 use crate::{JointState, Stamp, Transform, Twist, transform};
 use std::collections::VecDeque;
@@ -11,7 +11,7 @@ pub enum HistoryError {
     /// The newest reading is older than the stamp. Retry after more readings have arrived.
     #[error("no reading at or after the requested stamp yet{}", .newest.map(|newest| behind(newest, *.requested)).unwrap_or_default())]
     NotYet {
-        /// Stamp of the newest reading; `None` if the history is empty.
+        /// Stamp of the newest reading. `None` if the history is empty.
         newest: Option<Stamp>,
         /// Requested stamp.
         requested: Stamp,
@@ -274,9 +274,9 @@ impl JointHistory {
     ///
     /// Positions follow the cubic polynomial through the positions and velocities of both
     /// neighbors. If the device does not report velocities, positions follow a line. Velocities are
-    /// the derivative of that curve. Efforts are interpolated linearly. At the stamp of a reading,
-    /// that reading is returned. If it has no velocities, the slope of the line to a neighbor is
-    /// returned as its velocity.
+    /// the derivative of this curve. Efforts are interpolated linearly. At the stamp of a reading,
+    /// this reading is returned unchanged. If it has no velocities, the slope of the line to a
+    /// neighbor is returned as its velocity.
     pub fn at(&self, stamp: Stamp) -> Result<JointState, HistoryError> {
         let Bracket {
             before: (before, a),
@@ -286,7 +286,7 @@ impl JointHistory {
         let span_secs = after.secs_since(before);
         let n_joints = a.position.len();
         let has_velocities = |state: &JointState| state.velocity.len() == n_joints;
-        // A reading is returned bit for bit. The cubic would round it.
+        // A reading is returned bit for bit. The cubic polynomial would round its values.
         if frac == 0.0 || frac == 1.0 {
             let mut at_reading = if frac == 0.0 { a.clone() } else { b.clone() };
             if !has_velocities(&at_reading) && before < after {
@@ -421,8 +421,8 @@ impl PoseHistory {
         if span_secs <= 0.0 {
             return Ok((pose, Twist::zero()));
         }
-        // The velocity is that of the motion that `transform::interpolate` uses: a line for the
-        // position, and a constant rate for the rotation.
+        // The velocity matches the motion of `transform::interpolate`, in which the position moves
+        // along a line and the rotation has a constant rate.
         let velocity_m_s = (b.translation.vector - a.translation.vector) / span_secs;
         let angular_rad_s = (a.rotation.inverse() * b.rotation).scaled_axis() / span_secs;
         Ok((

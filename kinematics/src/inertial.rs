@@ -6,7 +6,7 @@ use crate::urdf::joint::origin;
 use nalgebra::Matrix3;
 
 /// Mass and inertia of a link as the URDF states them. The numbers are finite, but they need not be
-/// physically possible: many files contain zeros.
+/// physically possible. Many files contain zeros.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Inertial {
     /// Pose of the inertia's frame in the frame of the link. Its origin is the center of mass.

@@ -100,8 +100,8 @@ pub(crate) fn undistort_brown_conrady(
     )
 }
 
-/// Applies Brown-Conrady distortion with a rational radial part, OpenCV's rational model (Claus and
-/// Fitzgibbon 2005). `None` beyond the radius up to which the radial part is monotonic.
+/// Applies Brown-Conrady distortion with a rational radial part. This is OpenCV's rational model
+/// (Claus and Fitzgibbon 2005). `None` beyond the radius up to which the radial part is monotonic.
 pub(crate) fn rational(k: &[f64; 8], plane: Vector2<f64>) -> Option<Distorted> {
     distort(&rational_radial(k), [k[2], k[3]], plane)
 }
@@ -139,7 +139,7 @@ fn distort_unchecked(radial: &impl Radial, [p1, p2]: [f64; 2], plane: Vector2<f6
         x * factor + 2.0 * p1 * x * y + p2 * (r2 + 2.0 * x * x),
         y * factor + p1 * (r2 + 2.0 * y * y) + 2.0 * p2 * x * y,
     );
-    // Both mixed derivatives are equal: the distortion is the gradient of a potential.
+    // Both mixed derivatives are equal, because the distortion is the gradient of a potential.
     let across = 2.0 * (x * y * factor_by_r2 + p1 * x + p2 * y);
     let jacobian = Matrix2::new(
         factor + 2.0 * (x * x * factor_by_r2 + p1 * y + 3.0 * p2 * x),
@@ -372,7 +372,8 @@ mod tests {
 
     #[test]
     fn undistortion_inverts_rational_lenses() {
-        // The second has a pole at radius 2, and the third reaches its maximum below radius 1.4.
+        // The second lens has a pole at radius 2, and the third lens reaches its maximum below
+        // radius 1.4.
         for k in [
             [0.2, -0.05, 0.001, -0.0005, 0.01, 0.5, -0.02, 0.02],
             [0.1, 0.0, 0.0, 0.0, 0.0, -0.25, 0.0, 0.0],

@@ -1,5 +1,5 @@
-//! Transforms, time, camera models and kinematic chains: pure math in f64, no I/O, no clock, no
-//! GPU.
+//! Transforms, time, camera models and kinematic chains. The crate contains only math in f64,
+//! without I/O, clocks or the GPU.
 //!
 //! ```
 //! use kinematics::{Chain, Intrinsics, Lens};

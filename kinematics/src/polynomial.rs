@@ -5,7 +5,7 @@
 pub(crate) const CONVERGED: f64 = 1e-15;
 
 /// The smallest `x` from 0 to `limit` at which a function reaches `target`. The function is 0 at 0
-/// and must rise up to `x`. Otherwise, there is no result.
+/// and must rise up to `x`. If it does not, the result is `None`.
 ///
 /// Uses Newton's method inside a bracket that shrinks with every step.
 ///
@@ -21,9 +21,9 @@ pub(crate) fn solve_rising(
     // The higher limit only guards against a bracket that stops shrinking.
     const MAX_STEPS: usize = 200;
     let value = |x: f64| function(x).0 - target;
-    // Find a bracket. At `low`, the value is below the target. At `high`, the value is above the
-    // target, or the derivative has changed sign. Doubling reaches any magnitude in a few steps, so
-    // callers need not know how strongly their lens distorts.
+    // First, a bracket is found. At `low`, the value is below the target. At `high`, the value is
+    // above the target, or the derivative has changed sign. Doubling reaches any magnitude in a few
+    // steps, so callers need not know how strongly their lens distorts.
     let mut low = 0.0;
     let mut high = target.min(limit);
     while is_rising_to(high) && value(high) < 0.0 {
@@ -61,14 +61,14 @@ pub(crate) fn solve_rising(
         }
     }
     // The search may also end at a point where the function stops rising below the target, or after
-    // the last step. Both fail this check, so that no wrong root is returned. The tolerance is far
-    // above the rounding errors of a few operations, and far below any error that a pixel could
-    // show.
+    // the last step. This check rejects both cases, so that no wrong root is returned. The
+    // tolerance is far above the rounding errors of a few operations, and far below any error that
+    // a pixel could show.
     const CLOSE: f64 = 1e-12;
     (is_rising_to(x) && value(x).abs() <= CLOSE * target.max(1.0)).then_some(x)
 }
 
-/// Value of the polynomial with these coefficients, the constant one first.
+/// Value of the polynomial with these coefficients. The constant coefficient comes first.
 pub(crate) fn evaluate<const N: usize>(p: &[f64; N], s: f64) -> f64 {
     p.iter()
         .rev()

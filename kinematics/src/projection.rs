@@ -4,8 +4,8 @@ use crate::camera::{Intrinsics, Lens};
 use crate::lens;
 use nalgebra::{Matrix2x3, SMatrix, Vector2, Vector3};
 
-/// Maximum number of parameters of a camera: two focal lengths, the principal point, and eight
-/// coefficients.
+/// Maximum number of parameters of a camera, which are two focal lengths, the principal point, and
+/// eight coefficients.
 pub const MAX_INTRINSICS_PARAMS: usize = 12;
 
 /// A projected point and the derivatives of its pixel.
@@ -36,7 +36,7 @@ impl Intrinsics {
     /// These intrinsics with other parameters, in the order of [`Intrinsics::params`].
     ///
     /// # Panics
-    /// If the number of parameters differs.
+    /// Panics if `params` has another length than [`Intrinsics::params`].
     #[must_use]
     pub fn with_params(&self, params: &[f64]) -> Self {
         assert_eq!(params.len(), self.params().len(), "one value per parameter");
@@ -62,7 +62,7 @@ impl Intrinsics {
     /// with respect to the intrinsics.
     pub fn project_with_derivatives(&self, point_in_camera: &Vector3<f64>) -> Option<Projection> {
         let &[x, y, z] = point_in_camera.as_ref();
-        // NaN is checked explicitly: every comparison with it is false.
+        // NaN is checked explicitly, because every comparison with NaN is false.
         if z.is_nan() || z <= 0.0 {
             return None;
         }
@@ -110,7 +110,8 @@ impl Intrinsics {
     }
 }
 
-/// Sets the columns of the lens coefficients, which follow the four of the image plane.
+/// Sets the columns of the lens coefficients, which follow the four columns of focal lengths and
+/// principal point.
 fn set_coefficients(
     by_intrinsics: &mut SMatrix<f64, 2, MAX_INTRINSICS_PARAMS>,
     derivatives: &[Vector2<f64>],
@@ -144,9 +145,9 @@ mod tests {
     #[test]
     fn derivatives_with_respect_to_intrinsics_match_central_differences() {
         const NUDGE: f64 = 1e-6;
-        // The projection is linear in all parameters but the denominator, so only rounding errors
-        // of 1e-13 / 1e-6 and, for the denominator, truncation errors of 1e-12 times the focal
-        // length remain.
+        // The projection is linear in all parameters except the parameters of the denominator.
+        // Rounding errors of 1e-13 / 1e-6 remain. For the denominator, there are also truncation
+        // errors of 1e-12 times the focal length.
         const CLOSE: f64 = 1e-6;
         for camera in cameras() {
             let params = camera.params();

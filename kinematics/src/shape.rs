@@ -13,7 +13,7 @@ pub struct Shape {
     pub link_from_shape: Transform,
     /// Form and size.
     pub geometry: Geometry,
-    /// Red, green, blue (sRGB) and opacity, 0 to 1; `None` if the URDF sets no color.
+    /// Red, green, blue (sRGB) and opacity, 0 to 1. `None` if the URDF sets no color.
     pub color_srgba: Option<[f64; 4]>,
 }
 
@@ -48,7 +48,7 @@ pub enum Geometry {
     Mesh {
         /// The file as named in the URDF, such as `package://arm/meshes/link1.stl`.
         file: String,
-        /// Scale along x, y and z; negative values mirror the mesh.
+        /// Scale along x, y and z. Negative values mirror the mesh.
         scale: [f64; 3],
     },
 }
@@ -69,13 +69,13 @@ pub(crate) fn read_all(robot: Element<'_>, notes: &mut Notes) -> HashMap<String,
         read_material(material, "the robot", &mut materials, notes);
     }
     let mut by_link = HashMap::<String, LinkShapes>::new();
-    // Visual shapes are added after all links have been read. A material that a link defines may be
-    // used by all other links, including earlier ones.
+    // Visual shapes are added after all links have been read. All other links, including earlier
+    // links, may use a material that a link defines.
     let mut visuals = Vec::new();
     let mut seen = HashSet::new();
     for link in robot.all("link") {
         let name = link.attribute("name").unwrap_or_default();
-        // If several links have the same name, the robot uses the first one. The others have
+        // If several links have the same name, the robot uses the first link. The other links have
         // already been noted.
         if !seen.insert(name) {
             continue;
@@ -169,8 +169,8 @@ fn read_material<'a>(
     material.note_unknown(&["name"], &["color", "texture"], notes);
     let color = noted(own_color(material), &format!("a color of {owner}"), notes).flatten();
     if let (Some(name), Some(color)) = (material.attribute("name"), color) {
-        // The first definition is used, as for links. A material without a color is a reference and
-        // defines nothing.
+        // As with links, the first definition is used. A material without a color is a reference
+        // and defines nothing.
         materials.entry(name).or_insert(color);
     }
     if let Some(texture) = material.all("texture").next() {
@@ -197,8 +197,8 @@ fn own_color(material: Element<'_>) -> Result<Option<[f64; 4]>, Problem> {
     }
 }
 
-/// The first valid mass and inertia of a link. Only a simulation uses them, but an invalid one shows
-/// that the file is damaged or unfinished.
+/// The first valid mass and inertia of a link. Only a simulation uses mass and inertia. Invalid
+/// values are noted anyway, because they show that the file is damaged or unfinished.
 fn read_inertial(link: Element<'_>, of_link: &str, notes: &mut Notes) -> Option<Inertial> {
     let mut first = None;
     for element in link.all("inertial") {

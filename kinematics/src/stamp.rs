@@ -19,11 +19,11 @@ pub struct Stamp(pub i64);
 const NANOS_PER_SEC: f64 = 1e9;
 
 impl Stamp {
-    /// The stamp closest to `secs` after the clock's zero. Saturates at the ends of the range; NaN
-    /// becomes zero.
+    /// The stamp closest to `secs` after the clock's zero. Values beyond the range become the end
+    /// of the range, and NaN becomes zero.
     ///
-    /// Exact to a nanosecond up to 104 days from zero; beyond that, an f64 of seconds has a coarser
-    /// resolution.
+    /// The result is exact to a nanosecond up to 104 days from zero. For longer times, seconds as
+    /// f64 have a coarser resolution.
     #[expect(
         clippy::cast_possible_truncation,
         reason = "a float to integer cast saturates, as documented"
@@ -37,24 +37,24 @@ impl Stamp {
         self.0 as f64 / NANOS_PER_SEC
     }
 
-    /// Seconds from `earlier` to this stamp; negative if `earlier` is later.
+    /// Seconds from `earlier` to this stamp. The result is negative if `earlier` is later.
     ///
     /// The difference is computed in nanoseconds first, so short spans are exact at any clock time.
     pub fn secs_since(self, earlier: Self) -> f64 {
         self.nanos_since(earlier) as f64 / NANOS_PER_SEC
     }
 
-    /// Nanoseconds from `earlier` to this stamp; negative if `earlier` is later.
+    /// Nanoseconds from `earlier` to this stamp. The result is negative if `earlier` is later.
     pub fn nanos_since(self, earlier: Self) -> i64 {
         self.0.saturating_sub(earlier.0)
     }
 
-    /// The stamp `secs` later, or earlier if `secs` is negative.
+    /// The stamp that is `secs` later than this stamp. If `secs` is negative, it is earlier.
     pub fn plus_secs(self, secs: f64) -> Self {
         Self(self.0.saturating_add(Self::from_secs(secs).0))
     }
 
-    /// Time from `earlier` to this stamp; zero if `earlier` is later.
+    /// Time from `earlier` to this stamp. The result is zero if `earlier` is later.
     pub fn duration_since(self, earlier: Self) -> Duration {
         Duration::from_nanos(u64::try_from(self.nanos_since(earlier)).unwrap_or(0))
     }

@@ -118,8 +118,8 @@ pub fn to_rows(transform: &Transform) -> [f64; 16] {
     std::array::from_fn(|at| matrix[(at / 4, at % 4)])
 }
 
-/// The seven numbers of a pose in files: the position x, y, z in meters, then the quaternion x, y,
-/// z, w.
+/// The seven numbers of a pose in files. They are the position x, y, z in meters, then the
+/// quaternion x, y, z, w.
 pub fn to_xyz_xyzw(transform: &Transform) -> [f64; 7] {
     let [x, y, z] = transform.translation.vector.into();
     let [i, j, k, w] = transform.rotation.coords.into();
@@ -137,14 +137,15 @@ pub fn from_xyz_xyzw([x, y, z, i, j, k, w]: [f64; 7]) -> Transform {
     )
 }
 
-/// A smaller motion of a camera is noticeable neither in a picture nor in a map of the scene. At a
-/// focal length of 600 pixels, both bounds move a point at a distance of 1 m by 0.3 pixels.
+/// A motion of a camera below these two bounds is noticeable neither in a picture nor in a map of
+/// the scene. At a focal length of 600 pixels, each of the two bounds moves a point at a distance
+/// of 1 m by 0.3 pixels.
 const NOTICEABLE_M: f64 = 5e-4;
 const NOTICEABLE_RAD: f64 = 5e-4;
 
-/// Whether a camera has moved noticeably: by more than 0.5 mm or 0.5 mrad (0.03 degrees).
+/// Whether a camera has moved noticeably, that is, by more than 0.5 mm or 0.5 mrad (0.03 degrees).
 ///
-/// * `motion`: pose of the camera after the motion, in its own frame before.
+/// * `motion`: pose of the camera after the motion, in the frame of the camera before the motion.
 pub fn is_noticeable(motion: &Transform) -> bool {
     motion.translation.vector.norm() > NOTICEABLE_M || motion.rotation.angle() > NOTICEABLE_RAD
 }
@@ -156,8 +157,8 @@ pub fn is_finite(transform: &Transform) -> bool {
         .all(|number| number.is_finite())
 }
 
-/// Interpolates from `a` (`frac` 0) to `b` (`frac` 1): the translation linearly, the rotation at a
-/// constant rate along the shorter arc.
+/// Interpolates from `a` (`frac` 0) to `b` (`frac` 1). The translation is interpolated linearly.
+/// The rotation has a constant rate along the shorter arc.
 pub fn interpolate(a: &Transform, b: &Transform, frac: f64) -> Transform {
     let translation = a.translation.vector.lerp(&b.translation.vector, frac);
     // The scaled axis of a unit quaternion has an angle of at most pi, so this is the shorter arc.
@@ -168,8 +169,8 @@ pub fn interpolate(a: &Transform, b: &Transform, frac: f64) -> Transform {
     )
 }
 
-/// Motion of a frame that moves with a constant `twist` for `secs` seconds: the new
-/// `world_from_frame` is the old one times this motion.
+/// Motion of a frame that moves with a constant `twist` for `secs` seconds. The new
+/// `world_from_frame` is the old `world_from_frame` times this motion.
 ///
 /// Source: Murray, Li and Sastry 1994, section 2.3.2 (exponential of se(3)).
 ///
@@ -208,8 +209,8 @@ pub fn exp(twist: &Twist, secs: f64) -> Transform {
     )
 }
 
-/// The constant twist that produces `transform` in `secs` seconds. The inverse of [`exp`] for
-/// rotations below 180 degrees.
+/// The constant twist that produces `transform` in `secs` seconds. This is the inverse of [`exp`]
+/// for rotations below 180 degrees.
 pub fn log(transform: &Transform, secs: f64) -> Twist {
     let rotation_vector = transform.rotation.scaled_axis();
     let angle = rotation_vector.norm();
@@ -243,7 +244,8 @@ impl Twist {
     /// (adjoint transform).
     pub fn of_attached(&self, this_from_other: &Transform) -> Self {
         let other_from_this = this_from_other.rotation.inverse();
-        // The other origin also moves because this frame rotates: `v + w x r`.
+        // The origin of the other frame also moves because this frame rotates. Its velocity is `v +
+        // w x r`.
         let linear_m_s = self.linear_m_s
             + self
                 .angular_rad_s
@@ -382,7 +384,8 @@ mod tests {
         assert!(distance(&interpolate(&a, &b, 0.0), &a) < CLOSE);
         assert!(distance(&interpolate(&a, &b, 1.0), &b) < CLOSE);
         assert!(distance(&interpolate(&a, &b, 0.25), &pose(0.25, [0.0, 0.0, 0.25])) < CLOSE);
-        // From 170 to 190 degrees it is 20 degrees, and q and -q are the same rotation.
+        // The shorter arc from 170 to 190 degrees is 20 degrees long, although the quaternions of
+        // these rotations may have opposite signs.
         let c = pose(0.0, [0.0, 0.0, 170.0 / 180.0 * PI]);
         let d = pose(0.0, [0.0, 0.0, 190.0 / 180.0 * PI]);
         let flipped = Transform::from_parts(

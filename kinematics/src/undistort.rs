@@ -14,8 +14,8 @@ pub struct Undistortion {
     taps: Vec<Tap>,
 }
 
-/// Source of one output pixel: the upper left of four neighbors, and the weights of the right and
-/// the lower neighbors.
+/// Source of one output pixel. It consists of the upper left of four neighbors, and of the weights
+/// of the right and the lower neighbors.
 #[derive(Clone, Copy, Debug)]
 struct Tap {
     upper_left: u32,
@@ -31,7 +31,7 @@ impl Tap {
         lower: 0,
     };
 
-    /// The nearest of the four neighbors; 0 outside the image.
+    /// Index of the nearest of the four neighbors. It is 0 outside the image.
     ///
     /// * `steps`: see [`Undistortion::steps`].
     fn nearest(&self, depth_m: &[f32], [step_right, step_down]: [usize; 2]) -> f32 {
@@ -104,8 +104,8 @@ impl Undistortion {
         Ok(self.resample::<4>(rgba))
     }
 
-    /// Undistorts the rows of `[height, width, 4]` as [`Self::apply_rgba`] does, but one at a time,
-    /// so that the undistorted image need not be in memory.
+    /// Undistorts the rows of `[height, width, 4]` one at a time, with the same result as
+    /// [`Self::apply_rgba`]. The undistorted image then need not be in memory.
     ///
     /// The returned function writes the row with the given index to `[width, 4]`.
     pub fn rgba_rows(&self, rgba: &[u8]) -> Result<impl Fn(usize, &mut [u8]), Error> {
@@ -163,8 +163,8 @@ impl Undistortion {
         }
     }
 
-    /// Index offsets of the right and the lower neighbor in the source; 0 in an image of one column
-    /// or row.
+    /// Index offsets of the right and the lower neighbor in the source. An offset is 0 in an image
+    /// of one column or row.
     fn steps(&self) -> [usize; 2] {
         let [width, height] = self.size_px;
         [
@@ -209,7 +209,7 @@ fn round_share(sum: u32) -> u8 {
     ((sum + (1 << (2 * SHARE_BITS - 1))) >> (2 * SHARE_BITS)) as u8
 }
 
-/// The tap of one pixel of the pinhole image; `None` if its source is outside the distorted image.
+/// The tap of one pixel of the pinhole image. `None` if its source is outside the distorted image.
 fn tap_of([column, row]: [u32; 2], pinhole: &Intrinsics, distorted: &Intrinsics) -> Option<Tap> {
     let ray = pinhole.unproject([f64::from(column) + 0.5, f64::from(row) + 0.5])?;
     let source = distorted
@@ -241,8 +241,8 @@ fn tap_along(source_px: f64, size_px: u32) -> (u32, u16) {
     // The position is converted from integer pixel edges to integer pixel centers, because the
     // samples are at pixel centers.
     let position = (source_px - 0.5).clamp(0.0, last);
-    // The last pixel is read as the right neighbor of the one before it, so that no read goes past
-    // the end.
+    // The last pixel is read as the right neighbor of the pixel before it, so that no read goes
+    // past the end.
     let start = position.floor().min((last - 1.0).max(0.0));
     let share = (position - start) * f64::from(ONE);
     (start as u32, share.round() as u16)

@@ -7,8 +7,8 @@ use kinematics::urdf::Robot;
 use nalgebra::Matrix4;
 use serde_json::Value;
 
-/// Meters and rotation matrix elements. Rounding differs between the libraries by a few 1e-16 per
-/// joint.
+/// Tolerance for meters and rotation matrix elements. Rounding differs between the libraries by a
+/// few 1e-16 per joint.
 const CLOSE: f64 = 1e-12;
 
 fn numbers(value: &Value) -> Vec<f64> {

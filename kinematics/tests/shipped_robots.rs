@@ -17,10 +17,11 @@ const UR10E: &str = include_str!("../../rigs/robots/ur10e.urdf");
 const SO101: &str = include_str!("../../rigs/robots/so101.urdf");
 const ALL: [&str; 6] = [PANDA, FR3, UR3E, UR5E, UR10E, SO101];
 
-/// Meters and rotation matrix elements. The products have up to eight factors.
+/// Tolerance for meters and rotation matrix elements. The products have up to eight factors.
 const CLOSE: f64 = 1e-12;
 
-/// Meters and rotation matrix elements. The makers' model of the SO-101 has six decimals.
+/// Tolerance for meters and rotation matrix elements. The makers' model of the SO-101 has six
+/// decimals.
 const CLOSE_TO_SIX_DECIMALS: f64 = 1e-5;
 
 const N_CONFIGURATIONS: usize = 200;
@@ -46,8 +47,8 @@ const UR5E_M: [f64; 6] = [0.1625, -0.425, -0.3922, 0.1333, 0.0997, 0.0996];
 const UR10E_M: [f64; 6] = [0.1807, -0.6127, -0.57155, 0.17415, 0.11985, 0.11655];
 
 /// "Robot and interface specifications", Franka Robotics: the table of a Panda and an FR3, with the
-/// flange as last row. The order of a link's factors is that of Craig,
-/// `Rot(x, alpha) Trans(x, a) Rot(z, theta) Trans(z, d)`.
+/// flange as last row. The order of a link's factors follows Craig and is `Rot(x, alpha) Trans(x,
+/// a) Rot(z, theta) Trans(z, d)`.
 const FRANKA: [Row; 8] = [
     Row(0.0, 0.333, 0.0),
     Row(0.0, 0.0, -FRAC_PI_2),
@@ -119,7 +120,8 @@ fn universal_robots_match_the_tables_of_their_maker() {
         let chain = Chain::from_urdf(urdf, "base", "tool0").unwrap();
         let difference = max_difference(&chain, |q| classic_pose(&table, q));
         assert!(difference < CLOSE, "{lengths_m:?}: {difference:e}");
-        // The base of the ROS description is rotated by 180 degrees from the controller's.
+        // The base of the ROS description is rotated by 180 degrees relative to the base of the
+        // controller.
         let from_ros_base = Chain::from_urdf(urdf, "base_link", "tool0").unwrap();
         let difference = max_difference(&from_ros_base, |q| {
             about_z(PI, 0.0) * classic_pose(&table, q)

@@ -1,5 +1,5 @@
-//! Motion of the robot's base: fixed, moving around a pedestal, or walking from one station to the
-//! next.
+//! Motion of the robot's base. The base is fixed, moves around a pedestal, or walks from one
+//! station to the next.
 
 use crate::config::Scene;
 use crate::random::RandomStream;
@@ -24,7 +24,7 @@ pub(crate) enum BaseMotion {
         /// Height of the base link above the floor, meters.
         height_m: f64,
     },
-    /// The base stands at a far station, then walks to a near one. The value scales its speed.
+    /// The base stands at a far station, then walks to a near station. The value scales its speed.
     Stations(f64),
 }
 
@@ -44,23 +44,24 @@ pub(crate) const BODY_Z_M: f64 = 0.52;
 const DEPARTURE_SECS: f64 = 14.0;
 /// Duration of the walk to the second station, seconds at speed 1.
 const WALK_DURATION_SECS: f64 = 5.0;
-/// The stations: x, y in meters and heading in radians.
+/// The stations, each as x and y in meters and heading in radians.
 const FAR_STATION: [f64; 3] = [0.0, 0.15, -0.06];
 const NEAR_STATION: [f64; 3] = [1.15, 0.0, 0.02];
 
-/// Pose of the arm's base on the quadruped's back; link `top_plate` in the URDFs.
+/// Pose of the arm's base on the quadruped's back. In the URDFs, this is the link `top_plate`.
 pub(crate) fn base_from_arm() -> Transform {
     Transform::translation(0.12, 0.0, 0.10)
 }
 
-/// Smootherstep (Perlin 2002): 0 below zero, 1 above one, with continuous first and second
-/// derivatives. Velocity and acceleration are zero at both ends.
+/// Smootherstep (Perlin 2002). It is 0 below zero and 1 above one, and has continuous first and
+/// second derivatives. Velocity and acceleration are zero at both ends.
 pub(crate) fn smooth(share: f64) -> f64 {
     let share = share.clamp(0.0, 1.0);
     share.powi(3) * (10.0 - 15.0 * share + 6.0 * share * share)
 }
 
-/// A sine with an offset: mean, amplitude, period in seconds, phase in turns.
+/// A sine with an offset. The parameters are mean, amplitude, period in seconds, and phase in
+/// turns.
 pub(crate) fn oscillate([mean, amplitude, period, phase]: [f64; 4], at: f64) -> f64 {
     mean + amplitude * ((at / period + phase) * TAU).sin()
 }
@@ -122,8 +123,8 @@ impl BaseMotion {
         }
     }
 
-    /// Index of the current station and seconds since arrival (at speed 1), or `None` while the
-    /// base moves. The arm scans only at stations.
+    /// Index of the current station and seconds since arrival at speed 1. `None` while the base
+    /// moves. The arm scans only at stations.
     pub(crate) fn station_at(&self, secs: f64) -> Option<(usize, f64)> {
         match self {
             Self::Fixed | Self::FixedAt(_) => Some((0, secs)),
@@ -141,14 +142,14 @@ impl BaseMotion {
     }
 }
 
-/// Progress along the laps, in seconds at nominal speed. The walk starts at rest; then its speed
-/// varies by a third.
+/// Progress along the laps, in seconds at nominal speed. The walk starts at rest. Afterwards, its
+/// speed varies by a third.
 fn lap_secs(secs: f64, speed: f64) -> f64 {
     const START_SECS: f64 = 1.5;
     const OSCILLATION: (f64, f64) = (0.35, 7.3);
     let at = secs * speed;
-    // The integral of the smooth ramp 3 r^2 - 2 r^3, scaled so that the walk has speed 1 after the
-    // start.
+    // This is the integral of the smooth ramp 3 r^2 - 2 r^3, scaled so that the walk has speed 1
+    // after the start.
     let ramp = (at / START_SECS).clamp(0.0, 1.0);
     let started = START_SECS * (ramp.powi(3) - 0.5 * ramp.powi(4)) + (at - START_SECS).max(0.0);
     // The oscillation starts with zero derivative, so the walk starts smoothly.
@@ -194,7 +195,7 @@ fn gait(secs: f64, gait_amplitude: f64, [x, y, yaw]: [f64; 3]) -> Transform {
     )
 }
 
-/// Drift like that of a SLAM system: a random walk that advances only while the base walks.
+/// Drift as in a SLAM system. It is a random walk that advances only while the base walks.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Drift {
     random: RandomStream,
@@ -206,8 +207,8 @@ pub(crate) struct Drift {
 /// Steps of the random walk over the whole walk. With more steps, the drift changes more often and
 /// by less each time. The error at the end stays the same.
 const N_STEPS: f64 = 64.0;
-/// Errors of height, roll and pitch relative to those of the other axes. They are smaller, because
-/// gravity and the floor constrain them.
+/// Errors of height, roll and pitch relative to the errors of the other axes. They are smaller,
+/// because gravity and the floor constrain them.
 const CONSTRAINED_AXIS_FRAC: f64 = 0.3;
 /// Identifies the random number stream.
 const DRIFT: u64 = 0xd41f;

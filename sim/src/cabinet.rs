@@ -1,7 +1,7 @@
-//! The cabinet of the mobile-arm scene: a yellow switchboard of 1 x 1 m with a bar across it, and a
-//! box with a screen and a switch inside.
+//! The cabinet of the mobile-arm scene. It is a yellow switchboard of 1 x 1 m with a bar across it,
+//! and contains a box with a screen and a switch.
 //!
-//! The world's origin lies on the floor below the initial base position; the cabinet opens toward
+//! The world's origin lies on the floor below the initial base position. The cabinet opens toward
 //! it.
 
 use crate::furniture::{Furniture, upright};
@@ -27,7 +27,7 @@ pub(crate) const SCREEN_M: [f64; 3] = [2.20, 0.12, 0.97];
 const SHEET_M: f64 = 0.012;
 const BOX_HALF_M: [f64; 3] = [0.09, 0.16, 0.12];
 const SWITCH_M: [f64; 3] = [2.36, -0.23, 0.98];
-/// The room: minimum and maximum x, half its width, and height, meters.
+/// Minimum and maximum x of the room, meters. The next constants are half its width and its height.
 const ROOM_X_M: [f64; 2] = [-2.2, 2.48];
 const ROOM_HALF_Y_M: f64 = 2.4;
 const ROOM_HEIGHT_M: f64 = 2.7;
@@ -54,7 +54,7 @@ fn furniture() -> Furniture {
     furniture
 }
 
-/// Adds the equipment inside the cabinet: the box, breakers on a rail, ducts.
+/// Adds the equipment inside the cabinet, which is the box, breakers on a rail, and ducts.
 fn equip(furniture: &mut Furniture) {
     let [x, y, z] = SCREEN_M;
     let box_pose = upright([x + BOX_HALF_M[0], y, z], 180.0);

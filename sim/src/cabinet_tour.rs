@@ -1,4 +1,5 @@
-//! The camera tour of the mobile arm: it views the cabinet from two stations, then enters it.
+//! The camera tour of the mobile arm. The camera views the cabinet from two stations, then enters
+//! it.
 
 use crate::base::{BaseMotion, base_from_arm, oscillate, smooth};
 use crate::cabinet::{CENTER_Z_M, FRONT_X_M, SCREEN_M};
@@ -17,11 +18,12 @@ pub(crate) struct CabinetTour {
     speed: f64,
 }
 
-/// Seconds at the second station before the camera enters, and duration of one trip in and out.
+/// Seconds at the second station before the camera enters. The next constant is the duration of one
+/// trip in and out.
 const OUTSIDE_SECS: f64 = 9.0;
 const IN_AND_OUT_SECS: f64 = 22.0;
-/// The lamps change while the camera moves between these depths behind the opening, meters;
-/// negative is outside.
+/// The lamps change while the camera moves between these depths behind the opening, meters.
+/// Negative depths are outside.
 const LIGHT_TRANSITION_M: [f64; 2] = [-0.20, 0.02];
 
 impl CabinetTour {
@@ -80,8 +82,8 @@ fn far(at: f64) -> (Vector3<f64>, Vector3<f64>, f64) {
     (eye, look_at, oscillate([0.0, 0.15, 8.3, 0.6], at))
 }
 
-/// Eye, look-at point and roll at the second station: before the opening, then repeatedly in and
-/// out.
+/// Eye, look-at point and roll at the second station. The camera is first in front of the opening,
+/// then moves repeatedly in and out.
 fn near(at: f64) -> (Vector3<f64>, Vector3<f64>, f64) {
     // The cycle is a cosine, so that the camera is at rest when it starts and when it turns around.
     let cycle = ((at - OUTSIDE_SECS).max(0.0) / IN_AND_OUT_SECS * std::f64::consts::TAU).cos();
@@ -116,7 +118,7 @@ fn near(at: f64) -> (Vector3<f64>, Vector3<f64>, f64) {
     (eye, look_at, oscillate([0.0, 0.15, 8.3, 0.1], at))
 }
 
-/// Brightness of the lamps for a camera pose: 1 outside, `inside_frac` inside.
+/// Brightness of the lamps for a camera pose. It is 1 outside and `inside_frac` inside.
 pub(crate) fn light_frac(world_from_camera: &Transform, inside_frac: f64) -> f64 {
     let [from, to] = LIGHT_TRANSITION_M;
     let share = smooth((world_from_camera.translation.vector.x - FRONT_X_M - from) / (to - from));

@@ -1,4 +1,5 @@
-//! Configuration of a simulated rig: scene, cameras, sensor imperfections, and end conditions.
+//! Configuration of a simulated rig, with the scene, the cameras, the imperfections of the sensors,
+//! and the end of the run.
 
 use crate::Error;
 use crate::twin::RobotConfig;
@@ -13,8 +14,8 @@ pub struct Config {
     pub scene: Scene,
     /// Seed of all random numbers. In lockstep, the same seed gives identical bits.
     pub seed: u64,
-    /// Disables all sensor imperfections: noise, blur, rolling-shutter shear, holes, latency and
-    /// dropped images. The lens and the range limits remain in effect.
+    /// Disables all sensor imperfections, which are noise, blur, rolling-shutter shear, holes,
+    /// latency and dropped images. The lens and the range limits remain in effect.
     pub ideal: bool,
     /// Whether each color image is followed by its [`drivers::TruthImage`].
     pub truth: bool,
@@ -35,20 +36,20 @@ pub struct Config {
     /// Joint names in the order of the joint readings.
     pub reading_order: Vec<String>,
     /// Offsets that must be added to the joint readings to get the true positions, in the order of
-    /// the readings, radians; empty if the readings are right.
+    /// the readings, radians. The list is empty if the readings are right.
     pub joint_offsets: Vec<f64>,
-    /// The cameras; names are unique.
+    /// The cameras. Their names are unique.
     pub cameras: Vec<CameraConfig>,
-    /// The range scanners; names are unique.
+    /// The range scanners. Their names are unique.
     pub scanners: Vec<ScannerConfig>,
     /// Reporting of a moving base.
     pub base: BaseConfig,
     /// Brightness of all lamps while the arm's camera is inside the cabinet, relative to the
     /// brightness outside. A value of 1 has no effect.
     pub light_inside_frac: f64,
-    /// Printed calibration targets in the scene; names are unique.
+    /// Printed calibration targets in the scene. Their names are unique.
     pub targets: Vec<TargetConfig>,
-    /// The robot of a rig file. `None`: the robot of the scene.
+    /// The robot of a rig file. `None` selects the robot of the scene.
     pub robot: Option<RobotConfig>,
 }
 
@@ -61,19 +62,21 @@ pub struct TargetConfig {
     pub spec: String,
     /// Frame that the board is attached to.
     pub parent: TargetParent,
-    /// Pose of the board frame: x points right on the print, y down, z into the plate.
+    /// Pose of the board frame. On the print, x points right, y points down, and z points into the
+    /// plate.
     pub parent_from_board: Transform,
 }
 
 /// Frame that a printed target is attached to.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum TargetParent {
-    /// The world: the target is stationary.
+    /// The world. The target is stationary.
     World,
-    /// The arm's flange: the arm carries the target.
+    /// The arm's flange. The arm carries the target.
     Flange,
     /// A hand that holds the target at many places in front of a camera, one after the other. The
-    /// pose of the board is that of the hand, and not [`TargetConfig::parent_from_board`].
+    /// pose of the board follows from the hand, and [`TargetConfig::parent_from_board`] is not
+    /// used.
     Hand {
         /// Index of the camera in [`Config::cameras`].
         camera_ix: usize,
@@ -148,7 +151,7 @@ pub struct ScannerConfig {
 }
 
 impl ScannerConfig {
-    /// Sixteen rings at 10 Hz, on the back of the quadruped.
+    /// A scanner with sixteen rings at 10 Hz, on the back of the quadruped.
     pub fn sixteen_rings(name: &str) -> Self {
         Self {
             name: name.to_owned(),
@@ -209,11 +212,11 @@ impl Scene {
 /// Frame that a camera is attached to.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Parent {
-    /// The arm's flange: the camera moves with it.
+    /// The arm's flange. The camera moves with the arm.
     Flange,
     /// The robot's base.
     Base,
-    /// The world: the camera is stationary.
+    /// The world. The camera is stationary.
     World,
 }
 
@@ -287,8 +290,8 @@ impl Default for SensorConfig {
     }
 }
 
-/// Imperfections and limits of depth images, which have the stamp of the color image and a global
-/// shutter.
+/// Imperfections and limits of depth images. A depth image has the stamp of the color image. All
+/// its pixels are exposed at the same time.
 #[derive(Clone, Debug, PartialEq)]
 pub struct DepthConfig {
     /// Factor that must be applied to the readings to get the true depth.
@@ -331,8 +334,8 @@ impl Default for DepthConfig {
 }
 
 impl CameraConfig {
-    /// A wrist RGB-D camera like a `RealSense` D435i: 640x480 at 15 Hz, tilted, on a bracket next
-    /// to the flange.
+    /// A wrist RGB-D camera like a `RealSense` D435i, with 640x480 at 15 Hz. It is tilted and on a
+    /// bracket next to the flange.
     pub fn wrist(name: &str) -> Self {
         Self {
             name: name.to_owned(),
@@ -352,8 +355,9 @@ impl CameraConfig {
         }
     }
 
-    /// A wrist RGB-D camera like a `RealSense` L515, for upright objects in front of the arm:
-    /// 1280x720 color at 4 Hz, 640x480 depth with its own lens and pose, tilted by 80 degrees.
+    /// A wrist RGB-D camera like a `RealSense` L515, for upright objects in front of the arm. It
+    /// has 1280x720 color at 4 Hz, and 640x480 depth with its own lens and pose. It is tilted by 80
+    /// degrees.
     pub fn mobile_wrist(name: &str) -> Self {
         Self {
             intrinsics: pinhole([1280, 720], [905.3, 904.7], [648.2, 355.1]),
@@ -385,8 +389,8 @@ fn pinhole(size_px: [u32; 2], focal_px: [f64; 2], principal_px: [f64; 2]) -> Int
     }
 }
 
-/// The bracket of the wrist camera, as `flange_from_camera`: next to the flange, tilted to look
-/// past it.
+/// The bracket of the wrist camera, as `flange_from_camera`. The camera is next to the flange, and
+/// is tilted to look past it.
 ///
 /// With the tilt, the arm can view the scene from low elevations without reaching its joint limits.
 fn wrist_extrinsics(tilt_degrees: f64) -> Transform {
@@ -455,7 +459,7 @@ impl Config {
             })
     }
 
-    /// Checks all numbers before they reach MuJoCo, which aborts the process on invalid ones.
+    /// Checks all numbers before they reach MuJoCo, which aborts the process on invalid numbers.
     pub fn check(&self) -> Result<(), Error> {
         check("sim", "speed", self.speed, 0.01, 2.0)?;
         if let Some(secs) = self.duration_secs {
@@ -471,7 +475,7 @@ impl Config {
 
     fn check_joints(&self) -> Result<(), Error> {
         let expected = match &self.robot {
-            // The robot description has as many joints as it has.
+            // A robot description may have any number of joints.
             Some(_) => self.joint_names.len(),
             None if self.scene.has_arm() => N_JOINTS,
             None => 0,
@@ -538,7 +542,8 @@ impl Config {
         Ok(())
     }
 
-    /// A target in a hand needs its camera. Range scanners would see it at another place.
+    /// A target in a hand needs the camera in front of which it is moved. Range scanners are
+    /// rejected, because they would see the target at another place.
     fn check_hand(&self, target: &str, camera_ix: usize) -> Result<(), Error> {
         if camera_ix < self.cameras.len() && self.scanners.is_empty() {
             return Ok(());
@@ -621,7 +626,7 @@ impl CameraConfig {
         let sensor = &self.sensor;
         check(&self.name, "noise_sigma", sensor.noise_sigma, 0.0, 100.0)?;
         check(&self.name, "shot_frac", sensor.shot_frac, 0.0, 1.0)?;
-        // An exposure ends before the next one begins.
+        // An exposure ends before the next exposure begins.
         check(
             &self.name,
             "exposure_micros",
@@ -636,7 +641,7 @@ impl CameraConfig {
             1.0,
             64.0,
         )?;
-        // So does a readout.
+        // The readout must also fit between two images.
         check(
             &self.name,
             "readout_micros",

@@ -1,4 +1,4 @@
-//! A headless OpenGL context, current on the thread that created it.
+//! A headless OpenGL context. It is current on the thread that created it.
 #![expect(unsafe_code, reason = "EGL is a C interface")]
 
 use crate::Error;
@@ -7,8 +7,8 @@ use std::ffi::{CStr, c_char, c_void};
 
 type Egl = egl::DynamicInstance<egl::EGL1_5>;
 
-// Values of the EGL registry that the bindings do not contain: EGL_PLATFORM_DEVICE_EXT,
-// EGL_PLATFORM_SURFACELESS_MESA and EGL_EXTENSIONS.
+// The constants EGL_PLATFORM_DEVICE_EXT, EGL_PLATFORM_SURFACELESS_MESA and EGL_EXTENSIONS of the
+// EGL registry, which the bindings do not contain.
 const PLATFORM_DEVICE: egl::Enum = 0x313f;
 const PLATFORM_SURFACELESS_MESA: egl::Enum = 0x31dd;
 const EXTENSIONS: i32 = 0x3055;
@@ -25,8 +25,8 @@ pub(crate) struct HeadlessContext {
 }
 
 impl HeadlessContext {
-    /// Opens the first platform that works: a hardware device, Mesa's surfaceless platform, a
-    /// software device.
+    /// Opens the first platform that works. The order is hardware devices, Mesa's surfaceless
+    /// platform, software devices.
     ///
     /// On machines with a GPU, Mesa's surfaceless platform may render in software, so hardware
     /// devices come first.

@@ -31,12 +31,12 @@ pub(crate) struct Engine {
     joint_ixs: Vec<usize>,
     robot: Robot,
     drift: Drift,
-    /// Ray caster; `None` without range scanners.
+    /// Ray caster. `None` without range scanners.
     rays: Option<RayCaster>,
     n_base_poses: u64,
     n_scans: Vec<u64>,
     cameras: Vec<Camera>,
-    /// The targets that are moved by hand, with the camera before which each is moved.
+    /// The targets that are moved by hand, each with the camera in front of which it is moved.
     hands: Vec<(CameraConfig, Hand)>,
     renderer: Renderer,
     /// Stamp of simulated time zero.
@@ -62,7 +62,8 @@ enum Slot {
     Image(Exposure),
     /// A base pose at a time in nanoseconds.
     Base(i64),
-    /// A scanner revolution: scanner index, revolution number, and start time in nanoseconds.
+    /// A revolution of a scanner, with scanner index, revolution number, and start time in
+    /// nanoseconds.
     Scan(usize, u64, i64),
 }
 
@@ -175,8 +176,8 @@ impl Camera {
     }
 
     /// Exposure instants relative to the stamp. The list has all instants of the first row, then
-    /// those of the second row, and so on. It is empty if the camera is stationary or exposes all
-    /// rows at the stamp.
+    /// all instants of the second row, and so on. It is empty if the camera is stationary or
+    /// exposes all rows at the stamp.
     fn row_offsets_nanos(&self) -> Vec<i64> {
         let sensor = &self.sensor;
         if self.config.parent == Parent::World
@@ -351,7 +352,8 @@ impl Engine {
         Ok(())
     }
 
-    /// Moves the arm by emulated motors instead of the scan. `start`: stamp of simulated time zero.
+    /// Moves the arm by emulated motors instead of the scan. `start` is the stamp of simulated time
+    /// zero.
     pub(crate) fn follow_motors(
         &mut self,
         motors: MotorHistory,

@@ -1,5 +1,5 @@
-//! The scanning motion in joint space: joint positions over time that move the camera along its
-//! tour.
+//! The scanning motion in joint space. It gives joint positions over time that move the camera
+//! along its tour.
 
 use crate::Error;
 use crate::cabinet_tour::CabinetTour;
@@ -111,7 +111,7 @@ impl Follower {
     }
 
     /// Follows half a minute of the scan without dynamics. Returns the largest rotation of the
-    /// camera relative to the tour. The arm is moved, so this is called on a copy.
+    /// camera relative to the tour. This changes the state of the arm, so it is called on a copy.
     fn worst_rotation_rad(mut self) -> f64 {
         const CHECKED_SECS: f64 = 30.0;
         const STEP_SECS: f64 = 0.005;
@@ -136,12 +136,12 @@ impl Follower {
         &self.velocity_rad_s
     }
 
-    /// Advances to a time `step_secs` after the previous one.
+    /// Advances to a time that is `step_secs` after the previous time.
     pub(crate) fn advance(&mut self, secs: f64, step_secs: f64) {
         let target_pose = self.scan.arm_from_camera(secs);
         let before = self.scan.arm_from_camera(secs - step_secs);
-        // The velocity of the target is the feedforward. Without it, the camera would lag behind
-        // the tour by the camera's velocity divided by the gain.
+        // The velocity of the target is the feedforward. Without the feedforward, the camera would
+        // lag behind the tour by the camera's velocity divided by the gain.
         let target_twist = pose_error(&target_pose, &before) / step_secs;
         let desired_velocity = self.desired_velocity(&target_pose, &target_twist);
         for ix in 0..N_JOINTS {
@@ -200,7 +200,7 @@ impl Follower {
 /// Acceleration after a step, within the maxima of acceleration and jerk.
 ///
 /// The velocity follows the desired velocity like a critically damped spring of the frequency w =
-/// `SMOOTHING_RAD_S`: jerk = w^2 * error - 2 * w * acceleration.
+/// `SMOOTHING_RAD_S`. The jerk is w^2 * error - 2 * w * acceleration.
 pub(crate) fn smooth_acceleration(
     velocity_error: f64,
     acceleration: f64,

@@ -26,9 +26,9 @@ pub(crate) fn upright(at_m: [f64; 3], yaw_degrees: f64) -> Transform {
     Transform::from_parts(Translation3::from(Vector3::from(at_m)), yaw)
 }
 
-/// A light wooden bench: half length, half depth and height of its top, meters.
+/// Half length, half depth and height of the top of a light wooden bench, meters.
 const BENCH_M: [f64; 3] = [0.9, 0.375, 0.85];
-/// A shelf: half length, half depth and height, meters.
+/// Half length, half depth and height of a shelf, meters.
 const SHELF_M: [f64; 3] = [0.75, 0.22, 2.0];
 
 impl Furniture {
@@ -45,7 +45,7 @@ impl Furniture {
 
     /// The next random number.
     fn draw_uniform(&mut self, lower: f64, upper: f64) -> f64 {
-        // Numbers are drawn by index, so each draw needs its own.
+        // Random numbers are drawn by index, so each draw needs its own index.
         self.n_drawn += 1;
         self.random.between(self.n_drawn, lower, upper)
     }
@@ -137,12 +137,12 @@ impl Furniture {
                 self.draw_uniform(0.07, 0.24),
             ];
             y += half[1];
-            // Items are placed from one end to the other until the next one does not fit.
+            // Items are placed from one end to the other until the next item does not fit.
             if y + half[1] > half_length {
                 break;
             }
             let front = self.draw_picture(&[0, 1, 7, 8, 9, 9, 11, 13, 14, 15]);
-            // The order of the draws decides which numbers each item gets.
+            // The order of the draws determines which random numbers each item gets.
             let x = self.draw_uniform(-0.15, 0.12);
             let yaw = self.draw_uniform(-14.0, 14.0);
             let pose = at(x, y, top_m + 0.025 + half[2]) * upright([0.0; 3], yaw);
@@ -217,7 +217,7 @@ impl Furniture {
     /// Adds all larger boxes as occluders. Shadows of small items on shelves would not be visible
     /// on the floor.
     pub(crate) fn add_occluders(&self, occluders: &mut Occluders) {
-        /// Boxes count as large if half their side is at least this, meters. With more boxes,
+        /// Boxes count as large if half their side is at least this value, meters. With more boxes,
         /// computing the shadows takes longer.
         const MIN_HALF_M: f64 = 0.22;
         let large = |half_m: &[f64; 3]| half_m.iter().any(|half_m| *half_m >= MIN_HALF_M);

@@ -1,15 +1,17 @@
-//! A hand that moves a printed target in front of a camera, as a person does who calibrates a lens:
-//! it holds the target at one place after the other, at different distances and tilts.
+//! A hand that moves a printed target in front of a camera. Like a person who calibrates a lens, it
+//! holds the target at one place after the other, at different distances and tilts.
 
 use crate::config::CameraConfig;
 use kinematics::{Transform, transform};
 use nalgebra::{Point3, UnitQuaternion, Vector2, Vector3};
 use targets::TargetSpec;
 
-/// Time for which the target is held at each place, and time of each motion, seconds.
+/// Time for which the target is held at each place, seconds. The next constant is the time of each
+/// motion.
 const HOLD_SECS: f64 = 1.2;
 const MOVE_SECS: f64 = 0.9;
-/// Slow wavering of a hand that holds something still: amplitude and frequency along each axis.
+/// Amplitude of the slow wavering of a hand that holds something still, meters. The next constants
+/// are the amplitude in radians and the frequencies along the axes.
 const WAVER_M: f64 = 0.0003;
 const WAVER_RAD: f64 = 0.001;
 const WAVER_HZ: [f64; 3] = [0.7, 0.9, 0.5];
@@ -21,7 +23,8 @@ struct Place {
     at_frac: [f64; 2],
     /// Width or height of the target, whichever is longer, as a fraction of the width of the image.
     span_frac: f64,
-    /// Rotation about the x and the y axis of the camera relative to facing it, degrees.
+    /// Rotation about the x and the y axis of the camera, degrees. It is zero if the target faces
+    /// the camera.
     tilt_deg: [f64; 2],
     /// Rotation about the line of sight, degrees.
     roll_deg: f64,
@@ -41,8 +44,8 @@ const RIGHT: f64 = 0.8;
 const TOP: f64 = 0.22;
 const BOTTOM: f64 = 0.78;
 
-/// The places in order. The tilts, distances and parts of the image are those that the calibration
-/// of a lens asks for, with some variation.
+/// The places in order. The calibration of a lens asks for these tilts, distances and parts of the
+/// image. They vary slightly.
 const PLACES: [Place; 21] = [
     place([0.5, 0.5], 0.5, [0.0, 0.0], 0.0),
     place([0.5, 0.5], 0.55, [0.0, 30.0], 5.0),
@@ -110,8 +113,8 @@ impl Hand {
     }
 }
 
-/// Fraction of a motion of a hand after a fraction of its time: zero speed and acceleration at both
-/// ends (Flash and Hogan 1985, minimum jerk).
+/// Completed fraction of a motion of a hand after a fraction of its time. Speed and acceleration
+/// are zero at both ends (minimum jerk, Flash and Hogan 1985).
 fn smooth_frac(time_frac: f64) -> f64 {
     let t = time_frac.clamp(0.0, 1.0);
     t * t * t * (10.0 + t * (6.0 * t - 15.0))
@@ -126,8 +129,8 @@ fn waver(secs: f64) -> Transform {
     )
 }
 
-/// Pose of a target of this size at a place in the image. Distortion is left out, so that a target
-/// at the border of the image is a few pixels beside its place.
+/// Pose of a target of this size at a place in the image. Distortion is not considered, so a target
+/// at the border of the image is a few pixels away from its place.
 fn camera_from_middle(camera: &CameraConfig, place: &Place, longest_m: f64) -> Transform {
     let lens = &camera.intrinsics;
     let [width, height] = lens.size_px.map(f64::from);
@@ -215,7 +218,8 @@ mod tests {
     fn images_show_the_target_where_the_hand_holds_it() {
         /// Most corners are found at the places in the middle of the image.
         const MIN_CORNERS: usize = 12;
-        /// Measured values are below 0.1 px; the pose of a wrong place is off by tens of pixels.
+        /// Measured values are below 0.1 px. The pose of a wrong place would give errors of tens of
+        /// pixels.
         const MAX_RMS_PX: f64 = 0.3;
         const N_PLACES: u64 = 12;
         // The exposures are in the middle of the holds.

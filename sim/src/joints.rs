@@ -2,6 +2,6 @@
 
 use nalgebra::DVector;
 
-/// One value per joint of the arm, from base to flange: radians or meters, the same per second, or
-/// newton meters or newtons.
+/// One value per joint of the arm, from base to flange. Positions are in radians or meters,
+/// velocities are in the same units per second, and efforts are in newton meters or newtons.
 pub(crate) type Joints = DVector<f64>;

@@ -1,5 +1,6 @@
-//! The laboratory of the mobile base: 15 x 10 m with benches, shelves, crates and posters. A
-//! pedestal with a glass bowl stands in the middle; the world's origin is on the floor there.
+//! The laboratory of the mobile base. It has 15 x 10 m, with benches, shelves, crates and posters.
+//! A pedestal with a glass bowl stands in the middle. The world's origin is on the floor below the
+//! bowl.
 
 use crate::furniture::{Furniture, upright};
 use crate::lab_texture;
@@ -10,7 +11,7 @@ use crate::texture::{self, Texture};
 use kinematics::Transform;
 use nalgebra::{Point3, Vector3};
 
-/// Half sizes of the room along x and y, and its height, meters.
+/// Half sizes of the room along x and y, meters. The next constant is its height.
 pub const ROOM_HALF_M: [f64; 2] = [7.5, 5.0];
 /// Height of the ceiling, meters.
 pub const ROOM_HEIGHT_M: f64 = 3.0;
@@ -45,8 +46,8 @@ const BOX_STACKS: [([f64; 3], usize); 8] = [
     ([-1.6, 3.7, 5.0], 2),
     ([6.6, 4.2, 30.0], 4),
 ];
-/// Posters: wall (east, west, north, south), position along it, height, half width, half height,
-/// picture.
+/// Posters. Each entry has the wall (east, west, north, south), the position along the wall, the
+/// height, half the width, half the height of the poster, and the picture.
 const POSTERS: [(usize, [f64; 4], usize); 17] = [
     (0, [-3.6, 1.6, 0.5, 0.7], 0),
     (0, [0.0, 1.7, 0.55, 0.4], 7),
@@ -67,7 +68,8 @@ const POSTERS: [(usize, [f64; 4], usize); 17] = [
     (3, [6.3, 1.7, 0.5, 0.7], 9),
 ];
 
-/// Pose of a wall by index: x points into the room, z up, the origin on the floor at its middle.
+/// Pose of a wall by index. The x axis points into the room, and z points up. The origin is on the
+/// floor at the middle of the wall.
 fn world_from_wall(wall: usize) -> Transform {
     let [x, y] = ROOM_HALF_M;
     match wall {

@@ -1,5 +1,5 @@
-//! Procedural textures for rooms: floors, walls, and sheets of 16 small pictures for posters and
-//! for items on shelves.
+//! Procedural textures for floors and walls of rooms, and sheets of 16 small pictures for posters
+//! and for items on shelves.
 #![expect(
     clippy::cast_possible_truncation,
     reason = "picture indices on a sheet are small integers"
@@ -129,7 +129,7 @@ fn curves(own: f64, u: f64, v: f64) -> Color {
             0.5 - 0.36 * (-(2.0 + k) * u).exp() * ((9.0 + 4.0 * k) * (u + own)).cos() - 0.05 * k;
         ((v - y).abs(), hue(0.27 * k + own, 0.05, 0.85))
     });
-    // If curves overlap, the first one is on top.
+    // If curves overlap, the first curve is on top.
     near.filter(|(distance, _)| *distance < 0.013)
         .map(|(_, color)| color)
         .next()
@@ -150,7 +150,7 @@ fn letters(each: RandomStream, u: f64, v: f64) -> Color {
     let cell = (row * 12.0 + column) as u64;
     let x = ((u * 12.0).fract() * 5.0) as u64;
     let y = ((v * 9.0).fract() * 6.0) as u64;
-    // A character is a random bitmap of 4 x 5 bits; the last column and row of its cell stay free.
+    // A character is a random bitmap of 4 x 5 bits. The last column and row of its cell stay free.
     let on = x < 4 && y < 5 && each.bits(900 + cell) >> (y * 4 + x) & 1 == 1;
     let paper = hue((cell % 7) as f64 / 7.0, 0.62, 0.95);
     if on { [0.08, 0.08, 0.12] } else { paper }
@@ -158,7 +158,7 @@ fn letters(each: RandomStream, u: f64, v: f64) -> Color {
 
 fn spots(each: RandomStream, ix: u64, u: f64, v: f64) -> Color {
     let ground = hue(each.unit(50 + ix), 0.25, 0.8);
-    // The spots are searched from the last to the first, so that later spots cover earlier ones.
+    // The spots are searched from the last to the first, so that later spots cover earlier spots.
     let top = (0..14).rev().find(|spot| {
         let at = |counter: u64| each.unit(ix * 100 + spot * 4 + counter);
         (u - at(0)).hypot(v - at(1)) < 0.04 + 0.13 * at(2)
@@ -168,7 +168,8 @@ fn spots(each: RandomStream, ix: u64, u: f64, v: f64) -> Color {
     })
 }
 
-/// Sixteen items for shelves and benches: cartons, crates, books, instruments, screens.
+/// Sixteen items for shelves and benches, which are cartons, crates, books, instruments and
+/// screens.
 pub(crate) fn items() -> Texture {
     let noise = Noise::new(111);
     let each = RandomStream::new(0x7e37, &[112]);
@@ -397,7 +398,8 @@ pub(crate) fn floor_tiles(size_m: [f64; 2], lane_m: f64) -> Texture {
     })
 }
 
-/// A repeating texture of a painted wall, 3 m high and wide: a green dado, a rail, plaster above.
+/// A repeating texture of a painted wall, 3 m high and wide. It has a green dado, a rail, and
+/// plaster above the rail.
 pub(crate) fn painted_wall() -> Texture {
     let rough = Noise::new(131);
     let stain = Noise::new(132);

@@ -19,7 +19,7 @@ pub(crate) struct RayCaster {
     data: MjData<Arc<MjModel>>,
 }
 
-/// Geometry groups that rays hit: all except the robot and glass.
+/// Geometry groups that rays hit, which are all groups except the robot and glass.
 fn visible_groups() -> [u8; 6] {
     let mut groups = [1; 6];
     groups[ARM_GROUP] = 0;
@@ -34,7 +34,7 @@ impl RayCaster {
         Self { data }
     }
 
-    /// Distances along unit vectors from one point, meters; `None` if a ray hits nothing within
+    /// Distances along unit vectors from one point, meters. `None` if a ray hits nothing within
     /// `max_distance_m`.
     fn cast(
         &mut self,

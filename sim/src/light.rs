@@ -1,4 +1,4 @@
-//! Scene lighting: computes how much light reaches each point and bakes it into the textures.
+//! Computes how much light reaches each point of a scene, and bakes it into the textures.
 //!
 //! Nothing in front of a wrist camera moves, so shadows can be computed once instead of for every
 //! image. This halves the rendering time and allows soft shadows from an extended lamp and ambient
@@ -207,8 +207,8 @@ impl Occluders {
     ///
     /// `name` identifies the point and selects its random rays.
     pub(crate) fn light_frac(&self, point: &Point3<f64>, normal: &Vector3<f64>, name: u64) -> f64 {
-        /// Rays start this far above the surface, so that rounding does not let them hit it,
-        /// meters.
+        /// Rays start at this distance above the surface, meters, so that rounding does not cause
+        /// them to hit the surface.
         const LIFT_M: f64 = 5e-4;
         let random = RandomStream::new(0x11_6874, &[name]);
         let from = point + normal * LIFT_M;
@@ -259,9 +259,9 @@ impl Occluders {
         let boxes: Vec<&SolidBox> = self.boxes.iter().filter(can_block).collect();
         let rotation_rad = random.between(1, 0.0, std::f64::consts::TAU);
         let n_free = (0..N_AMBIENT_RAYS).filter(|ray| {
-            // Cosine-weighted directions around the normal, by Malley's method: points are spread
-            // evenly over a disc and projected up to the hemisphere. Each ray then carries the same
-            // light.
+            // The directions around the normal are cosine-weighted by Malley's method. Points are
+            // spread evenly over a disc and projected up to the hemisphere. Each ray then carries
+            // the same light.
             let square = (*ray as f64 + random.unit(2 + ray)) / N_AMBIENT_RAYS as f64;
             let (sin, cos) = (*ray as f64 * GOLDEN_ANGLE_RAD + rotation_rad).sin_cos();
             let direction =
@@ -274,7 +274,7 @@ impl Occluders {
 
 /// Whether a ray hits the unit sphere before `reach`, or starts inside the sphere.
 fn hits_sphere(from: &Vector3<f64>, direction: &Vector3<f64>, reach: f64) -> bool {
-    // The quadratic a t^2 + 2 b t + c = 0 of the distances at which the ray meets the sphere.
+    // The ray meets the sphere at the distances t for which a t^2 + 2 b t + c = 0.
     let a = direction.norm_squared();
     let b = from.dot(direction);
     let c = from.norm_squared() - 1.0;

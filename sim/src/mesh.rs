@@ -12,7 +12,7 @@ pub(crate) struct Mesh {
     faces: Vec<[i32; 3]>,
 }
 
-/// One vertex; `texcoord` is `(0, 0)` at the texture's top left.
+/// One vertex. `texcoord` is `(0, 0)` at the texture's top left.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Corner {
     pub(crate) point_m: Point3<f64>,
@@ -79,7 +79,7 @@ impl Mesh {
         self.triangle([a, c, d]);
     }
 
-    /// A box around the origin; texture rectangles in the order +x, -x, +y, -y, +z, -z.
+    /// A box around the origin. The texture rectangles are in the order +x, -x, +y, -y, +z, -z.
     pub(crate) fn cuboid(half_m: [f64; 3], textures: &[TextureRect; 6]) -> Self {
         let mut mesh = Self::default();
         for ((outward, right, up), texture) in BOX_FACES.iter().zip(textures) {
@@ -96,7 +96,7 @@ impl Mesh {
     }
 
     /// Adds an ellipsoid given by three perpendicular half axes. `texture_x` maps a point and its
-    /// normal to the horizontal texture coordinate; `texture_y` is constant.
+    /// normal to the horizontal texture coordinate, and `texture_y` is constant.
     pub(crate) fn add_ellipsoid(
         &mut self,
         center: Point3<f64>,
@@ -233,8 +233,8 @@ impl Mesh {
         mesh
     }
 
-    /// The bytes of MuJoCo's `.msh` format: four counts, then points, normals, texture coordinates
-    /// and faces.
+    /// The bytes of MuJoCo's `.msh` format. They are four counts, then points, normals, texture
+    /// coordinates and faces.
     pub(crate) fn to_msh(&self) -> Vec<u8> {
         let n_points = i32::try_from(self.points_m.len()).expect("meshes stay small");
         let n_faces = i32::try_from(self.faces.len()).expect("meshes stay small");
@@ -264,8 +264,8 @@ fn piece_normal(profile_m: &[[f64; 2]], piece: usize) -> Vector3<f64> {
     Vector3::new(b[1] - a[1], 0.0, a[0] - b[0]).normalize()
 }
 
-/// Normal at an end of a piece: 0 is its start, 1 its end. With `is_smooth`, it is the mean of the
-/// two pieces that meet there.
+/// Normal at an end of a piece, where 0 is its start and 1 is its end. With `is_smooth`, it is the
+/// mean of the normals of the two pieces that meet there.
 fn profile_normal(
     profile_m: &[[f64; 2]],
     piece: usize,
@@ -284,8 +284,8 @@ fn profile_normal(
     (piece_normal(profile_m, piece) + neighbor_normal).normalize()
 }
 
-/// Outward, right and up directions of a box's faces in the order +x, -x, +y, -y, +z, -z; sides are
-/// upright.
+/// Outward, right and up directions of a box's faces in the order +x, -x, +y, -y, +z, -z. On the
+/// sides, up is +z.
 pub(crate) const BOX_FACES: [([f64; 3], [f64; 3], [f64; 3]); 6] = [
     ([1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]),
     ([-1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [0.0, 0.0, 1.0]),
@@ -295,15 +295,16 @@ pub(crate) const BOX_FACES: [([f64; 3], [f64; 3], [f64; 3]); 6] = [
     ([0.0, 0.0, -1.0], [0.0, 1.0, 0.0], [1.0, 0.0, 0.0]),
 ];
 
-/// Direction on the unit sphere: `down` from 0 at +z to 1 at -z, `around` from 0 to 1 about z.
+/// Direction on the unit sphere. `down` goes from 0 at +z to 1 at -z, and `around` goes from 0 to 1
+/// about z.
 pub(crate) fn sphere_direction(down: f64, around: f64) -> Vector3<f64> {
     let (sin_down, cos_down) = (down * std::f64::consts::PI).sin_cos();
     let (sin_around, cos_around) = (around * std::f64::consts::TAU).sin_cos();
     Vector3::new(sin_down * cos_around, sin_down * sin_around, cos_down)
 }
 
-/// Outward normal of an ellipsoid at the point that corresponds to `direction` on the unit sphere;
-/// the half axes are perpendicular.
+/// Outward normal of an ellipsoid at the point that corresponds to `direction` on the unit sphere.
+/// The half axes are perpendicular.
 pub(crate) fn ellipsoid_normal(
     half_axes: &[Vector3<f64>; 3],
     direction: &Vector3<f64>,

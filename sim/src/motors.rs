@@ -6,9 +6,10 @@ use parking_lot::{Condvar, Mutex};
 use std::sync::Arc;
 use std::time::Duration;
 
-/// Positions are not interpolated across gaps longer than this, in which the emulator was stalled.
+/// Positions are not interpolated across longer gaps, because the emulator was stalled during such
+/// a gap.
 const MAX_GAP: Duration = Duration::from_secs(1);
-/// Number of states kept: those of ten seconds at 1 kHz.
+/// Maximum number of stored states, which are the states of ten seconds at 1 kHz.
 const MAX_STATES: usize = 10_000;
 /// Maximum time to wait for a state. After this time, the motors count as stopped. A state comes
 /// every millisecond, so only a stopped emulator is silent for this long.
@@ -35,7 +36,7 @@ impl Default for MotorHistory {
 }
 
 impl MotorHistory {
-    /// Adds the state of the motors. States that are not later than those before are ignored.
+    /// Adds the state of the motors. A state that is not later than the previous state is ignored.
     pub fn record(&self, state: JointState) {
         let _ = self.0.history.lock().push(state); // The history counts rejected states.
         self.0.arrived.notify_all();
@@ -62,7 +63,8 @@ pub(crate) struct MotorizedArm {
     pub(crate) start: Stamp,
     /// Joint index of each motor.
     pub(crate) joint_ixs: Vec<usize>,
-    /// Added to the positions of the motors to get those of the joints; empty if there are none.
+    /// Offsets that are added to the positions of the motors to get the positions of the joints.
+    /// The list is empty if there are no offsets.
     pub(crate) joint_offsets: Vec<f64>,
 }
 
@@ -72,7 +74,8 @@ impl MotorizedArm {
         self.motors.wait_until(Stamp(self.start.0 + nanos))
     }
 
-    /// Joint positions at a simulated time; `None` if the motors do not cover it.
+    /// Joint positions at a simulated time. `None` if no positions of the motors are known at this
+    /// time.
     pub(crate) fn position_at(&self, nanos: i64) -> Option<Joints> {
         let state = self
             .motors

@@ -65,9 +65,9 @@ pub(crate) fn noise_sigma(sensor: &SensorConfig, level: f64) -> f64 {
             .sqrt()
 }
 
-/// PSNR in dB of bytes against colors rounded to bytes; infinite if they are equal.
+/// PSNR in dB of bytes against colors rounded to bytes. It is infinite if they are equal.
 pub(crate) fn psnr(bytes: &[u8], colors: &[f32]) -> f64 {
-    // A chunk's sum of squares fits u32: 4096 * 255^2 < 2^32.
+    // A chunk's sum of squares fits into u32, because 4096 * 255^2 < 2^32.
     const SAMPLES_A_CHUNK: usize = 4096;
     // The data is processed in chunks, so that the innermost loop runs over slices.
     let squares = bytes
@@ -141,7 +141,7 @@ struct Holes {
 const MAX_EDGE_SHARE: f64 = 0.6;
 /// Side of a cluster of holes, pixels.
 const CLUSTER_PX: usize = 4;
-/// First random counter used for holes; the noise uses smaller ones.
+/// First random counter that is used for holes. The noise uses smaller counters.
 const HOLE_COUNTERS: u64 = 1 << 40;
 
 impl Holes {

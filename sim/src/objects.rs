@@ -1,4 +1,4 @@
-//! Objects of the static-arm scene: meshes, textures with baked lighting, and poses.
+//! Objects of the static-arm scene, with their meshes, textures with baked lighting, and poses.
 
 use crate::light::Occluders;
 use crate::mesh::{BOX_FACES, Mesh, WHOLE};
@@ -18,7 +18,8 @@ pub const CUBE_HALF_M: f64 = 0.03;
 /// Half sizes of the wooden block, meters.
 pub const BLOCK_HALF_M: [f64; 3] = [0.045, 0.02, 0.025];
 
-/// Half sizes of the table top along x and y, and x of its near edge, meters.
+/// Half sizes of the table top along x and y, meters. The next constant is the x coordinate of its
+/// near edge.
 const TABLE_HALF_XY_M: [f64; 2] = [0.40, 0.50];
 const TABLE_FRONT_X_M: f64 = TARGET_XY_M[0] - 0.34;
 const TABLE_HALF_THICKNESS_M: f64 = 0.02;
@@ -43,8 +44,8 @@ pub fn world_from_cube() -> Transform {
     on_table(-0.035, 0.062, CUBE_HALF_M, 28.0)
 }
 
-/// Pose of a tag on the cube by its id, 0 to 5: x points right on the printed tag, y down, z into
-/// the cube.
+/// Pose of a tag on the cube by its id, 0 to 5. On the printed tag, x points right, y points down,
+/// and z points into the cube.
 pub fn world_from_tag(id: usize) -> Transform {
     let (outward, right, up) = BOX_FACES[id];
     let [outward, right, up] = [outward, right, up].map(Vector3::from);
@@ -70,8 +71,8 @@ fn table_center() -> Point3<f64> {
     Point3::new(TABLE_FRONT_X_M + TABLE_HALF_XY_M[0], 0.0, TABLE_Z_M)
 }
 
-/// Pose of the wall on the +y side (1) or -y side (-1): x points into the room, z up. From the
-/// corner behind the table, both walls run toward the robot at 45 degrees.
+/// Pose of the wall on the +y side (1) or -y side (-1). The x axis points into the room, and z
+/// points up. From the corner behind the table, both walls run toward the robot at 45 degrees.
 fn world_from_wall(side: f64) -> Transform {
     let half = WALL_HALF_M[0] * std::f64::consts::FRAC_1_SQRT_2;
     let center = Translation3::new(
@@ -266,7 +267,7 @@ fn wall() -> Mesh {
     let up = Vector3::z() * WALL_HALF_M[1];
     let mut mesh = Mesh::default();
     mesh.rectangle(Point3::origin(), right, up, WHOLE);
-    // The back of the wall, because faces are drawn from their front only.
+    // The wall also has a back, because faces are drawn only from their front.
     mesh.rectangle(Point3::new(-0.01, 0.0, 0.0), -right, up, WHOLE);
     mesh
 }

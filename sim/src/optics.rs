@@ -1,4 +1,5 @@
-//! Converts rendered pinhole images to sensor images: lens, rolling shutter, motion blur.
+//! Converts rendered pinhole images to sensor images, with lens distortion, rolling shutter and
+//! motion blur.
 #![expect(
     clippy::cast_possible_truncation,
     reason = "pixel positions are clamped to the picture before the cast"
@@ -20,7 +21,8 @@ pub(crate) struct Optics {
     margin_px: u32,
     /// `[height, width]`: x and y of the point at z = 1 on the ray of each pixel's center.
     rays: Vec<[f32; 2]>,
-    /// Size and pinhole of the images to render: the camera image plus a margin, supersampled.
+    /// Size of the images to render. They are supersampled, and cover the camera image plus a
+    /// margin. The next field is their pinhole.
     view_size_px: [u32; 2],
     view_focal_px: [f64; 2],
     view_principal_px: [f64; 2],
@@ -160,7 +162,8 @@ impl Optics {
         }
     }
 
-    /// Color of each pixel at the instant of the rendered image: `[height, width, 3]`, 0 to 255.
+    /// Color of each pixel at the instant of the rendered image, as `[height, width, 3]` with
+    /// values from 0 to 255.
     pub(crate) fn motion_free(&self, picture: &Picture) -> Vec<f32> {
         if self.intrinsics.is_pinhole() {
             return self.expose(|row, colors| self.average_blocks(picture, row, colors));
@@ -180,7 +183,7 @@ impl Optics {
         let area = (side * side) as f32;
         let top = (margin + row * side) * stride + 3 * margin;
         for (column, color) in colors.iter_mut().enumerate() {
-            // There are at most 16 samples of 255, so the sum fits u16.
+            // There are at most 16 samples of 255, so the sum fits into u16.
             let mut sum = [0u16; 3];
             for y in 0..side {
                 let start = top + y * stride + 3 * column * side;
@@ -196,10 +199,10 @@ impl Optics {
 
     /// Color of each pixel, averaged over the instants at which its row is exposed.
     ///
-    /// `row_motions` holds all motions of the first row, then of the second, and so on. Each
-    /// pixel's ray is traced into the rendered image with the rendered depth, so surfaces have the
-    /// correct positions. There is one exception: a strip next to each depth edge repeats the
-    /// adjacent content. The strip is as wide as the parallax during the readout.
+    /// `row_motions` holds all motions of the first row, then all motions of the second row, and so
+    /// on. Each pixel's ray is traced into the rendered image with the rendered depth, so surfaces
+    /// have the correct positions. The exception is a strip next to each depth edge, which repeats
+    /// the adjacent content. The strip is as wide as the parallax during the readout.
     pub(crate) fn motion_blurred(&self, picture: &Picture, row_motions: &[RowMotion]) -> Vec<f32> {
         let n_samples = row_motions.len() / self.intrinsics.size_px[1] as usize;
         let share = 1.0 / n_samples as f32;
@@ -275,8 +278,8 @@ impl Optics {
         let mut depth = nearest_depth(picture, guess);
         let mut drawn = guess;
         for _ in 0..MAX_CORRECTIONS {
-            // The point on the moved ray that has this depth in the rendered image. If the surface
-            // at this point has another depth, the search repeats with that depth.
+            // This is the point on the moved ray that has this depth in the rendered image. If the
+            // surface at this point has another depth, the search repeats with the other depth.
             let along = (depth - row_motion.translation_m.z) / direction.z;
             let at =
                 |axis: usize| (direction[axis] * along + row_motion.translation_m[axis]) / depth;

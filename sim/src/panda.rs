@@ -1,4 +1,4 @@
-//! The Panda: its kinematics, limits, and a body of simple primitives.
+//! Kinematics and limits of the Panda, and a body of simple primitives.
 //!
 //! Source of the numbers: Franka's published Denavit-Hartenberg table (Craig's convention) and
 //! joint limits.
@@ -90,7 +90,7 @@ impl Link {
     }
 }
 
-/// Pose of each joint's frame, then of the flange, in the base.
+/// Pose of each joint's frame in the base, and pose of the flange in the base.
 fn frames(position_rad: &Joints) -> ([Transform; N_JOINTS], Transform) {
     let mut base_from_link = Transform::identity();
     let mut frames = [Transform::identity(); N_JOINTS];
@@ -264,7 +264,7 @@ const BODY: [&[Part]; N_JOINTS] = [
         ),
     ],
 ];
-/// Masses of the links, kilograms; approximately those of a Panda.
+/// Masses of the links, kilograms. They are approximately the masses of a Panda.
 const MASS_KG: [f64; N_JOINTS] = [4.5, 2.4, 2.7, 2.2, 3.0, 1.7, 0.8];
 
 /// The arm as MJCF bodies for the world body. `on_flange` is added to the flange.
@@ -273,8 +273,8 @@ pub(crate) fn mjcf(on_flange: &str) -> String {
     write_parts(&mut xml, BASE);
     for (ix, link) in LINKS.iter().enumerate() {
         let pose = pose_attributes(&link.parent_from_joint());
-        // The inertia is that of a solid of this mass and about the size of a link. Its exact value
-        // does not matter, because the controller is stiff.
+        // The inertia is approximately the inertia of a solid with this mass and the size of a
+        // link. Its exact value does not matter, because the controller is stiff.
         let [number, inertia, mass] = [ix as f64 + 1.0, 0.012 * MASS_KG[ix], MASS_KG[ix]];
         let lower = LOWER_RAD[ix];
         let upper = UPPER_RAD[ix];

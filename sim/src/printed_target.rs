@@ -1,4 +1,4 @@
-//! Printed calibration targets as objects of a scene: a textured rectangle on a plate.
+//! Printed calibration targets as objects of a scene. A target is a textured rectangle on a plate.
 
 use crate::Error;
 use crate::config::TargetConfig;
@@ -10,7 +10,8 @@ use targets::Raster;
 
 /// Side of the square texture, pixels. It is a power of two, so that no mipmap level is shifted.
 const SIDE_PX: u32 = 2048;
-/// Thickness of the plate, and gap between print and plate to avoid z-fighting, meters.
+/// Thickness of the plate, meters. The next constant is the gap between print and plate, which
+/// avoids z-fighting.
 const PLATE_M: f64 = 0.003;
 const GAP_M: f64 = 1e-4;
 /// Gray values of ink and paper. White would be overexposed where the light is bright.
@@ -67,7 +68,7 @@ pub(crate) fn print(config: &TargetConfig) -> Result<Printed, Error> {
     Ok(Printed { png, mesh, plate })
 }
 
-/// The picture at the top left of a square texture; the rest is paper.
+/// A square texture with the picture at its top left. The rest of the texture is paper.
 #[expect(
     clippy::cast_possible_truncation,
     clippy::cast_sign_loss,

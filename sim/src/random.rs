@@ -58,7 +58,8 @@ static QUANTILES: LazyLock<[f32; 4096]> = LazyLock::new(|| {
 
 /// Inverse of the normal distribution function, by Newton steps from a logistic guess.
 fn normal_quantile(probability: f64) -> f64 {
-    // The logistic distribution with the scale 1.702 differs from the normal one by less than 0.01.
+    // The logistic distribution with the scale 1.702 differs from the normal distribution by less
+    // than 0.01.
     let mut x = (probability / (1.0 - probability)).ln() / 1.702;
     for _ in 0..60 {
         let density = (-0.5 * x * x).exp() / (2.0 * std::f64::consts::PI).sqrt();

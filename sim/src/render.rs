@@ -28,11 +28,11 @@ pub(crate) struct View {
     pub(crate) focal_px: [f64; 2],
     pub(crate) principal_px: [f64; 2],
     pub(crate) world_from_camera: Transform,
-    /// Pose of the robot; `None` if nothing in the image depends on it.
+    /// Pose of the robot. `None` if nothing in the image depends on it.
     pub(crate) robot: Option<RobotPose>,
     /// Whether the robot is drawn and casts a shadow.
     pub(crate) is_robot_visible: bool,
-    /// Brightness of all lamps; 1 is nominal.
+    /// Brightness of all lamps, where 1 is nominal.
     pub(crate) light_frac: f64,
     /// Poses of the targets that are moved by hand, in the order of the configuration.
     pub(crate) world_from_boards: Vec<Transform>,
@@ -153,9 +153,9 @@ fn draw_all(
 ) {
     let mut canvas = Canvas::new(current, model, near_far_m);
     // OpenGL drivers compile their shaders for the first image, which takes seconds on a busy
-    // processor. Without this warm-up, cameras would send nothing for that time.
+    // processor. Without this warm-up, cameras would send no images during this time.
     canvas.draw(&View::warm_up());
-    // A closed channel means that the rig was dropped; `queue` is then closed as well.
+    // A closed channel means that the rig was dropped. `queue` is then closed, too.
     let _ = ready.send(Ok(current.renderer().to_owned()));
     for job in queue {
         // Sending fails if the requester has given up. Later requesters may still be waiting.
@@ -178,8 +178,8 @@ impl Canvas {
         model: &Arc<MjModel>,
         near_far_m: [f64; 2],
     ) -> Self {
-        // SAFETY: an OpenGL context is current on this thread until after the canvas is dropped;
-        // only this model is drawn.
+        // SAFETY: an OpenGL context is current on this thread until after the canvas is dropped.
+        // Only this model is drawn.
         let mut context = unsafe { MjrContext::new(model) };
         context.offscreen();
         Self {
@@ -220,7 +220,7 @@ impl Canvas {
             .filter(|geom| is_arm(geom.objid))
             .map(|geom| geom.segid)
             .collect();
-        // MuJoCo adds 1 to the number of each geometry; 0 is the background.
+        // MuJoCo adds 1 to the number of each geometry, because 0 is the background.
         let number =
             |rgb: &[u8]| i32::from(rgb[0]) + (i32::from(rgb[1]) << 8) + (i32::from(rgb[2]) << 16);
         picture
@@ -240,7 +240,7 @@ impl Canvas {
 
     fn draw_with(&mut self, view: &View, options: &MjvOption) -> Picture {
         if let Some(robot) = &view.robot {
-            // Only the poses are set; velocities and forces do not affect an image.
+            // Only the poses are set, because velocities and forces do not affect an image.
             if !robot.model_positions.is_empty() {
                 self.data.qpos_mut().copy_from_slice(&robot.model_positions);
             }
@@ -355,12 +355,12 @@ fn meters_from_depth(depth: f32, near_far_m: [f64; 2]) -> f32 {
     near * far / (far - depth * (far - near))
 }
 
-/// Sets the pose of a moving base; does nothing for a fixed one.
+/// Sets the pose of a moving base. Does nothing for a fixed base.
 pub(crate) fn set_base_pose<M: ModelType>(data: &mut MjData<M>, world_from_base: &Transform) {
     set_moved_pose(data, 0, world_from_base);
 }
 
-/// Sets the pose of a body that is moved from outside of the physics, by its index; does nothing if
+/// Sets the pose of a body that is moved from outside of the physics, by its index. Does nothing if
 /// there is no such body.
 fn set_moved_pose<M: ModelType>(data: &mut MjData<M>, moved_ix: usize, pose: &Transform) {
     if let Some(position) = data.mocap_pos_mut().get_mut(moved_ix) {

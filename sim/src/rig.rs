@@ -28,7 +28,7 @@ use std::sync::Arc;
 /// the flange is `panda_link8`.
 pub const PANDA_URDF: &str = include_str!("../../rigs/robots/panda.urdf");
 
-/// The mobile arm as a URDF. Its root is `base`, and its arm is the one above.
+/// The mobile arm as a URDF. Its root is `base`, and its arm is the arm of [`PANDA_URDF`].
 const MOBILE_ARM_URDF: &str = include_str!("../../rigs/robots/mobile-arm.urdf");
 /// The quadruped as a URDF. Its root is `base`, and `top_plate` is on its back.
 const QUADRUPED_URDF: &str = include_str!("../../rigs/robots/quadruped.urdf");
@@ -48,8 +48,8 @@ pub struct Rig {
     info: RigInfo,
 }
 
-/// Builds the scene and starts its render thread. Takes one to two seconds, and a second longer with
-/// the robot of a rig file.
+/// Builds the scene and starts its render thread. Takes one to two seconds, and a second longer
+/// with the robot of a rig file.
 pub fn open(config: &Config) -> Result<Rig, Error> {
     // This check comes before anything reaches MuJoCo, which aborts the process on invalid numbers.
     config.check()?;
@@ -153,7 +153,8 @@ fn tour_of(config: &Config) -> Option<Tour> {
 /// Whether a chain from base to flange has the kinematics of a scene's own arm. The names of joints
 /// and links do not matter.
 pub fn has_robot_of(scene: Scene, chain: &Chain) -> bool {
-    /// Far below the length of any part, and above rounding in a file, meters and radians.
+    /// Tolerance, meters and radians. It is far below the length of any part, and above rounding in
+    /// a file.
     const TOLERANCE: f64 = 1e-5;
     if !scene.has_arm() {
         return chain.n_joints() == 0;
@@ -162,9 +163,9 @@ pub fn has_robot_of(scene: Scene, chain: &Chain) -> bool {
         .is_some_and(|difference| difference.is_within(TOLERANCE, TOLERANCE))
 }
 
-/// The largest differences between the flange poses of a chain from base to flange and of a scene's
-/// own arm, over several postures. `None` if the scene has no arm, or the chain has another number
-/// of joints.
+/// The largest differences, over several postures, between the flange poses of a chain from base to
+/// flange and the flange poses of a scene's own arm. `None` if the scene has no arm, or the chain
+/// has another number of joints.
 pub fn difference_to_robot_of(scene: Scene, chain: &Chain) -> Option<FlangeDifference> {
     if !scene.has_arm() {
         return None;
@@ -174,7 +175,7 @@ pub fn difference_to_robot_of(scene: Scene, chain: &Chain) -> Option<FlangeDiffe
     } else {
         Transform::identity()
     };
-    // Positions without symmetry, at which every length and axis matters.
+    // The postures have no symmetry, so that every length and axis matters.
     let postures = [
         [0.0; N_JOINTS],
         [0.4, -0.9, 1.3, -2.2, -0.7, 1.8, 0.6],
@@ -194,8 +195,9 @@ pub fn difference_to_robot_of(scene: Scene, chain: &Chain) -> Option<FlangeDiffe
     Some(largest)
 }
 
-/// Whether the scene's own arm can follow its tour with the cameras of a rig: the arm reaches all
-/// poses, the exposure is short enough for the speed, and fixed cameras see the scene.
+/// Whether the scene's own arm can follow its tour with the cameras of a rig. For this, the arm
+/// must reach all poses, the exposure must be short enough for the speed, and fixed cameras must
+/// see the scene.
 pub fn suits_own_robot(config: &Config, max_blur_px: f64) -> bool {
     /// Image speed of the fastest camera motion in the scenes, relative to the focal length, per
     /// second.
@@ -212,8 +214,8 @@ pub fn suits_own_robot(config: &Config, max_blur_px: f64) -> bool {
     is_followed && is_sharp && fixed_cameras_see(config)
 }
 
-/// Whether all cameras in the world see the objects on the table. Cameras in other scenes always see
-/// something.
+/// Whether all cameras in the world see the objects on the table. Cameras in other scenes always
+/// see something.
 fn fixed_cameras_see(config: &Config) -> bool {
     let [x, y] = TARGET_XY_M;
     let center = Point3::new(x, y, TABLE_Z_M + LOOK_AT_HEIGHT_M);

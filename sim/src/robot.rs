@@ -1,4 +1,4 @@
-//! The whole robot: base motion and, if there is an arm, arm motion.
+//! The whole robot, with the motion of its base and, if it has an arm, the motion of the arm.
 
 use crate::Error;
 use crate::arm::{Arm, JointReading, STEP_NANOS};
@@ -16,7 +16,7 @@ pub(crate) struct RobotPose {
     pub(crate) world_from_base: Transform,
     /// Pose of the flange, or of the arm's mounting point if there is no arm.
     pub(crate) world_from_flange: Transform,
-    /// Positions of all joints of the MuJoCo model, in its order; empty without joints.
+    /// Positions of all joints of the MuJoCo model, in its order. The list is empty without joints.
     pub(crate) model_positions: Vec<f64>,
 }
 
@@ -32,7 +32,7 @@ pub(crate) enum RobotKinematics {
 }
 
 impl RobotKinematics {
-    /// The robot with its joints at `position`; `None` for the position if there is no arm.
+    /// The robot with its joints at `position`, which is `None` if there is no arm.
     fn pose(&self, world_from_base: Transform, position: Option<&Joints>) -> RobotPose {
         let (world_from_flange, model_positions) = match (self, position) {
             (Self::Panda(base_from_arm), Some(position)) => {
@@ -124,8 +124,8 @@ impl Robot {
         Ok((nanos, reading))
     }
 
-    /// The robot at a time in its recent past; `None` if the stored positions of the arm do not
-    /// cover that time.
+    /// The robot at a time in its recent past. `None` if the stored positions of the arm do not
+    /// cover this time.
     pub(crate) fn at(&self, nanos: i64) -> Option<RobotPose> {
         let position = match &self.arm {
             Some(ArmMotion::Simulated(arm)) => Some(arm.position_at(nanos)?),

@@ -1,4 +1,5 @@
-//! Where the robot is visible in a view of a scene, for tests of programs that draw the robot.
+//! Pixels at which the robot is visible in a view of a scene, for tests of programs that draw the
+//! robot.
 
 use crate::config::N_JOINTS;
 use crate::egl::HeadlessContext;
@@ -35,7 +36,7 @@ impl RobotMasks {
     ///
     /// # Errors
     ///
-    /// If OpenGL cannot be used, or the scene is invalid.
+    /// Fails if OpenGL cannot be used, or the scene is invalid.
     pub fn open(scene: Scene, largest_px: [u32; 2]) -> Result<Self, Error> {
         let config = Config {
             scene,
@@ -58,7 +59,7 @@ impl RobotMasks {
     ///
     /// # Errors
     ///
-    /// If the arm has another number of joints.
+    /// Fails if the arm has another number of joints.
     pub fn mask(
         &mut self,
         view: &PinholeView,

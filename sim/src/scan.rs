@@ -18,10 +18,10 @@ pub(crate) struct Scan {
     shape: ScanShape,
 }
 
-/// Where the tour leads, seen from the target area. The default is the tour of the static arm.
+/// Ranges of the tour as seen from the target area. The default is the tour of the static arm.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct ScanShape {
-    /// Direction of the camera about the vertical axis; 0 is toward the robot.
+    /// Direction of the camera about the vertical axis. A direction of 0 is toward the robot.
     pub(crate) azimuth_degrees: Oscillation,
     /// Direction of the camera above the horizontal.
     pub(crate) elevation_degrees: Oscillation,
@@ -39,12 +39,13 @@ impl Default for ScanShape {
     }
 }
 
-/// One oscillating quantity: mean, amplitude, period in seconds at speed 1, phase in turns.
+/// One oscillating quantity, given by its mean, amplitude, period in seconds at speed 1, and phase
+/// in turns.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Oscillation(f64, f64, f64, f64);
 
 impl Oscillation {
-    /// The same oscillation about another mean, with another amplitude.
+    /// This oscillation with another mean and another amplitude.
     pub(crate) fn over(&self, mean: f64, amplitude: f64) -> Self {
         Self(mean, amplitude, self.2, self.3)
     }
@@ -79,12 +80,12 @@ impl Scan {
         }
     }
 
-    /// The same tour in another shape.
+    /// This tour with another shape.
     pub(crate) fn with_shape(self, shape: ScanShape) -> Self {
         Self { shape, ..self }
     }
 
-    /// The same tour at another speed.
+    /// This tour at another speed.
     pub(crate) fn with_speed(self, speed: f64) -> Self {
         Self { speed, ..self }
     }
@@ -101,7 +102,7 @@ impl Scan {
         }
     }
 
-    /// Progress along the tour, in seconds at constant speed; starts at rest.
+    /// Progress along the tour, in seconds at constant speed. The motion starts at rest.
     fn progress(&self, secs: f64) -> f64 {
         let (share, period_secs) = SPEED_OSCILLATION;
         // This is the integral of a smooth ramp from 0 to 1.
@@ -135,7 +136,7 @@ impl Scan {
             .to_radians()
     }
 
-    /// Target pose of the camera: x right, y down, z toward the look-at point.
+    /// Target pose of the camera. Its axes are x right, y down, and z toward the look-at point.
     pub(crate) fn world_from_camera(&self, secs: f64) -> Transform {
         let at = self.progress(secs);
         let azimuth = self.shape.azimuth_degrees.at(at).to_radians();
@@ -160,7 +161,8 @@ impl Scan {
     }
 }
 
-/// Orientation of an upright camera that looks along a direction: x right, y down, z forward.
+/// Orientation of an upright camera that looks along a direction. The axes of the camera are x
+/// right, y down, z forward.
 pub(crate) fn looking_along(forward: &Vector3<f64>) -> UnitQuaternion<f64> {
     let right = forward.cross(&Vector3::z()).normalize();
     let axes = Matrix3::from_columns(&[right, forward.cross(&right), *forward]);

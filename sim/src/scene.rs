@@ -15,7 +15,7 @@ use std::collections::BTreeMap;
 use std::fmt::Write as _;
 use std::sync::Arc;
 
-/// Group of the arm's geometry, so that it can be hidden.
+/// Group of the arm's geometry. The arm can be hidden by hiding this group.
 pub(crate) const ARM_GROUP: usize = 1;
 /// Group of transparent geometry.
 pub(crate) const GLASS_GROUP: usize = 2;
@@ -207,7 +207,7 @@ fn add_twin(
     Ok(xml)
 }
 
-/// MJCF body of the robot: an arm alone, or a base with or without an arm.
+/// MJCF body of the robot, which is an arm alone, or a base with or without an arm.
 fn robot(config: &Config, on_flange: &str) -> String {
     let arm = if config.scene.has_arm() {
         panda::mjcf(&(brackets(config) + on_flange))
@@ -255,7 +255,7 @@ impl SceneAssets {
     fn get(scene: Scene) -> Result<Arc<Self>, Error> {
         static SCENE_ASSETS: Mutex<BTreeMap<&str, Arc<SceneAssets>>> = Mutex::new(BTreeMap::new());
         // The lock is held while assets are created, so that two rigs that open at once do not
-        // create the same ones twice.
+        // create the same assets twice.
         let mut all = SCENE_ASSETS.lock();
         if let Some(scene_assets) = all.get(scene.name()) {
             return Ok(Arc::clone(scene_assets));

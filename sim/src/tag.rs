@@ -1,8 +1,9 @@
 //! Fiducial tags of the family tag36h11.
 
-/// Codes of the first tags of the family; the index is the tag's id.
+/// Codes of the first tags of the family. The index is the tag's id.
 ///
-/// Source: Olson 2011; table `codedata` of AprilRobotics/apriltag, `tag36h11.c`.
+/// Source: Olson 2011. The codes are from the table `codedata` in `tag36h11.c` of
+/// AprilRobotics/apriltag.
 pub(crate) const CODES: [u64; 6] = [
     0xd_7e00_984b,
     0xd_da66_4ca7,
@@ -26,10 +27,11 @@ const BIT_Y: [usize; 36] = [
     5, 4, 3, 4,
 ];
 
-/// Cells of the tag with an id below 6, `[row][column]` from the top left; true is white.
+/// Cells of the tag with an id below 6, as `[row][column]` from the top left. A value of true is
+/// white.
 ///
 /// # Panics
-/// When the id is 6 or more.
+/// Panics if the id is 6 or more.
 pub fn cells(id: usize) -> [[bool; N_CELLS]; N_CELLS] {
     let last = N_CELLS - 1;
     let mut cells = [[false; N_CELLS]; N_CELLS];

@@ -22,7 +22,8 @@ pub(crate) struct Texture {
 }
 
 impl Texture {
-    /// Paints every pixel by its position; both coordinates run from 0 to 1 from the top left.
+    /// Paints every pixel by its position. Both coordinates go from 0 to 1, starting at the top
+    /// left.
     pub(crate) fn paint(side_px: usize, color_at: impl Fn(f64, f64) -> Color + Sync) -> Self {
         let at = |ix: usize| (ix as f64 + 0.5) / side_px as f64;
         let mut rgb = vec![0; 3 * side_px * side_px];
@@ -36,8 +37,8 @@ impl Texture {
         Self { side_px, rgb }
     }
 
-    /// Darkens a rectangle (left, top, right, bottom) by light fractions sampled on an `n` x `n`
-    /// grid.
+    /// Darkens a rectangle (left, top, right, bottom) by light fractions that are sampled on a grid
+    /// of `n` x `n` points.
     ///
     /// `share_at` receives the position in the rectangle, 0 to 1 from its top left, and the index
     /// of the sample.
@@ -117,7 +118,7 @@ fn between_points(grid: &[f64], n: usize, [x, y]: [f64; 2]) -> f64 {
     let step = 1.0 / (n - 1) as f64;
     let column = x.clamp(0.0, 1.0) / step;
     let row = y.clamp(0.0, 1.0) / step;
-    // The last point has no neighbor to the right, so it belongs to the cell before it.
+    // The last point has no neighbor to the right, so the last cell begins at the point before it.
     let left = (column as usize).min(n - 2);
     let top = (row as usize).min(n - 2);
     let fx = column - left as f64;
@@ -139,7 +140,7 @@ pub(crate) fn scale(color: Color, factor: f64) -> Color {
     color.map(|channel| channel * factor)
 }
 
-/// 0 below `lower`, 1 above `upper`, smooth in between.
+/// A smooth step from 0 below `lower` to 1 above `upper`.
 pub(crate) fn step(lower: f64, upper: f64, value: f64) -> f64 {
     let share = ((value - lower) / (upper - lower)).clamp(0.0, 1.0);
     share * share * (3.0 - 2.0 * share)
@@ -160,7 +161,7 @@ impl Noise {
     pub(crate) fn at(&self, x: f64, y: f64) -> f64 {
         let column = x.floor();
         let row = y.floor();
-        // The smooth step hides the lattice: bilinear noise would have visible creases.
+        // The smooth step hides the lattice, because bilinear noise would have visible creases.
         let fx = step(0.0, 1.0, x - column);
         let fy = step(0.0, 1.0, y - row);
         let column = column as i64;
@@ -171,11 +172,11 @@ impl Noise {
         top * (1.0 - fy) + bottom * fy
     }
 
-    /// Sum of octaves of noise, each with half the size and half the amplitude of the previous one,
-    /// 0 to 1.
+    /// Sum of octaves of noise, 0 to 1. Each octave has half the size and half the amplitude of the
+    /// previous octave.
     pub(crate) fn rough(&self, x: f64, y: f64, n_octaves: i32) -> f64 {
-        // Octaves are shifted against each other. Otherwise, all would have a lattice point at the
-        // origin.
+        // Octaves are shifted against each other. Otherwise, all octaves would have a lattice point
+        // at the origin.
         let octaves = (0..n_octaves).map(|octave| (f64::from(octave) * 17.3, 2f64.powi(octave)));
         let sum: f64 = octaves
             .map(|(shift, finer)| self.at(x * finer + shift, y * finer + shift) / finer)
@@ -374,7 +375,8 @@ pub(crate) fn metal_table(size_m: [f64; 2]) -> Texture {
     })
 }
 
-/// Sawn wood: six sides in the rectangles of [`side_rectangle`], the first two with end grain.
+/// Sawn wood, with six sides in the rectangles of [`side_rectangle`]. The first two sides have end
+/// grain.
 pub(crate) fn wood() -> Texture {
     let grain = Grain {
         bend: Noise::new(41),
@@ -452,7 +454,7 @@ pub(crate) fn fur() -> Texture {
     })
 }
 
-/// Brightness at the left edge of the fur texture; 1 at the right.
+/// Brightness at the left edge of the fur texture. At the right edge, it is 1.
 pub(crate) const FUR_DARKEST: f64 = 0.15;
 
 /// Bands of the fur texture from the top.
@@ -476,7 +478,7 @@ impl FurBand {
     }
 }
 
-/// Six tags in the rectangles of [`side_rectangle`]; the lowest third is white.
+/// Six tags in the rectangles of [`side_rectangle`]. The lowest third of the texture is white.
 pub(crate) fn tags() -> Texture {
     let cells: Vec<_> = (0..tag::CODES.len()).map(tag::cells).collect();
     let paper = Noise::new(61);
@@ -504,8 +506,8 @@ pub(crate) fn tags() -> Texture {
     })
 }
 
-/// Rectangle of a box's side in its texture, two rows of three from the top left: left, top, right,
-/// bottom.
+/// Rectangle of a box's side in its texture, as left, top, right, bottom. The sides are in two rows
+/// of three, from the top left.
 pub(crate) fn side_rectangle(side: usize) -> [f64; 4] {
     let column = (side % 3) as f64;
     let row = (side / 3) as f64;

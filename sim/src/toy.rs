@@ -1,16 +1,16 @@
-//! A furry toy donkey: a body of ellipsoids, and thousands of hairs in one mesh.
+//! A furry toy donkey. It has a body of ellipsoids, and thousands of hairs in one mesh.
 
 use crate::mesh::{Corner, Mesh, ellipsoid_normal, sphere_direction};
 use crate::random::RandomStream;
 use crate::texture::{FUR_DARKEST, FurBand};
 use nalgebra::{Point3, UnitQuaternion, Vector3};
 
-/// One part of the body: an ellipsoid with or without hair.
+/// One part of the body, which is an ellipsoid with or without hair.
 struct Part {
     center_m: [f64; 3],
     /// Half sizes along the part's axes.
     half_m: [f64; 3],
-    /// Rotation about y, radians: positive tips the part's x axis down.
+    /// Rotation about y, radians. A positive rotation tips the part's x axis down.
     pitch_rad: f64,
     /// Rotation about x, applied before `pitch_rad`, radians.
     roll_rad: f64,
@@ -258,8 +258,8 @@ pub(crate) fn body(light: Light<'_>) -> Mesh {
     let mut mesh = Mesh::default();
     for part in &PARTS {
         let [tip, root] = part.band.rows();
-        // Skin under hair has a color close to that of the roots. Bare skin has the middle color of
-        // the band.
+        // Skin under hair has a color close to the color of the roots. Bare skin has the middle
+        // color of the band.
         let texture_y = if part.n_hairs > 0 {
             0.3 * tip + 0.7 * root
         } else {
@@ -323,7 +323,7 @@ pub(crate) fn fur(light: Light<'_>) -> Mesh {
 
 fn is_inside_another(point: &Point3<f64>, own_ix: usize) -> bool {
     PARTS.iter().enumerate().any(|(ix, part)| {
-        // The axes are perpendicular, so projections on them give the coordinates in the unit
+        // The axes are perpendicular, so projections on the axes give the coordinates in the unit
         // sphere.
         let offset = point - part.center();
         let share: f64 = part

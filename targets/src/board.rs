@@ -1,8 +1,8 @@
 //! Board geometry: frame, positions of corners, symmetry.
 //!
 //! # Board frame
-//! The frame is that of OpenCV: as seen by a viewer of the printed target, x points right, y down
-//! and z into the board, away from the viewer. All corners have z = 0.
+//! The board frame is the frame that OpenCV uses. For a viewer of the printed target, x points
+//! right, y points down, and z points into the board, away from the viewer. All corners have z = 0.
 //!
 //! | target | origin | corner ids |
 //! |---|---|---|
@@ -62,8 +62,8 @@ impl TargetSpec {
         Some(Vector3::new(x, y, 0.0))
     }
 
-    /// Corners of the pattern's bounding rectangle in the board frame: smallest x and y, largest x
-    /// and y, meters.
+    /// Two opposite corners of the pattern's bounding rectangle in the board frame, meters: the
+    /// smallest x and y, then the largest x and y.
     pub fn bounds_m(&self) -> [[f64; 2]; 2] {
         match self.pattern {
             // The origin is the first inner corner, one square inside.
@@ -93,8 +93,8 @@ impl TargetSpec {
         }
     }
 
-    /// Rotations `board_from_rotated_board` of the board that give the same picture. The first one
-    /// is the identity.
+    /// Rotations `board_from_rotated_board` of the board that give the same picture. The first
+    /// rotation is the identity.
     ///
     /// A pose of such a board is ambiguous: `camera_from_board * rotation` fits the image equally
     /// well for every rotation of this list. A chessboard whose numbers of inner corners are both
@@ -129,8 +129,8 @@ impl TargetSpec {
     }
 }
 
-/// Smallest and largest x and y of a board of squares whose upper left corner is at
-/// `(first_m, first_m)`.
+/// The smallest x and y, then the largest x and y, of a board of squares whose upper left corner is
+/// at `(first_m, first_m)`.
 fn bounds_of_squares(squares: [u32; 2], square_m: f64, first_m: f64) -> [[f64; 2]; 2] {
     [
         [first_m; 2],

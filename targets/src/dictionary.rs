@@ -29,14 +29,14 @@ impl PartialEq for Dictionary {
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) struct Match {
     pub(crate) id: u32,
-    /// Number of quarter turns, clockwise as seen in the image, from the upright marker to the
-    /// cells as given.
+    /// Number of clockwise quarter turns, as seen in the image, that map the upright marker to the
+    /// given cells.
     pub(crate) quarter_turns: usize,
     pub(crate) n_wrong: u32,
 }
 
 /// Names in OpenCV's order, without its prefix `DICT_`. Smaller dictionaries are the beginnings of
-/// larger ones.
+/// larger dictionaries.
 const ARUCO: [&str; 16] = [
     "4X4_50", "4X4_100", "4X4_250", "4X4_1000", "5X5_50", "5X5_100", "5X5_250", "5X5_1000",
     "6X6_50", "6X6_100", "6X6_250", "6X6_1000", "7X7_50", "7X7_100", "7X7_250", "7X7_1000",
@@ -47,8 +47,8 @@ const ARUCO: [&str; 16] = [
 const CORRECTED: [u32; 2] = [0, 2];
 
 impl Dictionary {
-    /// Returns the dictionary with a name such as `6X6_250`, in any case, with or without OpenCV's
-    /// prefix `DICT_`.
+    /// Returns the dictionary with a name such as `6X6_250`. Upper and lower case are equivalent,
+    /// and OpenCV's prefix `DICT_` is optional.
     pub(crate) fn aruco(name: &str) -> Option<Self> {
         let upper = name.trim().to_ascii_uppercase();
         let short = upper.strip_prefix("DICT_").unwrap_or(&upper);
@@ -132,8 +132,8 @@ impl Dictionary {
                 code | u64::from(cell(quarter_turns, at / n, at % n)) << at
             });
             for (id, code) in (0..).zip(self.codes) {
-                // This is the Hamming distance. If several are equal, the first id and rotation are
-                // kept.
+                // This is the Hamming distance. If several ids and rotations have the same
+                // distance, the first of them is kept.
                 let n_wrong = (seen ^ code).count_ones();
                 if n_wrong <= n_corrected && best.is_none_or(|best| n_wrong < best.n_wrong) {
                     best = Some(Match {
@@ -168,7 +168,8 @@ mod tests {
 
     #[test]
     fn codes_match_opencv() {
-        // From `cv2.aruco.generateImageMarker`, OpenCV 5.0, without the border.
+        // The expected cells are from `cv2.aruco.generateImageMarker` in OpenCV 5.0, without the
+        // border.
         assert_eq!(
             rows(&Dictionary::aruco("4X4_50").unwrap(), 1),
             ["####", "....", ".##.", ".#.#"]

@@ -56,7 +56,7 @@ pub enum SpecError {
         /// Largest count.
         max: u32,
     },
-    /// A length has no unit or an unknown one.
+    /// A length has no unit, or its unit is unknown.
     #[error(
         "target {spec:?}: {what} {value:?} has no unit, expected a number with mm, cm or m, such as 25mm"
     )]
@@ -181,7 +181,7 @@ pub enum NotDetected {
         /// Columns and rows of the target.
         expected: Counts,
     },
-    /// The markers are those of a board with other counts.
+    /// The markers belong to a board with other counts.
     #[error(
         "the markers form a board of {found} {what} (or more rows), not {expected}; correct {}",
         Setting::Target
@@ -217,7 +217,7 @@ pub enum NotDetected {
         /// Number of markers.
         n: usize,
     },
-    /// The markers are of the right dictionary, but their ids are not on this target.
+    /// The markers belong to the right dictionary, but their ids are not on this target.
     #[error("found markers with ids {found}, expected {expected}; this is another target")]
     OtherIds {
         /// Ids in the image.
@@ -233,16 +233,16 @@ pub enum NotDetected {
         /// Ids in the image.
         found: Ids,
     },
-    /// The markers are larger or smaller relative to the squares.
+    /// Relative to the squares, the markers are larger or smaller than on the target.
     #[error(
         "the markers are about {:.2} times as wide as the squares, expected {:.2}; measure both on the print: if a square has {square}, a marker has about {marker}",
         found_frac,
         expected_frac
     )]
     MarkerSize {
-        /// Side of a marker in the image relative to that of a square.
+        /// Side of a marker in the image relative to the side of a square.
         found_frac: f64,
-        /// The same of the target.
+        /// Side of a marker of the target relative to the side of a square.
         expected_frac: f64,
         /// Side of a square of the target.
         square: String,

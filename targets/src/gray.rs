@@ -90,11 +90,12 @@ impl Plane {
         upper + (lower - upper) * lower_frac
     }
 
-    /// Smooths with the binomial kernel (1 4 6 4 1) / 16 along both axes, a Gaussian of 1 px.
+    /// Smooths with the binomial kernel (1 4 6 4 1) / 16 along both axes. This kernel approximates
+    /// a Gaussian with a standard deviation of 1 px.
     pub(crate) fn smoothed(&self) -> Self {
-        // The kernel is separable, so two passes with 5 values each replace one pass with 25. Two
-        // pixels at each border are not smoothed, because the kernel would reach outside. Detection
-        // does not use them.
+        // The kernel is separable, so two passes with 5 values each replace one pass with 25
+        // values. Two pixels at each border are not smoothed, because the kernel would reach
+        // outside. Detection does not use them.
         let mut across = self.values.clone();
         for (out, row) in across
             .chunks_exact_mut(self.width)
@@ -143,7 +144,7 @@ impl Plane {
 
     /// Whether the image can be halved and still be searched.
     pub(crate) fn can_be_halved(&self) -> bool {
-        // Half the image then still has four times the smallest side. In smaller images, the
+        // The halved image then still has four times the smallest side. In smaller images, the
         // squares of most boards would be only a few pixels wide at half resolution.
         self.width.min(self.height) >= 8 * MIN_SIDE_PX as usize
     }

@@ -18,7 +18,7 @@ use std::f64::consts::PI;
 /// between two corners. In a frontal view, the next direction of a lattice is the diagonal, which
 /// is 0.79 rad away. Half of that separates the two directions.
 const MAX_ANGLE_RAD: f64 = 0.4;
-/// Largest length of neighboring links relative to each other.
+/// Largest ratio of the lengths of neighboring links.
 ///
 /// Foreshortening makes the two axes of a board differ by `1 / cos(tilt)`, which is 2.5 at 66
 /// degrees. With a smaller value, tilted boards are rejected. With a larger value, links across a
@@ -80,7 +80,8 @@ fn links(plane: &Plane, saddles: &[Saddle]) -> Vec<[Link; 4]> {
     links
 }
 
-/// The nearest saddle along an edge that has an edge back, with black and white on the same sides.
+/// The nearest saddle along an edge that itself has an edge back to this saddle, with black and
+/// white on the same sides.
 fn nearest_along(saddles: &[Saddle], buckets: &Buckets, from: usize, edge: usize) -> Link {
     let origin = &saddles[from];
     buckets.nearest(saddles, origin.pixel, |to| {
@@ -135,8 +136,8 @@ fn is_edge(plane: &Plane, from: &Saddle, edge: usize, to: &Saddle) -> bool {
     })
 }
 
-/// The position next to a point of a line with direction `[dx, dy]`. For a positive sign, it is on
-/// the side of ascending angles.
+/// The position next to a point of a line with direction `[dx, dy]`. If `sign` is positive, the
+/// position is on the side of ascending angles.
 fn beside(point: [f64; 2], sign: f64, across_px: f64, [dx, dy]: [f64; 2]) -> [f64; 2] {
     [
         point[0] - sign * across_px * dy,
@@ -147,7 +148,7 @@ fn beside(point: [f64; 2], sign: f64, across_px: f64, [dx, dy]: [f64; 2]) -> [f6
 /// Removes links that are much longer than the other links of a saddle, because they skip a missing
 /// corner or leave the board.
 fn drop_odd_lengths(saddles: &[Saddle], links: &mut [[Link; 4]]) {
-    // All lengths are compared with those before any link is removed, so that the result does not
+    // The shortest lengths are computed before any link is removed, so that the result does not
     // depend on the order of the saddles.
     let shortest: Vec<f64> = links
         .iter()
@@ -175,11 +176,12 @@ fn shortest_link_px(saddles: &[Saddle], from: usize, edges: &[Link; 4]) -> f64 {
         .unwrap_or(f64::INFINITY)
 }
 
-/// Assigns columns and rows, starting at a saddle, which is at (0, 0). Its edge 0 leads to column
-/// 1, so the sector between its edges 2 and 3 is at the upper left, and black.
+/// Assigns columns and rows, starting at a saddle, which gets the cell (0, 0). Its edge 0 leads to
+/// column 1. The sector between its edges 2 and 3 is therefore at the upper left, and this sector
+/// is black.
 fn walk(saddles: &[Saddle], links: &[[Link; 4]], seed: usize, is_used: &mut [bool]) -> Lattice {
     let mut lattice = Lattice::default();
-    // Saddle, its cell, and the direction (index in STEPS) of its edge 0.
+    // Each entry is a saddle, its cell, and the direction of its edge 0 as an index in `STEPS`.
     let mut queue = VecDeque::from([(seed, [0, 0], 0_usize)]);
     is_used[seed] = true;
     lattice.corners.insert([0, 0], saddles[seed].pixel);
@@ -197,8 +199,8 @@ fn walk(saddles: &[Saddle], links: &[[Link; 4]], seed: usize, is_used: &mut [boo
             is_used[to] = true;
             lattice.corners.insert(neighbor, saddles[to].pixel);
             // Edge `back` of the neighbor points in the direction opposite to `step`, which is
-            // `step + 2`. Edge 0 of the neighbor is `back` quarter turns before this direction.
-            // Adding 4 keeps the difference positive.
+            // `step + 2`. Edge 0 of the neighbor is `back` quarter turns before this opposite
+            // direction. Adding 4 keeps the difference positive.
             queue.push_back((to, neighbor, (step + 2 + 4 - back) % 4));
         }
     }
@@ -214,8 +216,8 @@ struct Buckets {
 
 impl Buckets {
     fn new(saddles: &[Saddle]) -> Self {
-        // The size is about that of a square in a common image, so that the nearest neighbor is
-        // found in the first rings.
+        // The buckets are about as large as a square in a common image, so that the nearest
+        // neighbor is found in the first rings.
         const SIDE_PX: f64 = 24.0;
         let bucket = |pixel: [f64; 2]| pixel.map(|value| index(value, SIDE_PX));
         let mut counts = [1, 1];

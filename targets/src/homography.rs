@@ -7,8 +7,8 @@ use nalgebra::{Matrix2, Matrix3, SMatrix, SVector, Vector3};
 pub(crate) struct Homography(Matrix3<f64>);
 
 impl Homography {
-    /// The map that takes four points to four other points. `None` if three points of one of these
-    /// sets lie on a line.
+    /// The homography that maps four points to four other points. `None` if three of the first four
+    /// points, or three of the other four points, lie on a line.
     ///
     /// Source: Hartley and Zisserman 2004, section 4.1, with the last element fixed to 1. The image
     /// of the first plane's origin must therefore be finite, so points of the first plane should be
@@ -17,8 +17,9 @@ impl Homography {
         let mut matrix = SMatrix::<f64, 8, 8>::zeros();
         let mut right = SVector::<f64, 8>::zeros();
         for (at, ([x, y], [u, v])) in from.iter().zip(to).enumerate() {
-            // Two linear equations per point, from u = (h0 x + h1 y + h2) / (h6 x + h7 y + 1), and
-            // the same for v, after multiplication by the denominator.
+            // Each point gives two linear equations. The first is u = (h0 x + h1 y + h2) / (h6 x +
+            // h7 y + 1), multiplied by the denominator. The second is the corresponding equation
+            // for v.
             let rows = [
                 [*x, *y, 1.0, 0.0, 0.0, 0.0, -u * x, -u * y],
                 [0.0, 0.0, 0.0, *x, *y, 1.0, -v * x, -v * y],

@@ -1,6 +1,6 @@
 //! Corners of a board on an integer lattice, with prediction of each corner from its neighbors.
 //!
-//! Predictions only use neighbors, never the whole board, so they hold for any lens.
+//! Predictions use only neighbors and never the whole board, so they are accurate for any lens.
 
 use crate::gray::Plane;
 use crate::saddle;
@@ -22,8 +22,9 @@ pub(crate) struct Lattice {
 /// larger values, they would be accepted. With smaller values, corners would be lost where a lens
 /// bends the board strongly, because extrapolation is inaccurate there.
 const MAX_DEVIATION: f64 = 0.22;
-/// Radius of the ring that verifies a corner, relative to the distance between neighbors. At less
-/// than half, it crosses no edges of neighboring corners, even in foreshortened squares.
+/// Radius of the ring that verifies a corner, relative to the distance between neighbors. With a
+/// value clearly below 0.5, the ring crosses no edges of neighboring corners, even in foreshortened
+/// squares.
 const RING_FRAC: f64 = 0.27;
 /// Half the refinement window, relative to the distance between neighbors, and its limits in
 /// pixels.
@@ -36,8 +37,8 @@ const WINDOW_PX: [f64; 2] = [2.0, 9.0];
 /// How corners are refined and verified.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Refinement {
-    /// Fraction of the distance between corners, around each corner, in which only the four edges
-    /// are visible, 0 to 0.5.
+    /// Radius around each corner in which only its four edges are visible, as a fraction of the
+    /// distance between corners, 0 to 0.5.
     pub(crate) clear_frac: f64,
 }
 
@@ -58,17 +59,17 @@ impl Lattice {
     }
 
     /// Predicts a corner from its neighbors, without using the corner itself. Also returns the
-    /// distance between neighbors there.
+    /// local distance between neighbors.
     ///
     /// The mean of all predictions of the most accurate available kind is used. The kinds, from the
     /// most to the least accurate, are: between two neighbors, extrapolation of a parabola,
     /// completion of a square, and linear extrapolation.
     pub(crate) fn predict(&self, cell: Cell) -> Option<Prediction> {
         // Let `c` be the second difference of the corners (due to lenses and perspective), and `s`
-        // the noise of each corner. Each kind of prediction has a systematic error and noise. They
-        // are approximately c / 2 and 0.7 s between neighbors, the third difference and 4.4 s for
-        // the parabola, the mixed second difference and 1.7 s for the square, and c and 2.2 s for
-        // the line.
+        // the noise of each corner. Each kind of prediction has a systematic error and noise.
+        // Between two neighbors, they are approximately c / 2 and 0.7 s. For the parabola, they are
+        // the third difference and 4.4 s. For the square, they are the mixed second difference and
+        // 1.7 s. For the line, they are c and 2.2 s.
         mean(
             STEPS[..2]
                 .iter()
@@ -161,8 +162,9 @@ impl Lattice {
         Some(ahead.map(|value| value * f64::from(sign)))
     }
 
-    /// Second derivatives of the pixel with respect to x and x, x and y, y and y, pixels per square
-    /// meter, from the neighbors of a cell. They are zero if there are too few neighbors.
+    /// Second derivatives of the pixel with respect to the point on the board, pixels per square
+    /// meter, from the neighbors of a cell. The order is: x and x, x and y, y and y. They are zero
+    /// if there are too few neighbors.
     pub(crate) fn bend(&self, cell: Cell, pixel: [f64; 2], square_m: f64) -> [[f64; 2]; 3] {
         // At the corners of the board, only one of the four squares exists, which is enough.
         let twists: Vec<[f64; 2]> = [[1, 1], [1, -1], [-1, 1], [-1, -1]]
@@ -201,11 +203,11 @@ impl Lattice {
         Some(twist.map(|value| value * f64::from(x * y)))
     }
 
-    /// Adds corners that are missing inside `range` (inclusive) where a saddle lies close to its
-    /// prediction, repeatedly.
+    /// Adds missing corners inside `range`, which is inclusive. A corner is added if a saddle lies
+    /// close to its prediction. This is repeated until no corner is added.
     pub(crate) fn complete(&mut self, plane: &Plane, range: [Cell; 2], refinement: Refinement) {
-        // A pass adds the neighbors of known corners. From one end of the board to the other, it
-        // takes at most this many passes.
+        // Each pass adds the neighbors of known corners. At most this many passes are needed from
+        // one end of the board to the other.
         let max_passes = range[1][0] - range[0][0] + range[1][1] - range[0][1] + 2;
         for _ in 0..max_passes {
             // Corners found in this pass are added after it, so that the result does not depend on
@@ -230,7 +232,7 @@ impl Lattice {
         }
     }
 
-    /// Refines all corners and removes those that are no saddles.
+    /// Refines all corners, and removes corners that are not saddles.
     pub(crate) fn refine(&mut self, plane: &Plane, refinement: Refinement) {
         let refined = self.corners.iter().filter_map(|(&cell, &pixel)| {
             let spacing_px = self

@@ -96,7 +96,7 @@ fn charuco(squares: [u32; 2], square_m: f64, marker_m: f64, is_legacy: bool) -> 
 pub(crate) struct Fit {
     pub(crate) layout: Layout,
     pub(crate) markers: Vec<Marker>,
-    /// Number of markers confirmed by another one.
+    /// Number of markers that another marker confirms.
     pub(crate) n_confirmed: usize,
 }
 
@@ -113,8 +113,8 @@ pub(crate) fn fit(layouts: Vec<Layout>, markers: &[Marker]) -> Option<Fit> {
             n_confirmed,
         }
     });
-    // If several arrangements are equally good, the first one is kept, which is the standard
-    // arrangement.
+    // If several arrangements are equally good, the first arrangement is kept, which is the
+    // standard arrangement.
     let best = fits.reduce(|best, next| {
         if next.n_confirmed > best.n_confirmed {
             next
@@ -143,7 +143,7 @@ fn confirmed(layout: &Layout, markers: &[Marker]) -> (Vec<Marker>, usize) {
             .map(|other| (distance(center_m(marker), center_m(other)), *other))
             .collect();
         others.sort_by(|a, b| a.0.total_cmp(&b.0));
-        // The number of neighbors that a marker inside the board has at the same distance.
+        // This is the number of neighbors that a marker inside the board has at the same distance.
         const N_NEIGHBORS: usize = 4;
         let nearest = others.first().map_or(0.0, |other| other.0);
         let close = others
@@ -176,7 +176,7 @@ fn agrees(layout: &Layout, a: &Marker, b: &Marker) -> bool {
     predicts(layout, a, b) || predicts(layout, b, a)
 }
 
-/// Whether the homography of a marker predicts the corners of another one.
+/// Whether the homography of a marker predicts the corners of another marker.
 fn predicts(layout: &Layout, from: &Marker, to: &Marker) -> bool {
     let corners_m = &layout.corners_m[from.id as usize];
     let origin = center(corners_m);
@@ -186,7 +186,7 @@ fn predicts(layout: &Layout, from: &Marker, to: &Marker) -> bool {
         return false;
     };
     let to_m = centered(&layout.corners_m[to.id as usize]);
-    // From the diagonal.
+    // The side is the diagonal divided by the square root of 2.
     let side_px = distance(to.corners_px[0], to.corners_px[2]) / 2_f64.sqrt();
     // Farther markers are predicted less accurately, in particular through a fisheye lens.
     let steps =

@@ -1,4 +1,4 @@
-//! Calibration targets: their geometry, detection in gray images, printing to scale.
+//! Geometry of calibration targets, detection of targets in gray images, and printing to scale.
 //!
 //! A [`TargetSpec`] is parsed from text such as `chessboard:9x6:25mm`,
 //! `charuco:5x7:34mm:28mm:6X6_250`, `aprilgrid:6x6:88mm:0.3`, `puzzleboard:12x9:20mm` or

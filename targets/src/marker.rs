@@ -9,9 +9,9 @@ use crate::quad::{Quad, shortest_side};
 /// Smallest difference in gray value between black and white cells. With a lower value, cells are
 /// read from noise. With a higher value, markers in dark images are lost.
 const MIN_CONTRAST: f32 = 14.0;
-/// Fraction of the border cells that may be read wrong. These are 2 of the 20 border cells of a 4X4
-/// marker. Fingers and highlights cover single cells. In texture without a border, about half of
-/// the cells are wrong.
+/// Fraction of the border cells that may be read wrong. For a 4X4 marker, it allows 2 of the 20
+/// border cells. Fingers and highlights cover single cells. In texture without a border, about half
+/// of the cells are wrong.
 const MAX_BORDER_ERRORS: f64 = 0.1;
 
 /// A square of side 1 with its corners in the order of a [`Quad`].
@@ -99,7 +99,7 @@ pub(crate) fn read_exactly(
         let Some(mut cells) = read_cells(plane, quad, n, 1) else {
             continue;
         };
-        // Random cells equal one of the codes in one of four rotations.
+        // By chance, random cells may equal one of the codes in one of four rotations.
         exact.n_by_chance += 4.0 * f64::from(dictionary.n_markers()) * 0.5_f64.powf((n * n) as f64);
         if is_mirrored {
             cells.chunks_exact_mut(n).for_each(<[bool]>::reverse);

@@ -9,14 +9,15 @@ use calib_targets_puzzleboard::code_maps::{horizontal_edge_bit, vertical_edge_bi
 
 /// Number of columns and rows after which the master pattern repeats.
 pub(crate) const PERIOD: u32 = 501;
-/// The code of one kind of edges repeats after 3 squares along one axis and after this many along
-/// the other.
+/// The code of the horizontal or vertical edges repeats after 3 squares along one axis, and after
+/// this number of squares along the other axis.
 const LONG: u32 = 167;
 const SHORT: u32 = 3;
 /// Diameter of the dots relative to the square.
 pub(crate) const DOT_FRAC: f64 = 1.0 / 3.0;
 
-/// An edge between two squares of the master pattern or, with unknown offset, of a part of it.
+/// An edge between two squares of the master pattern. It may also be an edge of a part of the
+/// pattern whose offset is unknown.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) struct Edge {
     /// The square left of or above the edge.
@@ -57,9 +58,9 @@ pub(crate) struct Position {
 /// Finds the offset at which most observed dots (edge, whether the dot is white) agree with the
 /// master pattern. Only possible offsets are considered. `None` if no offset is possible.
 ///
-/// The horizontal and the vertical edges each depend on the offset modulo 3 along one axis and
-/// modulo 167 along the other. Their agreement is therefore counted separately and then summed for
-/// every offset.
+/// The colors of the horizontal edges depend on the offset modulo 3 along one axis and modulo 167
+/// along the other. For the vertical edges, the axes are swapped. The agreement of the two kinds is
+/// therefore counted separately and then summed for every offset.
 pub(crate) fn locate(
     dots: &[(Edge, bool)],
     is_possible: impl Fn([u32; 2]) -> bool,

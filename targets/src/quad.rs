@@ -21,7 +21,7 @@ const MIN_SIDE_PX: f64 = 6.0;
 const TOLERANCE: f64 = 0.1;
 const MIN_TOLERANCE_PX: f64 = 1.2;
 
-/// Corners in the order clockwise as seen in the image, pixels.
+/// Corners in clockwise order as seen in the image, pixels.
 pub(crate) type Quad = [[f64; 2]; 4];
 
 /// Finds dark quadrilaterals. The same quadrilateral may be found several times, with slightly
@@ -136,8 +136,8 @@ impl<'a> Mask<'a> {
         y.cast_unsigned() as usize * self.width + x.cast_unsigned() as usize
     }
 
-    /// Walks around every dark region on the borders between pixels. The dark region is on the
-    /// right. Pixels of a region have common sides.
+    /// Walks around every dark region along the borders between pixels, with the dark region on the
+    /// right. Pixels that touch only at a corner belong to different regions.
     ///
     /// Points are pixel corners, so the outline lies between dark and bright pixels. Holes are
     /// skipped.
@@ -158,7 +158,7 @@ impl<'a> Mask<'a> {
                     continue;
                 }
                 let twice_area = self.walk_around([x, y], &mut is_visited, &mut outline);
-                // Outlines of holes run the other way, so their area is negative.
+                // Outlines of holes have the opposite direction, so their area is negative.
                 if twice_area as f64 > MIN_SIDE_PX * MIN_SIDE_PX {
                     visit(&outline);
                 }
@@ -188,7 +188,7 @@ impl<'a> Mask<'a> {
             twice_area +=
                 i64::from(point[0]) * i64::from(next[1]) - i64::from(next[0]) * i64::from(point[1]);
             point = next;
-            // The two pixels ahead, left and right of the walking direction.
+            // These are the pixels ahead, to the left and to the right of the walking direction.
             let (left, right) = match step {
                 0 => ([0, -1], [0, 0]),
                 1 => ([0, 0], [-1, 0]),
@@ -197,8 +197,8 @@ impl<'a> Mask<'a> {
             };
             let is_dark_at = |[dx, dy]: [i32; 2]| self.at([point[0] + dx, point[1] + dy]);
             // The dark region stays on the right. The walk turns right where the region ends, and
-            // left where it blocks the way. If two dark pixels touch at a corner, the left pixel
-            // belongs to another region.
+            // left where the region blocks the way. If two dark pixels touch at a corner, the left
+            // pixel belongs to another region.
             step = match (is_dark_at(left), is_dark_at(right)) {
                 (_, false) => (step + 1) % 4,
                 (true, true) => (step + 3) % 4,
@@ -217,8 +217,8 @@ fn quad(outline: &[[i32; 2]]) -> Option<Quad> {
     let area = area(&points);
     let tolerance_px = (TOLERANCE * area.sqrt()).max(MIN_TOLERANCE_PX);
     // Outlines of quadrilaterals are short compared to the square root of their area. For a square,
-    // the ratio is 4. For a rectangle of 1 x 30, it is 11. This also bounds the time for text and
-    // texture, whose outlines are long.
+    // the ratio is 4. For a rectangle of 1 x 30, it is 11. The limit also bounds the time for text
+    // and texture, whose outlines are long.
     if points.len() as f64 > 12.0 * area.sqrt() {
         return None;
     }
@@ -250,7 +250,7 @@ fn split(points: &[[f64; 2]], from: usize, to: usize, tolerance_px: f64, corners
     let n = points.len();
     let a = points[from % n];
     let b = points[to % n];
-    // If the outline is cut only once, both are the same point.
+    // If the outline is cut at only one point, `a` and `b` are the same point.
     let length = distance(a, b).max(1e-9);
     let away = |at: usize| cross(a, b, points[at % n]).abs() / length;
     let Some(at) = (from + 1..to).max_by(|&a, &b| away(a).total_cmp(&away(b))) else {
@@ -299,7 +299,7 @@ pub(crate) fn shortest_side(quad: &Quad) -> f64 {
 ///
 /// Returns the quadrilateral unchanged if a side cannot be located or a corner moves far.
 fn refine(plane: &Plane, quad: Quad) -> Quad {
-    // A corner that moves farther belongs to another edge, such as that of a cell.
+    // A corner that moves farther belongs to another edge, such as the edge of a cell.
     let max_move_px = (0.15 * shortest_side(&quad)).max(2.0);
     let sides: [Option<Line>; 4] =
         std::array::from_fn(|at| fit_side(plane, quad[at], quad[(at + 1) % 4]));
@@ -361,8 +361,8 @@ fn fit_side(plane: &Plane, from: [f64; 2], to: [f64; 2]) -> Option<Line> {
         let sample = |away: f64| {
             f64::from(plane.sample([0, 1].map(|axis| center[axis] + away * outward[axis])))
         };
-        // The mean of all positions across the side, weighted by the squared rise from dark to
-        // bright. Falling edges belong to cells and do not count.
+        // This is the mean of all positions across the side, weighted by the squared rise from dark
+        // to bright. Falling edges belong to cells and do not count.
         let mut weight_sum = 0.0;
         let mut sum = 0.0;
         let mut away = -REACH_PX;
@@ -372,7 +372,7 @@ fn fit_side(plane: &Plane, from: [f64; 2], to: [f64; 2]) -> Option<Line> {
             sum += rise * rise * away;
             away += STEP_PX;
         }
-        // At least one rise of 5 gray values, or several smaller ones.
+        // The limit corresponds to one rise of 5 gray values, or to several smaller rises.
         if weight_sum > 25.0 {
             let away = sum / weight_sum;
             points.push([0, 1].map(|axis| center[axis] + away * outward[axis]));

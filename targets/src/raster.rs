@@ -33,8 +33,8 @@ impl TargetSpec {
         frac * (high[0] - low[0]).min(high[1] - low[1])
     }
 
-    /// Draws the target with a white margin. Pixels on edges are gray according to the part that is
-    /// white.
+    /// Draws the target with a white margin. The gray value of a pixel on an edge is proportional
+    /// to its white part.
     ///
     /// # Errors
     /// Fails if the resolution is not a positive number or the picture would be larger than 16384

@@ -3,8 +3,9 @@
 //!
 //! Candidates are maxima of minus the determinant of the Hessian. A ring of samples around each
 //! candidate shows whether it has two black and two white sectors, and the directions of the four
-//! edges between them. Positions are then refined to the point for which all gradients around it
-//! are perpendicular to the direction from this point (Förstner and Gülch 1987).
+//! edges between them. Positions are then refined (Förstner and Gülch 1987). At the refined point,
+//! every image gradient in the window is perpendicular to the direction from this point to the
+//! pixel of the gradient.
 
 use crate::gray::Plane;
 use std::f64::consts::{PI, TAU};
@@ -85,7 +86,7 @@ fn response_at([above, here, below]: [&[f32]; 3], x: usize) -> f32 {
     xy * xy - xx * yy
 }
 
-/// Whether a response is the largest within two pixels. If responses are equal, the first one
+/// Whether a response is the largest within two pixels. If responses are equal, the first response
 /// counts as larger.
 fn is_maximum(response: &[f32], width: usize, x: usize, y: usize) -> bool {
     let value = response[y * width + x];
@@ -146,8 +147,8 @@ pub(crate) fn ring(plane: &Plane, center: [f64; 2], radius_px: f64) -> Option<Sa
     if contrast < MIN_CONTRAST {
         return None;
     }
-    // The loop walks around the ring and collects every change of color. A change has an angle,
-    // which is interpolated between two samples, and whether black follows.
+    // The loop walks around the ring and collects every change of color. Each change has an angle,
+    // which is interpolated between two samples, and a flag that states whether black follows.
     let mut edges = [(0.0, false); 4];
     let mut n_edges = 0;
     for at in 0..N_RING {
@@ -271,8 +272,8 @@ pub(crate) fn refine(plane: &Plane, start: [f64; 2], half_window_px: f64) -> Opt
     Some(center)
 }
 
-/// Finds a saddle near a predicted position. It is the largest response within `reach_px`, and a
-/// ring verifies it.
+/// Finds a saddle near a predicted position. The saddle is the largest response within `reach_px`,
+/// and it is verified by a ring.
 #[expect(
     clippy::cast_possible_truncation,
     reason = "pixel indices are bounded by the image"

@@ -14,8 +14,8 @@ const MAX_COUNT: u32 = 100;
 
 /// A calibration target: its pattern and its dimensions.
 ///
-/// Values are made by parsing text. Every value describes a target that can be printed and
-/// detected.
+/// Specifications are created by parsing text. Every specification describes a target that can be
+/// printed and detected.
 ///
 /// ```
 /// use targets::TargetSpec;
@@ -150,7 +150,7 @@ impl fmt::Display for TargetSpec {
     }
 }
 
-/// A length, printed in millimeters without rounding errors of the conversion.
+/// A length that is printed in millimeters. The text has no rounding errors of the conversion.
 pub(crate) struct Millimeters(pub(crate) f64);
 
 impl fmt::Display for Millimeters {

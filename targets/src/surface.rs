@@ -1,5 +1,5 @@
-//! The printed pattern: the color of every point of a target, and the black shapes of which it
-//! consists.
+//! The printed pattern of a target: the color of every point, and the black shapes of which the
+//! pattern consists.
 
 use crate::dictionary::Dictionary;
 use crate::layout::is_black_square;
@@ -11,7 +11,7 @@ const GRID_TAG_BORDER: usize = 2;
 /// Border of single tags and ArUco markers.
 const BORDER: usize = 1;
 
-/// A black or white shape in the board frame, meters. Later shapes cover earlier ones.
+/// A black or white shape in the board frame, meters. Later shapes cover earlier shapes.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(crate) enum Shape {
     /// Black rectangle, given by its smallest x and y and its largest x and y.
@@ -192,7 +192,8 @@ fn is_black_on_aprilgrid(tags: [u32; 2], spacing_frac: f64, in_tags: [f64; 2]) -
     // and above the first tag, each period begins with the gap.
     let pitch = 1.0 + spacing_frac;
     let position = in_tags.map(|value| (value + spacing_frac) / pitch);
-    // There is one more column and row, because the last one consists of small squares only.
+    // There is one more column and one more row, because the last column and the last row consist
+    // only of small squares.
     let Some([column, row]) = square(position, tags.map(|count| count + 1)) else {
         return false;
     };
@@ -288,8 +289,8 @@ fn dots(squares: [u32; 2], square_m: f64, origin: [u32; 2], shapes: &mut Vec<Sha
 
 /// Mean of a color over a pixel, from samples at positions 0 to 1 along both axes.
 pub(crate) fn pixel_mean(color: impl Fn(f64, f64) -> f64) -> f64 {
-    /// Samples per pixel, which is a Fibonacci number, and the ratio of the previous Fibonacci
-    /// number to it.
+    /// Number of samples per pixel, which is a Fibonacci number. The next constant is the ratio of
+    /// the previous Fibonacci number to this number.
     const N_SAMPLES: usize = 89;
     const GOLDEN_FRAC: f64 = 55.0 / 89.0;
     const BORDER: [[f64; 2]; 8] = [
@@ -331,7 +332,7 @@ fn square(position: [f64; 2], counts: [u32; 2]) -> Option<[u32; 2]> {
     is_inside.then(|| position.map(|value| value as u32))
 }
 
-/// Whether a point of a marker is black; the marker's side is 1.
+/// Whether a point of a marker is black, in a frame in which the side of the marker is 1.
 fn is_black_cell(dictionary: &Dictionary, id: u32, border: usize, point: [f64; 2]) -> bool {
     let n_bits = dictionary.n_bits();
     let n = n_bits + 2 * border;
@@ -347,8 +348,8 @@ fn is_black_cell(dictionary: &Dictionary, id: u32, border: usize, point: [f64; 2
     !(is_inside(column) && is_inside(row)) || dictionary.is_black(id, row - border, column - border)
 }
 
-/// Appends a marker: one rectangle per run of black cells in a row, and one for each part of the
-/// border.
+/// Appends a marker. It has one rectangle per run of black cells in a row, and one rectangle for
+/// each part of the border.
 fn marker(
     dictionary: &Dictionary,
     id: u32,
@@ -371,8 +372,8 @@ fn marker(
     add([0, n], [n - border, n]);
     add([0, border], [border, n - border]);
     add([n - border, n], [border, n - border]);
-    // There is one rectangle per run of black cells, which gives fewer shapes and no seams between
-    // cells of a row.
+    // One rectangle per run of black cells gives fewer shapes, and no seams between the cells of a
+    // row.
     for row in 0..n_bits {
         let mut column = 0;
         while column < n_bits {

@@ -162,7 +162,7 @@ fn blur(values: &[f64], [width, height]: [usize; 2], stride: usize, sigma_px: f6
     let n = if stride == 1 { width } else { height };
     let mut blurred = Vec::with_capacity(values.len());
     for at in 0..values.len() {
-        // Position along the axis of the blur, and the start of its row or column.
+        // The position along the axis of the blur, and the index at which its row or column starts.
         let here = if stride == 1 { at % width } else { at / width };
         let start = at - here * stride;
         // Values beyond the border are equal to the outermost value.

@@ -1,10 +1,10 @@
 //! Refines corners by comparing the image with the printed pattern around them.
 //!
-//! If other edges are close to a corner, such as those of a marker with a narrow margin, the
+//! If other edges are close to a corner, such as the edges of a marker with a narrow margin, the
 //! pattern around the corner is not a plain saddle. Since the pattern is known, it is rendered with
-//! the local scale, rotation and shear, and shifted until it matches the image best (Lucas and
-//! Kanade 1981, inverse compositional as in Baker and Matthews 2004, with gain and offset of the
-//! gray values).
+//! the local scale, rotation and shear, and shifted until it matches the image best. The method is
+//! Lucas and Kanade 1981 in the inverse compositional form of Baker and Matthews 2004, with a gain
+//! and an offset of the gray values.
 
 use crate::gray::Plane;
 use crate::surface::Surface;
@@ -26,8 +26,8 @@ pub(crate) struct Neighborhood {
     pub(crate) pixel: [f64; 2],
     /// Derivative of the pixel with respect to the point, pixels per meter.
     pub(crate) pixel_by_point: Matrix2<f64>,
-    /// Second derivatives of the pixel with respect to x and x, x and y, y and y, pixels per square
-    /// meter.
+    /// Second derivatives of the pixel with respect to the point, pixels per square meter. The
+    /// order is: x and x, x and y, y and y.
     pub(crate) bend: [[f64; 2]; 3],
     /// Size of the part of the board whose image is about as large as the compared window should
     /// be.
@@ -37,19 +37,19 @@ pub(crate) struct Neighborhood {
     pub(crate) reach_px: Option<f64>,
 }
 
-/// Half the side of the window, relative to the image of `side_m`, and its limits in pixels. Larger
-/// windows average more noise, but contain more bending. Their time grows with the square of the
-/// size.
+/// Half the side of the window, relative to the image of `side_m`. The next constants are its
+/// limits in pixels. Larger windows average more noise, but contain more bending. Their time grows
+/// with the square of the size.
 pub(crate) const WINDOW_FRAC: f64 = 0.35;
 const HALF_WINDOW_PX: [f64; 2] = [3.0, 9.0];
-/// Largest distance from a prediction, relative to the image of `side_m`, and its limits in pixels.
-/// It must stay below the distance to the next edge. Otherwise, the pattern may be aligned with
-/// that edge.
+/// Largest distance from a prediction, relative to the image of `side_m`. The next constants are
+/// its limits in pixels. The distance must stay below the distance to the next edge. Otherwise, the
+/// pattern may be aligned with that edge.
 const REACH_FRAC: f64 = 0.12;
 const REACH_PX: [f64; 2] = [1.5, 8.0];
-/// Numbers of times the pattern is blurred by the kernel (1 2 1) / 4, from images in focus to
-/// images out of focus. The kernel has a variance of 1/2, so these are standard deviations of 0.7,
-/// 1.4 and 2.2 pixels.
+/// The pattern is blurred by applying the kernel (1 2 1) / 4 this many times. The numbers are for
+/// images from in focus to out of focus. The kernel has a variance of 1/2, so the standard
+/// deviations of the blurs are 0.7, 1.4 and 2.2 pixels.
 const BLURS: [usize; 3] = [1, 4, 10];
 /// Above this correlation, no other blur is tried.
 const GOOD_CORRELATION: f64 = 0.94;
@@ -158,9 +158,9 @@ fn is_white(
     point_by_pixel: &Matrix2<f64>,
     [x, y]: [f64; 2],
 ) -> bool {
-    // The pixel is a function of second order of the board point. Its inverse is approximated by
-    // one step. The linear inverse gives the point at which the second-order part is evaluated.
-    // This part is subtracted before the final linear inverse.
+    // The pixel is a second-order function of the board point. The inverse of this function is
+    // approximated by one step. The linear inverse gives the point at which the second-order part
+    // is evaluated. This part is subtracted before the final linear inverse.
     let first = point_by_pixel * Vector2::new(x, y);
     let [xx, xy, yy] = [
         first.x * first.x / 2.0,
@@ -197,8 +197,8 @@ impl Template {
         n_blurs: usize,
     ) -> Option<Self> {
         let point_by_pixel = neighborhood.pixel_by_point.try_inverse()?;
-        // The patch has more pixels on each side, because each blur takes one pixel and the
-        // derivatives take another one.
+        // The patch has additional pixels on each side. Each blur uses up one pixel, and the
+        // derivatives use up another pixel.
         let padding = i32::try_from(n_blurs).ok()? + 1;
         let padded = half_px + padding;
         let side = 2 * padded + 1;
@@ -292,7 +292,7 @@ impl Template {
     /// Shifts the pattern to the position of least squares.
     fn align(&self, plane: &Plane, start: [f64; 2]) -> Option<[f64; 2]> {
         // This number is sufficient for any shift within the limits below. It also ends oscillating
-        // steps. The correlation then decides.
+        // steps. Whether the result is used then depends on the correlation.
         const MAX_STEPS: usize = 20;
         const CONVERGED_PX: f64 = 1e-3;
         let mut center = start;
@@ -314,8 +314,9 @@ impl Template {
             // Far from the solution, the linear model overshoots.
             let limited = step.map(|value| value.clamp(-0.7, 0.7));
             center = [center[0] - limited[0], center[1] - limited[1]];
-            // The start is the best whole pixel, so the solution is within a pixel of it, with some
-            // reserve. The comparison is written so that NaN does not count as near.
+            // The start is the best whole pixel, so the solution is within a pixel of the start.
+            // The limit has some reserve. The comparison is written so that NaN does not count as
+            // near.
             let is_near = (center[0] - start[0]).hypot(center[1] - start[1]) < 2.0;
             if !is_near {
                 return None;

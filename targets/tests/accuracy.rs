@@ -158,7 +158,7 @@ fn corners_of_every_target_are_accurate() {
 
 #[test]
 fn boards_are_detected_through_a_fisheye_lens() {
-    // Field of view that the board's width covers, and limits as above.
+    // Each case has the field of view that the board's width covers, and limits as above.
     let cases = [
         ("chessboard:9x6:25mm", 150.0_f64, [0.08, 0.2, 0.95]),
         ("chessboard:13x12:25mm", 140.0, [0.08, 0.6, 0.95]),

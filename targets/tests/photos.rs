@@ -114,7 +114,7 @@ fn tags_in_a_photo_match_annotations() {
     };
     let annotated: Vec<[f64; 2]> = annotations.split('(').filter_map(corner).collect();
     assert_eq!(annotated.len(), 48);
-    // All tags have the id 0; the largest one is detected.
+    // All tags have the id 0, and the largest tag is detected.
     let target: TargetSpec = "tag:36h11:0:100mm".parse().unwrap();
     let image = GrayImage {
         size_px: [photo.width(), photo.height()],

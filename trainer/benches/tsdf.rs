@@ -14,7 +14,8 @@ use std::time::{Duration, Instant};
 use trainer::tsdf::{TsdfModel, TsdfOptions};
 use trainer::{Method, Projection, RenderRequest};
 
-/// Keyframes that are fused before anything is measured; measurements fuse the same images again.
+/// Number of keyframes that are fused before anything is measured. Measurements fuse the same
+/// images again.
 const N_KEYFRAMES: usize = 12;
 
 /// A ball on a floor in front of a wall. The camera moves around it.
@@ -98,7 +99,7 @@ impl Fusion {
     }
 }
 
-/// Sum of the passes; wall time since `begin` if there are no timestamps.
+/// Sum of the times of the passes. Without timestamps, it is the wall time since `begin`.
 fn gpu_time(passes: &[PassTiming], begin: Instant) -> Duration {
     match passes {
         [] => begin.elapsed(),

@@ -4,9 +4,9 @@
 //! applied a fixed number of steps after alignment began, so that the same seed gives the same
 //! model. In real time, the result is applied when the caller polls for it
 //! ([`AlignedModel::poll_alignment`]), so that training never waits. A single alignment from
-//! features, without depth, takes only seconds and precedes the first step. A result that changes
-//! the corrections replaces the keyframes; the model moves along with them or restarts, see
-//! [`Method::recalibrate`].
+//! features, without depth, takes only seconds and precedes the first step. If a result changes the
+//! corrections, the keyframes are replaced. The model then moves with its keyframes or restarts,
+//! see [`Method::recalibrate`].
 
 use crate::corrected_keyframe::{CorrectedKeyframe, id_of};
 use crate::model_metadata::{METADATA_FILE, read_metadata};
@@ -45,14 +45,14 @@ pub type ResumedModel<M = Box<dyn Method>> = (M, Vec<Arc<Keyframe>>);
 
 /// A scene model, and the alignment of its keyframes' cameras if that is requested.
 ///
-/// This type has the functions that involve alignment. All others are functions of the model
+/// This type has the functions that involve alignment. All other functions are called on the model
 /// ([`Self::model_mut`]).
 pub struct AlignedModel {
     model: Box<dyn Method>,
     alignment_task: AlignmentTask,
     /// The uncorrected keyframes in order of arrival, kept until alignment is done.
     original_keyframes: Vec<Arc<Keyframe>>,
-    /// Detection of movements; it has begun if `state.n_references` is given.
+    /// Detection of movements. It has begun if `state.n_references` is given.
     movement_task: Option<MovementTask>,
     state: AlignedState,
 }
@@ -187,7 +187,7 @@ impl AlignedModel {
             .collect();
         let original = |id: (&str, i64)| originals.get(&id).map(|keyframe| Arc::clone(keyframe));
         // After recovery, evicted keyframes have no pixels. They are removed from the model, like
-        // missing ones.
+        // missing keyframes.
         let with_pixels = |(camera, nanos): &(String, i64)| {
             original((camera, *nanos))
                 .filter(|keyframe: &Arc<Keyframe>| !keyframe.rgba_srgb.is_empty())
@@ -282,7 +282,8 @@ impl AlignedModel {
         self.finish_alignment_when_due()?;
         let n_steps = self.model.step(n.min(self.steps_to_alignment()))?;
         if n_steps > 0 {
-            // Alignment begins after the first step, because that step needs much CPU time itself.
+            // Alignment begins after the first step, because the first step also needs much CPU
+            // time.
             self.begin_alignment();
             if let (Some(task), None) = (&mut self.movement_task, self.state.n_begun) {
                 task.begin();
@@ -318,8 +319,8 @@ impl AlignedModel {
         Ok(is_ready)
     }
 
-    /// Waits for queued updates and returns the total number of updates, including those before a
-    /// restart and those of rejected trials. Unlike [`Progress::step`](crate::Progress::step), it
+    /// Waits for queued updates and returns the total number of updates, including updates before a
+    /// restart and updates of rejected trials. Unlike [`Progress::step`](crate::Progress::step), it
     /// never decreases.
     pub fn n_total_steps(&mut self) -> Result<u64, Error> {
         Ok(self.state.n_steps_before_restart + self.model.n_total_steps()?)
@@ -334,15 +335,15 @@ impl AlignedModel {
             .calibrated_camera(keyframe, learned.get(&*keyframe.camera)))
     }
 
-    /// Result of keyframe alignment. `None` until alignment has finished, and if it was not
-    /// requested or not possible.
+    /// Result of keyframe alignment. `None` until alignment has finished. Also `None` if alignment
+    /// was not requested or not possible.
     pub fn alignment(&self) -> Option<&Alignment> {
         self.alignment_task.result()
     }
 
     /// Writes the model and its alignment into an existing folder. See [`Method::save`].
     pub fn save(&mut self, folder: &Path) -> Result<(), Error> {
-        // The model writes its own metadata; the alignment is added to the same file afterwards.
+        // The model writes its own metadata. The alignment is added to the same file afterwards.
         self.model.save(folder)?;
         let Some(alignment) = self.alignment_task.result() else {
             return Ok(());
@@ -401,8 +402,8 @@ impl AlignedModel {
     /// Starts alignment if it is requested and there are enough keyframes.
     fn begin_alignment(&mut self) {
         let n_keyframes = self.original_keyframes.len();
-        // If a checkpoint was written while alignment ran, the resumed run must start it even if
-        // keyframes were removed since.
+        // If a checkpoint was written while alignment ran, the resumed run must start alignment
+        // again, even if keyframes were removed since then.
         let has_enough = self.state.n_begun.is_some() || n_keyframes >= self.state.begins_at;
         if !self.alignment_task.is_requested() || !has_enough {
             return;
@@ -416,7 +417,7 @@ impl AlignedModel {
         } else {
             self.model.progress().step
         };
-        // In real time, no step is due: the caller polls for the result.
+        // In real time, no step is due, because the caller polls for the result.
         if self.state.timing != AlignTiming::RealTime {
             self.state
                 .due_step
@@ -429,8 +430,8 @@ impl AlignedModel {
     /// Applies the result of alignment at a fixed step, or when the model is idle.
     fn finish_alignment_when_due(&mut self) -> Result<(), Error> {
         let step = self.model.progress().step;
-        // An idle model may never reach the due step: a distance field has no steps left once it
-        // has fused all keyframes. Its result is applied at once.
+        // An idle model may never reach the due step. For example, a distance field has no steps
+        // left once it has fused all keyframes. In this case, the result is applied at once.
         let is_idle = step > 0 && self.model.is_idle() && self.is_awaited();
         let is_due = is_idle || self.state.due_step.is_some_and(|due_step| step >= due_step);
         if self.alignment_task.is_done() || !is_due {
@@ -560,9 +561,9 @@ impl AlignedModel {
 
     /// Whether alignment must end before the first step.
     fn precedes_training(&self) -> bool {
-        // Alignment from features precedes training, because it takes only seconds and training on
-        // wrong cameras would take longer to correct. Registration with depth takes longer and runs
-        // in parallel with training.
+        // Alignment from features precedes training, because it takes only seconds. Undoing the
+        // effect of training on wrong cameras would take longer. Registration with depth takes
+        // longer and runs in parallel with training.
         self.state.timing == AlignTiming::Once
             && self.model.progress().step == 0
             && self.alignment_task.is_requested()
@@ -590,8 +591,8 @@ fn invalid_state(error: serde_json::Error) -> Error {
 
 /// Index of the first keyframe that is among the last `n` of its camera.
 fn first_recent(keyframes: &[Arc<Keyframe>], n: usize) -> usize {
-    // Keyframes of each camera are counted from the newest one backwards. Cameras have different
-    // rates, so the last keyframes of a slow camera may be far from the end of the list.
+    // Keyframes of each camera are counted backwards from the newest keyframe. Cameras have
+    // different rates, so the last keyframes of a slow camera may be far from the end of the list.
     let mut n_later = BTreeMap::<&str, usize>::new();
     let mut first = keyframes.len();
     for (ix, keyframe) in keyframes.iter().enumerate().rev() {
@@ -604,8 +605,8 @@ fn first_recent(keyframes: &[Arc<Keyframe>], n: usize) -> usize {
     first
 }
 
-/// Number of keyframes at which the next alignment of a live run begins, if the previous one used
-/// `n` keyframes.
+/// Number of keyframes at which the next alignment of a live run begins, if the previous alignment
+/// used `n` keyframes.
 #[expect(
     clippy::cast_possible_truncation,
     clippy::cast_sign_loss,
@@ -687,7 +688,7 @@ mod tests {
 
     #[test]
     fn models_get_corrected_cameras_and_resume_exactly() {
-        /// Steps after the first one that follows the correction.
+        /// Number of steps after the first step with corrected keyframes.
         const RESTARTED: u64 = 1;
         let gpu = test_gpu();
         check_correction(&gpu, "tsdf", tsdf(&gpu), RESTARTED);

@@ -9,8 +9,8 @@ const INSIDE_FRAC: f64 = 0.8;
 /// Fraction of the points inside the outer radius. It includes thin parts far from the center, such
 /// as the neck of a guitar, but not stray points around a model.
 const OUTER_FRAC: f64 = 0.99;
-/// Maximum outer radius, in radii. If points are farther away, they are the background of a scene
-/// rather than parts of an object, whose farthest parts are rarely beyond twice its radius.
+/// Maximum outer radius, in radii. Points that are farther away belong to the background of a
+/// scene, because the farthest parts of an object are rarely beyond twice its radius.
 const MAX_OUTER_RADII: f64 = 2.5;
 /// Minimum radius, meters. It is needed for a model of a single point.
 pub(crate) const MIN_RADIUS_M: f64 = 0.01;

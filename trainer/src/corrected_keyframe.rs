@@ -7,9 +7,9 @@ use std::sync::Arc;
 /// A keyframe with its corrections before and after an alignment.
 #[derive(Clone, Debug)]
 pub struct CorrectedKeyframe {
-    /// As it was pushed.
+    /// The keyframe as it was pushed.
     pub before: Arc<Keyframe>,
-    /// With the new corrections.
+    /// The keyframe with the new corrections.
     pub after: Arc<Keyframe>,
 }
 

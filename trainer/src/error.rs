@@ -126,7 +126,7 @@ pub enum Error {
         .placeholders.len(), if .placeholders.len() == 1 { "is" } else { "are" }, .placeholders[0].stamp.0, .placeholders[0].camera
     )]
     MissingKeyframes {
-        /// Keyframes without pixels that stand for the missing keyframes. There is at least one.
+        /// Keyframes without pixels that stand for the missing keyframes. The list is not empty.
         placeholders: Vec<Arc<Keyframe>>,
     },
     /// No registered method has this name.

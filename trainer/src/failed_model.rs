@@ -9,7 +9,7 @@ use kinematics::Stamp;
 use std::path::Path;
 use std::sync::Arc;
 
-/// A model whose GPU failed: every operation returns [`gpu::Error::DeviceLost`].
+/// A model whose GPU failed. Every operation returns [`gpu::Error::DeviceLost`].
 #[derive(Clone, Copy, Debug)]
 pub struct FailedModel;
 

@@ -35,7 +35,7 @@ impl KeyframeSignature {
         }
     }
 
-    /// A keyframe without pixels that stands for the recorded one.
+    /// A keyframe without pixels that stands for the recorded keyframe.
     fn placeholder(&self) -> Keyframe {
         let world_from_camera = from_xyz_xyzw(self.world_from_camera);
         let depth = self.depth_size_px.map(|size_px| DepthMap {
@@ -68,7 +68,7 @@ impl KeyframeSignature {
         self.camera == camera && self.stamp_nanos == stamp.0
     }
 
-    /// Describes a difference between `keyframe` and the recorded one. `None` if they match.
+    /// Describes a difference between `keyframe` and the recorded keyframe. `None` if they match.
     fn difference(&self, keyframe: &Keyframe) -> Option<String> {
         let other = Self::of(keyframe);
         // Values are compared bit by bit. A pose that was estimated again is different data,

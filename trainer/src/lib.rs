@@ -1,4 +1,4 @@
-//! Radiance fields trained on wgpu: keyframes in, pictures out.
+//! Trains radiance fields on wgpu. The inputs are keyframes, and the outputs are pictures.
 //!
 //! ```
 //! use trainer::eval::{PixelPair, psnr};

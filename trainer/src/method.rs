@@ -47,7 +47,7 @@ pub trait Method {
     }
     /// Queues up to `n` optimizer updates, but at most 20 ms of GPU work. While pictures are
     /// requested ([`Method::set_watched`]), the limit is 2 ms. Returns the number of queued
-    /// updates. At any time, at most one submit runs and one more is queued.
+    /// updates. At any time, at most one submit runs and one further submit is queued.
     ///
     /// If a buffer is too small, a queued update is discarded and repeated later. If all `n`
     /// updates were queued, the call waits for them, so that [`Method::progress`] is exact. Call in
@@ -55,7 +55,7 @@ pub trait Method {
     fn step(&mut self, n: u64) -> Result<u64, Error>;
     /// Whether further steps have no effect until a keyframe arrives.
     fn is_idle(&self) -> bool;
-    /// Waits for queued updates and returns the total number of updates, including those of
+    /// Waits for queued updates and returns the total number of updates, including updates of
     /// rejected trials. Unlike [`Progress::step`], it never decreases.
     fn n_total_steps(&mut self) -> Result<u64, Error>;
     /// Initializes the model from the keyframes added so far, so that it can be rendered without
@@ -117,8 +117,8 @@ pub trait Method {
         Err(Error::CannotFindFloaters)
     }
     /// PSNR of the requested picture against a keyframe's image of the same size, dB, computed on
-    /// the GPU. Bit-identical to [`crate::eval::psnr`] of the 8-bit picture. `None` if the model
-    /// cannot compute the PSNR, or cannot compute it yet.
+    /// the GPU. The result is bit-identical to [`crate::eval::psnr`] of the 8-bit picture. `None`
+    /// if the model cannot compute the PSNR, or cannot compute it yet.
     fn psnr(
         &mut self,
         _request: &RenderRequest,
@@ -131,8 +131,8 @@ pub trait Method {
     fn background_srgb(&self) -> [f32; 3] {
         [0.0; 3]
     }
-    /// Pixel stride along both axes for depth images that are compared with measured ones. It is
-    /// odd. It is above 1 if rendering a ray is expensive.
+    /// Pixel stride along both axes for rendered depth images that are compared with measured depth
+    /// images. It is odd. It is above 1 if rendering a ray is expensive.
     fn depth_stride(&self) -> u32 {
         1
     }

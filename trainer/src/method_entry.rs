@@ -12,8 +12,8 @@ use std::sync::Arc;
 
 /// Creates an untrained model.
 pub type StartModel = fn(Arc<Gpu>, &ModelOptions) -> Result<Box<dyn Method>, Error>;
-/// Restores a model from a checkpoint. The keyframes must include those that the model was trained
-/// on.
+/// Restores a model from a checkpoint. The keyframes must include the keyframes that the model was
+/// trained on.
 pub type ResumeModel = fn(Arc<Gpu>, &Checkpoint, &[Arc<Keyframe>]) -> Result<ResumedModel, Error>;
 /// Loads a saved model from a folder or a single file.
 pub type LoadModel = fn(Arc<Gpu>, &Path) -> Result<Box<dyn Method>, Error>;
@@ -28,7 +28,7 @@ pub struct MethodEntry {
     pub model: &'static str,
     /// The items that [`crate::Progress::primitives`] counts, in the singular.
     pub primitive: &'static str,
-    /// Label of the primitive count: plural and capitalized.
+    /// Label of the primitive count, in the plural and capitalized.
     pub primitives_label: &'static str,
     /// Files of a saved model besides `model.json`, in the order in which they are moved into
     /// place. A folder that contains the last file contains the complete model.
@@ -113,6 +113,7 @@ pub struct Exported {
     pub n_items: u64,
     /// Name of an item, in the singular.
     pub item: &'static str,
-    /// Additional properties to print after the items, such as `of SH degree 3`; may be empty.
+    /// Additional properties to print after the items, such as `of SH degree 3`. The text may be
+    /// empty.
     pub detail: String,
 }

@@ -12,8 +12,8 @@ pub(crate) struct Mismatches {
 }
 
 impl Mismatches {
-    /// Records a mismatch unless `|got - expected| <= abs + rel * max(|got|, |expected|)`; a NaN
-    /// never passes.
+    /// Records a mismatch unless `|got - expected| <= abs + rel * max(|got|, |expected|)`. NaN is
+    /// always a mismatch.
     pub(crate) fn check(
         &mut self,
         name: impl Display,

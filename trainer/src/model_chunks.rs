@@ -6,7 +6,7 @@ use serde::Serialize;
 /// The chunks of a model at one moment.
 #[derive(Debug, Default)]
 pub struct ModelChunks {
-    /// Whether `chunks` are all chunks of the model. Otherwise, they are the chunks that have
+    /// Whether `chunks` are all chunks of the model. If not, `chunks` are the chunks that have
     /// changed since the last call.
     pub is_complete: bool,
     /// The chunks.

@@ -73,7 +73,7 @@ fn difference(what: &str, stated: Option<u64>, actual: u64) -> Option<String> {
     ))
 }
 
-/// Reads the file in the folder of a saved model. If the file does not exist, everything is empty.
+/// Reads the file in the folder of a saved model. If the file does not exist, all fields are empty.
 ///
 /// # Errors
 ///
@@ -97,7 +97,7 @@ pub(crate) fn read_metadata(folder: &Path) -> Result<ModelMetadata, Error> {
 fn parse(bytes: &[u8]) -> Result<ModelMetadata, String> {
     let metadata: ModelMetadata =
         serde_json::from_slice(bytes).map_err(|error| error.to_string())?;
-    // Written so that a NaN is refused.
+    // The condition is written so that a NaN is refused.
     let background = metadata.background_srgb;
     if background
         .iter()

@@ -16,20 +16,21 @@ pub trait MethodOptions: Serialize + DeserializeOwned + Default {
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum AlignTiming {
-    /// Once, with the keyframes that are known at the first step. If a keyframe has depth, the
-    /// result is applied a fixed number of steps later. Otherwise, it is applied before the first
-    /// step.
+    /// Cameras are aligned once, with the keyframes that are known at the first step. If a keyframe
+    /// has depth, the result is applied a fixed number of steps later. Otherwise, it is applied
+    /// before the first step.
     #[default]
     Once,
-    /// Repeatedly as keyframes arrive. Results are applied a fixed number of steps later.
+    /// Cameras are aligned repeatedly as keyframes arrive. Results are applied a fixed number of
+    /// steps later.
     Lockstep,
-    /// Repeatedly as keyframes arrive. Results are applied by
+    /// Cameras are aligned repeatedly as keyframes arrive. Results are applied by
     /// [`poll_alignment`](crate::AlignedModel::poll_alignment), so that training never waits for
     /// them.
     RealTime,
 }
 
-/// Options that all methods share. A method ignores those that do not apply to it.
+/// Options that all methods share. A method ignores the options that do not apply to it.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct CommonOptions {

@@ -28,7 +28,7 @@ pub struct Resumed {
     pub model_spec: ModelSpec,
     /// The model.
     pub method: AlignedModel,
-    /// Keyframes that the model was not trained on: test keyframes and new ones.
+    /// Keyframes that the model was not trained on. These are test keyframes and new keyframes.
     pub untrained: Vec<Arc<Keyframe>>,
     /// Erased space.
     pub edits: Edits,
@@ -63,7 +63,7 @@ impl ModelSpec {
         let mut options = (kind.entry().default_options)();
         options.common = common;
         for (name, value) in settings {
-            // `get_mut` does not insert: an option that this method lacks stays absent.
+            // `get_mut` does not insert, so an option that this method lacks stays absent.
             if let Some(option) = options.specific.get_mut(name) {
                 *option = value.clone();
             }
@@ -113,8 +113,8 @@ impl ModelSpec {
     }
 }
 
-/// Restores a model from a checkpoint. `keyframes` must include those that the model was trained
-/// on.
+/// Restores a model from a checkpoint. `keyframes` must include the keyframes that the model was
+/// trained on.
 ///
 /// # Errors
 ///
@@ -128,8 +128,9 @@ pub fn resume(
     resume_with(gpu, checkpoint, keyframes, &[])
 }
 
-/// Like [`resume`], but keyframes may be missing. They are removed from the training set; their
-/// effect on the parameters remains. Also returns the cameras and stamps of the missing keyframes.
+/// Like [`resume`], but keyframes may be missing. Missing keyframes are removed from the training
+/// set, but their effect on the parameters remains. Also returns the cameras and stamps of the
+/// missing keyframes.
 ///
 /// # Errors
 ///
@@ -140,7 +141,8 @@ pub fn resume_without_missing(
     keyframes: &[Arc<Keyframe>],
 ) -> Result<(Resumed, Vec<KeyframeId>), Error> {
     // A first attempt shows which keyframes the model needs. The second attempt uses placeholders
-    // for the missing ones, because a model may store parameters in the order of the keyframes.
+    // for the missing keyframes, because a model may store parameters in the order of the
+    // keyframes.
     let placeholders = match resume_with(gpu.clone(), checkpoint, keyframes, &[]) {
         Ok(resumed) => return Ok((resumed, Vec::new())),
         Err(Error::MissingKeyframes { placeholders }) => placeholders,

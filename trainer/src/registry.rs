@@ -11,7 +11,7 @@ use std::path::Path;
 pub struct ModelKind(&'static MethodEntry);
 
 impl ModelKind {
-    /// All methods. The first one is the default.
+    /// All methods of training. The first method is the default.
     pub const ALL: &'static [Self] = &[
         Self(&splat::ENTRY),
         Self(&tsdf::ENTRY),

@@ -32,9 +32,9 @@ pub struct RenderRequest {
     pub projection: Projection,
     /// Rolling shutter to simulate, for comparison with a real image. `None` for viewers.
     pub shutter: Option<Shutter>,
-    /// Nothing nearer than this along z is rendered, meters.
+    /// Smallest depth along z that is rendered, meters.
     pub near_m: f64,
-    /// Nothing farther than this along z is rendered, meters.
+    /// Largest depth along z that is rendered, meters.
     pub far_m: f64,
     /// Only space inside this box is rendered.
     pub crop: Option<Aabb>,

@@ -1,4 +1,4 @@
-//! Calibration near a singular configuration of the arm, with joint offsets.
+//! Measures calibration near a singular configuration of the arm, with joint offsets.
 
 use super::method::Errors;
 use super::scene::{brown_conrady, intrinsics, view};
@@ -51,7 +51,8 @@ pub(super) struct ArmConfiguration {
     pub(super) within_3_sigma_frac: Option<f64>,
 }
 
-/// Result of a run: errors, and the error of each observable joint offset in standard deviations.
+/// Result of a run. It has the errors of the camera pose, and the error of each observable joint
+/// offset in standard deviations.
 type Run = Option<(Errors, Vec<f64>)>;
 
 /// Measures all arm configurations with and without estimated joint offsets.
@@ -223,7 +224,7 @@ fn run(chain: &Chain, angle_deg: f64, estimates_joints: bool, seed: u64) -> Run 
     ))
 }
 
-/// Error of an estimated offset in standard deviations; `None` if it is not observable.
+/// Error of an estimated offset in standard deviations. `None` if the offset is not observable.
 fn deviation(offset: &JointOffset, truth: f64) -> Option<f64> {
     let [value, sigma] = offset.estimate?;
     Some((value - truth).abs() / sigma)

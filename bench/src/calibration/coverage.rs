@@ -1,4 +1,4 @@
-//! How often the confidence ellipsoid of the reported uncertainty contains the truth.
+//! Measures how often the confidence ellipsoid of the reported uncertainty contains the truth.
 
 use super::CoverageScenes;
 use super::method::squared_error;
@@ -26,9 +26,9 @@ pub(super) struct Coverage {
     pub(super) n_refused: usize,
     /// Fraction of the results whose 95 % ellipsoid contains the truth.
     pub(super) covered_frac: f64,
-    /// Medians of two errors; `p95` has their 95th percentiles. For a camera pose, these are the
-    /// position (mm) and the rotation (degrees). For intrinsics, they are the focal length and the
-    /// principal point (px).
+    /// Medians of two errors. `p95` has the 95th percentiles of the same errors. For a camera pose,
+    /// these are the position (mm) and the rotation (degrees). For intrinsics, they are the focal
+    /// length and the principal point (px).
     pub(super) median: [f64; 2],
     pub(super) p95: [f64; 2],
     pub(super) units: [&'static str; 2],
@@ -87,8 +87,8 @@ pub(super) fn measure(scenes: CoverageScenes) -> Vec<Coverage> {
         estimate_intrinsics: true,
         ..default
     };
-    // The kinds of calibration differ in the source of uncertainty: the corners, the robot poses,
-    // the given lens, or a lens that is estimated together with the pose.
+    // The kinds of calibration differ in the source of uncertainty. The sources are the corners,
+    // the robot poses, the given lens, and a lens that is estimated together with the pose.
     let hand_eye = |name, noise, given, options| hand_eye(scenes, name, noise, given, options);
     let lens = |name, lens, model| intrinsics_coverage(scenes, name, lens, model);
     vec![
@@ -176,7 +176,8 @@ fn intrinsics_coverage(
 enum Given {
     /// Corners and the true lens.
     Lens,
-    /// Corners, and the lens from other images with its covariance.
+    /// A calibration from corners, with a lens and its covariance that were estimated from other
+    /// images.
     LensEstimate,
     /// Board poses.
     BoardPoses,

@@ -79,7 +79,7 @@ fn pair(sample: &HandEyeSample) -> Option<(Transform, Transform)> {
     }
 }
 
-/// Squared Mahalanobis distance of the error; below 12.59 in 95 % of correct calibrations.
+/// Squared Mahalanobis distance of the error. It is below 12.59 in 95 % of correct calibrations.
 pub(super) fn squared_error(found: &HandEyeCalibration, truth: &Transform) -> f64 {
     // The error is in the axes of the camera, with the translation first, like the reported
     // covariance.
@@ -119,7 +119,8 @@ impl Errors {
         }
     }
 
-    /// Whether the result failed: error above 5 mm or 0.5 degrees, or not finite.
+    /// Whether the result failed. This is the case if its error is above 5 mm or 0.5 degrees, or
+    /// not finite.
     ///
     /// The limits are far above the noise of all conditions, so that only wrong solutions exceed
     /// them.

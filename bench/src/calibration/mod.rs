@@ -1,5 +1,5 @@
-//! Accuracy, reported uncertainty, speed and limits of calibration, on simulated measurements with
-//! a known truth.
+//! Measures accuracy, reported uncertainty, speed and limits of calibration, on simulated
+//! measurements with a known truth.
 //!
 //! Corners of a chessboard are computed with normal errors, without rendering. Calibration without
 //! a target ([`CalibrationOptions::rig`]) needs the simulator.
@@ -60,7 +60,7 @@ pub struct CalibrationOptions {
     pub coverage: CoverageScenes,
     /// Number of scenes for each number of poses, and for each combination of conditions.
     pub seeds: u64,
-    /// Rig file for [`Part::Rigs`]; skipped if `None`.
+    /// Rig file for [`Part::Rigs`]. If it is `None`, this part is skipped.
     pub rig: Option<PathBuf>,
     /// Number of rigs. Each is the first camera of the rig file with different errors.
     pub rigs: u64,
@@ -97,7 +97,7 @@ impl CalibrationOptions {
 ///
 /// # Errors
 ///
-/// If the rig cannot be simulated, or the folder cannot be written.
+/// Fails if the rig cannot be simulated, or if the folder cannot be written.
 pub fn run(options: &CalibrationOptions) -> Result<BenchResult> {
     std::fs::create_dir_all(&options.out)
         .with_context(|| format!("cannot create {}", options.out.display()))?;
@@ -121,7 +121,7 @@ pub fn run(options: &CalibrationOptions) -> Result<BenchResult> {
             .rigs
             .push(rigs::measure(rig, seed, options.scan_secs)?);
         log::info!("rig {seed}: {:?}", results.rigs.last());
-        // Results are written after each rig, so that an interrupted bench leaves them.
+        // Results are written after each rig, so that they are kept if the bench is interrupted.
         write(options, &results)?;
     }
     write(options, &results)

@@ -9,7 +9,7 @@ use crate::findings::Findings;
 use report::Table;
 use report::chart::{Axis, Chart, Line, Point, Scale};
 
-/// Conditions of the sweeps in the charts; each chart varies one of them.
+/// Conditions of the sweeps in the charts. Each chart varies one of the conditions.
 const BASE_SPREAD_DEG: f64 = 20.0;
 const BASE_POSES: usize = 12;
 
@@ -313,7 +313,7 @@ impl Sweep {
         }
     }
 
-    /// The refused and failed results of a cell.
+    /// Describes how many results of a cell were refused or failed.
     fn describe_failures(&self, cell: &Cell) -> String {
         let rest = match (cell.n_refused, cell.n_failed) {
             (0, 0) => "ok".to_owned(),
@@ -325,7 +325,7 @@ impl Sweep {
     }
 }
 
-/// For each sweep and method: refused and failed results at each level.
+/// The table of refused and failed results at each level, for each sweep and method.
 fn limits_table(cells: &[Cell]) -> Table {
     let mut rows = Vec::new();
     for sweep in sweeps() {
@@ -348,7 +348,7 @@ fn limits_table(cells: &[Cell]) -> Table {
     }
 }
 
-/// The row of a method: sums over all conditions.
+/// The table row of a method, which contains sums over all conditions.
 fn totals_row(cells: &[Cell], method: Method) -> Vec<String> {
     let own: Vec<&Cell> = cells
         .iter()

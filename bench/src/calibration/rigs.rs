@@ -1,5 +1,5 @@
-//! Calibration of a rig without a target. The simulated rigs have a camera pose that is wrong in a
-//! random direction.
+//! Measures the calibration of a rig without a target. The simulated rigs have a camera pose that
+//! is wrong in a random direction.
 
 use super::method::Errors;
 use anyhow::Result;
@@ -23,7 +23,7 @@ const ERROR_MM: f64 = 20.0;
 pub(super) struct RigResult {
     pub(super) seed: u64,
     pub(super) n_images: usize,
-    /// Errors after the calibration; `None` if it was refused.
+    /// Errors after the calibration. `None` if it was refused.
     pub(super) errors: Option<Errors>,
     /// Euclidean norms of the reported per-axis standard deviations.
     pub(super) sigma_mm: Option<f64>,

@@ -12,7 +12,7 @@ const ROWS: u32 = 6;
 const SQUARE_M: f64 = 0.025;
 /// Typical distance of the board, meters.
 const DISTANCE_M: f64 = 0.5;
-/// Attempts to find a pose from which the whole board is visible.
+/// Maximum number of attempts to find a pose from which the whole board is visible.
 const MAX_ATTEMPTS: usize = 500;
 
 /// A camera on a flange and a board in the base.
@@ -173,7 +173,7 @@ pub(super) fn with_board_poses(samples: &[HandEyeSample]) -> Vec<HandEyeSample> 
         .collect()
 }
 
-/// A sample with the pose of the board; `None` if its corners do not determine one.
+/// A sample with the pose of the board. `None` if its corners do not determine a pose.
 fn with_board_pose(sample: &HandEyeSample, lens: &Intrinsics) -> Option<HandEyeSample> {
     let BoardObservation::View(view) = &sample.board else {
         return Some(sample.clone());

@@ -1,4 +1,4 @@
-//! Time and error of each method over the number of poses.
+//! Measures time and error of each method over the number of poses.
 
 use super::method::Method;
 use super::scene::{Noise, Scene};

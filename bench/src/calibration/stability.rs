@@ -1,4 +1,5 @@
-//! Failure modes of the methods: small rotations, few poses, outlier corners, outlier robot poses.
+//! Measures the failures of the methods with small rotations, few poses, outlier corners and
+//! outlier robot poses.
 
 use super::method::{Method, Outcome};
 use super::scene::{Noise, Scene};

@@ -48,7 +48,7 @@ impl<'a> Guide<'a> {
             detected: Vec::new(),
         };
         guide.show_coverage();
-        // The first advice appears before any image, so that it describes how to begin.
+        // The first advice appears before any image and describes how to begin.
         let advice = guide.advice();
         guide.shown.advise(&advice);
         guide
@@ -63,7 +63,8 @@ impl<'a> Guide<'a> {
     }
 
     fn detect(&mut self, images: &[CalibrationImage]) {
-        // There is one detection per image, so their number is the index of the first new image.
+        // There is one detection per image, so the number of detections is the index of the first
+        // new image.
         for image in &images[self.detected.len()..] {
             let detected = images::detect_in_image(image, self.target);
             let view = detected.board.as_ref().ok().map(|board| &board.view);
@@ -78,7 +79,8 @@ impl<'a> Guide<'a> {
                     self.show_coverage();
                     self.advice()
                 }
-                // The reason replaces the advice, while the target can still be moved.
+                // The reason why the target was not found replaces the advice, because the target
+                // can still be moved.
                 Err(reason) => format!("{}: {reason}", detected.name),
             };
             self.shown.advise(&text);
@@ -94,7 +96,8 @@ impl<'a> Guide<'a> {
         self.detected
     }
 
-    /// Shows what is covered. The pose of a camera does not depend on it.
+    /// Shows what the images cover, if a lens is calibrated. The calibration of the pose of a
+    /// camera does not depend on the coverage.
     fn show_coverage(&mut self) {
         if self.purpose == Purpose::Lens {
             self.shown.show_coverage(&self.coverage);

@@ -1,6 +1,6 @@
 //! Photographs of a target that are taken while a person moves the target, or an arm moves the
-//! camera. A photograph is taken when the target is still and sharp and adds to the coverage; the
-//! person sees what is missing, and it ends when everything is covered.
+//! camera. A photograph is taken if the target is still and sharp and adds to the coverage. The
+//! page shows what is missing. Photographs end when everything is covered.
 
 use crate::host::{Activity, CameraView, Host};
 use crate::images::{self, DetectedImage, NoBoard};
@@ -26,19 +26,21 @@ use targets::TargetSpec;
 /// instructions takes one to two minutes.
 const MAX_SECS: f64 = 600.0;
 /// Maximum motion of the corners while an image is read out, pixels. A rolling shutter distorts the
-/// target by as much.
+/// target by the same distance.
 const MAX_ROLLING_PX: f64 = 1.0;
 /// Readout time of cameras whose rig file has none, seconds. Rolling shutters of webcams take most
 /// of a frame period.
 const DEFAULT_READOUT_SECS: f64 = 0.03;
-/// Maximum time between two images whose motion is compared, in frame periods, and a minimum for
-/// cameras whose images are searched slowly.
+/// The motion between two images is computed if the time between them is at most this number of
+/// frame periods. The next constant is a lower limit of this time, for cameras whose images are
+/// searched slowly.
 const MAX_PERIODS: f64 = 2.5;
 const MIN_COMPARED_SECS: f64 = 0.5;
 /// Time for which a remark about an image stays, seconds. Remarks that alternate faster cannot be
 /// read.
 const REMARK_SECS: f64 = 1.0;
-/// Images without the target that are kept to explain why there are no photographs.
+/// Maximum number of images without the target that are kept to explain why there are no
+/// photographs.
 const MAX_FAILURES: usize = 5;
 
 /// Why an image was not taken as a photograph, although it shows the target.
@@ -64,8 +66,8 @@ struct Guide<'a> {
     target: &'a TargetSpec,
     coverage: LensCoverage,
     shown: Box<dyn CameraView>,
-    /// Whether the arm moves the camera. The images during its fast motions are not offered, so
-    /// that the motion between two images says nothing.
+    /// Whether the arm moves the camera. Images during fast motions of the arm are left out, so the
+    /// motion between the remaining images is not meaningful.
     is_carried: bool,
     readout_secs: f64,
     max_compared_secs: f64,
@@ -76,7 +78,7 @@ struct Guide<'a> {
     saved: Option<SavedImages>,
     /// The error of saving a photograph.
     save_error: Option<anyhow::Error>,
-    /// The text that is shown, and when its remark was made.
+    /// The text that is shown, and the time at which its remark was made.
     text: String,
     remarked_secs: f64,
 }
@@ -145,8 +147,8 @@ impl<'a> Guide<'a> {
         true
     }
 
-    /// Saves a photograph, if this was requested. After an error, no more photographs are saved, but
-    /// the lens is calibrated.
+    /// Saves a photograph, if this was requested. After an error, no more photographs are saved,
+    /// but the lens is calibrated.
     fn save(&mut self, image: &CalibrationImage) {
         if let Some(saved) = &mut self.saved
             && let Err(error) = saved.save(image.size_px, &image.gray)
@@ -157,7 +159,8 @@ impl<'a> Guide<'a> {
         }
     }
 
-    /// Why an image that shows the target is not taken; `None` if it is taken.
+    /// The reason why an image that shows the target is not taken as a photograph. `None` if it is
+    /// taken.
     fn remark(&self, image: &CalibrationImage, view: &BoardView) -> Option<Remark> {
         // An image that adds nothing needs no other remark, because the target has to be moved.
         if self.coverage.value_of(view).is_none() {
@@ -178,8 +181,8 @@ impl<'a> Guide<'a> {
         if !(0.0..=self.max_compared_secs).contains(&elapsed_secs) || elapsed_secs == 0.0 {
             return false;
         }
-        // With a global shutter, only the exposure blurs the image, which `is_sharp` detects. The
-        // minimum keeps a passing target from being taken for a still one.
+        // With a global shutter, only the exposure blurs the image, which `is_sharp` detects.
+        // Without the minimum, a moving target would be accepted as still.
         const MIN_EXPOSED_SECS: f64 = 0.005;
         let exposed_secs = self.readout_secs.max(MIN_EXPOSED_SECS);
         motion_px(before, view)
@@ -221,8 +224,7 @@ impl<'a> Guide<'a> {
         self.show_remark(secs, &reason.to_string());
     }
 
-    /// Shows a remark behind the instruction, but not in place of another remark that was made
-    /// just before.
+    /// Shows a remark after the instruction, unless another remark was made just before.
     fn show_remark(&mut self, secs: f64, remark: &str) {
         if secs - self.remarked_secs < REMARK_SECS {
             return;
@@ -243,8 +245,8 @@ impl<'a> Guide<'a> {
 }
 
 impl RigOptions {
-    /// Takes photographs with the devices of a rig until they cover what a lens needs. Returns
-    /// `None` if the input is not a rig file, or if the time was given.
+    /// Takes photographs with the devices of a rig until they cover what the calibration of a lens
+    /// needs. Returns `None` if the input is not a rig file, or if the user has set the duration.
     ///
     /// * `output`: gets the calibration that devices report.
     /// * `save`: folder for the photographs.
@@ -263,7 +265,8 @@ impl RigOptions {
         session::expect(input)?;
         let saved = save.map(SavedImages::create).transpose()?;
         let devices = self.open_for_lens(input)?;
-        // The calibration that a simulated camera reports is not that of the real camera.
+        // The calibration that a simulated camera reports is not the calibration of the real
+        // camera.
         if let Some(output) = output.filter(|_| !self.sim) {
             output.set_rig(&devices.rig);
         }
@@ -355,7 +358,8 @@ fn photographs<'a>(
     Ok((found, guide))
 }
 
-/// The photographs as a scan. Without any, it contains images that do not show the target.
+/// The photographs as a scan. Without photographs, the scan contains images that do not show the
+/// target.
 fn scan(
     rig: Rig,
     camera: Camera,
@@ -515,7 +519,7 @@ mod tests {
             "it moves"
         );
         assert!(guide.judge(&photograph(0.5, [0.0, 0.0, 0.6], tilt)));
-        // A pause in between: the images before it say nothing.
+        // The images before a pause are not compared with the images after it.
         let other = [0.0, -30.0, 0.0];
         assert!(!guide.judge(&photograph(9.0, center, other)));
         let blurred = blurred(&photograph(9.1, center, other));

@@ -182,7 +182,7 @@ fn check_readable(images: &[DetectedImage]) -> Result<(), BadInput> {
     Ok(())
 }
 
-/// A chessboard of another size than that of the target.
+/// A chessboard whose size differs from the size of the target.
 #[derive(Clone, Debug, PartialEq)]
 pub(crate) struct OtherSize {
     /// What the images show, and what to do.
@@ -191,7 +191,7 @@ pub(crate) struct OtherSize {
     pub(crate) prevails: bool,
 }
 
-/// The size of a board that several images show instead of that of the target.
+/// The board size that several images show instead of the size of the target.
 pub(crate) fn other_size<'a>(
     images: impl Iterator<Item = &'a DetectedImage>,
     target: &TargetSpec,

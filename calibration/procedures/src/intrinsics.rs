@@ -151,8 +151,8 @@ impl IntrinsicsTask {
             sizes_px.push(board.size_px);
         }
         let mut warnings = warnings;
-        // If more images show a board of the other size than of the target's size, `calibrate`
-        // fails with this text, so a warning is not needed.
+        // A warning is not needed if more images show the other size than the size of the target.
+        // In that case, `calibrate` fails with this text.
         if let Some(size) = other_size.as_ref().filter(|size| !size.prevails) {
             log::warn!("{}", size.text);
             warnings.push(size.text.clone());
@@ -267,8 +267,8 @@ impl IntrinsicsOutcome {
             )?;
             rig.write()?;
         }
-        // This error is returned last, so that the rig file is written even if the report could not be
-        // written.
+        // This error is returned last, so that the rig file is written even if the report could not
+        // be written.
         self.written
     }
 }

@@ -27,7 +27,7 @@ impl<'de> Visitor<'de> for UniqueVisitor {
     type Value = Value;
 
     fn expecting(&self, formatter: &mut Formatter<'_>) -> std::fmt::Result {
-        // Never shown, because values of all kinds are accepted.
+        // This text is never shown, because values of all kinds are accepted.
         formatter.write_str("a value")
     }
 

@@ -116,7 +116,8 @@ impl LensFile {
     }
 
     /// Covariance of [`Intrinsics::params`]. If only standard deviations are given, the parameters
-    /// count as independent, and parameters without a standard deviation count as exact.
+    /// are assumed to be independent, and parameters without a standard deviation are assumed to be
+    /// exact.
     pub(crate) fn covariance(
         &self,
         intrinsics: &Intrinsics,
@@ -162,7 +163,8 @@ impl LensFile {
     /// The intrinsics for images of the given size.
     pub(crate) fn intrinsics(&self, size_px: [u32; 2]) -> Result<Intrinsics, BadInput> {
         let [width, height] = size_px;
-        // Intrinsics are not scaled to another resolution, because cameras often crop instead.
+        // Intrinsics are not scaled to another resolution, because many cameras crop the image
+        // instead of scaling it.
         if let Some(own) = self.size_px.filter(|own| *own != size_px) {
             return Err(BadInput(format!(
                 "the intrinsics are for images of {}x{} pixels, but the images have {width}x{height}; calibrate this resolution",
@@ -260,14 +262,14 @@ fn list(values: &[f64]) -> String {
         .join(", ")
 }
 
-/// Names of focal lengths and principal point, and of the coefficients of both kinds of lenses in
-/// OpenCV's order.
+/// Names of focal lengths and principal point. The next constants are the names of the coefficients
+/// of both kinds of lenses in OpenCV's order.
 const PLANE_NAMES: [&str; 4] = ["fx", "fy", "cx", "cy"];
 const BROWN_CONRADY_NAMES: [&str; 8] = ["k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"];
 const KANNALA_BRANDT_NAMES: [&str; 4] = ["k1", "k2", "k3", "k4"];
 
 /// Names of the parameters of a lens model, in the order of [`Intrinsics::params`]. A lens may have
-/// only the first ones.
+/// only the first of these parameters.
 pub(crate) fn param_names(model: Option<&str>) -> Vec<&'static str> {
     let coefficients: &[&str] = if model == Some(KANNALA_BRANDT) {
         &KANNALA_BRANDT_NAMES

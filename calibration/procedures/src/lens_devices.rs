@@ -1,7 +1,7 @@
 //! The devices of a rig that the calibration of a lens needs.
 //!
-//! The lens of a camera can be calibrated before the rest of the robot is connected: only the
-//! camera is opened. The exception is a camera that an arm carries, because the images during fast
+//! Only the camera is opened, so its lens can be calibrated before the rest of the robot is
+//! connected. If an arm carries the camera, the arm is opened, too, because images during fast
 //! motions of the arm are not used.
 
 use capture::config::{ArmDriver, BaseDriver, Camera, Parent, Rig};
@@ -9,7 +9,7 @@ use capture::open::{self, Devices, Opened};
 
 /// Open devices, and the whole rig with the calibration that the camera reports.
 pub(crate) struct LensDevices {
-    /// The devices. In the rig of the devices, the arm has no driver if it is not used.
+    /// The devices. If the arm is not used, it has no driver in the rig of the devices.
     pub(crate) opened: Opened,
     pub(crate) rig: Rig,
 }
@@ -17,7 +17,7 @@ pub(crate) struct LensDevices {
 /// Opens a camera of a rig, and the arm if it carries the camera.
 ///
 /// # Errors
-/// If a device cannot be opened.
+/// Fails if a device cannot be opened.
 pub(crate) fn open(rig: Rig, camera: &str, devices: Devices) -> anyhow::Result<LensDevices> {
     let is_carried = is_carried(&rig, camera);
     // One simulation moves all devices.
@@ -43,7 +43,8 @@ pub(crate) fn open(rig: Rig, camera: &str, devices: Devices) -> anyhow::Result<L
             .iter()
             .find(|other| other.name == known.name);
         if let Some(reported) = reported {
-            // Everything but the parent, which `without_arm` may have changed, is as reported.
+            // Everything is copied from the reported camera except the parent, because
+            // `without_arm` may have changed the parent.
             *known = Camera {
                 parent: known.parent,
                 ..reported.clone()
@@ -62,7 +63,7 @@ fn is_carried(rig: &Rig, camera: &str) -> bool {
     is_on_flange && rig.arm.driver != ArmDriver::None
 }
 
-/// Lets the rig look as if it had neither an arm nor a moving base.
+/// Removes the arm and the motion of the base from the rig.
 fn without_arm(rig: &mut Rig) {
     rig.arm.driver = ArmDriver::None;
     rig.base.driver = BaseDriver::Fixed;

@@ -2,10 +2,10 @@
 //! a report and a rig file.
 //!
 //! A task holds the options of one procedure: [`IntrinsicsTask`] for the lens of a camera,
-//! [`HandEyeTask`] for its pose on a robot, [`SceneTask`] for the cameras of a rig without a
-//! target, and [`TimeOffsetTask`] for the clocks of two pose streams. Running a task returns an
-//! outcome, which contains the estimates and can write the rig file. If requested, the arm moves to
-//! the poses that determine the result best ([`MotionOptions`]).
+//! [`HandEyeTask`] for the pose of a camera on a robot, [`SceneTask`] for the cameras of a rig
+//! without a target, and [`TimeOffsetTask`] for the clocks of two pose streams. Running a task
+//! returns an outcome, which contains the estimates and can write the rig file. If requested, the
+//! arm moves to the poses that determine the result best ([`MotionOptions`]).
 //!
 //! The estimation itself is in the crate `calibration`, and the detection of targets is in
 //! `targets`. The program that runs a procedure implements [`Host`], which passes on stop requests

@@ -16,8 +16,8 @@ pub struct RigOptions {
     /// Name of the camera to calibrate in a recording or rig file. With images, it is the camera to
     /// change in the rig file for `write_rig`. `None` selects the only camera.
     pub camera: Option<String>,
-    /// With a recording, the rig file that replaces the one stored in it. With image files, the rig
-    /// file into which the result is written.
+    /// With a recording, this rig file replaces the rig file that is stored in the recording. With
+    /// image files, the result is written into this rig file.
     pub rig: Option<PathBuf>,
     /// The rig file to write, with the result.
     pub write_rig: Option<PathBuf>,
@@ -51,7 +51,7 @@ impl InputKind {
     }
 }
 
-/// Whether a path is that of a rig file.
+/// Whether a path leads to a rig file.
 pub(crate) fn is_rig_file(path: &Path) -> bool {
     path.extension()
         .is_some_and(|extension| extension == "toml")
@@ -144,7 +144,7 @@ impl RigOptions {
         }))
     }
 
-    /// The camera with the given name, or the only one.
+    /// The camera with the given name. If no name is given, the rig's only camera is returned.
     pub(crate) fn camera_of<'a>(&self, rig: &'a Rig) -> anyhow::Result<&'a Camera> {
         match (&self.camera, &rig.cameras[..]) {
             (Some(name), _) => corrected_rig::camera(rig, name),
@@ -181,7 +181,7 @@ impl RigOutput {
         self.rig = rig.clone();
     }
 
-    /// Adds offsets to those in the rig file.
+    /// Adds offsets to the offsets in the rig file.
     pub(crate) fn add_joint_offsets(&mut self, offsets: &[JointOffset]) {
         let arm = &mut self.rig.arm;
         // The rig file may have no offsets, or fewer than joints.
@@ -195,7 +195,7 @@ impl RigOutput {
         }
     }
 
-    /// Rejects images of another size than those of the camera.
+    /// Rejects images whose size differs from the size in the rig file.
     pub(crate) fn expect_size(&self, size_px: [u32; 2]) -> anyhow::Result<()> {
         corrected_rig::expect_size(corrected_rig::camera(&self.rig, &self.camera)?, size_px)
     }
@@ -232,13 +232,14 @@ impl RigOutput {
         Ok(())
     }
 
-    /// Warns if a pose was estimated with other intrinsics than those of the rig file.
+    /// Warns if a pose was estimated with intrinsics that differ from the intrinsics of the rig
+    /// file.
     pub(crate) fn warn_if_intrinsics_differ(&self, used: &Intrinsics) -> anyhow::Result<()> {
         const MAX_PX: f64 = 0.01;
         let given = &corrected_rig::camera(&self.rig, &self.camera)?.intrinsics;
         let pairs = given.params().into_iter().zip(used.params());
-        // Lens models differ in their number of parameters, and `zip` would compare only the first
-        // ones.
+        // Lens models differ in their number of parameters, and `zip` would ignore the additional
+        // parameters of the longer list.
         let differ = given.params().len() != used.params().len()
             || pairs.into_iter().any(|(a, b)| (a - b).abs() > MAX_PX);
         if differ {
@@ -265,8 +266,8 @@ fn parent_of(setup: Setup) -> Parent {
     }
 }
 
-/// A report to write: an HTML page with the result, its uncertainty and the errors of all samples.
-/// It is also written if the calibration is refused.
+/// A report to write. The report is an HTML page with the result, its uncertainty and the errors of
+/// all samples. It is also written if the calibration is refused.
 #[derive(Clone, Debug)]
 pub struct ReportOptions {
     /// The file, with the extension `.html`. An existing report is replaced.
@@ -313,8 +314,8 @@ impl ReportOptions {
         Ok(())
     }
 
-    /// The heading of the report on a result. `None` for errors other than a refusal, because no
-    /// report is written for such errors.
+    /// The heading of the report on a result. `None` for errors other than a refusal, because these
+    /// errors have no report.
     pub(crate) fn heading<T>(
         &self,
         input: &Path,
@@ -327,7 +328,7 @@ impl ReportOptions {
             Err(error) if session::class(error) == ErrorClass::InsufficientData => {
                 let text = format!("{error:#}");
                 Some(
-                    // The heading already says that the calibration was refused.
+                    // The heading already states that the calibration was refused.
                     text.strip_prefix("calibration refused: ")
                         .map_or(text.clone(), str::to_owned),
                 )

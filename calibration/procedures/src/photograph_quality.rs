@@ -4,9 +4,10 @@ use calibration::BoardView;
 use numbers::quantile::median;
 use std::collections::HashMap;
 
-/// Half the side of the square around a corner in which its edges are measured, pixels. It is larger
-/// than the widest accepted edge: around a corner whose edges are wider than the square, the image gradients
-/// and the contrast shrink together.
+/// Half the side of the square around a corner in which its edges are measured, pixels. The square
+/// is larger than the widest accepted edge. If the edges were wider than the square, the image
+/// gradients and the contrast inside it would both be smaller, and the computed width would be too
+/// small.
 const WINDOW_PX: i64 = 8;
 /// Corners with a smaller difference between ink and paper are not measured, gray levels.
 const MIN_CONTRAST: f64 = 24.0;
@@ -14,10 +15,11 @@ const MIN_CONTRAST: f64 = 24.0;
 const MIN_CORNERS: usize = 4;
 /// Maximum width of edges, pixels. The corners of wider edges are detected less accurately.
 const MAX_EDGE_PX: f64 = 6.0;
-/// The same as a fraction of the width of the image. Cameras with many pixels are not sharper.
+/// Maximum width of edges as a fraction of the width of the image. It is needed because the images
+/// of cameras with many pixels are not sharper.
 const MAX_EDGE_FRAC: f64 = 0.005;
 
-/// Whether the edges of a target are sharp. A target whose edges cannot be measured is not.
+/// Whether the edges of a target are sharp. Returns `false` if the edges cannot be measured.
 ///
 /// * `gray`: gray values, row by row.
 pub(crate) fn is_sharp(size_px: [u32; 2], gray: &[u8], view: &BoardView) -> bool {
@@ -25,9 +27,10 @@ pub(crate) fn is_sharp(size_px: [u32; 2], gray: &[u8], view: &BoardView) -> bool
     edge_width_px(size_px, gray, view).is_some_and(|width_px| width_px <= max_px)
 }
 
-/// Width of the edges at the corners of a target, pixels: the difference between ink and paper
-/// divided by the largest image gradient, median over the corners. It is 2 for a perfect step, because a
-/// central difference spans two pixels, and 2.5 times the standard deviation of a large blur.
+/// Width of the edges at the corners of a target, pixels. The width at a corner is the difference
+/// between ink and paper divided by the largest image gradient, and the result is the median over
+/// the corners. For a perfect step, the width is 2, because a central difference spans two pixels.
+/// For a large blur, it is 2.5 times the standard deviation of the blur.
 fn edge_width_px(size_px: [u32; 2], gray: &[u8], view: &BoardView) -> Option<f64> {
     let widths: Vec<f64> = view
         .points
@@ -37,7 +40,7 @@ fn edge_width_px(size_px: [u32; 2], gray: &[u8], view: &BoardView) -> Option<f64
     (widths.len() >= MIN_CORNERS).then(|| median(&widths))?
 }
 
-/// The same at one corner. `None` at the border of the image, or without contrast.
+/// Width of the edges at one corner. `None` at the border of the image, or without contrast.
 fn edge_width_at(size_px: [u32; 2], gray: &[u8], [x, y]: [f64; 2]) -> Option<f64> {
     let [width, height] = size_px.map(i64::from);
     #[expect(
@@ -70,11 +73,11 @@ fn edge_width_at(size_px: [u32; 2], gray: &[u8], [x, y]: [f64; 2]) -> Option<f64
     (contrast >= MIN_CONTRAST && steepest > 0.0).then(|| contrast / steepest)
 }
 
-/// Distance by which the corners have moved between two photographs, median, pixels. `None` if they
-/// share fewer than four corners.
+/// Median distance by which the corners have moved between two photographs, pixels. `None` if the
+/// photographs share fewer than four corners.
 pub(crate) fn motion_px(earlier: &BoardView, later: &BoardView) -> Option<f64> {
-    // Positions in the frame of the board are the same bits in all photographs, and identify the
-    // corner.
+    // The position of a corner in the frame of the board has exactly the same bits in all
+    // photographs. It therefore identifies the corner.
     let key = |point: &calibration::BoardPoint| {
         [0, 1, 2].map(|axis| point.point_in_board[axis].to_bits())
     };
@@ -112,7 +115,7 @@ mod tests {
             let sum: f64 = (0..n)
                 .map(|ix| {
                     let quantile = (f64::from(ix) + 0.5) / f64::from(n);
-                    // The logistic distribution approximates the normal one.
+                    // The logistic distribution approximates the normal distribution.
                     let offset = sigma_px * (quantile / (1.0 - quantile)).ln() / 1.7;
                     ((at + offset) / SQUARE_PX).floor().rem_euclid(2.0) * 2.0 - 1.0
                 })

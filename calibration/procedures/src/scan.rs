@@ -24,8 +24,8 @@ use std::ops::ControlFlow;
 use std::path::Path;
 use targets::TargetSpec;
 
-/// Time for which devices are read if no flag limits it, seconds. It is enough for about twenty
-/// poses of an arm or target that is moved by hand.
+/// Time for which devices are read if no flag limits it, seconds. This time is sufficient for about
+/// twenty poses of an arm or target that is moved by hand.
 const DEFAULT_SECS: f64 = 30.0;
 /// Maximum predicted image motion, pixels. The motion is predicted over the readout time, the
 /// exposure time and the uncertainty of the stamp. Corners are corrected for the motion during the
@@ -353,8 +353,9 @@ impl Scan {
             .map_or(Ok(()), |reason| Err(InsufficientData(reason)))
     }
 
-    /// Converts an estimated pose of the camera, relative to the flange or base, to the
-    /// `parent_from_camera` of the rig file, where the parent may also be the world.
+    /// Converts an estimated pose of the camera to the `parent_from_camera` of the rig file. The
+    /// estimated pose is relative to the flange or base. In the rig file, the parent may also be
+    /// the world.
     pub(crate) fn rig_pose(&self, parent_from_camera: &Transform) -> Transform {
         corrected_rig::parent_from_camera(&self.rig.base, self.camera.parent, parent_from_camera)
     }
@@ -383,8 +384,8 @@ impl Scan {
     }
 
     /// Samples for hand-eye calibration. Also returns the images in which no target was found, with
-    /// the reasons. `parent_from_camera` is the pose of the camera, if a better one than that of
-    /// the rig file is known.
+    /// the reasons. `parent_from_camera` is the pose of the camera, if it is known better than in
+    /// the rig file.
     pub(crate) fn samples(
         &self,
         parent_from_camera: Option<&Transform>,

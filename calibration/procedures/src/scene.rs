@@ -14,7 +14,7 @@ use session::{
 use std::collections::BTreeMap;
 use std::path::PathBuf;
 
-/// Time for which devices are read if no flag limits it, seconds.
+/// Time for which devices are read if no flag limits this time, seconds.
 const DEFAULT_SECS: f64 = 30.0;
 
 /// Input and options of a calibration from a scene.
@@ -24,7 +24,8 @@ pub struct SceneTask {
     pub input: PathBuf,
     /// The list of the keyframes to use. This requires a recording or a folder as input.
     pub keyframes: Option<PathBuf>,
-    /// The rig file to read a recording with, instead of the one stored in it.
+    /// The rig file for reading a recording. It replaces the rig file that is stored in the
+    /// recording.
     pub rig: Option<PathBuf>,
     /// What to estimate.
     pub params: Vec<Refine>,
@@ -60,7 +61,8 @@ impl SceneTask {
     /// Fails if the options contradict each other, or if the data cannot be read or are not
     /// sufficient.
     pub fn run(&self, host: &dyn Host) -> anyhow::Result<SceneOutcome> {
-        // `auto` chooses the parameters itself, so a list contradicts it.
+        // With `auto`, the calibration chooses the parameters, so `auto` cannot be combined with a
+        // list.
         if self.params.len() > 1 && self.params.contains(&Refine::Auto) {
             return Err(BadInput(format!(
                 "{}: auto cannot be combined with other values",
@@ -68,10 +70,11 @@ impl SceneTask {
             ))
             .into());
         }
-        // The paths are checked first, so that a wrong path does not cost a calibration.
+        // The paths are checked first, because a wrong path would otherwise fail only after the
+        // long calibration.
         self.report.as_ref().map_or(Ok(()), ReportOptions::check)?;
         let given = self.rig_as_given()?;
-        // Checked before data is read, which may take long.
+        // The rig file is checked before data is read, because reading may take long.
         if let Some(file) = &self.write_rig {
             let Some(rig) = &given else {
                 let input = self.input.display();
@@ -133,7 +136,7 @@ impl SceneTask {
             });
             heading
                 .warnings
-                // If all cameras are refused, the heading has the reasons already.
+                // If all cameras are refused, the heading already contains the reasons.
                 .extend(kept.filter(|_| heading.refused.is_none()));
         }
         let mut n_images: BTreeMap<String, usize> = BTreeMap::new();

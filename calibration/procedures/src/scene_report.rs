@@ -80,7 +80,8 @@ impl SceneReport<'_> {
         figures
     }
 
-    /// Adds the tables of corrections and of the trials that have decided about them.
+    /// Adds the tables of corrections, and of the trials by which corrections were accepted or
+    /// rejected.
     fn add_corrections(&self, page: &mut Page, calibration: &SceneCalibration) {
         let alignment = &calibration.alignment;
         let corrections: Vec<Vec<String>> = alignment
@@ -184,8 +185,9 @@ impl SceneReport<'_> {
         both.collect()
     }
 
-    /// Standard deviations of the camera poses, along and about the axes of the camera. They are
-    /// relative to the parents of the cameras and between cameras.
+    /// Standard deviations of the camera poses, along and about the axes of the camera. The table
+    /// lists the poses of the cameras relative to their parents, and then the poses of the cameras
+    /// relative to each other.
     fn sigmas(&self, calibration: &SceneCalibration) -> Vec<Vec<String>> {
         let mut rows = Vec::new();
         for (name, _) in self.n_images {

@@ -13,7 +13,8 @@ use std::path::{Path, PathBuf};
 /// Input and options of the estimation of a time offset.
 #[derive(Clone, Debug)]
 pub struct TimeOffsetTask {
-    /// Poses of the first body as rows t,x,y,z,qx,qy,qz,qw (seconds, meters).
+    /// File with the poses of the first body. Its rows are t,x,y,z,qx,qy,qz,qw in seconds and
+    /// meters.
     pub a: PathBuf,
     /// Poses of the second body, which is rigidly attached to the first.
     pub b: PathBuf,
@@ -25,7 +26,7 @@ pub struct TimeOffsetTask {
 
 /// The outcome of an estimation.
 pub struct TimeOffsetOutcome {
-    /// The result, or the reason why there is none.
+    /// The result, or the reason why there is no result.
     pub result: anyhow::Result<TimeOffset>,
     /// The result of writing the report.
     pub written: anyhow::Result<()>,
@@ -46,7 +47,7 @@ impl TimeOffsetTask {
         let written = match &self.report {
             Some(report) => self.write_report(
                 report,
-                // A report without the profile is better than none.
+                // A report without the profile is better than no report.
                 motion_profile(&a, &b, &self.options).ok().as_ref(),
                 &result,
             ),
@@ -91,7 +92,7 @@ fn read(path: &Path) -> anyhow::Result<Vec<PoseSample>> {
             .split([',', ' ', ';', '\t'])
             .filter(|field| !field.is_empty())
             .map(str::parse::<f64>);
-        // Any line that is not all numbers counts as a comment or header.
+        // A line that contains anything but numbers counts as a comment or header.
         let Ok(numbers) = parsed.collect::<Result<Vec<f64>, _>>() else {
             continue;
         };

@@ -23,8 +23,8 @@ pub(crate) struct Solution {
 }
 
 impl Solution {
-    /// The solution after a rotation and a translation of `x` in camera axes (6 values), and of `y`
-    /// in board axes.
+    /// The solution after a motion of `x` in camera axes and a motion of `y` in board axes. Each
+    /// motion is a rotation and a translation, and has 6 values.
     pub(crate) fn moved(&self, step: &[f64]) -> Self {
         Self {
             x: self.x * motion(&step[..6]),
@@ -154,8 +154,8 @@ pub(crate) fn nearest_rotation(correlation: &Matrix3<f64>) -> Option<UnitQuatern
     }
     let u = svd.u?;
     let v_t = svd.v_t?;
-    // If the product of the two orthogonal matrices is a reflection, the direction with the
-    // smallest singular value is flipped, because this reduces the trace least.
+    // The product of the two orthogonal matrices may be a reflection. In this case, the direction
+    // with the smallest singular value is flipped, because this reduces the trace least.
     let mirror = Matrix3::from_diagonal(&Vector3::new(1.0, 1.0, (u * v_t).determinant().signum()));
     Some(UnitQuaternion::from_rotation_matrix(
         &Rotation3::from_matrix_unchecked(u * mirror * v_t),

@@ -1,12 +1,13 @@
 //! Hand-eye calibration with a target: pose of a camera on the flange or beside the robot.
 //!
-//! [`calibrate_hand_eye`] takes robot poses. For each robot pose, it takes the pose of a board in
-//! the camera or the corners of the board in the image. Closed-form solutions of sample triples
-//! give an initial solution that most samples agree with. The solution is then refined. With board
-//! poses, it is refined by generalized least squares. The noise variances are estimated by
-//! restricted maximum likelihood. With corners, the reprojection error is minimized. Each robot
-//! pose may have a small unknown error. The result has an uncertainty and the errors of held-out
-//! samples. Input that does not determine the result is refused.
+//! [`calibrate_hand_eye`] takes robot poses. A sample combines a robot pose with the pose of a
+//! board in the camera, or with the corners of the board in the image. Closed-form solutions of
+//! three samples each give an initial solution that most samples agree with. This solution is then
+//! refined. With board poses, the refinement is a generalized least squares fit whose noise
+//! variances are estimated by restricted maximum likelihood. With corners, the refinement minimizes
+//! the reprojection error. Each robot pose may have a small unknown error. The result has an
+//! uncertainty and the errors of held-out samples. Input that does not determine the result is
+//! refused.
 
 mod checks;
 mod geometry;
@@ -76,12 +77,12 @@ pub struct HandEyeInput<'a> {
     /// initial values.
     pub intrinsics: Option<Intrinsics>,
     /// Covariance of the given intrinsics in the order of [`Intrinsics::params`]. It enlarges the
-    /// covariance of the result. With `None`, the intrinsics count as exact. The covariance is not
-    /// used if the intrinsics are estimated.
+    /// covariance of the result. If it is `None`, the intrinsics are assumed to be exact. The
+    /// covariance is not used if the intrinsics are estimated.
     pub intrinsics_covariance: Option<DMatrix<f64>>,
     /// Rotations `board_from_equivalent_board` after which the board looks the same. An example is
-    /// a half turn about the center of a chessboard whose numbers of inner corners are both even or
-    /// both odd. Empty if the orientation is unique.
+    /// a rotation by 180 degrees about the center of a chessboard whose two numbers of inner
+    /// corners are both even or both odd. The list is empty if the orientation is unique.
     pub board_symmetries: &'a [Transform],
     /// The arm, for joint offsets.
     pub chain: Option<&'a Chain>,
@@ -97,7 +98,7 @@ pub struct HandEyeOptions {
     /// Estimates offsets of the joints except the first and the last. This needs corners, joint
     /// values and a chain.
     pub estimate_joint_offsets: bool,
-    /// Whether the second pose of each sample is the pose of a board that a camera sees. Such a
+    /// Whether the second pose of each sample is the pose of a board that a camera sees. If so, the
     /// board must be in front of the camera.
     pub board_is_seen: bool,
     /// Maximum standard deviation of the position along any direction, meters. A less certain
@@ -126,9 +127,10 @@ pub const MIN_SAMPLES: usize = 3;
 /// Estimates the pose of the camera on the flange (eye in hand) or in the base (eye to hand). Also
 /// estimates the pose of the board.
 ///
-/// # Errors Returns [`Error::Refused`] if the samples do not determine the result or contain a
-/// mistake. The message names the reason and the remedy. Returns [`Error::HandEyeInput`] if the
-/// input is invalid.
+/// # Errors
+/// Returns [`Error::Refused`] if the samples do not determine the result or contain a mistake. The
+/// message names the reason and the remedy. Returns [`Error::HandEyeInput`] if the input is
+/// invalid.
 ///
 /// ```
 /// use calibration::hand_eye::{BoardObservation, HandEyeInput, HandEyeOptions, HandEyeSample, Setup, calibrate_hand_eye};

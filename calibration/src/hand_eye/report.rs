@@ -38,7 +38,7 @@ pub struct HandEyeCalibration {
     /// RMS length of the reprojection error of the used corners, pixels. The robot poses are taken
     /// as exact.
     pub rms_px: Option<f64>,
-    /// The same for held-out samples.
+    /// RMS length of the reprojection error of held-out samples, pixels.
     pub held_out_rms_px: Option<f64>,
     /// Estimated measurement errors.
     pub noise: HandEyeNoise,
@@ -96,7 +96,7 @@ pub struct SampleReport {
     /// RMS reprojection error, pixels.
     pub rms_px: Option<f64>,
     /// Origin of the board according to this sample minus the origin according to the result,
-    /// millimeters. The axes are those of the base (eye in hand) or the flange (eye to hand).
+    /// millimeters. It is along the axes of the base (eye in hand) or the flange (eye to hand).
     pub board_offset_mm: Option<[f64; 3]>,
     /// Corners without outliers, with their reprojection errors. Empty for given poses.
     pub points: Vec<PointFit>,
@@ -109,7 +109,7 @@ const MAX_JOINT_SIGMA: f64 = 0.0175;
 
 /// Evaluates a refined solution.
 ///
-/// * `repeated`: indices of the samples that are identical to an earlier one. They are not used.
+/// * `repeated`: indices of the samples that are identical to an earlier sample. They are not used.
 pub(super) fn report(
     input: &HandEyeInput<'_>,
     refined: &Refined,
@@ -134,7 +134,8 @@ pub(super) fn report(
     }
     let rms_px = rms_px(input, refined, |_| Some(refined.solution));
     let mut warnings = problems(input, refined, &samples);
-    // If the intrinsics contradict the corners, that is the more precise explanation.
+    // If the intrinsics contradict the corners, the warning about the intrinsics is the more
+    // precise explanation.
     if refined.intrinsics_doubt.is_none() {
         warnings.extend(large_errors(&refined.noise, scatter, rms_px));
     }
@@ -169,7 +170,7 @@ fn position_first(covariance: &Matrix6<f64>) -> Matrix6<f64> {
 /// Scatter and RMS reprojection error of held-out samples.
 fn held_out_errors(input: &HandEyeInput<'_>, refined: &Refined) -> (Option<Scatter>, Option<f64>) {
     let measurements = solve::measurements(&refined.samples);
-    // With corners, the weights were chosen by held-out errors.
+    // With corners, the weights were selected by their errors on held-out samples.
     let knows_noise = refined.noise.corner_px.is_some();
     let folds = solve::held_out_solutions(
         input.setup,
@@ -324,9 +325,10 @@ fn problems(input: &HandEyeInput<'_>, refined: &Refined, reports: &[SampleReport
     warnings
 }
 
-/// Names of the samples that show the board from the other side than most samples, so that its
-/// corners are mirrored. If only a few samples are mirrored, the detection has swapped corners. If
-/// most samples show the back of the board, the points of the board are defined that way.
+/// Names of the samples that show the other side of the board than most samples. The corners of
+/// these samples are mirrored. If only a few samples are mirrored, the detection has swapped
+/// corners. If most samples show the back of the board, the points of the board are defined that
+/// way.
 fn mirrored<'a>(input: &'a HandEyeInput<'_>, refined: &Refined) -> Vec<&'a str> {
     // The board's z axis points away from a viewer of the printed side.
     let is_front = |sample: &Sample| {
@@ -351,7 +353,8 @@ const MAX_SCATTER: Scatter = Scatter { mm: 5.0, deg: 0.5 };
 /// lens, the residual is at most a few tenths of a pixel.
 const MAX_RESIDUAL_PX: f64 = 0.7;
 
-/// A sentence on the likely cause if the errors are larger than those of usual arms and cameras.
+/// A sentence on the likely cause, if the errors are larger than the errors of usual arms and
+/// cameras.
 ///
 /// If each single image fits the board, the lens and the board are right. In that case, the robot
 /// poses do not belong to the images.
@@ -365,7 +368,8 @@ fn large_errors(noise: &HandEyeNoise, scatter: Scatter, rms_px: Option<f64>) -> 
         "the errors are large ({reprojection}{:.1} mm and {:.2} degrees; errors are usually at most {MAX_RMS_PX} px, {} mm and {} degrees)",
         scatter.mm, scatter.deg, MAX_SCATTER.mm, MAX_SCATTER.deg
     );
-    // Checks of everything between a robot pose and its image, the most common mistakes first.
+    // The checks cover everything between a robot pose and its image. The most common mistakes come
+    // first.
     let robot = "check that the arm stood still in each image, that each pose belongs to its image (time offset), that the flange or tool frame is the same in all poses, and that the target and the camera did not move";
     Some(match noise.residual_px {
         Some(residual_px) if residual_px > MAX_RESIDUAL_PX => format!(

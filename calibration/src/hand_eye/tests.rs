@@ -1,5 +1,5 @@
-//! Hand-eye calibration of simulated robots with a known truth: accuracy, stated uncertainty,
-//! ambiguities, mistakes and refusals.
+//! Hand-eye calibration of simulated robots with a known truth. The tests check accuracy, stated
+//! uncertainty, ambiguities, mistakes and refusals.
 
 use super::geometry::{Solution, stacked};
 use super::*;
@@ -156,7 +156,7 @@ impl Scene {
                 let mut vector = |scale: f64| {
                     Vector3::new(random.normal(), random.normal(), random.normal()) * scale
                 };
-                // The center of the board stays near the optical axis; the tilt stays below 60
+                // The center of the board stays near the optical axis, and the tilt stays below 60
                 // degrees.
                 let mut turn = vector(spread_rad);
                 turn.x = turn.x.clamp(-1.0, 1.0);
@@ -637,7 +637,7 @@ fn degenerate_samples_are_refused() {
 
 #[test]
 fn next_poses_shrink_the_uncertainty() {
-    // Rotations about the z axis are ten times those about x and y.
+    // Rotations about the z axis are ten times as large as rotations about x and y.
     let mut scene = Scene::new(Setup::EyeInHand, 8, 0.15, 10);
     let errors = Errors::robot(0.2, 2e-4);
     let input = scene.input(scene.views(&errors, 3));
@@ -663,7 +663,7 @@ fn next_poses_shrink_the_uncertainty() {
     }
 }
 
-/// Every combination is accurate within its stated uncertainty, or refused.
+/// Every combination is either accurate within its stated uncertainty, or refused.
 #[test]
 fn small_rotations_few_poses_and_wrong_samples_are_accurate_or_refused() {
     let errors = Errors::robot(0.2, 3e-4);

@@ -16,15 +16,15 @@ pub struct BoardPose {
 
 /// Estimates the pose of a flat target by minimizing the reprojection error.
 ///
-/// The initial value is the pose of a homography. If the normal of a flat target is mirrored at the
-/// line of sight, the target looks almost the same from far away or at a small angle. The
+/// The initial value is the pose of a homography. A second pose, whose normal is mirrored at the
+/// line of sight, looks almost the same if the target is far away or its tilt is small. The
 /// minimization therefore also starts from the mirrored pose, and the better minimum is returned.
 ///
 /// * `points`: at least four points that are not on a line, with the same z coordinate in the frame
 ///   of the target.
 ///
-/// Returns `None` if the points do not determine a pose, or if the lens cannot image the target
-/// there.
+/// Returns `None` if the points do not determine a pose, or if the lens cannot image the target at
+/// this pose.
 pub fn board_pose(intrinsics: &Intrinsics, points: &[BoardPoint]) -> Option<BoardPose> {
     let first = refine(intrinsics, points, initial_pose(intrinsics, points)?)?;
     let mirrored = refine(
@@ -41,9 +41,11 @@ pub fn board_pose(intrinsics: &Intrinsics, points: &[BoardPoint]) -> Option<Boar
 
 /// The pose of the homography from the target to the plane `z = 1`.
 pub(super) fn initial_pose(intrinsics: &Intrinsics, points: &[BoardPoint]) -> Option<Transform> {
-    /// 68 degrees from the optical axis.
+    /// Maximum distance of a point from the optical axis in the plane `z = 1`. It corresponds to an
+    /// angle of 68 degrees from the axis.
     const MAX_RADIUS: f64 = 2.5;
-    /// Twice the minimum of a homography, so that a few wrong points do not spoil the initial pose.
+    /// A homography needs at least four points. Twice this number is required, so that a few wrong
+    /// points do not spoil the initial pose.
     const MIN_ACCURATE: usize = 8;
     // Points beyond the lens model are left out.
     let mut pairs = Vec::with_capacity(points.len());
@@ -129,7 +131,8 @@ pub(super) fn refine(
     initial: Transform,
 ) -> Option<BoardPose> {
     const MAX_STEPS: usize = 30;
-    // Of the squared error.
+    // The iteration ends when the decrease of the squared error is at most this fraction of the
+    // squared error.
     const CONVERGED: f64 = 1e-9;
     let mut at = NormalEquations::new(intrinsics, points, &initial)?;
     let mut pose = initial;
@@ -153,7 +156,7 @@ pub(super) fn refine(
                     break;
                 }
             }
-            // Steps as short as this one change nothing. The pose is at a minimum.
+            // A step that is so strongly damped changes nothing, so the pose is at a minimum.
             None if damping > 1e6 => break,
             None => damping *= 10.0,
         }

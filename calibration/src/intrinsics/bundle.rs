@@ -52,7 +52,8 @@ impl Bundle {
 /// * `images`: points of each image, in the order of the poses.
 /// * `tolerance`: see [`Options::tolerance`].
 ///
-/// # Errors Fails as [`least_squares::minimize`] does.
+/// # Errors
+/// Fails as [`least_squares::minimize`] does.
 pub(super) fn refine(
     images: &[&[BoardPoint]],
     start: Bundle,
@@ -74,7 +75,8 @@ pub(super) fn refine(
     least_squares::minimize(&problem, start, &options)
 }
 
-/// One block per image, whose local parameters are the pose of the target.
+/// The least-squares problem. Each image is one block, whose local parameters are the pose of the
+/// target.
 struct Reprojection<'a> {
     images: &'a [&'a [BoardPoint]],
     /// Indices of the estimated parameters in [`Intrinsics::params`].
@@ -165,7 +167,7 @@ mod tests {
                 Vector3::new(0.4, -0.3, 0.6),
             );
             let mut points = observe(&camera, &pose, &board());
-            // Residuals of some pixels, so that the gradient is not zero.
+            // The residuals are a few pixels, so that the gradient is not zero.
             points
                 .iter_mut()
                 .enumerate()

@@ -176,7 +176,7 @@ pub(super) fn check_observable(fit: &Fit<Bundle>) -> Result<(), Error> {
     });
     let max_tilt_deg = max_tilt_deg.fold(0.0, f64::max);
     for (axis, focal_px) in intrinsics.focal_px.into_iter().enumerate() {
-        // Written so that NaN is refused.
+        // The condition is written so that NaN is refused.
         let sigma_frac = fit.sigma(axis) / focal_px.abs();
         if !(sigma_frac < MAX_SIGMA_FRAC && FOCAL_FRACS.contains(&(focal_px / side_px))) {
             return Err(Error::FocalLengthUnobservable {
@@ -185,7 +185,8 @@ pub(super) fn check_observable(fit: &Fit<Bundle>) -> Result<(), Error> {
             });
         }
         let sigma_px = fit.sigma(2 + axis);
-        // A shift of the principal point of a long lens is almost a rotation of the camera.
+        // For a long focal length, a change of the principal point has almost the same effect as a
+        // rotation of the camera.
         if sigma_px.is_nan() || sigma_px >= MAX_SIGMA_FRAC * side_px.max(focal_px) {
             return Err(Error::PrincipalPointUnobservable {
                 sigma_px: format!("{:.0}", sigma_px.min(side_px)),

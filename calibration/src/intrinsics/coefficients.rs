@@ -3,7 +3,8 @@
 use kinematics::{Intrinsics, Lens};
 use nalgebra::DVector;
 
-/// A lens model and those of its coefficients that are estimated. The other coefficients are zero.
+/// A lens model and the set of its coefficients that are estimated. The other coefficients are
+/// zero.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) struct Coefficients {
     pub(super) family: Family,
@@ -39,8 +40,8 @@ impl Coefficients {
         }
     }
 
-    /// The rational model with all radial coefficients. It has the tangential coefficients if this
-    /// set has them.
+    /// The rational model with all radial coefficients. The tangential coefficients are estimated
+    /// if this set contains them.
     pub(super) fn rational(self) -> Self {
         let [_, _, p1, p2, ..] = self.is_estimated;
         Self {

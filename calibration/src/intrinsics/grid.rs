@@ -76,9 +76,9 @@ fn sigma_px(derivatives: &DMatrix<f64>, covariance: &DMatrix<f64>) -> f64 {
 /// Derivatives of the projection of distant points with respect to the intrinsics, at the centers
 /// of the cells.
 ///
-/// A change of the intrinsics and a rotation of the camera frame have similar effects, and the
-/// poses of the target absorb such a rotation. Each change is therefore compensated by the rotation
-/// that minimizes the sum of the squared displacements over the grid.
+/// A change of the intrinsics has a similar effect as a rotation of the camera frame, and the poses
+/// of the target absorb such a rotation. Each change is therefore compensated by the rotation that
+/// minimizes the sum of the squared displacements over the grid.
 #[derive(Clone, Debug)]
 pub(super) struct ProjectionDerivatives {
     /// One matrix per cell, `[2, n_params]`, pixels. `None` where the lens model ends.
@@ -165,8 +165,9 @@ impl ProjectionDerivatives {
     }
 }
 
-/// Displacement between two calibrations of the projections of distant points, after the best
-/// rotation of the camera frame, pixels. `None` where one of the lens models ends.
+/// Distances between the projections of distant points by two calibrations, pixels. The camera
+/// frame of one calibration is first rotated such that these distances are smallest. `None` where
+/// one of the lens models ends.
 #[cfg(test)]
 pub(super) fn displacements_px(
     from: &Intrinsics,
@@ -267,8 +268,8 @@ mod tests {
 
     #[test]
     fn linear_displacements_match_the_difference_of_two_cameras() {
-        // Displacements are up to 0.2 px; the changes of the parameters, and with them the
-        // second-order terms, are about 1e-3.
+        // Displacements are up to 0.2 px. The changes of the parameters are about 1e-3, so the
+        // relative errors due to second-order terms are also about 1e-3.
         const CLOSE_PX: f64 = 1e-3;
         let camera = brown_conrady_camera();
         let params: Vec<usize> = (0..9).collect();
@@ -296,7 +297,8 @@ mod tests {
 
     #[test]
     fn rotations_of_the_camera_are_not_uncertainty() {
-        // A shift of the principal point by 1 px is almost a rotation for a long focal length.
+        // For a long focal length, moving the principal point by 1 px has almost the same effect as
+        // a rotation.
         let camera = Intrinsics {
             focal_px: [6000.0; 2],
             lens: kinematics::Lens::Pinhole,

@@ -65,7 +65,7 @@ struct Normalization {
     scale: f64,
 }
 
-/// `None` if all points are the same, or one is not finite.
+/// `None` if all points are the same, or if a point is not finite.
 fn normalization(points: impl Iterator<Item = Vector2<f64>> + Clone) -> Option<Normalization> {
     let n = points.clone().count() as f64;
     let mean = points.clone().sum::<Vector2<f64>>() / n;
@@ -115,7 +115,8 @@ impl Normalization {
 /// The pose `camera_from_plane` of the plane z = 0 from its homography to the plane `z = 1` of the
 /// camera.
 ///
-/// Source: Zhang 2000, section 3.1. The rotation is the one nearest to the matrix (appendix C).
+/// Source: Zhang 2000, section 3.1. The result is the rotation that is nearest to the matrix
+/// (appendix C).
 pub(super) fn pose(homography: &Matrix3<f64>) -> Option<Transform> {
     // The first two columns are the columns of the rotation, up to the scale. With noise, their
     // lengths differ a little.

@@ -68,7 +68,7 @@ fn rms_px(intrinsics: &Intrinsics, pose: Transform, points: &[BoardPoint]) -> f6
 /// Zhang's closed form, the closed form with the principal point at the center of the image, and a
 /// scan over focal lengths.
 ///
-/// Returns `None` if fewer than half of the images have a homography that fits one of them.
+/// Returns `None` if none of these results has poses for at least half of the images.
 pub(super) fn pinhole(images: &[&[BoardPoint]], size_px: [u32; 2]) -> Option<Start> {
     let homographies: Vec<Option<Matrix3<f64>>> = images
         .iter()
@@ -141,8 +141,8 @@ fn pixel_from_plane(points: &[BoardPoint]) -> Option<Matrix3<f64>> {
     homography(&pairs)
 }
 
-/// A homography to pixels, moved to the center of the image and divided by its longer side, with
-/// columns of about unit length.
+/// Converts a homography to pixels into coordinates with the origin at the center of the image and
+/// the longer side as unit. Its columns are scaled to about unit length.
 fn centered(homography: &Matrix3<f64>, size_px: [u32; 2]) -> Matrix3<f64> {
     let (center, side) = frame(size_px);
     let normalize = Matrix3::new(
@@ -213,7 +213,7 @@ fn zhang(homographies: &[Matrix3<f64>]) -> Option<Plane> {
             normal_matrix += row * row.transpose();
         }
     }
-    // One more row per image sets the second element to zero, which excludes skew.
+    // Each image gets one more row, which sets the second element to zero and thus excludes skew.
     normal_matrix[(1, 1)] += homographies.len() as f64;
     let eigen = normal_matrix.symmetric_eigen();
     let b = eigen.eigenvectors.column(eigen.eigenvalues.imin());

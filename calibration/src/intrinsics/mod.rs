@@ -1,8 +1,8 @@
 //! Calibration of focal length, principal point and lens of one camera from images of a flat
 //! target.
 //!
-//! Sources: Zhang 2000 for the approach; OpenCV for the lens models; mrcal for the projection
-//! uncertainty.
+//! The sources are Zhang 2000 for the approach, OpenCV for the lens models, and mrcal for the
+//! projection uncertainty.
 
 pub(crate) mod board_pose;
 mod bundle;
@@ -52,15 +52,15 @@ pub struct IntrinsicsInput<'a> {
 pub enum LensModel {
     /// The simplest model that explains the images. A coefficient is estimated only if it lowers
     /// the error on held-out corners significantly. With fewer than four images, two models are
-    /// compared: Brown-Conrady (k1, k2, p1, p2, k3) and Kannala-Brandt. All coefficients of the
-    /// better one are estimated.
+    /// compared: Brown-Conrady (k1, k2, p1, p2, k3) and Kannala-Brandt. In this case, all
+    /// coefficients of the better model are estimated.
     #[default]
     Auto,
     /// No distortion.
     Pinhole,
     /// k1, k2, p1, p2, k3.
     BrownConrady5,
-    /// k1, k2, p1, p2, k3, k4, k5, k6: OpenCV's rational model.
+    /// OpenCV's rational model with the coefficients k1, k2, p1, p2, k3, k4, k5, k6.
     BrownConrady8,
     /// k1, k2, k3, k4 of OpenCV's fisheye model.
     KannalaBrandt,
@@ -72,12 +72,13 @@ pub enum LensModel {
 /// are rejected and named. Up to half of the images may be inconsistent.
 ///
 /// # Errors
-/// Fails if the input is malformed, if too few images are usable, if no lens model fits, or if the
-/// images do not determine the focal length or the principal point. The message contains the
-/// remedy.
+/// Fails if the input is malformed, if too few images are usable, or if no lens model fits. Also
+/// fails if the images do not determine the focal length or the principal point. The message
+/// contains the remedy.
 pub fn calibrate_intrinsics(input: &IntrinsicsInput<'_>) -> Result<IntrinsicsCalibration, Error> {
-    // Each phase rejects what would affect the next one: malformed input, gross errors of single
-    // corners, images that contradict the others, and results that are not determined.
+    // Each phase removes errors that would affect the next phase. In order, the phases reject
+    // malformed input, gross errors of single corners, images that contradict the others, and
+    // results that are not determined.
     let (usable, mut rejected) = check::usable_images(input.views, input.sizes_px)?;
     let images: Vec<&[BoardPoint]> = usable
         .iter()
@@ -122,8 +123,9 @@ pub fn calibrate_intrinsics(input: &IntrinsicsInput<'_>) -> Result<IntrinsicsCal
     Ok(report::report(&views, fit, rejected, trials))
 }
 
-/// Selects the lens model from two fits, with the images and corners that the better fit keeps.
-/// With too few images for a comparison of coefficients, the better fit is the result.
+/// Selects the lens model, starting from two fits. The selection uses the images and corners that
+/// the better fit keeps. With too few images for a comparison of coefficients, the better fit is
+/// the result.
 fn select(
     images: &[&[BoardPoint]],
     near_pinhole: Option<RobustFit>,

@@ -15,11 +15,13 @@ pub struct NextView {
     pub instruction: String,
     /// Root mean square over the image of the current projection uncertainty, pixels.
     pub sigma_px: f64,
-    /// The same, predicted with the suggested image.
+    /// Predicted projection uncertainty with the suggested image, as the same root mean square,
+    /// pixels.
     pub predicted_sigma_px: f64,
 }
 
-/// Parts of the image: horizontal and vertical position from -1 (left, top) to 1, and words.
+/// Parts of the image, each with its horizontal and vertical position from -1 (left, top) to 1, and
+/// with its name.
 const REGIONS: [([f64; 2], &str); 9] = [
     ([0.0, 0.0], "at the center of the image"),
     ([-1.0, -1.0], "at the upper left of the image"),
@@ -55,14 +57,14 @@ pub(super) struct Known<'a> {
     pub(super) intrinsics: &'a Intrinsics,
     /// Indices of the estimated parameters in [`Intrinsics::params`].
     pub(super) params: &'a [usize],
-    /// Information about them for residuals of unit variance.
+    /// Information about the estimated parameters for residuals of unit variance.
     pub(super) information: &'a DMatrix<f64>,
     /// Variance of a residual, including the dispersion, px².
     pub(super) variance: f64,
 }
 
 /// Evaluates poses of the target in a fixed set of regions, tilts and distances, and returns the
-/// one with the smallest predicted projection uncertainty. `None` if the target does not fit into
+/// pose with the smallest predicted projection uncertainty. `None` if the target does not fit into
 /// the image or the information is singular.
 ///
 /// Source: A-optimal design (Pukelsheim 1993, chapter 6) with the projection uncertainty as the
@@ -166,7 +168,8 @@ impl Board {
         })
     }
 
-    /// Pose with the center of the target in a region of the image, tilted from facing the camera.
+    /// Pose with the center of the target in a region of the image. The target faces the camera and
+    /// is then tilted.
     fn pose(
         &self,
         intrinsics: &Intrinsics,

@@ -15,7 +15,7 @@ use numbers::quantile::median;
 /// Result of [`super::calibrate_intrinsics`].
 #[derive(Clone, Debug)]
 pub struct IntrinsicsCalibration {
-    /// The intrinsics. A pinhole if no coefficient was estimated.
+    /// The intrinsics. The lens is a pinhole if no coefficient was estimated.
     pub intrinsics: Intrinsics,
     /// The lens model and the coefficients that were estimated, such as `brown_conrady k1 k2`.
     pub model: String,
@@ -30,7 +30,8 @@ pub struct IntrinsicsCalibration {
     /// pixels.
     pub noise_px: f64,
     /// Ratio of the observed variance between images to the variance expected from independent
-    /// corner errors. Above 1, corners of an image share errors, which the covariance contains.
+    /// corner errors. If the ratio is above 1, the corners of an image share errors. The covariance
+    /// includes these shared errors.
     pub dispersion: f64,
     /// The images in use.
     pub images: Vec<ImageFit>,
@@ -45,17 +46,18 @@ pub struct IntrinsicsCalibration {
     /// worst direction, pixels. `None` beyond the range of the lens model.
     ///
     /// The uncertainty of the intrinsics is propagated to the pixel. A rotation of the camera frame
-    /// absorbs most of each change of the intrinsics. This part is removed, because such a rotation
-    /// does not matter for images of unknown pose. mrcal 2.4 ("projection uncertainty") derives
-    /// this rotation from the poses of the target. Here, the rotation minimizes the squared
-    /// displacements over the whole image.
+    /// has almost the same effect as a change of the intrinsics. The effect of such a rotation is
+    /// removed, because it does not matter for images of unknown pose. mrcal 2.4 ("projection
+    /// uncertainty") derives this rotation from the poses of the target. Here, the rotation
+    /// minimizes the squared displacements over the whole image.
     pub uncertainty_px: ImageGrid<Option<f64>>,
     /// The pose of the target that would lower the projection uncertainty the most.
     pub next_view: Option<NextView>,
 }
 
 impl IntrinsicsCalibration {
-    /// Covariance of [`Intrinsics::params`]. Coefficients that were not estimated count as exact.
+    /// Covariance of [`Intrinsics::params`]. Coefficients that were not estimated are assumed to be
+    /// exact.
     pub fn intrinsics_covariance(&self) -> DMatrix<f64> {
         let n = self.intrinsics.params().len();
         let mut covariance = DMatrix::zeros(n, n);
@@ -128,7 +130,7 @@ pub enum RejectionReason {
         /// Minimum number.
         min_points: usize,
     },
-    /// The image repeats an earlier one.
+    /// The image repeats an earlier image.
     Repeated {
         /// Median distance of the points in the two images, pixels.
         distance_px: f64,

@@ -23,13 +23,13 @@ const MAX_SIGMAS: f64 = 6.0;
 /// images. Blurred images have larger errors, but still contribute.
 const MAX_MEDIAN_RATIO: f64 = 6.0;
 /// An image is rejected if more than this fraction of its corners is rejected. In that case, the
-/// rejected corners may be the correct ones.
+/// rejected corners may be the correct corners.
 const MAX_OUTLIER_FRAC: f64 = 0.5;
-/// Ratio between the median and the standard deviation per axis of the norm of a normal error
-/// (Rayleigh distribution).
+/// The norm of a normal error has a Rayleigh distribution. This is the ratio of the median of the
+/// norm to the standard deviation per axis.
 const MEDIAN_PER_SIGMA: f64 = 1.177_410_022_515_474_7;
-/// Tolerances of the fits between which outliers are searched (a tenth of a standard deviation of
-/// the parameters), and of the last fit.
+/// Tolerance of the fits that alternate with the search for outliers. It corresponds to a tenth of
+/// a standard deviation of the parameters. The next constant is the tolerance of the last fit.
 const ROUGH: f64 = 1e-5;
 const EXACT: f64 = 1e-12;
 
@@ -81,7 +81,7 @@ impl Kept {
 /// remaining corners equally, which is optimal for normal errors. A rejected image or corner
 /// returns if a later fit agrees with it.
 ///
-/// * `start_images`: the points of the start; see [`without_gross_errors`].
+/// * `start_images`: the points for the initial values, which come from [`without_gross_errors`].
 pub(super) fn fit(
     images: &[&[BoardPoint]],
     start_images: &[&[BoardPoint]],
@@ -126,8 +126,8 @@ pub(super) fn fit(
 /// The points of each image that are consistent with one homography, up to a smooth distortion. For
 /// most images, these are all points.
 ///
-/// Half of the points may be wrong, because the homography is the one with the least median of
-/// errors over random samples (Rousseeuw 1984).
+/// Half of the points may be wrong, because the homography with the least median of errors over
+/// random samples is used (Rousseeuw 1984).
 pub(super) fn without_gross_errors(images: &[&[BoardPoint]]) -> Vec<Vec<BoardPoint>> {
     images
         .iter()
@@ -136,8 +136,8 @@ pub(super) fn without_gross_errors(images: &[&[BoardPoint]]) -> Vec<Vec<BoardPoi
 }
 
 fn consistent_points(points: &[BoardPoint]) -> Vec<BoardPoint> {
-    /// Samples of four points. With 45 % wrong points, one of them is free of errors with a
-    /// probability of 99.9 %.
+    /// Samples of four points. With 45 % wrong points, at least one of the samples contains no
+    /// wrong point with a probability of 99.9 %.
     const N_SAMPLES: usize = 75;
     /// Points with errors up to this multiple of the median error are kept. Deviations due to
     /// distortion are smaller.
@@ -330,8 +330,8 @@ fn judge(images: &[&[BoardPoint]], kept: &Kept, bundle: &Bundle) -> Option<(Kept
             }
         }
     }
-    // Images and corners within the limits. The limit of corners follows the image, because all
-    // corners of a blurred image have larger errors.
+    // Images and corners within the limits are kept. The limit for corners depends on their image,
+    // because all corners of a blurred image have larger errors.
     let mut judged = Kept {
         image_ixs: Vec::new(),
         points: Vec::new(),

@@ -23,8 +23,8 @@ pub struct LensTrial {
     pub standard_error_db: f64,
     /// Number of images.
     pub n_images: usize,
-    /// Whether the variant replaces the baseline. It does if the gain is significant, or if the
-    /// variant is simpler and not worse.
+    /// Whether the variant replaces the baseline. This is the case if the gain is significant, or
+    /// if the variant is simpler and not worse.
     pub kept: bool,
 }
 
@@ -41,13 +41,14 @@ struct Scored {
     errors_px: Vec<f64>,
 }
 
-/// Adds coefficients one group at a time, and keeps those that lower the error on held-out corners
-/// significantly. Returns the selected model with its parameters, and all comparisons.
+/// Adds coefficients one group at a time, and keeps the groups that lower the error on held-out
+/// corners significantly. Returns the selected model with its parameters, and all comparisons.
 ///
-/// Brown-Conrady starts as a pinhole. The groups are added in this order: k1; k2; p1 and p2; k3. If
-/// k3 was needed, the rational terms follow. If k1 alone is not significant, k1 and k2 are tried
-/// together. Finally, the result is compared with Kannala-Brandt. Since Kannala-Brandt has fewer
-/// coefficients than a rational model, it replaces that model even if both are equally good.
+/// The selection of Brown-Conrady coefficients starts with a pinhole. It adds k1, then k2, then p1
+/// and p2, then k3. If k3 was needed, it adds the rational terms. If k1 alone is not significant,
+/// k1 and k2 are tried together. Finally, the result is compared with Kannala-Brandt. Since
+/// Kannala-Brandt has fewer coefficients than a rational model, it replaces that model even if both
+/// are equally good.
 pub(super) fn select(
     kept: &Kept,
     near_pinhole: Option<&RobustFit>,
@@ -65,14 +66,14 @@ pub(super) fn select(
     let mut best = polynomial
         .as_ref()
         .and_then(|start| score(kept, start, Coefficients::PINHOLE));
-    // The start of all comparisons.
+    // All comparisons start from this model.
     if best.is_none() {
         // A pinhole may not be able to image all points.
         best = polynomial
             .as_ref()
             .and_then(|start| score(kept, start, Coefficients::BROWN_CONRADY));
     }
-    // The polynomial's last coefficient was tested and is not needed.
+    // Whether the last coefficient of the polynomial was tested and is not needed.
     let mut is_sufficient = false;
     let mut tested: Option<Coefficients> = None;
     for group in GROUPS.map(Some).into_iter().chain([None]) {
@@ -109,7 +110,7 @@ pub(super) fn select(
     {
         let mut trial = best.as_ref().map(|baseline| compare(baseline, &variant));
         if let (Some(trial), Some(baseline)) = (&mut trial, &best) {
-            // A fisheye lens with four coefficients is simpler than a rational one.
+            // A fisheye lens with four coefficients is simpler than a rational model.
             trial.kept |= baseline.coefficients.family == Family::RationalBrownConrady
                 && trial.gain_db >= 0.0;
         }
@@ -121,7 +122,8 @@ pub(super) fn select(
     best.map(|best| (best.coefficients, best.bundle, trials))
 }
 
-/// Parameters of a fit for the images in use. `None` if it rejected one of them.
+/// Parameters of a fit for the images in use, as a start for other fits. `None` if the pose of an
+/// image cannot be estimated.
 fn start_of(kept: &Kept, fit: &RobustFit) -> Option<Bundle> {
     let position = |image_ix: &usize| fit.kept.image_ixs.iter().position(|ix| ix == image_ix);
     let positions = kept

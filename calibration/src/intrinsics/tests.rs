@@ -227,7 +227,8 @@ fn images_with_shared_errors(
     let mut random = Random::new(seed);
     let mut view = |(ix, pose): (usize, &Transform)| {
         let mut points = observe(camera, pose, &board());
-        // A random quadratic function of the position on the board, for each axis of the image.
+        // The shared error of each axis of the image is a random quadratic function of the position
+        // on the board.
         let [horizontal, vertical] = [0, 1].map(|_| [0, 1, 2].map(|_| SHARED_PX * random.normal()));
         for point in &mut points {
             let x = point.point_in_board.x / (4.0 * SQUARE_M) - 1.0;
@@ -268,9 +269,9 @@ fn chi_squares(n_runs: u64, errors: impl Fn(u64) -> [f64; 4]) -> [f64; 4] {
 #[test]
 fn squared_errors_match_stated_variances_with_own_and_with_shared_errors() {
     const N_RUNS: u64 = 100;
-    // The mean of 100 squares of normal numbers has a standard deviation of 0.14. Variances of shared
-    // errors are estimated from 15 images, which makes the mean larger than 1 by about 0.1. With one
-    // factor for all parameters, the means of shared errors are up to 1.9.
+    // The mean of 100 squares of normal numbers has a standard deviation of 0.14. Variances of
+    // shared errors are estimated from 15 images, which makes the mean larger than 1 by about 0.1.
+    // With one factor for all parameters, the means of shared errors are up to 1.9.
     const RANGE: std::ops::Range<f64> = 0.55..1.7;
     let camera = brown_conrady_camera();
     let own = chi_squares(N_RUNS, |seed| {
@@ -291,7 +292,8 @@ fn squared_errors_match_stated_variances_with_own_and_with_shared_errors() {
 
 #[test]
 fn stated_uncertainty_covers_the_truth() {
-    // Three binomial standard deviations of 95 % are 4.6 % for 200 runs and 6.5 % for 100 runs.
+    // The expected fraction is 95 %. Three binomial standard deviations are 4.6 % for 200 runs and
+    // 6.5 % for 100 runs.
     for (camera, model, poses, n_runs) in [
         (
             brown_conrady_camera(),
@@ -393,7 +395,7 @@ fn simplest_sufficient_model_is_selected() {
 fn wrong_images_and_corners_are_rejected_and_named() {
     let camera = brown_conrady_camera();
     let mut views = observed_images(&camera, &poses(12, 7), 0.1, 8);
-    // If columns and rows are exchanged, the positions are those of another layout.
+    // If columns and rows are exchanged, the positions belong to another layout.
     let transposed: Vec<_> = (0..9)
         .flat_map(|row| (0..6).map(move |column| [column, row]))
         .collect();
@@ -550,7 +552,7 @@ fn images_without_tilt_are_refused_with_the_remedy() {
             "{model:?}: {error}"
         );
     }
-    // Many images, all with the same tilt, do not determine the principal point.
+    // Many images with the same tilt do not determine the principal point.
     let same_tilt = |ix: u32| {
         Transform::new(
             Vector3::new(-0.12 + 0.005 * f64::from(ix), -0.05, 0.4),
@@ -677,7 +679,7 @@ fn suggested_images_lower_the_uncertainty_as_predicted() {
         .unwrap();
     let ratio = better.sigma_px / next.predicted_sigma_px;
     assert!((ratio - 1.0).abs() < REL, "{ratio}");
-    // Another image like the first one helps less.
+    // Another image like the first image helps less.
     poses[6] = poses[0];
     let other = calibrate(
         &camera,

@@ -17,8 +17,8 @@ pub struct Fit<S> {
     /// Variance of a scalar residual, estimated from the residuals.
     pub variance: f64,
     /// Ratio of the scatter of the blocks' gradients to the scatter that independent residuals
-    /// would cause. If it is above 1, residuals of a block share errors, and the covariance times
-    /// this factor is more realistic.
+    /// would cause. If the ratio is above 1, residuals of a block share errors. In that case, the
+    /// covariance times this ratio is more realistic.
     pub dispersion: f64,
     /// Information about the shared parameters with free local parameters, for residuals of unit
     /// variance.
@@ -26,14 +26,14 @@ pub struct Fit<S> {
     /// Covariance of the shared parameters. Entries of unobservable parameters are very large, but
     /// finite.
     pub covariance: DMatrix<f64>,
-    /// Covariance of the shared parameters if the residuals of a block share errors. It is larger
-    /// than `covariance` as far as the solution changes more when one block is left out.
+    /// Covariance of the shared parameters if the residuals of a block share errors. The more the
+    /// solution changes when one block is left out, the larger it is than `covariance`.
     pub covariance_with_shared_errors: DMatrix<f64>,
     /// Orthogonal directions of the shared parameters, the least observable first.
     pub directions: Vec<Direction>,
     /// Whether the last step was negligible.
     pub converged: bool,
-    /// Number of steps, including rejected ones.
+    /// Number of steps, including rejected steps.
     pub n_steps: usize,
 }
 
@@ -42,8 +42,8 @@ pub struct Fit<S> {
 pub struct Direction {
     /// Unit vector. Component `i` is the change of shared parameter `i` divided by its scale.
     pub components: DVector<f64>,
-    /// Standard deviation along the vector, as a multiple of the scales. Above about 1, the
-    /// residuals do not determine this direction.
+    /// Standard deviation along the vector, as a multiple of the scales. If it is above about 1,
+    /// the residuals do not determine this direction.
     pub sigma: f64,
 }
 
@@ -127,10 +127,11 @@ pub(super) fn fit<S>(
     }
 }
 
-/// Combines two covariances that allow for shared errors. The covariance times the dispersion is
-/// precise, but assumes that shared errors have the same effect on all parameters. The jackknife
-/// does not, but is an estimate from a few blocks, as if a variance were computed from so many
-/// numbers. Their mean has the right size for both kinds of errors.
+/// Combines two covariances that allow for shared errors. The first covariance, which is multiplied
+/// by the dispersion, is precise. It assumes that shared errors have the same effect on all
+/// parameters. The second covariance, the jackknife, does not make this assumption. It is less
+/// precise, because it is estimated from as few values as there are blocks. The mean of the two has
+/// the right size for both kinds of errors.
 fn with_shared_errors(
     covariance: &DMatrix<f64>,
     dispersion: f64,
@@ -145,14 +146,14 @@ fn with_shared_errors(
 }
 
 /// Variance of a scalar residual, and the factor between the inverse of the weighted information
-/// and the covariance. Both are equal for the squared loss.
+/// and the covariance. For the squared loss, the two values are equal.
 ///
 /// Source: Huber 1981, section 7.6, equation 6.7 without the factor `K`, which is close to 1.
 fn variances<S>(at: &Evaluation<S>, n_params: usize, min_noise: f64) -> (f64, f64) {
     let totals = &at.totals;
     let n_vectors = totals.n_vectors as f64;
     let n_free = (totals.n_scalars - n_params) as f64;
-    // More than 95 % outliers would make the derivative too small to divide by.
+    // With more than 95 % outliers, the derivative would be too small for a division.
     let influence_derivative = (totals.influence_derivatives / n_vectors).max(0.05);
     let mean_weight = (totals.weights / n_vectors).max(f64::MIN_POSITIVE);
     let variance = (totals.weighted_squares / n_free / influence_derivative.powi(2))

@@ -5,14 +5,14 @@
 pub enum Loss {
     /// `|r|²`, which gives least squares.
     Squared,
-    /// `|r|²` up to the threshold, then linear in `|r|`. This loss is convex. Source: Huber 1964,
-    /// equation 2.16.
+    /// The loss is `|r|²` up to the threshold, and linear in `|r|` above it. This loss is convex.
+    /// Source: Huber 1964, equation 2.16.
     Huber {
         /// Norm above which the loss is linear, in units of the residuals.
         threshold: f64,
     },
-    /// `threshold² ln(1 + |r|² / threshold²)`. The influence of large residuals tends to zero. This
-    /// loss is not convex, so the initial parameters must be close.
+    /// The loss is `threshold² ln(1 + |r|² / threshold²)`. The influence of large residuals tends
+    /// to zero. This loss is not convex, so the initial parameters must be close.
     Cauchy {
         /// Norm at which the weight of a residual has dropped to one half, in units of the
         /// residuals.

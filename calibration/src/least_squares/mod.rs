@@ -2,9 +2,9 @@
 //!
 //! The method is Levenberg-Marquardt (Marquardt 1963) with the damping schedule of Nielsen 1999.
 //! Robust losses are minimized by iteratively reweighted least squares. Local parameters, such as
-//! the pose of one view, are eliminated by a Schur complement (Triggs et al. 2000, section 6.1), so
-//! the cost of a step grows linearly with the number of blocks. Without local parameters, the
-//! solver is a dense one.
+//! the pose of one view, are eliminated by a Schur complement (Triggs et al. 2000, section 6.1).
+//! The time of a step therefore grows linearly with the number of blocks. Without local parameters,
+//! the solver is dense.
 
 mod fit;
 mod loss;
@@ -22,13 +22,13 @@ use nalgebra::DVector;
 use normal_equations::Totals;
 
 /// A least-squares problem. The residuals of a block depend on the shared parameters and on the
-/// block's local ones.
+/// local parameters of the block.
 pub trait Problem {
     /// Values of all parameters.
     type State: Clone;
 
-    /// Typical magnitude of each shared parameter. All values are positive, and a change of this
-    /// size is large. The length of the vector is the number of shared parameters.
+    /// Typical magnitude of each shared parameter. All values are positive. A change of a parameter
+    /// by this value is large. The length of the vector is the number of shared parameters.
     fn scales(&self) -> DVector<f64>;
 
     /// Number of blocks.
@@ -59,7 +59,7 @@ pub trait Problem {
 pub struct Options {
     /// Loss of the residual vectors.
     pub loss: Loss,
-    /// Maximum number of steps, including rejected ones.
+    /// Maximum number of steps, including rejected steps.
     pub max_steps: usize,
     /// The minimization ends if a step is predicted to decrease the cost by less than this
     /// fraction.
@@ -96,7 +96,8 @@ pub fn minimize<P: Problem>(
     const INITIAL_DAMPING: f64 = 1e-4;
     // Below the rounding of the diagonal, damping has no effect.
     const MIN_DAMPING: f64 = 1e-15;
-    // With more damping, steps are too short to change the parameters, so there is no descent.
+    // With more damping, steps are too short to change the parameters, so the cost cannot decrease
+    // further.
     const MAX_DAMPING: f64 = 1e12;
     let scales = problem.scales();
     let n_shared = scales.len();
@@ -161,7 +162,8 @@ struct Evaluation<S> {
 }
 
 impl<S: Clone> Evaluation<S> {
-    /// # Errors Returns the block with a residual that is not defined.
+    /// # Errors
+    /// Returns the block with a residual that is not defined.
     fn new<P: Problem<State = S>>(problem: &P, state: S, loss: Loss) -> Result<Self, usize> {
         let n_shared = problem.scales().len();
         let mut blocks = Vec::with_capacity(problem.n_blocks());

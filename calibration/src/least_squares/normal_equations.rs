@@ -1,4 +1,4 @@
-//! Normal equations of shared and local parameters, and elimination of the local ones by a Schur
+//! Normal equations of shared and local parameters. The local parameters are eliminated by a Schur
 //! complement.
 
 use super::loss::Loss;
@@ -11,17 +11,18 @@ pub struct BlockSums {
     n_shared: usize,
     n_local: usize,
     /// Derivatives of the residuals times the roots of their weights, with one column per scalar
-    /// residual. They are kept until they are summed, because the product of the whole matrix is
+    /// residual. They are stored until [`Self::summed`], because one product of the whole matrix is
     /// several times faster than one update per residual.
     weighted_derivatives: Vec<f64>,
-    /// Weighted products of the derivatives with respect to all parameters, shared ones first.
+    /// Weighted products of the derivatives with respect to all parameters. Shared parameters come
+    /// first.
     products: DMatrix<f64>,
     /// Gradient of half the sum of the losses.
     gradient: DVector<f64>,
     pub(super) totals: Totals,
 }
 
-/// Sums over residuals whose size does not depend on the number of parameters.
+/// Sums over residuals. Their size does not depend on the number of parameters.
 #[derive(Clone, Copy, Debug, Default)]
 pub(super) struct Totals {
     /// Sum of the loss.
@@ -65,8 +66,8 @@ impl BlockSums {
 
     /// Adds one residual vector with `D` components. The robust loss depends on its norm.
     ///
-    /// * `derivatives`: per component, derivatives with respect to the shared parameters followed
-    ///   by those with respect to the block's local parameters.
+    /// * `derivatives`: per component, derivatives with respect to the shared parameters, then
+    ///   derivatives with respect to the block's local parameters.
     ///
     /// # Panics
     /// Panics if a row has another length.
@@ -124,7 +125,7 @@ impl BlockSums {
         &self.gradient
     }
 
-    /// Factor of the local part, damped. `None` if it is not positive definite.
+    /// Cholesky factor of the damped local part. `None` if this part is not positive definite.
     fn local_factor(&self, damping: f64) -> Option<Cholesky<f64, Dyn>> {
         let first = self.n_shared;
         let n = self.n_local;
@@ -158,7 +159,7 @@ pub(super) fn step(blocks: &[BlockSums], n_shared: usize, damping: f64) -> Optio
     } else {
         Cholesky::new(reduced.matrix)?.solve(&reduced.gradient)
     };
-    // Back-substitution: the local steps follow from the shared one, block by block.
+    // Back-substitution gives the local step of each block from the shared step.
     let mut local = Vec::with_capacity(blocks.len());
     let mut predicted = 0.0;
     for (block, factor) in blocks.iter().zip(&reduced.factors) {
@@ -190,8 +191,8 @@ pub(super) fn step(blocks: &[BlockSums], n_shared: usize, damping: f64) -> Optio
     })
 }
 
-/// Information about the shared parameters when the local ones are free: the Schur complement.
-/// Symmetric. Directions of local parameters without information are left out.
+/// Information about the shared parameters if the local parameters are free. It is the Schur
+/// complement, which is symmetric. Directions of local parameters without information are left out.
 pub(super) fn information(blocks: &[BlockSums], n_shared: usize) -> DMatrix<f64> {
     // Blocks may not determine their local parameters. Because of the tiny damping, such blocks do
     // not remove the information of other blocks.
@@ -207,8 +208,8 @@ pub(super) fn information(blocks: &[BlockSums], n_shared: usize) -> DMatrix<f64>
 }
 
 /// Ratio between the scatter of the blocks' gradients and the scatter that independent residuals of
-/// this variance would cause. About 1 for independent residuals, larger if the residuals of a block
-/// share errors. 1 if there are not enough blocks.
+/// this variance would cause. The ratio is about 1 for independent residuals, and larger if the
+/// residuals of a block share errors. It is 1 if there are not enough blocks.
 ///
 /// Let `g_b` and `S_b` be the gradient and the information of block b after elimination of its
 /// local parameters, `S` the sum of all `S_b`, and `P_b = inverse(S) S_b`. The ratio is the sum of
@@ -253,22 +254,22 @@ pub(super) fn dispersion(blocks: &[BlockSums], n_shared: usize, variance: f64) -
     }
 }
 
-/// Covariance of the shared parameters from the changes of the solution when one block is left out,
-/// to first order: the jackknife. Residuals of a block may share errors, which have a different
-/// effect on each parameter. `None` if there are not 1.5 times as many blocks as parameters, or if
-/// the blocks do not determine them.
+/// The jackknife estimate of the covariance of the shared parameters. It follows from the changes
+/// of the solution, to first order, when one block is left out. Residuals of a block may share
+/// errors, which have a different effect on each parameter. `None` if the number of blocks is below
+/// 1.5 times the number of parameters, or if the blocks do not determine the parameters.
 ///
-/// With the symbols of [`dispersion`], leaving out block b changes the solution by
-/// `inverse(S - S_b) g_b = inverse(S) inverse(1 - S_b inverse(S)) g_b`. Blocks that determine a
-/// direction almost alone would give very large changes, so the eigenvalues of the inner inverse are
-/// limited.
+/// With the symbols of [`dispersion`], leaving out block b changes the solution by `inverse(S -
+/// S_b) g_b = inverse(S) inverse(1 - S_b inverse(S)) g_b`. Blocks that determine a direction almost
+/// alone would give very large changes, so the eigenvalues of the inner inverse are limited.
 pub(super) fn jackknife(blocks: &[BlockSums], n_shared: usize) -> Option<DMatrix<f64>> {
     // Source: MacKinnon and White 1985 (HC3), with blocks as in Bell and McCaffrey 2002.
     const DAMPING: f64 = 1e-12;
-    // A block with 95 % of the information about a direction.
+    // This limit is reached by a block with 95 % of the information about a direction.
     const MIN_REST: f64 = 0.05;
-    // With 10 blocks and 9 parameters, each block is indispensable for some direction, and the
-    // variances of directions that are hardly determined become twice as large as they are.
+    // With 10 blocks and 9 parameters, each block is indispensable for some direction. For
+    // directions that are hardly determined, the estimated variances then become twice as large as
+    // the true variances.
     if n_shared == 0 || 2 * blocks.len() <= 3 * n_shared {
         return None;
     }
@@ -290,8 +291,8 @@ pub(super) fn jackknife(blocks: &[BlockSums], n_shared: usize) -> Option<DMatrix
         // With S = L L', the share of the block is inverse(L) S_b inverse(L)', which is symmetric.
         let half = lower.solve_lower_triangular(&matrix)?;
         let share = lower.solve_lower_triangular(&half.transpose())?;
-        // Rounding may leave nothing of a block that determines almost nothing. The decomposition of
-        // a matrix that is not finite would not end.
+        // For a block that determines almost nothing, rounding may give values that are not finite.
+        // The decomposition of such a matrix would not end.
         if !share.iter().all(|value| value.is_finite()) {
             return None;
         }
@@ -307,7 +308,7 @@ pub(super) fn jackknife(blocks: &[BlockSums], n_shared: usize) -> Option<DMatrix
     Some(covariance)
 }
 
-/// The normal equations of the shared parameters after elimination of the local ones.
+/// The normal equations of the shared parameters after elimination of the local parameters.
 struct Reduced {
     /// Lower triangle.
     matrix: DMatrix<f64>,

@@ -1,10 +1,13 @@
 //! Time offsets of cameras that accelerate.
 //!
+//! Corrects time offsets for the acceleration of cameras.
+//!
 //! A time offset is applied to the pose of an image as a motion with constant velocity. If the
-//! camera accelerates by 1 m/s², an offset of 8 ms is then wrong by 0.03 mm in each image. That is
-//! more than the standard deviation of extrinsics from a scan of 30 s, and it does not average out,
-//! because acceleration and camera direction are correlated in a scan. Velocities of neighboring
-//! images give the acceleration, with which the motion is correct up to the second order.
+//! camera accelerates by 1 m/s², the pose after an offset of 8 ms is wrong by 0.03 mm in each
+//! image. This error is larger than the standard deviation of extrinsics from a scan of 30 s. It
+//! does not average out, because acceleration and camera direction are correlated in a scan. The
+//! velocities of neighboring images give the acceleration. With the acceleration, the motion is
+//! correct up to the second order.
 
 use super::corrections::Corrections;
 use super::prepared_image::PreparedImage;
@@ -13,7 +16,7 @@ use kinematics::{Stamp, Twist};
 use std::collections::BTreeMap;
 use std::sync::Arc;
 
-/// Offsets below this do not matter: even at 10 m/s², the error is 0.005 mm.
+/// Smaller offsets do not matter, because the error is 0.005 mm even at 10 m/s².
 const MIN_OFFSET_SECS: f64 = 1e-3;
 /// Maximum time between two images whose velocities are compared. An arm changes its acceleration
 /// within about this time.
@@ -25,7 +28,8 @@ pub(super) struct Velocities<'a> {
 }
 
 impl<'a> Velocities<'a> {
-    /// The velocities of keyframes, with those of test keyframes, whose pixels are not used.
+    /// The velocities of keyframes. The velocities of test keyframes are included, although their
+    /// pixels are not used.
     pub(super) fn of(keyframes: &'a [Arc<Keyframe>]) -> Self {
         let mut by_camera = BTreeMap::<&str, Vec<(Stamp, Twist)>>::new();
         for keyframe in keyframes {
@@ -62,14 +66,14 @@ impl<'a> Velocities<'a> {
         has_changed
     }
 
-    /// The constant velocity that moves the camera of a keyframe as far within the time offset as
-    /// it has really moved. `None` if the acceleration is not known.
+    /// The constant velocity that moves the camera of a keyframe within the time offset exactly as
+    /// the accelerated motion does. `None` if the acceleration is not known.
     ///
-    /// A pose with the velocity `(v, w)` in its own axes, which changes by `(v', w')` per second,
-    /// moves within t by the exponential of `t (v, w) + t²/2 (v', w')`, up to the third order
-    /// (Magnus 1954). Corrections apply the inverse of this motion as the rotation `-t w` and the
-    /// translation `-t v`. The exponential of the inverse has the translation
-    /// `-t v - t²/2 v' + t²/2 w x v`, so `v` is replaced by `v + t/2 (v' - w x v)`.
+    /// A pose has the velocity `(v, w)` in its own axes, which changes by `(v', w')` per second.
+    /// Within the time t, it moves by the exponential of `t (v, w) + t²/2 (v', w')`, up to the
+    /// third order (Magnus 1954). Corrections apply the inverse of this motion as the rotation `-t
+    /// w` and the translation `-t v`. The exponential of the inverse has the translation `-t v -
+    /// t²/2 v' + t²/2 w x v`, so `v` is replaced by `v + t/2 (v' - w x v)`.
     fn mean_twist(&self, keyframe: &Keyframe, offset_secs: f64) -> Option<Twist> {
         let twist = keyframe.twist?;
         let rate = self.rate_at(&keyframe.camera, keyframe.stamp)?;
@@ -125,7 +129,7 @@ mod tests {
     #[test]
     fn accelerated_motion_is_correct_up_to_the_second_order() {
         const OFFSET_SECS: f64 = 0.03;
-        // The images of this scan are 0.3 s apart, so the acceleration itself has an error of some
+        // The images of this scan are 0.3 s apart, so the acceleration has an error of a few
         // percent.
         const MAX_ERROR_RATIO: f64 = 0.25;
         let keyframes = capture(&Miscalibration {

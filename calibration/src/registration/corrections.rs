@@ -69,12 +69,12 @@ impl Corrections {
         for (ix, param) in layout.params.iter().enumerate() {
             let delta = step[ix];
             match *param {
-                // A motion has six parameters. The first one applies all six; the other five are
-                // skipped below.
+                // A motion has six parameters. The first parameter applies all six, and the other
+                // five are skipped below.
                 CalibrationParam::Extrinsics(camera, 0) => {
                     let correction = &mut self.by_camera[camera];
                     // The step is a motion of the camera. The correction is applied after
-                    // `camera_from_world`, so it is the inverse.
+                    // `camera_from_world`, so it is the inverse of this motion.
                     let extrinsics = transform::exp(&twist(step, ix), -1.0)
                         * rigid_transform(
                             correction.rotation_rad.into(),

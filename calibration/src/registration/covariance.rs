@@ -60,9 +60,9 @@ impl ExtrinsicsCovariance {
             params.iter().enumerate().filter_map(first).unzip();
         (!cameras.is_empty()).then_some(())?;
         let ixs: Vec<usize> = begins.iter().flat_map(|begin| *begin..begin + 6).collect();
-        // The solution returns variances of weighted sums. Covariances are computed from the
-        // variances of sums of two parameters. The sum of a parameter and itself has four times the
-        // variance of the parameter.
+        // The solution returns variances of weighted sums of parameters. A covariance is computed
+        // from the variance of the sum of two parameters. On the diagonal, the sum of a parameter
+        // and itself has four times the variance of the parameter.
         let own: Vec<f64> = ixs
             .iter()
             .map(|ix| variance_of_sum(solution, params.len(), [*ix, *ix]) / 4.0)
@@ -89,7 +89,7 @@ impl ExtrinsicsCovariance {
     }
 
     /// Standard deviations of the pose of a camera in the frame of another camera with the same
-    /// parent, along and about its own axes. `None` if one of them was not estimated.
+    /// parent, along and about its own axes. `None` if one of the two poses was not estimated.
     pub fn between(
         &self,
         first: &str,
@@ -98,7 +98,7 @@ impl ExtrinsicsCovariance {
     ) -> Option<PoseSigmas> {
         let first = self.ix(first)?;
         let other = self.ix(other)?;
-        // A motion of the first camera moves the other one in the opposite direction.
+        // A motion of the first camera moves the other camera in the opposite direction.
         let mut by_first = Matrix6::zeros();
         for part in 0..6 {
             let unit =
@@ -164,7 +164,8 @@ mod tests {
         let sigmas = covariance
             .between("left", "right", &left_from_right)
             .expect("both were estimated");
-        // Along y and z, a rotation of the first camera moves the second one by its distance.
+        // A rotation of the first camera moves the second camera along y and z, by the angle times
+        // the distance of 1 m.
         let expected_m = [2e-6f64.sqrt(), 2.01e-6f64.sqrt(), 2.01e-6f64.sqrt()];
         for (axis, expected_m) in expected_m.into_iter().enumerate() {
             assert!((sigmas.m[axis] - expected_m).abs() < 1e-12, "{sigmas:?}");

@@ -35,12 +35,11 @@ pub(super) struct Fit {
 
 impl Fit {
     /// Adds the discretization error to the covariance. All pairs share this error, so the scatter
-    /// between pairs does not contain it. The size of the error is estimated from the change of the
-    /// result if the parameters are estimated at the next coarser level instead of the finest one.
-    /// There, pixels are twice as large. If the error grows at least linearly with the pixel size,
-    /// the error at the finest level is at most as large as the change. The error may have another
-    /// direction than the change, because it is a sum of errors that grow with different powers of
-    /// the pixel size.
+    /// between pairs does not contain it. The size of the error is estimated by repeating the
+    /// estimate at the next coarser level, where pixels are twice as large. If the error grows at
+    /// least linearly with the pixel size, the error at the finest level is at most as large as the
+    /// change of the result. The error may have another direction than the change, because it is a
+    /// sum of errors that grow with different powers of the pixel size.
     pub(super) fn add_discretization_error(&mut self, images: &[PreparedImage], pairs: &[Pair]) {
         // Steps at level 1 start from the result of level 0 and continue until they are small. The
         // change is the sum of these steps.

@@ -63,7 +63,7 @@ pub(super) struct Layout {
     joints: Option<usize>,
 }
 
-/// For each kind of parameter of a camera, the index of the first one.
+/// For each kind of parameter of a camera, the index of the first parameter.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub(super) struct CameraParamOffsets {
     pub(super) extrinsics: Option<usize>,
@@ -105,8 +105,8 @@ impl CameraParamOffsets {
 }
 
 impl Layout {
-    /// The parameters of a set that apply to keyframes, which are given with the index of their
-    /// camera. A static camera has no time offset, and a camera without joints has no joint
+    /// The parameters of a set that apply to some keyframes. Each keyframe is given with the index
+    /// of its camera. A static camera has no time offset, and a camera without joints has no joint
     /// offsets.
     pub(super) fn new(set: ParamSet, images: &[(usize, &Keyframe)], n_cameras: usize) -> Self {
         let mut layout = Self::default();

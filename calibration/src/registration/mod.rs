@@ -5,10 +5,11 @@
 //! pose of the depth camera. Their effect on each pair of images is known, so a few parameters
 //! explain thousands of small differences. They are estimated by Gauss-Newton steps from coarse to
 //! fine. A parameter is kept if it improves the prediction of images that were not used to estimate
-//! it. Parameters that the motion does not make observable are reported and stay at zero.
+//! it. If the motion does not make a parameter observable, this is reported and the parameter stays
+//! at zero.
 //!
-//! All functions are pure functions of keyframes. They use no clock and no I/O, and sum in a fixed
-//! order for any number of threads.
+//! All functions are pure functions of keyframes. They use no clock and no I/O. Sums are computed
+//! in a fixed order, whatever the number of threads.
 
 mod acceleration;
 mod corrections;
@@ -48,14 +49,15 @@ use std::collections::BTreeSet;
 use std::sync::Arc;
 use sums::PixelSubset;
 
-/// Maximum number of images for estimating the shared parameters. The next constant is the maximum
-/// number of partners of each image. The time grows with the product of both numbers. The few
-/// shared parameters do not need more images.
+/// Maximum number of images for estimating the shared parameters. The few shared parameters do not
+/// need more images. The next constant is the maximum number of partners of each image. The time
+/// grows with the product of both numbers.
 const MAX_IMAGES: usize = 100;
 const PARTNERS_PER_IMAGE: usize = 4;
 /// Maximum number of validation images.
 const MAX_VALIDATION_IMAGES: usize = 32;
-/// Covariances are computed from the scatter between pairs. Fewer pairs do not determine it.
+/// Covariances are computed from the scatter between pairs. Fewer pairs than this do not determine
+/// the scatter.
 const MIN_PAIRS: usize = 4;
 /// Corrections smaller than this number of standard deviations are not significant.
 const MIN_SIGNIFICANT_SIGMAS: f64 = 3.0;
@@ -72,7 +74,7 @@ struct AlignmentScene {
     validation_pairs: Vec<Pair>,
 }
 
-/// All parameter sets that alignment can estimate, the more likely ones first.
+/// All parameter sets that alignment can estimate. The more likely sets come first.
 pub fn candidates() -> Vec<ParamSet> {
     vec![
         ParamSet::EXTRINSICS,
@@ -220,7 +222,8 @@ impl AlignmentScene {
         Layout::new(set, &images, self.cameras.len())
     }
 
-    /// Estimates the corrections of a set of parameters, starting from those of another set.
+    /// Estimates the corrections of a set of parameters, starting from the corrections of another
+    /// set.
     fn model(&self, set: ParamSet, from: &CalibrationModel) -> Option<CalibrationModel> {
         let shared = set - (ParamSet::IMAGE_POSES | ParamSet::IMAGE_GAINS);
         let layout = self.layout(shared);
@@ -241,8 +244,8 @@ impl AlignmentScene {
         })
     }
 
-    /// Estimates the same parameters again, with velocities that make the estimated time offsets
-    /// exact also for cameras that accelerate.
+    /// Estimates the same parameters again, with velocities for which the estimated time offsets
+    /// are exact even if a camera accelerates.
     fn with_accelerations(
         &mut self,
         model: CalibrationModel,
@@ -323,8 +326,8 @@ impl AlignmentScene {
         trials: &mut Vec<Trial>,
         unobservable: &mut Vec<Unobservable>,
     ) -> CalibrationModel {
-        // In this forward selection, the candidates are tested in order of likelihood. Each is
-        // tested together with the candidates that were kept before.
+        // In this forward selection, the candidates are tested in order of likelihood. Each
+        // candidate is tested together with the candidates that were kept before.
         let mut kept = uncorrected;
         let mut kept_sets: Vec<ParamSet> = Vec::new();
         for candidate in candidates {
@@ -352,8 +355,8 @@ impl AlignmentScene {
             trials.push(trial);
         }
         // This backward elimination is needed, because a later parameter may explain the same
-        // errors as an earlier one. The earlier one is then superfluous. The last parameter was
-        // already tested with all others.
+        // errors as an earlier parameter. The earlier parameter is then superfluous. The last
+        // parameter was already tested with all others.
         for kept_set in kept_sets.clone().into_iter().rev().skip(1) {
             let other_params = kept_sets
                 .iter()
@@ -428,7 +431,7 @@ impl CalibrationModel {
     fn has_significant(&self, params: &Layout) -> bool {
         let Some(fit) = &self.fit else { return false };
         fit.layout.params.iter().enumerate().any(|(ix, param)| {
-            // The value of a mostly unobservable parameter comes only from its prior.
+            // The value of a mostly unobservable parameter follows only from its prior.
             params.params.contains(param)
                 && self.corrections.value(*param).abs()
                     > MIN_SIGNIFICANT_SIGMAS * fit.solution.sigma(ix)

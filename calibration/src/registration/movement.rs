@@ -1,16 +1,16 @@
 //! Detection of a camera that has moved relative to its mount.
 //!
 //! Each new image is compared with reference images, which are older than the last
-//! [`MOVEMENT_WINDOW`] images of its camera. If the camera has not moved, no motion estimated from
-//! previous new images improves the prediction of the next one. If it has moved, one motion
-//! explains all images since the movement.
+//! [`MOVEMENT_WINDOW`] images of its camera. If the camera has not moved, a motion that is
+//! estimated from some new images does not improve the prediction of the next image. If it has
+//! moved, one motion explains all images since the movement.
 //!
 //! The test is a Shiryaev-Roberts e-detector (Shin, Ramdas and Rinaldo 2022), so it may be repeated
-//! with every image. For each possible start of the movement, the detector bets on a motion that it
-//! estimates from the images since this start. The bet is that this motion improves the prediction
-//! of each later image. The stake is multiplied by a factor that is at most 1 on average if the
-//! camera has not moved. The probability that the sum of all stakes reaches [`ALARM`] within `n`
-//! images is therefore at most `n / ALARM`.
+//! with every image. For each possible start of the movement, the detector estimates a motion from
+//! the images since this start. It bets that this motion improves the prediction of each later
+//! image. After each bet, its stake is multiplied by a factor. If the camera has not moved, this
+//! factor is at most 1 on average. The probability that the sum of all stakes reaches [`ALARM`]
+//! within `n` images is therefore at most `n / ALARM`.
 
 use super::corrections::Corrections;
 use super::fit;
@@ -32,8 +32,8 @@ use std::sync::Arc;
 
 /// Number of latest images of a camera that are considered as the start of a movement.
 pub const MOVEMENT_WINDOW: usize = 16;
-/// Maximum number of reference images. If there are more, every second one is dropped. The time to
-/// choose partners for an image grows with their number.
+/// Maximum number of reference images. If there are more, every second reference image is dropped.
+/// The time to choose partners for an image grows with the number of reference images.
 const MAX_REFERENCES: usize = 48;
 /// Maximum and minimum number of reference images with which an image is compared.
 const MAX_PARTNERS: usize = 6;
@@ -44,8 +44,8 @@ const ALARM: f64 = 1e5;
 /// Fraction of the stake that is bet on each image. With a larger bet, movements are detected with
 /// fewer images, but one bad image loses most of the stake.
 const BET_FRAC: f64 = 0.8;
-/// Prediction gain that is ignored, dB. Because of other calibration errors, a motion may improve
-/// neighboring images by this gain.
+/// Prediction gain that is ignored, dB. A motion may improve the prediction of neighboring images
+/// by this gain because of other calibration errors.
 const MARGIN_DB: f64 = 0.2;
 /// Losses are clamped to this value, dB. Without a limit, the factor on the stake could become
 /// negative.
@@ -64,7 +64,7 @@ pub struct CameraMovement {
     pub camera: String,
     /// Stamp of the first image after the movement, nanoseconds.
     pub since_nanos: i64,
-    /// Time of that image after the first keyframe, seconds.
+    /// Time from the first keyframe to the first image after the movement, seconds.
     pub since_secs: f64,
     /// Rotation vector (radians) and translation (meters) of the correction for images since the
     /// movement, as in [`CameraCorrection`]. It is applied before all other corrections.

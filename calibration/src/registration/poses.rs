@@ -16,12 +16,12 @@ use nalgebra::{DVector, Matrix6, Vector6};
 use numbers::quantile::{Rank, quantile};
 use std::collections::BTreeMap;
 
-/// Bounds of the expected pose error of an image, meters and radians. The lower bound (next
-/// constant) is the accuracy of arms.
+/// Upper bounds of the expected pose error of an image, meters and radians. The next constant holds
+/// the lower bounds, which are the accuracy of arms.
 const MAX_POSE_ERROR: [f64; 2] = [0.02, 0.02];
 const MIN_POSE_ERROR: [f64; 2] = [2e-4, 3.5e-4];
-/// Maximum number of steps at each level, the finest first. The coarsest of four levels starts
-/// farthest from the solution.
+/// Maximum number of steps at each level, the finest first. The coarsest of the four levels has the
+/// most steps, because it starts farthest from the solution.
 const MAX_ITERATIONS: [usize; 4] = [6, 4, 4, 6];
 /// Maximum step, relative to the expected pose errors.
 const MAX_STEP: f64 = 2.0;
@@ -118,9 +118,9 @@ fn rms_motion(motions: &[Vector6<f64>]) -> [f64; 2] {
     })
 }
 
-/// Estimates the pose of one image relative to others that stay fixed, from a subset of its pixels.
-/// All `pairs` must lead to this image. Returns the correction of its camera with an entry for this
-/// image. `None` if the other images do not show the same surfaces.
+/// Estimates the pose of one image from a subset of its pixels, relative to other images that stay
+/// fixed. All `pairs` must lead to this image. Returns the correction of its camera with an entry
+/// for this image. `None` if the other images do not show the same surfaces.
 pub(super) fn fit_one(
     images: &[PreparedImage],
     views: &[CorrectedView],
@@ -171,7 +171,8 @@ pub(super) fn fit_one(
     Some(image_correction)
 }
 
-/// Contributions of pairs to the motion of the image that they lead to, which has this view.
+/// Contributions of pairs to the motion of the second image of each pair. `view` is the view of
+/// this image.
 fn sums_to(
     images: &[PreparedImage],
     views: &[CorrectedView],
@@ -221,7 +222,7 @@ fn median_depth_m(images: &[PreparedImage]) -> f64 {
 /// other parameters explain that part.
 ///
 /// A mean within its tolerance is not removed. Independent errors also have a nonzero mean, and
-/// removing it would leave the images misaligned.
+/// without this mean, the images would be misaligned.
 fn remove_mean(
     steps: &mut [Vector6<f64>],
     total: &[Vector6<f64>],
@@ -328,8 +329,8 @@ impl NormalEquations {
         equations
     }
 
-    /// The product of the symmetric matrix and a vector. Each block off the diagonal counts twice,
-    /// once transposed.
+    /// The product of the symmetric matrix and a vector. Each block off the diagonal is used twice,
+    /// the second time transposed.
     fn multiply(&self, x: &[Vector6<f64>]) -> Vec<Vector6<f64>> {
         let mut product = block_products(&self.diagonal, x);
         for (row, column, block) in &self.off_diagonal {

@@ -15,12 +15,12 @@ use std::sync::Arc;
 const MAX_COLUMNS: u32 = 400;
 /// Minimum side of the coarsest level. Smaller levels have too few texels inside their borders.
 const MIN_SIDE: usize = 40;
-/// Each level doubles the error from which the estimate converges.
+/// Each further level doubles the largest initial error from which the estimate converges.
 const MAX_LEVELS: usize = 4;
 /// Columns and rows of the grid of an image. Each cell contributes its most informative sample.
 const GRID_CELLS: [usize; 2] = [20, 15];
-/// Maximum relative difference of a sample's depth from its neighbors, and between readings that
-/// are interpolated.
+/// Maximum relative difference between the depth of a sample and the depths of its neighbors. The
+/// same limit applies to readings between which depth is interpolated.
 const SMOOTH_FRAC: f64 = 0.03;
 
 /// A keyframe prepared for alignment.
@@ -159,7 +159,7 @@ fn select_samples(
             if best.is_none_or(|(max, _)| norm > max) {
                 best = Some((norm, sample));
             }
-            // The first valid candidate from the middle of the cell on.
+            // This is the first valid candidate in the second half of the cell.
             if candidate >= CANDIDATES_PER_SIDE * CANDIDATES_PER_SIDE / 2 + CANDIDATES_PER_SIDE / 2
                 && middle.is_none()
             {
@@ -236,13 +236,13 @@ pub(super) fn depth_at(depth: &DepthMap, pixel: [f64; 2]) -> Option<SampledValue
     ];
     Some(SampledValue {
         value: z,
-        // The gradient of z = 1 / inverse is -z² times that of the inverse.
+        // The gradient of z = 1 / inverse is -z² times the gradient of the inverse.
         gradient: gradient.map(|gradient| -gradient * z * z),
     })
 }
 
 /// Size of the image in squares of `edge` pixels, and the mean brightness (0 to 255) of each
-/// square. It is NaN in masked areas.
+/// square. The brightness is NaN in masked areas.
 pub(super) fn brightness(keyframe: &Keyframe, edge: usize) -> ([usize; 2], Vec<f32>) {
     let [width, height] = keyframe.size_px.map(|side| side as usize);
     let size = [width / edge, height / edge];

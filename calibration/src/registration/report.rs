@@ -164,7 +164,7 @@ pub(super) fn alignment(
         .iter()
         .zip(&kept.corrections.by_camera)
         .map(|(name, correction)| (name.to_string(), correction.clone()));
-    // Without accepted parameters, the list is empty instead of containing corrections of zero.
+    // Without accepted parameters, the map is empty instead of containing corrections of zero.
     // Keyframes then stay unchanged.
     let corrections = if kept.set.is_empty() {
         BTreeMap::new()
@@ -212,8 +212,8 @@ fn estimate(
     };
     Some(match param {
         CalibrationParam::Extrinsics(camera, 0) => {
-            // The correction maps to the corrected camera, whereas the report contains the motion
-            // of the camera.
+            // The correction maps from the uncorrected to the corrected camera. The report contains
+            // the motion of the camera, which is the inverse.
             let wrong_extrinsics = rigid_transform(
                 correction(camera).rotation_rad.into(),
                 correction(camera).translation_m.into(),

@@ -2,9 +2,9 @@
 //!
 //! A depth reading becomes a point in the world. The point's brightness in image `i` is compared
 //! with its brightness in image `j`. Its distance along the z axis of `j`'s depth camera is
-//! compared with the depth reading of `j`. Source: Kerbl, Sturm and Cremers 2013 (the two
-//! residuals), Schoeps et al. 2019 (both cameras move). The separate pose of the depth camera and
-//! the rolling shutter are additions of fieldrig.
+//! compared with the depth reading of `j`. The two residuals are from Kerl, Sturm and Cremers 2013.
+//! The motion of both cameras is from Schoeps et al. 2019. The separate pose of the depth camera
+//! and the rolling shutter are additions of fieldrig.
 
 use super::prepared_image::{DepthSample, GrayImage, PreparedImage, depth_at, point};
 use super::view::{CorrectedView, unit_twist};
@@ -39,8 +39,8 @@ struct ObservedPoint {
 pub(super) struct Correspondence {
     i: ObservedPoint,
     j: ObservedPoint,
-    /// Position of the sample in the depth camera of `i`. The next field is its position in the
-    /// depth camera of `j`.
+    /// Position of the sample in the depth camera of `i`. The next field is the position of the
+    /// sample in the depth camera of `j`.
     point_in_depth_i: Vector3<f64>,
     in_depth: Vector3<f64>,
     depth_pixel: [f64; 2],
@@ -49,8 +49,8 @@ pub(super) struct Correspondence {
     depth_weight: f64,
 }
 
-/// Gain and offset that map the brightness of image `i` to that of image `j`, because their
-/// exposures differ.
+/// Gain and offset that map the brightness of image `i` to the brightness of image `j`. They are
+/// needed because the exposures of the two images differ.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) struct Tone {
     pub(super) gain: f64,
@@ -212,8 +212,8 @@ impl Correspondence {
 }
 
 /// Pyramid levels at which both images have about the same resolution on the surface. Neither level
-/// is finer than `level`. The levels differ because a near view has detail that a distant view
-/// lacks.
+/// is finer than `level`. The two levels differ if one view is nearer, because a near view has
+/// detail that a distant view lacks.
 fn levels([i, j]: [Side<'_>; 2], [z_i, z_j]: [f64; 2], level: usize) -> [usize; 2] {
     let texel_m =
         |side: Side<'_>, z_m: f64| z_m * side.image.level(level).texel_px() / side.view.focal_px[0];
@@ -309,8 +309,8 @@ fn gradient_by_point(view: &CorrectedView, observed: &ObservedPoint, factor: f64
     )
 }
 
-/// Gradient with respect to a displacement of the point at its readout time. A displacement also
-/// changes the row and thus the readout time. This effect is included.
+/// Gradient with respect to a displacement of the point at its readout time. The gradient includes
+/// the effect that a displacement also changes the row and thus the readout time.
 fn row_held_gradient(
     view: &CorrectedView,
     observed: &ObservedPoint,

@@ -64,8 +64,8 @@ impl Solution {
             let direction = eigen.eigenvectors.column(ix);
             // The prior is at zero with a standard deviation of one scale. Its information is
             // multiplied by `INFLATION`, because the information of the residuals is too large by
-            // this factor. Components that the residuals do not determine return to zero. Earlier
-            // steps may have moved them, because the directions were different then.
+            // this factor. Components that the residuals do not determine return to zero. Such
+            // components may be nonzero, because other directions were observable in earlier steps.
             let length = if *observable {
                 (direction.dot(&gradient) - INFLATION * direction.dot(&values))
                     / (eigen.eigenvalues[ix] + INFLATION)
@@ -91,12 +91,13 @@ impl Solution {
         solution
     }
 
-    /// Covariance from the scatter of the pairs' gradients, in scaled units. Assumes that each pair
-    /// has an independent error, and that pairs which share an image also have a common error. If
-    /// only one kind of error exists, the covariance is too large by a factor of at most two.
+    /// Covariance from the scatter of the pairs' gradients, in scaled units. Each pair is assumed
+    /// to have an independent error. Pairs that share an image are assumed to have a common error
+    /// in addition. If only one kind of error exists, the covariance is too large by a factor of at
+    /// most two.
     ///
-    /// Source: White 1980 (sandwich estimator); Aronow, Samii and Assenova 2015 (pairs that share a
-    /// member).
+    /// Sources: White 1980 for the sandwich estimator, and Aronow, Samii and Assenova 2015 for
+    /// pairs that share a member.
     fn covariance(&self, pairs: &[Pair], sums: &[PairSums]) -> DMatrix<f64> {
         let n = self.scales.len();
         let n_images = pairs
@@ -205,8 +206,9 @@ impl Solution {
                 0.0
             }
         });
-        // Any basis of the unobservable space is equally valid. In this one, some vectors do not
-        // change the selected parameters, if there are such vectors. They are easier to describe.
+        // Any basis of the unobservable space is equally valid. This basis contains as many vectors
+        // as possible that do not change the selected parameters, because such vectors are easier
+        // to describe.
         let rotated = SymmetricEigen::new(masked_basis.tr_mul(&masked_basis));
         let mut order: Vec<usize> = (0..columns.len()).collect();
         order.sort_by(|a, b| rotated.eigenvalues[*a].total_cmp(&rotated.eigenvalues[*b]));

@@ -1,11 +1,11 @@
 //! Correction of a mobile base's pose at a new station, by registering images of the station to
 //! earlier images.
 //!
-//! The six parameters of the base's pose are estimated like those of cameras: from depth samples of
-//! one image in another, differences of brightness and depth, and Gauss-Newton steps from coarse to
-//! fine. Each pair has one image from the new station and one from earlier ones. Pairs are formed
-//! in both directions, because a distant view contains a near view, but a near view does not
-//! contain a distant view.
+//! The six parameters of the base's pose are estimated in the same way as the parameters of
+//! cameras. Depth samples of one image are projected into another image, and Gauss-Newton steps
+//! from coarse to fine minimize the differences of brightness and depth. Each pair has one image
+//! from the new station and one image from an earlier station. Pairs are formed in both directions,
+//! because a distant view contains a near view, but a near view does not contain a distant view.
 
 use super::corrections::Corrections;
 use super::fit::{INITIAL_NOISE, OCCLUSION_FRAC};
@@ -26,8 +26,8 @@ use serde::Serialize;
 use std::collections::BTreeSet;
 use std::sync::Arc;
 
-/// Typical error of the position of the base, meters. The next constant is that of its rotation,
-/// radians.
+/// Typical error of the position of the base, meters. The next constant is the typical error of the
+/// rotation of the base, radians.
 const PRIOR_TRANSLATION_M: f64 = 0.02;
 const PRIOR_ROTATION_RAD: f64 = 0.0175;
 
@@ -37,8 +37,8 @@ const MAX_ITERATIONS: usize = 20;
 /// A step smaller than this number of standard deviations ends a level. The value of the finest
 /// level comes first.
 const CONVERGED_STEP_SIGMAS: [f64; 4] = [0.1, 0.3, 0.3, 0.3];
-/// Factor on the brightness noise. Near occlusions and reflections, the brightness errors are the
-/// same in all pairs of two stations. Depth errors are not.
+/// Factor on the brightness noise. Near occlusions and reflections, all pairs of two stations have
+/// the same brightness errors. Their depth errors differ.
 const BRIGHTNESS_NOISE_INFLATION: f64 = 4.0;
 
 /// Correction of the reported pose of a base at a station. Each sigma is a standard deviation.
@@ -185,7 +185,7 @@ fn describe(direction: &DVector<f64>) -> String {
     parts.join(" together with ")
 }
 
-/// Images of the new station and of earlier ones, and the pairs between them.
+/// Images of the new station and of earlier stations, and the pairs between them.
 struct StationScene {
     images: Vec<PreparedImage>,
     /// Index of the first image of the new station.
@@ -222,7 +222,9 @@ impl StationScene {
             validation_pairs: Vec::new(),
             images,
         };
-        // A validation image of either station is predicted from training images of the other one.
+        // Validation images of the new station are predicted from training images of earlier
+        // stations. Validation images of earlier stations are predicted from training images of the
+        // new station.
         scene.pairs = scene.pairs_across([Split::Train, Split::Train]);
         scene.validation_pairs = [
             scene.pairs_across([Split::Train, Split::Validation]),
@@ -232,7 +234,7 @@ impl StationScene {
         (scene.pairs.len() >= MIN_PAIRS).then_some(scene)
     }
 
-    /// Indices of the images of a split at the new station or at earlier ones.
+    /// Indices of the images of a split at the new station or at earlier stations.
     fn images_of(&self, in_new_station: bool, split: Split) -> Vec<usize> {
         (0..self.images.len())
             .filter(|ix| {
@@ -242,7 +244,7 @@ impl StationScene {
             .collect()
     }
 
-    /// Pairs between earlier images and new ones of these splits, in both directions.
+    /// Pairs between earlier images and new images of these splits, in both directions.
     fn pairs_across(&self, [earlier, later]: [Split; 2]) -> Vec<Pair> {
         let earlier = self.images_of(false, earlier);
         let later = self.images_of(true, later);
@@ -263,7 +265,7 @@ impl StationScene {
         )
     }
 
-    /// Views with the base moved by the estimate. Only views of the new station move; they have
+    /// Views with the base moved by the estimate. Only views of the new station move. They have
     /// columns for a further motion of the base.
     fn views(&self, estimate: &DVector<f64>) -> Vec<CorrectedView> {
         let part = |begin: usize| Vector3::from_fn(|row, _| estimate[begin + row]);
@@ -405,7 +407,7 @@ mod tests {
         Transform::new(Vector3::new(0.3, -0.2, 0.1), Vector3::new(0.0, 0.0, 0.2))
     }
 
-    /// The reported pose of the base is the true one moved by this drift.
+    /// The reported pose of the base is the true pose moved by this drift.
     fn drift() -> Transform {
         base_motion(
             &reported_base(),

@@ -8,12 +8,12 @@ use nalgebra::{DMatrix, DVector};
 use numbers::quantile::{Rank, quantile};
 use rayon::prelude::*;
 
-/// Number of standard deviations at which residuals get half the full weight (Cauchy weights, 95 %
-/// as efficient as least squares for normal noise).
+/// Number of standard deviations at which residuals get half the full weight of Cauchy weights.
+/// With this value, the estimate is 95 % as efficient as least squares for normal noise.
 const CAUCHY_SCALE: f64 = 2.385;
-/// Standard deviation of the prior on the gain, around 1. The next constant is the same for the
-/// offset, around 0. The priors are wide, because exposures differ. Without a prior, a pair of
-/// images of constant brightness would not determine gain and offset.
+/// Standard deviation of the prior on the gain, around 1. The next constant is the standard
+/// deviation of the prior on the offset, around 0. The priors are wide, because exposures differ.
+/// Without a prior, a pair of images of constant brightness would not determine gain and offset.
 const PRIOR_GAIN_DEVIATION: f64 = 0.2;
 const PRIOR_OFFSET: f64 = 30.0;
 /// Minimum number of samples of a pair. With fewer samples, gain and offset of the pair would
@@ -30,7 +30,7 @@ pub(super) struct Noise {
 /// Level, tolerance, noise and pixels of the residuals.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct ResidualOptions {
-    /// Pyramid level; 0 is the finest.
+    /// Pyramid level, where 0 is the finest.
     pub(super) level: usize,
     /// Relative depth difference above which a reading belongs to another surface.
     pub(super) occlusion_frac: f64,
@@ -42,8 +42,8 @@ pub(super) struct ResidualOptions {
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum PixelSubset {
     All,
-    /// Every second block, as in a checkerboard. Poses are estimated on one half of the blocks and
-    /// evaluated on the other half.
+    /// Every second block of pixels, as in a checkerboard. Poses are estimated on one half of the
+    /// blocks and evaluated on the other half.
     Blocks {
         odd: bool,
     },
@@ -195,7 +195,7 @@ fn of_shared_pair(sides: [Side<'_>; 2], options: &ResidualOptions) -> PairSums {
 }
 
 /// Contribution of every pair to the motions of its two cameras. The six parameters of the first
-/// camera come before those of the second.
+/// camera come first, followed by the six parameters of the second camera.
 pub(super) fn of_free_pairs(
     images: &[PreparedImage],
     views: &[CorrectedView],
@@ -215,7 +215,7 @@ pub(super) fn of_free_pairs(
         .collect()
 }
 
-/// Contribution of a pair to the motion of its second camera, with the first one fixed.
+/// Contribution of a pair to the motion of its second camera, if the first camera is fixed.
 pub(super) fn of_second(sides: [Side<'_>; 2], options: &ResidualOptions) -> PairSums {
     let param_columns = [
         ParamColumns::still(sides[0].view),
@@ -346,7 +346,8 @@ fn of_pair(
 
 /// Scatter of the residuals of all pairs, from their median. `None` without residuals.
 pub(super) fn noise_of(sums: &[PairSums]) -> Option<Noise> {
-    /// Lower limit of the noise. It is due to rounding to bytes and to a tenth of a millimeter.
+    /// Lower limit of the noise. Rounding brightness to bytes and depth to a tenth of a millimeter
+    /// causes this noise.
     const MIN_NOISE: Noise = Noise {
         photo: 0.3,
         depth: 5e-5,

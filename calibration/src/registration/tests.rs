@@ -81,8 +81,8 @@ fn wrong_depth_pose_is_found() {
         ParamSet::DEPTH_POSE,
     );
     let correction = &alignment.corrections["wrist"];
-    // The input pose is the true pose times the deviation; the correction is applied from the left
-    // to color_from_depth.
+    // The input pose is the true pose times the deviation. The correction is applied from the left
+    // to `color_from_depth`.
     let base = Transform::new(Vector3::new(0.02, 0.0, 0.0), Vector3::zeros());
     let estimated = crate::rigid_transform(
         correction.depth_rotation_rad.into(),
@@ -190,7 +190,8 @@ fn rotation_about_one_axis_leaves_extrinsics_unobservable() {
     assert!(
         alignment.unobservable[0].parts[0].starts_with("translation of camera \"wrist\" along")
     );
-    // Vertical direction of the base in the camera's axes; the correction along it is zero.
+    // This is the vertical direction of the base in the camera's axes. The correction along this
+    // direction is zero.
     let up = (camera_at(joints_at(0.0, true)) * miscalibration.extrinsics)
         .rotation
         .inverse()
@@ -281,8 +282,8 @@ fn reported_sigmas_match_actual_errors() {
     assert!((0.25..4.0).contains(&mean), "{mean} of {squares:.1?}");
 }
 
-/// Squared errors of the extrinsics, in units of their stated variances, along and about the axes of
-/// the camera.
+/// Squared errors of the extrinsics, in units of their stated variances, along and about the axes
+/// of the camera.
 fn squared_extrinsics_errors(miscalibration: &Miscalibration, set: ParamSet) -> [f64; 6] {
     let alignment = align_given(miscalibration, set);
     let correction = &alignment.corrections["wrist"];
@@ -308,8 +309,8 @@ fn squared_extrinsics_errors(miscalibration: &Miscalibration, set: ParamSet) -> 
 #[test]
 fn errors_match_stated_variances_with_a_time_offset() {
     const SEEDS: u64 = 6;
-    // Mean over 36 squares, of which only some are independent. The stated variances contain the
-    // discretization error, which is larger than the real one in small images.
+    // The mean is over 36 squares, of which only some are independent. The stated variances contain
+    // a discretization error, which is larger than the real discretization error in small images.
     const MAX_RATIO: f64 = 1.5;
     let mut squares = Vec::new();
     for seed in 0..SEEDS {
@@ -450,7 +451,7 @@ fn max_jacobian_errors(has_rolling_shutter: bool) -> Vec<(layout::CalibrationPar
     let all: ParamSet = candidates().into_iter().collect();
     let layout = scene.layout(all);
     let mut here = Corrections::none(1);
-    // Joint offsets are zero. To first order, their columns are those at the measured joint
+    // Joint offsets are zero. To first order, their columns are the columns at the measured joint
     // positions.
     let displaced = layout
         .params
@@ -583,7 +584,8 @@ fn drifting_image_poses_are_corrected() {
     let keyframes: Vec<Arc<Keyframe>> = capture(&Miscalibration::none())
         .iter()
         .map(|keyframe| {
-            // Smooth errors of millimeters, like those of a SLAM system; the motion is unknown.
+            // The pose errors are smooth and a few millimeters, as in a SLAM system. The motion is
+            // unknown.
             let secs = keyframe.stamp.0 as f64 * 1e-9;
             let wave = |hz: f64, phase: f64| (6.3 * hz * secs + phase).sin();
             let drift = Transform::new(
@@ -611,12 +613,12 @@ fn drifting_image_poses_are_corrected() {
     );
 }
 
-/// Seed of the pose errors of the first image. Errors of 10 mm are at the limit of convergence:
-/// with two of six seeds, single images converge to wrong poses.
+/// Seed of the pose errors of the first image. Errors of 10 mm are at the limit of convergence.
+/// With two of six seeds, single images converge to wrong poses.
 const NOISE_SEED: u64 = 1000;
 
-/// The capture with random errors in every pose except those of test images: `mm` millimeters along
-/// each axis, and a tenth of a degree per millimeter about each axis.
+/// The capture with random errors in every pose except the poses of test images. The errors are
+/// `mm` millimeters along each axis, and a tenth of a degree per millimeter about each axis.
 fn noisy(mm: f64, from_joints: bool) -> Vec<Arc<Keyframe>> {
     let moved = |(ix, keyframe): (usize, &Arc<Keyframe>)| {
         if keyframe.split == Split::Test {
@@ -644,8 +646,8 @@ fn noisy(mm: f64, from_joints: bool) -> Vec<Arc<Keyframe>> {
         .collect()
 }
 
-/// Mean pose errors relative to each other, after removing the common motion that minimizes them:
-/// millimeters and degrees.
+/// Mean relative errors of the poses, millimeters and degrees. The common motion that minimizes the
+/// errors is removed first.
 fn relative_pose_errors(estimates: &[Transform], expected: &[Transform]) -> (f64, f64) {
     let mut common = Transform::identity();
     for _ in 0..10 {

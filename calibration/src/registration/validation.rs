@@ -15,14 +15,15 @@ use std::collections::BTreeMap;
 /// Maximum brightness difference that counts, on a scale of 0 to 255. Larger differences come from
 /// other surfaces or highlights.
 const CLIP: f64 = 50.0;
-/// Noise whose square is added to each squared difference, on a scale of 0 to 255. With this noise,
-/// differences below the noise of a camera image do not count. It is needed because the compared
-/// images are blurred and thus have less noise.
+/// Noise whose square is added to each squared difference, on a scale of 0 to 255. Differences
+/// below the noise of a camera image then do not count. Without this value, they would count,
+/// because the compared images are blurred and thus have less noise than a camera image.
 const IMAGE_NOISE: f64 = 2.0;
 /// Relative depth difference above which a sample counts as occluded, as at the finest level of
 /// registration.
 const OCCLUSION_FRAC: f64 = 0.04;
-/// Minimum number of samples of a score. With fewer, the scores of images differ mostly by noise.
+/// Minimum number of samples of a score. With fewer samples, the scores of images differ mostly by
+/// noise.
 const MIN_SAMPLES: usize = 30;
 
 /// A comparison of the predictions of validation images without (baseline) and with (variant) a
@@ -70,13 +71,14 @@ impl PairedComparison<'_> {
     /// Like [`Self::scores`], but each validation image gets an individual pose, which is estimated
     /// on one half of its blocks and evaluated on the other half. Then the halves swap roles.
     ///
-    /// This tests whether the training images are more consistent with each other. If they are
-    /// misaligned, no single pose fits the predictions of all of them. The test must not depend on
-    /// anything else. The baseline therefore also estimates the individual pose, with the same
-    /// residuals, prior, number of steps and partners. Baseline and variant are evaluated at
-    /// samples that both show. As a result, both have the same freedom, and the accuracy of the
-    /// validation image's own pose does not matter. Overfitting to noise lowers the score on the
-    /// other half. The correction itself was not estimated from these images.
+    /// This tests whether the variant makes the training images more consistent with each other. If
+    /// the training images are misaligned, no single pose of the validation image fits the
+    /// predictions from all of them. The test must not depend on anything else. The individual pose
+    /// is therefore estimated for the baseline and for the variant, with the same residuals, prior,
+    /// number of steps and partners. Baseline and variant are evaluated at the samples that both of
+    /// them show. As a result, both have the same freedom, and the accuracy of the validation
+    /// image's own pose does not matter. Overfitting to noise lowers the score on the other half.
+    /// The correction itself was not estimated from the validation images.
     pub(super) fn scores_with_free_poses(&self) -> Vec<ImageScore> {
         let views = self.views();
         let mut by_image: BTreeMap<usize, Vec<Pair>> = BTreeMap::new();
@@ -230,8 +232,8 @@ fn errors(sides: [[Side<'_>; 2]; 2], noise: Noise, part: PixelSubset) -> PairedE
     };
     let correspondences =
         sides.map(|sides| sums::correspondences(sides, &sides[0].image.uniform_samples, &options));
-    // Samples that only the baseline or only the variant shows are left out, because they would
-    // favor or penalize it for its visibility.
+    // Samples that only the baseline or only the variant shows are left out. Otherwise, the
+    // comparison would also depend on which samples are visible.
     let (baseline, variant): (Vec<&Correspondence>, Vec<&Correspondence>) = correspondences[0]
         .iter()
         .zip(&correspondences[1])

@@ -31,7 +31,7 @@ impl RigidTransform {
     }
 }
 
-/// Unit motion along (0 to 2) or about (3 to 5) an axis.
+/// Unit motion of one part: along an axis for parts 0 to 2, or about an axis for parts 3 to 5.
 pub(super) fn unit_twist(part: usize) -> Twist {
     let unit = |axis: usize| Vector3::from_fn(|row, _| if row == axis { 1.0 } else { 0.0 });
     let (linear_m_s, angular_rad_s) = if part < 3 {
@@ -164,7 +164,8 @@ impl CorrectedView {
     }
 
     /// Computes the camera-frame position of a static point at the readout time of its row from its
-    /// position at mid-exposure. Also returns that time as a share of the total readout time.
+    /// position at mid-exposure. Also returns this readout time as a share of the total readout
+    /// time.
     pub(super) fn at_readout(&self, still: &Vector3<f64>) -> (Vector3<f64>, f64) {
         if self.readout_secs == 0.0 {
             return (*still, 0.0);

@@ -30,8 +30,8 @@ pub(super) fn correlate(
 ) -> Result<Vec<Coarse>, Refusal> {
     /// Lower maxima are not tried.
     const SIMILAR: f64 = 0.7;
-    /// Periodic motions have one maximum per period. Each maximum is refined, which takes most of
-    /// the time.
+    /// Periodic motions have one maximum per period. The number of maxima is limited, because each
+    /// of them is refined, which takes most of the time.
     const MAX_OTHERS: usize = 4;
     // Stamps in other units spread the motion over a long time, which looks like no rotation. This
     // is tested per stream, because streams in different units do not overlap.
@@ -72,8 +72,8 @@ pub(super) fn correlate(
             ),
         });
     };
-    // There is no correlation. A wrong rate of one clock is also a possible cause, but it has
-    // another remedy.
+    // There is no correlation. One possible cause is a wrong rate of one clock, which has its own
+    // remedy.
     if best.value < MIN_CORRELATION {
         if let Some(refusal) = clock_rate_mistake(a, b) {
             return Err(refusal);
@@ -107,7 +107,7 @@ pub(super) fn correlate(
 /// Explains the missing correlation by stamps that advance too fast or too slowly by a factor of
 /// two.
 pub(super) fn clock_rate_mistake(a: &Stream, b: &Stream) -> Option<Refusal> {
-    /// The correlation of unrelated motions of usual length is below this value.
+    /// For unrelated motions of usual length, the correlation is below this value.
     const MIN_CORRELATION: f64 = 0.7;
     let words = [(0.5, "twice"), (2.0, "half")]
         .into_iter()
@@ -219,8 +219,8 @@ impl Rates {
     /// # Errors
     /// Fails if the rate hardly changes.
     fn check_excitation(&self, name: &str) -> Result<(), Refusal> {
-        /// This is a tenth of the value for a hand-held or slowly moving camera. Below this limit,
-        /// tracking noise dominates.
+        /// Minimum standard deviation of the rotation rates. Below this limit, tracking noise
+        /// dominates. The limit is a tenth of the value for a hand-held or slowly moving camera.
         const MIN_DEVIATION_RAD_S: f64 = 0.02;
         let rates: Vec<f64> = self.values.iter().flatten().copied().collect();
         let n = rates.len().max(1) as f64;
@@ -288,8 +288,8 @@ impl Correlation {
     }
 }
 
-/// Whether a correlation is larger than both neighbors. If correlations are equal, the last one
-/// counts as larger.
+/// Whether a correlation is larger than both neighbors. If correlations are equal, the last
+/// correlation counts as larger.
 fn is_maximum(correlations: &[Correlation], ix: usize) -> bool {
     let value = correlations[ix].value;
     ix > 0

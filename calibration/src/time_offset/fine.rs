@@ -7,7 +7,8 @@ use crate::hand_eye::{Refusal, nearest_rotation};
 use crate::least_squares::{self, BlockSums, Fit, Loss, sigma_of};
 use nalgebra::{DMatrix, DVector, Matrix3, UnitQuaternion, Vector3};
 
-/// Parameters: rotation vectors of the hand-eye and the reference rotation, offset, drift.
+/// Number of parameters without the drift. The parameters are the rotation vectors of the hand-eye
+/// and the reference rotation, the offset, and the drift.
 const N_WITHOUT_DRIFT: usize = 7;
 const OFFSET_IX: usize = 6;
 const DRIFT_IX: usize = 7;
@@ -39,8 +40,8 @@ pub(super) struct Fine {
 /// Fails if the streams do not overlap.
 pub(super) fn refine(a: &Stream, b: &Stream, offset_secs: f64) -> Result<Fine, Error> {
     const MIN_SIGMAS: f64 = 3.0;
-    // The fit is done twice, first without a drift and then with one. An insignificant drift would
-    // only increase the uncertainty of the offset.
+    // The fit is done first without a drift, and then with a drift. An insignificant drift is not
+    // used, because it would only increase the uncertainty of the offset.
     let problem = Orientations::new(a, b, offset_secs)?;
     let initial = problem.initial_state(offset_secs)?;
     let without = problem.fit(initial)?;
@@ -130,8 +131,8 @@ impl<'a> Orientations<'a> {
             a,
             rate_half_secs,
             times_b,
-            // The drift is relative to the middle of the overlap, because there, it is not
-            // correlated with the offset.
+            // The drift is relative to the middle of the overlap, because the offset at this time
+            // is not correlated with the drift.
             mid_secs: 0.5 * (first + last),
             half_secs: 0.5 * (last - first),
             has_drift: false,

@@ -63,9 +63,9 @@ pub struct TimeOffset {
     pub offset_secs: f64,
     /// Standard deviation of the offset.
     pub sigma_secs: f64,
-    /// Drift of A's clock relative to B's and its standard deviation, parts per million. `None` if
-    /// it is not significant (three standard deviations). A's clock is at `secs_b + offset_secs +
-    /// 1e-6 * drift * (secs_b - mid_secs)`.
+    /// Drift of A's clock relative to B's clock and its standard deviation, parts per million.
+    /// `None` if the drift is smaller than three standard deviations. A's clock is at `secs_b +
+    /// offset_secs + 1e-6 * drift * (secs_b - mid_secs)`.
     pub drift_ppm: Option<[f64; 2]>,
     /// Middle of the overlap on B's clock.
     pub mid_secs: f64,
@@ -97,7 +97,8 @@ pub struct BodyTransform {
 /// The streams may have different rates, gaps, outliers and clocks with different zeros, but must
 /// overlap in time.
 ///
-/// # Errors Returns [`Error::Refused`] if the motion does not determine the offset, and
+/// # Errors
+/// Returns [`Error::Refused`] if the motion does not determine the offset, and
 /// [`Error::TimeOffsetInput`] if a stream is invalid.
 ///
 /// ```
@@ -152,8 +153,9 @@ fn estimate(
             _ => error,
         })?;
     let offset_secs = sign * fine.offset_secs;
-    // Rotation rates are the same for a stream and its inverse, but orientations are not. If one
-    // stream is inverted, the fit therefore moves away from its start.
+    // A stream and its inverse have the same rotation rates, but different orientations. If one
+    // stream is inverted, the initial offset is right, and the fit of the orientations moves away
+    // from it.
     if (offset_secs - coarse.offset_secs).abs() > 10.0 * coarse.step_secs {
         return Err(refused(Refusal::new(
             format!(
@@ -224,7 +226,8 @@ fn estimate(
 
 /// The refined offset with the smallest residuals, and the offset from which it started.
 ///
-/// # Errors Fails if no offset fits, or if another offset fits equally well.
+/// # Errors
+/// Fails if no offset fits, or if another offset fits equally well.
 fn refine_best(
     interpolated: &Stream,
     points: &Stream,
@@ -235,7 +238,7 @@ fn refine_best(
     const SIMILAR: f64 = 1.5;
     /// Smaller differences are below the resolution of all tracking systems.
     const EXACT_RAD: f64 = 1e-4;
-    /// Largest residual relative to the motion. Unrelated motions have about 1.
+    /// Largest residual relative to the motion. For unrelated motions, this ratio is about 1.
     const MAX_RESIDUAL_FRAC: f64 = 0.25;
     /// Largest residual per axis of rigidly joined bodies, about 5 degrees.
     const MAX_RESIDUAL_RAD: f64 = 0.09;
@@ -288,7 +291,7 @@ fn body_transform(
     b: &Stream,
     secs_a: impl Fn(f64) -> f64,
 ) -> Result<Result<BodyTransform, Refusal>, Error> {
-    /// More poses would not be independent of each other, and would only take longer.
+    /// Additional poses would not be independent of these poses. They would only take more time.
     const MAX_SAMPLES: usize = 50;
     let pairs: Vec<(f64, Transform, Transform)> = b
         .samples
@@ -325,8 +328,8 @@ fn body_transform(
             scatter: found.scatter,
         })),
         Err(Error::Refused(refusal)) => {
-            // The hand-eye calibration names its own input. Longer names come first, because the
-            // shorter ones are parts of them.
+            // The hand-eye calibration names its own input. Longer names come first, because
+            // shorter names are parts of them.
             let names = [
                 ("base_from_flange", "stream A"),
                 ("camera_from_board", "the inverse of stream B"),

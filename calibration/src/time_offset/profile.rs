@@ -1,4 +1,5 @@
-//! Rotation rates of two streams and their correlation, to show what an estimate is based on.
+//! Rotation rates of two streams and their correlation, for charts that show the basis of an
+//! estimate.
 
 use super::coarse::Grid;
 use super::stream::Stream;
@@ -18,7 +19,8 @@ pub struct MotionProfile {
 /// The rotation rates that [`super::estimate_time_offset`] compares. They are available even if the
 /// estimate is refused.
 ///
-/// # Errors Returns [`Error::TimeOffsetInput`] if a stream is invalid.
+/// # Errors
+/// Returns [`Error::TimeOffsetInput`] if a stream is invalid.
 pub fn motion_profile(
     a: &[PoseSample],
     b: &[PoseSample],
@@ -38,7 +40,7 @@ pub fn motion_profile(
     })
 }
 
-/// Times and rates of one stream of a grid. Gaps are left out.
+/// Times and rates of one of the two streams, sampled on the grid. Gaps are left out.
 fn curve(stream: &Stream, grid: &Grid, stream_ix: usize) -> Vec<[f64; 2]> {
     let values = grid.rates[stream_ix].values.iter().enumerate();
     values

@@ -1,12 +1,12 @@
-//! Names streams whose quaternions are in another order.
+//! Detects streams whose quaternions are in another order.
 
 use super::{PoseSample, TimeOffset, TimeOffsetOptions, estimate};
 use crate::Error;
 use crate::hand_eye::Refusal;
 use nalgebra::{Quaternion, UnitQuaternion};
 
-/// Explains large residuals by the order w, x, y, z of the quaternions of one or both streams, if
-/// the orientations fit several times better with this order.
+/// Explains large residuals by quaternions in the order w, x, y, z in one or both streams. This is
+/// the explanation if the orientations fit several times better with this order.
 ///
 /// * `found`: the estimate for the order x, y, z, w.
 pub(super) fn mistake(

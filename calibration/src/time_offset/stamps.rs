@@ -4,19 +4,19 @@
 use super::PoseSample;
 use crate::hand_eye::Refusal;
 
-/// Units in which stamps are often given by mistake, and their number per second.
+/// Units in which stamps are often given by mistake, and the number of these units per second.
 const UNITS: [(&str, f64); 3] = [
     ("milliseconds", 1e3),
     ("microseconds", 1e6),
     ("nanoseconds", 1e9),
 ];
 /// Times between poses of cameras, trackers and robots, seconds. They correspond to rates of 2.5 to
-/// 2500 Hz. The range spans a factor of 1000, which is the ratio of neighboring units, so that a
-/// step fits only one unit.
+/// 2500 Hz. The range spans a factor of 1000, which is also the ratio of neighboring units. A step
+/// therefore fits only one unit.
 const USUAL_STEPS_SECS: std::ops::RangeInclusive<f64> = 0.0004..=0.4;
 
 /// The unit of stamps that are not seconds. Stamps in seconds with steps of several seconds look
-/// like milliseconds, so this is only used to explain streams that cannot be used.
+/// like milliseconds. This function is therefore used only to explain streams that cannot be used.
 ///
 /// * `step_secs`: typical difference of consecutive stamps.
 pub(super) fn unit_mistake(name: &str, step_secs: f64) -> Option<Refusal> {

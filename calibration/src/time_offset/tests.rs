@@ -46,8 +46,8 @@ fn a_body_from_b_body() -> Transform {
     Transform::new(Vector3::new(0.1, -0.05, 0.2), Vector3::new(0.5, -1.2, 0.8))
 }
 
-/// Streams of 20 s: A with 100 Hz, B with 25 Hz, noise, a gap and wrong poses. B's clock is behind
-/// A's by the true offset and A's clock is faster by `drift`.
+/// Streams of 20 s. A has 100 Hz. B has 25 Hz, noise, a gap and wrong poses. B's clock is behind
+/// A's clock by the true offset, and A's clock is faster by `drift`.
 fn streams(seed: u64, noise_rad: f64, drift: f64) -> (Vec<PoseSample>, Vec<PoseSample>) {
     let motion = Motion::new(seed);
     let mut random = Random::new(seed + 1);
@@ -121,7 +121,8 @@ fn stated_sigma_matches_the_errors() {
         ((found.offset_secs - TRUE_OFFSET_SECS) / found.sigma_secs).powi(2)
     });
     let ratio = (squares.sum::<f64>() / n as f64).sqrt();
-    // The standard error of the ratio is 0.13, plus that of the sigmas from 20 parts each.
+    // The standard error of the ratio is 0.13. The standard error of the sigmas, which are from 20
+    // parts each, is added to it.
     assert!(
         (0.6..1.5).contains(&ratio),
         "errors are {ratio} times the stated ones"
@@ -305,7 +306,7 @@ fn stamps_that_advance_at_another_rate_or_repeat_are_named() {
     twice.iter_mut().for_each(|sample| sample.secs *= 2.0);
     let text = message(&a, &twice);
     assert!(text.contains("twice as fast"), "{text}");
-    // Whole seconds.
+    // The stamps are rounded to whole seconds.
     let mut rounded = b.clone();
     rounded
         .iter_mut()

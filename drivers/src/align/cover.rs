@@ -23,13 +23,13 @@ const WIDE: u16 = u16::MAX;
 /// Largest image width, in columns. Columns beyond it get no depth because they have no cell in a
 /// strip.
 pub(super) const MAX_COLUMNS: usize = N_STRIP_CELLS - 1 - N_DISCARD_CELLS - PAD - 1;
-/// Number of pixels tested at once: a few vector registers. A longer block computes more values
-/// beyond the first match. A shorter block tests for an exit more often.
+/// Number of pixels tested at once, which fill a few vector registers. A longer block computes more
+/// values beyond the first match. A shorter block tests for an exit more often.
 const BLOCK: usize = 32;
 
 /// First and last column and row that each pixel of one row of depth covers, clipped to the image.
-/// Indices start at 1; 0 is before the image. If a first index is greater than the corresponding
-/// last index, the pixel covers nothing.
+/// Indices start at 1. The index 0 is before the image. If a first index is greater than the
+/// corresponding last index, the pixel covers nothing.
 pub(super) struct PixelBounds {
     pub(super) first: [Vec<u16>; 2],
     pub(super) last: [Vec<u16>; 2],
@@ -41,7 +41,8 @@ pub(super) struct NearestDepth {
     /// Nearest count minus one of each pixel: `[height, width]`.
     nearest: Vec<u16>,
     /// For each column, the minimum over the squares of the current run that start there. There is
-    /// one strip per square width: `n_strips` strips of `stride` cells, then [`N_DISCARD_CELLS`].
+    /// one strip per square width. The array has `n_strips` strips of `stride` cells, followed by
+    /// [`N_DISCARD_CELLS`] cells.
     strips: Box<[u16; N_STRIP_CELLS]>,
     /// Number of strips that fit.
     n_strips: usize,
@@ -107,8 +108,9 @@ impl NearestDepth {
     fn fill(&mut self, run: Range<usize>, bounds: &PixelBounds) {
         let strip_cells = &self.strip_cells[run.clone()];
         let count_minus_one = &self.count_minus_one[run.clone()];
-        // The fast loop handles nearly all runs: one cell per pixel, without a branch. A pixel
-        // without depth writes into a cell that nobody reads, which is cheaper than skipping it.
+        // The fast loop handles nearly all runs. It writes one cell per pixel, without a branch. A
+        // pixel without depth writes into a cell that is never read, because this is faster than
+        // skipping the pixel.
         let has_too_wide = strip_cells
             .iter()
             .fold(false, |any, cell| any | (*cell == WIDE));
@@ -144,8 +146,8 @@ impl NearestDepth {
             first: [left, top],
             last: [right, bottom],
         } = bounds;
-        // Slices of one length let the compiler drop the bounds checks, which would prevent vector
-        // instructions in the loop.
+        // Because the slices have one length, the compiler drops the bounds checks, which would
+        // prevent vector instructions in the loop.
         let left = &left[..n];
         let top = &top[..n];
         let right = &right[..n];

@@ -2,11 +2,11 @@
 //!
 //! Source: the processing block `align` of librealsense (`src/proc/align.cpp`). A depth pixel is a
 //! square. Two opposite corners are projected to the color image at the depth of the pixel, and
-//! each color pixel keeps the nearest square that covers it. We clip squares at the edge of the
-//! image, whereas librealsense drops them. The SSE path of librealsense
-//! (`src/proc/sse/sse-align.cpp`) rounds half a pixel further to the right and down. It uses only
-//! the upper left corner if the color image has fewer pixels per angle than the depth image. We
-//! follow the scalar path of librealsense.
+//! each color pixel keeps the nearest square that covers it. This module clips squares at the edge
+//! of the image, whereas librealsense drops them. The SSE path of librealsense
+//! (`src/proc/sse/sse-align.cpp`) rounds half a pixel further to the right and down. It also uses
+//! only the upper left corner if the color image has fewer pixels per angle than the depth image.
+//! This module follows the scalar path of librealsense, which has neither of these two deviations.
 
 mod cover;
 
@@ -21,8 +21,8 @@ use std::sync::Arc;
 pub struct DepthAlignment {
     depth_px: [u32; 2],
     color: ColorCamera,
-    /// Rays of the pixel corners, `z` = 1 in the depth camera, rotated to the axes of the color
-    /// camera: `[height + 1, width + 1]`.
+    /// Rays of the pixel corners, `[height + 1, width + 1]`. They have `z` = 1 in the depth camera,
+    /// and are rotated to the axes of the color camera.
     corners: [Vec<f32>; 3],
     /// Position of the depth camera in the frame of the color camera, meters.
     depth_in_color: [f64; 3],
@@ -35,8 +35,8 @@ struct ColorCamera {
     focal_px: [f32; 2],
     principal_px: [f32; 2],
     lens: ColorLens,
-    /// Square of the largest valid radius on the plane `z` = 1. Beyond it, distortion polynomials
-    /// may not be monotonic.
+    /// Square of the largest valid radius on the plane `z` = 1. Beyond this radius, distortion
+    /// polynomials may not be monotonic.
     max_radius_squared: f32,
 }
 
@@ -51,9 +51,9 @@ enum ColorLens {
 /// A corner of the pixels of one row of depth.
 #[derive(Clone, Copy)]
 enum Corner {
-    /// Upper left corner. Hidden corners get a position after the image.
+    /// Upper left corner. The column of a hidden corner is set beyond the right edge of the image.
     First,
-    /// Lower right corner. Hidden corners get a position before the image.
+    /// Lower right corner. The column of a hidden corner is set beyond the left edge of the image.
     Last,
 }
 
@@ -81,7 +81,7 @@ struct Row {
 /// Work that runs with vector instructions.
 struct Task<'a> {
     alignment: &'a DepthAlignment,
-    /// Two bytes each, little endian.
+    /// The counts of the depth image. Each count has two bytes, little endian.
     counts: &'a [u8],
     meters_per_count: f64,
 }
@@ -138,7 +138,8 @@ impl DepthAlignment {
     /// pixels with a count of 0 or with the largest count are invalid and are skipped.
     ///
     /// # Errors
-    /// If the image contains no depth or its size differs from that of the depth camera.
+    /// Fails if the image contains no depth, or if its size differs from the size of the depth
+    /// camera.
     pub fn align(&self, depth: &Image) -> Result<Image, Error> {
         let PixelFormat::DepthU16 { meters_per_count } = depth.format else {
             return Err(depth.wrong_kind("depth"));
@@ -165,8 +166,8 @@ impl DepthAlignment {
         })
     }
 
-    /// Nearest count minus one of each color pixel. The invalid count 0 wraps to the largest number
-    /// and never wins.
+    /// Nearest count minus one of each color pixel. The invalid count 0 wraps to the largest
+    /// number, so every valid count is nearer.
     #[inline(always)]
     fn align_counts(&self, counts: &[[u8; 2]], meters_per_count: f64) -> Vec<u16> {
         let depth_width = self.depth_px[0] as usize;
@@ -309,8 +310,9 @@ fn project_by(
     }
 }
 
-/// Converts positions to pixel indices that start at 1, clipped to the image and one index after it
-/// ([`Corner::First`]) or before it ([`Corner::Last`]).
+/// Converts positions to pixel indices, which start at 1, and clips them. [`Corner::First`] also
+/// allows the index after the last pixel of the image. [`Corner::Last`] also allows the index
+/// before the first pixel.
 #[expect(
     clippy::cast_possible_truncation,
     reason = "the low 16 bits are the index"
@@ -497,7 +499,7 @@ mod tests {
             .collect()
     }
 
-    /// CPU twin: the same squares in f64 with the lenses of `kinematics`.
+    /// The twin of the alignment. It draws the same squares in f64 with the lenses of `kinematics`.
     fn twin(
         depth: &Intrinsics,
         color: &Intrinsics,

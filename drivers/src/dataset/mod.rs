@@ -16,7 +16,7 @@ use std::path::{Path, PathBuf};
 pub struct Dataset {
     /// The folder.
     pub path: PathBuf,
-    /// Images, sorted by file name (nerfstudio) or time (TUM); never empty.
+    /// Images, sorted by file name (nerfstudio) or time (TUM). The list is never empty.
     pub images: Vec<DatasetImage>,
     /// PLY file of points on the surfaces of the scene, in the world frame of the images. The file
     /// may not exist. `None` if the dataset names no such file.
@@ -45,14 +45,14 @@ fn is_nerfstudio(path: &Path) -> bool {
     path.is_file() || path.join(nerfstudio::FILE_NAME).is_file()
 }
 
-/// Whether [`read`] accepts `path` as a dataset folder; its contents are not checked.
+/// Whether [`read`] accepts `path` as a dataset folder. The contents of the folder are not checked.
 pub fn is_dataset_folder(path: &Path) -> bool {
     [nerfstudio::FILE_NAME, tum::COLOR_LIST]
         .iter()
         .any(|name| path.join(name).is_file())
 }
 
-/// Reads a dataset folder of either kind; `path` may also name a `transforms.json`.
+/// Reads a dataset folder of either kind. `path` may also name a `transforms.json`.
 pub fn read(path: &Path) -> Result<Dataset, Error> {
     if path.is_file()
         && let Some(hint) = other_formats::hint(path)
@@ -74,14 +74,14 @@ pub fn read(path: &Path) -> Result<Dataset, Error> {
     })
 }
 
-/// Describes a focal length or principal point that no camera has, such as the result of a division
-/// by almost zero, or lens coefficients that no lens has.
+/// Describes implausible lens parameters. These are a focal length or principal point that no
+/// camera has, such as the result of a division by almost zero, or coefficients that no lens has.
 fn implausible(intrinsics: &Intrinsics) -> Option<String> {
     /// Range of focal lengths relative to the longer side of the image. It corresponds to fields of
     /// view from 0.06 to 176 degrees.
     const FOCAL: std::ops::RangeInclusive<f64> = 0.02..=1000.0;
     /// Range of principal points relative to the image size. It is wide because images may be cut
-    /// out of larger ones.
+    /// out of larger images.
     const CENTER: std::ops::RangeInclusive<f64> = -1.0..=2.0;
     let [width, height] = intrinsics.size_px.map(f64::from);
     let longer = width.max(height);
@@ -101,7 +101,8 @@ fn implausible(intrinsics: &Intrinsics) -> Option<String> {
 }
 
 fn implausible_lens(intrinsics: &Intrinsics) -> Option<String> {
-    /// Coefficients that were fitted without measurements in the corners are often wrong there.
+    /// Maximum fraction of the image in which lens coefficients may be implausible. Coefficients
+    /// that were fitted without measurements in the corners are often wrong there.
     const MAX_IMPLAUSIBLE_FRAC: f64 = 1.0 / 3.0;
     let implausible_frac = intrinsics.implausible_lens_frac();
     (implausible_frac > MAX_IMPLAUSIBLE_FRAC).then(|| {
@@ -129,8 +130,8 @@ fn named_coefficients(lens: &Lens) -> String {
     named.join(", ")
 }
 
-/// Positions beyond this are assumed to be mistakes, meters. Scenes are far smaller, and f32, in
-/// which models are trained, has a resolution of 1 mm at this distance.
+/// Positions beyond this limit are assumed to be mistakes, meters. Scenes are far smaller, and f32,
+/// in which models are trained, has a resolution of 1 mm at this distance.
 const MAX_POSITION_M: f64 = 1e4;
 
 /// Images skipped while reading.
@@ -168,7 +169,7 @@ impl SkippedImages {
     ) -> Result<Dataset, Error> {
         let n_missing = self.missing.len();
         let n_unusable = self.unusable.len() + self.broken.len();
-        // One example says more about the cause than the counts.
+        // One example shows more about the cause than the counts.
         if images.is_empty() {
             let first_broken = self.broken.iter().chain(&self.unusable).next();
             let first_broken = first_broken.map(|(name, reason)| format!(" ({name}: {reason})"));

@@ -1,7 +1,7 @@
 //! Folders with a `transforms.json`, as written by nerfstudio and instant-ngp.
 //!
-//! Cameras in these files look along -z with y up (OpenGL). Poses are converted to our convention
-//! only in this module.
+//! Cameras in these files look along -z with y up (OpenGL). Only this module converts their poses
+//! to the convention of fieldrig.
 
 use super::posed_image::image_size_px;
 use super::{
@@ -55,12 +55,12 @@ const UNUSED: [&str; 14] = [
 ///
 /// Images are sorted by file name. The following images are skipped and counted: duplicates,
 /// missing or broken files, poses that are not finite or not rigid, and poses that are implausibly
-/// far away. If the file lists the images of the splits, images in no list are left out. The keys
-/// are explained in docs/reference/datasets.md.
+/// far away. If the file lists the images of the splits, images that are in no list are left out.
+/// The keys are explained in docs/reference/datasets.md.
 ///
 /// # Errors
-/// If the file cannot be parsed, no image is usable, or a frame uses an unsupported camera model.
-/// In the last case, the error names the frame.
+/// Fails if the file cannot be parsed, if no image is usable, or if a frame uses an unsupported
+/// camera model. In the last case, the error names the frame.
 pub fn read(path: &Path) -> Result<Dataset, Error> {
     let file = if path.is_file() {
         path.to_owned()
@@ -114,7 +114,7 @@ fn file_error(file: &Path, reason: String) -> Error {
     }
 }
 
-/// The images read so far, and everything that will be noted about the others.
+/// The images read so far, and the facts for the notes about images that were skipped.
 struct Reading<'a> {
     file: &'a Path,
     folder: &'a Path,
@@ -145,8 +145,8 @@ impl Reading<'_> {
     /// Adds the image of a frame, or notes why it is skipped.
     ///
     /// # Errors
-    /// If the frame has a malformed matrix or unsupported lens parameters. Such a mistake is
-    /// usually in all frames, and a dataset without them would be empty.
+    /// Fails if the frame has a malformed matrix or unsupported lens parameters. Such a mistake is
+    /// usually in all frames, so a dataset without these frames would be empty.
     fn add(&mut self, ix: usize, entry: &FrameEntry) -> Result<(), Error> {
         let name = &entry.file_path;
         if ix > 0 && self.document.frames[ix - 1].file_path == *name {
@@ -242,8 +242,8 @@ impl Reading<'_> {
         Some(poses)
     }
 
-    /// Notes that images have another size than the file says. The note is written only once,
-    /// because all images of a downscaled dataset have the same size.
+    /// Notes that the size of images differs from the size in the file. The note is written only
+    /// once, because all images of a downscaled dataset have the same size.
     fn note_other_size(&mut self, [width, height]: [u32; 2]) {
         if !std::mem::replace(&mut self.has_other_size, true) {
             self.notes.push(format!(
@@ -265,7 +265,7 @@ impl Reading<'_> {
     /// Adds notes about everything that was left out, and builds the dataset.
     ///
     /// # Errors
-    /// If it has no images.
+    /// Fails if the dataset has no images.
     fn finish(mut self) -> Result<Dataset, Error> {
         let absent = self.absent();
         self.note_splits(&absent);
@@ -277,7 +277,7 @@ impl Reading<'_> {
                 first_names(&self.rounded)
             ));
         }
-        // This error comes before that of an empty dataset, because it names the cause.
+        // This error comes before the error of an empty dataset, because it names the cause.
         if self.images.is_empty() && !self.unlisted.is_empty() {
             return Err(file_error(
                 self.file,
@@ -289,8 +289,8 @@ impl Reading<'_> {
             ));
         }
         self.note_missing_depth();
-        // The points are in the frame of the poses: nerfstudio applies `applied_transform` to both
-        // when it writes them.
+        // The points are in the frame of the poses, because nerfstudio applies `applied_transform`
+        // to both when it writes them.
         let folder = self.folder;
         let points_path = self
             .document
@@ -402,9 +402,9 @@ struct Document {
 }
 
 impl Document {
-    /// The split of each listed image; empty if the file has no lists. The keys are [`normalized`].
-    /// If the file lists no test images, its validation images become the test images, because
-    /// nerfstudio also scores them.
+    /// The split of each listed image. The map is empty if the file has no lists. Its keys are
+    /// [`normalized`] paths. If the file lists no test images, its validation images become the
+    /// test images, because nerfstudio also scores them.
     fn splits(&self) -> Result<HashMap<String, ListedSplit>, String> {
         let validation = if self.test_filenames.is_empty() {
             ListedSplit::Test
@@ -425,7 +425,8 @@ impl Document {
                 }
             }
         }
-        // Some files list only the images that are held out; the rest is meant for training.
+        // Some files list only the images that are held out. The other images are then for
+        // training.
         if self.train_filenames.is_empty() && !splits.is_empty() {
             for entry in &self.frames {
                 splits
@@ -491,14 +492,15 @@ fn normalized(path: &str) -> String {
     path.strip_prefix("./").unwrap_or(&path).to_owned()
 }
 
-/// One frame. Lens parameters of the frame override the common ones.
+/// One frame. Lens parameters of the frame override the common lens parameters of the file.
 #[derive(Deserialize)]
 struct FrameEntry {
     file_path: String,
     depth_file_path: Option<String>,
     mask_path: Option<String>,
     transform_matrix: Matrix,
-    /// Pose of the depth camera, if it differs from that of the photo. This field is our extension.
+    /// Pose of the depth camera, if it differs from the pose of the photo. This field is an
+    /// extension by fieldrig.
     depth_transform_matrix: Option<Matrix>,
     #[serde(flatten)]
     camera: CameraEntry,
@@ -506,7 +508,7 @@ struct FrameEntry {
     other: BTreeMap<String, Value>,
 }
 
-/// Rows of a pose; `None` where the number is not finite.
+/// Rows of a pose. Numbers that are not finite are `None`.
 type Matrix = Vec<Vec<Option<f64>>>;
 
 /// Lens parameters under the names used in the file.
@@ -557,7 +559,7 @@ fn deserialize_finite<'de, D: Deserializer<'de>>(from: D) -> Result<Option<f64>,
 }
 
 impl FrameEntry {
-    /// The matrices of the photo and, if it has its own, of the depth camera.
+    /// The matrix of the photo, and the matrix of the depth camera if the frame has one.
     fn matrices(&self) -> Result<([f64; 16], Option<[f64; 16]>), String> {
         let rows = rows_of(&self.transform_matrix)?;
         let depth_rows = self.depth_transform_matrix.as_ref().map(rows_of);
@@ -592,7 +594,8 @@ fn rows_of(matrix: &Matrix) -> Result<[f64; 16], String> {
     })
 }
 
-/// Converts an OpenGL camera pose to our convention. Also returns whether its numbers are rounded.
+/// Converts an OpenGL camera pose to the convention of fieldrig. Also returns whether its numbers
+/// are rounded.
 fn world_from_camera(rows: &[f64; 16]) -> Result<(Transform, bool), String> {
     let (world_from_opengl, is_rounded) =
         transform::from_rounded_rows(rows).map_err(|error| error.to_string())?;
@@ -605,15 +608,15 @@ fn excessive_distance_m(pose: Transform) -> Option<f64> {
     (excessive_distance_m > MAX_POSITION_M).then_some(excessive_distance_m)
 }
 
-/// Rotation by 180 degrees about x: OpenGL cameras look along -z with y up, ours along z with y
-/// down.
+/// Rotation by 180 degrees about x. OpenGL cameras look along -z with y up, and cameras of fieldrig
+/// look along z with y down.
 pub fn opengl_from_camera() -> Transform {
     let half_turn = UnitQuaternion::new_unchecked(nalgebra::Quaternion::new(0.0, 1.0, 0.0, 0.0));
     Transform::from_parts(Vector3::zeros().into(), half_turn)
 }
 
 impl CameraEntry {
-    /// Returns these parameters, and the common ones where they are not set.
+    /// Returns these parameters. Parameters that are not set are taken from the common parameters.
     fn or(&self, common: &Self) -> Self {
         Self {
             camera_model: self
@@ -721,7 +724,7 @@ impl CameraEntry {
 }
 
 /// Returns the focal length along one axis in pixels. It is computed from a focal length, a field
-/// of view, or both; `None` if neither is given. Each argument includes the name of its key.
+/// of view, or both. `None` if neither is given. Each argument includes the name of its key.
 fn focal_px(
     given: (&str, Option<f64>),
     angle: (&str, Option<f64>),

@@ -26,7 +26,8 @@ pub struct DatasetImage {
     pub depth: Option<DepthFile>,
     /// Image that is 0 at pixels that must not be used.
     pub mask_path: Option<PathBuf>,
-    /// The split to which the dataset assigns the image; `None` if it does not list splits.
+    /// The split to which the dataset assigns the image. `None` if the dataset does not list
+    /// splits.
     pub listed: Option<ListedSplit>,
 }
 
@@ -35,7 +36,7 @@ pub struct DatasetImage {
 pub enum ListedSplit {
     /// For training.
     Train,
-    /// Decides hyperparameters; not reported.
+    /// Images that decide hyperparameters. Scores on them are not reported.
     Validation,
     /// Gives the reported scores.
     Test,
@@ -46,7 +47,7 @@ pub enum ListedSplit {
 pub struct DepthFile {
     /// The file.
     pub path: PathBuf,
-    /// Meters per count; a count of 0 means that the depth is unknown.
+    /// Meters per count. A count of 0 means that the depth is unknown.
     pub meters_per_count: f64,
     /// Pose of the depth camera when the depth image was taken.
     pub world_from_camera: Transform,
@@ -56,7 +57,7 @@ pub struct DepthFile {
 #[derive(Clone, Debug, PartialEq)]
 pub struct LoadedImage {
     /// `[height, width, 4]`, sRGB, still distorted. Alpha is 0 at pixels that the mask or the alpha
-    /// of the photo excludes, else 255.
+    /// of the photo excludes, and 255 at other pixels.
     pub rgba_srgb: Vec<u8>,
     /// Depth, still distorted.
     pub depth: Option<DepthImage>,
@@ -71,7 +72,7 @@ pub struct LoadedImage {
 pub struct DepthImage {
     /// Lens parameters of the photo, scaled to the size of the depth image.
     pub intrinsics: Intrinsics,
-    /// `[height, width]`, meters along the camera's z axis; 0 if unknown.
+    /// `[height, width]`, meters along the camera's z axis. Unknown depths are 0.
     pub depth_m: Vec<f32>,
 }
 
@@ -147,8 +148,8 @@ impl DatasetImage {
     }
 }
 
-/// Converts an image to RGBA. An RGB image is converted in place: with 134 million pixels, a copy
-/// takes half a gigabyte.
+/// Converts an image to RGBA. An RGB image is converted in place, because a copy of 134 million
+/// pixels takes half a gigabyte.
 fn into_rgba(image: DynamicImage) -> RgbaImage {
     match image {
         DynamicImage::ImageRgb8(rgb) => {
@@ -157,7 +158,8 @@ fn into_rgba(image: DynamicImage) -> RgbaImage {
             let n_px = pixels.len() / 3;
             pixels.reserve_exact(n_px);
             pixels.resize(4 * n_px, 255);
-            // From the last pixel to the first, so that no pixel is overwritten before it is moved.
+            // The loop goes from the last pixel to the first, so that no pixel is overwritten
+            // before it is moved.
             for ix in (0..n_px).rev() {
                 let [red, green, blue] = [0, 1, 2].map(|channel| pixels[3 * ix + channel]);
                 pixels[4 * ix..4 * ix + 4].copy_from_slice(&[red, green, blue, 255]);
@@ -168,8 +170,8 @@ fn into_rgba(image: DynamicImage) -> RgbaImage {
     }
 }
 
-/// Whether a mask is black and its transparency varies. The alpha channel of such a mask contains
-/// the mask.
+/// Whether a mask is black and its transparency varies. In this case, the mask is in the alpha
+/// channel.
 fn is_in_alpha(mask: &DynamicImage) -> bool {
     if !mask.color().has_alpha() {
         return false;
@@ -237,7 +239,7 @@ fn decode_error(path: &Path, source: image::ImageError) -> Error {
     }
 }
 
-/// Name of the format of a file, if it is a known one that cannot be read.
+/// Name of the format of a file, if the format is known but cannot be read.
 fn unsupported_format(path: &Path) -> Option<&'static str> {
     let mut start = [0; 12];
     files::open(path).ok()?.read_exact(&mut start).ok()?;

@@ -390,7 +390,7 @@ fn unknown_folder_is_rejected() {
     );
 }
 
-/// A TUM folder: four photos, three of them with poses close in time, two with depth.
+/// A TUM folder with four photos. Three of them have poses close in time, and two have depth.
 fn tum_folder() -> tempfile::TempDir {
     let folder = tempfile::tempdir().unwrap();
     let path_of = |name: &str| folder.path().join(name);

@@ -59,10 +59,11 @@ const CAMERAS: [(&str, [f64; 9]); 3] = [
 
 /// Reads a folder.
 ///
-/// Each photo gets the depth image closest in time, within 20 ms. Its pose is interpolated at its
-/// stamp between two poses. These may be at most 40 ms apart, or 1.5 times the usual interval of
-/// the poses, up to 110 ms. Photos without a pose, photos of another size and invalid lines are
-/// skipped and counted. Lens parameters come from `calibration.txt`, else from the folder name. The
+/// Each photo gets the depth image closest in time, within 20 ms. The pose of a photo is
+/// interpolated at its stamp between two poses. The two poses may be at most 40 ms apart. If the
+/// usual interval of the poses is longer, 1.5 times this interval is allowed, up to 110 ms. Photos
+/// without a pose, photos of another size and invalid lines are skipped and counted. Lens
+/// parameters come from `calibration.txt`. Without this file, they follow from the folder name. The
 /// details are in docs/reference/datasets.md.
 pub fn read(folder: &Path) -> Result<Dataset, Error> {
     let (camera, lens_px) = camera_of(folder)?;
@@ -93,13 +94,14 @@ pub fn read(folder: &Path) -> Result<Dataset, Error> {
     reading.finish(&repeated_depth)
 }
 
-/// The photos read so far, and everything that will be noted about the others.
+/// The photos read so far, and the facts for the notes about photos that were skipped.
 struct Reading<'a> {
     folder: &'a Path,
     camera: Intrinsics,
-    /// Image size of the lens parameters; `None` until the first photo if it is unknown.
+    /// Image size of the lens parameters. If the size is unknown, it is `None` until the first
+    /// photo.
     lens_px: Option<[u32; 2]>,
-    /// Depth images by time; `None` if there is no list of them.
+    /// Depth images by time. `None` if the folder has no list of depth images.
     depths: Option<Vec<(Stamp, String)>>,
     poses: Poses,
     images: Vec<DatasetImage>,
@@ -114,10 +116,10 @@ impl Reading<'_> {
     /// Adds a photo, or notes why it is skipped.
     ///
     /// # Errors
-    /// If the lens parameters are implausible for the first photo.
+    /// Fails if the lens parameters are implausible for the first photo.
     fn add(&mut self, stamp: Stamp, name: String) -> Result<(), Error> {
-        // Lists are sorted by time. Keyframes are identified by camera and stamp, which must be
-        // different for each.
+        // Camera and stamp identify a keyframe, so two images must not have the same stamp. Equal
+        // stamps are neighbors, because lists are sorted by time.
         if self.images.last().is_some_and(|last| last.stamp == stamp) {
             self.skipped
                 .unusable
@@ -143,7 +145,7 @@ impl Reading<'_> {
             size_px,
             ..self.camera.clone()
         };
-        // All photos have the same lens parameters, so the first one decides.
+        // All photos have the same lens parameters, so they are checked only for the first photo.
         if self.images.is_empty()
             && let Some(reason) = implausible(&intrinsics)
         {
@@ -152,8 +154,8 @@ impl Reading<'_> {
                 reason,
             });
         }
-        // If their size is unknown, the lens parameters are assumed to be for photos of the size of
-        // the first one.
+        // If the image size of the lens parameters is unknown, it is assumed to be the size of the
+        // first photo.
         let expected_px = *self.lens_px.get_or_insert(size_px);
         if size_px != expected_px {
             let [width, height] = size_px;
@@ -178,8 +180,8 @@ impl Reading<'_> {
         Ok(())
     }
 
-    /// The depth image that is closest in time. It has its own pose: color and depth are not taken
-    /// at the same time, and the camera moves in between.
+    /// The depth image that is closest in time. It has its own pose, because color and depth are
+    /// not taken at the same time, and the camera moves in between.
     fn depth_at(&mut self, stamp: Stamp) -> Option<DepthFile> {
         let depths = self.depths.as_ref()?;
         let Some((depth_stamp, depth_name)) = nearest(depths, stamp) else {
@@ -210,7 +212,7 @@ impl Reading<'_> {
     /// Adds notes about depth images that are not used, and builds the dataset.
     ///
     /// # Errors
-    /// If it has no photos.
+    /// Fails if the dataset has no photos.
     fn finish(self, repeated_depth: &[String]) -> Result<Dataset, Error> {
         let mut notes = match self.n_without_depth {
             0 => Vec::new(),
@@ -251,8 +253,8 @@ fn find_file(folder: &Path, name: &str) -> Option<PathBuf> {
         .find(|path| path.is_file())
 }
 
-/// Removes entries that have the same time as an earlier one. Returns their names, unless both
-/// names are equal.
+/// Removes entries that have the same time as an earlier entry. Returns the names of the removed
+/// entries, except for entries with the same name as the earlier entry.
 fn remove_repeated(entries: &mut Vec<(Stamp, String)>) -> Vec<String> {
     let mut repeated = Vec::new();
     entries.dedup_by(|later, first| {
@@ -265,7 +267,7 @@ fn remove_repeated(entries: &mut Vec<(Stamp, String)>) -> Vec<String> {
 }
 
 /// Lens parameters of a folder, and the image size for which they are valid, if it is known. The
-/// caller sets the size in the lens parameters to that of each photo.
+/// caller sets the size in the lens parameters to the size of each photo.
 fn camera_of(folder: &Path) -> Result<(Intrinsics, Option<[u32; 2]>), Error> {
     let path = folder.join(CAMERA_FILE);
     let (numbers, lens_px) = if exists(&path) {
@@ -289,7 +291,7 @@ fn camera_of(folder: &Path) -> Result<(Intrinsics, Option<[u32; 2]>), Error> {
     } else {
         Lens::BrownConrady([k1, k2, p1, p2, k3])
     };
-    // Pixel centers are at integers in these files and at half-integers in ours.
+    // Pixel centers are at integers in these files, and at half-integers in fieldrig.
     let principal_px = [cx + 0.5, cy + 0.5];
     let intrinsics = Intrinsics {
         size_px: BENCHMARK_PX,
@@ -347,8 +349,8 @@ struct Line {
     rest: String,
 }
 
-/// Whether columns are separated by this character; the programs of the benchmark accept commas,
-/// too.
+/// Whether columns are separated by this character. Commas are accepted, because the programs of
+/// the benchmark also accept them.
 fn is_separator(c: char) -> bool {
     c.is_whitespace() || c == ','
 }
@@ -361,7 +363,7 @@ fn words(line: &str) -> impl Iterator<Item = &str> {
 /// Lines of a list, sorted by time. Invalid lines are skipped.
 ///
 /// # Errors
-/// If the file cannot be read, or no line is valid.
+/// Fails if the file cannot be read, or if no line is valid.
 fn stamped_lines(
     folder: &Path,
     list: &str,
@@ -404,7 +406,7 @@ fn stamped_lines(
     }
     skipped.lines(list, &invalid);
     // Lists that were merged or edited may be out of order, and stamps are searched by bisection.
-    // The sort is stable, so that if two lines have the same time, the first one is used.
+    // The sort is stable. If two lines have the same time, the first line is therefore used.
     lines.sort_by_key(|line| line.stamp);
     Ok(lines)
 }
@@ -449,7 +451,7 @@ fn stamp_of(word: &str) -> Option<Stamp> {
     // An i64 has at most 19 digits. The limit also keeps a huge exponent from producing as many
     // digits.
     let n_significant = usize::try_from(n_significant).ok().filter(|n| *n < 20)?;
-    // Digits after the last nanosecond are cut off, and missing ones are zeros.
+    // Digits after the last nanosecond are cut off, and missing digits are zeros.
     let padded = digits
         .bytes()
         .skip(zeros)
@@ -463,7 +465,7 @@ fn stamp_of(word: &str) -> Option<Stamp> {
 fn nearest<T>(entries: &[(Stamp, T)], stamp: Stamp) -> Option<&(Stamp, T)> {
     let gap = |entry: &(Stamp, T)| entry.0.nanos_since(stamp).saturating_abs();
     let after = entries.partition_point(|entry| entry.0 < stamp);
-    // The closest entry is the last one before the stamp or the first one after it.
+    // The closest entry is the last entry before the stamp or the first entry after it.
     let candidates = &entries[after.saturating_sub(1)..entries.len().min(after + 1)];
     candidates
         .iter()
@@ -521,7 +523,8 @@ impl Poses {
         })
     }
 
-    /// Pose at a stamp, interpolated between two poses. The error is the reason why there is none.
+    /// Pose at a stamp, interpolated between two poses. The error is the reason why there is no
+    /// pose.
     fn at(&self, stamp: Stamp) -> Result<Transform, String> {
         let after_ix = self.poses.partition_point(|(other, _)| *other < stamp);
         let after = self.poses.get(after_ix);

@@ -23,9 +23,9 @@ const TRIES_BEFORE_RESET: u32 = 3;
 /// configured, depth.
 ///
 /// A camera that is disconnected or hangs is reopened with the same settings for at most
-/// [`Config::reconnect_for`]. If it cannot be reopened, it is reset. During that time,
-/// [`Camera::next_image`] returns [`Error::Reconnecting`]. Afterwards, it returns the cause.
-/// Dropping this value stops the streams.
+/// [`Config::reconnect_for`]. If it cannot be reopened, it is reset. In the meantime,
+/// [`Camera::next_image`] returns [`Error::Reconnecting`]. If the camera does not come back in
+/// time, it returns the cause. Dropping this value stops the streams.
 #[derive(Debug)]
 pub struct RealsenseCamera {
     camera: Reconnecting<RealsenseDevice>,

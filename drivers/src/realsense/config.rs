@@ -36,15 +36,15 @@ pub struct Config {
 /// Delivery times of the images of a file, and the clock of their stamps.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum Pace {
-    /// Like a live camera: the first image comes immediately and is stamped on arrival. Later
-    /// images follow at the recorded intervals.
+    /// Images are delivered as by a live camera. The first image comes immediately and is stamped
+    /// on arrival. Later images follow at the recorded intervals.
     #[default]
     RealTime,
-    /// As fast as the caller takes them, with the stamps of the file.
+    /// Images are delivered as fast as the caller takes them, with the stamps of the file.
     Fast,
-    /// Stamps are those of the file plus [`Config::clock_offset_nanos`], on the monotonic clock of
-    /// this computer. Each image is delivered at the time of its stamp. Simulations use this pace
-    /// to emulate other devices in parallel with the file.
+    /// Stamps are the stamps of the file plus [`Config::clock_offset_nanos`], on the monotonic
+    /// clock of this computer. Each image is delivered at the time of its stamp. Simulations use
+    /// this pace to emulate other devices in parallel with the file.
     Clock,
 }
 
@@ -54,7 +54,8 @@ pub enum Stream {
     /// The color camera.
     #[default]
     Color,
-    /// The only infrared camera, or the left one (D4xx). Depth is in its frame.
+    /// The only infrared camera, or the left infrared camera of a D4xx. Depth is in the frame of
+    /// this camera.
     Infrared,
 }
 

@@ -23,7 +23,7 @@ enum Block {
     HoleFilling(HoleFillingFilter),
 }
 
-// SAFETY: the library may be called from any thread, one at a time; blocks are never cloned, so
+// SAFETY: the library may be called from any thread, one at a time. Blocks are never cloned, so
 // these are the only pointers.
 #[expect(unsafe_code, reason = "the wrapper lacks a Send implementation")]
 unsafe impl Send for Filters {}

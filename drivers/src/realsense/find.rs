@@ -30,17 +30,17 @@ impl FoundCamera {
         }
     }
 
-    /// Whether it runs at USB 2, which carries few of its modes.
+    /// Whether the camera is connected by USB 2, on which only few of its modes are available.
     pub fn is_on_usb2(&self) -> bool {
         self.usb
             .as_deref()
             .is_some_and(|usb| usb.starts_with('2') || usb.starts_with('1'))
     }
 
-    /// Whether its firmware is older than the version that the library recommends.
+    /// Whether the firmware of the camera is older than the version that the library recommends.
     pub fn has_old_firmware(&self) -> bool {
-        // The versions are compared part by part as numbers. Compared as text, 5.9 would be newer
-        // than 5.16.
+        // The versions are compared part by part as numbers. If they were compared as text, 5.9
+        // would be newer than 5.16.
         self.recommended_firmware
             .as_deref()
             .is_some_and(|requested| version_numbers(&self.firmware) < version_numbers(requested))

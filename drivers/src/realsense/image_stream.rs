@@ -34,14 +34,14 @@ pub(super) struct ImageStream {
     stamps: Stamps,
     filters: Filters,
     counter: [FrameCounter; 2],
-    /// For files only: an image that was read but is not due yet.
+    /// An image that was read but is not due yet. It is used only for files.
     pending: Option<Image>,
     image_secs_per_count: f64,
     is_file: bool,
     started_at: Instant,
     last_image: Instant,
     has_image: bool,
-    /// For files only: number of images that were due before the file was opened.
+    /// Number of images that were due before the file was opened. It is used only for files.
     n_before_open: u64,
     description: String,
     started: ActiveStreams,
@@ -52,7 +52,7 @@ pub(super) struct ImageStream {
     _context: Context,
 }
 
-/// State of one kind of image: color or infrared, or depth.
+/// Frame numbers of one kind of image. One kind is color or infrared, and the other kind is depth.
 #[derive(Clone, Copy, Debug, Default)]
 struct FrameCounter {
     last_number: Option<u64>,
@@ -143,7 +143,7 @@ impl ImageStream {
                         .max(0)
                         .unsigned_abs(),
                 );
-                // The error contains the time until the next call is useful.
+                // The error contains the time after which the next call is useful.
                 if remaining.is_zero() {
                     return Ok(Next::NotDue(due_in));
                 }
@@ -201,8 +201,8 @@ impl ImageStream {
         match counter.last_number.replace(number) {
             // The library sometimes returns the last image of a stream again.
             Some(last) if last == number => return Ok(None),
-            // If a number is lower than the last one, the stream was restarted. A restart loses no
-            // images.
+            // If a number is lower than the previous number, the stream was restarted. A restart
+            // loses no images.
             Some(last) if number > last => counter.n_unreported += number - last - 1,
             _ => {}
         }
@@ -279,8 +279,9 @@ fn warn_of_device(camera: &str, found: &FoundCamera) {
 }
 
 impl Drop for ImageStream {
-    /// Stops the streams while draining the queue. Otherwise, there would be a deadlock: stopping
-    /// waits for the thread that reads the file, and this thread waits for space in the queue.
+    /// Stops the streams while draining the queue. Stopping waits for the thread that reads the
+    /// file, and this thread may wait for space in the queue. Without draining, this would be a
+    /// deadlock.
     fn drop(&mut self) {
         let queue = &self.queue;
         let is_stopped = AtomicBool::new(false);

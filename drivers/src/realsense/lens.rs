@@ -1,8 +1,8 @@
-//! Converts lens parameters from and to those of librealsense2.
+//! Converts lens parameters between fieldrig and librealsense2.
 //!
 //! Source: `include/librealsense2/rsutil.h` of 2.56, functions `rs2_project_point_to_pixel` and
-//! `rs2_deproject_pixel_to_point`.
-//! In the library, the center of the first pixel is (0, 0); here it is (0.5, 0.5).
+//! `rs2_deproject_pixel_to_point`. In the library, the center of the first pixel is (0, 0). In
+//! fieldrig, it is (0.5, 0.5).
 
 use super::Problem;
 use kinematics::{Intrinsics, Lens, Transform};
@@ -17,11 +17,11 @@ const MAX_FIT_ERROR_PX: f64 = 0.5;
 /// maximum error at the points.
 const N_FIT_POINTS: u32 = 24;
 
-/// Converts intrinsics of the library to ours.
+/// Converts intrinsics of the library to intrinsics of fieldrig.
 ///
-/// Brown-Conrady and Kannala-Brandt are the same models. "Modified" and "inverse" Brown-Conrady are
-/// different polynomials, and our model is fitted to them. All D4xx color cameras report the
-/// inverse model, usually with zero coefficients.
+/// Brown-Conrady and Kannala-Brandt are the same models in both. "Modified" and "inverse"
+/// Brown-Conrady are different polynomials, so the Brown-Conrady model of fieldrig is fitted to
+/// them. All D4xx color cameras report the inverse model, usually with zero coefficients.
 pub(super) fn intrinsics(
     raw: &sys::rs2_intrinsics,
     stream: &'static str,
@@ -68,9 +68,9 @@ pub(super) fn intrinsics(
     Ok(intrinsics)
 }
 
-/// Converts our intrinsics to those of the library. The library has no rational model, so the
-/// closest polynomial model replaces it. If no polynomial model is close enough, the result has no
-/// distortion.
+/// Converts intrinsics of fieldrig to intrinsics of the library. The library has no rational model,
+/// so the closest polynomial model replaces it. If no polynomial model is close enough, the result
+/// has no distortion.
 #[cfg(feature = "emulation")]
 pub(super) fn raw(intrinsics: &Intrinsics) -> sys::rs2_intrinsics {
     let lens = if intrinsics.is_pinhole() {
@@ -175,8 +175,8 @@ fn modified(k: &[f64; 5], [x, y]: [f64; 2]) -> [f64; 2] {
     ]
 }
 
-/// Fits our Brown-Conrady model to another model by least squares over the image. Returns `None` if
-/// the fit is not accurate enough.
+/// Fits the Brown-Conrady model of fieldrig to another model by least squares over the image.
+/// Returns `None` if the fit is not accurate enough.
 ///
 /// `pair` takes the position on the plane `z` = 1 that a pinhole camera observes at a pixel, and
 /// returns a ray and its distorted position.
@@ -276,7 +276,7 @@ mod tests {
             let k = raw.coeffs.map(f64::from);
             for row in (0..=720).step_by(90) {
                 for column in (0..=1280).step_by(80) {
-                    // Pixel in the convention of the library, with integer centers.
+                    // The pixel is in the convention of the library, with integer centers.
                     let pixel = [f64::from(column), f64::from(row)];
                     let plane = [
                         (pixel[0] - f64::from(raw.ppx)) / f64::from(raw.fx),

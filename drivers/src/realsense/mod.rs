@@ -1,10 +1,10 @@
 //! RealSense cameras through librealsense2, and files recorded by it.
 //!
-//! Configuration and problems (`config.rs`, `problem.rs`) are always compiled; the rest needs the
-//! cargo feature `realsense`. `sdk.rs` wraps the part of the library that `realsense-rust` lacks;
-//! `find.rs` lists cameras; `lens.rs` and `stamps.rs` convert lens parameters and time stamps;
-//! `options.rs` applies settings; `streams.rs` selects and opens streams; `filters.rs` filters
-//! depth; `image_stream.rs` converts frames to images; `camera.rs` handles disconnections.
+//! Configuration and problems (`config.rs`, `problem.rs`) are always compiled. All other files need
+//! the cargo feature `realsense`. `sdk.rs` wraps the part of the library that `realsense-rust`
+//! lacks. `find.rs` lists cameras. `lens.rs` and `stamps.rs` convert lens parameters and time
+//! stamps. `options.rs` applies settings, `streams.rs` selects and opens streams, and `filters.rs`
+//! filters depth. `image_stream.rs` converts frames to images. `camera.rs` handles disconnections.
 //! `emulated/` writes the files of an emulated camera (cargo feature `emulation`).
 
 mod config;

@@ -15,7 +15,7 @@ pub enum Problem {
         /// Error of the library.
         reason: String,
     },
-    /// No camera is connected, or not the requested one.
+    /// No camera is connected, or the requested camera is not connected.
     #[error(
         "no RealSense camera {}is connected; found: {}",
         if serial.is_empty() { String::new() } else { format!("with the serial number {serial:?} ") },
@@ -23,12 +23,12 @@ pub enum Problem {
         else { connected.join(", ") }
     )]
     NoDevice {
-        /// Serial number in the rig file; may be empty.
+        /// Serial number in the rig file. It may be empty.
         serial: String,
         /// Names and serial numbers of the connected cameras.
         connected: Vec<String>,
     },
-    /// Several cameras are connected and the rig file does not select one.
+    /// Several cameras are connected, and the rig file does not select one of them.
     #[error("several RealSense cameras are connected: set device = \"SERIAL\" in the rig file to one of {}", connected.join(", "))]
     Ambiguous {
         /// Names and serial numbers of the connected cameras.

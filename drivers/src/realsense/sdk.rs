@@ -1,5 +1,5 @@
-//! Safe calls to the part of librealsense2 that `realsense-rust` lacks: opening sensors
-//! individually into one queue, files as devices, and names of presets.
+//! Safe calls to the part of librealsense2 that `realsense-rust` lacks. They open sensors
+//! individually into one queue, open files as devices, and read names of presets.
 
 #![expect(unsafe_code, reason = "FFI to a C library")]
 
@@ -30,7 +30,7 @@ pub(super) fn call<T>(
     if error.is_null() {
         return Ok(result);
     }
-    // SAFETY: the library created the error and it is owned here; its text lives until it is freed.
+    // SAFETY: the library created the error and it is owned here. Its text lives until it is freed.
     let reason = unsafe {
         let text = CStr::from_ptr(sys::rs2_get_error_message(error))
             .to_string_lossy()
@@ -56,9 +56,9 @@ pub(super) struct Context(NonNull<sys::rs2_context>);
 // SAFETY: the library may be called from any thread, and we hold the only pointer.
 unsafe impl Send for Context {}
 
-/// Locked while a device is created. The library keeps the relative poses of its streams in one
-/// list per process, and two threads that add to it concurrently write to freed memory
-/// (librealsense 2.56.5, `extrinsics_graph::register_extrinsics`).
+/// A lock that is held while a device is created. The library keeps the relative poses of its
+/// streams in one list per process. Two threads that add to this list concurrently write to freed
+/// memory (librealsense 2.56.5, `extrinsics_graph::register_extrinsics`).
 static DEVICE_CREATION: Mutex<()> = Mutex::new(());
 
 /// Prevents other threads from creating devices at the same time.
@@ -70,7 +70,7 @@ impl Context {
     pub(super) fn new() -> Result<Self, Problem> {
         const WHAT: &str = "start";
         // The library rejects programs compiled for another minor version, although its interface
-        // has only grown. We therefore pass the library's own version. SAFETY: only numbers are
+        // has only grown. The library's own version is therefore passed. SAFETY: only numbers are
         // passed.
         let context = unsafe {
             let version = call(WHAT, |error| sys::rs2_get_api_version(error))?;
@@ -84,7 +84,7 @@ impl Context {
         const WHAT: &str = "list devices";
         let any = sys::RS2_PRODUCT_LINE_ANY_INTEL.cast_signed();
         let _guard = device_creation_lock();
-        // SAFETY: the context is alive; the list is freed below, and devices outlive it.
+        // SAFETY: the context is alive. The list is freed below, and devices outlive it.
         unsafe {
             let list = call(WHAT, |error| {
                 sys::rs2_query_devices_ex(self.0.as_ptr(), any, error)
@@ -113,7 +113,7 @@ impl Context {
         }
         let name = path_name(path).map_err(file_problem)?;
         let _guard = device_creation_lock();
-        // SAFETY: the context is alive and the name is null-terminated; the device is checked and
+        // SAFETY: the context is alive and the name is null-terminated. The device is checked and
         // then owned here.
         let device = unsafe {
             let device = call("open a file", |error| {
@@ -152,7 +152,7 @@ pub(super) struct Device {
     raw: NonNull<sys::rs2_device>,
 }
 
-// SAFETY: as for `Context`; `Info` is `Send`.
+// SAFETY: as for `Context`. `Info` is `Send`.
 unsafe impl Send for Device {}
 
 impl Device {
@@ -162,7 +162,7 @@ impl Device {
         const WHAT: &str = "list the sensors of a device";
         let raw = non_null("open a device", device)?;
         let info = Info::from(raw);
-        // SAFETY: the device lives in `info`; the list is freed below, and sensors outlive it.
+        // SAFETY: the device lives in `info`. The list is freed below, and sensors outlive it.
         let sensors = unsafe {
             let list = call(WHAT, |error| sys::rs2_query_sensors(raw.as_ptr(), error))?;
             let n_sensors = call(WHAT, |error| sys::rs2_get_sensors_count(list, error));
@@ -197,7 +197,7 @@ impl Device {
 
     /// Pauses or resumes the playback of a file.
     pub(super) fn set_paused(&self, is_paused: bool) -> Result<(), Problem> {
-        // SAFETY: the device is alive; for a device that is not a file, the call returns an error.
+        // SAFETY: the device is alive. For a device that is not a file, the call returns an error.
         call("pause or resume a file", |error| unsafe {
             if is_paused {
                 sys::rs2_playback_device_pause(self.raw.as_ptr(), error);
@@ -209,7 +209,7 @@ impl Device {
 
     /// Whether the playback of a file has ended or has not started.
     pub(super) fn has_stopped(&self) -> Result<bool, Problem> {
-        // SAFETY: the device is alive; for a device that is not a file, the call returns an error.
+        // SAFETY: the device is alive. For a device that is not a file, the call returns an error.
         let status = call("get the playback status", |error| unsafe {
             sys::rs2_playback_device_get_current_status(self.raw.as_ptr(), error)
         })?;
@@ -235,7 +235,7 @@ impl Sensor {
     /// All modes of its image streams.
     pub(super) fn modes(&self) -> Result<Modes, Problem> {
         const WHAT: &str = "list the modes of a sensor";
-        // SAFETY: the sensor is alive; `Modes` frees the list and keeps it as long as the pointers
+        // SAFETY: the sensor is alive. `Modes` frees the list and keeps it as long as the pointers
         // into it.
         unsafe {
             let list = non_null(
@@ -299,7 +299,7 @@ impl Sensor {
 
     /// Name that the camera uses for a value of an option.
     pub(super) fn value_name(&self, option: sys::rs2_option, value: f32) -> Option<String> {
-        // SAFETY: sensors have options; the text is owned by the library and copied immediately.
+        // SAFETY: sensors have options. The text is owned by the library and copied immediately.
         unsafe {
             let text = call("get the name of an option value", |error| {
                 sys::rs2_get_option_value_description(
@@ -416,7 +416,7 @@ impl Mode {
     /// Intrinsics of this mode.
     pub(super) fn intrinsics(&self) -> Result<sys::rs2_intrinsics, Problem> {
         let mut intrinsics = MaybeUninit::uninit();
-        // SAFETY: the profile is alive; on success, all fields were written.
+        // SAFETY: the profile is alive. On success, all fields were written.
         unsafe {
             call("get intrinsics", |error| {
                 sys::rs2_get_video_stream_intrinsics(
@@ -466,7 +466,7 @@ impl Queue {
         // The library counts whole milliseconds.
         let millis = u32::try_from(timeout.as_millis()).unwrap_or(u32::MAX);
         let mut frame = null_mut();
-        // SAFETY: the queue is alive; a received frame is owned here, and `Frame` frees it.
+        // SAFETY: the queue is alive. A received frame is owned here, and `Frame` frees it.
         unsafe {
             let has_arrived = call(WHAT, |error| {
                 sys::rs2_try_wait_for_frame(self.0.as_ptr(), millis, &raw mut frame, error)
@@ -494,7 +494,7 @@ impl Queue {
     pub(super) fn empty(&self) -> Result<(), Problem> {
         loop {
             let mut frame = null_mut();
-            // SAFETY: the queue is alive; a received frame is owned here.
+            // SAFETY: the queue is alive. A received frame is owned here.
             unsafe {
                 call("poll for an image", |error| {
                     sys::rs2_poll_for_frame(self.0.as_ptr(), &raw mut frame, error)

@@ -1,9 +1,10 @@
-//! Computes the time at which an image of a RealSense camera was taken, on our clock.
+//! Computes the time at which an image of a RealSense camera was taken, on the monotonic clock of
+//! this computer.
 //!
-//! Metadata are available with a patched kernel module, or with the USB backend of the library.
-//! With metadata, a camera reports mid-exposure on its own clock, which is a 32-bit count of
-//! microseconds. Without metadata, only the arrival time is known. The library's conversion to
-//! "global time" is switched off, because the mapping here is robust to late arrivals.
+//! If metadata are available, a camera reports mid-exposure on its own clock, which is a 32-bit
+//! count of microseconds. Metadata need a patched kernel module or the USB backend of the library.
+//! Without metadata, only the arrival time is known. The library's conversion to "global time" is
+//! switched off, because the mapping here is robust to late arrivals.
 
 use super::{Config, Pace};
 use crate::clock;
@@ -39,13 +40,13 @@ impl FrameTime {
 #[derive(Debug)]
 pub(super) struct Stamps {
     camera: String,
-    /// Pace of the playback; `None` for a camera.
+    /// Pace of the playback. `None` for a camera.
     pace: Option<Pace>,
     offset_nanos: i64,
     opened: Stamp,
     micros: WrappingMicros,
     map: ClockMap,
-    /// First time in a file, nanoseconds, and the arrival of that image.
+    /// Time of the first image of a file, nanoseconds, and arrival of this image.
     first: Option<(i64, Stamp)>,
     has_warned: bool,
 }

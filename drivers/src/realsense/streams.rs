@@ -8,8 +8,8 @@ use realsense_rust::kind::Rs2Option;
 use realsense_sys as sys;
 use std::collections::BTreeSet;
 
-/// YUV encoding as in librealsense2 (`src/proc/color-formats-converter.cpp`): BT.601, limited
-/// range.
+/// YUV encoding as in librealsense2 (`src/proc/color-formats-converter.cpp`), which is BT.601 with
+/// limited range.
 const YUV_COLORS: YuvColors = YuvColors {
     matrix: YuvMatrix::Bt601,
     range: YuvRange::Limited,
@@ -94,14 +94,15 @@ impl StreamRequest {
             && self.is_of_stream(mode)
     }
 
-    /// Whether a mode belongs to this stream. If there are two infrared cameras, only the left one
-    /// matches, because depth is in the frame of that camera.
+    /// Whether a mode belongs to this stream. If there are two infrared cameras, only the left
+    /// camera matches, because depth is in its frame.
     fn is_of_stream(&self, mode: &Mode) -> bool {
         let is_infrared = mode.stream == sys::rs2_stream_RS2_STREAM_INFRARED;
         mode.stream == self.stream && (!is_infrared || mode.index <= LEFT)
     }
 
-    /// Best mode among all sensors: index of the sensor and of its mode.
+    /// Best mode among all sensors, as the index of the sensor and the index of the mode in this
+    /// sensor.
     fn choose(&self, config: &Config, modes: &[Modes]) -> Result<(usize, usize), Problem> {
         // A file has only one rate, which follows from its stamps.
         let rate_hz = config.file.is_none().then_some(config.rate_hz);
@@ -283,7 +284,8 @@ fn depth_calibration(
         .get_option(Rs2Option::DepthUnits);
     let scale =
         scale.ok_or_else(|| calibration_problem("it does not report depth units".into()))?;
-    // Parse the shortest decimal of the single-precision value: 0.001, not 0.001000000047.
+    // The shortest decimal of the single-precision value is parsed, so that the scale is 0.001 and
+    // not 0.001000000047.
     let meters_per_count = scale
         .to_string()
         .parse()

@@ -1,4 +1,4 @@
-//! Recordings: write samples to an MCAP file and read them back bit for bit, in the same order.
+//! Writes samples to an MCAP file, and reads them back bit for bit and in the same order.
 //!
 //! `docs/reference/recording.md` lists the topics and describes which samples remain readable after
 //! a crash or with a full disk.

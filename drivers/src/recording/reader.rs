@@ -22,7 +22,7 @@ const MAX_UNUSED: usize = 50;
 /// Maximum number of unused parts in the error about a recording without samples.
 const MAX_UNUSED_IN_ERROR: usize = 5;
 
-/// A recording that is being replayed: a [`Source`] of its samples in recorded order.
+/// A recording that is being replayed. It is a [`Source`] of its samples in recorded order.
 #[derive(Debug)]
 pub struct Recording {
     path: PathBuf,
@@ -80,8 +80,8 @@ impl Recording {
     /// Opens a recording.
     ///
     /// # Errors
-    /// If the file does not exist, is not an MCAP file, or contains no samples recorded by this
-    /// program.
+    /// Fails if the file does not exist, is not an MCAP file, or contains no samples recorded by
+    /// this program.
     pub fn open(path: &Path) -> Result<Self, Error> {
         let open = |source| Error::Open {
             path: path.to_owned(),
@@ -116,8 +116,8 @@ impl Recording {
             damage_kind: None,
             ended: false,
         };
-        // Joint names and attachments precede the first sample, so reading it makes them available.
-        // It also distinguishes recordings of this program from other MCAP files.
+        // The first sample is read here. Joint names and attachments precede it, so they are then
+        // available. If there is no sample, the file is not a recording of this program.
         recording.first = recording.read_sample()?;
         if recording.first.is_none() {
             return Err(Error::EmptyRecording {
@@ -164,7 +164,7 @@ impl Recording {
         self.joint_names.as_deref()
     }
 
-    /// Describes the damage of the file and how much of it could be read. The description is
+    /// Describes the damage of the file, and how much of the file could be read. The description is
     /// available after the last sample.
     pub fn damage(&self) -> Option<&str> {
         self.damage.as_deref()
@@ -228,8 +228,8 @@ impl Recording {
                 Ok(None) => self.ended = true,
                 Ok(Some(RawRecord { opcode, bytes })) => match Record::decode(opcode, &bytes) {
                     Ok(record) => {
-                        // Most records are no samples: schemas, channels, and the parts of a
-                        // ground-truth sample.
+                        // Most records, such as schemas, channels and the parts of a ground-truth
+                        // sample, do not complete a sample.
                         if let Some(sample) = self.take(record)? {
                             self.n_samples += 1;
                             return Ok(Some(sample));
@@ -258,7 +258,7 @@ impl Recording {
         ));
     }
 
-    /// Processes one record and returns a sample if it completes one.
+    /// Processes one record. If the record completes a sample, returns the sample.
     fn take(&mut self, record: Record<'_>) -> Result<Option<Sample>, Error> {
         match record {
             Record::Schema { id, name } => {
@@ -508,12 +508,12 @@ fn other_channel(id: u16) -> String {
     format!("another channel of the file has the same number, {id}")
 }
 
-/// Differences from recordings of this program that do not prevent reading.
+/// Notes about differences from recordings of this program that do not prevent reading.
 #[derive(Debug, Default)]
 struct Notes(BTreeMap<(String, &'static str), String>);
 
 impl Notes {
-    /// Logs a difference in a topic. For each subject, logs only the first one.
+    /// Logs a difference in a topic. For each subject, only the first difference is logged.
     fn add(&mut self, topic: &str, subject: &'static str, difference: impl FnOnce() -> String) {
         self.add_at(format!("topic {topic:?}"), subject, difference);
     }
@@ -545,7 +545,7 @@ impl Notes {
         *in_message = in_topic.into();
     }
 
-    /// Compares the frames of a pose with those of its topic.
+    /// Compares the frames of a pose with the frames of its topic.
     fn agree_frames(
         &mut self,
         topic: &str,
@@ -575,7 +575,7 @@ impl Notes {
         Ok(())
     }
 
-    /// Compares the scale of a depth image with that in the metadata of its channel.
+    /// Compares the scale of a depth image with the scale in the metadata of its channel.
     fn check_depth_scale(&mut self, channel: &Channel, image: &Image) {
         if let (PixelFormat::DepthU16 { meters_per_count }, Some(listed)) =
             (image.format, &channel.metadata)

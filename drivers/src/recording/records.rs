@@ -12,12 +12,12 @@ use ruzstd::decoding::StreamingDecoder;
 use std::io::{Cursor, Read, Seek, SeekFrom};
 
 /// Maximum allocation before any byte of a record was read. Most records are smaller and need one
-/// allocation. A damaged length causes no larger allocation than this.
+/// allocation. The limit bounds the allocation that a damaged length causes.
 const MAX_PREALLOCATED_BYTES: u64 = 1 << 20;
 /// Length of a record's header: opcode and length.
 const HEAD_BYTES: usize = 1 + 8;
-/// Length of a chunk's header up to the name of the compression: times, uncompressed length,
-/// checksum, length of the name.
+/// Length of a chunk's header up to the name of the compression. This part contains the times, the
+/// uncompressed length, the checksum, and the length of the name.
 const CHUNK_HEAD_BYTES: usize = 8 + 8 + 8 + 4 + 4;
 
 const FOOTER: u8 = 0x02;
@@ -88,7 +88,7 @@ impl<R: Read> Records<R> {
     /// Returns the next record, or `None` at the footer and after an error.
     pub(super) fn next(&mut self) -> Result<Option<RawRecord>, ReadError> {
         let next = if self.ended { Ok(None) } else { self.read() };
-        // After an error, the position in the file means nothing.
+        // After an error, the position in the file is no longer meaningful, so reading ends.
         self.ended |= !matches!(next, Ok(Some(_)));
         next
     }

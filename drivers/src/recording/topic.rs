@@ -56,7 +56,7 @@ impl Topic {
         }
     }
 
-    /// Message types of the topic in protobuf; none for joint states, which are JSON.
+    /// Message types of the topic in protobuf. Joint states have none, because they are JSON.
     pub(super) fn schemas(&self) -> &'static [Schema] {
         match self {
             Self::Color(_) | Self::TrueColor(_) => &[COMPRESSED_IMAGE, RAW_IMAGE],
@@ -79,7 +79,7 @@ impl Topic {
         }
     }
 
-    /// The only key that is read from the metadata of the channel; `None` if no key is read.
+    /// The only key that is read from the metadata of the channel. `None` if no key is read.
     pub(super) fn metadata_key(&self) -> Option<&'static str> {
         match self {
             Self::Joints => Some(JOINT_NAMES),
@@ -138,7 +138,7 @@ impl Encoding {
         }
     }
 
-    /// Joint states in JSON with our schema.
+    /// Joint states in JSON with the schema of fieldrig.
     pub(super) fn joint_state() -> Self {
         Self {
             schema_name: joint_state::SCHEMA_NAME,

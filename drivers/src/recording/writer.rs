@@ -25,7 +25,7 @@ const FLUSH_NANOS: i64 = 1_000_000_000;
 /// Description of the rig, written before the first sample.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct RecordingMetadata<'a> {
-    /// Files to attach, by name: the complete rig file and the robot description.
+    /// Files to attach, by name. They are the complete rig file and the robot description.
     pub files: &'a [(&'a str, &'a [u8])],
     /// Cameras and their lens parameters.
     pub cameras: &'a [(&'a str, &'a Intrinsics)],
@@ -38,8 +38,8 @@ pub struct RecordingMetadata<'a> {
 /// removed.
 pub struct Recorder {
     path: PathBuf,
-    /// The file, which somebody may remove or rename while it is written; `None` if it cannot be
-    /// watched.
+    /// The file, which another program may remove or rename while it is written. `None` if it
+    /// cannot be watched.
     kept: Option<Kept>,
     /// Location of the file at the last check.
     place: Place,
@@ -49,7 +49,8 @@ pub struct Recorder {
     cameras: Vec<(String, Intrinsics)>,
     joint_names: String,
     n_messages: u32,
-    /// Number of samples written, including those in the open chunk, and the range of their stamps.
+    /// Number of samples written, including the samples in the open chunk. The next fields are the
+    /// range of their stamps.
     n_samples: u64,
     stamps: Option<[Stamp; 2]>,
     /// Span of the samples in closed chunks.
@@ -65,8 +66,8 @@ impl Recorder {
     /// Starts a recording in a new file.
     ///
     /// # Errors
-    /// If the file cannot be created, or already exists, because it may be the recording that is
-    /// being replayed.
+    /// Fails if the file cannot be created. Also fails if it already exists, because it may be the
+    /// recording that is being replayed.
     pub fn create(path: &Path, recording_metadata: &RecordingMetadata<'_>) -> Result<Self, Error> {
         let file = File::create_new(path).map_err(|source| match source.kind() {
             ErrorKind::AlreadyExists => Error::Exists {
@@ -98,12 +99,12 @@ impl Recorder {
         };
         let options = mcap::WriteOptions::new()
             .profile("fieldrig")
-            // Noisy images hardly compress (docs/benchmarks/2026-11-23-reference-figures.md), and
-            // only in uncompressed chunks are all complete records readable after a crash.
+            // Noisy images hardly compress (docs/benchmarks/2026-11-23-reference-figures.md). In
+            // uncompressed chunks, all complete records remain readable after a crash.
             .compression(None)
             .chunk_size(Some(CHUNK_BYTES))
-            // Nothing is patched later, so that whatever has been written is readable after a
-            // crash.
+            // The writer never changes earlier parts of the file, so that everything already
+            // written is readable after a crash.
             .disable_seeking(true);
         let mut mcap = options.create(sink).map_err(recorder)?;
         for (name, data) in recording_metadata.files {
@@ -147,7 +148,7 @@ impl Recorder {
     /// Writes the index for viewers, completes the file, and returns the recorded span.
     ///
     /// # Errors
-    /// If some data could not be written.
+    /// Fails if some data could not be written.
     pub fn finish(mut self) -> Result<RecordedSpan, Error> {
         let closed = self
             .close_chunk()
@@ -169,7 +170,7 @@ impl Recorder {
         Ok(self.recorded)
     }
 
-    /// Warns if somebody has removed or renamed the file since the last check.
+    /// Warns if the file was removed or renamed since the last check.
     fn check_place(&mut self) {
         let Some(kept) = &self.kept else { return };
         let place = kept.place();
@@ -205,7 +206,7 @@ impl Recorder {
             .ok_or_else(|| McapError::Io(std::io::Error::other("an earlier write failed")))
     }
 
-    /// Closes the file after a failure. The error reports how much of it is readable. A file
+    /// Closes the file after a failure. The error reports how much of the file is readable. A file
     /// without samples is removed.
     fn fail(&mut self, error: McapError) -> Error {
         if self.mcap.take().is_some() {
@@ -253,8 +254,8 @@ impl Recorder {
         Ok(())
     }
 
-    /// Writes what readers and viewers need before the first sample: the joint names, and the lens
-    /// parameters with the stamp of that sample. Later calls write nothing.
+    /// Writes the joint names and the lens parameters, which readers and viewers need before the
+    /// first sample. The lens parameters have the stamp of this sample. Later calls write nothing.
     fn announce_rig(&mut self, stamp: Stamp) -> mcap::McapResult<()> {
         if self.n_messages == 0 && !self.joint_names.is_empty() {
             // The channel is announced before all samples, so that readers know the joints

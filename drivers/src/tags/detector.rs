@@ -7,8 +7,8 @@ use kinematics::Stamp;
 use std::sync::Arc;
 use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
 
-/// Maximum number of wrong cells that are corrected. With two or more, noise is occasionally
-/// detected as a tag (Olson 2011, section V.B).
+/// Maximum number of wrong cells that are corrected. With two or more corrected cells, noise is
+/// occasionally detected as a tag (Olson 2011, section V.B).
 const CORRECTED_BITS: usize = 1;
 /// Minimum mean difference in gray value between the cells of a tag and the decision threshold. The
 /// authors of AprilTag regard values below 10 as noise. The limit here is higher, because the
@@ -55,8 +55,8 @@ impl Family {
 pub struct TagDetection {
     /// Id in the family.
     pub id: u32,
-    /// Corners in the image, pixels: lower left, lower right, upper right, upper left of the
-    /// printed tag.
+    /// Corners in the image, pixels, in the order lower left, lower right, upper right, upper left
+    /// of the printed tag.
     pub corners_px: [[f64; 2]; 4],
 }
 
@@ -83,9 +83,9 @@ impl TagDetector {
     /// Starts the thread, which ends when this value is dropped.
     ///
     /// # Errors
-    /// If the thread cannot be started.
+    /// Fails if the thread cannot be started.
     pub fn start(family: Family) -> Result<Self, Error> {
-        // The channel has no capacity, so a busy thread accepts no images.
+        // The channel has a capacity of 0, so a busy thread accepts no images.
         let (images, incoming) = sync_channel(0);
         // The thread can continue while the last result waits to be received.
         let (sender, detections) = sync_channel(1);
@@ -201,7 +201,8 @@ fn detect(detector: &mut Detector, image: &Image) -> Result<TagDetections, Error
     Ok(detections)
 }
 
-/// The id and corners of a tag; `None` if the id does not fit, which no family has.
+/// The id and corners of a tag. `None` if the id does not fit into its type, which does not occur
+/// in any family.
 fn detection(tag: &apriltag::Detection) -> Option<TagDetection> {
     Some(TagDetection {
         id: tag.id().try_into().ok()?,

@@ -16,15 +16,15 @@ use nalgebra::{
 /// assumed noise.
 const CORNER_SIGMA_PX: f64 = 0.2;
 /// Residual above which the cost is linear instead of quadratic (Huber 1964). It reduces the effect
-/// of unreliable corners, such as those of tags that are viewed at a grazing angle.
+/// of unreliable corners, such as the corners of tags that are viewed at a grazing angle.
 const HUBER_PX: f64 = 3.0 * CORNER_SIGMA_PX;
 /// Maximum root mean square error, pixels. If it is larger, the corners do not match the tags of
 /// the rig file. The limit is several times the noise of corners. It accepts poses from inaccurate
 /// intrinsics or inaccurately measured tags, which cause errors of this size.
 const MAX_RMS_ERROR_PX: f64 = 3.0;
-/// Minimum ratio of the cost of the second-best pose to the best cost. Below it, the pose is
-/// ambiguous. A larger value rejects more correct poses of small or distant tags. A smaller value
-/// accepts more poses with the wrong tilt.
+/// Minimum ratio of the cost of the second-best pose to the best cost. Below this ratio, the pose
+/// is ambiguous. A larger value rejects more correct poses of small or distant tags. A smaller
+/// value accepts more poses with the wrong tilt.
 const MIN_AMBIGUITY_RATIO: f64 = 3.0;
 /// Maximum number of iterations. Both starting poses need far fewer. The limit only bounds the time
 /// for corners that no pose fits.
@@ -47,8 +47,8 @@ pub struct RollingShutterCamera<'a> {
     /// Velocity of the camera in its own axes. Rows are exposed one after another, so each corner
     /// is observed from a different pose.
     pub twist: Twist,
-    /// Time from the exposure of the first row to that of the last row, seconds. It is 0 for a
-    /// global shutter.
+    /// Time from the exposure of the first row to the exposure of the last row, seconds. It is 0
+    /// for a global shutter.
     pub readout_secs: f64,
 }
 
@@ -71,7 +71,7 @@ impl RollingShutterCamera<'_> {
 pub struct CameraPoseEstimate {
     /// Pose of the camera at mid-exposure.
     pub world_from_camera: Transform,
-    /// Covariance of a small motion of the world in the axes of the camera; meters first, then
+    /// Covariance of a small motion of the world in the axes of the camera. Meters come first, then
     /// radians.
     pub covariance: Matrix6<f64>,
     /// Root mean square reprojection error of the corners, pixels.
@@ -111,7 +111,8 @@ struct Corner {
 /// [`super::TagDetection`].
 ///
 /// # Errors
-/// If no tag is given, no pose fits the corners, or two poses fit them almost equally well.
+/// Fails if no tag is given, if no pose fits the corners, or if two poses fit them almost equally
+/// well.
 pub fn locate(
     camera: &RollingShutterCamera<'_>,
     tags: &[(&TagPlacement, [[f64; 2]; 4])],
@@ -135,9 +136,9 @@ pub fn locate(
     if rms_error_px > MAX_RMS_ERROR_PX {
         return Err(LocateError::LargeReprojectionError { rms_error_px });
     }
-    // Contribution of noise to the cost. It is added to the costs of both poses. The ratio of the
-    // costs of two nearly perfect fits is then about 1, so that their tiny costs do not decide
-    // which tilt is right.
+    // This is the contribution of noise to the cost. It is added to the costs of both poses. If
+    // both fits are nearly perfect, the ratio of their costs is then about 1, so the difference of
+    // their tiny costs does not decide which tilt is right.
     let floor = corners.len() as f64 * CORNER_SIGMA_PX * CORNER_SIGMA_PX;
     // With several tags, both solutions usually converge to one pose. If they differ by less than
     // 0.05 rad (3 degrees), they are the same minimum with rounding differences. Otherwise, they
@@ -187,8 +188,8 @@ fn corners(
     })
 }
 
-/// Both candidate poses of the world in the camera frame from a single tag. Empty if a corner
-/// cannot be unprojected.
+/// Both candidate poses of the world in the camera frame from a single tag. The list is empty if a
+/// corner cannot be unprojected.
 fn initial_poses(
     intrinsics: &Intrinsics,
     tag: &TagPlacement,
@@ -221,8 +222,9 @@ fn pose_from_homography(size_m: f64, rays: [Vector3<f64>; 4]) -> Option<Transfor
     for (ix, (corner, ray)) in corners_in_tag(size_m).iter().zip(rays).enumerate() {
         let [x, y] = [corner.x, corner.y];
         let [u, v] = [ray.x / ray.z, ray.y / ray.z];
-        // `u = (h0 x + h1 y + h2) / (h6 x + h7 y + 1)`, and alike for v, multiplied by the
-        // denominator. The last element is set to 1, as the tag's center is in front of the camera.
+        // The rows are `u = (h0 x + h1 y + h2) / (h6 x + h7 y + 1)` and the corresponding equation
+        // for v, both multiplied by the denominator. The last element is set to 1, because the
+        // tag's center is in front of the camera.
         rows.set_row(2 * ix, &[x, y, 1.0, 0.0, 0.0, 0.0, -u * x, -u * y].into());
         rows.set_row(
             2 * ix + 1,
@@ -315,14 +317,15 @@ fn equations(
         // The chain rule multiplies three derivatives. The first is the derivative of the pixel by
         // the point at the time of its row. The second is the derivative of this point by the point
         // at mid-exposure. The third is the derivative of the point at mid-exposure by the pose.
-        // The motion during the exposure is known, so its derivative is its rotation.
+        // The motion during the exposure is known, so the second derivative is the rotation of this
+        // motion.
         let jacobian = d_pixel_d_point
             * row_from_mid_exposure.rotation.to_rotation_matrix().matrix()
             * d_point_d_pose;
         let residual_px = residual.norm();
-        // Weights of iteratively reweighted least squares: 1 up to the threshold, then inversely
-        // proportional to the residual. The cost is Huber's, twice the usual form: `r²` up to the
-        // threshold `h`, `2 h r - h²` above.
+        // The weight of iteratively reweighted least squares is 1 up to the threshold, and
+        // inversely proportional to the residual above it. The cost is twice the usual Huber loss.
+        // It is `r²` up to the threshold `h`, and `2 h r - h²` above it.
         let weight = HUBER_PX / residual_px.max(HUBER_PX);
         cost += weight * (2.0 - weight) * residual_px * residual_px;
         normal_matrix += jacobian.transpose() * jacobian * weight;
@@ -391,7 +394,7 @@ mod tests {
             twist,
             readout_secs: 0.03,
         };
-        // Project each corner from the camera pose at the time of its row.
+        // Each corner is projected from the camera pose at the time of its row.
         let mut pixels = project_corners(&intrinsics, &mid_exposure, &tag, [[0.0; 2]; 4]);
         for _ in 0..20 {
             pixels = std::array::from_fn(|ix| {

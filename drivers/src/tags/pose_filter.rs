@@ -15,7 +15,8 @@ const FORGETTING_FACTOR: f64 = 0.97;
 /// Running average of a pose.
 #[derive(Clone, Debug, Default)]
 pub struct StationaryPoseFilter {
-    /// The average pose, and its covariance in the pose's own axes: meters first, then radians.
+    /// The average pose, and its covariance in the pose's own axes. Meters come first, then
+    /// radians.
     average: Option<(Transform, Matrix6<f64>)>,
 }
 
@@ -53,8 +54,9 @@ impl StationaryPoseFilter {
         if (residual.transpose() * innovation_inverse * residual).x > MAX_CHI_SQUARED {
             return None;
         }
-        // Each axis moves to the new pose in proportion to how uncertain the average is there. Tags
-        // far away determine the distance poorly but the direction well.
+        // Along each axis, the average moves toward the new pose in proportion to its own
+        // uncertainty. For example, distant tags determine the direction well, but the distance
+        // poorly.
         let gain = average_covariance * innovation_inverse;
         let step = gain * residual;
         let twist = Twist {

@@ -1,5 +1,5 @@
-//! The part of the kernel's V4L2 interface that cameras need: structures, constants and request
-//! codes of `linux/videodev2.h` and `linux/v4l2-controls.h` on 64-bit Linux.
+//! The part of the kernel's V4L2 interface that cameras need. It consists of structures, constants
+//! and request codes of `linux/videodev2.h` and `linux/v4l2-controls.h` on 64-bit Linux.
 
 use rustix::ioctl::{Opcode, opcode};
 
@@ -7,7 +7,8 @@ use rustix::ioctl::{Opcode, opcode};
 pub(super) const VIDEO_CAPTURE: u32 = 1;
 /// `V4L2_MEMORY_MMAP`.
 pub(super) const MEMORY_MMAP: u32 = 1;
-/// `V4L2_FIELD_ANY` and `V4L2_FIELD_NONE`: progressive images, not interlaced ones.
+/// `V4L2_FIELD_ANY` and `V4L2_FIELD_NONE`. The second value requests progressive images instead of
+/// interlaced images.
 pub(super) const FIELD_ANY: u32 = 0;
 pub(super) const FIELD_NONE: u32 = 1;
 
@@ -17,7 +18,7 @@ pub(super) const CAP_STREAMING: u32 = 0x0400_0000;
 pub(super) const CAP_DEVICE_CAPS: u32 = 0x8000_0000;
 /// `V4L2_CAP_TIMEPERFRAME`, of `CaptureParm::capability`.
 pub(super) const CAP_TIMEPERFRAME: u32 = 0x1000;
-/// `V4L2_IN_CAP_DV_TIMINGS`: a digital video input, as on HDMI grabbers.
+/// `V4L2_IN_CAP_DV_TIMINGS`, which marks a digital video input, as on HDMI grabbers.
 pub(super) const INPUT_DV_TIMINGS: u32 = 0x2;
 
 /// `V4L2_BUF_FLAG_*`.
@@ -120,8 +121,8 @@ pub(super) struct FrameSize {
     pub(super) index: u32,
     pub(super) fourcc: u32,
     pub(super) kind: u32,
-    /// If discrete: width, height. Otherwise: minimum, maximum and step of the width, then of the
-    /// height.
+    /// Width and height, if the type is discrete. Otherwise, minimum, maximum and step of the
+    /// width, then of the height.
     pub(super) numbers: [u32; 6],
     pub(super) reserved: [u32; 2],
 }
@@ -134,7 +135,8 @@ pub(super) struct FrameInterval {
     pub(super) width: u32,
     pub(super) height: u32,
     pub(super) kind: u32,
-    /// If discrete: the first fraction. Otherwise: minimum, maximum, step.
+    /// If the type is discrete, only the first fraction is used. Otherwise, the fractions are
+    /// minimum, maximum and step.
     pub(super) fractions: [Fraction; 3],
     pub(super) reserved: [u32; 2],
 }
@@ -163,7 +165,8 @@ pub(super) struct Buffer {
     pub(super) timecode: [u32; 4],
     pub(super) sequence: u32,
     pub(super) memory: u32,
-    /// With `MEMORY_MMAP`: offset of the buffer for `mmap`. The union has the size of a pointer.
+    /// With `MEMORY_MMAP`, this is the offset of the buffer for `mmap`. The union has the size of a
+    /// pointer.
     pub(super) offset: u32,
     pub(super) offset_padding: u32,
     pub(super) length: u32,
@@ -232,8 +235,8 @@ impl Plain for QueryMenu {}
 impl Plain for Input {}
 impl Plain for u32 {}
 
-/// A request code and the type of its argument. Only this file creates them, from the list of the
-/// kernel.
+/// A request code and the type of its argument. Only this file creates requests, from the request
+/// codes of the kernel.
 pub(super) struct Request<T> {
     code: Opcode,
     payload: std::marker::PhantomData<T>,

@@ -18,9 +18,9 @@ const MAX_SILENT_IMAGES: f64 = 5.0;
 /// A streaming V4L2 camera.
 ///
 /// A camera that is disconnected or hangs is reopened with the same settings for at most
-/// [`Config::reconnect_for`]. During that time, [`Camera::next_image`] returns
-/// [`Error::Reconnecting`]. Afterwards, it returns the cause. Images missed in the meantime count
-/// as skipped. Dropping this value stops the stream.
+/// [`Config::reconnect_for`]. In the meantime, [`Camera::next_image`] returns
+/// [`Error::Reconnecting`]. If the camera does not come back in time, it returns the cause. Images
+/// missed in the meantime count as skipped. Dropping this value stops the stream.
 #[derive(Debug)]
 pub struct V4l2Camera(Reconnecting<V4l2Device>);
 
@@ -105,8 +105,8 @@ impl ReopenableCamera for V4l2Device {
         stream: &mut V4l2Stream,
         deadline: Instant,
     ) -> Result<Option<Image>, Failure<Problem>> {
-        // Between opening and the first request, other devices may take seconds to open. By then,
-        // the images in the queue are outdated.
+        // Between opening this camera and the first request for an image, other devices may take
+        // seconds to open. By then, the images in the queue are outdated.
         if !std::mem::replace(&mut self.was_read, true) {
             stream.discard_queued()?;
         }

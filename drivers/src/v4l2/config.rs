@@ -10,8 +10,8 @@ use std::time::Duration;
 pub struct Config {
     /// Name in the rig file.
     pub name: String,
-    /// A path (preferably a link under `/dev/v4l`, whose name is stable), a USB serial number, or
-    /// the port as reported by the kernel (`usb-0000:00:14.0-2`).
+    /// A path, a USB serial number, or the port as reported by the kernel (`usb-0000:00:14.0-2`).
+    /// The best path is a link under `/dev/v4l`, because its name is stable.
     pub device: String,
     /// Pixel format. `None` selects the first of [`V4l2Format::COLOR_FORMATS`] that is available at
     /// this size and rate.
@@ -20,7 +20,7 @@ pub struct Config {
     pub intrinsics: Intrinsics,
     /// Images per second.
     pub rate_hz: f64,
-    /// Meters per count of depth; required for [`V4l2Format::Z16`].
+    /// Meters per count of depth. It is required for [`V4l2Format::Z16`].
     pub meters_per_count: Option<f64>,
     /// Exposure, gain, white balance, brightness.
     pub settings: Settings,
@@ -34,7 +34,7 @@ pub struct Config {
 /// Tests use it to provoke faults.
 ///
 /// # Errors
-/// If the kernel rejects the value.
+/// Fails if the kernel rejects the value.
 pub fn set_control(node: &Path, id: u32, value: i32) -> std::io::Result<()> {
     Ok(device::Device::open(node)?.set_control(id, value)?)
 }

@@ -27,7 +27,7 @@ pub(super) enum Id {
     WhiteBalanceTemperature = 0x0098_091a,
     ExposureAuto = 0x009a_0901,
     ExposureAbsolute = 0x009a_0902,
-    /// `exposure_dynamic_framerate`: automatic exposure may lower the rate.
+    /// `exposure_dynamic_framerate`, with which automatic exposure may lower the rate.
     ExposureAutoPriority = 0x009a_0903,
     AnalogueGain = 0x009e_0903,
 }
@@ -75,7 +75,7 @@ pub(super) struct AppliedSettings {
     pub(super) read_back: Vec<(&'static str, i32)>,
 }
 
-/// Access to the controls of a camera: a [`Device`], or a table in tests.
+/// Access to the controls of a camera. It is implemented by a [`Device`], and by a table in tests.
 pub(super) trait Controls {
     fn find(&self, id: Id) -> Option<QueryControl>;
     fn menu(&self, id: Id) -> Vec<i32>;
@@ -172,8 +172,8 @@ fn check(
     if settings.exposure_micros.is_none() {
         applied.reports_exposure = exposure_secs(camera).is_some();
     } else if applied.exposure_secs.is_none() {
-        // The camera cannot set the exposure, so the exposure time of the rig file is taken as the
-        // known value.
+        // The exposure of this camera cannot be set, so the exposure time of the rig file is used
+        // as the known value.
         applied.exposure_secs = settings.exposure_micros.map(|micros| micros * 1e-6);
     }
     Ok(applied)
@@ -257,7 +257,7 @@ impl AutoControl {
     }
 }
 
-/// A value, after checking it against the range and step of its control.
+/// Checks a value against the range and step of its control, and returns it.
 fn fixed(
     control: &'static str,
     id: Id,
@@ -374,7 +374,7 @@ mod tests {
     use std::cell::RefCell;
     use std::collections::BTreeMap;
 
-    /// A camera defined by a table of controls: id, minimum, maximum, step.
+    /// A camera that is defined by a table of controls, with id, minimum, maximum and step.
     struct FakeControls {
         controls: &'static [(Id, i32, i32, i32)],
         exposure_modes: &'static [i32],
@@ -565,7 +565,8 @@ mod tests {
 
     #[test]
     fn camera_without_exposure_control_is_accepted() {
-        // The key then states the known exposure time, as described in docs/reference/rig.md.
+        // The key `exposure_micros` then states the known exposure time, as described in
+        // docs/reference/rig.md.
         let known = Settings {
             exposure_micros: Some(4000.0),
             ..Settings::default()

@@ -1,5 +1,5 @@
-//! An open V4L2 device: safe calls for the requests of the kernel, and images in memory shared with
-//! the kernel.
+//! An open V4L2 device, with safe calls for the requests of the kernel, and with images in memory
+//! that is shared with the kernel.
 
 use super::abi::{self, Plain, Request};
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
@@ -37,7 +37,7 @@ pub(super) struct FilledBuffer {
     n_bytes: usize,
     /// Sequence number since the stream started, including lost images.
     pub(super) sequence: u32,
-    /// Stamp in nanoseconds; its clock depends on `is_monotonic`.
+    /// Stamp in nanoseconds. Its clock depends on `is_monotonic`.
     pub(super) stamp_nanos: i64,
     /// Whether the device reports that its stamps come from the kernel's monotonic clock.
     pub(super) is_monotonic: bool,
@@ -52,7 +52,7 @@ struct Exchange<'a, T> {
 }
 
 // SAFETY: the kernel writes at most the structure whose size is in the code, and `Request` pairs
-// each code with its structure; the sizes are asserted in `abi`. The structures consist of
+// each code with its structure. The sizes are asserted in `abi`. The structures consist of
 // integers, so any written bytes are valid.
 #[expect(unsafe_code, reason = "system call")]
 unsafe impl<T: Plain> Ioctl for Exchange<'_, T> {
@@ -76,8 +76,8 @@ impl Device {
     /// Opens a node in nonblocking mode.
     pub(super) fn open(path: &Path) -> rustix::io::Result<Self> {
         // The node is opened in nonblocking mode, so that a device that stops sending cannot block
-        // the thread. `wait` has a timeout, but `DQBUF` has none. The descriptor is closed in child
-        // processes, which would otherwise keep the device busy.
+        // the thread. `wait` has a timeout, but `DQBUF` has no timeout. The descriptor is closed in
+        // child processes, which would otherwise keep the device busy.
         let flags = OFlags::RDWR | OFlags::NONBLOCK | OFlags::CLOEXEC;
         Ok(Self {
             fd: rustix::fs::open(path, flags, Mode::empty())?,
@@ -88,7 +88,7 @@ impl Device {
     fn ioctl<T: Plain>(&self, request: &Request<T>, value: &mut T) -> rustix::io::Result<()> {
         rustix::io::retry_on_intr(|| {
             // SAFETY: the code belongs to the structure `T` (see `Exchange`), which outlives the
-            // call; none of the structures contains a pointer that the kernel follows.
+            // call. None of the structures contains a pointer that the kernel follows.
             #[expect(unsafe_code, reason = "system call")]
             unsafe {
                 rustix::ioctl::ioctl(
@@ -102,8 +102,8 @@ impl Device {
         })
     }
 
-    /// Enumerates entries with increasing indices until the device has no more. The list is empty
-    /// if the device lacks the request.
+    /// Enumerates entries with increasing indices until the device has no more entries. The list is
+    /// empty if the device does not support the request.
     fn list<T: Plain>(&self, request: &Request<T>, mut request_at: impl FnMut(u32) -> T) -> Vec<T> {
         // This limit ends the loop even if a driver never ends its list.
         const MAX_ENTRIES: u32 = 1000;
@@ -117,8 +117,8 @@ impl Device {
     pub(super) fn identity(&self) -> rustix::io::Result<Identity> {
         let mut reported = abi::Capability::default();
         self.ioctl(&abi::QUERYCAP, &mut reported)?;
-        // `capabilities` covers all nodes of a device, `device_caps` only this one. Old drivers
-        // report just the first.
+        // `capabilities` covers all nodes of a device, and `device_caps` covers only this node. Old
+        // drivers report only `capabilities`.
         let of_node = if reported.capabilities & abi::CAP_DEVICE_CAPS == 0 {
             reported.capabilities
         } else {
@@ -228,7 +228,7 @@ impl Device {
             && input.capabilities & abi::INPUT_DV_TIMINGS != 0
     }
 
-    /// Description of a control; `None` if the device has no writable control of this id.
+    /// Description of a control. `None` if the device has no writable control with this id.
     pub(super) fn control(&self, id: u32) -> Option<abi::QueryControl> {
         let mut control = abi::QueryControl {
             id,
@@ -406,7 +406,8 @@ unsafe impl Send for Mapped {}
 impl Mapped {
     fn new(fd: impl AsFd, buffer: &abi::Buffer) -> rustix::io::Result<Self> {
         let n_bytes = buffer.length as usize;
-        // SAFETY: a new read-only mapping placed by the kernel; it lives until `drop`.
+        // SAFETY: the kernel chooses the address of this new read-only mapping. The mapping lives
+        // until `drop`.
         #[expect(unsafe_code, reason = "system call")]
         let start = unsafe {
             rustix::mm::mmap(
@@ -435,7 +436,7 @@ impl Mapped {
 
 impl Drop for Mapped {
     fn drop(&mut self) {
-        // SAFETY: mapped in `new` with this length; no slice of it outlives `self`.
+        // SAFETY: `new` mapped the memory with this length. No slice of the memory outlives `self`.
         #[expect(unsafe_code, reason = "system call")]
         let unmapped = unsafe { rustix::mm::munmap(self.start, self.n_bytes) };
         debug_assert!(unmapped.is_ok(), "unmapping failed: {unmapped:?}");

@@ -26,8 +26,8 @@ pub struct FoundCamera {
 }
 
 impl FoundCamera {
-    /// Name for the rig file. It is a udev link if there is one. Otherwise, it is the serial number
-    /// or, without one, the bus address.
+    /// Name for the rig file. It is a udev link if there is one. Otherwise, it is the serial
+    /// number. If there is no serial number either, it is the bus address.
     pub fn address(&self) -> String {
         let link = self.links.first().map(|link| link.display().to_string());
         link.or_else(|| self.serial.clone())
@@ -189,7 +189,7 @@ fn nodes(root: &Path) -> Vec<Node> {
         .collect()
 }
 
-/// An attribute of a USB device in sysfs; `None` if it is missing or empty.
+/// An attribute of a USB device in sysfs. `None` if it is missing or empty.
 fn usb_attribute(usb: &Path, name: &str) -> Option<String> {
     let text = std::fs::read_to_string(usb.join(name)).ok()?;
     Some(text.trim().to_owned()).filter(|text| !text.is_empty())

@@ -76,7 +76,7 @@ impl V4l2Format {
     }
 }
 
-/// A mode of a device: a format with its sizes and rates.
+/// A mode of a device, which is a format with its sizes and rates.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Mode {
     /// Kernel code of the format.
@@ -85,7 +85,8 @@ pub struct Mode {
     pub format: V4l2Format,
     /// Supported sizes.
     pub sizes: Sizes,
-    /// Images per second at these sizes; for a range of sizes, at the largest size.
+    /// Images per second at these sizes. For a range of sizes, these are the rates at the largest
+    /// size.
     pub rates: Rates,
 }
 
@@ -94,7 +95,7 @@ pub struct Mode {
 pub enum Sizes {
     /// A single size.
     One([u32; 2]),
-    /// Any size in a range, in steps, for width and height separately.
+    /// Any size within a range of widths and a range of heights, in steps.
     Range {
         /// Minimum.
         min: [u32; 2],
@@ -213,7 +214,8 @@ pub(super) fn choose(
         .collect();
     match format {
         Some(format) => first_of_format(&suitable, format),
-        // The order of preference decides, not the order in which the device lists its formats.
+        // The order of preference determines the format, not the order in which the device lists
+        // its formats.
         None => V4l2Format::COLOR_FORMATS
             .iter()
             .find_map(|(_, format)| first_of_format(&suitable, *format)),
@@ -233,11 +235,11 @@ pub(super) fn rank(format: V4l2Format) -> usize {
         .unwrap_or(V4l2Format::COLOR_FORMATS.len())
 }
 
-/// USB bandwidth for one camera in bytes per second at the speed reported by sysfs: the largest
-/// isochronous transfer of an endpoint.
+/// USB bandwidth for one camera in bytes per second at the speed reported by sysfs. It is the
+/// largest isochronous transfer of an endpoint.
 ///
-/// Source: USB 2.0 section 5.6.3 (full speed 1023 bytes per millisecond, high speed 3072 bytes in
-/// 125 us), USB 3.2 section 8.12.6 (48 KiB in 125 us; twice that at 10 Gbit/s).
+/// Sources: USB 2.0, section 5.6.3 (full speed: 1023 bytes per millisecond, high speed: 3072 bytes
+/// in 125 us), and USB 3.2, section 8.12.6 (48 KiB in 125 us, and 96 KiB in 125 us at 10 Gbit/s).
 pub(super) fn usb_bytes_per_sec(mbits: f64) -> f64 {
     match mbits {
         mbits if mbits < 480.0 => 1023.0 * 1e3,

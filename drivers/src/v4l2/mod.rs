@@ -2,9 +2,9 @@
 //! software.
 //!
 //! `abi.rs` declares the kernel interface, and only `device.rs` calls it. `config.rs` and
-//! `problem.rs` define configuration and errors. `find.rs` lists devices; `format.rs`,
-//! `pixel_format.rs` and `controls.rs` select formats and settings; `stream.rs` and `sequence.rs`
-//! read images; `camera.rs` handles disconnections. On systems other than Linux, only the names of
+//! `problem.rs` define configuration and errors. `find.rs` lists devices. `format.rs`,
+//! `pixel_format.rs` and `controls.rs` select formats and settings. `stream.rs` and `sequence.rs`
+//! read images. `camera.rs` handles disconnections. On systems other than Linux, only the names of
 //! the formats are available. Rig files need these names on every system.
 
 #[cfg(target_os = "linux")]

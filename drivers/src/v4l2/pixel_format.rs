@@ -13,7 +13,7 @@ pub enum V4l2Format {
     Rgb,
     /// `BGR3`: three bytes per pixel.
     Bgr,
-    /// `MJPG` or `JPEG`: compressed, far less than one byte per pixel.
+    /// `MJPG` or `JPEG`. Compressed images have far less than one byte per pixel.
     Mjpeg,
     /// `GREY`: one byte per pixel.
     Grey,
@@ -22,8 +22,8 @@ pub enum V4l2Format {
 }
 
 impl V4l2Format {
-    /// Formats of color images by their name in rig files, in order of preference: uncompressed
-    /// before compressed, color before gray.
+    /// Formats of color images by their name in rig files, in order of preference. Uncompressed
+    /// formats come before compressed formats, and color comes before gray.
     pub const COLOR_FORMATS: [(&str, Self); 7] = [
         ("yuyv", Self::Yuyv),
         ("uyvy", Self::Uyvy),

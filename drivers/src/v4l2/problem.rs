@@ -53,7 +53,7 @@ pub enum Problem {
         /// All modes of the device.
         offered: String,
     },
-    /// The device selected a mode that differs from the requested one.
+    /// The device selected a mode that differs from the requested mode.
     #[error("requested {requested}, but it selected {got}")]
     OtherMode {
         /// Requested mode.
@@ -80,7 +80,7 @@ pub enum Problem {
     Bandwidth {
         /// Format, size and rate.
         mode: String,
-        /// Required bandwidth, bytes per second; `None` for compressed formats.
+        /// Required bandwidth, bytes per second. `None` for compressed formats.
         bytes_per_sec: Option<f64>,
     },
     /// The device rejected a request.

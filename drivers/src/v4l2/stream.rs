@@ -18,8 +18,8 @@ use std::time::{Duration, Instant};
 /// buffers, images are lost when the caller pauses. More buffers take more kernel memory.
 const N_BUFFERS: u32 = 8;
 /// Maximum time by which a stamp may be earlier than the start of the stream, or later than the
-/// current time. A stamp outside these limits comes from another clock, even if its flag says
-/// otherwise.
+/// current time. A stamp outside these limits comes from another clock, even if its flag states
+/// that it is monotonic.
 const MAX_STAMP_ERROR_SECS: f64 = 1.0;
 /// Maximum duration of an exposure query, as a fraction of the time between two images. Some
 /// cameras answer so slowly that images would be lost in the meantime.
@@ -145,7 +145,7 @@ impl V4l2Stream {
             };
             self.stream.requeue(filled).map_err(lost)?;
         }
-        // The discarded images must not appear as a gap before the first one.
+        // The discarded images must not appear as a gap before the first returned image.
         self.sequence = Sequence::default();
         Ok(())
     }
@@ -202,9 +202,9 @@ impl V4l2Stream {
         loop {
             match self.stream.take().map_err(lost)? {
                 Some(newer) => {
-                    // For `Newest`, continue until the queue is empty, and requeue all buffers
-                    // except the newest. The skipped images are counted in the order of their
-                    // sequence numbers.
+                    // For `Newest`, the loop continues until the queue is empty, and requeues all
+                    // buffers except the newest. The skipped images are counted in the order of
+                    // their sequence numbers.
                     if let Some(older) = taken.replace(newer) {
                         self.n_unreported += self.sequence.n_skipped_before(older.sequence) + 1;
                         self.stream.requeue(older).map_err(lost)?;
@@ -239,8 +239,9 @@ impl V4l2Stream {
         .pack_rows(self.bytes_per_line)
     }
 
-    /// The stamp of the device if it comes from our clock, or else the current time.
-    /// `stamp_to_mid_exposure_millis` of the rig file converts the stamp to mid-exposure.
+    /// The stamp of the device, if it is on the monotonic clock of this computer. Otherwise, the
+    /// current time. `stamp_to_mid_exposure_millis` of the rig file converts the stamp to
+    /// mid-exposure.
     fn stamp_of(&mut self, filled: &FilledBuffer) -> Stamp {
         let now = clock::now();
         let stamp = Stamp(filled.stamp_nanos);
@@ -371,8 +372,8 @@ fn set_mode(config: &Config, path: &Path, device: &Device) -> Result<(Mode, PixF
     };
     let pix = device.set_format(mode.fourcc, size_px).map_err(refused)?;
     let got_hz = device.set_rate_hz(rate_hz).map_err(refused)?;
-    // The kernel replaces an unsupported request with the closest supported one instead of refusing
-    // it. Lens parameters are valid for one size only.
+    // The kernel does not refuse an unsupported mode, but selects the closest supported mode. Lens
+    // parameters are valid for only one size.
     let is_same = pix.fourcc == mode.fourcc && [pix.width, pix.height] == size_px;
     if !is_same || got_hz.is_some_and(|got_hz| !format::is_same_rate(got_hz, rate_hz)) {
         let format = V4l2Format::from_fourcc(pix.fourcc).map_or("another format", V4l2Format::name);

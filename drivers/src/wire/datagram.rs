@@ -21,8 +21,8 @@ const MAX_ANGLE_RAD: f64 = 100.0;
 const MAX_ERROR_CHARS: usize = 200;
 /// Maximum length of a list of names in an error message.
 const MAX_LIST_CHARS: usize = 400;
-/// Maximum asymmetry of a covariance matrix, as a fraction of the maximum covariance. Single
-/// precision is more accurate.
+/// Maximum asymmetry of a covariance matrix, as a fraction of the maximum covariance. Matrices in
+/// single precision have a smaller asymmetry.
 const SYMMETRY_TOLERANCE: f64 = 1e-4;
 /// Maximum deviation of a quaternion's norm from 1.
 const UNIT_NORM_TOLERANCE: f64 = 1e-3;
@@ -71,9 +71,9 @@ pub struct PoseDatagram {
     pub header: DatagramHeader,
     /// Pose of the base.
     pub world_from_base: Transform,
-    /// Covariance of the pose, row-major, if the sender reports it. The order is that of
-    /// `geometry_msgs/PoseWithCovariance` of ROS: position along the world's axes, then small
-    /// rotations about these axes. Units are m², m rad and rad².
+    /// Covariance of the pose, row-major, if the sender reports it. The order is the same as in
+    /// `geometry_msgs/PoseWithCovariance` of ROS. The position along the world's axes comes first,
+    /// then small rotations about these axes. Units are m², m rad and rad².
     pub covariance: Option<Box<[f64; 36]>>,
 }
 
@@ -270,7 +270,8 @@ pub fn decode_scan(bytes: &[u8]) -> Result<ScanPart, Malformed> {
         wire.offsets_micros.as_ref().map(Vec::len),
         n,
     )?;
-    // Directions without an echo are left out only here, because they also have rings and offsets.
+    // Directions without an echo are left out only here, because the lists of rings and offsets
+    // also contain these directions.
     let points = echo_positions
         .into_iter()
         .enumerate()
@@ -375,7 +376,7 @@ fn covariance(numbers: Vec<f64>) -> Result<Box<[f64; 36]>, Malformed> {
 }
 
 /// Decodes the state of joints with these names. `None` if the datagram names only other joints,
-/// such as those of a gripper.
+/// such as the joints of a gripper.
 ///
 /// Joints are found by their names. Without names, the numbers must be in the order of `names`.
 /// Velocities and efforts count as not reported if one of them is null or NaN.
@@ -429,7 +430,8 @@ pub fn decode_joints(
     ))
 }
 
-/// Why a valid state is not one of these joints: the names in the datagram, and ours.
+/// The reason why a valid state is not a state of these joints. It contains the names in the
+/// datagram and the expected names.
 pub fn unmatched_names(bytes: &[u8], joints: &[String]) -> Result<String, Malformed> {
     let state: WireJoints<Option<f64>> = parse_json(bytes)?;
     let reported = state.names.unwrap_or_default();
@@ -440,19 +442,19 @@ pub fn unmatched_names(bytes: &[u8], joints: &[String]) -> Result<String, Malfor
     ))
 }
 
-/// Positions of our joints in the lists of a datagram.
+/// Positions of the requested joints in the lists of a datagram.
 struct JointLayout {
-    /// Index of each of our joints in the lists.
+    /// Index of each requested joint in the lists.
     order: Vec<usize>,
     /// Length of the lists.
     n: usize,
-    /// The items for which the lists have one number each, as named in messages.
+    /// The items for which the lists have one number each, in the words of messages.
     per: &'static str,
 }
 
 impl JointLayout {
-    /// The numbers of our joints. A list that is optional may be empty. If it has null or NaN for
-    /// one of our joints, it counts as empty.
+    /// The numbers of the requested joints. An optional list may be empty. If such a list has null
+    /// or NaN for a requested joint, it counts as empty.
     fn numbers(
         &self,
         what: &str,
@@ -630,7 +632,7 @@ fn check_kind(bytes: &[u8], expected: &'static str) -> Result<(), Malformed> {
     Ok(())
 }
 
-/// Parses JSON in which `NaN` and `Infinity`, which Python writes, are read as null.
+/// Parses JSON. `NaN` and `Infinity`, which Python writes, are read as null.
 fn parse_json<T: DeserializeOwned>(bytes: &[u8]) -> Result<T, Malformed> {
     let parse =
         |bytes: &[u8]| serde_json::from_slice(bytes).map_err(|error| invalid(reported(&error)));

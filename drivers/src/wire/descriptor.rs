@@ -1,7 +1,8 @@
 //! Self-description of the protobuf messages in a recording, so that any MCAP viewer can read them.
 //!
-//! Source: `google/protobuf/descriptor.proto` for the encoding; the Foxglove schemas
-//! (docs.foxglove.dev/docs/sdk/schemas) for names and numbers. Fields from 1001 are our extensions.
+//! The encoding follows `google/protobuf/descriptor.proto`. Names and numbers are from the Foxglove
+//! schemas (docs.foxglove.dev/docs/sdk/schemas). Fields from number 1001 are extensions by
+//! fieldrig.
 
 use super::protobuf::{Message, fields};
 
@@ -214,7 +215,8 @@ impl Schema {
             .collect()
     }
 
-    /// The encoded `FileDescriptorSet`: the files that this message depends on, then its own file.
+    /// The encoded `FileDescriptorSet`. It contains the files that this message depends on,
+    /// followed by its own file.
     pub fn file_descriptor_set(&self) -> Vec<u8> {
         let mut set = Message::default();
         // Readers resolve imports in order, so dependencies come before the file that uses them.

@@ -1,7 +1,8 @@
 //! Foxglove messages for images, intrinsics and poses.
 //!
-//! Color images keep the bytes of the device, and depth images their raw counts. Stamps are exact
-//! to the nanosecond, and numbers are bit-exact. Field numbers are those of [`super::descriptor`].
+//! Color images keep the bytes of the device, and depth images keep their raw counts. Stamps are
+//! exact to the nanosecond, and numbers are bit-exact. Field numbers are the same as in
+//! [`super::descriptor`].
 
 use super::protobuf::{Field, Message, fields};
 use super::{Malformed, descriptor};
@@ -48,7 +49,8 @@ const YUV_COLORS_NAMES: [(&str, YuvColors); 4] = [
         },
     ),
 ];
-/// Foxglove's names of layouts. The first name of a layout is written; all names are accepted.
+/// Foxglove's names of layouts. The first name of a layout is written, and all names are accepted
+/// when reading.
 const YUV_LAYOUTS: [(&str, YuvLayout); 5] = [
     ("yuyv", YuvLayout::Yuyv),
     ("uyvy", YuvLayout::Uyvy),
@@ -174,7 +176,8 @@ pub fn decode_image(schema: &str, bytes: &[u8]) -> Result<Image, Malformed> {
             (N_SKIPPED, _) => image.n_skipped = field.varint()?,
             (YUV_COLORS, false) => colors = Some(field.text()?),
             (METERS_PER_COUNT, false) => meters_per_count = Some(field.double()?),
-            // Unknown fields of a newer version, see `descriptor::Schema::unknown_fields`.
+            // These are unknown fields of a newer version, see
+            // `descriptor::Schema::unknown_fields`.
             _ => {}
         }
     }
@@ -407,9 +410,10 @@ pub fn decode_transform(bytes: &[u8]) -> Result<(Stamp, Transform), Malformed> {
 /// because normalizing would change its last bits. A quaternion that is not finite is also returned
 /// unchanged, because users of the pose reject it.
 fn unit_quaternion(quaternion: [f64; 4]) -> Result<[f64; 4], Malformed> {
-    /// Products of many rotations and quaternions in f32 deviate by less than this.
+    /// Products of many rotations, and quaternions in f32, deviate from unit length by less than
+    /// this value.
     const EXACT: f64 = 1e-6;
-    /// Quaternions with two decimals deviate by less than this.
+    /// Quaternions with two decimals deviate from unit length by less than this value.
     const ROUNDED: f64 = 0.01;
     let length = quaternion
         .iter()

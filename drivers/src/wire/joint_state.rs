@@ -46,7 +46,8 @@ const NANOS_PER_SEC: i64 = 1_000_000_000;
 /// The fields of [`Wire`].
 const FIELDS: [&str; 4] = ["timestamp", "position", "velocity", "effort"];
 
-/// Encodes joint states as JSON. Decoding restores finite numbers bit for bit, and others as NaN.
+/// Encodes joint states as JSON. Decoding restores finite numbers bit for bit. Other numbers become
+/// NaN.
 pub fn encode(state: &JointState) -> Vec<u8> {
     let nsec = u32::try_from(state.stamp.0.rem_euclid(NANOS_PER_SEC))
         .expect("the remainder is below one billion");

@@ -1,8 +1,8 @@
 //! JSON as Python writes it.
 
 /// Replaces `NaN` and `Infinity` outside of strings with null. Python writes these words although
-/// JSON does not have them. With null instead, the reader can name the place, or decide what the
-/// value means.
+/// they are not valid JSON. If they are null, the reader can name their place or give them a
+/// meaning.
 pub(crate) fn nan_as_null(text: &str) -> String {
     let mut out = String::with_capacity(text.len());
     for (ix, part) in text.split('"').enumerate() {

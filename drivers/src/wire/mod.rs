@@ -1,4 +1,4 @@
-//! Byte codecs: pure `encode` and `decode` functions without sockets and clocks.
+//! Byte codecs. They consist of pure `encode` and `decode` functions without sockets and clocks.
 
 pub mod can;
 pub mod datagram;

@@ -1,7 +1,7 @@
 //! Range scans as Foxglove's `PointCloud`.
 //!
-//! A point is 20 bytes, little-endian: x, y, z as f32 in meters, ring as u16 and two unused bytes,
-//! microseconds since the stamp as u32. The encoding is lossless.
+//! A point has 20 bytes, little-endian. It consists of x, y and z as f32 in meters, the ring as
+//! u16, two unused bytes, and the microseconds since the stamp as u32. The encoding is lossless.
 
 use super::Malformed;
 use super::foxglove::{numbers, stamp_from, timestamp};
@@ -10,7 +10,8 @@ use crate::{RangePoint, RangeScan};
 use std::sync::Arc;
 
 const STRIDE: u32 = 20;
-/// Name, offset in the point, and Foxglove's number of the type: 3 is u16, 5 u32, 7 f32.
+/// Name, offset in the point, and Foxglove's number of the type. The number 3 is u16, 5 is u32, and
+/// 7 is f32.
 const FIELDS: [(&str, u32, u64); 5] = [
     ("x", 0, 7),
     ("y", 4, 7),
@@ -30,7 +31,7 @@ pub fn encode(scan: &RangeScan) -> Vec<u8> {
                 .flat_map(|meters| meters.to_le_bytes()),
         );
         data.extend(point.ring.to_le_bytes());
-        // Padding, so that the last number is aligned to four bytes.
+        // The padding aligns the last number to four bytes.
         data.extend([0; 2]);
         data.extend(point.offset_micros.to_le_bytes());
     }
@@ -51,7 +52,7 @@ pub fn encode(scan: &RangeScan) -> Vec<u8> {
     message.into_bytes()
 }
 
-/// Identity pose: the points are in the frame of the scanner itself.
+/// The identity as a pose, because the points are in the frame of the scanner.
 fn identity() -> Message {
     let mut position = Message::default();
     let mut orientation = Message::default();
@@ -89,8 +90,8 @@ pub fn decode(bytes: &[u8]) -> Result<RangeScan, Malformed> {
     if stride != Some(STRIDE) || data.len() % STRIDE as usize != 0 {
         return Err(Malformed::Range { field: 4 });
     }
-    // A cloud of another program may have the same stride with other contents. Its bytes would be
-    // read as wrong positions.
+    // A cloud of another program may have points of the same length with other contents. Its bytes
+    // would be read as wrong positions.
     if layout != FIELDS {
         return Err(Malformed::Unsupported {
             name: "fields",

@@ -74,7 +74,8 @@ impl Message {
     }
 
     fn raw_varint(&mut self, mut value: u64) {
-        // Seven bits per byte, the lowest first; the high bit means that more follow.
+        // Each byte has seven bits of the number, the lowest bits first. The high bit of a byte
+        // means that more bytes follow.
         while value >= 0x80 {
             self.0.push(value.to_le_bytes()[0] | 0x80);
             value >>= 7;
@@ -174,7 +175,7 @@ impl<'a> Iterator for Fields<'a> {
             return None;
         }
         let field = self.field();
-        // Without the length of a field, the next one cannot be found.
+        // Without the length of a field, the next field cannot be found.
         if field.is_err() {
             self.0 = &[];
         }
@@ -244,8 +245,8 @@ mod tests {
 
     #[test]
     fn documented_examples_match_published_bytes() {
-        // Protocol Buffers documentation: field 1 = 150; field 2 = "testing"; field 3 contains the
-        // first message.
+        // These are the examples of the Protocol Buffers documentation. Field 1 is 150, field 2 is
+        // "testing", and field 3 contains the first message.
         let mut inner = Message::default();
         inner.varint(1, 150);
         let mut outer = Message::default();

@@ -10,7 +10,7 @@ pub fn counted(n: u64, noun: &str) -> String {
     }
 }
 
-/// Words with commas and a conjunction before the last one: `ply or spz`.
+/// Words with commas, and a conjunction before the last word, such as `ply or spz`.
 #[must_use]
 pub fn listed(words: &[&str], conjunction: &str) -> String {
     match words.split_last() {

@@ -1,4 +1,5 @@
-//! Classes of errors, which determine the exit code, and errors that state their class.
+//! Classes of errors, and errors that state their class. The class determines the exit code of a
+//! program.
 
 /// Class of an error, from which a program derives its exit code.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]

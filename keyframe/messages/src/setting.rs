@@ -101,7 +101,7 @@ settings! {
     Report = "report",
     /// Folder of the run that training continues.
     Resume = "resume",
-    /// Rig file that replaces the one stored in a recording.
+    /// Rig file that replaces the rig file stored in a recording.
     Rig = "rig",
     /// Known robot.
     Robot = "robot",

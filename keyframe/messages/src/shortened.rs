@@ -2,7 +2,8 @@
 
 use std::fmt::Display;
 
-/// The first `max` items of a list, and the number of the others: `a, b, c and 7 more`.
+/// The first `max` items of a list, and the number of the other items, such as `a, b, c and 7
+/// more`.
 ///
 /// ```
 /// use messages::shortened;

@@ -1,5 +1,5 @@
-//! Numbers without a unit or frame: reproducible random numbers, medians and quantiles, rounding to
-//! f32.
+//! Functions for numbers without a unit or frame: reproducible random numbers, medians and
+//! quantiles, and rounding to f32.
 //!
 //! ```
 //! use numbers::quantile::median;

@@ -1,15 +1,16 @@
 //! Medians and quantiles of finite numbers.
 //!
-//! Except for [`median`], every result is one of the given values; [`Rank`] selects which one.
+//! Except for [`median`], every result is one of the given values. [`Rank`] selects this value.
 
 /// Selects the value that is returned if the quantile falls between two of `n` sorted values.
 /// Indices start at 0.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Rank {
-    /// The smallest value that at least the fraction `frac` of the values do not exceed: index
-    /// `ceil(frac n) - 1`.
+    /// The smallest value that at least the fraction `frac` of the values do not exceed. Its index
+    /// is `ceil(frac n) - 1`.
     ///
-    /// This is the inverse of the empirical distribution function: type 1 of Hyndman and Fan 1996.
+    /// This is the inverse of the empirical distribution function, which is type 1 of Hyndman and
+    /// Fan 1996.
     Lower,
     /// The value at index `round(frac (n - 1))`.
     Nearest,
@@ -45,7 +46,7 @@ pub fn quantile(values: &mut [f64], frac: f64, rank: Rank) -> Option<f64> {
     let last_ix = values.len().checked_sub(1)?;
     let n = values.len() as f64;
     let ix = match rank {
-        // At a fraction of zero, this index is below the first one, so it is clamped below.
+        // At a fraction of zero, this index is below the first index, so it is clamped below.
         Rank::Lower => (frac * n).ceil() - 1.0,
         Rank::Nearest => (frac * (n - 1.0)).round(),
         Rank::Upper => (frac * n).floor(),

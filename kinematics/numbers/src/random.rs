@@ -1,8 +1,8 @@
 //! Reproducible pseudorandom numbers: `SplitMix64`.
 //!
-//! The same seed gives the same numbers on every machine. Source: Steele, Lea and Flood 2014, "Fast
-//! splittable pseudorandom number generators", with the output function "variant 13" of Stafford;
-//! Box and Muller 1958 for normal numbers.
+//! The same seed gives the same numbers on every machine. The generator is from Steele, Lea and
+//! Flood 2014, "Fast splittable pseudorandom number generators", with the output function "variant
+//! 13" of Stafford. Normal numbers are from Box and Muller 1958.
 
 use std::f64::consts::TAU;
 
@@ -49,10 +49,10 @@ impl Random {
         (0..n).map(|_| self.byte()).collect()
     }
 
-    /// A number in `0..bound`; all are equally likely up to a factor of `1 + bound / 2^64`.
+    /// A number in `0..bound`. All numbers are equally likely up to a factor of `1 + bound / 2^64`.
     ///
     /// # Panics
-    /// If `bound` is 0.
+    /// Panics if `bound` is 0.
     pub fn below(&mut self, bound: usize) -> usize {
         // The bias of the modulo is accepted. If values were rejected, the number of draws, and
         // thus all later numbers, would depend on the values.
@@ -81,7 +81,7 @@ impl Random {
         radius * cosine
     }
 
-    /// Shuffles the items; all orders are equally likely. Source: Durstenfeld 1964.
+    /// Shuffles the items. All orders are equally likely. Source: Durstenfeld 1964.
     pub fn shuffle<T>(&mut self, items: &mut [T]) {
         for ix in (1..items.len()).rev() {
             // Each position receives one of the remaining items, including its own.
@@ -90,7 +90,8 @@ impl Random {
     }
 }
 
-/// The bits at index `n` of the sequence of a seed, computed without the preceding ones.
+/// The bits at index `n` of the sequence of a seed. They are computed without the preceding
+/// elements.
 pub fn nth_bits(seed: u64, n: u64) -> u64 {
     // The state after `n` steps is known without taking them, so any element can be computed in
     // parallel. The factor is `n + 1`, because the generator advances before it mixes.
@@ -100,7 +101,7 @@ pub fn nth_bits(seed: u64, n: u64) -> u64 {
     mixed ^ (mixed >> 31)
 }
 
-/// A hash of a word: the first bits of the sequence with this seed.
+/// A hash of a word. It consists of the first bits of the sequence with this word as seed.
 pub fn hash(word: u64) -> u64 {
     nth_bits(word, 0)
 }
@@ -116,7 +117,7 @@ mod tests {
 
     #[test]
     fn bits_match_reference_implementation() {
-        // From `splitmix64.c` of Sebastiano Vigna (public domain) for the state 1234567.
+        // These values are from `splitmix64.c` of Sebastiano Vigna (public domain) for the state 1234567.
         const EXPECTED: [u64; 5] = [
             6_457_827_717_110_365_317,
             3_203_168_211_198_807_973,

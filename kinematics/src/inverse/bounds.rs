@@ -4,7 +4,7 @@ use crate::{Chain, Error};
 use std::f64::consts::{PI, TAU};
 
 /// Distance by which a value of the closed form may be beyond a range because of rounding, radians.
-/// It is moved into the range, which changes the pose by about as much.
+/// Such a value is moved into the range, which changes the pose by a similar angle.
 const ROUNDING_RAD: f64 = 1e-9;
 
 /// Ranges of the joints, in the order of the chain.
@@ -17,7 +17,8 @@ pub(super) struct Bounds {
 
 impl Bounds {
     /// # Errors
-    /// If there is not one range per joint, or a range contains no value. Ranges may be infinite.
+    /// Fails if there is not one range per joint, or if a range contains no value. Ranges may be
+    /// infinite.
     pub(super) fn new(chain: &Chain, ranges: Vec<[f64; 2]>) -> Result<Self, Error> {
         if ranges.len() != chain.n_joints() {
             return Err(Error::JointCount {
@@ -62,20 +63,21 @@ impl Bounds {
         value.clamp(lower, upper)
     }
 
-    /// Whether a joint is at an end of its range and a change would move it beyond.
+    /// Whether a joint is at an end of its range and a change would move it beyond this end.
     pub(super) fn would_leave(&self, joint_ix: usize, value: f64, change: f64) -> bool {
         let [lower, upper] = self.ranges[joint_ix];
         (value <= lower && change < 0.0) || (value >= upper && change > 0.0)
     }
 
     /// The value within the range that gives the same pose as `value` and is closest to
-    /// `reference`. `None` if there is none.
+    /// `reference`. `None` if no value within the range gives this pose.
     pub(super) fn nearest_turn(&self, joint_ix: usize, value: f64, reference: f64) -> Option<f64> {
         let [lower, upper] = self.ranges[joint_ix];
         let mut turned = value;
         if self.is_periodic[joint_ix] {
             turned += TAU * ((reference - value) / TAU).round();
-            // The reference may be near an end of the range, with the closest value beyond.
+            // If the reference is near an end of the range, the closest value may be beyond this
+            // end.
             if turned > upper + ROUNDING_RAD {
                 turned -= TAU * ((turned - upper - ROUNDING_RAD) / TAU).ceil();
             } else if turned < lower - ROUNDING_RAD {
@@ -86,8 +88,8 @@ impl Bounds {
         is_inside.then(|| turned.clamp(lower, upper))
     }
 
-    /// The range from which a search starts: the part of the range that covers all poses and is
-    /// closest to `around`.
+    /// The range from which random starts of a search are drawn. It is a part of the joint's range
+    /// that covers all poses, and it is as close as possible to `around`.
     ///
     /// * `span_m`: half the range of a prismatic joint without limits, meters.
     pub(super) fn start_range(&self, joint_ix: usize, around: f64, span_m: f64) -> [f64; 2] {

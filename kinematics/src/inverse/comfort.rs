@@ -1,17 +1,19 @@
-//! Which of several joint values for the same pose are preferred: those that are far from the ends
-//! of the ranges and close to a posture.
+//! Selects among joint values for the same pose. Values far from the ends of the ranges and close
+//! to a posture are preferred.
 
 use super::bounds::Bounds;
 
 /// Width of the zone at each end of a range that is avoided, as a fraction of the range.
 const ZONE_FRAC: f64 = 0.1;
-/// Cost at the end of a range. The posture costs as much at a distance of one radian from one joint.
+/// Cost of a joint at the end of its range. A joint that is one radian from the posture has the
+/// same cost.
 const LIMIT_WEIGHT: f64 = 1.0;
 /// Cost of the squared distance from the posture, per rad^2 or m^2.
 const POSTURE_WEIGHT: f64 = 1.0;
 
-/// A preference among joint values (Liegeois 1977, with zones instead of the whole range, so that
-/// joints in the middle are not pulled).
+/// A preference among joint values, given by a cost (Liegeois 1977). Unlike in this source, only
+/// zones at the ends of the ranges have a cost, so that joints in the middle of their ranges are
+/// not moved.
 #[derive(Clone, Debug, Default)]
 pub(super) struct Comfort {
     /// Preferred joint values. Empty without a posture.
@@ -33,8 +35,8 @@ impl Comfort {
             .sum()
     }
 
-    /// The change of one joint value that decreases the cost. Alone, the posture would be reached
-    /// and the zone left with this change.
+    /// The change of one joint value that decreases the cost. It is the sum of the change that
+    /// leaves the zone and the change that reaches the posture.
     pub(super) fn descent_of(&self, bounds: &Bounds, joint_ix: usize, value: f64) -> f64 {
         let range = bounds.range(joint_ix);
         let zone = ZONE_FRAC * (range[1] - range[0]);
@@ -50,10 +52,11 @@ impl Comfort {
     }
 }
 
-/// How far a value is inside a zone: 0 outside, 1 at the upper end of the range, -1 at the lower.
+/// Depth of a value inside a zone. It is 0 outside the zones, 1 at the upper end of the range, and
+/// -1 at the lower end.
 fn zone_depth([lower, upper]: [f64; 2], value: f64) -> f64 {
     let zone = ZONE_FRAC * (upper - lower);
-    // A range of a single value, and one without ends, have no zones.
+    // A range of a single value and an infinite range have no zones.
     if !(zone > 0.0 && zone.is_finite()) {
         return 0.0;
     }

@@ -6,10 +6,11 @@ use super::target::Target;
 use crate::{Chain, Transform};
 use nalgebra::Vector6;
 
-/// Largest remaining error of a solution, radians and meters relative to half the arm's length. It
-/// is far below the repeatability of any arm, and far above the rounding of forward kinematics.
+/// Largest remaining error of a solution. It combines radians, and meters relative to half the
+/// arm's length. It is far below the repeatability of any arm, and far above the rounding of
+/// forward kinematics.
 pub(super) const TOLERANCE: f64 = 1e-7;
-/// Damping that remains when the error is zero; it bounds the steps near singular configurations. A
+/// Damping that remains when the error is zero. It bounds the steps near singular configurations. A
 /// larger value would slow down the last steps. With a smaller value, rounding errors would
 /// determine the step in directions in which the matrix is nearly singular.
 const MIN_DAMPING: f64 = 1e-9;
@@ -26,32 +27,35 @@ pub(super) struct Problem<'a> {
     pub(super) meters_per_rad: f64,
 }
 
-/// How long and how boldly a descent works.
+/// Limits of a descent: number of steps, length of steps, and minimum progress.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Effort {
     pub(super) max_steps: usize,
     /// Largest step of one joint, radians or meters. The Jacobian is only valid near a
     /// configuration.
     pub(super) max_change: f64,
-    /// Gives up if the squared error after eight steps is above this fraction of the one before.
+    /// The descent ends if the squared error is above this fraction of the squared error eight
+    /// steps earlier.
     pub(super) stall_frac: f64,
 }
 
 impl Effort {
-    /// For the first of several starts. Slow descents are cut, because most end in a local minimum.
-    /// A new start is faster: on the robots of `rigs/robots`, 19 instead of 35 steps per pose.
+    /// Limits for a search from several starts. Slow descents end early, because most of them would
+    /// end in a local minimum. A new start is faster. On the robots of `rigs/robots`, the search
+    /// takes 19 instead of 35 steps per pose.
     pub(super) const SEARCH: Self = Self {
         max_steps: 100,
         max_change: 1.0,
         stall_frac: 0.3,
     };
-    /// Goes on until no step helps, in order to end at the closest pose.
+    /// The descent continues until no step decreases the error, in order to end at the closest
+    /// pose.
     pub(super) const THOROUGH: Self = Self {
         max_steps: 300,
         max_change: 0.3,
         stall_frac: 1.0 - 1e-6,
     };
-    /// Short steps, which end at a solution near the start.
+    /// Short steps, with which the descent ends at a solution near the start.
     pub(super) const NEAR: Self = Self {
         max_steps: 100,
         max_change: 0.3,
@@ -90,7 +94,8 @@ pub(super) struct Descent {
     columns: Vec<Vector6<f64>>,
     trial: Vec<f64>,
     trial_columns: Vec<Vector6<f64>>,
-    /// Columns in which those of joints at the ends of their ranges are 0.
+    /// The columns of the Jacobian. The columns of joints that are held at the ends of their ranges
+    /// are 0.
     free_columns: Vec<Vector6<f64>>,
     change: Vec<f64>,
 }
@@ -138,7 +143,7 @@ impl Descent {
             self.try_change(problem.bounds, joints, effort.max_change);
             let pose = problem.linearize(&self.trial, &mut self.trial_columns);
             let trial_error = problem.error(&pose);
-            // The factor on the damping comes from Levenberg and Marquardt: a step that increases
+            // The factor on the damping comes from Levenberg and Marquardt. A step that increases
             // the error is discarded and tried again with more damping. The lower bound keeps the
             // factor large enough to react. The upper bound ends the search if no step improves the
             // pose.
@@ -170,8 +175,8 @@ impl Descent {
             damped_change(&self.free_columns, error, damping, &mut self.change);
             let mut is_complete = true;
             for (joint_ix, value) in joints.iter().enumerate() {
-                // Joints that are at an end and would leave it are removed, and the others take
-                // over. The change of a removed joint is 0.
+                // Joints that are at an end of their range and would move beyond it are left out,
+                // and the step is computed with the other joints. The change of an omitted joint is 0.
                 if bounds.would_leave(joint_ix, *value, self.change[joint_ix]) {
                     self.free_columns[joint_ix] = Vector6::zeros();
                     is_complete = false;
@@ -196,8 +201,8 @@ impl Descent {
             1.0
         };
         for (joint_ix, value) in joints.iter().enumerate() {
-            // A joint may still cross an end that it was not at. It then stops at the end, and the
-            // next step leaves it out if necessary.
+            // A joint that was not at an end may still cross it. The joint then stops at this end,
+            // and the next step leaves the joint out if necessary.
             self.trial[joint_ix] = bounds.clamp(joint_ix, value + scale * self.change[joint_ix]);
         }
     }

@@ -1,19 +1,22 @@
 //! Closed form for arms with the geometry of a Franka arm (Panda, FR3).
 //!
-//! If the last joint is given, a pose has at most eight solutions. Two circles about the shoulder
-//! and the wrist intersect in two elbows, the wrist is bent to either side, and the shoulder reaches
-//! each upper arm in two ways.
+//! If the last joint is given, a pose has at most eight solutions, from three choices of two. Two
+//! circles about the shoulder and the wrist intersect in two positions of the elbow. The wrist can
+//! be bent to either side. The shoulder joints can reach each direction of the upper arm in two
+//! ways.
 //!
 //! Source: He and Liu 2021, "Analytical inverse kinematics for Franka Emika Panda - a geometrical
-//! solver for 7-DOF manipulators with unconventional design", section III. Differences: both elbows
-//! are computed (the paper omits one that is rarely within the ranges), angles come from `atan2`
-//! instead of arc sines, and the lengths are measured in the chain.
+//! solver for 7-DOF manipulators with unconventional design", section III. There are three
+//! differences. Both elbows are computed, whereas the paper omits the elbow that is rarely within
+//! the ranges. Angles are computed with `atan2` instead of arc sines. The lengths are measured in
+//! the chain.
 
 use crate::{Chain, Transform};
 use nalgebra::{Rotation3, Translation3, UnitQuaternion, Vector3};
 
-/// Largest distance between the axes of a chain and those of a Franka arm, meters and radians.
-/// Calibrated arms deviate by about a millimeter. The rest is corrected by least squares.
+/// Largest distance between the axes of a chain and the axes of a Franka arm, meters and radians.
+/// Calibrated arms deviate by about a millimeter. Least squares correct the remaining error of the
+/// pose.
 const MAX_DEVIATION: f64 = 3e-3;
 /// Shortest lengths of the parts of an arm for which the closed form is accurate, meters.
 const MIN_LENGTH_M: f64 = 0.01;
@@ -21,20 +24,23 @@ const MIN_LENGTH_M: f64 = 0.01;
 /// undetermined.
 const MIN_SINE: f64 = 1e-6;
 
-/// The geometry of an arm whose axes are arranged like those of a Franka arm.
+/// The geometry of an arm whose axes are arranged like the axes of a Franka arm.
 ///
-/// All computations use the frame of the shoulder: its origin is where the axes of joints 1 and 2
-/// meet, z is the axis of joint 1, and y is the axis of joint 2 if joint 1 is at 0. With all joints
-/// at 0, the axes are parallel to y or z and lie in the plane of x and z.
+/// All computations use the frame of the shoulder. Its origin is the point where the axes of joints
+/// 1 and 2 meet. Its z axis is the axis of joint 1, and its y axis is the axis of joint 2 if joint
+/// 1 is at 0. With all joints at 0, each axis is parallel to y or z and passes through the plane of
+/// x and z.
 #[derive(Clone, Debug)]
 pub struct FrankaArm {
     shoulder_from_base: Transform,
-    /// From the frame of joint 7 to the tip. The origin is the point of its axis that is closest to
-    /// the axis of joint 6, and x leads away from that axis if joint 7 is at 0.
+    /// Pose of the tip in the frame of joint 7. The origin of this frame is the point on the axis
+    /// of joint 7 that is closest to the axis of joint 6. If joint 7 is at 0, its x axis points
+    /// away from the axis of joint 6.
     seven_from_tip: Transform,
     lengths: Lengths,
-    /// Lengths of upper arm and forearm, and the value of joint 4 at which they coincide. They are
-    /// derived from `lengths`, because each test of the search needs them.
+    /// Lengths of upper arm and forearm. The next field is the value of joint 4 at which the two
+    /// coincide. Both follow from `lengths` and are stored, because each test of the search needs
+    /// them.
     segments_m: [f64; 2],
     folded_q4: f64,
 }
@@ -50,13 +56,13 @@ struct Lengths {
     flange_offset: f64,
 }
 
-/// Which of the eight solutions for a given last joint.
+/// Identifies one of the eight solutions for a given last joint.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Branch {
-    /// Joint 4 is below the angle at which the arm is longest, which is -0.47 rad. This is so for
-    /// most values within the range of joint 4.
+    /// Whether joint 4 is below -0.47 rad, the angle at which the arm is longest. Most values
+    /// within the range of joint 4 are below this angle.
     pub is_elbow_bent: bool,
-    /// The wrist is bent to the side of larger angles of joint 6.
+    /// Whether the wrist is bent to the side of larger angles of joint 6.
     pub is_wrist_outward: bool,
     /// Joint 2 is positive.
     pub is_shoulder_forward: bool,
@@ -96,8 +102,8 @@ pub struct FrankaSolutions {
 }
 
 impl FrankaSolutions {
-    /// The joints of a branch, radians in -pi to pi (the last joint as given). `None` if the branch
-    /// does not reach the pose.
+    /// The joints of a branch, radians. The last joint has the given value, and the others are
+    /// between -pi and pi. `None` if the branch does not reach the pose.
     pub fn on_branch(&self, branch: Branch) -> Option<[f64; 7]> {
         self.joints_by_branch[branch.ix()]
     }
@@ -110,8 +116,8 @@ impl FrankaSolutions {
 }
 
 impl FrankaArm {
-    /// Measures the geometry of a chain. `None` if its axes are not arranged like those of a Franka
-    /// arm with the same directions and zeros. Base and tip may be any links.
+    /// Measures the geometry of a chain. `None` if its axes are not arranged like the axes of a
+    /// Franka arm, with the same directions and zeros. Base and tip may be any links.
     pub fn of(chain: &Chain) -> Option<Self> {
         let axes = axes_at_zero(chain)?;
         let base_from_shoulder = shoulder_frame(&axes)?;
@@ -134,10 +140,11 @@ impl FrankaArm {
         (!deviates).then_some(arm)
     }
 
-    /// All solutions for a pose of the tip and a value of the last joint. Ranges are not considered.
+    /// All solutions for a pose of the tip and a value of the last joint. Ranges are not
+    /// considered.
     ///
-    /// If joint 2 is at 0, joints 1 and 3 have the same axis, and only their sum is determined.
-    /// Joint 1 is then 0.
+    /// If joint 2 is at 0, joints 1 and 3 have the same axis, and only their sum is determined. In
+    /// this case, joint 1 is set to 0.
     pub fn solutions(&self, base_from_tip: &Transform, last_rad: f64) -> FrankaSolutions {
         let mut joints_by_branch = [None; 8];
         if let Some(wrist) = self.wrist(&self.shoulder_from_seven(base_from_tip), last_rad) {
@@ -213,11 +220,12 @@ impl FrankaArm {
         wrap(self.folded_q4 + sign * wrist.elbow_angle)
     }
 
-    /// The elbow for a value of joint 4, which gives the wrist its distance. `None` if the plane of
-    /// the arm is undetermined.
+    /// The elbow for a value of joint 4. This value determines the distance of the wrist from the
+    /// shoulder. `None` if the plane of the arm is undetermined.
     pub(super) fn elbow(&self, wrist: &Wrist, q4: f64) -> Option<Elbow> {
         let (sin, cos) = q4.sin_cos();
-        // The wrist in the plane of the arm, in the axes of the upper arm. Joint 4 rotates about -y.
+        // This is the position of the wrist in the plane of the arm, in the axes of the upper arm.
+        // Joint 4 rotates about -y.
         let [x, z] = self.lengths.wrist_from_elbow;
         let wrist_x = self.lengths.elbow[0] + x * cos - z * sin;
         let wrist_z = self.lengths.elbow[1] + z * cos + x * sin;
@@ -243,8 +251,8 @@ pub(super) struct Wrist {
     toward_shoulder: Vector3<f64>,
     /// Distance from the shoulder.
     distance_m: f64,
-    /// Angle of joint 6 at which the forearm points most toward the shoulder. It is between the two
-    /// solutions.
+    /// Angle of joint 6 at which the forearm points most toward the shoulder. It is in the middle
+    /// between the two solutions.
     middle_q6: f64,
     /// Cosine of the angle between the two at this value.
     largest_cosine: f64,
@@ -274,8 +282,8 @@ pub(super) struct Forearm {
 impl Elbow {
     /// The forearm of a branch. `None` if joint 6 cannot give it the angle to the shoulder.
     pub(super) fn forearm(&self, wrist: &Wrist, branch: Branch) -> Option<Forearm> {
-        // Joint 6 rotates the axis of joint 5, `sin(q6) x + cos(q6) y`. Its dot product with the
-        // direction toward the shoulder must be the cosine.
+        // Joint 6 rotates the axis of joint 5, which is `sin(q6) x + cos(q6) y`. The dot product of
+        // this axis and the direction toward the shoulder must be `cosine`.
         let ratio = self.cosine / wrist.largest_cosine;
         let is_possible = ratio.abs() <= 1.0;
         if !is_possible {
@@ -286,8 +294,8 @@ impl Elbow {
         let (sin, cos) = q6.sin_cos();
         let z_of_five = wrist.x_of_six * sin + wrist.y_of_six * cos;
         let normal = z_of_five.cross(&wrist.toward_shoulder) / self.sine;
-        // Joint 5 rotates about `z_of_five`, from the axis of joint 4 (opposite to the normal of the
-        // arm's plane) to the axis of joint 6.
+        // Joint 5 rotates about `z_of_five`, from the axis of joint 4 (opposite to the normal of
+        // the arm's plane) to the axis of joint 6.
         let z_of_six = wrist.x_of_six.cross(&wrist.y_of_six);
         let q5 = (-z_of_six.dot(&z_of_five.cross(&normal))).atan2(-z_of_six.dot(&normal));
         let z_of_three = z_of_five * self.cos_q4 + normal.cross(&z_of_five) * self.sin_q4;
@@ -325,7 +333,8 @@ impl Forearm {
 }
 
 impl Lengths {
-    /// Measures the lengths between axes that are at their places. `None` if a part is too short.
+    /// Measures the lengths between axes that are arranged as in a Franka arm. `None` if a part is
+    /// too short.
     fn measure(axes: &[Axis; 7]) -> Option<Self> {
         let elbow = [axes[3].point.x, axes[3].point.z];
         let wrist = [axes[4].point.x, axes[5].point.z];
@@ -346,8 +355,8 @@ impl Lengths {
         [self.elbow, self.wrist_from_elbow].map(|[x, z]| x.hypot(z))
     }
 
-    /// The angle of joint 4 at which shoulder and wrist are in the same direction from the elbow. The
-    /// angle between the two directions counts from here.
+    /// The angle of joint 4 at which shoulder and wrist are in the same direction from the elbow.
+    /// The angle between these two directions is joint 4 relative to this value.
     fn folded_q4(&self) -> f64 {
         let [elbow_x, elbow_z] = self.elbow;
         let [wrist_x, wrist_z] = self.wrist_from_elbow;
@@ -423,8 +432,8 @@ fn axes_at_zero(chain: &Chain) -> Option<[Axis; 7]> {
     for (axis, column) in axes.iter_mut().zip(jacobian.column_iter()) {
         let linear: Vector3<f64> = column.fixed_rows::<3>(0).into();
         let direction: Vector3<f64> = column.fixed_rows::<3>(3).into();
-        // Prismatic joints do not rotate, and joints that mimic joints follow rotate the tip about a
-        // moving axis or at another rate.
+        // A prismatic joint does not rotate. A joint that a mimic joint follows rotates the tip
+        // about a moving axis or at another rate.
         let is_rotation = (direction.norm() - 1.0).abs() < 1e-9
             && direction.dot(&linear).abs() < 1e-9
             && chain.has_one_segment_per_joint();

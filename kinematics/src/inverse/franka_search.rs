@@ -9,11 +9,12 @@ use crate::Transform;
 /// Number of intervals in the range of the last joint at the first level. About 98 % of the
 /// reachable poses of a Panda have a solution at one of their ends.
 const N_INTERVALS: u32 = 14;
-/// Number of levels; each halves the intervals of the one before. At the last level, the last joint
-/// is known to 0.013 rad. The few poses without a solution there are left to least squares.
+/// Number of levels. Each level halves the intervals of the previous level. At the last level,
+/// values of the last joint are 0.013 rad apart. The few poses without a solution at these values
+/// are left to least squares.
 const N_LEVELS: u32 = 6;
-/// Steps of the final search between two tested values, each of which shortens the interval by the
-/// golden ratio. They end within 2 % of the interval.
+/// Number of steps of the final search between two tested values. Each step shortens the interval
+/// by the golden ratio. The last interval is 2 % of the first interval.
 const N_GOLDEN_STEPS: usize = 8;
 
 /// The pose and the preference of a search.
@@ -35,8 +36,9 @@ struct Candidate {
 }
 
 impl FrankaSearch<'_> {
-    /// Joints with the least cost, found on a grid and refined on its branch. `None` if no tested
-    /// value of the last joint has a solution within the ranges.
+    /// Joints with the least cost. The best solution on a grid of the last joint is found first,
+    /// and then refined on its branch. `None` if no tested value of the last joint has a solution
+    /// within the ranges.
     pub(super) fn run(&self) -> Option<[f64; 7]> {
         let [lower, upper] = self.bounds.start_range(6, self.seed[6], 0.0);
         let mut step = (upper - lower) / f64::from(N_INTERVALS);
@@ -52,10 +54,10 @@ impl FrankaSearch<'_> {
         Some(self.refine(best?, lower..=upper, step).joints)
     }
 
-    /// Tests values of the last joint at growing distance from the seed, and stops where that
-    /// distance alone costs more than the best solution.
+    /// Tests values of the last joint at growing distance from the seed. Stops when the cost of
+    /// this distance alone exceeds the cost of the best solution.
     ///
-    /// * `stride`: 1 to test all multiples of `step`, 2 for the odd ones.
+    /// * `stride`: 1 tests all multiples of `step`, and 2 tests only the odd multiples.
     fn scan(
         &self,
         range: std::ops::RangeInclusive<f64>,
@@ -89,12 +91,12 @@ impl FrankaSearch<'_> {
         best
     }
 
-    /// Compares all solutions for a value of the last joint with the best one.
+    /// Compares all solutions for a value of the last joint with the best solution so far.
     fn test(&self, last_rad: f64, best: &mut Option<Candidate>) {
         let Some(wrist) = self.arm.wrist(&self.shoulder_from_seven, last_rad) else {
             return;
         };
-        // Pairs of branches that share elbow and wrist are neighbors.
+        // Two consecutive branches have the same elbow and wrist, and differ only in the shoulder.
         for branches in Branch::ALL.chunks(2) {
             let most = best.map_or(f64::INFINITY, |best| best.cost);
             for candidate in self.on_branches(&wrist, last_rad, branches, most) {
@@ -130,8 +132,9 @@ impl FrankaSearch<'_> {
         })
     }
 
-    /// The joints from the elbow outward with their cost. Each is checked before the next is
-    /// computed, because most combinations leave a range.
+    /// The values of the joints from the elbow to the last joint, and their cost. Each joint is
+    /// checked before the next joint is computed, because most combinations of joint values leave a
+    /// range.
     fn outer_joints(
         &self,
         wrist: &Wrist,
@@ -154,7 +157,8 @@ impl FrankaSearch<'_> {
         (cost <= most).then_some((forearm, joints, cost))
     }
 
-    /// The value within the range that is closest to the seed; its cost is added.
+    /// Adds the cost of a joint, and returns its value within the range that is closest to the
+    /// seed.
     fn place(&self, joint_ix: usize, value: f64, cost: &mut f64) -> Option<f64> {
         let seed = self.seed[joint_ix];
         let value = self.bounds.nearest_turn(joint_ix, value, seed)?;
@@ -184,8 +188,8 @@ impl FrankaSearch<'_> {
         let mut inner = [high - RATIO * (high - low), low + RATIO * (high - low)];
         let mut found = inner.map(at);
         for _ in 0..N_GOLDEN_STEPS {
-            // Values without a solution cost infinity. If both have none, the solutions are around
-            // the start.
+            // Values without a solution have an infinite cost. If neither neighbor has a solution,
+            // the solutions are around the start.
             let [lower_cost, upper_cost] = [cost_of(&found[0]), cost_of(&found[1])];
             let is_start_below = start.joints[6] < 0.5 * (low + high);
             if lower_cost < upper_cost || (lower_cost == upper_cost && is_start_below) {
@@ -197,7 +201,8 @@ impl FrankaSearch<'_> {
                 inner = [inner[1], low + RATIO * (high - low)];
                 found = [found[1], at(inner[1])];
             }
-            // The better of the two is never discarded before.
+            // The better of the two inner values is kept in every step, so no better candidate is
+            // missed.
             for candidate in found.into_iter().flatten() {
                 keep_better(&mut best, candidate);
             }

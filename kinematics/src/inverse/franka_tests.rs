@@ -94,7 +94,8 @@ fn other_chains_are_not_taken_for_a_franka_arm() {
         assert!(FrankaArm::of(&chain).is_none(), "{}", chain.tip_link());
     }
     for (from, to) in [
-        // A forearm beside the upper arm, an elbow that bends to the other side, and a tilted axis.
+        // These chains have a forearm beside the upper arm, an elbow that bends to the other side,
+        // and a tilted axis.
         (r#"xyz="-0.0825 0.384 0.0""#, r#"xyz="-0.0825 0.384 0.05""#),
         (
             r#"<origin xyz="0.0825 0.0 0.0" rpy="1.57"#,
@@ -115,7 +116,7 @@ fn other_chains_are_not_taken_for_a_franka_arm() {
 #[test]
 fn other_lengths_are_measured_and_calibrated_arms_are_corrected() {
     for (from, to) in [
-        // Another arm of the same kind, and a calibrated Panda.
+        // These chains are another arm of the same kind, and a calibrated Panda.
         (r#"xyz="0.0825 0.0 0.0""#, r#"xyz="0.11 0.0 0.0""#),
         (
             r#"xyz="0.0825 0.0 0.0" rpy="1.5707"#,

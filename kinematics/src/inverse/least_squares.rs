@@ -1,14 +1,15 @@
-//! Damped least squares: joint changes that give the tip a small motion.
+//! Computes joint changes that give the tip a small motion, by damped least squares.
 
 use nalgebra::{Matrix6, SymmetricEigen, Vector6};
 
-/// Singular values below which a direction is damped, and the damping where a singular value is 0,
-/// radians per radian. With both equal, a unit velocity of the tip in a nearly singular direction
-/// never needs a joint velocity above the inverse: 12.5. Arms work at singular values from 0.2.
+/// Singular value below which a direction is damped, radians per radian. The value is also the
+/// damping at a singular value of 0. Because the two are equal, a unit velocity of the tip in a
+/// nearly singular direction never needs a joint velocity above 12.5, which is the inverse of this
+/// value. In usual configurations of arms, singular values are at least 0.2.
 pub(super) const SINGULAR: f64 = 0.08;
 
-/// Joint changes `J^T (J J^T + d^2 1)^-1 e` (Wampler 1986; Nakamura and Hanafusa 1986), which need
-/// no inverse for any number of joints. All changes are 0 if the numbers overflow.
+/// Joint changes `J^T (J J^T + d^2 1)^-1 e` (Wampler 1986; Nakamura and Hanafusa 1986), which are
+/// computed without an inverse for any number of joints. All changes are 0 if the numbers overflow.
 ///
 /// * `columns`: the Jacobian, one column per joint.
 /// * `motion`: wanted motion of the tip, `e`.
@@ -80,7 +81,7 @@ impl SelectiveInverse {
         let values = self.eigen.eigenvalues.iter();
         values
             .zip(self.eigen.eigenvectors.column_iter())
-            // Rounding can make the smallest ones negative.
+            // Rounding can make the smallest eigenvalues negative.
             .map(|(value, direction)| (value.max(0.0), direction.into_owned()))
     }
 }

@@ -2,13 +2,13 @@
 //!
 //! [`InverseSolver::solve`] finds joint values for one pose, and [`InverseSolver::servo`] takes one
 //! step toward a moving pose at bounded joint speeds. Results are always within the ranges of the
-//! joints. Nothing depends on time or on earlier calls, so the same input gives the same bits.
+//! joints. They do not depend on time or on earlier calls, so the same input gives the same bits.
 //!
-//! - Any chain: damped least squares (`descent.rs`, Sugihara 2011) within the ranges, with restarts
-//!   from reproducible random configurations.
-//! - Arms with the geometry of a Franka arm, which is detected from the chain: closed form for a
-//!   given last joint (`franka.rs`, He and Liu 2021) and a search over that joint.
-//! - Servo steps: damping only in nearly singular directions (`servo.rs`, Maciejewski and Klein
+//! - Any chain is solved by damped least squares within the ranges (`descent.rs`, Sugihara 2011).
+//!   The search restarts from reproducible random configurations.
+//! - Arms with the geometry of a Franka arm have a closed form for a given last joint (`franka.rs`,
+//!   He and Liu 2021), and the last joint is searched. This geometry is detected from the chain.
+//! - Servo steps are damped only in nearly singular directions (`servo.rs`, Maciejewski and Klein
 //!   1988).
 //!
 //! ```

@@ -16,7 +16,7 @@ const UR5E_DH: &str = include_str!("../../tests/data/ur5e-dh.urdf");
 
 /// Joint values of a Panda in the middle of its workspace.
 pub(super) const PANDA_READY: [f64; 7] = [0.0, -0.3, 0.0, -2.2, 0.0, 2.2, 0.8];
-/// The same for arms of Universal Robots.
+/// Joint values of an arm of Universal Robots in the middle of its workspace.
 pub(super) const UR_READY: [f64; 6] = [0.2, -1.2, 1.5, -1.4, -1.3, 0.3];
 
 fn chain(urdf: &str, base: &str, tip: &str) -> Chain {
@@ -39,7 +39,8 @@ pub(super) fn panda_tool() -> Chain {
     chain(PANDA_WITH_HAND, "link0", "tcp")
 }
 
-/// The tip has a prismatic joint that follows another, and there are eight joints.
+/// A Panda whose tip is a finger. The chain has eight joints, and a prismatic joint that follows
+/// another joint.
 pub(super) fn panda_finger() -> Chain {
     chain(PANDA_WITH_HAND, "link0", "finger_right")
 }

@@ -1,4 +1,4 @@
-//! Servo steps: one step of the joints toward a moving pose at bounded speeds.
+//! Servo steps. A servo step moves the joints once toward a moving pose, at bounded speeds.
 
 use super::descent::Problem;
 use super::least_squares::SelectiveInverse;
@@ -8,13 +8,15 @@ use crate::Error;
 use nalgebra::Vector6;
 
 /// Largest speed at which a joint approaches an end of its range, as a fraction of the remaining
-/// distance per second. It then stops smoothly.
+/// distance per second. With this limit, the joint stops smoothly.
 const APPROACH_HZ: f64 = 5.0;
 /// Distance that joint 4 of a Franka arm keeps from the angle at which the arm is longest, radians.
-/// Beyond that angle, its range ends after 0.4 rad, and the arm could not move back: it would first
-/// have to move outward. The margin shortens the reach by less than a millimeter.
+/// Beyond that angle, the range of joint 4 ends after 0.4 rad. The arm could not move back from
+/// there toward the base, because it would first have to move outward. The margin shortens the
+/// reach by less than a millimeter.
 const ELBOW_MARGIN_RAD: f64 = 0.03;
-/// Fraction of a motion that damping removes above which a step counts as slowed by a singularity.
+/// A step counts as slowed by a singularity if damping removes more than this fraction of the
+/// motion.
 const SINGULAR_LOSS_FRAC: f64 = 0.05;
 
 /// The largest speeds of servo steps.
@@ -27,7 +29,7 @@ pub struct ServoLimits {
     /// Largest angular speed of the tip, rad/s.
     pub angular_rad_s: f64,
     /// Rate at which free joints approach the posture and leave the ends of their ranges, per
-    /// second. 0 holds them.
+    /// second. With 0, free joints do not move.
     pub comfort_hz: f64,
 }
 
@@ -36,12 +38,13 @@ pub struct ServoLimits {
 pub struct ServoStep {
     /// Distance from the target before the step.
     pub gap: PoseGap,
-    /// Fraction of the wanted speed that the joint speeds allow, 0 to 1. The tip stays on its path.
+    /// Fraction of the wanted speed that the limits of the joint speeds allow, 0 to 1. The tip
+    /// stays on its path at any fraction.
     pub speed_frac: f64,
     /// The joint whose speed is at its limit.
     pub fastest_joint_ix: Option<usize>,
-    /// A joint that is near an end of its range and held back. The others take over as far as they
-    /// can.
+    /// A joint that is held back because it is near an end of its range. The other joints
+    /// compensate for it as far as possible.
     pub joint_at_limit_ix: Option<usize>,
     /// Whether the arm is nearly singular in the direction of the motion, which slows this part of
     /// the motion.
@@ -51,22 +54,22 @@ pub struct ServoStep {
 impl InverseSolver {
     /// Computes the next joint values on the way to a pose, `step_secs` after `joints`.
     ///
-    /// The tip moves straight toward the target and turns at a constant ratio to the distance. It is
-    /// there after one step if all speeds allow it, so a moving target is followed one step behind.
-    /// No joint is ever faster than its limit, whatever the target is: a distant target, and one out
-    /// of reach, are approached at the same speeds. Joints near the ends of their ranges stop
-    /// smoothly. Joints that start beyond their ranges move inward. The elbow of a Franka arm never
-    /// bends to its other side.
+    /// The tip moves straight toward the target, and its rotation rate has a constant ratio to its
+    /// speed. If all speed limits allow it, the tip is at the target after one step, so it follows
+    /// a moving target one step behind. No joint is ever faster than its limit, whatever the target
+    /// is. Targets that are distant or out of reach are approached within the same limits. Joints
+    /// near the ends of their ranges stop smoothly. Joints that start beyond their ranges move
+    /// inward. The elbow of a Franka arm never bends to its other side.
     ///
     /// * `joints`: present joint values, radians or meters.
     /// * `next`: output, the next joint values. It is unchanged on error.
     ///
-    /// Near singularities, only motions in the directions that the arm loses are damped. A joint that
-    /// is too fast slows all others, so that the tip stays on its path.
+    /// Near singularities, only motions in the nearly singular directions are damped. If a joint is
+    /// too fast, all joints are slowed by the same factor, so that the tip stays on its path.
     ///
     /// # Errors
-    /// If numbers are not finite, speeds or times are not positive, or lists do not have one value
-    /// per joint.
+    /// Fails if numbers are not finite, if speeds or times are not positive, or if lists do not
+    /// have one value per joint.
     pub fn servo(
         &mut self,
         target: &Target,
@@ -104,13 +107,14 @@ impl InverseSolver {
         })
     }
 
-    /// Computes joint velocities for a velocity of the tip, in `change`. Returns a joint that is held
-    /// at the end of its range, and whether the motion is slowed by a singularity.
+    /// Computes joint velocities for a velocity of the tip, and stores them in `change`. Returns a
+    /// joint that is held at the end of its range, and whether a singularity slows the motion.
     ///
-    /// Free joints follow their preferred velocities, whose effect on the tip is compensated. Joints
-    /// that would approach an end of their range too fast get the largest allowed velocity, and the
-    /// others compensate for the rest (Flacco, De Luca and Khatib 2015, "Control of redundant robots
-    /// under hard joint constraints: saturation in the null space", section IV, for position limits).
+    /// Free joints follow their preferred velocities, and the other joints compensate for the
+    /// effect on the tip. A joint that would approach an end of its range too fast gets the largest
+    /// allowed velocity, and the others compensate for the difference (Flacco, De Luca and Khatib
+    /// 2015, "Control of redundant robots under hard joint constraints: saturation in the null
+    /// space", section IV, for position limits).
     fn choose_velocity(
         &mut self,
         velocity: &Vector6<f64>,
@@ -162,8 +166,8 @@ impl InverseSolver {
         }
     }
 
-    /// Preferred velocity of a joint, at most a quarter of its speed limit, so that most of the speed
-    /// is left to the motion of the tip.
+    /// Preferred velocity of a joint, at most a quarter of its speed limit, so that most of the
+    /// speed is left to the motion of the tip.
     fn comfort_velocity(&self, joint_ix: usize, value: f64, limits: &ServoLimits) -> f64 {
         let wanted = self.comfort.descent_of(&self.bounds, joint_ix, value);
         let most = 0.25 * limits.joint_speeds[joint_ix];
@@ -218,7 +222,7 @@ impl InverseSolver {
             ("slowest joint speed", slowest.fold(f64::INFINITY, f64::min)),
         ];
         for (what, value) in positive {
-            // A chain without joints has no slowest one, and infinity is allowed.
+            // Infinity is allowed, because a chain without joints has an infinite minimum.
             let is_positive = value > 0.0;
             if !is_positive {
                 return Err(Error::InverseSetting {
@@ -241,8 +245,8 @@ impl InverseSolver {
     }
 }
 
-/// The rate at which the distance from the target decreases, per second: in one step if the speeds
-/// of the tip allow it.
+/// The rate at which the distance from the target decreases, per second. If the speed limits of the
+/// tip allow it, the tip reaches the target in one step.
 fn approach_rate_hz(gap: &PoseGap, limits: &ServoLimits, step_secs: f64) -> f64 {
     // Quotients of 0 are infinite and do not limit the rate.
     let linear = limits.linear_m_s / gap.distance_m;
@@ -250,8 +254,8 @@ fn approach_rate_hz(gap: &PoseGap, limits: &ServoLimits, step_secs: f64) -> f64 
     linear.min(angular).min(1.0 / step_secs)
 }
 
-/// Slows all joints by the same factor until none is too fast. Returns the factor and the joint that
-/// decides it.
+/// Slows all joints by the same factor, such that no joint is too fast. Returns the factor and the
+/// joint that determines the factor.
 fn slow_down(velocities: &mut [f64], speeds: &[f64]) -> (f64, Option<usize>) {
     let mut speed_frac = 1.0;
     let mut fastest_joint_ix = None;

@@ -79,7 +79,7 @@ fn a_moving_target_is_followed_one_step_behind() {
         let mut follower = Follower::new(chain, ready);
         let start = follower.pose();
         for step in 0..2000 {
-            // A circle of 10 cm at 0.16 m/s, with a rotation of 0.2 rad.
+            // The target moves along a circle of 10 cm at 0.16 m/s, with a rotation of 0.2 rad.
             let angle = TAU * f64::from(step) * STEP_SECS / 4.0;
             let offset = Vector3::new(angle.sin(), 1.0 - angle.cos(), 0.0) * 0.1;
             let target = Target::pose(
@@ -116,7 +116,8 @@ fn distant_targets_are_approached_straight_and_at_the_speeds_of_the_tip() {
     assert!((last - start - offset).norm() < 1e-6);
 }
 
-/// Moves the tip to the mirrored angle of the wrist, through the angle at which two axes are in line.
+/// Moves the tip to the mirrored angle of the wrist, through the angle at which two axes are in
+/// line.
 #[test]
 fn singularities_are_passed_at_bounded_speeds() {
     for chain in [ur3e(), ur5e(), ur10e()] {

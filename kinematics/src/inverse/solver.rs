@@ -12,10 +12,11 @@ use crate::{Chain, Error};
 use nalgebra::Vector6;
 use numbers::random::Random;
 
-/// Number of configurations from which a pose is searched. Of random reachable poses of the robots
-/// in `rigs/robots`, all are found from fewer; a pose that is out of reach takes all of them.
+/// Maximum number of configurations from which a pose is searched. For the robots in `rigs/robots`,
+/// all random reachable poses are found with fewer starts. For a pose that is out of reach, all
+/// starts are used.
 const MAX_STARTS: usize = 60;
-/// Number of starts without ranges, after which a pose is considered out of reach.
+/// Number of starts without joint ranges, after which a pose is considered out of reach.
 const MAX_UNLIMITED_STARTS: usize = 12;
 /// Seed of the starts. It is the same for each pose, so that the same pose has the same solution.
 const START_SEED: u64 = 42;
@@ -26,7 +27,7 @@ const MAX_COMFORT_STEPS: usize = 20;
 const MAX_COMFORT_CHANGE: f64 = 0.3;
 /// Steps toward the preferred values end below this change of the cost.
 const MIN_COMFORT_GAIN: f64 = 1e-4;
-/// Damping of the projection to motions that keep the pose. Rounding stays below it.
+/// Damping of the projection to motions that keep the pose. It is above rounding errors.
 const PROJECTION_DAMPING: f64 = 1e-9;
 
 /// Inverse kinematics of one chain. Buffers are kept, so that solving allocates only the result.
@@ -51,7 +52,7 @@ impl InverseSolver {
     /// A solver within the joint ranges of the URDF.
     ///
     /// # Errors
-    /// If a range contains no value.
+    /// Fails if a range contains no value.
     pub fn new(chain: Chain) -> Result<Self, Error> {
         let limits = chain.limits().iter();
         let ranges = limits.map(|limit| [limit.lower, limit.upper]).collect();
@@ -60,10 +61,10 @@ impl InverseSolver {
 
     /// A solver within other ranges.
     ///
-    /// * `ranges`: lower and upper end for each joint; may be infinite.
+    /// * `ranges`: lower and upper end for each joint. The ends may be infinite.
     ///
     /// # Errors
-    /// If there is not one range per joint, or a range contains no value.
+    /// Fails if there is not one range per joint, or if a range contains no value.
     pub fn within(chain: Chain, ranges: Vec<[f64; 2]>) -> Result<Self, Error> {
         let n_joints = chain.n_joints();
         let bounds = Bounds::new(&chain, ranges)?;
@@ -92,7 +93,7 @@ impl InverseSolver {
     /// Sets preferred joint values. Joints that a pose leaves free are moved toward them.
     ///
     /// # Errors
-    /// If there is not one finite value per joint.
+    /// Fails if there is not one finite value per joint.
     pub fn with_posture(mut self, posture: &[f64]) -> Result<Self, Error> {
         self.chain.check(posture)?;
         self.comfort.posture = posture.to_vec();
@@ -111,12 +112,13 @@ impl InverseSolver {
 
     /// Joint values within the ranges for which the tip has the pose of the target.
     ///
-    /// A Franka arm gets a solution close to the seed in the closed form. The search over the last
-    /// joint minimizes the squared distance from the seed, the distance from the posture, and the
-    /// closeness to the ends of the ranges. For other arms, and if only a part of the orientation
-    /// counts, the search descends from the seed, then from the posture, then from random
-    /// configurations, and returns the first solution. It moves joints by full turns toward the
-    /// seed, and redundant joints toward the posture and away from the ends of their ranges.
+    /// For a Franka arm, the closed form gives a solution close to the seed. A search over the last
+    /// joint minimizes a cost, which is the sum of the squared distance from the seed, the squared
+    /// distance from the posture, and a cost near the ends of the ranges. Other arms are solved by
+    /// descents, and so is a Franka arm if only a part of the orientation counts. The descents
+    /// start from the seed, then from the posture, then from random configurations, and the first
+    /// solution is used. Joints of this solution are moved by full turns toward the seed. Redundant
+    /// joints are moved toward the posture and away from the ends of their ranges.
     ///
     /// # Errors
     /// [`Unsolved::Invalid`] if the seed does not have one finite value per joint, or the target is
@@ -139,7 +141,7 @@ impl InverseSolver {
                 self.best.copy_from_slice(&self.joints);
             }
         }
-        // The starts are cut as soon as they are slow, so the best one may still improve.
+        // Descents end early if they are slow, so the best configuration may still improve.
         self.joints.copy_from_slice(&self.best);
         if self.descend(target, Effort::THOROUGH) < TOLERANCE {
             return Ok(self.finish(target, seed));
@@ -147,11 +149,13 @@ impl InverseSolver {
         self.give_up(target, MAX_UNLIMITED_STARTS)
     }
 
-    /// Joint values near the seed: short steps from the seed, without other starts and without
-    /// changes of branch. Poses that are reachable only by a detour are not found.
+    /// Joint values near the seed. The descent takes short steps from the seed, without other
+    /// starts and without changes of branch. Poses that are reachable only by a detour are not
+    /// found.
     ///
     /// # Errors
-    /// As [`InverseSolver::solve`]. The nearest configuration is where the steps end.
+    /// The errors are the errors of [`InverseSolver::solve`]. The nearest configuration is the
+    /// configuration at which the steps end.
     pub fn solve_near(&mut self, target: &Target, seed: &[f64]) -> Result<Vec<f64>, Unsolved> {
         self.check(target, seed)?;
         self.place_at(seed);
@@ -166,7 +170,8 @@ impl InverseSolver {
         target.check()
     }
 
-    /// Whether the closed form applies and gives a solution, which is then in `joints`.
+    /// Solves the pose in closed form, if this is possible, and stores the solution in `joints`.
+    /// Returns whether there is a solution.
     fn solve_in_closed_form(&mut self, target: &Target, seed: &[f64]) -> bool {
         let Some(arm) = self.franka.as_ref().filter(|_| target.n_constraints() == 6) else {
             return false;
@@ -182,8 +187,8 @@ impl InverseSolver {
             return false;
         };
         self.joints.copy_from_slice(&joints);
-        // The first step checks the pose, and ends if it is exact. A calibrated arm, which deviates
-        // from the ideal geometry, needs two more.
+        // The descent ends at once if the pose is exact. A calibrated arm deviates from the ideal
+        // geometry and needs two more steps.
         self.descend(target, Effort::NEAR) < TOLERANCE
     }
 
@@ -223,7 +228,7 @@ impl InverseSolver {
         }
     }
 
-    /// Makes the solution in `joints` as comfortable as the pose allows.
+    /// Decreases the cost of the solution in `joints` as far as the pose allows.
     fn finish(&mut self, target: &Target, seed: &[f64]) -> Vec<f64> {
         for (joint_ix, seed) in seed.iter().enumerate() {
             let value = self.joints[joint_ix];
@@ -278,13 +283,14 @@ impl InverseSolver {
         }
     }
 
-    /// Called with the nearest configuration in `joints`: tries to reach the target without ranges,
-    /// to distinguish a pose beyond the ranges from a pose that is out of reach.
+    /// The reason why the target was not reached. To distinguish a pose beyond the joint ranges
+    /// from a pose that is out of reach, the target is searched again without ranges. When this
+    /// function is called, `joints` contains the nearest configuration.
     ///
     /// * `n_starts`: number of configurations from which the target is searched.
     ///
     /// # Errors
-    /// Unless a full turn of some joints moves all of them into their ranges.
+    /// Returns an error unless full turns move all joints into their ranges.
     fn give_up(&mut self, target: &Target, n_starts: usize) -> Result<Vec<f64>, Unsolved> {
         let nearest = self.nearest(target);
         std::mem::swap(&mut self.bounds, &mut self.unlimited);
@@ -316,7 +322,8 @@ impl InverseSolver {
         }
     }
 
-    /// Moves `joints` by full turns into their ranges. Returns those for which no turn is enough.
+    /// Moves `joints` by full turns into their ranges. Returns the joints that no full turn moves
+    /// into their ranges.
     fn turn_into_ranges(&mut self, references: &[f64]) -> Vec<JointBeyond> {
         let mut beyond = Vec::new();
         for (joint_ix, value) in self.joints.iter_mut().enumerate() {

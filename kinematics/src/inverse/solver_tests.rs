@@ -1,4 +1,5 @@
-//! Behavior of the solver: nearness, ranges, free parts of poses, postures and failures.
+//! Tests of the solver: solutions near the seed, ranges, free parts of poses, postures and
+//! failures.
 
 use super::robots_for_tests::{
     PANDA_READY, UR_READY, is_within, panda, panda_finger, random_joints, so101, ur3e, ur5e,
@@ -92,7 +93,8 @@ fn the_solution_turns_toward_the_seed() {
 fn singular_poses_are_found_from_singular_seeds() {
     let chain = ur5e();
     let mut solver = InverseSolver::new(chain.clone()).unwrap();
-    // Stretched, with parallel wrist axes, and with the wrist above the base.
+    // In the first posture, the arm is stretched. In the second posture, two axes of the wrist are
+    // parallel. In the third posture, the wrist is above the base.
     for joints in [
         [0.0; 6],
         [0.3, -1.2, 1.5, -1.4, 0.0, 0.3],

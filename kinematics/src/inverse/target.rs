@@ -1,4 +1,5 @@
-//! The pose that inverse kinematics has to reach, which parts of it count, and the distance from it.
+//! The target of inverse kinematics: a pose, the parts of its orientation that count, and the
+//! distance of other poses from it.
 
 use crate::{Error, Transform};
 use nalgebra::{Unit, Vector3, Vector6};
@@ -16,12 +17,12 @@ pub struct Target {
 /// poses only if a part is free.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Orientation {
-    /// All of it.
+    /// The complete orientation.
     Full,
     /// The direction of an axis of the tip, in the frame of the tip. The rotation about the axis is
     /// free.
     Axis(Unit<Vector3<f64>>),
-    /// None of it: only the position counts.
+    /// No part of the orientation, so that only the position counts.
     Free,
 }
 
@@ -58,7 +59,7 @@ impl Target {
     }
 
     /// # Errors
-    /// If the pose or the axis contains NaN or infinity.
+    /// Fails if the pose or the axis contains NaN or infinity.
     pub(super) fn check(&self) -> Result<(), Error> {
         let rows = crate::transform::to_rows(&self.base_from_tip);
         if let Some(at) = rows.iter().position(|value| !value.is_finite()) {
@@ -94,7 +95,7 @@ impl Target {
         }
     }
 
-    /// Removes from columns of a Jacobian the velocities that do not count.
+    /// Removes the velocities that do not count from the columns of a Jacobian.
     ///
     /// * `columns`: linear velocity (rows 0 to 2) and angular velocity (3 to 5) in base axes.
     pub(super) fn remove_free(&self, actual: &Transform, columns: &mut [Vector6<f64>]) {
@@ -128,8 +129,8 @@ impl PoseGap {
     }
 }
 
-/// Translation (rows 0 to 2, meters) and rotation (rows 3 to 5, a vector along the axis of the
-/// rotation, radians) from the actual pose to the target, in base axes.
+/// Translation and rotation from the actual pose to the target, in base axes. Rows 0 to 2 are the
+/// translation in meters. Rows 3 to 5 are the rotation vector in radians.
 pub fn pose_error(target: &Transform, actual: &Transform) -> Vector6<f64> {
     let translation = target.translation.vector - actual.translation.vector;
     let rotation = (target.rotation * actual.rotation.inverse()).scaled_axis();
@@ -142,8 +143,8 @@ fn stack(linear: &Vector3<f64>, angular: &Vector3<f64>) -> Vector6<f64> {
     )
 }
 
-/// The smallest rotation from one direction to another, as a vector along its axis. Between opposite
-/// directions, it is half a turn about any perpendicular axis.
+/// The smallest rotation from one direction to another, as a vector along its axis. Between
+/// opposite directions, it is half a turn about any perpendicular axis.
 fn rotation_between(from: &Unit<Vector3<f64>>, to: &Unit<Vector3<f64>>) -> Vector3<f64> {
     let cross = from.cross(to.as_ref());
     let angle = cross.norm().atan2(from.dot(to.as_ref()));

@@ -1,4 +1,4 @@
-//! Elements and attributes of a robot description, and notes about those that are not used.
+//! Elements and attributes of a robot description, and notes about unused elements and attributes.
 
 use crate::Error;
 use roxmltree::{Document, Node, ParsingOptions};
@@ -10,16 +10,16 @@ use std::collections::{BTreeMap, BTreeSet};
 pub const MAX_BYTES: usize = 16 << 20;
 /// The parser's memory grows with the number of nodes.
 const MAX_NODES: u32 = 1 << 20;
-/// The parser's time grows with the square of an element's attributes, and with the cube of nested
-/// namespaces.
+/// The parser's time grows with the square of the number of attributes of an element, and with the
+/// cube of the number of nested namespaces.
 const MAX_ATTRIBUTES: usize = 2000;
 const MAX_NAMESPACES: usize = 100;
-/// Maximum number of notes. Notes are printed, and a longer list would hide the first ones, whose
-/// problems often cause the others.
+/// Maximum number of notes. Notes are printed, and a longer list would hide the first notes. The
+/// problems in the first notes often cause the others.
 const MAX_NOTES: usize = 100;
 
-/// Repairs what the parsers of other programs accept: white space before the XML declaration, and
-/// prefixes without a namespace. Lines stay as they are.
+/// Repairs two mistakes that the parsers of other programs accept: white space before the XML
+/// declaration, and prefixes without a namespace. Line numbers do not change.
 pub(super) fn repaired(xml: &str) -> Cow<'_, str> {
     let mut text = Cow::Borrowed(xml);
     // An XML declaration that does not start the file is an error in XML 1.0. The contents of the
@@ -32,7 +32,7 @@ pub(super) fn repaired(xml: &str) -> Cow<'_, str> {
         text.to_mut().replace_range(begin..begin + n + 2, "");
     }
     // Parsers that ignore namespaces accept prefixes without a declaration. `xacro` is left
-    // undeclared on purpose: its elements mean that the file has not been expanded.
+    // undeclared, because its elements mean that the file has not been expanded.
     let unbound: String = prefixes(xml)
         .into_iter()
         .filter(|prefix| {
@@ -141,13 +141,14 @@ pub(crate) struct Problem {
     pub(crate) why: String,
 }
 
-/// Notes about elements that are not used: problems in file order, then unknown names, sorted.
+/// Notes about elements that are not used. Problems come first, in file order. Unknown names
+/// follow, in alphabetical order.
 #[derive(Debug, Default)]
 pub(crate) struct Notes {
     texts: Vec<String>,
     n_omitted: usize,
-    /// First line and number of the unknown elements and attributes with one name in elements with
-    /// one name.
+    /// For each pair of an element name and an unknown name inside such elements: the first line,
+    /// and the number of occurrences.
     unknown: BTreeMap<(String, String), (u32, usize)>,
 }
 
@@ -222,7 +223,7 @@ impl<'a> Element<'a> {
 
     pub(crate) fn children(self) -> impl Iterator<Item = Element<'a>> {
         let namespace = self.0.document().root_element().tag_name().namespace();
-        // An element of another namespace, such as that of xacro, has a different meaning.
+        // An element of another namespace, such as the namespace of xacro, has a different meaning.
         self.0
             .children()
             .filter(move |node| node.is_element() && node.tag_name().namespace() == namespace)

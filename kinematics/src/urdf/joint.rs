@@ -37,7 +37,7 @@ const MIN_QUATERNION_NORM: f64 = 1e-6;
 /// because only chains through this joint need it.
 ///
 /// # Errors
-/// If its name or its links are missing.
+/// Fails if the name of the joint or one of its links is missing.
 pub(super) fn read(element: Element<'_>, notes: &mut Notes) -> Result<Joint, Error> {
     let invalid =
         |what: String| move |Problem { line, why }| Error::UrdfElement { line, what, why };
@@ -169,7 +169,7 @@ impl Motion {
 
 pub(crate) const ORIGIN_ATTRIBUTES: [&str; 3] = ["xyz", "rpy", "quat_xyzw"];
 
-/// The pose in an element's `<origin>`; the identity without one.
+/// The pose in an element's `<origin>`. Without an `<origin>`, it is the identity.
 pub(crate) fn origin(element: Element<'_>) -> Result<Transform, Problem> {
     let Some(origin) = element.only("origin")? else {
         return Ok(Transform::identity());
@@ -204,7 +204,7 @@ fn axis(joint: Element<'_>) -> Result<Unit<Vector3<f64>>, Problem> {
     let Some(xyz) = axis.numbers("xyz")? else {
         return Ok(Vector3::x_axis());
     };
-    // Any length but zero is accepted: only the direction matters.
+    // Any length but zero is accepted, because only the direction matters.
     Unit::try_new(Vector3::from(xyz), f64::MIN_POSITIVE)
         .ok_or_else(|| axis.problem("xyz of <axis> is zero, expected a direction"))
 }
@@ -220,7 +220,7 @@ fn mimic(joint: Element<'_>) -> Result<Option<Mimic>, Problem> {
     }))
 }
 
-/// Reads limits. Forward kinematics do not depend on them, so invalid ones are noted.
+/// Reads limits. Forward kinematics do not depend on limits, so invalid limits are only noted.
 fn read_limits(
     limit: Element<'_>,
     is_continuous: bool,
@@ -235,7 +235,7 @@ fn read_limits(
         }
     };
     let [lower, upper] = ["lower", "upper"].map(&mut number);
-    // Zero means unknown: exporters of CAD programs write it.
+    // Zero means unknown, because exporters of CAD programs write zero for missing values.
     let [velocity, effort] = ["velocity", "effort"].map(|name| {
         number(name)
             .filter(|max| *max > 0.0)

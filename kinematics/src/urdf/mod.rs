@@ -24,7 +24,7 @@ pub struct Robot {
     links: Vec<String>,
     joints: Vec<Joint>,
     joints_by_name: HashMap<String, usize>,
-    /// Index of the joint above each link; `None` for a root.
+    /// Index of the joint above each link. `None` for a root.
     joint_above: HashMap<String, Option<usize>>,
     /// Visual and collision shapes of each link that has any.
     shapes: HashMap<String, shape::LinkShapes>,
@@ -32,13 +32,13 @@ pub struct Robot {
 }
 
 impl Robot {
-    /// Parses and checks URDF text. Elements that kinematics do not depend on are left out if they
-    /// are invalid; see [`Robot::notes`].
+    /// Parses and checks URDF text. Invalid elements are left out if kinematics do not depend on
+    /// them, see [`Robot::notes`].
     ///
     /// # Errors
-    /// If it is not the XML of a robot, is larger than [`MAX_BYTES`], a link or joint has no name,
-    /// a joint lacks a link, two joints have one name, a link has two parents, or joints form a
-    /// cycle.
+    /// Fails if the text is not the XML of a robot, or is larger than [`MAX_BYTES`]. Also fails if
+    /// a link or joint has no name, a joint lacks a link, two joints have the same name, a link has
+    /// two parents, or joints form a cycle.
     pub fn parse(xml: &str) -> Result<Self, Error> {
         let xml = element::repaired(xml);
         let document = element::parse(&xml)?;
@@ -70,7 +70,7 @@ impl Robot {
         let joints_by_name = indices_by_name("joint", root.all("joint"))?;
         let joint_above = joints_above(&links, &joints)?;
         reject_cycles(&links, &joints, &joint_above)?;
-        // Shapes come last: they are only drawn and checked for collisions, so their errors are
+        // Shapes come last. They are only drawn and checked for collisions, so their errors are
         // notes.
         let mut shapes = shape::read_all(root, &mut notes);
         drop_below_problems(&links, &joints, &joint_above, &mut shapes);
@@ -85,7 +85,7 @@ impl Robot {
         })
     }
 
-    /// Name of the robot; empty if the file has none.
+    /// Name of the robot. It is empty if the file has none.
     pub fn name(&self) -> &str {
         &self.name
     }
@@ -100,19 +100,19 @@ impl Robot {
         &self.joints
     }
 
-    /// Visual shapes of a link, without invalid ones.
+    /// Valid visual shapes of a link.
     pub fn visuals(&self, link: &str) -> &[Shape] {
         self.shapes.get(link).map_or(&[], |shapes| &shapes.visuals)
     }
 
-    /// Collision shapes of a link, without invalid ones.
+    /// Valid collision shapes of a link.
     pub fn collisions(&self, link: &str) -> &[Shape] {
         self.shapes
             .get(link)
             .map_or(&[], |shapes| &shapes.collisions)
     }
 
-    /// Mass and inertia of a link; `None` if the URDF states none, or invalid ones.
+    /// Mass and inertia of a link. `None` if the URDF states no values or invalid values.
     pub fn inertial(&self, link: &str) -> Option<&Inertial> {
         self.shapes.get(link)?.inertial.as_ref()
     }
@@ -127,7 +127,7 @@ impl Robot {
         self.joints_by_name.get(name).map(|ix| &self.joints[*ix])
     }
 
-    /// The root link: the ancestor of all other links.
+    /// The root link, which is the ancestor of all other links.
     pub fn root(&self) -> Result<&str, Error> {
         let roots: Vec<&String> = self
             .links
@@ -660,7 +660,8 @@ mod tests {
             (0..=N).map(link).collect::<String>(),
             (1..=N).map(joint).collect::<String>()
         );
-        // With quadratic time, this would take minutes, even on a fast computer.
+        // If the time grew quadratically, parsing this chain would take minutes, even on a fast
+        // computer.
         let robot = Robot::parse(&chain).unwrap();
         let chain = crate::Chain::new(&robot, robot.root().unwrap(), &format!("l{N}")).unwrap();
         assert_eq!(chain.joint_names(), ["j1"]);

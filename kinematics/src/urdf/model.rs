@@ -12,18 +12,18 @@ pub struct Joint {
     pub kind: JointKind,
     /// Parent link.
     pub parent: String,
-    /// Child link; its frame moves with the joint.
+    /// Child link. Its frame moves with the joint.
     pub child: String,
     /// Pose of the joint's frame in the parent link at joint value 0.
     pub parent_from_joint: Transform,
-    /// Direction of motion in the joint's frame; unused for fixed joints.
+    /// Direction of motion in the joint's frame. It is not used for fixed joints.
     pub axis: Unit<Vector3<f64>>,
     /// Allowed range.
     pub limits: JointLimits,
-    /// The joint that this joint follows; `None` if it moves independently.
+    /// The rule by which this joint follows another joint. `None` if it moves independently.
     pub mimic: Option<Mimic>,
-    /// Why the joint cannot be part of a chain. If there is an error, only the names above are
-    /// valid.
+    /// The reason why the joint cannot be part of a chain. If there is a problem, only the names
+    /// above are valid.
     pub problem: Option<Error>,
 }
 
@@ -40,7 +40,7 @@ pub enum JointKind {
     Unsupported(&'static str),
 }
 
-/// Allowed range of a joint; infinite if the URDF sets no limit, or the limits are zero.
+/// Allowed range of a joint. It is infinite if the URDF sets no limits, or if the limits are zero.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct JointLimits {
     /// Smallest position, radians or meters.

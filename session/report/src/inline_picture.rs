@@ -25,7 +25,7 @@ pub fn fit_size(size_px: [u32; 2], max_side_px: u32) -> [u32; 2] {
 /// * `rgb`: three bytes per pixel, row by row.
 ///
 /// # Errors
-/// If the picture cannot be encoded.
+/// Fails if the picture cannot be encoded.
 pub fn data_uri(rgb: &[u8], [width, height]: [u32; 2], quality: u8) -> anyhow::Result<String> {
     let mut bytes = Vec::new();
     let mut encoder = JpegEncoder::new_with_quality(&mut bytes, quality);
@@ -40,7 +40,7 @@ pub fn data_uri(rgb: &[u8], [width, height]: [u32; 2], quality: u8) -> anyhow::R
 fn write_base64(bytes: &[u8], to: &mut String) {
     const SYMBOLS: &[u8; 64] = b"ABCDEFGHIJKLMNOPQRSTUVWXYZabcdefghijklmnopqrstuvwxyz0123456789+/";
     for group in bytes.chunks(3) {
-        // Three bytes are 24 bits, that is four symbols of 6 bits. A shorter group at the end is
+        // Three bytes are 24 bits, which are four symbols of 6 bits. A shorter group at the end is
         // filled with zero bits, and its unused symbols are `=`.
         let bits = group
             .iter()

@@ -1,5 +1,5 @@
-//! Parts of reports: charts, tables, pictures that are embedded in a page, and the pages of
-//! calibrations. All pages work offline.
+//! Parts of reports. They are charts, tables, pictures that are embedded in a page, and the pages
+//! of calibrations. All pages work offline.
 //!
 //! A [`chart::Chart`] is drawn once for SVG and PNG. A [`Table`] is printed as HTML or as text. The
 //! reports in [`calibration_report`] are whole pages.

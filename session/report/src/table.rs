@@ -2,7 +2,7 @@
 
 use crate::chart::drawing::escaped;
 
-/// A table of text; the first column contains the row headers.
+/// A table of text. The first column contains the row headers.
 pub struct Table {
     /// Title above the table.
     pub title: String,
@@ -32,7 +32,8 @@ impl Table {
         let all = || std::iter::once(&self.head).chain(&self.rows);
         let mut text = format!("\n{}\n", self.title);
         for row in all() {
-            // Row headers are words, aligned left; the other columns are numbers, aligned right.
+            // Row headers are words and are aligned left. The other columns are numbers and are
+            // aligned right.
             let cells = row.iter().enumerate().map(|(column, cell)| match column {
                 0 => format!("{cell:<0$}", self.width(column)),
                 _ => format!("{cell:>0$}", self.width(column)),

@@ -1,4 +1,4 @@
-//! MJCF of a robot from a URDF: links, joints, shapes, masses.
+//! MJCF of a robot from a URDF, with links, joints, shapes and masses.
 
 use super::mesh_file;
 use super::model::{LinkNode, TwinModel};
@@ -38,8 +38,8 @@ pub(crate) struct BodyPlan<'a> {
 const DENSITY_KG_M3: f64 = 700.0;
 /// Smallest and largest estimated mass of a link, kilograms.
 const MASS_RANGE_KG: [f64; 2] = [0.05, 20.0];
-/// Radius of the bars that are drawn for a link without shapes, as a fraction of their length, and
-/// its range in meters.
+/// A link without shapes is drawn as bars. This is the radius of a bar as a fraction of its length.
+/// The next constant is the range of the radius in meters.
 const BAR_RADIUS_FRAC: f64 = 0.14;
 const BAR_RADIUS_RANGE_M: [f64; 2] = [0.008, 0.05];
 /// Bars shorter than this are not drawn, meters.
@@ -47,7 +47,7 @@ const MIN_BAR_M: f64 = 0.01;
 /// Color of shapes without one.
 const DEFAULT_SRGBA: [f64; 4] = [0.85, 0.85, 0.84, 1.0];
 
-/// Writes the robot. Logs what is estimated or cannot be drawn.
+/// Writes the robot. Logs which values are estimated and which shapes cannot be drawn.
 pub(crate) fn robot_body(plan: &BodyPlan<'_>) -> RobotBody {
     let mut writer = Writer {
         plan,
@@ -155,8 +155,9 @@ impl<'a> Writer<'a> {
         }
     }
 
-    /// Visual shapes, without meshes that cannot be drawn. If there are none, collision shapes, and
-    /// otherwise bars to the joints below the link.
+    /// The shapes with which a link is drawn. These are the visual shapes, without meshes that
+    /// cannot be drawn. A link without visual shapes is drawn with its collision shapes. A link
+    /// without any shapes is drawn as bars to the joints below it.
     fn drawn_shapes(&mut self, ix: usize, node: &'a LinkNode) -> Vec<Shape> {
         let robot: &'a urdf::Robot = self.plan.model.robot();
         let visuals = robot.visuals(&node.link);
@@ -284,7 +285,7 @@ struct PrincipalInertia {
     moments: [f64; 3],
 }
 
-/// Principal axes of an inertia; `None` if no body has this mass and inertia.
+/// Principal axes of an inertia. `None` if no body has this mass and inertia.
 fn principal_inertia(inertial: &Inertial) -> Option<PrincipalInertia> {
     /// Smaller masses and moments cause an error in MuJoCo.
     const SMALLEST: f64 = 1e-10;
@@ -344,13 +345,14 @@ fn shape_volume_m3(geometry: &Geometry) -> f64 {
             PI * radius_m * radius_m * (length_m + 4.0 / 3.0 * radius_m)
         }
         Geometry::Sphere { radius_m } => 4.0 / 3.0 * PI * radius_m.powi(3),
-        // The volume of a mesh is not computed. This is about that of a link of a small arm.
+        // The volume of a mesh is not computed. This value is about the volume of a link of a small
+        // arm.
         Geometry::Mesh { .. } => 1e-3,
     }
 }
 
-/// Height of the lowest point of the robot with its joints at rest, meters. It is at most the height
-/// of the base. Meshes count with their origins only.
+/// Height of the lowest point of the robot with its joints at rest, meters. It is at most the
+/// height of the base. Of a mesh, only the origin is considered.
 ///
 /// * `world_from_base`: pose in which z is up.
 pub(crate) fn lowest_z_m(model: &TwinModel, world_from_base: &Transform) -> f64 {
@@ -405,7 +407,7 @@ fn bar(end: &Vector3<f64>) -> Option<Shape> {
         return None;
     }
     let radius_m = (BAR_RADIUS_FRAC * length_m).clamp(BAR_RADIUS_RANGE_M[0], BAR_RADIUS_RANGE_M[1]);
-    // Opposite vectors have no unique rotation between them; any half turn works.
+    // The rotation between opposite vectors is not unique, so any rotation by 180 degrees is used.
     let rotation = UnitQuaternion::rotation_between(&Vector3::z(), end).unwrap_or_else(|| {
         UnitQuaternion::from_axis_angle(&Vector3::x_axis(), std::f64::consts::PI)
     });

@@ -12,17 +12,19 @@ pub struct RobotConfig {
     pub urdf: String,
     /// Link that is the base of the robot.
     pub base_link: String,
-    /// Link to which cameras with the parent [`Parent::Flange`](crate::Parent::Flange) are attached.
+    /// Link to which cameras with the parent [`Parent::Flange`](crate::Parent::Flange) are
+    /// attached.
     pub flange_link: String,
     /// Contents of mesh files, by their names in the URDF. A link without its meshes is drawn with
     /// its collision shapes, or with bars between its joints.
     pub meshes: BTreeMap<String, Arc<[u8]>>,
-    /// Pose of a fixed base. A moving base starts where the scene says.
+    /// Pose of a fixed base. A moving base starts at the place that the scene defines.
     pub world_from_base: Transform,
     /// Whether the base moves and reports its pose.
     pub has_moving_base: bool,
-    /// Maximum motion blur of an image that is used, pixels. The scan is slow enough for it.
+    /// Images with more motion blur than this are not used, pixels. The scan is slow enough for
+    /// this limit.
     pub max_blur_px: f64,
-    /// Maximum rolling-shutter shear of an image that is used, pixels.
+    /// Images with more rolling-shutter shear than this are not used, pixels.
     pub max_shear_px: f64,
 }

@@ -1,5 +1,5 @@
-//! The scanning motion of an arm from a URDF: joint positions over time that move its camera along
-//! a tour, within the joint limits.
+//! The scanning motion of an arm from a URDF. It gives joint positions over time that move the
+//! arm's camera along a tour, within the joint limits.
 
 use super::model::TwinModel;
 use crate::follower::{
@@ -44,30 +44,33 @@ pub(crate) struct TwinFollower {
     acceleration: Joints,
 }
 
-/// Margin to the joint limits, as a fraction of the range. The scan does not press against limits.
+/// Margin to the joint limits, as a fraction of the range. The margin keeps the scan away from the
+/// limits.
 const LIMIT_MARGIN_FRAC: f64 = 0.01;
 /// Damping of the least squares, in meters and radians. Near singular postures, it bounds the joint
 /// velocities but causes a pose error.
 const DAMPING: f64 = 0.03;
-/// Weight of errors of the roll about the optical axis, relative to those of the viewing direction
-/// and the position. An arm with fewer than six joints gives up the roll first.
+/// Weight of errors of the roll about the optical axis, relative to errors of the viewing direction
+/// and the position. An arm with fewer than six joints cannot follow all of them, and with this
+/// weight, the roll has the largest error.
 const ROLL_WEIGHT: f64 = 0.1;
-/// Largest acceleration of a joint, as a multiple of its largest speed per second, and largest jerk
-/// as a multiple of the largest acceleration per second. Those of robot arms are several times
-/// higher.
+/// Largest acceleration of a joint, as a multiple of its largest speed per second. The next
+/// constant is the largest jerk, as a multiple of the largest acceleration per second. Robot arms
+/// allow several times higher values.
 const ACCELERATION_HZ: f64 = 5.0;
 const JERK_HZ: f64 = 60.0;
-/// Amplitude of the sway: radians or meters, and at most this fraction of the range of a joint.
+/// Amplitude of the sway, radians or meters. The amplitude is also limited to this fraction of the
+/// range of a joint.
 const SWAY_AMPLITUDE: f64 = 0.1;
 const SWAY_AMPLITUDE_FRAC: f64 = 0.1;
-/// Period of the sway of the first joint, seconds, and the factor from joint to joint. It is not
-/// rational, so that no posture is repeated.
+/// Period of the sway of the first joint, seconds. The next constant is the factor of the period
+/// from joint to joint. The factor is not rational, so that no posture is repeated.
 const SWAY_PERIOD_SECS: f64 = 8.0;
 const SWAY_PERIOD_FACTOR: f64 = 1.171;
 
 impl TwinFollower {
-    /// Starts at rest. On the table, the start is the first pose of the tour, or as close to it as
-    /// the arm gets.
+    /// Starts at rest. With a table, the arm starts at the first pose of the tour, or as close to
+    /// this pose as possible.
     pub(crate) fn new(model: Arc<TwinModel>, tour: TwinTour, posture: Joints) -> Self {
         let n_joints = posture.len();
         let mut follower = Self {
@@ -102,7 +105,7 @@ impl TwinFollower {
         self.model.base_from_flange(&self.position) * flange_from_camera
     }
 
-    /// Advances to a time `step_secs` after the previous one.
+    /// Advances to a time that is `step_secs` after the previous time.
     pub(crate) fn advance(&mut self, secs: f64, step_secs: f64) {
         let desired = self.desired_velocity(secs, Some(step_secs));
         for ix in 0..self.position.len() {
@@ -119,8 +122,8 @@ impl TwinFollower {
         self.velocity += &self.acceleration * step_secs;
         let before = self.position.clone();
         self.position = self.clamp_to_limits(&self.position + &self.velocity * step_secs);
-        // A joint at its limit has stopped. Reported velocities would otherwise contradict the
-        // positions.
+        // A joint at its limit has stopped, so its velocity is zero. Otherwise, reported velocities
+        // would contradict the positions.
         for ix in 0..self.position.len() {
             let velocity = (self.position[ix] - before[ix]) / step_secs;
             if (velocity - self.velocity[ix]).abs() > 1e-9 {
@@ -154,8 +157,9 @@ impl TwinFollower {
         })
     }
 
-    /// Joint velocity toward the tour at a time. With `step_secs`, it includes the velocity of the
-    /// tour since the previous step. Without this feedforward, the camera would lag behind.
+    /// Joint velocity that leads toward the position of the tour at a time. If `step_secs` is
+    /// given, the velocity of the tour since the previous step is added. Without this feedforward,
+    /// the camera would lag behind.
     fn desired_velocity(&self, secs: f64, step_secs: Option<f64>) -> Joints {
         match &self.tour {
             TwinTour::Table(tour) => self.velocity_along_table(tour, secs, step_secs),
@@ -163,7 +167,7 @@ impl TwinFollower {
         }
     }
 
-    /// Position of the sway at a time at speed 1.
+    /// Joint positions of the sway at a time, if the sway has speed 1.
     fn sway(&self, at: f64) -> Joints {
         let mut period_secs = SWAY_PERIOD_SECS;
         Joints::from_fn(self.posture.len(), |ix, _| {
@@ -175,9 +179,9 @@ impl TwinFollower {
         })
     }
 
-    /// Joint velocity that moves the camera toward its position on the tour and turns it toward the
-    /// look-at point as seen from where it is. Null-space motion moves the joints toward the
-    /// preferred posture.
+    /// Joint velocity that moves the camera toward its position on the tour. It also rotates the
+    /// camera from its present position toward the look-at point. Null-space motion moves the
+    /// joints toward the preferred posture.
     fn velocity_along_table(&self, tour: &TableTour, secs: f64, step_secs: Option<f64>) -> Joints {
         let base_from_camera = self.base_from_camera(&tour.flange_from_camera);
         let goal = goal(tour, secs, &base_from_camera);
@@ -195,8 +199,8 @@ impl TwinFollower {
         posture_velocity + change
     }
 
-    /// Jacobian of the camera and a twist in base axes, both weighted and in camera axes. The
-    /// Jacobian has one column per joint.
+    /// Computes the Jacobian of the camera in camera axes, and converts `twist` from base axes to
+    /// camera axes. Both results are weighted. The Jacobian has one column per joint.
     fn in_camera_axes(
         &self,
         tour: &TableTour,
@@ -238,8 +242,8 @@ impl TwinFollower {
     }
 }
 
-/// Pose in the base that the camera should have: the position is that of the tour, and the viewing
-/// direction leads from the present position to the look-at point.
+/// Pose in the base that the camera should have. Its position is the position of the tour. Its
+/// viewing direction leads from the present position of the camera to the look-at point.
 fn goal(tour: &TableTour, secs: f64, base_from_camera: &Transform) -> Transform {
     let TableTour {
         scan,
@@ -257,8 +261,8 @@ fn goal(tour: &TableTour, secs: f64, base_from_camera: &Transform) -> Transform 
     Transform::from_parts(eye.translation, base_from_scene.rotation * rotation)
 }
 
-/// Orientation along a direction, with a roll. Straight down, no orientation is upright, so the
-/// camera keeps its roll there.
+/// Orientation along a direction, with a roll. If the camera looks straight down, no orientation is
+/// upright, so the camera keeps its roll.
 fn toward(
     forward: &Vector3<f64>,
     roll_rad: f64,

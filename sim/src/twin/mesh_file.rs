@@ -1,4 +1,4 @@
-//! Reads triangles from STL and OBJ files, the mesh files of a robot description.
+//! Reads triangles from STL and OBJ files, which are the mesh files of a robot description.
 //!
 //! Sources of the formats: 3D Systems, "Stereolithography Interface Specification" (1989), and
 //! Wavefront, "Advanced Visualizer Manual", appendix B1 (OBJ).
@@ -6,7 +6,8 @@
 use crate::mesh::{Corner, Mesh};
 use nalgebra::{Point3, Vector3};
 
-/// Largest number of triangles of one file. Software rendering of more would take seconds per image.
+/// Largest number of triangles of one file. With more triangles, software rendering would take
+/// seconds per image.
 const MAX_TRIANGLES: usize = 200_000;
 /// Sizes of the header of a binary STL file and of each of its triangles, bytes.
 const STL_HEADER_BYTES: usize = 84;
@@ -19,7 +20,8 @@ type Triangle = [Point3<f64>; 3];
 ///
 /// # Errors
 ///
-/// The reason, in one sentence, if the file has another format, or no valid triangles.
+/// Fails if the file has another format, or no valid triangles. The error is the reason as one
+/// sentence.
 pub(crate) fn read(file: &str, bytes: &[u8], scale: [f64; 3]) -> Result<Mesh, String> {
     let extension = file.rsplit('.').next().unwrap_or_default();
     let triangles = match extension.to_ascii_lowercase().as_str() {
@@ -55,7 +57,7 @@ pub(crate) fn read(file: &str, bytes: &[u8], scale: [f64; 3]) -> Result<Mesh, St
     Ok(mesh)
 }
 
-/// Adds a flat triangle. Returns false for one without an area, which has no normal.
+/// Adds a flat triangle. Returns false for a triangle without an area, because it has no normal.
 fn add(mesh: &mut Mesh, corners: &Triangle) -> bool {
     let [a, b, c] = corners;
     let normal = (b - a).cross(&(c - a));
@@ -80,7 +82,8 @@ fn stl(bytes: &[u8]) -> Result<Vec<Triangle>, String> {
         .and_then(|count| count.try_into().ok())
         .map(u32::from_le_bytes)
         .and_then(|count| usize::try_from(count).ok());
-    // Many binary files start with the word `solid` of text files, so the size decides.
+    // Many binary files start with the word `solid` of text files, so the kind of file is
+    // determined from the size.
     if let Some(n_triangles) = n_binary
         && n_triangles.checked_mul(STL_TRIANGLE_BYTES) == Some(bytes.len() - STL_HEADER_BYTES)
     {
@@ -95,7 +98,8 @@ fn stl(bytes: &[u8]) -> Result<Vec<Triangle>, String> {
     Err("it is neither a binary nor a text STL file".to_owned())
 }
 
-/// A triangle of a binary STL file: normal, three corners, two unused bytes.
+/// A triangle of a binary STL file, which consists of a normal, three corners, and two unused
+/// bytes.
 fn binary_triangle(bytes: &[u8]) -> Triangle {
     let number = |ix: usize| {
         let start = 4 * ix;
@@ -135,7 +139,7 @@ fn obj(text: &str) -> Result<Vec<Triangle>, String> {
                 .split_whitespace()
                 .map(|corner| obj_corner(corner, &points))
                 .collect::<Result<Vec<_>, _>>()?;
-            // Polygons are split into a fan, which is right for convex ones.
+            // Polygons are split into a fan, which is correct for convex polygons.
             for pair in corners.get(1..).unwrap_or_default().windows(2) {
                 triangles.push([corners[0], pair[0], pair[1]]);
             }
@@ -147,8 +151,8 @@ fn obj(text: &str) -> Result<Vec<Triangle>, String> {
     Ok(triangles)
 }
 
-/// The point of a corner such as `3`, `3/1` or `-1//2`. Indices start at 1; negative ones count from
-/// the last point.
+/// The point of a corner such as `3`, `3/1` or `-1//2`. Indices start at 1. Negative indices count
+/// from the last point.
 fn obj_corner(corner: &str, points: &[Point3<f64>]) -> Result<Point3<f64>, String> {
     let index = corner.split('/').next().unwrap_or_default();
     let position = index.parse::<i64>().ok().and_then(|index| {

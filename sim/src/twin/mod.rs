@@ -1,4 +1,4 @@
-//! The robot of a rig file in simulation: its kinematics, its body, its scene and its motion.
+//! The simulation of a rig file's robot, with its kinematics, its body, its scene and its motion.
 
 mod body;
 mod description;

@@ -1,4 +1,5 @@
-//! Kinematics of a robot from a URDF: its arm, its joint ranges, and the tree of all its links.
+//! Kinematics of a robot from a URDF, with its arm, its joint ranges, and the tree of all its
+//! links.
 
 use super::description::RobotConfig;
 use crate::Error;
@@ -22,10 +23,10 @@ pub(crate) struct JointRange {
 
 /// Half the range of a prismatic joint without limits, meters.
 const ESTIMATED_HALF_STROKE_M: f64 = 0.25;
-/// Speed of a joint without a speed limit, and the largest speed of a scan, rad/s. Many URDFs state
-/// the speed of the bare motor.
+/// Speed of a joint without a speed limit, rad/s. It is also the largest speed of a scan, because
+/// many URDFs state the speed of the motor without its gear.
 const MAX_SPEED_RAD_S: f64 = 1.5;
-/// The same of a prismatic joint, m/s.
+/// Speed of a prismatic joint without a speed limit, and largest speed of a scan, m/s.
 const MAX_SPEED_M_S: f64 = 0.3;
 
 /// A link with the joint above it.
@@ -35,9 +36,9 @@ pub(crate) struct LinkNode {
     pub(crate) link: String,
     /// Number of links above it.
     pub(crate) depth: usize,
-    /// Pose in the link above at joint position 0; the identity for the root.
+    /// Pose in the link above at joint position 0. It is the identity for the root.
     pub(crate) parent_from_link: Transform,
-    /// Motion of the joint; `None` if it is fixed.
+    /// Motion of the joint. `None` if the joint is fixed.
     pub(crate) motion: Option<LinkMotion>,
 }
 
@@ -46,7 +47,7 @@ pub(crate) struct LinkNode {
 pub(crate) struct LinkMotion {
     /// Axis in the frame of the link.
     pub(crate) axis: Vector3<f64>,
-    /// Whether the link slides along the axis. Otherwise, it rotates about it.
+    /// Whether the link slides along the axis. If not, the link rotates about the axis.
     pub(crate) is_prismatic: bool,
     source: MotionSource,
 }
@@ -54,7 +55,7 @@ pub(crate) struct LinkMotion {
 /// What determines the position of a joint.
 #[derive(Clone, Copy, Debug)]
 enum MotionSource {
-    /// A joint of the arm, by its index: `multiplier * position + offset`.
+    /// A joint of the arm, given by its index. The position is `multiplier * position + offset`.
     Arm {
         joint_ix: usize,
         multiplier: f64,
@@ -126,8 +127,8 @@ impl TwinModel {
         &self.base_from_root
     }
 
-    /// Whether the robot stands on its base link. Otherwise, the base link is part of a body, such
-    /// as a torso.
+    /// Whether the robot stands on its base link. If not, the base link is part of a body, such as
+    /// a torso.
     pub(crate) fn stands_on_base(&self) -> bool {
         self.links
             .first()
@@ -239,7 +240,7 @@ fn moved(motion: &LinkMotion, position: f64) -> Transform {
     )
 }
 
-/// Ranges of the arm's joints. Logs the estimated ones.
+/// Ranges of the arm's joints. Logs the ranges that are estimated.
 fn ranges(robot: &Robot, chain: &Chain) -> Vec<JointRange> {
     let mut estimated = Vec::new();
     let ranges = chain
@@ -338,14 +339,14 @@ fn links_below(robot: &Robot, chain: &Chain, root: &str) -> Vec<LinkNode> {
                 .map_or_else(Transform::identity, |joint| joint.parent_from_joint),
             motion: joint.and_then(|joint| motion(robot, chain, joint)),
         });
-        // The last one is taken first, so the order is reversed.
+        // The last entry of the stack is taken first, so the order is reversed.
         let children = below.get(link).into_iter().flatten().rev();
         pending.extend(children.map(|joint| (Some(*joint), depth + 1)));
     }
     links
 }
 
-/// How a joint moves; `None` if it is fixed, or has more than one degree of freedom.
+/// The motion of a joint. `None` if the joint is fixed, or has more than one degree of freedom.
 fn motion(robot: &Robot, chain: &Chain, joint: &Joint) -> Option<LinkMotion> {
     let is_prismatic = match joint.kind {
         JointKind::Revolute => false,
@@ -359,7 +360,7 @@ fn motion(robot: &Robot, chain: &Chain, joint: &Joint) -> Option<LinkMotion> {
     })
 }
 
-/// What determines the position of a joint, after following its mimic rules.
+/// The source of the position of a joint, after following its mimic rules.
 fn source(robot: &Robot, chain: &Chain, joint: &Joint) -> MotionSource {
     let (mut multiplier, mut offset) = (1.0, 0.0);
     let mut current = joint;

@@ -1,4 +1,5 @@
-//! Plans the simulation of a rig file's robot: its scene, where the scene is, and all motion.
+//! Plans the simulation of a rig file's robot. The plan contains the scene, the place of the scene,
+//! and all motion.
 
 use super::body::{BodyPlan, RobotBody, lowest_z_m, robot_body};
 use super::description::RobotConfig;
@@ -17,9 +18,9 @@ pub(crate) struct TwinPlan {
     /// Pose of the scene's coordinates in the world.
     pub(crate) world_from_scene: Transform,
     pub(crate) motion: BaseMotion,
-    /// The motion of the arm; `None` without an arm.
+    /// The motion of the arm. `None` without an arm.
     pub(crate) follower: Option<TwinFollower>,
-    /// Height of a pedestal from the floor to the base; `None` if the robot needs none.
+    /// The pedestal from the floor to the base. `None` if the robot needs no pedestal.
     pub(crate) pedestal: Option<Pedestal>,
 }
 
@@ -41,7 +42,8 @@ const MIN_PEDESTAL_M: f64 = 0.03;
 ///
 /// # Errors
 ///
-/// If the URDF is invalid, the scene is made for another robot, or a camera cannot see the scene.
+/// Fails if the URDF is invalid, if the scene is for another robot, or if a camera cannot see the
+/// scene.
 pub(crate) fn plan(config: &Config, robot: &RobotConfig) -> Result<TwinPlan, Error> {
     let model = Arc::new(TwinModel::new(robot)?);
     if model.chain().joint_names() != config.joint_names {
@@ -86,8 +88,8 @@ pub(crate) fn plan(config: &Config, robot: &RobotConfig) -> Result<TwinPlan, Err
     }
 }
 
-/// A pedestal for a robot beside the table. A robot whose base link is not the root has a body below
-/// it.
+/// A pedestal for a robot beside the table. A robot whose base link is not the root has a body
+/// below it.
 fn pedestal(
     model: &TwinModel,
     robot: &RobotConfig,

@@ -14,11 +14,11 @@ use std::sync::Arc;
 /// How the robot moves in the room.
 pub(crate) struct RoomPlan {
     pub(crate) motion: BaseMotion,
-    /// The motion of the arm; `None` without an arm.
+    /// The motion of the arm. `None` without an arm.
     pub(crate) follower: Option<TwinFollower>,
 }
 
-/// Plans a lap around the pedestal. The arm holds its camera ahead, and sways a little.
+/// Plans a lap around the pedestal. The arm points its camera ahead, and sways a little.
 pub(crate) fn plan(config: &Config, model: &Arc<TwinModel>) -> RoomPlan {
     let follower = (model.n_joints() > 0).then(|| {
         TwinFollower::new(
@@ -37,7 +37,8 @@ pub(crate) fn plan(config: &Config, model: &Arc<TwinModel>) -> RoomPlan {
 /// The sampled posture in which the camera on the flange looks ahead and is upright, close to the
 /// rest posture.
 fn posture(config: &Config, model: &TwinModel) -> Joints {
-    /// Weight of the distance from the rest posture. It decides between equal views.
+    /// Weight of the distance from the rest posture. With this weight, the closest of several equal
+    /// views is selected.
     const REST_WEIGHT: f64 = 0.05;
     let rest = model.rest();
     let Some(camera) = config
@@ -51,7 +52,7 @@ fn posture(config: &Config, model: &TwinModel) -> Joints {
     let rating = |base_from_camera: &Transform, position: &Joints| {
         let forward = base_from_camera.rotation * Vector3::z();
         let down = base_from_camera.rotation * Vector3::y();
-        // The motion of the base keeps the pedestal ahead. It is lower than most cameras.
+        // The motion of the base keeps the pedestal ahead. The pedestal is lower than most cameras.
         forward.x
             - 0.5 * (forward.z + 0.15).abs()
             - 0.5 * down.z

@@ -18,7 +18,7 @@ use std::sync::Arc;
 /// Where the table is, and how the arm moves.
 pub(crate) struct TablePlan {
     pub(crate) world_from_scene: Transform,
-    /// The motion of the arm; `None` without an arm.
+    /// The motion of the arm. `None` without an arm.
     pub(crate) follower: Option<TwinFollower>,
 }
 
@@ -33,32 +33,33 @@ pub(crate) struct PlacedRobot<'a> {
 /// Width of the objects on the table, meters. At the preferred distance, they fill most of the
 /// image.
 const SCENE_WIDTH_M: f64 = 0.32;
-/// Preferred distances are at least this, so that the camera does not touch the objects, and at
-/// most this, so that they fill some pixels, meters.
+/// Smallest and largest preferred distance, meters. At the smallest distance, the camera does not
+/// touch the objects. At the largest distance, the objects still fill some pixels.
 const DISTANCE_RANGE_M: [f64; 2] = [0.22, 0.9];
-/// Smallest and largest distance relative to the preferred one.
+/// Smallest and largest distance relative to the preferred distance.
 const DISTANCE_SHARE: [f64; 2] = [0.6, 1.9];
-/// Number of places that are rated, of places that are tried, and their smallest distance from each
-/// other in meters.
+/// Number of places that are rated. The next constants are the number of places that are tried, and
+/// the smallest distance between two of these places in meters.
 const N_RATED: usize = 240;
 const N_TRIED: usize = 8;
 const MIN_APART_M: f64 = 0.08;
-/// Factors on the size of the tour that are tried. An arm often follows a small tour where its
-/// limits prevent a large one.
+/// Factors on the size of the tour that are tried. An arm can often follow a small tour at a place
+/// where its limits prevent a large tour.
 const TOUR_SIZES: [f64; 3] = [1.0, 0.6, 0.35];
-/// Quality of a scan with which the search ends, and below which there is no scan.
+/// Quality of a scan at which the search ends. The next constant is the smallest quality of a scan.
 const GOOD_QUALITY: f64 = 0.9;
 const MIN_QUALITY: f64 = 0.1;
-/// Largest amplitudes of a tour: azimuth and elevation in degrees, and distance as a fraction.
+/// Largest amplitudes of a tour. Azimuth and elevation are in degrees, and the distance is a
+/// fraction.
 const MAX_AMPLITUDES: [f64; 3] = [45.0, 20.0, 0.28];
-/// Distance from the center of the target area to the near edge of the table, and the space that a
-/// robot needs in front of it, meters.
+/// Distance from the center of the target area to the near edge of the table, meters. The next
+/// constant is the space that a robot needs in front of the table.
 const TABLE_EDGE_M: f64 = 0.34;
 const BASE_HALF_M: f64 = 0.14;
 /// A small arm prefers a distance of at most this fraction of its reach.
 const DISTANCE_REACH_FRAC: f64 = 0.75;
-/// Height difference between table and robot that costs a place most of its rating, meters, and this
-/// part of the rating.
+/// Height difference between table and robot at which a place loses a large part of its rating,
+/// meters. The next constant is this part of the rating.
 const HEIGHT_TOLERANCE_M: f64 = 0.3;
 const HEIGHT_WEIGHT: f64 = 0.6;
 /// Largest height of the table above the lowest point of the robot, meters. The floor is 0.87 m
@@ -74,7 +75,7 @@ const MIN_SLOWDOWN: f64 = 0.02;
 ///
 /// # Errors
 ///
-/// If a camera cannot see the table.
+/// Fails if a camera cannot see the table.
 pub(crate) fn plan(config: &Config, robot: &PlacedRobot<'_>) -> Result<TablePlan, Error> {
     let n_joints = robot.model.n_joints();
     let on_flange = config
@@ -133,7 +134,7 @@ fn center_in_scene() -> Point3<f64> {
     Point3::new(x, y, TABLE_Z_M + LOOK_AT_HEIGHT_M)
 }
 
-/// Pose of the scene with its center at a point, turned about z.
+/// Pose of the scene with its center at a point, rotated about z.
 fn world_from_scene(center: &Point3<f64>, yaw_rad: f64) -> Transform {
     let yaw = UnitQuaternion::from_axis_angle(&Vector3::z_axis(), yaw_rad);
     let rotated = Transform::from_parts(Translation3::identity(), yaw);
@@ -291,7 +292,7 @@ fn rated_places(
         let Some(center) = with_room_for_base(in_front, is_at_base, lowest_m) else {
             continue;
         };
-        // Close to the base's axis, the direction to the place says nothing.
+        // Close to the base's axis, the direction to the place is not meaningful.
         let direction = if away_m > 0.1 {
             from_base
         } else {
@@ -302,10 +303,11 @@ fn rated_places(
         if views.is_empty() {
             continue;
         }
-        // Places in front of the robot are preferred to those beside and behind it, and places at
-        // some distance to those on its base.
+        // Places in front of the robot are preferred to places beside and behind it. Places at some
+        // distance are preferred to places on its base.
         let turn_frac = direction.xy().angle(&base_forward.xy()) / std::f64::consts::PI;
-        // A robot usually stands on the table or at its height. One with a torso stands on the floor.
+        // A robot usually stands on the table or at the height of the table. A robot with a torso
+        // stands on the floor.
         let height_m = (center.z - LOOK_AT_HEIGHT_M - lowest_m).abs();
         let height_frac = if robot.model.stands_on_base() {
             (height_m / HEIGHT_TOLERANCE_M).min(1.0)
@@ -328,8 +330,8 @@ fn rated_places(
     places
 }
 
-/// The place, lowered if the table would otherwise be inside the base; `None` if the table is too
-/// high.
+/// The place, which is lowered if the table would otherwise be inside the base. `None` if the table
+/// is too high.
 fn with_room_for_base(
     mut center: Point3<f64>,
     is_at_base: bool,
@@ -360,7 +362,8 @@ fn apart(places: Vec<Place>) -> Vec<Place> {
     kept
 }
 
-/// Azimuth, elevation and distance of most views, each as middle and half width.
+/// Ranges of azimuth, elevation and distance that contain most views, each as middle and half
+/// width.
 fn spans(views: &[View]) -> [[f64; 2]; 3] {
     [
         |view: &View| view.azimuth_degrees,
@@ -389,8 +392,8 @@ fn tour_shape(views: &[View], size: f64) -> ScanShape {
     }
 }
 
-/// The sampled posture with which the tour begins: its view is close to the middle of all views, and
-/// as few links as possible are inside the table.
+/// The sampled posture with which the tour begins. Its view is close to the middle of all views,
+/// and as few links as possible are inside the table.
 fn middle_posture(robot: &PlacedRobot<'_>, place: &Place, viewpoints: &[Viewpoint]) -> Joints {
     /// A link inside the table outweighs any view.
     const INSIDE_PENALTY: f64 = 10.0;
@@ -412,7 +415,7 @@ fn middle_posture(robot: &PlacedRobot<'_>, place: &Place, viewpoints: &[Viewpoin
 }
 
 /// Number of links whose origin is below the top of the table and close to its objects. The scan
-/// does not check collisions, so its first posture decides on which side the links are.
+/// does not check collisions, so the side on which the links are follows from its first posture.
 fn n_links_inside(robot: &PlacedRobot<'_>, place: &Place, position: &Joints) -> usize {
     const MARGIN_M: f64 = 0.02; // A robot that stands on the table touches it.
     const NEAR_M: f64 = 0.55;
@@ -475,12 +478,13 @@ fn report(camera: &CameraConfig, robot: &PlacedRobot<'_>, trial: &Trial) {
 /// Places the scene in front of fixed cameras.
 fn before_cameras(fixed: &[FixedCamera<'_>], robot: &PlacedRobot<'_>) -> Result<Transform, Error> {
     const MAX_UPWARD: f64 = 0.5; // Cosine of the angle to the vertical.
-    /// A camera that looks ahead must be this far above the table to see its top, meters.
+    /// Smallest height above the table, meters, at which a camera that looks ahead sees the top of
+    /// the table.
     const MIN_ABOVE_TABLE_M: f64 = 0.18;
     const N_DISTANCES: u32 = 24;
     const MAX_DISTANCE_M: f64 = 3.0;
     let Some(first) = fixed.first() else {
-        // Without cameras, the table stands where that of a Panda does.
+        // Without cameras, the table has the same place as the table of a Panda.
         let center = robot.world_from_base.translation.vector + center_in_scene().coords;
         return Ok(world_from_scene(&center.into(), 0.0));
     };
@@ -505,7 +509,8 @@ fn before_cameras(fixed: &[FixedCamera<'_>], robot: &PlacedRobot<'_>) -> Result<
         center
     });
     let n_seeing = |center: &Point3<f64>| fixed.iter().filter(|camera| camera.sees(center)).count();
-    // The first of equal places is the closest to the preferred distance.
+    // The first of several equal places is used, because it is the closest to the preferred
+    // distance.
     let mut best: Option<(usize, Point3<f64>)> = None;
     for center in centers {
         let n = n_seeing(&center);

@@ -1,4 +1,5 @@
-//! Tries a tour without images: what its camera sees, and how fast the images move.
+//! Tries a tour without rendering images. Determines what the camera sees, and how fast the images
+//! move.
 
 use super::follower::TwinFollower;
 use crate::config::CameraConfig;
@@ -13,7 +14,7 @@ pub(crate) struct Trial {
     /// Root mean square angle between the directions from which the target area is seen and their
     /// mean, radians.
     pub(crate) spread_rad: f64,
-    /// Image speed that is exceeded for a tenth of the time, pixels per second.
+    /// Image speed that is exceeded during a tenth of the time, pixels per second.
     pub(crate) fast_px_s: f64,
 }
 
@@ -22,9 +23,9 @@ const TRIAL_SECS: f64 = 30.0;
 const STEP_SECS: f64 = 0.005;
 /// Steps from one sample to the next.
 const SAMPLE_STEPS: u32 = 10;
-/// Fraction of the image at each border that does not count as seeing the target area.
+/// A target area closer to a border of the image than this fraction does not count as seen.
 const BORDER_FRAC: f64 = 0.06;
-/// Distances at which the target area counts as seen, meters.
+/// Smallest and largest distance at which the target area counts as seen, meters.
 const SEEN_RANGE_M: [f64; 2] = [0.08, 6.0];
 /// Spread of the views of a good scan, radians.
 const GOOD_SPREAD_RAD: f64 = 0.3;

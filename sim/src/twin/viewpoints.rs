@@ -1,4 +1,4 @@
-//! Where the camera of an arm can be, and which places it can see from many directions.
+//! Poses that the camera of an arm can reach, and places that it can see from many directions.
 //!
 //! Postures are sampled at random, and places are rated by the directions from which sampled
 //! cameras see them, as in a capability map (Zacharias, Borst and Hirzinger 2007, "Capturing Robot
@@ -30,7 +30,8 @@ pub(crate) fn sampled(
     flange_from_camera: &Transform,
 ) -> Vec<Viewpoint> {
     let ranges = model.ranges();
-    // Joints that turn more than once reach the same poses again.
+    // Of joints that can turn more than once, only one turn is sampled, because further turns reach
+    // the same poses again.
     let bounds: Vec<[f64; 2]> = ranges
         .iter()
         .map(|range| {
@@ -70,8 +71,9 @@ pub(crate) struct ViewLimits {
     pub(crate) off_axis_rad: f64,
 }
 
-/// Directions from which a place may be seen: elevation above the horizontal, and azimuth to the
-/// side of the robot, degrees. Behind that, the walls of the scene block the view.
+/// Range of the elevation above the horizontal from which a place may be seen, degrees. The next
+/// constant is the largest azimuth relative to the side of the robot. Beyond this azimuth, the
+/// walls of the scene block the view.
 const ELEVATION_DEGREES: [f64; 2] = [15.0, 87.0];
 const MAX_AZIMUTH_DEGREES: f64 = 75.0;
 /// Sizes of the bins of directions, degrees.

@@ -35,8 +35,8 @@ struct SharedFlags {
 
 impl EmulatedMotors {
     /// Opens the buses, which must be up, and emulates all motors of the arm. The track's joints
-    /// are in the order of the motors. Once a client has enabled a motor, all motors follow client
-    /// commands only.
+    /// are in the order of the motors. Once a client has enabled a motor, all motors follow only
+    /// client commands.
     pub fn start(track: &JointTrack, arm: &ArmConfig) -> Result<Self, Error> {
         let mut motors = Self {
             flags: Arc::default(),
@@ -123,8 +123,8 @@ fn run_bus(
         let arrived = bus.receive(RECEIVE_TIMEOUT)?;
         let now = clock::now();
         // The script moves the motors until a client takes over any of them. From then on, all
-        // motors stay where they are, because a script that moves some joints would fight the
-        // client.
+        // motors stay where they are, because a script that moves some joints would interfere with
+        // the client.
         let joints = (!flags.is_client_controlled.load(Ordering::Relaxed)).then(|| track.at(now));
         for emulated_joint in &mut joints_on_bus {
             if let Some(joints) = &joints {

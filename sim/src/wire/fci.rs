@@ -10,7 +10,7 @@ use std::time::Duration;
 /// Accepts clients until it is dropped. Once a client has moved the arm, it follows client commands
 /// only.
 ///
-/// * `answer_wait`: as in [`EmulatedRobot::start_waiting`]; zero on a real robot
+/// * `answer_wait`: as in [`EmulatedRobot::start_waiting`]. It is zero on a real robot
 /// * `motors`: gets the joints once per millisecond.
 pub fn emulate_fci(
     track: JointTrack,

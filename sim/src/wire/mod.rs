@@ -1,5 +1,5 @@
-//! Emulates the devices of a recorded rig on the wire: a controller of a Franka arm or of Universal
-//! Robots, motors on CAN buses, servos on a serial bus, datagrams.
+//! Emulates the devices of a recorded rig on the wire. These are a controller of a Franka arm or of
+//! Universal Robots, motors on CAN buses, servos on a serial bus, and senders of datagrams.
 //!
 //! A [`DeviceScript`] holds the samples of a simulated or recorded rig. [`PlaybackClock`] maps
 //! their stamps to playback times. Images are not played back here. To play back images, use a file
@@ -29,7 +29,7 @@ use drivers::{BasePose, RangeScan, Sample};
 use kinematics::{HistoryError, JointHistory, JointState, Stamp};
 use std::time::Duration;
 
-/// Joint readings are not interpolated across gaps longer than this.
+/// Joint readings are not interpolated across longer gaps.
 const MAX_GAP: Duration = Duration::from_secs(1);
 
 /// Samples of all devices of a rig except cameras, each list in stamp order.
@@ -60,7 +60,7 @@ impl DeviceScript {
 pub struct PlaybackClock {
     /// An instant of the script.
     pub scripted: Stamp,
-    /// The playback time of that instant, on the monotonic clock.
+    /// The playback time of the same instant, on the monotonic clock.
     pub emulated: Stamp,
 }
 

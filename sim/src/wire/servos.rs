@@ -11,7 +11,7 @@ const COUNTS_PER_TURN: f64 = 4096.0;
 
 /// Emulates the servos of an arm at the path of its port, which becomes a symbolic link to a pseudo
 /// terminal. The track's joints are in the order of the servos. Once a client has enabled a servo,
-/// all servos follow client commands only.
+/// all servos follow only client commands.
 pub fn emulate_servos(
     track: JointTrack,
     config: &ServoArmConfig,
@@ -22,7 +22,7 @@ pub fn emulate_servos(
     let servos = joints.iter().map(new).collect();
     let mut is_client_controlled = false;
     EmulatedServoBus::start(kind, servos, &config.port.device, move |now, servos| {
-        // A script that moves some joints would fight the client.
+        // A script that moves some joints would interfere with the client.
         if servos.iter().any(EmulatedServo::is_enabled) && !is_client_controlled {
             is_client_controlled = true;
             log::info!("a client controls the arm: it no longer follows the script");
@@ -52,7 +52,7 @@ mod tests {
     use drivers::servos::{DynamixelProtocol, FeetechProtocol, PortConfig, ServoArm};
     use std::time::Duration;
 
-    /// Time limit that only a failure reaches.
+    /// Time limit, which is reached only if the test fails.
     const LIMIT: Duration = Duration::from_secs(60);
 
     #[test]
@@ -87,7 +87,7 @@ mod tests {
             let mut arm = ServoArm::open(&config).expect("two servos");
             let state = arm.read(LIMIT).expect("a state");
             for (got, expected) in state.position.iter().zip(&position) {
-                // Half a count.
+                // The tolerance is half a count.
                 assert!((got - expected).abs() <= TAU / 8192.0 + 1e-9, "{state:?}");
             }
         }

@@ -14,8 +14,8 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::thread::JoinHandle;
 use std::time::Duration;
 
-/// Maximum echoes per datagram. Each takes about 60 bytes as JSON; a datagram holds at most 65 507
-/// bytes.
+/// Maximum number of echoes per datagram. An echo takes about 60 bytes as JSON, and a datagram
+/// holds at most 65 507 bytes.
 const MAX_POINTS: usize = 1000;
 /// Period at which the state at rest is resent. Receivers consider a sender lost if they receive
 /// nothing. They also interpolate only between readings that are close in time.

@@ -1,4 +1,5 @@
-//! Finds the inner corners of ChArUco boards, first next to markers, then next to other corners.
+//! Finds the inner corners of ChArUco boards. The search starts next to markers and continues next
+//! to corners that were already found.
 
 use crate::alignment::Printed;
 use crate::gray::Plane;
@@ -58,8 +59,8 @@ pub(super) fn corners(target: &TargetSpec, plane: &Plane, fit: &Fit) -> Vec<(u32
     let mut lattice = search.near_markers(fit);
     lattice.remove_outliers();
     search.complete(&mut lattice);
-    // Now every corner has neighbors on several sides. They give a more accurate scale and shear
-    // than a marker or neighbors on one side only.
+    // Now every corner has neighbors on several sides. These neighbors give a more accurate scale
+    // and shear than a marker, or than neighbors on only one side.
     search.printed.align(plane, &mut lattice);
     lattice.remove_outliers();
     let id = |cell: Cell| (cell[1] * inner[0] + cell[0]).cast_unsigned();
@@ -129,8 +130,8 @@ impl Search<'_> {
 
     /// Finds missing corners next to others, repeatedly.
     fn complete(&self, lattice: &mut Lattice) {
-        // A pass adds neighbors of known corners. From one end of the board to the other, it takes
-        // at most this many passes.
+        // Each pass adds the neighbors of known corners. At most this many passes are needed from
+        // one end of the board to the other.
         for _ in 0..self.inner[0] + self.inner[1] {
             let cells = (0..self.inner[1])
                 .flat_map(|row| (0..self.inner[0]).map(move |column| [column, row]));

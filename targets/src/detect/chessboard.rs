@@ -13,14 +13,14 @@ use crate::spec::TargetSpec;
 /// pixels. Corners are always refined in the full image.
 const HALVE_ABOVE_PX: usize = 3_000_000;
 /// Number of resolutions that are searched. The ring around saddles has a fixed radius. Squares
-/// must not be smaller than the ring, and their blur must not be much larger than it. Three
+/// must not be smaller than the ring, and their blur must not be much larger than the ring. Three
 /// resolutions cover a factor of four.
 const N_LEVELS: usize = 3;
 /// A row or column belongs to the board if it has at least this fraction of its corners. False
 /// corners next to the board form lines with few corners. If some corners of the board are hidden,
 /// most of a line remains.
 const MIN_LINE_FRAC: f64 = 0.5;
-/// A board is used if at least these percent of its corners are found. With fewer corners, a wrong
+/// A board is used if at least this percentage of its corners is found. With fewer corners, a wrong
 /// grid of the right size is more likely than a board with that many hidden corners.
 const MIN_CORNER_PERCENT: usize = 60;
 
@@ -96,7 +96,8 @@ pub(super) fn detect(
                     .filter_map(|(&cell, &pixel)| Some((id(cell)?, pixel)));
                 return Ok(target.detection(pixels, false));
             }
-            // At another resolution, a part of a larger board may look like this one.
+            // At another resolution, a part of a larger board may look like the board of the
+            // target.
             Err(reason @ NotDetected::OtherSize { .. }) if is_complete_and_larger(&grid, inner) => {
                 return Err(reason);
             }
@@ -112,8 +113,8 @@ pub(super) fn detect(
 
 /// Whether almost all corners of a larger grid were found.
 fn is_complete_and_larger(grid: &Lattice, inner: [u32; 2]) -> bool {
-    // A grid with gaps may contain corners of the surroundings, so it is no evidence of a larger
-    // board.
+    // A grid with gaps may contain corners of the surroundings, so such a grid is no evidence of a
+    // larger board.
     const MIN_PERCENT: usize = 95;
     let Some([low, high]) = grid.range() else {
         return false;
@@ -125,11 +126,11 @@ fn is_complete_and_larger(grid: &Lattice, inner: [u32; 2]) -> bool {
         && grid.corners.len() * 100 >= n * MIN_PERCENT
 }
 
-/// Refines a grid and renumbers its corners as those of the board.
+/// Refines a grid, and gives its corners the numbers of the board's corners.
 fn matching(lattice: &mut Lattice, inner: [u32; 2], plane: &Plane) -> Result<Lattice, NotDetected> {
     // Lines at the edge of the board may have been missed.
     const GROWN_LINES: i32 = 1;
-    // Fill the grid first, so that its size can be checked.
+    // The grid is filled first, so that its size can be checked.
     if let Some([low, high]) = lattice.range() {
         let is_smaller =
             (high[0] - low[0] + 1) * (high[1] - low[1] + 1) < (inner[0] * inner[1]).cast_signed();
@@ -215,7 +216,8 @@ fn oriented(lattice: &Lattice, [low, high]: [Cell; 2], inner: [u32; 2]) -> Optio
         .min_by(|a, b| from_right(a).total_cmp(&from_right(b)))
 }
 
-/// Removes outermost lines that have few corners, because such lines are not part of the board.
+/// Removes outermost rows and columns that have few corners, because they are not part of the
+/// board.
 pub(super) fn trim(lattice: &mut Lattice) {
     while let Some([low, high]) = lattice.range() {
         // One line is removed at a time, starting with the weakest, because its removal changes the
@@ -248,7 +250,7 @@ fn line_frac(lattice: &Lattice, axis: usize, at: i32, length: i32) -> f64 {
     n as f64 / f64::from(length)
 }
 
-/// The cells relative to a corner, with the x axis along `STEPS[turns]`.
+/// Renumbers the cells relative to a corner, with the x axis along `STEPS[turns]`.
 fn renumber(lattice: &Lattice, corner: Cell, turns: usize) -> Lattice {
     let x = STEPS[turns];
     let y = STEPS[(turns + 1) % 4];
@@ -276,9 +278,10 @@ fn x_axis_rad(lattice: &Lattice) -> Option<f64> {
     (sum != [0.0; 2]).then(|| angle_between(sum[1].atan2(sum[0]), 0.0))
 }
 
-/// The board is of another size, or a part of it is outside the image.
+/// The reason for a wrong size: the board has another size, or a part of it is outside the image.
 fn wrong_size(lattice: &Lattice, size: [u32; 2], inner: [u32; 2], plane: &Plane) -> NotDetected {
-    // For the message, columns and rows are swapped so that the longer side is that of the target.
+    // For the message, columns and rows are swapped such that the longer side is the same side as
+    // on the target.
     let is_swapped = (size[0] < size[1]) != (inner[0] < inner[1]);
     let [columns, rows] = if is_swapped { [size[1], size[0]] } else { size };
     let found = Counts { columns, rows };

@@ -13,15 +13,15 @@ use crate::spec::{Millimeters, Pattern, TargetSpec};
 /// Minimum number of different markers that were read without an error. Fewer such markers may
 /// occur by chance.
 const MIN_MARKERS: usize = 3;
-/// With at least this many cells per side, a single marker without an error does not occur by
-/// chance. Random cells match one of 1000 markers, in any of four rotations, with a probability of
-/// `4000 / 2^36`, or 6e-8. With 4 cells, it would be 6 %.
+/// If markers have at least this many cells per side, a single marker without an error does not
+/// occur by chance. Random cells match one of 1000 markers, in any of four rotations, with a
+/// probability of `4000 / 2^36`, or 6e-8. With 4 cells, it would be 6 %.
 const MIN_BITS_OF_SINGLE: usize = 6;
 
 /// Minimum relative difference in the size of markers that may prevent the detection of corners.
 pub(super) const MIN_SIZE_CHANGE: f64 = 0.1;
 
-/// The size of ChArUco markers relative to the squares, if it differs from that of the target.
+/// The size of ChArUco markers relative to the squares, if it differs from the size on the target.
 ///
 /// Each marker measures the distance to its neighbors in units of its side.
 ///
@@ -46,8 +46,8 @@ pub(super) fn marker_size(
         return None;
     };
     let expected_frac = marker_m / square_m;
-    // If the markers are not where the layout says, their distances scatter. The first layout in
-    // which most pairs agree is the right one.
+    // If the markers are not at the places of the layout, their distances scatter. The first layout
+    // in which most pairs agree is the right layout.
     let mut measured = None;
     for layout in layouts(&target.pattern) {
         let mut fracs = neighbor_fracs(&layout, markers, square_m, marker_m);
@@ -80,7 +80,7 @@ pub(super) fn marker_size(
 /// The counts of the board that the markers form, if the markers fit other counts better than the
 /// counts of the target.
 ///
-/// * `n_confirmed`: number of markers that fit those of the target.
+/// * `n_confirmed`: number of markers that fit the counts of the target.
 pub(super) fn other_counts(
     target: &TargetSpec,
     markers: &[Marker],
@@ -99,8 +99,8 @@ pub(super) fn other_counts(
     };
     let n_ids = markers.iter().map(|marker| marker.id + 1).max()?;
     // The number of columns alone determines where a marker is. The number of rows is the smallest
-    // number with which the board contains all ids. If the counts can be those of the target with
-    // its sides swapped, the swapped counts are used.
+    // number with which the board contains all ids. If the ids also fit the target with columns and
+    // rows swapped, the swapped counts are used.
     let counts = (2..=MAX_COLUMNS)
         .filter(|columns| *columns != expected[0])
         .map(|columns| {
@@ -114,8 +114,8 @@ pub(super) fn other_counts(
         let layouts = layouts(&with_counts(&target.pattern, counts));
         Some((counts, layout::fit(layouts, markers)?.n_confirmed))
     });
-    // If several counts are equally good, the swapped sides are used, because this mistake is more
-    // common than a different board.
+    // If several counts are equally good, the swapped counts are used, because swapped sides are a
+    // more common mistake than a different board.
     let (found, n_found) =
         fits.max_by_key(|(counts, n)| (*n, *counts == [expected[1], expected[0]]))?;
     let of = |[columns, rows]: [u32; 2]| Counts { columns, rows };
@@ -159,7 +159,7 @@ fn relative(quad: &Quad, [x, y]: [f64; 2]) -> Quad {
     quad.map(|corner| [corner[0] - x, corner[1] - y])
 }
 
-/// The size of a marker relative to a square according to each marker and its neighbors.
+/// The sizes of a marker relative to a square that follow from each marker and its neighbors.
 fn neighbor_fracs(layout: &Layout, markers: &[Marker], square_m: f64, marker_m: f64) -> Vec<f64> {
     const MAX_SQUARES: f64 = 1.6; // Diagonal neighbors.
     let mut fracs = Vec::new();
@@ -212,7 +212,7 @@ fn n_certain(exact: &Exact) -> usize {
         .saturating_sub((4.0 * exact.n_by_chance).ceil() as usize)
 }
 
-/// Explains why the markers found in an image are not those of the target.
+/// Explains why the markers found in an image differ from the markers of the target.
 pub(super) fn markers(
     target: &TargetSpec,
     plane: &Plane,
@@ -262,7 +262,7 @@ pub(super) fn markers(
     // All other dictionaries are tried last, because this takes the longest.
     let others = Dictionary::all().filter(|other| other != dictionary);
     let read = others.map(|other| (read_exactly(plane, quads, &other, false), other));
-    // If several dictionaries are equally good, the first one is used. It is the smallest
+    // If several dictionaries are equally good, the first dictionary is used. It is the smallest
     // dictionary that contains all markers.
     let best = read.reduce(|best, next| {
         if next.0.ids.len() > best.0.ids.len() {

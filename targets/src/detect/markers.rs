@@ -12,8 +12,8 @@ use crate::quad::{self, Quad, shortest_side};
 use crate::spec::{Pattern, TargetSpec};
 use crate::template::{self, Neighborhood};
 
-/// Widths of the black border of tags, in cells. Kalibr prints a border of 2 cells, AprilTag of 1
-/// cell.
+/// Widths of the black border of tags, in cells. Kalibr prints a border of 2 cells, and AprilTag
+/// prints a border of 1 cell.
 const TAG_BORDERS: [usize; 2] = [1, 2];
 /// Largest relative difference between the size of the ChArUco markers in the image and the size on
 /// the target. Blur makes small markers look up to 10 % smaller, so a found board needs a clearer
@@ -99,15 +99,15 @@ fn corners(
     ids: [u32; 4],
     side_m: f64,
 ) -> Vec<(u32, [f64; 2])> {
-    // The border of a tag and the squares between tags are the same for all tags and for this part
-    // of the side.
+    // Up to this fraction of the side from a corner, only the border of the tag and the squares
+    // between tags are visible. They are the same for all tags.
     const CLEAR_FRAC: f64 = 0.28;
     let center_m = layout::center(corners_m);
     let centered = corners_m.map(|corner| [corner[0] - center_m[0], corner[1] - center_m[1]]);
     let mut corners_px = marker.corners_px;
     let mut is_found = [false; 4];
-    // Sides that are bent by the lens displace the corners. In the second round, scale and rotation
-    // are more accurate.
+    // The lens bends the sides, so the first positions of the corners are displaced. In the second
+    // round, scale and rotation are more accurate.
     for reach_frac in [MAX_MOVE_FRAC, MAX_MOVE_FRAC / 4.0] {
         let Some(pixel_from_board) = Homography::from_corners(&centered, &corners_px) else {
             return Vec::new();

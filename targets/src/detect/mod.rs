@@ -43,8 +43,9 @@ impl TargetSpec {
     ///
     /// ChArUco boards, AprilGrids and PuzzleBoards may be partly visible. Some inner corners of a
     /// chessboard may be missing. Its outermost rows and columns must be visible, because they
-    /// identify the board. If the board is symmetric ([`TargetSpec::symmetry`]), the rotation is
-    /// chosen whose x axis points most to the right in the image.
+    /// identify the board. A symmetric board ([`TargetSpec::symmetry`]) has several possible
+    /// rotations. In that case, the rotation is chosen for which the x axis of the board points
+    /// most to the right in the image.
     ///
     /// Lines may be bent by any lens, including fisheye lenses, because only neighboring corners
     /// are compared. The result depends only on the image. The function can be called from several
@@ -71,7 +72,7 @@ impl TargetSpec {
                 };
                 board.detect(&plane)
             }
-            // These three have markers, from which the search starts.
+            // These three patterns have markers, from which the search starts.
             Pattern::Charuco { .. } | Pattern::Aprilgrid { .. } | Pattern::Tag { .. } => {
                 markers::detect(self, &plane)
             }

@@ -15,8 +15,8 @@ use crate::spec::TargetSpec;
 /// [`MIN_DOTS`]. A larger value accepts more blur, but is closer to this chance level.
 const MAX_WRONG_FRAC: f64 = 0.12;
 /// Minimum number of dots. With fewer dots, other positions in the pattern may fit equally well.
-/// The pattern has 501 x 501 positions in four rotations, which 20 bits enumerate. The remaining
-/// dots correct wrong dots.
+/// The pattern has 501 x 501 positions in four rotations, so 20 bits identify a position. The
+/// remaining dots correct wrong dots.
 const MIN_DOTS: usize = 60;
 /// Dots begin at a third of the square from each corner.
 const REFINEMENT: Refinement = Refinement { clear_frac: 0.3 };
@@ -127,8 +127,8 @@ impl Board<'_> {
 }
 
 impl Board<'_> {
-    /// Determines the quarter turns of a lattice with this range of cells and its offset in the
-    /// master pattern from its dots.
+    /// Determines the quarter turns of a lattice and its offset in the master pattern from its
+    /// dots.
     ///
     /// `found` contains the counts of the lattice, for messages.
     fn located(
@@ -243,9 +243,9 @@ fn turn([x, y]: Cell, turns: usize) -> Cell {
 
 /// The dots as edges of the master pattern, if the lattice is rotated by quarter turns.
 ///
-/// Corner `(x, y)` is the lower right corner of square `(x, y)`, so the edge from it to the right
-/// is the horizontal edge below square `(x + 1, y)`, and the edge from it downwards the vertical
-/// edge right of square `(x, y + 1)`.
+/// Corner `(x, y)` is the lower right corner of square `(x, y)`, so the edge from the corner to the
+/// right is the horizontal edge below square `(x + 1, y)`. The edge from the corner downwards is
+/// the vertical edge to the right of square `(x, y + 1)`.
 fn rotated(dots: &[Dot], turns: usize) -> Vec<(Edge, bool)> {
     dots.iter()
         .map(|&(cell, step, is_white)| {

@@ -98,7 +98,7 @@ impl TargetSpec {
         let is_short = |length: &u32| f64::from(*length) + 12.0 <= width_mm;
         let length = RULERS_MM.into_iter().find(is_short).unwrap_or(RULERS_MM[3]);
         let left = PAGE_MARGIN_MM;
-        // This is below the white margin that the detection of outer corners needs.
+        // The ruler is below the white margin that the detection of outer corners needs.
         let top = corner_mm[1] + pattern_mm[1] + 4.0;
         page.line([left, top], [left + f64::from(length), top], 0.2);
         for at in 0..=length {

@@ -7,7 +7,7 @@ use std::str::FromStr;
 /// A paper size. Printing chooses portrait or landscape.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Paper {
-    /// Shorter and longer side of a named size, or width and height as given, millimeters.
+    /// The shorter and the longer side of a named size, or the given width and height, millimeters.
     size_mm: [f64; 2],
 }
 
@@ -21,8 +21,8 @@ const NAMED: [(&str, [f64; 2]); 7] = [
     ("a0", [841.0, 1189.0]),
     ("2a0", [1189.0, 1682.0]),
 ];
-/// Smallest and largest side of other papers, millimeters. If a side is outside this range, its
-/// unit is probably wrong.
+/// Smallest and largest side of papers without a name, millimeters. If a side is outside this
+/// range, its unit is probably wrong.
 const SIDE_MM: [f64; 2] = [50.0, 5000.0];
 
 impl Paper {
@@ -43,8 +43,8 @@ impl Paper {
         }
     }
 
-    /// The smallest named paper into which a rectangle fits. If none is large enough, a paper of
-    /// about the size of the rectangle.
+    /// The smallest named paper into which a rectangle fits. If no named paper is large enough, the
+    /// result is a paper of about the size of the rectangle.
     pub(super) fn for_size(need_mm: [f64; 2]) -> Self {
         let fits = |[width, height]: [f64; 2]| need_mm[0] <= width && need_mm[1] <= height;
         let named = NAMED

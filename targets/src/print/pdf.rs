@@ -38,7 +38,7 @@ impl Page {
 
     /// Sets the gray value of everything that is drawn afterwards, from 0 (black) to 1 (white).
     pub(super) fn set_gray(&mut self, gray: f64) {
-        // PDF has one operator for filling and another one for lines.
+        // PDF has one operator for filling and another operator for lines.
         self.operator(&[gray], "g");
         self.operator(&[gray], "G");
     }

@@ -40,7 +40,8 @@ pub struct Gpu {
     pub(super) pipelines: PipelineCache,
     /// Read-back buffers for reuse, the oldest first.
     idle_staging: Mutex<VecDeque<wgpu::Buffer>>,
-    /// Read-locked while memory is mapped or copied, because destroying the device unmaps it.
+    /// A lock that is held for reading while memory is mapped or copied, because destroying the
+    /// device unmaps this memory.
     mapped: RwLock<()>,
 }
 
@@ -98,7 +99,7 @@ impl Health {
             wgpu::Error::Internal { description, .. } => Failure::Driver(description),
             wgpu::Error::Validation { description, .. } => Failure::Invalid(description),
         };
-        // Later errors are usually consequences of the first one.
+        // Only the first error is kept, because later errors are usually its consequences.
         self.failed.get_or_init(|| failure);
     }
 
@@ -133,7 +134,7 @@ fn instance() -> wgpu::Instance {
 }
 
 /// The adapter with this index. Without an index, it is the fastest adapter. A software adapter is
-/// used only if there is no other.
+/// used only if there is no other adapter.
 fn find_adapter(
     instance: &wgpu::Instance,
     requested: Option<usize>,
@@ -177,9 +178,9 @@ fn all_adapters(instance: &wgpu::Instance) -> Vec<wgpu::Adapter> {
 ///
 /// By default, wgpu places buffers in shared blocks of 128 MiB or more. Buffers that grow with the
 /// scene leave holes in these blocks, and a block is freed only when it is empty. In long runs,
-/// blocks took more than twice the memory in use. On a software adapter, blocks are host memory, so
-/// each large buffer gets its own block at the cost of a `malloc`. Drivers of real GPUs allocate
-/// blocks far more slowly and limit their number, so the default is kept for them.
+/// blocks took more than twice the memory in use. On a software adapter, blocks are host memory.
+/// There, each large buffer gets its own block, which costs only a `malloc`. Drivers of real GPUs
+/// allocate blocks far more slowly and limit their number, so the default is kept for real GPUs.
 fn memory_hints(device_type: wgpu::DeviceType) -> wgpu::MemoryHints {
     match device_type {
         wgpu::DeviceType::Cpu => wgpu::MemoryHints::Manual {
@@ -199,8 +200,8 @@ impl Gpu {
             .collect()
     }
 
-    /// Opens the requested adapter, or the fastest one if none was requested. A software adapter is
-    /// used only if there is no other.
+    /// Opens the requested adapter, or the fastest adapter if none was requested. A software
+    /// adapter is used only if there is no other adapter.
     ///
     /// # Errors
     ///
@@ -537,8 +538,8 @@ impl Gpu {
     fn staging(&self, bytes: u64) -> Option<wgpu::Buffer> {
         let bytes = bytes.max(4);
         let mut idle = self.idle_staging.lock();
-        // Much larger buffers are left for large reads. Otherwise, a read of a few counters would
-        // occupy a buffer that is needed for a picture.
+        // A much larger buffer is not reused for a small read. Otherwise, a read of a few counters
+        // would occupy a buffer that is needed for a picture.
         let fits = |buffer: &wgpu::Buffer| (bytes..=4 * bytes).contains(&buffer.size());
         let found = idle
             .iter()
@@ -613,7 +614,7 @@ impl Gpu {
             .unwrap_or_else(|| Error::internal(internal))
     }
 
-    /// The recorded failure, or [`Error::DeviceLost`] if there is none.
+    /// The recorded failure. If there is no recorded failure, it is [`Error::DeviceLost`].
     fn failure(&self) -> Error {
         self.check().err().unwrap_or(Error::DeviceLost)
     }

@@ -1,6 +1,6 @@
 //! Options for opening a GPU.
 
-/// Which adapter to open, and how much of it to use.
+/// Selects the adapter to open, and limits the use of its features and memory.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct GpuOptions {
     /// Whether optional features of the adapter may be used.

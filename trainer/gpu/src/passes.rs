@@ -64,7 +64,7 @@ impl Passes {
     ///
     /// # Panics
     ///
-    /// Panics if the names differ from those in the kernel, which is a bug in the caller. The
+    /// Panics if the names differ from the names in the kernel, which is a bug in the caller. The
     /// message lists both.
     pub fn dispatch(
         &mut self,
@@ -158,8 +158,9 @@ impl Passes {
         gpu.queue.submit([encoder.finish()]);
     }
 
-    /// Submits the list, empties it, and begins to read the first bytes of each of these buffers,
-    /// as they will be after the list. All buffers share one submit and one read-back.
+    /// Submits the list, empties it, and begins to read the start of each of these buffers. Each
+    /// buffer is given with the number of bytes to read. The buffers are read after the passes of
+    /// the list have run. All buffers share one submit and one read-back.
     pub fn submit_reading(&mut self, gpu: &Gpu, reads: &[(&Buffer, usize)]) -> PendingRead {
         let mut encoder = gpu.encoder();
         encode_all(&mut encoder, self.list.drain(..));

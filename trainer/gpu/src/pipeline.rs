@@ -7,7 +7,7 @@ use rayon::prelude::*;
 use std::borrow::Cow;
 use std::sync::Arc;
 
-/// A kernel: its WGSL file and the files it may import.
+/// A kernel, given by its WGSL file and the files that it may import.
 #[derive(Clone, Copy, Debug)]
 pub struct Kernel {
     /// The file with the entry point `main`.

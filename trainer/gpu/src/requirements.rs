@@ -36,7 +36,7 @@ fn has_half_matrices(adapter: &wgpu::Adapter) -> bool {
 
 impl Optional {
     /// Features of `adapter` that `options` allows. With `FIELDRIG_GPU_FEATURES=none`, the caller
-    /// allows none.
+    /// allows no features.
     pub(super) fn of(adapter: &wgpu::Adapter, options: &GpuOptions) -> Self {
         let allowed = options.optional_features;
         let features = adapter.features();

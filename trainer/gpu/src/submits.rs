@@ -4,8 +4,8 @@ use crate::{Error, Gpu, PendingRead};
 use std::time::Instant;
 
 /// Weight of the latest submit in the smoothed step time. With a larger weight, the step time
-/// follows the growth of a model faster. With a smaller weight, single slow submits, such as those
-/// that compete with a render, shorten the following submits less.
+/// follows the growth of a model faster. With a smaller weight, a single slow submit, for example
+/// one that competes with a render, shortens the following submits less.
 const NEW_WEIGHT: f64 = 0.2;
 /// Maximum GPU time of a training submit. It is short enough for checkpoints, keyframes and Ctrl-C
 /// to be handled soon.
@@ -14,7 +14,7 @@ const SUBMIT_MILLIS: f64 = 20.0;
 /// running submit and the queued submit.
 const SUBMIT_MILLIS_WATCHED: f64 = 2.0;
 
-/// Tracks training submits. At most one submit is in flight while the next one is recorded.
+/// Tracks training submits. At most one submit is in flight while the next submit is recorded.
 #[derive(Debug)]
 pub struct Submits {
     in_flight: Option<InFlight>,
@@ -71,8 +71,8 @@ impl Submits {
         };
         let counters = counters.finish(gpu)?;
         let completed = Instant::now();
-        // The previous submit may still have been running at `since`, and the GPU executes submits
-        // one after another.
+        // The GPU executes submits one after another, and the previous submit may still have been
+        // running at `since`.
         let began = since.max(self.idle_since);
         self.idle_since = completed;
         let millis = (completed - began).as_secs_f64() * 1e3 / n_steps.max(1) as f64;

@@ -7,12 +7,12 @@ use crate::{Error, Gpu, GpuOptions, Kernel, reflect, resolve};
 use parking_lot::Mutex;
 use std::sync::Arc;
 
-/// Devices of finished tests, with the options they were opened with.
+/// Devices of finished tests, with the options with which they were opened.
 static DEVICES: Mutex<Vec<(GpuOptions, Arc<Gpu>)>> = Mutex::new(Vec::new());
 
 /// A device that no other test uses at the same time. An earlier test may have used it, so its
 /// pipelines may already be compiled. It has no buffers left. Tests of the device itself open their
-/// own.
+/// own device.
 #[must_use]
 pub fn test_gpu() -> Arc<Gpu> {
     test_gpu_with(&GpuOptions::default())

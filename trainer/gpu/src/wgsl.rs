@@ -128,7 +128,7 @@ pub(super) fn bindings(module: &naga::Module) -> Vec<Binding> {
             })
         })
         .collect();
-    // A file may declare them in any order, and imports come first.
+    // A file may declare its bindings in any order, and the bindings of imports come first.
     found.sort_by_key(|binding| binding.number);
     found
 }

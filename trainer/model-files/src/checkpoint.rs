@@ -1,4 +1,4 @@
-//! Training state on disk: a self-describing file that is either complete or absent.
+//! Training state on disk, in a self-describing file that is either complete or absent.
 //!
 //! `docs/reference/files.md` describes the layout.
 

@@ -7,15 +7,16 @@ use std::collections::BTreeMap;
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct RunHistory {
-    /// Training time in seconds and mean PSNR of the test images in dB, in order. All are finite.
+    /// Training time in seconds and mean PSNR of the test images in dB, in order. All numbers are
+    /// finite.
     psnr: Vec<(f64, f64)>,
     /// Number of images that did not become keyframes, by reason.
     rejected: BTreeMap<String, u64>,
 }
 
 impl RunHistory {
-    /// The history with these scores and numbers of rejected images. Scores that are not finite,
-    /// such as that of a perfect picture, are left out, because JSON cannot express them.
+    /// The history with these scores and numbers of rejected images. Scores that are not finite are
+    /// left out, because JSON cannot express them. An example is the score of a perfect picture.
     #[must_use]
     pub fn new(psnr: &[(f64, f64)], rejected: BTreeMap<String, u64>) -> Self {
         let is_finite = |(secs, psnr): &&(f64, f64)| secs.is_finite() && psnr.is_finite();

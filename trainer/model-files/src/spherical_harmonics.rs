@@ -1,5 +1,5 @@
-//! Color of a splat as a function of the viewing direction: real spherical harmonics up to degree
-//! 3.
+//! Color of a splat as a function of the viewing direction, given by real spherical harmonics up to
+//! degree 3.
 //!
 //! Source: Kerbl et al. 2023 for constants, order and signs. The polynomials agree with Sloan 2013
 //! on the unit sphere.
@@ -13,8 +13,8 @@ pub const MAX_N_COEFFS: usize = 16;
 // phase. C0 is 1/2 sqrt(1/pi) and C1 is 1/2 sqrt(3/pi).
 const C0: f64 = 0.282_094_791_773_878_14;
 const C1: f64 = 0.488_602_511_902_919_9;
-// Degree 2, for m from -2 to 2: 1/2 sqrt(15/pi) for m = -2, -1 and 1, 1/4 sqrt(5/pi) for m = 0, and
-// 1/4 sqrt(15/pi) for m = 2.
+// The constants of degree 2, for m from -2 to 2, are 1/2 sqrt(15/pi) for m = -2, -1 and 1, 1/4
+// sqrt(5/pi) for m = 0, and 1/4 sqrt(15/pi) for m = 2.
 const C2: [f64; 5] = [
     1.092_548_430_592_079_2,
     -1.092_548_430_592_079_2,
@@ -22,8 +22,9 @@ const C2: [f64; 5] = [
     -1.092_548_430_592_079_2,
     0.546_274_215_296_039_6,
 ];
-// Degree 3, for m from -3 to 3: 1/4 sqrt(35/(2 pi)) for m = -3 and 3, 1/2 sqrt(105/pi) for m = -2,
-// 1/4 sqrt(21/(2 pi)) for m = -1 and 1, 1/4 sqrt(7/pi) for m = 0, and 1/4 sqrt(105/pi) for m = 2.
+// The constants of degree 3, for m from -3 to 3, are 1/4 sqrt(35/(2 pi)) for m = -3 and 3, 1/2
+// sqrt(105/pi) for m = -2, 1/4 sqrt(21/(2 pi)) for m = -1 and 1, 1/4 sqrt(7/pi) for m = 0, and 1/4
+// sqrt(105/pi) for m = 2.
 const C3: [f64; 7] = [
     -0.590_043_589_926_643_5,
     2.890_611_442_640_554,

@@ -25,7 +25,7 @@ pub fn depth_rmse_m(rendered_m: &[f32], truth_m: &[f32]) -> Result<Option<f64>, 
     Ok((n_known > 0).then(|| (squares / f64::from(n_known)).sqrt()))
 }
 
-/// Distance of a rendered surface from a measured one.
+/// Distance of a rendered surface from a measured surface.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct SurfaceError {
     /// Mean distance along the normal of the measured surface, meters, over measured pixels with a
@@ -44,8 +44,8 @@ impl SurfaceError {
 /// same camera.
 ///
 /// Only measured pixels with a known surface normal count: all four neighbors must have a reading,
-/// and none may differ by more than 4 % (an edge). Returns `None` if there is no such pixel. Fails
-/// if the images differ in size.
+/// and no neighbor may differ by more than 4 %, which would be an edge. Returns `None` if there is
+/// no such pixel. Fails if the images differ in size.
 pub fn surface_error(
     rendered_m: &[f32],
     measured: &DepthMap,

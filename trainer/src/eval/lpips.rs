@@ -9,8 +9,9 @@ use std::path::Path;
 /// Minimum side length, pixels. It is the size of the patches to which the weights were fitted.
 const MIN_SIDE_PX: u32 = 64;
 /// Channel means and standard deviations of the inputs, which are between -1 and 1. They are
-/// derived from the usual values of `ImageNet` for inputs between 0 and 1 (0.485, 0.456, 0.406 and
-/// 0.229, 0.224, 0.225): all are doubled, and the means are lowered by 1.
+/// derived from the usual values of `ImageNet` for inputs between 0 and 1, which are means of
+/// 0.485, 0.456, 0.406 and deviations of 0.229, 0.224, 0.225. All values are doubled, and the means
+/// are then lowered by 1.
 const CHANNEL_MEAN: [f32; 3] = [-0.030, -0.088, -0.188];
 const CHANNEL_DEVIATION: [f32; 3] = [0.458, 0.448, 0.450];
 /// Keeps the normalization of an all-zero feature finite.
@@ -29,8 +30,8 @@ const STAGES: [&[(usize, bool)]; 6] = [
 /// The learned perceptual distance of two pictures. It is 0 for equal pictures.
 ///
 /// Features of seven depths of `SqueezeNet` 1.1 are normalized per pixel. Squared differences are
-/// weighted per channel, averaged over pixels and summed over depths. Source: Zhang, Isola, Efros,
-/// Shechtman, Wang 2018, section 3; Iandola et al. 2016.
+/// weighted per channel, averaged over pixels and summed over depths. Sources: Zhang, Isola, Efros,
+/// Shechtman, Wang 2018, section 3, for the distance, and Iandola et al. 2016 for the network.
 #[derive(Debug)]
 pub struct Lpips {
     first: Convolution,
@@ -40,7 +41,7 @@ pub struct Lpips {
 }
 
 impl Lpips {
-    /// Reads the weights: a safetensors file with `features.*` of `SqueezeNet` 1.1 and
+    /// Reads the weights from a safetensors file with `features.*` of `SqueezeNet` 1.1 and
     /// `lin0..6.weight`.
     pub fn load(path: &Path) -> Result<Self, Error> {
         let bytes = files::read(path, files::Budget::PLAIN).map_err(|source| Error::Read {
@@ -111,7 +112,8 @@ impl Lpips {
     }
 }
 
-/// `[1, 3, height, width]`: -1 to 1, then normalized with the channel means and deviations.
+/// `[1, 3, height, width]`. Values are scaled to -1 to 1, and then normalized with the channel
+/// means and deviations.
 fn network_input(pair: &PixelPair<'_>, rgba: &[u8]) -> candle_core::Result<Tensor> {
     let n_pixels = rgba.len() / 4;
     let mut planes = Vec::with_capacity(3 * n_pixels);
@@ -180,7 +182,7 @@ impl Convolution {
     }
 }
 
-/// The fire module of `SqueezeNet`: a 1x1 convolution to few channels, then 1x1 and 3x3
+/// The fire module of `SqueezeNet`. A 1x1 convolution to few channels is followed by 1x1 and 3x3
 /// convolutions in parallel.
 #[derive(Debug)]
 struct Fire {

@@ -1,4 +1,4 @@
-//! Comparison of a rendered picture with the truth: PSNR, SSIM, LPIPS and depth error.
+//! Metrics that compare a rendered picture with the truth: PSNR, SSIM, LPIPS and depth error.
 
 mod depth;
 #[cfg(feature = "lpips")]

@@ -10,7 +10,8 @@ use std::path::Path;
 pub enum Lpips {}
 
 impl Lpips {
-    /// # Errors Always returns [`Error::LpipsNotBuilt`].
+    /// # Errors
+    /// Always returns [`Error::LpipsNotBuilt`].
     pub fn load(_: &Path) -> Result<Self, Error> {
         Err(Error::LpipsNotBuilt)
     }

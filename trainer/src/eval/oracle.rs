@@ -8,7 +8,7 @@ use std::path::Path;
 
 /// Both implementations compute the same integers.
 const PSNR_TOLERANCE_DB: f64 = 1e-6;
-/// Our metric blurs in f32; the f64 reference agrees to a few 1e-6.
+/// The metric of fieldrig blurs in f32, and agrees with the f64 reference to a few 1e-6.
 const SSIM_TOLERANCE: f64 = 1e-4;
 /// 26 convolutions in f32 sum in a different order.
 #[cfg(feature = "lpips")]
@@ -33,7 +33,7 @@ fn json(path: &Path) -> Value {
     serde_json::from_slice(&std::fs::read(path).unwrap()).unwrap()
 }
 
-/// Whether the value agrees; prints it if not.
+/// Whether the value agrees. Prints the value if it does not.
 fn agrees(what: &str, got: f64, expected: f64, tolerance: f64) -> bool {
     let all_agree = (got - expected).abs() <= tolerance;
     if !all_agree {

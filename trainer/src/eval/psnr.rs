@@ -6,11 +6,11 @@ use crate::Error;
 /// Peak signal-to-noise ratio in decibels over the three colors of the unmasked pixels. It is
 /// infinite for equal pictures.
 ///
-/// `10 log10(255^2 / mean squared difference)`, on values already rounded to 8 bits. Fails if all
-/// pixels are masked.
+/// The ratio is `10 log10(255^2 / mean squared difference)`, for values already rounded to 8 bits.
+/// Fails if all pixels are masked.
 pub fn psnr(pair: &PixelPair<'_>) -> Result<f64, Error> {
-    // Integer sums are exact, so the result does not depend on the order, and equals that of the
-    // GPU.
+    // Integer sums are exact, so the result does not depend on the order, and equals the result of
+    // the GPU.
     let mut squares = 0_u64;
     let mut n_visible = 0_u64;
     for (rendered, truth) in pair

@@ -40,7 +40,8 @@ pub fn ssim(pair: &PixelPair<'_>) -> Result<f64, Error> {
     Ok(rows.iter().map(|row| row.0).sum::<f64>() / (3 * n_windows) as f64)
 }
 
-/// `rendered + truth` and `rendered - truth`, colors interleaved, each picture in 0 to 1.
+/// The signals `rendered + truth` and `rendered - truth`. Colors are interleaved, and the values of
+/// each picture are from 0 to 1.
 ///
 /// SSIM follows from the local variances of these two signals. The sum of the variances is twice
 /// the sum of the pictures' variances. Their difference is four times the covariance. This takes

@@ -1,10 +1,11 @@
 //! Groups of connected items.
 
-/// Items that are connected by pairs form groups (union-find; Galler and Fischer 1964).
+/// Groups of items that are connected by pairs. The algorithm is union-find (Galler and Fischer
+/// 1964).
 #[derive(Debug)]
 pub(crate) struct Groups {
-    /// For each item, another item of its group that is closer to the group's representative, which
-    /// refers to itself.
+    /// For each item, another item of its group that is closer to the group's representative. The
+    /// representative refers to itself.
     parents: Vec<u32>,
 }
 

@@ -56,8 +56,7 @@ impl CellLabels {
         }
     }
 
-    /// Divides occupied cells into groups, after connecting adjacent ones. Groups with few cells
-    /// are floaters.
+    /// Divides occupied cells into groups of connected cells. Groups with few cells are floaters.
     pub(crate) fn of_occupied(grid: &CellGrid, occupied: &CellMask, mut groups: Groups) -> Self {
         // Cells that touch only at a corner also count as adjacent, so that a thin slanted surface
         // stays connected.
@@ -86,7 +85,7 @@ impl CellLabels {
         labels
     }
 
-    /// Also keeps the cells around those of large parts.
+    /// Also keeps the cells around the cells of large parts.
     pub(crate) fn keep_around(&mut self, grid: &CellGrid) {
         // The neighbors are taken from a copy. Otherwise, cells that were just added would also add
         // their neighbors.

@@ -1,4 +1,4 @@
-//! Tests of the search for floaters among cells; the tests of each method search through models.
+//! Tests of the search for floaters among cells. The tests of each method search through models.
 
 use super::{CellLabels, CellMask, Groups};
 use model_files::edits::CellGrid;
@@ -19,7 +19,8 @@ fn mask_holds_the_marked_cells_in_order() {
 
 #[test]
 fn small_groups_of_cells_are_floaters() {
-    // A plate of 30 x 30 cells, two cells above it, and one that touches a corner of the plate.
+    // The model is a plate of 30 x 30 cells, two cells above the plate, and one cell that touches a
+    // corner of the plate.
     let cell = |x: u32, y: u32, z: u32| x + 40 * (y + 40 * z);
     let mut occupied = CellMask::none(&GRID);
     occupied.extend((5..35).flat_map(|x| (5..35).map(move |y| cell(x, y, 10))));

@@ -1,9 +1,10 @@
 //! Plain CPU version of the training loss in f64: absolute difference, structural similarity (SSIM)
 //! and depth, with gradients.
 //!
-//! Source: Kerbl et al. 2023, equation 7; SSIM of Wang et al. 2004 with a Gaussian window. Unlike
-//! there, sums are divided by the total number of pixels, including masked pixels. The depth
-//! residual is not divided by the coverage, so that it is linear in the image.
+//! The loss is from Kerbl et al. 2023, equation 7, and SSIM with a Gaussian window is from Wang et
+//! al. 2004. Unlike in these sources, sums are divided by the total number of pixels, including
+//! masked pixels. The depth residual is not divided by the coverage, so that it is linear in the
+//! image.
 
 use super::rendered_image::{RenderedImage, Upstream};
 
@@ -35,7 +36,7 @@ pub struct Weights {
     pub dssim_frac: f64,
     /// Weight of the depth loss, per meter.
     pub depth_per_m: f64,
-    /// Depth residuals beyond this have no gradient, meters.
+    /// Depth residuals beyond this limit have no gradient, meters.
     pub depth_clip_m: f64,
     /// Color behind the splats.
     pub background_rgb: [f64; 3],
@@ -138,8 +139,9 @@ pub fn mean_ssim(size_px: [usize; 2], rendered: &[f64], truth: &[f64]) -> (f64, 
         let denominator = luminance.1 * contrast.1;
         let ssim = luminance.0 * contrast.0 / denominator;
         sum += ssim;
-        // The variances also depend on the mean, so its gradient has three parts: directly, through
-        // variance = mean_xx - x², and through covariance = mean_xy - x y.
+        // The variances also depend on the mean. The gradient of the mean therefore has three
+        // parts: a direct part, a part through variance = mean_xx - x², and a part through
+        // covariance = mean_xy - x y.
         let v_variance = -ssim / contrast.1;
         let v_covariance = 2.0 * luminance.0 / denominator;
         let v_luminance = 2.0 * y * contrast.0 / denominator - 2.0 * x * ssim / luminance.1;
@@ -256,7 +258,7 @@ fn blurred_along(Axis { stride, side }: Axis, plane: &[f64]) -> Vec<f64> {
         .collect()
 }
 
-/// -1, 0 or 1.
+/// Sign of a value: -1, 0 or 1.
 fn sign(value: f64) -> f64 {
     if value == 0.0 { 0.0 } else { value.signum() }
 }
@@ -447,8 +449,8 @@ mod tests {
 
     #[test]
     fn flat_image_gives_known_values() {
-        // A fully opaque render that is 0.25 too bright everywhere. The depth of one pixel is off
-        // by 0.1 m, and the depth of another by more than the clip threshold.
+        // The render is fully opaque and 0.25 too bright everywhere. The depth of one pixel is
+        // wrong by 0.1 m, and the depth of another pixel is wrong by more than the clip threshold.
         let n = N_PIXELS;
         let mut depth_m = vec![0.0; n];
         (depth_m[3], depth_m[4]) = (2.0, 2.0);

@@ -17,10 +17,10 @@ pub struct RenderedImage {
 /// Gradient of a loss with respect to a [`RenderedImage`], row by row.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Upstream {
-    /// With respect to the color.
+    /// Gradient with respect to the color.
     pub rgb: Vec<[f64; 3]>,
-    /// With respect to the transmittance.
+    /// Gradient with respect to the transmittance.
     pub transmittance: Vec<f64>,
-    /// With respect to the depth.
+    /// Gradient with respect to the depth.
     pub depth: Vec<f64>,
 }

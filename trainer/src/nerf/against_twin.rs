@@ -19,7 +19,7 @@ use gpu::{Buffer, Gpu, GpuOptions, Passes};
 use model_files::contraction::contract;
 use numbers::{f32_of, f32s_of};
 
-/// Enough rays for more samples than one partial sum covers.
+/// Number of rays. Their samples exceed the number that one partial sum covers.
 const N_RAYS: u32 = 90;
 
 /// Rows of a matrix, padded with zeros.
@@ -37,7 +37,7 @@ fn padded(
     padded
 }
 
-/// Layer sizes of both networks: the twin's and the kernels'.
+/// Layer sizes of both networks, in the twin and in the kernels.
 fn layers<'a>(
     twin: &'a Field,
     widths: &Widths,
@@ -225,7 +225,7 @@ fn bench(options: &GpuOptions, twin: &Field, rays: &[Ray], scales: &[f32]) -> Be
     }
 }
 
-/// Without cooperative matrices, as on software adapters.
+/// Options without cooperative matrices, as on software adapters.
 fn without_matrices() -> GpuOptions {
     GpuOptions {
         matrices: false,
@@ -460,7 +460,7 @@ fn check_pictures(options: &GpuOptions) {
 }
 
 /// Gradients with respect to poses and appearance embeddings of images, and the first step of each
-/// parameter. Images have seven rays, the last one has fewer.
+/// parameter. Images have seven rays each, except for the last image, which has fewer.
 fn check_image_param_gradients(options: &GpuOptions) {
     const RAYS_PER_IMAGE: usize = 7;
     const N_IMAGES: usize = (N_RAYS as usize).div_ceil(RAYS_PER_IMAGE);
@@ -468,7 +468,8 @@ fn check_image_param_gradients(options: &GpuOptions) {
     const RATES: [f64; 3] = [0.25, 0.125, 0.0625];
     let twin = field(7);
     let rays = rays();
-    // Rotation, translation and appearance embedding gradients of each ray.
+    // These are the gradients of each ray with respect to rotation, translation and appearance
+    // embedding.
     let expected: Vec<[[f64; 3]; 3]> = rays
         .iter()
         .map(|ray| {
@@ -602,8 +603,8 @@ fn check_image_param_gradients(options: &GpuOptions) {
                     1e-12,
                     1e-4,
                 );
-                // The length of the first step is the rate. Weight decay then undoes half of the
-                // step.
+                // The length of the first step is the learning rate. Weight decay then undoes half
+                // of the step.
                 mismatches.check(
                     label("value"),
                     value,

@@ -18,8 +18,9 @@ use numbers::{f32_of, f32s_of};
 use std::sync::Arc;
 use std::time::Instant;
 
-/// Number of levels, coarsest and finest cells along an axis, and log2 of the entries per level, as
-/// in Mueller et al. 2022.
+/// Shape of the hash grid, as in Mueller et al. 2022. The numbers are the number of levels, the
+/// numbers of cells along an axis of the coarsest and of the finest level, and log2 of the entries
+/// per level.
 const GRID_SHAPE: (u32, u32, u32, u32) = (16, 16, 2048, 19);
 /// Step at which no occupancy update is due.
 const STEP: u64 = 1;
@@ -31,13 +32,13 @@ pub struct StepFigures {
     pub n_rays: u32,
     /// Samples per step.
     pub n_samples: u32,
-    /// GPU time of a step, milliseconds: median of the sum over its passes; wall time if there are
-    /// no timestamps.
+    /// GPU time of a step, milliseconds. It is the median of the sum over the passes of the step,
+    /// or the wall time if there are no timestamps.
     pub step_millis: f64,
-    /// Wall time of a step, milliseconds: mean of consecutive steps.
+    /// Mean wall time of consecutive steps, milliseconds.
     pub step_wall_millis: f64,
-    /// GPU time to render the colors of `n_samples` samples of a picture, milliseconds: median;
-    /// wall time if there are no timestamps.
+    /// Median GPU time to render the colors of `n_samples` samples of a picture, milliseconds. It
+    /// is the wall time if there are no timestamps.
     pub colors_millis: f64,
     /// GPU time of each pass of one step. The list is empty without timestamps.
     pub passes: Vec<PassTiming>,
@@ -81,7 +82,7 @@ pub fn time_steps(
     let since = Instant::now();
     let mut before = None;
     for _ in 0..n_submits {
-        // As in training, encode the next submit while the previous one runs.
+        // As in training, the next submit is encoded while the previous submit runs.
         if let Some(before) = before.replace(timed_field.submit()?) {
             before.finish::<u32>(gpu)?;
         }

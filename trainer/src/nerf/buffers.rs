@@ -56,8 +56,8 @@ pub(crate) struct FieldMoments {
 /// Occupancy grid: the cells in which rays are sampled.
 #[derive(Debug)]
 pub(crate) struct Occupancy {
-    /// Two bit sets: the cells to sample, and the solid cells. Each set has cells, groups and
-    /// blocks; see `cell_blocks.wgsl`.
+    /// Two bit sets: the cells to sample, and the solid cells. Each set has bits for cells, groups
+    /// and blocks, see `cell_blocks.wgsl`.
     pub(crate) occupied: Buffer,
     /// One f32 per cell, which is its recent opacity over one step. It is negative if the cell was
     /// never updated, and 0 if the cell is outside all views.
@@ -114,8 +114,8 @@ pub(crate) const THREADS_PER_RAY: u32 = 8;
 pub(crate) struct RaySlot {
     pub(crate) n_rays: u32,
     pub(crate) rays: Buffer,
-    /// Number of segments found per ray. Also, for each thread of a ray, the number found by
-    /// earlier threads.
+    /// Number of segments found per ray. The buffer also contains, for each thread of a ray, the
+    /// number of segments found by earlier threads.
     pub(crate) n_found: Buffer,
     pub(crate) n_before: Buffer,
     pub(crate) march: Buffer,
@@ -182,7 +182,8 @@ pub(crate) struct ImageParamBuffers {
 }
 
 impl ImageParamBuffers {
-    /// All parameters start at zero: no pose correction and equal lighting.
+    /// Creates parameters that are all zero, which means no pose correction and the same lighting
+    /// for all images.
     pub(crate) fn new(
         gpu: &Gpu,
         rule: &ImageParamRule,

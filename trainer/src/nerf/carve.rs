@@ -15,8 +15,8 @@ const SURFACE: u32 = 2 << 30;
 /// Maximum distance up to which cells along rays without a reading are marked, in units of the
 /// scene radius. In the contracted cube, only 1 % of the radius lies beyond this distance.
 const UNBOUNDED_DISTANCE: f64 = 50.0;
-/// Depth readings per ray whose free space is marked. Surfaces and missing readings are processed
-/// at a spacing of half a cell. Free space needs fewer rays.
+/// Free space is marked along one ray for this number of depth readings. Surfaces and missing
+/// readings are processed at a spacing of half a cell, but free space needs fewer rays.
 const READINGS_PER_FREE_RAY: u32 = 4;
 /// Radius, in pixels, of the neighborhood that distinguishes a small hole in the depth image from a
 /// region that the depth camera cannot measure.
@@ -25,7 +25,8 @@ const HOLE_RADIUS_PX: u32 = 2;
 /// free.
 const DEPTH_ERROR_FRAC: f64 = 0.03;
 
-/// Cells that images observe along rays without a reading, as free space, or as a surface.
+/// Cells that images observe. They are divided into cells along rays without a reading, cells in
+/// free space, and cells of surfaces.
 #[derive(Debug)]
 struct Cells {
     unbounded: CellSet,

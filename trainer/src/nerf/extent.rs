@@ -67,15 +67,15 @@ impl Extent {
         keyframes: impl Iterator<Item = &'a Keyframe>,
         cameras: &[Vector3<f64>],
     ) -> Self {
-        // The point with the smallest sum of squared distances to the optical axes, weakly
-        // regularized toward the cameras' mean.
+        // The center is the point with the smallest sum of squared distances to the optical axes.
+        // The sum is weakly regularized toward the mean position of the cameras.
         const CENTER_REGULARIZATION: f64 = 1e-3;
         let mean = cameras.iter().sum::<Vector3<f64>>() / cameras.len().max(1) as f64;
         let mut normal = Matrix3::identity() * CENTER_REGULARIZATION;
         let mut right = mean * CENTER_REGULARIZATION;
         // Normal equations: `across` projects an offset from the camera onto the plane
-        // perpendicular to the axis. Parallel axes alone would give a singular matrix, hence the
-        // regularization.
+        // perpendicular to the axis. The regularization is needed because parallel axes alone would
+        // give a singular matrix.
         for keyframe in keyframes {
             let axis = keyframe.world_from_camera.rotation * Vector3::z();
             let across = Matrix3::identity() - axis * axis.transpose();
@@ -114,12 +114,14 @@ impl Extent {
         pose
     }
 
-    /// Maps positions in units of the radius, relative to the center, to world, meters.
+    /// Maps positions that are relative to the center, in units of the radius, to world coordinates
+    /// in meters.
     pub(crate) fn world_from_scene(&self) -> Matrix4<f64> {
         Matrix4::new_translation(&self.center_m.into()) * Matrix4::new_scaling(self.radius_m)
     }
 
-    /// Converts all lengths of a camera to units of the radius. Erased space stays in world.
+    /// Converts all lengths of a camera to units of the radius. Erased space stays in world
+    /// coordinates.
     pub(crate) fn camera_in_scene_units(&self, camera: &Camera) -> Camera {
         let shutter = camera.shutter.map(|shutter| Shutter {
             twist: Twist {
@@ -166,7 +168,8 @@ fn depth_samples(keyframe: &Keyframe) -> Vec<(f64, Vector3<f64>)> {
         .collect()
 }
 
-/// Range that contains all cameras and nearly all points, whose depths are ignored, along an axis.
+/// Range along an axis that contains all cameras and nearly all points. The depths of the points
+/// are not used.
 fn range_along(
     axis: usize,
     visible_points: &[(f64, Vector3<f64>)],
@@ -178,7 +181,7 @@ fn range_along(
         .collect();
     let of_points =
         trimmed_range(&mut along, OUTSIDE_FRAC).expect("readings at the median depth remain");
-    // No camera is left out, because rays begin at cameras, and steps must be short there.
+    // All cameras are inside, because rays begin at cameras, and steps must be short there.
     let camera_coords = cameras.iter().map(|camera| camera[axis]);
     camera_coords.fold(of_points, |range, camera| {
         [range[0].min(camera), range[1].max(camera)]

@@ -37,12 +37,12 @@ const FIRST_OCCUPANCY_UPDATE_WITH_DEPTH: u64 = 128;
 /// empty are sampled longer. With a smaller factor, a single point that happens to miss a thin
 /// object clears its cell.
 const OCCUPANCY_DECAY: f32 = 0.7;
-/// Fraction of the cells that an update evaluates, limited by the batch size, whose buffers it
-/// uses. A larger fraction makes updates slower. With a smaller fraction, cells follow the field
-/// with a longer delay.
+/// Fraction of the cells that an update evaluates. The number of cells is also limited by the batch
+/// size, because the update uses the buffers of a batch. A larger fraction makes updates slower.
+/// With a smaller fraction, cells follow the field with a longer delay.
 const UPDATED_FRAC: f64 = 0.25;
-/// Maximum number of samples of a training ray, as a multiple of the mean, so that few rays through
-/// unknown space cannot use up the batch.
+/// Maximum number of samples of a training ray, as a multiple of the mean, so that a few rays
+/// through unknown space cannot use up the batch.
 const MAX_SAMPLES_OVER_MEAN: u32 = 4;
 /// Samples per round for a ray of a picture. It equals `MAX_SAMPLES_PER_ROUND` of
 /// `find_samples.wgsl`.
@@ -81,7 +81,7 @@ const IMAGE_PARAM_DECAY: f32 = 5e-4;
 /// are summed as integers. `end_step` then chooses the scale of each level from its largest sum.
 const INITIAL_GRADIENT_SCALE: f32 = 1_048_576.0;
 
-/// Index of a picture's parameters in their buffer, which holds no others.
+/// Index of a picture's parameters in their buffer, which holds no other parameters.
 const PICTURE_EMBEDDING_IX: u32 = 0;
 
 /// GPU state of one field.
@@ -295,7 +295,7 @@ impl FieldTrainer {
         passes.forward(list, kept);
         passes.backward(list, kept, gradients);
         // All gradients use the parameters before this step, so nothing is updated before the last
-        // one.
+        // gradient is computed.
         if let Some(images) = images {
             if learned.contains(ParamSet::IMAGE_POSES) {
                 passes.pose_gradients(list, kept, images);
@@ -357,7 +357,8 @@ impl FieldTrainer {
         passes.forward(list, kept);
         passes.composite(list, kept);
         list.submit(gpu);
-        // This buffer of image parameters is used once, and cached bindings would keep it.
+        // This buffer of image parameters is used only once, and cached bindings would keep it in
+        // memory.
         list.clear_bindings();
         let ray_colors: Vec<[f32; 4]> = gpu.read(&kept.ray_colors, rays.len())?;
         let errors: Vec<[f32; 2]> = gpu.read(&kept.ray_errors, rays.len())?;
@@ -406,7 +407,8 @@ impl FieldTrainer {
             n_rays, n_samples, ..
         } = self.sizes.nerf_budget;
         let images = ImageParamBuffers::new(gpu, &rule, n_rays, n_samples)?;
-        // Values and optimizer state of known images stay. Those of new images start at zero.
+        // Values and optimizer state of known images stay. Values and state of new images start at
+        // zero.
         if let Some(known) = self.images.take() {
             gpu.copy(
                 (&known.image_params, 0),
@@ -418,8 +420,8 @@ impl FieldTrainer {
         Ok(())
     }
 
-    /// Sets the appearance embeddings of images `first_ix` onward, and their pose corrections to
-    /// zero.
+    /// Sets the appearance embeddings of images from index `first_ix` onward. Sets the pose
+    /// corrections of these images to zero.
     pub(crate) fn initialize_images(
         &self,
         gpu: &Gpu,
@@ -512,7 +514,7 @@ impl FieldTrainer {
         self.make_slot(gpu, slot_ix)?;
         let slot = &self.slots[slot_ix];
         gpu.write(&slot.rays, 0, bytemuck::cast_slice(rays));
-        // This is the limit of a single ray. The batch as a whole has its own limit, see
+        // This limits the samples of a single ray. The whole batch has its own limit, see
         // `place_samples`.
         let max_samples_per_ray = n_samples / n_rays * MAX_SAMPLES_OVER_MEAN;
         gpu.write(
@@ -531,7 +533,7 @@ impl FieldTrainer {
             distortion: f32_of(options.specific.distortion),
             near: DISTORTION_NEAR,
             line_of_sight: f32_of(options.specific.line_of_sight),
-            // A surface cannot be located more accurately than the length of the steps; see
+            // A surface cannot be located more accurately than the length of the steps, see
             // design/nerf.md.
             band: 2.0 * march_of(self.sizes.nerf_budget).step,
             band_frac: DEPTH_BAND_FRAC,
@@ -582,7 +584,7 @@ impl FieldTrainer {
         Ok(())
     }
 
-    /// Submits the recorded passes. The returned read completes when they do.
+    /// Submits the recorded passes. The returned read completes when these passes have completed.
     pub(crate) fn submit(&mut self, gpu: &Gpu) -> PendingRead {
         self.passes.submit_reading(gpu, &[(&self.samples.batch, 8)])
     }
@@ -592,7 +594,7 @@ impl FieldTrainer {
         Ok(self.passes.submit_timed(gpu)?)
     }
 
-    /// Halves the size of cells and steps. The new cells inherit the occupancy of the old ones. No
+    /// Halves the size of cells and steps. The new cells inherit the occupancy of the old cells. No
     /// submit may be in flight.
     pub(crate) fn refine_cells(&mut self, gpu: &Gpu) -> Result<(), Error> {
         // The occupancy is read before the old buffers are dropped.
@@ -767,7 +769,7 @@ impl FieldTrainer {
                 let at = 8 * batch_ix as u64;
                 list.copy((&samples.batch, 4), (&canvas.progress, at), 4);
                 list.copy((&canvas.selected, 8), (&canvas.progress, at + 4), 4);
-                // The next batch overwrites the parameters of this one.
+                // The next batch overwrites the parameters of this batch.
                 list.submit(gpu);
             }
             let progress = gpu.read::<[u32; 2]>(&canvas.progress, batches.len())?;
@@ -801,7 +803,7 @@ impl FieldTrainer {
             canvas.n_pixels >= n_pixels && slot.n_rays >= n_rays
         };
         if !self.picture.as_ref().is_some_and(fits) {
-            // The old buffers are freed before the larger ones are allocated.
+            // The old buffers are freed before the larger buffers are allocated.
             self.passes.clear_bindings();
             self.picture = None;
             let samples = SampleBuffers::new(gpu, SAMPLES_PER_ROUND * n_rays)?;
@@ -824,7 +826,7 @@ impl FieldTrainer {
 struct PictureBatch {
     first_ray: u32,
     n_rays: u32,
-    /// Pixels along x and y per ray. It is 1, or more in the prepass.
+    /// Pixels along x and y per ray. The value is 1, except in the prepass, where it is larger.
     pixel_stride: u32,
 }
 
@@ -910,8 +912,8 @@ fn write_view(
 /// Number of rounds for the next attempt, or for the next picture.
 fn next_rounds(n_rounds: u32, needed: u32, is_complete: bool) -> u32 {
     let n_next = if is_complete {
-        // The next picture gets some more rounds, because its view may be deeper. Rounds without
-        // samples take little time.
+        // The next picture gets a few additional rounds, because its rays may need more samples.
+        // Rounds without samples take little time.
         needed + needed / 4 + 2
     } else {
         2 * n_rounds
@@ -919,8 +921,8 @@ fn next_rounds(n_rounds: u32, needed: u32, is_complete: bool) -> u32 {
     n_next.min(MAX_ROUNDS)
 }
 
-/// Reproducible random numbers. Each one depends only on seed, stream and index, so they can be
-/// computed in parallel, and in any order.
+/// Reproducible random numbers. Each number depends only on seed, stream and index, so the numbers
+/// can be computed in parallel, and in any order.
 #[derive(Clone, Copy, Debug)]
 struct RandomStream {
     seed: u64,
@@ -1034,7 +1036,7 @@ fn occupancy_update_of(nerf_budget: &NerfBudget) -> OccupancyUpdate {
     }
 }
 
-/// Pads the hints to a multiple of 16 bytes, as buffers require, by repeating the last one.
+/// Pads the hints to a multiple of 16 bytes, which buffers require. The last hint is repeated.
 fn pad_hints(hints: &[u32]) -> Vec<u32> {
     let n = hints.len().next_multiple_of(4);
     hints
@@ -1063,8 +1065,8 @@ fn rule(options: &ModelOptions<NerfOptions>, weight_decay: f32) -> AdamRule {
     AdamRule {
         rate: f32_of(options.specific.rate),
         final_rate_frac: f32_of(options.specific.final_rate_frac),
-        // The values are those of Mueller et al. 2022, section 4. Gradients of grid entries are
-        // small and rare, so epsilon must be far below them.
+        // The values are from Mueller et al. 2022, section 4. Gradients of grid entries are small
+        // and rare, so epsilon must be far below them.
         betas: [0.9, 0.99],
         epsilon: 1e-15,
         weight_decay,

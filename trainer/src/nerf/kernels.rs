@@ -255,7 +255,7 @@ pub(crate) struct FieldPipelines {
     pub(crate) place_samples: Pipeline,
     pub(crate) write_samples: Pipeline,
     pub(crate) find_samples: Pipeline,
-    /// One per kind of hint, in the order in which they are applied.
+    /// One pipeline per kind of hint, in the order in which the hints are applied.
     pub(crate) hint_cells: [Pipeline; 3],
     pub(crate) sample_cells: Pipeline,
     pub(crate) update_cells: Pipeline,
@@ -266,14 +266,15 @@ pub(crate) struct FieldPipelines {
     pub(crate) select_samples: Pipeline,
     pub(crate) keep_fronts: Pipeline,
     pub(crate) show_rays: Pipeline,
-    /// Variants of the networks: densities only; densities of a picture, with geometry features
-    /// stored; colors from these features; and both networks with everything stored for the
-    /// backward pass.
+    /// The next four fields are variants of the networks. This variant computes only densities. The
+    /// second variant computes the densities of a picture and stores the geometry features. The
+    /// third variant computes colors from these features. The fourth variant computes both networks
+    /// and stores everything that the backward pass needs.
     pub(crate) densities: Pipeline,
     pub(crate) picture_densities: Pipeline,
     pub(crate) picture_colors: Pipeline,
     pub(crate) forward: Pipeline,
-    /// Only with f16 cooperative matrices.
+    /// `None` if the GPU has no cooperative matrices of f16.
     pub(crate) weights_to_half: Option<Pipeline>,
     pub(crate) pack_grid: Pipeline,
     pub(crate) composite: Pipeline,
@@ -302,7 +303,8 @@ impl<'a> LayerKernels<'a> {
         let n_lanes = if widths.is_half_precision {
             HALF_LANES
         } else {
-            // A thread computes four outputs of four samples: 32 * n_hidden / 16 threads.
+            // A thread computes four outputs of four samples, which takes 32 * n_hidden / 16
+            // threads.
             2 * widths.n_hidden
         };
         let sizes = [
@@ -350,7 +352,8 @@ impl<'a> LayerKernels<'a> {
         )?)
     }
 
-    /// The networks of pictures: densities of all samples, and colors of the selected ones.
+    /// The networks of pictures. They compute densities of all samples and colors of the selected
+    /// samples.
     fn picture_networks(&self) -> (Result<Pipeline, Error>, Result<Pipeline, Error>) {
         let variants = [FULL_PICTURE, HALF_PICTURE];
         rayon::join(
@@ -374,8 +377,8 @@ impl<'a> LayerKernels<'a> {
         ]);
         let mut constants = vec![("CHUNK_TILES", f64::from(CHUNK_TILES))];
         if !self.widths.is_half_precision {
-            // Each thread sums the gradients of 16 weights of a layer; the largest layer needs the
-            // most threads.
+            // Each thread sums the gradients of 16 weights of a layer, so the largest layer needs
+            // the most threads.
             let max_weights = self
                 .widths
                 .layers()
@@ -394,7 +397,7 @@ impl<'a> LayerKernels<'a> {
 }
 
 impl FieldPipelines {
-    /// Pipelines for up to `n_samples` samples; `picture_embedding_ix` is the index of a picture's
+    /// Pipelines for up to `n_samples` samples. `picture_embedding_ix` is the index of a picture's
     /// parameters in its buffer.
     pub(crate) fn new(
         gpu: &Gpu,

@@ -189,8 +189,8 @@ impl NerfModel {
     /// Applies occupancy hints of new images, if any image has depth, and initializes their
     /// appearance embeddings.
     fn hint(&mut self) -> Result<(), Error> {
-        // The embeddings come first, because `n_hinted` still separates the known images from the
-        // new ones.
+        // The embeddings are initialized first, while `n_hinted` still separates the known images
+        // from the new images.
         self.initialize_embeddings()?;
         self.hint_images(self.n_hinted..self.images.len())?;
         if self.field.is_some() {
@@ -290,7 +290,7 @@ impl NerfModel {
     /// Number of steps that fit into the time limit of a submit.
     fn steps_per_submit(&self) -> u64 {
         // On a software adapter, a step takes longer than the limit. Until the first submit was
-        // timed, a step of unknown duration is submitted alone.
+        // timed, the duration of a step is unknown, so each step is submitted alone.
         match self.submits.n_steps_in_limit() {
             Some(n) if !self.gpu.is_software() => n.clamp(1, STEPS_PER_SUBMIT as u64),
             _ => 1,
@@ -384,7 +384,7 @@ impl Method for NerfModel {
         let Some((_, field_trainer)) = &mut self.field else {
             return Err(no_field());
         };
-        // This waits for the previous submit while the new one runs.
+        // This waits for the previous submit while the new submit runs.
         let batch = field_trainer.submit(&self.gpu);
         self.finish_in_flight()?;
         self.submits.begin(batch, n_steps, since);

@@ -45,7 +45,7 @@ pub struct NerfBudget {
 }
 
 impl NerfBudget {
-    /// For a software adapter, on which the full sizes would be far too slow.
+    /// Sizes for a software adapter, on which the full sizes would be far too slow.
     pub const SMALL: Self = Self {
         n_rays: 512,
         n_samples: 1 << 14,
@@ -56,8 +56,8 @@ impl NerfBudget {
         max_levels: 8,
         picture_rays: 1 << 11,
     };
-    /// For a GPU. On the data set of the mobile base, twice the rays and samples, or four times the
-    /// entries, gave no higher PSNR after 16 s (`docs/benchmarks/2026-11-23-nerf.md`).
+    /// Sizes for a GPU. On the data set of the mobile base, twice the rays and samples, or four
+    /// times the entries, gave no higher PSNR after 16 s (`docs/benchmarks/2026-11-23-nerf.md`).
     pub const FULL: Self = Self {
         n_rays: 4096,
         n_samples: 1 << 18,
@@ -71,8 +71,8 @@ impl NerfBudget {
 }
 
 impl NerfBudget {
-    /// Halves the size of cells and steps if they are those of [`Self::FULL`]. Does not refine
-    /// other sizes, because refinement is too slow on software adapters, and even finer cells would
+    /// Halves the size of cells and steps if they have the sizes of [`Self::FULL`]. Other sizes are
+    /// not refined, because refinement is too slow on software adapters, and even finer cells would
     /// need too much memory.
     #[must_use]
     pub(crate) fn refined(self) -> Self {
@@ -88,7 +88,7 @@ impl NerfBudget {
 }
 
 impl NerfOptions {
-    /// The sizes in use: the given ones, or the default of the adapter.
+    /// The sizes in use, which are the given sizes, or the default of the adapter.
     pub(crate) fn budget_or_default(&self, is_software: bool) -> NerfBudget {
         self.nerf_budget.unwrap_or(if is_software {
             NerfBudget::SMALL

@@ -145,8 +145,8 @@ pub(crate) struct ImageParamRule {
 }
 
 /// One of the [`IMAGE_PARAM_STRIDE`] parameters of an image. It has the value, Adam's two moments,
-/// and the number of steps taken. The first three parameters are the rotation, the next three the
-/// translation, and the appearance embedding starts at [`EMBEDDING`], as in
+/// and the number of steps taken. The first three parameters are the rotation, and the next three
+/// are the translation. The appearance embedding starts at [`EMBEDDING`], as in
 /// `shared/image_params.wgsl`.
 pub(crate) type ImageParam = [f32; 4];
 pub(crate) const IMAGE_PARAM_STRIDE: usize = 9;
@@ -175,8 +175,8 @@ impl AdamRule {
         StepScale {
             rate_frac: 1.0,
             unused: 0.0,
-            // Bias corrections of the moments (Kingma and Ba 2015, algorithm 1). `end_step`
-            // computes those of later steps.
+            // Bias corrections of the moments for the first step (Kingma and Ba 2015, algorithm 1).
+            // `end_step` computes the corrections for later steps.
             correction: self.betas.map(|beta| 1.0 / (1.0 - beta)),
         }
     }

@@ -32,11 +32,13 @@ pub(crate) struct Canvas {
     pub(crate) depths: Buffer,
     /// Parameters of the image whose appearance is used.
     pub(crate) image_params: Buffer,
-    /// Color, transmittance, distance and front of the rays of a batch.
+    /// Color, transmittance, distance and front of the rays of a batch. The front is the distance
+    /// at which the weights of a ray first reach 1/64.
     pub(crate) light: Buffer,
     /// Distances at which the weights of every fourth ray along x and y first reach 1/64.
     fronts: Buffer,
-    /// For each batch of rays, the samples in its last round and the rounds that had samples.
+    /// For each batch of rays, the number of samples in its last round and the number of rounds
+    /// that had samples.
     pub(crate) progress: Buffer,
     /// The grid's entries as f16.
     packed_grid: Buffer,
@@ -139,8 +141,8 @@ impl FieldPasses<'_> {
             ("n_found", &slot.n_found),
             ("rays", &slot.rays),
         ];
-        // A single workgroup does this, because the first sample of a ray depends on all rays
-        // before it, and the number of samples that are kept depends on all rays.
+        // A single workgroup places the samples of all rays. The first sample of a ray depends on
+        // all rays before it, and the number of samples that are kept depends on all rays.
         list.dispatch(gpu, &pipelines.place_samples, 1, &shared);
         let written = [
             ("n_before", &slot.n_before),
@@ -148,7 +150,8 @@ impl FieldPasses<'_> {
             ("spans", &samples.spans),
             ("points", &samples.points),
         ];
-        // The rays are walked a second time instead of storing segments whose number is unknown.
+        // The rays are walked a second time, because segments cannot be stored before their number
+        // is known.
         let n_groups = groups(THREADS_PER_RAY * slot.n_rays, 64);
         list.dispatch(
             gpu,
@@ -344,8 +347,8 @@ impl FieldPasses<'_> {
         );
     }
 
-    /// Densities of a picture's samples, and the selection of those whose colors contribute to
-    /// their rays. Run after [`FieldPasses::find`].
+    /// Densities of a picture's samples, and the selection of the samples whose colors contribute
+    /// to their rays. Run after [`FieldPasses::find`].
     pub(crate) fn select(&self, list: &mut Passes, canvas: &Canvas) {
         let Self {
             gpu,
@@ -496,7 +499,7 @@ impl FieldPasses<'_> {
         );
     }
 
-    /// The rays of a picture, what they have accumulated, and their view.
+    /// The rays of a picture, their accumulated colors and distances, and their view.
     fn picture_bindings<'a>(&'a self, canvas: &'a Canvas) -> [(&'static str, &'a Buffer); 5] {
         [
             ("batch", &self.samples.batch),

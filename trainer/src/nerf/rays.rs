@@ -48,8 +48,8 @@ impl RayImage {
             .get_or_init(|| depth_in_color_view(&self.keyframe))
     }
 
-    /// Origin, direction of length 1, and measured distance along the ray (0 if there is no
-    /// reading), in units of the extent's radius.
+    /// Origin, direction of length 1, and measured distance along the ray, in units of the extent's
+    /// radius. The distance is 0 if there is no reading.
     pub(crate) fn reading(&self, extent: &Extent, pixel_ix: usize) -> ([f64; 3], [f64; 3], f64) {
         let Keyframe {
             size_px: [width, height],
@@ -150,7 +150,8 @@ impl RaySampling {
         let image_ix = ((share * images.len() as f64) as usize).min(images.len() - 1);
         let image = &images[image_ix];
         let pixel_ix = unmasked_pixel(&image.keyframe, ray_key);
-        // Each purpose needs its own random number, so the constant only makes the key different.
+        // Each purpose needs its own random number. The constant has no meaning except that it
+        // gives a different key.
         let jitter = f32_of(unit_from_bits(hash(ray_key ^ 0x5bd1_e995)));
         let embedding = u32::try_from(image_ix).expect("few images");
         params::Ray {

@@ -56,7 +56,7 @@ fn with_cameras(cameras: CameraRefinement, n_planned_steps: u64) -> ModelOptions
     })
 }
 
-/// The ball alone: the pixels around it are black and have no depth.
+/// The ball without a floor. The pixels around the ball are black and have no depth.
 fn ball(n: usize) -> Vec<Arc<Keyframe>> {
     scenes::ring(&[scenes::ball(BALL_CENTER)], BALL_CENTER, n)
 }
@@ -325,8 +325,8 @@ fn renders_crop_range_and_equirectangular() {
     );
 }
 
-/// With dense depth, cells are refined during training; resuming from before or after the
-/// refinement gives the same result.
+/// With dense depth, cells are refined during training. Resuming from a checkpoint before or after
+/// the refinement gives the same result.
 #[test]
 fn occupancy_cells_are_refined() {
     const PLANNED: u64 = 40;
@@ -479,8 +479,8 @@ fn drifting_poses_are_corrected() {
 }
 
 /// Changing light is modeled during training if a trial finds a significant gain. Images that were
-/// not trained on use an embedding interpolated in time; pictures without a time use the mean
-/// embedding.
+/// not trained on use an embedding that is interpolated in time. Pictures without a time use the
+/// mean embedding.
 #[test]
 fn changing_light_is_modeled() {
     let options = |cameras| with_cameras(cameras, 480).with(|options| options.common.seed = 3);

@@ -135,7 +135,7 @@ mod tests {
 
     #[test]
     fn each_parameter_uses_its_own_rate() {
-        // The first step equals the rate for any gradient magnitude; a zero gradient changes
+        // The first step equals the rate for any gradient magnitude. A zero gradient changes
         // nothing.
         let mut params = [1.0, 2.0, 3.0];
         let mut moments = [Moments::default(); 3];

@@ -1,5 +1,6 @@
-//! Packs pictures on the GPU for viewers: color as JPEG, depth as 16-bit counts at half resolution.
-//! This reduces the read-back to about a fifth, and the CPU no longer encodes.
+//! Packs pictures on the GPU for viewers. Color is encoded as JPEG, and depth as 16-bit counts at
+//! half resolution. This reduces the read-back to about a fifth, and the CPU need not encode
+//! pictures.
 
 mod panorama;
 mod tables;
@@ -9,12 +10,12 @@ use crate::{Error, Picture, Projection, RenderRequest};
 use gpu::{Buffer, Gpu, Passes, PendingRead, Pipeline, Source, shared};
 use panorama::{Face, Panorama};
 
-/// MCUs (8 x 8 pixels, no subsampling) per restart interval, which one lane encodes. With more
-/// MCUs, fewer lanes work in parallel. With fewer MCUs, the markers between intervals make the file
-/// longer.
+/// Number of MCUs per restart interval. An MCU has 8 x 8 pixels without subsampling, and one lane
+/// encodes an interval. With more MCUs, fewer lanes work in parallel. With fewer MCUs, the markers
+/// between intervals make the file longer.
 const MCUS_PER_INTERVAL: u32 = 2;
-/// Capacity of an interval, in words: four times the average at [`WORDS_PER_MCU`], because detail
-/// is distributed unevenly in a picture.
+/// Capacity of an interval, in words. It is four times the average that [`WORDS_PER_MCU`] allows,
+/// because detail is distributed unevenly in a picture.
 const WORDS_PER_INTERVAL: u32 = 4 * WORDS_PER_MCU * MCUS_PER_INTERVAL;
 /// Maximum average of coded words per MCU. At quality 92, pictures of splats need about 6. The
 /// read-back has this size, so a larger number makes each picture slower. A picture that does not
@@ -397,7 +398,7 @@ impl Packer {
         Ok(())
     }
 
-    /// Uploads the tables of a JPEG quality, unless they are those of the last picture.
+    /// Uploads the tables of a JPEG quality, unless the last picture had the same quality.
     fn set_quality(&mut self, gpu: &Gpu, passes: &mut Passes, quality: u8) -> Result<(), Error> {
         if self.tables.as_ref().is_none_or(|(of, _)| *of != quality) {
             passes.clear_bindings();
@@ -535,8 +536,8 @@ pub(crate) struct Reader {
 }
 
 impl Reader {
-    /// The same output, or an unpacked picture if the adapter is a CPU or GPU memory is too small
-    /// for packing.
+    /// The requested output if packing is available. If the adapter is a CPU, or if GPU memory is
+    /// too small for packing, the output is an unpacked picture.
     pub(crate) fn available(
         &mut self,
         gpu: &Gpu,
@@ -566,9 +567,9 @@ impl Reader {
         }
     }
 
-    /// Records the passes after those that draw a view into `canvas`: pixels (rgba8) and depths
-    /// (meters). Returns the buffers to read back for [`Self::take`]. Returns no buffers if the
-    /// picture is not complete.
+    /// Records the passes that follow the drawing of a view into `canvas`. `canvas` contains pixels
+    /// (rgba8) and depths (meters). Returns the buffers to read back for [`Self::take`]. Returns no
+    /// buffers if the picture is not complete.
     pub(crate) fn record<'a>(
         &'a mut self,
         gpu: &Gpu,
@@ -578,7 +579,7 @@ impl Reader {
         canvas: [&'a Buffer; 2],
     ) -> Result<Vec<(&'a Buffer, usize)>, Error> {
         let Self { packer, panorama } = self;
-        // Faces are collected in the panorama, so the canvas may be overwritten by the next one.
+        // Faces are collected in the panorama, so the next face may overwrite the canvas.
         let canvas = match output.face {
             Some(face) => Panorama::record(panorama, gpu, passes, face, canvas)?,
             None => canvas,
@@ -794,7 +795,8 @@ mod tests {
         }
     }
 
-    /// Smooth colors with sharp edges, different in every corner. Depths with holes.
+    /// A picture with smooth colors and sharp edges, which differ in every corner. Its depths have
+    /// holes.
     fn picture(size_px: [u32; 2]) -> Picture {
         let [width, height] = size_px;
         let byte = |value: u32| u8::try_from(value % 256).unwrap();

@@ -33,8 +33,8 @@ impl Face {
         self.ix + 1 == N_FACES
     }
 
-    /// Width and height of a face, pixels. Measured through its middle, a face covers a quarter of
-    /// the panorama's width and half of its height.
+    /// Width and height of a face, pixels. Along the lines through its middle, a face covers a
+    /// quarter of the panorama's width and half of its height.
     fn edge_px(self) -> u32 {
         let [width, height] = self.panorama_px;
         (width / 4).max(height / 2).max(1)
@@ -42,7 +42,8 @@ impl Face {
 
     fn rotation(self) -> Rotation3<f64> {
         let about = |axis, angle| Rotation3::from_axis_angle(&axis, angle);
-        // Forward, right, back and left, then up and down: x is right and y is down.
+        // The faces are forward, right, back and left, then up and down. In each face, x is right
+        // and y is down.
         match self.ix {
             0 => Rotation3::identity(),
             1 => about(Vector3::y_axis(), FRAC_PI_2),
@@ -127,7 +128,7 @@ impl Panorama {
             .as_ref()
             .is_none_or(|panorama| panorama.n_pixels < n_pixels)
         {
-            // The old panorama is freed before the larger one is allocated.
+            // The old panorama is freed before the larger panorama is allocated.
             passes.clear_bindings();
             *panorama = None;
             *panorama = Some(Self::new(gpu, n_pixels)?);

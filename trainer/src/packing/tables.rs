@@ -1,4 +1,5 @@
-//! Tables of JPEG: the transform, quantization and Huffman codes (ITU-T T.81, annexes A and K).
+//! Tables of JPEG for the transform, the quantization and the Huffman codes (ITU-T T.81, annexes A
+//! and K).
 
 use std::f64::consts::PI;
 
@@ -126,8 +127,8 @@ pub(super) fn transform_tables(quality: u8) -> Vec<f32> {
     let basis = (0..64).map(|at| {
         let frequency = f64::from(at / 8);
         let position = f64::from(at % 8);
-        // Makes the transform orthonormal (T.81, A.3.3, with the factor 1/4 divided between the
-        // axes).
+        // This makes the transform orthonormal. The factor 1/4 of T.81, A.3.3 is divided between
+        // the two axes.
         let norm = if at < 8 { 0.125f64.sqrt() } else { 0.5 };
         norm * ((2.0 * position + 1.0) * frequency * PI / 16.0).cos()
     });
@@ -158,8 +159,9 @@ fn codes_of(huffman: &Huffman, n_symbols: usize) -> Vec<u32> {
     let mut codes = vec![0; n_symbols];
     let mut code = 0;
     let mut symbols = huffman.symbols.iter();
-    // Codes of one length are successive numbers. The first code of the next length follows the
-    // last one, with a zero appended, so no code is the beginning of another.
+    // Codes of one length are successive numbers. The first code of the next length is the number
+    // after the last code, with a zero appended. No code is therefore the beginning of another
+    // code.
     for (n_bits, n_codes) in (1..).zip(huffman.n_codes) {
         for symbol in symbols.by_ref().take(n_codes.into()) {
             codes[usize::from(*symbol)] = n_bits << 16 | code;
@@ -184,8 +186,8 @@ pub(super) fn file_header(size_px: [u16; 2], quality: u8, mcus_per_interval: u16
         }
         push_segment(&mut file, 0xdb, &contents);
     }
-    // Baseline frame: 8 bits per sample and three components. Each one has its number, sampling
-    // factors of 1 by 1, and the number of its quantization table.
+    // Baseline frame with 8 bits per sample and three components. Each component has its number,
+    // sampling factors of 1 by 1, and the number of its quantization table.
     let [width, height] = size_px.map(u16::to_be_bytes);
     let frame = [
         &[8],

@@ -150,7 +150,7 @@ fn every_method_resumes_without_missing_keyframes() {
             resumed.method.model().progress().step > n_before || resumed.method.is_idle(),
             "{kind:?}"
         );
-        // A checkpoint of the resumed model does not need them.
+        // A checkpoint of the resumed model does not need the removed keyframes.
         let checkpoint = resumed.method.checkpoint().unwrap().finish().unwrap();
         assert!(resume(gpu.clone(), &checkpoint, &left).is_ok(), "{kind:?}");
     }

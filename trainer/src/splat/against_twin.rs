@@ -183,7 +183,7 @@ pub(super) fn unambiguous_pixels(view: &View, splats: &[Splat]) -> Vec<bool> {
     are_unambiguous(margins.iter().map(|margin| *margin > MARGIN))
 }
 
-/// Collects which pixels are unambiguous. Asserts that almost all of them are.
+/// Collects which pixels are unambiguous. Asserts that almost all pixels are unambiguous.
 pub(super) fn are_unambiguous(pixels: impl Iterator<Item = bool>) -> Vec<bool> {
     let unambiguous: Vec<bool> = pixels.collect();
     assert!(
@@ -281,7 +281,7 @@ fn more_opaque(splat: &Splat, drop_frac: f32) -> Splat {
     splat
 }
 
-/// Compares the fixture's picture with that of the twin.
+/// Compares the fixture's picture with the picture of the twin.
 fn check_picture(fixture: &KernelFixture, view: &View, splats: &[Splat]) {
     check_image(
         &fixture.render(),
@@ -290,7 +290,7 @@ fn check_picture(fixture: &KernelFixture, view: &View, splats: &[Splat]) {
     );
 }
 
-/// Compares a color image with transmittance, and a depth image, with those of the twin.
+/// Compares a color image with transmittance, and a depth image, with the images of the twin.
 pub(super) fn check_image(
     (image, depth): &(Vec<[f32; 4]>, Vec<f32>),
     expected: &RenderedImage,
@@ -352,7 +352,7 @@ fn check_short_lists(variants: &[GpuOptions]) {
     }
 }
 
-/// Lists of several segments, of splats that touch more tiles than one lane of `update` sums.
+/// Checks lists of several segments. Their splats touch more tiles than one lane of `update` sums.
 fn check_long_lists(variants: &[GpuOptions]) {
     let (view, splats) = long_lists(400, 2.5, -4.4);
     check_gradients_with_loss(&view, &splats, variants);
@@ -391,7 +391,7 @@ fn long_lists(n: usize, log_scale: f64, opacity_logit: f64) -> (View, Vec<Splat>
     let world_from_camera = view.camera_from_world.inverse();
     let mut splats = scene::small_scene(5, n);
     for (ix, splat) in splats.iter_mut().enumerate() {
-        // The depths differ, and their order is unlike the order of the indices.
+        // The depths differ, and their order differs from the order of the indices.
         let z = 1.5 + 0.0025 * (ix * 149 % n) as f64;
         splat.mean = (world_from_camera * nalgebra::Point3::new(splat.mean[0], splat.mean[1], z))
             .coords
@@ -746,7 +746,7 @@ fn check_hidden_splats(variants: &[GpuOptions]) {
         let fixture = KernelFixture::new(options, &view, &arrays_of(&stack));
         let gpu = &fixture.gpu;
         let n_pixels = (view.size_px[0] * view.size_px[1]) as usize;
-        // Slots with gradients of an earlier step, and a gradient at every pixel.
+        // The slots contain gradients of an earlier step, and every pixel has a gradient.
         gpu.write(
             &fixture.scratch.gradients,
             0,
@@ -828,7 +828,8 @@ fn camera_params_start_at_zero_and_step_by_their_rate() {
         let set = ParamSet::LENS | ParamSet::IMAGE_GAINS;
         let mut cameras = CameraParams::new(gpu, set).unwrap();
         let lens = cameras.lens(gpu, &moving_keyframe()).unwrap();
-        // A scene of 1 m, at the start of training: all rates have their initial values.
+        // The scene has a size of 1 m. At the start of training, all rates have their initial
+        // values.
         cameras.write_rule(gpu, 0.0, 1.0);
         let target = target_of(&reference::render(&view, &splats), view.size_px);
         let weights = loss_reference::Weights {
@@ -858,7 +859,7 @@ fn camera_params_start_at_zero_and_step_by_their_rate() {
         view_passes.update(&mut passes, &fixture.train.update_with_camera, &rule, true);
         cameras.refine(&view_passes, &mut passes, &fixture.train, &lens);
         passes.submit(gpu);
-        // Phase 1: the view was corrected before the step, with parameters of zero.
+        // Phase 1 checks that the view was corrected before the step, with parameters of zero.
         let corrected: Vec<f32> = gpu.read(&cameras.corrected, 20).unwrap();
         let base = camera_of(&view).view();
         for (ix, (got, expected)) in corrected
@@ -871,7 +872,7 @@ fn camera_params_start_at_zero_and_step_by_their_rate() {
                 "word {ix}: {got}, expected {expected}"
             );
         }
-        // Phase 2: only the lens is enabled among the parameters of the camera.
+        // Phase 2 checks the steps. Among the parameters of the camera, only the lens is enabled.
         let steps: Vec<f64> = cameras.param_values(gpu);
         for (param, step) in steps.iter().enumerate() {
             let rate = if (7..11).contains(&param) { 1e-3 } else { 0.0 };

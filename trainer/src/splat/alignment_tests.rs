@@ -1,4 +1,4 @@
-//! Tests of training with alignment: the correction is applied to every camera, and resuming from a
+//! Tests of training with alignment. The correction is applied to every camera, and resuming from a
 //! checkpoint is bit-exact.
 
 use super::{SplatOptions, SplatTrainer};

@@ -10,7 +10,7 @@ use serde::{Deserialize, Serialize};
 use std::collections::{BTreeMap, VecDeque};
 
 /// Number of latest keyframes that a decision is based on. With more keyframes, a change is
-/// detected later. With fewer, a single outlier could decide.
+/// detected later. With fewer keyframes, a single outlier could decide.
 const MAX_SCORED: usize = 8;
 /// Minimum mean gain, dB. Smaller gains may come from areas that the model does not show yet.
 const MIN_MEAN_GAIN_DB: f64 = 1.0;
@@ -33,7 +33,8 @@ impl ArrivalGains {
     /// Adds a keyframe. Returns the result if the latest keyframes show that gains are needed.
     ///
     /// * `log_gains`: logarithms of the gains that best match the picture to the keyframe.
-    /// * `psnr`: PSNR of the picture scaled by gains, dB; `None` if all pixels are masked.
+    /// * `psnr`: returns the PSNR of the picture scaled by gains, dB. `None` if all pixels are
+    ///   masked.
     pub(crate) fn add(
         &mut self,
         camera: &str,
@@ -45,8 +46,8 @@ impl ArrivalGains {
         if psnr(log_gains.map(f64::exp))? < MIN_PSNR_DB {
             return None;
         }
-        // Cameras adapt their exposure independently, so each one predicts only its own keyframes.
-        // The first keyframe of a camera has no prediction.
+        // Cameras adapt their exposure independently, so the gains of a camera predict only its own
+        // keyframes. The first keyframe of a camera has no prediction.
         let previous = self.last_log_gains.insert(camera.to_owned(), log_gains)?;
         self.differences_db
             .push_back(psnr(previous.map(f64::exp))? - psnr([1.0; 3])?);
@@ -68,7 +69,7 @@ mod tests {
     use super::*;
 
     /// Number of keyframes up to the decision, if the keyframes have these log gains and the model
-    /// has none. The picture matches up to 30 dB.
+    /// has no gains. The picture matches up to 30 dB.
     fn n_until_decision(log_gains: impl IntoIterator<Item = f64>) -> Option<usize> {
         let mut arrivals = ArrivalGains::default();
         let is_decided = |log_gain: f64| {

@@ -29,7 +29,7 @@ const RATE: f32 = 1e-5;
 
 /// Depth that the images of [`Losses::Training`] show, meters.
 const DEPTH_M: f32 = 3.2;
-/// Number of images; large enough to turn off few-image regularization.
+/// Number of images. It is large enough to turn off the regularization for few images.
 const N_IMAGES: usize = 1000;
 
 /// Results for one image size and cloud.
@@ -42,7 +42,7 @@ pub struct KernelFigures {
     /// timestamps are unavailable.
     pub render_millis: f64,
     /// Median GPU time of a picture that is also packed as JPEG and depth for a viewer,
-    /// milliseconds; `None` on the CPU, where pictures are not packed.
+    /// milliseconds. `None` on the CPU, where pictures are not packed.
     pub packed_millis: Option<f64>,
     /// Median GPU time of a step that updates every splat, milliseconds.
     pub step_millis: f64,
@@ -67,9 +67,11 @@ pub struct KernelFigures {
 /// Position of the camera on the z axis, meters.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Eye {
-    /// -3.2, as in the peer's benchmark. The whole cloud is visible.
+    /// The z coordinate of the camera is -3.2, as in the peer's benchmark. The whole cloud is
+    /// visible.
     Outside,
-    /// 0, inside the cloud, as in a room. Part of the cloud is visible.
+    /// The z coordinate of the camera is 0, inside the cloud, as in a room. Only a part of the
+    /// cloud is visible.
     Inside,
 }
 
@@ -153,7 +155,7 @@ pub fn time_kernels(
         bench.time(&mut passes, repeats, KernelBench::record_picture)?;
     let (step_millis, step_wall_millis) =
         bench.time(&mut passes, repeats, KernelBench::record_step)?;
-    // Timestamps around every pass slow down a step, so passes are timed in an additional one.
+    // Timestamps around every pass slow down a step, so passes are timed in an additional step.
     bench.record_step(&mut passes)?;
     let mut timings = passes.submit_timed(gpu)?;
     let mut packed_millis = None;
@@ -236,8 +238,8 @@ impl KernelBench {
             supervision: gpu.uniform_with("bench.supervision", &supervision),
             gains: gpu.storage_with("bench.gains", bytemuck::cast_slice(&[1.0f32; 4]))?,
             rule: gpu.uniform_with("bench.rule", &rule()),
-            // There are two rules instead of one that is rewritten, so that no upload is part of
-            // the timing.
+            // There are two rules, because rewriting a single rule would add an upload to the
+            // timing.
             rule_visible: gpu.uniform_with(
                 "bench.rule_touched",
                 &Rule {
@@ -270,8 +272,8 @@ impl KernelBench {
                 n_slots: with_headroom(counters[status::NEED_SLOTS]),
                 n_bins: n_bins(self.size_px),
             };
-            // A minimal buffer frees the previous one before the larger one is allocated, so that
-            // both do not count toward the peak of memory.
+            // A minimal buffer replaces the previous buffer before the larger buffer is allocated.
+            // Otherwise, both would count toward the peak of memory.
             drop(passes);
             self.scratch = Scratch::new(
                 &self.gpu,
@@ -385,8 +387,8 @@ impl KernelBench {
         repeats: Repeats,
         record: Recorded,
     ) -> Result<(f64, f64), Error> {
-        // Warm up, because some GPUs stay busy for tenths of a second after large buffers are
-        // freed.
+        // The warm-up is needed, because some GPUs stay busy for tenths of a second after large
+        // buffers are freed.
         let warming = Instant::now();
         let mut n_warm = 0;
         while n_warm < repeats.n_warm_up
@@ -453,7 +455,7 @@ fn camera(size_px: [u32; 2], eye: Eye) -> Camera {
     }
 }
 
-/// Opaque color of a pixel of noise: a hash of its index.
+/// Opaque color of a pixel of noise, which is a hash of its index.
 fn noise_pixel(pixel: u32) -> u32 {
     pixel
         .wrapping_mul(2_654_435_761)

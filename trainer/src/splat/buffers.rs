@@ -7,7 +7,7 @@ use gpu::sort::SortBuffers;
 use gpu::{Buffer, Gpu, Passes, PendingRead};
 use model_files::splat::arrays::SplatArrays;
 
-/// Splats per block, consecutive in depth. This constant and the next two equal those of
+/// Splats per block, consecutive in depth. This constant and the next two equal the constants of
 /// shared/bins.wgsl.
 pub(crate) const BLOCK: u32 = 256;
 /// Bins per workgroup.
@@ -384,8 +384,8 @@ pub(crate) struct Scratch {
     pub(crate) segments: Buffer,
     pub(crate) segment_counts: Buffer,
     pub(crate) segment_states: Buffer,
-    /// Capacity for segments and for pieces of the hidden ends of lists, not counting one or two
-    /// per tile.
+    /// Capacity for segments and for pieces of the hidden ends of lists. The capacity of one
+    /// segment and of two pieces per tile is not included.
     pub(crate) n_segments: [u32; 2],
 }
 
@@ -425,7 +425,7 @@ impl Scratch {
         // A `Segment` has four words, which are 16 bytes.
         let segment_bytes =
             16 * (u64::from(n_segments[0]) + u64::from(n_segments[1]) + u64::from(n_of_tiles));
-        // A float for each part of the state of each pixel of a tile.
+        // Each part of the state of each pixel of a tile takes one float.
         let state_bytes = u64::from(4 * N_STATE_PARTS * 2 * STATE_PAIRS);
         // The product is computed in u64, because it can exceed 32 bits.
         let per_bin =
@@ -460,8 +460,8 @@ impl Scratch {
                 status::N_SPLATS,
                 status::FURTHEST,
             )?,
-            // Counts that are turned into offsets. There are two levels, because summing thousands
-            // of blocks one by one would take too long.
+            // Counts that are turned into offsets. They are summed in two levels, because summing
+            // thousands of blocks one by one would take too long.
             bin_counts: per_bin("splat.bin_counts", n_blocks)?,
             group_counts: per_bin("splat.group_counts", n_blocks.div_ceil(GROUP))?,
             bin_totals: words("splat.bin_totals", n_bins)?,
@@ -494,8 +494,8 @@ impl Scratch {
     }
 }
 
-/// Maximum number of segments after the first of each tile, and of pieces of hidden ends (without
-/// two per tile), for lists of this length; see shared/segment.wgsl.
+/// Maximum number of segments after the first segment of each tile, and maximum number of pieces of
+/// hidden ends beyond two per tile, for lists of this length. See shared/segment.wgsl.
 fn n_segments(n_entries: u32, n_slots: u32) -> [u32; 2] {
     // Segments are made of whole batches, so there can be twice as many as intended. An entry of a
     // bin can be in the hidden end of the lists of all of its tiles.

@@ -2,7 +2,7 @@
 //! offset, lens and exposure.
 //!
 //! All images of a camera share its parameters. Each image can have additional parameters. The
-//! parameters stay on the GPU during training: `correct_view` applies them to the view of a step,
+//! parameters stay on the GPU during training. `correct_view` applies them to the view of a step,
 //! and `refine_camera` updates them.
 
 use super::kernels::TrainPipelines;
@@ -58,8 +58,8 @@ pub(crate) struct CameraParams {
     n_used: u32,
 }
 
-/// Slots of each camera by name. They are the slot of the camera, and the slots of its images by
-/// stamp in nanoseconds.
+/// For each camera by name, the slot of the camera, and the slots of its images by stamp in
+/// nanoseconds.
 #[derive(Clone, Debug, Default, PartialEq, serde::Serialize, serde::Deserialize)]
 pub(crate) struct CameraSlots(BTreeMap<String, (u32, BTreeMap<i64, u32>)>);
 
@@ -374,7 +374,7 @@ impl ParamValues {
         } else {
             BTreeMap::new()
         };
-        // The indices are those of `shared/camera_params.wgsl`.
+        // The indices are the same as in `shared/camera_params.wgsl`.
         CameraCorrection {
             rotation_rad: [0, 1, 2].map(camera_value),
             translation_m: [3, 4, 5].map(camera_value),

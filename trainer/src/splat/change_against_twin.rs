@@ -135,7 +135,8 @@ fn optimizer_steps_match_the_twin() {
         .iter_mut()
         .for_each(|depth_m| *depth_m = f64::from(f32_of(*depth_m)));
     let target_buffers = TargetBuffers::new(gpu, &target, &weights);
-    // Several steps, because the first one does not show whether moments are carried over.
+    // Several steps are taken, because the first step does not show whether moments are carried
+    // over.
     let mut moments: Vec<SplatMoments> = vec![vec![Default::default(); 11 + 48]; splats.len()];
     for step in 0..N_STEPS {
         let (_, upstream) =
@@ -162,7 +163,7 @@ fn optimizer_steps_match_the_twin() {
         );
     }
     // A step is at most about as large as the learning rate. Gradients differ by a few thousandths
-    // of the largest one, and EPSILON damps the steps of small gradients.
+    // of the largest gradient, and `EPSILON` damps the steps of small gradients.
     let of = |rate: f32| 0.02 * f64::from(rate);
     let tolerances = [
         RULE.mean_rate_m,
@@ -200,7 +201,7 @@ fn growth_matches_the_twin() {
         splats[ix].opacity_logit = -9.0; // Dead.
     }
     let mut random = scene::F32Random::new(9);
-    // A few large errors, so that some families have many children.
+    // A few errors are large, so that some families have many children.
     let errors: Vec<f32> = (0..N_BEFORE)
         .map(|_| f32_of(random.uniform(0.0, 1.0).powi(8)))
         .collect();
@@ -240,7 +241,7 @@ fn growth_matches_the_twin() {
     let n_children = expected.parents.iter().flatten().count();
     assert_eq!(n_children, 204, "the number of dead and new splats");
 
-    // Moments that differ everywhere show which ones are reset.
+    // If all moments differ, the test shows which moments are reset.
     gpu.write(&fixture.splats.error_sums, 0, bytemuck::cast_slice(&errors));
     let n_planes = 6 * growth.capacity as usize;
     let moments: Vec<[f32; 4]> = (0..n_planes)

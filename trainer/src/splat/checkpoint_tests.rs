@@ -1,4 +1,4 @@
-//! Tests of checkpoints: a resumed model is bit-identical to a model trained without interruption.
+//! Tests of checkpoints. A resumed model is bit-identical to a model trained without interruption.
 
 use super::SplatTrainer;
 use super::training_tests::{keyframes, options, train};

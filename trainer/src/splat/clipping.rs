@@ -19,7 +19,7 @@ pub(crate) struct Clipper {
     clips: Option<Buffer>,
 }
 
-/// What the passes of a picture need to clip its splats.
+/// The buffers and pipelines with which the passes of a picture clip its splats.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Clipping<'a> {
     pub(crate) pipelines: &'a ClipPipelines,

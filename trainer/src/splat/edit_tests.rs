@@ -1,4 +1,4 @@
-//! Erased splats: pictures, chunks and exports without them, and floaters.
+//! Tests of erased splats, which pictures, chunks and exports leave out, and of floaters.
 
 use super::SplatTrainer;
 use super::training_tests::{keyframes, options, pose, request, scene, train};

@@ -8,8 +8,8 @@ use numbers::f32_of;
 /// With this number of images or more, models are not regularized, and the number of splats is
 /// limited only by the options.
 ///
-/// The measured data sets with few images have 6 to 36 images. Those with many images have 43 and
-/// more (docs/benchmarks/2026-11-25-few-images.md).
+/// In the measurements, data sets with few images have 6 to 36 images, and data sets with many
+/// images have at least 43 images (docs/benchmarks/2026-11-25-few-images.md).
 pub(crate) const FEW_IMAGES: usize = 40;
 /// Maximum number of splats per image if there are few images.
 ///
@@ -21,8 +21,8 @@ const MAX_SPLATS_PER_IMAGE: u32 = 8000;
 /// Up to this number of images, the regularization is complete. The changes were measured with 6
 /// and 11 images (docs/benchmarks/2026-11-25-few-images.md).
 const VERY_FEW_IMAGES: usize = 20;
-/// Completed fraction of the planned steps from which on splats are dropped at the full rate.
-/// Earlier, dropping would only slow down training.
+/// Completed fraction of the planned steps at which the rate of dropped splats reaches its full
+/// value. At earlier steps, dropping would only slow down training.
 const DROP_RAMP_FRAC: f64 = 0.2;
 /// Depth residuals above this limit have no gradient, because such readings are often outliers of
 /// the sensor.
@@ -32,7 +32,7 @@ const DEPTH_CLIP_M: f64 = 0.2;
 /// the depth loss removes them.
 const FEW_DEPTH_CLIP_M: f64 = 1.0;
 /// Weight of the depth loss for few images, relative to the usual weight. It lowers the depth
-/// error. Ten times the weight lowers it a little more, but also the PSNR
+/// error. Ten times the weight lowers the depth error a little more, but it also lowers the PSNR
 /// (docs/benchmarks/2026-11-25-few-images.md).
 const FEW_DEPTH_WEIGHT: f64 = 3.0;
 
@@ -57,8 +57,8 @@ impl Scarcity {
         Self(missing.min(1.0))
     }
 
-    /// Fraction of the splats that a step leaves out, given its maximum (Park et al. 2025,
-    /// `DropGaussian`).
+    /// Fraction of the splats that a step leaves out, given the maximum of this fraction (Park et
+    /// al. 2025, `DropGaussian`).
     pub(crate) fn drop_frac(self, max: f64, completed_frac: f64) -> f64 {
         self.0 * max * (completed_frac / DROP_RAMP_FRAC).min(1.0)
     }

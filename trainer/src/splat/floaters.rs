@@ -68,14 +68,14 @@ fn occupied(splats: &SplatArrays, visible: &[usize], grid: &CellGrid) -> (CellMa
         .map(|ix| n_steps(splats, *ix, grid))
         .collect();
     // Large models with many large splats would take minutes. The largest splats are therefore
-    // sampled more coarsely. This loses least, because they still have many points.
+    // sampled more coarsely. This affects the result least, because they still have many points.
     let mut max_samples = MAX_SAMPLES;
     while max_samples > 1.0 && n_samples_of_all(&steps, max_samples) > MAX_TOTAL_SAMPLES {
         max_samples /= 2.0;
     }
     let mut opacities = vec![0.0_f32; grid.n()];
-    // The last splat that covers each cell, counted from 1. With it, each splat counts only once
-    // per cell.
+    // For each cell, the last splat that covers it, counted from 1. With this number, each splat
+    // counts only once per cell.
     let mut last_splat = vec![0_u32; grid.n()];
     let mut connected = Groups::new(grid.n());
     for (number, (&ix, steps)) in (1..).zip(visible.iter().zip(&steps)) {
@@ -111,7 +111,7 @@ fn n_steps(splats: &SplatArrays, ix: usize, grid: &CellGrid) -> [f64; 3] {
     splats.log_scales[ix].map(|log_scale| (REACH * f64::from(log_scale).exp() / cell_m).round())
 }
 
-/// Number of points of a splat with so many steps per axis.
+/// Number of points of a splat with these numbers of steps per axis.
 fn n_samples(steps: &[f64; 3]) -> f64 {
     steps.iter().map(|n| 2.0 * n + 1.0).product()
 }
@@ -135,8 +135,8 @@ fn limited(steps: &[f64; 3], max_samples: f64) -> [f64; 3] {
     steps.map(|n| ((factor * (2.0 * n + 1.0) - 1.0) / 2.0).floor().max(0.0))
 }
 
-/// Points of a splat in world, meters, and the falloff of opacity at these points. Along each axis,
-/// points near the center of the splat come first.
+/// Points of a splat in world coordinates, meters, and the falloff of opacity at these points.
+/// Along each axis, points near the center of the splat come first.
 fn samples(
     splats: &SplatArrays,
     ix: usize,
@@ -168,8 +168,8 @@ fn samples(
     })
 }
 
-/// Positions along an axis of a splat, in standard deviations. The first one is 0, and the others
-/// alternate between both sides.
+/// Positions along an axis of a splat, in standard deviations. The first position is 0, and the
+/// others alternate between both sides.
 fn offsets(n_steps: f64) -> Vec<f64> {
     #[expect(
         clippy::cast_possible_truncation,

@@ -240,12 +240,12 @@ pub(crate) const KERNELS: &[Kernel] = &[
     kernel!("gather"),
 ];
 
-/// Creates `Self` from given fields and from pipelines. The pipelines are compiled while the fields
-/// are computed.
+/// Creates `Self` from given fields and from pipelines. The pipelines are compiled while the given
+/// fields are computed.
 macro_rules! compile {
     ($gpu:expr, { $($given:ident: $value:expr),* $(,)? }, { $($field:ident: $kernel:expr, $overrides:expr);* $(;)? }) => {{
-        // The values may contain `?`, so they are in their own closure. Both sides compile for
-        // seconds, so they run in parallel.
+        // The values may contain `?`, so they are computed in a closure. The fields and the
+        // pipelines both take seconds to compile, so they are computed in parallel.
         let others = || -> Result<_, Error> { Ok(($($value),*)) };
         let compile = || Pipeline::compile_all($gpu, [$(($kernel, &$overrides[..])),*]);
         let (others, compiled) = rayon::join(others, compile);
@@ -311,13 +311,13 @@ impl ClipPipelines {
 /// Pipelines of SSIM, in the variant that suits the adapter.
 #[derive(Debug)]
 pub(crate) enum Ssim {
-    /// One kernel; `loss` gathers its gradients.
+    /// One kernel, whose gradients `loss` gathers.
     Tiles(Pipeline),
     /// Workgroups of a few lanes, for software adapters.
     Strips {
         /// Computes the gradients with respect to the window means.
         means: Pipeline,
-        /// Propagates these gradients to the pixels, for `loss`.
+        /// Propagates the gradients from the window means to the pixels, for `loss`.
         upstream: Pipeline,
     },
 }

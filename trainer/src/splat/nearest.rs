@@ -60,8 +60,8 @@ impl<'a> Tree<'a> {
         }
         let smaller = &range[..middle];
         let larger = &range[middle + 1..];
-        // The side of the query point is searched first. Its points are likely to be near, and the
-        // distances found there often exclude the other side.
+        // The side of the query point is searched first, because its points are likely to be near.
+        // The distances found there often exclude the other side.
         let (near, far) = if offset(axis) < 0.0 {
             (smaller, larger)
         } else {
@@ -125,7 +125,8 @@ mod tests {
         let mut points: Vec<[f32; 3]> = (0..500)
             .map(|_| std::array::from_fn(|_| f32_of(2.0 * random.unit() - 1.0)))
             .collect();
-        // A plane, on which many coordinates are equal, and a dense cluster far away.
+        // The points are a plane, on which many coordinates are equal, and a dense cluster far
+        // away.
         points.extend((0..400).map(|ix| [0.25 * (ix % 20) as f32, 3.0, 0.25 * (ix / 20) as f32]));
         points.extend(
             (0..100).map(|_| std::array::from_fn(|_| f32_of(500.0 + 1e-2 * random.unit()))),

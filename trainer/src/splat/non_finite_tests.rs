@@ -1,4 +1,4 @@
-//! Tests with invalid keyframes and splats: training continues, and no non-finite value reaches a
+//! Tests with invalid keyframes and splats. Training continues, and no non-finite value reaches a
 //! parameter.
 
 use super::SplatTrainer;

@@ -5,10 +5,10 @@ use super::trials::CountPolicy;
 use crate::model_options::{MethodOptions, ModelOptions};
 use serde::{Deserialize, Serialize};
 
-/// Options of a [`super::SplatTrainer`], besides those that all methods share.
+/// Options of a [`super::SplatTrainer`], besides the options that all methods share.
 ///
-/// Checkpoints store them. A new field therefore needs `#[serde(default)]`, or `default = ..` with
-/// the value that training used before, so that older checkpoints can be read.
+/// Checkpoints store these options. Older checkpoints must remain readable. A new field therefore
+/// needs `#[serde(default)]`, or `default = ..` with the value that training used before.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct SplatOptions {
@@ -35,8 +35,8 @@ pub struct SplatOptions {
     /// Scale of the noise added to the means, relative to their learning rate. The noise is largest
     /// for transparent splats.
     pub noise: f64,
-    /// Maximum fraction of the splats that a step leaves out at random. It is reached if there are
-    /// few images, and zero if there are many.
+    /// Maximum fraction of the splats that a step leaves out at random. The fraction reaches this
+    /// maximum if there are few images, and it is zero if there are many.
     pub drop_frac: f64,
     /// Steps at which training switches from a quarter to half of the resolution, and from half to
     /// the full resolution. `None` selects a default for the adapter. The default is higher on a
@@ -59,7 +59,7 @@ impl Default for SplatOptions {
         Self {
             max_splats: 400_000,
             count: CountPolicy::default(),
-            // This value and the weight of D-SSIM are those of Kerbl et al. 2023.
+            // This value and the weight of D-SSIM are from Kerbl et al. 2023.
             sh_degree: 3,
             dssim_frac: 0.2,
             depth_per_m: 0.1,
@@ -69,7 +69,7 @@ impl Default for SplatOptions {
             cost_images: 13.0,
             // This is twice the growth fraction of 3DGS-MCMC.
             growth_frac: 0.1,
-            // As in 3DGS-MCMC.
+            // This is the value of 3DGS-MCMC.
             noise: 5e5,
             // With 6 and 11 images, 10 % gained less
             // (docs/benchmarks/2026-11-25-few-images.md, section "Single changes").
@@ -82,7 +82,7 @@ impl Default for SplatOptions {
 }
 
 impl SplatOptions {
-    /// Bytes per splat: parameters, Adam's moments and the error sum. The higher SH coefficients
+    /// Bytes per splat for parameters, Adam's moments and the error sum. The higher SH coefficients
     /// share one moment.
     pub fn bytes_per_splat(&self) -> u64 {
         // Means, rotations and shapes are padded to 4 each, and the constant color has 3. Each has
@@ -99,7 +99,7 @@ impl ModelOptions<SplatOptions> {
             .common
             .max_bytes
             .map_or(u64::MAX, |bytes| bytes / self.specific.bytes_per_splat());
-        // At least one splat, because buffers cannot be empty.
+        // The result is at least one splat, because buffers cannot be empty.
         self.specific
             .max_splats
             .min(u32::try_from(by_bytes).unwrap_or(u32::MAX))
@@ -111,7 +111,7 @@ impl ModelOptions<SplatOptions> {
 mod tests {
     use super::SplatOptions;
 
-    /// The options that every checkpoint contains. Do not add new ones.
+    /// The options that every checkpoint contains. Do not add new options.
     const REQUIRED: [&str; 12] = [
         "max_splats",
         "count",

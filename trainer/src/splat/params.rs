@@ -104,10 +104,10 @@ pub(crate) mod status {
     pub(crate) const LEN: usize = 16;
 }
 
-/// Opacity below which a splat is dead, that is, replaced by a child of another splat, as in
+/// Opacity below which a splat is dead. A dead splat is replaced by a child of another splat, as in
 /// 3DGS-MCMC (Kheradmand et al. 2024). At most 0.5 % of a pixel depends on such a splat. It is also
 /// the minimum opacity of a new member of a family. With less opacity, the new member would be dead
-/// at once. At this opacity, exploration noise has half its maximum.
+/// at once. At this opacity, the exploration noise is half of its maximum.
 pub(crate) const MIN_OPACITY: f32 = 0.005;
 
 /// `Growth` of shared/growth.wgsl.

@@ -19,7 +19,7 @@ pub(crate) struct ViewPasses<'a> {
     pub(crate) status: &'a Buffer,
     pub(crate) view: &'a Buffer,
     pub(crate) size_px: [u32; 2],
-    /// `None` in training, and without a crop box and erased space.
+    /// `None` in training, and if there is neither a crop box nor erased space.
     pub(crate) clipping: Option<Clipping<'a>>,
 }
 
@@ -112,8 +112,8 @@ pub(crate) fn grow(
         ]
         .concat(),
     );
-    // Opacity and scale depend on the size of the family, so they follow once all children are
-    // counted.
+    // Opacity and scale depend on the size of the family, so they are computed after all children
+    // are counted.
     passes.dispatch(
         gpu,
         &pipelines.grow_family,
@@ -456,9 +456,9 @@ impl ViewPasses<'_> {
         let mut n_groups = n_tiles;
         if pipelines.rasterize_segments.is_some() {
             buffers.extend(self.segments());
-            // The first segment of each tile, further segments, and the pieces of hidden ends with
-            // up to two more per tile. Their numbers are known only on the GPU, so these are upper
-            // bounds.
+            // The workgroups process the first segment of each tile, the further segments, and the
+            // pieces of hidden ends, of which there are up to two more per tile. These numbers are
+            // upper bounds, because the actual numbers are known only on the GPU.
             let [n_further, n_hidden] = scratch.n_segments.map(u64::from);
             n_groups = n_tiles + n_further + n_hidden + 2 * n_tiles;
         }

@@ -25,7 +25,7 @@ const MAX_SH_DEGREE: u64 = 3;
 pub(crate) struct Schedule {
     /// Optimizer updates so far.
     pub(super) step: u64,
-    /// Step at which the planned steps begin. Late keyframes move it forward.
+    /// Step at which the planned steps begin. A keyframe that arrives late moves this step forward.
     pub(super) start: u64,
     pub(super) last_growth_step: u64,
     pub(super) n_planned_steps: u64,
@@ -42,9 +42,9 @@ impl Schedule {
         }
     }
 
-    /// Moves the planned steps forward when a keyframe arrives, so that at least half of them
-    /// remain. This keeps the learning rates large enough for the new keyframe and continues
-    /// growth.
+    /// Moves the planned steps forward when a keyframe arrives, so that at least half of the
+    /// planned steps remain. This keeps the learning rates large enough for the new keyframe and
+    /// continues growth.
     pub(super) fn extend_for_arrival(&mut self) {
         self.start = self
             .start
@@ -70,8 +70,8 @@ impl Schedule {
 
     /// Whether the splat count changes at the current step.
     pub(super) fn is_growth_due(&self) -> bool {
-        // The last step is compared because the count changes before a step is trained. A failed
-        // submit may lead to the same step again.
+        // The count changes before a step is trained, and a failed submit may lead to the same step
+        // again. The step of the last change is therefore compared with the current step.
         self.step >= GROWTH_START
             && !self.is_mature()
             && self.step.is_multiple_of(GROWTH_PERIOD)
@@ -83,7 +83,7 @@ impl Schedule {
         GROWTH_PERIOD - self.step % GROWTH_PERIOD
     }
 
-    /// SH degree to train at the current step, unless the model has a lower one.
+    /// SH degree to train at the current step, unless the model has a lower degree.
     pub(super) fn active_degree(&self) -> u32 {
         u32::try_from((self.step / SH_PERIOD).min(MAX_SH_DEGREE)).expect("at most 3")
     }

@@ -40,7 +40,7 @@ const N_RANDOM_PER_IMAGE: usize = 10_000;
 /// Most positions of a random cloud are wrong. Low opacity lets the gradients reach splats behind
 /// them.
 const RANDOM_OPACITY: f64 = 0.1;
-/// As in Kerbl et al. 2023.
+/// This is the value of Kerbl et al. 2023.
 const POINT_OPACITY: f64 = 0.1;
 /// Value of the constant spherical harmonic: `1 / (2 sqrt(pi))`.
 const SH_0: f64 = 0.282_094_791_773_878_14;
@@ -71,7 +71,8 @@ struct Disc {
 pub(crate) struct Density {
     /// Maximum number of discs.
     pub(crate) max_discs: f64,
-    /// Minimum number of pixels per disc, unless this minimum results in fewer than [`MIN_DISCS`].
+    /// Minimum number of pixels per disc, unless this minimum results in fewer than [`MIN_DISCS`]
+    /// discs.
     pub(crate) px_per_disc: f64,
 }
 
@@ -102,7 +103,7 @@ impl Seeder {
     /// result does not depend on thread scheduling.
     pub(crate) fn discs(&mut self, keyframes: &[Arc<Keyframe>], density: Density) -> SplatArrays {
         // Within a batch, several keyframes may propose discs at the same position. All but one of
-        // these discs are discarded. A larger batch wastes more of this work, and a smaller one
+        // these discs are discarded. A larger batch wastes more of this work, and a smaller batch
         // keeps fewer cores busy.
         const BATCH: usize = 32;
         let mut seeds = Seeds::new();
@@ -418,7 +419,7 @@ impl InverseDepths {
         }
     }
 
-    /// Sets a cell's inverse depth unless a nearer one is known.
+    /// Sets a cell's inverse depth unless the inverse depth of a nearer surface is known.
     fn set_nearest(&mut self, [column, row]: [usize; 2], per_m: f64) {
         let known = &mut self.per_m[row * self.n_cells[0] + column];
         // A nearer surface hides farther surfaces, and its inverse depth is larger.
@@ -580,8 +581,9 @@ pub(crate) fn random_cloud(
             continue;
         }
         let position = keyframe.world_from_camera * Point3::from(ray * z);
-        // Mean distance of the splats in one image. Each image has about `n / keyframes.len()`
-        // splats. The size follows the depth, so near and far splats look equally large.
+        // This is the mean distance of the splats in one image. Each image has about `n /
+        // keyframes.len()` splats. The size follows the depth, so near and far splats look equally
+        // large.
         let spacing_px =
             (f64::from(width) * f64::from(height) * keyframes.len() as f64 / n as f64).sqrt();
         let size = 0.3 * spacing_px * z / keyframe.focal_px[0];
@@ -660,8 +662,8 @@ impl Seeds {
                 Rotation3::from_axis_angle(&Vector3::x_axis(), std::f64::consts::PI)
             });
         let rotation = UnitQuaternion::from_rotation_matrix(&rotation_matrix);
-        // The inverses of the maps from the optimized values: `exp`, the logistic function, and
-        // `color = 0.5 + SH_0 * coefficient` (Kerbl et al. 2023).
+        // These are the inverses of the maps from the optimized values. The maps are `exp`, the
+        // logistic function, and `color = 0.5 + SH_0 * coefficient` (Kerbl et al. 2023).
         let arrays = &mut self.arrays;
         arrays.means.push(f32s_of(position.coords.into()));
         arrays

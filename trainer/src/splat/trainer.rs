@@ -1,4 +1,4 @@
-//! The splat trainer: implements [`Method`] by combining the modules for training and drawing.
+//! The splat trainer. It implements [`Method`] by combining the modules for training and drawing.
 
 mod checkpoint;
 mod gains;

@@ -22,7 +22,7 @@ use std::sync::Arc;
 const SIZE_PX: [u32; 2] = [96, 80];
 const FOCAL_PX: f64 = 90.0;
 
-/// The inside of a colorful sphere: a closed surface with well-defined depth.
+/// The inside of a colorful sphere, which is a closed surface with well-defined depth.
 pub(super) fn scene() -> SplatArrays {
     const N_DISCS: usize = 400;
     let mut arrays = synthetic_cloud(N_DISCS, 3);
@@ -515,7 +515,7 @@ fn crop_box_limits_the_picture() {
     assert!(n_inside > 500 && n_outside > 500, "{n_inside} {n_outside}");
 }
 
-/// The newest image must not wait for the next one.
+/// The newest image must not wait for the next image.
 #[test]
 fn newest_keyframe_is_trained_on() {
     let gpu = test_gpu();
@@ -864,7 +864,7 @@ fn buffer_overflow_does_not_change_the_result() {
     assert!(one_by_one.2 == together.2);
 }
 
-/// Pictures are queued before any of them is read. The first ones do not fit into the buffers.
+/// Pictures are queued before any of them is read. The first pictures do not fit into the buffers.
 #[test]
 fn queued_pictures_equal_rendered_ones() {
     const MAX_MEAN_DIFFERENCE: f64 = 1.0; // JPEG error at quality 95, in units of 1/255.

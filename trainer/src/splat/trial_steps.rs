@@ -1,8 +1,8 @@
-//! When parts of the model are tested, and for how long.
+//! The steps at which parts of the model are tested, and the number of steps of a test.
 
 use serde::{Deserialize, Serialize};
 
-/// Steps at which trials start, and how many steps they take.
+/// The steps at which trials start, and the number of steps that they take.
 ///
 /// These values are options instead of constants, so that a checkpoint keeps them, and so that
 /// tests can use fewer steps.
@@ -24,9 +24,9 @@ impl Default for TrialSteps {
     fn default() -> Self {
         Self {
             first_trial: 500,
-            // This is long enough for the optimizer to settle after the change. It is also short
-            // enough that a trial does not cost much, although its losing half is discarded. A
-            // change that improves the model only later is rejected.
+            // This number is large enough for the optimizer to settle after the change. It is also
+            // small enough that a trial does not cost much, although one of its halves is
+            // discarded. A change that improves the model only later is rejected.
             trial_half: 250,
             // A pose of an image changes only in steps on this image.
             per_image: 4,

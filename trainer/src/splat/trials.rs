@@ -3,9 +3,10 @@
 //!
 //! The baseline and the variant with the change are trained from the same state for the same number
 //! of steps. Keyframes that arrive during the first half of a trial are added to both at the same
-//! step; later ones wait for the end of the trial. [`Trial::of`] decides whether the mean gain over
-//! the validation keyframes is significant. The total loss of all reductions is at most
-//! [`MAX_TOTAL_LOSS_DB`]. After the last trial, the validation keyframes become training keyframes.
+//! step. Keyframes that arrive later wait for the end of the trial. [`Trial::of`] determines
+//! whether the mean gain over the validation keyframes is significant. The total loss of all
+//! reductions is at most [`MAX_TOTAL_LOSS_DB`]. After the last trial, the validation keyframes
+//! become training keyframes.
 
 use super::arrival_gains::ArrivalGains;
 use super::buffers::SplatBuffers;
@@ -44,8 +45,8 @@ pub enum CountPolicy {
     /// Grows up to the limit.
     #[default]
     ToCap,
-    /// Grows up to the limit, or to fewer splats if there are few images. Then halves the number
-    /// repeatedly as long as the loss on validation images is below 0.1 dB.
+    /// The model grows up to the limit, or to fewer splats if there are few images. The number of
+    /// splats is then halved repeatedly, as long as the loss on validation images is below 0.1 dB.
     // Runs of earlier versions also had `TestedGrowth`, which ended with the same halvings.
     #[serde(alias = "TestedGrowth")]
     Tested,
@@ -103,11 +104,11 @@ pub(crate) struct Arrival {
 pub(crate) enum CountState {
     /// Grows up to the limit without trials.
     ToCap,
-    /// Grows. Trials that halve the number start once growth has ended.
+    /// The model grows. Trials that halve the number of splats start after growth has ended.
     Growing,
     /// Trials halve the number until one of them is rejected.
     Halving,
-    /// The number is final.
+    /// The number of splats is final.
     Finished,
 }
 
@@ -123,7 +124,8 @@ pub(crate) struct SplatTrials {
     pub(crate) finished: Vec<Trial>,
     /// Optimizer updates that were reverted.
     pub(crate) n_reverted_steps: u64,
-    /// Present until arriving keyframes show that image gains are needed, if this is watched for.
+    /// The detector of image gains. It is present until arriving keyframes show that gains are
+    /// needed, and only if gains are watched for.
     arrival_gains: Option<ArrivalGains>,
     trial_phase: SplatTrialPhase,
 }
@@ -159,7 +161,7 @@ pub(crate) struct RunningTrial {
 pub(crate) struct SecondHalf {
     /// The state to restore.
     pub(crate) from: Snapshot,
-    /// The change to apply to it.
+    /// The change to apply to the restored state.
     pub(crate) candidate: Candidate,
     /// Keyframes to remove, because the second half adds them again.
     pub(crate) arrived: Vec<Arc<Keyframe>>,
@@ -210,8 +212,8 @@ pub(crate) enum Due {
 pub(crate) struct TrialContext {
     pub(crate) step: u64,
     pub(crate) n_splats: u32,
-    /// Whether growth has ended. Before that, a small model may score as well as a large one only
-    /// because it converges faster.
+    /// Whether growth has ended. Before growth has ended, a small model may score as well as a
+    /// large model only because it converges faster.
     pub(crate) is_mature: bool,
     /// SH degree.
     pub(crate) sh_degree: u32,
@@ -232,8 +234,8 @@ impl RunningTrial {
     }
 
     fn due(&self, step: u64) -> Due {
-        // Arrivals come first: a keyframe that arrived at the last step of the first half must also
-        // be added to the variant before the variant is scored.
+        // Arrivals come first, because a keyframe that arrived at the last step of the first half
+        // must also be added to the variant before the variant is scored.
         match (step >= self.until, self.is_second_half()) {
             _ if step >= self.next_arrival_step() => Due::Arrival,
             (false, _) => Due::Nothing,
@@ -279,8 +281,8 @@ impl SplatTrials {
         !matches!(self.trial_phase, SplatTrialPhase::Finished)
     }
 
-    /// Number of validation images. During a trial, those that arrive do not count, because both
-    /// halves must have the same number at each step.
+    /// Number of validation images. Images that arrive during a trial do not count before its end,
+    /// because both halves must have the same number at each step.
     pub(crate) fn n_validation(&self) -> usize {
         self.running_trial()
             .map_or(self.validation.len(), |trial| trial.scored.len())
@@ -330,8 +332,8 @@ impl SplatTrials {
                 Due::ReleaseValidation
             };
         }
-        // Cameras come before the size: with wrong cameras, more splats may only fit the errors of
-        // the poses.
+        // Cameras come before the size, because with wrong cameras, more splats may only fit the
+        // errors of the poses.
         if let Some(params) = self.candidates.front() {
             return if *params == GAINS {
                 Due::Gains
@@ -365,7 +367,7 @@ impl SplatTrials {
             SplatTrialPhase::Waiting if step < self.steps.first_trial => {
                 self.steps.first_trial - step
             }
-            // At least 1, because a submit of zero steps would make no progress.
+            // The result is at least 1, because a submit of zero steps would make no progress.
             SplatTrialPhase::Running(trial) => trial
                 .until
                 .min(trial.next_arrival_step())
@@ -403,8 +405,8 @@ impl SplatTrials {
         trial.arrivals.pop_front().map(|arrival| arrival.keyframe)
     }
 
-    /// The validation keyframes to score: those of the running trial, or else an evenly spaced
-    /// subset.
+    /// The validation keyframes to score. During a trial, they are the keyframes of the trial.
+    /// Otherwise, they are an evenly spaced subset.
     pub(crate) fn scored(&self) -> Vec<ImageId> {
         // Both halves are scored on the same keyframes, even if more have arrived since.
         self.running_trial()
@@ -414,7 +416,7 @@ impl SplatTrials {
     /// At most [`MAX_SCORED`] of the validation keyframes.
     fn evenly_spaced(&self) -> Vec<ImageId> {
         // Neighbors in time show nearly the same view, so every n-th keyframe represents the scene
-        // better than the first or last ones.
+        // better than the first or the last keyframes.
         let stride = self.validation.len().div_ceil(MAX_SCORED).max(1);
         self.validation
             .iter()
@@ -497,8 +499,9 @@ impl SplatTrials {
                 self.count = CountState::Halving
             }
             Candidate::Halved { .. } => self.count = CountState::Finished,
-            // The lowest acceptable degree is searched upward from 0, so the first accepted one
-            // is the result. `from` is above the new degree of the model, which ends the search.
+            // The lowest acceptable degree is searched upward from 0, so the first accepted degree
+            // is the result. The search ends, because the next degree is set to `from`, which is
+            // above the new degree of the model.
             Candidate::ShDegree { from, to } => self.degree = if kept { from } else { to + 1 },
         }
         Some(TrialEnd {

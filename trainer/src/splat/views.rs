@@ -33,7 +33,7 @@ pub(crate) struct TrainView {
     /// Mean color of the pixels that are not masked, sRGB. `None` if all pixels are masked.
     mean_srgb: Option<[f64; 3]>,
     levels: [Option<Level>; 3],
-    /// Present once camera parameters are optimized.
+    /// `None` until camera parameters are optimized.
     lens: Option<Buffer>,
 }
 
@@ -90,11 +90,11 @@ fn shuffled(round: u64, n_views: usize, seed: u64) -> Vec<usize> {
 pub(crate) struct Level {
     pub(crate) size_px: [u32; 2],
     pub(crate) view: Buffer,
-    /// rgba8; a = 0 where masked.
+    /// Color as rgba8. Alpha is 0 for masked pixels.
     pub(crate) image: Buffer,
     /// Meters along z in the color camera, 0 if unknown.
     pub(crate) depth: Buffer,
-    /// Value of the request counter at the last use, for [`drop_levels`].
+    /// Value of the request counter when the level was last used, for [`drop_levels`].
     used_at: u64,
 }
 
@@ -143,7 +143,7 @@ pub(crate) fn drop_levels(views: &mut [TrainView], keep: Keep<'_>) -> Vec<Level>
     }
     candidates.sort_unstable();
     while bytes > keep.max_bytes {
-        // The last candidate is the most recently used one. Without candidates, all images are
+        // The last candidate is the most recently used image. Without candidates, all images are
         // needed, and the limit is exceeded.
         let Some((_, view_ix, level_ix)) = candidates.pop() else {
             break;
@@ -323,7 +323,7 @@ fn clamped(level: u32, [width, height]: [u32; 2]) -> usize {
     level.min((width.min(height) / TILE_PX).max(1).ilog2()) as usize
 }
 
-/// Whether the depth of two versions of a keyframe, seen from its color camera, is the same.
+/// Whether two versions of a keyframe have the same depth as seen from its color camera.
 fn has_same_depth(a: &Keyframe, b: &Keyframe) -> bool {
     // A correction of the color camera's pose often moves the depth camera along with it. In that
     // case, their relative pose is the same except for rounding. Only the relative pose matters

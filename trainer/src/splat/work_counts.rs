@@ -39,8 +39,8 @@ impl WorkCounts {
         let bin_starts: Vec<u32> = gpu.read(&scratch.bin_starts, n_bins(size_px) as usize + 1)?;
         let n_entries = bin_starts.last().copied().unwrap_or(0);
         let entries: Vec<[u32; 4]> = gpu.read(&scratch.entries, n_entries as usize)?;
-        // One past the last splat that contributes to each pixel, counted from the start of the
-        // bin's list.
+        // For each pixel, this is the index after the last splat that contributes to it, counted
+        // from the start of the bin's list.
         let last: Vec<u32> = gpu.read(&image_buffers.last, (size_px[0] * size_px[1]) as usize)?;
         let tile_counts: Vec<u32> = gpu.read(&scratch.tile_counts, n_splats as usize)?;
         let columns = size_px[0].div_ceil(TILE_PX);

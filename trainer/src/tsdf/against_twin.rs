@@ -1,4 +1,5 @@
-//! Tests of the kernels against their f64 twins, with optional features and without.
+//! Tests of the kernels against their f64 twins, with and without the optional features of the
+//! adapter.
 
 use super::TsdfModel;
 use super::block::{Blocks, GridCoord, N_VOXELS, stored_distance};
@@ -67,8 +68,8 @@ fn fused_voxels_match_twin() {
     compare(&got, &twin, &voxel_grid);
 }
 
-/// Fuses the keyframes one after the other, on the GPU and in the twin, which allocates the same
-/// blocks.
+/// Fuses the keyframes one after the other, on the GPU and in the twin. The twin allocates the
+/// blocks that the GPU allocates.
 fn fused_with_twin(keyframes: &[Arc<Keyframe>]) -> (Blocks, VoxelBlocks, VoxelGrid) {
     let mut model = TsdfModel::new(test_gpu(), scenes::options()).unwrap();
     let mut twin = VoxelBlocks::new();
@@ -396,7 +397,8 @@ fn compare_triangles(
 
 #[test]
 fn triangles_match_twin() {
-    // The second capacity processes a few blocks at a time and must grow first.
+    // With the second capacity, a few blocks are processed at a time, and the buffers must grow
+    // first.
     let capacities = [
         MeshCapacity::default(),
         MeshCapacity {

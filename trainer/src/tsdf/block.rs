@@ -16,8 +16,8 @@ pub const N_VOXELS: usize = 512;
 /// maximum of the option `max_weight` is 65535 / 256 = 255.
 pub const WEIGHT_ONE: f64 = 256.0;
 
-/// Coordinates of a block in blocks, or of a voxel in voxels, relative to the field's anchor along
-/// the world's axes.
+/// Coordinates relative to the field's anchor along the world's axes. For a block, the unit is
+/// blocks. For a voxel, it is voxels.
 pub type GridCoord = [i32; 3];
 
 /// Blocks ordered by their coordinates.
@@ -26,11 +26,12 @@ pub type Blocks = BTreeMap<GridCoord, Block>;
 /// The voxels of one block in the format of the GPU, x fastest.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Block {
-    /// The low half is the signed distance as a fraction of the field's scale, times 32767. The
-    /// high half is the weight in 256ths, which is 0 if the voxel was not observed.
+    /// One word per voxel. The low half is the signed distance as a fraction of the field's scale,
+    /// times 32767. The high half is the weight in 256ths, which is 0 if the voxel was not
+    /// observed.
     pub geometry: Vec<u32>,
-    /// Two words with 16 bits per value, low half first. The first word has red and green. The
-    /// second word has blue and the weight in 256ths. Colors are scaled by 65535.
+    /// Two words per voxel with 16 bits per value, low half first. The first word has red and
+    /// green. The second word has blue and the weight in 256ths. Colors are scaled by 65535.
     pub colors: Vec<[u32; 2]>,
 }
 

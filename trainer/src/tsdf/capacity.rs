@@ -13,7 +13,7 @@ pub(crate) const BYTES_PER_CHUNK: u64 = 4 + 4 * 512;
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) struct Capacity {
     pub(crate) n_blocks: u32,
-    /// A power of two.
+    /// Number of chunks in the hash table, which is a power of two.
     pub(crate) n_chunks: u32,
 }
 
@@ -32,7 +32,7 @@ pub(crate) fn max_blocks_within(gpu: &Gpu, max_bytes: Option<u64>, n_chunks: u32
     let by_bytes = max_bytes.map_or(u64::MAX, |bytes| {
         bytes.saturating_sub(table_bytes) / BYTES_PER_BLOCK
     });
-    // At least one block, because empty buffers cannot be bound.
+    // The result is at least one block, because empty buffers cannot be bound.
     max_blocks(gpu)
         .min(u32::try_from(by_bytes).unwrap_or(u32::MAX))
         .max(1)

@@ -31,7 +31,8 @@ pub struct VoxelGrid {
     pub voxel_m: f64,
     /// Minimum truncation, meters.
     pub truncation_m: f64,
-    /// Maximum truncation, and the distance that the largest stored number represents, meters.
+    /// Maximum truncation, meters. This is also the distance that the largest stored number
+    /// represents.
     pub scale_m: f64,
     /// Standard deviation of depth at 1 m, meters.
     pub noise_per_m2: f64,
@@ -39,8 +40,8 @@ pub struct VoxelGrid {
     pub max_depth_m: f64,
     /// Maximum weight of a voxel, in 256ths.
     pub max_weight: u32,
-    /// Origin of the field's coordinates, in world, meters. It is near the first camera, where f32
-    /// is precise.
+    /// Origin of the field's coordinates, in world coordinates, meters. It is near the first
+    /// camera, where f32 is precise.
     pub anchor_m: [f64; 3],
 }
 
@@ -119,7 +120,7 @@ impl VoxelGrid {
         Transform::from_parts(Translation3::new(-x, -y, -z), UnitQuaternion::identity())
     }
 
-    /// Maps positions in voxels from the anchor to world, meters.
+    /// Maps positions in voxels from the anchor to world coordinates in meters.
     pub(crate) fn world_from_voxels(&self) -> Matrix4<f64> {
         Matrix4::new_translation(&self.anchor_m.into()) * Matrix4::new_scaling(self.voxel_m)
     }

@@ -1,4 +1,5 @@
-//! Erased parts of a distance field: pictures, meshes and exports without them, and floaters.
+//! Tests of erased parts of a distance field, which pictures, meshes and exports leave out, and of
+//! floaters.
 
 use super::mesh::floaters;
 use super::tests::{BALL_CENTER, ball_on_floor, fused_model, gpu, same, view_of};

@@ -52,7 +52,8 @@ fn export(
     write: fn(&Path, &Mesh) -> Result<(), model_files::Error>,
 ) -> Result<Exported, Error> {
     let mesh = TsdfModel::load(gpu, request.model)?.mesh_without(&Edits::read(request.model)?)?;
-    // Simplification may merge all vertices into one. An empty file would look like a success.
+    // Simplification may merge all vertices into one vertex. An empty file would look like a
+    // success.
     let simplified = request
         .cell_m
         .map(|cell_m| (cell_m, mesh.clustered(cell_m)));

@@ -90,7 +90,8 @@ impl MeshBuffers {
             if needed[0] > self.mesh_capacity.n_vertices
                 || needed[1] > self.mesh_capacity.n_triangles
             {
-                // Kernels count the triangles that did not fit, so the second attempt fits.
+                // Kernels also count the triangles that did not fit. The second attempt therefore
+                // has enough space.
                 self.grow(gpu, &needed)?;
                 continue;
             }
@@ -143,8 +144,8 @@ impl MeshBuffers {
                 vertices: vertices[own(part.first_vertex, part.n_vertices)].to_vec(),
                 triangles: triangles[own(part.first_triangle, part.n_triangles)]
                     .iter()
-                    // Indices on the GPU count through the whole batch, but the blocks are kept
-                    // separately here.
+                    // On the GPU, indices count vertices of the whole batch. Here, each block gets
+                    // its own indices.
                     .map(|corners| corners.map(|ix| ix - part.first_vertex))
                     .collect(),
             };

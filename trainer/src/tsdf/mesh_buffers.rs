@@ -11,9 +11,9 @@ use gpu::{Buffer, Gpu};
 pub(crate) struct MeshCapacity {
     /// Maximum number of blocks per dispatch. The list of a field may be longer.
     pub(crate) n_blocks: u32,
-    /// Initial capacity, which grows to fit a batch.
+    /// Initial number of vertices. The number grows to fit a batch.
     pub(crate) n_vertices: u32,
-    /// Initial capacity, which grows to fit a batch.
+    /// Initial number of triangles. The number grows to fit a batch.
     pub(crate) n_triangles: u32,
 }
 
@@ -87,8 +87,8 @@ impl MeshBuffers {
     }
 }
 
-/// The 256 cases in the format of the kernel. A case has the number of triangles, then three edges
-/// per triangle with five bits each.
+/// The 256 cases in the format of the kernel. A case consists of the number of triangles, then
+/// three edges per triangle with five bits each.
 fn case_words() -> Vec<u32> {
     CASES
         .iter()

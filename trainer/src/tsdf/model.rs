@@ -138,7 +138,8 @@ impl TsdfModel {
         })
     }
 
-    /// The current surface in world. Only blocks that changed since the last call are meshed.
+    /// The current surface in world coordinates. Only blocks that changed since the last call are
+    /// meshed.
     pub fn mesh(&mut self) -> Result<Mesh, Error> {
         self.mesh_without(&Edits::default())
     }
@@ -182,7 +183,7 @@ impl TsdfModel {
     /// images. Returns whether there was such an image.
     fn begin(&mut self) -> Result<bool, Error> {
         // The maximum size of a binding limits the field, just like a budget. The voxel size must
-        // fit it.
+        // suit this limit.
         let max_blocks = capacity::max_blocks_within(
             &self.gpu,
             self.options.common.max_bytes,
@@ -193,8 +194,8 @@ impl TsdfModel {
             let Some(first) = self.queue.pending.front() else {
                 return Ok(false);
             };
-            // An image without valid readings, such as the first one of a sensor that is starting,
-            // contains no information about the scene.
+            // An image without valid readings, such as the first image of a sensor that is
+            // starting, contains no information about the scene.
             match first
                 .depth
                 .as_ref()
@@ -213,8 +214,8 @@ impl TsdfModel {
         Ok(!self.queue.pending.is_empty())
     }
 
-    /// Fuses one keyframe if none was fused yet, so that there is something to render. Fuses only
-    /// one, because rendering must not train the model.
+    /// Fuses one keyframe if none was fused yet, so that there is something to render. Only one
+    /// keyframe is fused, because rendering must not train the model.
     fn fuse_one(&mut self) -> Result<(), Error> {
         while self.queue.step() == 0 && !self.queue.pending.is_empty() {
             self.step(1)?;
@@ -240,8 +241,8 @@ impl TsdfModel {
 
     /// Fuses the first pending keyframe after loading the blocks that it could change.
     fn step_with_host_blocks(&mut self, n: u64) -> Result<u64, Error> {
-        // Only one keyframe is fused at a time. Only the host knows which blocks the next keyframe
-        // needs, and these may have to replace other blocks.
+        // Only one keyframe is fused at a time. The host determines which blocks the next keyframe
+        // needs, and these blocks may have to replace other blocks.
         if n == 0 || self.queue.pending.is_empty() {
             return Ok(0);
         }
@@ -356,15 +357,15 @@ impl Method for TsdfModel {
             self.finish_in_flight()?;
             return Ok(self.queue.step() - before);
         }
-        // If some blocks are in host memory, the host must load those that the image could change
-        // first.
+        // If some blocks are in host memory, the host must first load the blocks that the image
+        // could change.
         if self.n_host_blocks() > 0 {
             self.finish_in_flight()?;
             return self.step_with_host_blocks(n);
         }
 
-        // Otherwise, the next submit is recorded while the previous one runs. Keyframes in flight
-        // are still pending, but must not be recorded again.
+        // Otherwise, the next submit is recorded while the previous submit runs. Keyframes in
+        // flight are still pending, but must not be recorded again.
         let n_in_flight =
             usize::try_from(self.fusion.submits.n_steps_in_flight()).expect("few keyframes");
         let n_left = self.queue.pending.len().saturating_sub(n_in_flight) as u64;
@@ -388,7 +389,7 @@ impl Method for TsdfModel {
             .passes
             .submit_reading(&self.gpu, &[(&field.status, 4 * status::LEN)]);
 
-        // This waits for the previous submit while the new one runs. If the previous submit
+        // This waits for the previous submit while the new submit runs. If the previous submit
         // overflowed, the new submit had no effect, and its counters need not be read.
         let failed = self.finish_in_flight()?;
         if !failed {

@@ -116,7 +116,7 @@ pub(crate) fn fuse(
         ],
     );
     // The visible blocks include more than the blocks of this image's surfaces, because voxels in
-    // front of them are carved.
+    // front of the surfaces are carved.
     list.dispatch(
         gpu,
         &pipelines.find_visible,

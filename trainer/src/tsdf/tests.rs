@@ -188,8 +188,8 @@ fn n_views_until_removed(n_with: usize) -> [usize; 2] {
 
 #[test]
 fn removed_object_fades_faster_than_it_was_built() {
-    // Measured: 2, 7 and 17 observations. The lower part is overwritten by new distances and
-    // disappears at once.
+    // The measured numbers are 2, 7 and 17 observations. The lower part is overwritten by new
+    // distances and disappears at once.
     for (n_with, max_views) in [(8, 3), (32, 9), (100, 20)] {
         let n_views = n_views_until_removed(n_with);
         assert!(
@@ -230,8 +230,8 @@ fn keyframes_without_depth_are_ignored() {
 fn back_faces_are_not_drawn() {
     let keyframes = ball_on_floor(4);
     let mut model = fused_model(scenes::options(), &keyframes);
-    // Just below the floor's surface, looking up and forward: the back of the floor must not be
-    // rendered.
+    // The camera is just below the floor's surface and looks up and forward. The back of the floor
+    // must not be rendered.
     let eye = Point3::new(BALL_CENTER.x, BALL_CENTER.y - 0.5, -0.33);
     let picture = model
         .render(&scenes::request(scenes::look_at(

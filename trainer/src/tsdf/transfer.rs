@@ -187,7 +187,7 @@ impl FieldBuffers {
         for (slot, (block_coord, block)) in free_slots.zip(incoming) {
             self.write_block(gpu, slot.into(), block_coord, &block);
         }
-        // Slots past the end must be unobserved when new blocks get them.
+        // Slots past the end must be marked as unobserved, because new blocks may get these slots.
         if end < n_before {
             let from = u64::from(end);
             let n = u64::from(n_before - end);

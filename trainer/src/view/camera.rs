@@ -49,9 +49,9 @@ pub(crate) struct Camera {
     pub(crate) low_pass_px2: f64,
 }
 
-/// Variance of the low-pass at full size, pixels squared, as in Kerbl et al. 2023. With it, a splat
-/// covers at least about one pixel. A larger value blurs the picture. With a smaller value, splats
-/// fall between pixel centers.
+/// Variance of the low-pass at full size, pixels squared, as in Kerbl et al. 2023. With this value,
+/// a splat covers at least about one pixel. A larger value blurs the picture. With a smaller value,
+/// splats fall between pixel centers.
 pub(crate) const LOW_PASS_PX2: f64 = 0.3;
 
 impl Camera {
@@ -75,8 +75,8 @@ impl Camera {
         }
     }
 
-    /// The same camera with an image smaller by `2^level`. Leftover rows and columns at the far
-    /// edges are cropped.
+    /// This camera with an image that is smaller by the factor `2^level`. Leftover rows and columns
+    /// at the far edges are cropped.
     pub(crate) fn at_level(&self, level: u32) -> Self {
         let share = 0.5f64.powi(i32::try_from(level).expect("a few levels"));
         Self {

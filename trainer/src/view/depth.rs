@@ -72,7 +72,7 @@ fn reprojected(depth: &DepthMap, keyframe: &Keyframe) -> Arc<[f32]> {
         if !is_visible {
             continue;
         }
-        // A surface in the depth image may be hidden from the color camera by a nearer one.
+        // A surface in the depth image may be hidden from the color camera by a nearer surface.
         let nearest_m = &mut reprojected[pixel[1] as usize * width as usize + pixel[0] as usize];
         let depth_m = f32_of(point.z);
         if *nearest_m == 0.0 || depth_m < *nearest_m {
@@ -95,7 +95,8 @@ mod tests {
         let pose = scenes::look_at(Point3::new(0.0, -2.0, 0.5), target);
         let mut keyframe = scenes::keyframe(0, &[scenes::ball(target)], pose);
         let depth = keyframe.depth.as_mut().expect("the scene has depth");
-        // The depth comes from another camera, so that it is projected.
+        // The pose of the depth differs from the pose of the color camera, so that the depth is
+        // projected.
         depth.world_from_camera *= Transform::translation(0.01, 0.0, 0.0);
         let n_seen = depth.depth_m.iter().filter(|z| **z > 0.0).count();
         depth.depth_m = depth.depth_m.iter().map(|_| f32::INFINITY).collect();

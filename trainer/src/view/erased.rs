@@ -31,7 +31,8 @@ struct Erased {
 impl Erased {
     /// Whether the buffer holds these edits in this frame.
     fn is_of(&self, edits: &Arc<Edits>, world_from_drawn: &Matrix4<f64>) -> bool {
-        // Requests of one client share the edits, so most comparisons end at the address.
+        // All requests of one client point to the same edits, so comparing the addresses is usually
+        // sufficient.
         let has_same_edits = Arc::ptr_eq(&self.edits, edits) || self.edits == *edits;
         has_same_edits && self.world_from_drawn == *world_from_drawn
     }
@@ -46,7 +47,8 @@ impl ErasedSpace {
         })
     }
 
-    /// The buffer of these edits. Replaces the previous one if the edits or the frame have changed.
+    /// The buffer of these edits. Replaces the previous buffer if the edits or the frame have
+    /// changed.
     ///
     /// * `world_from_drawn`: maps points of the kernel to world, meters.
     pub(crate) fn set(
@@ -86,8 +88,8 @@ fn buffer(gpu: &Gpu, edits: &Edits, world_from_drawn: &Matrix4<f64>) -> Result<B
     )?)
 }
 
-/// The data of shared/erased.wgsl, for kernels whose frame and units differ from those of the
-/// world.
+/// The data of shared/erased.wgsl, for kernels whose frame and units differ from the frame and
+/// units of the world.
 ///
 /// * `world_from_drawn`: maps points of the kernel to world, meters.
 fn words(edits: &Edits, world_from_drawn: &Matrix4<f64>) -> Vec<[u32; 4]> {

@@ -79,7 +79,7 @@ pub struct CalibratedHandEye {
 
 /// The outcome of a hand-eye calibration.
 pub struct HandEyeOutcome {
-    /// The result, or the reason why there is none.
+    /// The result, or the reason why there is no result.
     pub result: anyhow::Result<CalibratedHandEye>,
     source: Source,
     samples: Samples,
@@ -90,8 +90,8 @@ pub struct HandEyeOutcome {
 
 impl HandEyeTask {
     /// Reads a samples file, or takes the images from a recording or from the devices of a rig. If
-    /// the arm moves to take the images, returns the arm. [`MovedArm::finish`] must then be called
-    /// with the result of the calibration.
+    /// the arm has moved to take the images, the arm is also returned. In that case, the caller
+    /// must call [`MovedArm::finish`] with the result of the calibration.
     ///
     /// # Errors
     /// Fails if the input does not fit the options, or if it cannot be read.
@@ -381,7 +381,7 @@ impl HandEyeOutcome {
                 (None, Some(given)) => rig.warn_if_intrinsics_differ(&given)?,
                 (None, None) => (),
             }
-            // The joints of a samples file need not be those of the rig.
+            // The joints of a samples file need not be the joints of the rig.
             match self.source {
                 Source::Scan { .. } => rig.add_joint_offsets(&calibration.joint_offsets),
                 Source::File(_) if !calibration.joint_offsets.is_empty() => {
@@ -449,8 +449,8 @@ fn nine_digits(values: &[f64]) -> String {
         .join(", ")
 }
 
-/// Initial values for estimating a lens. They include distortion. Without distortion, the estimate
-/// of a real lens would be wrong by more than its standard deviation.
+/// Initial values for estimating a lens. The lens model has distortion, because the estimate of a
+/// real lens without distortion would be wrong by more than its standard deviation.
 fn with_distortion(given: Intrinsics) -> Intrinsics {
     match given.lens {
         Lens::Pinhole => Intrinsics {

@@ -25,8 +25,8 @@ use targets::{GrayImage, TargetSpec};
 /// the arm expects motions near its current posture. Larger changes give more diverse poses, but
 /// the elbow and the cables also reach farther.
 const MAX_JOINT_CHANGE_RAD: f64 = 1.2;
-/// Default of the maximum distance of the flange from its position at the start, meters. This room
-/// is usually free around an arm that was moved to its target by hand.
+/// Default of the maximum distance of the flange from its position at the start, meters. If an arm
+/// was moved to its target by hand, this much space around it is usually free.
 const DEFAULT_DISTANCE_M: f64 = 0.3;
 /// Standard deviation of the rotation below which the result counts as accurate, degrees. It
 /// corresponds to half a millimeter at a distance of half a meter.
@@ -40,7 +40,7 @@ pub struct MotionOptions {
     /// Maximum number of poses.
     pub max_poses: u16,
     /// Goal for the standard deviations of the camera position, millimeters. The motion ends when
-    /// they are below it.
+    /// the standard deviations are below the goal.
     pub goal_mm: f64,
     /// Maximum distance of the flange from its position at the start, millimeters. The default
     /// (`None`) is 300. If the camera is on the flange, the default is at most half the distance to
@@ -66,13 +66,13 @@ impl MovedArm {
     /// Fails if the calibration or the motion failed, or if the arm has stopped because of a fault.
     pub fn finish<T>(mut self, result: anyhow::Result<T>) -> anyhow::Result<T> {
         let failure = self.failure.take();
-        // The arm is held before anything is returned, because the motors of some arms release it
-        // when this program ends.
+        // The arm is held before anything is returned, because the motors of some arms release the
+        // arm when this program ends.
         let held = self.hold_after(result.as_ref().err());
         match (held, failure) {
             (Err(error), None) if result.is_ok() => Err(error),
             (held, Some(failure)) => {
-                // Why the motion was not completed has been logged.
+                // The log already contains the reason why the motion was not completed.
                 outputs::log_failure(held);
                 if self.holds_on_exit {
                     outputs::log_failure(result.map(|_| ()));
@@ -98,7 +98,8 @@ impl MovedArm {
         if let Some(error) = error {
             log::error!("{error:#}");
         }
-        // The next Ctrl-C ends the hold in order, even if an earlier one has stopped the motion.
+        // The next Ctrl-C ends the hold in an orderly way, even if an earlier Ctrl-C has stopped
+        // the motion.
         self.stop.rearm("ending; the motors no longer hold the arm");
         log::info!("{HOLDING}");
         self.capture.hold(&self.stop)
@@ -151,7 +152,7 @@ impl MotionOptions {
         let is_simulated = flags.sim || given.arm.driver == ArmDriver::Sim;
         if !is_simulated {
             given.require_before_opening(Need::Intrinsics(camera))?;
-            // Without the pose, the motion could lead anywhere.
+            // Without the approximate pose of the camera, the planned motion would be arbitrary.
             if given_camera.unknown.parent_from_camera {
                 return Err(BadInput(format!(
                     "camera.{camera}.parent_from_camera is missing: {} plans the motion with it; measure it to about 5 degrees and 25 mm, or calibrate without {}",
@@ -178,7 +179,8 @@ impl MotionOptions {
         } else {
             Devices::Real
         };
-        // The page is opened before the arm, because without it, the planned motion is not shown.
+        // The page is opened before the arm is connected, because the user must see the planned
+        // motion.
         let view = request.host.open_view(&given_camera, activity)?;
         let mut capture = ArmCapture::new(open::movable(&given, devices, camera)?)?;
         let rig = resolved(&given, capture.rig());
@@ -224,7 +226,7 @@ impl MotionOptions {
             failure: None,
         };
         match failure {
-            // At this point, no more than the first motion was tried.
+            // At this point, at most the first motion was tried.
             Some(error) if found.len() < 2 => {
                 outputs::log_failure(arm.hold_after(Some(&error)));
                 return Err(error);
@@ -256,8 +258,8 @@ impl MotionOptions {
         }
     }
 
-    /// Takes images until the plan is finished, then returns to the start. Ctrl-C stops the arm
-    /// where it is.
+    /// Takes images until the plan is finished, then moves the arm back to the start. Ctrl-C stops
+    /// the arm where it is.
     fn take_images(
         &self,
         capture: &mut ArmCapture,
@@ -271,7 +273,8 @@ impl MotionOptions {
             return Ok(());
         };
         let view = images.add(first)?;
-        // Joint offsets are not part of the plan, so all poses are used for them.
+        // The accuracy of joint offsets is not a goal of the plan, so the plan does not end early
+        // if they are estimated.
         let goal_mm = if images.request.options.estimate_joint_offsets {
             0.0
         } else {

@@ -58,7 +58,7 @@ impl SamplesFile {
         let name = path.display().to_string();
         let text = outputs::read_text(path)?;
         let mut value = json_object::parse(&text)
-            // Such files often come from other programs, so the error says what to change.
+            // Such files often come from other programs, so the error describes what to change.
             .map_err(|error| BadInput(format!("{name}: {error}{}", not_json_hint(&text))))?;
         // Paths in the file are relative to it, so that its folder can be moved.
         let folder = path.parent().unwrap_or(Path::new(""));
@@ -80,7 +80,7 @@ impl SamplesFile {
                 .iter()
                 .for_each(|note| log::warn!("{name}: intrinsics: {source}{note}"));
         }
-        // Unknown keys are errors, because a misspelled one would be ignored silently.
+        // Unknown keys are errors, because a misspelled key would be ignored silently.
         let file = JsonObject::new(&name, String::new(), &value, &FILE_KEYS)?;
         let intrinsics = file.object("intrinsics", &LensFile::KEYS)?;
         let target = file
@@ -116,8 +116,8 @@ impl SamplesFile {
             setup,
             entries,
         };
-        // These two are optional keys, because samples may contain poses of the board instead of
-        // images.
+        // The target and the intrinsics are optional keys, because samples may contain poses of the
+        // board instead of images.
         if read.has_images() && read.target.is_none() {
             return Err(file.invalid(
                 "target",
@@ -237,7 +237,8 @@ impl SamplesFile {
 
     /// An error if no image shows the target.
     pub(super) fn check_detected(&self, samples: &Samples) -> Result<(), InsufficientData> {
-        // Without any image, the samples are poses, and the calibration itself checks their number.
+        // Without any image, the samples are poses. The calibration itself checks the number of
+        // poses.
         if samples.used.is_empty() && !samples.unused.is_empty() {
             Err(InsufficientData(format!(
                 "{}: no image shows the target",
@@ -270,7 +271,7 @@ fn not_json_hint(text: &str) -> &'static str {
 }
 
 impl Samples {
-    /// Rejects images whose size differs from that of the first image.
+    /// Rejects images whose size differs from the size of the first image.
     fn expect_size(&mut self, name: &str, size_px: [u32; 2]) -> Result<(), calibration::Error> {
         let first_px = *self.size_px.get_or_insert(size_px);
         // The first image defines the size.
@@ -298,7 +299,7 @@ fn check_images(samples: &[JsonObject<'_>], entries: &[Entry]) -> Result<(), Bad
         let EntryBoard::Image(image) = &entry.board else {
             continue;
         };
-        // The same pose twice is allowed, because the same sample may simply be listed twice.
+        // The same image with the same pose is allowed, because a sample may be listed twice.
         let first = *first_use.entry(&image.path).or_insert(ix);
         if entries[first].base_from_flange != entry.base_from_flange {
             let why = format!(
@@ -355,7 +356,7 @@ impl Entry {
                     sample.invalid("image", "missing; give \"image\" or \"camera_from_board\"")
                 );
             }
-            // Two sources for one value may contradict each other, so this is an error.
+            // Two sources for one value are an error, because they may contradict each other.
             (Some(_), Some(_)) => {
                 return Err(sample.invalid(
                     "image",

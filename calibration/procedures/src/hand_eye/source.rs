@@ -34,7 +34,7 @@ impl Source {
         }
     }
 
-    /// Number of samples, including those whose image does not show the target.
+    /// Number of samples, including samples whose image does not show the target.
     pub(super) fn n_samples(&self) -> usize {
         match self {
             Self::File(file) => file.len(),
@@ -105,7 +105,7 @@ impl Source {
 
     /// Fails if there is no image, or if no image shows the target.
     pub(super) fn check(&self, samples: &Samples) -> anyhow::Result<()> {
-        // More images show a different board than the given one, so the given target is probably
+        // More images show another board than the given target, so the given target is probably
         // wrong. A wrong target explains missing detections better than the errors below.
         if let Some(size) = samples.other_size.as_ref().filter(|size| size.prevails) {
             return Err(InsufficientData(size.text.clone()).into());

@@ -19,8 +19,9 @@ use nalgebra::{DMatrix, SymmetricEigen, Vector3};
 
 /// Finds an initial solution, and reports mistakes in the samples.
 ///
-/// # Errors Returns [`Error::Refused`] if the samples contain a known mistake, do not determine the
-/// result, or disagree.
+/// # Errors
+/// Returns [`Error::Refused`] if the samples contain a known mistake, do not determine the result,
+/// or disagree.
 pub(crate) fn find_consensus(
     input: &HandEyeInput<'_>,
     sorted: &Sorted,
@@ -67,7 +68,8 @@ pub(crate) fn find_consensus(
 
 /// Checks that the samples that were used determine the result.
 ///
-/// # Errors Returns [`Error::Refused`] with the likely cause of a result that is too uncertain.
+/// # Errors
+/// Returns [`Error::Refused`] with the likely cause of a result that is too uncertain.
 pub(crate) fn check_result(
     input: &HandEyeInput<'_>,
     refined: &Refined,
@@ -97,8 +99,8 @@ pub(crate) fn check_result(
 
 const NO_SOLUTION: &str = "no hand-eye transform explains three of the samples";
 
-/// Positions of a robot or distances of a board in meters do not exceed this limit. If they are in
-/// millimeters, all lengths above 2 cm exceed it.
+/// In meters, positions of a robot and distances of a board are below this limit. In millimeters,
+/// all lengths above 2 cm exceed the limit.
 const MAX_POSITION_M: f64 = 20.0;
 
 /// A variant of the input explains the disagreement if it fits better by this factor. With a
@@ -107,7 +109,8 @@ const MUCH_BETTER: f64 = 5.0;
 
 /// Checks that the positions can be meters.
 ///
-/// # Errors Fails if most of the positions are too large.
+/// # Errors
+/// Fails if most of the positions are too large.
 fn check_magnitudes(samples: &[HandEyeSample]) -> Result<(), Refusal> {
     let robot: Vec<f64> = samples
         .iter()
@@ -165,8 +168,8 @@ fn explain(
     if let Some(refusal) = shift_mistake(input, samples, found_m, distance_m) {
         return Some(refusal);
     }
-    // Wrong scales are tested even if the samples agree roughly. If the scale is near 1, for
-    // example because the board has another size, the samples still agree roughly.
+    // Wrong scales are tested even if the samples agree roughly. With a scale near 1, for example
+    // because the board has another size, the samples still agree roughly.
     if let Some((why, remedy)) = scale_mistake(samples, found) {
         return Some(Refusal::new(format!("{residual}, and {why}"), remedy));
     }
@@ -191,9 +194,9 @@ fn has_images(samples: &[Sample]) -> bool {
         .any(|sample| sample.candidates[0].corners.is_some())
 }
 
-/// Explanation of samples that agree on a board behind the camera. Either the camera axes are
-/// different, or both poses of each sample are inverted, so that the samples agree on the inverse
-/// of another transform.
+/// Explanation of samples that agree on a board behind the camera. There are two possible causes.
+/// The camera axes may be different, or both poses of each sample may be inverted. In the second
+/// case, the samples agree on the inverse of another transform.
 fn behind_mistake(samples: &[Sample]) -> Option<Refusal> {
     let is_behind = |sample: &&Sample| likely_board(sample).translation.z <= 0.0;
     let n_behind = samples.iter().filter(is_behind).count();
@@ -213,7 +216,8 @@ fn behind_mistake(samples: &[Sample]) -> Option<Refusal> {
 /// Explains the disagreement by inverted robot or board poses, if the samples agree after inverting
 /// the robot poses.
 ///
-/// * `[found_m, distance_m]`: how well the samples agree as given, and the distance of the board.
+/// * `[found_m, distance_m]`: median error of the samples without inversion, and the distance of
+///   the board.
 /// * `residual`: the disagreement, as text.
 fn inversion_mistake(
     input: &HandEyeInput<'_>,
@@ -246,8 +250,8 @@ fn inversion_mistake(
     );
     let robot_remedy = format!("invert the robot poses, or choose the setup {other}");
     let board = "camera_from_board is inverted: the given matrices are board_from_camera";
-    // Only boards in front of the camera are visible. Poses from corners are not inverted, because
-    // this program computed them.
+    // Only boards in front of the camera are visible. Poses that fieldrig computed from corners
+    // cannot be inverted.
     let is_in_front = |sample: &Sample| likely_board(sample).translation.z > 0.0;
     let inverse_is_in_front = |sample: &Sample| likely_board(sample).inverse().translation.z > 0.0;
     let may_be_robot = !has_poses || samples.iter().all(is_in_front);
@@ -282,9 +286,9 @@ fn contradiction(refined: &Refined, scatter_mm: f64) -> Option<Refusal> {
     })
 }
 
-/// Explains the disagreement by lists of robot poses and images that are off by one. This is the
-/// case if pairing each image with the robot pose of the next or the previous sample makes the
-/// samples agree.
+/// Explains the disagreement by a shift of one entry between the lists of robot poses and images.
+/// This is the case if pairing each image with the robot pose of the next or the previous sample
+/// makes the samples agree.
 fn shift_mistake(
     input: &HandEyeInput<'_>,
     samples: &[Sample],
@@ -427,7 +431,7 @@ fn explain_scale(scale: f64, sigma: f64) -> (String, String) {
     }
 }
 
-/// A sentence about positions whose unit differs from that of another body.
+/// A sentence about positions of a body whose unit differs from the unit of another body.
 fn wrong_unit(body: &str, other: &str, unit: &str, per_m: f64) -> String {
     format!(
         "the positions of {body} are {per_m} times too large relative to those of {other}: they are probably in {unit}"
@@ -436,12 +440,13 @@ fn wrong_unit(body: &str, other: &str, unit: &str, per_m: f64) -> String {
 
 /// Checks the predicted uncertainty of position and rotation along every direction.
 ///
-/// # Errors The error names the direction that is determined worst.
+/// # Errors
+/// The error names the direction that is determined worst.
 fn check_uncertainty(input: &HandEyeInput<'_>, refined: &Refined) -> Result<(), Refusal> {
     let [max_sigma_m, max_sigma_rad] = [input.options.max_sigma_m, input.options.max_sigma_rad];
     let (sigma_rad, rotation_axis) = worst_direction(&refined.covariance, 0);
     let (sigma_m, direction) = worst_direction(&refined.covariance, 3);
-    // Written so that NaN is refused.
+    // The condition is written so that NaN is refused.
     if sigma_m <= max_sigma_m && sigma_rad <= max_sigma_rad {
         return Ok(());
     }
@@ -460,7 +465,8 @@ fn check_uncertainty(input: &HandEyeInput<'_>, refined: &Refined) -> Result<(), 
         );
         (rotation_axis, what)
     };
-    // People move the flange, so the axes of the flange are named if the camera is on the flange.
+    // If the camera is on the flange, the axes of the flange are named, because people move the
+    // flange.
     let is_on_flange = input.setup == Setup::EyeInHand;
     let (axis, body) = if is_on_flange {
         (refined.solution.x.rotation * in_camera, "flange")

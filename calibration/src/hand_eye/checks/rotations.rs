@@ -1,9 +1,9 @@
 //! Checks whether the rotations of the robot determine all parameters, and which rotations are
 //! missing.
 //!
-//! A rotation about one axis leaves the position along it and the rotation around it undetermined
-//! (Tsai and Lenz 1989, section III). Errors of the robot poses are amplified by the reciprocal of
-//! the rotation about the second axis.
+//! If the robot rotates about only one axis, the position along this axis and the rotation around
+//! it remain undetermined (Tsai and Lenz 1989, section III). Errors of the robot poses are
+//! amplified by the reciprocal of the rotation about the second axis.
 
 use super::super::geometry::{nearest_rotation, rotation_sum};
 use super::super::{Refusal, Setup};
@@ -22,7 +22,8 @@ const RECOMMENDED_DEG: f64 = 20.0;
 
 /// Checks that the rotations span at least two directions.
 ///
-/// # Errors The error names the only axis of rotation.
+/// # Errors
+/// The error names the only axis of rotation.
 pub(super) fn check_rotations(base_from_flange: &[Transform]) -> Result<(), Refusal> {
     let Some((spreads, axes)) = rotation_spread(base_from_flange) else {
         return Err(Refusal::new(
@@ -87,8 +88,8 @@ impl RotationExcitation {
 /// RMS rotations about three orthogonal axes of the body, radians, the largest first, and the axes
 /// as columns.
 fn rotation_spread(poses: &[Transform]) -> Option<([f64; 3], Matrix3<f64>)> {
-    // Rotation vectors relative to the mean rotation are small, so that their covariance describes
-    // the spread.
+    // Rotation vectors relative to the mean rotation are small. Their covariance therefore
+    // describes the spread of the rotations.
     let mean = nearest_rotation(&rotation_sum(poses))
         .or_else(|| poses.first().map(|pose| pose.rotation))?;
     let vectors: Vec<Vector3<f64>> = poses
@@ -124,7 +125,7 @@ pub(crate) fn axis_name(axis: &Vector3<f64>, body: &str) -> String {
     if axis[largest].abs() >= CLOSE_RAD.cos() {
         return format!("the {body}'s {} axis", ["x", "y", "z"][largest]);
     }
-    // Adding zero turns a negative zero into a positive one.
+    // Adding zero changes a negative zero to a positive zero.
     let signed = axis.map(|value| (100.0 * value * axis[largest].signum()).round() / 100.0 + 0.0);
     format!(
         "the axis [{:.2}, {:.2}, {:.2}] of the {body}",
@@ -132,7 +133,8 @@ pub(crate) fn axis_name(axis: &Vector3<f64>, body: &str) -> String {
     )
 }
 
-/// Describes the missing rotations, which are about the axes perpendicular to an axis of a body.
+/// Describes the missing rotations. These are rotations about the axes that are perpendicular to
+/// `axis`.
 pub(super) fn rotations_across(axis: &Vector3<f64>, body: &str) -> String {
     let [first, second] = [["y", "z"], ["x", "z"], ["x", "y"]][axis.iamax()];
     format!(
@@ -140,12 +142,13 @@ pub(super) fn rotations_across(axis: &Vector3<f64>, body: &str) -> String {
     )
 }
 
-/// Number of poses that are sufficient, if their rotations suffice.
+/// Recommended number of poses. It is sufficient if the poses also have sufficient rotations.
 pub const RECOMMENDED_POSES: usize = 12;
 /// Rotation about each axis that the poses should span, degrees. It corresponds to 20 degrees in
 /// both directions.
 const MIN_SPAN_DEG: f64 = 40.0;
-/// Number of poses that are requested at a time. There are two in each direction.
+/// Number of poses that are requested at a time. Two poses are rotated in one direction, and two in
+/// the opposite direction.
 const POSES_AT_A_TIME: usize = 4;
 /// A pose counts as rotated about an axis if the angle is at least this, degrees. The limit is half
 /// of the requested angle, because people estimate rotations by eye.
@@ -156,8 +159,8 @@ const ROTATED_DEG: f64 = 10.0;
 pub struct HandEyeGuidance {
     /// Number of poses at which the target was seen.
     pub n_poses: usize,
-    /// Range of the rotations about the x, y and z axis, degrees. With the eye in hand, these are
-    /// the axes of the camera, otherwise of the flange.
+    /// Range of the rotations about the x, y and z axis, degrees. With the eye in hand, these axes
+    /// are the axes of the camera. With the eye to hand, they are the axes of the flange.
     pub span_deg: [f64; 3],
     /// What to do next.
     pub advice: HandEyeAdvice,

@@ -20,7 +20,7 @@ pub struct ArmPlanOptions {
     /// Standard deviation of the position along each axis at which the result is accurate,
     /// millimeters.
     pub goal_mm: f64,
-    /// The same limit for the rotation, degrees.
+    /// Standard deviation of the rotation about each axis at which the result is accurate, degrees.
     pub goal_deg: f64,
 }
 
@@ -31,10 +31,11 @@ pub const MIN_POSES: usize = 10;
 /// wrong.
 const MAX_UNSEEN: usize = 8;
 
-/// As long as small rotations remain, an estimate selects poses only if the standard deviation of
-/// the position is at most this, millimeters. If the error of the camera pose is larger, the target
-/// may not be visible at suggested poses. With a smaller limit, the arm makes more small rotations,
-/// which add little information.
+/// Maximum standard deviation of the position, millimeters, at which an estimate selects the next
+/// pose. With a larger standard deviation, the plan continues with the small rotations as long as
+/// some remain. If the error of the camera pose is larger than this value, the target may not be
+/// visible at suggested poses. With a smaller limit, the arm makes more small rotations, which add
+/// little information.
 const MAX_EARLY_SIGMA_MM: f64 = 20.0;
 
 /// What an arm does next.
@@ -80,7 +81,7 @@ pub struct ArmPlan<'a> {
     reach: Reach<'a>,
     poses: NextPoseOptions<'a>,
     options: ArmPlanOptions,
-    /// Flange poses that remain to be tried before there is an estimate, with their purpose.
+    /// Flange poses that are tried before an estimate is available, with their purpose.
     first: VecDeque<(Transform, String)>,
     n_unseen: usize,
     n_refined: usize,
@@ -89,7 +90,7 @@ pub struct ArmPlan<'a> {
 impl<'a> ArmPlan<'a> {
     /// Plans motions around the configuration at which the target is seen.
     ///
-    /// * `poses`: the board's size and the visibility limits for [`suggest_next_poses`]; `n_poses`,
+    /// * `poses`: the board's size and the visibility limits for [`suggest_next_poses`]. `n_poses`,
     ///   `reach` and `seed` are ignored.
     pub fn new(
         reach: &Reach<'a>,
@@ -134,7 +135,7 @@ impl<'a> ArmPlan<'a> {
     /// The next step.
     ///
     /// * `input`: the samples so far.
-    /// * `estimate`: the calibration from these samples, or the reason why there is none.
+    /// * `estimate`: the calibration from these samples, or the reason why there is no calibration.
     /// * `current`: the current joint values, in the order of the chain.
     pub fn next(
         &mut self,
@@ -221,9 +222,10 @@ fn purpose(verb: &str, (sign, axis): (f64, usize), degrees: f64, body: &str) -> 
     )
 }
 
-/// Rotations about the center of the target according to the approximate pose of the camera, which
-/// keep the target in view. If that pose has a large error, the target leaves the view. Therefore,
-/// small rotations about the flange follow.
+/// Rotations about the center of the target, followed by small rotations about the flange. The
+/// center follows from the approximate pose of the camera, so that the rotations about it keep the
+/// target in view. If the approximate pose has a large error, these rotations move the target out
+/// of view. The rotations about the flange are for this case.
 fn first_poses(
     reach: &Reach<'_>,
     first: &FirstView<'_>,
@@ -232,8 +234,9 @@ fn first_poses(
     /// Rotation about the target, degrees. It is large enough for a first estimate, and small
     /// enough to be reached almost everywhere.
     const ABOUT_TARGET_DEG: f64 = 15.0;
-    /// Rotations about the flange, degrees. They move the target in the image by the same angle, so
-    /// it stays in view only if they are much smaller than half the field of view.
+    /// Rotations about the flange, degrees. They move the target in the image by the same angle.
+    /// The target therefore stays in view only if they are much smaller than half the field of
+    /// view.
     const ABOUT_FLANGE_DEG: [f64; 2] = [6.0, 10.0];
     const DIRECTIONS: [(f64, usize); 6] = [
         (1.0, 0),
@@ -395,7 +398,7 @@ mod tests {
             goal_mm: 0.3,
             goal_deg: 0.05,
         };
-        // A given pose that is wrong by 4 degrees and 30 mm, and one that is useless.
+        // One given pose is wrong by 4 degrees and 30 mm, and another given pose is useless.
         let wrong = Transform::new(
             Vector3::new(0.02, -0.02, 0.01),
             Vector3::new(0.04, 0.05, -0.03),

@@ -1,8 +1,8 @@
 //! Suggests the next robot poses by information gain, within the space in which an arm may move.
 //!
-//! Candidates keep the board in view at a distance and tilt at which it is detected well. Poses are
-//! selected greedily such that the volume of the hand-eye uncertainty shrinks most (D-optimality;
-//! Fedorov 1972, section 2.2).
+//! At each candidate pose, the board is in view, at a distance and tilt at which it is detected
+//! well. Poses are selected greedily such that the volume of the hand-eye uncertainty shrinks most
+//! (D-optimality; Fedorov 1972, section 2.2).
 
 use super::super::checks::axis_name;
 use super::super::geometry::{self, Matrix6x12};
@@ -18,9 +18,9 @@ use numbers::random::Random;
 /// Distance that configurations keep from the limits of the joints, radians or meters. Some
 /// controllers stop an arm shortly before its limits.
 const LIMIT_MARGIN: f64 = 0.05;
-/// Largest change of a joint between two configurations of a path at which the distance from the
-/// start is checked, radians or meters. With an arm of 1 m, one joint moves the flange by 5 cm
-/// between two configurations.
+/// The distance from the start is checked at configurations along a path. This value is the largest
+/// change of a joint between two such configurations, radians or meters. With an arm of 1 m, one
+/// joint moves the flange by 5 cm between two configurations.
 const PATH_STEP: f64 = 0.05;
 
 /// The space around a start configuration in which an arm moves.
@@ -37,8 +37,9 @@ pub struct Reach<'a> {
 }
 
 impl Reach<'_> {
-    /// Joint values for a flange pose. `None` unless two straight paths in joint space stay near
-    /// the start: from `current` to the pose, and from the pose back to the start.
+    /// Joint values for a flange pose. Two straight paths in joint space must stay near the start:
+    /// from `current` to the pose, and from the pose back to the start. Otherwise, the function
+    /// returns `None`.
     pub fn joints_for(&self, base_from_flange: &Transform, current: &[f64]) -> Option<Vec<f64>> {
         let start = self.chain.forward(self.start).ok()?;
         // The distance is checked before inverse kinematics, which takes long.
@@ -140,10 +141,11 @@ pub struct NextPose {
 
 /// Suggests poses for a finished calibration. `input` must be the input of the calibration.
 ///
-/// With a [`Reach`], candidates are poses around the board to which the arm moves within it. With a
-/// chain and joint values, they are configurations near those of the samples, within the joint
-/// limits. Otherwise, they are flange poses that rotate the camera around the board or about its
-/// own axes. The caller must check that the arm reaches these poses.
+/// With a [`Reach`], the candidates are poses around the board that the arm reaches without leaving
+/// this space. With a chain and joint values, the candidates are configurations near the
+/// configurations of the samples, within the joint limits. Otherwise, the candidates are flange
+/// poses that rotate the camera around the board or about its own axes. In this last case, the
+/// caller must check that the arm reaches the poses.
 pub fn suggest_next_poses(
     input: &HandEyeInput<'_>,
     calibration: &HandEyeCalibration,
@@ -159,8 +161,8 @@ pub fn suggest_next_poses(
     };
     let candidates = scene.candidates();
     let mut suggested: Vec<NextPose> = Vec::new();
-    // Poses are selected greedily: first the best pose, then the best pose given the first one, and
-    // so on. Comparing all sets of poses would take far longer.
+    // Poses are selected greedily. The best pose comes first, then the pose that is best together
+    // with the first pose, and so on. Comparing all sets of poses would take far longer.
     for _ in 0..options.n_poses {
         let Some(before) = log_volume(&information) else {
             break;
@@ -268,8 +270,8 @@ impl Scene<'_> {
             .collect()
     }
 
-    /// The information of a new sample. Its board pose is assumed to be as accurate as those of the
-    /// previous samples.
+    /// The information of a new sample. Its board pose is assumed to be as accurate as the board
+    /// poses of the previous samples.
     fn information(&self, measurement: &Measurement) -> Option<DMatrix<f64>> {
         let refined = &self.calibration.refined;
         let solution = &refined.solution;
@@ -296,13 +298,13 @@ impl Scene<'_> {
             .map(|sum| sum / n)
     }
 
-    /// A random pose near that of a sample.
+    /// A random pose near the pose of a sample.
     fn moved(
         &self,
         sample_ix: usize,
         random: &mut Random,
     ) -> Option<(Transform, Option<Vec<f64>>)> {
-        // Large changes give more information, but the board leaves the image more often.
+        // Large changes give more information, but they move the board out of the image more often.
         const MAX_JOINT_CHANGE: f64 = 0.8;
         const MAX_ROTATION_RAD: f64 = 0.9;
         let sample = &self.input.samples[sample_ix];
@@ -353,8 +355,8 @@ impl Scene<'_> {
 
     /// Whether the whole board is in view, at a distance and tilt at which the board is detected.
     fn is_well_visible(&self, camera_from_board: &Transform, distance_m: f64) -> bool {
-        // Allowed distances, relative to those of the samples so far. In these samples, the board
-        // was detected.
+        // Allowed distances of the board, relative to the distances in the samples so far. In these
+        // samples, the board was detected.
         const DISTANCES: std::ops::RangeInclusive<f64> = 0.6..=1.6;
         const MARGIN_FRAC: f64 = 0.02;
         // The margin for an arm is larger, because it moves before anyone can check whether the
@@ -421,7 +423,7 @@ impl Scene<'_> {
             Setup::EyeInHand => x.rotation.inverse() * old_from_new.translation.vector,
             Setup::EyeToHand => old_from_new.translation.vector,
         };
-        // Adding zero turns a negative zero into a positive one.
+        // Adding zero changes a negative zero to a positive zero.
         let [right, down, forward]: [f64; 3] =
             moved.map(|meters| (1e3 * meters).round() + 0.0).into();
         let relation = format!(

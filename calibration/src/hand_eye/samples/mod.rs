@@ -22,7 +22,7 @@ pub(crate) struct Sample {
     pub(crate) stop_ix: usize,
     /// See [`geometry::Solution`].
     pub(crate) a: Transform,
-    /// Poses of the board, the most likely first. Not empty.
+    /// Poses of the board, the most likely first. The list is not empty.
     pub(crate) candidates: Vec<Candidate>,
     /// Index of the candidate that fits the solution.
     pub(crate) choice: usize,
@@ -118,7 +118,7 @@ impl CornerStatistics {
 pub(crate) struct Sorted {
     /// Samples with candidates.
     pub(crate) usable: Vec<Sample>,
-    /// Indices of samples that are identical to an earlier one. They contain no further
+    /// Indices of samples that are identical to an earlier sample. They contain no further
     /// information.
     pub(crate) repeated: Vec<usize>,
 }
@@ -182,12 +182,12 @@ fn measured_poses(board: &BoardObservation, intrinsics: Option<&Intrinsics>) -> 
     }
 }
 
-/// Every pose, followed by those of the equivalent rotations of the board.
+/// Every pose, followed by the poses of the equivalent rotations of the board.
 fn with_symmetries(poses: &[Candidate], symmetries: &[Transform]) -> Vec<Candidate> {
     let mut candidates = Vec::new();
     for pose in poses {
         candidates.push(pose.clone());
-        // The identity is in most lists of symmetries, and would be a second equal candidate.
+        // Most lists of symmetries contain the identity, which would give the same candidate twice.
         let rotations = symmetries.iter().filter(|symmetry| !is_identity(symmetry));
         candidates.extend(rotations.map(|symmetry| Candidate {
             camera_from_board: pose.camera_from_board * symmetry,
@@ -254,7 +254,7 @@ fn require(is_met: bool, why: impl FnOnce() -> String) -> Result<(), Error> {
 /// The refusal of too few samples.
 ///
 /// * `kind`: empty, or an adjective and a space.
-/// * `what`: what these samples are or have, for one and for several.
+/// * `what`: the property of these samples, as words for one sample and for several samples.
 pub(crate) fn too_few(n: usize, kind: &str, [one, several]: [&str; 2]) -> Refusal {
     let (samples, what) = if n == 1 {
         ("sample", one)

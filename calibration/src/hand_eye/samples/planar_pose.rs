@@ -347,8 +347,8 @@ fn refine(
     let pose = least_squares::minimize(&problem, initial, &options)
         .ok()?
         .state;
-    // All corners are checked, not only the used ones, because a corner outside the initial set may
-    // fit the refined pose.
+    // All corners are checked and not only the used corners, because a corner outside the initial
+    // set may fit the refined pose.
     let errors: Vec<f64> = points
         .iter()
         .map(|point| {

@@ -148,14 +148,14 @@ impl CornerProblem<'_> {
         let Some(chain) = self.chain else {
             return Some((view.base_from_flange, Vec::new()));
         };
-        // The reported pose may differ from that of the chain's tip, because a tool frame may be
-        // set in the controller. This difference is kept.
+        // The reported pose may differ from the pose of the chain's tip, because a tool frame may
+        // be set in the controller. This difference is kept.
         let corrected = corrected_joints(&view.joints, offsets);
         let tip_from_flange = chain.forward(&view.joints).ok()?.inverse() * view.base_from_flange;
         let twists = chain.tip_twists_by_joint(&corrected).ok()?;
-        // An offset of the first joint has the same effect as a motion of the base, and an offset
-        // of the last joint the same as a motion of the flange. The other parameters already
-        // contain both motions.
+        // An offset of the first joint has the same effect as a motion of the base. An offset of
+        // the last joint has the same effect as a motion of the flange. The other parameters
+        // already contain both motions.
         let inner = twists[1..twists.len() - 1]
             .iter()
             .map(|twist| twist.of_attached(&tip_from_flange))
@@ -305,7 +305,7 @@ struct PointAt {
     by_solution: SMatrix<f64, 3, 12>,
     /// Derivatives with respect to a motion of the corrected flange pose, in flange axes.
     by_flange: SMatrix<f64, 3, 6>,
-    /// By the pose error.
+    /// Derivatives with respect to the pose error.
     by_error: SMatrix<f64, 3, 6>,
 }
 
@@ -374,7 +374,7 @@ impl PointChain {
                 )
             }
         };
-        // `x` moves in the axes of the camera, and `y` in the axes of the board; see
+        // `x` moves in the axes of the camera, and `y` moves in the axes of the board, see
         // `Solution::moved`. A motion of the camera moves the point in the opposite direction.
         let mut by_solution = SMatrix::<f64, 3, 12>::zeros();
         let camera_from_board = camera_from_y * matrix(self.y.rotation);
@@ -397,7 +397,7 @@ impl PointChain {
     }
 }
 
-/// The columns of a rotation, then those of a translation.
+/// The columns of a rotation, then the columns of a translation.
 fn joined(rotation: Matrix3<f64>, translation: Matrix3<f64>) -> SMatrix<f64, 3, 6> {
     let mut both = SMatrix::<f64, 3, 6>::zeros();
     both.fixed_view_mut::<3, 3>(0, 0).copy_from(&rotation);
@@ -425,14 +425,15 @@ pub(super) fn propagated(
         .view((0, 0), (N_PARAMS, N_PARAMS))
         .into_owned();
     let shared = free.information.view((0, N_PARAMS), (N_PARAMS, n_others));
-    // `A` above. Its sign does not matter, because it enters squared.
+    // This is the matrix `A` of the documentation. Its sign does not matter, because `A` enters
+    // squared.
     let by_others = own.cholesky()?.solve(&shared.into_owned());
     let of_fit = free
         .covariance
         .view((N_PARAMS, N_PARAMS), (n_others, n_others))
         .into_owned();
     let covariance = covariance.unwrap_or(&of_fit);
-    // A covariance of another lens model has another size.
+    // The covariance has another size if it belongs to another lens model.
     (covariance.shape() == (n_others, n_others))
         .then(|| &by_others * covariance * by_others.transpose())
 }
@@ -520,7 +521,7 @@ fn squared_change(
     Some(change.dot(&total.cholesky()?.solve(&change)))
 }
 
-/// The changes of focal length and principal point, the larger one first.
+/// The changes of focal length and principal point, the larger change first.
 fn change_of_intrinsics(given: &Intrinsics, free: &Intrinsics) -> String {
     let largest = |a: [f64; 2], b: [f64; 2]| f64::max((a[0] - b[0]).abs(), (a[1] - b[1]).abs());
     let [x, y] = [0, 1].map(|axis| free.principal_px[axis] - given.principal_px[axis]);

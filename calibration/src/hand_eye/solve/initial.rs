@@ -49,14 +49,15 @@ impl Consensus {
     }
 }
 
-/// Number of samples whose agreement decides. With `(n + p + 1) / 2` for solutions of `p = 3`
-/// samples, the largest number of wrong samples is tolerated (Rousseeuw 1984).
+/// Number of samples whose agreement is compared between solutions. For solutions of `p = 3`
+/// samples, the value `(n + p + 1) / 2` tolerates the largest number of wrong samples (Rousseeuw
+/// 1984).
 fn n_deciding(n: usize) -> usize {
     (n + 4).div_ceil(2).min(n)
 }
 
-/// Distance between poses, meters. It combines the translation with the rotation times the typical
-/// distance of the board.
+/// Distance between poses, meters. It combines the translation with the rotation angle. The angle
+/// is multiplied by the typical distance of the board.
 #[derive(Clone, Copy, Debug)]
 struct Metric {
     lever_m: f64,
@@ -81,11 +82,11 @@ impl Metric {
     }
 }
 
-/// The best solution found. `None` if no three samples determine one.
+/// The best solution found. `None` if no three samples determine a solution.
 pub(crate) fn consensus(samples: &[Sample]) -> Option<Consensus> {
     /// If two fifths of the samples are wrong, this number of trials draws three good samples with
-    /// a probability of 99 %. Each draw must also select the right one of the four poses of each
-    /// sample.
+    /// a probability of 99 %. Each sample has four poses, and each draw must also select the right
+    /// pose of each sample.
     const TRIALS: usize = 1500;
     /// If each sample has only one pose, this number is sufficient.
     const TRIALS_WITHOUT_CHOICE: usize = 200;
@@ -194,7 +195,8 @@ pub(super) fn best_closed_form(samples: &[Sample]) -> Option<Solution> {
         .map(|(_, solution)| solution)
 }
 
-/// Scatter of the positions of the board, each from a closed form without this pair, millimeters.
+/// Scatter of the positions of the board, millimeters. The position of each pair follows from a
+/// closed-form solution of the other pairs.
 fn leave_one_out_mm(pairs: &[(Transform, Transform)], solver: ClosedForm) -> Option<f64> {
     /// This number is sufficient to rank three solvers. In each fold, a solver uses all pairs of
     /// the other samples.
@@ -277,8 +279,9 @@ fn concentrate(samples: &[Sample], solution: &Solution, metric: Metric) -> Optio
 /// their rotations may be as large as the rotations.
 const MIN_ROTATION_RAD: f64 = 1e-3;
 
-/// Maximum number of pairs of samples in a solution. It is enough for all pairs of 63 samples. It
-/// limits the time for recordings with hundreds of samples. Every sample is still in many pairs.
+/// Maximum number of pairs of samples in a solution. All pairs of 63 samples are below this limit.
+/// The limit bounds the time for recordings with hundreds of samples, in which every sample is
+/// still in many pairs.
 const MAX_MOTIONS: usize = 2000;
 
 /// A closed-form solver.
@@ -339,8 +342,8 @@ pub(crate) fn motions(pairs: &[(Transform, Transform)]) -> Vec<Motion> {
         .collect()
 }
 
-/// Rotation with the least squared distance between the rotation vectors of `a` and the rotated
-/// ones of `b`.
+/// Rotation that minimizes the squared distances between the rotation vectors of `a` and the
+/// rotated rotation vectors of `b`.
 fn park_martin_rotation(motions: &[Motion]) -> Option<UnitQuaternion<f64>> {
     let mut correlation = Matrix3::zeros();
     for motion in motions {
@@ -376,8 +379,8 @@ fn modified_rodrigues(motion: &Transform) -> Vector3<f64> {
     2.0 * q.imag()
 }
 
-/// One of the two quaternions that represent the rotation. It is the one whose scalar part is not
-/// negative.
+/// The quaternion of the rotation whose scalar part is not negative. Its negative represents the
+/// same rotation.
 fn positive(rotation: UnitQuaternion<f64>) -> Quaternion<f64> {
     let q = rotation.into_inner();
     if q.scalar() < 0.0 { -q } else { q }
@@ -407,9 +410,9 @@ fn with_translation(motions: &[Motion], rotation: UnitQuaternion<f64>) -> Option
     ))
 }
 
-/// Scale of the translations of `b` relative to those of `a`, estimated together with the
-/// translation, and its standard deviation. The scale is 1 if both have the same unit, and 1000 if
-/// only the translations of `a` are in millimeters.
+/// Scale of the translations of `b` relative to the translations of `a`, and the standard deviation
+/// of this scale. The scale is estimated together with the translation. The scale is 1 if both have
+/// the same unit, and 1000 if only the translations of `a` are in millimeters.
 pub(crate) fn relative_scale(
     motions: &[Motion],
     rotation: UnitQuaternion<f64>,
@@ -418,7 +421,7 @@ pub(crate) fn relative_scale(
     (rows > 4).then_some(())?;
     let mut matrix = DMatrix::zeros(rows, 4);
     let mut right = DVector::zeros(rows);
-    // The equation is that of `with_translation`, with the scale as the fourth unknown: (R_a - 1) t
+    // The equation of `with_translation` gets the scale as its fourth unknown: (R_a - 1) t
     // - s R t_b = -t_a.
     for (ix, motion) in motions.iter().enumerate() {
         let factor = motion.a.rotation.to_rotation_matrix().into_inner() - Matrix3::identity();
@@ -444,8 +447,8 @@ pub(crate) fn relative_scale(
 }
 
 fn daniilidis(motions: &[Motion]) -> Option<Transform> {
-    // Six linear equations per motion for the eight elements of the dual quaternion. The scalar
-    // parts of `a` and `b` are equal, so only the vector parts give equations.
+    // Each motion gives six linear equations for the eight elements of the dual quaternion. The
+    // scalar parts of `a` and `b` are equal, so only the vector parts give equations.
     let mut normal = SMatrix::<f64, 8, 8>::zeros();
     for motion in motions {
         if motion.a.rotation.angle() < MIN_ROTATION_RAD {
@@ -498,8 +501,8 @@ fn dot(p: &Quaternion<f64>, q: &Quaternion<f64>) -> f64 {
     p.coords.dot(&q.coords)
 }
 
-/// Coefficients that combine two null vectors to a dual quaternion, which has unit length after
-/// scaling. Each null vector has a real and a dual part. The real part of the combination is
+/// Coefficients that combine two null vectors to a dual quaternion. After scaling, it has unit
+/// length. Each null vector has a real and a dual part. The real part of the combination is
 /// orthogonal to its dual part (Daniilidis 1999, equations 31 to 35).
 fn coefficients(null: &[(Quaternion<f64>, Quaternion<f64>); 2]) -> Option<(f64, f64)> {
     let [(u1, v1), (u2, v2)] = null;

@@ -43,8 +43,10 @@ pub(crate) struct Refined {
 impl Refined {
     /// The result of a fit that estimates only the hand-eye transform and the board pose.
     fn new(samples: Vec<Sample>, fit: PoseFit, intrinsics: Option<Intrinsics>) -> Self {
-        // The 95 % quantile of F with 6 and n degrees of freedom relative to that of chi squared /
-        // 6, to first order.
+        // The noise was estimated with n degrees of freedom, so the errors follow an F distribution
+        // instead of a chi squared distribution. The covariance is multiplied by the ratio of the
+        // 95 % quantiles of these two distributions, to first order. The F distribution has 6 and n
+        // degrees of freedom. The chi squared distribution has 6, and its quantile is divided by 6.
         const CHI_SQUARED_95: f64 = 12.59;
         let enlarged = 1.0 + (CHI_SQUARED_95 - 4.0) / (2.0 * fit.n_free);
         Self {
@@ -61,10 +63,10 @@ impl Refined {
     }
 }
 
-/// Refines a consensus.
+/// Refines the initial solution on which most samples agree.
 ///
-/// # Errors Returns [`Error::Refused`] if fewer than three samples agree, or fewer than half of all
-/// samples.
+/// # Errors
+/// Returns [`Error::Refused`] if fewer than three samples agree, or fewer than half of all samples.
 pub(crate) fn refine(
     input: &HandEyeInput<'_>,
     mut samples: Vec<Sample>,
@@ -80,11 +82,12 @@ pub(crate) fn refine(
     let Some(given) = input.intrinsics.clone().filter(|_| corner_px.is_some()) else {
         return Ok(Refined::new(samples, fit, input.intrinsics.clone()));
     };
-    // For a board that faces the camera, the pose that fits one image best is biased. Steps from
-    // the predicted poses are not biased, so outliers are searched again with these steps.
+    // For a board that faces the camera, the pose that fits one image best is biased. Single
+    // Gauss-Newton steps from the predicted poses are not biased, so these steps are used to find
+    // the outliers again.
     relinearize(input, &mut samples, &fit.solution, &given);
     let fit = reject_and_fit(input, &mut samples, fit.solution, fit.noise)?;
-    // Then from corners.
+    // The second fit uses the corners of the board.
     if input.options.estimate_intrinsics || input.options.estimate_joint_offsets {
         refine_with_others(input, samples, fit, given)
     } else {
@@ -100,8 +103,8 @@ fn refine_with_given(
     given: Intrinsics,
 ) -> Result<Refined, Error> {
     // A fit with free intrinsics shows whether the given intrinsics are right, and how their
-    // uncertainty changes the result. With few images, this fit may fail. In that case, neither is
-    // known.
+    // uncertainty changes the result. With few images, this fit may fail. In that case, both
+    // answers are unknown.
     let start = Start {
         input,
         samples: &samples,
@@ -120,8 +123,8 @@ fn refine_with_given(
         .and_then(|free| IntrinsicsDoubt::new(start, free, lens));
     let by_lens = free.as_ref().and_then(|free| propagated(free, Some(lens?)));
     let mut fit = minimize_weighted(start)?;
-    // The covariance of `doubt` already contains the effect of the lens, so only one of the two
-    // covariances is added.
+    // The covariance of `doubt` already contains the uncertainty of the given lens parameters,
+    // which is `by_lens`. For this reason, `by_lens` is added only if there is no doubt.
     if let Some(doubt) = &doubt {
         fit.covariance += doubt.covariance(&fit.solution);
     } else if let Some(by_lens) = by_lens {
@@ -141,8 +144,8 @@ fn refine_with_others(
     given: Intrinsics,
 ) -> Result<Refined, Error> {
     let free = minimize_free(input, &mut samples, &mut fit, given)?;
-    // The solution is computed with the other parameters fixed at their estimates, as if they were
-    // given. Their uncertainty is then added to its covariance.
+    // The solution is computed with intrinsics and joint offsets fixed at their estimates. The
+    // uncertainty of these estimates is then added to the covariance of the solution.
     let intrinsics = free.state.intrinsics.clone();
     let mut fit = minimize_weighted(Start {
         input: &with_offsets(input, &free.state.joint_offsets),
@@ -234,14 +237,15 @@ fn reject_and_fit(
     mut solution: Solution,
     mut noise: HandEyeNoise,
 ) -> Result<PoseFit, Error> {
-    /// Squared distance with six degrees of freedom. One good sample in 100 000 exceeds it.
+    /// Squared distance with six degrees of freedom. Of 100 000 good samples, about one exceeds
+    /// this limit.
     const MAX_SQUARED_DISTANCE: f64 = 33.1;
     // This limit ends the loop if two sets of samples alternate.
     const MAX_ROUNDS: usize = 8;
     let mut n_rounds = 0;
     loop {
         n_rounds += 1;
-        // If only a minority agrees, another group of samples may be the right one.
+        // If only a minority agrees, another group of samples may be right.
         let n_used = used(samples).count();
         if 2 * n_used < samples.len() || samples::n_stops(samples) < MIN_SAMPLES {
             let refusal = Refusal::new(
@@ -291,7 +295,7 @@ fn corner_noise(samples: &[Sample]) -> Option<f64> {
     Some((squares / f64::max(n_free, 1.0)).sqrt().max(MIN_PX))
 }
 
-/// Replaces the poses of the samples by steps from the predicted ones.
+/// Replaces the board pose of each sample by one Gauss-Newton step from the predicted pose.
 fn relinearize(
     input: &HandEyeInput<'_>,
     samples: &mut [Sample],

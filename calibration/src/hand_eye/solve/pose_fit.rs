@@ -1,9 +1,9 @@
 //! Generalized least squares over board poses, with noise variances estimated by restricted maximum
 //! likelihood.
 //!
-//! The source of the variance estimate is Patterson and Thompson 1971. Its iteration is that of Rao
-//! and Kleffe 1988, section 8.2, but with square roots. The square roots keep the variances
-//! positive and increase the likelihood monotonically.
+//! The source of the variance estimate is Patterson and Thompson 1971. The iteration follows Rao
+//! and Kleffe 1988, section 8.2, but takes square roots of the update factors. The square roots
+//! keep the variances positive and increase the likelihood monotonically.
 
 use super::super::Setup;
 use super::super::geometry::{self, Matrix6x12, N_PARAMS, Solution};
@@ -20,10 +20,10 @@ const LOSS_THRESHOLD: f64 = 3.55;
 /// Standard deviations of the measurement errors.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct HandEyeNoise {
-    /// Error of the corners, pixels along each axis. `None` if poses of the board were given.
-    /// Errors of the lens model and blur are common to the corners of one image. This value
-    /// includes such errors. Independent errors of this size would have the same effect on the pose
-    /// of the board.
+    /// Error of the corners, pixels along each axis. `None` if poses of the board were given. The
+    /// value includes errors that the corners of one image share, such as errors of the lens model
+    /// and blur. Independent corner errors of this size would have the same effect on the pose of
+    /// the board.
     pub corner_px: Option<f64>,
     /// Residual of the corners after a separate fit of each image, pixels along each axis. It is at
     /// most `corner_px`.
@@ -31,13 +31,13 @@ pub struct HandEyeNoise {
     /// Rotation error about each axis, radians. If corners were given, it is the error of the robot
     /// poses. Otherwise, it is the error of the board poses, which includes the error of the robot.
     pub rotation_rad: f64,
-    /// Translation error along each axis, meters, of the same poses.
+    /// Translation error of the same poses along each axis, meters.
     pub translation_m: f64,
 }
 
 impl HandEyeNoise {
-    /// No robot or board has smaller errors than these. They keep variances positive and limit the
-    /// stated accuracy.
+    /// No robot or board has smaller errors than these values. The values keep variances positive
+    /// and limit the stated accuracy.
     const MIN: Self = Self {
         corner_px: None,
         residual_px: None,
@@ -213,16 +213,16 @@ pub(super) fn fit(
     }
 }
 
-/// Largest number of fits of a cross-validation. With more measurements, several are left out at a
-/// time, because the time would grow with the square of their number. Leaving out even one of 60
-/// measurements changes a solution very little.
+/// Largest number of fits of a cross-validation. With more measurements than this, each fit leaves
+/// out several measurements. Otherwise, the time would grow with the square of their number.
+/// Leaving out even one of 60 measurements changes a solution very little.
 pub const MAX_FOLDS: usize = 60;
 
 /// For each measurement, the solution from the other measurements. Stops are left out one by one.
 /// If there are many stops, they are left out in [`MAX_FOLDS`] interleaved folds.
 ///
-/// * `knows_noise`: keeps the given noise, which is faster than estimating it without the
-///   measurement.
+/// * `knows_noise`: keeps the given noise. This is faster than estimating the noise again without
+///   the measurement.
 pub(crate) fn held_out_solutions(
     setup: Setup,
     measurements: &[Measurement],
@@ -507,14 +507,14 @@ fn update_variances(
         .try_inverse()
         .unwrap_or_else(|| DMatrix::zeros(N_PARAMS, N_PARAMS));
     let x_information = inverse.view((0, 0), (6, 6)).into_owned().try_inverse();
-    // For each variance, these are the part of the squared residuals that it explains, and the part
-    // that is expected with the current values. The expectation considers that the parameters were
-    // fitted to the same residuals.
+    // There are two sums for each variance: the part of the squared residuals that this variance
+    // explains, and the expected value of this part with the current variances. The expected value
+    // takes into account that the parameters were fitted to the same residuals.
     let mut squares = vec![0.0; n_variances];
     let mut expected = vec![0.0; n_variances];
-    // These are the Fisher information about the variances, and the derivative of the logarithm of
-    // the hand-eye covariance (the mean over its six parameters). The degrees of freedom follow
-    // from both.
+    // The first matrix is the Fisher information about the variances. The vector is the derivative
+    // of the logarithm of the hand-eye covariance, averaged over its six parameters. The degrees of
+    // freedom follow from both.
     let mut fisher = DMatrix::<f64>::zeros(n_variances, n_variances);
     let mut log_volume_by_variance = DVector::<f64>::zeros(n_variances);
     for measurement in measurements {
@@ -579,8 +579,8 @@ fn update_variances(
 
 /// Weight of six whitened residuals, divided by its mean for normal residuals.
 fn robust_weight(squared_norm: f64) -> f64 {
-    // Mean of the weighted squared norm, divided by six. Without it, variances of normal residuals
-    // would be 1 % too small.
+    // Mean of the weighted squared norm, divided by six. Without this factor, variances of normal
+    // residuals would be 1 % too small.
     const MEAN: f64 = 0.99;
     (LOSS_THRESHOLD / squared_norm.sqrt()).min(1.0) / MEAN
 }

@@ -37,8 +37,8 @@ impl ImagePart {
         Self::LowerRight,
     ];
 
-    /// The order in which the parts are requested: opposite corners first, because they show whether
-    /// the lens is distorted.
+    /// The order in which the parts are requested. Opposite corners come first, because they show
+    /// whether the lens is distorted.
     pub(super) const REQUESTED: [Self; 9] = [
         Self::Center,
         Self::UpperLeft,
@@ -90,7 +90,8 @@ pub enum CoverageGoal {
 pub struct GoalProgress {
     /// The goal.
     pub goal: CoverageGoal,
-    /// For a part of the image, cells with corners; otherwise, photographs. It may exceed `n_needed`.
+    /// Number of cells with corners if the goal is a part of the image, otherwise the number of
+    /// photographs. It may exceed `n_needed`.
     pub n_done: usize,
     /// The required number.
     pub n_needed: usize,
@@ -106,10 +107,10 @@ impl GoalProgress {
 /// The photograph to take next.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum NextPhotograph {
-    /// Any with the whole target.
+    /// Any view that shows the whole target.
     ShowTarget,
-    /// One that helps to reach this goal.
+    /// A view that helps to reach this goal.
     Toward(GoalProgress),
-    /// None: everything is covered.
+    /// No view is needed, because everything is covered.
     Enough,
 }

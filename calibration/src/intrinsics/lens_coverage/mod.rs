@@ -1,30 +1,34 @@
-//! What photographs of a target must cover to determine a lens, what they cover so far, and which
-//! photograph to take next. This needs no calibration.
+//! Checks whether photographs of a target determine a lens, and suggests which photograph to take
+//! next. This works before a calibration exists.
 //!
 //! # The rule
 //!
-//! - **Parts of the image.** Each of 3 x 3 parts of the image needs corners in half of its cells, of
-//!   16 x 9 cells in the whole image. Between corners, a lens model interpolates; beyond them, it
-//!   extrapolates, and the error grows with a power of the distance. The corners of the image, where
-//!   the distortion is largest, therefore need corners of the target, and not only its center.
-//!   Not every cell is needed: the distortion is smooth over several cells, and the corners of a
-//!   whole chessboard cannot reach the outermost cells, because the detector needs its margin.
-//! - **Tilts.** Two photographs each need the left, right, upper and lower side of the target away
-//!   from the camera. If all photographs face the target, a longer focal length looks the same as a
-//!   larger distance (Zhang 2000, section 3.3: parallel planes add no constraints). Opposite tilts
-//!   separate the focal length from the principal point, which moves in opposite directions. Two of
-//!   each, so that one photograph that is rejected later is not missed.
-//! - **Distances.** Two photographs need a target that is large in the image, and two one that is
-//!   clearly smaller. The focal length shows in the perspective of a tilted target: the sizes of its
-//!   near and far sides differ by the size of the target divided by its distance, which must be
-//!   large compared with the errors of corners. The smaller targets show the same part of the image
-//!   from another distance, so that an uneven target is not taken for distortion, and only they fit
-//!   into the corners of the image as a whole.
-//! - **Number.** There are at least [`RECOMMENDED_IMAGES`] photographs that all differ, so that
-//!   lens models can be compared on photographs that were held out.
+//! - **Parts of the image.** The image has 16 x 9 cells and is divided into 3 x 3 parts. In each
+//!   part, half of the cells need a corner of the target. Between target corners, a lens model
+//!   interpolates. Beyond them, it extrapolates, and its error grows with a power of the distance.
+//!   The distortion is largest in the corners of the image, so these parts need target corners as
+//!   well as the center does. Not every cell needs a target corner, because the distortion is
+//!   smooth over several cells. The corners of a whole chessboard cannot reach the outermost cells
+//!   anyway, because the detector needs the margin of the board.
+//! - **Tilts.** Each of the left, right, upper and lower side of the target must be tilted away
+//!   from the camera in two photographs. If all photographs face the target, a longer focal length
+//!   looks the same as a larger distance (Zhang 2000, section 3.3: parallel planes add no
+//!   constraints). Opposite tilts separate the focal length from the principal point, because they
+//!   move the principal point in opposite directions. Two photographs per side are requested,
+//!   because one of them may be rejected later.
+//! - **Distances.** In two photographs, the target must be large in the image. In two others, it
+//!   must be clearly smaller. The large targets determine the focal length from the perspective of
+//!   a tilted target. The sizes of its near and far sides differ by a fraction that is the size of
+//!   the target divided by its distance. This fraction must be large compared with the errors of
+//!   corners. The smaller targets cover the same part of the image from another distance, so that
+//!   the unevenness of a target is not mistaken for distortion. A whole target also fits into the
+//!   corners of the image only if it is small.
+//! - **Number.** There must be at least [`RECOMMENDED_IMAGES`] different photographs, so that lens
+//!   models can be compared on held-out photographs.
 //!
-//! Similar rules are used by the calibrator of ROS (`camera_calibration`: ranges of position, size
-//! and skew) and recommended by the documentation of mrcal ("choreography").
+//! The calibrator of ROS (`camera_calibration`) uses similar rules, which are ranges of position,
+//! size and skew. The documentation of mrcal recommends similar rules in its section on
+//! choreography.
 
 mod goals;
 mod shape;
@@ -43,12 +47,14 @@ use shape::ViewShape;
 pub const RECOMMENDED_IMAGES: usize = 15;
 /// A part of the image is covered if this fraction of its cells has corners.
 const MIN_COVERED_FRAC: f64 = 0.5;
-/// A tilt counts if the angle between the target and the image is at least this value. The value is below the requested 20 degrees, because people estimate tilts by eye.
+/// A tilt counts if the angle between the target and the image is at least this value. The value is
+/// below the requested 20 degrees, because people estimate tilts by eye.
 const MIN_TILT_DEG: f64 = 15.0;
 /// Number of photographs with each tilt, with a near target, and with a far target.
 const MIN_EACH: usize = 2;
-/// A target is near if the square root of the part of the image between its corners is at least
-/// this, and far if it is at most [`FAR_RATIO`] of the largest one so far.
+/// The span of a target is the square root of the fraction of the image that its corners cover. A
+/// target is near if its span is at least this value. It is far if its span is at most
+/// [`FAR_RATIO`] times the largest span so far.
 const NEAR_SPAN_FRAC: f64 = 0.4;
 const FAR_RATIO: f64 = 0.6;
 /// A photograph covers more of a part of the image if it has corners in this many new cells. One
@@ -67,7 +73,7 @@ impl LensCoverage {
     /// The coverage without photographs.
     ///
     /// * `intrinsics`: an approximate lens with the size of the images. It is used to estimate the
-    ///   tilts; an error of its focal length by a third changes them by a few degrees.
+    ///   tilts. If its focal length is wrong by a third, the tilts change by a few degrees.
     pub fn new(intrinsics: &Intrinsics) -> Self {
         Self {
             intrinsics: intrinsics.clone(),
@@ -85,8 +91,8 @@ impl LensCoverage {
         }
     }
 
-    /// The goal that a photograph would help to reach; `None` if it would add nothing. A photograph
-    /// that looks like an earlier one adds nothing.
+    /// The goal that a photograph would help to reach. `None` if it would add nothing. A photograph
+    /// that looks like an earlier photograph adds nothing.
     pub fn value_of(&self, view: &BoardView) -> Option<CoverageGoal> {
         let shape = ViewShape::of(view, &self.intrinsics);
         if self.shapes.iter().any(|other| !shape.differs_from(other)) {
@@ -99,7 +105,8 @@ impl LensCoverage {
             CoverageGoal::Tilt(side) => shape.tilt_away_deg(side) >= MIN_TILT_DEG,
             CoverageGoal::Near => shape.span_frac >= NEAR_SPAN_FRAC,
             CoverageGoal::Far => shape.span_frac <= FAR_RATIO * self.largest_span_frac(),
-            // The number alone is not worth a photograph while others are needed anyway.
+            // If other goals are still open, a photograph is not accepted only to increase the
+            // number, because more photographs are needed anyway.
             CoverageGoal::Number => self.reaches_all_but_number(),
         };
         let goal = missing.into_iter().find(helps).map(|goal| goal.goal);
@@ -129,7 +136,7 @@ impl LensCoverage {
     }
 
     /// All goals in the order in which they should be reached. Tilts come first, because they
-    /// determine the focal length, and the other goals are of little use without it.
+    /// determine the focal length. Without the focal length, the other goals are of little use.
     pub fn goals(&self) -> Vec<GoalProgress> {
         let n_with = |counts: &dyn Fn(&ViewShape) -> bool| {
             self.shapes.iter().filter(|shape| counts(shape)).count()

@@ -6,9 +6,9 @@ use crate::BoardView;
 use kinematics::Intrinsics;
 use nalgebra::{Matrix2, Vector2, Vector3};
 
-/// Two photographs differ if the target has moved by this part of the width of the image, if its
-/// tilt has changed by this angle, or if its size has changed by this factor. Smaller differences
-/// would accept the trembling of a hand as another photograph.
+/// Two photographs differ if the target has moved by this fraction of the width of the image, if
+/// its tilt has changed by this angle, or if its size has changed by this factor. With smaller
+/// limits, the trembling of a hand would count as another photograph.
 const MIN_SHIFT_FRAC: f64 = 0.06;
 const MIN_TILT_CHANGE_DEG: f64 = 8.0;
 const MIN_SIZE_RATIO: f64 = 1.12;
@@ -20,8 +20,8 @@ pub(super) struct ViewShape {
     center_frac: Vector2<f64>,
     /// Square root of the fraction of the image that the corners span.
     pub(super) span_frac: f64,
-    /// Rotation of the target about the x and the y axis of the camera, degrees; zero if it is
-    /// parallel to the image, or if its pose is not determined.
+    /// Rotation of the target about the x and the y axis of the camera, degrees. It is zero if the
+    /// target is parallel to the image, or if its pose is not determined.
     tilt_deg: [f64; 2],
 }
 
@@ -36,7 +36,8 @@ impl ViewShape {
             .sum::<Matrix2<f64>>()
             / n;
         // The variance of points that fill an interval evenly is the square of its length divided
-        // by 12. Unlike a box around the corners, this does not depend on the rotation.
+        // by 12. Unlike the area of a box around the corners, this area does not depend on the
+        // rotation.
         let area_px2 = 12.0 * covariance.determinant().max(0.0).sqrt();
         Self {
             center_frac: center / width,
@@ -56,7 +57,7 @@ impl ViewShape {
         }
     }
 
-    /// Whether this is another photograph, and not the same one again.
+    /// Whether the target appears differently in two photographs.
     pub(super) fn differs_from(&self, other: &Self) -> bool {
         let shift_frac = (self.center_frac - other.center_frac).norm();
         let tilt_change = Vector2::from(self.tilt_deg) - Vector2::from(other.tilt_deg);
@@ -67,9 +68,9 @@ impl ViewShape {
     }
 }
 
-/// Rotation of the target about the x and the y axis of the camera, degrees: zero if it is parallel
-/// to the image. With a positive angle about y, the left side is farther away. With a positive angle
-/// about x, the lower side is farther away.
+/// Rotation of the target about the x and the y axis of the camera, degrees. It is zero if the
+/// target is parallel to the image. With a positive angle about y, the left side is farther away.
+/// With a positive angle about x, the lower side is farther away.
 ///
 /// The angle is relative to the optical axis and not to the line of sight, because parallel targets
 /// add no constraints, wherever they are in the image.
@@ -134,8 +135,8 @@ mod tests {
         let [upright, rotated] = [0.0, 40.0]
             .map(|deg| ViewShape::of(&view([0.0, 0.0, 0.4], [0.0, 0.0, deg]), &camera()));
         assert!((upright.span_frac - rotated.span_frac).abs() < CLOSE);
-        // The board has 9 x 7 points, which span 0.2 x 0.15 m; the discrete points have a variance
-        // that is larger by (n + 1) / (n - 1).
+        // The board has 9 x 7 points, which span 0.2 x 0.15 m. The variance of these discrete
+        // points is larger by (n + 1) / (n - 1).
         let area_px2 =
             (0.2 * 500.0 / 0.4) * (0.15 * 500.0 / 0.4) * (10.0_f64 / 8.0 * 8.0 / 6.0).sqrt();
         let expected = (area_px2 / (640.0 * 480.0)).sqrt();

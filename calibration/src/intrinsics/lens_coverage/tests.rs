@@ -24,7 +24,7 @@ pub(super) fn view(center: [f64; 3], rotation_deg: [f64; 3]) -> BoardView {
     view_of(&camera(), center, rotation_deg)
 }
 
-/// The same with any lens. Corners outside of the image are missing.
+/// The view of such a board by a camera with any lens. Corners outside of the image are missing.
 fn view_of(camera: &Intrinsics, center: [f64; 3], rotation_deg: [f64; 3]) -> BoardView {
     let rotation =
         UnitQuaternion::from_scaled_axis(Vector3::from(rotation_deg).map(f64::to_radians));
@@ -44,7 +44,7 @@ fn view_of(camera: &Intrinsics, center: [f64; 3], rotation_deg: [f64; 3]) -> Boa
     }
 }
 
-/// A pose of the target with which an obedient person follows an instruction.
+/// A pose of the target with which a person follows an instruction.
 fn follow(next: NextPhotograph, random: &mut Random) -> ([f64; 3], [f64; 3]) {
     let mut about = |value: f64, spread: f64| value + random.uniform(-spread, spread);
     let rotation_z = about(0.0, 12.0);
@@ -141,9 +141,9 @@ fn following_the_instructions_covers_everything() {
 fn what_is_covered_determines_the_lens_in_the_whole_image() {
     /// Errors of detected corners, pixels.
     const NOISE_PX: f64 = 0.1;
-    /// Required standard deviation of the projection anywhere in the image, and the largest error
-    /// of the focal length, pixels. With the same number of frontal images, the calibration is
-    /// refused.
+    /// Largest allowed standard deviation of the projection anywhere in the image, pixels. The next
+    /// constant is the largest allowed error of the focal length, pixels. With the same number of
+    /// frontal images, the calibration is refused.
     const MAX_SIGMA_PX: f64 = 1.0;
     const MAX_FOCAL_ERROR_PX: f64 = 2.0;
     let camera = Intrinsics {
@@ -175,7 +175,7 @@ fn what_is_covered_determines_the_lens_in_the_whole_image() {
     }
 }
 
-/// The coverage of views, without a check whether they add anything.
+/// The coverage of all views. It is not checked whether a view adds anything.
 fn coverage_of(views: impl IntoIterator<Item = BoardView>) -> LensCoverage {
     let mut coverage = LensCoverage::new(&camera());
     views.into_iter().for_each(|view| coverage.add(&view));
@@ -222,7 +222,7 @@ fn each_goal_needs_its_own_photographs() {
         &coverage_of(many([0.0; 3], 0.7)),
         CoverageGoal::Near
     ));
-    // All in the center, tilted to all sides and at all distances.
+    // All targets are in the center, tilted to all sides and at all distances.
     let tilts = [
         [0.0, 30.0, 0.0],
         [0.0, -30.0, 0.0],

@@ -60,8 +60,8 @@ impl Sampson {
 
     /// Derivatives of the distance by the elements of the essential matrix.
     fn derivatives(&self) -> Matrix3<f64> {
-        // The quotient rule for numerator / norm. The numerator is linear in the essential matrix,
-        // and the squared norm is quadratic.
+        // This is the quotient rule for numerator / norm. The numerator is linear in the essential
+        // matrix, and the squared norm is quadratic.
         let by_norm = self.gradients[1] * self.rays[0].transpose()
             + self.rays[1] * self.gradients[0].transpose();
         let by_numerator = self.rays[1] * self.rays[0].transpose();
@@ -84,8 +84,7 @@ fn essential_derivatives(to_from_from: &Transform) -> [[Matrix3<f64>; N_PARTS]; 
     });
     let of_second = std::array::from_fn(|part| {
         let axis = Vector3::ith(part % 3, 1.0);
-        // If the two factors of the essential matrix are rotated from the left, the matrix is
-        // rotated.
+        // A rotation of both factors of the essential matrix from the left rotates the matrix.
         if part < 3 {
             -axis.cross_matrix() * rotation
         } else {
@@ -101,12 +100,12 @@ pub(super) struct PairMatches {
     pub(super) pair: Pair,
     pub(super) cameras: [usize; 2],
     pub(super) matches: Vec<Match>,
-    /// Half the width of the band in which they were searched.
+    /// Half the width of the band in which the matches were searched.
     pub(super) band_rad: f64,
 }
 
 impl PairMatches {
-    /// Pose of the first camera in the frame of the second one.
+    /// Pose of the first camera in the frame of the second camera.
     fn to_from_from(&self, cameras: &[MovingCamera]) -> Transform {
         cameras[self.pair.to].world_from_camera.inverse()
             * cameras[self.pair.from].world_from_camera
@@ -143,7 +142,7 @@ impl PairMatches {
             .collect()
     }
 
-    /// Contribution to the normal equations. Their derivatives neglect the motion during readout,
+    /// Contribution to the normal equations. The derivatives neglect the motion during readout,
     /// which is small compared with the distance between the cameras.
     ///
     /// * `noise_texels`: standard deviation of the distances.
@@ -188,7 +187,8 @@ impl PairMatches {
             row.iter_mut()
                 .zip(&derivatives)
                 .for_each(|(value, derivative)| *value = by_essential.dot(derivative));
-            // The lens moves the rays, each along its own gradient.
+            // A lens parameter moves the ray in each image, and the gradient gives the effect on
+            // the distance.
             for (ix, camera) in pair_cameras.into_iter().enumerate() {
                 let by_ray = sampson.gradients[ix].xy() * (scale / sampson.norm);
                 for (param, motion) in camera

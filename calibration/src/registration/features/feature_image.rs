@@ -24,8 +24,8 @@ const MAX_LEVELS: usize = 4;
 const MIN_SIDE: usize = 40;
 /// Approximate maximum number of corners of the finest level.
 const MAX_CORNERS: usize = 700;
-/// Minimum side of a cell of the grid that spreads corners over the image, texels, and maximum
-/// number of corners of a cell.
+/// Minimum side of a cell of the grid that spreads corners over the image, texels. The next
+/// constant is the maximum number of corners of a cell.
 const MIN_CELL: usize = 16;
 const CORNERS_PER_CELL: usize = 3;
 /// Minimum brightness gradient of a corner in every direction, as root mean square per texel. With
@@ -33,8 +33,9 @@ const CORNERS_PER_CELL: usize = 3;
 const MIN_GRADIENT: f32 = 1.5;
 /// Half the side of the window of a corner, texels.
 const WINDOW_RADIUS: usize = 2;
-/// Samples along each side of a descriptor, and their distance in texels. A larger window is more
-/// distinctive, but shows a single flat surface less often.
+/// Number of samples along each side of a descriptor. The next constant is the distance between
+/// them in texels. A larger window is more distinctive, but less often lies on a single flat
+/// surface.
 const SIDE: usize = 8;
 const SPACING: f64 = 2.5;
 /// Number of samples of a descriptor.
@@ -92,8 +93,8 @@ pub(super) struct FeatureImage {
 /// Side of the window of a corner, texels.
 const DIAMETER: usize = 2 * WINDOW_RADIUS + 1;
 
-/// Whether a response is larger than those of its eight neighbors. If responses are equal, the
-/// first one counts as larger.
+/// Whether a response is larger than the responses of its eight neighbors. If responses are equal,
+/// the first response counts as larger.
 fn is_maximum(response: &[f32], width: usize, ix: usize) -> bool {
     let own = response[ix];
     let earlier = [ix - width - 1, ix - width, ix - width + 1, ix - 1];
@@ -172,8 +173,8 @@ impl FeatureImage {
         }
     }
 
-    /// Descriptor of a corner along axes that are rotated by an angle, given as cosine and sine,
-    /// from those of the image.
+    /// Descriptor of a corner along axes that are rotated relative to the axes of the image. The
+    /// angle is given as cosine and sine.
     pub(super) fn rotated_descriptor(
         &self,
         corner: &Corner,
@@ -338,7 +339,7 @@ impl Level {
                 tensors[ix] = [gx * gx, gx * gy, gy * gy];
             }
         }
-        // The sum over the window, along rows first, then along columns.
+        // The tensors are summed over the window, along rows first, then along columns.
         let mut rows = vec![[f32::NAN; 3]; tensors.len()];
         for y in 0..height {
             for x in WINDOW_RADIUS..width - WINDOW_RADIUS {

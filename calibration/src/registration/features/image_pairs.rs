@@ -9,11 +9,11 @@ use nalgebra::Vector3;
 use numbers::quantile::median;
 use rayon::prelude::*;
 
-/// Maximum angle between the viewing directions of a pair, radians. Corners look too different
-/// beyond it.
+/// Maximum angle between the viewing directions of a pair, radians. Beyond this angle, corners look
+/// too different.
 const MAX_VIEW_ANGLE_RAD: f64 = 0.8;
-/// Minimum distances between the cameras of a pair. One is in meters, and the other is relative to
-/// the median distance. Closer images hardly determine any epipolar lines.
+/// Minimum distance between the cameras of a pair, meters. The next constant is a second minimum,
+/// relative to the median distance. The epipolar lines of closer images are hardly determined.
 const MIN_BASELINE_M: f64 = 0.02;
 const MIN_BASELINE_FRAC: f64 = 0.1;
 /// Minimum fraction of an image that its partner must show if all points are at the same, most

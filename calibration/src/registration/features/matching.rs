@@ -8,14 +8,15 @@ use nalgebra::{Matrix3, Vector2, Vector3};
 /// Minimum normalized cross-correlation of a match. A lower value adds matches that are mostly
 /// wrong. A higher value loses corners that are seen from different directions.
 const MIN_CORRELATION: f32 = 0.75;
-/// Maximum squared distance of the best match's descriptor, relative to that of the second-best
-/// match.
+/// Maximum squared distance of the best match's descriptor, relative to the squared distance of the
+/// second-best match.
 const MAX_RATIO: f32 = 0.7;
 /// Candidates closer than this to the best match, in texels, do not count as second best, because
 /// they are the same corner on another level.
 const SAME_CORNER_TEXELS: f64 = 3.0;
-/// Maximum difference of the levels of two corners, which is a factor of 1.5 in distance. With more
-/// levels, larger differences would be allowed, but there would be more wrong matches.
+/// Maximum difference of the levels of two corners. One level is a factor of 1.5 in distance. With
+/// a larger value, corners could be matched across larger ratios of distance, but there would be
+/// more wrong matches.
 const MAX_LEVEL_DIFFERENCE: usize = 1;
 
 /// Two corners that show the same point.
@@ -34,7 +35,7 @@ pub(super) fn essential(rotation: &Matrix3<f64>, translation_m: &Vector3<f64>) -
     translation_m.cross_matrix() * rotation
 }
 
-/// Matches corners of one image with those of another.
+/// Matches corners of one image with corners of another image.
 ///
 /// * `cameras`: approximate poses of the two images.
 /// * `tolerance_rad`: maximum distance of a match from its epipolar line.
@@ -52,8 +53,9 @@ pub(super) fn matches(
         .iter()
         .map(|corner| cameras[1].sighting(corner).ray)
         .collect();
-    // Descriptors of the second image along the axes of the first one. The roll is known, so
-    // descriptors need not be invariant, which makes them more distinctive.
+    // The descriptors of the second image are computed along the axes of the first image.
+    // Descriptors need not be invariant to rotation, because the roll is known. They are therefore
+    // more distinctive.
     let descriptors: Vec<Option<Descriptor>> = to
         .corners
         .iter()
@@ -74,13 +76,13 @@ pub(super) fn matches(
             };
             let correlation = dot(&from.descriptors[ix], descriptor);
             candidates.push((correlation, other_ix));
-            // This maximum is used for the check in the other direction, so this check needs no
+            // The maximum is used for the check in the other direction, which therefore needs no
             // second search.
             if correlation > best_of_to[other_ix].0 {
                 best_of_to[other_ix] = (correlation, ix);
             }
         }
-        // If several are equal, the first one is taken.
+        // If several matches are equal, the first match is used.
         let Some(best) = candidates
             .iter()
             .copied()
@@ -118,8 +120,8 @@ pub(super) fn matches(
     matches
 }
 
-/// Cosine and sine of the angle from the axes of the second image at a ray to those of the first
-/// image.
+/// Cosine and sine of the angle, at a ray, from the axes of the second image to the axes of the
+/// first image.
 fn roll(to_from_from: &Matrix3<f64>, ray: &Vector2<f64>) -> Option<[f64; 2]> {
     // The axes of the first image as seen in the second image are derivatives of the projection.
     let project = |axis: Vector3<f64>| axis.xy() - ray * axis.z;
@@ -137,8 +139,8 @@ struct Band {
     /// offset`.
     normal: Vector2<f64>,
     offset: f64,
-    /// Where a very distant point appears, and the unit direction in which it moves as it comes
-    /// nearer.
+    /// Position at which a very distant point appears, and the unit direction in which the point
+    /// moves as it comes nearer.
     from_infinity: Option<(Vector2<f64>, Vector2<f64>)>,
     tolerance_rad: f64,
 }

@@ -35,15 +35,16 @@ use rayon::prelude::*;
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 
-/// Typical errors relative to those of registration. Registration starts from an approximate
-/// calibration. Without depth, transforms are often measured by hand, so their errors are larger.
+/// Typical calibration errors without depth, relative to the typical errors that registration with
+/// depth assumes. Without depth, transforms are often measured by hand, so their errors are larger.
 const SCALE: f64 = 2.0;
 
-/// Cameras with fewer training and validation images keep the given extrinsics, because the errors
-/// of an estimate may exceed those of the given ones.
+/// Cameras with fewer training and validation images keep the given extrinsics, because an estimate
+/// may be less accurate than the given extrinsics.
 const MIN_IMAGES_PER_CAMERA: usize = 10;
 
-/// Minimum gain in cross-validation, dB. Errors of single poses also cause gains, but smaller ones.
+/// Minimum gain in cross-validation, dB. Errors of single poses also cause gains, but these gains
+/// are smaller.
 const MIN_GAIN_DB: f64 = 0.1;
 
 /// Minimum gain that a variant must reach with the matches of the baseline before it is tried with
@@ -105,12 +106,12 @@ const MAX_PARALLAX: f64 = 0.5;
 /// Minimum half width of the band, texels of the finest level. Corners are less accurate than a
 /// texel, and matches must be able to move away from their start.
 const MIN_BAND_TEXELS: f64 = 4.0;
-/// Noise that cross-validation assumes, so that differences below it do not count.
+/// Noise that cross-validation assumes. Differences below this noise do not count.
 const NOISE_TEXELS: f64 = 0.5;
 /// Minimum number of matches of a pair. Fewer may all be wrong.
 const MIN_MATCHES: usize = 8;
-/// Limits of the standard deviation of the distances from the epipolar lines, texels. Above the
-/// upper limit, wrong matches affect the median.
+/// Lower limit of the standard deviation of the distances from the epipolar lines, texels. The next
+/// constant is the upper limit. Above it, wrong matches affect the median.
 const MIN_NOISE_TEXELS: f64 = 0.25;
 const MAX_NOISE_TEXELS: f64 = 1.5;
 /// The standard deviation that an iteration assumes, relative to the previous iteration. With a
@@ -120,7 +121,8 @@ const MAX_ITERATIONS: usize = 40;
 /// A step smaller than this number of standard deviations ends a round.
 const CONVERGED_STEP_SIGMAS: f64 = 0.05;
 /// Minimum fraction of the last round's matches that are near the epipolar line. A match is near if
-/// it is within the same fraction of the band. Random matches are spread evenly over the band.
+/// its distance is below the same fraction of the half width of the band. Random matches are spread
+/// evenly over the band.
 const MIN_INNER_MATCHES: f64 = 0.5;
 const MAX_INNER_FRAC: f64 = 0.25;
 
@@ -166,8 +168,8 @@ pub(super) fn align(keyframes: &[Arc<Keyframe>], choice: &CameraRefinement) -> O
     for set in sets.into_iter().filter(|set| scene.layout(*set).n() > 0) {
         let has_extrinsics = set.contains(ParamSet::EXTRINSICS);
         // Matching takes most of the time, so parameters that hardly improve existing matches are
-        // rejected without searching for new ones. This does not apply to extrinsics, because
-        // existing matches contain little information about their improvement.
+        // rejected without a search for new matches. Extrinsics are an exception, because existing
+        // matches contain little information about the improvement by new extrinsics.
         if is_optional && !has_extrinsics {
             let matches =
                 kept_matches.get_or_insert_with(|| scene.matches(&kept.corrections, &QUICK_ROUND));
@@ -233,7 +235,8 @@ impl FeatureScene {
             }
         }
         ixs_of_camera.retain(|_, ixs| ixs.len() >= MIN_IMAGES_PER_CAMERA);
-        // The limit holds for all cameras together, but each one gets enough for an estimate.
+        // The limit holds for all cameras together, but each camera keeps enough images for an
+        // estimate.
         let max_images = (MAX_IMAGES / ixs_of_camera.len().max(1)).max(MIN_IMAGES_PER_CAMERA);
         let sampled = ixs_of_camera.values().flat_map(|ixs| {
             let n = ixs.len().min(max_images);
@@ -288,8 +291,9 @@ impl FeatureScene {
     fn band_rad(&self, pair: &Pair, to_from_from: &Transform, round: &Round) -> f64 {
         let from = &self.images[pair.from];
         let to = &self.images[pair.to];
-        // An error that both images share cancels unless the images are rotated relative to each
-        // other. Errors of two cameras are independent and add up.
+        // If both images are from one camera, they share its error. This error cancels unless the
+        // images are rotated relative to each other. Errors of two cameras are independent and add
+        // up.
         let share = if from.camera == to.camera {
             2.0 * (0.5 * to_from_from.rotation.angle()).sin()
         } else {
@@ -335,14 +339,15 @@ impl FeatureScene {
         start: &CalibrationModel,
     ) -> Option<(Vec<Pair>, CalibrationModel)> {
         let mut corrections = start.corrections.clone();
-        // Once extrinsics are known, or if they are assumed to be known, the coarsest round is not
-        // needed.
+        // The coarsest round is not needed if extrinsics were already estimated or are assumed to
+        // be known.
         let is_coarse =
             set.contains(ParamSet::EXTRINSICS) && !start.set.contains(ParamSet::EXTRINSICS);
         let rounds = if is_coarse { &ROUNDS[..] } else { &ROUNDS[1..] };
         let mut last = None;
         for (ix, round) in rounds.iter().enumerate() {
-            // In wide bands, wrong matches disturb the less observable parameters.
+            // In wide bands, wrong matches disturb the less observable parameters, so only the
+            // extrinsics are estimated there.
             let layout = self.layout(if ix >= 2 || !is_coarse {
                 set
             } else {
@@ -366,8 +371,8 @@ impl FeatureScene {
             }
         }
         let (matches, fit) = last?;
-        // Images without texture or overlap also give matches, but these are not where the estimate
-        // predicts them.
+        // Images without texture or overlap also give matches, but these matches are not near the
+        // predicted epipolar lines.
         let cameras = self.moving_cameras(&corrections);
         let mut n_inner = 0;
         let mut n = 0;
@@ -387,7 +392,8 @@ impl FeatureScene {
         is_consistent.then(|| (matches.iter().map(|pair| pair.pair).collect(), model))
     }
 
-    /// Minimizes the distances of given matches, with decreasing influence of distant ones.
+    /// Minimizes the distances of given matches. The influence of distant matches decreases with
+    /// every iteration.
     fn fit(&self, matches: &[PairMatches], layout: &Layout, start: &Corrections) -> Option<Fit> {
         let pairs: Vec<Pair> = matches.iter().map(|pair| pair.pair).collect();
         let mut corrections = start.clone();
@@ -440,7 +446,7 @@ impl FeatureScene {
         })
     }
 
-    /// Largest difference of an image with two corrections. See [`MovingCamera::difference`].
+    /// Largest difference between two corrections of an image. See [`MovingCamera::difference`].
     fn largest_difference(&self, one: &Corrections, other: &Corrections) -> [f64; 2] {
         let both = self
             .moving_cameras(one)
@@ -483,7 +489,8 @@ impl FeatureScene {
         baseline: &CalibrationModel,
         variant: &CalibrationModel,
     ) -> Vec<PairMatches> {
-        // The band around the epipolar lines of the baseline also contains those of the variant.
+        // The band around the epipolar lines of the baseline is wide enough to contain the epipolar
+        // lines of the variant.
         let [change_rad, change_m] =
             self.largest_difference(&baseline.corrections, &variant.corrections);
         let round = Round {
@@ -495,7 +502,7 @@ impl FeatureScene {
     }
 
     /// Evaluates a set of parameters with given matches. This is faster than searching for new
-    /// ones, but underestimates the gain.
+    /// matches, but underestimates the gain.
     fn quick_trial(
         &self,
         set: ParamSet,
@@ -516,8 +523,8 @@ impl FeatureScene {
     }
 
     /// Evaluates by cross-validation how much closer matches are to their epipolar lines with the
-    /// variant than with the baseline. Both are estimated again without one group of images, and
-    /// then applied to the matches of this group.
+    /// variant than with the baseline. For each group of images, both models are estimated again
+    /// without this group, and then applied to the matches of this group.
     fn cross_validate(
         &self,
         set: ParamSet,
@@ -578,8 +585,8 @@ impl FeatureScene {
     }
 }
 
-/// Mean decrease, dB, of the distances of the matches of an image from their epipolar lines, from
-/// baseline to variant cameras. `None` without matches.
+/// Mean decrease from baseline to variant cameras of the distances between the matches of an image
+/// and their epipolar lines, dB. `None` without matches.
 fn mean_gain_db(
     pairs: &[PairMatches],
     image: usize,

@@ -29,8 +29,8 @@ pub(super) struct Sighting {
     /// Direction of the corner in the axes that the camera has at mid-exposure, given by x and y at
     /// a depth of 1.
     pub(super) ray: Vector2<f64>,
-    /// Position of the camera when it read out the corner's row, in its frame at mid-exposure,
-    /// meters.
+    /// Position of the camera when it read out the corner's row, meters. The frame is the camera
+    /// frame at mid-exposure.
     pub(super) center_m: Vector3<f64>,
 }
 
@@ -74,8 +74,9 @@ impl MovingCamera {
         layout.of_camera(camera).motions(Some(&self.twist))
     }
 
-    /// Difference of the rays of the image from those of the same image with other corrections. It
-    /// consists of an angle, radians, and the distance of the camera positions, meters.
+    /// Difference between the rays of the image and the rays of the same image with other
+    /// corrections. It consists of an angle in radians and the distance between the camera
+    /// positions in meters.
     pub(super) fn difference(&self, other: &Self) -> [f64; 2] {
         let motion = self.world_from_camera.inverse() * other.world_from_camera;
         let of_lens = |axis: usize| {

@@ -21,8 +21,8 @@ use std::ptr::NonNull;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::{Duration, Instant};
 
-/// Maximum number of images that the library still has to write. If there are more, the writer
-/// waits, because the library drops images that it cannot store.
+/// Maximum number of images that the library still has to write. If this number is reached, the
+/// writer waits, because the library drops images that it cannot store.
 const MAX_QUEUED_IMAGES: usize = 16;
 /// If no image is written for this long, the disk is assumed to be full or disconnected.
 const MAX_WAIT: Duration = Duration::from_secs(30);
@@ -104,7 +104,7 @@ impl BagWriter {
         // The file usually does not exist. If removing it fails, the library reports an error.
         let _ = std::fs::remove_file(path);
         let _guard = device_creation_lock();
-        // SAFETY: the device is checked and then owned here; sensors and profiles live as long as
+        // SAFETY: the device is checked and then owned here. Sensors and profiles live as long as
         // the device.
         let device = unsafe {
             let device = call("create a software device", |error| {
@@ -113,7 +113,7 @@ impl BagWriter {
             register(device, camera)?;
             device
         };
-        // SAFETY: as above; added sensors live in the device.
+        // SAFETY: as above. Added sensors live in the device.
         let (color, depth) = unsafe { EmulatedStream::all(device, camera)? };
         // SAFETY: the device is not freed elsewhere.
         let device = unsafe { Device::new(device)? };
@@ -150,7 +150,7 @@ impl BagWriter {
     /// clock, in whole microseconds.
     ///
     /// # Errors
-    /// If the format or size of the image differs from that of the emulated camera, or the disk
+    /// Fails if the format or size of the image differs from the emulated camera, or if the disk
     /// accepts no more data.
     pub fn write(&mut self, image: &Image) -> Result<(), Problem> {
         let file_problem = |reason: String| Problem::File {
@@ -185,20 +185,20 @@ impl BagWriter {
         self.recorder.sensors.iter().for_each(Sensor::stop);
         let path = self.path.clone();
         let number = self.number;
-        // Dropping the recorder makes the library write what it still holds.
+        // When the recorder is dropped, the library writes the images that it still holds.
         drop(self);
         wait_until_written(&path, number, 0, || Ok(()))
     }
 }
 
-/// A device that records the images of another one in a new file.
+/// A device that records the images of another device in a new file.
 fn recorder(device: &Device, path: &Path) -> Result<Device, Problem> {
     let file_problem = |reason: String| Problem::File {
         path: path.to_owned(),
         reason,
     };
     let name = path_name(path).map_err(file_problem)?;
-    // SAFETY: device and name are alive; the recorder is then owned here and keeps the device
+    // SAFETY: device and name are alive. The recorder is then owned here and keeps the device
     // alive.
     unsafe {
         let recorder = call("create a recorder", |error| {
@@ -254,7 +254,7 @@ impl EmulatedStream {
         device: *mut sys::rs2_device,
         camera: &EmulatedCamera,
     ) -> Result<(Self, Option<Self>), Problem> {
-        // SAFETY: guaranteed by the caller; profiles live as long as the device.
+        // SAFETY: guaranteed by the caller. Profiles live as long as the device.
         unsafe {
             let depth = camera
                 .depth
@@ -347,7 +347,7 @@ impl EmulatedStream {
         let format = PixelFormat::DepthU16 {
             meters_per_count: depth.meters_per_count,
         };
-        // SAFETY: guaranteed by the caller; the sensor lives in the device.
+        // SAFETY: guaranteed by the caller. The sensor lives in the device.
         unsafe {
             let emulated = Self::add(device, DEPTH_SENSOR, stream, format, DEPTH_EXPOSURE_SECS)?;
             let units = sys::rs2_option_RS2_OPTION_DEPTH_UNITS;
@@ -374,7 +374,7 @@ impl EmulatedStream {
         exposure_secs_per_count: f64,
     ) -> Result<Self, Problem> {
         const WHAT: &str = "create a stream";
-        // SAFETY: device and name are alive; added sensors and streams live in the device.
+        // SAFETY: device and name are alive. Added sensors and streams live in the device.
         unsafe {
             let sensor = call(WHAT, |error| {
                 abi::rs2_software_device_add_sensor(device, name.as_ptr(), error)
@@ -439,7 +439,7 @@ impl EmulatedStream {
                 _ => 0.0,
             },
         };
-        // SAFETY: the sensor lives in the device; the pixels live until the library returns them to
+        // SAFETY: the sensor lives in the device. The pixels live until the library returns them to
         // `reclaim_pixels`.
         call("write an image", |error| unsafe {
             abi::rs2_software_sensor_on_video_frame(self.sensor.as_ptr(), frame, error);
@@ -478,7 +478,7 @@ fn stream(
 /// Images by address, each with the number of its file.
 type LentPixels = BTreeMap<usize, (u64, Box<[u8]>)>;
 
-/// Images that the library currently uses. It returns only their address.
+/// Images that the library currently uses. The library returns only the addresses of images.
 static LENT_PIXELS: Mutex<LentPixels> = Mutex::new(BTreeMap::new());
 /// Number of files started so far.
 static N_FILES: AtomicU64 = AtomicU64::new(0);

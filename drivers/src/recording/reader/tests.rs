@@ -1,5 +1,5 @@
 //! Recordings as other programs write or change them. The files are built byte by byte, because the
-//! library that writes recordings does not write invalid ones.
+//! library that writes recordings does not write invalid files.
 
 use super::{Notes, Recording};
 use crate::recording::{RIG_FILE, URDF_FILE};
@@ -52,7 +52,7 @@ struct Part {
 #[derive(Clone)]
 struct Chunk {
     compression: &'static str,
-    /// `None`: the correct checksum.
+    /// The checksum to write. If it is `None`, the correct checksum is written.
     checksum: Option<u32>,
 }
 
@@ -66,7 +66,7 @@ struct Contents {
     schema_encoding: &'static str,
     schema_text: &'static str,
     parts: Vec<Part>,
-    /// `log_time` of all messages, and `sequence` of the first one.
+    /// `log_time` of all messages. The next field is the `sequence` of the first message.
     log_time: u64,
     chunk: Option<Chunk>,
     /// Records after the messages.
@@ -332,7 +332,8 @@ impl Contents {
             .expect("a known topic")
     }
 
-    /// Appends fields to a message. The last field of each number counts.
+    /// Appends fields to a message. If several fields have the same number, readers use the last of
+    /// them.
     fn append(&mut self, topic: &str, fields: &Message) {
         self.part(topic).message.extend(fields.clone().into_bytes());
     }

@@ -1,9 +1,9 @@
 //! CANopen: network management, heartbeats, SYNC, expedited SDO transfers, and PDO mapping.
 //!
-//! Source: CiA 301 (CANopen application layer and communication profile) 4.2.0: sections 7.2.2
-//! (PDO), 7.2.4 (SDO and its abort codes), 7.2.8 (NMT, heartbeat), 7.5.2 (objects); the same bytes
-//! in christiansandberg/canopen. Segmented and block transfers are not supported, because no object
-//! that a drive needs is longer than four bytes.
+//! Source: CiA 301 (CANopen application layer and communication profile) 4.2.0, sections 7.2.2
+//! (PDO), 7.2.4 (SDO and its abort codes), 7.2.8 (NMT, heartbeat) and 7.5.2 (objects).
+//! christiansandberg/canopen uses the same bytes. Segmented and block transfers are not supported,
+//! because no object that a drive needs is longer than four bytes.
 
 use super::{CanError, Frame, Id, decode_enum};
 
@@ -41,7 +41,8 @@ impl Node {
 pub enum Nmt {
     /// Enter the operational state: send and accept PDOs.
     Start = 0x01,
-    /// Enter the stopped state: only heartbeats and NMT commands.
+    /// Enter the stopped state, in which a node sends only heartbeats and accepts only NMT
+    /// commands.
     Stop = 0x02,
     /// Enter the pre-operational state: SDOs but no PDOs.
     EnterPreOperational = 0x80,
@@ -76,14 +77,14 @@ pub struct Object {
     pub n_bytes: u8,
 }
 
-/// Consumer heartbeat time, entry 1: node in bits 16 to 22, milliseconds in bits 0 to 15. It makes
-/// a drive stop when the host's heartbeat is missing.
+/// Entry 1 of the consumer heartbeat time. The node is in bits 16 to 22, and the milliseconds are
+/// in bits 0 to 15. With this entry, a drive stops when the host's heartbeat is missing.
 pub const CONSUMER_HEARTBEAT: Object = Object {
     index: 0x1016,
     subindex: 1,
     n_bytes: 4,
 };
-/// Producer heartbeat time, milliseconds; 0 disables it.
+/// Producer heartbeat time, milliseconds. A value of 0 disables the heartbeat.
 pub const PRODUCER_HEARTBEAT: Object = Object {
     index: 0x1017,
     subindex: 0,
@@ -104,9 +105,9 @@ pub enum Pdo {
 /// Direction of a PDO, from the node's point of view.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Direction {
-    /// To the node.
+    /// From the host to the node.
     Receive,
-    /// From the node.
+    /// From the node to the host.
     Transmit,
 }
 
@@ -121,7 +122,8 @@ impl Pdo {
             .expect("the identifier is at most 0x57F")
     }
 
-    /// The mapping object: entries from 1 are mapped objects; entry 0 is their number.
+    /// The mapping object. Entry 0 is the number of mapped objects, and the following entries are
+    /// these objects.
     pub fn mapping(self, direction: Direction, entry: u8) -> Object {
         let base = match direction {
             Direction::Receive => 0x1600,
@@ -134,8 +136,8 @@ impl Pdo {
         }
     }
 
-    /// The communication object: entry 1 is its identifier (bit 31 disables the PDO), entry 2 the
-    /// transmission type.
+    /// The communication object. Entry 1 is the identifier of the PDO, in which bit 31 disables the
+    /// PDO. Entry 2 is the transmission type.
     pub fn communication(self, direction: Direction, entry: u8) -> Object {
         let base = match direction {
             Direction::Receive => 0x1400,
@@ -150,7 +152,8 @@ impl Pdo {
 }
 
 impl Object {
-    /// The entry of this object in a PDO mapping: index, subindex, length in bits.
+    /// The entry of this object in a PDO mapping, which consists of index, subindex and length in
+    /// bits.
     pub fn mapped(self) -> u32 {
         u32::from(self.index) << 16 | u32::from(self.subindex) << 8 | (8 * u32::from(self.n_bytes))
     }
@@ -172,8 +175,8 @@ impl Object {
     }
 }
 
-/// The value of [`CONSUMER_HEARTBEAT`] that makes a drive react after `millis` without a heartbeat
-/// from `host`; 0 disables the reaction.
+/// The value of [`CONSUMER_HEARTBEAT`] with which a drive reacts after `millis` without a heartbeat
+/// from `host`. If `millis` is 0, the reaction is disabled.
 pub fn consumer_heartbeat(host: Node, millis: u16) -> u32 {
     u32::from(host.0) << 16 | u32::from(millis)
 }
@@ -230,7 +233,7 @@ pub fn encode_read(node: Node, object: Object) -> Frame {
 /// Encodes a request to write an object of a node. Negative values are encoded as two's complement.
 ///
 /// # Errors
-/// If the value does not fit into the object.
+/// Fails if the value does not fit into the object.
 pub fn encode_write(node: Node, object: Object, value: i64) -> Result<Frame, CanError> {
     let n_bits = 8 * u32::from(object.n_bytes);
     let command = match object.n_bytes {
@@ -275,11 +278,12 @@ pub enum SdoAnswer {
         /// Subindex of the object.
         subindex: u8,
     },
-    /// Value of an object; `n_bytes` is 4 if the node does not report the length.
+    /// Value of an object. `n_bytes` is 4 if the node does not report the length.
     Value {
         /// The object, with the length that the node reports.
         object: Object,
-        /// Its bytes; the upper ones are 0. Use [`signed`] for values that may be negative.
+        /// The bytes of the value. Unused upper bytes are 0. Use [`signed`] for values that may be
+        /// negative.
         raw: u32,
     },
 }
@@ -419,8 +423,8 @@ mod tests {
             encode_heartbeat(Node(127), NodeState::Operational),
             data_frame(0x77F, &[5])
         );
-        // christiansandberg/canopen, test_sdo: expedited upload of 0x1018:01 and download of
-        // 0x1017.
+        // The bytes are from test_sdo of christiansandberg/canopen, which uploads 0x1018:01 and
+        // downloads 0x1017 in expedited transfers.
         let vendor = Object {
             index: 0x1018,
             subindex: 1,

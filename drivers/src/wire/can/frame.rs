@@ -1,9 +1,10 @@
 //! A CAN frame as plain data, and the time it takes on the bus.
 //!
-//! Sources: Robert Bosch, CAN Specification 2.0 (1991), parts A and B; ISO 11898-1:2015 (FD frames
-//! and their fixed stuff bits), field by field as in Linux's `include/linux/can/length.h`. Worst
-//! stuffing of classic frames: Davis, Burns, Bril and Lukkien 2007 (Controller Area Network
-//! schedulability analysis: refuted, revisited and revised), equation 1.
+//! Sources: Robert Bosch, CAN Specification 2.0 (1991), parts A and B, and ISO 11898-1:2015 for FD
+//! frames and their fixed stuff bits. Frames are divided into the same fields as in Linux's
+//! `include/linux/can/length.h`. The worst stuffing of classic frames is from Davis, Burns, Bril
+//! and Lukkien 2007 (Controller Area Network schedulability analysis: refuted, revisited and
+//! revised), equation 1.
 
 use super::CanError;
 
@@ -82,7 +83,7 @@ impl Frame {
         }
     }
 
-    /// A remote frame: a request for the data frame with the same identifier. `n_bytes` is the
+    /// A remote frame, which requests the data frame with the same identifier. `n_bytes` is the
     /// expected length of the answer.
     pub fn remote(id: Id, n_bytes: usize) -> Result<Self, CanError> {
         match n_bytes {
@@ -99,8 +100,8 @@ impl Frame {
         }
     }
 
-    /// An FD frame of 0 to 8, 12, 16, 20, 24, 32, 48 or 64 bytes. `switched`: whether the data
-    /// phase uses the data bit rate.
+    /// An FD frame of 0 to 8, 12, 16, 20, 24, 32, 48 or 64 bytes. `switched` states whether the
+    /// data phase uses the data bit rate.
     pub fn fd(id: Id, data: &[u8], switched: bool) -> Result<Self, CanError> {
         match data.len() {
             n if n <= 8 || FD_LENGTHS.contains(&n) => {
@@ -129,7 +130,7 @@ impl Frame {
         self.id
     }
 
-    /// The payload; empty in a remote frame.
+    /// The payload. It is empty in a remote frame.
     pub fn data(&self) -> &[u8] {
         match self.kind {
             Kind::Remote => &[],
@@ -161,19 +162,20 @@ impl Frame {
     /// errors and retransmissions.
     ///
     /// The fixed stuff bits of FD frames are always included. The two bits in which the rate
-    /// switches (bit rate switch and CRC delimiter) are sent partly at each rate; they are counted
-    /// at the slower nominal rate here.
+    /// switches (bit rate switch and CRC delimiter) are sent partly at each rate. Here, they are
+    /// counted at the nominal rate, which is slower.
     pub fn bits(&self, stuffing: Stuffing) -> Bits {
         let n_data = u32::try_from(8 * self.data().len()).expect("at most 64 bytes");
         let n_stuff_bits = |n_bits: u32| match stuffing {
             Stuffing::None => 0,
             // A stuff bit follows five equal bits and is the first bit of the next group of five.
             // After the first stuff bit, every four bits of the frame may therefore cause another
-            // one (Davis et al. 2007, equation 1).
+            // stuff bit (Davis et al. 2007, equation 1).
             Stuffing::Worst => (n_bits - 1) / 4,
         };
         let Kind::Fd { switched } = self.kind else {
-            // Start of frame, identifier, control, data and CRC are stuffed; the rest is not.
+            // Start of frame, identifier, control, data and CRC are stuffed. The rest of the frame
+            // is not stuffed.
             let stuffed = if self.id.extended { 54 } else { 34 } + n_data;
             return Bits {
                 nominal: stuffed + n_stuff_bits(stuffed) + 1 + TAIL_BITS,
@@ -184,16 +186,16 @@ impl Frame {
         // state, length and data. The check contains stuff count, CRC and their fixed stuff bits.
         let head = if self.id.extended { 36 } else { 17 };
         let body = 5 + n_data;
-        // For up to 16 bytes, the CRC has 17 bits, otherwise 21. It has its own fixed stuff bits.
-        // The stuff count in front of it has four bits.
+        // The CRC has 17 bits for up to 16 bytes of data, and 21 bits for more data. It has its own
+        // fixed stuff bits. The stuff count in front of the CRC has four bits.
         let check = if n_data <= 8 * 16 {
             4 + 17 + 6
         } else {
             4 + 21 + 7
         };
         let nominal = head + n_stuff_bits(head) + 1 + TAIL_BITS;
-        // Stuffing continues across the switch of the rate, so the stuff bits of the data phase are
-        // those of both parts minus those of the head.
+        // Stuffing continues across the switch of the rate, so the number of stuff bits in the data
+        // phase is the number in both parts minus the number in the head.
         let data = body + n_stuff_bits(head + body) - n_stuff_bits(head) + check;
         if switched {
             Bits { nominal, data }
@@ -220,7 +222,7 @@ pub enum Stuffing {
 pub struct Bits {
     /// Number of bits at the nominal rate, which is used for arbitration and classic frames.
     pub nominal: u32,
-    /// Number of bits at the data rate; 0 unless the frame switches the rate.
+    /// Number of bits at the data rate. It is 0 unless the frame switches the rate.
     pub data: u32,
 }
 
@@ -229,7 +231,7 @@ pub struct Bits {
 pub struct BitRates {
     /// Nominal bit rate, bit/s.
     pub nominal_hz: f64,
-    /// Data bit rate, bit/s; equal to the nominal one on a classic bus.
+    /// Data bit rate, bit/s. On a classic bus, it is equal to the nominal bit rate.
     pub data_hz: f64,
 }
 
@@ -240,7 +242,7 @@ impl Bits {
     }
 }
 
-/// Fraction of the bus capacity that frames with these rates in Hz use; above 1 if the bus is
+/// Fraction of the bus capacity that frames with these rates in Hz use. It is above 1 if the bus is
 /// overloaded.
 pub fn load_frac(traffic: impl IntoIterator<Item = (Bits, f64)>, rates: BitRates) -> f64 {
     traffic
@@ -271,7 +273,8 @@ mod tests {
 
     #[test]
     fn classic_frames_have_the_published_lengths() {
-        // Davis et al. 2007: 55 + 10 s and 80 + 10 s bits for s bytes in the worst case.
+        // According to Davis et al. 2007, frames with s bytes have 55 + 10 s and 80 + 10 s bits in
+        // the worst case.
         for n_bytes in 0..=8_usize {
             let s = u32::try_from(n_bytes).expect("small");
             let bits = |frame: Frame, stuffing| frame.bits(stuffing);
@@ -311,8 +314,8 @@ mod tests {
 
     #[test]
     fn fd_frame_lengths_match_linux() {
-        // Computed by hand from can_frame_bits(true, is_eff, bitstuffing, true, n) of
-        // linux/can/length.h.
+        // The expected values were computed by hand from can_frame_bits(true, is_eff, bitstuffing,
+        // true, n) of linux/can/length.h.
         let cases = [
             (0, false, 62, 67),
             (8, false, 126, 147),

@@ -1,9 +1,9 @@
 //! MIT mode: position, velocity, two gains and a torque in the eight bytes of one frame.
 //!
-//! Source: Ben Katz, mini cheetah motor controller (`pack_cmd`, `unpack_reply`); the same bytes in
-//! `DM_CAN.py` of `cmjang/DM_Control_Python` and in `mit_can.py` of
-//! `neurobionics/TMotorCANControl`. The drive applies `torque = kp (position - measured) + kd
-//! (velocity - measured) + torque`. As in these sources, values outside the limits are clamped.
+//! Source: Ben Katz, mini cheetah motor controller (`pack_cmd`, `unpack_reply`). `DM_CAN.py` of
+//! `cmjang/DM_Control_Python` and `mit_can.py` of `neurobionics/TMotorCANControl` use the same
+//! bytes. The drive applies `torque = kp (position - measured) + kd (velocity - measured) +
+//! torque`. As in these sources, values outside the limits are clamped.
 
 use super::CanError;
 use super::scale::Scale;
@@ -105,7 +105,7 @@ impl Scales {
 /// Encodes a command. Values outside the limits are clamped.
 ///
 /// # Errors
-/// If a value is NaN.
+/// Fails if a value is NaN.
 pub fn encode(command: &Command, limits: &Limits) -> Result<[u8; 8], CanError> {
     let scales = Scales::of(limits);
     let position = scales
@@ -128,7 +128,8 @@ pub fn encode(command: &Command, limits: &Limits) -> Result<[u8; 8], CanError> {
     ];
     Ok(fields
         .iter()
-        // The fields follow each other without gaps, the highest bit first: 16 + 4 x 12 = 64 bits.
+        // The fields follow each other without gaps, the highest bit first. Together, they have 16 +
+        // 4 x 12 = 64 bits.
         .fold(0_u64, |bits, (raw, n_bits)| {
             bits << n_bits | u64::from(*raw)
         })
@@ -196,8 +197,8 @@ mod tests {
 
     #[test]
     fn commands_match_manufacturer_sample_bytes() {
-        // DM_CAN.py, controlMIT with the limits of a DM4310: zeros, both ends of the ranges, and kp
-        // = 50, kd = 1, q = 1, dq = -3, tau = 2.5.
+        // The bytes are from controlMIT of DM_CAN.py with the limits of a DM4310. The commands are
+        // zeros, both ends of the ranges, and kp = 50, kd = 1, q = 1, dq = -3, tau = 2.5.
         let command = |kp_nm_rad, kd_nm_s_rad, position_rad, velocity_rad_s, torque_nm| Command {
             position_rad,
             velocity_rad_s,
@@ -212,8 +213,8 @@ mod tests {
             ),
             (command(500.0, 5.0, 12.5, 30.0, 10.0), [0xFF; 8]),
             (command(0.0, 0.0, -12.5, -30.0, -10.0), [0x00; 8]),
-            // 35388.9, 1842.75, 409.5, 819 and 2559.375 are rounded to the nearest integer; 409.5
-            // is rounded to 409.
+            // 35388.9, 1842.75, 409.5, 819 and 2559.375 are rounded to the nearest integer. The
+            // half in 409.5 is rounded down to 409.
             (
                 command(50.0, 1.0, 1.0, -3.0, 2.5),
                 [0x8A, 0x3D, 0x73, 0x31, 0x99, 0x33, 0x39, 0xFF],

@@ -1,9 +1,9 @@
 //! CAN frames as plain data, and the encodings that several motor families share. The codec of a
 //! family is in its folder of [`can`](crate::can).
 //!
-//! Every codec is pure: it converts between a [`Frame`] and SI values. Values outside the range of
-//! a field are clamped if the manufacturers' own examples clamp them (MIT packing, Robstride,
-//! ODrive's feedforward). Otherwise, they are errors. NaN is always an error.
+//! Every codec is pure and only converts between a [`Frame`] and SI values. Values outside the
+//! range of a field are clamped if the manufacturers' own examples clamp them (MIT packing,
+//! Robstride, ODrive's feedforward). Otherwise, they are errors. NaN is always an error.
 
 pub mod canopen;
 pub mod frame;
@@ -21,7 +21,7 @@ pub enum CanError {
     IdRange {
         /// The number.
         id: u32,
-        /// 11 or 29.
+        /// Number of bits of the identifier, 11 or 29.
         bits: u8,
     },
     /// The frame format does not allow this payload length.
@@ -92,7 +92,7 @@ pub enum CanError {
         /// The abort code of CiA 301.
         code: u32,
     },
-    /// The device answered with a segmented transfer: the object is longer than four bytes.
+    /// The device answered with a segmented transfer, because the object is longer than four bytes.
     #[error(
         "object {index:#06x}:{subindex:02x} uses a segmented transfer, but only expedited transfers (up to 4 bytes) are supported"
     )]
@@ -117,7 +117,7 @@ pub(crate) fn decode_enum<T: Copy>(
         .ok_or(CanError::Undefined { field, raw })
 }
 
-/// Returns the eight bytes of a data frame with an 11-bit or 29-bit identifier; any other frame is
+/// Returns the eight bytes of a data frame with an 11-bit or 29-bit identifier. Any other frame is
 /// an error.
 pub(crate) fn eight_bytes(
     frame: &Frame,
@@ -145,7 +145,8 @@ pub(crate) mod testing {
     use super::{Frame, Id};
     use numbers::random::Random;
 
-    /// Frames of random format, identifier, length and bytes; every fourth has the identifier `id`.
+    /// Frames of random format, identifier, length and bytes. Every fourth frame has the identifier
+    /// `id`.
     pub(crate) fn random_frames(seed: u64, id: Id) -> impl Iterator<Item = Frame> {
         let mut random = Random::new(seed);
         (0..20_000).map(move |round| {
@@ -170,8 +171,8 @@ pub(crate) mod testing {
         })
     }
 
-    /// The frame truncated to every shorter length, and twice as long as an FD frame. All of these
-    /// must be rejected.
+    /// The frame truncated to every shorter length, and an FD frame of twice the length. Codecs
+    /// must reject all of these frames.
     pub(crate) fn truncated_and_doubled(frame: &Frame) -> Vec<Frame> {
         let bytes = [frame.data(), frame.data()].concat();
         let n_bytes = frame.data().len();

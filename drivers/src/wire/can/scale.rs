@@ -1,9 +1,9 @@
 //! Linear map between SI values and unsigned integers, shared by MIT packing and Robstride.
 //!
 //! Source: `float_to_uint` and `uint_to_float` of Ben Katz's mini cheetah firmware, as in
-//! `cmjang/DM_Control_Python`: 0 is the lower end of the range, the maximum integer the upper end.
-//! These sources truncate. We round to the nearest integer. Halves are rounded down, so that 0 in a
-//! symmetric range is encoded as in these sources.
+//! `cmjang/DM_Control_Python`. The integer 0 is the lower end of the range, and the maximum integer
+//! is the upper end. These sources truncate, but this module rounds to the nearest integer. Halves
+//! are rounded down, so that 0 in a symmetric range is encoded as in these sources.
 
 use super::CanError;
 
@@ -42,7 +42,7 @@ impl Scale {
         (self.upper - self.lower) / self.max_raw()
     }
 
-    /// Converts to the nearest raw value. Values outside the range are clamped; NaN is an error
+    /// Converts to the nearest raw value. Values outside the range are clamped. NaN is an error
     /// that names `field`.
     #[expect(
         clippy::cast_possible_truncation,
@@ -56,7 +56,8 @@ impl Scale {
         let unit_interval =
             (value.clamp(self.lower, self.upper) - self.lower) / (self.upper - self.lower);
         // `ceil(x - 0.5)` rounds halves down. The largest integer is odd, so 0 of a symmetric range
-        // is half of it, rounded down. The sources truncate it to the same integer.
+        // is encoded as half of the largest integer, rounded down. The sources truncate it to the
+        // same integer.
         Ok((unit_interval * self.max_raw() - 0.5)
             .ceil()
             .clamp(0.0, self.max_raw()) as u16)

@@ -9,7 +9,7 @@ pub(super) type Column = (&'static str, usize);
 /// A row of a table with bars.
 pub(super) struct BarRow {
     pub(super) name: String,
-    /// Tag of the row, such as `outlier`; may be empty.
+    /// Tag of the row, such as `outlier`. It may be empty.
     pub(super) tag: String,
     /// One value per column.
     pub(super) values: Vec<Option<f64>>,
@@ -52,17 +52,19 @@ pub(super) fn table(head: &str, columns: &[Column], rows: &[BarRow]) -> String {
 
 /// A column that has values.
 struct ShownColumn {
-    /// Its index among the values of a row.
+    /// Index of the column among the values of a row.
     ix: usize,
     name: &'static str,
     digits: usize,
-    /// The value with a full bar.
+    /// The largest value of the column, whose bar has the full length.
     largest: f64,
 }
 
-/// Largest value of a column in rows without a tag; of all rows if there is none.
+/// Largest value of a column in rows without a tag. If all rows have a tag, it is the largest value
+/// of all rows.
 fn largest(rows: &[BarRow], ix: usize) -> f64 {
-    // An outlier may be hundreds of times larger than the other values, whose bars would disappear.
+    // An outlier may be hundreds of times larger than the other values. If outliers determined the
+    // scale, the bars of the other values would disappear.
     let used = largest_of(rows.iter().filter(|row| row.tag.is_empty()), ix);
     if used > 0.0 {
         used
@@ -71,7 +73,7 @@ fn largest(rows: &[BarRow], ix: usize) -> f64 {
     }
 }
 
-/// Largest finite value of a column; 0 if there is none.
+/// Largest finite value of a column. It is 0 if there is none.
 fn largest_of<'a>(rows: impl Iterator<Item = &'a BarRow>, ix: usize) -> f64 {
     rows.filter_map(|row| row.value(ix))
         .filter(|value| value.is_finite())

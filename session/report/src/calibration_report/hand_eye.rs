@@ -23,7 +23,7 @@ pub struct HandEyeReport<'a> {
     pub samples: &'a [HandEyeSample],
     /// Samples whose image does not show the target.
     pub unused: &'a [Unused],
-    /// The result; `None` if the calibration was refused.
+    /// The result. `None` if the calibration was refused.
     pub calibration: Option<&'a HandEyeCalibration>,
     /// Poses that would lower the uncertainty.
     pub next_poses: &'a [NextPose],
@@ -218,7 +218,7 @@ impl HandEyeReport<'_> {
         photo::with_corners(self.photos, &report.name, &caption, &report.points)
     }
 
-    /// Photo of a sample with its detected corners; `None` if its pose was given without an image.
+    /// Photo of a sample with its detected corners. `None` if its pose was given without an image.
     fn picture_of_input(&self, sample: &HandEyeSample) -> Option<String> {
         match &sample.board {
             BoardObservation::View(view) => {

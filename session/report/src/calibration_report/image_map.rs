@@ -1,4 +1,4 @@
-//! Maps over the area of an image, as SVG: values on a grid, points and arrows.
+//! Maps over the area of an image, as SVG. They show values on a grid, points and arrows.
 
 use calibration::{ImageGrid, PointFit};
 use std::fmt::Write;
@@ -21,7 +21,7 @@ impl Shade {
     }
 }
 
-/// A rectangle in an image: its first pixel and its size.
+/// A rectangle in an image, given by its first pixel and its size.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) struct ImagePart {
     pub(super) first_px: [u32; 2],
@@ -68,8 +68,8 @@ impl ImageMap {
         ));
     }
 
-    /// Shades the cells of a grid by their value relative to the largest one. Cells without a value
-    /// are hatched.
+    /// Shades the cells of a grid by their value relative to the largest value. Cells without a
+    /// value are hatched.
     pub(super) fn grid(&mut self, grid: &ImageGrid<Option<f64>>, shade: Shade, digits: usize) {
         let largest = grid
             .values
@@ -112,7 +112,7 @@ impl ImageMap {
         ));
     }
 
-    /// Draws circles around detected corners and crosses at the predicted ones.
+    /// Draws circles around detected corners and crosses at predicted corners.
     pub(super) fn corners(&mut self, points: &[PointFit]) {
         let mut circles = String::new();
         let mut crosses = String::new();
@@ -123,7 +123,7 @@ impl ImageMap {
             residual_px: [dx, dy],
         } in points
         {
-            // A path has no circles, so each one consists of two half arcs.
+            // A path has no circles, so each circle consists of two half arcs.
             let left = x - radius;
             let diameter = 2.0 * radius;
             write!(circles, "M{left:.1} {y:.1}a{radius:.1} {radius:.1} 0 1 0 {diameter:.1} 0a{radius:.1} {radius:.1} 0 1 0 -{diameter:.1} 0")
@@ -168,7 +168,7 @@ impl ImageMap {
         ));
     }
 
-    /// Draws residuals as arrows from the detected corners; returns the factor by which they are
+    /// Draws residuals as arrows from the detected corners. Returns the factor by which they are
     /// magnified.
     pub(super) fn arrows(&mut self, points: &[PointFit]) -> f64 {
         /// More arrows cannot be distinguished.
@@ -178,8 +178,8 @@ impl ImageMap {
             .iter()
             .map(|point| point.residual_px[0].hypot(point.residual_px[1]))
             .collect();
-        // A quantile instead of the maximum, so that one wrong corner does not make all other
-        // arrows too short to see.
+        // A quantile is used instead of the maximum, so that one wrong corner does not make all
+        // other arrows too short to see.
         let rank = numbers::quantile::Rank::Nearest;
         let long_px = numbers::quantile::quantile(&mut lengths, 0.95, rank).unwrap_or(0.0);
         let magnification =
@@ -219,7 +219,7 @@ impl ImageMap {
     }
 }
 
-/// The largest of 1, 2, 5, 10, 20, 50, ... that is not larger than a factor; at least 1.
+/// The largest of 1, 2, 5, 10, 20, 50, ... that is not larger than a factor. The result is at least 1.
 fn round_down(factor: f64) -> f64 {
     let power = 10f64.powf(factor.max(1.0).log10().floor());
     [5.0, 2.0]

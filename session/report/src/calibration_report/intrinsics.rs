@@ -23,7 +23,7 @@ pub struct IntrinsicsReport<'a> {
     pub views: &'a [BoardView],
     /// Images in which the target was not detected.
     pub unused: &'a [Unused],
-    /// The result; `None` if the calibration was refused.
+    /// The result. `None` if the calibration was refused.
     pub calibration: Option<&'a IntrinsicsCalibration>,
     /// Line for the rig file.
     pub rig_line: Option<&'a str>,
@@ -144,7 +144,8 @@ impl IntrinsicsReport<'_> {
         maps
     }
 
-    /// Where the corners are in the images, and the outline of the suggested next image.
+    /// Map of the corners in all images, with the outline of the target in the suggested next
+    /// image.
     fn coverage_map(&self, pixels: Vec<[f64; 2]>, next: Option<&NextView>) -> String {
         let counted = ImageGrid::coverage(self.size_px, pixels.iter().copied());
         let values: Vec<Option<f64>> = counted.values.iter().map(|n| Some(*n as f64)).collect();
@@ -168,7 +169,7 @@ impl IntrinsicsReport<'_> {
         page::figure(&caption, &map.svg("corners per part of the image"))
     }
 
-    /// How uncertain the projection is in each part of the image.
+    /// Map of the uncertainty of the projection in each part of the image.
     fn uncertainty_map(&self, calibration: &IntrinsicsCalibration) -> String {
         let mut map = ImageMap::new(self.size_px);
         map.grid(&calibration.uncertainty_px, Shade::Bad, 2);
@@ -202,7 +203,7 @@ impl IntrinsicsReport<'_> {
         let (low, high) = points.fold((infinite, -infinite), |(low, high), point| {
             (low.inf(&point), high.sup(&point))
         });
-        // The target is flat: all of its points have the same z.
+        // The target is flat, so all of its points have the same z.
         let corner = |[x, y]: [f64; 2]| {
             intrinsics.project(&(next.camera_from_board * Point3::new(x, y, low.z)).coords)
         };
@@ -243,7 +244,7 @@ impl IntrinsicsReport<'_> {
             .map_or(&[][..], |calibration| &calibration.images);
         let used = images.iter().find(|image| image.name == view.name);
         let n_corners = used.map_or(view.points.len(), |image| image.points.len());
-        // Without a result, nothing is known about any image, and there is no tag.
+        // Without a result, it is unknown which images are used, so there is no tag.
         let tag = match (used, self.calibration) {
             (None, Some(_)) => "not used",
             (Some(_), _) if n_corners < view.points.len() => "some corners rejected",
@@ -363,7 +364,8 @@ fn range(grid: &ImageGrid<Option<f64>>) -> [f64; 2] {
     ]
 }
 
-/// Value and standard deviation of a parameter; empty if the lens model does not have it.
+/// Value and standard deviation of a parameter. The text is empty if the lens model does not have
+/// this parameter.
 fn with_deviation(calibration: &IntrinsicsCalibration, name: &str) -> String {
     calibration
         .params

@@ -19,7 +19,7 @@ pub use time_offset::TimeOffsetReport;
 /// Heading of every report.
 #[derive(Clone, Debug)]
 pub struct Heading {
-    /// The input: a folder or file.
+    /// The input, which is a folder or file.
     pub input: String,
     /// Date and time in UTC, for readers.
     pub utc: String,
@@ -38,7 +38,8 @@ pub struct Unused {
     pub name: String,
     /// Why it was not used.
     pub reason: String,
-    /// Whether its file could not be read, so that nothing is known about the target.
+    /// Whether the file of the image could not be read. In that case, it is unknown whether the
+    /// image shows the target.
     pub is_unreadable: bool,
 }
 
@@ -47,7 +48,7 @@ pub fn is_report(text: &str) -> bool {
     text.contains(page::SUBTITLE)
 }
 
-/// A number with a fixed number of decimals; a dash if it is unknown.
+/// A number with a fixed number of decimals. An unknown number is shown as a dash.
 fn number(value: Option<f64>, digits: usize) -> String {
     match value.filter(|value| value.is_finite()) {
         Some(value) => format!("{value:.digits$}"),

@@ -20,7 +20,7 @@ pub struct Page {
 impl Page {
     /// Begins a page.
     ///
-    /// * `verdict`: what the result is based on, if there is one.
+    /// * `verdict`: the basis of the result, if there is a result.
     pub fn new(title: &str, heading: &Heading, verdict: &str, figures: &[Figure]) -> Self {
         let subtitle = [
             env!("CARGO_PKG_VERSION").to_owned(),
@@ -50,7 +50,7 @@ impl Page {
         }
     }
 
-    /// Adds a section. Without content, adds nothing.
+    /// Adds a section. If the content is empty, nothing is added.
     ///
     /// * `legend`: what the section shows, as text.
     /// * `content`: HTML.
@@ -114,7 +114,7 @@ fn key_figure((name, value, unit): &Figure) -> String {
     )
 }
 
-/// A list of sentences; nothing if there are none.
+/// A list of sentences. The text is empty if there are no sentences.
 fn list(sentences: &[String]) -> String {
     let items: String = sentences
         .iter()
@@ -127,7 +127,7 @@ fn list(sentences: &[String]) -> String {
     }
 }
 
-/// A short text in a box; nothing if there is none.
+/// A short text in a box. The result is empty if there is no text.
 pub fn note(text: Option<&str>) -> String {
     text.map_or(String::new(), |text| {
         format!("<p class=\"card note\">{}</p>", escaped(text))

@@ -13,8 +13,8 @@ use std::path::{Path, PathBuf};
 /// Maximum side of an embedded photo. Corners must be visible, but a report has several photos and
 /// should stay small enough to send.
 const MAX_SIDE_PX: u32 = 800;
-/// JPEG quality. Edges of the board look clean at this quality; a higher one mainly enlarges the
-/// page.
+/// JPEG quality. Edges of the board look clean at this quality. A higher quality mainly enlarges
+/// the page.
 const QUALITY: u8 = 78;
 
 /// An image that a report can show.
@@ -59,7 +59,7 @@ pub(super) fn with_corners(
     }
 }
 
-/// A small copy of the part of an image around the corners, as a data URI, and the part.
+/// A small copy of the part of an image around the corners, as a data URI. Also returns the part.
 fn embedded(photo: &Photo, points: &[PointFit]) -> anyhow::Result<(String, ImagePart)> {
     let picture = match photo {
         Photo::File(file) => read(file)?,
@@ -116,8 +116,8 @@ fn around(points: &[PointFit], size_px: [u32; 2]) -> ImagePart {
     }
 }
 
-/// First pixel and number of pixels of a range with a margin, inside an image of `size_px`; `None`
-/// if it is empty.
+/// First pixel and number of pixels of a range with a margin, inside an image of `size_px`. `None`
+/// if the range is empty.
 fn range_with_margin(
     pixels: impl Iterator<Item = f64> + Clone,
     size_px: u32,
@@ -137,7 +137,8 @@ fn range_with_margin(
     (high > low + 1.0).then_some((low as u32, (high - low) as u32))
 }
 
-/// Indices of the largest and the median value; fewer if there are fewer values.
+/// Indices of the largest and the median value. With fewer than two values, there are fewer
+/// indices.
 pub(super) fn worst_and_median(values: &[f64]) -> Vec<usize> {
     let mut order: Vec<usize> = (0..values.len()).collect();
     order.sort_by(|a, b| values[*b].total_cmp(&values[*a]));

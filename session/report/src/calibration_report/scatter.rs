@@ -80,7 +80,7 @@ pub(super) fn svg(axes: [&str; 2], points: &[ScatterPoint]) -> String {
 
 /// The smallest round tick step such that two steps cover `largest`.
 fn tick_step(largest: f64) -> f64 {
-    // Two ticks on each side of the center, so that a step is about half of the largest value.
+    // There are two ticks on each side of the center, so a step is about half of the largest value.
     let half = largest / 2.0;
     let power = 10f64.powf(half.log10().floor());
     [1.0, 2.0, 5.0, 10.0]

@@ -13,12 +13,12 @@ pub struct TimeOffsetReport<'a> {
     pub heading: &'a Heading,
     /// Rotation rates and their correlation.
     pub profile: Option<&'a MotionProfile>,
-    /// The result; `None` if it was refused.
+    /// The result. `None` if it was refused.
     pub offset: Option<&'a TimeOffset>,
 }
 
-/// Maximum number of points of a curve: about one per pixel of its width. More would enlarge the
-/// page without a visible difference.
+/// Maximum number of points of a curve, which is about one per pixel of its width. More points
+/// would enlarge the page without a visible difference.
 const MAX_POINTS: usize = 800;
 
 impl TimeOffsetReport<'_> {
@@ -117,7 +117,7 @@ fn liveliest(curve: &[[f64; 2]]) -> std::ops::RangeInclusive<f64> {
     let mut best = (0.0, *first);
     let mut at = *first;
     // Intervals overlap by half, so that a movement is not cut by the borders of all of them. At
-    // least one is tried, also on a short recording.
+    // least one interval is tried, even in a short recording.
     while at < (last - SHOWN_SECS).max(first + 0.5 * SHOWN_SECS) {
         let found = variation(curve, at..=at + SHOWN_SECS);
         if found > best.0 {
@@ -289,7 +289,7 @@ fn residual(offset: &TimeOffset) -> String {
 /// Inserts a NaN point into each gap, so that the line is interrupted.
 fn interrupted(curve: &[[f64; 2]]) -> Vec<[f64; 2]> {
     // Minimum length of a gap, relative to the smallest step. One missing sample doubles the step
-    // and does not count as a gap. Two missing samples do.
+    // and does not count as a gap. Two missing samples count as a gap.
     const GAP: f64 = 2.5;
     let step = curve
         .windows(2)
@@ -330,7 +330,8 @@ fn line(label: &str, curve: &[[f64; 2]]) -> Line {
     }
 }
 
-/// A curve with fewer points: the lowest and the highest of each interval, so that no peak is lost.
+/// A curve with fewer points. It keeps the lowest and the highest point of each interval, so that
+/// no peak is lost.
 fn with_peaks(curve: &[[f64; 2]]) -> Vec<[f64; 2]> {
     if curve.len() <= MAX_POINTS {
         return curve.to_vec();

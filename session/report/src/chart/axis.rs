@@ -19,7 +19,8 @@ pub struct Axis {
     pub label: String,
     /// How values are mapped to positions.
     pub scale: Scale,
-    /// Tick values; chosen automatically if empty. Ticks outside the data are omitted.
+    /// Tick values. If the list is empty, ticks are chosen automatically. Ticks outside the data
+    /// are omitted.
     pub ticks: Vec<f64>,
 }
 
@@ -86,7 +87,7 @@ impl Axis {
 }
 
 impl AxisRange {
-    /// Relative position of a value: 0 at the low end, 1 at the high end.
+    /// Relative position of a value, from 0 at the low end to 1 at the high end.
     pub(super) fn frac(&self, value: f64) -> f64 {
         match &self.scale {
             Scale::Linear => (value - self.low) / (self.high - self.low),
@@ -99,7 +100,7 @@ impl AxisRange {
     }
 }
 
-/// Position of a value among levels: 0 at the first, 1 at the second and so on.
+/// Position of a value among levels. It is 0 at the first level, 1 at the second level, and so on.
 fn level_position(levels: &[f64], value: f64) -> f64 {
     if levels.len() < 2 {
         return 0.0;
@@ -162,7 +163,8 @@ fn log_ticks(low: f64, high: f64) -> Vec<f64> {
     }
 }
 
-/// Formats a number for an axis: at most three decimals, thousands as k, millions as M.
+/// Formats a number for an axis. It has at most three decimals, and thousands are written as k and
+/// millions as M.
 pub fn compact_number(value: f64) -> String {
     let (value, suffix) = match value.abs() {
         size if size >= 1e6 => (value / 1e6, "M"),

@@ -1,4 +1,5 @@
-//! A drawing as plain data: lines, areas and text. Its units are pixels of the SVG file.
+//! A drawing as plain data, which consists of lines, areas and text. Its units are pixels of the
+//! SVG file.
 
 use std::fmt::Write;
 
@@ -35,7 +36,7 @@ pub enum Anchor {
     End,
 }
 
-/// A shape; y points down.
+/// A shape. The y axis points down.
 #[derive(Clone, Debug, PartialEq)]
 pub enum VectorShape {
     /// A line through points.
@@ -46,7 +47,7 @@ pub enum VectorShape {
         color: Color,
         /// Width of the line, units.
         width: f64,
-        /// Lengths of dashes and gaps, units; `None` for a solid line.
+        /// Lengths of dashes and gaps, units. `None` for a solid line.
         dash: Option<[f64; 2]>,
     },
     /// A filled polygon.
@@ -60,7 +61,7 @@ pub enum VectorShape {
     },
     /// One line of text.
     Text {
-        /// Position of the anchor, vertically in the middle of the line, units.
+        /// Position of the anchor, units. Vertically, the anchor is in the middle of the line.
         at: [f64; 2],
         /// The text.
         text: String,

@@ -46,7 +46,7 @@ pub struct Line {
 pub struct Point {
     /// Position on the horizontal axis.
     pub x: f64,
-    /// Position on the vertical axis; the line is interrupted where it is not finite.
+    /// Position on the vertical axis. The line is interrupted where it is not finite.
     pub y: f64,
     /// Lower end of the band around the line.
     pub low: f64,
@@ -116,7 +116,7 @@ impl Plot {
 }
 
 impl Chart {
-    /// Draws the chart; the legend is next to the plot and never covers it.
+    /// Draws the chart. The legend is next to the plot and never covers it.
     pub fn draw(&self) -> Drawing {
         let legend = self.legend();
         let longest = legend
@@ -158,8 +158,8 @@ impl Chart {
     }
 
     fn draw_grid(&self, plot: &Plot, shapes: &mut Vec<VectorShape>) {
-        // The x position at which the last drawn label ends. A label that would start before it is
-        // left out, but the grid line of this label is drawn.
+        // This is the x position at which the last drawn label ends. A label that would start
+        // before this position is left out, but its grid line is drawn.
         let mut free_from = f64::MIN;
         for (value, label) in &plot.x.ticks {
             let x = plot.x(*value);
@@ -364,10 +364,11 @@ fn draw_line(line: &Line, ix: usize, plot: &Plot, shapes: &mut Vec<VectorShape>)
     }
 }
 
-/// Draws a dot whose shape identifies the line: disc, square, triangle, diamond.
+/// Draws a dot whose shape identifies the line. The shapes are disc, square, triangle and diamond.
 fn draw_dot([x, y]: [f64; 2], line_ix: usize, shapes: &mut Vec<VectorShape>) {
-    // Number of corners, direction of the first corner as a fraction of a turn, and radius. The
-    // shapes have about the same area; 24 corners look like a circle.
+    // Each shape has a number of corners, the direction of the first corner as a fraction of a
+    // turn, and a radius. The shapes have about the same area. A shape with 24 corners looks like a
+    // circle.
     let (n_corners, first_angle_frac, radius) = [
         (24, 0.0, 3.6),
         (4, 0.125, 4.6),
@@ -407,7 +408,7 @@ fn text(at: [f64; 2], text: &str, color: Color, anchor: Anchor) -> VectorShape {
     }
 }
 
-/// Wraps text into rows of at most `max_chars`. Rows break after spaces; a word that is longer than
+/// Wraps text into rows of at most `max_chars`. Rows break after spaces. A word that is longer than
 /// a row breaks anywhere.
 fn wrap(text: &str, max_chars: usize) -> Vec<String> {
     let mut rows = vec![String::new()];

@@ -132,9 +132,9 @@ impl RadixSort {
         })
     }
 
-    /// Allocates buffers for up to `n_max` keys. When sorting, `status[counter]` must hold the
-    /// number of keys, `status[largest]` the largest key, and the next word the smallest key,
-    /// inverted. Keys with all bits set are excluded from this range and sorted last.
+    /// Allocates buffers for up to `n_max` keys. When keys are sorted, `status[counter]` must hold
+    /// their number, `status[largest]` must hold the largest key, and the next word must hold the
+    /// inverted smallest key. Keys with all bits set are excluded from this range and sorted last.
     ///
     /// # Errors
     ///
@@ -200,8 +200,8 @@ impl RadixSort {
                 n_groups.into(),
                 &[base[0], base[1], base[2], ("keys", keys)],
             );
-            // The first pass writes indices itself, so no other pass has to fill the values with 0,
-            // 1, 2 and so on.
+            // The first pass writes the indices, so no other pass has to fill the values with 0, 1,
+            // 2 and so on.
             let scatter = if pass == 0 {
                 &self.scatter_indices
             } else {

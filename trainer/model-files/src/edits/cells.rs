@@ -55,7 +55,7 @@ impl CellGrid {
         4.0 * self.radius_m / f64::from(self.n_cells) * largest * largest / (2.0 * largest - 1.0)
     }
 
-    /// Indices of the cells around a cell, itself excluded.
+    /// Indices of the cells around a cell, without the cell itself.
     pub fn neighbors(&self, index: u32) -> impl Iterator<Item = u32> + use<> {
         let grid = *self;
         let n = self.n_cells;
@@ -89,8 +89,8 @@ fn moved_by(along: u32, step: u32, n: u32) -> Option<u32> {
 pub struct CellSet {
     /// The grid.
     pub(super) grid: CellGrid,
-    /// Disjoint ranges of indices in increasing order. Each range has its first index and the index
-    /// after its last one.
+    /// Disjoint ranges of indices in increasing order. A range consists of its first index and of
+    /// the index after its last index.
     pub(super) ranges: Vec<[u32; 2]>,
 }
 
@@ -114,8 +114,8 @@ impl CellSet {
         &self.grid
     }
 
-    /// Disjoint ranges of indices in increasing order. Each range has its first index and the index
-    /// after its last one.
+    /// Disjoint ranges of indices in increasing order. A range consists of its first index and of
+    /// the index after its last index.
     pub fn ranges(&self) -> &[[u32; 2]] {
         &self.ranges
     }

@@ -83,7 +83,7 @@ fn check_box(
 #[serde(try_from = "Vec<StoredEdit>", into = "Vec<StoredEdit>")]
 pub struct Edits {
     made: Vec<Edit>,
-    /// The edit that was undone last is the last one.
+    /// The edit that was undone last is at the end.
     undone: Vec<Edit>,
 }
 
@@ -101,12 +101,12 @@ struct File {
 }
 
 impl Edits {
-    /// Adds an edit. Edits that were undone before can no longer be made again.
+    /// Adds an edit. After this call, edits that were undone before can no longer be redone.
     ///
     /// # Errors
     ///
-    /// Fails if there are [`MAX_EDITS`] already, or if the edit is too large or too far away to be
-    /// computed with.
+    /// Fails if there are already [`MAX_EDITS`] edits, or if the edit is too large or too far away
+    /// for the kernels.
     pub fn push(&mut self, edit: Edit) -> Result<(), Error> {
         if self.made.len() >= MAX_EDITS {
             return Err(Error::TooManyEdits {
@@ -124,7 +124,7 @@ impl Edits {
     ///
     /// # Errors
     ///
-    /// Fails if there is none.
+    /// Fails if there is no edit.
     pub fn undo(&mut self) -> Result<(), Error> {
         let edit = self.made.pop().ok_or(Error::NothingToUndo)?;
         self.undone.push(edit);

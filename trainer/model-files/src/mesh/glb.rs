@@ -16,7 +16,7 @@ const VERTICES: u32 = 34_962;
 const INDICES: u32 = 34_963;
 
 /// Writes a mesh. glTF has y up and z toward the viewer, while the world has z up. One node
-/// contains this rotation, and another node the origin.
+/// contains this rotation, and another node contains the origin.
 pub fn write(path: &Path, mesh: &Mesh) -> Result<(), Error> {
     files::write(path, to_bytes(mesh)).map_err(|source| Error::Write {
         path: path.to_owned(),

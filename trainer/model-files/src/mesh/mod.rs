@@ -13,9 +13,9 @@ mod tests;
 /// Triangles with shared vertices, in the order of their blocks.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Mesh {
-    /// Origin of the positions, in world, meters. f32 is precise near it.
+    /// Origin of the positions, in world coordinates, meters. f32 is precise near this point.
     pub origin_m: [f64; 3],
-    /// Relative to `origin_m`, along the world's axes, meters.
+    /// Positions relative to `origin_m`, along the world's axes, meters.
     pub positions_m: Vec<[f32; 3]>,
     /// Outward normals of length 1, along the world's axes.
     pub normals: Vec<[f32; 3]>,

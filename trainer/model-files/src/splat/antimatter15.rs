@@ -29,7 +29,8 @@ fn from_bytes(bytes: &[u8]) -> Result<SplatArrays, String> {
             bytes.len()
         ));
     }
-    // Quaternions are stored as `128 q + 128`, w first, and colors without spherical harmonics.
+    // Quaternions are stored as `128 q + 128`, w first. Colors are stored without spherical
+    // harmonics.
     let rotation =
         |row: &[u8; SPLAT_BYTES]| [28, 29, 30, 31].map(|at| (f32::from(row[at]) - 128.0) / 128.0);
     let color =

@@ -10,11 +10,11 @@ use std::path::Path;
 const MAX_COEFFICIENTS: usize = 16;
 /// Splats that are more transparent are not drawn, see `projection.wgsl` of the trainer.
 const MIN_ALPHA: f64 = 1.0 / 255.0;
-/// Maximum absolute coordinate of a mean in a file: beyond the size of the Earth, also in
-/// millimeters.
+/// Maximum absolute coordinate of a mean in a file. It exceeds the size of the Earth, even if the
+/// unit is millimeters.
 const MAX_MEAN: f32 = 1e11;
-/// Logarithm of the maximum standard deviation in a file, 1000 km. Larger splats cover every
-/// picture.
+/// Logarithm of the maximum standard deviation in a file, which is 1000 km. Larger splats cover
+/// every picture.
 const MAX_LOG_SCALE: f32 = 13.8;
 /// Maximum absolute color coefficient in a file. The sum of 16 larger coefficients might not be
 /// finite.
@@ -202,7 +202,7 @@ impl SplatArrays {
             .all(|value| value.is_finite())
     }
 
-    /// The splats for which `is_kept` is true of the index.
+    /// The splats for whose index `is_kept` returns true.
     #[must_use]
     pub fn filtered(&self, is_kept: impl Fn(usize) -> bool + Sync) -> Self {
         // The splats are tested in parallel, because the condition may search through edits. Their

@@ -1,4 +1,5 @@
-//! Splats for kernel benchmarks: a synthetic cloud, or a file written by a peer implementation.
+//! Splats for kernel benchmarks. They are a synthetic cloud, or come from a file of a peer
+//! implementation.
 
 use crate::Error;
 use crate::splat::arrays::SplatArrays;
@@ -21,7 +22,7 @@ const PATCHES: [([f64; 2], f64); 4] = [
     ([0.7, 0.4], 0.2),
     ([-1.1, -0.6], 0.14),
 ];
-/// Fraction of splats in patches, and fraction of large splats.
+/// Fraction of splats in patches. The next constant is the fraction of large splats.
 const PATCH_FRAC: f64 = 0.25;
 const LARGE_FRAC: f64 = 0.005;
 /// Number of splats that cover the whole image.
@@ -72,13 +73,13 @@ fn random_color(random: &mut Random) -> [[f32; 3]; N_COEFFICIENTS] {
     })
 }
 
-/// Generates `n_splats` splats like those of a scan with depth, for a camera at z = -3.2 that looks
+/// Generates `n_splats` splats that resemble a scan with depth, for a camera at z = -3.2 that looks
 /// along z. Equal seeds give equal splats.
 ///
 /// Most splats are flat and lie on an uneven wall around z = 0, whose edges lie outside an image
-/// with a focal length of 0.9 image widths. `PATCH_FRAC` of them are smaller and lie in a few
-/// `PATCHES`, where the lists of the tiles are several times longer. `LARGE_FRAC` of them are
-/// large, and `N_HUGE` cover the whole image.
+/// with a focal length of 0.9 image widths. A fraction `PATCH_FRAC` of the splats is smaller and
+/// lies in a few `PATCHES`, where the lists of the tiles are several times longer. A fraction
+/// `LARGE_FRAC` is large, and `N_HUGE` splats cover the whole image.
 #[expect(clippy::cast_possible_truncation, reason = "drawn in f64, used in f32")]
 pub fn scan_cloud(n_splats: usize, seed: u64) -> SplatArrays {
     let mut random = Random::new(seed);
@@ -89,8 +90,8 @@ pub fn scan_cloud(n_splats: usize, seed: u64) -> SplatArrays {
         ..SplatArrays::default()
     };
     for splat_ix in 0..n_splats {
-        // The random number is drawn for every splat, even for huge ones, so that their number does
-        // not change the others.
+        // The random number is drawn for every splat, even for huge splats, so that the number of
+        // huge splats does not change the other splats.
         let kind = random.unit();
         let (xy_m, size_m, depth_m) = if splat_ix < N_HUGE {
             ([0.2 * random.normal(), 0.2 * random.normal()], 3.0, 0.0)

@@ -12,7 +12,7 @@ pub const IN_FOLDER: &str = "splats.ply";
 
 /// Extensions of the formats that can be read.
 pub const EXTENSIONS: [&str; 3] = ["ply", "spz", "splat"];
-/// Extensions of other formats. They are recognized only to name them in the error.
+/// Extensions of other formats. They are recognized only so that the error can name the format.
 pub const UNSUPPORTED: [&str; 2] = ["ksplat", "sog"];
 
 /// Format of a written file.

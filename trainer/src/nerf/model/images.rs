@@ -26,10 +26,10 @@ use nalgebra::{Translation3, UnitQuaternion, Vector3};
 use std::collections::{BTreeMap, VecDeque};
 use std::sync::Arc;
 
-/// This constant and the next two are fractions (1 / divisor) of the planned steps. They are the
-/// start of optimizing image parameters, the start of trials, and the length of each half of a
-/// trial. Before the first start, the field is too coarse. With longer halves, smaller gains are
-/// detected, but a rejected variant wastes all steps of its half.
+/// This constant and the next two are divisors of the number of planned steps. They give the step
+/// at which image parameters start to be optimized, the step at which trials start, and the length
+/// of each half of a trial. Before the first start, the field is too coarse. With longer halves,
+/// smaller gains are detected, but a rejected variant wastes all steps of its half.
 const POSE_START_DIVISOR: u64 = 32;
 const TRIAL_START_DIVISOR: u64 = 8;
 const TRIAL_LENGTH_DIVISOR: u64 = 16;
@@ -53,7 +53,7 @@ pub(super) struct FieldSnapshot {
 /// Trials of image parameters.
 #[derive(Debug, Default)]
 pub(super) struct Trials {
-    /// Candidates in the order of their trials. The first one is on trial.
+    /// Candidates in the order of their trials. The first candidate is on trial.
     remaining: VecDeque<ParamSet>,
     pub(super) finished: Vec<TrialReport>,
     running: Option<RunningTrial>,
@@ -334,7 +334,8 @@ impl NerfModel {
                 &rays,
                 appearance_embeddings,
             )?) {
-                // Masked pixels have no target. A field may be non-finite in a trial that diverges.
+                // Masked pixels have no target. In a trial that diverges, the field may be
+                // non-finite.
                 let [rgb @ .., alpha] = ray.target_rgb.to_le_bytes();
                 if alpha > 0 && render_rays.error.is_finite() {
                     sums[ray.embedding as usize]
@@ -380,7 +381,8 @@ impl NerfModel {
         Ok(corrections)
     }
 
-    /// Initializes the embeddings of new images from those of images before and after them.
+    /// Initializes the embeddings of new images from the embeddings of images before and after
+    /// them.
     pub(super) fn initialize_embeddings(&mut self) -> Result<(), Error> {
         if !self.learned_params.contains(ParamSet::IMAGE_GAINS)
             || self.n_hinted == self.images.len()
@@ -426,8 +428,8 @@ pub(super) fn embedding_of(
     })
 }
 
-/// Appearance embedding of an image, interpolated between those of its camera. It is neutral if the
-/// camera has no embeddings.
+/// Appearance embedding of an image, interpolated between the embeddings of its camera. It is
+/// neutral if the camera has no embeddings.
 fn interpolated_embedding(
     corrections: &BTreeMap<String, CameraCorrection>,
     image: &RayImage,
@@ -447,8 +449,9 @@ fn all_embeddings(
         .flat_map(|correction| correction.appearance_embeddings.values())
 }
 
-/// Converts a field's pose correction (rotation about the camera, translation in world) to rotation
-/// and translation after `camera_from_world`, in the camera's axes.
+/// Converts a pose correction of a field to a rotation and a translation after `camera_from_world`,
+/// in the camera's axes. The correction of the field is a rotation about the camera and a
+/// translation in world axes.
 fn drift_of(
     keyframe: &Keyframe,
     [a, b, c, x, y, z, ..]: &[f64; IMAGE_PARAM_STRIDE],
@@ -457,8 +460,8 @@ fn drift_of(
     let given = &keyframe.world_from_camera;
     let rotation = UnitQuaternion::from_scaled_axis(Vector3::new(*a, *b, *c));
     let translation_m = Vector3::new(*x, *y, *z) * extent.radius_m;
-    // The kernel adds the translation in world, and rotates directions about the camera, so the
-    // rotation is on the left.
+    // The kernel adds the translation in world axes, and rotates directions about the camera. The
+    // rotation is therefore on the left.
     let found = Transform::from_parts(
         Translation3::from(given.translation.vector + translation_m),
         rotation * given.rotation,

@@ -35,11 +35,11 @@ pub struct Field {
 /// Gradient of a loss with respect to the parameters of a field.
 #[derive(Clone, Debug, PartialEq)]
 pub struct FieldGrad {
-    /// With respect to the entries of the grid.
+    /// Gradient with respect to the entries of the grid.
     pub table: Vec<[f64; N_FEATURES]>,
-    /// With respect to the weights of the first network.
+    /// Gradient with respect to the weights of the first network.
     pub density: Vec<f64>,
-    /// With respect to the weights of the second network.
+    /// Gradient with respect to the weights of the second network.
     pub color: Vec<f64>,
 }
 

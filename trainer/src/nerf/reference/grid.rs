@@ -14,7 +14,8 @@ pub struct GridShape {
 }
 
 impl GridShape {
-    /// Levels with numbers of cells between two values, evenly spaced on a logarithmic scale.
+    /// A grid whose numbers of cells per level are between two values, evenly spaced on a
+    /// logarithmic scale.
     pub fn between(coarsest: u32, finest: u32, n_levels: u32, log2_entries: u32) -> Self {
         let growth =
             (f64::from(finest) / f64::from(coarsest)).ln() / f64::from(n_levels.max(2) - 1);
@@ -58,7 +59,7 @@ impl GridShape {
     pub fn entry(&self, level: usize, corner: [u32; 3]) -> u32 {
         let side = self.n_cells[level] + 1;
         let [x, y, z] = corner;
-        // The primes of Mueller et al. 2022, equation 4. The first one is 1.
+        // The primes of Mueller et al. 2022, equation 4. The first factor is 1.
         let is_dense = u64::from(side).pow(3) <= 1u64 << self.log2_entries;
         let offset = if is_dense {
             x + side * (y + side * z)
@@ -101,8 +102,8 @@ fn corners(shape: &GridShape, level: usize, at: [f64; 3]) -> [Corner; 8] {
         let step: [u32; 3] =
             std::array::from_fn(|axis| u32::try_from(ix >> axis & 1).expect("0 or 1"));
         let part = |axis: usize| part_of(share[axis], step[axis]);
-        // The derivative of a product of three linear factors. It is zero outside the cube, where
-        // points are clamped.
+        // This is the derivative of a product of three linear factors. It is zero outside the cube,
+        // where points are clamped.
         let weight_gradient = std::array::from_fn(|axis| {
             let sign = if step[axis] == 1 { n_cells } else { -n_cells };
             let inside = at[axis] >= 0.0 && at[axis] <= 1.0;

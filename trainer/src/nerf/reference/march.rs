@@ -98,7 +98,8 @@ impl March {
     /// integer.
     ///
     /// Steps have constant length inside the inner cube. Outside, the step at a distance u from the
-    /// cube is longer by (1 + u)^2, so that each step changes 1 / (1 + u) by the same amount.
+    /// cube is longer by the factor (1 + u)^2, so that each step changes 1 / (1 + u) by the same
+    /// amount.
     pub fn segments(
         &self,
         (origin, direction): ([f64; 3], [f64; 3]),
@@ -131,8 +132,8 @@ impl March {
     }
 
     fn path(&self, (origin, direction): ([f64; 3], [f64; 3]), [begin, end]: [f64; 2]) -> Path {
-        // Intersection with the inner cube (slab method), limited to the part after the beginning
-        // of the ray.
+        // The ray is intersected with the inner cube by the slab method. Only the part after the
+        // beginning of the ray is used.
         let [mut enter, mut leave] = [begin, f64::INFINITY];
         for axis in 0..3 {
             let along = if direction[axis].abs() < MIN_DIRECTION {

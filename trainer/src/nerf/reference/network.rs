@@ -1,5 +1,5 @@
-//! A small fully connected network without biases. Hidden layers have a `ReLU`. The last layer has
-//! none.
+//! A small fully connected network without biases. Hidden layers are followed by a `ReLU`, and the
+//! last layer is not.
 
 /// Weights of a network.
 #[derive(Clone, Debug, PartialEq)]

@@ -5,9 +5,9 @@ use nalgebra::{UnitQuaternion, Vector3};
 /// Pose correction of an image.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct ImagePose {
-    /// Rotation vector in world, radians.
+    /// Rotation vector in the world frame, radians.
     pub rotation_rad: [f64; 3],
-    /// In world, in units of the scene's radius.
+    /// Translation in the world frame, in units of the scene's radius.
     pub translation: [f64; 3],
 }
 

@@ -1,5 +1,5 @@
-//! Compositing of samples along a ray, and the loss of the result. Lengths are in units of the
-//! scene radius.
+//! Compositing of samples along a ray, and the loss of the composited color and distance. Lengths
+//! are in units of the scene radius.
 
 /// One sample of a ray.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -59,13 +59,13 @@ pub fn composite(samples: &[Sample]) -> RenderedRay {
 /// Gradients of a loss with respect to the outputs of compositing.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Upstream {
-    /// With respect to the premultiplied color.
+    /// Gradient with respect to the premultiplied color.
     pub rgb: [f64; 3],
-    /// With respect to the transmittance.
+    /// Gradient with respect to the transmittance.
     pub transmittance: f64,
-    /// With respect to the distance.
+    /// Gradient with respect to the distance.
     pub distance: f64,
-    /// With respect to each weight directly.
+    /// Gradient with respect to each weight directly.
     pub weights: Vec<f64>,
 }
 
@@ -95,8 +95,8 @@ pub fn composite_backward(
     gradients
 }
 
-/// Gradient with respect to the weight of a sample. It has three parts: through the color, through
-/// the distance, and directly.
+/// Gradient with respect to the weight of a sample. It has three parts: a part through the color, a
+/// part through the distance, and a direct part.
 fn weight_gradient(sample: &Sample, upstream: &Upstream, ix: usize) -> f64 {
     let color: f64 = (0..3)
         .map(|channel| upstream.rgb[channel] * sample.rgb[channel])
@@ -168,8 +168,8 @@ pub struct Weights {
     pub near: f64,
     /// Weight of the line-of-sight loss, which penalizes opacity away from the measured depth.
     pub line_of_sight: f64,
-    /// Opacity within this band around the measured distance is allowed: a fraction of the
-    /// distance, plus an offset.
+    /// Half the width of the band around the measured distance in which opacity is allowed. It is
+    /// given as a fraction of the distance and an offset.
     pub band: [f64; 2],
     /// Color behind everything.
     pub background_rgb: [f64; 3],

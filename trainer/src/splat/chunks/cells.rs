@@ -13,11 +13,12 @@ const ROOT_M: f64 = 1024.0;
 /// Maximum number of splats in a cell. They take tens of kilobytes, so that a chunk does not delay
 /// pictures for long.
 const MAX_SPLATS: usize = 2048;
-/// A cell of the last version is divided only above this number of splats. If the number were equal
-/// to [`MAX_SPLATS`], a cell with about this many splats would be repeatedly divided and merged,
-/// and sent each time.
+/// A cell that existed in the last version of the model is divided only if it has more splats than
+/// this. If the number were equal to [`MAX_SPLATS`], a cell with about this many splats would be
+/// repeatedly divided and merged, and sent each time.
 const MAX_SPLATS_KEPT: usize = 2560;
-/// Cells of the last version are merged only if they have at most this many splats together.
+/// Cells that existed in the last version of the model are merged only if they have at most this
+/// many splats together.
 const MAX_SPLATS_MERGED: usize = 1024;
 /// Levels between a cell and its parts.
 const PART_LEVELS: u32 = 2;
@@ -42,12 +43,13 @@ impl Cell {
 
     /// Index of the part of the cell that contains a location.
     pub(super) fn part_of(self, code: u64) -> usize {
-        // The smallest cells have no levels below them, so all of their splats are in few parts.
+        // The smallest cells have no levels below them, so their splats are in few of the possible
+        // parts.
         let shift = 3 * N_LEVELS.saturating_sub(self.level + PART_LEVELS);
         usize::try_from(code >> shift & ((1 << (3 * PART_LEVELS)) - 1)).unwrap_or(0)
     }
 
-    /// Location code after the last one of the cell.
+    /// First location code after the cell.
     fn end(self) -> u64 {
         self.first + (1 << (3 * (N_LEVELS - self.level)))
     }
@@ -107,7 +109,7 @@ fn divide<T>(
     last: &BTreeMap<Cell, T>,
     leaves: &mut Vec<(Cell, Range<usize>)>,
 ) {
-    // The cells of the last version do not overlap, so the first one in this cell shows whether
+    // The cells of the last version do not overlap, so the first of them in this cell shows whether
     // this cell was divided.
     let first_last = last
         .range(
@@ -131,7 +133,7 @@ fn divide<T>(
         leaves.push((cell, range));
         return;
     }
-    // The splats are sorted by location code, so those of each child are consecutive.
+    // The splats are sorted by location code, so the splats of each child are consecutive.
     let mut begin = range.start;
     for child in cell.children() {
         let n = sorted[begin..range.end].partition_point(|(code, _)| *code < child.end());

@@ -23,8 +23,8 @@ const N_DEGREE_1: usize = 3;
 const N_DEGREE_2: usize = 8;
 /// Maximum magnitude of a coefficient in 5 bits.
 const MAX_SH_COUNT: f64 = 15.0;
-/// Larger coefficients are clamped, in units of the root mean square of the chunk. A single outlier
-/// would otherwise make the steps of all other coefficients too coarse.
+/// Coefficients above this limit are clamped. The limit is in units of the root mean square of the
+/// chunk. A single outlier would otherwise make the steps of all other coefficients too coarse.
 const MAX_SH_DEVIATIONS: f64 = 4.0;
 
 /// Encodes these splats in the given order.
@@ -126,7 +126,7 @@ impl Ranges {
     }
 
     /// Coefficients of degree 1 and 2, with six in each word. Red, green and blue of one basis
-    /// function come before those of the next one.
+    /// function come before the colors of the next basis function.
     fn sh_words(&self, splats: &SplatArrays, splat_ix: u32) -> [u32; 4] {
         let mut words = [0; 4];
         for function in 0..N_DEGREE_2 {
@@ -161,8 +161,8 @@ fn sh_range(splats: &SplatArrays, members: &[u32], functions: Range<usize>) -> f
     f32_of(largest.min(MAX_SH_DEVIATIONS * rms))
 }
 
-/// Red, green and blue of a basis function after the constant one. They are zero if the splats have
-/// no such function.
+/// Red, green and blue of a basis function after the constant function. They are zero if the splats
+/// have no such function.
 fn higher_coefficient(splats: &SplatArrays, splat_ix: u32, function: usize) -> [f64; 3] {
     let n_coefficients = splats.n_coefficients();
     let is_present = function + 1 < n_coefficients;

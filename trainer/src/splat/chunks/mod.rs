@@ -1,8 +1,8 @@
 //! Splats in spatial chunks, for viewers that draw them.
 //!
-//! A chunk is a cell of an octree. Splats have no stable identity in training, because growth
-//! reorders them. Cells have a stable identity. Within a chunk, the most visible splats come first,
-//! and the first few of them, enlarged, approximate the chunk.
+//! A chunk contains the splats of one cell of an octree. Splats have no stable identity in
+//! training, because growth reorders them, but cells have a stable identity. Within a chunk, the
+//! most visible splats come first. The first few splats, enlarged, approximate the chunk.
 
 mod cells;
 mod codec;
@@ -23,9 +23,9 @@ const COARSE_STRIDE: usize = 8;
 /// The maximum factor by which coarse splats are enlarged. With a larger factor, they would blur
 /// into blobs that hide other chunks.
 const MAX_SCALE_FACTOR: f64 = 2.0;
-/// Changes are measured in `N_PARTS` parts of a cell, which are 4 x 4 x 4.
+/// Changes are measured in `N_PARTS` parts of a cell, which form a grid of 4 x 4 x 4.
 const N_PARTS: usize = 64;
-/// A change that does not affect the sums of all parts counts as this fraction of the sums.
+/// A change that does not affect the sums of the parts counts as this fraction of the sums.
 /// Otherwise, a chunk whose splats only exchange positions would never be sent.
 const MIN_CHANGE_FRAC: f64 = 1e-3;
 
@@ -94,7 +94,7 @@ fn encoded(
 ) -> (Content, ModelChunk) {
     let sums = sums(splats, cell, members);
     let mut members: Vec<u32> = members.iter().map(|(_, splat_ix)| *splat_ix).collect();
-    // The most visible splats come first, because the coarse form consists of the first ones.
+    // The most visible splats come first, because the coarse form consists of the first splats.
     members.sort_by(|a, b| area(splats, *b).total_cmp(&area(splats, *a)));
     let fine = encode(splats, &members, 1.0, splats.sh_degree);
     // A hash is stored instead of the bytes, because the bytes would double the memory of the
@@ -119,7 +119,7 @@ fn encoded(
 
 /// Opacity times the largest cross section of a splat, square meters up to a constant factor.
 fn area(splats: &SplatArrays, splat_ix: u32) -> f64 {
-    // The product of the two largest standard deviations, as a sum of logarithms.
+    // This is the product of the two largest standard deviations, as a sum of logarithms.
     let log_scale = splats.log_scales[splat_ix as usize].map(f64::from);
     let smallest = log_scale.into_iter().fold(f64::INFINITY, f64::min);
     splats.opacity(splat_ix as usize) * (log_scale.iter().sum::<f64>() - smallest).exp()

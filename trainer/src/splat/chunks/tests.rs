@@ -359,7 +359,7 @@ fn changes_are_listed_where_they_are_and_by_their_size() {
     let first = chunker.chunks(&splats, true);
     assert_eq!(apply(&first), n_visible(&splats));
     assert!(chunker.chunks(&splats, true).chunks.is_empty());
-    // Two splats far from each other; the color of the first one changes much more.
+    // There are two splats far from each other. The color of the first splat changes much more.
     let corner = |sign: f32| {
         (0..splats.n_splats())
             .max_by(|a, b| {

@@ -1,8 +1,9 @@
 //! Plain CPU version of the kernels that change splats: the optimizer step (update.wgsl) and growth
 //! (grow_*.wgsl).
 //!
-//! Source: Kingma and Ba 2015; Kheradmand et al. 2024 (3DGS-MCMC), sections 4.1 and 4.2. Parents
-//! are chosen by error instead of opacity, as in Bulo et al. 2024.
+//! Sources: Kingma and Ba 2015 for the optimizer, and Kheradmand et al. 2024 (3DGS-MCMC), sections
+//! 4.1 and 4.2, for noise and growth. Parents are chosen by error instead of opacity, as in Bulo et
+//! al. 2024.
 
 use super::random::{normal3, uniform3};
 use super::{Splat, SplatGrad};
@@ -59,7 +60,7 @@ pub(crate) fn update(
         rule.final_mean_rate_frac,
     ]
     .map(f64::from);
-    // Phase 1: gradients of the loss and of the costs, and the rates at this step.
+    // Phase 1 computes the gradients of the loss and of the costs, and the rates at this step.
     let since = f64::from(step) - f64::from(rule.schedule_start);
     let progress = (since / f64::from(rule.n_planned_steps).max(1.0)).clamp(0.0, 1.0);
     let mean_rate = of_mean * final_frac.powf(progress);
@@ -80,7 +81,7 @@ pub(crate) fn update(
         .chain([of_opacity])
         .chain([of_dc; 3])
         .collect();
-    // Phase 2: Adam. The higher coefficients, which follow the other values, share a moment.
+    // Phase 2 is Adam. The higher coefficients, which follow the other values, share a moment.
     let mut updated = values(splat);
     let gradients = values(&gradient);
     let adam = Adam {
@@ -104,7 +105,7 @@ pub(crate) fn update(
         &mut moments[n_own].second,
     );
 
-    // Phase 3: noise moves nearly transparent splats to positions where they may be useful
+    // In phase 3, noise moves nearly transparent splats to positions where they may be useful
     // (Kheradmand et al. 2024, section 4.1). The noise is the product of the covariance and a
     // normal vector. It fades out above the opacity below which splats are dead.
     let [w, x, y, z] = splat.rotation_wxyz;
@@ -114,8 +115,8 @@ pub(crate) fn update(
     let noise_weight = 1.0 / (1.0 + (100.0 * (opacity - f64::from(rule.noise_center))).exp());
     let jitter = rotation * variance.component_mul(&along) * (noise * mean_rate * noise_weight);
 
-    // Phase 4: values stay in range. At a logit of 12, the opacity differs from 1 by 6e-6. Closer
-    // to 1, its gradient would vanish.
+    // Phase 4 limits values to their ranges. At a logit of 12, the opacity differs from 1 by 6e-6.
+    // Closer to 1, its gradient would vanish.
     let range = rule.log_scale_range.map(f64::from);
     let norm = updated[6..10]
         .iter()
@@ -144,7 +145,7 @@ pub(crate) struct Grown {
     pub(crate) margin: f64,
 }
 
-/// Replaces dead splats and creates new ones as children of parents that are chosen by error. A
+/// Replaces dead splats and creates new splats, as children of parents that are chosen by error. A
 /// child gets a position within its parent and a share of its parent's opacity.
 pub(crate) fn grow(splats: &[Splat], errors: &[f64], growth: &Growth) -> Grown {
     // Dead splats are replaced, so they cannot be parents.
@@ -222,7 +223,7 @@ fn choose(n: u32, k: u32) -> f64 {
 /// splat.
 fn share_opacity(splat: &mut Splat, n: u32, min_opacity: f64) {
     // Together, `n` splats of the new opacity at the same position are as opaque as the original
-    // splat. The scale follows from Kheradmand et al. 2024, equation 9.
+    // splat. The new scale follows from Kheradmand et al. 2024, equation 9.
     let opacity = sigmoid(splat.opacity_logit).clamp(1e-4, 0.9999);
     let shared = (1.0 - (1.0 - opacity).powf(1.0 / f64::from(n))).clamp(min_opacity, 0.9999);
     let term = |i: u32, k: u32| {

@@ -1,7 +1,7 @@
 //! Clipping of splats at the crop box and in erased space, pixel by pixel.
 //!
-//! A splat is drawn at a pixel only if its density along the pixel's ray is largest at a point that
-//! is shown. In the linear approximation of the projection (Zwicker et al. 2001), this point is the
+//! A splat is drawn at a pixel only if the point with the largest density along the pixel's ray is
+//! shown. In the linear approximation of the projection (Zwicker et al. 2001), this point is the
 //! conditional mean of the Gaussian given the pixel. The center of the splat is not sufficient,
 //! because a long splat with its center inside a box can reach far beyond the box.
 
@@ -16,7 +16,8 @@ use nalgebra::{Matrix3x2, Vector2, Vector3};
 pub struct Clipping {
     /// Only the inside of this box is shown.
     pub crop: Option<Aabb>,
-    /// Boxes are cut out of splats. Cells remove splats whose centers they contain.
+    /// The space that is erased from pictures. Boxes are cut out of splats. Cells remove splats
+    /// whose centers they contain.
     pub edits: Edits,
 }
 
@@ -81,7 +82,8 @@ impl RayPoints {
         }
     }
 
-    /// The point of the pixel at `offset_px` from the center of the splat, in world, meters.
+    /// The point for the pixel at `offset_px` from the center of the splat, in world coordinates,
+    /// meters.
     fn at(&self, offset_px: [f64; 2]) -> [f64; 3] {
         (self.mean + self.point_per_px * Vector2::from(offset_px)).into()
     }

@@ -1,9 +1,10 @@
 //! Plain CPU version of splatting in f64. Tests compare every kernel of `splat` with it.
 //!
 //! `project` projects each splat onto the image plane, and `rasterize` composites the splats pixel
-//! by pixel. Each of the two has a backward function. `clip` limits splats to boxes, or cuts boxes
-//! out of them, in pictures. Discrete decisions (visibility, depth order, contributors of each
-//! pixel) are made once, in [`decide`], and kept fixed while gradients are computed.
+//! by pixel. Each of the two has a backward function. In pictures, `clip` limits splats to boxes or
+//! cuts boxes out of them. [`decide`] makes the discrete decisions once, which are visibility,
+//! depth order and the contributors of each pixel. These decisions are kept fixed while gradients
+//! are computed.
 //!
 //! Source: Kerbl et al. 2023 (3D Gaussian splatting) and Ye et al. 2024 (gsplat, appendix on
 //! gradients). The rolling shutter and the depth output are additions of fieldrig. Depth is
@@ -62,15 +63,15 @@ pub struct View {
     pub size_px: [u32; 2],
     /// Splats nearer than this along z are not drawn, meters.
     pub near_m: f64,
-    /// Translation of the camera during the whole readout in its own axes, meters: linear velocity
-    /// times readout time.
+    /// Translation of the camera during the whole readout in its own axes, meters. This is the
+    /// linear velocity times the readout time.
     pub linear_m: [f64; 3],
-    /// Rotation of the camera during the whole readout in its own axes, radians: angular velocity
-    /// times readout time.
+    /// Rotation of the camera during the whole readout in its own axes, radians. This is the
+    /// angular velocity times the readout time.
     pub angular_rad: [f64; 3],
     /// Whether opacities are lowered where [`BLUR_PX2`](project::BLUR_PX2) enlarges splats. See
     /// [`SplatArrays::is_antialiased`](model_files::splat::arrays::SplatArrays::is_antialiased).
-    /// Gradients ignore this.
+    /// Gradients do not include this effect.
     pub is_antialiased: bool,
 }
 
@@ -95,9 +96,9 @@ pub struct ViewGrad {
     /// Gradient with respect to a small motion `exp(pose) * camera_from_world`. The translation in
     /// meters comes before the rotation in radians.
     pub pose: [f64; 6],
-    /// With respect to [`View::linear_m`].
+    /// Gradient with respect to [`View::linear_m`].
     pub linear_m: [f64; 3],
-    /// With respect to [`View::angular_rad`].
+    /// Gradient with respect to [`View::angular_rad`].
     pub angular_rad: [f64; 3],
 }
 
@@ -115,23 +116,23 @@ pub struct Projected {
     /// Depth of the center along the camera's z axis, meters.
     pub depth: f64,
     /// Half width and height of the bounding box around `mean_px`, pixels. The splat contributes
-    /// nothing outside of it.
+    /// nothing outside of this box.
     pub extent_px: [f64; 2],
 }
 
 /// Gradient of a loss with respect to a [`Projected`]. The extent has no gradient.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct ProjectedGrad {
-    /// With respect to the center.
+    /// Gradient with respect to the center.
     pub mean_px: [f64; 2],
     /// Gradient with respect to the three numbers of the conic. `b` represents both off-diagonal
     /// entries.
     pub conic: [f64; 3],
-    /// With respect to the opacity.
+    /// Gradient with respect to the opacity.
     pub opacity: f64,
-    /// With respect to the color.
+    /// Gradient with respect to the color.
     pub color: [f64; 3],
-    /// With respect to the depth.
+    /// Gradient with respect to the depth.
     pub depth: f64,
 }
 
@@ -142,7 +143,7 @@ pub struct RenderGrad {
     pub splats: Vec<SplatGrad>,
     /// Gradient with respect to each projected splat. It is zero for invisible splats.
     pub projected: Vec<ProjectedGrad>,
-    /// With respect to the view.
+    /// Gradient with respect to the view.
     pub view: ViewGrad,
 }
 
@@ -189,7 +190,8 @@ pub fn render_backward(view: &View, splats: &[Splat], upstream: &Upstream) -> Re
 }
 
 fn project_decided(view: &View, splats: &[Splat], decisions: &Decisions) -> Vec<Projected> {
-    // Invisible splats keep their position in the list, so that indices stay those of the splats.
+    // Invisible splats keep their position in the list, so that indices remain the indices of the
+    // splats.
     let project_one = |(splat, row_share): (&Splat, &Option<f64>)| {
         row_share
             .map(|row_share| project::project_at(view, splat, row_share))

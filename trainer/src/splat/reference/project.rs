@@ -14,7 +14,7 @@ pub const MIN_ALPHA: f64 = 1.0 / 255.0;
 /// between pixels.
 pub const BLUR_PX2: f64 = 0.3;
 /// Margin around the image beyond which the Jacobian is clamped, as a fraction of half the image
-/// size. The value is that of gsplat. Far outside the image, the linear approximation of the
+/// size. The value is from gsplat. Far outside the image, the linear approximation of the
 /// projection would stretch splats across the whole image.
 const MARGIN_FRAC: f64 = 0.3;
 
@@ -55,9 +55,9 @@ pub fn project_at(view: &View, splat: &Splat, row_share: f64) -> Projected {
         1.0
     };
     let opacity = sigmoid(splat.opacity_logit) * compensation;
-    // Number of standard deviations at which alpha is MIN_ALPHA, from `opacity * exp(-reach^2 / 2)
-    // = MIN_ALPHA`. Along an axis of the image, the ellipse extends by this number times the square
-    // root of the variance.
+    // This is the number of standard deviations at which alpha is `MIN_ALPHA`. It follows from
+    // `opacity * exp(-reach^2 / 2) = MIN_ALPHA`. Along an axis of the image, the ellipse extends by
+    // this number times the square root of the variance.
     let reach = (2.0 * (opacity / MIN_ALPHA).ln()).max(0.0).sqrt();
     Projected {
         mean_px: [fx * point.x / point.z + cx, fy * point.y / point.z + cy],
@@ -76,7 +76,8 @@ pub fn project_at(view: &View, splat: &Splat, row_share: f64) -> Projected {
     }
 }
 
-/// Change of the splat's conditional mean in world with the position of a pixel, meters per pixel.
+/// Derivative of the splat's conditional mean in world coordinates with respect to the position of
+/// a pixel, meters per pixel.
 ///
 /// The mean of the splat given its projection is `mean + C J^T (J C J^T + B)^-1 offset_px` for the
 /// covariance `C` in world, the Jacobian `J` and the low-pass `B`. Because of the low-pass, this

@@ -1,5 +1,5 @@
-//! Comparison with an independent renderer: four splats rendered by gsplat, published with Brush
-//! (Apache-2.0).
+//! Comparison with an independent renderer. The picture shows four splats that were rendered by
+//! gsplat, and was published with Brush (Apache-2.0).
 
 use super::{Splat, View, render};
 use crate::mismatches::Mismatches;

@@ -1,6 +1,7 @@
 //! Plain CPU version of shared/random.wgsl: random numbers from a hash of a key.
 //!
-//! Source: Jarzynski and Olano 2020 (PCG3D); Box and Muller 1958.
+//! Sources: Jarzynski and Olano 2020 (PCG3D) for the hash, and Box and Muller 1958 for normal
+//! numbers.
 
 /// Three hashes of three numbers.
 pub(crate) fn hash3(key: [u32; 3]) -> [u32; 3] {
@@ -22,7 +23,8 @@ fn mix(v: &mut [u32; 3]) {
 
 /// Three uniform numbers in 0 <= x < 1.
 pub(crate) fn uniform3(key: [u32; 3]) -> [f64; 3] {
-    // 24 bits, which f32 holds exactly, so that the kernels compute the same numbers.
+    // The numbers have 24 bits, which f32 holds exactly, so that the kernels compute the same
+    // numbers.
     hash3(key).map(|hash| f64::from(hash >> 8) / 16_777_216.0)
 }
 

@@ -16,8 +16,8 @@ pub const MIN_TRANSMITTANCE: f64 = 1e-4;
 /// Results of all comparisons, stored so that forward and backward passes agree.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Decisions {
-    /// Share of the readout at which each splat is read out (see [`row_share`]). `None` for splats
-    /// that are not drawn.
+    /// Time at which each splat is read out, as a share of the readout (see [`row_share`]). `None`
+    /// for splats that are not drawn.
     pub row_shares: Vec<Option<f64>>,
     /// Indices of the splats that contribute to each pixel, front to back. Pixels are row by row.
     pub contributors: Vec<Vec<usize>>,
@@ -90,8 +90,9 @@ pub fn composite_backward(
             in_front.push(transmittance);
             transmittance *= 1.0 - Coverage::new(&projected[splat_ix], &center_px).alpha();
         }
-        // Part of the loss that depends on everything behind the current splat. The twin iterates
-        // back to front, as in Kerbl et al. 2023, whereas the kernel iterates front to back.
+        // This is the part of the loss that depends on everything behind the current splat. The
+        // twin iterates back to front, as in Kerbl et al. 2023, whereas the kernel iterates front
+        // to back.
         let mut behind = upstream.transmittance[pixel_ix] * transmittance;
         for (&splat_ix, transmittance) in
             decisions.contributors[pixel_ix].iter().zip(in_front).rev()
@@ -121,9 +122,9 @@ pub fn composite_backward(
 
 /// Smallest relative distance of each pixel's decisions from their thresholds.
 ///
-/// Compares all alphas with [`MIN_ALPHA`] and [`MAX_ALPHA`], all transmittances with
-/// [`MIN_TRANSMITTANCE`], and the depths of consecutive splats with each other unless they are
-/// equal. Arithmetic with larger rounding errors may decide differently.
+/// All alphas are compared with [`MIN_ALPHA`] and [`MAX_ALPHA`], and all transmittances with
+/// [`MIN_TRANSMITTANCE`]. The depths of consecutive splats are compared with each other unless they
+/// are equal. Arithmetic with larger rounding errors may decide differently.
 pub fn threshold_margins(view: &View, splats: &[Splat]) -> Vec<f64> {
     threshold_margins_clipped(view, splats, &Clipping::default())
 }

@@ -70,7 +70,7 @@ pub(crate) fn some_upstream(seed: u64, view: &View) -> Upstream {
 }
 
 impl Upstream {
-    /// A loss that is linear in the image. Its gradient is `self`.
+    /// A loss that is linear in the image, with `self` as its gradient.
     pub(crate) fn dot(&self, image: &RenderedImage) -> f64 {
         let dot = |a: &[f64], b: &[f64]| a.iter().zip(b).map(|(a, b)| a * b).sum::<f64>();
         dot(self.rgb.as_flattened(), image.rgb.as_flattened())

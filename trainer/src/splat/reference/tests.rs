@@ -9,8 +9,8 @@ use crate::mismatches::Mismatches;
 const NUDGE: f64 = 1e-5;
 /// Rounding error of the loss (a few tens), divided by the nudge.
 const ABS: f64 = 2e-8;
-/// Truncation error: the nudge squared times third derivatives, which are large for small sharp
-/// splats.
+/// Truncation error, which is the nudge squared times third derivatives. These are large for small
+/// sharp splats.
 const REL: f64 = 1e-6;
 
 /// Compares every gradient of a render with central differences at fixed decisions.

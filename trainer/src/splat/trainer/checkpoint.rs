@@ -265,7 +265,7 @@ impl TrialState {
     }
 }
 
-/// The keyframes of a checkpoint, found among those of a run.
+/// The keyframes of a checkpoint that were found among the keyframes of a run.
 struct SavedKeyframes {
     /// The training views, in their order.
     views: Vec<Arc<Keyframe>>,
@@ -372,8 +372,8 @@ pub(super) fn take(
     let state = serde_json::to_value(state).map_err(|error| Error::CheckpointState {
         reason: error.to_string(),
     })?;
-    // Reading back begins now, so that the arrays belong to this step. Training may change the
-    // buffers before the reads are finished.
+    // The copies for reading back are queued now, so that the arrays belong to this step. Training
+    // may change the buffers before the reads are finished.
     let params = (&cameras.params, cameras.used_bytes());
     let mut halves = vec![PendingArrays::begin(gpu, "", splats, &scene.seeder, params)];
     if let Some(RunningTrial { other, .. }) = trials.running_trial() {

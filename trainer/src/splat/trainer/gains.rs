@@ -72,7 +72,7 @@ struct InitialGains {
     known: LogGains,
     /// The mean gains, to which the initial values are relative.
     mean: [f64; 3],
-    /// The first view to initialize, besides those in `known`.
+    /// The first view to initialize, besides the views in `known`.
     first_ix: usize,
 }
 
@@ -131,12 +131,12 @@ pub(super) fn add_live_arrival(
     };
     let log_gains = products::log_gains(&products);
     training.add_arrival(keyframe.clone())?;
-    // While gains are watched for, they are not optimized, so there is nothing to initialize.
+    // While gains are only watched for, they are not optimized, so there is nothing to initialize.
     if is_watched {
         let psnr = |gains| products::psnr_with_gains(&products, gains);
         let needed = trials.add_arrival_gains(&keyframe, log_gains, psnr);
-        // The model still has the brightness of earlier views, which need no gains. The
-        // latest views include those after the change of exposure.
+        // The model still has the brightness of earlier views, which need no gains. The latest
+        // views include the views after the change of exposure.
         let initial = InitialGains {
             known: LogGains::new(),
             mean: [0.0; 3],
@@ -158,8 +158,8 @@ pub(super) fn add_live_arrival(
     Ok(())
 }
 
-/// Adds the gains that best match the pictures of views to their images, for those views that
-/// `known` does not contain yet.
+/// For each view that `known` does not contain yet, adds the gains that best match the picture of
+/// the view to its image.
 fn add_gains(
     training: &mut Training,
     comparer: &Comparer,

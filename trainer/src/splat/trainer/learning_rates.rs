@@ -7,7 +7,8 @@ use crate::splat::schedule::Schedule;
 use crate::splat::snapshot::ObservedScene;
 use numbers::f32_of;
 
-// The rates and Adam's parameters are those of Kerbl et al. 2023 and its reference implementation.
+// The rates and Adam's parameters are from Kerbl et al. 2023 and the reference implementation of
+// this paper.
 
 /// Initial learning rate of the means, in scene sizes.
 const MEAN_RATE: f32 = 1.6e-4;
@@ -32,7 +33,8 @@ const SCALE_RANGE: [f32; 2] = [1e-5, 2.0];
 /// these costs gained nothing (docs/benchmarks/2026-11-25-few-images.md).
 const MAX_COST: f64 = 0.1;
 
-/// Returns the update rule of the next steps, which train `n_splats` splats on `n_views` images.
+/// Returns the update rule for the next steps. These steps train `n_splats` splats on `n_views`
+/// images.
 pub(super) fn rule(
     options: &ModelOptions<SplatOptions>,
     schedule: &Schedule,

@@ -127,7 +127,7 @@ impl TrainedModel {
         Ok(())
     }
 
-    /// Reserves capacity for `n_splats`. Returns that number, or a smaller one if GPU memory is
+    /// Reserves capacity for `n_splats`. Returns this number, or a smaller number if GPU memory is
     /// insufficient.
     fn reserve_up_to(
         &mut self,
@@ -164,8 +164,8 @@ impl TrainedModel {
         let capacity = n_splats
             .max(have.saturating_mul(3) / 2)
             .min(self.max_splats.max(n_splats));
-        // Reserve the drawing buffers first, so that every model that fits into memory can also be
-        // drawn.
+        // The drawing buffers are reserved first, so that every model that fits into memory can
+        // also be drawn.
         renderer.reserve_splats(recorder, capacity)?;
         self.splats = self
             .splats

@@ -1,5 +1,5 @@
-//! Reduces the model's size: computes the contribution of each splat, prunes the splats that
-//! contribute least, and lowers the SH degree.
+//! Reduces the size of the model. Splats that contribute least are pruned, and the SH degree is
+//! lowered.
 
 use super::optimizer::StepContext;
 use super::recorder::Recorder;
@@ -26,8 +26,8 @@ fn contributions(training: &mut Training, learn: &TrainPipelines) -> Result<Vec<
         .storage("splat.contributions", 4 * u64::from(n_splats))?;
     let stride = training.views.len().div_ceil(MAX_VIEWS).max(1);
     let sampled_views: Vec<usize> = (0..training.views.len()).step_by(stride).collect();
-    // All sizes are reserved first, because new image buffers would lose the errors that are
-    // written to them next.
+    // Buffers for all sizes are reserved first. The errors that are written next would be lost if
+    // the image buffers were replaced later.
     for view_ix in &sampled_views {
         training.reserve_view(training.views.size_px((*view_ix, 0)))?;
     }

@@ -114,8 +114,8 @@ impl Optimizer {
             .ok_or_else(|| Error::internal("no image buffers are reserved for a step"))
     }
 
-    /// Sets the error of every pixel to one and its other gradients to zero. Then, a splat's error
-    /// sum equals the sum of its blending weights.
+    /// Sets the error of every pixel to one and its other gradients to zero. The error sum of a
+    /// splat then equals the sum of its blending weights.
     pub(super) fn set_unit_errors(&self, recorder: &mut Recorder) {
         if let Some(image_buffers) = &self.image_buffers {
             recorder.gpu.write(
@@ -226,7 +226,7 @@ impl Optimizer {
     /// Stores the number of non-finite gradients. Logs a warning when it becomes nonzero and at
     /// each doubling.
     pub(super) fn log_non_finite(&mut self, n_non_finite: u64) {
-        // `None`, the logarithm of 0, is less than any number.
+        // The logarithm of 0 is `None`, which is less than any number.
         if n_non_finite.checked_ilog2() > self.n_non_finite.checked_ilog2() {
             log::warn!("dropped {n_non_finite} non-finite gradients of splats so far");
         }

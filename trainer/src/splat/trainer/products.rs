@@ -53,7 +53,8 @@ pub(super) fn sum_up(sums: &[[u32; 4]]) -> [Products; 3] {
 
 /// Adds up one of the four parts for one color.
 fn sum_of(sums: &[[u32; 4]], color: usize, part: usize) -> u64 {
-    // A workgroup of 256 pixels fits into u32 (256 * 255 * 255), but a picture does not.
+    // The sums of a workgroup of 256 pixels fit into u32 (256 * 255 * 255), but the sums of a
+    // picture do not.
     sums.iter()
         .skip(color)
         .step_by(3)

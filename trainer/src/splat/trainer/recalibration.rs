@@ -25,16 +25,17 @@ use std::sync::Arc;
 /// all keyframes. Every splat is projected into each of them, so the time is proportional to their
 /// number.
 const MAX_KEYFRAMES: usize = 64;
-/// A splat belongs to the surface of a depth reading if it is at most this fraction of its depth
-/// away. Otherwise, the surface hides it, or it floats in front.
+/// Maximum distance of a splat from the surface that a depth reading shows, as a fraction of the
+/// depth of the splat. A splat that is farther away is hidden by the surface or floats in front of
+/// the surface. It then does not belong to the surface.
 const SURFACE_FRAC: f64 = 0.05;
 /// Depth error, as a fraction of the depth, at which the weight of a keyframe is halved. With wrong
 /// cameras, keyframes disagree about a surface. The keyframe from which a splat was seeded agrees
 /// best, and should determine its motion.
 const AGREEMENT_FRAC: f64 = 0.001;
 /// Weight of a keyframe without a depth reading. Such a keyframe shows the splat unless something
-/// hides it. The weight matters only if no keyframe has depth there, because the weight with depth
-/// is at least 4e-4 (at an error of [`SURFACE_FRAC`]).
+/// hides it. The weight of a keyframe with depth is at least 4e-4, at an error of [`SURFACE_FRAC`].
+/// The weight without depth is smaller, so it matters only if no keyframe has depth at the splat.
 const WITHOUT_DEPTH: f64 = 1e-4;
 /// Parameters of single images, which stay enabled. Shared parameters are part of the alignment.
 const IMAGE_PARAMS: ParamSet = ParamSet::IMAGE_POSES.union(ParamSet::IMAGE_GAINS);
@@ -53,8 +54,8 @@ pub(super) fn move_with_keyframes(
     let gpu = training.recorder.gpu.clone();
     let motions = motions(keyframes, |camera| learned.get(camera));
     move_splats(&gpu, &training.model.splats, &motions)?;
-    // Then everything that refers to the keyframes is replaced. Views come before seeding, which
-    // takes the corrected depth from them.
+    // Then everything that refers to the keyframes is replaced. Views come before seeding, because
+    // seeding takes the corrected depth from the views.
     let corrected = replacement(keyframes);
     training.recorder.passes.clear_bindings();
     training.views.replace_cameras(&gpu, &corrected);
@@ -67,8 +68,8 @@ pub(super) fn move_with_keyframes(
         .for_each(|image| corrected(&mut image.keyframe));
     // Camera parameters start at zero again, because the keyframes now contain the correction.
     let mut params = training.model.cameras.set & IMAGE_PARAMS;
-    // Image poses from depth are accurate to a few millimeters. Training the splats refines them,
-    // without a trial.
+    // Image poses from depth are accurate to a few millimeters. They are refined together with the
+    // splats. No trial has to show first that the refinement is useful.
     if alignment.has_image_poses() && trials.remove_candidate(ParamSet::IMAGE_POSES) {
         params |= ParamSet::IMAGE_POSES;
     }
@@ -168,7 +169,7 @@ impl Motion {
     /// the splats, if any.
     fn of(keyframe: &CorrectedKeyframe, learned: Option<&CameraCorrection>) -> Self {
         let CorrectedKeyframe { before, after } = keyframe;
-        // The splats were fitted to the learned cameras, not to those of the keyframes.
+        // The splats were fitted to the learned cameras, not to the cameras of the keyframes.
         let before = learned.map_or_else(
             || before.clone(),
             |learned| Arc::new(learned.corrected(before)),
@@ -195,8 +196,8 @@ impl Motion {
             let reading = reading_m(depth, px);
             (reading > 0.0).then_some((reading - z) / z)
         });
-        // The weight falls with the square of the error, like that of a robust mean, so that one
-        // keyframe in good agreement outweighs many others.
+        // The weight falls with the square of the error, as in a robust mean. One keyframe in good
+        // agreement therefore outweighs many others.
         let weight = match known {
             Some(error_frac) if error_frac.abs() > SURFACE_FRAC => return None,
             Some(error_frac) => 1.0 / (1.0 + (error_frac / AGREEMENT_FRAC).powi(2)),
@@ -208,7 +209,7 @@ impl Motion {
 }
 
 /// The motions of a subset of the keyframes. `learned` returns the correction of a camera that was
-/// learned with the splats on top of those in the keyframes.
+/// learned with the splats. It is applied after the corrections in the keyframes.
 fn motions<'a>(
     keyframes: &[CorrectedKeyframe],
     learned: impl Fn(&str) -> Option<&'a CameraCorrection>,

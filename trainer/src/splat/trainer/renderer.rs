@@ -12,13 +12,13 @@ use crate::splat::passes::ViewPasses;
 use crate::{Error, Packing, QueuedPicture, Rendered};
 use gpu::{Buffer, Gpu, PendingRead, Pipeline};
 
-/// Minimum capacity of the bin lists, in entries. Few large splats need many entries each, so small
-/// models would otherwise overflow in their first steps.
+/// Minimum capacity of the bin lists, in entries. In a small model, splats are large and need many
+/// entries each. With a smaller capacity, such models would overflow in their first steps.
 const MIN_ENTRIES: u32 = 1 << 14;
 
-/// Divisors of the required size that give the headroom of grown buffers. The headroom is 1/2,
-/// 1/16, or none, and is tried in this order. Each overflow repeats steps, so more headroom saves
-/// time. If memory is insufficient, less headroom is better than no larger buffer.
+/// Divisors of the required size that give the headroom of grown buffers. The headroom is 1/2 of
+/// the required size, then 1/16, then none, until memory is sufficient. Each overflow repeats
+/// steps, so more headroom saves time.
 const HEADROOM_DIVISORS: [u32; 3] = [2, 16, u32::MAX];
 
 /// Draws pinhole views of splats.
@@ -187,9 +187,9 @@ impl Renderer {
         parts: ReadParts<'_>,
         take: impl Fn(&[&[u8]]) -> R,
     ) -> Result<R, Error> {
-        // The needed sizes depend on the view and are known only once it is binned. The counters
-        // contain the required sizes of the whole view even if it does not fit, so one repetition
-        // is sufficient.
+        // The required sizes depend on the view, and are known only after the view is binned. The
+        // counters contain the required sizes of the whole view even if it does not fit, so one
+        // repetition is sufficient.
         loop {
             let (counters, taken) =
                 self.submit(recorder, drawn, parts)?
@@ -462,7 +462,7 @@ pub(super) fn write_n_splats(gpu: &Gpu, status: &Buffer, n_splats: u32) {
 
 /// Clears the failure flag and the requested buffer sizes.
 pub(super) fn clear_failure(gpu: &Gpu, status: &Buffer) {
-    // Three adjacent words: the flag and the two needs.
+    // This clears three adjacent words, which are the flag and the two required sizes.
     gpu.write(status, 4 * status::FAILED as u64, &[0; 12]);
 }
 

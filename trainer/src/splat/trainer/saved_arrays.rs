@@ -42,7 +42,7 @@ pub(super) fn read_splats(
         let used_bytes = u64::from(n_splats) * bytes;
         let array =
             checkpoint.array(&format!("{prefix}{name}"), u64::from(n_planes) * used_bytes)?;
-        // Planes are contiguous in the checkpoint, but as far apart as the capacity on the GPU.
+        // Planes are contiguous in the checkpoint. On the GPU, their distance is the capacity.
         for plane in 0..u64::from(n_planes) {
             let from = to_usize(plane * used_bytes);
             let at = plane * u64::from(capacity) * bytes;

@@ -121,8 +121,8 @@ impl Seeding {
             .filter(|keyframe| !self.is_pending(keyframe))
             .cloned()
             .collect();
-        // Seeding again with the corrected cameras marks the corrected surfaces as occupied. The
-        // discs are dropped, because the model has their splats already.
+        // A second seeding with the corrected cameras marks the corrected surfaces as occupied. The
+        // discs are dropped, because the model already has splats at their positions.
         self.scene.seeder = Seeder::default();
         drop(self.scene.seeder.discs(&seeded, self.density));
     }

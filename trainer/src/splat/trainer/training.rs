@@ -1,5 +1,5 @@
-//! The model in training, and everything that a training step needs. A submit is prepared and sent.
-//! Its results are applied later.
+//! The model in training, and everything that a training step needs. Steps are submitted to the
+//! GPU, and their results are applied later.
 
 use super::lazy_pipelines::LazyPipelines;
 use super::learning_rates;
@@ -185,7 +185,8 @@ impl Training {
         }
         let counters = self.optimizer.submit(&mut self.recorder);
         self.schedule.step += n_steps;
-        // This waits for the previous submit while the new one runs, so that the GPU never idles.
+        // This waits for the previous submit while the new submit runs, so that the GPU never
+        // idles.
         let failed = self.finish_in_flight()?;
         // After a failure, the failure flag also turns this submit into a no-op. Its steps are
         // repeated, so its counters are not needed.
@@ -255,7 +256,7 @@ impl Training {
     /// Number of steps of the next submit. The submit stays within its time limit and does not pass
     /// a step at which the splat count or the SH degree may change.
     fn n_steps_of_submit(&self, n_requested: u64) -> u64 {
-        // Before the first measurement, a step may take arbitrarily long.
+        // Before the first measurement, the duration of a step is unknown.
         let by_time = self.optimizer.submits.n_steps_in_limit().unwrap_or(1);
         n_requested
             .min(by_time.clamp(1, MAX_STEPS_PER_SUBMIT))
@@ -297,8 +298,8 @@ impl Training {
         }
         let n_splats = model.splats.n_splats;
         optimizer.set_n_splats(gpu, n_splats);
-        // Both fractions use `completed_frac`, which changes only at growth steps. The result
-        // therefore does not depend on how many steps a submit holds.
+        // `drop_frac` and the background use `completed_frac`, which changes only at growth steps.
+        // The result therefore does not depend on how many steps a submit holds.
         let scarcity = self.scarcity(n_validation);
         let drop_frac = scarcity.drop_frac(options.specific.drop_frac, schedule.completed_frac());
         optimizer.write_drop_frac(gpu, f32_of(drop_frac));
@@ -410,8 +411,8 @@ impl Training {
         self.model.splats.read(&self.recorder.gpu)
     }
 
-    /// Current corrections of each camera, including those of a running trial. They apply to
-    /// keyframes that alignment has already corrected.
+    /// Current corrections of each camera, including the corrections of a running trial. They apply
+    /// to keyframes that alignment has already corrected.
     pub(super) fn learned_corrections(&self) -> Result<BTreeMap<String, CameraCorrection>, Error> {
         let cameras = &self.model.cameras;
         if cameras.set.is_empty() {
@@ -464,10 +465,10 @@ struct SkippedSteps {
 }
 
 impl SkippedSteps {
-    /// Adds a step. Returns the number of consecutive skipped steps up to this one.
+    /// Adds a step. Returns the number of consecutive skipped steps up to this step.
     fn add(&mut self, step: u64) -> u64 {
         // This is logged once per run of skipped steps, because the number is at least 1 after the
-        // first one.
+        // first skipped step.
         if self.n_consecutive == 0 {
             log::warn!("images that need too much GPU memory are skipped in training");
         }

@@ -148,7 +148,7 @@ impl TrialRunner<'_> {
             .map_or(Ok(()), |aborted| self.end(aborted))
     }
 
-    /// Ends all trials, which need copies of the model, if there is no memory for them. Training
+    /// Ends all trials if there is no memory for the copies of the model that they need. Training
     /// continues.
     fn finish_without_memory(&mut self, error: Error) -> Result<(), Error> {
         if !error.is_out_of_memory() {
@@ -168,9 +168,10 @@ impl TrialRunner<'_> {
 
     /// Restores a state and counts the reverted steps.
     fn restore(&mut self, snapshot: Snapshot) -> Result<(), Error> {
-        // The sum of steps and reverted steps stays the number of steps that were trained. If the
-        // second half of a trial is canceled, the snapshot may be from a later step. The result is
-        // still not negative, because the steps of the first half were counted as reverted before.
+        // The sum of steps and reverted steps must remain equal to the number of steps that were
+        // trained. If the second half of a trial is canceled, the snapshot may be from a later
+        // step. The result is still not negative, because the steps of the first half were counted
+        // as reverted before.
         self.trials.n_reverted_steps =
             self.trials.n_reverted_steps + self.training.schedule.step - snapshot.schedule.step;
         self.training.restore_snapshot(snapshot)

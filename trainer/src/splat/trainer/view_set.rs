@@ -14,8 +14,8 @@ use std::collections::BTreeSet;
 use std::ops::Range;
 use std::sync::Arc;
 
-/// Maximum bytes of images on a software adapter. It allocates host memory, which already holds all
-/// keyframes.
+/// Maximum bytes of images on a software adapter. Such an adapter allocates host memory, which
+/// already holds all keyframes.
 const SOFTWARE_IMAGE_BYTES: u64 = 256 << 20;
 /// Number of images uploaded together when iterating over all views. They are downscaled in
 /// parallel, so their number should be at least the number of cores. All of them must fit into
@@ -109,7 +109,7 @@ impl ViewSet {
     /// Indices of the last view before and the first view after a keyframe, from the same camera.
     pub(super) fn neighbors(&self, keyframe: &Keyframe) -> Vec<usize> {
         // Other cameras have their own exposure. Views are in the order of arrival, which may
-        // differ from that of the stamps.
+        // differ from the order of the stamps.
         let (before, after): (Vec<_>, Vec<_>) = self
             .keyframes()
             .enumerate()

@@ -7,7 +7,7 @@
 
 use std::sync::LazyLock;
 
-/// An edge of a cube. It has the corner where it begins, as bits x, y, z, and its axis.
+/// An edge of a cube, given by the corner where it begins, as bits x, y, z, and by its axis.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(in crate::tsdf) struct Edge {
     pub(in crate::tsdf) corner: usize,

@@ -1,7 +1,7 @@
 //! The mesh in chunks of neighboring blocks, in a compact form for viewers.
 //!
 //! Positions are rounded to a grid that all chunks share, so that neighboring chunks meet without
-//! gaps. Values are stored as differences to the previous one, which zlib compresses well.
+//! gaps. Values are stored as differences to the previous value, which zlib compresses well.
 
 use super::mesher::{BlockMesh, Mesher, shared_key, without_erased};
 use crate::model_chunks::{ChunkData, ChunkLayout, MAX_MESH_COUNT, ModelChunk, ModelChunks};
@@ -46,8 +46,8 @@ impl ChangedChunks {
         edits: &Arc<Edits>,
         only_changed: bool,
     ) -> Self {
-        // The list of changes is taken in both cases, because after all chunks were sent, no chunk
-        // has unsent changes.
+        // The list of changes is taken in both cases. After all chunks were sent, no chunk has
+        // unsent changes.
         let changed = mesher.take_changed().filter(|_| only_changed);
         let is_complete = changed.is_none();
         let mut chunks: BTreeMap<GridCoord, ChunkBlocks> = BTreeMap::new();
@@ -151,7 +151,7 @@ fn encoded(coord: GridCoord, chunk: &ChunkBlocks, voxel_grid: &VoxelGrid) -> Mod
     }
 }
 
-/// A coordinate relative to the chunk, in counts, rounded.
+/// A coordinate relative to the chunk, rounded to whole counts.
 fn count_of(offset_m: f64, meters_per_count: f64) -> f64 {
     (offset_m / meters_per_count)
         .round()

@@ -10,7 +10,8 @@ use nalgebra::Vector3;
 /// better from nearby surfaces, but more of them are needed. The largest grid has 1024 cells along
 /// an axis.
 const CELL_VOXELS: f64 = 2.0;
-/// Number of these cells along an axis, half of which cover the larger part of the mesh.
+/// Smallest and largest number of these cells along an axis. Half of the cells along an axis cover
+/// the larger part of the mesh.
 const N_CELLS_RANGE: [f64; 2] = [64.0, 1024.0];
 
 /// The small parts of a mesh. `None` if there are none.
@@ -41,7 +42,7 @@ pub(in crate::tsdf) fn floaters(mesh: &Mesh, voxel_m: f64) -> Option<Floaters> {
     for corners in &mesh.triangles {
         let is_floating = is_floater_size(part_sizes[corners[0] as usize], mesh.triangles.len());
         // The triangles are small, so every cell that a triangle crosses contains one of its
-        // corners or is next to a cell that does.
+        // corners or is next to a cell that contains a corner.
         let cells = corners.map(|ix| grid.cell_at(positions_m[ix as usize]));
         if is_floating {
             &mut labels.floating
@@ -64,7 +65,8 @@ pub(in crate::tsdf) fn floaters(mesh: &Mesh, voxel_m: f64) -> Option<Floaters> {
     })
 }
 
-/// Center of a triangle in world, meters. Erased triangles are those whose centers are erased.
+/// Center of a triangle in world coordinates, meters. A triangle is erased if its center is in
+/// erased space.
 fn triangle_center_m(corners: &[u32; 3], positions_m: &[[f64; 3]]) -> [f64; 3] {
     let sum: Vector3<f64> = corners
         .iter()

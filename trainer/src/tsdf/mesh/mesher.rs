@@ -132,8 +132,8 @@ impl Mesher {
     }
 }
 
-/// All triangles outside erased space, in world, in the order of their blocks; vertices shared by
-/// blocks are merged.
+/// All triangles outside erased space, in world coordinates and in the order of their blocks.
+/// Vertices that blocks share are merged.
 pub(in crate::tsdf) fn joined(meshes: &BlockMeshes, voxel_grid: &VoxelGrid, edits: &Edits) -> Mesh {
     let mut whole = Mesh {
         origin_m: voxel_grid.anchor_m,
@@ -164,10 +164,11 @@ pub(in crate::tsdf) fn joined(meshes: &BlockMeshes, voxel_grid: &VoxelGrid, edit
     whole
 }
 
-/// Key of an edge that may belong to several blocks: its first voxel in the field, and its axis.
+/// Key of an edge that may belong to several blocks. It consists of the first voxel of the edge in
+/// the field, and of its axis.
 pub(super) fn shared_key(block: GridCoord, edge: u32) -> Option<(GridCoord, u32)> {
-    // An edge has the number axis + 3 (x + 9 (y + 9 z)) of its first voxel, 0 to 8 along each axis.
-    // Only edges on a face of the block can also belong to a neighbor.
+    // The number of an edge is axis + 3 (x + 9 (y + 9 z)), where x, y and z are the coordinates of
+    // its first voxel, 0 to 8. Only edges on a face of the block can also belong to a neighbor.
     let local = [edge / 3 % 9, edge / 27 % 9, edge / 243].map(u32::cast_signed);
     let is_shared = local.iter().any(|along| matches!(*along, 0 | BLOCK_EDGE));
     is_shared.then(|| {

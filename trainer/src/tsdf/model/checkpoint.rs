@@ -67,8 +67,9 @@ impl TsdfModel {
         Ok((state, arrays_of(&blocks)))
     }
 
-    /// Resumes training exactly where the checkpoint was taken. `keyframes` must include all that
-    /// the model had received. Also returns the other keyframes, to be pushed or kept for testing.
+    /// Resumes training exactly where the checkpoint was taken. `keyframes` must include all
+    /// keyframes that the model had received. Also returns the other keyframes, to be pushed or
+    /// kept for testing.
     pub fn resume(
         gpu: Arc<Gpu>,
         checkpoint: &Checkpoint,

@@ -70,7 +70,7 @@ impl TsdfModel {
             .as_ref()
             .is_none_or(|canvas| canvas.n_pixels < n)
         {
-            // The smaller buffer is freed before the larger one is allocated.
+            // The smaller buffer is freed before the larger buffer is allocated.
             self.passes.clear_bindings();
             self.canvas = None;
         }

@@ -22,7 +22,7 @@ pub(super) const INITIAL_CAPACITY: Capacity = Capacity {
     n_chunks: 512,
 };
 /// Fraction of the pool that is freed at once, to avoid evictions for every image. With a larger
-/// fraction, more blocks are evicted that the next images need again.
+/// fraction, more of the evicted blocks are needed again by the next images.
 const EVICTED_FRAC: f64 = 0.125;
 
 /// A field that may be larger than the GPU's memory.
@@ -32,7 +32,8 @@ pub(super) struct FieldStore {
     pub(super) buffers: FieldBuffers,
     /// Blocks that do not fit on the GPU.
     pub(super) host_blocks: Blocks,
-    /// Blocks that changed since the mesh was updated, in addition to those flagged on the GPU.
+    /// Blocks that changed since the mesh was updated, in addition to the blocks flagged on the
+    /// GPU.
     pub(super) stale: BTreeSet<GridCoord>,
     /// Number of blocks on the GPU when this number was last read from the GPU.
     pub(super) n_resident: u32,
@@ -160,9 +161,9 @@ impl FieldStore {
         Ok(n_evicted >= n as usize)
     }
 
-    /// Loads visible blocks from host memory. If not all of them fit, `allows_partial` decides: if
-    /// it is true, the nearest blocks are loaded; otherwise, none are loaded, and false is
-    /// returned.
+    /// Loads visible blocks from host memory. If not all of them fit, the result depends on
+    /// `allows_partial`. If it is true, the nearest blocks are loaded. If it is false, no blocks
+    /// are loaded, and false is returned.
     pub(super) fn load_visible(
         &mut self,
         gpu: &Gpu,

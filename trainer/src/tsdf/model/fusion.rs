@@ -37,8 +37,8 @@ impl Fusion {
     /// Number of keyframes in a submit that stays within the time limit.
     pub(super) fn keyframes_per_submit(&self) -> usize {
         // Pictures wait for the running submit, so submits must be short while pictures are
-        // requested. If no pictures are requested, more images per submit waste less time between
-        // submits.
+        // requested. If no pictures are requested, a submit holds more images, so that less time is
+        // lost between submits.
         match self.submits.n_steps_in_limit() {
             Some(n) if self.submits.is_watched() => usize::try_from(n)
                 .unwrap_or(usize::MAX)

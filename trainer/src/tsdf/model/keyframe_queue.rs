@@ -9,7 +9,7 @@ use std::sync::Arc;
 /// Keyframes in the order in which they are fused.
 #[derive(Debug, Default)]
 pub(super) struct KeyframeQueue {
-    /// Keyframes not confirmed as fused yet, in order. The first ones may be in flight.
+    /// Keyframes that are not confirmed as fused yet, in order. The first of them may be in flight.
     pub(super) pending: VecDeque<Arc<Keyframe>>,
     /// Keyframes that were fused or skipped, and not removed afterwards.
     pub(super) fused: Vec<KeyframeSignature>,

@@ -164,7 +164,7 @@ fn around(block_coord: &GridCoord) -> impl Iterator<Item = GridCoord> + use<> {
     (0..27).map(move |ix| [x + ix % 3 - 1, y + ix / 3 % 3 - 1, z + ix / 9 - 1])
 }
 
-/// Returns the kept buffers, or allocates new ones if they are too small for a pool of this size.
+/// Returns the kept buffers. If they are too small for a pool of this size, allocates new buffers.
 fn reserve<'a>(
     kept: &'a mut Option<MeshBuffers>,
     gpu: &Gpu,

@@ -51,8 +51,7 @@ pub fn required_blocks(
             depth,
             [(ix % width) as f64 + 0.5, (ix / width) as f64 + 0.5],
         );
-        // The truncation is converted to a length along the ray, which is longer than the depth
-        // along z.
+        // The truncation is converted from a depth along z to the longer distance along the ray.
         let band_m = voxel_grid.truncation_at(reading.depth_m) / ray.norm();
         let at = |z: f64| (field_from_depth * Point3::from(ray * z)).coords / block_m;
         let begin = at((reading.depth_m - band_m).max(0.0));

@@ -62,7 +62,7 @@ pub fn cast(blocks: &Blocks, voxel_grid: &VoxelGrid, ray: &Ray, edits: &Edits) -
     None
 }
 
-/// The eight voxels around a point given in voxels, and their interpolation weights.
+/// The eight voxels around a point, which is given in voxels, and their interpolation weights.
 #[expect(
     clippy::cast_possible_truncation,
     reason = "coordinates are rounded down on purpose"

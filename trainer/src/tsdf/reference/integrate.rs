@@ -17,7 +17,7 @@ pub struct Voxel {
     pub weight: f64,
     /// sRGB, 0 to 1.
     pub color_srgb: [f64; 3],
-    /// In 256ths, an integer.
+    /// Weight of the color in 256ths, which is an integer.
     pub color_weight: f64,
 }
 
@@ -27,14 +27,15 @@ pub type VoxelBlocks = BTreeMap<GridCoord, Vec<Voxel>>;
 /// Minimum cosine between ray and normal for scaling distances. Normals of steeper surfaces are
 /// mostly noise.
 const MIN_RAY_DOT_NORMAL: f64 = 0.3;
-/// Number of observations of a solid voxel that one observation through it cancels, if the surface
-/// behind it is one truncation away. The next constant is the number for a surface that is at least
-/// two truncations away. With larger numbers, surfaces that are only displaced by pose errors would
-/// be carved away. See "Carving" in `docs/benchmarks/2026-11-23-tsdf.md`.
+/// An observation through a solid voxel shows that the voxel is free, and cancels this number of
+/// observations of the voxel. This number applies if the surface behind the voxel is one truncation
+/// away. The next constant applies if the surface is at least two truncations away. With larger
+/// numbers, surfaces that are only displaced by pose errors would be carved away. See "Carving" in
+/// `docs/benchmarks/2026-11-23-tsdf.md`.
 const CARVING_NEAR: f64 = 1.0;
 const CARVING_FAR: f64 = 4.0;
 /// Colors are stored up to this distance from the surface, in voxels. Pictures and meshes do not
-/// use colors beyond it.
+/// use colors at larger distances.
 const COLOR_VOXELS: f64 = 2.0;
 
 /// Fuses a keyframe with depth into the given blocks.
@@ -110,8 +111,8 @@ fn fuse(
         }
         return;
     }
-    // This is a running mean (Curless and Levoy 1996). Because of the maximum weight, moved objects
-    // fade.
+    // This is a running mean (Curless and Levoy 1996). Because of the maximum weight, objects that
+    // were moved away fade.
     let weight_gain = (256.0 * gain_frac + 0.5).floor().clamp(1.0, 256.0);
     let sum = voxel.weight + weight_gain;
     voxel.distance_m = (voxel.distance_m * voxel.weight + distance_m * weight_gain) / sum;

@@ -1,20 +1,20 @@
-//! Twin of `march_cubes`: the triangles of one block.
+//! Twin of `march_cubes`, which extracts the triangles of one block.
 
 use crate::tsdf::block::{BLOCK_EDGE, Block, Blocks, GridCoord, voxel_ix};
 use crate::tsdf::mesh::CASES;
 use nalgebra::Vector3;
 use std::collections::HashMap;
 
-/// Color of voxels without one.
+/// Color of voxels without a color.
 const GRAY: f64 = 0.5;
 
 /// A vertex of a block's triangles.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Vertex {
-    /// The edge of the vertex. It has its first voxel, relative to the block's first voxel, and its
-    /// axis.
+    /// The edge of the vertex. It is given by its first voxel, relative to the block's first voxel,
+    /// and by its axis.
     pub between: (GridCoord, usize),
-    /// Relative to the field's anchor, along the world's axes, meters.
+    /// Position relative to the field's anchor, along the world's axes, meters.
     pub position_m: [f64; 3],
     /// Outward normal of length 1.
     pub normal: [f64; 3],
@@ -25,9 +25,10 @@ pub struct Vertex {
 /// The triangles of the cubes whose lowest corner is in one block.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct BlockTriangles {
-    /// In the order in which triangles first use them.
+    /// Vertices in the order in which triangles first use them.
     pub vertices: Vec<Vertex>,
-    /// Counterclockwise when viewed from outside, in the order of the cubes, x fastest.
+    /// Vertex indices, counterclockwise when viewed from outside. Triangles are in the order of the
+    /// cubes, x fastest.
     pub triangles: Vec<[usize; 3]>,
 }
 
@@ -51,8 +52,8 @@ impl<'a> BlockNeighborhood<'a> {
         }
     }
 
-    /// The block that contains a voxel, and the voxel's index in it. `voxel` is relative to this
-    /// block, -8 to 15.
+    /// The block that contains a voxel, and the voxel's index in that block. `voxel` is relative to
+    /// the block of this view, from -8 to 15.
     fn at(&self, voxel: GridCoord) -> Option<(&'a Block, usize)> {
         let [x, y, z] = voxel.map(|along| along.div_euclid(BLOCK_EDGE) + 1);
         let block = self.blocks[usize::try_from(9 * z + 3 * y + x).ok()?]?;

@@ -13,12 +13,12 @@ pub struct Reading {
     pub ray_dot_normal: f64,
 }
 
-/// Wide differences for normals use pixels this far apart on each side. They reduce the noise of
+/// Wide differences for normals use pixels at this distance on each side. They reduce the noise of
 /// normals threefold.
 const WIDE_STEP: i64 = 3;
 /// Maximum second difference of depths on a flat surface, in units of the noise. A second
-/// difference has a standard deviation of sqrt(1 + 4 + 1) = 2.45 units, so this is 2.45 standard
-/// deviations.
+/// difference has a standard deviation of sqrt(1 + 4 + 1) = 2.45 units, so this maximum is 2.45
+/// standard deviations.
 const MAX_FLAT_NOISES: f64 = 6.0;
 /// Minimum valid depth, meters. Nearer readings are errors of the sensor.
 const MIN_DEPTH_M: f64 = 0.01;
@@ -99,7 +99,7 @@ fn tangent_along(
     {
         return None;
     }
-    // A side without a neighbor is replaced by the center.
+    // If a side has no neighbor, the center takes its place.
     let taken = if is_flat { wide_pair } else { sides };
     let [high, low] = taken.map(|side| {
         side.map_or_else(

@@ -3,7 +3,7 @@
 use std::borrow::Cow;
 
 /// Maximum length of a header. Headers of splat files have about 2000 bytes. The limit bounds the
-/// search for the end of the header in files that have none.
+/// search for the end of the header in files without such an end.
 const MAX_HEADER_BYTES: usize = 64 * 1024;
 
 /// The tables of a file.
@@ -33,11 +33,11 @@ struct Property {
     offset: usize,
 }
 
-/// A list property, which is a length followed by as many numbers.
+/// A list property. It consists of a length, followed by this number of numbers.
 struct List {
     length: NumberType,
     number: NumberType,
-    /// Number of the properties before it that are not lists, and their size.
+    /// Number of the properties before the list that are not lists. The next field is their size.
     n_before: usize,
     bytes_before: usize,
 }
@@ -258,7 +258,7 @@ impl<'a> Header<'a> {
                 return;
             };
             rest = after;
-            // Tables with lists are skipped, so their bytes need no swapping.
+            // The numbers of tables with lists are not used, so their bytes need no swapping.
             element.rows = Ok(match format {
                 Format::BigEndian if element.lists.is_empty() => swapped(element, rows).into(),
                 _ => rows.into(),

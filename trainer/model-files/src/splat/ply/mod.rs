@@ -19,15 +19,15 @@ pub(super) const SH_0: f32 = 0.282_094_8;
 /// logarithm. It corresponds to one thousandth. This is thin enough to be invisible from the side,
 /// and thick enough for a covariance that is invertible in f32.
 const LOG_FLATNESS: f32 = -7.0;
-/// Properties of splats that are not used: normals, which are zero in these files, and names of
-/// other programs for numbers that do not affect pictures.
+/// Properties of splats that are not used. They are normals, which are zero in these files, and
+/// properties of other programs that do not affect pictures.
 const UNUSED: [&str; 5] = ["nx", "ny", "nz", "label", "id"];
 
-/// Reads a `.ply` file of splats. Properties may have any order and number type, and the file any
-/// format. The number of `f_rest_*` properties determines the SH degree.
+/// Reads a `.ply` file of splats. Properties may have any order and number type, and the file may
+/// have any format of PLY. The number of `f_rest_*` properties determines the SH degree.
 ///
-/// Warnings report splats with invalid numbers, which are left out, and properties that are not
-/// used.
+/// Splats with invalid numbers are left out. Warnings report them, and also report properties that
+/// are not used.
 pub fn read(path: &Path) -> Result<SplatArrays, Error> {
     super::read_with(path, from_bytes)
 }
@@ -219,7 +219,8 @@ impl<'a> ColorColumns<'a> {
         let n_rest = rest.len() / 3;
         let constant = match vertices.columns(["f_dc_0", "f_dc_1", "f_dc_2"]) {
             Ok(columns) => ConstantColor::Coefficients(columns),
-            // Some programs write plain vertex colors. Without these, the usual layout is named.
+            // Some programs write plain vertex colors. If these are also missing, the error names
+            // the usual properties.
             Err(missing) => {
                 let channels = vertices
                     .columns(["red", "green", "blue"])
@@ -263,7 +264,8 @@ fn rest_columns<'a>(table: &Table<'a>) -> Result<(u32, Vec<Column<'a>>), String>
     let rest: Vec<_> = (0..)
         .map_while(|ix| table.column(&format!("f_rest_{ix}")).ok())
         .collect();
-    // Three channels of `(degree + 1)^2 - 1` coefficients. Degree 4 (72) is read as degree 3.
+    // There are three channels of `(degree + 1)^2 - 1` coefficients. A file of degree 4, with 72
+    // coefficients, is read as degree 3.
     let degree = match rest.len() {
         0 => 0,
         9 => 1,

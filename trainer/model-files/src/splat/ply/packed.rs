@@ -29,7 +29,7 @@ pub(super) fn splats(header: &Header<'_>) -> Result<SplatArrays, String> {
         "packed_scale",
         "packed_color",
     ])?;
-    // Files without view-dependent colors lack the element.
+    // Files without view-dependent colors have no element `sh`.
     let (sh_degree, rest) = if header.has_element("sh") {
         let sh = header.table("sh")?;
         if sh.n_rows() != vertices.n_rows() {

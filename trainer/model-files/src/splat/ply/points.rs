@@ -1,4 +1,4 @@
-//! Point clouds in `.ply` files: positions, and optionally colors.
+//! Point clouds in `.ply` files. Points have positions, and may have colors.
 
 use super::header::{Column, Header};
 use super::{UNUSED, note_of_unread, note_of_unused};

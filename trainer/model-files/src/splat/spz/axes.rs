@@ -38,7 +38,7 @@ impl Axes {
     /// The axes for a number in the extension.
     fn from_number(number: u32) -> Result<Self, String> {
         match number {
-            // Not specified.
+            // The file does not specify its axes.
             0 => Ok(Self::RIGHT_UP_BACK),
             // The bits stand for right instead of left, up instead of down, and front instead of
             // back.
@@ -76,7 +76,8 @@ impl Axes {
         ]
     }
 
-    /// Factors of the higher color coefficients: -1 for basis functions that change sign.
+    /// Factors of the higher color coefficients. The factor is -1 for basis functions that change
+    /// sign.
     pub(super) fn sh_signs(self) -> [f32; 15] {
         ODD_AXES.map(|odd| odd.iter().map(|axis| self.0[*axis]).product())
     }

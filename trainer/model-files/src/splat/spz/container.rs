@@ -101,12 +101,13 @@ impl Header {
         self.flags & IS_ANTIALIASED != 0
     }
 
-    /// Whether x, y and z of rotations have a byte each, and w follows from them.
+    /// Whether rotations are stored as x, y and z with one byte each. In that case, w follows from
+    /// x, y and z.
     pub(super) fn has_short_rotations(&self) -> bool {
         self.version == 2
     }
 
-    /// Color coefficients per splat and channel without the constant one.
+    /// Number of color coefficients per splat and channel, without the constant coefficient.
     pub(super) fn n_higher_coefficients(&self) -> usize {
         (self.sh_degree as usize + 1).pow(2) - 1
     }
@@ -259,8 +260,8 @@ fn from_zstd(header: Header, bytes: &[u8]) -> Result<Contents<'_>, String> {
         .ok_or("truncated")?;
     let n_streams = usize::from(long_header[15]);
     let table_start = u32::from_le_bytes(std::array::from_fn(|ix| long_header[16 + ix])) as usize;
-    // Phase 1: the streams and the table must be in the file. An attribute without bytes has no
-    // stream.
+    // Phase 1 checks that the table and the streams are in the file. An attribute without bytes has
+    // no stream.
     let sizes = header
         .attribute_bytes()
         .map(|per_splat| header.n_splats * per_splat);
@@ -276,8 +277,8 @@ fn from_zstd(header: Header, bytes: &[u8]) -> Result<Contents<'_>, String> {
     let (table, mut streams) = bytes[table_start..]
         .split_at_checked(ROW_BYTES * n_streams)
         .ok_or("truncated")?;
-    // Phase 2: each stream is decompressed into its part of the body, so that a stream with a
-    // wrong size cannot shift the attributes after it.
+    // Phase 2 decompresses each stream into its own part of the body, so that a stream with a wrong
+    // size cannot shift the attributes after it.
     let mut body = vec![0_u8; header.n_body_bytes(bytes.len())?];
     let mut undecoded = body.as_mut_slice();
     for (stream_ix, (row, size)) in table

@@ -2,8 +2,8 @@
 //! more programs read than version 4.
 //!
 //! The file contains a header and the means, opacities, constant colors, scales, rotations and
-//! higher color coefficients of all splats, compressed (`container.rs`). Each value is quantized to
-//! a few bits (`quantize.rs`).
+//! higher color coefficients of all splats. It is compressed (`container.rs`). Each value is
+//! quantized to a few bits (`quantize.rs`).
 //!
 //! The axes of `.spz` are right, up, back, unless an extension names other axes (`axes.rs`). Other
 //! programs interpret the axes of a `.ply`, which are also fieldrig's axes, as right, down, front.
@@ -86,7 +86,7 @@ fn splats(header: &Header, axes: Axes, body: &[u8]) -> SplatArrays {
         let signed = coefficients.iter().zip(sh_signs);
         sh.extend(signed.map(|(rgb, sign)| rgb.map(|byte| sign * quantize::sh_from_byte(byte))));
     }
-    // Version 2 has three bytes per rotation, later versions have four.
+    // Version 2 has three bytes per rotation, and later versions have four.
     let rotations_wxyz = if header.has_short_rotations() {
         rotations
             .as_chunks()

@@ -100,7 +100,7 @@ pub(super) fn rotation_from_smallest(bytes: [u8; 4]) -> [f32; 4] {
     let mut bits = u32::from_le_bytes(bytes);
     let largest_ix = (bits >> 30) as usize;
     let mut xyzw = [0.0; 4];
-    // The components are read in reverse order, because the last one is in the lowest bits.
+    // The components are read in reverse order, because the last component is in the lowest bits.
     for ix in (0..4).rev().filter(|ix| *ix != largest_ix) {
         let magnitude = f64::from(bits & MAX_COMPONENT) / f64::from(MAX_COMPONENT) * FRAC_1_SQRT_2;
         xyzw[ix] = if bits >> 9 & 1 == 0 {

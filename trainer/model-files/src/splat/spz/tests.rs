@@ -194,8 +194,8 @@ fn one_splat_file_has_the_specified_bytes() {
         128,                                                         // Half of 255, rounded up.
         128, 166, 0,                                                 // 127.5 + 38.25 * coefficient, clamped at 0.
         0, 112, 255,                                                 // 16 (log scale + 10)
-        // (x, -y, -z, w) is (0, -1, 0, 1) / sqrt(2). y is the first of the two largest components
-        // and therefore omitted; the other signs flip because y is negative.
+        // (x, -y, -z, w) is (0, -1, 0, 1) / sqrt(2). The component y is the first of the two
+        // largest components and is therefore omitted. The other signs flip because y is negative.
         0xff, 0x03, 0x00, 0x40,                                      // Index 01; sign and magnitude: 0 0, 0 0, 1 511.
         96, 64, 192,                                                 // -y: 128 - 32, - 64, + 64
         128, 0, 255,                                                 // -z: 128, - 128, + 128 clamped at the upper end
@@ -252,7 +252,8 @@ fn every_container_gives_the_same_splats() {
 
 #[test]
 fn axes_of_an_extension_apply() {
-    // Type, size, and the number of the axes right, down, front, which are those of a `.ply`.
+    // The record has a type, a size, and the number of the axes right, down, front, which are the
+    // axes of a `.ply`.
     let axes = [0x03, 0x00, 0xbe, 0xad, 4, 0, 0, 0, 6, 0, 0, 0];
     let mut uncompressed = uncompressed_bytes(&cloud_of_degree(5, 1)).unwrap();
     let plain = from_bytes(&packed(&uncompressed)).unwrap().0;
