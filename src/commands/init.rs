@@ -105,6 +105,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     }
     // Whatever can be wrong in the arguments is checked before the search, which takes seconds.
     check_new(&args.rig, args.force)?;
+    check_folder(&args.rig)?;
     let robot = robot(args)?;
     print::notice("searching for cameras, CAN motors, servos and controllers");
     let mut findings = search(&SearchPlan {
@@ -143,6 +144,12 @@ fn check_new(rig: &Path, force: bool) -> Result<(), BadInput> {
         )));
     }
     Ok(())
+}
+
+/// Checks that the folder of the rig file exists and accepts files.
+fn check_folder(rig: &Path) -> Result<(), BadInput> {
+    files::destination::check_file(rig)
+        .map_err(|problem| BadInput(format!("cannot write {}: {problem}", rig.display())))
 }
 
 /// The robot that the flags name.

@@ -122,6 +122,22 @@ fn existing_files_are_only_replaced_by_force() {
 }
 
 #[test]
+fn init_checks_the_folder_before_it_searches() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let output = fieldrig(
+        folder.path(),
+        &["init", "absent/rig.toml", "--robot", "ur5e"],
+    );
+    let printed = stderr(&output);
+    assert_eq!(output.status.code(), Some(2), "{printed}");
+    assert!(
+        printed.contains("the folder absent does not exist; create it"),
+        "{printed}"
+    );
+    assert!(!printed.contains("searching"), "{printed}");
+}
+
+#[test]
 fn urdf_is_named_relative_to_the_rig_file() {
     let folder = tempfile::tempdir().expect("a folder");
     std::fs::create_dir(folder.path().join("robots")).expect("a folder");
