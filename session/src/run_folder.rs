@@ -1,6 +1,7 @@
 //! The folder of a run and its files.
 
 use anyhow::{Context, bail, ensure};
+use capture::check_output_folder;
 use capture::config::Rig;
 use keyframe::Keyframe;
 use messages::{BadInput, Setting, listed};
@@ -77,8 +78,8 @@ pub fn check_no_unfinished_run(out: &Path) -> anyhow::Result<()> {
     }
 }
 
-/// Checks the folder that was requested for the results of a run, if any: the results of another
-/// run would be overwritten.
+/// Checks the folder for the results of a run: it must be writable, and if it was requested, the
+/// results of another run would be overwritten.
 ///
 /// * `resume`: folder of the run that is continued.
 /// * `data`: folder of the data.
@@ -87,6 +88,10 @@ pub(crate) fn check_out(
     resume: Option<&Path>,
     data: Option<&Path>,
 ) -> anyhow::Result<()> {
+    // A run that is continued may be finished, and then writes nothing.
+    if out.is_some() || resume.is_none() {
+        check_output_folder(Setting::Out, out.unwrap_or(Path::new(RUNS)))?;
+    }
     let Some(out) = out else { return Ok(()) };
     check_no_model(out)?;
     if let Some(data) = data {

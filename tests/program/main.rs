@@ -25,6 +25,8 @@ mod guides;
 mod init;
 mod metrics_export;
 mod output;
+#[cfg(feature = "sim")]
+mod output_places;
 mod page_replay;
 #[cfg(feature = "sim")]
 mod page_server;
