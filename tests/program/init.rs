@@ -7,7 +7,7 @@ use drivers::servos::emulated::{EmulatedServo, EmulatedServoBus, ServoKind};
 use drivers::ur::emulated::{ControllerConfig, EmulatedController, Joints};
 use kinematics::Chain;
 use std::collections::BTreeSet;
-use std::net::{Ipv4Addr, SocketAddr};
+use std::net::{Ipv4Addr, SocketAddr, TcpListener};
 use std::path::Path;
 
 /// Joint angles at which the arms of Universal Robots differ by decimeters.
@@ -73,6 +73,23 @@ fn controller_is_identified_by_its_flange() {
         !failed_checks(folder.path(), &["rig.toml"]).is_empty(),
         "the controller is gone"
     );
+}
+
+#[test]
+fn a_server_of_another_kind_is_not_found_as_a_controller() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let server = TcpListener::bind("127.0.0.1:0").expect("a free port");
+    let address = server.local_addr().expect("bound").to_string();
+    // It accepts connections and closes them, as a server does with requests of other protocols.
+    std::thread::spawn(move || server.incoming().for_each(drop));
+    let (printed, rig) = init(folder.path(), &["--ur", &address]);
+    let row = printed.lines().find(|line| line.contains(&*address));
+    assert!(
+        row.is_some_and(|row| row.starts_with("  not found")),
+        "{printed}"
+    );
+    // The user may know better: the controller may be switched off.
+    assert_eq!(rig["arm"]["address"].as_str(), Some(&*address));
 }
 
 #[test]
@@ -157,6 +174,8 @@ fn unknown_robots_and_places_are_refused() {
         (["--robot", "ur5"], "did you mean \"ur5e\""),
         (["--camera", "wrist"], "flange, base or world"),
         (["--urdf", "absent.urdf"], "absent.urdf"),
+        (["--ur", "192.168.1"], "four numbers from 0 to 255"),
+        (["--franka", "robot:fci"], "is not a number up to 65535"),
     ] {
         let output = fieldrig(folder.path(), &[&["init"], &args[..]].concat());
         assert!(!output.status.success());

@@ -198,9 +198,9 @@ fn source(
     for controller in &findings.controllers {
         let kind = controller.kind;
         if robot.may_have(kind) && kind.n_joints() == n_joints {
-            if !controller.answers {
+            if !controller.answers() {
                 assumptions.push(format!(
-                    "the {kind} controller at {} is switched off now",
+                    "a {kind} controller will answer at {}, as it does not now",
                     controller.address
                 ));
             }

@@ -85,7 +85,7 @@ fn controller(kind: ControllerKind, robot: Option<&str>) -> FoundController {
     FoundController {
         kind,
         address: "10.0.0.7".to_owned(),
-        answers: true,
+        problem: None,
         robot: robot.map(|name| KnownRobot::find(name).expect(name)),
     }
 }
