@@ -17,6 +17,8 @@ mod demo;
 mod depth_from;
 mod edits;
 mod end_to_end;
+#[cfg(feature = "sim")]
+mod exit_codes;
 mod file_cycles;
 mod fk;
 mod gpu_loss;
