@@ -7,6 +7,7 @@ use keyframe::Keyframe;
 use messages::{BadInput, Setting, listed};
 use model_files::Edits;
 use serde::Serialize;
+use serde_json::Value;
 use sha2::{Digest, Sha256};
 use std::ffi::OsStr;
 use std::path::{Path, PathBuf};
@@ -181,6 +182,13 @@ pub fn expect_model(model: &Path) -> anyhow::Result<()> {
         return Err(BadInput(message).into());
     }
     Ok(())
+}
+
+/// The content of the report in a model's folder; `Null` if there is none.
+pub(crate) fn report(model: &Path) -> Value {
+    // Splat files of other programs have no report.
+    let text = files::read_text(&model.join(REPORT)).unwrap_or_default();
+    serde_json::from_str(&text).unwrap_or_default()
 }
 
 /// Whether a file is one of several that a model of this kind consists of.

@@ -126,7 +126,11 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     let hub = run.live.hub();
     let saved = run.run_to_end()?;
     if !args.json {
-        print_end(&saved.models, &saved.verdict());
+        print_end(
+            &saved.models,
+            saved.likely_cause().as_deref(),
+            &saved.verdict(),
+        );
     }
     let EndedRun {
         models,
