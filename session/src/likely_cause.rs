@@ -86,7 +86,9 @@ impl Figures {
             images: images(report),
             is_software: adapter.contains("(Cpu, "),
             is_calibrated: !report["alignment"].is_null()
-                || report["cameras"].as_object().is_some_and(|all| !all.is_empty()),
+                || report["cameras"]
+                    .as_object()
+                    .is_some_and(|all| !all.is_empty()),
         })
     }
 

@@ -31,8 +31,6 @@ const THICKNESS: f64 = 0.15;
 /// A disc is known to lie on a surface, so it is mostly opaque. The opacity is below 1, because the
 /// gradient of the logit vanishes at 1.
 const SEED_OPACITY: f64 = 0.7;
-/// Number of initial splats if there is no depth.
-const N_RANDOM: usize = 50_000;
 /// Most positions of a random cloud are wrong. Low opacity lets the gradients reach splats behind
 /// them.
 const RANDOM_OPACITY: f64 = 0.1;
@@ -505,13 +503,13 @@ fn color_of_point(points: &InitialPoints, ix: usize, keyframes: &[&Keyframe]) ->
         .unwrap_or(GRAY)
 }
 
-/// Creates a random cloud along the rays of all keyframes, densest around their common focus.
-pub(crate) fn random_cloud(keyframes: &[&Keyframe], seed: u64, n_max: usize) -> SplatArrays {
+/// Creates a random cloud of at most `n` splats along the rays of all keyframes, densest around their
+/// common focus.
+pub(crate) fn random_cloud(keyframes: &[&Keyframe], seed: u64, n: usize) -> SplatArrays {
     let mut seeds = Seeds::new();
     let focus = common_focus(keyframes);
     // The constant separates these random numbers from others that are drawn with the same seed.
     let mut random = Random::new(seed ^ 0x5eed_5eed);
-    let n = N_RANDOM.min(n_max);
     for _ in 0..n {
         // A random pixel of a random image gives a color, and a ray that is certainly in view. The
         // minimum is needed because the product may round up to the number of images.

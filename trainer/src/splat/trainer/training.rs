@@ -133,7 +133,8 @@ impl Training {
             let balls = points
                 .map(|points| seed::balls(points, &keyframes, n_max))
                 .unwrap_or_default();
-            let cloud = seed::random_cloud(&keyframes, self.options.common.seed, n_max);
+            let n_cloud = n_max.min(self.seeding.random_splats() as usize);
+            let cloud = seed::random_cloud(&keyframes, self.options.common.seed, n_cloud);
             // Structure from motion finds no points where images have no texture. A random cloud is
             // therefore added, so that there are at least as many splats as without points.
             let n_random = cloud.n_splats().saturating_sub(balls.n_splats());
