@@ -125,7 +125,7 @@ impl RunPlan {
     ) -> anyhow::Result<PreparedRun<'_>> {
         run_folder::check_out(self.out.as_deref(), self.resume.as_deref(), None)?;
         if let Some(file) = &self.record {
-            check_output_file(Setting::Record, file)?;
+            self.check_record(file)?;
         }
         let plan = match &previous {
             Some(previous) => {
@@ -162,6 +162,17 @@ impl RunPlan {
             models,
         };
         Ok(PreparedRun::new(rig, parts))
+    }
+
+    /// Checks that a recording can be written. It may be in the folder of the results, which the run
+    /// makes.
+    fn check_record(&self, file: &Path) -> Result<(), BadInput> {
+        let is_in_out = self.out.as_deref().is_some_and(|out| file.starts_with(out));
+        if is_in_out {
+            Ok(())
+        } else {
+            check_output_file(Setting::Record, file)
+        }
     }
 
     /// Checks that the rig file has what keyframes need. Simulated devices assume what is missing.
