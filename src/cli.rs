@@ -18,9 +18,11 @@ use clap::{ArgAction, Parser, Subcommand};
     arg_required_else_help = true,
     max_term_width = 110,
     after_help = "Results go to stdout; the log and progress bars go to stderr.\n\
-                  Exit codes: 0 done, 1 failed, 2 bad arguments, 3 done with loss, 4 insufficient data.\n\
-                  A loss is input data that is missing from the result: images that devices dropped or that cannot be decoded, \
-                  or a truncated recording. Each loss is printed on stderr; train and run also list it in report.json. \
+                  Exit codes: 0 done, 1 failed, 2 bad arguments, 3 done with loss, 4 insufficient data, 101 bug in fieldrig, \
+                  130 interrupted by a second Ctrl-C, 128 + n ended by signal n.\n\
+                  A loss is input data that is missing from the result: images that cannot be decoded, a damaged recording, \
+                  or images that devices dropped while they were recorded. Without --record, run counts no dropped images, \
+                  because later images replace them. Each loss is printed on stderr; train and run also list it in report.json. \
                   Output lines that could not be written count as losses, too."
 )]
 pub(crate) struct Cli {

@@ -183,14 +183,17 @@ pub(crate) fn print_json(value: &impl Serialize) {
     }
 }
 
-/// Prints commands to run next on these models. The last line is the verdict on the models, with
-/// the first of these commands.
-pub(crate) fn print_end(models: &[FinishedModel], verdict: &Verdict) {
+/// Prints commands to run next on these models, and the likely cause of a poor result. The last line
+/// is the verdict on the models, with the first of these commands.
+pub(crate) fn print_end(models: &[FinishedModel], likely_cause: Option<&str>, verdict: &Verdict) {
     let saved: Vec<SavedModel<'_>> = models.iter().map(FinishedModel::saved).collect();
     let commands = next_commands::for_models(&saved);
     next_commands::lines(&commands)
         .iter()
         .for_each(print::report);
+    if let Some(cause) = likely_cause {
+        print::report(format_args!("likely cause of the low PSNR: {cause}"));
+    }
     if let Some(first) = commands.first() {
         print::report(format_args!("{}. Next: {}", verdict.text, first.command));
     }

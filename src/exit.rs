@@ -83,6 +83,26 @@ mod tests {
     }
 
     #[test]
+    fn every_exit_code_is_documented() {
+        let page = include_str!("cli_page/end.md");
+        let program = <crate::cli::Cli as clap::CommandFactory>::command();
+        let help = program.get_after_help().expect("a text").to_string();
+        let exits = [
+            Exit::Done,
+            Exit::Failed,
+            Exit::BadArguments,
+            Exit::Loss,
+            Exit::InsufficientData,
+        ];
+        // A panic has the code 101, and a second Ctrl-C the code 130.
+        let codes = exits.map(|exit| (exit as u8).to_string());
+        for code in codes.iter().map(String::as_str).chain(["101", "130"]) {
+            assert!(page.contains(&format!("\n| {code} | ")), "{code}");
+            assert!(help.contains(&format!(" {code} ")), "{code}: {help}");
+        }
+    }
+
+    #[test]
     fn loss_sets_the_exit_code() {
         assert_eq!(from_losses(&[]), Exit::Done);
         assert_eq!(from_losses(&["1 image did not decode".into()]), Exit::Loss);

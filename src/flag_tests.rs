@@ -14,7 +14,7 @@ use syn::{Attribute, Item, LitStr, Macro, Meta};
 /// Source files or folders, and the commands that print their messages. If a message contains a
 /// flag or setting, all these commands must accept it. The exception is a message that names a
 /// command that accepts the flag.
-const PRINTED_BY: [(&str, &[&str]); 36] = [
+const PRINTED_BY: [(&str, &[&str]); 37] = [
     ("bench/src", &["bench"]),
     (
         "calibration/procedures/src/hand_eye",
@@ -54,6 +54,7 @@ const PRINTED_BY: [(&str, &[&str]); 36] = [
     ("session/src/data.rs", &["train", "eval", "bench"]),
     ("session/src/depth_from.rs", &["train"]),
     ("session/src/eval_plan.rs", &["eval"]),
+    ("session/src/likely_cause.rs", &["run", "train"]),
     ("session/src/method_options.rs", &["run", "train", "bench"]),
     ("session/src/rendered_files.rs", &["render"]),
     ("session/src/run_folder.rs", &["run", "train"]),
@@ -214,10 +215,11 @@ pub(crate) fn names_a_command_with(text: &str, flag: NamedFlag<'_>) -> bool {
         || commands.any(|name| is_named(name) && flags_of(name).contains(flag.name))
 }
 
-/// Whether a flag belongs to another program that the text names: to cargo.
+/// Whether a flag belongs to another program that the text names: to cargo, or to a sender.
 fn is_of_other_program(text: &str, flag: NamedFlag<'_>) -> bool {
     match flag.name {
         "features" | "release" => text.contains("build"),
+        "to" => text.contains("scripts/senders/"),
         _ => false,
     }
 }

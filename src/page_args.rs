@@ -11,7 +11,7 @@ use viz::{Certificate, Hub, Server, ServerConfig, Sharing, Tokens};
 /// Where the page is served, and to whom.
 #[derive(Clone, Debug, clap::Args)]
 pub(crate) struct PageArgs {
-    /// Address of the page: numeric IP address and port [default: 127.0.0.1:7007, with --share
+    /// Address of the page: numeric IP address or localhost, and port [default: 127.0.0.1:7007, with --share
     /// 0.0.0.0:7007; `view`, `preview` and `calibrate` take a free port if this port is in use]
     #[arg(long, value_name = "ADDRESS", value_parser = address)]
     listen: Option<SocketAddr>,
@@ -32,10 +32,19 @@ pub(crate) struct PageArgs {
     foxglove: Option<SocketAddr>,
 }
 
-/// Parses the address of the page.
+/// Parses the address of the page. Other names than localhost are not resolved, because a name may
+/// have several addresses.
 fn address(text: &str) -> Result<SocketAddr, String> {
-    text.parse()
-        .map_err(|_| "expected an address and a port, such as 127.0.0.1:7007".to_owned())
+    let on_this_computer = text
+        .strip_prefix("localhost:")
+        .and_then(|port| port.parse().ok())
+        .map(|port| SocketAddr::new(Ipv4Addr::LOCALHOST.into(), port));
+    match on_this_computer {
+        Some(address) => Ok(address),
+        None => text.parse().map_err(|_| {
+            "expected an IP address or localhost, and a port, such as 127.0.0.1:7007".to_owned()
+        }),
+    }
 }
 
 impl PageArgs {
@@ -151,4 +160,32 @@ fn data_folder() -> Result<PathBuf, BadInput> {
                     .to_owned(),
             )
         })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn addresses_are_numeric_or_localhost() {
+        for (text, expected) in [
+            ("127.0.0.1:7007", "127.0.0.1:7007"),
+            ("[::1]:7007", "[::1]:7007"),
+            ("localhost:7007", "127.0.0.1:7007"),
+            ("localhost:0", "127.0.0.1:0"),
+        ] {
+            let found = address(text).expect(text);
+            assert_eq!(found.to_string(), expected);
+        }
+        for text in [
+            "localhost",
+            "localhost:",
+            "localhost:99999",
+            "robot:7007",
+            "7007",
+        ] {
+            let error = address(text).expect_err(text);
+            assert!(error.contains("127.0.0.1:7007"), "{error}");
+        }
+    }
 }

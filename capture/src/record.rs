@@ -2,6 +2,7 @@
 
 use crate::config::{ArmDriver, BaseDriver, Override, Rig};
 use crate::open::{self, Devices, Opened};
+use crate::outputs::check_output_file;
 use crate::stop::Stop;
 use drivers::recording::{Recorder, Recording};
 use drivers::{Image, Sample, Source};
@@ -91,9 +92,9 @@ impl RecordPlan {
             overrides.push(Override::new("sim.lockstep", true));
         }
         let rig = Rig::load(&self.rig_file, &overrides)?;
-        // The check for an end comes before the devices are opened, because devices may take long
-        // to start.
+        // These checks come before the devices are opened, because devices may take long to start.
         self.check_end(&rig)?;
+        check_output_file(Setting::Out, &self.out)?;
         if self.out.exists() {
             let path = self.out.clone();
             return Err(drivers::Error::Exists { path }.into());

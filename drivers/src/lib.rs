@@ -30,6 +30,7 @@ mod gap_estimator;
 pub mod jpeg;
 mod live_devices;
 pub mod motion;
+mod network_address;
 #[cfg(feature = "nokhwa")]
 pub mod nokhwa;
 #[cfg(any(target_os = "linux", feature = "nokhwa", feature = "realsense"))]
@@ -57,6 +58,7 @@ pub use error::{Error, RecordedSpan};
 pub use flange_difference::FlangeDifference;
 pub use live_devices::{Devices, LiveDevices};
 pub use motion::MovableArm;
+pub use network_address::NetworkAddress;
 pub use playback::{Playback, PlaybackClock};
 #[cfg(any(target_os = "linux", feature = "nokhwa", feature = "realsense"))]
 pub use reconnecting::CameraCounts;

@@ -1,11 +1,11 @@
-//! Tests of the programs in `scripts/senders`: their datagrams are read by the driver for arms that
-//! send UDP. The packages of the robots are replaced by small fakes in `senders/fakes`. If a
+//! Tests of the programs in `scripts/senders`: their datagrams are read by the drivers for arms and
+//! bases that send UDP. The packages of the robots are replaced by small fakes in `senders/fakes`. If a
 //! package is installed, it is also tested against an emulated controller.
 #![cfg(unix)]
 #![expect(clippy::unwrap_used, reason = "a failing test may panic")]
 
-use drivers::udp::UdpArm;
-use drivers::{Arm, Error, clock};
+use drivers::udp::{UdpArm, UdpBase};
+use drivers::{Arm, Base, Error, clock};
 use kinematics::JointState;
 use std::io::{BufRead, BufReader, Read};
 use std::path::{Path, PathBuf};
@@ -222,6 +222,40 @@ fn ros_stamps_of_the_same_computer_become_monotonic() {
     for state in &states {
         assert!(start < state.stamp && state.stamp < end, "{state:?}");
     }
+}
+
+#[test]
+fn ros_odometry_becomes_base_poses() {
+    if !has_python() {
+        return;
+    }
+    const MAX_SIGMA: [f64; 2] = [0.1, 0.1];
+    let mut base = UdpBase::open("127.0.0.1:0".parse().unwrap(), MAX_SIGMA).unwrap();
+    let mut command = python(&[test_file("fakes")]);
+    command
+        .arg(sender("ros2_base.py"))
+        .args(["--to", &base.address().to_string()]);
+    let start = Instant::now();
+    let mut program = Running::start(&mut command);
+    let mut poses = Vec::new();
+    while poses.len() < 20 {
+        match base.next_pose(Duration::from_millis(200)) {
+            Ok(pose) => poses.push(pose),
+            Err(Error::NoBasePose { .. }) => {
+                assert!(!program.has_ended(), "{}", program.errors());
+                assert!(start.elapsed() < MAX_START, "{:?}", base.counts());
+            }
+            Err(other) => panic!("{other}"),
+        }
+    }
+    for pose in &poses {
+        let position_m = pose.world_from_base.translation.vector;
+        assert_close(position_m.as_slice(), &[1.25, -0.5, 0.0]);
+        let rotation = pose.world_from_base.rotation;
+        assert_close(rotation.coords.as_slice(), &[0.0, 0.0, 0.6, 0.8]);
+    }
+    assert!(poses.windows(2).all(|pair| pair[0].stamp < pair[1].stamp));
+    assert_eq!(base.counts().n_rejected, 0, "{:?}", base.counts());
 }
 
 fn check_ur_states(states: &[JointState]) {

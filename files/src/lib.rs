@@ -13,6 +13,7 @@
 //!   requires a file system that supports locks.
 
 mod budget;
+pub mod destination;
 mod kept;
 pub mod partial;
 mod reading;

@@ -16,16 +16,32 @@ import time
 DEFAULT_ADDRESS = ("127.0.0.1", 7011)  # default of arm.address in rig files
 
 
-class JointSender:
-    """Sends joint states from one port, so that fieldrig can ignore other senders."""
+class DatagramSender:
+    """Sends datagrams from one port, so that fieldrig can ignore other senders."""
 
-    def __init__(self, address=DEFAULT_ADDRESS):
+    def __init__(self, address):
         host = ipaddress.ip_address(address[0])
         self._address = address
         # Name of the clock time.monotonic_ns() for fieldrig. CLOCK_MONOTONIC has another zero on every computer.
         self.own_clock = "monotonic" if host.is_loopback else "device"
         self._socket = socket.socket(socket.AF_INET if host.version == 4 else socket.AF_INET6, socket.SOCK_DGRAM)
         self._seq = 0
+
+    def send(self, kind, fields, stamp_nanos=None, clock="device"):
+        """Sends a datagram of this kind with these fields; stamp_nanos and clock are as for JointSender.send()."""
+        if stamp_nanos is None:
+            stamp_nanos, clock = time.monotonic_ns(), self.own_clock
+        datagram = {"kind": kind, "version": 1, "seq": self._seq, "clock": clock, "stamp_nanos": int(stamp_nanos)}
+        self._socket.sendto(json.dumps(datagram | fields).encode(), self._address)
+        self._seq += 1
+
+
+class JointSender:
+    """Sends joint states."""
+
+    def __init__(self, address=DEFAULT_ADDRESS):
+        self._sender = DatagramSender(address)
+        self.own_clock = self._sender.own_clock
 
     def send(self, names, position, velocity=(), effort=(), stamp_nanos=None, clock="device"):
         """Sends one state: position in rad or m, velocity in rad/s or m/s, effort in N m or N.
@@ -34,12 +50,26 @@ class JointSender:
         on a clock that runs at a constant rate. Without it, the state was measured now. clock is "monotonic" if
         stamp_nanos is CLOCK_MONOTONIC of the computer on which fieldrig runs, as in time.monotonic_ns().
         """
-        if stamp_nanos is None:
-            stamp_nanos, clock = time.monotonic_ns(), self.own_clock
-        state = {"kind": "joints", "version": 1, "seq": self._seq, "clock": clock, "stamp_nanos": int(stamp_nanos)}
-        state.update(names=list(names), position=list(position), velocity=list(velocity), effort=list(effort))
-        self._socket.sendto(json.dumps(state).encode(), self._address)
-        self._seq += 1
+        state = {"names": list(names), "position": list(position), "velocity": list(velocity), "effort": list(effort)}
+        self._sender.send("joints", state, stamp_nanos, clock)
+
+
+class RateLimit:
+    """Lets at most `rate_hz` events per second pass."""
+
+    def __init__(self, rate_hz):
+        self._period_secs = 1 / rate_hz
+        self._next_secs = None
+
+    def is_due(self):
+        """Whether the event that happens now may pass."""
+        now_secs = time.monotonic()
+        if self._next_secs is None:
+            self._next_secs = now_secs
+        if now_secs < self._next_secs:
+            return False
+        self._next_secs = max(self._next_secs + self._period_secs, now_secs)
+        return True
 
 
 def ticks(rate_hz):
@@ -51,13 +81,13 @@ def ticks(rate_hz):
         time.sleep(max(0.0, next_tick - time.monotonic()))
 
 
-def arguments(description, rate_hz):
-    """A parser with the flags that all senders have."""
+def arguments(description, rate_hz, address=DEFAULT_ADDRESS, key="arm.address"):
+    """A parser with the flags that all senders have. The rig file has the address in this key."""
     parser = argparse.ArgumentParser(description=description)
-    parser.add_argument("--to", type=_address, default=DEFAULT_ADDRESS, metavar="IP:PORT",
-                        help="arm.address in the rig file (default: 127.0.0.1:7011)")
+    parser.add_argument("--to", type=_address, default=address, metavar="IP:PORT",
+                        help=f"{key} in the rig file (default: {address[0]}:{address[1]})")
     parser.add_argument("--rate", type=_rate, default=rate_hz, metavar="HZ",
-                        help=f"states per second (default: {rate_hz})")
+                        help=f"datagrams per second (default: {rate_hz})")
     return parser
 
 

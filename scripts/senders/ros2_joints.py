@@ -7,10 +7,8 @@
 The topic may contain other joints, and several nodes may publish to it. The URDF of the rig file needs the same names.
 """
 
-import sys
-import time
-
-from joint_sender import JointSender, arguments
+from joint_sender import JointSender, RateLimit, arguments
+from ros2_node import add_arguments, stamp_nanos_and_clock, subscribe
 
 
 class Relay:
@@ -18,53 +16,25 @@ class Relay:
 
     def __init__(self, sender, rate_hz, is_publisher_here):
         self._sender = sender
-        self._period_secs = 1 / rate_hz
+        self._rate_hz = rate_hz
         self._is_publisher_here = is_publisher_here
-        # Sets of joints are counted separately, so that a gripper does not use up the rate of the arm.
-        self._next_secs = {}
+        # Sets of joints are limited separately, so that a gripper does not use up the rate of the arm.
+        self._limits = {}
 
     def on_state(self, state):
-        now_secs = time.monotonic()
         names = tuple(state.name)
-        next_secs = self._next_secs.get(names, now_secs)
-        if now_secs < next_secs:
+        if not self._limits.setdefault(names, RateLimit(self._rate_hz)).is_due():
             return
-        self._next_secs[names] = max(next_secs + self._period_secs, now_secs)
-        stamp_nanos, clock = self._stamp(state.header.stamp)
+        stamp_nanos, clock = stamp_nanos_and_clock(state.header.stamp, self._is_publisher_here)
         self._sender.send(names, state.position, state.velocity, state.effort, stamp_nanos, clock)
-
-    def _stamp(self, stamp):
-        nanos = stamp.sec * 1_000_000_000 + stamp.nanosec
-        if nanos == 0:  # The publisher sets no stamp, so the time of arrival is used.
-            return None, "device"
-        if self._is_publisher_here:
-            return nanos + time.monotonic_ns() - time.time_ns(), "monotonic"
-        return nanos, "device"
 
 
 def main():
     parser = arguments(__doc__.splitlines()[0], rate_hz=200)
-    parser.add_argument("--topic", default="/joint_states", help="default: /joint_states")
-    parser.add_argument("--same-computer", action="store_true",
-                        help="publisher, this program and fieldrig use the time of day of one computer: convert stamps "
-                        "exactly, instead of letting fieldrig estimate how the clocks are related")
+    add_arguments(parser, topic="/joint_states")
     args = parser.parse_args()
-    try:
-        import rclpy
-        from rclpy.executors import ExternalShutdownException
-        from rclpy.qos import qos_profile_sensor_data
-        from sensor_msgs.msg import JointState
-    except ImportError as error:
-        sys.exit(f"error: the Python package {error.name} is missing; first run: source /opt/ros/jazzy/setup.bash")
-    rclpy.init()
-    node = rclpy.create_node("fieldrig_joint_sender")
     relay = Relay(JointSender(args.to), args.rate, args.same_computer)
-    # This profile also accepts publishers that are reliable.
-    node.create_subscription(JointState, args.topic, relay.on_state, qos_profile_sensor_data)
-    try:
-        rclpy.spin(node)
-    except (KeyboardInterrupt, ExternalShutdownException):
-        pass
+    subscribe(args.topic, "sensor_msgs", "JointState", relay.on_state)
 
 
 if __name__ == "__main__":

@@ -149,7 +149,7 @@ fn state_text(situation: &Situation) -> String {
 }
 
 /// Why most of the recent images are of no use, and what to do.
-fn problem(recent: &ImageFlow) -> Option<String> {
+pub(crate) fn problem(recent: &ImageFlow) -> Option<String> {
     let n_sent = recent.received + recent.dropped;
     // Smaller losses are common on slow computers and are no problem: see `hint`.
     if n_sent >= MIN_IMAGES && 2 * recent.dropped >= n_sent {

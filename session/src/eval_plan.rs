@@ -5,6 +5,7 @@ use crate::evaluate::{Evaluator, ImageScores, Scores, warn_if_hardly_covered};
 use crate::methods;
 use crate::read_progress::OnReadProgress;
 use crate::recoveries::OpenGpu;
+use crate::run_folder;
 use capture::config::{Override, Rig};
 use keyframe::{Keyframe, KeyframeList, Split};
 use messages::Setting;
@@ -176,7 +177,6 @@ fn n_trained_on(plan: &EvalPlan, tests: &[Arc<Keyframe>], is_recording: bool) ->
 
 /// The data that a model was trained on, according to its report.
 fn trained_folder(model: &Path) -> Option<PathBuf> {
-    let report = files::read_text(&model.join("report.json")).ok()?;
-    let report: serde_json::Value = serde_json::from_str(&report).ok()?;
+    let report = run_folder::report(model);
     Path::new(report["data"].as_str()?).canonicalize().ok()
 }

@@ -44,6 +44,7 @@ mod holdout;
 mod kept_folder;
 mod latency;
 mod ledger;
+mod likely_cause;
 mod live_loop;
 mod method_options;
 pub mod methods;

@@ -1,9 +1,9 @@
 //! Describes the saved model or file that `view` shows.
 
+use crate::run_folder::report;
 use crate::verdict;
 use kinematics::Transform;
 use nalgebra::Vector3;
-use serde_json::Value;
 use std::path::{Path, PathBuf};
 use std::time::UNIX_EPOCH;
 use trainer::ModelKind;
@@ -49,13 +49,6 @@ pub(crate) fn of_saved(
         verdict: verdict::of_report(&report),
         up_axis: up_axis(model_from_page),
     }
-}
-
-/// The report in a model's folder; `Null` if there is none.
-pub(crate) fn report(model: &Path) -> Value {
-    // Splat files of other programs have no report.
-    let text = files::read_text(&model.join("report.json")).unwrap_or_default();
-    serde_json::from_str(&text).unwrap_or_default()
 }
 
 /// The files of a model.

@@ -1,7 +1,8 @@
-//! The verdict on models that have just been saved and scored.
+//! The verdict on models that have just been saved and scored, and the likely cause of a poor one.
 
 use crate::session::FinishedModel;
 use crate::verdict::{self, Findings, ImageLoss, ModelScore};
+use crate::{likely_cause, run_folder};
 use viz::Verdict;
 
 /// Judges the models of one run. `loss` is zero if the images come from a dataset, which loses none.
@@ -17,4 +18,14 @@ pub(crate) fn verdict_of(models: &[FinishedModel], loss: ImageLoss) -> Verdict {
         n_received: loss.n_received,
         n_lost: loss.n_lost,
     })
+}
+
+/// The likely cause of the poor result of a run, and its remedy, from the report of its best model.
+/// `None` if the result is not poor.
+pub(crate) fn likely_cause_of(models: &[FinishedModel]) -> Option<String> {
+    let psnr_db = |model: &&FinishedModel| model.scores.psnr.unwrap_or(f64::NEG_INFINITY);
+    let best = models
+        .iter()
+        .max_by(|a, b| psnr_db(a).total_cmp(&psnr_db(b)))?;
+    likely_cause::of_report(&run_folder::report(&best.folder))
 }

@@ -1,11 +1,13 @@
 //! The folder of a run and its files.
 
 use anyhow::{Context, bail, ensure};
+use capture::check_output_folder;
 use capture::config::Rig;
 use keyframe::Keyframe;
 use messages::{BadInput, Setting, listed};
 use model_files::Edits;
 use serde::Serialize;
+use serde_json::Value;
 use sha2::{Digest, Sha256};
 use std::ffi::OsStr;
 use std::path::{Path, PathBuf};
@@ -77,8 +79,8 @@ pub fn check_no_unfinished_run(out: &Path) -> anyhow::Result<()> {
     }
 }
 
-/// Checks the folder that was requested for the results of a run, if any: the results of another
-/// run would be overwritten.
+/// Checks the folder for the results of a run: it must be writable, and if it was requested, the
+/// results of another run would be overwritten.
 ///
 /// * `resume`: folder of the run that is continued.
 /// * `data`: folder of the data.
@@ -87,6 +89,10 @@ pub(crate) fn check_out(
     resume: Option<&Path>,
     data: Option<&Path>,
 ) -> anyhow::Result<()> {
+    // A run that is continued may be finished, and then writes nothing.
+    if out.is_some() || resume.is_none() {
+        check_output_folder(Setting::Out, out.unwrap_or(Path::new(RUNS)))?;
+    }
     let Some(out) = out else { return Ok(()) };
     check_no_model(out)?;
     if let Some(data) = data {
@@ -176,6 +182,13 @@ pub fn expect_model(model: &Path) -> anyhow::Result<()> {
         return Err(BadInput(message).into());
     }
     Ok(())
+}
+
+/// The content of the report in a model's folder; `Null` if there is none.
+pub(crate) fn report(model: &Path) -> Value {
+    // Splat files of other programs have no report.
+    let text = files::read_text(&model.join(REPORT)).unwrap_or_default();
+    serde_json::from_str(&text).unwrap_or_default()
 }
 
 /// Whether a file is one of several that a model of this kind consists of.

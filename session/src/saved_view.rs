@@ -1,6 +1,6 @@
 //! Shows saved models to viewers: their cameras, scores and initial view.
 
-use crate::model_source::report;
+use crate::run_folder::report;
 use crate::scene_hint::SceneView;
 use crate::{camera_list, methods, model_source, served_files, viewers};
 use gpu::Gpu;

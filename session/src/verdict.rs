@@ -11,7 +11,7 @@ const GOOD_DB: f64 = 30.0;
 /// Minimum PSNR of a fair model, dB. At this PSNR, pictures differ from photos by 16 gray levels
 /// (RMS), twice as much as for a good model. Shapes are in place, but details are blurred. Below
 /// this PSNR, poses or lens are often wrong.
-const FAIR_DB: f64 = 24.0;
+pub(crate) const FAIR_DB: f64 = 24.0;
 /// Minimum fraction of lost images that verdicts and reports mention. Cameras drop single images now and
 /// then, which the next image replaces.
 const MIN_LOST_FRAC: f64 = 0.05;

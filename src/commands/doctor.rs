@@ -56,6 +56,11 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     if let Some(rig) = &rig {
         findings.extend(doctor::meaning(rig)?);
     }
+    if let Some(path) = &args.rig {
+        let text =
+            files::read_text(path).with_context(|| format!("cannot read {}", path.display()))?;
+        findings.extend(doctor::guesses(&text));
+    }
     if let (Some(rig), Some(file)) = (&rig, &args.picture) {
         write_picture(rig, file)?;
     }

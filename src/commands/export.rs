@@ -7,7 +7,7 @@ use crate::work_lines::WorkLines;
 use crate::{print, signals};
 use anyhow::{Context, ensure};
 use clap::builder::{PossibleValue, PossibleValuesParser};
-use messages::{BadInput, counted, listed};
+use messages::{BadInput, Setting, counted, listed};
 use session::{RecordingExport, Written, methods, run_folder};
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -159,7 +159,7 @@ fn check_file(args: &Args) -> Result<(), BadInput> {
     let extension = &args.to;
     // This output is a folder.
     if extension == NERFSTUDIO {
-        return Ok(());
+        return capture::check_output_folder(Setting::Out, &args.out);
     }
     let out = args.out.display();
     if !args
@@ -176,7 +176,7 @@ fn check_file(args: &Args) -> Result<(), BadInput> {
             "--out {out}: the file exists; choose another name"
         )));
     }
-    Ok(())
+    capture::check_output_file(Setting::Out, &args.out)
 }
 
 fn unsupported(sentence: &str, args: &Args) -> anyhow::Error {

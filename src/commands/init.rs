@@ -11,6 +11,7 @@ use capture::Rig;
 use capture::config::Parent;
 use capture::init::{Findings, RigPlan, RobotChoice, SearchPlan, WantedCamera, Wishes, search};
 use capture::known_robots::{BUILTIN_PREFIX, KNOWN_ROBOTS, KnownRobot};
+use drivers::NetworkAddress;
 use messages::BadInput;
 use questions::Questions;
 use std::path::{Path, PathBuf};
@@ -21,7 +22,8 @@ use std::path::{Path, PathBuf};
     Nothing moves, no setting of a device is changed, and no network is scanned. Found are: V4L2 and RealSense cameras; \
     motors on CAN interfaces that are up (by their heartbeats, or by requests that only ask for an ID); Feetech and \
     Dynamixel servos with IDs from 1 to 12 on USB adapters for servos; a Franka controller at 172.16.0.2, and one of \
-    Universal Robots at 192.168.56.101. Give other addresses with --franka and --ur.\n\n\
+    Universal Robots at 192.168.56.101, if it answers a request of its protocol, RTDE. Give other addresses with \
+    --franka and --ur. A controller that does not answer at such an address is reported, and is still written.\n\n\
     Without any device, the rig file describes a UR5e with a webcam at its wrist. `fieldrig run RIG.toml --sim` simulates \
     it.\n\n\
     The flange of a URDF is found from its chain with the most moving joints, without the joints of a gripper. It is the \
@@ -105,6 +107,8 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     }
     // Whatever can be wrong in the arguments is checked before the search, which takes seconds.
     check_new(&args.rig, args.force)?;
+    check_folder(&args.rig)?;
+    check_addresses(args)?;
     let robot = robot(args)?;
     print::notice("searching for cameras, CAN motors, servos and controllers");
     let mut findings = search(&SearchPlan {
@@ -141,6 +145,23 @@ fn check_new(rig: &Path, force: bool) -> Result<(), BadInput> {
         return Err(BadInput(format!(
             "{rig} exists: choose another name, or replace it with --force"
         )));
+    }
+    Ok(())
+}
+
+/// Checks that the folder of the rig file exists and accepts files.
+fn check_folder(rig: &Path) -> Result<(), BadInput> {
+    files::destination::check_file(rig)
+        .map_err(|problem| BadInput(format!("cannot write {}: {problem}", rig.display())))
+}
+
+/// Rejects addresses of controllers that are incomplete.
+fn check_addresses(args: &Args) -> Result<(), BadInput> {
+    for (flag, address) in [("--franka", &args.franka), ("--ur", &args.ur)] {
+        if let Some(address) = address {
+            NetworkAddress::parse(address)
+                .map_err(|reason| BadInput(format!("{flag} {address}: {reason}")))?;
+        }
     }
     Ok(())
 }
@@ -189,11 +210,14 @@ fn report_findings(findings: &Findings) {
         notes,
     } = findings;
     print::report("Found");
+    let (found, silent): (Vec<_>, Vec<_>) = controllers
+        .iter()
+        .partition(|controller| controller.answers());
     let rows = [
         ("camera", texts(cameras)),
         ("CAN", texts(buses)),
         ("servos", texts(servos)),
-        ("controller", texts(controllers)),
+        ("controller", texts(&found)),
     ];
     if rows.iter().all(|(_, found)| found.is_empty()) {
         print::report("  no cameras, motors, servos or controllers");
@@ -202,6 +226,9 @@ fn report_findings(findings: &Findings) {
         for device in found {
             print::report(format_args!("  {kind:10} {device}"));
         }
+    }
+    for controller in silent {
+        print::report(format_args!("  not found  {controller}"));
     }
     for note in notes {
         print::report(format_args!("  not used   {note}"));

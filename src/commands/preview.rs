@@ -12,7 +12,7 @@ const DETAILS: &str = "The page shows the images of every camera that opens, and
     opened is listed with the reason, and is opened again every two seconds, so that you can plug it in while the page \
     is open. Nothing is trained, nothing is moved, and nothing is written.\n\n\
     The rig file may be incomplete: a camera without intrinsics or without its pose on the robot is shown as an image \
-    only, and a rig without an arm shows images only.\n\n\
+    only, a rig without an arm shows images only, and a rig without cameras shows the robot only.\n\n\
     Examples:\n  \
     fieldrig preview rig.toml                 devices of a rig, at http://127.0.0.1:7007\n  \
     fieldrig preview rig.toml --sim           the same rig, simulated\n  \

@@ -5,7 +5,7 @@ use crate::exit::Exit;
 use crate::open_gpu::open_gpu;
 use crate::{print, signals};
 use anyhow::Context;
-use messages::{BadInput, counted};
+use messages::{BadInput, Setting, counted};
 use model_files::Aabb;
 use serde::Serialize;
 use session::camera_path::{CameraPath, PathCamera};
@@ -139,6 +139,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
         .collect::<Result<Vec<_>, _>>()?;
     // Everything that can be refused is checked before the GPU is opened and the model is loaded.
     expect_model(&args.model)?;
+    capture::check_output_folder(Setting::Out, &args.out)?;
     rendered_files::check_no_overwrite(&args.out, requests.len())?;
     signals::remove_partial_files_on_signals()?;
     let loaded = methods::load(open_gpu()?, &args.model)?;

@@ -50,7 +50,7 @@ pub(crate) struct Args {
     resume: Option<PathBuf>,
     /// Stop S seconds after the first image. Time before --resume counts [default: run until
     /// Ctrl-C]
-    #[arg(long, value_name = "S", allow_negative_numbers = true, value_parser = number_in_range(0.0..=1e9))]
+    #[arg(long, value_name = "S", allow_negative_numbers = true, value_parser = run_secs)]
     seconds: Option<f64>,
     /// Stop after N optimizer steps, or when the devices have ended and all data is fused. Steps
     /// before --resume count. With --lockstep, the result then depends only on the seed
@@ -78,6 +78,15 @@ pub(crate) struct Args {
     /// Print JSON, one object per line
     #[arg(long)]
     json: bool,
+}
+
+/// Parses the length of a run. With a length of zero, a run would end before its first image.
+fn run_secs(text: &str) -> Result<f64, String> {
+    let secs = number_in_range(0.0..=1e9)(text)?;
+    if secs > 0.0 {
+        return Ok(secs);
+    }
+    Err("must be more than 0; a run without --seconds ends with Ctrl-C".to_owned())
 }
 
 /// What to do when a run reaches its limit.
@@ -117,7 +126,11 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     let hub = run.live.hub();
     let saved = run.run_to_end()?;
     if !args.json {
-        print_end(&saved.models, &saved.verdict());
+        print_end(
+            &saved.models,
+            saved.likely_cause().as_deref(),
+            &saved.verdict(),
+        );
     }
     let EndedRun {
         models,

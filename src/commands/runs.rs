@@ -18,7 +18,9 @@ use std::time::{Duration, SystemTime};
     args_conflicts_with_subcommands = true,
     after_long_help = "Without a subcommand, the runs are listed. States: `running`: a process writes into the folder. \
                        `done`: all models were saved and scored. `not scored`: the run ended before its scores. \
-                       `unfinished`: there is a checkpoint, from which `run --resume` or `train --resume` continues, but no model. `no model`: there is neither."
+                       `unfinished`: there is a checkpoint, from which `run --resume` or `train --resume` continues, but no model. `no model`: there is neither.\n\n\
+                       The name of the rig or data is in the report, which is written with the scores, and is `unknown` before. \
+                       The models of a run come with their PSNR on the test images."
 )]
 pub(crate) struct Args {
     #[command(subcommand)]
@@ -172,9 +174,9 @@ fn row(run: &KeptRun) -> [String; 6] {
     [
         run.name.clone(),
         session::run_folder::utc_time(Duration::from_secs(run.changed_unix_secs)),
-        run.rig.clone().unwrap_or_else(|| "-".to_owned()),
+        run.rig.clone().unwrap_or_else(|| "unknown".to_owned()),
         if models.is_empty() {
-            "-".to_owned()
+            "none".to_owned()
         } else {
             models.join(", ")
         },
@@ -186,7 +188,7 @@ fn row(run: &KeptRun) -> [String; 6] {
 fn model(model: &KeptModel) -> String {
     match model.psnr {
         Some(psnr) => format!("{} {psnr:.2} dB", model.method),
-        None => model.method.clone(),
+        None => format!("{} not scored", model.method),
     }
 }
 
@@ -319,10 +321,10 @@ mod tests {
         ]);
         assert_eq!(
             lines[1],
-            "a                2026-11-18 11:06  -            splat 25.25 dB, tsdf  467.0 MB  done"
+            "a                2026-11-18 11:06  unknown      splat 25.25 dB, tsdf not scored  467.0 MB  done"
         );
         assert!(
-            lines[2].ends_with("-                     1.50 GB   done"),
+            lines[2].ends_with("unknown      none                             1.50 GB   done"),
             "{}",
             lines[2]
         );

@@ -88,7 +88,11 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
         TrainOutcome::Trained(trained) => trained,
     };
     if !args.json {
-        print_end(&trained.models, &trained.verdict());
+        print_end(
+            &trained.models,
+            trained.likely_cause().as_deref(),
+            &trained.verdict(),
+        );
     }
     trained.write_rig()?;
     Ok(exit::from_losses(&trained.data_losses))

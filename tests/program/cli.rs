@@ -99,6 +99,14 @@ fn wrong_arguments_exit_with_2() {
 }
 
 #[test]
+fn a_run_of_no_time_is_refused() {
+    for secs in ["0", "0.0", "-0"] {
+        let args = ["run", "absent.toml", "--seconds", secs];
+        assert_fails_with(&args, 2, &["--seconds", "must be more than 0"]);
+    }
+}
+
+#[test]
 fn missing_file_exits_with_1_and_is_named() {
     assert_fails_with(
         &[

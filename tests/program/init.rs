@@ -7,7 +7,7 @@ use drivers::servos::emulated::{EmulatedServo, EmulatedServoBus, ServoKind};
 use drivers::ur::emulated::{ControllerConfig, EmulatedController, Joints};
 use kinematics::Chain;
 use std::collections::BTreeSet;
-use std::net::{Ipv4Addr, SocketAddr};
+use std::net::{Ipv4Addr, SocketAddr, TcpListener};
 use std::path::Path;
 
 /// Joint angles at which the arms of Universal Robots differ by decimeters.
@@ -76,6 +76,23 @@ fn controller_is_identified_by_its_flange() {
 }
 
 #[test]
+fn a_server_of_another_kind_is_not_found_as_a_controller() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let server = TcpListener::bind("127.0.0.1:0").expect("a free port");
+    let address = server.local_addr().expect("bound").to_string();
+    // It accepts connections and closes them, as a server does with requests of other protocols.
+    std::thread::spawn(move || server.incoming().for_each(drop));
+    let (printed, rig) = init(folder.path(), &["--ur", &address]);
+    let row = printed.lines().find(|line| line.contains(&*address));
+    assert!(
+        row.is_some_and(|row| row.starts_with("  not found")),
+        "{printed}"
+    );
+    // The user may know better: the controller may be switched off.
+    assert_eq!(rig["arm"]["address"].as_str(), Some(&*address));
+}
+
+#[test]
 fn servos_become_the_joints_of_an_so101() {
     let folder = tempfile::tempdir().expect("a folder");
     let port = folder.path().join("servos");
@@ -122,6 +139,22 @@ fn existing_files_are_only_replaced_by_force() {
 }
 
 #[test]
+fn init_checks_the_folder_before_it_searches() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let output = fieldrig(
+        folder.path(),
+        &["init", "absent/rig.toml", "--robot", "ur5e"],
+    );
+    let printed = stderr(&output);
+    assert_eq!(output.status.code(), Some(2), "{printed}");
+    assert!(
+        printed.contains("the folder absent does not exist; create it"),
+        "{printed}"
+    );
+    assert!(!printed.contains("searching"), "{printed}");
+}
+
+#[test]
 fn urdf_is_named_relative_to_the_rig_file() {
     let folder = tempfile::tempdir().expect("a folder");
     std::fs::create_dir(folder.path().join("robots")).expect("a folder");
@@ -141,6 +174,8 @@ fn unknown_robots_and_places_are_refused() {
         (["--robot", "ur5"], "did you mean \"ur5e\""),
         (["--camera", "wrist"], "flange, base or world"),
         (["--urdf", "absent.urdf"], "absent.urdf"),
+        (["--ur", "192.168.1"], "four numbers from 0 to 255"),
+        (["--franka", "robot:fci"], "is not a number up to 65535"),
     ] {
         let output = fieldrig(folder.path(), &[&["init"], &args[..]].concat());
         assert!(!output.status.success());

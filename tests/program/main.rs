@@ -17,6 +17,8 @@ mod demo;
 mod depth_from;
 mod edits;
 mod end_to_end;
+#[cfg(feature = "sim")]
+mod exit_codes;
 mod file_cycles;
 mod fk;
 mod gpu_loss;
@@ -25,6 +27,8 @@ mod guides;
 mod init;
 mod metrics_export;
 mod output;
+#[cfg(feature = "sim")]
+mod output_places;
 mod page_replay;
 #[cfg(feature = "sim")]
 mod page_server;

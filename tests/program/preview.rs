@@ -209,6 +209,24 @@ fn a_missing_camera_is_listed_while_the_arm_moves() {
     assert_eq!(files_in(folder.path()), before);
 }
 
+#[test]
+fn a_rig_without_cameras_says_what_to_do() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let rig = "[arm]\ndriver = \"udp\"\naddress = \"127.0.0.1:0\"\nurdf = \"builtin:ur5e\"\n";
+    std::fs::write(folder.path().join("rig.toml"), rig).expect("written");
+    let mut preview = Preview::start(folder.path(), &["rig.toml"]);
+    preview.wait_for("note", |message| {
+        let notes = message["notes"].as_array();
+        notes.is_some_and(|notes| {
+            notes
+                .iter()
+                .filter_map(Value::as_str)
+                .any(|note| note.contains("has no camera") && note.contains("`fieldrig devices`"))
+        })
+    });
+    preview.interrupt();
+}
+
 /// Names of the files in a folder.
 fn files_in(folder: &Path) -> Vec<String> {
     let entries = std::fs::read_dir(folder).expect("a folder");

@@ -1,8 +1,8 @@
 //! The devices of a rig that the calibration of a lens needs.
 //!
-//! Only the camera is opened, so its lens can be calibrated before the rest of the robot is
-//! connected. If an arm carries the camera, the arm is opened, too, because images during fast
-//! motions of the arm are not used.
+//! The lens of a camera can be calibrated before the rest of the robot is connected: only the
+//! camera is opened, also if an arm carries it. A simulated camera is the exception, because one
+//! simulation moves the camera, its arm and the target.
 
 use capture::config::{ArmDriver, BaseDriver, Camera, Parent, Rig};
 use capture::open::{self, Devices, Opened};
@@ -14,26 +14,15 @@ pub(crate) struct LensDevices {
     pub(crate) rig: Rig,
 }
 
-/// Opens a camera of a rig, and the arm if it carries the camera.
+/// Opens a camera of a rig. If the camera is simulated, opens the whole rig.
 ///
 /// # Errors
 /// Fails if a device cannot be opened.
 pub(crate) fn open(rig: Rig, camera: &str, devices: Devices) -> anyhow::Result<LensDevices> {
-    let is_carried = is_carried(&rig, camera);
-    // One simulation moves all devices.
-    let is_simulated = devices == Devices::Sim || open::is_any_simulated(&rig);
-    if is_carried || is_simulated {
-        let mut opened = open::rig(rig, devices)?;
-        let rig = opened.rig.clone();
-        if !is_carried {
-            without_arm(&mut opened.rig);
-        }
-        return Ok(LensDevices { opened, rig });
+    let part = camera_alone(&rig, camera);
+    if devices == Devices::Sim || open::is_any_simulated(&part) {
+        return open_simulated(rig, camera, devices);
     }
-    let mut part = rig.clone();
-    part.cameras.retain(|other| &*other.name == camera);
-    part.scanners.clear();
-    without_arm(&mut part);
     let opened = open::rig(part, devices)?;
     let mut rig = rig;
     for known in &mut rig.cameras {
@@ -54,7 +43,28 @@ pub(crate) fn open(rig: Rig, camera: &str, devices: Devices) -> anyhow::Result<L
     Ok(LensDevices { opened, rig })
 }
 
-/// Whether an arm that is read carries the camera.
+/// Opens all devices of a rig. The arm is used if it carries the camera, because a simulated arm
+/// never rests: its speed decides which images are sharp.
+fn open_simulated(rig: Rig, camera: &str, devices: Devices) -> anyhow::Result<LensDevices> {
+    let is_carried = is_carried(&rig, camera);
+    let mut opened = open::rig(rig, devices)?;
+    let rig = opened.rig.clone();
+    if !is_carried {
+        without_arm(&mut opened.rig);
+    }
+    Ok(LensDevices { opened, rig })
+}
+
+/// The rig with only this camera.
+fn camera_alone(rig: &Rig, camera: &str) -> Rig {
+    let mut part = rig.clone();
+    part.cameras.retain(|other| &*other.name == camera);
+    part.scanners.clear();
+    without_arm(&mut part);
+    part
+}
+
+/// Whether an arm carries the camera.
 fn is_carried(rig: &Rig, camera: &str) -> bool {
     let is_on_flange = rig
         .cameras
@@ -77,23 +87,53 @@ fn without_arm(rig: &mut Rig) {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use capture::config::Override;
     use std::path::Path;
 
-    fn rig() -> Rig {
+    fn rig(overrides: &[Override]) -> Rig {
         let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../rigs/two-cameras.toml");
-        Rig::load(&path, &[]).expect("a bundled rig file")
+        Rig::load(&path, overrides).expect("a bundled rig file")
+    }
+
+    /// The rig with a real camera on the flange.
+    fn rig_with_webcam(arm: &str) -> Rig {
+        rig(&[
+            Override::new("arm.driver", arm),
+            // An address of RFC 5737 that no arm has.
+            Override::new("arm.address", "192.0.2.1"),
+            Override::new("camera.wrist.driver", "v4l2"),
+            Override::new("camera.wrist.device", "no such serial"),
+            Override::new("camera.wrist.depth.device", "no such serial"),
+            Override::new("camera.wrist.depth.meters_per_count", 0.001),
+        ])
     }
 
     #[test]
-    fn only_a_camera_on_an_arm_needs_the_arm() {
-        let mut rig = rig();
-        let name = rig.cameras[0].name.to_string();
-        rig.cameras[0].parent = Parent::Flange;
-        assert!(is_carried(&rig, &name));
+    fn a_real_camera_on_an_arm_is_opened_without_the_arm() {
+        for arm in ["franka", "sim"] {
+            let rig = rig_with_webcam(arm);
+            let part = camera_alone(&rig, "wrist");
+            assert_eq!(part.arm.driver, ArmDriver::None);
+            assert_eq!(part.cameras.len(), 1);
+            assert_eq!(part.cameras[0].parent, Parent::Base);
+            assert!(!open::is_any_simulated(&part), "{arm}");
+            // The camera is missed, and not the arm.
+            let Err(error) = open(rig, "wrist", Devices::Real) else {
+                panic!("there is no such camera");
+            };
+            let error = format!("{error:#}");
+            assert!(
+                error.contains("wrist") && !error.contains("192.0.2.1"),
+                "{error}"
+            );
+        }
+    }
+
+    #[test]
+    fn only_a_camera_on_an_arm_is_carried() {
+        let mut rig = rig(&[]);
+        assert!(is_carried(&rig, "wrist") && !is_carried(&rig, "overview"));
         rig.arm.driver = ArmDriver::None;
-        assert!(!is_carried(&rig, &name), "the arm is not read");
-        rig.arm.driver = ArmDriver::Udp;
-        rig.cameras[0].parent = Parent::World;
-        assert!(!is_carried(&rig, &name));
+        assert!(!is_carried(&rig, "wrist"), "the rig has no arm");
     }
 }

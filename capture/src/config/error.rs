@@ -95,6 +95,21 @@ pub enum ConfigError {
     },
 }
 
+impl ConfigError {
+    /// The problem that is shown first.
+    pub(super) fn first(&self) -> &Self {
+        match self {
+            Self::Several { first, .. } => first,
+            other => other,
+        }
+    }
+
+    /// Whether the problem is that this key is missing.
+    pub(super) fn is_missing(&self, wanted: &str) -> bool {
+        matches!(self, Self::Missing { key, .. } if key == wanted)
+    }
+}
+
 /// Where a value comes from.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum SourceLocation {

@@ -80,3 +80,22 @@ fn relative_path(absolute: &Path) -> PathBuf {
     let down = absolute.components().skip(1);
     up.chain(down).collect()
 }
+
+#[test]
+fn a_missing_robot_description_is_reported_before_a_missing_link() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let path = folder.path().join("rig.toml");
+    std::fs::write(&path, rig_file("urdf = \"my-arm.urdf\"")).expect("written");
+    let load = || Rig::load(&path, &[]).expect_err("incomplete").to_string();
+    let message = load();
+    assert!(
+        message.contains("robot description") && message.contains("my-arm.urdf"),
+        "{message}"
+    );
+    std::fs::write(folder.path().join("my-arm.urdf"), "<robot name=\"a\"/>").expect("written");
+    let message = load();
+    assert!(
+        message.contains("\"arm.flange_link\" is missing"),
+        "{message}"
+    );
+}

@@ -23,6 +23,14 @@ pub(super) fn read(
 ) -> Result<Rig, ConfigError> {
     let (rig, context) = keys(file, text, overrides, folder)?;
     if let Some(problem) = context.into_problem() {
+        // Only the robot description tells which links there are, so a missing description comes
+        // first.
+        if let Some((_, urdf_path)) = &rig
+            && problem.first().is_missing("arm.flange_link")
+            && !urdf_path.is_empty()
+        {
+            read_urdf(urdf_path)?;
+        }
         return Err(problem);
     }
     let (mut rig, urdf_path) = rig.expect("without problems, there is a rig");

@@ -4,8 +4,8 @@
 use super::{Finding, Verdict, field};
 use crate::config::{ArmDriver, Rig};
 use crate::open::FCI_PORT;
-use std::io::ErrorKind;
-use std::net::{TcpStream, ToSocketAddrs};
+use drivers::NetworkAddress;
+use std::net::TcpStream;
 use std::path::Path;
 use std::process::Command;
 use std::time::Duration;
@@ -35,7 +35,16 @@ pub(super) fn franka(rig: Option<&Rig>) -> Vec<Finding> {
         findings.push(Finding::fail("robot", "arm.address is missing", remedy));
         return findings;
     }
-    let host = host_of(&arm.address);
+    let address = match NetworkAddress::parse(&arm.address) {
+        Ok(address) => address,
+        Err(reason) => {
+            let remedy = "Desk shows the address of the robot under Settings, Network";
+            let message = format!("arm.address is {:?}: {reason}", arm.address);
+            findings.push(Finding::fail("robot", message, remedy));
+            return findings;
+        }
+    };
+    let host = &*address.host;
     findings.extend(
         output_of("ip", &["-o", "route", "get", host])
             .map(|command_output| route(Path::new("/sys"), host, &command_output)),
@@ -58,7 +67,7 @@ pub(super) fn franka(rig: Option<&Rig>) -> Vec<Finding> {
     // same problem again.
     let is_reachable = pinged.verdict != Verdict::Fail;
     findings.push(pinged);
-    findings.extend(is_reachable.then(|| port(&arm.address)));
+    findings.extend(is_reachable.then(|| port(&arm.address, &address)));
     findings
 }
 
@@ -70,40 +79,17 @@ fn output_of(program: &str, arguments: &[&str]) -> Option<String> {
 
 /// Checks that the controller accepts clients. It opens a connection and closes it without sending
 /// anything, so the robot is not occupied.
-fn port(address: &str) -> Finding {
-    let has_no_port = host_of(address) == address;
-    let found = if has_no_port {
-        (address, FCI_PORT).to_socket_addrs()
-    } else {
-        address.to_socket_addrs()
-    };
-    let connected = found.and_then(|mut all| {
-        let address = all.next().ok_or(ErrorKind::AddrNotAvailable)?;
-        TcpStream::connect_timeout(&address, CONNECT_TIMEOUT)
+fn port(text: &str, address: &NetworkAddress) -> Finding {
+    let connected = address.resolve(FCI_PORT).and_then(|all| {
+        TcpStream::connect_timeout(&all[0], CONNECT_TIMEOUT).map_err(|error| error.to_string())
     });
     match connected {
-        Ok(_) => Finding::ok("FCI", format!("{address} accepts clients")),
+        Ok(_) => Finding::ok("FCI", format!("{text} accepts clients")),
         Err(error) => {
             let remedy =
                 "activate FCI in Desk and unlock the joints; the robot must have the FCI feature";
-            Finding::fail(
-                "FCI",
-                format!("{address} accepts no client: {error}"),
-                remedy,
-            )
+            Finding::fail("FCI", format!("{text} accepts no client: {error}"), remedy)
         }
-    }
-}
-
-/// The host part of an address. IPv6 addresses with a port are in brackets.
-fn host_of(address: &str) -> &str {
-    match address
-        .strip_prefix('[')
-        .and_then(|rest| rest.split_once(']'))
-    {
-        Some((host, _)) => host,
-        None if address.matches(':').count() == 1 => address.split(':').next().unwrap_or(address),
-        None => address,
     }
 }
 
@@ -214,25 +200,13 @@ mod tests {
     use super::*;
 
     #[test]
-    fn host_and_port_are_separated() {
-        for (address, host) in [
-            ("172.16.0.2", "172.16.0.2"),
-            ("172.16.0.2:1338", "172.16.0.2"),
-            ("robot.local", "robot.local"),
-            ("fe80::1", "fe80::1"),
-            ("[fe80::1]:1337", "fe80::1"),
-        ] {
-            assert_eq!(host_of(address), host);
-        }
-    }
-
-    #[test]
     fn controller_connection_is_checked() {
         let listener = std::net::TcpListener::bind("127.0.0.1:0").expect("a free port");
         let address = listener.local_addr().expect("bound").to_string();
-        assert_eq!(port(&address).verdict, Verdict::Ok);
+        let parsed = NetworkAddress::parse(&address).expect("complete");
+        assert_eq!(port(&address, &parsed).verdict, Verdict::Ok);
         drop(listener);
-        let finding = port(&address);
+        let finding = port(&address, &parsed);
         assert!(
             finding.message.contains(&address)
                 && finding.remedy.is_some_and(|remedy| remedy.contains("Desk"))

@@ -9,6 +9,7 @@ mod datagrams;
 mod flange;
 mod franka;
 mod governor;
+mod guesses;
 mod listen;
 mod meaning;
 mod memory;
@@ -24,6 +25,7 @@ mod ur;
 mod usb;
 mod video_devices;
 
+pub use guesses::guesses;
 pub use listen::{DeviceStatistics, Latency, ListenResult, listen};
 pub use meaning::meaning;
 

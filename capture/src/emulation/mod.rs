@@ -85,6 +85,8 @@ pub struct Emulation {
     pub descriptions: Vec<String>,
     /// Time at which the playback begins.
     pub starts_at: Stamp,
+    /// Description of the damage of the recording, if the playback ends early because of it.
+    pub damage: Option<String>,
     _devices: EmulatedDevices,
 }
 
@@ -128,7 +130,8 @@ impl EmulationPlan {
             },
         };
         let mut camera_files = CameraFiles::new(&rig, &folder)?;
-        let Some(script) = self.read(&recording, &mut camera_files, stop, on_progress)? else {
+        let Some((script, damage)) = self.read(&recording, &mut camera_files, stop, on_progress)?
+        else {
             return Ok(None);
         };
         let mut descriptions = camera_files.finish(&mut rig)?;
@@ -163,6 +166,7 @@ impl EmulationPlan {
             rig_file,
             descriptions,
             starts_at: playback_clock.emulated,
+            damage,
             _devices: devices,
         }))
     }
@@ -227,15 +231,15 @@ impl EmulationPlan {
         Ok(true)
     }
 
-    /// Reads the samples of the first `seconds` of a recording. Images are written to the camera
-    /// files. `None` if interrupted.
+    /// Reads the samples of the first `seconds` of a recording, and describes its damage. Images are
+    /// written to the camera files. `None` if interrupted.
     fn read(
         &self,
         recording: &Path,
         camera_files: &mut CameraFiles,
         stop: &Stop,
         on_progress: &mut dyn FnMut(Stage, f64),
-    ) -> anyhow::Result<Option<DeviceScript>> {
+    ) -> anyhow::Result<Option<(DeviceScript, Option<String>)>> {
         let Opened {
             mut source, damage, ..
         } = open::recording(recording, None, &[])?;
@@ -252,10 +256,11 @@ impl EmulationPlan {
             return Ok(None);
         }
         // A damaged recording still has data to play back.
-        if let Some(damage) = damage.get() {
+        let damage = damage.get().cloned();
+        if let Some(damage) = &damage {
             log::warn!("{damage}; the data before that is played back");
         }
-        Ok(Some(script))
+        Ok(Some((script, damage)))
     }
 }
 

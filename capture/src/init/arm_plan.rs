@@ -19,8 +19,12 @@ pub(super) struct ArmPlan {
     pub title: String,
     /// Value of `arm.urdf`.
     pub urdf: String,
+    /// Whether nobody has said which robot it is, and no device has identified it.
+    pub is_robot_guessed: bool,
     /// Whether the keys of the links are written. The links of a known robot are defaults.
     pub names_links: bool,
+    /// Whether nobody has said which link is the flange of a robot that is not known.
+    pub is_flange_guessed: bool,
     /// Its links and joints.
     pub links: ArmLinks,
     /// Source of its joint states.
@@ -91,6 +95,8 @@ pub(super) fn choose(
     }
     let source = source(&robot, &links, findings, assumptions)?;
     Ok(Some(ArmPlan {
+        is_robot_guessed: wishes.robot == RobotChoice::Automatic && !is_robot_identified(findings),
+        is_flange_guessed: robot.known.is_none() && wishes.tip.is_none(),
         names_links: robot.known.is_none() || wishes.tip.is_some() || wishes.base_link.is_some(),
         title: robot.title,
         urdf: robot.urdf,
@@ -159,6 +165,12 @@ pub fn likely_robot(findings: &Findings) -> Option<&'static KnownRobot> {
     KnownRobot::find(name)
 }
 
+/// Whether the controller has identified its robot.
+fn is_robot_identified(findings: &Findings) -> bool {
+    let first = findings.controllers.first();
+    first.is_some_and(|controller| controller.robot.is_some())
+}
+
 /// The likely robot, with a sentence about the assumption.
 fn automatic_robot(
     findings: &Findings,
@@ -173,8 +185,7 @@ fn automatic_robot(
     };
     let title = robot.title;
     let reason = match (findings.controllers.first(), findings.servos.first()) {
-        // The controller has identified its robot.
-        (Some(controller), _) if controller.robot.is_some() => return Ok(robot),
+        _ if is_robot_identified(findings) => return Ok(robot),
         (Some(_), _) => format!("the robot is a {title}"),
         (None, Some(_)) => format!("the servos belong to an {title}"),
         (None, None) => format!("no arm was found, so the rig has a {title} as an example"),
@@ -198,9 +209,9 @@ fn source(
     for controller in &findings.controllers {
         let kind = controller.kind;
         if robot.may_have(kind) && kind.n_joints() == n_joints {
-            if !controller.answers {
+            if !controller.answers() {
                 assumptions.push(format!(
-                    "the {kind} controller at {} is switched off now",
+                    "a {kind} controller will answer at {}, as it does not now",
                     controller.address
                 ));
             }

@@ -135,10 +135,19 @@ pub struct FoundController {
     pub kind: ControllerKind,
     /// Its address, as in rig files.
     pub address: String,
-    /// Whether it answers. A controller whose address the user has given may be switched off.
-    pub answers: bool,
+    /// Why nothing answers there as this controller does. A controller whose address the user has
+    /// given may be switched off.
+    pub problem: Option<String>,
     /// The known robot whose kinematics agree with the pose that the controller reports.
     pub robot: Option<&'static KnownRobot>,
+}
+
+impl FoundController {
+    /// Whether it answers as a controller of its maker does.
+    #[must_use]
+    pub fn answers(&self) -> bool {
+        self.problem.is_none()
+    }
 }
 
 impl fmt::Display for FoundCamera {
@@ -182,8 +191,8 @@ impl fmt::Display for FoundServos {
 impl fmt::Display for FoundController {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let Self { kind, address, .. } = self;
-        if !self.answers {
-            return write!(f, "{kind} controller at {address}: it does not answer");
+        if let Some(problem) = &self.problem {
+            return write!(f, "{kind} controller at {address}: {problem}");
         }
         match self.robot {
             Some(robot) => write!(f, "{kind} controller at {address}: {}", robot.title),

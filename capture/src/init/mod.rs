@@ -15,6 +15,9 @@ mod search;
 mod tests;
 mod wishes;
 
+/// Beginning of the comment above a key whose value is a guess.
+pub(crate) const GUESS: &str = "Guess: ";
+
 pub use arm_plan::likely_robot;
 pub use findings::{
     ControllerKind, Findings, FoundBus, FoundCamera, FoundController, FoundMotor, FoundServos,

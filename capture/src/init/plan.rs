@@ -34,6 +34,8 @@ pub(super) struct CameraPlan {
     pub size_px: [u32; 2],
     pub rate_hz: f64,
     pub parent: Parent,
+    /// Whether nobody has said where the camera is.
+    pub is_parent_guessed: bool,
     /// Guess of its pose.
     pub parent_from_camera: Transform,
     /// Guess of its focal length; `None` if the camera reports its intrinsics.
@@ -204,6 +206,7 @@ fn camera(
         size_px,
         rate_hz,
         parent: wanted.parent,
+        is_parent_guessed: wishes.cameras.is_empty(),
         parent_from_camera: camera_guess::parent_from_camera(wanted.parent, links),
         focal_px: (!reports_intrinsics)
             .then(|| camera_guess::focal_px(size_px[0], wishes.field_of_view_deg)),

@@ -1,6 +1,7 @@
 //! Writes a plan as the text of a rig file: each key with a comment, and unknown keys as comments
 //! with the command that finds their values.
 
+use super::GUESS;
 use super::arm_plan::{ArmPlan, ArmSource};
 use super::findings::{ControllerKind, FoundBus, FoundMotor, FoundServos};
 use super::plan::{CameraPlan, RigPlan, place};
@@ -64,10 +65,13 @@ impl RigPlan {
             "exposure_micros = 8000",
             "Exposure time in microseconds. A fixed exposure makes motion blur predictable; without this key, it is automatic.",
         );
-        let about = format!(
-            "The camera is {}. Other values: flange, base, world.",
-            place(camera.parent)
-        );
+        let place = place(camera.parent);
+        let others = "Other values: flange, base, world.";
+        let about = if camera.is_parent_guessed {
+            format!("{GUESS}the camera is {place}. {others}")
+        } else {
+            format!("The camera is {place}. {others}")
+        };
         let parent = match camera.parent {
             Parent::Flange => "flange",
             Parent::Base => "base",
@@ -83,7 +87,7 @@ impl RigPlan {
             format!("`fieldrig calibrate scene {rig}` measures it if the base moves.")
         };
         let about = format!(
-            "Guess: pose of the camera (x right, y down, z forward) in that frame. {commands}"
+            "{GUESS}pose of the camera (x right, y down, z forward) in that frame. {commands}"
         );
         text.key(
             "parent_from_camera",
@@ -127,7 +131,7 @@ impl RigPlan {
             number(y)
         );
         let about = format!(
-            "Guess: a lens without distortion and with a horizontal field of view of {} degrees. `fieldrig calibrate intrinsics {rig} {} SPEC` measures it.",
+            "{GUESS}a lens without distortion and with a horizontal field of view of {} degrees. `fieldrig calibrate intrinsics {rig} {} SPEC` measures it.",
             self.field_of_view_deg,
             Setting::Target
         );
@@ -161,7 +165,15 @@ fn write_arm(text: &mut RigText, arm: &ArmPlan, rig: &str) {
     write_arm_source(text, arm);
     let about =
         "Robot description: a URDF file relative to this file, or builtin:NAME of a known robot.";
-    text.key("urdf", quoted(&arm.urdf), about);
+    let about = if arm.is_robot_guessed {
+        format!(
+            "{GUESS}the robot is a {}. Other values: a URDF file relative to this file, or builtin:NAME of a known robot.",
+            arm.title
+        )
+    } else {
+        about.to_owned()
+    };
+    text.key("urdf", quoted(&arm.urdf), &about);
     if arm.names_links {
         let links = &arm.links;
         text.key(
@@ -169,11 +181,14 @@ fn write_arm(text: &mut RigText, arm: &ArmPlan, rig: &str) {
             quoted(&links.base),
             "Link that is the base of the robot.",
         );
-        text.key(
-            "flange_link",
-            quoted(&links.flange),
-            "Link to which cameras on the arm are attached.",
-        );
+        let about = if arm.is_flange_guessed {
+            format!(
+                "{GUESS}link to which cameras on the arm are attached. Other values: links of the URDF."
+            )
+        } else {
+            "Link to which cameras on the arm are attached.".to_owned()
+        };
+        text.key("flange_link", quoted(&links.flange), &about);
     }
     match &arm.source {
         ArmSource::Motors { buses, motors } => write_motors(text, arm, buses, motors),
@@ -242,9 +257,9 @@ fn write_servos(text: &mut RigText, arm: &ArmPlan, servos: &FoundServos) {
     for (ix, (joint, id)) in arm.links.joints.iter().zip(&servos.ids).enumerate() {
         text.table(&format!("arm.servo.{}", bare_or_quoted(joint)));
         if ix == 0 {
-            text.comment(
-                "Each joint has a servo, in the order of the IDs. `fieldrig doctor` pings them.",
-            );
+            text.comment(&format!(
+                "{GUESS}each joint has a servo, in the order of the IDs, with its zero in the middle of its range. `fieldrig doctor` pings them; move each joint by hand to check them."
+            ));
         }
         text.line(&format!("id = {id}"));
         if ix == 0 {
@@ -281,11 +296,13 @@ fn write_motors(
     }
     for (ix, (joint, (bus_ix, motor))) in arm.links.joints.iter().zip(motors).enumerate() {
         text.table(&format!("arm.motor.{}", bare_or_quoted(joint)));
-        if ix == 0 {
-            text.comment("Each joint has a motor, in the order of buses and IDs. Move the arm by hand to check them.");
-        }
         text.line(&format!("family = {}", quoted(motor.family)));
         text.line(&format!("bus = {}", quoted(&buses[*bus_ix].interface)));
+        if ix == 0 {
+            text.comment(&format!(
+                "{GUESS}each joint has a motor, in the order of buses and IDs, without a gear and an offset. Move each joint by hand to check them."
+            ));
+        }
         text.line(&format!("id = {}", motor.id));
         write_family_keys(text, motor);
         if ix == 0 {
@@ -316,7 +333,7 @@ fn write_family_keys(text: &mut RigText, motor: &FoundMotor) {
         match (reported, key.required) {
             (Some((name, value)), _) => text.line(&format!("{name} = {}", setting(value))),
             (None, Some(meaning)) => {
-                text.key(key.name, guess(&key), &format!("Guess: {meaning}."));
+                text.key(key.name, guess(&key), &format!("{GUESS}{meaning}."));
             }
             (None, None) => {}
         }

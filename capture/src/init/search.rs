@@ -45,7 +45,7 @@ pub fn controller_at(kind: ControllerKind, address: &str) -> FoundController {
     FoundController {
         kind,
         address: address.to_owned(),
-        answers: false,
+        problem: Some("this build cannot ask it".to_owned()),
         robot: None,
     }
 }

@@ -3,7 +3,7 @@
 use super::*;
 use crate::config::schema_tests::problems_of;
 use crate::config::{ArmDriver, BaseDriver, CameraDriver, Parent};
-use crate::doctor::suspicious_values;
+use crate::doctor::{Finding, guesses, suspicious_values};
 use crate::known_robots::{KNOWN_ROBOTS, KnownRobot};
 use crate::{Override, Rig};
 use drivers::can::SettingValue;
@@ -85,7 +85,7 @@ fn controller(kind: ControllerKind, robot: Option<&str>) -> FoundController {
     FoundController {
         kind,
         address: "10.0.0.7".to_owned(),
-        answers: true,
+        problem: None,
         robot: robot.map(|name| KnownRobot::find(name).expect(name)),
     }
 }
@@ -134,6 +134,56 @@ fn rig(wishes: &Wishes, findings: &Findings) -> (Rig, RigPlan) {
         assert!(line.chars().count() <= 200, "{line}");
     }
     (rig, plan)
+}
+
+/// The keys that `doctor` calls guesses.
+fn guessed_keys(plan: &RigPlan) -> Vec<String> {
+    let findings = guesses(&plan.to_toml("rig.toml"));
+    let key = |finding: &Finding| finding.message.split(' ').next().map(str::to_owned);
+    findings.iter().filter_map(key).collect()
+}
+
+#[test]
+fn doctor_names_every_guess_and_nothing_that_is_known() {
+    let (_, plan) = rig(&wishes(RobotChoice::Automatic), &Findings::default());
+    assert_eq!(
+        guessed_keys(&plan),
+        [
+            "arm.urdf",
+            "camera.wrist.parent",
+            "camera.wrist.parent_from_camera",
+            "camera.wrist.intrinsics"
+        ]
+    );
+    let known = Wishes {
+        cameras: vec![wanted(Parent::Flange)],
+        ..wishes(known("ur5e"))
+    };
+    let findings = Findings {
+        cameras: vec![realsense()],
+        ..Findings::default()
+    };
+    let (_, plan) = rig(&known, &findings);
+    assert_eq!(guessed_keys(&plan), ["camera.wrist.parent_from_camera"]);
+    // The order of the servos and the flange of a file are guesses, too.
+    let own = Wishes {
+        cameras: vec![wanted(Parent::Flange)],
+        ..wishes(own_robot(&["a", "b"]))
+    };
+    let findings = Findings {
+        cameras: vec![realsense()],
+        servos: vec![servos("feetech", 2)],
+        ..Findings::default()
+    };
+    let (_, plan) = rig(&own, &findings);
+    assert_eq!(
+        guessed_keys(&plan),
+        [
+            "arm.flange_link",
+            "arm.servo.a.id",
+            "camera.wrist.parent_from_camera"
+        ]
+    );
 }
 
 /// Keys that are comments become keys of a valid rig file if their number sign is removed.

@@ -4,3 +4,4 @@
 pub(crate) mod counts;
 pub(crate) mod receiver;
 pub(crate) mod senders;
+pub(crate) mod silence;

@@ -1,5 +1,6 @@
 //! A UDP socket read by a separate thread that stamps datagrams on arrival.
 
+use super::silence::{self, Silence};
 use crate::{Error, clock};
 use kinematics::Stamp;
 use parking_lot::{Condvar, Mutex};
@@ -57,6 +58,7 @@ struct State {
     error: Option<std::io::Error>,
     /// Whether a datagram was requested yet.
     has_reader: bool,
+    silence: Silence,
     stop: bool,
 }
 
@@ -119,6 +121,7 @@ impl Receiver {
         }
         loop {
             if let Some((at, from, bytes)) = state.queue.pop_front() {
+                state.silence.end();
                 state.n_bytes -= bytes.len() + OVERHEAD_BYTES;
                 return Ok(Some(ReceivedDatagram {
                     at,
@@ -136,6 +139,9 @@ impl Receiver {
             }
             let remaining = until.saturating_duration_since(Instant::now());
             if remaining.is_zero() {
+                if state.silence.is_news(Instant::now()) {
+                    log::warn!("{}", silence::advice(&self.device, self.address));
+                }
                 return Ok(None);
             }
             self.shared.arrived.wait_for(&mut state, remaining);

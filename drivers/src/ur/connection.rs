@@ -83,23 +83,17 @@ pub(super) enum Reading {
     Rejected,
 }
 
+/// Asks a controller for its version, and disconnects. The joints need no power.
+pub(super) fn version_at(address: &str) -> Result<ControllerVersion, String> {
+    PackageStream::open(address).map(|(_, version)| version)
+}
+
 impl Connection {
     /// Connects, agrees on the protocol, requests the variables, and starts the states.
     ///
     /// * `is_moved`: whether setpoints will be sent
     pub(super) fn open(address: &str, is_moved: bool) -> Result<Self, String> {
-        let address = ControllerAddress::parse(address)?;
-        let stream = address.connect(Interface::Rtde)?;
-        // A controller that does not read must not stop the thread that reads the states.
-        stream
-            .set_write_timeout(Some(POLL))
-            .map_err(|error| format!("cannot limit the time for sending: {error}"))?;
-        let mut packages = PackageStream {
-            stream,
-            splitter: PackageSplitter::default(),
-        };
-        packages.agree_on_protocol()?;
-        let version = packages.controller_version()?;
+        let (mut packages, version) = PackageStream::open(address)?;
         let (outputs, output_id) = packages.request_outputs(Outputs::all(is_moved), version)?;
         let setpoint_id = if is_moved {
             Some(packages.request_setpoint()?)
@@ -186,6 +180,23 @@ struct PackageStream {
 }
 
 impl PackageStream {
+    /// Connects, agrees on the protocol, and asks for the version of the controller.
+    fn open(address: &str) -> Result<(Self, ControllerVersion), String> {
+        let address = ControllerAddress::parse(address)?;
+        let stream = address.connect(Interface::Rtde)?;
+        // A controller that does not read must not stop the thread that reads the states.
+        stream
+            .set_write_timeout(Some(POLL))
+            .map_err(|error| format!("cannot limit the time for sending: {error}"))?;
+        let mut packages = Self {
+            stream,
+            splitter: PackageSplitter::default(),
+        };
+        packages.agree_on_protocol()?;
+        let version = packages.controller_version()?;
+        Ok((packages, version))
+    }
+
     fn agree_on_protocol(&mut self) -> Result<(), String> {
         let answer = self.ask(
             PackageType::RequestProtocolVersion,

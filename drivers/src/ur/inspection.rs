@@ -3,7 +3,7 @@
 use super::address::ControllerAddress;
 use super::arm::{fault, first_state};
 use super::config::ArmConfig;
-use super::connection::{Connection, ControllerVersion};
+use super::connection::{Connection, ControllerVersion, version_at};
 use super::flange_check::check_flange;
 use super::{dashboard, words};
 use crate::{Error, FlangeDifference};
@@ -57,4 +57,14 @@ pub fn inspect(config: &ArmConfig) -> Result<Inspection, Error> {
             Err(reason) => FlangePose::Different(reason),
         },
     })
+}
+
+/// Connects, agrees on the protocol, asks for the version, and disconnects. Only a controller of
+/// Universal Robots answers, whether or not its joints have power. Takes seconds if something else
+/// listens at the address.
+///
+/// # Errors
+/// If nothing answers as such a controller does.
+pub fn controller_version(address: &str) -> Result<ControllerVersion, Error> {
+    version_at(address).map_err(|reason| fault(address, reason))
 }

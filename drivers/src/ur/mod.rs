@@ -45,7 +45,7 @@ pub use address::RTDE_PORT;
 pub use arm::UrArm;
 pub use config::ArmConfig;
 pub use connection::ControllerVersion;
-pub use inspection::{FlangePose, Inspection, inspect};
+pub use inspection::{FlangePose, Inspection, controller_version, inspect};
 pub use movable::MovableUrArm;
 pub use statistics::{MotionStatistics, StateStatistics};
 

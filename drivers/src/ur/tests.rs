@@ -4,7 +4,7 @@ use super::emulated::{ControllerConfig, EmulatedController, Joints, Modes};
 use super::flange_check::check_flange;
 use super::message::{self, PackageType};
 use super::state::RobotState;
-use super::{ArmConfig, N_JOINTS, RTDE_PORT, StateStatistics, UrArm};
+use super::{ArmConfig, N_JOINTS, RTDE_PORT, StateStatistics, UrArm, controller_version};
 use crate::{Arm, Error};
 use kinematics::{Chain, JointState, Stamp, Transform};
 use numbers::random::Random;
@@ -466,4 +466,24 @@ fn nominal_dimensions_and_unknown_tools_only_cause_a_warning() {
         "{unknown_tool}"
     );
     assert!(checked(state(&longer(0.1), identity, true)).is_err());
+}
+
+#[test]
+fn only_a_controller_tells_its_version() {
+    let emulated = e_series();
+    let version = controller_version(&emulated.address().to_string()).unwrap();
+    assert_eq!(version.rate_hz(), 500.0);
+
+    // A server of another kind greets its clients.
+    let other = TcpListener::bind("127.0.0.1:0").unwrap();
+    let address = other.local_addr().unwrap().to_string();
+    let greeting = std::thread::spawn(move || {
+        let (mut client, _) = other.accept().unwrap();
+        client.write_all(b"SSH-2.0-OpenSSH_9.2\r\n").unwrap();
+        // It closes the connection after the first request, which it does not understand.
+        client.read_exact(&mut [0]).unwrap();
+    });
+    let error = controller_version(&address).unwrap_err().to_string();
+    assert!(error.contains(&address), "{error}");
+    greeting.join().unwrap();
 }

@@ -37,7 +37,7 @@ def check_relay():
     clock = Clock()
     counter = Counter()
     relay = ros2_joints.Relay(counter, 100, False)
-    ros2_joints.time = clock
+    joint_sender.time = clock
     stamp = types.SimpleNamespace(sec=0, nanosec=0)
     for _ in range(round(SECS / PERIOD_SECS)):
         for names in (["joint1", "joint2"], ["finger"]):

@@ -27,6 +27,9 @@ const POLL_PERIOD: Duration = Duration::from_millis(50);
 const STATE: &str = "preview";
 /// What a preview does not do, in words of the page.
 const NOTHING_IS_TRAINED: &str = "Preview: nothing is trained, and nothing is written.";
+/// Note on a rig without cameras.
+const NO_CAMERAS: &str = "The rig file has no camera, so there are no images: connect a camera, find its name with \
+    `fieldrig devices`, add a table [camera.NAME] to the rig file, and start the preview again.";
 /// Answer to clients that request pictures or edits of a model.
 const NO_MODEL: &str = "this is a preview: it has no model";
 
@@ -79,6 +82,9 @@ impl Preview {
     /// If a thread cannot be started, or the simulation cannot be opened.
     pub fn serve(self, stop: &Stop) -> anyhow::Result<()> {
         let mut shown = Shown::new(&self)?;
+        for note in &shown.notes {
+            log::warn!("{note}");
+        }
         shown.publish_status();
         let devices = SeparateDevices::start(self.groups)?;
         while !stop.requested() {
@@ -129,6 +135,9 @@ impl Shown {
                 "The base is shown at base.world_from_base, because a preview does not search tags."
                     .to_owned(),
             );
+        }
+        if rig.cameras.is_empty() {
+            notes.push(NO_CAMERAS.to_owned());
         }
         let rig_name = rig_file.file_stem();
         let identity = Identity {
@@ -248,6 +257,12 @@ impl Shown {
         }
     }
 
+    /// The notes after which nobody has to act.
+    fn infos(&self) -> Vec<String> {
+        let notes = self.notes.iter();
+        notes.filter(|note| *note != NO_CAMERAS).cloned().collect()
+    }
+
     fn publish_status(&mut self) {
         self.published = Some(Instant::now());
         let devices = self.devices.statuses(Instant::now());
@@ -267,7 +282,7 @@ impl Shown {
                     text,
                     is_warning: problem.is_some(),
                 }),
-                infos: self.notes.clone(),
+                infos: self.infos(),
                 ..OperatorStatus::default()
             },
             ..Status::default()

@@ -16,7 +16,7 @@ pub(crate) use scene_pictures::ScenePictures;
 pub(crate) use wording::image_name;
 
 use crate::next_commands::NextCommand;
-use crate::{evaluation_schedule, run_folder, verdict};
+use crate::{evaluation_schedule, likely_cause, run_folder, verdict};
 use report::Table;
 use report::chart::drawing::escaped;
 use report::chart::{Axis, Chart, Line, Point, Scale};
@@ -155,11 +155,15 @@ impl Page<'_> {
     }
 }
 
-/// How good the model is, in one sentence.
+/// How good the model is, in one sentence, and the likely cause of a poor result.
 fn verdict_line(report: &Value) -> String {
-    verdict::of_report(report).map_or(String::new(), |verdict| {
+    let verdict = verdict::of_report(report).map_or(String::new(), |verdict| {
         format!("<p class=\"verdict\">{}.</p>\n", escaped(&verdict.text))
-    })
+    });
+    let cause = likely_cause::of_report(report).map_or(String::new(), |cause| {
+        format!("<p>Likely cause: {}.</p>\n", escaped(&cause))
+    });
+    verdict + &cause
 }
 
 /// The main scores and sizes.

@@ -30,6 +30,7 @@ use crate::run_folder;
 use crate::session::Limits;
 use crate::session_setup::Services;
 use crate::training_options::{AvailableData, REALIGN, RefineSettings, TrainingOptions};
+use capture::check_output_file;
 use capture::config::{ArmDriver, Need, Override, Rig};
 use capture::open::{self, Devices, Opened};
 use gpu::Gpu;
@@ -123,6 +124,9 @@ impl RunPlan {
         services: Services<'_>,
     ) -> anyhow::Result<PreparedRun<'_>> {
         run_folder::check_out(self.out.as_deref(), self.resume.as_deref(), None)?;
+        if let Some(file) = &self.record {
+            self.check_record(file)?;
+        }
         let plan = match &previous {
             Some(previous) => {
                 previous.run.check_not_passed(self.limits)?;
@@ -158,6 +162,17 @@ impl RunPlan {
             models,
         };
         Ok(PreparedRun::new(rig, parts))
+    }
+
+    /// Checks that a recording can be written. It may be in the folder of the results, which the run
+    /// makes.
+    fn check_record(&self, file: &Path) -> Result<(), BadInput> {
+        let is_in_out = self.out.as_deref().is_some_and(|out| file.starts_with(out));
+        if is_in_out {
+            Ok(())
+        } else {
+            check_output_file(Setting::Record, file)
+        }
     }
 
     /// Checks that the rig file has what keyframes need. Simulated devices assume what is missing.

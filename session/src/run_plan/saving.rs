@@ -5,7 +5,7 @@ use super::no_model::no_model_reason;
 use crate::error::is_rejection;
 use crate::latency::Latency;
 use crate::live_loop::{EndedLoop, LiveLoop};
-use crate::models_verdict::verdict_of;
+use crate::models_verdict::{likely_cause_of, verdict_of};
 use crate::next_commands::DataSource;
 use crate::run_folder::{self, CreatedFolders};
 use crate::session::{self, EndViewers, EndingSession, FinishedModel, Session};
@@ -89,7 +89,12 @@ impl SavedRun {
         verdict_of(&self.models, self.loss)
     }
 
-    /// Errors that ended the run, and descriptions of lost data.
+    /// The likely cause of a poor result, and its remedy.
+    pub fn likely_cause(&self) -> Option<String> {
+        likely_cause_of(&self.models)
+    }
+
+    /// Errors that ended the run, descriptions of lost data, and the likely cause of a poor result.
     fn problems(&self) -> Vec<String> {
         let failure = self.failure.as_ref().map(|error| format!("{error:#}"));
         let input_error = self.input_error.as_ref().map(ToString::to_string);
@@ -99,6 +104,8 @@ impl SavedRun {
             .chain(self.no_model_reason.clone())
             .collect();
         problems.extend(self.data_losses.iter().cloned());
+        let cause = self.likely_cause();
+        problems.extend(cause.map(|cause| format!("Likely cause of the result: {cause}")));
         problems
     }
 

@@ -1,7 +1,7 @@
 //! Lists the runs in a folder.
 
 use super::own_files::{is_run, model_folders};
-use crate::run_folder::{CHECKPOINT, LOCK, REPORT, holds_model};
+use crate::run_folder::{self, CHECKPOINT, LOCK, holds_model};
 use serde::Serialize;
 use serde_json::Value;
 use std::path::{Path, PathBuf};
@@ -145,8 +145,7 @@ impl KeptModel {
 
 /// The report in a folder.
 fn report(folder: &Path) -> Option<Value> {
-    let text = files::read_text(&folder.join(REPORT)).ok()?;
-    serde_json::from_str(&text).ok()
+    Some(run_folder::report(folder)).filter(|report| !report.is_null())
 }
 
 /// Name of the rig, or file name of the data, in a report.

@@ -9,7 +9,7 @@ use crate::checkpoints::CheckpointOptions;
 use crate::data::DataOptions;
 use crate::depth_from::{self, DepthSource};
 use crate::error::is_rejection;
-use crate::models_verdict::verdict_of;
+use crate::models_verdict::{likely_cause_of, verdict_of};
 use crate::previous_run::{FinishedRun, PreviousRun, limit_flags, out_folder};
 use crate::read_progress::OnReadProgress;
 use crate::run_folder::{self, CreatedFolders};
@@ -92,6 +92,11 @@ impl Trained {
     /// How good the models are, in one sentence.
     pub fn verdict(&self) -> Verdict {
         verdict_of(&self.models, ImageLoss::default())
+    }
+
+    /// The likely cause of a poor result, and its remedy.
+    pub fn likely_cause(&self) -> Option<String> {
+        likely_cause_of(&self.models)
     }
 
     /// Writes the rig with the estimated calibration, if the plan names a file for it.

@@ -19,8 +19,8 @@ const TARGET_HELP: &str = "The target, such as chessboard:9x6:25mm, charuco:5x7:
 const DETAILS: &str = "With a rig file, the photographs are taken for you. Move the target in front of the camera, or \
     let the arm move the camera. A photograph is taken when the target is still and sharp and shows something new. The \
     terminal and the page show what is missing next, such as another tilt or a corner of the image. It ends when \
-    everything is covered, or with Ctrl-C, and then estimates the lens. Only this camera is opened, and also the arm if \
-    it carries the camera. With --seconds, all images of that time are used instead.\n\n\
+    everything is covered, or with Ctrl-C, and then estimates the lens. Only this camera is opened, also if an arm carries \
+    it. With --seconds, all devices are opened, and all images of that time are used that show no fast motion of the arm.\n\n\
     Examples:\n  \
     fieldrig calibrate target --target charuco:5x7:34mm:26mm:5X5_100 --out target.pdf\n  \
     fieldrig calibrate intrinsics rig.toml --target charuco:5x7:34mm:26mm:5X5_100 --write-rig rig.toml\n  \

@@ -8,6 +8,7 @@ use capture::init::{
     ControllerKind, Findings, RobotChoice, WantedCamera, Wishes, controller_at, likely_robot,
 };
 use capture::known_robots::KNOWN_ROBOTS;
+use drivers::NetworkAddress;
 use std::io::IsTerminal;
 use std::path::Path;
 
@@ -46,9 +47,13 @@ impl Questions {
         if let Some(kind) = missing_controller(wishes, findings) {
             let question =
                 format!("Address of the {kind} controller, or empty to simulate the arm");
-            let address = answer(&question, "", |text| Ok(text.to_owned()))?;
+            let address = answer(&question, "", complete_address)?;
             if !address.is_empty() {
-                findings.controllers.push(controller_at(kind, &address));
+                let controller = controller_at(kind, &address);
+                if let Some(problem) = &controller.problem {
+                    print::notice(format_args!("no {kind} controller answers now: {problem}"));
+                }
+                findings.controllers.push(controller);
             }
         }
         if wishes.cameras.is_empty() {
@@ -56,6 +61,14 @@ impl Questions {
         }
         Ok(())
     }
+}
+
+/// An answer that is an address of a controller, or empty.
+fn complete_address(text: &str) -> anyhow::Result<String> {
+    if !text.is_empty() {
+        NetworkAddress::parse(text).map_err(anyhow::Error::msg)?;
+    }
+    Ok(text.to_owned())
 }
 
 fn ask_robot(findings: &Findings, rig: &Path) -> anyhow::Result<RobotChoice> {

@@ -1,7 +1,7 @@
 //! Prints the progress of emulated devices, and waits until they are no longer needed.
 
 use super::Args;
-use crate::exit::Exit;
+use crate::exit::{self, Exit};
 use crate::{print, signals};
 use capture::Stop;
 use capture::emulation::{EmulationPlan, Stage};
@@ -75,7 +75,7 @@ pub(super) fn run(args: &Args) -> anyhow::Result<Exit> {
         ));
     }
     wait(&stop, emulation.starts_at, args)?;
-    Ok(Exit::Done)
+    Ok(exit::from_losses(emulation.damage.as_slice()))
 }
 
 /// Waits for Ctrl-C. The devices stand still after the playback.

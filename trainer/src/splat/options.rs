@@ -42,12 +42,37 @@ pub struct SplatOptions {
     /// the full resolution. `None` selects a default for the adapter. The default is higher on a
     /// CPU, where the duration of a step is proportional to the number of pixels.
     pub coarse_steps: Option<[u64; 2]>,
+    /// Maximum number of pixels of an image during the first and the second of the coarse stages. An
+    /// image that is still larger at a quarter or at half of the resolution is made even coarser.
+    /// `None` selects a default: a limit on a CPU, and none on a GPU.
+    #[serde(default = "without_limit")]
+    pub max_coarse_px: Option<[u32; 2]>,
+    /// Number of splats at random positions from which training starts if there is no depth. `None`
+    /// selects a default, which is lower on a CPU.
+    #[serde(default = "former_random_splats")]
+    pub random_splats: Option<u32>,
     /// Maximum number of splats added for one depth image. `None` selects a default, which is lower
     /// on a CPU.
     pub seeds_per_image: Option<f64>,
     /// When parts of the model are tested.
     #[serde(default)]
     pub trial_steps: TrialSteps,
+}
+
+/// Images of any size, in both coarse stages.
+pub(super) const ANY_SIZE_PX: [u32; 2] = [u32::MAX; 2];
+/// Number of splats at random positions on a GPU, about as many as the discs of the first keyframes
+/// with depth.
+pub(super) const RANDOM_SPLATS: u32 = 50_000;
+
+/// The limit of checkpoints that store none.
+fn without_limit() -> Option<[u32; 2]> {
+    Some(ANY_SIZE_PX)
+}
+
+/// The number of checkpoints that store none.
+fn former_random_splats() -> Option<u32> {
+    Some(RANDOM_SPLATS)
 }
 
 impl MethodOptions for SplatOptions {
@@ -75,6 +100,8 @@ impl Default for SplatOptions {
             // (docs/benchmarks/2026-11-25-few-images.md, section "Single changes").
             drop_frac: 0.2,
             coarse_steps: None,
+            max_coarse_px: None,
+            random_splats: None,
             seeds_per_image: None,
             trial_steps: TrialSteps::default(),
         }
@@ -136,6 +163,12 @@ mod tests {
             .retain(|name, _| REQUIRED.contains(&name.as_str()));
         let read: SplatOptions =
             serde_json::from_value(options).expect("newer options have defaults");
-        assert_eq!(read, SplatOptions::default());
+        // Training continues in the way in which it began.
+        let former = SplatOptions {
+            max_coarse_px: Some([u32::MAX; 2]),
+            random_splats: Some(50_000),
+            ..SplatOptions::default()
+        };
+        assert_eq!(read, former);
     }
 }

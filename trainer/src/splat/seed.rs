@@ -32,11 +32,9 @@ const THICKNESS: f64 = 0.15;
 /// A disc is known to lie on a surface, so it is mostly opaque. The opacity is below 1, because the
 /// gradient of the logit vanishes at 1.
 const SEED_OPACITY: f64 = 0.7;
-/// Number of initial splats if there is no depth.
-const N_RANDOM: usize = 50_000;
-/// Maximum number of them per image. The first image of a live scan does not tell how far the scene
-/// is away, so it gets only some of them.
-const N_RANDOM_PER_IMAGE: usize = 10_000;
+/// Maximum number of splats in a random cloud per image. The first image of a live scan does not
+/// tell how far the scene is away, so it gets only some of them.
+const RANDOM_PER_IMAGE: usize = 10_000;
 /// Most positions of a random cloud are wrong. Low opacity lets the gradients reach splats behind
 /// them.
 const RANDOM_OPACITY: f64 = 0.1;
@@ -526,14 +524,14 @@ fn color_of_point(points: &InitialPoints, ix: usize, keyframes: &[&Keyframe]) ->
         .unwrap_or(GRAY)
 }
 
-/// Maximum number of splats in random clouds after so many images. A scan has clouds only at its
-/// beginning, because later images show surfaces together with earlier ones.
-pub(crate) fn n_random_left(n_images: usize) -> usize {
-    N_RANDOM.saturating_sub(N_RANDOM_PER_IMAGE * n_images)
+/// Number of splats of a random cloud that remain after so many images. A scan has clouds only at
+/// its beginning, because later images show surfaces together with earlier ones.
+pub(crate) fn random_left(n_random: usize, n_images: usize) -> usize {
+    n_random.saturating_sub(RANDOM_PER_IMAGE * n_images)
 }
 
-/// Creates a random cloud along the rays of keyframes, densest around a point that they are
-/// expected to show.
+/// Creates a random cloud of at most `n_max` splats along the rays of keyframes, densest around a
+/// point that they are expected to show.
 pub(crate) fn random_cloud(
     keyframes: &[&Keyframe],
     focus: Vector3<f64>,
@@ -546,9 +544,7 @@ pub(crate) fn random_cloud(
     }
     // The constant separates these random numbers from others that are drawn with the same seed.
     let mut random = Random::new(seed ^ 0x5eed_5eed);
-    let n = N_RANDOM
-        .min(N_RANDOM_PER_IMAGE * keyframes.len())
-        .min(n_max);
+    let n = n_max.min(RANDOM_PER_IMAGE * keyframes.len());
     for _ in 0..n {
         // A random pixel of a random image gives a color, and a ray that is certainly in view. The
         // minimum is needed because the product may round up to the number of images.

@@ -20,6 +20,9 @@ const NEAR_M: f64 = 0.01;
 /// Far clipping distance along z, meters. Larger depth readings are also not seeded.
 pub(crate) const FAR_M: f64 = 1e4;
 
+/// Number of resolutions of an image. At the coarsest, an image of 4096 x 3072 pixels has 128 x 96.
+const N_LEVELS: usize = 6;
+
 /// Transforms that differ by less than this value, in meters and radians, are the same up to
 /// rounding.
 const MAX_ROUNDING: f64 = 1e-9;
@@ -32,7 +35,7 @@ pub(crate) struct TrainView {
     pub(crate) median_depth_m: Option<f64>,
     /// Mean color of the pixels that are not masked, sRGB. `None` if all pixels are masked.
     mean_srgb: Option<[f64; 3]>,
-    levels: [Option<Level>; 3],
+    levels: [Option<Level>; N_LEVELS],
     /// `None` until camera parameters are optimized.
     lens: Option<Buffer>,
 }
@@ -110,8 +113,8 @@ impl Level {
 pub(crate) struct Keep<'a> {
     /// Views and levels that the next steps need. They are always kept.
     pub(crate) needed: &'a BTreeSet<(usize, usize)>,
-    /// Coarsest level that is still used for training.
-    pub(crate) coarsest: u32,
+    /// Coarsest level of each view that is still used for training.
+    pub(crate) coarsest: &'a [usize],
     /// Maximum total bytes of the kept images.
     pub(crate) max_bytes: u64,
 }
@@ -126,7 +129,7 @@ pub(crate) fn drop_levels(views: &mut [TrainView], keep: Keep<'_>) -> Vec<Level>
     let mut candidates = Vec::new();
     let mut bytes = 0;
     for (view_ix, view) in views.iter_mut().enumerate() {
-        let coarsest = view.clamped(keep.coarsest);
+        let coarsest = keep.coarsest[view_ix];
         for level_ix in 0..view.levels.len() {
             let is_needed = keep.needed.contains(&(view_ix, level_ix));
             // Training never returns to a coarser resolution. Finer images are kept, because
@@ -162,7 +165,7 @@ impl TrainView {
             median_depth_m: median_depth_m(&keyframe),
             mean_srgb: mean_srgb(&keyframe),
             keyframe,
-            levels: [const { None }; 3],
+            levels: [const { None }; N_LEVELS],
             lens: None,
         }
     }
@@ -183,7 +186,7 @@ impl TrainView {
         // so it depends on the extrinsics and intrinsics.
         if !has_same_depth {
             self.median_depth_m = median_depth_m(&self.keyframe);
-            self.levels = [const { None }; 3];
+            self.levels = [const { None }; N_LEVELS];
         }
         // Poses are part of the small view uniform, so large images need no second upload.
         for (level_ix, level) in self.levels.iter().enumerate() {
@@ -214,9 +217,10 @@ impl TrainView {
         ))
     }
 
-    /// Returns `level`, or a finer level if a side of the image would be smaller than a tile.
+    /// Returns `level`, or a finer level if there is no such level, or if a side of the image would
+    /// be smaller than a tile.
     pub(crate) fn clamped(&self, level: u32) -> usize {
-        clamped(level, self.keyframe.size_px)
+        clamped(level, self.keyframe.size_px).min(N_LEVELS - 1)
     }
 
     /// Size of the image at a level, pixels.
@@ -396,7 +400,7 @@ fn downscaled_image(keyframe: &Keyframe, size_px: [u32; 2], level: u32) -> Arc<[
     let mut downscaled = Vec::with_capacity(4 * (size_px[0] * size_px[1]) as usize);
     for y in 0..size_px[1] as usize {
         for x in 0..size_px[0] as usize {
-            // Integer sums fit: at level 2, 16 pixels of at most 255 are added.
+            // Integer sums fit: at level 5, 1024 pixels of at most 255 are added.
             let mut sums = [0u32; 3];
             // A mean that includes masked pixels would leak their color into the loss.
             let mut is_visible = true;

@@ -5,8 +5,9 @@ use crate::Rig;
 use crate::init::findings::{ControllerKind, Findings, FoundController};
 use crate::known_robots::{KNOWN_ROBOTS, KnownRobot};
 use crate::open::{FCI_PORT, ur_config};
-use drivers::ur::{FlangePose, RTDE_PORT, inspect};
-use std::net::{TcpStream, ToSocketAddrs};
+use drivers::ur::{FlangePose, RTDE_PORT, controller_version, inspect};
+use drivers::{Error, NetworkAddress};
+use std::net::TcpStream;
 use std::time::Duration;
 
 /// Address of a Franka controller in Franka's documentation of FCI ("Getting started").
@@ -33,8 +34,12 @@ pub(super) fn find(plan: &SearchPlan, findings: &mut Findings) {
     for (kind, given, usual) in searched {
         match given {
             Some(address) => findings.controllers.push(controller_at(kind, address)),
-            None if is_usual && is_only_port(port(kind), |port| answers(usual, port, QUICK)) => {
-                findings.controllers.push(controller_at(kind, usual));
+            None if is_usual && is_only_port(port(kind), |port| connects(usual, port)) => {
+                let found = controller_at(kind, usual);
+                // Nobody has said that there is a controller, so another service is none.
+                findings
+                    .controllers
+                    .extend(Some(found).filter(FoundController::answers));
             }
             None => {}
         }
@@ -47,15 +52,30 @@ fn is_only_port(port: u16, answers: impl Fn(u16) -> bool) -> bool {
     answers(port) && !answers(UNUSED_PORT)
 }
 
+/// Whether a port of the usual address of a controller accepts connections at once.
+fn connects(host: &str, port: u16) -> bool {
+    connect(host, port, QUICK).is_ok()
+}
+
 /// The controller at an address, whether or not it answers.
 pub(super) fn controller_at(kind: ControllerKind, address: &str) -> FoundController {
-    let answers = answers(address, port(kind), PATIENT);
-    let is_ur = kind == ControllerKind::Ur;
+    let asked = match kind {
+        // Only a controller agrees on the protocol.
+        ControllerKind::Ur => match controller_version(address) {
+            Ok(_) => Ok(()),
+            // The address is shown before the reason.
+            Err(Error::Rtde { reason, .. }) => Err(reason),
+            Err(other) => Err(other.to_string()),
+        },
+        ControllerKind::Franka => connect(address, FCI_PORT, PATIENT),
+    };
     FoundController {
         kind,
         address: address.to_owned(),
-        answers,
-        robot: (answers && is_ur).then(|| ur_robot(address)).flatten(),
+        robot: (kind == ControllerKind::Ur && asked.is_ok())
+            .then(|| ur_robot(address))
+            .flatten(),
+        problem: asked.err(),
     }
 }
 
@@ -67,19 +87,18 @@ fn port(kind: ControllerKind) -> u16 {
     }
 }
 
-/// Whether a port accepts connections. Nothing is sent, so the only client connection of a Franka
+/// Opens a connection and closes it. Nothing is sent, so the only client connection of a Franka
 /// controller stays free.
-fn answers(address: &str, port: u16, patience: Duration) -> bool {
-    let has_port =
-        address.starts_with('[') && address.contains("]:") || address.matches(':').count() == 1;
-    let resolved = if has_port {
-        address.to_socket_addrs()
-    } else {
-        (address.trim_matches(['[', ']']), port).to_socket_addrs()
-    };
-    resolved.is_ok_and(|mut addresses| {
-        addresses.any(|address| TcpStream::connect_timeout(&address, patience).is_ok())
-    })
+fn connect(address: &str, default_port: u16, patience: Duration) -> Result<(), String> {
+    let resolved = NetworkAddress::parse(address)?.resolve(default_port)?;
+    let mut failure = String::new();
+    for address in resolved {
+        match TcpStream::connect_timeout(&address, patience) {
+            Ok(_) => return Ok(()),
+            Err(error) => failure = format!("cannot connect to {address}: {error}"),
+        }
+    }
+    Err(failure)
 }
 
 /// The known robot whose flange is where the controller reports it. `None` if none fits, or if the
@@ -123,12 +142,15 @@ mod tests {
     use super::*;
     use std::net::TcpListener;
 
+    /// An address at which nothing listens: a port that was free a moment ago.
+    fn silent_address() -> String {
+        let free = TcpListener::bind("127.0.0.1:0").expect("a free port");
+        free.local_addr().expect("bound").to_string()
+    }
+
     #[test]
     fn given_address_is_kept_although_nothing_answers() {
-        // A port that was free a moment ago.
-        let free = TcpListener::bind("127.0.0.1:0").expect("a free port");
-        let address = free.local_addr().expect("bound").to_string();
-        drop(free);
+        let address = silent_address();
         let plan = SearchPlan {
             franka: Some(address.clone()),
             ..SearchPlan::default()
@@ -140,7 +162,9 @@ mod tests {
             .iter()
             .find(|controller| controller.kind == ControllerKind::Franka)
             .expect("it was given");
-        assert_eq!((&*franka.address, franka.answers), (&*address, false));
+        assert_eq!((&*franka.address, franka.answers()), (&*address, false));
+        let shown = franka.to_string();
+        assert!(shown.contains("cannot connect"), "{shown}");
     }
 
     #[test]
@@ -151,11 +175,21 @@ mod tests {
     }
 
     #[test]
+    fn a_server_of_another_kind_is_no_controller_of_universal_robots() {
+        let server = TcpListener::bind("127.0.0.1:0").expect("a free port");
+        let address = server.local_addr().expect("bound").to_string();
+        let closes = std::thread::spawn(move || drop(server.accept().expect("a client")));
+        let found = controller_at(ControllerKind::Ur, &address);
+        closes.join().expect("it has accepted");
+        assert!(!found.answers() && found.robot.is_none(), "{found}");
+    }
+
+    #[test]
     fn ports_are_part_of_an_address() {
         let server = TcpListener::bind("127.0.0.1:0").expect("a free port");
         let port = server.local_addr().expect("bound").port();
-        assert!(answers(&format!("127.0.0.1:{port}"), 1, PATIENT));
-        assert!(answers("127.0.0.1", port, PATIENT));
-        assert!(!answers("no host", port, PATIENT));
+        assert_eq!(connect(&format!("127.0.0.1:{port}"), 1, PATIENT), Ok(()));
+        assert_eq!(connect("127.0.0.1", port, PATIENT), Ok(()));
+        assert!(connect("no host", port, PATIENT).is_err());
     }
 }

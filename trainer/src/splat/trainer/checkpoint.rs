@@ -345,7 +345,10 @@ pub(super) fn take(
         // Defaults that depend on the adapter are stored as values, so that training continues in
         // the same way on another adapter.
         options: training.options.clone().with(|options| {
-            options.specific.coarse_steps = Some(training.views.coarse_steps());
+            let resolution = training.views.resolution();
+            options.specific.coarse_steps = Some(resolution.coarse_steps);
+            options.specific.max_coarse_px = Some(resolution.max_coarse_px);
+            options.specific.random_splats = Some(training.seeding.random_splats());
             options.specific.seeds_per_image = Some(training.seeding.seeds_per_image());
         }),
         step: schedule.step,

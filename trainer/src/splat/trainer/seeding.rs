@@ -2,7 +2,7 @@
 
 use super::view_set::ViewSet;
 use crate::model_options::ModelOptions;
-use crate::splat::options::SplatOptions;
+use crate::splat::options::{RANDOM_SPLATS, SplatOptions};
 use crate::splat::seed::{self, Density, Seeder};
 use crate::splat::snapshot::ObservedScene;
 use crate::splat::stereo;
@@ -24,6 +24,12 @@ const PX_PER_SEED: f64 = 48.0;
 const SEEDS_PER_IMAGE: f64 = 20_000.0;
 /// The default on a software adapter, where steps with more splats would take too long.
 const SOFTWARE_SEEDS_PER_IMAGE: f64 = 4_000.0;
+/// Default number of splats at random positions on a software adapter. Without depth, every step
+/// updates every splat, and almost every splat of the cloud is in every image, so the duration of the
+/// first steps is proportional to this number. With 50 000, a minute on two cores was enough for 270
+/// steps, which are too few to sort out the wrong positions (docs/design/splats.md, section
+/// "Software adapters"). With depth, training starts with about as many discs: the demo with 11 800.
+const SOFTWARE_RANDOM_SPLATS: u32 = 10_000;
 /// Minimum scale of the scene. With a scale of zero, which a single camera without depth would
 /// give, the means could not move.
 const MIN_SCENE_SIZE_M: f64 = 1e-3;
@@ -40,6 +46,7 @@ pub(super) struct Seeding {
     /// Keyframes without dense depth that arrived since the last step.
     unseeded: Vec<Arc<Keyframe>>,
     density: Density,
+    random_splats: u32,
     /// Points from which training starts if no keyframe has depth.
     pub(super) points: Option<Arc<InitialPoints>>,
 }
@@ -64,6 +71,11 @@ impl Seeding {
                 max_discs,
                 px_per_disc: PX_PER_SEED,
             },
+            random_splats: options.specific.random_splats.unwrap_or(if is_software {
+                SOFTWARE_RANDOM_SPLATS
+            } else {
+                RANDOM_SPLATS
+            }),
             points: None,
         }
     }
@@ -71,6 +83,11 @@ impl Seeding {
     /// Maximum number of seeds per image.
     pub(super) fn seeds_per_image(&self) -> f64 {
         self.density.max_discs
+    }
+
+    /// Number of splats at random positions, if there is no depth.
+    pub(super) fn random_splats(&self) -> u32 {
+        self.random_splats
     }
 
     /// Queues a keyframe for seeding.
@@ -237,4 +254,24 @@ fn scene_size_m(views: &ViewSet, seeder: &Seeder) -> f64 {
     (1.1 * spread)
         .max(0.5 * typical_depth_m)
         .max(MIN_SCENE_SIZE_M)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn software_adapters_start_with_fewer_random_splats() {
+        let random_splats = |options: SplatOptions, is_software| {
+            Seeding::new(&ModelOptions::from(options), is_software).random_splats()
+        };
+        assert_eq!(random_splats(SplatOptions::default(), false), 50_000);
+        assert_eq!(random_splats(SplatOptions::default(), true), 10_000);
+        // A checkpoint of another adapter stores its number.
+        let resumed = SplatOptions {
+            random_splats: Some(50_000),
+            ..SplatOptions::default()
+        };
+        assert_eq!(random_splats(resumed, true), 50_000);
+    }
 }

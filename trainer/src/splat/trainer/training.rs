@@ -140,8 +140,9 @@ impl Training {
             let balls = points
                 .map(|points| seed::balls(points, &keyframes, n_max))
                 .unwrap_or_default();
+            let n_cloud = n_max.min(self.seeding.random_splats() as usize);
             let focus = seed::common_focus(&keyframes);
-            let cloud = seed::random_cloud(&keyframes, focus, self.options.common.seed, n_max);
+            let cloud = seed::random_cloud(&keyframes, focus, self.options.common.seed, n_cloud);
             // Structure from motion finds no points where images have no texture. A random cloud is
             // therefore added, so that there are at least as many splats as without points.
             let n_random = cloud.n_splats().saturating_sub(balls.n_splats());
@@ -160,7 +161,8 @@ impl Training {
         let n_before = all.len() - arrived.len();
         // Another seed for each arrival, so that no two clouds are alike.
         let seed = self.options.common.seed ^ n_before as u64;
-        let n_max = seed::n_random_left(n_before).min(self.options.cap() as usize);
+        let n_random = self.seeding.random_splats() as usize;
+        let n_max = seed::random_left(n_random, n_before).min(self.options.cap() as usize);
         let cloud = seed::random_cloud(&poor, seed::common_focus(&all), seed, n_max);
         self.add(&cloud)
     }

@@ -4,7 +4,7 @@ use super::recorder::Recorder;
 use crate::Error;
 use crate::model_options::ModelOptions;
 use crate::splat::camera_params::CameraParams;
-use crate::splat::options::SplatOptions;
+use crate::splat::options::{ANY_SIZE_PX, SplatOptions};
 use crate::splat::views::{self, Keep, Level, LevelImages, Order, TrainView};
 use gpu::{Buffer, Gpu};
 use keyframe::Keyframe;
@@ -27,13 +27,18 @@ pub(super) const VIEWS_AT_ONCE: usize = 16;
 const COARSE_STEPS: [u64; 2] = [150, 400];
 /// The default on a software adapter, whose steps at full resolution take much longer.
 const SOFTWARE_COARSE_STEPS: [u64; 2] = [500, 4000];
+/// Default of [`SplatOptions::max_coarse_px`] on a software adapter, where the duration of a step is
+/// proportional to the number of pixels. Images of 640 x 480 pixels stay below it: at a quarter, they
+/// have 19 200 pixels, and at half 76 800. Images of 1280 x 720 pixels are trained at an eighth and a
+/// quarter, which is four times as fast.
+const SOFTWARE_COARSE_PX: [u32; 2] = [24_000, 96_000];
 
 /// Training views.
 #[derive(Debug)]
 pub(super) struct ViewSet {
     views: Vec<TrainView>,
     order: Order,
-    coarse_steps: [u64; 2],
+    resolution: Resolution,
     /// Maximum bytes of the views' images on the GPU, unless a submit needs more.
     max_image_bytes: u64,
     /// Number of image requests so far. Images store it at each use, and eviction compares the
@@ -44,17 +49,55 @@ pub(super) struct ViewSet {
 /// Index of a view, and index of a resolution level of its images.
 pub(super) type ViewLevel = (usize, usize);
 
+/// The resolution of the images at each step.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Resolution {
+    /// See [`SplatOptions::coarse_steps`].
+    pub(super) coarse_steps: [u64; 2],
+    /// See [`SplatOptions::max_coarse_px`].
+    pub(super) max_coarse_px: [u32; 2],
+}
+
+impl Resolution {
+    fn new(options: &SplatOptions, is_software: bool) -> Self {
+        let (coarse_steps, max_coarse_px) = if is_software {
+            (SOFTWARE_COARSE_STEPS, SOFTWARE_COARSE_PX)
+        } else {
+            (COARSE_STEPS, ANY_SIZE_PX)
+        };
+        Self {
+            coarse_steps: options.coarse_steps.unwrap_or(coarse_steps),
+            max_coarse_px: options.max_coarse_px.unwrap_or(max_coarse_px),
+        }
+    }
+
+    /// Level of an image of this size at a step. Level `n` divides width and height by `2^n`.
+    fn level(&self, step: u64, size_px: [u32; 2]) -> u32 {
+        let (coarse, max_px) = match step {
+            step if step < self.coarse_steps[0] => (2, self.max_coarse_px[0]),
+            step if step < self.coarse_steps[1] => (1, self.max_coarse_px[1]),
+            _ => return 0,
+        };
+        let n_px = |level: u32| {
+            size_px
+                .map(|side| u64::from(side >> level))
+                .iter()
+                .product::<u64>()
+        };
+        // The last level of an image has one pixel or none.
+        (coarse..u32::BITS)
+            .find(|level| n_px(*level) <= u64::from(max_px))
+            .unwrap_or(coarse)
+    }
+}
+
 impl ViewSet {
     /// Creates an empty set.
     pub(super) fn new(options: &ModelOptions<SplatOptions>, is_software: bool) -> Self {
         Self {
             views: Vec::new(),
             order: Order::new(options.common.seed),
-            coarse_steps: options.specific.coarse_steps.unwrap_or(if is_software {
-                SOFTWARE_COARSE_STEPS
-            } else {
-                COARSE_STEPS
-            }),
+            resolution: Resolution::new(&options.specific, is_software),
             // On a GPU, a lack of memory is an error of the allocation, not a limit.
             max_image_bytes: if is_software {
                 SOFTWARE_IMAGE_BYTES
@@ -139,9 +182,14 @@ impl ViewSet {
         }
     }
 
-    /// See [`SplatOptions::coarse_steps`].
-    pub(super) fn coarse_steps(&self) -> [u64; 2] {
-        self.coarse_steps
+    /// The resolution of the images at each step.
+    pub(super) fn resolution(&self) -> Resolution {
+        self.resolution
+    }
+
+    /// Level of a view at a step.
+    fn level(&self, view: &TrainView, step: u64) -> usize {
+        view.clamped(self.resolution.level(step, view.keyframe.size_px))
     }
 
     /// Allocates slots for the camera parameters of all views.
@@ -158,10 +206,7 @@ impl ViewSet {
     /// The view and level that a step trains on.
     pub(super) fn of_step(&mut self, step: u64) -> ViewLevel {
         let view_ix = self.order.pick(step, self.views.len());
-        (
-            view_ix,
-            self.views[view_ix].clamped(level_at(step, self.coarse_steps)),
-        )
+        (view_ix, self.level(&self.views[view_ix], step))
     }
 
     /// Size of the image of a view at a level, pixels.
@@ -239,9 +284,14 @@ impl ViewSet {
             .map(|(view_ix, level)| LevelImages::new(&self.views[*view_ix].keyframe, *level))
             .collect();
         let new_bytes = made.iter().map(LevelImages::bytes).sum();
+        let coarsest: Vec<usize> = self
+            .views
+            .iter()
+            .map(|view| self.level(view, step))
+            .collect();
         let keep = Keep {
             needed: requested,
-            coarsest: level_at(step, self.coarse_steps),
+            coarsest: &coarsest,
             max_bytes: self.max_image_bytes.saturating_sub(new_bytes),
         };
         let mut dropped = views::drop_levels(&mut self.views, keep);
@@ -291,11 +341,41 @@ impl ViewSet {
     }
 }
 
-/// Resolution level at a step. Level `n` divides width and height by `2^n`.
-fn level_at(step: u64, coarse_steps: [u64; 2]) -> u32 {
-    match step {
-        step if step < coarse_steps[0] => 2,
-        step if step < coarse_steps[1] => 1,
-        _ => 0,
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn levels(options: &SplatOptions, is_software: bool, size_px: [u32; 2]) -> [u32; 3] {
+        let resolution = Resolution::new(options, is_software);
+        let [first, second] = resolution.coarse_steps;
+        [0, first, second].map(|step| resolution.level(step, size_px))
+    }
+
+    #[test]
+    fn large_images_are_coarser_on_a_software_adapter() {
+        let options = SplatOptions::default();
+        for (size_px, expected) in [
+            ([160, 120], [2, 1, 0]),
+            ([640, 480], [2, 1, 0]),
+            ([1280, 720], [3, 2, 0]),
+            ([1920, 1080], [4, 3, 0]),
+        ] {
+            assert_eq!(levels(&options, true, size_px), expected, "{size_px:?}");
+            assert_eq!(levels(&options, false, size_px), [2, 1, 0], "{size_px:?}");
+        }
+    }
+
+    #[test]
+    fn options_take_precedence_over_the_adapter() {
+        let options = SplatOptions {
+            max_coarse_px: Some(ANY_SIZE_PX),
+            ..SplatOptions::default()
+        };
+        assert_eq!(levels(&options, true, [1920, 1080]), [2, 1, 0]);
+        let full = SplatOptions {
+            coarse_steps: Some([0, 0]),
+            ..SplatOptions::default()
+        };
+        assert_eq!(levels(&full, true, [1920, 1080]), [0, 0, 0]);
     }
 }

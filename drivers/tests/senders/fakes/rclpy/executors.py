@@ -1,4 +1,4 @@
-"""The part of rclpy.executors that ros2_joints.py uses."""
+"""The part of rclpy.executors that the senders for ROS 2 use."""
 
 
 class ExternalShutdownException(Exception):

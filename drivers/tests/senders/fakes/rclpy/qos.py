@@ -1,3 +1,3 @@
-"""The part of rclpy.qos that ros2_joints.py uses."""
+"""The part of rclpy.qos that the senders for ROS 2 use."""
 
 qos_profile_sensor_data = object()
