@@ -4,6 +4,7 @@
 use super::emulated::{
     CommandedJoints, EmulatedRobot, JointSimulator, Joints, Limits, RobotConfig,
 };
+use super::test_pace::Pace;
 use super::tests::{
     FREE_PORT, REST_RAD, TEST_TIMEOUT, VERSIONS, chain, config, ideal_joints, robot, waiting_robot,
 };
@@ -66,6 +67,32 @@ fn with_counter(mut joint_simulator: JointSimulator) -> (JointSimulator, Arc<Ato
         joint_simulator(stamp, commanded)
     });
     (counting, n_moving)
+}
+
+/// Lets a robot move only as far as a test permits.
+fn paced_motion(mut joint_simulator: JointSimulator, pace: &Pace) -> JointSimulator {
+    let pace = pace.clone();
+    Box::new(move |stamp, commanded| {
+        if commanded.is_moving {
+            pace.wait();
+        }
+        joint_simulator(stamp, commanded)
+    })
+}
+
+/// Waits until the robot has moved for this many milliseconds of its own time, and stands still.
+/// Returns the reason if the arm has stopped.
+fn move_for(arm: &MovableFrankaArm, pace: &Pace, n_states: u64) -> Result<(), String> {
+    pace.limit(n_states);
+    let deadline = Instant::now() + TEST_TIMEOUT;
+    while !pace.is_standing_still() {
+        if let Motion::Stopped { reason } = arm.motion() {
+            return Err(reason);
+        }
+        assert!(Instant::now() < deadline, "the robot does not move");
+        std::thread::sleep(Duration::from_millis(2));
+    }
+    Ok(())
 }
 
 fn offset_from_rest(by_rad: [f64; N_JOINTS]) -> JointTarget {
@@ -177,13 +204,18 @@ fn motion_of_all_joints_respects_robot_limits() {
 fn retargeting_and_stopping_respect_robot_limits() {
     for version in VERSIONS {
         let (joint_simulator, last_command) = recording_joints();
+        let pace = Pace::default();
+        let joint_simulator = paced_motion(joint_simulator, &pace);
         let emulated = waiting_robot(version, ANSWER_WAIT, joint_simulator);
         let mut arm = open(emulated.address());
         let far = offset_from_rest([1.2, -0.8, 1.0, 0.9, 1.0, 1.0, 1.0]);
+        // The times are those of the robot, which stands still between them. If this thread is not
+        // scheduled for long, the arm would otherwise arrive before it is stopped.
         retry_until_settled(&mut arm, |arm| {
+            pace.free();
             command_target(arm, &far)?;
             for ix in 0..8 {
-                std::thread::sleep(Duration::from_millis(90));
+                move_for(arm, &pace, 90)?;
                 let sign = if ix % 2 == 0 { -1.0 } else { 1.0 };
                 command_target(
                     arm,
@@ -191,8 +223,9 @@ fn retargeting_and_stopping_respect_robot_limits() {
                 )?;
             }
             command_target(arm, &far)?;
-            std::thread::sleep(Duration::from_millis(700));
+            move_for(arm, &pace, 700)?;
             arm.stop().unwrap();
+            pace.free();
             Ok(())
         });
         let CommandedJoints {
