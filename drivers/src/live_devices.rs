@@ -164,7 +164,11 @@ impl LiveDevices {
                 Err(Error::Ended { .. }) => Ok(ReadOutcome::End),
                 Err(Error::NoImage { .. }) => Ok(ReadOutcome::NoSample),
                 // The driver has its own time limit for reconnecting, and a file has its own clock.
-                Err(Error::Reconnecting { .. } | Error::NotDue { .. }) => Ok(ReadOutcome::Pending),
+                Err(
+                    Error::Reconnecting { .. }
+                    | Error::NotDue { .. }
+                    | Error::SimulationLags { .. },
+                ) => Ok(ReadOutcome::Pending),
                 image => image.map(Sample::Image).map(ReadOutcome::Sample),
             }
         })
@@ -177,7 +181,9 @@ impl LiveDevices {
             match arm.read(POLL) {
                 Err(Error::NoJoints { .. }) => Ok(ReadOutcome::NoSample),
                 // The driver has its own time limit for reconnecting.
-                Err(Error::ArmReconnecting { .. }) => Ok(ReadOutcome::Pending),
+                Err(Error::ArmReconnecting { .. } | Error::SimulationLags { .. }) => {
+                    Ok(ReadOutcome::Pending)
+                }
                 state => state.map(Sample::Joints).map(ReadOutcome::Sample),
             }
         })
@@ -192,6 +198,7 @@ impl LiveDevices {
             timeout_error,
             move || match base.next_pose(POLL) {
                 Err(Error::NoBasePose { .. }) => Ok(ReadOutcome::NoSample),
+                Err(Error::SimulationLags { .. }) => Ok(ReadOutcome::Pending),
                 pose => pose.map(Sample::Base).map(ReadOutcome::Sample),
             },
         )
@@ -208,6 +215,7 @@ impl LiveDevices {
         self.read(device, policy, timeout_error, move || {
             match scanner.next_scan(POLL) {
                 Err(Error::NoScan { .. }) => Ok(ReadOutcome::NoSample),
+                Err(Error::SimulationLags { .. }) => Ok(ReadOutcome::Pending),
                 scan => scan.map(Sample::Range).map(ReadOutcome::Sample),
             }
         })
@@ -270,8 +278,8 @@ enum ReadOutcome {
     Sample(Sample),
     /// The device is connected but sent nothing.
     NoSample,
-    /// The driver is trying to reconnect for a limited time, or the next image of a file is not due
-    /// yet.
+    /// The driver is trying to reconnect for a limited time, the next image of a file is not due
+    /// yet, or a simulation is late.
     Pending,
     /// The file has ended.
     End,
