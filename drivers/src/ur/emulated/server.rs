@@ -53,8 +53,8 @@ impl EmulatedController {
     }
 
     /// Like [`start`](Self::start), but a program that follows setpoints waits up to `answer_wait`
-    /// for the setpoint after each state. A real controller does not wait. Tests wait, so that
-    /// their motions do not depend on the load of the machine.
+    /// for the setpoint after each state, and follows one setpoint per cycle. A real controller does
+    /// not wait. Tests wait, so that their motions do not depend on the load of the machine.
     pub fn start_waiting(
         config: ControllerConfig,
         answer_wait: Duration,
@@ -240,12 +240,14 @@ impl Server {
                 self.clients.push(Client::new(stream));
             }
         }
+        // Setpoints that arrive together are followed one by one, as if none had been late.
+        let takes_one = self.waits_for_setpoints();
         let mut ix = 0;
         while ix < self.clients.len() {
             let mut client = self.clients.swap_remove(ix);
             let others = self.clients.iter();
             let held: Vec<String> = others.flat_map(Client::held_inputs).cloned().collect();
-            if client.serve(&self.config, &mut self.robot, &held) {
+            if client.serve(&self.config, &mut self.robot, &held, takes_one) {
                 // The last client has taken the place of this one, so they change places again.
                 self.clients.push(client);
                 let last = self.clients.len() - 1;
