@@ -545,3 +545,21 @@ fn remember(recent: &mut VecDeque<JointState>, state: &JointState) {
     }
     recent.push_back(state.clone());
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_time_of_a_late_simulation_does_not_count() {
+        let at = |secs: f64| Stamp(0).plus_secs(secs);
+        let mut wait = Wait::new(at(100.0));
+        wait.advance(at(105.0));
+        assert_eq!(wait.secs, 5.0);
+        wait.is_simulation_late = true;
+        wait.advance(at(125.0));
+        assert_eq!(wait.secs, 5.0, "the camera was late until then");
+        wait.advance(at(126.0));
+        assert_eq!(wait.secs, 6.0);
+    }
+}

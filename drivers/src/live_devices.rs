@@ -595,14 +595,15 @@ mod tests {
         );
     }
 
-    /// A camera that reports reconnecting for longer than the silence limit. It returns without
-    /// waiting.
-    struct ReconnectingCamera {
+    /// A camera that reports why it has no image, for longer than the silence limit. It returns
+    /// without waiting.
+    struct LateCamera {
         camera: FastCamera,
+        reason: fn(Duration) -> Error,
         n_tries: u32,
     }
 
-    impl Camera for ReconnectingCamera {
+    impl Camera for LateCamera {
         fn name(&self) -> &str {
             self.camera.name()
         }
@@ -612,47 +613,57 @@ mod tests {
         fn next_image(&mut self, timeout: Duration) -> Result<Image, Error> {
             self.n_tries += 1;
             if self.n_tries <= 100 {
-                return Err(Error::Reconnecting {
-                    camera: "fast".into(),
-                    waited: timeout * self.n_tries,
-                });
+                return Err((self.reason)(timeout * self.n_tries));
             }
             self.camera.next_image(timeout)
         }
     }
 
     #[test]
-    fn reconnecting_camera_does_not_time_out() {
-        let camera = ReconnectingCamera {
-            camera: FastCamera {
-                intrinsics: LENS,
-                n_images: 1,
-                next: 0,
+    fn reconnecting_cameras_and_late_simulations_do_not_time_out() {
+        let reasons: [fn(Duration) -> Error; 2] = [
+            |waited| Error::Reconnecting {
+                camera: "fast".into(),
+                waited,
             },
-            n_tries: 0,
-        };
-        let devices = Devices {
-            cameras: vec![Box::new(camera)],
-            ..Devices::default()
-        };
-        let mut live = LiveDevices::new(devices).expect("threads start");
-        while live.shared.state.lock().n_running > 0 {
-            std::thread::yield_now();
+            |lag| Error::SimulationLags {
+                device: "fast".into(),
+                lag,
+            },
+        ];
+        for reason in reasons {
+            let camera = LateCamera {
+                camera: FastCamera {
+                    intrinsics: LENS,
+                    n_images: 1,
+                    next: 0,
+                },
+                reason,
+                n_tries: 0,
+            };
+            let devices = Devices {
+                cameras: vec![Box::new(camera)],
+                ..Devices::default()
+            };
+            let mut live = LiveDevices::new(devices).expect("threads start");
+            while live.shared.state.lock().n_running > 0 {
+                std::thread::yield_now();
+            }
+            // After ten seconds, the image arrives. The error follows it.
+            assert!(
+                live.next_sample()
+                    .expect_err("the cable")
+                    .to_string()
+                    .contains("cable pulled")
+            );
+            assert_eq!(
+                live.next_sample()
+                    .expect("the error is returned only once")
+                    .expect("an image")
+                    .stamp(),
+                Stamp(1)
+            );
         }
-        // After ten seconds of reconnecting, the image arrives. The error follows it.
-        assert!(
-            live.next_sample()
-                .expect_err("the cable")
-                .to_string()
-                .contains("cable pulled")
-        );
-        assert_eq!(
-            live.next_sample()
-                .expect("the error is returned only once")
-                .expect("an image")
-                .stamp(),
-            Stamp(1)
-        );
     }
 
     /// A camera that is played back from a file as fast as possible.
