@@ -10,7 +10,7 @@ use drivers::Image;
 use drivers::motion::JointTarget;
 use kinematics::{Chain, JointState, Stamp, Transform};
 use std::collections::VecDeque;
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
 /// Largest change of a joint in one step, radians or meters. The position is checked after each
 /// step. The step therefore also bounds how far the arm pushes against an obstacle. Smaller steps
@@ -27,7 +27,7 @@ const SETTLE_SECS: f64 = 0.3;
 /// larger value, images of a moving camera are accepted. At an arm's length of 1 m, 3e-4 rad is 0.3
 /// mm.
 const MAX_DRIFT: f64 = 3e-4;
-/// Maximum time until the arm stands still and an image arrives.
+/// Maximum time until the arm stands still and an image arrives, by the stamps of the arm.
 const MAX_WAIT_SECS: f64 = 15.0;
 /// Largest distance of a joint from its target after a motion, radians or meters. It is also the
 /// largest correction of the joint's sag. Arms without gravity compensation sag by their load
@@ -39,13 +39,36 @@ const MAX_ERROR: f64 = 0.1;
 const DISTANCE_TOLERANCE_M: f64 = 0.03;
 /// Duration of one wait for an image. It bounds the time until a fault of the arm is noticed.
 const POLL: Duration = Duration::from_millis(20);
-/// Number of joint states kept. At 1 kHz, they cover four seconds.
-const MAX_STATES: usize = 4000;
+/// Number of joint states kept. At 1 kHz, they cover a minute, because a slow computer may take this
+/// long to render an image of a simulated camera. They take 20 MB.
+const MAX_STATES: usize = 60_000;
 
-/// The start of a wait for an image.
+/// A wait for an image, in the time of the arm. Simulated devices that wait for their caller stand
+/// still between reads, and a slow computer delays a simulated camera but not the arm.
 struct Wait {
-    began: Stamp,
-    since: Instant,
+    secs: f64,
+    last: Stamp,
+    /// Whether a simulation was late when the camera was read. Until the next state, the time does
+    /// not count.
+    is_simulation_late: bool,
+}
+
+impl Wait {
+    fn new(began: Stamp) -> Self {
+        Self {
+            secs: 0.0,
+            last: began,
+            is_simulation_late: false,
+        }
+    }
+
+    /// Counts the time until a joint state.
+    fn advance(&mut self, now: Stamp) {
+        if !std::mem::take(&mut self.is_simulation_late) {
+            self.secs += now.secs_since(self.last);
+        }
+        self.last = now;
+    }
 }
 
 /// Why the last image was not usable.
@@ -297,10 +320,7 @@ impl ArmCapture {
         // state from before the motion.
         self.read_queued()?;
         let began = self.read()?.stamp;
-        let wait = Wait {
-            began,
-            since: Instant::now(),
-        };
+        let mut wait = Wait::new(began);
         self.first.get_or_insert(began);
         let mut seen = Seen::Nothing;
         loop {
@@ -310,10 +330,14 @@ impl ArmCapture {
             // Reading the states detects faults. The check of the time then ends the wait if no
             // image is usable.
             self.read_queued()?;
-            let now = self.read()?.stamp;
-            self.check_wait(&wait, now, &seen)?;
+            wait.advance(self.read()?.stamp);
+            self.check_wait(&wait, &seen)?;
             let image = match self.camera.next_image(POLL) {
                 Ok(image) => image,
+                Err(drivers::Error::SimulationLags { .. }) => {
+                    wait.is_simulation_late = true;
+                    continue;
+                }
                 Err(
                     drivers::Error::NoImage { .. }
                     | drivers::Error::Reconnecting { .. }
@@ -335,7 +359,7 @@ impl ArmCapture {
                 };
                 continue;
             }
-            if !self.wait_for_states(end, &wait, stop)? {
+            if !self.wait_for_states(end, &mut wait, stop)? {
                 return Ok(None);
             }
             let joints = match self.joints_at_rest(settling, end) {
@@ -355,17 +379,23 @@ impl ArmCapture {
 
     /// Waits until joint states cover an image that is exposed until `end`. Returns false if a stop
     /// was requested.
-    fn wait_for_states(&mut self, end: Stamp, wait: &Wait, stop: &Stop) -> anyhow::Result<bool> {
+    fn wait_for_states(
+        &mut self,
+        end: Stamp,
+        wait: &mut Wait,
+        stop: &Stop,
+    ) -> anyhow::Result<bool> {
         while self.recent.back().is_none_or(|newest| newest.stamp < end) {
             if stop.requested() {
                 return Ok(false);
             }
             let now = self.read()?.stamp;
+            wait.advance(now);
             // If the clocks of camera and arm differ, the joint states may never reach `end`.
             let seen = Seen::Early {
                 secs: end.secs_since(now),
             };
-            self.check_wait(wait, now, &seen)?;
+            self.check_wait(wait, &seen)?;
         }
         Ok(true)
     }
@@ -403,15 +433,8 @@ impl ArmCapture {
         self.arm.read_queued(|state| remember(recent, state))
     }
 
-    fn check_wait(&self, wait: &Wait, now: Stamp, seen: &Seen) -> anyhow::Result<()> {
-        // Time in a simulation stands still between reads, so the wait is measured in simulated
-        // time.
-        let secs = if self.camera.waits_for_caller() {
-            now.secs_since(wait.began)
-        } else {
-            wait.since.elapsed().as_secs_f64()
-        };
-        if secs <= MAX_WAIT_SECS {
+    fn check_wait(&self, wait: &Wait, seen: &Seen) -> anyhow::Result<()> {
+        if wait.secs <= MAX_WAIT_SECS {
             return Ok(());
         }
         let camera = &self.camera().name;
@@ -521,4 +544,22 @@ fn remember(recent: &mut VecDeque<JointState>, state: &JointState) {
         recent.pop_front();
     }
     recent.push_back(state.clone());
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_time_of_a_late_simulation_does_not_count() {
+        let at = |secs: f64| Stamp(0).plus_secs(secs);
+        let mut wait = Wait::new(at(100.0));
+        wait.advance(at(105.0));
+        assert_eq!(wait.secs, 5.0);
+        wait.is_simulation_late = true;
+        wait.advance(at(125.0));
+        assert_eq!(wait.secs, 5.0, "the camera was late until then");
+        wait.advance(at(126.0));
+        assert_eq!(wait.secs, 6.0);
+    }
 }

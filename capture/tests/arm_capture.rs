@@ -221,41 +221,38 @@ fn arm_that_reports_nothing_is_stopped() {
 #[cfg(target_os = "linux")]
 mod emulated_controller {
     use super::{
-        Arm, ArmCapture, Devices, Error, JOINT, JointState, JointTarget, Motion, MovableArm,
-        Override, Path, Rig, Stop, open, rotated,
+        Arc, Arm, ArmCapture, Devices, Duration, Error, JOINT, JointState, JointTarget, Motion,
+        MovableArm, Mutex, Override, Path, Rig, Stop, open, rotated,
     };
-    use std::time::{Duration, Instant};
+    use drivers::clock;
+    use kinematics::Stamp;
 
     /// The emulated controller stops the arm if the computer is too busy to answer in time, as a
     /// real one does.
     const BUSY: &str = "communication_constraints_violation";
     const MAX_ATTEMPTS: usize = 3;
 
-    /// An arm that requests a stop once its joint has moved by this much. The stop depends on the
-    /// position, because a time would depend on the load of the computer.
-    struct StoppedOnTheWay {
+    /// An arm whose joint states a test observes.
+    struct Observed {
         arm: Box<dyn MovableArm>,
-        after_rad: f64,
-        start_rad: Option<f64>,
-        stop: Stop,
+        on_state: Box<dyn FnMut(&JointState) + Send>,
+        newest: Arc<Mutex<Stamp>>,
     }
 
-    impl Arm for StoppedOnTheWay {
+    impl Arm for Observed {
         fn joint_names(&self) -> &[String] {
             self.arm.joint_names()
         }
 
         fn read(&mut self, timeout: Duration) -> Result<JointState, Error> {
             let state = self.arm.read(timeout)?;
-            let position = state.position[JOINT];
-            if (position - *self.start_rad.get_or_insert(position)).abs() > self.after_rad {
-                self.stop.request();
-            }
+            *self.newest.lock() = state.stamp;
+            (self.on_state)(&state);
             Ok(state)
         }
     }
 
-    impl MovableArm for StoppedOnTheWay {
+    impl MovableArm for Observed {
         fn command(&mut self, target: &JointTarget) -> Result<JointTarget, Error> {
             self.arm.command(target)
         }
@@ -273,27 +270,58 @@ mod emulated_controller {
         }
     }
 
-    fn connected(rate_hz: f64) -> anyhow::Result<(ArmCapture, Vec<f64>)> {
-        connected_as(rate_hz, |arm| arm)
+    /// A driver that is connected to an emulated controller.
+    struct Connected {
+        capture: ArmCapture,
+        start: Vec<f64>,
+        /// Stamp of the newest joint state that was read.
+        newest: Arc<Mutex<Stamp>>,
     }
 
-    fn connected_as(
-        rate_hz: f64,
-        wrap: impl FnOnce(Box<dyn MovableArm>) -> Box<dyn MovableArm>,
-    ) -> anyhow::Result<(ArmCapture, Vec<f64>)> {
-        let overrides = [
-            Override::new("arm.driver", "franka"),
-            Override::new("arm.motion.on_loss", "hold"),
-            Override::new("camera.wrist.rate_hz", rate_hz),
-            Override::new("sim.emulate_arm", true),
-        ];
-        let file = Path::new(env!("CARGO_MANIFEST_DIR")).join("../rigs/calibration-board.toml");
-        let rig = Rig::load(&file, &overrides).expect("a bundled rig file");
-        let mut movable = open::movable(&rig, Devices::Sim, "wrist")?;
-        movable.arm = wrap(movable.arm);
-        let mut capture = ArmCapture::new(movable)?;
-        let start = capture.joints()?;
-        Ok((capture, start))
+    impl Connected {
+        /// * `on_state`: is called with each joint state
+        fn open(
+            rate_hz: f64,
+            on_state: impl FnMut(&JointState) + Send + 'static,
+        ) -> anyhow::Result<Self> {
+            let overrides = [
+                Override::new("arm.driver", "franka"),
+                Override::new("arm.motion.on_loss", "hold"),
+                Override::new("camera.wrist.rate_hz", rate_hz),
+                Override::new("sim.emulate_arm", true),
+            ];
+            let file = Path::new(env!("CARGO_MANIFEST_DIR")).join("../rigs/calibration-board.toml");
+            let rig = Rig::load(&file, &overrides).expect("a bundled rig file");
+            let mut movable = open::movable(&rig, Devices::Sim, "wrist")?;
+            let newest: Arc<Mutex<Stamp>> = Arc::default();
+            movable.arm = Box::new(Observed {
+                arm: movable.arm,
+                on_state: Box::new(on_state),
+                newest: newest.clone(),
+            });
+            let mut capture = ArmCapture::new(movable)?;
+            let start = capture.joints()?;
+            Ok(Self {
+                capture,
+                start,
+                newest,
+            })
+        }
+
+        /// The joints 0.2 s from now, and how far they move within the next half second. The times
+        /// are those of the joint states, which may be read late.
+        fn joints_and_drift(&mut self) -> anyhow::Result<(Vec<f64>, f64)> {
+            let settled = clock::now().plus_secs(0.2);
+            let mut joints = self.capture.joints()?;
+            while *self.newest.lock() < settled {
+                joints = self.capture.joints()?;
+            }
+            let (end, mut drift) = (settled.plus_secs(0.5), 0.0f64);
+            while *self.newest.lock() < end {
+                drift = drift.max(distance(&self.capture.joints()?, &joints));
+            }
+            Ok((joints, drift))
+        }
     }
 
     /// Repeats a test that fails because the computer is busy.
@@ -320,20 +348,6 @@ mod emulated_controller {
             .fold(0.0, f64::max)
     }
 
-    /// The joints after the states that have arrived, and how far they move within half a second.
-    fn joints_and_drift(capture: &mut ArmCapture) -> anyhow::Result<(Vec<f64>, f64)> {
-        let settled = Instant::now() + Duration::from_millis(200);
-        let mut joints = capture.joints()?;
-        while Instant::now() < settled {
-            joints = capture.joints()?;
-        }
-        let (end, mut drift) = (Instant::now() + Duration::from_millis(500), 0.0f64);
-        while Instant::now() < end {
-            drift = drift.max(distance(&capture.joints()?, &joints));
-        }
-        Ok((joints, drift))
-    }
-
     fn requested_after(secs: f64) -> Stop {
         let stop = Stop::default();
         let later = stop.clone();
@@ -347,7 +361,9 @@ mod emulated_controller {
     #[test]
     fn poses_are_visited_and_photographed_at_rest() {
         unless_busy(|| {
-            let (mut capture, start) = connected(2.0)?;
+            let Connected {
+                mut capture, start, ..
+            } = Connected::open(2.0, |_| ())?;
             let mut last = None;
             for angle in [0.0, 0.15, -0.2] {
                 let goal = rotated(&start, angle);
@@ -374,20 +390,20 @@ mod emulated_controller {
     fn stop_while_waiting_for_an_image_leaves_the_arm_holding() {
         unless_busy(|| {
             // The next image is a minute away.
-            let (mut capture, start) = connected(0.01)?;
-            let goal = rotated(&start, 0.15);
-            assert!(capture.move_to(&goal, &Stop::default())?);
+            let mut arm = Connected::open(0.01, |_| ())?;
+            let goal = rotated(&arm.start, 0.15);
+            assert!(arm.capture.move_to(&goal, &Stop::default())?);
             assert!(
-                capture.image(&requested_after(1.0))?.is_none(),
+                arm.capture.image(&requested_after(1.0))?.is_none(),
                 "it waits until the stop"
             );
-            let (held, drift) = joints_and_drift(&mut capture)?;
+            let (held, drift) = arm.joints_and_drift()?;
             assert!(
                 distance(&held, &goal) < 1e-3 && drift < 1e-4,
                 "{held:?} drifts by {drift}, commanded {goal:?}"
             );
             // It has not stopped because of a fault.
-            assert!(capture.move_to(&start, &Stop::default())?);
+            assert!(arm.capture.move_to(&arm.start, &Stop::default())?);
             Ok(())
         });
     }
@@ -397,26 +413,28 @@ mod emulated_controller {
         unless_busy(|| {
             let stop = Stop::default();
             let on_the_way = stop.clone();
-            let (mut capture, start) = connected_as(2.0, |arm| {
-                Box::new(StoppedOnTheWay {
-                    arm,
-                    after_rad: 0.1,
-                    start_rad: None,
-                    stop: on_the_way,
-                })
+            // The stop depends on the position, because a time would depend on the load of the
+            // computer.
+            let mut start_rad = None;
+            let mut arm = Connected::open(2.0, move |state| {
+                let position = state.position[JOINT];
+                if (position - *start_rad.get_or_insert(position)).abs() > 0.1 {
+                    on_the_way.request();
+                }
             })?;
             // Three steps. If this thread is not scheduled for long, the arm completes the first
             // one.
-            let goal = rotated(&start, 0.6);
+            let goal = rotated(&arm.start, 0.6);
             assert!(
-                !capture.move_to(&goal, &stop)?,
+                !arm.capture.move_to(&goal, &stop)?,
                 "the stop was requested on the way"
             );
-            let (rest, drift) = joints_and_drift(&mut capture)?;
+            let (rest, drift) = arm.joints_and_drift()?;
             assert!(drift < 1e-4, "{drift}");
             assert!(
-                distance(&rest, &start) > 0.05 && distance(&rest, &goal) > 0.3,
-                "{rest:?}, started at {start:?}"
+                distance(&rest, &arm.start) > 0.05 && distance(&rest, &goal) > 0.3,
+                "{rest:?}, started at {:?}",
+                arm.start
             );
             Ok(())
         });

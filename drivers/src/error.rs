@@ -71,6 +71,15 @@ pub enum Error {
         /// Time until the image is due.
         remaining: Duration,
     },
+    /// A simulated device delivers nothing yet, because the computer is too slow for the simulation
+    /// to keep up with real time. A later call returns a sample.
+    #[error("{device}: the simulation lags {lag:.1?} behind real time")]
+    SimulationLags {
+        /// The device.
+        device: String,
+        /// By how much the simulation is late.
+        lag: Duration,
+    },
     /// A nokhwa camera cannot be opened, or did not reconnect in time.
     #[cfg(feature = "nokhwa")]
     #[error("camera {camera:?}: {problem}")]

@@ -85,7 +85,8 @@ pub trait Camera: Send {
     /// [`Error::NoImage`] if no image arrives within `timeout`. [`Error::Reconnecting`] while the
     /// driver tries to reconnect to the camera; the driver gives up after a time limit. A camera
     /// that is played back from a file returns [`Error::NotDue`] if its next image is due later. It
-    /// returns [`Error::Ended`] after its last image.
+    /// returns [`Error::Ended`] after its last image. A simulated camera returns
+    /// [`Error::SimulationLags`] if the image is late because the computer is too slow.
     fn next_image(&mut self, timeout: Duration) -> Result<Image, Error>;
     /// Whether the camera waits for a slow caller instead of dropping images. A file that is read
     /// as fast as possible, for example, waits for its caller.

@@ -164,7 +164,11 @@ impl LiveDevices {
                 Err(Error::Ended { .. }) => Ok(ReadOutcome::End),
                 Err(Error::NoImage { .. }) => Ok(ReadOutcome::NoSample),
                 // The driver has its own time limit for reconnecting, and a file has its own clock.
-                Err(Error::Reconnecting { .. } | Error::NotDue { .. }) => Ok(ReadOutcome::Pending),
+                Err(
+                    Error::Reconnecting { .. }
+                    | Error::NotDue { .. }
+                    | Error::SimulationLags { .. },
+                ) => Ok(ReadOutcome::Pending),
                 image => image.map(Sample::Image).map(ReadOutcome::Sample),
             }
         })
@@ -177,7 +181,9 @@ impl LiveDevices {
             match arm.read(POLL) {
                 Err(Error::NoJoints { .. }) => Ok(ReadOutcome::NoSample),
                 // The driver has its own time limit for reconnecting.
-                Err(Error::ArmReconnecting { .. }) => Ok(ReadOutcome::Pending),
+                Err(Error::ArmReconnecting { .. } | Error::SimulationLags { .. }) => {
+                    Ok(ReadOutcome::Pending)
+                }
                 state => state.map(Sample::Joints).map(ReadOutcome::Sample),
             }
         })
@@ -192,6 +198,7 @@ impl LiveDevices {
             timeout_error,
             move || match base.next_pose(POLL) {
                 Err(Error::NoBasePose { .. }) => Ok(ReadOutcome::NoSample),
+                Err(Error::SimulationLags { .. }) => Ok(ReadOutcome::Pending),
                 pose => pose.map(Sample::Base).map(ReadOutcome::Sample),
             },
         )
@@ -208,6 +215,7 @@ impl LiveDevices {
         self.read(device, policy, timeout_error, move || {
             match scanner.next_scan(POLL) {
                 Err(Error::NoScan { .. }) => Ok(ReadOutcome::NoSample),
+                Err(Error::SimulationLags { .. }) => Ok(ReadOutcome::Pending),
                 scan => scan.map(Sample::Range).map(ReadOutcome::Sample),
             }
         })
@@ -270,8 +278,8 @@ enum ReadOutcome {
     Sample(Sample),
     /// The device is connected but sent nothing.
     NoSample,
-    /// The driver is trying to reconnect for a limited time, or the next image of a file is not due
-    /// yet.
+    /// The driver is trying to reconnect for a limited time, the next image of a file is not due
+    /// yet, or a simulation is late.
     Pending,
     /// The file has ended.
     End,
@@ -587,14 +595,15 @@ mod tests {
         );
     }
 
-    /// A camera that reports reconnecting for longer than the silence limit. It returns without
-    /// waiting.
-    struct ReconnectingCamera {
+    /// A camera that reports why it has no image, for longer than the silence limit. It returns
+    /// without waiting.
+    struct LateCamera {
         camera: FastCamera,
+        reason: fn(Duration) -> Error,
         n_tries: u32,
     }
 
-    impl Camera for ReconnectingCamera {
+    impl Camera for LateCamera {
         fn name(&self) -> &str {
             self.camera.name()
         }
@@ -604,47 +613,57 @@ mod tests {
         fn next_image(&mut self, timeout: Duration) -> Result<Image, Error> {
             self.n_tries += 1;
             if self.n_tries <= 100 {
-                return Err(Error::Reconnecting {
-                    camera: "fast".into(),
-                    waited: timeout * self.n_tries,
-                });
+                return Err((self.reason)(timeout * self.n_tries));
             }
             self.camera.next_image(timeout)
         }
     }
 
     #[test]
-    fn reconnecting_camera_does_not_time_out() {
-        let camera = ReconnectingCamera {
-            camera: FastCamera {
-                intrinsics: LENS,
-                n_images: 1,
-                next: 0,
+    fn reconnecting_cameras_and_late_simulations_do_not_time_out() {
+        let reasons: [fn(Duration) -> Error; 2] = [
+            |waited| Error::Reconnecting {
+                camera: "fast".into(),
+                waited,
             },
-            n_tries: 0,
-        };
-        let devices = Devices {
-            cameras: vec![Box::new(camera)],
-            ..Devices::default()
-        };
-        let mut live = LiveDevices::new(devices).expect("threads start");
-        while live.shared.state.lock().n_running > 0 {
-            std::thread::yield_now();
+            |lag| Error::SimulationLags {
+                device: "fast".into(),
+                lag,
+            },
+        ];
+        for reason in reasons {
+            let camera = LateCamera {
+                camera: FastCamera {
+                    intrinsics: LENS,
+                    n_images: 1,
+                    next: 0,
+                },
+                reason,
+                n_tries: 0,
+            };
+            let devices = Devices {
+                cameras: vec![Box::new(camera)],
+                ..Devices::default()
+            };
+            let mut live = LiveDevices::new(devices).expect("threads start");
+            while live.shared.state.lock().n_running > 0 {
+                std::thread::yield_now();
+            }
+            // After ten seconds, the image arrives. The error follows it.
+            assert!(
+                live.next_sample()
+                    .expect_err("the cable")
+                    .to_string()
+                    .contains("cable pulled")
+            );
+            assert_eq!(
+                live.next_sample()
+                    .expect("the error is returned only once")
+                    .expect("an image")
+                    .stamp(),
+                Stamp(1)
+            );
         }
-        // After ten seconds of reconnecting, the image arrives. The error follows it.
-        assert!(
-            live.next_sample()
-                .expect_err("the cable")
-                .to_string()
-                .contains("cable pulled")
-        );
-        assert_eq!(
-            live.next_sample()
-                .expect("the error is returned only once")
-                .expect("an image")
-                .stamp(),
-            Stamp(1)
-        );
     }
 
     /// A camera that is played back from a file as fast as possible.

@@ -11,6 +11,26 @@ use std::time::{Duration, Instant};
 /// the same way as with devices.
 const MAX_DELAY: Duration = Duration::from_millis(270);
 
+/// The time of a playback. Tests replace the time of this process, so that they do not depend on
+/// the load of the computer.
+trait PlaybackTime: Send {
+    fn now(&self) -> Instant;
+    fn sleep(&self, duration: Duration);
+}
+
+/// The time of this process.
+struct ProcessTime;
+
+impl PlaybackTime for ProcessTime {
+    fn now(&self) -> Instant {
+        Instant::now()
+    }
+
+    fn sleep(&self, duration: Duration) {
+        std::thread::sleep(duration);
+    }
+}
+
 /// A source that returns each sample when it is due. Stamps and order of the samples determine when
 /// they are due.
 ///
@@ -21,6 +41,7 @@ const MAX_DELAY: Duration = Duration::from_millis(270);
 /// as with devices.
 pub struct Playback {
     source: Box<dyn Source>,
+    time: Box<dyn PlaybackTime>,
     clock: PlaybackClock,
     /// When the latest sample was due.
     last_due: Option<Instant>,
@@ -56,8 +77,13 @@ impl Playback {
     /// Plays a source from its first sample, which is returned at once.
     #[must_use]
     pub fn new(source: Box<dyn Source>) -> Self {
+        Self::with_time(source, Box::new(ProcessTime))
+    }
+
+    fn with_time(source: Box<dyn Source>, time: Box<dyn PlaybackTime>) -> Self {
         Self {
             source,
+            time,
             clock: PlaybackClock::default(),
             last_due: None,
             n_dropped: BTreeMap::new(),
@@ -72,14 +98,15 @@ impl Playback {
 
     /// When a sample is due.
     fn due(&mut self, stamp: Stamp) -> Instant {
-        self.clock.start.get_or_init(|| (stamp, Instant::now()));
+        let now = self.time.now();
+        self.clock.start.get_or_init(|| (stamp, now));
         let due = self
             .clock
             .instant_of(stamp)
             // A sample is never due before the samples in front of it. Times that the clock cannot
             // represent are replaced by the current time.
             .max(self.last_due)
-            .unwrap_or_else(Instant::now);
+            .unwrap_or(now);
         self.last_due = Some(due);
         due
     }
@@ -92,16 +119,10 @@ impl Source for Playback {
                 return Ok(None);
             };
             // A sample that is late is returned at once, which lets the playback catch up.
-            let delay = match self
-                .due(sample.stamp())
-                .checked_duration_since(Instant::now())
-            {
-                Some(remaining) => {
-                    std::thread::sleep(remaining);
-                    Duration::ZERO
-                }
-                None => self.last_due.map_or(Duration::ZERO, |due| due.elapsed()),
-            };
+            let due = self.due(sample.stamp());
+            let now = self.time.now();
+            let delay = now.saturating_duration_since(due);
+            self.time.sleep(due.saturating_duration_since(now));
             if let Sample::Image(image) = &mut sample {
                 let key = (image.camera.clone(), image.is_depth());
                 if delay > MAX_DELAY {
@@ -129,6 +150,7 @@ impl Source for Playback {
 mod tests {
     use super::*;
     use crate::scripted::{self, Scripted, joints};
+    use parking_lot::Mutex;
 
     fn millis(millis: i64) -> Stamp {
         // These are stamps of another computer.
@@ -139,36 +161,44 @@ mod tests {
         Sample::Image(scripted::image(stamp))
     }
 
-    fn playback(samples: Vec<Sample>) -> Playback {
-        Playback::new(Box::new(Scripted::new(samples)))
+    /// A time that only passes while someone sleeps. Clones share it.
+    #[derive(Clone)]
+    struct SimulatedTime(Arc<Mutex<Instant>>);
+
+    impl PlaybackTime for SimulatedTime {
+        fn now(&self) -> Instant {
+            *self.0.lock()
+        }
+
+        fn sleep(&self, duration: Duration) {
+            *self.0.lock() += duration;
+        }
+    }
+
+    fn playback(samples: Vec<Sample>) -> (Playback, SimulatedTime) {
+        let time = SimulatedTime(Arc::new(Mutex::new(Instant::now())));
+        let source = Box::new(Scripted::new(samples));
+        (Playback::with_time(source, Box::new(time.clone())), time)
     }
 
     #[test]
     fn samples_are_returned_when_due_and_keep_their_latency() {
-        let mut playback = playback(vec![
+        let (mut playback, time) = playback(vec![
             joints(millis(0)),
             joints(millis(60)),
             image(millis(20)),
             joints(millis(80)),
         ]);
+        let began = time.now();
         assert_eq!(playback.clock().instant_of(millis(0)), None);
         let mut returned = Vec::new();
         while let Some(sample) = playback.next_sample().expect("no error") {
-            returned.push((sample.stamp(), Instant::now()));
-        }
-        let began = playback
-            .clock()
-            .instant_of(millis(0))
-            .expect("it has begun");
-        for ((stamp, at), due_millis) in returned.iter().zip([0, 60, 60, 80]) {
-            assert!(
-                *at >= began + Duration::from_millis(due_millis),
-                "{stamp:?}"
-            );
+            returned.push((sample.stamp(), time.now() - began));
         }
         assert_eq!(
-            returned.iter().map(|(stamp, _)| *stamp).collect::<Vec<_>>(),
-            [0, 60, 20, 80].map(millis)
+            returned,
+            [(0, 0), (60, 60), (20, 60), (80, 80)]
+                .map(|(stamp, at)| (millis(stamp), Duration::from_millis(at)))
         );
         assert_eq!(
             playback.clock().instant_of(millis(20)),
@@ -177,8 +207,17 @@ mod tests {
     }
 
     #[test]
+    fn playback_sleeps_until_a_sample_is_due() {
+        let samples = vec![joints(millis(0)), joints(millis(30))];
+        let mut playback = Playback::new(Box::new(Scripted::new(samples)));
+        while playback.next_sample().expect("no error").is_some() {}
+        let due = playback.clock().instant_of(millis(30));
+        assert!(due.is_some_and(|due| Instant::now() >= due));
+    }
+
+    #[test]
     fn images_are_dropped_and_counted_if_the_caller_is_slow() {
-        let mut playback = playback(vec![
+        let (mut playback, time) = playback(vec![
             image(millis(0)),
             image(millis(10)),
             joints(millis(15)),
@@ -192,7 +231,7 @@ mod tests {
                 .map(|sample| sample.stamp()),
             Some(millis(0))
         );
-        std::thread::sleep(Duration::from_millis(20) + 2 * MAX_DELAY);
+        time.sleep(Duration::from_millis(20) + 2 * MAX_DELAY);
         assert!(
             matches!(playback.next_sample(), Ok(Some(Sample::Joints(_)))),
             "joint states are kept"

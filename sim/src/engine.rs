@@ -20,6 +20,7 @@ use kinematics::{JointState, Stamp, Transform};
 use mujoco_rs::prelude::MjModel;
 use std::collections::VecDeque;
 use std::sync::Arc;
+use std::sync::atomic::{AtomicI64, Ordering};
 
 /// Simulated arrival time of a sample, nanoseconds, and the sample.
 pub(crate) type Delivery = (i64, Sample);
@@ -49,6 +50,8 @@ pub(crate) struct Engine {
     /// Images that would arrive before this simulated time are skipped. The real-time loop sets the
     /// time when it is late.
     skip_before_nanos: i64,
+    /// Simulated time until which the robot has moved, nanoseconds.
+    time_nanos: Arc<AtomicI64>,
     slots: VecDeque<Slot>,
     n_pending: usize,
     ready: VecDeque<Delivery>,
@@ -319,6 +322,7 @@ impl Engine {
             looks_ahead: true,
             max_pending: 2,
             skip_before_nanos: i64::MIN,
+            time_nanos: Arc::default(),
             slots: VecDeque::new(),
             n_pending: 0,
             ready: VecDeque::new(),
@@ -375,6 +379,11 @@ impl Engine {
         self.start = start;
     }
 
+    /// Simulated time until which the robot has moved, nanoseconds. It advances with the engine.
+    pub(crate) fn time_nanos(&self) -> Arc<AtomicI64> {
+        Arc::clone(&self.time_nanos)
+    }
+
     /// Skips images that arrive before a simulated time.
     pub(crate) fn skip_before(&mut self, nanos: i64) {
         self.skip_before_nanos = nanos;
@@ -424,6 +433,7 @@ impl Engine {
     /// Moves the robot by one step and starts rendering the images that arrive by then.
     fn step(&mut self) -> Result<(), Error> {
         let (nanos, reading) = self.robot.step()?;
+        self.time_nanos.store(nanos, Ordering::Relaxed);
         if self
             .config
             .duration_secs

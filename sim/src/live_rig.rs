@@ -10,6 +10,7 @@ use kinematics::{Intrinsics, JointState, Stamp};
 use parking_lot::{Condvar, Mutex};
 use std::collections::VecDeque;
 use std::sync::Arc;
+use std::sync::atomic::{AtomicI64, Ordering};
 use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
@@ -25,6 +26,9 @@ const MAX_TRUTH_IMAGES: usize = 8;
 /// short pauses of the computer. With a larger value, samples arrive later than those of a real
 /// device.
 const MAX_LATE: Duration = Duration::from_millis(50);
+/// Lag of the simulation beyond which a device without samples counts as silent. A slow computer may
+/// take many seconds to render an image.
+const MAX_LAG: Duration = Duration::from_secs(120);
 
 /// Simulated devices that deliver in real time.
 pub struct LiveRig {
@@ -71,10 +75,30 @@ impl Drop for SimulationThread {
     }
 }
 
-#[derive(Default)]
 struct SharedQueues {
     state: Mutex<QueueState>,
     arrived: Condvar,
+    clock: SimulationClock,
+}
+
+/// Relates simulated time to real time.
+struct SimulationClock {
+    /// Real time of simulated time zero.
+    started: Instant,
+    /// Simulated time until which the robot has moved, nanoseconds.
+    time_nanos: Arc<AtomicI64>,
+}
+
+impl SimulationClock {
+    /// By how much the simulation is late, if a slow computer is the likely cause.
+    fn lag(&self) -> Option<Duration> {
+        let simulated = u64::try_from(self.time_nanos.load(Ordering::Relaxed)).unwrap_or(0);
+        let lag = self
+            .started
+            .elapsed()
+            .saturating_sub(Duration::from_nanos(simulated));
+        (lag > MAX_LATE && lag < MAX_LAG).then_some(lag)
+    }
 }
 
 #[derive(Default)]
@@ -101,13 +125,20 @@ impl LiveRig {
             .iter()
             .map(|camera| camera.name.as_str().into())
             .collect();
-        let shared = Arc::new(SharedQueues::default());
-        {
-            let mut state = shared.state.lock();
-            state.images = vec![VecDeque::new(); names.len()];
-            state.n_dropped = vec![[0; 2]; names.len()];
-            state.scans = vec![VecDeque::new(); info.scanner_names.len()];
-        }
+        let state = QueueState {
+            images: vec![VecDeque::new(); names.len()],
+            n_dropped: vec![[0; 2]; names.len()],
+            scans: vec![VecDeque::new(); info.scanner_names.len()],
+            ..QueueState::default()
+        };
+        let shared = Arc::new(SharedQueues {
+            state: Mutex::new(state),
+            arrived: Condvar::new(),
+            clock: SimulationClock {
+                started: Instant::now(),
+                time_nanos: engine.time_nanos(),
+            },
+        });
         let thread = std::thread::Builder::new()
             .name("sim-live".to_owned())
             .spawn({
@@ -179,7 +210,7 @@ struct DeviceNames {
 /// Delivers samples when they are due, until the rig ends or all devices are dropped.
 fn run_simulation(mut engine: Engine, shared: &SharedQueues, names: &DeviceNames, start: Stamp) {
     engine.set_start(start);
-    let started = Instant::now();
+    let started = shared.clock.started;
     let end = loop {
         // If rendering is slower than real time, images are skipped. Joint readings then stay on
         // time, and delays do not add up.
@@ -249,8 +280,11 @@ impl SharedQueues {
 
     /// Waits until `take` returns a value. Returns an error if nothing came in time or the rig has
     /// ended.
+    ///
+    /// * `device`: the device in the error if the simulation is late
     fn wait<T>(
         &self,
+        device: &str,
         timeout: Duration,
         mut take: impl FnMut(&mut QueueState) -> Option<T>,
         timeout_error: impl FnOnce() -> drivers::Error,
@@ -269,7 +303,13 @@ impl SharedQueues {
             }
             let left = until.saturating_duration_since(Instant::now());
             if left.is_zero() {
-                return Err(timeout_error());
+                return Err(match self.clock.lag() {
+                    Some(lag) => drivers::Error::SimulationLags {
+                        device: device.to_owned(),
+                        lag,
+                    },
+                    None => timeout_error(),
+                });
             }
             self.arrived.wait_for(&mut state, left);
         }
@@ -332,6 +372,7 @@ impl Camera for LiveCamera {
             waited: timeout,
         };
         self.simulation.shared.wait(
+            &format!("camera {:?}", self.name),
             timeout,
             |state| state.images[self.camera_ix].pop_front(),
             timeout_error,
@@ -351,9 +392,12 @@ impl Arm for LiveArm {
 
     fn read(&mut self, timeout: Duration) -> Result<JointState, drivers::Error> {
         let timeout_error = || drivers::Error::NoJoints { waited: timeout };
-        self.simulation
-            .shared
-            .wait(timeout, |state| state.readings.pop_front(), timeout_error)
+        self.simulation.shared.wait(
+            "arm",
+            timeout,
+            |state| state.readings.pop_front(),
+            timeout_error,
+        )
     }
 }
 
@@ -364,9 +408,12 @@ struct LiveBase {
 impl Base for LiveBase {
     fn next_pose(&mut self, timeout: Duration) -> Result<BasePose, drivers::Error> {
         let timeout_error = || drivers::Error::NoBasePose { waited: timeout };
-        self.simulation
-            .shared
-            .wait(timeout, |state| state.poses.pop_front(), timeout_error)
+        self.simulation.shared.wait(
+            "base",
+            timeout,
+            |state| state.poses.pop_front(),
+            timeout_error,
+        )
     }
 }
 
@@ -387,9 +434,47 @@ impl RangeScanner for LiveScanner {
             waited: timeout,
         };
         self.simulation.shared.wait(
+            &format!("range scanner {:?}", self.name),
             timeout,
             |state| state.scans[self.scanner_ix].pop_front(),
             timeout_error,
         )
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// The error of a device without samples, after this real and simulated time.
+    fn error_after(real: Duration, simulated: Duration) -> String {
+        let started = Instant::now().checked_sub(real);
+        let nanos = i64::try_from(simulated.as_nanos()).expect("a short time");
+        let shared = SharedQueues {
+            state: Mutex::default(),
+            arrived: Condvar::new(),
+            clock: SimulationClock {
+                started: started.expect("the computer has been on for longer"),
+                time_nanos: Arc::new(AtomicI64::new(nanos)),
+            },
+        };
+        let waited = Duration::ZERO;
+        let silent = || drivers::Error::NoJoints { waited };
+        let error = shared.wait("arm", waited, |state| state.readings.pop_front(), silent);
+        error.expect_err("there are no samples").to_string()
+    }
+
+    #[test]
+    fn a_late_simulation_is_not_a_silent_device() {
+        let [short, hour] = [7, 3600].map(Duration::from_secs);
+        let late = error_after(short, Duration::ZERO);
+        assert!(late.contains("arm: the simulation lags "), "{late}");
+        let silent = drivers::Error::NoJoints {
+            waited: Duration::ZERO,
+        };
+        // A simulation in time, and one that no longer advances.
+        for (real, simulated) in [(short, hour), (short + MAX_LAG, short)] {
+            assert_eq!(error_after(real, simulated), silent.to_string());
+        }
     }
 }

@@ -37,9 +37,13 @@ fn config(path: PathBuf, camera: &EmulatedCamera, pace: Pace) -> Config {
     }
 }
 
-/// Reads all images until the end of the file.
+/// Opens a file and reads all its images.
 fn play(config: Config) -> (RealsenseCamera, Vec<Image>) {
-    let mut camera = RealsenseCamera::open(config).unwrap_or_else(|error| panic!("{error}"));
+    read_all(RealsenseCamera::open(config).unwrap_or_else(|error| panic!("{error}")))
+}
+
+/// Reads all remaining images of a file.
+fn read_all(mut camera: RealsenseCamera) -> (RealsenseCamera, Vec<Image>) {
     let mut images = Vec::new();
     loop {
         match camera.next_image(TEST_TIMEOUT) {
@@ -212,12 +216,12 @@ fn file_on_the_clock_starts_at_its_stamps() {
     let folder = tempfile::tempdir().unwrap();
     let camera = d435i([640, 480], Lens::Pinhole);
     let path = folder.path().join("camera.bag");
-    let starts_at = drivers::clock::now().plus_secs(LATER_SECS);
     let mut writer = BagWriter::create(&path, &camera).unwrap();
     for number in 0..3 {
         writer.write(&image(&camera, number)).unwrap();
     }
     writer.finish().unwrap();
+    let starts_at = drivers::clock::now().plus_secs(LATER_SECS);
     // The file contains only color.
     let clock_config = Config {
         depth_size_px: None,
@@ -244,46 +248,84 @@ fn file_on_the_clock_starts_at_its_stamps() {
     assert_eq!(live.next_sample().unwrap(), None);
 }
 
+/// Plays a file that began a second ago. Returns its images, the stamp of its first image, and the
+/// times before and after it was opened. If the machine stalls until the file is over, another
+/// second is tried.
+fn play_late(
+    config: &Config,
+    read: impl Fn(RealsenseCamera) -> Vec<Image>,
+) -> (Vec<Image>, Stamp, [Stamp; 2]) {
+    let deadline = Instant::now() + TEST_TIMEOUT;
+    loop {
+        let before = drivers::clock::now();
+        let starts_at = before - Duration::from_secs(1);
+        let camera = RealsenseCamera::open(Config {
+            clock_offset_nanos: starts_at.0 - BEGIN_NANOS,
+            ..config.clone()
+        })
+        .unwrap();
+        let opened = [before, drivers::clock::now()];
+        let images = read(camera);
+        if !images.is_empty() {
+            return (images, starts_at, opened);
+        }
+        assert!(Instant::now() < deadline, "the file is over when it opens");
+    }
+}
+
 #[test]
 fn file_opened_late_starts_at_current_time_without_loss() {
+    const N_IN_FILE: i64 = 90;
     let folder = tempfile::tempdir().unwrap();
     let (path, camera) = (
         folder.path().join("camera.bag"),
         d435i([640, 480], Lens::Pinhole),
     );
-    let n_before = 30;
     let mut writer = BagWriter::create(&path, &camera).unwrap();
-    (0..3 * n_before).for_each(|number| writer.write(&image(&camera, number)).unwrap());
+    (0..N_IN_FILE).for_each(|number| writer.write(&image(&camera, number)).unwrap());
     writer.finish().unwrap();
-    let starts_at =
-        drivers::clock::now() - Duration::from_nanos((n_before * PERIOD_NANOS).unsigned_abs());
     let clock_config = Config {
         depth_size_px: None,
         ..config(path, &camera, Pace::Clock)
     };
-    let open = RealsenseCamera::open(Config {
-        clock_offset_nanos: starts_at.0 - BEGIN_NANOS,
-        ..clock_config
-    })
-    .unwrap();
-    let mut live = LiveDevices::new(Devices {
-        cameras: vec![Box::new(open)],
-        ..Devices::default()
-    })
-    .unwrap();
-    let mut images = Vec::new();
-    while let Some(Sample::Image(image)) = live.next_sample().unwrap() {
-        images.push(image);
-    }
+    // The first image is the first one that is due after the file was opened.
+    let check_first = |first: i64, starts_at: Stamp, opened: [Stamp; 2]| {
+        let [earliest, latest] = opened.map(|opened| (opened.0 - starts_at.0) / PERIOD_NANOS);
+        assert!((earliest..=latest + 1).contains(&first), "{first}");
+    };
+    // The file waits for its reader, however slow that is.
+    let (images, starts_at, opened) = play_late(&clock_config, |camera| read_all(camera).1);
     let first = (images[0].stamp.0 - starts_at.0) / PERIOD_NANOS;
-    assert!((n_before..2 * n_before).contains(&first), "{first}");
+    check_first(first, starts_at, opened);
     for (ix, image) in (first..).zip(&images) {
         assert_eq!(
             (image.stamp.0, image.n_skipped),
             (starts_at.0 + ix * PERIOD_NANOS, 0)
         );
     }
-    assert_eq!(first + i64::try_from(images.len()).unwrap(), 3 * n_before);
+    assert_eq!(first + i64::try_from(images.len()).unwrap(), N_IN_FILE);
+    // The queue of a live rig drops images if this thread stalls, and counts them.
+    let (images, starts_at, opened) = play_late(&clock_config, |camera| {
+        let mut live = LiveDevices::new(Devices {
+            cameras: vec![Box::new(camera)],
+            ..Devices::default()
+        })
+        .unwrap();
+        let mut images = Vec::new();
+        while let Some(Sample::Image(image)) = live.next_sample().unwrap() {
+            images.push(image);
+        }
+        images
+    });
+    let n_skipped = |image: &Image| i64::try_from(image.n_skipped).unwrap();
+    let mut next = (images[0].stamp.0 - starts_at.0) / PERIOD_NANOS - n_skipped(&images[0]);
+    check_first(next, starts_at, opened);
+    for image in &images {
+        next += n_skipped(image);
+        assert_eq!(image.stamp.0, starts_at.0 + next * PERIOD_NANOS);
+        next += 1;
+    }
+    assert_eq!(next, N_IN_FILE);
 }
 
 #[test]

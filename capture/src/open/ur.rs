@@ -107,7 +107,9 @@ mod tests {
             ..Joints::default()
         };
         let config = ControllerConfig::e_series(address, chain);
-        let controller = EmulatedController::start(config, Box::new(joint_simulator));
+        // A busy machine may stall the driver, so the controller waits for its setpoints.
+        let simulator = Box::new(joint_simulator);
+        let controller = EmulatedController::start_waiting(config, TEST_TIMEOUT, simulator);
         (controller.expect("a free address"), address)
     }
 

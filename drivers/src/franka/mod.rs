@@ -34,6 +34,8 @@ mod request;
 mod state;
 mod statistics;
 #[cfg(test)]
+mod test_pace;
+#[cfg(test)]
 mod tests;
 
 #[cfg(any(test, fuzzing))]

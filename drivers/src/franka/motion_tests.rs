@@ -4,6 +4,7 @@
 use super::emulated::{
     CommandedJoints, EmulatedRobot, JointSimulator, Joints, Limits, RobotConfig,
 };
+use super::test_pace::Pace;
 use super::tests::{
     FREE_PORT, REST_RAD, TEST_TIMEOUT, VERSIONS, chain, config, ideal_joints, robot, waiting_robot,
 };
@@ -66,6 +67,48 @@ fn with_counter(mut joint_simulator: JointSimulator) -> (JointSimulator, Arc<Ato
         joint_simulator(stamp, commanded)
     });
     (counting, n_moving)
+}
+
+/// Lets a robot move only as far as a test permits.
+fn paced_motion(mut joint_simulator: JointSimulator, pace: &Pace) -> JointSimulator {
+    let pace = pace.clone();
+    Box::new(move |stamp, commanded| {
+        if commanded.is_moving {
+            pace.wait();
+        }
+        joint_simulator(stamp, commanded)
+    })
+}
+
+/// Waits until the robot has moved for this many milliseconds of its own time, and stands still.
+/// Returns the reason if the arm has stopped.
+fn move_for(arm: &MovableFrankaArm, pace: &Pace, n_states: u64) -> Result<(), String> {
+    pace.limit(n_states);
+    let deadline = Instant::now() + TEST_TIMEOUT;
+    while !pace.is_standing_still() {
+        if let Motion::Stopped { reason } = arm.motion() {
+            return Err(reason);
+        }
+        assert!(Instant::now() < deadline, "the robot does not move");
+        std::thread::sleep(Duration::from_millis(2));
+    }
+    Ok(())
+}
+
+/// Commands a target, and waits until the robot has moved for this many milliseconds, and stands
+/// still. If the machine is so busy that the robot triggers a reflex, repeats it.
+fn move_until(arm: &mut MovableFrankaArm, pace: &Pace, target: &JointTarget, n_states: u64) {
+    loop {
+        pace.free();
+        let moved = command_target(arm, target).and_then(|()| move_for(arm, pace, n_states));
+        match moved {
+            Ok(()) => return,
+            Err(why) if why.contains("communication_constraints_violation") => {
+                arm.recover().unwrap()
+            }
+            Err(why) => panic!("{why}"),
+        }
+    }
 }
 
 fn offset_from_rest(by_rad: [f64; N_JOINTS]) -> JointTarget {
@@ -177,13 +220,18 @@ fn motion_of_all_joints_respects_robot_limits() {
 fn retargeting_and_stopping_respect_robot_limits() {
     for version in VERSIONS {
         let (joint_simulator, last_command) = recording_joints();
+        let pace = Pace::default();
+        let joint_simulator = paced_motion(joint_simulator, &pace);
         let emulated = waiting_robot(version, ANSWER_WAIT, joint_simulator);
         let mut arm = open(emulated.address());
         let far = offset_from_rest([1.2, -0.8, 1.0, 0.9, 1.0, 1.0, 1.0]);
+        // The times are those of the robot, which stands still between them. If this thread is not
+        // scheduled for long, the arm would otherwise arrive before it is stopped.
         retry_until_settled(&mut arm, |arm| {
+            pace.free();
             command_target(arm, &far)?;
             for ix in 0..8 {
-                std::thread::sleep(Duration::from_millis(90));
+                move_for(arm, &pace, 90)?;
                 let sign = if ix % 2 == 0 { -1.0 } else { 1.0 };
                 command_target(
                     arm,
@@ -191,8 +239,9 @@ fn retargeting_and_stopping_respect_robot_limits() {
                 )?;
             }
             command_target(arm, &far)?;
-            std::thread::sleep(Duration::from_millis(700));
+            move_for(arm, &pace, 700)?;
             arm.stop().unwrap();
+            pace.free();
             Ok(())
         });
         let CommandedJoints {
@@ -501,14 +550,17 @@ fn lossy_network_is_reported_and_motions_complete() {
 fn disconnect_triggers_reflex_and_arm_recovers() {
     let (joint_simulator, last_command) = recording_joints();
     let (joint_simulator, n_moving) = with_counter(joint_simulator);
+    let pace = Pace::default();
+    let joint_simulator = paced_motion(joint_simulator, &pace);
     let emulated = waiting_robot(FciVersion::V10, ANSWER_WAIT, joint_simulator);
     let relay = Relay::start(emulated.address());
     let mut arm = open(relay.address);
     let far = offset_from_rest([0.9, -0.6, 0.9, 0.9, 0.9, 0.9, 0.9]);
-    command_target(&mut arm, &far).unwrap();
-    std::thread::sleep(Duration::from_millis(500));
+    // The robot stands still on its way while it is disconnected, so that it has not arrived.
+    move_until(&mut arm, &pace, &far, 500);
     relay.faults.is_disconnected.store(true, Ordering::Relaxed);
     let n_before = n_moving.load(Ordering::Relaxed);
+    pace.free();
     wait_until(
         || !last_command.lock().unwrap().is_moving,
         "the robot stops on its own",
@@ -569,6 +621,10 @@ fn child_program_moves_arm() {
 fn suspended_program_triggers_reflex_and_sends_nothing_stale() {
     let (joint_simulator, last_command) = recording_joints();
     let (joint_simulator, n_moving) = with_counter(joint_simulator);
+    // The robot stands still on its way while the program is suspended, so that it has not arrived.
+    let pace = Pace::default();
+    pace.limit(300);
+    let joint_simulator = paced_motion(joint_simulator, &pace);
     let emulated = waiting_robot(FciVersion::V10, ANSWER_WAIT, joint_simulator);
     let relay = Relay::start(emulated.address());
     let mut child = Command::new(std::env::current_exe().unwrap())
@@ -599,8 +655,9 @@ fn suspended_program_triggers_reflex_and_sends_nothing_stale() {
         lines.by_ref().find_map(of_arm).expect("the program ended")
     };
     assert_eq!(text(), "moving");
-    std::thread::sleep(Duration::from_millis(300));
+    wait_until(|| pace.is_standing_still(), "the robot moves");
     signal("-STOP");
+    pace.free();
     // Commands may still be on their way through the relay.
     let (mut n_before, mut n_commands) = (0, 0);
     let has_stopped = || {

@@ -412,3 +412,76 @@ impl ActiveMotion {
             .map_err(|_| "the setpoint has the wrong number of joints".to_owned())
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::motion::JointTarget;
+    use std::iter::repeat_n;
+
+    const CYCLE: Duration = Duration::from_millis(2);
+
+    /// A motion that has just begun, from zero to one radian.
+    fn active_motion() -> ActiveMotion {
+        let limits = MotionLimits {
+            position: [-6.0, 6.0],
+            velocity: 0.5,
+            acceleration: 2.0,
+            jerk: 20.0,
+        };
+        let limits = [limits; N_JOINTS];
+        let mut generator =
+            TrajectoryGenerator::new(&limits, &[0.0; N_JOINTS], CYCLE).expect("valid limits");
+        let target = JointTarget {
+            position: vec![1.0; N_JOINTS],
+        };
+        generator.set_target(&target).expect("a valid target");
+        ActiveMotion {
+            session: 1,
+            generator,
+            sent_rad: [0.0; N_JOINTS],
+            n_at_rest: 0,
+        }
+    }
+
+    /// The first joint of the next setpoint.
+    fn advance(active: &mut ActiveMotion, n_cycles: u64, pause: Duration) -> f64 {
+        let state = RobotState::default();
+        let cycle = Cycle {
+            state: &state,
+            n_cycles,
+            pause,
+        };
+        active.sent_rad = active.next_position(None, &cycle).expect("a setpoint");
+        active.sent_rad[0]
+    }
+
+    #[test]
+    fn a_setpoint_covers_the_cycles_since_the_last_one() {
+        let mut in_time = active_motion();
+        let each: Vec<f64> = (0..1000).map(|_| advance(&mut in_time, 1, CYCLE)).collect();
+        let mut delayed = active_motion();
+        let mut n_steps = 0;
+        // More than four cycles are not caught up: the setpoint would jump.
+        for (n_cycles, n_expected) in [(1, 1), (2, 2), (3, 3), (4, 4), (5, 4), (24, 4)]
+            .into_iter()
+            .flat_map(|steps| repeat_n(steps, 30))
+        {
+            let position = advance(&mut delayed, n_cycles, CYCLE);
+            n_steps += n_expected;
+            assert_eq!(position, each[n_steps - 1], "after {n_steps} cycles");
+        }
+    }
+
+    #[test]
+    fn a_motion_continues_from_rest_after_a_pause() {
+        let mut active = active_motion();
+        let moving: Vec<f64> = (0..300).map(|_| advance(&mut active, 1, CYCLE)).collect();
+        assert!(moving[299] - moving[298] > 0.9e-3, "it moves at 0.5 rad/s");
+        let resumed = advance(&mut active, 100, MAX_PAUSE + CYCLE);
+        // One cycle of the maximum jerk.
+        let max_step = 20.0 * CYCLE.as_secs_f64().powi(3);
+        let step = resumed - moving[299];
+        assert!((0.0..=max_step).contains(&step), "{step}");
+    }
+}

@@ -184,7 +184,13 @@ fn garbage_and_lost_connections_are_followed_by_a_reconnect() {
     emulated.disconnect();
     read_until(&mut arm, |statistics| statistics.n_reconnects == 2);
     emulated.set_silent(true);
-    std::thread::sleep(Duration::from_millis(1500));
+    let deadline = Instant::now() + TEST_TIMEOUT;
+    while !matches!(
+        arm.read(Duration::from_millis(20)),
+        Err(Error::ArmReconnecting { .. })
+    ) {
+        assert!(Instant::now() < deadline, "{}", arm.statistics());
+    }
     emulated.set_silent(false);
     read_until(&mut arm, |statistics| statistics.n_reconnects >= 3);
     let before = arm.statistics();

@@ -49,11 +49,13 @@ impl Client {
     /// client is still connected.
     ///
     /// * `held`: the input variables that other clients write
+    /// * `takes_one`: whether later inputs are kept for the next call
     pub(super) fn serve(
         &mut self,
         config: &ControllerConfig,
         robot: &mut Robot,
         held: &[String],
+        takes_one: bool,
     ) -> bool {
         let mut bytes = [0; RECEIVE_BYTES];
         loop {
@@ -69,6 +71,9 @@ impl Client {
                 Ok(Some(package)) => {
                     if !self.answer(&package, config, robot, held) {
                         return false;
+                    }
+                    if takes_one && package.package_type == PackageType::Data {
+                        return true;
                     }
                 }
                 Ok(None) => return true,

@@ -203,6 +203,17 @@ impl Robot {
         }
     }
 
+    /// Whether the program follows setpoints: it has set a watchdog on their number.
+    pub(super) fn follows_setpoints(&self) -> bool {
+        self.watchdog.is_some() && self.values.runtime_state == PLAYING
+    }
+
+    /// Whether a setpoint has arrived since the last cycle.
+    pub(super) fn has_new_setpoint(&self) -> bool {
+        self.watchdog
+            .is_some_and(|watchdog| self.inputs.int_ages[watchdog.register] == 0)
+    }
+
     fn is_ready(&self) -> bool {
         self.values.modes.robot_mode == RUNNING && (1..=2).contains(&self.values.modes.safety_mode)
     }

@@ -48,8 +48,16 @@ struct Controls {
 
 impl EmulatedController {
     /// Starts listening. From then on, `joint_simulator` is called for the joint states.
-    pub fn start(
+    pub fn start(config: ControllerConfig, joint_simulator: JointSimulator) -> Result<Self, Error> {
+        Self::start_waiting(config, Duration::ZERO, joint_simulator)
+    }
+
+    /// Like [`start`](Self::start), but a program that follows setpoints waits up to `answer_wait`
+    /// for the setpoint after each state, and follows one setpoint per cycle. A real controller does
+    /// not wait. Tests wait, so that their motions do not depend on the load of the machine.
+    pub fn start_waiting(
         config: ControllerConfig,
+        answer_wait: Duration,
         mut joint_simulator: JointSimulator,
     ) -> Result<Self, Error> {
         let device = "emulated controller".to_owned();
@@ -77,6 +85,7 @@ impl EmulatedController {
         let mut server = Server {
             robot: Robot::new(&config, start, FIRST_TIMESTAMP_SECS),
             config,
+            answer_wait,
             joint_simulator,
             rtde,
             scripts,
@@ -157,6 +166,8 @@ fn bind(address: SocketAddr) -> std::io::Result<TcpListener> {
 /// State of the thread.
 struct Server {
     config: ControllerConfig,
+    /// Maximum time by which a setpoint may be late.
+    answer_wait: Duration,
     joint_simulator: JointSimulator,
     rtde: TcpListener,
     scripts: LineServer,
@@ -174,7 +185,8 @@ impl Server {
         while !self.controls.lock().stop {
             let due = start.plus_secs(cycle as f64 * step_secs);
             let lag = clock::now().duration_since(due);
-            if lag <= MAX_LAG {
+            // A program that waits for setpoints also waits for those to late states.
+            if lag <= MAX_LAG || self.waits_for_setpoints() {
                 std::thread::sleep(due.duration_since(clock::now()));
                 self.robot.values.timestamp_secs = FIRST_TIMESTAMP_SECS + cycle as f64 * step_secs;
                 self.cycle(cycle, due);
@@ -187,6 +199,9 @@ impl Server {
     fn cycle(&mut self, cycle: u64, due: Stamp) {
         let (injected, is_silent) = self.take_controls();
         self.serve_clients();
+        if !is_silent {
+            self.wait_for_setpoint();
+        }
         self.serve_lines();
         self.robot.advance();
         self.move_joints(due);
@@ -225,18 +240,43 @@ impl Server {
                 self.clients.push(Client::new(stream));
             }
         }
+        // Setpoints that arrive together are followed one by one, as if none had been late.
+        let takes_one = self.waits_for_setpoints();
         let mut ix = 0;
         while ix < self.clients.len() {
             let mut client = self.clients.swap_remove(ix);
             let others = self.clients.iter();
             let held: Vec<String> = others.flat_map(Client::held_inputs).cloned().collect();
-            if client.serve(&self.config, &mut self.robot, &held) {
+            if client.serve(&self.config, &mut self.robot, &held, takes_one) {
                 // The last client has taken the place of this one, so they change places again.
                 self.clients.push(client);
                 let last = self.clients.len() - 1;
                 self.clients.swap(ix, last);
                 ix += 1;
             }
+        }
+    }
+
+    /// Whether a program follows the setpoints of a client, and waits for late ones.
+    fn waits_for_setpoints(&self) -> bool {
+        let has_sender = || {
+            let mut clients = self.clients.iter();
+            clients.any(|client| client.held_inputs().next().is_some())
+        };
+        !self.answer_wait.is_zero() && self.robot.follows_setpoints() && has_sender()
+    }
+
+    /// Waits for the setpoint after the last state.
+    fn wait_for_setpoint(&mut self) {
+        const POLL: Duration = Duration::from_micros(100);
+        let deadline = clock::now() + self.answer_wait;
+        while self.waits_for_setpoints()
+            && !self.robot.has_new_setpoint()
+            && clock::now() < deadline
+            && !self.controls.lock().stop
+        {
+            std::thread::sleep(POLL);
+            self.serve_clients();
         }
     }
 
