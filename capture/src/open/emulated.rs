@@ -8,7 +8,7 @@ use crate::config::{ArmDriver, Rig};
 use anyhow::bail;
 use drivers::franka::FciVersion;
 use drivers::franka::emulated::{EmulatedRobot, Limits, RobotConfig};
-use drivers::motion::{JointTarget, Motion, MovableArm};
+use drivers::motion::{JointTarget, Motion, MovableArm, SteeringPort};
 use drivers::{Arm, Camera, Error, clock};
 use kinematics::{JointState, Transform};
 use sim::MotorHistory;
@@ -94,5 +94,9 @@ impl MovableArm for EmulatedArm {
 
     fn recover(&mut self) -> Result<(), Error> {
         self.arm.recover()
+    }
+
+    fn steering_port(&mut self, brake_factor: f64) -> Result<SteeringPort, Error> {
+        self.arm.steering_port(brake_factor)
     }
 }
