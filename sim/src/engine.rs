@@ -1,11 +1,12 @@
 //! Steps the rig and creates samples in the order in which devices would deliver them.
 
-use crate::arm::{JointReading, STEP_NANOS};
+use crate::arm::{JointReading, ReadingOrder, STEP_NANOS};
 use crate::base::Drift;
 use crate::cabinet_tour::light_frac;
 use crate::commands::Commands;
 use crate::config::{CameraConfig, Config, Parent, Scene, SensorConfig, StampConfig, TargetParent};
 use crate::hand::Hand;
+use crate::handover::Handover;
 use crate::joints::Joints;
 use crate::lidar::{self, RayCaster};
 use crate::motors::{MotorHistory, MotorizedArm};
@@ -345,10 +346,26 @@ impl Engine {
 
     /// Moves the arm by commands instead of the scan.
     pub(crate) fn follow_commands(&mut self, commands: Commands) -> Result<(), Error> {
+        let order = self.reading_order();
         let arm = self.robot.arm_mut().ok_or(Error::NoArm)?;
-        arm.follow_commands(commands, &self.joint_ixs, &self.config.joint_offsets);
+        arm.follow_commands(commands, order);
         self.looks_ahead = false;
         Ok(())
+    }
+
+    /// Lets a controller take the arm over from its tour.
+    pub(crate) fn hand_over_to(&mut self, handover: Handover) -> Result<(), Error> {
+        let order = self.reading_order();
+        let arm = self.robot.arm_mut().ok_or(Error::NoArm)?;
+        arm.hand_over_to(handover, order);
+        Ok(())
+    }
+
+    fn reading_order(&self) -> ReadingOrder {
+        ReadingOrder {
+            joint_ixs: self.joint_ixs.clone(),
+            joint_offsets: self.config.joint_offsets.clone(),
+        }
     }
 
     /// Moves the arm by emulated motors instead of the scan. `start`: stamp of simulated time zero.
@@ -409,7 +426,7 @@ impl Engine {
 
     /// Whether the robot may move before the next sample is delivered.
     fn may_step(&self) -> bool {
-        if self.looks_ahead {
+        if self.looks_ahead && !self.robot.is_commanded() {
             // While images are rendered, the processor steps the robot.
             self.n_pending < self.max_pending
         } else {

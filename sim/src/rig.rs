@@ -15,6 +15,7 @@ use crate::render::Renderer;
 use crate::rig_info::{CameraInfo, RigInfo};
 use crate::robot::{Robot, RobotKinematics};
 use crate::scan::{LOOK_AT_HEIGHT_M, Scan};
+use crate::steered_arm::{SteeredArm, SteeredLimits};
 use crate::twin::{self, Efforts, RobotConfig};
 use crate::{CameraConfig, Error, scene};
 use drivers::motion::MotionLimits;
@@ -290,6 +291,20 @@ impl Rig {
         Ok(LiveRig::start(self.engine, self.info, start)?
             .devices
             .cameras)
+    }
+
+    /// Lets the rig run in real time, with an arm that an operator may take over from its tour.
+    /// Simulated time zero is the time of this call, which is `start` on the caller's clock.
+    ///
+    /// # Errors
+    ///
+    /// If the rig has no arm, the arm is outside its limits, or a thread cannot be started.
+    pub fn into_steered(
+        self,
+        start: Stamp,
+        limits: SteeredLimits<'_>,
+    ) -> Result<(LiveRig, SteeredArm), Error> {
+        LiveRig::start_steered(self.engine, self.info, start, limits)
     }
 
     /// Lets the rig run in real time. Simulated time zero is the time of this call, which is
