@@ -245,6 +245,13 @@ impl Arm {
         self.handover = Some((handover, order));
     }
 
+    /// Tells the controller that the simulation has ended.
+    pub(crate) fn end_control(&self) {
+        if let Some((handover, _)) = &self.handover {
+            handover.finish();
+        }
+    }
+
     /// Whether commands move the arm, which may come at any time.
     pub(crate) fn is_commanded(&self) -> bool {
         matches!(self.reference, Reference::Commands(_))

@@ -23,6 +23,7 @@ mod cabinet_tour;
 mod commanded;
 mod commands;
 pub mod config;
+mod contacts;
 mod egl;
 mod engine;
 mod error;

@@ -1,6 +1,7 @@
 //! A rig in real time: devices behind the traits of `drivers`, fed by one thread.
 
 use crate::Error;
+use crate::contacts::ContactCounter;
 use crate::engine::{Delivery, Engine};
 use crate::handover::Handover;
 use crate::rig_info::RigInfo;
@@ -104,7 +105,7 @@ impl LiveRig {
 
     /// Starts a rig whose arm an operator may take over from its tour.
     pub(crate) fn start_steered(
-        mut engine: Engine,
+        (mut engine, contacts): (Engine, ContactCounter),
         info: RigInfo,
         start: Stamp,
         limits: SteeredLimits<'_>,
@@ -112,7 +113,8 @@ impl LiveRig {
         let position = engine.reported_joints()?;
         let handover = Handover::default();
         engine.hand_over_to(handover.clone())?;
-        let n_contacts = engine.count_contacts()?;
+        let n_contacts = contacts.n_contacts();
+        engine.count_contacts(contacts);
         let started = Instant::now();
         let (controller, arm) =
             Controller::start(limits, &position, handover, started, n_contacts)?;
@@ -233,6 +235,7 @@ fn run_simulation(
             Err(error) => break error.to_string(),
         }
     };
+    engine.end_control();
     // The end is set under the lock, so that a device that is about to wait cannot miss it.
     shared.state.lock().end = Some(end);
     shared.arrived.notify_all();

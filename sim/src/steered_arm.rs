@@ -105,7 +105,8 @@ impl Controller {
         let failed = |error: drivers::Error| Error::Motion {
             reason: error.to_string(),
         };
-        let port = SteeringPort::new(limits.motion, limits.brake_factor, recover).map_err(failed)?;
+        let port =
+            SteeringPort::new(limits.motion, limits.brake_factor, recover).map_err(failed)?;
         let control = Control {
             steered: Steered::new(port.clone(), position, PERIOD).map_err(failed)?,
             phase: Phase::Tour,
@@ -374,7 +375,10 @@ mod tests {
         }
         let state = port.state().expect("a report");
         assert!(state.is_at_rest && state.braked_motion == 1, "{state:?}");
-        assert!(last.position[0] > rest - 0.4, "it braked on the way: {last:?}");
+        assert!(
+            last.position[0] > rest - 0.4,
+            "it braked on the way: {last:?}"
+        );
     }
 
     #[test]

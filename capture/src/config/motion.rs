@@ -75,7 +75,9 @@ impl ArmSteering {
         let Some([lower, upper]) = self.workspace_corners_m() else {
             return Ok(());
         };
-        let sides = ["x", "y", "z"].into_iter().zip(lower.into_iter().zip(upper));
+        let sides = ["x", "y", "z"]
+            .into_iter()
+            .zip(lower.into_iter().zip(upper));
         for (axis, (lower, upper)) in sides {
             if lower >= upper {
                 return Err(ConfigError::Robot {
@@ -113,7 +115,11 @@ mod tests {
             workspace_m: Some(workspace_m),
             ..ArmSteering::default()
         };
-        assert!(with([-1.0, -1.0, 0.0, 1.0, 1.0, 1.0]).check("rig.toml").is_ok());
+        assert!(
+            with([-1.0, -1.0, 0.0, 1.0, 1.0, 1.0])
+                .check("rig.toml")
+                .is_ok()
+        );
         let error = with([-1.0, 1.0, 0.0, 1.0, 1.0, 1.0]).check("rig.toml");
         let text = error.expect_err("y has no length").to_string();
         assert!(text.contains("workspace_m: y is from 1 to 1"), "{text}");
