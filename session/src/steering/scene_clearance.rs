@@ -1,0 +1,152 @@
+//! What is known about the space around the arm of a run: the map of free space, and what feeds it.
+//!
+//! Keyframes with measured depth show what is free and what is not. Before the first operator, the
+//! space through which the arm itself moves is free, too: a person guides it, or a simulated arm is
+//! on its tour.
+
+use super::robot::ChainAndBody;
+use capture::config::Rig;
+use clearance_map::{ClearanceMap, DepthImage, DepthOrigin, MapConfig, Posture, reach_m};
+use drivers::motion::ArmState;
+use keyframe::{Keyframe, RobotState};
+use kinematics::{JointHistory, JointState, Stamp, Transform};
+use parking_lot::Mutex;
+use std::sync::Arc;
+use std::time::Duration;
+use steering::{Clearance, Seen};
+
+/// Postures are not interpolated across longer gaps.
+const MAX_GAP: Duration = Duration::from_millis(100);
+/// Number of postures kept: those of five seconds at 1 kHz. Keyframes take less time to arrive.
+const MAX_POSTURES: usize = 5000;
+/// Time between two postures that are swept. The arm of a tour moves by less than the margin.
+const SWEEP_PERIOD_SECS: f64 = 0.2;
+/// Distance around the arm that counts as free where the arm has moved safely, meters. It is below
+/// the distance that people keep from surfaces when they guide an arm.
+const SWEEP_MARGIN_M: f64 = 0.05;
+
+/// The space around an arm.
+pub(super) struct SceneClearance {
+    map: ClearanceMap,
+    /// Index in the lists of the rig file of each joint of the chain.
+    joint_ixs: Vec<usize>,
+    world_from_base: Transform,
+    state: Mutex<State>,
+}
+
+struct State {
+    /// Postures in the order of the chain.
+    postures: JointHistory,
+    /// Whether no operator has had the arm.
+    is_sweeping: bool,
+    swept_at: Option<Stamp>,
+}
+
+impl SceneClearance {
+    /// The space around the arm of a rig with a fixed base, of which nothing is known.
+    ///
+    /// # Errors
+    ///
+    /// If the reach of the robot is too large for a map, or no thread can be started.
+    pub(super) fn new(rig: &Rig, robot: &ChainAndBody) -> anyhow::Result<Self> {
+        let config = MapConfig::for_reach(reach_m(&robot.body, &robot.chain));
+        Ok(Self {
+            map: ClearanceMap::start(config, robot.body.clone())?,
+            joint_ixs: robot.chain.order_in(&rig.arm.joints)?,
+            world_from_base: rig.base.world_from_base,
+            state: Mutex::new(State {
+                postures: JointHistory::new(MAX_GAP, MAX_POSTURES),
+                is_sweeping: true,
+                swept_at: None,
+            }),
+        })
+    }
+
+    /// Sets where the arm is now, in the order of the chain.
+    pub(super) fn set_posture(&self, arm: &ArmState) {
+        let posture = self.posture(arm.reported_at, arm.position.clone());
+        if let Err(error) = self.map.set_posture(&posture) {
+            // The chain of decisions brakes because of the same report.
+            log::debug!("steering: {error}");
+        }
+    }
+
+    /// From now on, an operator moves the arm, so that its own way proves nothing any more.
+    pub(super) fn end_sweep(&self) {
+        self.state.lock().is_sweeping = false;
+    }
+
+    /// Takes a reading of the joints.
+    pub(super) fn observe_robot(&self, robot: &RobotState) {
+        let of_chain = |ix: &usize| robot.positions.get(*ix).copied();
+        let Some(position) = self
+            .joint_ixs
+            .iter()
+            .map(of_chain)
+            .collect::<Option<Vec<_>>>()
+        else {
+            return;
+        };
+        let mut state = self.state.lock();
+        let is_swept = state.is_sweeping
+            && state
+                .swept_at
+                .is_none_or(|last| robot.stamp.secs_since(last) >= SWEEP_PERIOD_SECS);
+        if is_swept {
+            state.swept_at = Some(robot.stamp);
+        }
+        // Readings that are not later than the last one are counted by the history.
+        let _ = state.postures.push(JointState {
+            stamp: robot.stamp,
+            position: position.clone(),
+            velocity: Vec::new(),
+            effort: Vec::new(),
+        });
+        drop(state);
+        if is_swept {
+            let posture = self.posture(robot.stamp, position);
+            if let Err(error) = self.map.sweep(posture, SWEEP_MARGIN_M) {
+                log::debug!("steering: {error}");
+            }
+        }
+    }
+
+    /// Takes a keyframe. Without depth, it shows no free space.
+    pub(super) fn observe_keyframe(&self, keyframe: &Keyframe) {
+        let Some(depth) = &keyframe.depth else {
+            return;
+        };
+        let Ok(joints) = self.state.lock().postures.at(keyframe.stamp) else {
+            log::debug!("steering: no posture at the time of a keyframe");
+            return;
+        };
+        let image = DepthImage {
+            camera: Arc::clone(&keyframe.camera),
+            stamp: keyframe.stamp,
+            size_px: depth.size_px,
+            focal_px: depth.focal_px,
+            principal_px: depth.principal_px,
+            depth_m: Arc::clone(&depth.depth_m),
+            world_from_camera: depth.world_from_camera,
+            posture: self.posture(keyframe.stamp, joints.position),
+            origin: DepthOrigin::Measured,
+        };
+        if let Err(error) = self.map.push(image) {
+            log::debug!("steering: {error}");
+        }
+    }
+
+    fn posture(&self, stamp: Stamp, position: Vec<f64>) -> Posture {
+        Posture {
+            stamp,
+            position,
+            world_from_base: self.world_from_base,
+        }
+    }
+}
+
+impl Clearance for SceneClearance {
+    fn readings(&self, points_in_base: &[[f64; 3]], now: Stamp) -> Vec<Option<Seen>> {
+        self.map.readings(points_in_base, now)
+    }
+}
