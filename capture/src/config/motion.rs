@@ -48,6 +48,10 @@ keys! {
         /// Round trip between page and run, ms, up to which the arm follows the hand. With a longer
         /// one, the page previews goals instead.
         pub servo_round_trip_millis: f64 = 120.0, in 1.0..=1000.0;
+        /// Distance around the arm, m, up to which space that no camera has seen counts as free where
+        /// the arm was before the first operator took it over, for example guided by hand. A
+        /// simulated arm uses at least 0.15.
+        pub swept_margin_m: f64 = 0.0, in 0.0..=0.2;
     }
 }
 
@@ -58,6 +62,7 @@ impl Default for ArmSteering {
             max_angular_rad_s: 1.0,
             workspace_m: None,
             servo_round_trip_millis: 120.0,
+            swept_margin_m: 0.0,
         }
     }
 }

@@ -142,6 +142,7 @@ pub(super) const KEYS: &[(&str, &str, &str)] = &[
         "[0, 1]",
     ),
     ("arm.motion.steering.servo_round_trip_millis", "50", "0"),
+    ("arm.motion.steering.swept_margin_m", "0.05", "0.5"),
     ("arm.serial.device", "'/dev/ttyACM0'", "7"),
     ("arm.serial.baud_hz", "57_600", "1"),
     ("arm.serial.reconnect_secs", "5", "-1"),

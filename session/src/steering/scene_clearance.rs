@@ -1,11 +1,12 @@
 //! What is known about the space around the arm of a run: the map of free space, and what feeds it.
 //!
 //! Keyframes with measured depth show what is free and what is not. Before the first operator, the
-//! space through which the arm itself moves is free, too: a person guides it, or a simulated arm is
-//! on its tour.
+//! space through which the arm itself moves is free, too, with the margin that the rig file permits:
+//! a person guides it, or a simulated arm is on its tour.
 
 use super::robot::ChainAndBody;
 use capture::config::Rig;
+use capture::open;
 use clearance_map::{ClearanceMap, DepthImage, DepthOrigin, MapConfig, Posture, reach_m};
 use drivers::motion::ArmState;
 use keyframe::{Keyframe, RobotState};
@@ -21,9 +22,8 @@ const MAX_GAP: Duration = Duration::from_millis(100);
 const MAX_POSTURES: usize = 5000;
 /// Time between two postures that are swept. The arm of a tour moves by less than the margin.
 const SWEEP_PERIOD_SECS: f64 = 0.2;
-/// Distance around the arm that counts as free where the arm has moved safely, meters. It is below
-/// the distance that people keep from surfaces when they guide an arm.
-const SWEEP_MARGIN_M: f64 = 0.05;
+/// Margin of swept space in simulations, meters. Their tours keep this distance from the scene.
+const SIMULATED_MARGIN_M: f64 = 0.15;
 
 /// The space around an arm.
 pub(super) struct SceneClearance {
@@ -31,6 +31,7 @@ pub(super) struct SceneClearance {
     /// Index in the lists of the rig file of each joint of the chain.
     joint_ixs: Vec<usize>,
     world_from_base: Transform,
+    swept_margin_m: f64,
     state: Mutex<State>,
 }
 
@@ -49,11 +50,19 @@ impl SceneClearance {
     ///
     /// If the reach of the robot is too large for a map, or no thread can be started.
     pub(super) fn new(rig: &Rig, robot: &ChainAndBody) -> anyhow::Result<Self> {
+        let settings = rig.arm.motion.as_ref().map(|motion| &motion.steering);
+        let permitted_m = settings.map_or(0.0, |settings| settings.swept_margin_m);
+        let swept_margin_m = if open::is_any_simulated(rig) {
+            permitted_m.max(SIMULATED_MARGIN_M)
+        } else {
+            permitted_m
+        };
         let config = MapConfig::for_reach(reach_m(&robot.body, &robot.chain));
         Ok(Self {
-            map: ClearanceMap::start(config, robot.body.clone())?,
+            map: ClearanceMap::start(&config, robot.body.clone())?,
             joint_ixs: robot.chain.order_in(&rig.arm.joints)?,
             world_from_base: rig.base.world_from_base,
+            swept_margin_m,
             state: Mutex::new(State {
                 postures: JointHistory::new(MAX_GAP, MAX_POSTURES),
                 is_sweeping: true,
@@ -105,7 +114,7 @@ impl SceneClearance {
         drop(state);
         if is_swept {
             let posture = self.posture(robot.stamp, position);
-            if let Err(error) = self.map.sweep(posture, SWEEP_MARGIN_M) {
+            if let Err(error) = self.map.sweep(posture, self.swept_margin_m) {
                 log::debug!("steering: {error}");
             }
         }
