@@ -45,7 +45,7 @@ pub(crate) struct Args {
     #[arg(long, value_name = "FILE")]
     record: Option<PathBuf>,
     /// Let operators steer the arm from the page. Confirms that nobody is within reach of a real
-    /// arm, and that a hand is on the emergency stop. A real arm also needs the table [arm.motion]
+    /// arm, and that a hand is on the emergency stop. A real arm also needs the table arm.motion
     /// in the rig file. Not restored by --resume
     #[arg(long, conflicts_with = "from")]
     enable_motion: bool,
