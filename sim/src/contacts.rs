@@ -21,8 +21,8 @@ const MAX_PIECES: usize = 64;
 const FLAT_THICKNESS_M: f64 = 0.005;
 /// Extent below which a piece is flat, meters.
 const MAX_FLATNESS_M: f64 = 1e-4;
-/// Pieces smaller than this cannot be enclosed by MuJoCo, meters.
-const MIN_SIZE_M: f64 = 2e-3;
+/// Smallest area that a piece spans, square meters. MuJoCo cannot enclose points on a line.
+const MIN_AREA_M2: f64 = 1e-6;
 
 /// Counts the contacts of a robot with its scene.
 pub(crate) struct ContactCounter {
@@ -116,11 +116,7 @@ impl Piece {
     /// extent.
     fn solid_points(&self) -> Option<Vec<[f64; 3]>> {
         let first = self.points.first()?;
-        let size_m = self
-            .points
-            .iter()
-            .fold(0.0, |size, point| f64::max(size, (point - first).norm()));
-        if size_m < MIN_SIZE_M {
+        if spanned_area_m2(first, &self.points) < MIN_AREA_M2 {
             return None;
         }
         let mut points = self.points.clone();
@@ -136,6 +132,18 @@ impl Piece {
         }
         Some(points.into_iter().map(|point| point.into()).collect())
     }
+}
+
+/// About the area that points span: zero for points on a line.
+fn spanned_area_m2(first: &Point3<f64>, points: &[Point3<f64>]) -> f64 {
+    let edges = points.iter().map(|point| point - first);
+    let longest = edges
+        .clone()
+        .max_by(|a, b| a.norm_squared().total_cmp(&b.norm_squared()))
+        .unwrap_or_default();
+    edges.fold(0.0, |area, edge| {
+        f64::max(area, edge.cross(&longest).norm())
+    })
 }
 
 /// Parts of a mesh that share points. If `by_normal`, points with different normals are different,

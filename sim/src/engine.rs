@@ -369,9 +369,9 @@ impl Engine {
         Ok(())
     }
 
-    /// Counts contacts while commands move the arm.
-    pub(crate) fn count_contacts(&mut self, contacts: ContactCounter) {
-        self.contacts = Some(contacts);
+    /// Counts contacts while commands move the arm, if there is a counter.
+    pub(crate) fn count_contacts(&mut self, contacts: Option<ContactCounter>) {
+        self.contacts = contacts;
     }
 
     /// Tells the controller of the arm that the simulation has ended.

@@ -105,7 +105,7 @@ impl LiveRig {
 
     /// Starts a rig whose arm an operator may take over from its tour.
     pub(crate) fn start_steered(
-        (mut engine, contacts): (Engine, ContactCounter),
+        (mut engine, contacts): (Engine, Option<ContactCounter>),
         info: RigInfo,
         start: Stamp,
         limits: SteeredLimits<'_>,
@@ -113,7 +113,7 @@ impl LiveRig {
         let position = engine.reported_joints()?;
         let handover = Handover::default();
         engine.hand_over_to(handover.clone())?;
-        let n_contacts = contacts.n_contacts();
+        let n_contacts = contacts.as_ref().map(ContactCounter::n_contacts);
         engine.count_contacts(contacts);
         let started = Instant::now();
         let (controller, arm) =

@@ -329,7 +329,11 @@ impl Rig {
         start: Stamp,
         limits: SteeredLimits<'_>,
     ) -> Result<(LiveRig, SteeredArm), Error> {
-        let contacts = ContactCounter::new((self.build_contacts)()?);
+        // Steering does not need the contacts, which only tell how well it works.
+        let contacts = (self.build_contacts)()
+            .map(ContactCounter::new)
+            .inspect_err(|error| log::warn!("contacts with the scene are not counted: {error}"))
+            .ok();
         LiveRig::start_steered((self.engine, contacts), self.info, start, limits)
     }
 

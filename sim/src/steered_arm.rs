@@ -28,7 +28,7 @@ const TOUR_BRAKE_JERK_SECS: f64 = 0.05;
 pub struct SteeredArm {
     port: SteeringPort,
     requests: Arc<Requests>,
-    n_contacts: Arc<AtomicU64>,
+    n_contacts: Option<Arc<AtomicU64>>,
 }
 
 /// What the controller is asked for.
@@ -49,9 +49,10 @@ impl SteeredArm {
         self.requests.begin.store(true, Ordering::Relaxed);
     }
 
-    /// How often a part of the robot has touched a part of the scene.
-    pub fn n_contacts(&self) -> u64 {
-        self.n_contacts.load(Ordering::Relaxed)
+    /// How often a part of the robot has touched a part of the scene; `None` if it is not counted.
+    pub fn n_contacts(&self) -> Option<u64> {
+        let n_contacts = self.n_contacts.as_ref()?;
+        Some(n_contacts.load(Ordering::Relaxed))
     }
 }
 
@@ -86,13 +87,13 @@ impl Controller {
     /// Starts the controller of an arm that is at `position`.
     ///
     /// * `started`: simulated time zero.
-    /// * `n_contacts`: counted by the simulation.
+    /// * `n_contacts`: counted by the simulation, if it is.
     pub(crate) fn start(
         limits: SteeredLimits<'_>,
         position: &[f64],
         handover: Handover,
         started: Instant,
-        n_contacts: Arc<AtomicU64>,
+        n_contacts: Option<Arc<AtomicU64>>,
     ) -> Result<(Self, SteeredArm), Error> {
         let requests = Arc::<Requests>::default();
         let recover = {

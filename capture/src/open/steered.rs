@@ -56,11 +56,12 @@ impl SteeredArm {
         }
     }
 
-    /// How often a part of the robot has touched the scene; `None` if it is not simulated.
+    /// How often a part of the robot has touched the scene; `None` if it is not counted, as for real
+    /// arms.
     #[must_use]
     pub fn n_contacts(&self) -> Option<u64> {
         #[cfg(feature = "sim")]
-        return self.simulated.as_ref().map(sim::SteeredArm::n_contacts);
+        return self.simulated.as_ref()?.n_contacts();
         #[cfg(not(feature = "sim"))]
         None
     }

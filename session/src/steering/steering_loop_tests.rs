@@ -364,7 +364,7 @@ fn an_arm_with_a_fault_is_recovered_only_when_the_holder_permits_motion() {
 fn goals_are_judged_without_moving_the_arm() {
     let mut run = Run::new();
     let rest = run.tip();
-    let mut ask = |run: &mut Run, goal: PreviewGoal| {
+    let ask = |run: &mut Run, goal: PreviewGoal| {
         let request = PreviewRequest { id: 7, goal };
         let outcome = run.cycle(vec![(BEN, SteeringRequest::Preview(request))]);
         match &outcome.replies[..] {
