@@ -70,3 +70,10 @@ pub use topics::robot_description::{MeshFormat, RobotDescription, RobotMesh};
 pub fn check_messages(messages: &str) {
     client::message_checks::check_messages(messages);
 }
+
+/// Handles the messages of a client that steers, one per line, and panics if a result is
+/// inconsistent.
+#[cfg(fuzzing)]
+pub fn check_steering_messages(messages: &str) {
+    steering::message_checks::check_messages(messages);
+}

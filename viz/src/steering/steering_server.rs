@@ -193,6 +193,17 @@ fn urgent_part(state: &SteeringState) -> UrgentPart<'_> {
     )
 }
 
+/// Waits until clients may no longer steer the arm of this server.
+pub(crate) async fn steering_ended(hub: &Hub, server: &Arc<SteeringServer>) {
+    let mut steered = hub.latest::<SteeredArm>().subscribe();
+    let is_other = |arm: &SteeredArm| {
+        let current = arm.0.as_ref();
+        current.is_none_or(|current| !Arc::ptr_eq(current, server))
+    };
+    // The hub keeps the sender, so there is no error while somebody waits.
+    let _ = steered.wait_for(is_other).await;
+}
+
 /// The arm that clients may steer.
 #[derive(Clone, Debug, Default)]
 struct SteeredArm(Option<Arc<SteeringServer>>);
@@ -202,6 +213,10 @@ impl Hub {
     /// 404, and connected clients are disconnected.
     pub fn set_steering(&self, server: Option<Arc<SteeringServer>>) {
         self.latest::<SteeredArm>().send_replace(SteeredArm(server));
+        // The status tells pages whether they can connect.
+        if self.status().is_some() {
+            self.change_status(|_| {});
+        }
     }
 
     /// The arm that clients may steer.

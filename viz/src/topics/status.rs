@@ -76,6 +76,7 @@ impl Hub {
             // The clients are also read within the lock. A client that joins afterwards then
             // changes this status.
             status.operator.clients = self.pictures().clients();
+            status.operator.steering = self.steering().is_some();
             *latest = Some(Arc::new(status));
         });
     }
