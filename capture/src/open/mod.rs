@@ -16,6 +16,8 @@ mod simulated;
 #[cfg(all(test, feature = "sim"))]
 mod simulated_tests;
 mod steered;
+#[cfg(all(test, feature = "sim"))]
+mod steered_tests;
 mod tag_check;
 mod tags;
 #[cfg(feature = "sim")]
