@@ -159,3 +159,116 @@ impl Clearance for SceneClearance {
         self.map.readings(points_in_base, now)
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::steering::robot::chain_and_body;
+    use keyframe::{DepthMap, Split};
+    use kinematics::Transform;
+    use std::path::Path;
+    use std::time::Instant;
+
+    const START: [f64; 7] = [0.0, -0.5, 0.0, -2.2, 0.0, 1.8, 0.8];
+    const AT: Stamp = Stamp(1_000_000_000);
+    /// Maximum time until the map has integrated something, on a busy machine.
+    const TIMEOUT: Duration = Duration::from_secs(60);
+
+    fn simulated() -> (SceneClearance, ChainAndBody) {
+        let file = Path::new(env!("CARGO_MANIFEST_DIR")).join("../rigs/static-arm.toml");
+        let rig = Rig::load(&file, &[]).expect("a rig of this repository");
+        let robot = chain_and_body(&rig, Path::new("")).expect("its shapes are in the URDF");
+        let scene = SceneClearance::new(&rig, &robot).expect("a map of its reach");
+        (scene, robot)
+    }
+
+    fn at(stamp: Stamp, positions: [f64; 7]) -> RobotState {
+        RobotState {
+            stamp,
+            captured_at: Instant::now(),
+            world_from_base: Transform::identity(),
+            positions: positions.to_vec(),
+        }
+    }
+
+    fn is_known(scene: &SceneClearance, point: [f64; 3]) -> bool {
+        scene.readings(&[point], AT)[0].is_some()
+    }
+
+    fn wait_until_known(scene: &SceneClearance, point: [f64; 3]) {
+        let began = Instant::now();
+        while !is_known(scene, point) {
+            assert!(began.elapsed() < TIMEOUT, "{point:?} is still unknown");
+            std::thread::sleep(Duration::from_millis(5));
+        }
+    }
+
+    #[test]
+    fn the_way_of_the_arm_is_free_until_an_operator_has_it() {
+        let (scene, robot) = simulated();
+        let tip = robot
+            .chain
+            .forward(&START)
+            .expect("seven joints")
+            .translation;
+        let beside_tip = [tip.x, tip.y + 0.1, tip.z];
+        assert!(!is_known(&scene, beside_tip));
+        scene.observe_robot(&at(AT, START));
+        wait_until_known(&scene, beside_tip);
+        assert!(
+            !is_known(&scene, [tip.x, tip.y + 0.5, tip.z]),
+            "it was not there"
+        );
+        scene.end_sweep();
+        scene.observe_robot(&at(Stamp(2 * AT.0), START));
+        assert_eq!(
+            scene.state.lock().swept_at,
+            Some(AT),
+            "it moves by itself no more"
+        );
+    }
+
+    #[test]
+    fn keyframes_with_depth_show_free_space_in_front_of_their_surfaces() {
+        const SIZE_PX: [u32; 2] = [64, 48];
+        let (scene, _) = simulated();
+        scene.end_sweep();
+        // Before and after the keyframe, so that its posture is known.
+        for nanos in [0, 20_000_000] {
+            scene.observe_robot(&at(Stamp(AT.0 + nanos), START));
+        }
+        // The camera stands beside the arm, looks along x, and sees a wall at a distance of 1 m.
+        let looks_along_x = nalgebra::UnitQuaternion::face_towards(
+            &nalgebra::Vector3::x(),
+            &-nalgebra::Vector3::z(),
+        );
+        let world_from_camera =
+            Transform::from_parts(nalgebra::Translation3::new(-0.3, 0.5, 0.5), looks_along_x);
+        let n_px = (SIZE_PX[0] * SIZE_PX[1]) as usize;
+        let keyframe = Keyframe {
+            camera: "front".into(),
+            stamp: Stamp(AT.0 + 10_000_000),
+            size_px: SIZE_PX,
+            focal_px: [60.0; 2],
+            principal_px: [32.0, 24.0],
+            rgba_srgb: vec![255; 4 * n_px].into(),
+            depth: Some(DepthMap {
+                size_px: SIZE_PX,
+                focal_px: [60.0; 2],
+                principal_px: [32.0, 24.0],
+                depth_m: vec![1.0; n_px].into(),
+                world_from_camera,
+            }),
+            world_from_camera,
+            twist: None,
+            readout_secs: 0.0,
+            joint_twists: Arc::default(),
+            base: None,
+            split: Split::Train,
+            truth: None,
+        };
+        scene.observe_keyframe(&keyframe);
+        wait_until_known(&scene, [0.2, 0.5, 0.5]);
+        assert!(!is_known(&scene, [0.9, 0.5, 0.5]), "behind the wall");
+    }
+}
