@@ -192,7 +192,7 @@ mod tests {
     }
 
     fn is_known(scene: &SceneClearance, point: [f64; 3]) -> bool {
-        scene.readings(&[point], AT)[0].is_some()
+        scene.readings(&[point], AT.plus_secs(1.0))[0].is_some()
     }
 
     fn wait_until_known(scene: &SceneClearance, point: [f64; 3]) {
