@@ -49,7 +49,7 @@ pub use steering::request::{
     SteeringRequest,
 };
 pub use steering::state::{AppliedCommand, AppliedLimit, LimitEffect, LimitLink, SteeringState};
-pub use steering::steering_server::SteeringServer;
+pub use steering::steering_server::{SteeringServer, publish_steering};
 pub use topics::edit_status::{ErasedBox, LastEdit, SavedEdits};
 pub use topics::model_chunks::PublishedChunks;
 pub use topics::observations::{ObservationMap, ObservedCell};

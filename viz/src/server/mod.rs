@@ -22,6 +22,7 @@ use crate::server::page::{FILES, has_version};
 use crate::server::server_context::ServerContext;
 use crate::steering::client_message;
 use crate::steering::socket::SteeringSocket;
+use crate::steering::steering_server::steered_arm;
 use crate::steering::steering_thread::{SteeringSpawner, SteeringThread};
 use crate::topics::robot_description::RobotDescription;
 use crate::topics::{self, Publisher};
@@ -527,7 +528,7 @@ async fn steer(
     Extension(role): Extension<Role>,
     State(app_state): State<AppState>,
 ) -> Response {
-    let Some(server) = app_state.server_context.hub.steering() else {
+    let Some(server) = steered_arm(&app_state.server_context.hub) else {
         return (
             StatusCode::NOT_FOUND,
             "no arm can be steered: this needs [arm.motion] in the rig file and a run that permits motion",

@@ -14,7 +14,7 @@ use std::time::{Duration, Instant};
 use trainer::Picture;
 use viz::{
     AppliedCommand, AppliedLimit, LimitEffect, LimitLink, Preview, PreviewGoal, PreviewVerdict,
-    RefusedRequest, SteeringIntent, SteeringRequest, SteeringState,
+    RefusedRequest, SteeringIntent, SteeringRequest, SteeringState, publish_steering,
 };
 
 /// Duration of a lease that a test waits for. The tests take the requests much faster.
@@ -75,9 +75,9 @@ fn without_an_arm_there_is_nothing_to_steer() {
     is_not_found();
     // A run may open its arm after the page.
     let desk = Desk::start();
-    hub.set_steering(Some(Arc::clone(&desk.arm)));
+    publish_steering(&hub, Some(Arc::clone(&desk.arm)));
     let mut client = SteeringClient::connect(address);
-    hub.set_steering(None);
+    publish_steering(&hub, None);
     assert_eq!(client.close_reason(), "the arm is no longer steered");
     is_not_found();
     // Another run without motion, while this one steers.
@@ -93,10 +93,10 @@ fn the_status_tells_pages_whether_they_can_steer() {
     let mut page = Client::connect(server.address());
     assert_eq!(page.text_of("status")["steering"], Value::Null);
     let desk = Desk::start();
-    hub.set_steering(Some(Arc::clone(&desk.arm)));
+    publish_steering(&hub, Some(Arc::clone(&desk.arm)));
     // A status from before may arrive first.
     while page.text_of("status")["steering"] != json!(true) {}
-    hub.set_steering(None);
+    publish_steering(&hub, None);
     while page.text_of("status")["steering"] != Value::Null {}
 }
 
@@ -385,7 +385,7 @@ fn a_client_that_answers_pings_but_is_silent_releases_its_lease() {
         let received = desk.requests_until(is_end_of(number));
         assert_eq!(received[0].request, SteeringRequest::TakeLease);
         // Ends the connection, and with it the thread.
-        desk.hub.set_steering(None);
+        publish_steering(&desk.hub, None);
     });
 }
 
@@ -409,7 +409,7 @@ fn a_server_that_stops_says_so_and_releases_leases() {
 fn viewers_watch_and_stop_over_tls() {
     let shared = Shared::start();
     let desk = Desk::start();
-    shared.hub.set_steering(Some(Arc::clone(&desk.arm)));
+    publish_steering(&shared.hub, Some(Arc::clone(&desk.arm)));
     let connect = |token: &str| {
         let headers = [("authorization", format!("Bearer {token}"))];
         let url = format!("wss://{}/steer", shared.address());

@@ -10,7 +10,7 @@ use tungstenite::client::IntoClientRequest;
 use tungstenite::{HandshakeError, Message, WebSocket};
 use viz::{
     ArmDescription, Hub, ReceivedRequest, Server, ServerConfig, SteeredJoint, SteeringRequest,
-    SteeringServer, SteeringState,
+    SteeringServer, SteeringState, publish_steering,
 };
 
 /// Number of joints of the arm.
@@ -70,7 +70,7 @@ impl Desk {
     pub(crate) fn with_leases_of(lease_secs: f64) -> Self {
         let (hub, server) = serve();
         let arm = arm(lease_secs);
-        hub.set_steering(Some(Arc::clone(&arm)));
+        publish_steering(&hub, Some(Arc::clone(&arm)));
         Self { hub, arm, server }
     }
 

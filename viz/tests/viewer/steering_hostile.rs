@@ -11,7 +11,7 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 use tungstenite::Message;
-use viz::{ReceivedRequest, RefusedRequest, SteeringRequest, SteeringServer};
+use viz::{ReceivedRequest, RefusedRequest, SteeringRequest, SteeringServer, publish_steering};
 
 /// Attempts to open a WebSocket. The error is the status of the response.
 fn attempt(address: SocketAddr, headers: &[(&'static str, String)]) -> Result<(), u16> {
@@ -57,7 +57,7 @@ fn foreign_pages_cannot_connect() {
 fn beyond_this_computer_a_client_needs_a_token_tls_and_the_right_origin() {
     let shared = Shared::start();
     let desk = Desk::start();
-    shared.hub.set_steering(Some(Arc::clone(&desk.arm)));
+    publish_steering(&shared.hub, Some(Arc::clone(&desk.arm)));
     let address = shared.address();
     let connect = |headers: &[(&'static str, String)]| {
         let url = format!("wss://{address}/steer");
