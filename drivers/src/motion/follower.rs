@@ -51,18 +51,13 @@ impl Follower {
     ) -> Result<Self, Error> {
         check_brake_limits(limits, brake_limits)?;
         let generator = TrajectoryGenerator::new(limits, position, period).map_err(motion_error)?;
-        let zero = vec![0.0; position.len()];
         Ok(Self {
             generator,
             brake: None,
             limits: limits.to_vec(),
             brake_limits: brake_limits.to_vec(),
             period,
-            setpoint: Setpoint {
-                position: position.to_vec(),
-                velocity: zero.clone(),
-                acceleration: zero,
-            },
+            setpoint: Setpoint::at_rest(position.to_vec()),
             target: position.to_vec(),
             order: TargetOrder::default(),
             expires_at: None,
@@ -87,6 +82,12 @@ impl Follower {
             ..Self::new(limits, brake_limits, position, self.period)?
         };
         Ok(())
+    }
+
+    /// Sets the time between setpoints. The next call must be [`Follower::rest_at`].
+    #[cfg(target_os = "linux")]
+    pub(super) fn set_period(&mut self, period: Duration) {
+        self.period = period;
     }
 
     /// Continues from a different state of motion. Use it if the reference of the arm differs from
@@ -318,11 +319,8 @@ fn brake_from(
     brake_limits: &[MotionLimits],
     period: Duration,
 ) -> Result<TrajectoryGenerator, String> {
-    // A stop is the shortest way to rest, wherever it ends, so it needs no ranges. With ranges,
-    // `rsruckig` 3.0.1 checks a target position in velocity control, too. It is 0 in a new
-    // generator. For a joint whose range does not contain 0, such as joint 4 of a Panda, it then
-    // replaces the plan with one of unlimited jerk (`repair_profile_step2`, and `time_none` of
-    // `velocity_third_step2.rs`).
+    // A stop is the shortest way to rest, wherever it ends. A generator with ranges would refuse to
+    // start outside of them.
     let without_ranges: Vec<MotionLimits> = brake_limits
         .iter()
         .map(|joint| MotionLimits {

@@ -4,7 +4,7 @@
 use super::MotionLimits;
 use super::follower::{Follower, brake_limits};
 use super::generator::Setpoint;
-use super::steering_port::SteeringPort;
+use super::steering_port::{SteeringPort, position_in};
 use super::target::{ArmState, Output};
 use crate::Error;
 use kinematics::Stamp;
@@ -16,6 +16,8 @@ use std::time::Duration;
 pub struct Steered {
     port: SteeringPort,
     follower: Follower,
+    /// The position in the newest report.
+    position: Vec<f64>,
     /// Whether the arm takes no more targets, because it is shut down.
     is_closed: bool,
 }
@@ -30,8 +32,18 @@ impl Steered {
         Ok(Self {
             port,
             follower,
+            position: position.to_vec(),
             is_closed: false,
         })
+    }
+
+    /// An arm that does not move until [`Steered::rest_at`] sets its position.
+    #[cfg(target_os = "linux")]
+    pub(super) fn waiting(port: SteeringPort) -> Self {
+        let position = position_in(port.limits());
+        // The period is replaced together with the position.
+        Self::new(port, &position, Duration::from_millis(1))
+            .expect("the port has checked its limits, and the position is inside them")
     }
 
     /// The port that is followed.
@@ -47,6 +59,7 @@ impl Steered {
     pub fn step(&mut self, now: Stamp) -> Result<Setpoint, Error> {
         self.obey(now);
         let setpoint = self.follower.step(now)?;
+        self.position.clone_from(&setpoint.position);
         self.report(now, None);
         Ok(setpoint)
     }
@@ -66,7 +79,21 @@ impl Steered {
     /// For the reasons of [`Follower::new`].
     pub fn rest_at(&mut self, limits: &[MotionLimits], position: &[f64]) -> Result<(), Error> {
         let brake_limits = brake_limits(limits, self.port.brake_factor());
-        self.follower.rest_at(limits, &brake_limits, position)
+        self.follower.rest_at(limits, &brake_limits, position)?;
+        self.position = position.to_vec();
+        Ok(())
+    }
+
+    /// Like [`Steered::rest_at`], with another period.
+    #[cfg(target_os = "linux")]
+    pub(super) fn rest_with_period(
+        &mut self,
+        limits: &[MotionLimits],
+        position: &[f64],
+        period: Duration,
+    ) -> Result<(), Error> {
+        self.follower.set_period(period);
+        self.rest_at(limits, position)
     }
 
     /// Brakes and ends the motion. The arm moves again with a new motion.
@@ -83,13 +110,14 @@ impl Steered {
     /// Discards what was sent to the port, and reports why the arm is stopped.
     pub fn report_stopped(&mut self, now: Stamp, reason: &str) {
         // A target from before a stop must not be followed after the recovery.
-        self.follower.end_motion(self.port.end_motions());
+        self.brake();
         self.report(now, Some(reason.to_owned()));
     }
 
     /// Reports that the arm rests at `position`, which may change while a person guides the arm.
     /// What was sent to the port is kept until the next [`Steered::step`].
-    pub fn report_rest(&self, now: Stamp, position: &[f64]) {
+    pub fn report_rest(&mut self, now: Stamp, position: &[f64]) {
+        self.position = position.to_vec();
         self.port.report(ArmState {
             reported_at: now,
             position: position.to_vec(),
@@ -115,6 +143,11 @@ impl Steered {
     /// Whether a target waits to be followed.
     pub fn has_target(&self) -> bool {
         !self.is_closed && self.port.has_target()
+    }
+
+    /// Whether a target waits to be followed, and has not expired.
+    pub fn has_fresh_target(&self, now: Stamp) -> bool {
+        !self.is_closed && self.port.has_fresh_target(now)
     }
 
     /// Whether the arm is at rest.
@@ -143,7 +176,7 @@ impl Steered {
     fn report(&self, now: Stamp, stopped: Option<String>) {
         self.port.report(ArmState {
             reported_at: now,
-            position: self.follower.setpoint().position.clone(),
+            position: self.position.clone(),
             is_at_rest: self.follower.is_at_rest(),
             braked_motion: self.follower.braked_motion(),
             stopped,

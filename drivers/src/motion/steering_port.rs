@@ -3,12 +3,14 @@
 //! The program sends targets that expire, and reads the state of the arm. Neither side waits for
 //! the other.
 
-use super::follower::brake_limits;
+use super::follower::{Follower, brake_limits};
 use super::target::{ArmState, NotFollowed, Output, Target, TargetOrder};
 use super::{MotionLimits, motion_error};
 use crate::Error;
+use kinematics::Stamp;
 use parking_lot::Mutex;
 use std::sync::Arc;
+use std::time::Duration;
 
 /// Enables a stopped arm again, see [`MovableArm::recover`](super::MovableArm::recover).
 type Recover = Box<dyn Fn() -> Result<(), Error> + Send + Sync>;
@@ -52,7 +54,7 @@ impl SteeringPort {
     /// * `recover`: enables a stopped arm again, and returns when it is enabled.
     ///
     /// # Errors
-    /// If the factor is below 1 or not finite.
+    /// If the factor is below 1 or not finite, or a limit is not positive and finite.
     pub fn new(
         limits: &[MotionLimits],
         brake_factor: f64,
@@ -65,9 +67,13 @@ impl SteeringPort {
                 "the factor of braking is {brake_factor}, must be at least 1: the arm brakes at least as hard as it moves"
             )));
         }
+        let brake_limits = brake_limits(limits, brake_factor);
+        // Limits are checked here and not by the arm's thread, so that the caller gets the error.
+        let period = Duration::from_millis(1);
+        Follower::new(limits, &brake_limits, &position_in(limits), period)?;
         Ok(Self(Arc::new(Shared {
             limits: limits.to_vec(),
-            brake_limits: brake_limits(limits, brake_factor),
+            brake_limits,
             brake_factor,
             exchange: Mutex::new(Exchange::default()),
             recover: Box::new(recover),
@@ -141,10 +147,23 @@ impl SteeringPort {
         self.0.exchange.lock().orders.target.is_some()
     }
 
+    /// Whether a target waits to be taken, and has not expired.
+    pub(super) fn has_fresh_target(&self, now: Stamp) -> bool {
+        let exchange = self.0.exchange.lock();
+        let target = exchange.orders.target.as_ref();
+        target.is_some_and(|target| now <= target.expires_at)
+    }
+
     /// Sets the state that the program sees.
     pub(super) fn report(&self, state: ArmState) {
         self.0.exchange.lock().state = Some(state);
     }
+}
+
+/// A position within all ranges, at 0 if possible.
+pub(super) fn position_in(limits: &[MotionLimits]) -> Vec<f64> {
+    let in_range = |joint: &MotionLimits| 0.0_f64.max(joint.position[0]).min(joint.position[1]);
+    limits.iter().map(in_range).collect()
 }
 
 impl Exchange {

@@ -193,14 +193,14 @@ struct Admission(Hub);
 
 impl Admission {
     fn open(hub: &Hub, server: Arc<SteeringServer>) -> Self {
-        hub.set_steering(Some(server));
+        viz::publish_steering(hub, Some(server));
         Self(hub.clone())
     }
 }
 
 impl Drop for Admission {
     fn drop(&mut self) {
-        self.0.set_steering(None);
+        viz::publish_steering(&self.0, None);
     }
 }
 
