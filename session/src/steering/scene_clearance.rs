@@ -74,7 +74,16 @@ impl SceneClearance {
     /// Sets where the arm is now, in the order of the chain.
     pub(super) fn set_posture(&self, arm: &ArmState) {
         let posture = self.posture(arm.reported_at, arm.position.clone());
-        if let Err(error) = self.map.set_posture(&posture) {
+        let is_swept = self.state.lock().is_swept(arm.reported_at);
+        let result = self.map.set_posture(&posture).and_then(|()| {
+            // The arm reports its state also while the input waits for a busy trainer.
+            if is_swept {
+                self.map.sweep(posture, self.swept_margin_m)
+            } else {
+                Ok(())
+            }
+        });
+        if let Err(error) = result {
             // The chain of decisions brakes because of the same report.
             log::debug!("steering: {error}");
         }
@@ -96,28 +105,13 @@ impl SceneClearance {
         else {
             return;
         };
-        let mut state = self.state.lock();
-        let is_swept = state.is_sweeping
-            && state
-                .swept_at
-                .is_none_or(|last| robot.stamp.secs_since(last) >= SWEEP_PERIOD_SECS);
-        if is_swept {
-            state.swept_at = Some(robot.stamp);
-        }
         // Readings that are not later than the last one are counted by the history.
-        let _ = state.postures.push(JointState {
+        let _ = self.state.lock().postures.push(JointState {
             stamp: robot.stamp,
-            position: position.clone(),
+            position,
             velocity: Vec::new(),
             effort: Vec::new(),
         });
-        drop(state);
-        if is_swept {
-            let posture = self.posture(robot.stamp, position);
-            if let Err(error) = self.map.sweep(posture, self.swept_margin_m) {
-                log::debug!("steering: {error}");
-            }
-        }
     }
 
     /// Takes a keyframe. Without depth, it shows no free space.
@@ -154,6 +148,20 @@ impl SceneClearance {
     }
 }
 
+impl State {
+    /// Whether a posture at a time shows free space. It is noted as such.
+    fn is_swept(&mut self, at: Stamp) -> bool {
+        let is_due = self
+            .swept_at
+            .is_none_or(|last| at.secs_since(last) >= SWEEP_PERIOD_SECS);
+        let is_swept = self.is_sweeping && is_due;
+        if is_swept {
+            self.swept_at = Some(at);
+        }
+        is_swept
+    }
+}
+
 impl Clearance for SceneClearance {
     fn readings(&self, points_in_base: &[[f64; 3]], now: Stamp) -> Vec<Option<Seen>> {
         self.map.readings(points_in_base, now)
@@ -182,12 +190,12 @@ mod tests {
         (scene, robot)
     }
 
-    fn at(stamp: Stamp, positions: [f64; 7]) -> RobotState {
+    fn reading_at(stamp: Stamp) -> RobotState {
         RobotState {
             stamp,
             captured_at: Instant::now(),
             world_from_base: Transform::identity(),
-            positions: positions.to_vec(),
+            positions: START.to_vec(),
         }
     }
 
@@ -203,6 +211,17 @@ mod tests {
         }
     }
 
+    /// The state of an arm that moves.
+    fn arm_at(stamp: Stamp) -> ArmState {
+        ArmState {
+            reported_at: stamp,
+            position: START.to_vec(),
+            is_at_rest: false,
+            braked_motion: 0,
+            stopped: None,
+        }
+    }
+
     #[test]
     fn the_way_of_the_arm_is_free_until_an_operator_has_it() {
         let (scene, robot) = simulated();
@@ -213,14 +232,14 @@ mod tests {
             .translation;
         let beside_tip = [tip.x, tip.y + 0.1, tip.z];
         assert!(!is_known(&scene, beside_tip));
-        scene.observe_robot(&at(AT, START));
+        scene.set_posture(&arm_at(AT));
         wait_until_known(&scene, beside_tip);
         assert!(
             !is_known(&scene, [tip.x, tip.y + 0.5, tip.z]),
             "it was not there"
         );
         scene.end_sweep();
-        scene.observe_robot(&at(Stamp(2 * AT.0), START));
+        scene.set_posture(&arm_at(Stamp(2 * AT.0)));
         assert_eq!(
             scene.state.lock().swept_at,
             Some(AT),
@@ -235,7 +254,7 @@ mod tests {
         scene.end_sweep();
         // Before and after the keyframe, so that its posture is known.
         for nanos in [0, 20_000_000] {
-            scene.observe_robot(&at(Stamp(AT.0 + nanos), START));
+            scene.observe_robot(&reading_at(Stamp(AT.0 + nanos)));
         }
         // The camera stands beside the arm, looks along x, and sees a wall at a distance of 1 m.
         let looks_along_x = nalgebra::UnitQuaternion::face_towards(
