@@ -24,6 +24,7 @@ mod commanded;
 mod commands;
 pub mod config;
 mod contacts;
+mod convex_pieces;
 mod egl;
 mod engine;
 mod error;

@@ -2,7 +2,7 @@
 
 use crate::base;
 use crate::config::{Config, Parent, Scene, TargetParent};
-use crate::contacts::convex_pieces;
+use crate::convex_pieces::convex_pieces;
 use crate::objects::{self, Object};
 use crate::texture::Texture;
 use crate::twin::{Pedestal, RobotBody, RobotConfig, TwinPlan};
