@@ -5,7 +5,7 @@
 use capture::config::{Override, Rig};
 use capture::open::{self, Devices};
 use capture::{ArmCapture, Stop};
-use drivers::motion::{JointTarget, Motion, MovableArm};
+use drivers::motion::{JointTarget, Motion, MovableArm, SteeringPort};
 use drivers::{Arm, Error};
 use kinematics::JointState;
 use parking_lot::Mutex;
@@ -85,6 +85,10 @@ impl MovableArm for FaultyArm {
 
     fn recover(&mut self) -> Result<(), Error> {
         self.arm.recover()
+    }
+
+    fn steering_port(&mut self, brake_factor: f64) -> Result<SteeringPort, Error> {
+        self.arm.steering_port(brake_factor)
     }
 }
 
@@ -222,7 +226,7 @@ fn arm_that_reports_nothing_is_stopped() {
 mod emulated_controller {
     use super::{
         Arm, ArmCapture, Devices, Error, JOINT, JointState, JointTarget, Motion, MovableArm,
-        Override, Path, Rig, Stop, open, rotated,
+        Override, Path, Rig, SteeringPort, Stop, open, rotated,
     };
     use std::time::{Duration, Instant};
 
@@ -270,6 +274,10 @@ mod emulated_controller {
 
         fn recover(&mut self) -> Result<(), Error> {
             self.arm.recover()
+        }
+
+        fn steering_port(&mut self, brake_factor: f64) -> Result<SteeringPort, Error> {
+            self.arm.steering_port(brake_factor)
         }
     }
 

@@ -10,7 +10,7 @@ use crate::arm::STEP_NANOS;
 use crate::commands::Commands;
 use crate::engine::Engine;
 use crate::rig_info::RigInfo;
-use drivers::motion::{JointTarget, Motion, MotionLimits, MovableArm};
+use drivers::motion::{JointTarget, Motion, MotionLimits, MovableArm, SteeringPort};
 use drivers::{Arm, Camera, Image, Sample};
 use kinematics::{Intrinsics, JointState};
 use parking_lot::Mutex;
@@ -184,6 +184,14 @@ impl MovableArm for CommandedArm {
             .recover()
             .map_err(|reason| drivers::Error::Simulation { reason })
     }
+
+    /// The times of targets are those of the joint readings, not those of the computer's clock. The
+    /// arm brakes when the simulation is advanced beyond the expiry of its target.
+    fn steering_port(&mut self, brake_factor: f64) -> Result<SteeringPort, drivers::Error> {
+        self.commands
+            .steer(brake_factor)
+            .map_err(|reason| drivers::Error::Simulation { reason })
+    }
 }
 
 struct SharedCamera {
@@ -221,6 +229,8 @@ impl Camera for SharedCamera {
 mod tests {
     use super::*;
     use crate::{CameraConfig, Config, SensorConfig};
+    use drivers::motion::{Output, Target};
+    use kinematics::Stamp;
 
     const SPEED_RAD_S: f64 = 0.4;
 
@@ -345,5 +355,58 @@ mod tests {
             .is_err()
         );
         assert_eq!(arm.motion(), Motion::Holding);
+    }
+
+    #[test]
+    fn steered_arm_brakes_when_its_target_expires_in_simulated_time() {
+        const VALIDITY: Duration = Duration::from_millis(100);
+        let CommandedRig { mut arm, .. } = rig(&[0, 1, 2, 3, 4, 5, 6], Vec::new());
+        let mut newest = arm.read(Duration::from_secs(1)).expect("a reading");
+        let mut goal = newest.position.clone();
+        goal[1] += 0.5;
+        let port = arm.steering_port(2.0).expect("it is enabled");
+        let send = |motion, serial, at: Stamp| {
+            port.send(&Output::Follow(Target {
+                motion,
+                serial,
+                position: goal.clone(),
+                expires_at: at + VALIDITY,
+            }));
+        };
+        let start = newest.position[1];
+        for serial in 1..=700 {
+            send(1, serial, newest.stamp);
+            newest = arm.read(Duration::from_secs(1)).expect("a reading");
+        }
+        let refusal = arm
+            .command(&JointTarget {
+                position: goal.clone(),
+            })
+            .expect_err("it is steered");
+        assert!(refusal.to_string().contains("steered"), "{refusal}");
+        let state = || port.state().expect("a report");
+        assert!(!state().is_at_rest && state().position[1] > start + 0.01);
+        let ended_at = newest.stamp;
+        while state().braked_motion < 1 {
+            newest = arm.read(Duration::from_secs(1)).expect("a reading");
+            assert!(newest.stamp < ended_at + 2 * VALIDITY, "it brakes");
+        }
+        while !state().is_at_rest {
+            newest = arm.read(Duration::from_secs(1)).expect("a reading");
+            assert!(newest.stamp < ended_at + 20 * VALIDITY, "it comes to rest");
+        }
+        assert_eq!(arm.motion(), Motion::Holding);
+        let rest = state().position;
+        assert!(rest[1] < goal[1] - 0.05, "{rest:?}");
+        for serial in 701..=800 {
+            send(1, serial, newest.stamp);
+            newest = arm.read(Duration::from_secs(1)).expect("a reading");
+        }
+        assert_eq!(state().position, rest);
+        send(2, 1, newest.stamp);
+        for _ in 0..100 {
+            arm.read(Duration::from_secs(1)).expect("a reading");
+        }
+        assert!(state().position[1] > rest[1]);
     }
 }

@@ -136,6 +136,10 @@ impl Follower {
         &self.velocity_rad_s
     }
 
+    pub(crate) fn acceleration_rad_s2(&self) -> &Joints {
+        &self.acceleration_rad_s2
+    }
+
     /// Advances to a time `step_secs` after the previous one.
     pub(crate) fn advance(&mut self, secs: f64, step_secs: f64) {
         let target_pose = self.scan.arm_from_camera(secs);

@@ -8,6 +8,7 @@ use drivers::can::emulated::{EmulatedMotor, State};
 use drivers::can::odrive::{self, Odrive};
 use drivers::can::robstride::{self, Robstride};
 use drivers::can::{Bus, BusConfig, BusEvent, Gains, MotorConfig, MovableArmConfig, MovableCanArm};
+use drivers::motion::steering_check::{TriedMotion, check_steering};
 use drivers::motion::{JointTarget, Motion, MotionConfig, MotionLimits, MovableArm, OnLoss};
 use drivers::wire::can::{Frame, Id, canopen};
 use drivers::{Arm, clock};
@@ -535,6 +536,34 @@ fn commands_respect_limits_and_joints_arrive_together() {
         "{max:?}"
     );
     assert!(max[0] > 0.9, "expected a fast motion: {max:?}");
+}
+
+#[test]
+#[ignore = "needs the virtual kernel"]
+fn steered_arm_brakes_when_its_targets_expire() {
+    let wire = Wire::new("vcan15", false);
+    let configs = motors_with_watchdog();
+    let motors = Motors::new(wire.config(false), configs.clone(), false);
+    let config = movable(wire.config(false), &configs, OnLoss::Release);
+    let mut arm = MovableCanArm::open(&config).expect("all motors are enabled");
+    let tried = TriedMotion {
+        joint_ix: 0,
+        distance: 1.5,
+        until: 0.1,
+        busy: Some("stalled"),
+    };
+    check_steering(&mut arm, tried);
+    wait_until_holding(&mut arm);
+    let port = arm.steering_port(1.0).expect("the same port");
+    let commanded = port.state().expect("a report").position[0];
+    let position = motors.positions()[0];
+    assert!(
+        (position - commanded).abs() < 0.01,
+        "{position} {commanded}"
+    );
+    drop(arm);
+    assert!(motors.states().iter().all(|state| *state != State::Enabled));
+    port.recover().expect_err("there is no arm");
 }
 
 #[test]

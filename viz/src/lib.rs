@@ -24,6 +24,7 @@ mod operator_requests;
 mod pictures;
 mod pose;
 mod server;
+mod steering;
 mod topics;
 
 pub use client::keyframe_image::ReadKeyframe;
@@ -41,6 +42,14 @@ pub use server::access::{Role, Token, Tokens};
 pub use server::certificate::Certificate;
 pub use server::downloads::{OpenFile, ServedFile, publish_files};
 pub use server::{Server, ServerConfig, Sharing};
+pub use steering::arm_description::{ArmDescription, SteeredJoint};
+pub use steering::preview::{Preview, PreviewVerdict};
+pub use steering::request::{
+    PreviewGoal, PreviewRequest, ReceivedRequest, RefusedRequest, SteeringCommand, SteeringIntent,
+    SteeringRequest,
+};
+pub use steering::state::{AppliedCommand, AppliedLimit, LimitEffect, LimitLink, SteeringState};
+pub use steering::steering_server::{SteeringServer, publish_steering};
 pub use topics::edit_status::{ErasedBox, LastEdit, SavedEdits};
 pub use topics::model_chunks::PublishedChunks;
 pub use topics::observations::{ObservationMap, ObservedCell};
@@ -60,4 +69,11 @@ pub use topics::robot_description::{MeshFormat, RobotDescription, RobotMesh};
 #[cfg(fuzzing)]
 pub fn check_messages(messages: &str) {
     client::message_checks::check_messages(messages);
+}
+
+/// Handles the messages of a client that steers, one per line, and panics if a result is
+/// inconsistent.
+#[cfg(fuzzing)]
+pub fn check_steering_messages(messages: &str) {
+    steering::message_checks::check_messages(messages);
 }

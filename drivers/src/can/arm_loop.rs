@@ -19,8 +19,8 @@ use super::movable_motor::MovableMotor;
 use super::plan::watchdog_plan;
 use super::watchdog::WatchdogPlan;
 use crate::motion::{
-    CommandedArm, Motion, MotionLimits, OnLoss, Reply, Request, SharedWithOwner,
-    TrajectoryGenerator,
+    CommandedArm, Motion, MotionLimits, Mover, OnLoss, Reply, Request, Setpoint, SharedWithOwner,
+    reason_of,
 };
 use crate::wire::can::Frame;
 use crate::wire::can::canopen::{self, NodeState};
@@ -76,11 +76,10 @@ enum ArmState {
     Enabling {
         since: Stamp,
         is_ordered: bool,
-        generator: Box<TrajectoryGenerator>,
         reply: Reply<()>,
     },
-    /// The motors follow the trajectory.
-    Moving { generator: Box<TrajectoryGenerator> },
+    /// The motors follow the setpoints.
+    Moving,
 }
 
 /// Buses and motors that have been prepared.
@@ -109,6 +108,7 @@ pub(super) struct ArmLoop {
     is_shutting_down: Arc<AtomicBool>,
     prepared: Option<PreparedMotors>,
     arm_state: ArmState,
+    mover: Mover,
     /// Start of the last cycle, on a clock that keeps counting while the computer is suspended.
     last_cycle: Stamp,
     /// Number of cycles that started late.
@@ -142,6 +142,7 @@ impl ArmLoop {
             is_shutting_down,
             prepared: None,
             arm_state,
+            mover: Mover::default(),
             last_cycle: clock::now_including_suspend(),
             n_late: 0,
             max_stall: Duration::ZERO,
@@ -194,61 +195,43 @@ impl ArmLoop {
     }
 
     fn handle_request(&mut self, request: Request) {
-        // The requester may have gone away.
-        match (request, &mut self.arm_state) {
-            (Request::SetTarget(target, answer), ArmState::Moving { generator }) => {
-                let accepted = generator
-                    .set_target(&target)
-                    .map_err(|reason| Error::Motion { reason });
-                if accepted.is_ok() {
-                    // The state is set before the reply, because the requester may wait for the end
-                    // of the motion as soon as its target is accepted.
-                    *self.motion.lock() = Motion::Moving;
-                }
-                let _ = answer.try_send(accepted);
-            }
-            (Request::Stop(answer), ArmState::Moving { generator }) => {
-                generator.stop();
-                let _ = answer.try_send(Ok(()));
-            }
-            (Request::SetTarget(_, answer), arm_state) => {
-                drop(answer.try_send(Err(arm_state.refusal())))
-            }
-            // The arm is not moving, so it is already at rest.
-            (Request::Stop(answer), _) => drop(answer.try_send(Ok(()))),
-            // All buses and motors are prepared again. While the arm was stopped, an interface may
-            // have been set up again, and motors may have been reset or replaced.
+        match (request, &self.arm_state) {
             (
                 Request::Recover(answer),
                 ArmState::Stopped {
                     pending_fail_safe, ..
                 },
-            ) => {
-                let pending_fail_safe = *pending_fail_safe;
-                match self.prepare() {
-                    Ok(prepared) => {
-                        self.prepared = Some(prepared);
-                        // The preparation takes longer than a watchdog timeout, but it is not a
-                        // stall of this thread.
-                        self.last_cycle = clock::now_including_suspend();
-                        self.arm_state = ArmState::Measuring {
-                            since: clock::now(),
-                            reply: answer,
-                        };
-                    }
-                    Err(error) => {
-                        // Motors that have not confirmed the fail-safe command may still execute
-                        // their last command, so it is resent through the former sockets.
-                        if pending_fail_safe.is_none() {
-                            self.prepared = None;
-                        }
-                        self.stopped(&reason_of(&error), pending_fail_safe);
-                        let _ = answer.try_send(Err(error));
-                    }
-                }
+            ) => self.recover(answer, *pending_fail_safe),
+            (request, ArmState::Moving) => self.mover.handle(request, &self.motion),
+            (request, arm_state) => request.refuse(arm_state.refusal()),
+        }
+    }
+
+    /// Prepares a stopped arm. It is enabled in the cycles after this.
+    fn recover(&mut self, answer: Reply<()>, pending_fail_safe: Option<OnLoss>) {
+        // All buses and motors are prepared again. While the arm was stopped, an interface may have
+        // been set up again, and motors may have been reset or replaced.
+        match self.prepare() {
+            Ok(prepared) => {
+                self.prepared = Some(prepared);
+                // The preparation takes longer than a watchdog timeout, but it is not a stall of
+                // this thread.
+                self.last_cycle = clock::now_including_suspend();
+                self.arm_state = ArmState::Measuring {
+                    since: clock::now(),
+                    reply: answer,
+                };
             }
-            // The arm is enabled, or is being enabled.
-            (Request::Recover(answer), _) => drop(answer.try_send(Ok(()))),
+            Err(error) => {
+                // Motors that have not confirmed the fail-safe command may still execute their last
+                // command, so it is resent through the former sockets.
+                if pending_fail_safe.is_none() {
+                    self.prepared = None;
+                }
+                self.stopped(&reason_of(&error), pending_fail_safe);
+                // The requester may have gone away.
+                let _ = answer.try_send(Err(error));
+            }
         }
     }
 
@@ -284,6 +267,9 @@ impl ArmLoop {
         let now_including_suspend = clock::now_including_suspend();
         let stall = now_including_suspend.duration_since(self.last_cycle);
         self.last_cycle = now_including_suspend;
+        if let Some(reason) = self.arm_state.not_moving() {
+            self.mover.report_stopped(now, reason);
+        }
         let Some(prepared) = &mut self.prepared else {
             return Ok(());
         };
@@ -304,7 +290,7 @@ impl ArmLoop {
                 self.check_stall(stall)?;
                 self.enabling_cycle(since, now)
             }
-            ArmState::Moving { .. } => {
+            ArmState::Moving => {
                 self.check_stall(stall)?;
                 self.moving_cycle(now)
             }
@@ -354,11 +340,10 @@ impl ArmLoop {
             prepared.poll_disabled()?;
             return prepared.send_sync(self.plan.host);
         };
-        // The generator starts where the joints are now. An older position would make them jump
-        // when they are enabled.
+        // The setpoints start where the joints are now. An older position would make them jump when
+        // they are enabled.
         let limits = prepared.limits(&self.config.motion.limits);
-        let generator =
-            TrajectoryGenerator::new(&limits, &positions, self.plan.period).map_err(motion)?;
+        self.mover.hold_at(limits, positions, self.plan.period)?;
         // Frames that queued up during the preparation may report faults that the preparation has
         // cleared. Only reports from now on count.
         prepared
@@ -372,7 +357,6 @@ impl ArmLoop {
         self.arm_state = ArmState::Enabling {
             since: now,
             is_ordered: false,
-            generator: Box::new(generator),
             reply,
         };
         Ok(())
@@ -381,27 +365,22 @@ impl ArmLoop {
     /// A cycle in which the motors are enabled, which began at `since`. Once all report that they
     /// are enabled, the arm may move.
     fn enabling_cycle(&mut self, since: Stamp, now: Stamp) -> Result<(), Error> {
-        let (
-            Some(prepared),
-            ArmState::Enabling {
-                is_ordered,
-                generator,
-                ..
-            },
-        ) = (&mut self.prepared, &mut self.arm_state)
+        let (Some(prepared), ArmState::Enabling { is_ordered, .. }) =
+            (&mut self.prepared, &mut self.arm_state)
         else {
             return Ok(());
         };
+        let setpoint = self.mover.held();
         // Motors get their target before they are enabled, so that none moves to an old target. For
         // drives, these commands also enable them, one state per cycle.
-        prepared.command(generator)?;
+        prepared.command(&setpoint)?;
         if !*is_ordered {
             // The order to enable is sent only once. If it were repeated, it would enable a motor
             // that has stopped because of a fault.
             *is_ordered = true;
             prepared.enable()?;
             // A motor that ignores commands while it is disabled gets its target now.
-            prepared.command(generator)?;
+            prepared.command(&setpoint)?;
         }
         prepared.send_sync(self.plan.host)?;
         if now.duration_since(since) > STARTUP_TIMEOUT {
@@ -411,11 +390,8 @@ impl ArmLoop {
             return Ok(());
         }
         let enabling = std::mem::replace(&mut self.arm_state, ArmState::stopped(now, None));
-        if let ArmState::Enabling {
-            generator, reply, ..
-        } = enabling
-        {
-            self.arm_state = ArmState::Moving { generator };
+        if let ArmState::Enabling { reply, .. } = enabling {
+            self.arm_state = ArmState::Moving;
             *self.motion.lock() = Motion::Holding;
             log::info!("the arm is enabled and holds its position");
             let _ = reply.try_send(Ok(()));
@@ -426,23 +402,16 @@ impl ArmLoop {
     /// A cycle of an enabled arm.
     fn moving_cycle(&mut self, now: Stamp) -> Result<(), Error> {
         let max_silence_allowed = self.max_silence();
-        let (Some(prepared), ArmState::Moving { generator }) =
-            (&mut self.prepared, &mut self.arm_state)
-        else {
+        let Some(prepared) = &mut self.prepared else {
             return Ok(());
         };
         // The checks come first, because after a fault of one motor, the others must not get
         // another setpoint.
         prepared.check(now, max_silence_allowed)?;
-        prepared.command(generator)?;
+        prepared.command(&self.mover.step(now)?)?;
         // The SYNC follows the targets of all drives, so that they accept them at the same instant.
         prepared.send_sync(self.plan.host)?;
-        let motion_now = if generator.is_at_rest() {
-            Motion::Holding
-        } else {
-            Motion::Moving
-        };
-        *self.motion.lock() = motion_now;
+        *self.motion.lock() = self.mover.motion();
         Ok(())
     }
 
@@ -516,7 +485,7 @@ impl ArmLoop {
     fn fail_safe_command(&self) -> OnLoss {
         // Holding or damping needs enabled motors. If only some motors were enabled, these would
         // hold while the others fall. In this case, all motors are released.
-        if matches!(self.arm_state, ArmState::Moving { .. }) {
+        if matches!(self.arm_state, ArmState::Moving) {
             self.plan.on_loss
         } else {
             OnLoss::Release
@@ -525,6 +494,7 @@ impl ArmLoop {
 
     fn stopped(&mut self, reason: &str, pending_fail_safe: Option<OnLoss>) {
         log::warn!("the arm stopped: {reason}");
+        self.mover.report_stopped(clock::now(), reason);
         let stopped = ArmState::Stopped {
             since: clock::now(),
             reason: reason.to_owned(),
@@ -543,11 +513,8 @@ impl ArmLoop {
 
     /// Returns whether the arm is at rest. If it moves, starts to bring it to rest.
     fn is_at_rest(&mut self) -> bool {
-        match &mut self.arm_state {
-            ArmState::Moving { generator } => {
-                generator.stop();
-                generator.is_at_rest()
-            }
+        match self.arm_state {
+            ArmState::Moving => self.mover.come_to_rest(),
             _ => true,
         }
     }
@@ -587,6 +554,8 @@ impl ArmLoop {
             );
             self.arm_state = ArmState::stopped(clock::now(), Some(fail_safe));
         }
+        self.mover
+            .report_stopped(clock::now(), "the arm was shut down");
         self.finish_fail_safe();
     }
 
@@ -683,8 +652,17 @@ impl ArmState {
                 format!("the arm stopped and has not been recovered: {reason}")
             }
             Self::Measuring { .. } | Self::Enabling { .. } => "the arm is being enabled".to_owned(),
-            Self::Moving { .. } => "the arm is moving".to_owned(),
+            Self::Moving => "the arm is moving".to_owned(),
         })
+    }
+
+    /// Why the arm follows no target; `None` if it may.
+    fn not_moving(&self) -> Option<&str> {
+        match self {
+            Self::Stopped { reason, .. } => Some(reason),
+            Self::Measuring { .. } | Self::Enabling { .. } => Some("the arm is being enabled"),
+            Self::Moving => None,
+        }
     }
 }
 
@@ -773,8 +751,7 @@ impl PreparedMotors {
     }
 
     /// Sends every motor its setpoint for this cycle.
-    fn command(&mut self, generator: &mut TrajectoryGenerator) -> Result<(), Error> {
-        let setpoint = generator.step().map_err(motion)?;
+    fn command(&mut self, setpoint: &Setpoint) -> Result<(), Error> {
         for (ix, movable_motor) in self.movable_motors.iter().enumerate() {
             let command = movable_motor.command(setpoint.position[ix], setpoint.velocity[ix]);
             let command = command.map_err(|error| self.fault(movable_motor, error.to_string()))?;
@@ -784,7 +761,7 @@ impl PreparedMotors {
         }
         // The following error is measured against this position, and the fail-safe command "hold"
         // commands it.
-        self.sent_rad = setpoint.position;
+        self.sent_rad.clone_from(&setpoint.position);
         Ok(())
     }
 
@@ -947,12 +924,4 @@ impl PreparedMotors {
 
 fn motion(reason: String) -> Error {
     Error::Motion { reason }
-}
-
-/// Reason of the error, without the prefix "the arm is not moved".
-fn reason_of(error: &Error) -> String {
-    match error {
-        Error::Motion { reason } => reason.clone(),
-        other => other.to_string(),
-    }
 }

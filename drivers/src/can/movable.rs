@@ -8,7 +8,7 @@ use super::arm_loop::ArmLoop;
 use super::config::MovableArmConfig;
 use super::joints::{JointReading, Joints};
 use super::plan::watchdog_plan;
-use crate::motion::{JointTarget, Motion, MotionLock, MotionThread, MovableArm};
+use crate::motion::{JointTarget, Motion, MotionLock, MotionThread, MovableArm, SteeringPort};
 use crate::{Arm, Error};
 use kinematics::JointState;
 use std::sync::mpsc::{Receiver, RecvTimeoutError, sync_channel};
@@ -127,5 +127,9 @@ impl MovableArm for MovableCanArm {
 
     fn recover(&mut self) -> Result<(), Error> {
         self.thread.recover()
+    }
+
+    fn steering_port(&mut self, brake_factor: f64) -> Result<SteeringPort, Error> {
+        self.thread.steering_port(brake_factor)
     }
 }

@@ -2,7 +2,7 @@
 
 use super::N_JOINTS;
 use super::reference::Reference;
-use crate::motion::{JointTarget, MotionLimits};
+use crate::motion::MotionLimits;
 use franka::joint_velocity_limits::JointVelocityLimitsConfig;
 use franka::rate_limiting::{self, fer, limit_rate_joint_positions};
 
@@ -30,6 +30,9 @@ const MARGIN_RAD: f64 = 5e-3;
 const SPEED_MARGIN_RAD_S: f64 = 1e-2;
 /// Changes by the rate limiter that are smaller than this are rounding errors.
 const UNCHANGED_RAD: f64 = 1e-9;
+
+/// Rounding of a quotient of limits.
+const FACTOR_ROUNDING: f64 = 1.0 + 1e-9;
 
 /// Limits of one robot.
 #[derive(Clone, Debug)]
@@ -141,6 +144,26 @@ impl RobotLimits {
         })
     }
 
+    /// Checks that braking stays within the limits of the robot. Its jerk may be a quarter of the
+    /// robot's, for the reason of [`JERK_LIMIT_FRAC`].
+    pub(super) fn check_brake_factor(
+        &self,
+        limits: &[MotionLimits],
+        factor: f64,
+    ) -> Result<(), String> {
+        for (ix, joint) in limits.iter().enumerate() {
+            let max_factor = (self.acceleration_rad_s2[ix] / joint.acceleration)
+                .min(0.25 * self.jerk_rad_s3[ix] / joint.jerk);
+            if factor > max_factor * FACTOR_ROUNDING {
+                return Err(format!(
+                    "it cannot brake joint {} with {factor} times the acceleration and jerk of its motions, but with {max_factor:.2} times at most: lower the factor, or the acceleration of motions",
+                    ix + 1
+                ));
+            }
+        }
+        Ok(())
+    }
+
     /// Limits the rates of a position to be sent, so that the robot does not trigger a reflex.
     /// Returns the position and whether it was changed.
     ///
@@ -185,35 +208,4 @@ impl RobotLimits {
             (limited, true)
         })
     }
-}
-
-/// Clamps a target to the joints' ranges.
-pub(super) fn clamp_to_range(
-    target: &JointTarget,
-    limits: &[MotionLimits],
-) -> Result<JointTarget, String> {
-    let n = target.position.len();
-    if n != limits.len() {
-        return Err(format!(
-            "the target has {n} joints, but the arm has {}",
-            limits.len()
-        ));
-    }
-    if let Some(ix) = target
-        .position
-        .iter()
-        .position(|position| !position.is_finite())
-    {
-        return Err(format!(
-            "the target of joint {} is not a finite number: {}",
-            ix + 1,
-            target.position[ix]
-        ));
-    }
-    let joints = target.position.iter().zip(limits);
-    Ok(JointTarget {
-        position: joints
-            .map(|(position, joint)| position.clamp(joint.position[0], joint.position[1]))
-            .collect(),
-    })
 }

@@ -9,7 +9,7 @@ use super::reference::{CommandFate, N_SUCCESS_WINDOW, Reference, ReferenceTracke
 use super::request::{self, MotionResponse};
 use super::state::NumberedState;
 use crate::clock;
-use crate::motion::{Motion, MotionCommand, MotionLimits, TrajectoryGenerator};
+use crate::motion::{Motion, MotionCommand, MotionLimits, Mover, idle_cycle, reason_of};
 use franka::{RobotMode, RobotState};
 use kinematics::Stamp;
 use std::net::SocketAddr;
@@ -36,6 +36,7 @@ pub(super) struct MotionLoop {
     mailbox: Arc<MotionMailbox>,
     robot: RobotLimits,
     limits: Vec<MotionLimits>,
+    mover: Mover,
     motion_state: MotionState,
     mode: RobotMode,
 }
@@ -72,7 +73,6 @@ enum MotionState {
 #[derive(Debug)]
 struct ActiveMotion {
     id: u32,
-    generator: TrajectoryGenerator,
     tracker: ReferenceTracker,
     /// Number of the newest state.
     number: u64,
@@ -98,6 +98,7 @@ impl MotionLoop {
             mailbox,
             robot,
             limits,
+            mover: Mover::default(),
             motion_state: MotionState::Idle,
             mode: RobotMode::Other,
         }
@@ -110,16 +111,13 @@ impl MotionLoop {
         // Each state of the loop is consumed and replaced, so that a finished motion cannot be
         // continued by mistake.
         self.motion_state = match std::mem::replace(&mut self.motion_state, MotionState::Idle) {
-            MotionState::Idle => match self.mailbox.lock().started_motion.take() {
-                Some(id) => MotionState::Beginning { id, n_waited: 0 },
-                None => MotionState::Idle,
-            },
+            MotionState::Idle => self.start_request(),
             MotionState::Beginning { id, n_waited } => self.start_motion(id, n_waited, stamped),
             // The robot has ended the motion, either as requested or because of a reflex or the
             // user stop. A command that arrives now belongs to the next motion.
             MotionState::ActiveMotion(active) if state.robot_mode != RobotMode::Move => {
                 self.mailbox
-                    .update(|mailbox_state| mailbox_state.accepts_commands = false);
+                    .update(|mailbox_state| mailbox_state.control.accepts_commands = false);
                 let summary = match state.robot_mode {
                     RobotMode::Reflex => self.summary(&active.recent, stamped.numbered.number),
                     _ => String::new(),
@@ -139,14 +137,28 @@ impl MotionLoop {
                 summary,
             } => self.conclude(id, n_waited, reason, summary),
         };
+        // The state of a motion is reported with its setpoint.
+        if !matches!(self.motion_state, MotionState::ActiveMotion(_)) {
+            idle_cycle(&self.mailbox, &mut self.mover, clock::now(), &state.q_d);
+        }
+    }
+
+    fn start_request(&self) -> MotionState {
+        match self.mailbox.lock().robot.started_motion.take() {
+            Some(id) => MotionState::Beginning { id, n_waited: 0 },
+            None => MotionState::Idle,
+        }
     }
 
     /// Handles the loss of the connection. In this case, the robot stops without a command.
     pub(super) fn handle_disconnect(&mut self, reason: &str) {
         self.motion_state = MotionState::Idle;
         self.mailbox
-            .update(|mailbox_state| mailbox_state.is_lost = true);
-        self.stop_because(format!("connection lost: {reason}"));
+            .update(|mailbox_state| mailbox_state.control.is_lost = true);
+        let reason = format!("connection lost: {reason}");
+        // No state follows, so a steered arm reports the stop here.
+        self.mover.report_stopped(clock::now(), &reason);
+        self.stop_because(reason);
     }
 
     /// Records the robot's mode. Outside of a motion, also reports a mode that stops the arm.
@@ -158,7 +170,7 @@ impl MotionLoop {
         }
         self.mode = mode;
         self.mailbox
-            .update(|mailbox_state| mailbox_state.mode = mode);
+            .update(|mailbox_state| mailbox_state.robot.mode = mode);
         // Between motions, no reply is pending. Without this check, a user stop would go unnoticed
         // until the next target.
         if let (MotionState::Idle, RobotMode::Reflex | RobotMode::UserStopped, Some(reason)) =
@@ -192,15 +204,13 @@ impl MotionLoop {
         // The trajectory starts at the position that the robot commands, not at the measured one.
         // The two differ by the sag under load, so the measured position would cause a jump.
         let reference = Reference::at_rest(&numbered.state);
-        let generator = match TrajectoryGenerator::new(&self.limits, &reference.position_rad, STEP)
-        {
-            Ok(generator) => generator,
-            Err(why) => return self.halt(id, why),
-        };
-        self.mailbox.lock().statistics.n_motions += 1;
+        let position = reference.position_rad.to_vec();
+        if let Err(error) = self.mover.hold_at(self.limits.clone(), position, STEP) {
+            return self.halt(id, reason_of(&error));
+        }
+        self.mailbox.lock().robot.statistics.n_motions += 1;
         let active = ActiveMotion {
             id,
-            generator,
             tracker: ReferenceTracker::new(reference),
             number: numbered.number,
             sent: None,
@@ -225,11 +235,11 @@ impl MotionLoop {
         active.number = *number;
         active.sent = None;
         let command = self.take_command(&mut active, n_states, fate, stamped);
-        let position_rad = match self.next_position(&mut active, command.as_ref(), fate) {
+        let position_rad = match self.next_position(&active, command.as_ref(), fate) {
             Ok(position_rad) => position_rad,
             Err(why) => return self.halt(active.id, why),
         };
-        // The generator advances even if nothing is sent. The next state then shows that the robot
+        // The trajectory advances even if nothing is sent. The next state then shows that the robot
         // has extrapolated.
         if stamped.is_fresh {
             self.send(&mut active, stamped, position_rad);
@@ -253,59 +263,67 @@ impl MotionLoop {
     ) -> Option<MotionCommand> {
         active.n_cycles += 1;
         let mut mailbox_state = self.mailbox.lock();
-        mailbox_state.statistics.n_cycles += 1;
-        mailbox_state.statistics.n_lost += n_states.saturating_sub(1);
-        mailbox_state.statistics.n_stale += u64::from(!stamped.is_fresh);
-        mailbox_state.statistics.n_missed += fate.n_missed();
+        mailbox_state.robot.statistics.n_cycles += 1;
+        mailbox_state.robot.statistics.n_lost += n_states.saturating_sub(1);
+        mailbox_state.robot.statistics.n_stale += u64::from(!stamped.is_fresh);
+        mailbox_state.robot.statistics.n_missed += fate.n_missed();
         // The window of the success rate is full only after this number of cycles.
         if active.n_cycles > N_SUCCESS_WINDOW {
             mailbox_state
+                .robot
                 .statistics
                 .count_robot_success(stamped.numbered.state.control_command_success_rate);
         }
-        let command = mailbox_state.command.take();
+        let command = mailbox_state.control.command.take();
         // A command that has just arrived keeps the motion alive. Otherwise, it would be lost with
         // the end of the motion.
-        let is_at_rest = active.generator.is_at_rest() && command.is_none();
-        active.n_at_rest = if is_at_rest { active.n_at_rest + 1 } else { 0 };
-        if is_at_rest && (active.n_at_rest > MAX_AT_REST || mailbox_state.is_shutting_down) {
+        let is_resting = self.mover.is_resting() && command.is_none();
+        active.n_at_rest = if is_resting { active.n_at_rest + 1 } else { 0 };
+        if is_resting && (active.n_at_rest > MAX_AT_REST || mailbox_state.control.is_ending()) {
             // The lock under which the command was taken above is still held. No command can
             // therefore be accepted in between and then be lost.
             active.is_ending = true;
-            mailbox_state.accepts_commands = false;
+            mailbox_state.control.accepts_commands = false;
         }
-        let motion = if is_at_rest {
-            Motion::Holding
-        } else {
+        let motion = if command.is_some() {
             Motion::Moving
+        } else {
+            self.mover.motion()
         };
-        if mailbox_state.motion != motion {
-            mailbox_state.motion = motion;
+        if mailbox_state.control.motion != motion {
+            mailbox_state.control.motion = motion;
         }
         command
     }
 
     /// Computes the next joint positions.
     fn next_position(
-        &self,
-        active: &mut ActiveMotion,
+        &mut self,
+        active: &ActiveMotion,
         command: Option<&MotionCommand>,
         fate: CommandFate,
     ) -> Result<[f64; super::N_JOINTS], String> {
-        let ActiveMotion {
-            generator, tracker, ..
-        } = active;
-        let reference = tracker.reference();
-        match command {
-            Some(MotionCommand::SetTarget(target)) => drop(generator.set_target(target)?),
-            Some(MotionCommand::Stop) => generator.stop(),
-            None => {}
+        let reference = active.tracker.reference();
+        let mover = &mut self.mover;
+        if let Some(command) = command {
+            command.apply(mover).map_err(|error| reason_of(&error))?;
         }
         // At rest, the robot keeps its position even if commands were lost.
-        if fate != CommandFate::Followed && !generator.is_at_rest() {
-            generator.resume(&reference.setpoint())?;
+        if fate != CommandFate::Followed && !mover.is_at_rest() {
+            mover
+                .resume(&reference.setpoint())
+                .map_err(|error| reason_of(&error))?;
         }
-        let desired = generator.step()?.position;
+        // The robot ends the motion with the position at which it rests. A target that arrives now
+        // needs a new motion.
+        let setpoint = if active.is_ending {
+            mover.held()
+        } else {
+            mover
+                .step(clock::now())
+                .map_err(|error| reason_of(&error))?
+        };
+        let desired = setpoint.position;
         let desired = desired
             .try_into()
             .map_err(|_| "the setpoint has the wrong number of joints".to_owned())?;
@@ -316,8 +334,10 @@ impl MotionLoop {
         if is_limited {
             // The generator continues from the position that was sent instead of its own setpoint.
             // Otherwise, its next setpoint would have to be limited, too.
-            generator.resume(&reference.sent(position_rad).setpoint())?;
-            self.mailbox.lock().statistics.n_limited += 1;
+            mover
+                .resume(&reference.sent(position_rad).setpoint())
+                .map_err(|error| reason_of(&error))?;
+            self.mailbox.lock().robot.statistics.n_limited += 1;
         }
         Ok(position_rad)
     }
@@ -335,6 +355,7 @@ impl MotionLoop {
                 active.sent = Some(position_rad);
                 self.mailbox
                     .lock()
+                    .robot
                     .statistics
                     .count(clock::now().duration_since(stamped.stamp));
             }
@@ -368,7 +389,7 @@ impl MotionLoop {
             Err(why) => format!("{reason}; {why}"),
         };
         self.mailbox
-            .update(|mailbox_state| mailbox_state.accepts_commands = false);
+            .update(|mailbox_state| mailbox_state.control.accepts_commands = false);
         MotionState::Ending {
             id,
             n_waited: 0,
@@ -418,25 +439,17 @@ impl MotionLoop {
     fn finish(&self, reason: Option<String>) -> MotionState {
         match reason {
             Some(reason) => self.stop_because(reason),
-            None => self.mailbox.update(|mailbox_state| {
-                mailbox_state.is_idle = true;
-                mailbox_state.accepts_commands = false;
-                mailbox_state.command = None;
-                mailbox_state.motion = Motion::Holding;
-            }),
+            None => self
+                .mailbox
+                .update(|mailbox_state| mailbox_state.control.rest()),
         }
         MotionState::Idle
     }
 
     fn stop_because(&self, reason: String) {
         log::warn!("{}: {reason}", self.device);
-        self.mailbox.update(|mailbox_state| {
-            // A command from before the stop must not be executed after the recovery.
-            mailbox_state.command = None;
-            mailbox_state.is_idle = true;
-            mailbox_state.accepts_commands = false;
-            mailbox_state.motion = Motion::Stopped { reason };
-        });
+        self.mailbox
+            .update(|mailbox_state| mailbox_state.control.stop_because(reason));
     }
 }
 

@@ -8,6 +8,7 @@ use super::tests::{
     FREE_PORT, REST_RAD, TEST_TIMEOUT, VERSIONS, chain, config, ideal_joints, robot, waiting_robot,
 };
 use super::{ContactConfig, FciVersion, MovableFrankaArm, N_JOINTS};
+use crate::motion::steering_check::{TriedMotion, check_steering};
 use crate::motion::{JointTarget, Motion, MotionConfig, MotionLimits, MovableArm, OnLoss};
 use kinematics::Transform;
 use numbers::random::Random;
@@ -659,4 +660,48 @@ fn suspended_program_triggers_reflex_and_sends_nothing_stale() {
     assert_eq!(text(), "held");
     assert!(child.wait().unwrap().success());
     assert!((last_command.lock().unwrap().position_rad[0] - REST_RAD[0]).abs() < 1e-4);
+}
+
+#[test]
+fn steered_arm_brakes_when_its_targets_expire() {
+    for version in VERSIONS {
+        let (joint_simulator, last_command) = recording_joints();
+        let emulated = waiting_robot(version, ANSWER_WAIT, joint_simulator);
+        let mut arm = open(emulated.address());
+        let tried = TriedMotion {
+            joint_ix: 0,
+            distance: 1.2,
+            until: 0.1,
+            busy: Some("communication_constraints_violation"),
+        };
+        let is_moving = || last_command.lock().unwrap().is_moving;
+        check_steering(&mut arm, tried);
+        wait_until(|| !is_moving(), "the motion of the robot ends");
+        let n_motions = arm.motion_statistics().n_motions;
+        // A new target starts a motion of the robot.
+        check_steering(&mut arm, tried);
+        let statistics = arm.motion_statistics();
+        assert!(statistics.n_motions > n_motions, "{statistics}");
+        drop(arm);
+        assert!(!is_moving(), "the motion ends with the arm");
+    }
+}
+
+#[test]
+fn brakes_beyond_the_limits_of_the_robot_are_refused() {
+    let emulated = waiting_robot(FciVersion::V10, ANSWER_WAIT, ideal_joints());
+    let mut arm = open(emulated.address());
+    let port = arm.steering_port(2.0).unwrap();
+    wait_until(|| port.state().is_some(), "a report");
+    let error = arm.steering_port(1e6).map(|port| port.brake_limits()[0]);
+    assert_eq!(
+        error.unwrap().jerk,
+        2.0 * arm.limits()[0].jerk,
+        "the same port"
+    );
+    drop(arm);
+    let mut arm = open(emulated.address());
+    let error = arm.steering_port(1e6).unwrap_err().to_string();
+    assert!(error.contains("cannot brake joint 1"), "{error}");
+    arm.command(&offset_from_rest([0.0; N_JOINTS])).unwrap();
 }

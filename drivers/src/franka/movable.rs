@@ -2,29 +2,25 @@
 //! to rest.
 
 use super::connection::Connection;
-use super::limits::{RobotLimits, clamp_to_range};
-use super::mailbox::{MailboxState, MotionMailbox};
+use super::limits::RobotLimits;
+use super::mailbox::{MotionMailbox, RobotExchange};
 use super::motion_loop::MotionLoop;
 use super::request::{self, ContactConfig};
 use super::{ArmConfig, FrankaArm, MotionStatistics, StateStatistics};
 use crate::motion::{
-    JointTarget, Motion, MotionCommand, MotionConfig, MotionLimits, MotionLock, MovableArm, OnLoss,
+    ControlledArm, JointTarget, Motion, MotionCommand, MotionConfig, MotionController,
+    MotionLimits, MotionLock, MovableArm, OnLoss, SteeringPort,
 };
 use crate::{Arm, Error};
 use franka::{FciVersion, RobotMode};
 use kinematics::JointState;
 use std::net::ToSocketAddrs;
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, OnceLock};
 use std::time::Duration;
 
 /// A robot stops on its own after 20 ms without a command.
 const ROBOT_TIMEOUT: Duration = Duration::from_millis(20);
-/// Maximum time for an arm to come to rest and end its motion.
-const STOP_TIMEOUT: Duration = Duration::from_secs(5);
-/// Maximum time until the states agree with the robot's reply. States come over another connection,
-/// so states from before the reply may still arrive.
-const SETTLE_TIMEOUT: Duration = Duration::from_secs(2);
-
 /// A Franka arm that is moved by joint positions, under the joint impedance controller of the
 /// robot.
 ///
@@ -33,14 +29,21 @@ const SETTLE_TIMEOUT: Duration = Duration::from_secs(2);
 /// brings the arm to rest and frees the robot's interface.
 #[derive(Debug)]
 pub struct MovableFrankaArm {
-    address: String,
     arm: FrankaArm,
+    moved: ControlledArm<Controller>,
+    _lock: MotionLock,
+}
+
+/// The requests that start motions and end stops.
+struct Controller {
+    address: String,
     connection: Arc<Connection>,
     mailbox: Arc<MotionMailbox>,
     contact: ContactConfig,
+    robot: RobotLimits,
     limits: Vec<MotionLimits>,
-    is_set: bool,
-    _lock: MotionLock,
+    /// Whether the settings have been sent.
+    is_set: AtomicBool,
 }
 
 impl MovableFrankaArm {
@@ -99,7 +102,7 @@ impl MovableFrankaArm {
             let limits = robot.allowed(&motion.limits)?;
             let device = format!("arm at {}", config.address);
             // The closure is called once.
-            let _ = connected.set((Arc::clone(connection), limits.clone()));
+            let _ = connected.set((Arc::clone(connection), robot.clone(), limits.clone()));
             let mut motion_loop = MotionLoop::new(
                 device,
                 Arc::clone(connection),
@@ -111,17 +114,21 @@ impl MovableFrankaArm {
             motion_loop.take_mode(first);
             Ok(Some(motion_loop))
         })?;
-        let (connection, limits) = connected
+        let (connection, robot, limits) = connected
             .into_inner()
             .expect("an arm that is open has a connection");
-        Ok(Self {
+        let controller = Controller {
             address,
-            arm,
             connection,
             mailbox,
             contact: contact.clone(),
+            robot,
             limits,
-            is_set: false,
+            is_set: AtomicBool::new(false),
+        };
+        Ok(Self {
+            arm,
+            moved: ControlledArm::new(controller),
             _lock: lock,
         })
     }
@@ -133,69 +140,80 @@ impl MovableFrankaArm {
 
     /// Statistics of the commands so far.
     pub fn motion_statistics(&self) -> MotionStatistics {
-        self.mailbox.lock().statistics.clone()
+        self.moved
+            .controller()
+            .mailbox
+            .lock()
+            .robot
+            .statistics
+            .clone()
     }
 
     /// Limits of the commanded motions, in the order of the joints.
     pub fn limits(&self) -> &[MotionLimits] {
-        &self.limits
-    }
-
-    fn fault(&self, reason: impl Into<String>) -> Error {
-        Error::Fci {
-            address: self.address.clone(),
-            reason: reason.into(),
-        }
-    }
-
-    /// Starts a motion towards a target.
-    fn start_motion(&mut self, target: &JointTarget) -> Result<(), Error> {
-        // Wait for a motion that is just ending.
-        let Some(mailbox_state) = self
-            .mailbox
-            .wait(STOP_TIMEOUT, |mailbox_state| mailbox_state.is_idle)
-        else {
-            return Err(self.fault("the previous motion does not end"));
-        };
-        let mode = mailbox_state.mode;
-        let refusal = refusal(&mailbox_state);
-        // The requests below wait for the robot, and the thread needs the lock in every
-        // millisecond.
-        drop(mailbox_state);
-        if let Some(why) = refusal.or_else(|| request::blocking_reason(mode).map(str::to_owned)) {
-            return Err(self.fault(why));
-        }
-        // Settings are sent with the first motion. A program that only opens the arm therefore
-        // changes no settings.
-        if !self.is_set {
-            request::set(&self.connection, &self.contact).map_err(|why| self.fault(why))?;
-            self.is_set = true;
-        }
-        let id = request::start_motion(&self.connection);
-        let id = id.map_err(|why| self.fault(format!("it refused to start a motion: {why}")))?;
-        self.mailbox.update(|mailbox_state| {
-            mailbox_state.started_motion = Some(id);
-            mailbox_state.accepts_commands = true;
-            mailbox_state.is_idle = false;
-            mailbox_state.command = Some(MotionCommand::SetTarget(target.clone()));
-            // The motion is set here and not by the thread, because a caller may wait for its end
-            // as soon as this function returns. If the robot has stopped since the request was
-            // sent, the reason must be kept.
-            if !matches!(mailbox_state.motion, Motion::Stopped { .. }) {
-                mailbox_state.motion = Motion::Moving;
-            }
-        });
-        Ok(())
+        self.moved.controller().limits()
     }
 }
 
-/// The reason why an arm accepts no target.
-fn refusal(mailbox_state: &MailboxState) -> Option<String> {
-    match &mailbox_state.motion {
-        Motion::Stopped { reason } => Some(format!(
-            "it accepts no target before it is recovered: {reason}"
-        )),
-        Motion::Holding | Motion::Moving => None,
+impl MotionController for Controller {
+    type Robot = RobotExchange;
+
+    fn mailbox(&self) -> &MotionMailbox {
+        &self.mailbox
+    }
+
+    fn limits(&self) -> &[MotionLimits] {
+        &self.limits
+    }
+
+    fn start(&self, command: Option<MotionCommand>) -> Result<(), String> {
+        let mode = self.mailbox.lock().robot.mode;
+        if let Some(why) = request::blocking_reason(mode) {
+            return Err(why.to_owned());
+        }
+        // Settings are sent with the first motion. A program that only opens the arm therefore
+        // changes no settings.
+        if !self.is_set.load(Ordering::Relaxed) {
+            request::set(&self.connection, &self.contact)?;
+            self.is_set.store(true, Ordering::Relaxed);
+        }
+        let id = request::start_motion(&self.connection)
+            .map_err(|why| format!("it refused to start a motion: {why}"))?;
+        self.mailbox.update(|mailbox_state| {
+            mailbox_state.robot.started_motion = Some(id);
+            mailbox_state.control.begin(command);
+        });
+        Ok(())
+    }
+
+    /// Clears the reflex if a reflex stopped the arm. If the user stop is active or joints are
+    /// locked, a person must release them first. In this case, the error names the cause.
+    fn recover(&self) -> Result<(), String> {
+        let mode = self.mailbox.lock().robot.mode;
+        if mode == RobotMode::Reflex {
+            return request::recover(&self.connection);
+        }
+        // There is no reflex to clear. The robot either became ready in the meantime, or needs a
+        // person.
+        match request::blocking_reason(mode) {
+            Some(why) => Err(why.to_owned()),
+            None => Ok(()),
+        }
+    }
+
+    fn is_ready(robot: &RobotExchange) -> bool {
+        robot.mode == RobotMode::Idle
+    }
+
+    fn check_brake_factor(&self, factor: f64) -> Result<(), String> {
+        self.robot.check_brake_factor(&self.limits, factor)
+    }
+
+    fn fault(&self, reason: String) -> Error {
+        Error::Fci {
+            address: self.address.clone(),
+            reason,
+        }
     }
 }
 
@@ -211,95 +229,37 @@ impl Arm for MovableFrankaArm {
 
 impl MovableArm for MovableFrankaArm {
     fn command(&mut self, target: &JointTarget) -> Result<JointTarget, Error> {
-        // The generator clamps as well, but on another thread. Clamping here gives the caller the
-        // accepted target at once.
-        let target = clamp_to_range(target, &self.limits).map_err(|why| self.fault(why))?;
-        let mut mailbox_state = self.mailbox.lock();
-        if let Some(why) = refusal(&mailbox_state) {
-            drop(mailbox_state);
-            return Err(self.fault(why));
-        }
-        if mailbox_state.accepts_commands {
-            mailbox_state.command = Some(MotionCommand::SetTarget(target.clone()));
-            mailbox_state.motion = Motion::Moving;
-            return Ok(target);
-        }
-        drop(mailbox_state);
-        self.start_motion(&target)?;
-        Ok(target)
+        self.moved.command(target)
     }
 
     fn motion(&self) -> Motion {
-        self.mailbox.lock().motion.clone()
+        self.moved.motion()
     }
 
     fn stop(&mut self) -> Result<(), Error> {
-        let mut mailbox_state = self.mailbox.lock();
-        if mailbox_state.accepts_commands {
-            mailbox_state.command = Some(MotionCommand::Stop);
-        }
+        self.moved.stop();
         Ok(())
     }
 
-    /// Clears the reflex if a reflex stopped the arm. If the user stop is active or joints are
-    /// locked, a person must release them first. In this case, the error names the cause.
     fn recover(&mut self) -> Result<(), Error> {
-        let Some(mailbox_state) = self.mailbox.wait(STOP_TIMEOUT, |mailbox_state| {
-            mailbox_state.is_idle || mailbox_state.is_lost
-        }) else {
-            return Err(self.fault("a motion is active"));
-        };
-        let mode = mailbox_state.mode;
-        let is_lost = mailbox_state.is_lost;
-        let motion = mailbox_state.motion.clone();
-        drop(mailbox_state);
-        match (motion, mode) {
-            (Motion::Stopped { reason }, _) if is_lost => return Err(self.fault(reason)),
-            (Motion::Stopped { .. }, RobotMode::Reflex) => {
-                request::recover(&self.connection).map_err(|why| self.fault(why))?;
-            }
-            // There is no reflex to clear. The robot either became ready in the meantime, or needs
-            // a person.
-            (Motion::Stopped { .. }, mode) => {
-                if let Some(why) = request::blocking_reason(mode) {
-                    return Err(self.fault(why));
-                }
-            }
-            (Motion::Holding | Motion::Moving, _) => return Ok(()),
-        }
-        // States from before the recovery may still be in flight.
-        let Some(mut mailbox_state) = self.mailbox.wait(SETTLE_TIMEOUT, |mailbox_state| {
-            mailbox_state.mode == RobotMode::Idle
-        }) else {
-            return Err(self.fault("it reported a successful recovery but is not ready"));
-        };
-        mailbox_state.motion = Motion::Holding;
-        Ok(())
+        self.moved.recover()
+    }
+
+    fn steering_port(&mut self, brake_factor: f64) -> Result<SteeringPort, Error> {
+        self.moved.steering_port(brake_factor)
     }
 }
 
 impl Drop for MovableFrankaArm {
     fn drop(&mut self) {
-        self.mailbox.update(|mailbox_state| {
-            mailbox_state.is_shutting_down = true;
-            // The stop replaces a pending target. Without a motion, the stop is not stored, because
-            // it would wait in the mailbox until the next motion.
-            mailbox_state.command = mailbox_state
-                .accepts_commands
-                .then_some(MotionCommand::Stop);
-        });
-        if self
-            .mailbox
-            .wait(STOP_TIMEOUT, |mailbox_state| {
-                mailbox_state.is_idle || mailbox_state.is_lost
-            })
-            .is_none()
-        {
-            log::warn!("arm at {}: the motion did not end", self.address);
+        let is_over = self.moved.shut_down();
+        let address = &self.moved.controller().address;
+        if !is_over {
+            log::warn!("arm at {address}: the motion did not end");
         }
         let statistics = self.motion_statistics();
         if statistics.n_motions > 0 {
-            log::info!("arm at {}: {statistics}", self.address);
+            log::info!("arm at {address}: {statistics}");
         }
     }
 }

@@ -26,7 +26,7 @@ const JERK_REDUCTIONS: [f64; 3] = [1e-6, 1e-4, 1e-2];
 
 /// Setpoint of all joints at an instant, in the order of the joints. Units are radians or meters,
 /// and seconds.
-#[derive(Clone, Debug, PartialEq)]
+#[derive(Clone, Debug, Default, PartialEq)]
 pub struct Setpoint {
     /// Positions.
     pub position: Vec<f64>,
@@ -34,6 +34,18 @@ pub struct Setpoint {
     pub velocity: Vec<f64>,
     /// Accelerations.
     pub acceleration: Vec<f64>,
+}
+
+impl Setpoint {
+    /// Rest at a position.
+    pub fn at_rest(position: Vec<f64>) -> Self {
+        let zero = vec![0.0; position.len()];
+        Self {
+            position,
+            velocity: zero.clone(),
+            acceleration: zero,
+        }
+    }
 }
 
 /// Generates one setpoint per cycle. All joints arrive at the same time.
@@ -143,6 +155,7 @@ impl TrajectoryGenerator {
             // possible.
             self.input.control_interface = ControlInterface::Velocity;
             self.input.synchronization = Synchronization::None;
+            self.forget_ranges();
         }
     }
 
@@ -156,10 +169,23 @@ impl TrajectoryGenerator {
         self.input.current_velocity = data_array(from.velocity.iter().copied());
         self.input.current_acceleration = data_array(from.acceleration.iter().copied());
         // An earlier trajectory may have been allowed to overshoot. The new one must stay
-        // inside the ranges again, if possible.
-        self.keep_in_range();
+        // inside the ranges again, if possible. A stop needs no ranges.
+        if self.input.control_interface == ControlInterface::Position {
+            self.keep_in_range();
+        }
         self.is_at_rest = false;
         Ok(())
+    }
+
+    /// Plans stops without ranges. A stop is the shortest way to rest, wherever it ends.
+    ///
+    /// With ranges, `rsruckig` 3.0.1 also checks the target position of an earlier trajectory in
+    /// velocity control. It is 0 in a new generator. For a joint whose range does not contain 0,
+    /// such as joint 4 of a Panda, it then replaces the plan with one of unlimited jerk
+    /// (`repair_profile_step2`, and `time_none` of `velocity_third_step2.rs`).
+    fn forget_ranges(&mut self) {
+        self.input.min_position = None;
+        self.input.max_position = None;
     }
 
     /// Keeps future trajectories within the ranges.
@@ -311,6 +337,7 @@ fn data_array(values: impl Iterator<Item = f64>) -> DataArrayOrVec<f64, 0> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use numbers::random::Random;
 
     const PERIOD: Duration = Duration::from_millis(1);
 
@@ -604,5 +631,96 @@ mod tests {
                 .unwrap_err()
                 .contains("joint 1 is at 1.5")
         );
+    }
+    /// Joint 4 of a Panda, whose range does not contain 0.
+    fn panda_joint_4() -> MotionLimits {
+        MotionLimits {
+            position: [-3.0718, -0.0698],
+            velocity: 1.0,
+            acceleration: 2.0,
+            jerk: 20.0,
+        }
+    }
+
+    /// Invariant: acceleration and jerk change within the limits of `joint` in one cycle.
+    fn check_cycle(before: &Setpoint, after: &Setpoint, joint: &MotionLimits, period: Duration) {
+        let secs = period.as_secs_f64();
+        let jerk = (after.acceleration[0] - before.acceleration[0]) / secs;
+        let acceleration = (after.velocity[0] - before.velocity[0]) / secs;
+        assert!(
+            jerk.abs() <= joint.jerk * 1.0001 && acceleration.abs() <= joint.acceleration * 1.0001,
+            "{jerk} {acceleration}: {before:?} {after:?}"
+        );
+    }
+
+    /// Stops a joint whose range does not contain 0 in many states of motion.
+    ///
+    /// * `replan`: changes the generator before the stop.
+    fn check_stops(replan: impl Fn(&mut TrajectoryGenerator, &Setpoint)) {
+        const N_STOPS: u32 = 2000;
+        let joint = panda_joint_4();
+        // The states of the steering tests, in which a brake once had more than twice its jerk.
+        for period in [Duration::from_millis(10), PERIOD] {
+            let mut random = Random::new(5);
+            let mut generator = TrajectoryGenerator::new(&[joint], &[-2.2], period).unwrap();
+            let mut last = generator.step().unwrap();
+            for _ in 0..N_STOPS {
+                let position = vec![random.uniform(-3.0, -0.1)];
+                generator.set_target(&JointTarget { position }).unwrap();
+                for _ in 0..5 + random.below(30) {
+                    let next = generator.step().unwrap();
+                    check_cycle(&last, &next, &joint, period);
+                    last = next;
+                }
+                replan(&mut generator, &last);
+                generator.stop();
+                let n_cycles = random.below(40);
+                for _ in 0..n_cycles {
+                    let next = generator.step().unwrap();
+                    check_cycle(&last, &next, &joint, period);
+                    last = next;
+                }
+                // A stop continues from the state that the arm reports.
+                replan(&mut generator, &last);
+                while !generator.is_at_rest() {
+                    let next = generator.step().unwrap();
+                    check_cycle(&last, &next, &joint, period);
+                    last = next;
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn stop_of_a_joint_whose_range_does_not_contain_zero_respects_limits() {
+        check_stops(|_, _| {});
+    }
+
+    #[test]
+    fn resumed_stop_of_a_joint_whose_range_does_not_contain_zero_respects_limits() {
+        check_stops(|generator, last| generator.resume(last).unwrap());
+    }
+
+    #[test]
+    fn first_motion_of_a_generator_that_is_a_stop_respects_limits() {
+        let joint = panda_joint_4();
+        let mut random = Random::new(6);
+        for _ in 0..2000 {
+            let start = Setpoint {
+                position: vec![random.uniform(-2.8, -0.3)],
+                velocity: vec![random.uniform(-0.5, 0.5)],
+                acceleration: vec![random.uniform(-2.0, 2.0)],
+            };
+            let mut generator =
+                TrajectoryGenerator::new(&[joint], &start.position, PERIOD).unwrap();
+            generator.resume(&start).unwrap();
+            generator.stop();
+            let mut last = start;
+            while !generator.is_at_rest() {
+                let next = generator.step().unwrap();
+                check_cycle(&last, &next, &joint, PERIOD);
+                last = next;
+            }
+        }
     }
 }

@@ -2,6 +2,8 @@
 //! it.
 
 use super::JointTarget;
+use super::mover::Mover;
+use crate::Error;
 use parking_lot::{Condvar, Mutex, MutexGuard};
 use std::time::{Duration, Instant};
 
@@ -17,6 +19,22 @@ pub(crate) struct Mailbox<S> {
 pub(crate) enum MotionCommand {
     SetTarget(JointTarget),
     Stop,
+}
+
+impl MotionCommand {
+    /// Changes the setpoints of an arm.
+    ///
+    /// # Errors
+    /// If the target is not valid, or the arm is steered.
+    pub(crate) fn apply(&self, mover: &mut Mover) -> Result<(), Error> {
+        match self {
+            Self::SetTarget(target) => mover.set_target(target).map(drop),
+            Self::Stop => {
+                mover.stop();
+                Ok(())
+            }
+        }
+    }
 }
 
 impl<S> Mailbox<S> {

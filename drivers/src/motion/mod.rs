@@ -1,23 +1,46 @@
 //! Arms that may be moved: targets, motion limits, and fail-safe behavior if this computer stops
 //! sending.
 
+#[cfg(target_os = "linux")]
+mod control;
+#[cfg(target_os = "linux")]
+mod controlled_arm;
+pub mod exact;
 mod fail_safe;
+mod follower;
 mod generator;
 #[cfg(target_os = "linux")]
 mod lock;
 #[cfg(target_os = "linux")]
 mod mailbox;
+mod mover;
+mod steered;
+#[cfg(feature = "emulation")]
+pub mod steering_check;
+mod steering_port;
+#[cfg(test)]
+mod steering_tests;
+mod target;
 #[cfg(target_os = "linux")]
 mod thread;
 
 #[cfg(target_os = "linux")]
+pub(crate) use control::{Exchange, idle_cycle};
+#[cfg(target_os = "linux")]
+pub(crate) use controlled_arm::{ControlledArm, MotionController};
+#[cfg(target_os = "linux")]
 pub(crate) use fail_safe::CommandedArm;
 pub use fail_safe::apply_fail_safe;
+pub use follower::{Follower, brake_limits};
 pub use generator::{Setpoint, TrajectoryGenerator};
 #[cfg(target_os = "linux")]
 pub(crate) use lock::MotionLock;
 #[cfg(target_os = "linux")]
 pub(crate) use mailbox::{Mailbox, MotionCommand};
+pub use mover::Mover;
+pub use steered::Steered;
+pub use steering_port::SteeringPort;
+pub use target::{ArmState, NotFollowed, Output, Target};
 #[cfg(target_os = "linux")]
 pub(crate) use thread::{MotionThread, Reply, Request, SharedWithOwner};
 
@@ -69,6 +92,30 @@ pub trait MovableArm: Arm {
     /// Enables a stopped arm again, holding its current position. Call this only at the request of
     /// a person who has checked the arm, never automatically.
     fn recover(&mut self) -> Result<(), Error>;
+    /// Switches the arm to steering. From now on, it follows the targets of the port, brakes when
+    /// they expire, and refuses [`MovableArm::command`]. A motion that is under way is braked.
+    /// Further calls return the same port.
+    ///
+    /// * `brake_factor`: acceleration and jerk of braking, as a factor of the limits of motions; at
+    ///   least 1.
+    ///
+    /// # Errors
+    /// If the factor is below 1 or not finite, the arm is [`Motion::Stopped`], or its thread has
+    /// ended. The arm is then not steered.
+    fn steering_port(&mut self, brake_factor: f64) -> Result<SteeringPort, Error>;
+}
+
+fn motion_error(reason: String) -> Error {
+    Error::Motion { reason }
+}
+
+/// Reason of the error, without the prefix "the arm cannot be moved".
+#[cfg(target_os = "linux")]
+pub(crate) fn reason_of(error: &Error) -> String {
+    match error {
+        Error::Motion { reason } => reason.clone(),
+        other => other.to_string(),
+    }
 }
 
 /// Action of the motors when commands from this computer stop.

@@ -1,6 +1,8 @@
 //! The thread that moves an arm, and the requests of its owner.
 
-use super::{CommandedArm, JointTarget, Motion};
+use super::mover::Mover;
+use super::steering_port::SteeringPort;
+use super::{CommandedArm, JointTarget, Motion, MotionLimits};
 use crate::Error;
 use parking_lot::Mutex;
 use std::sync::Arc;
@@ -11,6 +13,10 @@ use std::time::Duration;
 
 /// Maximum time to recover. Preparing and enabling takes some hundred milliseconds per motor.
 const MAX_RECOVERY: Duration = Duration::from_secs(60);
+
+/// Maximum number of requests that wait. The owner and the holders of a steering port each wait for
+/// their reply, so more would mean that the thread is stuck.
+const MAX_REQUESTS: usize = 4;
 
 pub(crate) type Reply<T> = SyncSender<Result<T, Error>>;
 
@@ -23,6 +29,50 @@ pub(crate) enum Request {
     Stop(Reply<()>),
     /// Prepare and enable the motors. The reply comes when they are enabled.
     Recover(Reply<()>),
+    /// The reply is the limits of the enabled joints.
+    Limits(Reply<Vec<MotionLimits>>),
+    /// Follow a steering port from now on.
+    Steer(SteeringPort, Reply<()>),
+}
+
+impl Request {
+    /// Answers a request to an arm that is not enabled, for this reason.
+    pub(crate) fn refuse(self, reason: Error) {
+        // The requester may have gone away, so errors of replies are ignored.
+        match self {
+            Self::SetTarget(_, answer) => drop(answer.try_send(Err(reason))),
+            Self::Limits(answer) => drop(answer.try_send(Err(reason))),
+            Self::Steer(_, answer) => drop(answer.try_send(Err(reason))),
+            // The arm does not move, or is being enabled already.
+            Self::Stop(answer) | Self::Recover(answer) => drop(answer.try_send(Ok(()))),
+        }
+    }
+}
+
+impl Mover {
+    /// Answers a request to an enabled arm. `motion` is the state that the owner sees.
+    pub(crate) fn handle(&mut self, request: Request, motion: &Mutex<Motion>) {
+        // The requester may have gone away, so errors of replies are ignored.
+        match request {
+            Request::SetTarget(target, answer) => {
+                let accepted = self.set_target(&target);
+                if accepted.is_ok() {
+                    // The state is set before the reply, because the requester may wait for the end
+                    // of the motion as soon as its target is accepted.
+                    *motion.lock() = Motion::Moving;
+                }
+                let _ = answer.try_send(accepted);
+            }
+            Request::Stop(answer) => {
+                self.stop();
+                let _ = answer.try_send(Ok(()));
+            }
+            Request::Limits(answer) => drop(answer.try_send(Ok(self.limits().to_vec()))),
+            Request::Steer(port, answer) => drop(answer.try_send(self.steer(port))),
+            // The arm is enabled.
+            Request::Recover(answer) => drop(answer.try_send(Ok(()))),
+        }
+    }
 }
 
 /// What the thread shares with the owner of the arm.
@@ -42,6 +92,8 @@ pub(crate) struct SharedWithOwner {
 #[derive(Debug)]
 pub(crate) struct MotionThread {
     requests: SyncSender<Request>,
+    /// The port, if the arm is steered.
+    port: Option<SteeringPort>,
     motion: Arc<Mutex<Motion>>,
     is_shutting_down: Arc<AtomicBool>,
     thread: Option<JoinHandle<()>>,
@@ -52,8 +104,7 @@ impl MotionThread {
     /// Returns the sides of the owner and of the thread, which has not started yet. The thread
     /// replies to targets and stops within `max_answer`, if it is not stuck.
     pub(crate) fn new(max_answer: Duration) -> (Self, SharedWithOwner) {
-        // Only one request waits at a time, because the owner waits for each reply.
-        let (requests, receiver) = sync_channel(1);
+        let (requests, receiver) = sync_channel(MAX_REQUESTS);
         let motion = Arc::new(Mutex::new(Motion::Stopped {
             reason: "the arm has not been enabled yet".to_owned(),
         }));
@@ -65,6 +116,7 @@ impl MotionThread {
         };
         let owner = Self {
             requests,
+            port: None,
             motion,
             is_shutting_down,
             thread: None,
@@ -99,7 +151,8 @@ impl MotionThread {
 
     /// See [`MovableArm::command`](super::MovableArm::command).
     pub(crate) fn command(&self, target: &JointTarget) -> Result<JointTarget, Error> {
-        self.request_and_wait(
+        request_and_wait(
+            &self.requests,
             |answer| Request::SetTarget(target.clone(), answer),
             self.max_answer,
         )
@@ -112,32 +165,50 @@ impl MotionThread {
 
     /// See [`MovableArm::stop`](super::MovableArm::stop).
     pub(crate) fn stop(&self) -> Result<(), Error> {
-        self.request_and_wait(Request::Stop, self.max_answer)
+        request_and_wait(&self.requests, Request::Stop, self.max_answer)
     }
 
     /// See [`MovableArm::recover`](super::MovableArm::recover).
     pub(crate) fn recover(&self) -> Result<(), Error> {
-        self.request_and_wait(Request::Recover, MAX_RECOVERY)
+        request_and_wait(&self.requests, Request::Recover, MAX_RECOVERY)
     }
 
-    /// Sends a request to the thread, and waits for the reply.
-    fn request_and_wait<T>(
-        &self,
-        request: impl FnOnce(Reply<T>) -> Request,
-        timeout: Duration,
-    ) -> Result<T, Error> {
-        // Each request has its own channel. A reply that comes after the timeout cannot be mistaken
-        // for the reply to the next request.
-        let (sender, answer) = sync_channel(1);
-        // Waits have a timeout, because the thread may have ended after a panic.
-        let no_answer = || Error::Motion {
-            reason: "the arm's thread does not answer".to_owned(),
-        };
-        self.requests
-            .try_send(request(sender))
-            .map_err(|_| no_answer())?;
-        answer.recv_timeout(timeout).map_err(|_| no_answer())?
+    /// See [`MovableArm::steering_port`](super::MovableArm::steering_port).
+    pub(crate) fn steering_port(&mut self, brake_factor: f64) -> Result<SteeringPort, Error> {
+        if let Some(port) = &self.port {
+            return Ok(port.clone());
+        }
+        let limits = request_and_wait(&self.requests, Request::Limits, self.max_answer)?;
+        let requests = self.requests.clone();
+        let recover = move || request_and_wait(&requests, Request::Recover, MAX_RECOVERY);
+        let port = SteeringPort::new(&limits, brake_factor, recover)?;
+        request_and_wait(
+            &self.requests,
+            |answer| Request::Steer(port.clone(), answer),
+            self.max_answer,
+        )?;
+        self.port = Some(port.clone());
+        Ok(port)
     }
+}
+
+/// Sends a request to the thread of an arm, and waits for the reply.
+fn request_and_wait<T>(
+    requests: &SyncSender<Request>,
+    request: impl FnOnce(Reply<T>) -> Request,
+    timeout: Duration,
+) -> Result<T, Error> {
+    // Each request has its own channel. A reply that comes after the timeout cannot be mistaken for
+    // the reply to the next request.
+    let (sender, answer) = sync_channel(1);
+    // Waits have a timeout, because the thread may have ended after a panic.
+    let no_answer = || Error::Motion {
+        reason: "the arm's thread does not answer".to_owned(),
+    };
+    requests
+        .try_send(request(sender))
+        .map_err(|_| no_answer())?;
+    answer.recv_timeout(timeout).map_err(|_| no_answer())?
 }
 
 impl Drop for MotionThread {

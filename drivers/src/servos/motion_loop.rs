@@ -11,7 +11,7 @@ use super::config::MovableServoArmConfig;
 use super::moved_servos::MovedServos;
 use super::plan;
 use crate::motion::{
-    CommandedArm, Motion, MotionLimits, OnLoss, Request, SharedWithOwner, TrajectoryGenerator,
+    CommandedArm, Motion, MotionLimits, Mover, OnLoss, Request, SharedWithOwner, reason_of,
 };
 use crate::{Error, clock};
 use kinematics::{JointState, Stamp};
@@ -39,8 +39,8 @@ const MAX_CONFIRMATION: Duration = Duration::from_secs(2);
 enum ArmState {
     /// No setpoints are sent.
     Stopped { reason: String },
-    /// The servos follow the trajectory.
-    Moving { generator: Box<TrajectoryGenerator> },
+    /// The servos follow the setpoints.
+    Moving,
 }
 
 /// The thread's state.
@@ -55,6 +55,7 @@ pub(super) struct MotionLoop {
     /// still be read. `None` after the port was disconnected.
     servos: Option<MovedServos>,
     arm_state: ArmState,
+    mover: Mover,
     /// Start of the last cycle, on a clock that keeps counting while the computer is suspended.
     last_cycle: Stamp,
     max_stall: Duration,
@@ -86,6 +87,7 @@ impl MotionLoop {
             arm_state: ArmState::Stopped {
                 reason: String::new(),
             },
+            mover: Mover::default(),
             last_cycle: clock::now_including_suspend(),
             max_stall: Duration::ZERO,
         })
@@ -131,38 +133,20 @@ impl MotionLoop {
     }
 
     fn handle_request(&mut self, request: Request) {
-        // The requester may have gone away, so errors of replies are ignored.
-        match (request, &mut self.arm_state) {
-            (Request::SetTarget(target, answer), ArmState::Moving { generator }) => {
-                let accepted = generator.set_target(&target).map_err(motion_error);
-                if accepted.is_ok() {
-                    // The state is set before the reply, because the requester may wait for the end
-                    // of the motion as soon as its target is accepted.
-                    *self.motion.lock() = Motion::Moving;
-                }
-                let _ = answer.try_send(accepted);
-            }
-            (Request::Stop(answer), ArmState::Moving { generator }) => {
-                generator.stop();
-                let _ = answer.try_send(Ok(()));
-            }
-            (Request::SetTarget(_, answer), ArmState::Stopped { reason }) => {
-                let reason = format!("the arm stopped and has not been recovered: {reason}");
-                let _ = answer.try_send(Err(motion_error(reason)));
-            }
-            (Request::Stop(answer), ArmState::Stopped { .. }) => {
-                let _ = answer.try_send(Ok(()));
-            }
-            (Request::Recover(answer), ArmState::Moving { .. }) => {
-                let _ = answer.try_send(Ok(()));
-            }
+        match (request, &self.arm_state) {
             (Request::Recover(answer), ArmState::Stopped { .. }) => {
                 let recovered = self.recover();
                 if let Err(error) = &recovered {
                     self.stopped(&reason_of(error));
                 }
+                // The requester may have gone away.
                 let _ = answer.try_send(recovered);
             }
+            (request, ArmState::Stopped { reason }) => {
+                let reason = format!("the arm stopped and has not been recovered: {reason}");
+                request.refuse(motion_error(reason));
+            }
+            (request, ArmState::Moving) => self.mover.handle(request, &self.motion),
         }
     }
 
@@ -173,28 +157,22 @@ impl MotionLoop {
         let mut servos = MovedServos::find(&self.config)?;
         let limits = servos.limits(&self.config.motion.limits);
         let positions = servos.positions().unwrap_or_default();
-        // The generator refuses a position outside the limits. This is checked before anything is
-        // changed in the servos.
-        TrajectoryGenerator::new(&limits, &positions, servos.period()).map_err(motion_error)?;
+        let period = servos.period();
+        // A position outside the limits is refused before anything is changed in the servos.
+        self.mover.hold_at(limits.clone(), positions, period)?;
         servos.enable(&limits, self.config.motion.timeout)?;
         // The joints may have moved until they were enabled.
         let positions = servos.positions().unwrap_or_default();
-        let generator = TrajectoryGenerator::new(&limits, &positions, servos.period());
-        let generator = match generator {
-            Ok(generator) => generator,
-            Err(reason) => {
-                servos.apply(OnLoss::Release, false);
-                return Err(motion_error(reason));
-            }
-        };
+        if let Err(error) = self.mover.hold_at(limits, positions, period) {
+            servos.apply(OnLoss::Release, false);
+            return Err(error);
+        }
         log::info!(
             "the arm is enabled and holds its position; {:.0} setpoints per second",
             1.0 / servos.period().as_secs_f64()
         );
         self.servos = Some(servos);
-        self.arm_state = ArmState::Moving {
-            generator: Box::new(generator),
-        };
+        self.arm_state = ArmState::Moving;
         *self.motion.lock() = Motion::Holding;
         // Enabling takes longer than a watchdog timeout, but it is not a stall of this thread.
         self.last_cycle = clock::now_including_suspend();
@@ -209,10 +187,13 @@ impl MotionLoop {
         let stall = now.duration_since(self.last_cycle);
         self.last_cycle = now;
         let max_silence = self.config.motion.timeout.mul_f64(SILENCE_FRAC);
+        if let ArmState::Stopped { reason } = &self.arm_state {
+            self.mover.report_stopped(clock::now(), reason);
+        }
         let Some(servos) = &mut self.servos else {
             return Ok(());
         };
-        let ArmState::Moving { generator } = &mut self.arm_state else {
+        if let ArmState::Stopped { .. } = self.arm_state {
             // A stopped arm is still read. If that fails, only a recovery opens the port again.
             match servos.read() {
                 Ok(Some(state)) => drop(self.states.try_send(Ok(state))),
@@ -220,7 +201,7 @@ impl MotionLoop {
                 Err(_) => self.servos = None,
             }
             return Ok(());
-        };
+        }
         self.max_stall = self.max_stall.max(stall);
         // Setpoints from before a long stall must not be sent, because the servos have stopped or
         // are about to.
@@ -236,13 +217,9 @@ impl MotionLoop {
             // If the reader is slow, the newest state is dropped.
             let _ = self.states.try_send(Ok(state));
         }
-        let setpoint = generator.step().map_err(motion_error)?;
+        let setpoint = self.mover.step(clock::now())?;
         servos.command(&setpoint)?;
-        *self.motion.lock() = if generator.is_at_rest() {
-            Motion::Holding
-        } else {
-            Motion::Moving
-        };
+        *self.motion.lock() = self.mover.motion();
         Ok(())
     }
 
@@ -257,6 +234,7 @@ impl MotionLoop {
 
     fn stopped(&mut self, reason: &str) {
         log::warn!("the arm stopped: {reason}");
+        self.mover.report_stopped(clock::now(), reason);
         let reason = reason.to_owned();
         *self.motion.lock() = Motion::Stopped {
             reason: reason.clone(),
@@ -290,11 +268,8 @@ impl MotionLoop {
 
     /// Returns whether the arm is at rest. If it moves, starts to bring it to rest.
     fn is_at_rest(&mut self) -> bool {
-        match &mut self.arm_state {
-            ArmState::Moving { generator } => {
-                generator.stop();
-                generator.is_at_rest()
-            }
+        match self.arm_state {
+            ArmState::Moving => self.mover.come_to_rest(),
             ArmState::Stopped { .. } => true,
         }
     }
@@ -319,11 +294,11 @@ impl MotionLoop {
 
     /// Applies the fail-safe at the end, unless the arm has already stopped.
     fn end(&mut self) {
-        if let ArmState::Moving { .. } = self.arm_state {
+        if let ArmState::Moving = self.arm_state {
             self.apply_fail_safe(false);
-            self.arm_state = ArmState::Stopped {
-                reason: "it was shut down".to_owned(),
-            };
+            let reason = "it was shut down".to_owned();
+            self.mover.report_stopped(clock::now(), &reason);
+            self.arm_state = ArmState::Stopped { reason };
         }
         if let Some(servos) = &self.servos {
             log::info!(
@@ -349,12 +324,4 @@ impl Drop for MotionLoop {
 
 fn motion_error(reason: String) -> Error {
     Error::Motion { reason }
-}
-
-/// Reason of the error, without the prefix "the arm cannot be moved".
-fn reason_of(error: &Error) -> String {
-    match error {
-        Error::Motion { reason } => reason.clone(),
-        other => other.to_string(),
-    }
 }

@@ -5,7 +5,7 @@ use super::arm::MAX_WAITING;
 use super::config::MovableServoArmConfig;
 use super::motion_loop::MotionLoop;
 use super::plan;
-use crate::motion::{JointTarget, Motion, MotionLock, MotionThread, MovableArm};
+use crate::motion::{JointTarget, Motion, MotionLock, MotionThread, MovableArm, SteeringPort};
 use crate::{Arm, Error};
 use kinematics::JointState;
 use std::sync::mpsc::{Receiver, sync_channel};
@@ -97,5 +97,9 @@ impl MovableArm for MovableServoArm {
 
     fn recover(&mut self) -> Result<(), Error> {
         self.thread.recover()
+    }
+
+    fn steering_port(&mut self, brake_factor: f64) -> Result<SteeringPort, Error> {
+        self.thread.steering_port(brake_factor)
     }
 }

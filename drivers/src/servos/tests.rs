@@ -7,7 +7,10 @@ use super::{
     ServoArm, ServoArmConfig, ServoConfig, ServoProtocol, servos_on,
 };
 use crate::can::FollowingLimits;
-use crate::motion::{JointTarget, Motion, MotionConfig, MotionLimits, MovableArm, OnLoss};
+use crate::motion::steering_check::{TriedMotion, check_steering};
+use crate::motion::{
+    JointTarget, Motion, MotionConfig, MotionLimits, MovableArm, OnLoss, Output, Target,
+};
 use crate::{Arm, Error, clock};
 use kinematics::JointState;
 use std::f64::consts::TAU;
@@ -602,4 +605,78 @@ fn unsuitable_configurations_are_refused_before_anything_is_sent() {
     assert!(message.contains("operating mode is 1"), "{message}");
     let line = dynamixel.bus().line();
     assert!(!line.servos.iter().any(EmulatedServo::is_enabled));
+}
+
+#[test]
+fn steered_arm_brakes_when_its_targets_expire() {
+    for kind in KINDS {
+        let bench = Bench::new(kind);
+        let mut arm = MovableServoArm::open(&bench.movable(OnLoss::Release)).expect("enabled");
+        let tried = TriedMotion {
+            joint_ix: 0,
+            distance: 0.8,
+            until: 0.05,
+            busy: None,
+        };
+        check_steering(&mut arm, tried);
+        let port = arm.steering_port(1.0).expect("the same port");
+        let commanded = port.state().expect("a report").position;
+        wait_until("arrival of the servos", || {
+            let state = next_state(&mut arm);
+            let is_near = |(got, goal): (&f64, &f64)| (got - goal).abs() <= RAD_PER_COUNT;
+            state.position.iter().zip(&commanded).all(is_near)
+        });
+        drop(arm);
+        let state = port.state().expect("a report");
+        assert!(state.stopped.is_some(), "the port outlives the arm");
+        port.recover().expect_err("there is no arm");
+        assert!(
+            !bench
+                .bus()
+                .line()
+                .servos
+                .iter()
+                .any(EmulatedServo::is_enabled)
+        );
+    }
+}
+
+#[test]
+fn steered_arm_that_stopped_moves_only_after_a_recovery_with_a_new_motion() {
+    let bench = Bench::new(ServoKind::Dynamixel);
+    let mut arm = MovableServoArm::open(&bench.movable(OnLoss::Hold)).expect("enabled");
+    let port = arm.steering_port(2.0).expect("enabled");
+    let send = |motion, serial| {
+        port.send(&Output::Follow(Target {
+            motion,
+            serial,
+            position: vec![0.9, 0.0, 0.0],
+            // It does not expire in this test.
+            expires_at: clock::now() + 10 * LIMIT,
+        }));
+    };
+    let position = || port.state().expect("a report").position[0];
+    wait_until("a report", || port.state().is_some());
+    let start = position();
+    send(1, 1);
+    wait_until("motion", || position() > start + 0.05);
+    bench.bus().line().servos[2].set_faults(1 << 5);
+    let stopped = || port.state().and_then(|state| state.stopped);
+    wait_until("a stop", || stopped().is_some());
+    let reason = stopped().expect("it stopped");
+    assert!(reason.contains("overload"), "{reason}");
+    port.recover().expect_err("still overloaded");
+    bench.bus().line().servos[2].set_faults(0);
+    send(1, 2);
+    port.recover().expect("the fault is gone");
+    wait_until("a report", || stopped().is_none());
+    // Neither the old target nor a new one of the same motion is followed.
+    let rest = position();
+    for serial in 3..20 {
+        send(1, serial);
+        next_state(&mut arm);
+        assert!((position() - rest).abs() < 1e-9 && stopped().is_none());
+    }
+    send(2, 1);
+    wait_until("motion", || position() > rest + 0.05);
 }

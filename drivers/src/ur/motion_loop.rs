@@ -9,7 +9,8 @@ use super::program::{
 };
 use super::state::RobotState;
 use super::words;
-use crate::motion::{self, Motion, MotionCommand, MotionLimits, TrajectoryGenerator};
+use crate::motion::{self, Motion, MotionCommand, MotionLimits, Mover, idle_cycle, reason_of};
+use crate::{Error, clock};
 use std::sync::Arc;
 use std::time::Duration;
 
@@ -33,6 +34,7 @@ pub(super) struct MotionLoop {
     mailbox: Arc<MotionMailbox>,
     limits: Vec<MotionLimits>,
     rate_hz: f64,
+    mover: Mover,
     motion_state: MotionState,
     /// Number of the newest setpoint. The program detects silence by it.
     number: i32,
@@ -67,7 +69,6 @@ enum MotionState {
 #[derive(Debug)]
 struct ActiveMotion {
     session: i32,
-    generator: TrajectoryGenerator,
     /// The last setpoint.
     sent_rad: [f64; N_JOINTS],
     n_at_rest: u64,
@@ -85,6 +86,7 @@ impl MotionLoop {
             mailbox,
             limits,
             rate_hz,
+            mover: Mover::default(),
             motion_state: MotionState::Idle,
             number: 0,
         }
@@ -113,6 +115,11 @@ impl MotionLoop {
             } => self.end(session, n_waited, reason, cycle),
         };
         self.motion_state = next;
+        // The state of a motion is reported with its setpoint.
+        if !matches!(self.motion_state, MotionState::ActiveMotion(_)) {
+            let position = &cycle.state.target_rad;
+            idle_cycle(&self.mailbox, &mut self.mover, clock::now(), position);
+        }
         let Some((session, position_rad)) = setpoint else {
             return Ok(());
         };
@@ -128,20 +135,26 @@ impl MotionLoop {
     pub(super) fn handle_disconnect(&mut self, reason: &str) {
         self.motion_state = MotionState::Idle;
         self.mailbox
-            .update(|mailbox_state| mailbox_state.is_lost = true);
-        self.stop_because(format!("connection lost: {reason}"));
+            .update(|mailbox_state| mailbox_state.control.is_lost = true);
+        let reason = format!("connection lost: {reason}");
+        // No state follows, so a steered arm reports the stop here.
+        self.mover.report_stopped(clock::now(), &reason);
+        self.stop_because(reason);
     }
 
     /// Records whether the robot is ready. Outside of a motion, also reports a stop of the safety
     /// system. During a motion, the end of the program is reported with its reason.
     pub(super) fn take_mode(&mut self, state: &RobotState) {
         let blocking_reason = words::blocking_reason(state).or_else(|| self.other_program(state));
-        if self.mailbox.lock().blocking_reason == blocking_reason {
+        if self.mailbox.lock().robot.blocking_reason == blocking_reason {
             return;
         }
         self.mailbox.update(|mailbox_state| {
-            mailbox_state.blocking_reason.clone_from(&blocking_reason);
-            mailbox_state.is_protective_stop = words::is_protective_stop(state);
+            mailbox_state
+                .robot
+                .blocking_reason
+                .clone_from(&blocking_reason);
+            mailbox_state.robot.is_protective_stop = words::is_protective_stop(state);
         });
         if let (MotionState::Idle, true, Some(reason)) = (
             &self.motion_state,
@@ -160,7 +173,7 @@ impl MotionLoop {
     }
 
     fn start_request(&self) -> MotionState {
-        match self.mailbox.lock().requested_session.take() {
+        match self.mailbox.lock().robot.requested_session.take() {
             Some(session) => MotionState::Beginning {
                 session,
                 n_waited: 0,
@@ -172,7 +185,7 @@ impl MotionLoop {
     /// Waits for the program of a motion.
     fn begin(&mut self, session: i32, n_waited: u64, cycle: &Cycle<'_>) -> Step {
         let state = cycle.state;
-        let failure = self.mailbox.lock().start_error.clone();
+        let failure = self.mailbox.lock().robot.start_error.clone();
         let failure = failure.or_else(|| words::blocking_reason(state));
         if let Some(reason) = failure {
             return self.fail_to_start(reason);
@@ -200,17 +213,16 @@ impl MotionLoop {
         // one. The two differ by the sag under load, so the measured position would cause a jump.
         let start_rad = cycle.state.target_rad;
         let period = Duration::from_secs_f64(1.0 / self.rate_hz);
-        let generator = match TrajectoryGenerator::new(&self.limits, &start_rad, period) {
-            Ok(generator) => generator,
-            Err(reason) => return self.halt(session, start_rad, Some(reason)),
-        };
+        let limits = self.limits.clone();
+        if let Err(error) = self.mover.hold_at(limits, start_rad.to_vec(), period) {
+            return self.halt(session, start_rad, Some(reason_of(&error)));
+        }
         self.mailbox.update(|mailbox_state| {
-            mailbox_state.is_running = true;
-            mailbox_state.statistics.n_motions += 1;
+            mailbox_state.robot.is_running = true;
+            mailbox_state.robot.statistics.n_motions += 1;
         });
         let active = ActiveMotion {
             session,
-            generator,
             sent_rad: start_rad,
             n_at_rest: 0,
         };
@@ -224,7 +236,7 @@ impl MotionLoop {
         } = *active;
         if has_ended(cycle.state, session) {
             self.mailbox
-                .update(|mailbox_state| mailbox_state.accepts_commands = false);
+                .update(|mailbox_state| mailbox_state.control.accepts_commands = false);
             let reason = self.end_reason(cycle.state);
             return self.halt(session, sent_rad, Some(reason));
         }
@@ -232,44 +244,44 @@ impl MotionLoop {
             NextAction::Command(command) => command,
             NextAction::End => return self.halt(session, sent_rad, None),
         };
-        match active.next_position(command.as_ref(), cycle) {
+        match next_position(&mut self.mover, sent_rad, command.as_ref(), cycle) {
             Ok(position_rad) => {
                 active.sent_rad = position_rad;
                 let setpoint = Some((session, position_rad));
                 (MotionState::ActiveMotion(active), setpoint)
             }
-            Err(reason) => self.halt(session, sent_rad, Some(reason)),
+            Err(error) => self.halt(session, sent_rad, Some(reason_of(&error))),
         }
     }
 
     /// Takes the pending command, and decides whether the motion ends.
     fn take_command(&self, active: &mut ActiveMotion, cycle: &Cycle<'_>) -> NextAction {
         let mut mailbox_state = self.mailbox.lock();
-        mailbox_state.statistics.n_setpoints += 1;
-        mailbox_state.statistics.n_pauses += u64::from(cycle.pause > MAX_PAUSE);
-        let command = mailbox_state.command.take();
+        mailbox_state.robot.statistics.n_setpoints += 1;
+        mailbox_state.robot.statistics.n_pauses += u64::from(cycle.pause > MAX_PAUSE);
+        let command = mailbox_state.control.command.take();
         // A command that has just arrived keeps the motion alive. Otherwise, it would be lost with
         // the end of the motion.
-        let is_at_rest = active.generator.is_at_rest() && command.is_none();
-        active.n_at_rest = if is_at_rest {
+        let is_resting = self.mover.is_resting() && command.is_none();
+        active.n_at_rest = if is_resting {
             active.n_at_rest + cycle.n_cycles
         } else {
             0
         };
         let at_rest_secs = active.n_at_rest as f64 / self.rate_hz;
-        if is_at_rest && (at_rest_secs > MAX_AT_REST_SECS || mailbox_state.is_shutting_down) {
+        if is_resting && (at_rest_secs > MAX_AT_REST_SECS || mailbox_state.control.is_ending()) {
             // The flag is set under the same lock under which the command was taken above. A motion
             // that ends can therefore not accept a command that arrives in between.
-            mailbox_state.accepts_commands = false;
+            mailbox_state.control.accepts_commands = false;
             return NextAction::End;
         }
-        let motion = if is_at_rest {
-            Motion::Holding
-        } else {
+        let motion = if command.is_some() {
             Motion::Moving
+        } else {
+            self.mover.motion()
         };
-        if mailbox_state.motion != motion {
-            mailbox_state.motion = motion;
+        if mailbox_state.control.motion != motion {
+            mailbox_state.control.motion = motion;
         }
         NextAction::Command(command)
     }
@@ -277,7 +289,7 @@ impl MotionLoop {
     /// Asks the program to end.
     fn halt(&self, session: i32, at_rad: [f64; N_JOINTS], reason: Option<String>) -> Step {
         self.mailbox
-            .update(|mailbox_state| mailbox_state.accepts_commands = false);
+            .update(|mailbox_state| mailbox_state.control.accepts_commands = false);
         let ending = MotionState::Ending {
             session,
             n_waited: 0,
@@ -325,12 +337,12 @@ impl MotionLoop {
     /// Gives up a motion that has not moved the arm.
     fn fail_to_start(&self, reason: String) -> Step {
         self.mailbox.update(|mailbox_state| {
-            mailbox_state.start_error = Some(reason);
-            mailbox_state.command = None;
-            mailbox_state.is_idle = true;
-            mailbox_state.accepts_commands = false;
-            if mailbox_state.motion == Motion::Moving {
-                mailbox_state.motion = Motion::Holding;
+            mailbox_state.robot.start_error = Some(reason);
+            mailbox_state.control.command = None;
+            mailbox_state.control.is_idle = true;
+            mailbox_state.control.accepts_commands = false;
+            if mailbox_state.control.motion == Motion::Moving {
+                mailbox_state.control.motion = Motion::Holding;
             }
         });
         // The program may still start. Without this setpoint, it would wait for the next motion.
@@ -342,11 +354,8 @@ impl MotionLoop {
         match reason {
             Some(reason) => self.stop_because(reason),
             None => self.mailbox.update(|mailbox_state| {
-                mailbox_state.is_idle = true;
-                mailbox_state.is_running = false;
-                mailbox_state.accepts_commands = false;
-                mailbox_state.command = None;
-                mailbox_state.motion = Motion::Holding;
+                mailbox_state.robot.is_running = false;
+                mailbox_state.control.rest();
             }),
         }
         MotionState::Idle
@@ -355,12 +364,8 @@ impl MotionLoop {
     fn stop_because(&self, reason: String) {
         log::warn!("{}: {reason}", self.device);
         self.mailbox.update(|mailbox_state| {
-            // A command from before the stop must not be executed after the recovery.
-            mailbox_state.command = None;
-            mailbox_state.is_idle = true;
-            mailbox_state.is_running = false;
-            mailbox_state.accepts_commands = false;
-            mailbox_state.motion = Motion::Stopped { reason };
+            mailbox_state.robot.is_running = false;
+            mailbox_state.control.stop_because(reason);
         });
     }
 }
@@ -381,34 +386,27 @@ fn has_ended(state: &RobotState, session: i32) -> bool {
     state.program[0] != session || state.runtime_state != words::PLAYING
 }
 
-impl ActiveMotion {
-    /// Computes the next joint positions.
-    fn next_position(
-        &mut self,
-        command: Option<&MotionCommand>,
-        cycle: &Cycle<'_>,
-    ) -> Result<[f64; N_JOINTS], String> {
-        let generator = &mut self.generator;
-        if cycle.pause > MAX_PAUSE && !generator.is_at_rest() {
-            generator.resume(&motion::Setpoint {
-                position: self.sent_rad.to_vec(),
-                velocity: vec![0.0; N_JOINTS],
-                acceleration: vec![0.0; N_JOINTS],
-            })?;
-        }
-        match command {
-            Some(MotionCommand::SetTarget(target)) => drop(generator.set_target(target)?),
-            Some(MotionCommand::Stop) => generator.stop(),
-            None => {}
-        }
-        let mut position = generator.step()?.position;
-        if cycle.pause <= MAX_PAUSE {
-            for _ in 1..cycle.n_cycles.min(MAX_STEPS) {
-                position = generator.step()?.position;
-            }
-        }
-        position
-            .try_into()
-            .map_err(|_| "the setpoint has the wrong number of joints".to_owned())
+/// Computes the next joint positions, after those that were sent last.
+fn next_position(
+    mover: &mut Mover,
+    sent_rad: [f64; N_JOINTS],
+    command: Option<&MotionCommand>,
+    cycle: &Cycle<'_>,
+) -> Result<[f64; N_JOINTS], Error> {
+    if cycle.pause > MAX_PAUSE && !mover.is_at_rest() {
+        mover.resume(&motion::Setpoint::at_rest(sent_rad.to_vec()))?;
     }
+    if let Some(command) = command {
+        command.apply(mover)?;
+    }
+    let now = clock::now();
+    let mut position = mover.step(now)?.position;
+    if cycle.pause <= MAX_PAUSE {
+        for _ in 1..cycle.n_cycles.min(MAX_STEPS) {
+            position = mover.step(now)?.position;
+        }
+    }
+    position.try_into().map_err(|_| Error::Motion {
+        reason: "the setpoint has the wrong number of joints".to_owned(),
+    })
 }

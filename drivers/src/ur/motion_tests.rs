@@ -4,8 +4,11 @@ use super::connection::Connection;
 use super::emulated::{CommandedJoints, ControllerConfig, EmulatedController, Joints, Modes};
 use super::tests::{REST_RAD, TEST_TIMEOUT, config, flange_chain, free_address};
 use super::{MovableUrArm, N_JOINTS};
-use crate::Arm;
-use crate::motion::{JointTarget, Motion, MotionConfig, MotionLimits, MovableArm, OnLoss};
+use crate::motion::steering_check::{TriedMotion, check_steering};
+use crate::motion::{
+    JointTarget, Motion, MotionConfig, MotionLimits, MovableArm, OnLoss, Output, Target,
+};
+use crate::{Arm, clock};
 use std::io::{Read, Write};
 use std::net::TcpStream;
 use std::time::{Duration, Instant};
@@ -375,4 +378,66 @@ fn unsupported_settings_and_targets_are_rejected() {
         assert!(arm.command(&JointTarget { position }).is_err());
     }
     assert!(!emulated.commanded().is_moving);
+}
+
+const TRIED: TriedMotion = TriedMotion {
+    joint_ix: 2,
+    distance: 1.0,
+    until: 0.05,
+    // A busy computer stops this arm with any of several reasons.
+    busy: Some(""),
+};
+
+#[test]
+fn steered_arm_brakes_when_its_targets_expire() {
+    for controller in [ControllerConfig::e_series, ControllerConfig::cb3] {
+        let emulated = ideal_robot(controller(free_address(), flange_chain()));
+        let mut arm = open(&emulated);
+        check_steering(&mut arm, TRIED);
+        wait_until("the program ends", || !emulated.commanded().is_moving);
+        let n_motions = arm.motion_statistics().n_motions;
+        // A new target starts the program.
+        check_steering(&mut arm, TRIED);
+        assert!(arm.motion_statistics().n_motions > n_motions);
+        drop(arm);
+        wait_until("the program ends", || !emulated.commanded().is_moving);
+    }
+}
+
+#[test]
+fn steered_arm_that_cannot_start_reports_why_and_is_recovered() {
+    let emulated = e_series();
+    emulated.set_modes(Modes {
+        is_remote: false,
+        ..Modes::default()
+    });
+    let mut arm = open(&emulated);
+    let port = arm.steering_port(2.0).unwrap();
+    wait_until("a report", || port.state().is_some());
+    let mut serial = 0;
+    let mut reason = None;
+    wait_until("the arm reports why", || {
+        serial += 1;
+        port.send(&Output::Follow(Target {
+            motion: 1,
+            serial,
+            position: target(0.5).position,
+            expires_at: clock::now() + TEST_TIMEOUT,
+        }));
+        reason = port.state().and_then(|state| state.stopped);
+        reason.is_some()
+    });
+    let reason = reason.unwrap_or_default();
+    assert!(reason.contains("local control"), "{reason}");
+    assert!(!emulated.commanded().is_moving);
+    emulated.set_modes(Modes::default());
+    port.recover().unwrap();
+    // The targets from before the recovery do not start a motion.
+    let recovered_at = clock::now();
+    wait_until("a report", || {
+        port.state()
+            .is_some_and(|state| state.reported_at > recovered_at && state.stopped.is_none())
+    });
+    assert!(is_near(&emulated, &target(0.0)));
+    check_steering(&mut arm, TRIED);
 }

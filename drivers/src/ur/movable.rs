@@ -3,13 +3,14 @@
 
 use super::address::{ControllerAddress, Interface};
 use super::arm::fault;
-use super::mailbox::{MailboxState, MotionMailbox};
+use super::mailbox::{MotionMailbox, RobotExchange};
 use super::motion_loop::MotionLoop;
 use super::program::{ProgramConfig, program};
 use super::statistics::MotionStatistics;
 use super::{ArmConfig, StateStatistics, UrArm, dashboard};
 use crate::motion::{
-    JointTarget, Motion, MotionCommand, MotionConfig, MotionLimits, MotionLock, MovableArm, OnLoss,
+    ControlledArm, Exchange, JointTarget, Motion, MotionCommand, MotionConfig, MotionController,
+    MotionLimits, MotionLock, MovableArm, OnLoss, SteeringPort,
 };
 use crate::{Arm, Error, clock};
 use kinematics::JointState;
@@ -24,11 +25,6 @@ const MIN_TIMEOUT: Duration = Duration::from_millis(40);
 const MIN_BRAKE_RAD_S2: f64 = 2.0;
 /// Maximum time for starting the program.
 const START_TIMEOUT: Duration = Duration::from_secs(5);
-/// Maximum time for an arm to come to rest and end its motion.
-const STOP_TIMEOUT: Duration = Duration::from_secs(5);
-/// Maximum time until the states agree with the end of a protective stop.
-const SETTLE_TIMEOUT: Duration = Duration::from_secs(3);
-
 /// An arm of Universal Robots that is moved by joint positions.
 ///
 /// A motion lasts from the first target until the arm has been at rest for a second. Between
@@ -36,13 +32,18 @@ const SETTLE_TIMEOUT: Duration = Duration::from_secs(3);
 /// closes the connection.
 #[derive(Debug)]
 pub struct MovableUrArm {
+    arm: UrArm,
+    moved: ControlledArm<Controller>,
+    _lock: MotionLock,
+}
+
+/// The requests that start motions and end stops.
+struct Controller {
     address: String,
     controller: ControllerAddress,
-    arm: UrArm,
     mailbox: Arc<MotionMailbox>,
     limits: Vec<MotionLimits>,
     timeout: Duration,
-    _lock: MotionLock,
 }
 
 impl MovableUrArm {
@@ -80,13 +81,16 @@ impl MovableUrArm {
         let arm = UrArm::open_to_move(config, |rate_hz| {
             MotionLoop::new(device, Arc::clone(&mailbox), motion.limits.clone(), rate_hz)
         })?;
-        Ok(Self {
+        let controller = Controller {
             address,
             controller,
-            arm,
             mailbox,
             limits: motion.limits.clone(),
             timeout: motion.timeout,
+        };
+        Ok(Self {
+            arm,
+            moved: ControlledArm::new(controller),
             _lock: lock,
         })
     }
@@ -98,75 +102,104 @@ impl MovableUrArm {
 
     /// Statistics of the setpoints so far.
     pub fn motion_statistics(&self) -> MotionStatistics {
-        self.mailbox.lock().statistics.clone()
+        self.moved
+            .controller()
+            .mailbox
+            .lock()
+            .robot
+            .statistics
+            .clone()
     }
 
     /// The reason why the robot accepts no motion, according to its newest state.
     #[cfg(test)]
     pub(super) fn blocking_reason(&self) -> Option<String> {
-        self.mailbox.lock().blocking_reason.clone()
-    }
-
-    fn fault(&self, reason: impl Into<String>) -> Error {
-        fault(&self.address, reason.into())
-    }
-
-    /// Starts a motion towards a target, and waits until its program runs.
-    fn start_motion(&mut self, target: &JointTarget) -> Result<(), Error> {
-        // Wait for a motion that is just ending.
-        let Some(mailbox_state) = self
+        self.moved
+            .controller()
             .mailbox
-            .wait(STOP_TIMEOUT, |mailbox_state| mailbox_state.is_idle)
-        else {
-            return Err(self.fault("the previous motion does not end"));
-        };
-        let problem = refusal(&mailbox_state).or_else(|| mailbox_state.blocking_reason.clone());
-        // The requests below wait for the controller, and the thread needs the lock in every cycle.
-        drop(mailbox_state);
-        if let Some(reason) = problem {
-            return Err(self.fault(reason));
-        }
+            .lock()
+            .robot
+            .blocking_reason
+            .clone()
+    }
+}
+
+impl MotionController for Controller {
+    type Robot = RobotExchange;
+
+    fn mailbox(&self) -> &MotionMailbox {
+        &self.mailbox
+    }
+
+    fn limits(&self) -> &[MotionLimits] {
+        &self.limits
+    }
+
+    /// Returns when the program of the motion runs.
+    fn start(&self, command: Option<MotionCommand>) -> Result<(), String> {
+        // The lock is released at the end of this line, because the requests below wait for the
+        // controller.
+        let problem = self.mailbox.lock().robot.blocking_reason.clone();
+        problem.map_or(Ok(()), Err)?;
         // A controller in local control ignores programs from the network without an answer. A
         // dashboard server that is missing or disabled is no reason to refuse.
         if dashboard::is_in_remote_control(&self.controller) == Ok(Some(false)) {
-            return Err(self.fault(
-                "it is in local control: select Remote Control in the upper right corner of the pendant",
-            ));
+            return Err("it is in local control: select Remote Control in the upper right corner of the pendant".to_owned());
         }
         let session = new_session();
         self.mailbox.update(|mailbox_state| {
-            mailbox_state.requested_session = Some(session);
-            mailbox_state.start_error = None;
-            mailbox_state.accepts_commands = true;
-            mailbox_state.is_idle = false;
-            mailbox_state.command = Some(MotionCommand::SetTarget(target.clone()));
-            // The motion is set here and not by the thread, because a caller may wait for its end
-            // as soon as this function returns.
-            if !matches!(mailbox_state.motion, Motion::Stopped { .. }) {
-                mailbox_state.motion = Motion::Moving;
-            }
+            mailbox_state.robot.requested_session = Some(session);
+            mailbox_state.robot.start_error = None;
+            mailbox_state.control.begin(command);
         });
         // The connection stays open until the program runs. The controller reads it when it has
         // time.
         let connection = self.send_program(session);
         if let Err(reason) = &connection {
             self.mailbox
-                .update(|mailbox_state| mailbox_state.start_error = Some(reason.clone()));
+                .update(|mailbox_state| mailbox_state.robot.start_error = Some(reason.clone()));
         }
-        let Some(mailbox_state) = self.mailbox.wait(START_TIMEOUT, |mailbox_state| {
-            mailbox_state.is_running || mailbox_state.is_idle || mailbox_state.is_lost
-        }) else {
-            return Err(self.fault("it sends no states while its program starts"));
+        let is_decided = |mailbox_state: &Exchange<RobotExchange>| {
+            let control = &mailbox_state.control;
+            mailbox_state.robot.is_running || control.is_idle || control.is_lost
         };
-        let failure = mailbox_state.start_error.clone();
-        let failure = failure.or_else(|| refusal(&mailbox_state));
-        drop(mailbox_state);
-        match failure {
-            Some(reason) => Err(self.fault(reason)),
-            None => Ok(()),
-        }
+        let Some(mailbox_state) = self.mailbox.wait(START_TIMEOUT, is_decided) else {
+            return Err("it sends no states while its program starts".to_owned());
+        };
+        let failure = mailbox_state.robot.start_error.clone();
+        let failure = failure.or_else(|| mailbox_state.control.refusal());
+        failure.map_or(Ok(()), Err)
     }
 
+    /// Ends a protective stop if there is one. Other stops must be ended by a person first. In this
+    /// case, the error names the cause.
+    fn recover(&self) -> Result<(), String> {
+        let (is_protective_stop, blocking_reason) = {
+            let exchange = self.mailbox.lock();
+            let robot = &exchange.robot;
+            (robot.is_protective_stop, robot.blocking_reason.clone())
+        };
+        if is_protective_stop {
+            return dashboard::unlock_protective_stop(&self.controller);
+        }
+        blocking_reason.map_or(Ok(()), Err)
+    }
+
+    fn is_ready(robot: &RobotExchange) -> bool {
+        robot.blocking_reason.is_none()
+    }
+
+    fn check_brake_factor(&self, _: f64) -> Result<(), String> {
+        // The controller publishes no limits of the acceleration.
+        Ok(())
+    }
+
+    fn fault(&self, reason: String) -> Error {
+        fault(&self.address, reason)
+    }
+}
+
+impl Controller {
     fn send_program(&self, session: i32) -> Result<std::net::TcpStream, String> {
         let brake_rad_s2 = self
             .limits
@@ -190,38 +223,6 @@ impl MovableUrArm {
             .map_err(|error| format!("cannot send the program to it: {error}"))?;
         Ok(stream)
     }
-
-    /// Clamps a target to the joints' ranges.
-    fn clamp(&self, target: &JointTarget) -> Result<JointTarget, String> {
-        let n = target.position.len();
-        if n != self.limits.len() {
-            return Err(format!(
-                "the target has {n} joints, but the arm has {}",
-                self.limits.len()
-            ));
-        }
-        let mut position = target.position.clone();
-        for (ix, (position, joint)) in position.iter_mut().zip(&self.limits).enumerate() {
-            if !position.is_finite() {
-                return Err(format!(
-                    "the target of joint {} is not a finite number: {position}",
-                    ix + 1
-                ));
-            }
-            *position = position.clamp(joint.position[0], joint.position[1]);
-        }
-        Ok(JointTarget { position })
-    }
-}
-
-/// The reason why an arm accepts no target.
-fn refusal(mailbox_state: &MailboxState) -> Option<String> {
-    match &mailbox_state.motion {
-        Motion::Stopped { reason } => Some(format!(
-            "it accepts no target before it is recovered: {reason}"
-        )),
-        Motion::Holding | Motion::Moving => None,
-    }
 }
 
 /// A number for a motion that differs from those of earlier motions, also of other processes.
@@ -243,93 +244,37 @@ impl Arm for MovableUrArm {
 
 impl MovableArm for MovableUrArm {
     fn command(&mut self, target: &JointTarget) -> Result<JointTarget, Error> {
-        // The generator clamps as well, but on another thread. Clamping here gives the caller the
-        // accepted target at once.
-        let target = self.clamp(target).map_err(|reason| self.fault(reason))?;
-        let mut mailbox_state = self.mailbox.lock();
-        if let Some(reason) = refusal(&mailbox_state) {
-            drop(mailbox_state);
-            return Err(self.fault(reason));
-        }
-        if mailbox_state.accepts_commands {
-            mailbox_state.command = Some(MotionCommand::SetTarget(target.clone()));
-            mailbox_state.motion = Motion::Moving;
-            return Ok(target);
-        }
-        drop(mailbox_state);
-        self.start_motion(&target)?;
-        Ok(target)
+        self.moved.command(target)
     }
 
     fn motion(&self) -> Motion {
-        self.mailbox.lock().motion.clone()
+        self.moved.motion()
     }
 
     fn stop(&mut self) -> Result<(), Error> {
-        let mut mailbox_state = self.mailbox.lock();
-        if mailbox_state.accepts_commands {
-            mailbox_state.command = Some(MotionCommand::Stop);
-        }
+        self.moved.stop();
         Ok(())
     }
 
-    /// Ends a protective stop if there is one. Other stops must be ended by a person first. In this
-    /// case, the error names the cause.
     fn recover(&mut self) -> Result<(), Error> {
-        let Some(mailbox_state) = self.mailbox.wait(STOP_TIMEOUT, |mailbox_state| {
-            mailbox_state.is_idle || mailbox_state.is_lost
-        }) else {
-            return Err(self.fault("a motion is active"));
-        };
-        let Motion::Stopped { reason } = mailbox_state.motion.clone() else {
-            return Ok(());
-        };
-        let is_lost = mailbox_state.is_lost;
-        let is_protective_stop = mailbox_state.is_protective_stop;
-        let blocking_reason = mailbox_state.blocking_reason.clone();
-        drop(mailbox_state);
-        if is_lost {
-            return Err(self.fault(reason));
-        }
-        if is_protective_stop {
-            dashboard::unlock_protective_stop(&self.controller)
-                .map_err(|reason| self.fault(reason))?;
-        } else if let Some(reason) = blocking_reason {
-            return Err(self.fault(reason));
-        }
-        // States from before the end of the stop may still arrive.
-        let Some(mut mailbox_state) = self.mailbox.wait(SETTLE_TIMEOUT, |mailbox_state| {
-            mailbox_state.blocking_reason.is_none()
-        }) else {
-            return Err(self.fault("it ended the protective stop but is not ready"));
-        };
-        mailbox_state.motion = Motion::Holding;
-        Ok(())
+        self.moved.recover()
+    }
+
+    fn steering_port(&mut self, brake_factor: f64) -> Result<SteeringPort, Error> {
+        self.moved.steering_port(brake_factor)
     }
 }
 
 impl Drop for MovableUrArm {
     fn drop(&mut self) {
-        self.mailbox.update(|mailbox_state| {
-            mailbox_state.is_shutting_down = true;
-            // The stop replaces a pending target. Without a motion, the stop is not stored, because
-            // it would wait in the mailbox until the next motion.
-            mailbox_state.command = mailbox_state
-                .accepts_commands
-                .then_some(MotionCommand::Stop);
-        });
-        if self
-            .mailbox
-            .wait(STOP_TIMEOUT, |mailbox_state| {
-                mailbox_state.is_idle || mailbox_state.is_lost
-            })
-            .is_none()
-        {
-            log::warn!("arm at {}: the motion did not end", self.address);
+        let is_over = self.moved.shut_down();
+        let address = &self.moved.controller().address;
+        if !is_over {
+            log::warn!("arm at {address}: the motion did not end");
         }
         let statistics = self.motion_statistics();
         if statistics.n_motions > 0 {
-            log::info!("arm at {}: {statistics}", self.address);
+            log::info!("arm at {address}: {statistics}");
         }
     }
 }

@@ -14,7 +14,7 @@
 //!    seen counts as occupied.
 //!
 //! The result ([`Output`]) is a target that expires, or the order to brake. The arm's thread turns
-//! it into setpoints with [`Follower`], which brakes when targets expire, whatever happens to the
+//! it into setpoints with [`Follower`] (see [`SteeringPort`](drivers::motion::SteeringPort)), which brakes when targets expire, whatever happens to the
 //! rest of the program. Acceleration and jerk are limited there, by the generator of
 //! [`drivers::motion`].
 //!
@@ -83,9 +83,7 @@ mod check;
 mod clearance;
 mod clutch;
 mod error;
-mod exact;
 mod fit;
-mod follower;
 mod inverse;
 mod lease;
 mod limits;
@@ -95,9 +93,9 @@ mod record;
 mod request;
 mod self_collision;
 mod steering;
-mod target;
 #[cfg(test)]
 mod tests;
+mod verdict;
 
 pub use analytic_scene::{AnalyticScene, Solid};
 pub use body::Body;
@@ -105,7 +103,6 @@ pub use capsule::{Capsule, Gap};
 pub use clearance::{Clearance, ClearanceConfig, ClearancePoints, Restriction, Seen};
 pub use clutch::ClutchConfig;
 pub use error::Error;
-pub use follower::{Follower, NotFollowed, brake_limits};
 pub use inverse::{InverseKinematics, NearestPosture};
 pub use lease::LeaseConfig;
 pub use limits::LimitConfig;
@@ -114,4 +111,7 @@ pub use record::{Difference, Entry};
 pub use request::{Command, Device, Intent, Operator, Request};
 pub use self_collision::{SelfCollision, SelfCollisionConfig};
 pub use steering::{Robot, Steering, SteeringConfig};
-pub use target::{ArmState, Output, Target, Verdict};
+pub use verdict::Verdict;
+
+/// What passes between the chain and the arm's thread.
+pub use drivers::motion::{ArmState, Follower, NotFollowed, Output, Target, brake_limits};

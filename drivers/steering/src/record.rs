@@ -1,10 +1,10 @@
 //! A record of all inputs and decisions, for recordings and replays.
 
 use crate::clearance::Restriction;
-use crate::exact;
 use crate::reason::Reason;
 use crate::request::Request;
-use crate::target::{ArmState, Verdict};
+use crate::verdict::Verdict;
+use drivers::motion::{ArmState, exact};
 use kinematics::Stamp;
 use serde::{Deserialize, Serialize};
 use std::collections::VecDeque;

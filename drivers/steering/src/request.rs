@@ -4,7 +4,7 @@
 //! the base's pose must not move a goal. A caller that maps a hand into these axes, for example "as
 //! seen by the camera", must keep the map while the dead-man switch is held.
 
-use crate::exact;
+use drivers::motion::exact;
 use kinematics::{Stamp, Transform, transform};
 use serde::{Deserialize, Serialize};
 

@@ -1,13 +1,12 @@
-//! Turns targets that expire into setpoints: the last part of the chain, which belongs into the
-//! thread that moves the arm.
+//! Turns targets that expire into setpoints. This belongs into the thread that moves the arm.
 //!
 //! It needs nothing but targets and the time. The arm therefore brakes whatever happens to the
 //! program that sends the targets.
 
-use crate::check::check;
-use crate::error::Error;
-use crate::target::{Output, Target};
-use drivers::motion::{MotionLimits, Setpoint, TrajectoryGenerator};
+use super::generator::{Setpoint, TrajectoryGenerator};
+use super::target::{NotFollowed, Output, Target, TargetOrder};
+use super::{MotionLimits, motion_error};
+use crate::Error;
 use kinematics::Stamp;
 use std::time::Duration;
 
@@ -16,39 +15,6 @@ use std::time::Duration;
 const TOLERANCE: f64 = 1.0 + 1e-4;
 /// Fractions of the jerk with which the brake is planned if its plan cannot be used.
 const BRAKE_JERK_FRACS: [f64; 5] = [1.0, 1.0 - 1e-6, 1.0 - 1e-4, 0.99, 0.9];
-
-/// Why a target was not followed.
-#[derive(Clone, Debug, PartialEq, thiserror::Error)]
-pub enum NotFollowed {
-    /// The target arrived after its expiry.
-    #[error("target {serial} expired {late_secs:.3} s before it arrived")]
-    Expired {
-        /// Number of the target.
-        serial: u64,
-        /// Time since its expiry.
-        late_secs: f64,
-    },
-    /// The target was repeated or overtaken by a newer one.
-    #[error("target {serial} came after target {newest}")]
-    OutOfOrder {
-        /// Number of the target.
-        serial: u64,
-        /// Greatest number received.
-        newest: u64,
-    },
-    /// The arm braked during this motion, or still brakes.
-    #[error("motion {motion} ended when the arm braked: it moves again with a new grip")]
-    MotionEnded {
-        /// Number of the motion.
-        motion: u64,
-    },
-    /// The generator cannot use the target. The arm brakes.
-    #[error("the arm brakes: {why}")]
-    Generator {
-        /// Message of the generator.
-        why: String,
-    },
-}
 
 /// Generates one setpoint per cycle, and brakes when targets expire.
 #[derive(Debug)]
@@ -62,11 +28,7 @@ pub struct Follower {
     setpoint: Setpoint,
     /// Target of the generator, before it was clamped.
     target: Vec<f64>,
-    newest_serial: u64,
-    /// Number of the motion whose targets are followed.
-    motion: u64,
-    /// The greatest number of a motion that has ended.
-    ended_motion: u64,
+    order: TargetOrder,
     /// When the newest target expires; `None` if no target is followed.
     expires_at: Option<Stamp>,
 }
@@ -88,26 +50,65 @@ impl Follower {
         period: Duration,
     ) -> Result<Self, Error> {
         check_brake_limits(limits, brake_limits)?;
-        let generator = TrajectoryGenerator::new(limits, position, period)
-            .map_err(|why| Error::Generator { why })?;
-        let zero = vec![0.0; position.len()];
+        let generator = TrajectoryGenerator::new(limits, position, period).map_err(motion_error)?;
         Ok(Self {
             generator,
             brake: None,
             limits: limits.to_vec(),
             brake_limits: brake_limits.to_vec(),
             period,
-            setpoint: Setpoint {
-                position: position.to_vec(),
-                velocity: zero.clone(),
-                acceleration: zero,
-            },
+            setpoint: Setpoint::at_rest(position.to_vec()),
             target: position.to_vec(),
-            newest_serial: 0,
-            motion: 0,
-            ended_motion: 0,
+            order: TargetOrder::default(),
             expires_at: None,
         })
+    }
+
+    /// Rests at `position` with other limits, because the arm stopped or was guided by hand. Ends
+    /// the motion: no target of it is followed any more.
+    ///
+    /// # Errors
+    /// For the reasons of [`Follower::new`]. The follower then does not change.
+    pub fn rest_at(
+        &mut self,
+        limits: &[MotionLimits],
+        brake_limits: &[MotionLimits],
+        position: &[f64],
+    ) -> Result<(), Error> {
+        let mut order = self.order;
+        order.end_motion(order.motion);
+        *self = Self {
+            order,
+            ..Self::new(limits, brake_limits, position, self.period)?
+        };
+        Ok(())
+    }
+
+    /// Sets the time between setpoints. The next call must be [`Follower::rest_at`].
+    #[cfg(target_os = "linux")]
+    pub(super) fn set_period(&mut self, period: Duration) {
+        self.period = period;
+    }
+
+    /// Continues from a different state of motion. Use it if the reference of the arm differs from
+    /// the last setpoint.
+    ///
+    /// # Errors
+    /// If a value is not finite, or their number is wrong. The follower then does not change.
+    pub fn resume(&mut self, from: &Setpoint) -> Result<(), Error> {
+        // While the arm brakes, this generator is not used, but it checks the values.
+        self.generator.resume(from).map_err(motion_error)?;
+        self.setpoint.clone_from(from);
+        if self.expires_at.is_none() {
+            self.brake = brake_from(from, &self.brake_limits, self.period).ok();
+        }
+        Ok(())
+    }
+
+    /// Brakes, and ends all motions up to a number, whether a target of them has arrived or not.
+    pub fn end_motion(&mut self, motion: u64) {
+        self.start_brake();
+        self.order.end_motion(motion);
     }
 
     /// Takes the output of the chain of decisions.
@@ -160,32 +161,32 @@ impl Follower {
         is_zero(&self.setpoint.velocity) && is_zero(&self.setpoint.acceleration)
     }
 
+    /// Whether the arm follows a target, also if it has arrived there.
+    pub fn is_following(&self) -> bool {
+        self.expires_at.is_some()
+    }
+
     /// The greatest number of a motion that ended because the arm braked; 0 at first.
     pub fn braked_motion(&self) -> u64 {
-        self.ended_motion
+        self.order.ended_motion
     }
 
     fn follow(&mut self, now: Stamp, target: &Target) -> Result<(), NotFollowed> {
+        self.order.check(target, self.limits.len())?;
         let serial = target.serial;
-        if serial <= self.newest_serial {
-            let newest = self.newest_serial;
-            return Err(NotFollowed::OutOfOrder { serial, newest });
-        }
         if now > target.expires_at {
             let late_secs = now.secs_since(target.expires_at);
             return Err(NotFollowed::Expired { serial, late_secs });
         }
-        let motion = target.motion;
-        let is_braking = self.expires_at.is_none() && !self.is_at_rest();
-        if motion <= self.ended_motion || motion < self.motion || is_braking {
+        if self.expires_at.is_none() && !self.is_at_rest() {
+            let motion = target.motion;
             return Err(NotFollowed::MotionEnded { motion });
         }
         if self.expires_at.is_none() {
             self.restart()
                 .map_err(|why| NotFollowed::Generator { why })?;
         }
-        self.newest_serial = serial;
-        self.motion = motion;
+        self.order.accept(target);
         self.expires_at = Some(target.expires_at);
         // An equal target only lasts longer. Planning again from a state on the way to it could
         // fail because of rounding, and an arm that holds its position would plan in every cycle.
@@ -212,7 +213,7 @@ impl Follower {
     /// Ends the motion. The arm continues from its state of motion with the brake limits.
     fn start_brake(&mut self) {
         self.expires_at = None;
-        self.ended_motion = self.ended_motion.max(self.motion);
+        self.order.end_motion(self.order.motion);
         if self.brake.is_some() || self.is_at_rest() {
             return;
         }
@@ -250,7 +251,7 @@ impl Follower {
                 Err(error) => why = error,
             }
         }
-        Err(Error::Generator { why })
+        Err(motion_error(why))
     }
 
     /// Returns what is wrong with a setpoint that does not continue from the last one within
@@ -261,14 +262,10 @@ impl Follower {
         let secs = self.period.as_secs_f64();
         let last = &self.setpoint;
         limits.iter().enumerate().find_map(|(ix, joint)| {
+            let [velocity, acceleration] = allowed_rates(joint, last, ix, secs);
             let changes = [
-                ("position", &last.position, &next.position, joint.velocity),
-                (
-                    "velocity",
-                    &last.velocity,
-                    &next.velocity,
-                    joint.acceleration,
-                ),
+                ("position", &last.position, &next.position, velocity),
+                ("velocity", &last.velocity, &next.velocity, acceleration),
                 (
                     "acceleration",
                     &last.acceleration,
@@ -291,6 +288,21 @@ impl Follower {
     }
 }
 
+/// Velocity and acceleration that a joint may have after its last setpoint. They exceed its limits
+/// only if the last setpoint does, which is possible after [`Follower::resume`]: the joint then
+/// returns to its limits with limited jerk, and may first become faster.
+fn allowed_rates(joint: &MotionLimits, last: &Setpoint, ix: usize, secs: f64) -> [f64; 2] {
+    let last_velocity = last.velocity[ix].abs();
+    let last_acceleration = last.acceleration[ix].abs();
+    let acceleration = joint.acceleration.max(last_acceleration);
+    let velocity = if last_velocity > joint.velocity {
+        last_velocity + acceleration * secs
+    } else {
+        joint.velocity
+    };
+    [velocity, acceleration]
+}
+
 fn with_jerk(limits: &[MotionLimits], frac: f64) -> Vec<MotionLimits> {
     limits
         .iter()
@@ -307,11 +319,8 @@ fn brake_from(
     brake_limits: &[MotionLimits],
     period: Duration,
 ) -> Result<TrajectoryGenerator, String> {
-    // A stop is the shortest way to rest, wherever it ends, so it needs no ranges. With ranges,
-    // `rsruckig` 3.0.1 checks a target position in velocity control, too. It is 0 in a new
-    // generator. For a joint whose range does not contain 0, such as joint 4 of a Panda, it then
-    // replaces the plan with one of unlimited jerk (`repair_profile_step2`, and `time_none` of
-    // `velocity_third_step2.rs`).
+    // A stop is the shortest way to rest, wherever it ends. A generator with ranges would refuse to
+    // start outside of them.
     let without_ranges: Vec<MotionLimits> = brake_limits
         .iter()
         .map(|joint| MotionLimits {
@@ -327,11 +336,11 @@ fn brake_from(
 
 fn check_brake_limits(limits: &[MotionLimits], brake_limits: &[MotionLimits]) -> Result<(), Error> {
     if brake_limits.len() != limits.len() {
-        return Err(Error::JointCount {
-            what: "the list of brake limits",
-            got: brake_limits.len(),
-            expected: limits.len(),
-        });
+        return Err(motion_error(format!(
+            "brake limits are given for {} joints, but the arm has {}",
+            brake_limits.len(),
+            limits.len()
+        )));
     }
     for (ix, (limits, brake)) in limits.iter().zip(brake_limits).enumerate() {
         for (what, limit, brake) in [
@@ -339,12 +348,14 @@ fn check_brake_limits(limits: &[MotionLimits], brake_limits: &[MotionLimits]) ->
             ("acceleration", limits.acceleration, brake.acceleration),
             ("jerk", limits.jerk, brake.jerk),
         ] {
-            check(
-                format!("the {what} of joint {} for braking", ix + 1),
-                brake,
-                brake >= limit,
-                "at least that of its motions",
-            )?;
+            // Written so that NaN is refused.
+            let is_sufficient = brake >= limit && brake.is_finite();
+            if !is_sufficient {
+                return Err(motion_error(format!(
+                    "the {what} of joint {} for braking is {brake}, must be at least {limit}, that of its motions",
+                    ix + 1
+                )));
+            }
         }
     }
     Ok(())

@@ -34,32 +34,36 @@ impl Written {
 }
 
 /// A list of numbers of any length.
-pub(crate) mod list {
+pub mod list {
     use super::{Deserialize, Deserializer, Serializer, Written};
 
-    pub(crate) fn serialize<S: Serializer>(values: &[f64], to: S) -> Result<S::Ok, S::Error> {
+    /// For `#[serde(with = ..)]`.
+    pub fn serialize<S: Serializer>(values: &[f64], to: S) -> Result<S::Ok, S::Error> {
         to.collect_seq(values.iter().map(|value| Written::from(*value)))
     }
 
-    pub(crate) fn deserialize<'de, D: Deserializer<'de>>(from: D) -> Result<Vec<f64>, D::Error> {
+    /// For `#[serde(with = ..)]`.
+    pub fn deserialize<'de, D: Deserializer<'de>>(from: D) -> Result<Vec<f64>, D::Error> {
         let written = Vec::<Written>::deserialize(from)?;
         written.into_iter().map(Written::read).collect()
     }
 }
 
 /// A list of a known number of numbers.
-pub(crate) mod array {
+pub mod array {
     use super::{Deserializer, Serializer, list};
     use serde::de::Error;
 
-    pub(crate) fn serialize<S: Serializer, const N: usize>(
+    /// For `#[serde(with = ..)]`.
+    pub fn serialize<S: Serializer, const N: usize>(
         values: &[f64; N],
         to: S,
     ) -> Result<S::Ok, S::Error> {
         list::serialize(values, to)
     }
 
-    pub(crate) fn deserialize<'de, D: Deserializer<'de>, const N: usize>(
+    /// For `#[serde(with = ..)]`.
+    pub fn deserialize<'de, D: Deserializer<'de>, const N: usize>(
         from: D,
     ) -> Result<[f64; N], D::Error> {
         let values = list::deserialize(from)?;
@@ -71,15 +75,17 @@ pub(crate) mod array {
 }
 
 /// A stamp as nanoseconds.
-pub(crate) mod stamp {
+pub mod stamp {
     use super::{Deserialize, Deserializer, Serializer};
     use kinematics::Stamp;
 
-    pub(crate) fn serialize<S: Serializer>(stamp: &Stamp, to: S) -> Result<S::Ok, S::Error> {
+    /// For `#[serde(with = ..)]`.
+    pub fn serialize<S: Serializer>(stamp: &Stamp, to: S) -> Result<S::Ok, S::Error> {
         to.serialize_i64(stamp.0)
     }
 
-    pub(crate) fn deserialize<'de, D: Deserializer<'de>>(from: D) -> Result<Stamp, D::Error> {
+    /// For `#[serde(with = ..)]`.
+    pub fn deserialize<'de, D: Deserializer<'de>>(from: D) -> Result<Stamp, D::Error> {
         i64::deserialize(from).map(Stamp)
     }
 }
