@@ -34,7 +34,7 @@ pub struct MapState {
     pub n_integrated: u64,
     /// Images that were replaced by newer ones before they were integrated.
     pub n_replaced: u64,
-    /// Images that were older than everything in the map, or whose camera was outside of any range.
+    /// Images that were too old, or showed nothing of the region.
     pub n_unused: u64,
     /// Stamp of the newest integrated image.
     pub newest: Option<Stamp>,

@@ -1,4 +1,5 @@
 //! Tests against scenes whose distances are known exactly.
+#![expect(clippy::cast_possible_truncation, reason = "small numbers of tests")]
 
 mod capsule_tests;
 mod distance_tests;

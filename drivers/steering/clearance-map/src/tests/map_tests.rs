@@ -227,7 +227,7 @@ fn map_follows_a_moving_base_with_bounded_memory() {
     }
     let config = config();
     let n_voxels = (config.n_blocks() * 8).pow(3);
-    assert!(max_bytes < 6 * n_voxels, "{max_bytes} {n_voxels}");
+    assert!(max_bytes < 2 * n_voxels, "{max_bytes} {n_voxels}");
     // A part of the scene that was seen before a short motion is still known.
     let before = Transform::translation(100.0, 0.0, 0.0);
     tested.see_robot(&image(100.0, before, &mut random), &[]);

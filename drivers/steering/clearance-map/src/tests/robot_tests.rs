@@ -11,7 +11,7 @@ use steering::Capsule;
 
 fn arm(x: f64) -> Capsule {
     Capsule {
-        ends: [Vector3::new(x, 0.0, 0.05), Vector3::new(x, 0.0, 0.5)],
+        ends: [Vector3::new(x, 0.0, 0.12), Vector3::new(x, 0.0, 0.5)],
         radius_m: 0.06,
     }
 }
@@ -90,7 +90,7 @@ fn volume_of_the_robot_is_free_without_a_margin() {
     let mut tested = Tested::new(&config());
     tested.set_robot(&[arm(0.0)], at(0.0));
     for z in 0..=40 {
-        let z = 0.05 + 0.45 * f64::from(z) / 40.0;
+        let z = 0.12 + 0.38 * f64::from(z) / 40.0;
         let seen = tested.reading([0.0, 0.0, z], at(1.5)).unwrap();
         assert!(
             seen.distance_m > 0.06 - 1e-4 && seen.distance_m < 0.07 + 1e-4,
@@ -140,7 +140,7 @@ fn swept_space_is_free_unless_a_surface_was_seen_there() {
         0.05,
     );
     tested.publish();
-    assert_eq!(tested.distance([-0.16, 0.0, 0.3]), None, "the wall stays");
+    assert_eq!(tested.distance([-0.155, 0.0, 0.3]), None, "the wall stays");
 }
 
 #[test]
@@ -148,24 +148,28 @@ fn volume_of_a_resting_robot_does_not_age() {
     let mut random = Random::new(24);
     let mut tested = Tested::new(&config());
     let table = Solid::Below(0.0);
+    // A cell of 8 cm around this axis is inside as a whole.
+    let axis = [0.12, 0.04];
+    let arm = Capsule {
+        ends: [0.25, 0.5].map(|z| Vector3::new(axis[0], axis[1], z)),
+        radius_m: 0.15,
+    };
     tested.see(&photograph(&[table], pose(), at(0.0), &STEREO, &mut random));
-    let with_arm = [table, Solid::Capsule(arm(0.1))];
+    let with_arm = [table, Solid::Capsule(arm)];
     for secs in [10.0, 20.0] {
-        tested.see_robot(
-            &photograph(&with_arm, pose(), at(secs), &STEREO, &mut random),
-            &[arm(0.1)],
-        );
+        let image = photograph(&with_arm, pose(), at(secs), &STEREO, &mut random);
+        tested.see_robot(&image, &[arm]);
     }
-    tested.set_robot(&[arm(0.1)], at(20.0));
-    // The ball of 5 cm around a point on the side toward the camera.
-    let seen = tested.reading([0.15, 0.0, 0.3], at(20.0)).unwrap();
-    assert!(seen.distance_m > 0.05, "{seen:?}");
-    let block = tested.map.snapshot();
-    let at_axis = block
-        .grid
-        .from_world(&Vector3::new(0.1, 0.0, 0.3))
-        .map(|x| x as usize / 4);
-    let oldest = block.oldest[block.cell(at_axis.x, at_axis.y, at_axis.z)];
-    let age_secs = block.clock.age_secs(oldest, at(20.0));
-    assert!(age_secs < 20.1, "{age_secs}");
+    let snapshot = tested.map.snapshot();
+    let age_secs = |x: f64, z: f64| {
+        let in_grid = snapshot.grid.from_world(&Vector3::new(x, axis[1], z));
+        let [x, y, z] = [in_grid.x, in_grid.y, in_grid.z].map(|voxel| voxel as usize / 4);
+        snapshot
+            .clock
+            .age_secs(snapshot.oldest[snapshot.cell(x, y, z)], at(20.0))
+    };
+    assert!(age_secs(axis[0], 0.36) < 0.01, "inside");
+    // Hidden by the robot since it came, and in view all the time.
+    assert!(age_secs(-0.3, 0.2) >= 19.9, "behind");
+    assert!(age_secs(0.5, 0.36) < 0.01, "in front");
 }

@@ -111,12 +111,9 @@ fn objects_that_move_are_removed_and_added() {
         }
     };
     let in_ball = [0.1, 0.0, 0.15];
-    let behind_ball = [-0.06, 0.0, 0.1];
     see(&mut tested, &[table()]);
     let free_m = tested.distance(in_ball).unwrap();
-    assert!(tested.distance(behind_ball).is_some());
-    // The ball appears: its surface is occupied, and neither its inside nor the space behind it is
-    // known any more.
+    // The ball appears: its surface is occupied, and its inside is not known any more.
     see(&mut tested, &[table(), ball(0.1)]);
     assert_eq!(tested.distance(in_ball), None);
     assert_eq!(
@@ -124,7 +121,6 @@ fn objects_that_move_are_removed_and_added() {
         None,
         "just under the surface"
     );
-    assert_eq!(tested.distance(behind_ball), None, "in the shadow");
     let beside_m = tested.distance([0.1, 0.3, 0.15]).unwrap();
     assert!(beside_m <= 0.2 + 1e-5, "{beside_m}");
     // It moves away.
@@ -183,7 +179,7 @@ fn rendered_depth_keeps_a_larger_margin_and_clears_nothing_measured() {
         let distance_m = |tested: &mut Tested| tested.distance(point.into()).unwrap_or(0.0);
         mean_m += (distance_m(&mut measured) - distance_m(&mut drawn)) / 1000.0;
     }
-    assert!(mean_m > 0.015, "{mean_m}");
+    assert!(mean_m > 0.01, "{mean_m}");
     // A model that has not learned a new object does not remove it.
     measured.see(&photograph(
         &[table(), ball(0.1)],
