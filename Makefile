@@ -33,6 +33,8 @@ RIG_FILE = $(if $(filter %.toml,$(RIG)),$(RIG),rigs/$(RIG).toml)
 PORT = 7007
 # Without a GPU, a run corrects the calibration only if that is requested, because it takes time from training. This rig shows it.
 REFINE = $(if $(filter uncalibrated,$(RIG)),--refine auto)
+# The arms of these rigs can be steered from the page.
+MOTION = $(if $(filter static-arm static-arm-720p two-cameras uncalibrated,$(RIG)),--enable-motion)
 # Duration of `make hil` in seconds.
 LISTEN_SECONDS ?= 20
 
@@ -41,7 +43,7 @@ help: ## List the targets
 
 demo: check-demo deps web ## Simulate a rig (RIG=static-arm, mobile-arm, uncalibrated, ...) and serve the live scene at PORT=7007; needs no display
 	cargo build --release $(FEATURES)
-	$(TARGET_FOLDER)/release/fieldrig run $(RIG_FILE) --sim --listen 127.0.0.1:$(PORT) $(REFINE)
+	$(TARGET_FOLDER)/release/fieldrig run $(RIG_FILE) --sim --listen 127.0.0.1:$(PORT) $(MOTION) $(REFINE)
 
 check-demo:
 	@scripts/check-demo.sh '$(RIG_FILE)' '$(PORT)'

@@ -11,7 +11,7 @@ use crate::stop::Stop;
 use anyhow::{Context, anyhow};
 use drivers::recording::Recorder;
 use drivers::{Sample, Source};
-use keyframe::{LiveImage, RangePoints, RangeScan, RobotState};
+use keyframe::{Keyframe, LiveImage, RangePoints, RangeScan, RobotState};
 use kinematics::{Stamp, Transform};
 use parking_lot::Mutex;
 use std::collections::{BTreeMap, HashMap, VecDeque};
@@ -64,6 +64,9 @@ pub trait InputObserver: Send {
 
     /// Receives the state of the robot.
     fn observe_robot(&self, robot: RobotState);
+
+    /// Receives a keyframe when it is accepted, before it waits for the trainer.
+    fn observe_keyframe(&self, _keyframe: &Arc<Keyframe>) {}
 
     /// Receives a scan of a range scanner.
     fn observe_range_scan(&self, scan: RangeScan);
@@ -376,6 +379,9 @@ impl Pump {
 
     fn send(&self, changes: Vec<Change>) -> Result<(), TrainerGone> {
         changes.into_iter().try_for_each(|change| {
+            if let Change::Accepted(keyframe) = &change {
+                self.observer.observe_keyframe(keyframe);
+            }
             let times = self.times(&change);
             // This blocks while the queue is full, which gives the trainer back pressure on the
             // input.

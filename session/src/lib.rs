@@ -76,6 +76,7 @@ mod served_files;
 mod session;
 mod session_setup;
 mod started_run;
+mod steering;
 mod stored_keyframes;
 mod time_slices;
 mod train_plan;

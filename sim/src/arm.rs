@@ -5,9 +5,11 @@ use crate::Error;
 use crate::commands::Commands;
 use crate::config::N_JOINTS;
 use crate::follower::Follower;
+use crate::handover::Handover;
 use crate::joints::Joints;
 use crate::panda;
 use crate::twin::{Efforts, TwinFollower};
+use drivers::motion::Setpoint;
 use mujoco_rs::prelude::{MjData, MjModel};
 use std::collections::VecDeque;
 use std::sync::Arc;
@@ -42,25 +44,66 @@ enum Reference {
     Commands(JointCommands),
 }
 
-/// Commands in the order and with the offsets of the joint readings.
-struct JointCommands {
-    commands: Commands,
+/// How values of joint readings and commands belong to the joints.
+#[derive(Clone)]
+pub(crate) struct ReadingOrder {
     /// Joint index of each value of a reading.
-    joint_ixs: Vec<usize>,
+    pub(crate) joint_ixs: Vec<usize>,
     /// Offsets that are added to reported positions to get the true positions; empty if there are
     /// none.
-    joint_offsets: Vec<f64>,
+    pub(crate) joint_offsets: Vec<f64>,
+}
+
+impl ReadingOrder {
+    fn offset(&self, value_ix: usize) -> f64 {
+        self.joint_offsets.get(value_ix).copied().unwrap_or(0.0)
+    }
+
+    /// A motion of the joints as it is reported.
+    fn reported(&self, position: &Joints, velocity: &Joints, acceleration: &Joints) -> Setpoint {
+        let ordered = |joints: &Joints| self.joint_ixs.iter().map(|ix| joints[*ix]).collect();
+        let mut reported: Vec<f64> = ordered(position);
+        for (value_ix, position) in reported.iter_mut().enumerate() {
+            *position -= self.offset(value_ix);
+        }
+        Setpoint {
+            position: reported,
+            velocity: ordered(velocity),
+            acceleration: ordered(acceleration),
+        }
+    }
+}
+
+/// Where the setpoints of a commanded arm come from.
+enum SetpointSource {
+    /// A client that commands the arm at the pace of the simulation.
+    Commands(Commands),
+    /// A controller that runs in real time.
+    Controller(Handover),
+}
+
+/// Commands in the order and with the offsets of the joint readings.
+struct JointCommands {
+    source: SetpointSource,
+    order: ReadingOrder,
     position: Joints,
     velocity: Joints,
 }
 
 impl JointCommands {
     fn advance(&mut self) {
-        let setpoint = self.commands.next_setpoint();
-        for (value_ix, joint_ix) in self.joint_ixs.iter().enumerate() {
+        let next = match &self.source {
+            SetpointSource::Commands(commands) => Some(commands.next_setpoint()),
+            SetpointSource::Controller(handover) => handover.next_setpoint(),
+        };
+        // Without a controller, the arm stays where it is.
+        let Some(setpoint) = next else {
+            self.velocity.fill(0.0);
+            return;
+        };
+        for (value_ix, joint_ix) in self.order.joint_ixs.iter().enumerate() {
             // Commands are reported positions, but the arm needs true positions.
-            let offset = self.joint_offsets.get(value_ix).copied().unwrap_or(0.0);
-            self.position[*joint_ix] = setpoint.position[value_ix] + offset;
+            self.position[*joint_ix] = setpoint.position[value_ix] + self.order.offset(value_ix);
             self.velocity[*joint_ix] = setpoint.velocity[value_ix];
         }
     }
@@ -80,6 +123,17 @@ impl Reference {
             Self::Scan(follower) => Joints::from_column_slice(follower.velocity_rad_s().as_slice()),
             Self::Tour(follower) => follower.velocity().clone(),
             Self::Commands(commands) => commands.velocity.clone(),
+        }
+    }
+
+    fn acceleration(&self) -> Joints {
+        match self {
+            Self::Scan(follower) => {
+                Joints::from_column_slice(follower.acceleration_rad_s2().as_slice())
+            }
+            Self::Tour(follower) => follower.acceleration().clone(),
+            // Only tours are handed over.
+            Self::Commands(commands) => Joints::zeros(commands.position.len()),
         }
     }
 
@@ -106,6 +160,8 @@ enum Drive {
 pub(crate) struct Arm {
     drive: Drive,
     reference: Reference,
+    /// The controller that may take the arm over from its tour, if there is one.
+    handover: Option<(Handover, ReadingOrder)>,
     n_steps: i64,
     readings: VecDeque<JointReading>,
     history_duration_nanos: i64,
@@ -158,6 +214,7 @@ impl Arm {
         Self {
             drive,
             reference,
+            handover: None,
             n_steps: 0,
             readings: VecDeque::new(),
             history_duration_nanos,
@@ -172,22 +229,51 @@ impl Arm {
         }
     }
 
-    /// Follows commands from now on, starting at rest at the current position. `joint_ixs` and
-    /// `joint_offsets` are those of the joint readings.
-    pub(crate) fn follow_commands(
-        &mut self,
-        commands: Commands,
-        joint_ixs: &[usize],
-        joint_offsets: &[f64],
-    ) {
+    /// Follows commands from now on, starting at rest at the current position.
+    pub(crate) fn follow_commands(&mut self, commands: Commands, order: ReadingOrder) {
         let position = self.position();
         self.reference = Reference::Commands(JointCommands {
-            commands,
-            joint_ixs: joint_ixs.to_vec(),
-            joint_offsets: joint_offsets.to_vec(),
+            source: SetpointSource::Commands(commands),
+            order,
             velocity: Joints::zeros(position.len()),
             position,
         });
+    }
+
+    /// Lets a controller take the arm over from its tour.
+    pub(crate) fn hand_over_to(&mut self, handover: Handover, order: ReadingOrder) {
+        self.handover = Some((handover, order));
+    }
+
+    /// Tells the controller that the simulation has ended.
+    pub(crate) fn end_control(&self) {
+        if let Some((handover, _)) = &self.handover {
+            handover.finish();
+        }
+    }
+
+    /// Whether commands move the arm, which may come at any time.
+    pub(crate) fn is_commanded(&self) -> bool {
+        matches!(self.reference, Reference::Commands(_))
+    }
+
+    /// Follows the controller from now on, if it takes the arm over.
+    fn hand_over(&mut self) {
+        let Some((handover, order)) = &self.handover else {
+            return;
+        };
+        let position = self.reference.position();
+        let velocity = self.reference.velocity();
+        let acceleration = self.reference.acceleration();
+        let motion = order.reported(&position, &velocity, &acceleration);
+        if handover.note_tour(self.n_steps, motion) {
+            self.reference = Reference::Commands(JointCommands {
+                source: SetpointSource::Controller(handover.clone()),
+                order: order.clone(),
+                position,
+                velocity,
+            });
+        }
     }
 
     /// Reads the joints, then advances by one step.
@@ -208,6 +294,9 @@ impl Arm {
         };
         self.n_steps += 1;
         self.reference.advance(self.n_steps as f64 * STEP_SECS);
+        if !self.is_commanded() {
+            self.hand_over();
+        }
         self.readings.push_back(reading.clone());
         while self
             .readings

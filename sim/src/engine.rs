@@ -1,11 +1,13 @@
 //! Steps the rig and creates samples in the order in which devices would deliver them.
 
-use crate::arm::{JointReading, STEP_NANOS};
+use crate::arm::{JointReading, ReadingOrder, STEP_NANOS};
 use crate::base::Drift;
 use crate::cabinet_tour::light_frac;
 use crate::commands::Commands;
 use crate::config::{CameraConfig, Config, Parent, Scene, SensorConfig, StampConfig, TargetParent};
+use crate::contacts::ContactCounter;
 use crate::hand::Hand;
+use crate::handover::Handover;
 use crate::joints::Joints;
 use crate::lidar::{self, RayCaster};
 use crate::motors::{MotorHistory, MotorizedArm};
@@ -42,6 +44,8 @@ pub(crate) struct Engine {
     renderer: Renderer,
     /// Stamp of simulated time zero.
     start: Stamp,
+    /// Counts contacts while commands move the arm, if there is a counter.
+    contacts: Option<ContactCounter>,
     /// Whether the robot moves ahead of its samples while images are rendered.
     looks_ahead: bool,
     /// Maximum number of images that are being rendered. When the maximum is reached, the engine
@@ -103,6 +107,10 @@ const FIRST_NANOS: i64 = 50_000_000;
 /// Additional delay of each further camera. The cameras have different delays, because cameras of a
 /// real rig are not synchronized either.
 const STAGGER_NANOS: i64 = 3_700_000;
+
+/// Time between two checks for contacts. At the speeds of operators, a robot moves by a few
+/// millimeters.
+const CONTACT_CHECK_NANOS: i64 = 10 * STEP_NANOS;
 
 /// Random number streams of one image.
 const COLOR_NOISE: u64 = 1;
@@ -319,6 +327,7 @@ impl Engine {
             cameras: cameras.0,
             renderer,
             start: Stamp(0),
+            contacts: None,
             looks_ahead: true,
             max_pending: 2,
             skip_before_nanos: i64::MIN,
@@ -350,10 +359,38 @@ impl Engine {
 
     /// Moves the arm by commands instead of the scan.
     pub(crate) fn follow_commands(&mut self, commands: Commands) -> Result<(), Error> {
+        let order = self.reading_order();
         let arm = self.robot.arm_mut().ok_or(Error::NoArm)?;
-        arm.follow_commands(commands, &self.joint_ixs, &self.config.joint_offsets);
+        arm.follow_commands(commands, order);
         self.looks_ahead = false;
         Ok(())
+    }
+
+    /// Lets a controller take the arm over from its tour.
+    pub(crate) fn hand_over_to(&mut self, handover: Handover) -> Result<(), Error> {
+        let order = self.reading_order();
+        let arm = self.robot.arm_mut().ok_or(Error::NoArm)?;
+        arm.hand_over_to(handover, order);
+        Ok(())
+    }
+
+    /// Counts contacts while commands move the arm, if there is a counter.
+    pub(crate) fn count_contacts(&mut self, contacts: Option<ContactCounter>) {
+        self.contacts = contacts;
+    }
+
+    /// Tells the controller of the arm that the simulation has ended.
+    pub(crate) fn end_control(&mut self) {
+        if let Some(arm) = self.robot.arm_mut() {
+            arm.end_control();
+        }
+    }
+
+    fn reading_order(&self) -> ReadingOrder {
+        ReadingOrder {
+            joint_ixs: self.joint_ixs.clone(),
+            joint_offsets: self.config.joint_offsets.clone(),
+        }
     }
 
     /// Moves the arm by emulated motors instead of the scan. `start` is the stamp of simulated time
@@ -420,7 +457,7 @@ impl Engine {
 
     /// Whether the robot may move before the next sample is delivered.
     fn may_step(&self) -> bool {
-        if self.looks_ahead {
+        if self.looks_ahead && !self.robot.is_commanded() {
             // While images are rendered, the processor steps the robot.
             self.n_pending < self.max_pending
         } else {
@@ -441,6 +478,13 @@ impl Engine {
         {
             self.has_ended = true;
             return Ok(());
+        }
+        if let Some(contacts) = &mut self.contacts
+            && nanos % CONTACT_CHECK_NANOS == 0
+            && self.robot.is_commanded()
+            && let Some(robot) = self.robot.at(nanos)
+        {
+            contacts.check(&robot);
         }
         // Slots keep the order of the arrivals. Readings come first, then base poses and scans,
         // then images whose readout has ended by now.

@@ -136,6 +136,10 @@ impl Follower {
         &self.velocity_rad_s
     }
 
+    pub(crate) fn acceleration_rad_s2(&self) -> &Joints {
+        &self.acceleration_rad_s2
+    }
+
     /// Advances to a time that is `step_secs` after the previous time.
     pub(crate) fn advance(&mut self, secs: f64, step_secs: f64) {
         let target_pose = self.scan.arm_from_camera(secs);

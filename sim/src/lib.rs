@@ -2,7 +2,7 @@
 //!
 //! [`open`] builds a rig. [`Rig::into_lockstep`] runs it as fast as the caller takes samples. In
 //! this mode, the same seed gives bit-identical samples. [`Rig::into_live`] runs the rig in real
-//! time as devices. [`Rig::into_commanded`] returns an arm that moves by commands.
+//! time as devices, and [`Rig::into_steered`] lets an operator take the arm over. [`Rig::into_commanded`] returns an arm that moves by commands.
 //! [`Rig::into_motorized`] returns cameras on an arm that emulated motors move.
 //!
 //! ```no_run
@@ -23,12 +23,15 @@ mod cabinet_tour;
 mod commanded;
 mod commands;
 pub mod config;
+mod contacts;
+mod convex_pieces;
 mod egl;
 mod engine;
 mod error;
 mod follower;
 mod furniture;
 mod hand;
+mod handover;
 mod joints;
 mod lab;
 mod lab_texture;
@@ -51,6 +54,7 @@ mod robot;
 mod robot_masks;
 mod scan;
 mod scene;
+mod steered_arm;
 pub mod tag;
 mod texture;
 mod toy;
@@ -78,4 +82,5 @@ pub use motors::MotorHistory;
 pub use rig::{PANDA_URDF, Rig, difference_to_robot_of, has_robot_of, open, suits_own_robot};
 pub use rig_info::{CameraInfo, RigInfo};
 pub use robot_masks::{PinholeView, RobotMasks};
+pub use steered_arm::{SteeredArm, SteeredLimits};
 pub use twin::RobotConfig;

@@ -1,8 +1,11 @@
 //! A rig in real time: devices behind the traits of `drivers`, fed by one thread.
 
 use crate::Error;
+use crate::contacts::ContactCounter;
 use crate::engine::{Delivery, Engine};
+use crate::handover::Handover;
 use crate::rig_info::RigInfo;
+use crate::steered_arm::{Controller, SteeredArm, SteeredLimits};
 use drivers::{
     Arm, Base, BasePose, Camera, Devices, Image, PixelFormat, RangeScan, RangeScanner, Sample,
 };
@@ -119,7 +122,37 @@ struct QueueState {
 }
 
 impl LiveRig {
+    /// Starts a rig whose arm follows its tour.
     pub(crate) fn start(engine: Engine, info: RigInfo, start: Stamp) -> Result<Self, Error> {
+        Self::start_with(engine, info, start, Instant::now(), None)
+    }
+
+    /// Starts a rig whose arm an operator may take over from its tour.
+    pub(crate) fn start_steered(
+        (mut engine, contacts): (Engine, Option<ContactCounter>),
+        info: RigInfo,
+        start: Stamp,
+        limits: SteeredLimits<'_>,
+    ) -> Result<(Self, SteeredArm), Error> {
+        let position = engine.reported_joints()?;
+        let handover = Handover::default();
+        engine.hand_over_to(handover.clone())?;
+        let n_contacts = contacts.as_ref().map(ContactCounter::n_contacts);
+        engine.count_contacts(contacts);
+        let started = Instant::now();
+        let (controller, arm) =
+            Controller::start(limits, &position, handover, started, n_contacts)?;
+        let rig = Self::start_with(engine, info, start, started, Some(controller))?;
+        Ok((rig, arm))
+    }
+
+    fn start_with(
+        engine: Engine,
+        info: RigInfo,
+        start: Stamp,
+        started: Instant,
+        controller: Option<Controller>,
+    ) -> Result<Self, Error> {
         let names: Vec<Arc<str>> = info
             .cameras
             .iter()
@@ -135,7 +168,7 @@ impl LiveRig {
             state: Mutex::new(state),
             arrived: Condvar::new(),
             clock: SimulationClock {
-                started: Instant::now(),
+                started,
                 time_nanos: engine.time_nanos(),
             },
         });
@@ -169,6 +202,7 @@ impl LiveRig {
             }) as Box<dyn Camera>
         });
         let arm = LiveArm {
+            _controller: controller,
             simulation: Arc::clone(&simulation),
             joint_names: info.joint_names.clone(),
         };
@@ -207,7 +241,8 @@ struct DeviceNames {
     scanners: Vec<String>,
 }
 
-/// Delivers samples when they are due, until the rig ends or all devices are dropped.
+/// Delivers samples when they are due, until the rig ends or all devices are dropped. `start` is the
+/// stamp of simulated time zero.
 fn run_simulation(mut engine: Engine, shared: &SharedQueues, names: &DeviceNames, start: Stamp) {
     engine.set_start(start);
     let started = shared.clock.started;
@@ -227,6 +262,7 @@ fn run_simulation(mut engine: Engine, shared: &SharedQueues, names: &DeviceNames
             Err(error) => break error.to_string(),
         }
     };
+    engine.end_control();
     // The end is set under the lock, so that a device that is about to wait cannot miss it.
     shared.state.lock().end = Some(end);
     shared.arrived.notify_all();
@@ -381,6 +417,8 @@ impl Camera for LiveCamera {
 }
 
 struct LiveArm {
+    /// Dropped first: the simulation must not wait for setpoints when it ends.
+    _controller: Option<Controller>,
     simulation: Arc<SimulationThread>,
     joint_names: Vec<String>,
 }

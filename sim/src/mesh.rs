@@ -27,6 +27,20 @@ pub(crate) type TextureRect = [f64; 4];
 pub(crate) const WHOLE: TextureRect = [0.0, 0.0, 1.0, 1.0];
 
 impl Mesh {
+    /// Position and normal of each vertex.
+    pub(crate) fn corners(&self) -> impl Iterator<Item = (Point3<f64>, Vector3<f64>)> {
+        let wide = |values: &[f32; 3]| values.map(f64::from);
+        let both = self.points_m.iter().zip(&self.normals);
+        both.map(move |(point, normal)| (wide(point).into(), wide(normal).into()))
+    }
+
+    /// Indices of the vertices of each triangle.
+    pub(crate) fn faces(&self) -> impl Iterator<Item = [usize; 3]> {
+        // Vertices are numbered from 0 when they are added.
+        let ix = |ix: i32| usize::try_from(ix).expect("an index is not negative");
+        self.faces.iter().map(move |face| face.map(ix))
+    }
+
     /// Adds a vertex and returns its index.
     #[expect(
         clippy::cast_possible_truncation,

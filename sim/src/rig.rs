@@ -5,6 +5,7 @@ use crate::base::{BaseMotion, base_from_arm};
 use crate::cabinet_tour::CabinetTour;
 use crate::commanded::CommandedRig;
 use crate::config::{Config, N_JOINTS, Parent, Scene};
+use crate::contacts::ContactCounter;
 use crate::engine::{Cameras, Engine, history_nanos};
 use crate::follower::{Follower, Tour};
 use crate::live_rig::LiveRig;
@@ -15,6 +16,7 @@ use crate::render::Renderer;
 use crate::rig_info::{CameraInfo, RigInfo};
 use crate::robot::{Robot, RobotKinematics};
 use crate::scan::{LOOK_AT_HEIGHT_M, Scan};
+use crate::steered_arm::{SteeredArm, SteeredLimits};
 use crate::twin::{self, Efforts, RobotConfig};
 use crate::{CameraConfig, Error, scene};
 use drivers::motion::MotionLimits;
@@ -46,7 +48,12 @@ pub(crate) fn urdf_of(scene: Scene) -> &'static str {
 pub struct Rig {
     engine: Engine,
     info: RigInfo,
+    build_contacts: BuildContacts,
 }
+
+/// Builds the model that counts contacts. It is built only if it is needed, because this takes a
+/// moment.
+type BuildContacts = Box<dyn FnOnce() -> Result<MjModel, Error> + Send>;
 
 /// Builds the scene and starts its render thread. Takes one to two seconds, and a second longer
 /// with the robot of a rig file.
@@ -88,7 +95,16 @@ fn open_scene(config: &Config, cameras: Cameras) -> Result<Rig, Error> {
         RobotKinematics::NoArm(base_from_arm)
     };
     let robot = Robot::new(arm, motion, kinematics);
-    finish(config, cameras, (robot, model), urdf_of(config.scene))
+    let build_contacts = {
+        let config = config.clone();
+        move || scene::build_contacts(&config, None)
+    };
+    let (engine, info) = finish(config, cameras, (robot, model), urdf_of(config.scene))?;
+    Ok(Rig {
+        engine,
+        info,
+        build_contacts: Box::new(build_contacts),
+    })
 }
 
 /// Opens a scene with the robot of a rig file.
@@ -104,17 +120,27 @@ fn open_twin(config: &Config, robot: &RobotConfig, cameras: Cameras) -> Result<R
         let efforts = Efforts::new(Arc::clone(&model), Arc::clone(&plan.model));
         Arm::exact(efforts, follower, history_nanos(config))
     });
-    let moving = Robot::new(arm, plan.motion, RobotKinematics::Twin(plan.model));
-    finish(config, cameras, (moving, model), &robot.urdf)
+    let kinematics = RobotKinematics::Twin(Arc::clone(&plan.model));
+    let moving = Robot::new(arm, plan.motion, kinematics);
+    let build_contacts = {
+        let (config, robot) = (config.clone(), robot.clone());
+        move || scene::build_contacts(&config, Some((&robot, &plan)))
+    };
+    let (engine, info) = finish(config, cameras, (moving, model), &robot.urdf)?;
+    Ok(Rig {
+        engine,
+        info,
+        build_contacts: Box::new(build_contacts),
+    })
 }
 
-/// Starts the render thread and assembles the rig.
+/// Starts the render thread and the engine.
 fn finish(
     config: &Config,
     cameras: Cameras,
     (robot, model): (Robot, Arc<MjModel>),
     urdf: &str,
-) -> Result<Rig, Error> {
+) -> Result<(Engine, RigInfo), Error> {
     let renderer = Renderer::start(Arc::clone(&model), scene::near_far_m(config.scene))?;
     let world_from_base = robot.motion().world_from_base(0.0);
     let engine = Engine::new(config.clone(), robot, cameras, renderer, model)?;
@@ -135,7 +161,7 @@ fn finish(
         world_from_base,
         renderer: engine.renderer_name().to_owned(),
     };
-    Ok(Rig { engine, info })
+    Ok((engine, info))
 }
 
 /// The camera tour of a scene with an arm.
@@ -292,6 +318,25 @@ impl Rig {
         Ok(LiveRig::start(self.engine, self.info, start)?
             .devices
             .cameras)
+    }
+
+    /// Lets the rig run in real time, with an arm that an operator may take over from its tour.
+    /// Simulated time zero is the time of this call, which is `start` on the caller's clock.
+    ///
+    /// # Errors
+    ///
+    /// If the rig has no arm, the arm is outside its limits, or a thread cannot be started.
+    pub fn into_steered(
+        self,
+        start: Stamp,
+        limits: SteeredLimits<'_>,
+    ) -> Result<(LiveRig, SteeredArm), Error> {
+        // Steering does not need the contacts, which only tell how well it works.
+        let contacts = (self.build_contacts)()
+            .map(ContactCounter::new)
+            .inspect_err(|error| log::warn!("contacts with the scene are not counted: {error}"))
+            .ok();
+        LiveRig::start_steered((self.engine, contacts), self.info, start, limits)
     }
 
     /// Lets the rig run in real time. Simulated time zero is the time of this call, which is

@@ -102,6 +102,11 @@ impl Robot {
         }
     }
 
+    /// Whether commands move the arm, which may come at any time.
+    pub(crate) fn is_commanded(&self) -> bool {
+        matches!(&self.arm, Some(ArmMotion::Simulated(arm)) if arm.is_commanded())
+    }
+
     /// Replaces the arm by one that emulated motors move.
     pub(crate) fn follow_motors(&mut self, arm: MotorizedArm) {
         self.arm = Some(ArmMotion::Motorized(arm));

@@ -2,10 +2,12 @@
 
 use crate::base;
 use crate::config::{Config, Parent, Scene, TargetParent};
+use crate::convex_pieces::convex_pieces;
 use crate::objects::{self, Object};
 use crate::texture::Texture;
 use crate::twin::{Pedestal, RobotBody, RobotConfig, TwinPlan};
 use crate::{Error, cabinet, lab, light, panda, printed_target};
+use kinematics::Transform;
 use mujoco_rs::prelude::MjModel;
 use mujoco_rs::wrappers::mj_auxiliary::MjVfs;
 use nalgebra::{Point3, Translation3};
@@ -183,6 +185,59 @@ fn build_with(
     })
 }
 
+/// Builds the model that counts contacts of the robot with the scene: the robot, and convex pieces of
+/// all objects. Nothing is drawn.
+pub(crate) fn build_contacts(
+    config: &Config,
+    twin: Option<(&RobotConfig, &TwinPlan)>,
+) -> Result<MjModel, Error> {
+    let mut files = MjVfs::new();
+    let mut assets = MATERIALS.to_owned();
+    let mut bodies = String::new();
+    let world_from_scene = twin.map_or_else(Transform::identity, |(_, plan)| plan.world_from_scene);
+    let scene_assets = SceneAssets::get(config.scene)?;
+    for object in &scene_assets.objects {
+        let pose = panda::pose_attributes(&(world_from_scene * object.world_from_mesh));
+        let name = object.name;
+        // Each object is a body, so that its pieces are counted as one.
+        let _ = writeln!(bodies, "<body name=\"{name}\" {pose}>");
+        for (ix, points) in convex_pieces(object).iter().enumerate() {
+            let vertices: Vec<String> = points.iter().map(|point| list(point)).collect();
+            let vertices = vertices.join(" ");
+            let _ = writeln!(assets, "<mesh name=\"{name}{ix}\" vertex=\"{vertices}\"/>");
+            let _ = writeln!(bodies, "<geom type=\"mesh\" mesh=\"{name}{ix}\"/>");
+        }
+        bodies.push_str("</body>\n");
+    }
+    let robot = match twin {
+        Some((robot, plan)) => add_twin(
+            &mut files,
+            &mut assets,
+            plan.quiet_body(robot, &brackets(config)),
+            plan.pedestal.as_ref(),
+        )?,
+        None => robot(config, ""),
+    };
+    // Only pairs of a part of the robot and an object are tested.
+    let xml = format!(
+        "<mujoco model=\"contacts\">\n\
+         <compiler angle=\"radian\" autolimits=\"true\" balanceinertia=\"true\"/>\n\
+         <default><geom contype=\"0\" conaffinity=\"1\"/>\n\
+         <default class=\"arm\"><geom contype=\"1\" conaffinity=\"0\" mass=\"0\"/></default></default>\n\
+         <asset>\n{assets}</asset>\n\
+         <worldbody>\n{bodies}{robot}</worldbody>\n</mujoco>\n"
+    );
+    add_file(&mut files, "contacts.xml", xml.as_bytes())?;
+    MjModel::from_xml_vfs("contacts.xml", &files).map_err(|error| Error::Scene {
+        reason: error.to_string(),
+    })
+}
+
+/// Numbers in full precision, as MJCF lists them.
+fn list(numbers: &[f64; 3]) -> String {
+    numbers.map(|number| format!("{number:e}")).join(" ")
+}
+
 /// Adds the files and assets of a rig file's robot. Returns its elements.
 fn add_twin(
     files: &mut MjVfs,
@@ -196,7 +251,6 @@ fn add_twin(
     assets.push_str(&body.assets);
     let mut xml = body.body;
     if let Some(Pedestal { center_m, half_m }) = pedestal {
-        let list = |numbers: &[f64; 3]| numbers.map(|number| format!("{number:e}")).join(" ");
         let _ = writeln!(
             xml,
             "<geom type=\"box\" pos=\"{}\" size=\"{}\" material=\"frame\"/>",

@@ -44,6 +44,11 @@ pub(crate) struct Args {
     /// count as a loss (exit code 3)
     #[arg(long, value_name = "FILE")]
     record: Option<PathBuf>,
+    /// Let operators steer the arm from the page. Confirms that nobody is within reach of a real
+    /// arm, and that a hand is on the emergency stop. A real arm also needs the table arm.motion
+    /// in the rig file. Not restored by --resume
+    #[arg(long, conflicts_with = "from")]
+    enable_motion: bool,
     /// Continue a run that crashed or was stopped, from the checkpoint and keyframes in its folder
     /// and with its flags. New keyframes are added; --record and --listen are not restored
     #[arg(long, value_name = "FOLDER", conflicts_with = "from", conflicts_with_all = TRAINING_ARGS)]
@@ -189,6 +194,7 @@ impl Args {
                 },
             },
             record: self.record.clone(),
+            is_steered: self.enable_motion,
             resume: self.resume.clone(),
             limits: Limits {
                 seconds: self.seconds,

@@ -15,6 +15,7 @@ const ALLOWED: &str = "
     kinematics    -> messages numbers
     drivers       -> files kinematics messages numbers
     steering      -> drivers kinematics numbers
+    clearance-map -> kinematics steering
     test-support  -> drivers kinematics numbers
     gpu           -> messages test-support
     keyframe      -> files kinematics messages numbers
@@ -27,8 +28,8 @@ const ALLOWED: &str = "
     trainer       -> background calibration files gpu keyframe kinematics messages model-files \
                      numbers
     viz           -> files keyframe kinematics messages model-files numbers trainer
-    session       -> background calibration capture drivers files gpu keyframe kinematics messages \
-                     model-files numbers report trainer viz
+    session       -> background calibration capture clearance-map drivers files gpu keyframe \
+                     kinematics messages model-files numbers report steering trainer viz
     calibrate     -> calibration capture drivers files keyframe kinematics messages numbers report \
                      session targets
     bench         -> calibration capture files gpu keyframe kinematics messages model-files numbers \

@@ -211,6 +211,9 @@ pub(super) fn resolve_joints(file: &str, arm: &mut Arm) -> Result<(), ConfigErro
     chain
         .order_in(&arm.joints)
         .map_err(|e| robot("arm.joints", e))?;
+    if let Some(motion) = &arm.motion {
+        motion.steering.check(file)?;
+    }
     resolve_motors(file, arm)?;
     if matches!(arm.driver, ArmDriver::Feetech | ArmDriver::Dynamixel) {
         servos::resolve(file, &arm.serial, &arm.joints, &mut arm.servos)?;

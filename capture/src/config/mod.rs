@@ -41,7 +41,7 @@ pub use camera::{
 };
 pub use error::{ConfigError, SourceLocation};
 pub use join::JoinConfig;
-pub use motion::ArmMotion;
+pub use motion::{ArmMotion, ArmSteering};
 pub use required::{MissingKey, Need};
 pub use scanner::{Scanner, ScannerDriver, ScannerSim};
 pub use servos::{ArmSerial, ArmServo};

@@ -62,6 +62,17 @@ pub(super) fn motion_limits(
     Ok(limits)
 }
 
+/// Motion limits of each joint of a simulated arm, which does not need the table `[arm.motion]`.
+pub(super) fn simulated_limits(rig: &Rig) -> anyhow::Result<Vec<MotionLimits>> {
+    /// The defaults of the table.
+    const DEFAULT_SECS: [f64; 2] = [0.5, 0.1];
+    let motion = rig.arm.motion.as_ref();
+    let [acceleration_secs, jerk_secs] = motion.map_or(DEFAULT_SECS, |motion| {
+        [motion.acceleration_secs, motion.jerk_secs]
+    });
+    motion_limits(rig, acceleration_secs, jerk_secs)
+}
+
 #[cfg(target_os = "linux")]
 pub(super) fn motion_config(rig: &Rig, motion: &ArmMotion) -> anyhow::Result<MotionConfig> {
     let limits = motion_limits(rig, motion.acceleration_secs, motion.jerk_secs)?;

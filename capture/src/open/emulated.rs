@@ -21,8 +21,8 @@ use std::time::Duration;
 /// the computer.
 const ANSWER_WAIT: Duration = Duration::from_millis(15);
 
-/// Opens the camera, and the arm for motion. The address of the arm becomes that of the controller.
-pub(super) fn open(rig: &mut Rig) -> anyhow::Result<(Box<dyn MovableArm>, Box<dyn Camera>)> {
+/// Opens the cameras, and the arm for motion. The address of the arm becomes that of the controller.
+pub(super) fn open(rig: &mut Rig) -> anyhow::Result<(Box<dyn MovableArm>, Vec<Box<dyn Camera>>)> {
     if rig.arm.driver != ArmDriver::Franka {
         bail!(
             "sim.emulate_arm: only a controller of the driver \"franka\" can be emulated for a simulated camera"
@@ -48,18 +48,12 @@ pub(super) fn open(rig: &mut Rig) -> anyhow::Result<(Box<dyn MovableArm>, Box<dy
         "the arm is moved by an emulated Franka controller at {}",
         rig.arm.address
     );
-    let Some(camera) = simulated
-        .into_motorized(motors, clock::now())?
-        .into_iter()
-        .next()
-    else {
-        bail!("the simulated rig has no camera");
-    };
+    let cameras = simulated.into_motorized(motors, clock::now())?;
     let arm = Box::new(EmulatedArm {
         arm: real::movable_arm(rig)?,
         _controller: controller,
     });
-    Ok((arm, camera))
+    Ok((arm, cameras))
 }
 
 /// A driver with the emulated controller that it is connected to.

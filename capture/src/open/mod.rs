@@ -15,6 +15,9 @@ mod servos;
 mod simulated;
 #[cfg(all(test, feature = "sim"))]
 mod simulated_tests;
+mod steered;
+#[cfg(all(test, feature = "sim"))]
+mod steered_tests;
 mod tag_check;
 mod tags;
 #[cfg(feature = "sim")]
@@ -30,6 +33,7 @@ pub use movable::{Movable, movable};
 pub use real::{check_motion, motion_of, movable_arm, udp_arm_address};
 #[cfg(target_os = "linux")]
 pub(crate) use servos::servo_config;
+pub use steered::{SteeredArm, check_steerable, steered};
 #[cfg(target_os = "linux")]
 pub use ur::arm_config as ur_config;
 
@@ -151,7 +155,17 @@ fn open_recording(
 ///
 /// If a device cannot be opened, a driver is not part of this build, or the rig file lacks a
 /// setting that a driver needs.
-pub fn rig(mut rig: Rig, devices: Devices) -> anyhow::Result<Opened> {
+pub fn rig(rig: Rig, devices: Devices) -> anyhow::Result<Opened> {
+    Ok(open_rig(rig, devices, false)?.0)
+}
+
+/// Opens the devices of a rig, and enables its arm if it is steered.
+fn open_rig(
+    mut rig: Rig,
+    devices: Devices,
+    is_steered: bool,
+) -> anyhow::Result<(Opened, Option<SteeredArm>)> {
+    let arm_driver = rig.arm.driver;
     if devices == Devices::Sim {
         use_simulated_devices(&mut rig);
     }
@@ -163,12 +177,12 @@ pub fn rig(mut rig: Rig, devices: Devices) -> anyhow::Result<Opened> {
         bail!("{device} cannot be opened by this version; {}", sim_hint());
     }
     check_arm(&rig)?;
-    let opened = real::open(&mut rig, &mut real::end_on_failure);
-    let (real, _) = opened.map_err(|error| anyhow!("{error:#}; {}", sim_hint()))?;
-    let (source, stamp_clock): (Box<dyn Source>, _) = if is_any_simulated(&rig) {
-        simulate(&rig, real)?
+    let (source, stamp_clock, steered_arm) = if is_steered {
+        let (source, stamp_clock, arm) = steered::open_devices(&mut rig, arm_driver)?;
+        (source, stamp_clock, Some(arm))
     } else {
-        (Box::new(LiveDevices::new(real)?), StampClock::Computer)
+        let (source, stamp_clock) = open_devices(&mut rig)?;
+        (source, stamp_clock, None)
     };
     // This source wraps all devices, because tags are searched in the images of all cameras on the
     // robot.
@@ -176,12 +190,27 @@ pub fn rig(mut rig: Rig, devices: Devices) -> anyhow::Result<Opened> {
         BaseDriver::Tags => Box::new(TagBaseSource::new(&rig, source)?),
         _ => source,
     };
-    Ok(Opened {
+    let opened = Opened {
         rig,
         source,
         damage: Arc::default(),
         stamp_clock,
-    })
+    };
+    Ok((opened, steered_arm))
+}
+
+/// Opens the real and the simulated devices of a rig for reading.
+fn open_devices(rig: &mut Rig) -> anyhow::Result<(Box<dyn Source>, StampClock)> {
+    let opened = real::open(rig, &mut real::end_on_failure);
+    let (real, _) = opened.map_err(with_sim_hint)?;
+    if is_any_simulated(rig) {
+        return simulate(rig, real);
+    }
+    Ok((Box::new(LiveDevices::new(real)?), StampClock::Computer))
+}
+
+fn with_sim_hint(error: anyhow::Error) -> anyhow::Error {
+    anyhow!("{error:#}; {}", sim_hint())
 }
 
 /// Replaces every device by its simulated twin. Calibration that only a real camera could report is

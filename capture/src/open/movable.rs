@@ -1,7 +1,7 @@
 //! Opens a camera together with an arm that can be moved, real or simulated.
 
 #[cfg(feature = "sim")]
-use super::arm_config::motion_limits;
+use super::arm_config::simulated_limits;
 use super::assumed_lens::assume_calibration_of_simulated;
 use super::real;
 use super::{Devices, check_arm, use_simulated_devices, without_readout_if_ideal};
@@ -74,13 +74,7 @@ pub fn movable(rig: &Rig, devices: Devices, camera: &str) -> anyhow::Result<Mova
 
 #[cfg(feature = "sim")]
 fn simulated(rig: Rig) -> anyhow::Result<Movable> {
-    /// The defaults of `[arm.motion]`, which a simulated arm does not need.
-    const DEFAULT_SECS: [f64; 2] = [0.5, 0.1];
-    let motion = rig.arm.motion.as_ref();
-    let [acceleration_secs, jerk_secs] = motion.map_or(DEFAULT_SECS, |motion| {
-        [motion.acceleration_secs, motion.jerk_secs]
-    });
-    let limits = motion_limits(&rig, acceleration_secs, jerk_secs)?;
+    let limits = simulated_limits(&rig)?;
     let sim::CommandedRig { arm, cameras, .. } = super::simulated::commanded(&rig, &limits)?;
     let Some(camera) = cameras.into_iter().next() else {
         bail!("the simulated rig has no camera");
@@ -90,7 +84,10 @@ fn simulated(rig: Rig) -> anyhow::Result<Movable> {
 
 #[cfg(all(feature = "sim", target_os = "linux"))]
 fn emulated(mut rig: Rig) -> anyhow::Result<Movable> {
-    let (arm, camera) = super::emulated::open(&mut rig)?;
+    let (arm, cameras) = super::emulated::open(&mut rig)?;
+    let Some(camera) = cameras.into_iter().next() else {
+        bail!("the simulated rig has no camera");
+    };
     Ok(Movable { rig, arm, camera })
 }
 

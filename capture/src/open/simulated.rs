@@ -14,7 +14,7 @@ use std::sync::Arc;
 /// Opens the simulated rig, in lockstep or in real time according to the rig file. In real time,
 /// `real` devices run in parallel. Also returns the clock of the stamps.
 pub(super) fn open(rig: &Rig, real: Devices) -> anyhow::Result<(Box<dyn Source>, StampClock)> {
-    let mut config = config_of(rig)?;
+    let config = config_of(rig)?;
     let any_real = real.arm.is_some()
         || real.base.is_some()
         || !real.scanners.is_empty()
@@ -36,26 +36,36 @@ pub(super) fn open(rig: &Rig, real: Devices) -> anyhow::Result<(Box<dyn Source>,
     } else {
         (Stamp::default(), StampClock::Simulation)
     };
-    // In real time, this source checks the limits itself. If the simulated devices ended instead,
-    // they would look like devices that have failed.
-    config.duration_secs = None;
-    config.n_images = None;
-    let sim::LiveRig {
-        mut devices, truth, ..
-    } = sim::open(&config)?.into_live(start)?;
+    let mut live = sim::open(&without_end(config))?.into_live(start)?;
     // A real device replaces the simulated one of the same kind.
-    devices.arm = real.arm.or(devices.arm);
-    devices.base = devices.base.or(real.base);
+    let devices = &mut live.devices;
+    devices.arm = real.arm.or(devices.arm.take());
+    devices.base = devices.base.take().or(real.base);
     devices.scanners.extend(real.scanners);
     devices.cameras.extend(real.cameras);
-    let source = RealTime {
-        live: LiveDevices::new(devices)?,
-        truth,
-        first_camera: rig.cameras.first().map(|camera| Arc::clone(&camera.name)),
-        n_left: rig.sim.n_images,
-        end: rig.sim.duration_secs.map(|secs| start.plus_secs(secs)),
-    };
-    Ok((Box::new(source), stamp_clock))
+    Ok((Box::new(RealTime::new(rig, live, start)?), stamp_clock))
+}
+
+/// Opens a simulated rig in real time, with an arm that an operator may take over from its tour. Its
+/// stamps are on the clock of this computer, like those of operators.
+pub(super) fn steered(
+    rig: &Rig,
+    limits: sim::SteeredLimits<'_>,
+) -> anyhow::Result<(Box<dyn Source>, sim::SteeredArm)> {
+    let opened = sim::open(&without_end(config_of(rig)?))?;
+    let start = drivers::clock::now();
+    let (live, arm) = opened.into_steered(start, limits)?;
+    Ok((Box::new(RealTime::new(rig, live, start)?), arm))
+}
+
+/// A configuration without limits. In real time, the source checks them itself: if the simulated
+/// devices ended instead, they would look like devices that have failed.
+fn without_end(config: sim::Config) -> sim::Config {
+    sim::Config {
+        duration_secs: None,
+        n_images: None,
+        ..config
+    }
 }
 
 /// Opens a simulated rig with an arm that moves by commands.
@@ -81,6 +91,19 @@ struct RealTime {
     first_camera: Option<Arc<str>>,
     n_left: Option<u64>,
     end: Option<Stamp>,
+}
+
+impl RealTime {
+    /// * `start`: stamp of simulated time zero.
+    fn new(rig: &Rig, live: sim::LiveRig, start: Stamp) -> Result<Self, Error> {
+        Ok(Self {
+            live: LiveDevices::new(live.devices)?,
+            truth: live.truth,
+            first_camera: rig.cameras.first().map(|camera| Arc::clone(&camera.name)),
+            n_left: rig.sim.n_images,
+            end: rig.sim.duration_secs.map(|secs| start.plus_secs(secs)),
+        })
+    }
 }
 
 impl Source for RealTime {

@@ -127,6 +127,19 @@ impl Steered {
         });
     }
 
+    /// Reports that something else moves the arm, which is at `position`. What was sent to the port
+    /// is discarded.
+    pub fn report_moving(&mut self, now: Stamp, position: &[f64]) {
+        self.follower.end_motion(self.port.end_motions());
+        self.port.report(ArmState {
+            reported_at: now,
+            position: position.to_vec(),
+            is_at_rest: false,
+            braked_motion: self.follower.braked_motion(),
+            stopped: None,
+        });
+    }
+
     /// Whether a target waits to be followed.
     pub fn has_target(&self) -> bool {
         !self.is_closed && self.port.has_target()

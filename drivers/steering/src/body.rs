@@ -123,7 +123,7 @@ impl Body {
     }
 
     /// Number of joint values that the body needs.
-    pub(crate) fn n_joints(&self) -> usize {
+    pub fn n_joints(&self) -> usize {
         self.n_joints
     }
 

@@ -56,6 +56,18 @@ impl Lease {
         self.holder.map(|holder| (holder.operator, holder.since))
     }
 
+    /// Time until the lease expires if its holder is silent.
+    pub(crate) fn left_secs(&self, now: Stamp) -> Option<f64> {
+        let silent_secs = now.secs_since(self.holder?.heard_at);
+        Some((self.config.expiry_secs - silent_secs).max(0.0))
+    }
+
+    /// The operator who may take the lease over now.
+    pub(crate) fn offered_to(&self, now: Stamp) -> Option<Operator> {
+        let (to, until) = self.holder?.offered_to?;
+        (now <= until).then_some(to)
+    }
+
     /// Ends the lease if its holder has been silent for too long.
     pub(crate) fn expire(&mut self, now: Stamp) -> Option<Reason> {
         let holder = self.holder?;

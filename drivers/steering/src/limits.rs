@@ -51,6 +51,8 @@ impl Default for LimitConfig {
 /// means that the posture found is another branch of solutions. The way to it would not follow the
 /// pose.
 const MAX_POSTURE_STEP: f64 = 0.3;
+/// Rounding of postures at the end of a range, radians or meters.
+const ROUNDING: f64 = 1e-9;
 /// Step lengths that are tried if no posture is found for the whole step.
 const STEP_FRACS: [f64; 3] = [1.0, 0.5, 0.25];
 /// Rounds in which a step is shortened. Parts move on arcs, so shortening by a ratio may leave them
@@ -145,6 +147,26 @@ impl Limits {
     /// Ranges of the joints, without margins.
     pub(crate) fn ranges(&self) -> Vec<[f64; 2]> {
         self.joints.iter().map(|joint| joint.position).collect()
+    }
+
+    /// Why the arm may not rest at a posture, if it may not: a joint is outside its range, or the tip
+    /// is outside the workspace.
+    pub(crate) fn outside(&self, chain: &Chain, q: &[f64]) -> Option<Reason> {
+        let margin = self.config.joint_margin;
+        let outside = q.iter().zip(&self.joints).position(|(q, joint)| {
+            let [lower, upper] = joint.position;
+            // Written so that NaN is outside.
+            let is_inside = *q >= lower + margin - ROUNDING && *q <= upper - margin + ROUNDING;
+            !is_inside
+        });
+        if let Some(ix) = outside {
+            let joint = chain.joint_names()[ix].clone();
+            return Some(Reason::JointRange { joint });
+        }
+        let [low, high] = self.config.workspace_m?;
+        let tip = chain.forward(q).ok()?.translation.vector;
+        let is_inside = (0..3).all(|axis| (low[axis]..=high[axis]).contains(&tip[axis]));
+        (!is_inside).then(|| Reason::Workspace { place: tip.into() })
     }
 
     /// The joint that is too far behind its target, and by how much.

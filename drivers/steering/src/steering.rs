@@ -19,6 +19,8 @@ use kinematics::{Chain, Stamp, Transform};
 use serde::{Deserialize, Serialize};
 use std::sync::Arc;
 
+mod posture_check;
+
 /// Configuration of all links.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
@@ -179,6 +181,16 @@ impl Steering {
     /// Who has control, and since when.
     pub fn holder(&self) -> Option<(Operator, Stamp)> {
         self.lease.holder()
+    }
+
+    /// Time until the lease expires if its holder is silent; `None` if nobody has control.
+    pub fn lease_left_secs(&self, now: Stamp) -> Option<f64> {
+        self.lease.left_secs(now)
+    }
+
+    /// The operator who may take control from its holder now.
+    pub fn offered_to(&self, now: Stamp) -> Option<Operator> {
+        self.lease.offered_to(now)
     }
 
     /// Why the arm stays at rest until an operator permits motion, if it does.

@@ -6,6 +6,7 @@ use super::saving::{self, SavedRun};
 use crate::error::{is_gpu_error, is_gpu_unrecoverable, is_rejection};
 use crate::live_loop::{EndedLoop, LiveLoop};
 use crate::run_folder::{self, CreatedFolders};
+use crate::steering::SteeringThread;
 use capture::config::Rig;
 use capture::{InputResult, SampleUse, Stop};
 use gpu::Gpu;
@@ -27,6 +28,8 @@ pub struct RunInProgress {
     /// damage.
     pub(super) damage: Arc<OnceLock<String>>,
     pub(super) created: CreatedFolders,
+    /// Lets operators steer the arm, if they may.
+    pub(super) steering: Option<SteeringThread>,
 }
 
 /// Results of a run that saves nothing.
@@ -62,7 +65,8 @@ impl RunInProgress {
         if result.is_ok() && self.live.has_exhausted_input() {
             log::info!("the devices have ended and all their data is in the model");
         }
-        // The devices are stopped before saving, which may take minutes.
+        // The arm and the devices are stopped before saving, which may take minutes.
+        drop(self.steering.take());
         self.stop.request();
         let hub = self.live.hub();
         let Self {
@@ -124,7 +128,8 @@ impl RunInProgress {
     }
 
     /// Closes the devices without saving anything.
-    pub fn discard(self) -> anyhow::Result<DiscardedRun> {
+    pub fn discard(mut self) -> anyhow::Result<DiscardedRun> {
+        drop(self.steering.take());
         let is_interrupted = self.stop.signaled();
         self.stop.request();
         let keyframes = self.live.keyframes();

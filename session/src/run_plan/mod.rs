@@ -32,7 +32,7 @@ use crate::session_setup::Services;
 use crate::training_options::{AvailableData, REALIGN, RefineSettings, TrainingOptions};
 use capture::check_output_file;
 use capture::config::{ArmDriver, Need, Override, Rig};
-use capture::open::{self, Devices, Opened};
+use capture::open::{self, Devices, Opened, SteeredArm};
 use gpu::Gpu;
 use messages::{BadInput, Setting};
 use model_files::Edits;
@@ -61,6 +61,9 @@ pub struct RunPlan {
     pub input: RunInput,
     /// File to which everything is recorded that the devices send.
     pub record: Option<PathBuf>,
+    /// Whether operators may steer the arm. It is not stored with the run: whoever resumes a run
+    /// decides again.
+    pub is_steered: bool,
     /// Folder of a run to continue, with its flags.
     pub resume: Option<PathBuf>,
     /// When the run stops. Time and steps of the resumed run count, too.
@@ -138,6 +141,9 @@ impl RunPlan {
         overrides.extend(previous.iter().flat_map(PreviousLiveRun::overrides));
         let rig = Rig::load(&plan.rig_file, &overrides)?;
         plan.require_calibration(&rig)?;
+        if plan.is_steered {
+            open::check_steerable(&rig, plan.devices()?)?;
+        }
         log::info!("{}", opening::describe(&plan.rig_name(), &rig, &plan.input));
         let kinds = methods_of(&rig)?;
         let available = available_data(&rig);
@@ -346,27 +352,45 @@ impl RunPlan {
         }
     }
 
-    /// Opens the devices or the recording.
-    fn open(&self, rig: Rig) -> anyhow::Result<Opened> {
-        let (path, is_real_time, is_repeated) = match &self.input {
-            RunInput::Recording {
-                path,
-                is_real_time,
-                is_repeated,
-            } => (path, *is_real_time, *is_repeated),
+    /// Which devices are opened.
+    fn devices(&self) -> Result<Devices, BadInput> {
+        match self.input {
             RunInput::Devices {
                 is_simulated: true, ..
-            } => return open::rig(rig, Devices::Sim),
-            RunInput::Devices { .. } => return open::rig(rig, Devices::Real),
+            } => Ok(Devices::Sim),
+            RunInput::Devices { .. } => Ok(Devices::Real),
+            RunInput::Recording { .. } => Err(BadInput(format!(
+                "{}: a recording has no arm that could move: remove {} or {}",
+                Setting::EnableMotion,
+                Setting::EnableMotion,
+                Setting::From
+            ))),
+        }
+    }
+
+    /// Opens the devices or the recording. Also returns the arm if it is steered.
+    fn open(&self, rig: Rig) -> anyhow::Result<(Opened, Option<SteeredArm>)> {
+        let RunInput::Recording {
+            path,
+            is_real_time,
+            is_repeated,
+        } = &self.input
+        else {
+            let devices = self.devices()?;
+            if self.is_steered {
+                let (opened, arm) = open::steered(rig, devices)?;
+                return Ok((opened, Some(arm)));
+            }
+            return Ok((open::rig(rig, devices)?, None));
         };
         let mut opened = open::recording(path, Some(rig), &[])?;
-        if is_repeated {
+        if *is_repeated {
             opened = opened.repeated(path);
         }
-        if is_real_time {
+        if *is_real_time {
             opened = opened.in_real_time();
         }
-        Ok(opened)
+        Ok((opened, None))
     }
 
     /// Recordings and lockstep simulations wait for the trainer; everything else runs in real time.

@@ -10,11 +10,12 @@ use crate::robot_meshes;
 use crate::run_folder::CreatedFolders;
 use crate::session::{Evaluators, Session};
 use crate::session_setup::{Services, SessionSetup};
+use crate::steering::PreparedSteering;
 use crate::training_clock::Clock;
 use crate::viewers::{Viewers, gpu_notes};
 use capture::config::Rig;
-use capture::open::{self, Opened};
-use capture::{Feed, Input, Join, Notes, RobotMotion, StampClock, Stations, doctor};
+use capture::open::{self, Opened, SteeredArm};
+use capture::{Feed, Input, InputObserver, Join, Notes, RobotMotion, StampClock, Stations, doctor};
 use drivers::Source;
 use gpu::Gpu;
 use keyframe::Keyframe;
@@ -43,6 +44,8 @@ pub struct PreparedRun<'a> {
 /// A run whose devices are open.
 pub struct OpenedRun<'a> {
     opened: Opened,
+    /// The arm, if operators may steer it.
+    steered_arm: Option<SteeredArm>,
     device_notes: Notes,
     parts: Parts<'a>,
     hub: Hub,
@@ -104,8 +107,9 @@ impl<'a> PreparedRun<'a> {
                 .recording()
                 .map_or("devices", |_| "recording")
         );
-        let opened = self.parts.plan.open(self.rig)?;
+        let (opened, steered_arm) = self.parts.plan.open(self.rig)?;
         Ok(OpenedRun {
+            steered_arm,
             opened: opened.with_tag_check(&device_notes)?,
             device_notes,
             parts: self.parts,
@@ -131,6 +135,7 @@ impl OpenedRun<'_> {
     fn start_in(self, created: &mut CreatedFolders) -> anyhow::Result<RunInProgress> {
         let Self {
             opened,
+            steered_arm,
             device_notes,
             parts,
             hub,
@@ -160,9 +165,14 @@ impl OpenedRun<'_> {
             .map_or(&[][..], |previous| &previous.keyframes);
         let (input, evicted) = input(&plan, &rig, (source, stamp_clock), held)?;
         let robot = publish_robot(&hub, &rig, &plan)?;
+        let steering = steered_arm
+            .map(|arm| PreparedSteering::new(arm, &rig, &plan.rig_file))
+            .transpose()?;
         let identity = identity(&plan, &folders, robot);
         let stop = services.stop.clone();
-        let feed = Feed::start(input, Box::new(Viewers(hub.clone())), stop.clone())?;
+        let clearance = steering.as_ref().map(PreparedSteering::clearance_feed);
+        let feed = Feed::start(input, observer(&hub, steering.as_ref()), stop.clone())?;
+        let steering = steering.map(|steering| steering.start(&hub)).transpose()?;
         let setup = SessionSetup {
             services,
             gpu: &gpu,
@@ -206,8 +216,12 @@ impl OpenedRun<'_> {
         let held = sessions
             .first()
             .map_or(Vec::new(), |session| session.keyframes().to_vec());
+        let mut live = LiveLoop::new(sessions, feed, hub, options).resume_from(held);
+        if let Some(clearance) = clearance {
+            live.draw_clearance_for(clearance);
+        }
         Ok(RunInProgress {
-            live: LiveLoop::new(sessions, feed, hub, options).resume_from(held),
+            live,
             gpu,
             plan,
             stop,
@@ -215,7 +229,17 @@ impl OpenedRun<'_> {
             folders,
             damage,
             created: CreatedFolders::default(),
+            steering,
         })
+    }
+}
+
+/// What receives the data of the devices besides the trainer.
+fn observer(hub: &Hub, steering: Option<&PreparedSteering>) -> Box<dyn InputObserver> {
+    let viewers = Viewers(hub.clone());
+    match steering {
+        Some(steering) => Box::new(steering.observer(viewers)),
+        None => Box::new(viewers),
     }
 }
 

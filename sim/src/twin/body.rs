@@ -32,6 +32,8 @@ pub(crate) struct BodyPlan<'a> {
     pub(crate) world_from_base: Transform,
     /// Whether the base is moved by setting its pose.
     pub(crate) has_moving_base: bool,
+    /// Whether what is estimated or cannot be drawn is logged.
+    pub(crate) is_logged: bool,
 }
 
 /// Density with which missing masses are estimated from shapes, kg/m^3. Links are partly hollow.
@@ -79,7 +81,9 @@ pub(crate) fn robot_body(plan: &BodyPlan<'_>) -> RobotBody {
         n_open += 1;
     }
     body.push_str(&"</body>\n".repeat(n_open + 1));
-    writer.report();
+    if plan.is_logged {
+        writer.report();
+    }
     RobotBody {
         body,
         assets: writer.assets,

@@ -100,6 +100,10 @@ impl TwinFollower {
         &self.velocity
     }
 
+    pub(crate) fn acceleration(&self) -> &Joints {
+        &self.acceleration
+    }
+
     /// Pose of a camera on the flange in the base.
     pub(crate) fn base_from_camera(&self, flange_from_camera: &Transform) -> Transform {
         self.model.base_from_flange(&self.position) * flange_from_camera

@@ -116,12 +116,25 @@ fn pedestal(
 impl TwinPlan {
     /// MJCF of the robot.
     pub(crate) fn body(&self, robot: &RobotConfig, on_flange: &str) -> RobotBody {
+        robot_body(&self.body_plan(robot, on_flange))
+    }
+
+    /// The same robot for another model, without the log.
+    pub(crate) fn quiet_body(&self, robot: &RobotConfig, on_flange: &str) -> RobotBody {
         robot_body(&BodyPlan {
+            is_logged: false,
+            ..self.body_plan(robot, on_flange)
+        })
+    }
+
+    fn body_plan<'a>(&'a self, robot: &'a RobotConfig, on_flange: &'a str) -> BodyPlan<'a> {
+        BodyPlan {
             model: &self.model,
             meshes: &robot.meshes,
             on_flange,
             world_from_base: self.motion.world_from_base(0.0),
             has_moving_base: robot.has_moving_base,
-        })
+            is_logged: true,
+        }
     }
 }

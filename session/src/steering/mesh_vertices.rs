@@ -1,0 +1,137 @@
+//! Reads the vertices of mesh files, which bound the parts of a robot.
+//!
+//! Sources of the formats: 3D Systems, "Stereolithography Interface Specification" (1989), and
+//! Wavefront, "Advanced Visualizer Manual", appendix B1 (OBJ).
+
+use capture::mesh_file_candidates;
+use files::Budget;
+use std::path::Path;
+
+/// Sizes of the header of a binary STL file and of each of its triangles, bytes.
+const STL_HEADER_BYTES: usize = 84;
+const STL_TRIANGLE_BYTES: usize = 50;
+/// Sizes of a number and of the normal before the corners of a triangle, bytes.
+const NUMBER_BYTES: usize = 4;
+const NORMAL_BYTES: usize = 3 * NUMBER_BYTES;
+
+/// Vertices of a mesh file of a URDF in the frame of the mesh, meters.
+///
+/// # Errors
+///
+/// Why it cannot be read, in one sentence.
+pub(super) fn read(file: &str, urdf_folder: &Path) -> Result<Vec<[f64; 3]>, String> {
+    let candidates = mesh_file_candidates(file, urdf_folder);
+    let path = candidates
+        .iter()
+        .find(|path| path.is_file())
+        .ok_or_else(|| format!("no such file near {}", urdf_folder.display()))?;
+    let bytes = files::read(path, Budget::MESH).map_err(|error| error.to_string())?;
+    let extension = file.rsplit('.').next().unwrap_or_default();
+    let vertices = match extension.to_ascii_lowercase().as_str() {
+        "stl" => stl(&bytes)?,
+        "obj" => text(&String::from_utf8_lossy(&bytes), "v ")?,
+        other => {
+            return Err(format!(
+                "the bounds of .{other} files cannot be read, convert it to .stl or .obj"
+            ));
+        }
+    };
+    if vertices.is_empty() {
+        return Err("it has no vertices".to_owned());
+    }
+    Ok(vertices)
+}
+
+fn stl(bytes: &[u8]) -> Result<Vec<[f64; 3]>, String> {
+    let n_triangles = bytes
+        .get(STL_HEADER_BYTES - NUMBER_BYTES..STL_HEADER_BYTES)
+        .and_then(|count| count.try_into().ok())
+        .map(u32::from_le_bytes)
+        .and_then(|count| usize::try_from(count).ok());
+    // Many binary files start with the word `solid` of text files, so the size decides.
+    if let Some(n_triangles) = n_triangles
+        && n_triangles.checked_mul(STL_TRIANGLE_BYTES) == Some(bytes.len() - STL_HEADER_BYTES)
+    {
+        let triangles = bytes[STL_HEADER_BYTES..].chunks_exact(STL_TRIANGLE_BYTES);
+        return Ok(triangles.flat_map(binary_corners).collect());
+    }
+    if bytes.trim_ascii_start().starts_with(b"solid") {
+        return text(&String::from_utf8_lossy(bytes), "vertex ");
+    }
+    Err("it is neither a binary nor a text STL file".to_owned())
+}
+
+/// The corners of a triangle of a binary STL file, after its normal.
+fn binary_corners(triangle: &[u8]) -> [[f64; 3]; 3] {
+    let number = |ix: usize| {
+        let start = NORMAL_BYTES + NUMBER_BYTES * ix;
+        let bytes: [u8; NUMBER_BYTES] = std::array::from_fn(|at| triangle[start + at]);
+        f64::from(f32::from_le_bytes(bytes))
+    };
+    std::array::from_fn(|corner| std::array::from_fn(|axis| number(3 * corner + axis)))
+}
+
+/// The points on the lines of a text file that start with a keyword.
+fn text(text: &str, keyword: &str) -> Result<Vec<[f64; 3]>, String> {
+    let lines = text.lines().enumerate();
+    let points = lines.filter_map(|(ix, line)| {
+        let numbers = line.trim_start().strip_prefix(keyword)?;
+        Some(point(numbers).ok_or_else(|| format!("line {} has no point", ix + 1)))
+    });
+    points.collect()
+}
+
+fn point(numbers: &str) -> Option<[f64; 3]> {
+    let mut numbers = numbers.split_whitespace();
+    let mut next = || -> Option<f64> {
+        let number: f64 = numbers.next()?.parse().ok()?;
+        number.is_finite().then_some(number)
+    };
+    Some([next()?, next()?, next()?])
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn vertices(name: &str, contents: &[u8]) -> Result<Vec<[f64; 3]>, String> {
+        let folder = tempfile::tempdir().expect("a folder");
+        std::fs::write(folder.path().join(name), contents).expect("written");
+        read(name, folder.path())
+    }
+
+    #[test]
+    fn vertices_of_all_formats_are_read() {
+        let mut binary = b"solid, but binary".to_vec();
+        binary.resize(STL_HEADER_BYTES - NUMBER_BYTES, 0);
+        binary.extend(1_u32.to_le_bytes());
+        let numbers = [
+            0.0, 0.0, 1.0, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0, 8.0, 9.5_f32,
+        ];
+        binary.extend(numbers.iter().flat_map(|number| number.to_le_bytes()));
+        binary.extend([0, 0]);
+        let expected = vec![[1.0, 2.0, 3.0], [4.0, 5.0, 6.0], [7.0, 8.0, 9.5]];
+        assert_eq!(vertices("a.stl", &binary), Ok(expected.clone()));
+        let stl = "solid\n facet normal 0 0 1\n outer loop\n vertex 1 2 3\n vertex 4 5 6\n\
+                   vertex 7 8 9.5\n endloop\n endfacet\nendsolid\n";
+        assert_eq!(vertices("a.STL", stl.as_bytes()), Ok(expected.clone()));
+        let obj = "# a mesh\nvn 0 0 1\nv 1 2 3\nv 4 5 6\nv 7 8 9.5\nf 1 2 3\n";
+        assert_eq!(vertices("a.obj", obj.as_bytes()), Ok(expected));
+    }
+
+    #[test]
+    fn broken_files_are_refused_with_a_reason() {
+        for (name, contents, words) in [
+            ("a.stl", "short", "neither a binary nor a text"),
+            ("a.stl", "solid\n vertex 1 2\n", "line 2 has no point"),
+            ("a.obj", "v 1 2 inf\n", "line 1 has no point"),
+            ("a.obj", "# nothing\n", "no vertices"),
+            ("a.dae", "<COLLADA/>", "convert it to .stl"),
+        ] {
+            let error = vertices(name, contents.as_bytes()).expect_err(name);
+            assert!(error.contains(words), "{name}: {error}");
+        }
+        let missing = read("missing.stl", Path::new("/nowhere")).expect_err("missing");
+        assert!(missing.contains("no such file"), "{missing}");
+    }
+}

@@ -1,0 +1,309 @@
+//! What is known about the space around the arm of a run: the map of free space, and what feeds it.
+//!
+//! Keyframes with measured depth show what is free and what is not; for the others, the live model
+//! draws depth (`clearance_feed.rs`). Before the first operator, the
+//! space through which the arm itself moves is free, too, with the margin that the rig file permits:
+//! a person guides it, or a simulated arm is on its tour.
+
+use super::robot::ChainAndBody;
+use super::undrawn::UndrawnKeyframes;
+use capture::config::Rig;
+use capture::open;
+use clearance_map::{ClearanceMap, DepthImage, DepthOrigin, MapConfig, Posture, reach_m};
+use drivers::motion::ArmState;
+use keyframe::{Keyframe, RobotState};
+use kinematics::{JointHistory, JointState, Stamp, Transform};
+use parking_lot::Mutex;
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+use steering::{Clearance, Seen};
+
+/// Postures are not interpolated across longer gaps.
+const MAX_GAP: Duration = Duration::from_millis(100);
+/// Number of postures kept: those of five seconds at 1 kHz. Keyframes take less time to arrive.
+const MAX_POSTURES: usize = 5000;
+/// Time between two postures that are swept. The arm of a tour moves by less than the margin.
+const SWEEP_PERIOD_SECS: f64 = 0.2;
+/// Margin of swept space in simulations, meters. Their tours keep this distance from the scene.
+const SIMULATED_MARGIN_M: f64 = 0.15;
+
+/// The space around an arm.
+pub(super) struct SceneClearance {
+    map: ClearanceMap,
+    /// Index in the lists of the rig file of each joint of the chain.
+    joint_ixs: Vec<usize>,
+    world_from_base: Transform,
+    swept_margin_m: f64,
+    state: Mutex<State>,
+    undrawn: UndrawnKeyframes,
+}
+
+struct State {
+    /// Postures in the order of the chain.
+    postures: JointHistory,
+    /// Whether no operator has had the arm.
+    is_sweeping: bool,
+    swept_at: Option<Stamp>,
+}
+
+impl SceneClearance {
+    /// The space around the arm of a rig with a fixed base, of which nothing is known.
+    ///
+    /// # Errors
+    ///
+    /// If the reach of the robot is too large for a map, or no thread can be started.
+    pub(super) fn new(rig: &Rig, robot: &ChainAndBody) -> anyhow::Result<Self> {
+        let settings = rig.arm.motion.as_ref().map(|motion| &motion.steering);
+        let permitted_m = settings.map_or(0.0, |settings| settings.swept_margin_m);
+        let swept_margin_m = if open::is_any_simulated(rig) {
+            permitted_m.max(SIMULATED_MARGIN_M)
+        } else {
+            permitted_m
+        };
+        let config = MapConfig::for_reach(reach_m(&robot.body, &robot.chain));
+        Ok(Self {
+            map: ClearanceMap::start(&config, robot.body.clone())?,
+            joint_ixs: robot.chain.order_in(&rig.arm.joints)?,
+            world_from_base: rig.base.world_from_base,
+            swept_margin_m,
+            state: Mutex::new(State {
+                postures: JointHistory::new(MAX_GAP, MAX_POSTURES),
+                is_sweeping: true,
+                swept_at: None,
+            }),
+            undrawn: UndrawnKeyframes::default(),
+        })
+    }
+
+    /// Sets where the arm is now, in the order of the chain.
+    pub(super) fn set_posture(&self, arm: &ArmState) {
+        let posture = self.posture(arm.reported_at, arm.position.clone());
+        let is_swept = self.state.lock().is_swept(arm.reported_at);
+        let result = self.map.set_posture(&posture).and_then(|()| {
+            // The arm reports its state also while the input waits for a busy trainer.
+            if is_swept {
+                self.map.sweep(posture, self.swept_margin_m)
+            } else {
+                Ok(())
+            }
+        });
+        if let Err(error) = result {
+            // The chain of decisions brakes because of the same report.
+            log::debug!("steering: {error}");
+        }
+    }
+
+    /// From now on, an operator moves the arm, so that its own way proves nothing any more.
+    pub(super) fn end_sweep(&self) {
+        self.state.lock().is_sweeping = false;
+    }
+
+    /// Takes a reading of the joints.
+    pub(super) fn observe_robot(&self, robot: &RobotState) {
+        let of_chain = |ix: &usize| robot.positions.get(*ix).copied();
+        let Some(position) = self
+            .joint_ixs
+            .iter()
+            .map(of_chain)
+            .collect::<Option<Vec<_>>>()
+        else {
+            return;
+        };
+        // Readings that are not later than the last one are counted by the history.
+        let _ = self.state.lock().postures.push(JointState {
+            stamp: robot.stamp,
+            position,
+            velocity: Vec::new(),
+            effort: Vec::new(),
+        });
+    }
+
+    /// Takes a keyframe. If most of its pixels have no depth, it waits for that of the model.
+    pub(super) fn observe_keyframe(&self, keyframe: &Keyframe) {
+        let Ok(joints) = self.state.lock().postures.at(keyframe.stamp) else {
+            log::debug!("steering: no posture at the time of a keyframe");
+            return;
+        };
+        let posture = self.posture(keyframe.stamp, joints.position);
+        if keyframe.lacks_dense_depth() {
+            self.undrawn.push(keyframe, posture.clone(), Instant::now());
+        }
+        let Some(depth) = &keyframe.depth else {
+            return;
+        };
+        self.observe_depth(DepthImage {
+            camera: Arc::clone(&keyframe.camera),
+            stamp: keyframe.stamp,
+            size_px: depth.size_px,
+            focal_px: depth.focal_px,
+            principal_px: depth.principal_px,
+            depth_m: Arc::clone(&depth.depth_m),
+            world_from_camera: depth.world_from_camera,
+            posture,
+            origin: DepthOrigin::Measured,
+        });
+    }
+
+    /// Keyframes whose depth is to be drawn.
+    pub(super) fn undrawn(&self) -> &UndrawnKeyframes {
+        &self.undrawn
+    }
+
+    /// Takes a depth image.
+    pub(super) fn observe_depth(&self, image: DepthImage) {
+        if let Err(error) = self.map.push(image) {
+            log::debug!("steering: {error}");
+        }
+    }
+
+    fn posture(&self, stamp: Stamp, position: Vec<f64>) -> Posture {
+        Posture {
+            stamp,
+            position,
+            world_from_base: self.world_from_base,
+        }
+    }
+}
+
+impl State {
+    /// Whether a posture at a time shows free space. It is noted as such.
+    fn is_swept(&mut self, at: Stamp) -> bool {
+        let is_due = self
+            .swept_at
+            .is_none_or(|last| at.secs_since(last) >= SWEEP_PERIOD_SECS);
+        let is_swept = self.is_sweeping && is_due;
+        if is_swept {
+            self.swept_at = Some(at);
+        }
+        is_swept
+    }
+}
+
+impl Clearance for SceneClearance {
+    fn readings(&self, points_in_base: &[[f64; 3]], now: Stamp) -> Vec<Option<Seen>> {
+        self.map.readings(points_in_base, now)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::steering::robot::chain_and_body;
+    use keyframe::{DepthMap, Split};
+    use kinematics::Transform;
+    use std::path::Path;
+
+    const START: [f64; 7] = [0.0, -0.5, 0.0, -2.2, 0.0, 1.8, 0.8];
+    const AT: Stamp = Stamp(1_000_000_000);
+    /// Maximum time until the map has integrated something, on a busy machine.
+    const TIMEOUT: Duration = Duration::from_secs(60);
+
+    fn simulated() -> (SceneClearance, ChainAndBody) {
+        let file = Path::new(env!("CARGO_MANIFEST_DIR")).join("../rigs/static-arm.toml");
+        let rig = Rig::load(&file, &[]).expect("a rig of this repository");
+        let robot = chain_and_body(&rig, Path::new("")).expect("its shapes are in the URDF");
+        let scene = SceneClearance::new(&rig, &robot).expect("a map of its reach");
+        (scene, robot)
+    }
+
+    fn reading_at(stamp: Stamp) -> RobotState {
+        RobotState {
+            stamp,
+            captured_at: Instant::now(),
+            world_from_base: Transform::identity(),
+            positions: START.to_vec(),
+        }
+    }
+
+    fn is_known(scene: &SceneClearance, point: [f64; 3]) -> bool {
+        scene.readings(&[point], AT.plus_secs(1.0))[0].is_some()
+    }
+
+    fn wait_until_known(scene: &SceneClearance, point: [f64; 3]) {
+        let began = Instant::now();
+        while !is_known(scene, point) {
+            assert!(began.elapsed() < TIMEOUT, "{point:?} is still unknown");
+            std::thread::sleep(Duration::from_millis(5));
+        }
+    }
+
+    /// The state of an arm that moves.
+    fn arm_at(stamp: Stamp) -> ArmState {
+        ArmState {
+            reported_at: stamp,
+            position: START.to_vec(),
+            is_at_rest: false,
+            braked_motion: 0,
+            stopped: None,
+        }
+    }
+
+    #[test]
+    fn the_way_of_the_arm_is_free_until_an_operator_has_it() {
+        let (scene, robot) = simulated();
+        let tip = robot
+            .chain
+            .forward(&START)
+            .expect("seven joints")
+            .translation;
+        let beside_tip = [tip.x, tip.y + 0.1, tip.z];
+        assert!(!is_known(&scene, beside_tip));
+        scene.set_posture(&arm_at(AT));
+        wait_until_known(&scene, beside_tip);
+        assert!(
+            !is_known(&scene, [tip.x, tip.y + 0.5, tip.z]),
+            "it was not there"
+        );
+        scene.end_sweep();
+        scene.set_posture(&arm_at(Stamp(2 * AT.0)));
+        assert_eq!(
+            scene.state.lock().swept_at,
+            Some(AT),
+            "it moves by itself no more"
+        );
+    }
+
+    #[test]
+    fn keyframes_with_depth_show_free_space_in_front_of_their_surfaces() {
+        const SIZE_PX: [u32; 2] = [64, 48];
+        let (scene, _) = simulated();
+        scene.end_sweep();
+        // Before and after the keyframe, so that its posture is known.
+        for nanos in [0, 20_000_000] {
+            scene.observe_robot(&reading_at(Stamp(AT.0 + nanos)));
+        }
+        // The camera stands beside the arm, looks along x, and sees a wall at a distance of 1 m.
+        let looks_along_x = nalgebra::UnitQuaternion::face_towards(
+            &nalgebra::Vector3::x(),
+            &-nalgebra::Vector3::z(),
+        );
+        let world_from_camera =
+            Transform::from_parts(nalgebra::Translation3::new(-0.3, 0.5, 0.5), looks_along_x);
+        let n_px = (SIZE_PX[0] * SIZE_PX[1]) as usize;
+        let keyframe = Keyframe {
+            camera: "front".into(),
+            stamp: Stamp(AT.0 + 10_000_000),
+            size_px: SIZE_PX,
+            focal_px: [60.0; 2],
+            principal_px: [32.0, 24.0],
+            rgba_srgb: vec![255; 4 * n_px].into(),
+            depth: Some(DepthMap {
+                size_px: SIZE_PX,
+                focal_px: [60.0; 2],
+                principal_px: [32.0, 24.0],
+                depth_m: vec![1.0; n_px].into(),
+                world_from_camera,
+            }),
+            world_from_camera,
+            twist: None,
+            readout_secs: 0.0,
+            joint_twists: Arc::default(),
+            base: None,
+            split: Split::Train,
+            truth: None,
+        };
+        scene.observe_keyframe(&keyframe);
+        wait_until_known(&scene, [0.2, 0.5, 0.5]);
+        assert!(!is_known(&scene, [0.9, 0.5, 0.5]), "behind the wall");
+    }
+}

@@ -1,0 +1,353 @@
+//! One cycle of the steering loop: takes the requests of clients, decides what the arm does, and
+//! says what clients should know. It has no thread and no clock, so that tests can set the time.
+
+use super::joint_map::JointMap;
+use super::previews::{Now, Previews};
+use super::recovery::Recovery;
+use super::requests;
+use super::time_base::TimeBase;
+use drivers::motion::{ArmState, Output, SteeringPort};
+use kinematics::inverse::InverseSolver;
+use kinematics::{Chain, Stamp, transform};
+use std::collections::VecDeque;
+use std::time::Instant;
+use steering::{
+    Body, Clearance, NearestPosture, Operator, Request, Robot, Steering, SteeringConfig, Verdict,
+};
+use viz::{
+    AppliedCommand, Preview, PreviewRequest, ReceivedRequest, RefusedRequest, SteeringCommand,
+    SteeringRequest, SteeringState,
+};
+
+/// Maximum number of goals that wait to be checked. The server keeps one per client.
+const MAX_PREVIEWS: usize = 32;
+
+/// What the loop needs to know about the arm.
+pub(super) struct SteeredRobot {
+    /// The chain from the base to the tip that operators move.
+    pub(super) chain: Chain,
+    /// The shape of the robot.
+    pub(super) body: Body,
+    /// Between the driver and the chain.
+    pub(super) joints: JointMap,
+    /// The arm.
+    pub(super) port: SteeringPort,
+}
+
+/// The state of the loop between two cycles.
+pub(super) struct SteeringLoop {
+    steering: Steering,
+    chain: Chain,
+    joints: JointMap,
+    port: SteeringPort,
+    previews: Previews,
+    waiting_previews: VecDeque<(u64, PreviewRequest)>,
+    recovery: Recovery,
+    times: TimeBase,
+    /// Whether an operator has had the lease. Nothing is sent to the arm before.
+    has_begun: bool,
+    /// The newest command that moves the arm, until a cycle has applied it.
+    pending: Option<AppliedSource>,
+    applied: Option<AppliedCommand>,
+}
+
+/// Where a setpoint comes from.
+#[derive(Clone, Copy, Debug)]
+struct AppliedSource {
+    device: u64,
+    sequence: u64,
+    captured_at: Instant,
+}
+
+/// Results of a cycle.
+#[derive(Debug, Default)]
+pub(super) struct Outcome {
+    /// Replies to clients.
+    pub(super) replies: Vec<(u64, Reply)>,
+    /// Whether an operator has the lease for the first time, and thus the arm.
+    pub(super) begins: bool,
+    /// The state for clients; `None` if the arm's report has no pose.
+    pub(super) state: Option<SteeringState>,
+}
+
+/// A reply to a client.
+#[derive(Clone, Debug, PartialEq)]
+pub(super) enum Reply {
+    /// Why a request was refused.
+    Refused(RefusedRequest, String),
+    /// Whether the goal of this number can be reached.
+    Preview(u64, Preview),
+}
+
+impl SteeringLoop {
+    /// * `first`: the first state that the arm reported, in the order of the driver.
+    ///
+    /// # Errors
+    ///
+    /// If the limits of the arm and the configuration do not match the robot.
+    pub(super) fn new(
+        config: SteeringConfig,
+        robot: SteeredRobot,
+        times: TimeBase,
+        first: &ArmState,
+    ) -> anyhow::Result<Self> {
+        let SteeredRobot {
+            chain,
+            body,
+            joints,
+            port,
+        } = robot;
+        let limits = joints.limits_in_chain(port.limits());
+        let margin = config.limits.joint_margin;
+        let ranges = limits
+            .iter()
+            .map(|joint| [joint.position[0] + margin, joint.position[1] - margin]);
+        let solver = InverseSolver::within(chain.clone(), ranges.collect())?;
+        // Nothing touches where the arm is now.
+        let free_posture = joints.in_chain(&first.position);
+        let steering = Steering::new(
+            config,
+            Robot {
+                inverse: Box::new(NearestPosture::new(chain.clone())),
+                chain: chain.clone(),
+                body,
+                joints: &limits,
+                free_posture: Some(&free_posture),
+            },
+        )?;
+        for note in steering.self_collision().notes() {
+            log::warn!("steering: {note}");
+        }
+        Ok(Self {
+            steering,
+            previews: Previews::new(solver),
+            waiting_previews: VecDeque::new(),
+            recovery: Recovery::new(port.clone()),
+            chain,
+            joints,
+            port,
+            times,
+            has_begun: false,
+            pending: None,
+            applied: None,
+        })
+    }
+
+    /// The newest state of the arm, in the order of the chain; `None` before the arm has reported one.
+    pub(super) fn arm(&self) -> Option<ArmState> {
+        Some(self.joints.state_in_chain(self.port.state()?))
+    }
+
+    /// Takes the requests, and decides what the arm does.
+    ///
+    /// * `arm`: the newest state of the arm, in the order of the chain.
+    /// * `scene`: what is known about the scene.
+    pub(super) fn cycle(
+        &mut self,
+        now: Stamp,
+        received: &[ReceivedRequest],
+        arm: &ArmState,
+        scene: &dyn Clearance,
+    ) -> Outcome {
+        let mut outcome = Outcome::default();
+        for request in received {
+            self.take(now, request, arm, &mut outcome);
+        }
+        self.finish_recovery(now, arm, &mut outcome);
+        let verdict = self.steering.cycle(now, arm, scene);
+        if self.has_begun {
+            let output = verdict.output.clone();
+            self.port.send(&self.joints.output_for_driver(output));
+        }
+        self.note_applied(now, &verdict);
+        self.answer_preview(now, arm, scene, &mut outcome);
+        outcome.state = self.state(now, arm, &verdict);
+        outcome
+    }
+
+    /// Brakes, because the loop ends.
+    pub(super) fn finish(&self) {
+        if self.has_begun {
+            self.port.send(&Output::Brake);
+        }
+    }
+
+    fn take(
+        &mut self,
+        now: Stamp,
+        received: &ReceivedRequest,
+        arm: &ArmState,
+        outcome: &mut Outcome,
+    ) {
+        let client = received.client;
+        if let Err(reason) = self.decide(now, received, arm, outcome)
+            && let Some(kind) = requests::kind(&received.request)
+        {
+            let refused = Reply::Refused(kind, reason);
+            outcome.replies.push((client, refused));
+        }
+    }
+
+    fn decide(
+        &mut self,
+        now: Stamp,
+        received: &ReceivedRequest,
+        arm: &ArmState,
+        outcome: &mut Outcome,
+    ) -> Result<(), String> {
+        let operator = Operator(received.client);
+        let request = match &received.request {
+            SteeringRequest::TakeLease => return self.take_lease(now, operator, outcome),
+            SteeringRequest::RenewLease => Request::RenewLease(operator),
+            SteeringRequest::ReleaseLease => Request::ReleaseLease(operator),
+            SteeringRequest::OfferLease { to } => Request::OfferLease {
+                from: operator,
+                to: Operator(*to),
+            },
+            SteeringRequest::Stop => Request::Stop { by: Some(operator) },
+            SteeringRequest::Rearm => return self.rearm(now, operator, arm),
+            SteeringRequest::Command(command) => return self.command(now, operator, command),
+            SteeringRequest::Preview(request) => {
+                return self.queue_preview(received.client, request);
+            }
+            // Whoever has gone cannot open a dead-man switch any more.
+            SteeringRequest::Disconnected if self.holds_lease(operator) => {
+                Request::ReleaseLease(operator)
+            }
+            SteeringRequest::Disconnected => return Ok(()),
+        };
+        self.handle(now, &request)
+    }
+
+    fn handle(&mut self, now: Stamp, request: &Request) -> Result<(), String> {
+        let handled = self.steering.handle(now, request);
+        handled.map_err(|reason| reason.to_string())
+    }
+
+    fn holds_lease(&self, operator: Operator) -> bool {
+        self.steering
+            .holder()
+            .is_some_and(|(holder, _)| holder == operator)
+    }
+
+    fn take_lease(
+        &mut self,
+        now: Stamp,
+        operator: Operator,
+        outcome: &mut Outcome,
+    ) -> Result<(), String> {
+        self.handle(now, &Request::TakeLease(operator))?;
+        outcome.begins |= !self.has_begun;
+        self.has_begun = true;
+        Ok(())
+    }
+
+    fn command(
+        &mut self,
+        now: Stamp,
+        operator: Operator,
+        command: &SteeringCommand,
+    ) -> Result<(), String> {
+        let n_joints = self.chain.n_joints();
+        let converted = requests::command(operator.0, command, self.times, n_joints);
+        self.handle(now, &Request::Command(converted))?;
+        if command.grip.is_some() {
+            self.pending = Some(AppliedSource {
+                device: command.device,
+                sequence: command.sequence,
+                captured_at: command.captured_at,
+            });
+        }
+        Ok(())
+    }
+
+    /// Permits motion after a stop. An arm that has stopped by itself is enabled first, which takes
+    /// a while.
+    fn rearm(&mut self, now: Stamp, operator: Operator, arm: &ArmState) -> Result<(), String> {
+        if arm.stopped.is_some() && self.holds_lease(operator) {
+            return self.recovery.start(operator);
+        }
+        self.handle(now, &Request::Rearm(operator))
+    }
+
+    fn finish_recovery(&mut self, now: Stamp, arm: &ArmState, outcome: &mut Outcome) {
+        let Some((operator, recovered)) = self.recovery.take_result(now, arm) else {
+            return;
+        };
+        // The arm's stop was noted in each cycle, also during its recovery.
+        let permitted = recovered.and_then(|()| self.handle(now, &Request::Rearm(operator)));
+        if let Err(reason) = permitted {
+            let refused = Reply::Refused(RefusedRequest::Rearm, reason);
+            outcome.replies.push((operator.0, refused));
+        }
+    }
+
+    fn queue_preview(&mut self, client: u64, request: &PreviewRequest) -> Result<(), String> {
+        if self.waiting_previews.len() >= MAX_PREVIEWS {
+            return Err("too many goals wait to be checked: ask again".to_owned());
+        }
+        self.waiting_previews.push_back((client, request.clone()));
+        Ok(())
+    }
+
+    /// Answers at most one preview, because a goal out of reach takes a part of the cycle.
+    fn answer_preview(
+        &mut self,
+        now: Stamp,
+        arm: &ArmState,
+        scene: &dyn Clearance,
+        outcome: &mut Outcome,
+    ) {
+        let Some((client, request)) = self.waiting_previews.pop_front() else {
+            return;
+        };
+        let compared = Now {
+            steering: &self.steering,
+            scene,
+            at: now,
+            position: &arm.position,
+        };
+        let preview = self.previews.answer(&request.goal, &compared);
+        outcome
+            .replies
+            .push((client, Reply::Preview(request.id, preview)));
+    }
+
+    /// Notes which command the arm follows.
+    fn note_applied(&mut self, now: Stamp, verdict: &Verdict) {
+        if verdict.target().is_none() {
+            self.pending = None;
+            self.applied = None;
+            return;
+        }
+        if let Some(source) = self.pending.take() {
+            self.applied = Some(AppliedCommand {
+                device: source.device,
+                sequence: source.sequence,
+                captured_at: source.captured_at,
+                applied_at: self.times.instant(now),
+            });
+        }
+    }
+
+    /// The state for clients; `None` if the arm's report has no pose.
+    fn state(&self, now: Stamp, arm: &ArmState, verdict: &Verdict) -> Option<SteeringState> {
+        let pose_at = |q: &[f64]| Some(transform::to_xyz_xyzw(&self.chain.forward(q).ok()?));
+        let target = verdict.target().map(|target| target.position.clone());
+        Some(SteeringState {
+            at: self.times.instant(arm.reported_at),
+            holder: self.steering.holder().map(|(holder, _)| holder.0),
+            lease_left_secs: self.steering.lease_left_secs(now),
+            offered_to: self.steering.offered_to(now).map(|operator| operator.0),
+            stop: self.steering.stop().map(ToString::to_string),
+            is_moving: !arm.is_at_rest,
+            base_from_tip: pose_at(&arm.position)?,
+            base_from_target: target.as_deref().and_then(pose_at),
+            position: arm.position.clone(),
+            target,
+            limits: verdict.limits.iter().map(requests::applied_limit).collect(),
+            applied: self.applied,
+            contacts: None,
+        })
+    }
+}

@@ -1,0 +1,314 @@
+//! A client of `/steer` moves the simulated arm of `fieldrig run`, and viewers see it.
+
+use crate::small_rig::{self, Pace};
+use serde_json::{Value, json};
+use std::io::{BufRead, BufReader, Read, Write};
+use std::net::TcpStream;
+use std::path::Path;
+use std::process::{Child, ChildStdout, Command, Stdio};
+use std::time::{Duration, Instant};
+use tungstenite::{Message, WebSocket};
+
+/// Maximum time until an event, on a machine that is busy with other tests.
+const TIMEOUT: Duration = Duration::from_secs(300);
+/// Time between two commands of the client: those of a page with 40 pictures per second.
+const COMMAND_PERIOD: Duration = Duration::from_millis(25);
+/// How far the tip moves, meters.
+const DISTANCE_M: f64 = 0.1;
+/// How far a joint may be from its goal when the arm has arrived, radians. The simulated arm follows
+/// its setpoints with a controller.
+const ARRIVED_RAD: f64 = 0.01;
+
+/// A run, which is killed if the test fails.
+struct Run {
+    child: Child,
+    address: String,
+    /// Kept, so that the run can print until its end.
+    _stdout: BufReader<ChildStdout>,
+}
+
+impl Drop for Run {
+    fn drop(&mut self) {
+        let _ = self.child.kill(); // Fails if the process has already ended.
+        let _ = self.child.wait();
+    }
+}
+
+impl Run {
+    fn start(folder: &Path, flags: &[&str]) -> Self {
+        let mut child = Command::new(env!("CARGO_BIN_EXE_fieldrig"))
+            .args([
+                "run",
+                "rig.toml",
+                "--sim",
+                "--listen",
+                "127.0.0.1:0",
+                "--json",
+            ])
+            .args(["--when-done", "exit", "--out", "out"])
+            .args(flags)
+            .current_dir(folder)
+            .stdout(Stdio::piped())
+            .spawn()
+            .expect("it is built");
+        let mut stdout = BufReader::new(child.stdout.take().expect("piped"));
+        let mut line = String::new();
+        stdout.read_line(&mut line).expect("text");
+        let serving: Value = serde_json::from_str(&line).expect("an event");
+        let url = serving["url"].as_str().expect("a URL");
+        let address = url.strip_prefix("http://").expect("a local page");
+        Self {
+            child,
+            address: address.trim_end_matches('/').to_owned(),
+            _stdout: stdout,
+        }
+    }
+
+    /// Connects to a WebSocket; `None` if the server refuses.
+    fn connect(&self, path: &str) -> Option<WebSocket<TcpStream>> {
+        let stream = TcpStream::connect(&self.address).expect("the server listens");
+        stream.set_read_timeout(Some(TIMEOUT)).expect("a timeout");
+        let url = format!("ws://{}{path}", self.address);
+        tungstenite::client(url, stream)
+            .ok()
+            .map(|(socket, _)| socket)
+    }
+
+    /// The head and the text with which the server refuses a WebSocket.
+    fn refusal(&self, path: &str) -> String {
+        let mut stream = TcpStream::connect(&self.address).expect("the server listens");
+        stream.set_read_timeout(Some(TIMEOUT)).expect("a timeout");
+        let request = format!(
+            "GET {path} HTTP/1.1\r\nHost: {}\r\nConnection: close, Upgrade\r\nUpgrade: websocket\r\n\
+             Sec-WebSocket-Version: 13\r\nSec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\n\r\n",
+            self.address
+        );
+        stream.write_all(request.as_bytes()).expect("sent");
+        let mut reply = String::new();
+        stream.read_to_string(&mut reply).expect("text");
+        reply
+    }
+
+    fn interrupt(mut self) {
+        let pid = rustix::process::Pid::from_child(&self.child);
+        rustix::process::kill_process(pid, rustix::process::Signal::INT).expect("it runs");
+        assert!(self.child.wait().expect("our own child").success());
+    }
+}
+
+/// A page that steers.
+struct Operator {
+    socket: WebSocket<TcpStream>,
+    client: u64,
+    sequence: u64,
+    grip: u64,
+    /// The newest state, and when it came.
+    state: Value,
+    state_at: Instant,
+}
+
+impl Operator {
+    /// Connects as soon as the arm is open.
+    fn connect(run: &Run) -> Self {
+        let began = Instant::now();
+        let socket = loop {
+            if let Some(socket) = run.connect("/steer") {
+                break socket;
+            }
+            assert!(
+                began.elapsed() < TIMEOUT,
+                "the arm is not open within {TIMEOUT:?}"
+            );
+            std::thread::sleep(Duration::from_millis(100));
+        };
+        let mut operator = Self {
+            socket,
+            client: 0,
+            sequence: 0,
+            grip: 1,
+            state: Value::Null,
+            state_at: Instant::now(),
+        };
+        let arm = operator.read_until(|message| message["type"] == "arm");
+        assert_eq!(arm["may_steer"], true, "{arm}");
+        assert_eq!(arm["joints"].as_array().map(Vec::len), Some(7), "{arm}");
+        operator.client = arm["client"].as_u64().expect("a number");
+        operator
+    }
+
+    fn send(&mut self, message: Value) {
+        let message = Message::text(message.to_string());
+        self.socket.send(message).expect("the server reads");
+    }
+
+    /// Reads messages until one is accepted.
+    fn read_until(&mut self, accepts: impl Fn(&Value) -> bool) -> Value {
+        let began = Instant::now();
+        loop {
+            assert!(began.elapsed() < TIMEOUT, "last state: {}", self.state);
+            let Message::Text(text) = self.socket.read().expect("the server sends") else {
+                continue;
+            };
+            let message: Value = serde_json::from_str(&text).expect("JSON");
+            if message["type"] == "state" {
+                self.state = message.clone();
+                self.state_at = Instant::now();
+            }
+            if accepts(&message) {
+                return message;
+            }
+        }
+    }
+
+    fn next_state(&mut self) -> Value {
+        self.read_until(|message| message["type"] == "state")
+    }
+
+    /// Sends a command, whose device was read now.
+    fn command(&mut self, grip: Option<u64>, position: &[f64]) {
+        self.sequence += 1;
+        let state_micros = self.state["time_micros"].as_f64().expect("a number");
+        let since = self.state_at.elapsed().as_secs_f64();
+        self.send(json!({
+            "type": "command",
+            "device": 1,
+            "sequence": self.sequence,
+            "captured_micros": state_micros + 1e6 * since,
+            "grip": grip,
+            "intent": {"kind": "joints", "position": position},
+        }));
+    }
+
+    /// Holds the switch until the arm is at a position. A pause of this program lets the arm brake,
+    /// so the operator grips again whenever the arm does not follow.
+    fn move_to(&mut self, position: &[f64]) {
+        let began = Instant::now();
+        let mut n_unfollowed = 0;
+        loop {
+            assert!(began.elapsed() < TIMEOUT, "last state: {}", self.state);
+            self.command(Some(self.grip), position);
+            let state = self.next_state();
+            if distance(&numbers(&state["position"]), position) < ARRIVED_RAD {
+                return;
+            }
+            n_unfollowed = if state["target"].is_null() {
+                n_unfollowed + 1
+            } else {
+                0
+            };
+            if n_unfollowed > 20 {
+                self.command(None, position);
+                self.grip += 1;
+                n_unfollowed = 0;
+            }
+            std::thread::sleep(COMMAND_PERIOD);
+        }
+    }
+}
+
+fn numbers(value: &Value) -> Vec<f64> {
+    let list = value
+        .as_array()
+        .unwrap_or_else(|| panic!("no list: {value}"));
+    list.iter()
+        .map(|number| number.as_f64().expect("a number"))
+        .collect()
+}
+
+/// Largest difference.
+fn distance(a: &[f64], b: &[f64]) -> f64 {
+    assert_eq!(a.len(), b.len());
+    a.iter()
+        .zip(b)
+        .fold(0.0, |most, (a, b)| f64::max(most, (a - b).abs()))
+}
+
+/// Distance between two positions of the tip, meters.
+fn tip_distance_m(a: &Value, b: &Value) -> f64 {
+    let [a, b] = [a, b].map(|state| numbers(&state["base_from_tip"]));
+    a[..3]
+        .iter()
+        .zip(&b[..3])
+        .map(|(a, b)| (a - b).powi(2))
+        .sum::<f64>()
+        .sqrt()
+}
+
+/// Joint positions that viewers of the page receive.
+fn watched_positions(socket: &mut WebSocket<TcpStream>) -> Vec<f64> {
+    loop {
+        let message: Value = match socket.read().expect("the server sends") {
+            Message::Text(text) => serde_json::from_str(&text).expect("JSON"),
+            _ => continue,
+        };
+        if message["type"] == "robot_state" {
+            return numbers(&message["positions"]);
+        }
+    }
+}
+
+#[test]
+fn an_operator_takes_the_simulated_arm_over_and_moves_its_tip_back_by_ten_centimeters() {
+    let folder = tempfile::tempdir().expect("a folder");
+    small_rig::write(folder.path(), Pace::RealTime);
+    let run = Run::start(folder.path(), &["--enable-motion"]);
+    let mut operator = Operator::connect(&run);
+    let mut viewer = run.connect("/ws").expect("the page is served");
+    for message in [
+        json!({"type": "hello", "protocols": [3, 4], "capabilities": ["subscribe", "robot"]}),
+        json!({"type": "subscribe", "topic": "robot_state", "rate_hz": 20}),
+    ] {
+        let message = Message::text(message.to_string());
+        viewer.send(message).expect("the server reads");
+    }
+
+    // The arm is on its tour. The space that it has passed is free, so the operator goes back.
+    let mut way = vec![operator.next_state()];
+    while tip_distance_m(&way[0], &operator.state) < 2.0 * DISTANCE_M {
+        way.push(operator.next_state());
+    }
+    let client = operator.client;
+    operator.send(json!({"type": "lease", "action": "take"}));
+    operator.read_until(|message| message["holder"] == client && message["is_moving"] == false);
+    let start = operator.state.clone();
+
+    // A device is first heard with an open switch.
+    let rest = numbers(&start["position"]);
+    operator.command(None, &rest);
+    let mut goal = start.clone();
+    while tip_distance_m(&start, &goal) < DISTANCE_M {
+        goal = way.pop().expect("the way is longer");
+        operator.move_to(&numbers(&goal["position"]));
+    }
+    operator.command(None, &rest);
+    let left = operator.read_until(|message| {
+        message["type"] == "state" && message["is_moving"] == false && message["target"].is_null()
+    });
+    assert!(tip_distance_m(&start, &left) > 0.9 * DISTANCE_M, "{left}");
+    assert_eq!(left["contacts"], 0, "{left}");
+
+    // Viewers see the arm where the operator left it, and it stays there.
+    let left = numbers(&left["position"]);
+    let began = Instant::now();
+    while distance(&watched_positions(&mut viewer), &left) > ARRIVED_RAD {
+        assert!(began.elapsed() < TIMEOUT, "viewers do not see {left:?}");
+    }
+    for _ in 0..20 {
+        let watched = watched_positions(&mut viewer);
+        assert!(
+            distance(&watched, &left) < ARRIVED_RAD,
+            "{watched:?}, not {left:?}"
+        );
+    }
+    run.interrupt();
+}
+
+#[test]
+fn a_run_without_the_flag_refuses_operators_with_a_sentence() {
+    let folder = tempfile::tempdir().expect("a folder");
+    small_rig::write(folder.path(), Pace::RealTime);
+    let run = Run::start(folder.path(), &["--seconds", "5"]);
+    let refusal = run.refusal("/steer");
+    assert!(refusal.starts_with("HTTP/1.1 404"), "{refusal}");
+    assert!(refusal.contains("no arm can be steered"), "{refusal}");
+}
