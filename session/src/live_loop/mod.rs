@@ -1,5 +1,6 @@
 //! The loop of a live run: takes keyframes, trains models, and draws pictures for viewers.
 
+mod clearance;
 mod growing_scene;
 mod keyframe_warning;
 mod keyframes;
@@ -14,6 +15,7 @@ use crate::recoveries::{self, OpenGpu, Recoveries};
 use crate::render_budget::RenderBudget;
 use crate::run_state::RunState;
 use crate::session::{EndViewers, Session};
+use crate::steering::ClearanceFeed;
 use background::Task;
 use capture::{Feed, InputResult, Notes};
 use growing_scene::GrowingScene;
@@ -70,6 +72,8 @@ pub struct LiveLoop {
     /// Times of the keyframes.
     ledger: Ledger,
     keyframe_change: Option<KeyframeChange>,
+    /// Receives drawn depth, if an arm is steered.
+    clearance: Option<ClearanceFeed>,
     requests: Requests,
     publishing: Publishing,
     keyframe_warning: KeyframeWarning,
@@ -104,6 +108,7 @@ impl LiveLoop {
             recoveries: Recoveries::new(options.open_gpu),
             ledger: Ledger::default(),
             keyframe_change: None,
+            clearance: None,
             requests: Requests::default(),
             keyframe_warning: KeyframeWarning::start(),
             earlier_rejected: options.earlier_rejected,
@@ -191,6 +196,7 @@ impl LiveLoop {
             .take_keyframes()
             .and_then(|()| self.step())
             .and_then(|()| self.render())
+            .and_then(|()| self.draw_clearance())
             .map(|()| self.publish_models())
             .and_then(|()| self.publish());
         advanced.or_else(|error| self.recover(error))

@@ -170,6 +170,7 @@ impl OpenedRun<'_> {
             .transpose()?;
         let identity = identity(&plan, &folders, robot);
         let stop = services.stop.clone();
+        let clearance = steering.as_ref().map(PreparedSteering::clearance_feed);
         let feed = Feed::start(input, observer(&hub, steering.as_ref()), stop.clone())?;
         let steering = steering.map(|steering| steering.start(&hub)).transpose()?;
         let setup = SessionSetup {
@@ -215,8 +216,12 @@ impl OpenedRun<'_> {
         let held = sessions
             .first()
             .map_or(Vec::new(), |session| session.keyframes().to_vec());
+        let mut live = LiveLoop::new(sessions, feed, hub, options).resume_from(held);
+        if let Some(clearance) = clearance {
+            live.draw_clearance_for(clearance);
+        }
         Ok(RunInProgress {
-            live: LiveLoop::new(sessions, feed, hub, options).resume_from(held),
+            live,
             gpu,
             plan,
             stop,

@@ -3,7 +3,10 @@
 use super::persistence::Persistence;
 use crate::chunk_publisher::ChunkPublisher;
 use crate::editing::{self, Editor};
+use crate::evaluate;
 use gpu::Gpu;
+use keyframe::Keyframe;
+use kinematics::Transform;
 use model_files::Edits;
 use std::sync::Arc;
 use std::time::Duration;
@@ -47,6 +50,18 @@ impl ViewedModel<'_> {
     pub(crate) fn render(&mut self, request: &RenderRequest) -> Result<Picture, trainer::Error> {
         self.persistence.log_render();
         self.method.model_mut().render(request)
+    }
+
+    /// Draws color and depth at the pose of a keyframe. Also returns this pose, with the corrections
+    /// that the model has found.
+    pub(crate) fn draw_keyframe(
+        &mut self,
+        keyframe: &Keyframe,
+    ) -> Result<(Picture, Transform), trainer::Error> {
+        self.persistence.log_render();
+        let world_from_camera = self.method.calibrated_camera(keyframe)?.world_from_camera;
+        let picture = evaluate::draw(self.method, keyframe, true)?;
+        Ok((picture, world_from_camera))
     }
 
     /// Labels a requested picture with this model, which draws it.

@@ -5,6 +5,7 @@
 //! which brakes as soon as targets expire. The thread needs neither the trainer nor the GPU, so
 //! both may be busy for any time. `steering_loop.rs` has one cycle, and the other files its parts.
 
+mod clearance_feed;
 mod joint_map;
 mod mesh_vertices;
 mod observer;
@@ -17,7 +18,9 @@ mod steering_loop;
 #[cfg(test)]
 mod steering_loop_tests;
 mod time_base;
+mod undrawn;
 
+pub(crate) use clearance_feed::{ClearanceFeed, MIN_STEPS};
 pub(crate) use observer::SteeringObserver;
 
 use crate::viewers::Viewers;
@@ -82,6 +85,11 @@ impl PreparedSteering {
     /// passes everything on to viewers.
     pub(crate) fn observer(&self, viewers: Viewers) -> SteeringObserver {
         SteeringObserver::new(viewers, Arc::clone(&self.scene))
+    }
+
+    /// Passes depth that the live model draws to the map of free space.
+    pub(crate) fn clearance_feed(&self) -> ClearanceFeed {
+        ClearanceFeed::new(Arc::clone(&self.scene))
     }
 
     /// Lets clients of the hub steer the arm.

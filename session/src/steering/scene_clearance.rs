@@ -1,10 +1,12 @@
 //! What is known about the space around the arm of a run: the map of free space, and what feeds it.
 //!
-//! Keyframes with measured depth show what is free and what is not. Before the first operator, the
+//! Keyframes with measured depth show what is free and what is not; for the others, the live model
+//! draws depth (`clearance_feed.rs`). Before the first operator, the
 //! space through which the arm itself moves is free, too, with the margin that the rig file permits:
 //! a person guides it, or a simulated arm is on its tour.
 
 use super::robot::ChainAndBody;
+use super::undrawn::UndrawnKeyframes;
 use capture::config::Rig;
 use capture::open;
 use clearance_map::{ClearanceMap, DepthImage, DepthOrigin, MapConfig, Posture, reach_m};
@@ -13,7 +15,7 @@ use keyframe::{Keyframe, RobotState};
 use kinematics::{JointHistory, JointState, Stamp, Transform};
 use parking_lot::Mutex;
 use std::sync::Arc;
-use std::time::Duration;
+use std::time::{Duration, Instant};
 use steering::{Clearance, Seen};
 
 /// Postures are not interpolated across longer gaps.
@@ -33,6 +35,7 @@ pub(super) struct SceneClearance {
     world_from_base: Transform,
     swept_margin_m: f64,
     state: Mutex<State>,
+    undrawn: UndrawnKeyframes,
 }
 
 struct State {
@@ -68,6 +71,7 @@ impl SceneClearance {
                 is_sweeping: true,
                 swept_at: None,
             }),
+            undrawn: UndrawnKeyframes::default(),
         })
     }
 
@@ -114,16 +118,20 @@ impl SceneClearance {
         });
     }
 
-    /// Takes a keyframe. Without depth, it shows no free space.
+    /// Takes a keyframe. If most of its pixels have no depth, it waits for that of the model.
     pub(super) fn observe_keyframe(&self, keyframe: &Keyframe) {
-        let Some(depth) = &keyframe.depth else {
-            return;
-        };
         let Ok(joints) = self.state.lock().postures.at(keyframe.stamp) else {
             log::debug!("steering: no posture at the time of a keyframe");
             return;
         };
-        let image = DepthImage {
+        let posture = self.posture(keyframe.stamp, joints.position);
+        if keyframe.lacks_dense_depth() {
+            self.undrawn.push(keyframe, posture.clone(), Instant::now());
+        }
+        let Some(depth) = &keyframe.depth else {
+            return;
+        };
+        self.observe_depth(DepthImage {
             camera: Arc::clone(&keyframe.camera),
             stamp: keyframe.stamp,
             size_px: depth.size_px,
@@ -131,9 +139,18 @@ impl SceneClearance {
             principal_px: depth.principal_px,
             depth_m: Arc::clone(&depth.depth_m),
             world_from_camera: depth.world_from_camera,
-            posture: self.posture(keyframe.stamp, joints.position),
+            posture,
             origin: DepthOrigin::Measured,
-        };
+        });
+    }
+
+    /// Keyframes whose depth is to be drawn.
+    pub(super) fn undrawn(&self) -> &UndrawnKeyframes {
+        &self.undrawn
+    }
+
+    /// Takes a depth image.
+    pub(super) fn observe_depth(&self, image: DepthImage) {
         if let Err(error) = self.map.push(image) {
             log::debug!("steering: {error}");
         }
@@ -175,7 +192,6 @@ mod tests {
     use keyframe::{DepthMap, Split};
     use kinematics::Transform;
     use std::path::Path;
-    use std::time::Instant;
 
     const START: [f64; 7] = [0.0, -0.5, 0.0, -2.2, 0.0, 1.8, 0.8];
     const AT: Stamp = Stamp(1_000_000_000);

@@ -76,11 +76,7 @@ impl MapConfig {
     fn in_blocks(&self, length_m: f64) -> usize {
         let n = (length_m / (BLOCK_VOXELS as f64 * self.voxel_m)).ceil();
         // The range was checked; a float to integer cast saturates.
-        #[expect(
-            clippy::cast_possible_truncation,
-            clippy::cast_sign_loss,
-            reason = "checked"
-        )]
+        #[expect(clippy::cast_possible_truncation, reason = "checked")]
         let n = n as usize;
         n
     }
@@ -153,9 +149,8 @@ pub fn reach_m(body: &Body, chain: &Chain) -> f64 {
     let mut best_m = farthest_m(body, &q);
     // Each round changes one joint after the other. The distance never becomes smaller.
     for _ in 0..4 {
-        for joint_ix in 0..q.len() {
+        for (joint_ix, [low, high]) in ranges.iter().enumerate() {
             for step in 0..=REACH_STEPS {
-                let [low, high] = ranges[joint_ix];
                 let frac = f64::from(step) / f64::from(REACH_STEPS);
                 let before = std::mem::replace(&mut q[joint_ix], low + (high - low) * frac);
                 let distance_m = farthest_m(body, &q);

@@ -93,7 +93,6 @@ impl Grid {
 /// Index of a voxel or a pixel: a number that is not negative, rounded down.
 #[expect(
     clippy::cast_possible_truncation,
-    clippy::cast_sign_loss,
     reason = "callers check the range; outside, the cast saturates"
 )]
 pub(crate) fn floor(x: f32) -> usize {

@@ -53,6 +53,8 @@ mod map;
 mod query;
 mod snapshot;
 mod surfaces;
+#[cfg(test)]
+mod tests;
 mod view;
 mod voxel_map;
 

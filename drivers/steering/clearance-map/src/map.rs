@@ -34,7 +34,7 @@ pub struct MapState {
     pub n_integrated: u64,
     /// Images that were replaced by newer ones before they were integrated.
     pub n_replaced: u64,
-    /// Images that were older than everything in the map, or whose camera was outside of any range.
+    /// Images that were too old, or showed nothing of the region.
     pub n_unused: u64,
     /// Stamp of the newest integrated image.
     pub newest: Option<Stamp>,
@@ -104,7 +104,7 @@ impl ClearanceMap {
         })
     }
 
-    /// Queues an image. It replaces an older waiting image of the same camera.
+    /// Queues an image. It replaces an older waiting image of the same camera and origin.
     ///
     /// # Errors
     /// If the image or its posture is invalid. The map is unchanged.
@@ -114,7 +114,7 @@ impl ClearanceMap {
         let same = inbox
             .images
             .iter()
-            .position(|waiting| waiting.camera == image.camera);
+            .position(|waiting| waiting.camera == image.camera && waiting.origin == image.origin);
         if let Some(ix) = same {
             inbox.images.remove(ix);
             inbox.n_replaced += 1;

@@ -127,8 +127,7 @@ impl Query {
             .around(point)
             .map_or(0.0, |around| self.distance(&around));
         let distance = in_map.max(in_robot).min(self.max_distance);
-        // Also false if the point is not finite.
-        if !(distance > 0.0) {
+        if distance <= 0.0 {
             return None;
         }
         let oldest = self.oldest(point, distance);

@@ -7,6 +7,11 @@ use nalgebra::{Matrix3, Vector2, Vector3};
 /// Cubes closer to the plane of the camera than this are too distorted to be judged, meters.
 const MIN_DEPTH_M: f32 = 0.01;
 
+/// Pixels around a cube that must also show that it is free. A part of a surface that reaches into
+/// the cube by less than the distance of two pixels may be between them, and a pixel may be without
+/// a reading.
+const PADDING_PX: f32 = 2.0;
+
 /// A pinhole camera in the grid.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct View {
@@ -96,32 +101,31 @@ impl View {
         if near_m < MIN_DEPTH_M {
             return Visible::Partly;
         }
-        let mut low_px = [0.0; 2];
-        let mut high_px = [0.0; 2];
-        let mut is_whole = true;
-        for axis in 0..2 {
-            let slope = in_camera[axis] / in_camera.z;
-            // For a point of the cube at `x + dx, z + dz`, the slope differs from `x / z` by
-            // `(dx - x / z * dz) / (z + dz)`.
-            let half_px = self.focal_px[axis] * (half[axis] + slope.abs() * half.z) / near_m;
-            let center_px = self.focal_px[axis] * slope + self.principal_px[axis];
-            let size_px = self.size_px[axis] as f32;
-            low_px[axis] = center_px - half_px;
-            high_px[axis] = center_px + half_px;
-            if high_px[axis] < 0.0 || low_px[axis] >= size_px {
-                return Visible::No;
-            }
-            is_whole &= low_px[axis] >= 0.0 && high_px[axis] < size_px;
+        let spans_px = [0, 1].map(|axis| self.span_px(axis, &in_camera, &half));
+        let spans_and_sizes = || spans_px.iter().zip(self.size_px);
+        if spans_and_sizes().any(|([low, high], size)| *high < 0.0 || *low >= size as f32) {
+            return Visible::No;
         }
-        if !is_whole {
+        if spans_and_sizes().any(|([low, high], size)| *low < 0.0 || *high >= size as f32) {
             return Visible::Partly;
         }
         Visible::Whole(Projected {
             center_m: in_camera.z,
             near_m,
             far_m,
-            low_px,
-            high_px,
+            low_px: spans_px.map(|[low, _]| low),
+            high_px: spans_px.map(|[_, high]| high),
         })
+    }
+
+    /// Smallest and largest coordinate of a cube's pixels, with padding.
+    fn span_px(&self, axis: usize, in_camera: &Vector3<f32>, half: &Vector3<f32>) -> [f32; 2] {
+        let slope = in_camera[axis] / in_camera.z;
+        // For a point of the cube at `x + dx, z + dz`, the slope differs from `x / z` by
+        // `(dx - x / z * dz) / (z + dz)`.
+        let max_change = (half[axis] + slope.abs() * half.z) / (in_camera.z - half.z);
+        let half_px = self.focal_px[axis] * max_change + PADDING_PX;
+        let center_px = self.focal_px[axis] * slope + self.principal_px[axis];
+        [center_px - half_px, center_px + half_px]
     }
 }
