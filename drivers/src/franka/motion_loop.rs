@@ -255,7 +255,7 @@ impl MotionLoop {
 
     /// Updates the statistics, takes the pending command, and updates whether the arm is at rest.
     fn take_command(
-        &self,
+        &mut self,
         active: &mut ActiveMotion,
         n_states: u64,
         fate: CommandFate,
@@ -275,6 +275,10 @@ impl MotionLoop {
                 .count_robot_success(stamped.numbered.state.control_command_success_rate);
         }
         let command = mailbox_state.control.command.take();
+        if mailbox_state.control.is_shutting_down {
+            // Targets that still arrive at the port must not keep the motion alive.
+            self.mover.come_to_rest();
+        }
         // A command that has just arrived keeps the motion alive. Otherwise, it would be lost with
         // the end of the motion.
         let is_resting = self.mover.is_resting() && command.is_none();

@@ -13,6 +13,9 @@ use std::time::Duration;
 /// Rounding of a setpoint, relative to its limits. The generator sets velocities of up to 1e-8 to
 /// zero at the end of a trajectory.
 const TOLERANCE: f64 = 1.0 + 1e-4;
+/// Longest time for which a target is followed, whatever its expiry: a program with a wrong clock
+/// must not keep the arm moving.
+const MAX_VALIDITY: Duration = Duration::from_secs(1);
 /// Fractions of the jerk with which the brake is planned if its plan cannot be used.
 const BRAKE_JERK_FRACS: [f64; 5] = [1.0, 1.0 - 1e-6, 1.0 - 1e-4, 0.99, 0.9];
 
@@ -187,7 +190,7 @@ impl Follower {
                 .map_err(|why| NotFollowed::Generator { why })?;
         }
         self.order.accept(target);
-        self.expires_at = Some(target.expires_at);
+        self.expires_at = Some(target.expires_at.min(now + MAX_VALIDITY));
         // An equal target only lasts longer. Planning again from a state on the way to it could
         // fail because of rounding, and an arm that holds its position would plan in every cycle.
         if target.position == self.target {

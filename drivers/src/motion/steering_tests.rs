@@ -137,6 +137,24 @@ fn arm_follows_a_stream_and_brakes_when_it_ends() {
 }
 
 #[test]
+fn target_with_a_distant_expiry_is_followed_for_a_second() {
+    let mut sim = Sim::new();
+    let target = Target {
+        expires_at: Stamp(i64::MAX),
+        ..sim.target(1, [0.9, -1.0])
+    };
+    sim.port.send(&Output::Follow(target));
+    for _ in 0..1000 {
+        sim.step();
+    }
+    assert!(sim.steered.is_following());
+    for _ in 0..2 {
+        sim.step();
+    }
+    assert_eq!(sim.state().braked_motion, 1);
+}
+
+#[test]
 fn arm_arrives_at_a_target_that_is_repeated() {
     let mut sim = Sim::new();
     sim.drive(1, [0.1, -1.9], 2000);
@@ -366,6 +384,37 @@ fn commanded_motion_is_braked_when_steering_begins() {
         assert!(n_cycles < 1000, "it brakes");
     }
     assert!(mover.held().position[0] < 0.8);
+}
+
+#[test]
+fn arm_that_shuts_down_follows_no_further_targets() {
+    let mut mover = mover_at_rest();
+    let port = port();
+    mover.steer(port.clone()).unwrap();
+    let mut now = Stamp(0);
+    let mut cycle = |mover: &mut Mover, motion| {
+        port.send(&Output::Follow(Target {
+            motion,
+            serial: now.0.unsigned_abs(),
+            position: vec![0.9, -1.0],
+            expires_at: now + VALIDITY,
+        }));
+        mover.step(now).unwrap();
+        now += PERIOD;
+    };
+    for _ in 0..300 {
+        cycle(&mut mover, 1);
+    }
+    assert_eq!(mover.motion(), Motion::Moving);
+    // The operator grips again and again.
+    let mut motion = 2;
+    while !mover.come_to_rest() {
+        cycle(&mut mover, motion);
+        motion += 1;
+        assert!(motion < 1000, "it comes to rest");
+    }
+    cycle(&mut mover, motion);
+    assert!(mover.is_at_rest());
 }
 
 #[test]

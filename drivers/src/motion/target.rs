@@ -14,7 +14,8 @@ pub struct Target {
     pub serial: u64,
     /// Joint positions, radians or meters.
     pub position: Vec<f64>,
-    /// When the arm must brake, if no newer target has arrived.
+    /// When the arm must brake, if no newer target has arrived. An arm brakes after one second at
+    /// the latest.
     #[serde(with = "exact::stamp")]
     pub expires_at: Stamp,
 }

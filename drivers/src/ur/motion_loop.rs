@@ -255,11 +255,15 @@ impl MotionLoop {
     }
 
     /// Takes the pending command, and decides whether the motion ends.
-    fn take_command(&self, active: &mut ActiveMotion, cycle: &Cycle<'_>) -> NextAction {
+    fn take_command(&mut self, active: &mut ActiveMotion, cycle: &Cycle<'_>) -> NextAction {
         let mut mailbox_state = self.mailbox.lock();
         mailbox_state.robot.statistics.n_setpoints += 1;
         mailbox_state.robot.statistics.n_pauses += u64::from(cycle.pause > MAX_PAUSE);
         let command = mailbox_state.control.command.take();
+        if mailbox_state.control.is_shutting_down {
+            // Targets that still arrive at the port must not keep the motion alive.
+            self.mover.come_to_rest();
+        }
         // A command that has just arrived keeps the motion alive. Otherwise, it would be lost with
         // the end of the motion.
         let is_resting = self.mover.is_resting() && command.is_none();
