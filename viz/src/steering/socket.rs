@@ -31,8 +31,9 @@ const SEND_BUFFER_BYTES: usize = 8 * 1024;
 const MESSAGES_PER_TURN: u32 = 16;
 /// Time for the client to close the connection after the server has given its reason.
 const LINGER: Duration = Duration::from_millis(300);
-/// Range of the silence after which a client releases the lease, seconds.
-const SILENCE_SECS: std::ops::RangeInclusive<f64> = 0.05..=3600.0;
+/// Range of the silence after which a client releases the lease.
+const MIN_SILENCE_SECS: f64 = 0.05;
+const MAX_SILENCE_SECS: f64 = 3600.0;
 
 /// A connected client.
 pub(crate) struct SteeringSocket {
@@ -131,9 +132,13 @@ struct Reader<'a> {
 impl Reader<'_> {
     /// Reads until the client disconnects or violates the WebSocket protocol.
     async fn run(mut self) {
-        let silence_secs = self.server.description().lease_secs;
-        let silence =
-            Duration::from_secs_f64(silence_secs.clamp(*SILENCE_SECS.start(), *SILENCE_SECS.end()));
+        let lease_secs = self.server.description().lease_secs;
+        let silence_secs = if lease_secs.is_nan() {
+            MIN_SILENCE_SECS
+        } else {
+            lease_secs.clamp(MIN_SILENCE_SECS, MAX_SILENCE_SECS)
+        };
+        let silence = Duration::from_secs_f64(silence_secs);
         let mut heard_at = Instant::now();
         let mut is_silent = false;
         let mut n_read: u32 = 0;
@@ -162,8 +167,10 @@ impl Reader<'_> {
                     self.handle(&text, heard_at);
                 }
                 Message::Binary(_) => {
-                    let text = "binary messages are not supported, send JSON as text";
-                    self.refuse(RefusedRequest::Message, text.to_owned());
+                    if self.rate.count(Instant::now()) == Counted::Within {
+                        let text = "binary messages are not supported, send JSON as text";
+                        self.refuse(RefusedRequest::Message, text.to_owned());
+                    }
                 }
             }
             n_read = n_read.wrapping_add(1);
