@@ -51,6 +51,7 @@ mod grid;
 mod image;
 mod map;
 mod query;
+mod rows;
 mod snapshot;
 mod surfaces;
 #[cfg(test)]

@@ -3,16 +3,14 @@
 use crate::block::{BLOCK_CELLS, CELL_VOXELS, NEVER};
 use crate::capsules::{GridCapsule, in_grid};
 use crate::config::{BLOCK_VOXELS, MapConfig};
-use crate::grid::{Grid, floor};
+use crate::grid::floor;
+use crate::rows::{BUNDLE, Rows};
 use crate::snapshot::Snapshot;
 use kinematics::{Stamp, Transform};
 use nalgebra::{Point3, Vector3};
 use std::ops::RangeInclusive;
 use std::sync::Arc;
 use steering::{Capsule, Seen};
-
-/// Rows of voxels per side of a bundle, which is skipped as a whole if all of its voxels are free.
-const BUNDLE: usize = 4;
 
 /// Motion of the robot in voxels up to which the voxels inside of it are not computed again.
 const MAX_MOTION: f32 = 0.1;
@@ -31,12 +29,10 @@ pub(crate) struct Query {
     snapshot: Arc<Snapshot>,
     robot: Option<Robot>,
     in_grid: Vec<GridCapsule>,
-    /// As in the snapshot, without the voxels inside of the robot at `cleared`.
-    blocked: Vec<u8>,
+    rows: Rows,
+    /// The robot that is cleared in the rows.
     cleared: Vec<GridCapsule>,
     is_outdated: bool,
-    /// For each bundle of rows, the union of its rows.
-    bundles: Vec<u8>,
     /// Offsets of bundles in y and z, by distance.
     offsets: Vec<Offset>,
     /// Largest distance, voxels.
@@ -66,13 +62,12 @@ impl Query {
         #[expect(clippy::cast_possible_truncation, reason = "inner loops use f32")]
         let max_distance = (config.max_distance_m / config.voxel_m) as f32;
         Self {
-            blocked: Vec::new(),
-            bundles: Vec::new(),
+            rows: Rows::new(&snapshot),
             snapshot,
             robot: None,
             in_grid: Vec::new(),
             cleared: Vec::new(),
-            is_outdated: true,
+            is_outdated: false,
             offsets: offsets(max_distance),
             max_distance,
         }
@@ -81,7 +76,8 @@ impl Query {
     pub(crate) fn set_snapshot(&mut self, snapshot: Arc<Snapshot>) {
         if !Arc::ptr_eq(&snapshot, &self.snapshot) {
             self.snapshot = snapshot;
-            self.is_outdated = true;
+            self.rows.set_map(&self.snapshot);
+            self.cleared.clear();
             self.place_robot();
         }
     }
@@ -98,7 +94,9 @@ impl Query {
         now: Stamp,
     ) -> Vec<Option<Seen>> {
         if self.is_outdated {
-            self.rebuild();
+            self.rows.set_robot(&self.in_grid);
+            self.cleared.clone_from(&self.in_grid);
+            self.is_outdated = false;
         }
         let world_from_base = self
             .robot
@@ -162,8 +160,6 @@ impl Query {
     /// Distance to the closest voxel that is not free, at most the maximum, voxels.
     fn distance(&self, around: &Around) -> f32 {
         let mut best = self.max_distance * self.max_distance;
-        let grid = &self.snapshot.grid;
-        let n_bundles = grid.side() / BUNDLE;
         let [_, y, z] = around.voxel.map(|voxel| voxel / BUNDLE);
         for offset in &self.offsets {
             if offset.min_squared >= best {
@@ -175,9 +171,9 @@ impl Query {
             );
             let gap_y = gap(around.point.y, y * BUNDLE, BUNDLE);
             let gap_z = gap(around.point.z, z * BUNDLE, BUNDLE);
-            let row = (z * n_bundles + y) * grid.row_bytes();
+            let row = self.rows.bundle_row(y, z);
             if gap_y * gap_y + gap_z * gap_z >= best
-                || self.window(&self.bundles, row, around.voxel[0]) == 0
+                || self.window(self.rows.bundles(), row, around.voxel[0]) == 0
             {
                 continue;
             }
@@ -197,7 +193,7 @@ impl Query {
                     continue;
                 }
                 let row = self.snapshot.grid.row(y, z);
-                let window = self.window(&self.blocked, row, around.voxel[0]);
+                let window = self.window(self.rows.blocked(), row, around.voxel[0]);
                 if window != 0 {
                     let along = self.gap_x(window, around.frac_x);
                     best = best.min(across + along * along);
@@ -274,43 +270,6 @@ impl Query {
         let moved = |(now, then): (&GridCapsule, &GridCapsule)| now.moved(then) > MAX_MOTION;
         self.is_outdated |= self.in_grid.len() != self.cleared.len()
             || self.in_grid.iter().zip(&self.cleared).any(moved);
-    }
-
-    /// Clears the volume of the robot, and prepares the bundles.
-    fn rebuild(&mut self) {
-        let grid = self.snapshot.grid;
-        self.blocked.clone_from(&self.snapshot.blocked);
-        let blocked = &mut self.blocked;
-        for capsule in &self.in_grid {
-            capsule.rows(grid.side(), |span| {
-                let row = grid.row(span.y, span.z);
-                for x in span.x {
-                    blocked[row + x / BLOCK_VOXELS] &= !(1 << (x % BLOCK_VOXELS));
-                }
-            });
-        }
-        self.cleared.clone_from(&self.in_grid);
-        join_rows(&grid, &self.blocked, &mut self.bundles);
-        self.is_outdated = false;
-    }
-}
-
-/// The union of the rows of each bundle.
-fn join_rows(grid: &Grid, blocked: &[u8], bundles: &mut Vec<u8>) {
-    let n_bundles = grid.side() / BUNDLE;
-    let row_bytes = grid.row_bytes();
-    bundles.clear();
-    bundles.resize(n_bundles * n_bundles * row_bytes, 0);
-    for (ix, bundle) in bundles.chunks_exact_mut(row_bytes).enumerate() {
-        let (y, z) = (ix % n_bundles * BUNDLE, ix / n_bundles * BUNDLE);
-        for z in z..z + BUNDLE {
-            let first = grid.row(y, z);
-            for row in blocked[first..first + BUNDLE * row_bytes].chunks_exact(row_bytes) {
-                for (joined, byte) in bundle.iter_mut().zip(row) {
-                    *joined |= byte;
-                }
-            }
-        }
     }
 }
 

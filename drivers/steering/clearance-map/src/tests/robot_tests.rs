@@ -3,7 +3,9 @@
 use super::scene::{
     STEREO, Solid, Tested, at, config, distance_m, looking, photograph, random_point,
 };
+use crate::capsules::in_grid;
 use crate::image::Posture;
+use crate::rows::{BUNDLE, Rows};
 use kinematics::Transform;
 use nalgebra::Vector3;
 use numbers::random::Random;
@@ -172,4 +174,51 @@ fn volume_of_a_resting_robot_does_not_age() {
     // Hidden by the robot since it came, and in view all the time.
     assert!(age_secs(-0.3, 0.2) >= 19.9, "behind");
     assert!(age_secs(0.5, 0.36) < 0.01, "in front");
+}
+
+#[test]
+fn moving_robot_leaves_no_trace_in_the_rows() {
+    let mut random = Random::new(25);
+    let mut tested = Tested::new(&config());
+    tested.see(&photograph(
+        &[Solid::Below(0.0)],
+        pose(),
+        at(0.0),
+        &STEREO,
+        &mut random,
+    ));
+    let snapshot = tested.map.snapshot();
+    let mut moved = Rows::new(&snapshot);
+    for _ in 0..20 {
+        let capsules: Vec<Capsule> = (0..5)
+            .map(|_| Capsule {
+                ends: [
+                    random_point(&mut random, 0.9),
+                    random_point(&mut random, 0.9),
+                ],
+                radius_m: random.uniform(0.02, 0.2),
+            })
+            .collect();
+        let robot = in_grid(&capsules, &Transform::identity(), &snapshot.grid, 0.0);
+        moved.set_robot(&robot);
+        let mut fresh = Rows::new(&snapshot);
+        fresh.set_robot(&robot);
+        assert!(moved.blocked() == fresh.blocked() && moved.bundles() == fresh.bundles());
+        // Bundles are the union of their rows, also where the robot has cleared some.
+        let mut n_free = 0;
+        for z in 0..snapshot.grid.side() {
+            for y in 0..snapshot.grid.side() {
+                let row = snapshot.grid.row(y, z);
+                let bundle = moved.bundle_row(y / BUNDLE, z / BUNDLE);
+                for byte in 0..snapshot.grid.n_blocks {
+                    let of_row = moved.blocked()[row + byte];
+                    n_free += of_row.count_zeros();
+                    assert_eq!(of_row & !moved.bundles()[bundle + byte], 0);
+                }
+            }
+        }
+        assert!(n_free > 0);
+    }
+    moved.set_robot(&[]);
+    assert!(moved.blocked() == snapshot.blocked, "the map itself");
 }
