@@ -265,7 +265,7 @@ impl Follower {
         let secs = self.period.as_secs_f64();
         let last = &self.setpoint;
         limits.iter().enumerate().find_map(|(ix, joint)| {
-            let [velocity, acceleration] = allowed_rates(joint, last, ix, secs);
+            let [velocity, acceleration] = allowed_rates(joint, last, ix);
             let changes = [
                 ("position", &last.position, &next.position, velocity),
                 ("velocity", &last.velocity, &next.velocity, acceleration),
@@ -292,18 +292,20 @@ impl Follower {
 }
 
 /// Velocity and acceleration that a joint may have after its last setpoint. They exceed its limits
-/// only if the last setpoint does, which is possible after [`Follower::resume`]: the joint then
-/// returns to its limits with limited jerk, and may first become faster.
-fn allowed_rates(joint: &MotionLimits, last: &Setpoint, ix: usize, secs: f64) -> [f64; 2] {
-    let last_velocity = last.velocity[ix].abs();
-    let last_acceleration = last.acceleration[ix].abs();
-    let acceleration = joint.acceleration.max(last_acceleration);
-    let velocity = if last_velocity > joint.velocity {
-        last_velocity + acceleration * secs
+/// only if they must after [`Follower::resume`]: while a joint reduces an acceleration `a` with the
+/// jerk `j`, it gains the velocity `a² / 2j`.
+fn allowed_rates(joint: &MotionLimits, last: &Setpoint, ix: usize) -> [f64; 2] {
+    let velocity = last.velocity[ix];
+    let acceleration = last.acceleration[ix];
+    let gained = if velocity * acceleration >= 0.0 {
+        acceleration.powi(2) / (2.0 * joint.jerk)
     } else {
-        joint.velocity
+        0.0
     };
-    [velocity, acceleration]
+    [
+        joint.velocity.max(velocity.abs() + gained),
+        joint.acceleration.max(acceleration.abs()),
+    ]
 }
 
 fn with_jerk(limits: &[MotionLimits], frac: f64) -> Vec<MotionLimits> {
