@@ -45,6 +45,8 @@ export interface Hello {
   max_size_px: [number, number];
   default_stages: number[];
   clock_millis: number;
+  /** Whether the server has the WebSocket `/steer`; missing in runs without motion, and on older servers. */
+  steering?: boolean;
 }
 
 /** Reply to the page's hello. */
