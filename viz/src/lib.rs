@@ -24,6 +24,7 @@ mod operator_requests;
 mod pictures;
 mod pose;
 mod server;
+mod steering;
 mod topics;
 
 pub use client::keyframe_image::ReadKeyframe;
@@ -41,6 +42,14 @@ pub use server::access::{Role, Token, Tokens};
 pub use server::certificate::Certificate;
 pub use server::downloads::{OpenFile, ServedFile, publish_files};
 pub use server::{Server, ServerConfig, Sharing};
+pub use steering::arm_description::{ArmDescription, SteeredJoint};
+pub use steering::preview::{Preview, PreviewVerdict};
+pub use steering::request::{
+    PreviewGoal, PreviewRequest, ReceivedRequest, RefusedRequest, SteeringCommand, SteeringIntent,
+    SteeringRequest,
+};
+pub use steering::state::{AppliedCommand, AppliedLimit, LimitEffect, LimitLink, SteeringState};
+pub use steering::steering_server::SteeringServer;
 pub use topics::edit_status::{ErasedBox, LastEdit, SavedEdits};
 pub use topics::model_chunks::PublishedChunks;
 pub use topics::observations::{ObservationMap, ObservedCell};

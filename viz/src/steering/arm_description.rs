@@ -1,0 +1,36 @@
+//! What clients need to know about an arm before they steer it.
+
+use serde::Serialize;
+
+/// The arm of a [`SteeringServer`](crate::SteeringServer).
+#[derive(Clone, Debug, Default, PartialEq, Serialize)]
+pub struct ArmDescription {
+    /// Link of the URDF in whose frame all poses are.
+    pub base_link: String,
+    /// Link of the URDF that the operator moves.
+    pub tip_link: String,
+    /// The joints, in the order of all lists of joint values.
+    pub joints: Vec<SteeredJoint>,
+    /// Silence of a device after which the arm brakes.
+    pub expiry_secs: f64,
+    /// Silence of a client after which its lease ends.
+    pub lease_secs: f64,
+    /// Round trip from which on a page should show goals before the arm moves, instead of moving the
+    /// arm with the hand.
+    pub servo_round_trip_millis: f64,
+}
+
+/// A joint that an operator moves.
+#[derive(Clone, Debug, Default, PartialEq, Serialize)]
+pub struct SteeredJoint {
+    /// Name in the URDF.
+    pub name: String,
+    /// Lowest position, radians or meters; `None` if the joint turns without end.
+    pub lower: Option<f64>,
+    /// Highest position, radians or meters; `None` if the joint turns without end.
+    pub upper: Option<f64>,
+    /// Whether positions are meters.
+    pub is_prismatic: bool,
+    /// Greatest speed while an operator moves the arm, radians or meters per second.
+    pub velocity: f64,
+}

@@ -1,0 +1,211 @@
+//! The link between the clients of `/steer` and the loop that steers an arm.
+
+use crate::Hub;
+use crate::server::access::Role;
+use crate::steering::arm_description::ArmDescription;
+use crate::steering::inbox::{Inbox, NotAccepted};
+use crate::steering::outbox::{Outbox, Reply};
+use crate::steering::preview::Preview;
+use crate::steering::request::{ReceivedRequest, RefusedRequest, SteeringRequest};
+use crate::steering::state::{LimitEffect, LimitLink, SteeringState};
+use crate::topics::operator_status::ConnectedClient;
+use parking_lot::{Condvar, Mutex};
+use std::collections::BTreeMap;
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+use tokio::sync::{Notify, watch};
+
+/// Passes the requests of clients to the loop that steers an arm, and its answers to the clients.
+///
+/// No function waits for a client. [`Hub::set_steering`] gives it to the server, which then accepts
+/// clients under `/steer`.
+#[derive(Debug)]
+pub struct SteeringServer {
+    description: ArmDescription,
+    inbox: Mutex<Inbox>,
+    request_arrived: Condvar,
+    clients: Mutex<BTreeMap<u64, SteeringClient>>,
+    published: watch::Sender<Published>,
+}
+
+#[derive(Debug)]
+struct SteeringClient {
+    role: Role,
+    outbox: Outbox,
+}
+
+/// What all clients receive.
+#[derive(Clone, Debug, Default)]
+pub(crate) struct Published {
+    /// The newest state.
+    pub(crate) state: Option<Arc<SteeringState>>,
+    /// The connected clients.
+    pub(crate) clients: Arc<[ConnectedClient]>,
+    /// Number of changes that clients must learn at once.
+    pub(crate) n_urgent: u64,
+}
+
+impl SteeringServer {
+    /// A server without clients and without a state.
+    pub fn new(description: ArmDescription) -> Arc<Self> {
+        Arc::new(Self {
+            description,
+            inbox: Mutex::default(),
+            request_arrived: Condvar::new(),
+            clients: Mutex::default(),
+            published: watch::Sender::default(),
+        })
+    }
+
+    /// The arm.
+    pub fn description(&self) -> &ArmDescription {
+        &self.description
+    }
+
+    /// The requests that have arrived since the last call, in the order of their arrival. Of
+    /// commands of a device with the same grip, and of previews, only the newest of each client is
+    /// returned.
+    pub fn take_requests(&self) -> Vec<ReceivedRequest> {
+        self.inbox.lock().take()
+    }
+
+    /// Waits up to `timeout` until there are requests.
+    pub fn wait_for_requests(&self, timeout: Duration) {
+        let mut inbox = self.inbox.lock();
+        self.request_arrived
+            .wait_while_for(&mut inbox, |inbox| inbox.is_empty(), timeout);
+    }
+
+    /// Sets the state that clients receive: at once if the lease, the stop or the kinds of limits
+    /// have changed, and at most 30 times per second otherwise.
+    pub fn publish(&self, state: SteeringState) {
+        self.published.send_modify(|published| {
+            let before = published.state.as_deref().map(urgent_part);
+            if before != Some(urgent_part(&state)) {
+                published.n_urgent += 1;
+            }
+            published.state = Some(Arc::new(state));
+        });
+    }
+
+    /// Answers a preview. Does nothing if the client has left.
+    pub fn answer_preview(&self, client: u64, id: u64, preview: Preview) {
+        self.reply(client, Reply::Preview { id, preview });
+    }
+
+    /// Sends the client the reason why a request was refused, in one sentence. Does nothing if the
+    /// client has left.
+    pub fn refuse(&self, client: u64, request: RefusedRequest, text: String) {
+        self.reply(client, Reply::Refused { request, text });
+    }
+
+    /// The connected clients.
+    pub fn clients(&self) -> Arc<[ConnectedClient]> {
+        Arc::clone(&self.published.borrow().clients)
+    }
+
+    /// Adds a client. The returned handle is notified when there is a reply.
+    pub(crate) fn join(&self, client: u64, role: Role) -> Arc<Notify> {
+        self.inbox.lock().join(client);
+        let outbox = Outbox::default();
+        let wake = outbox.wake();
+        self.clients
+            .lock()
+            .insert(client, SteeringClient { role, outbox });
+        self.publish_clients();
+        wake
+    }
+
+    /// Removes a client. The loop learns that it has left.
+    pub(crate) fn leave(&self, client: u64) {
+        self.inbox.lock().leave(client, Instant::now());
+        self.request_arrived.notify_all();
+        self.clients.lock().remove(&client);
+        self.publish_clients();
+    }
+
+    /// Tells the loop that a client is silent.
+    pub(crate) fn silence(&self, client: u64) {
+        self.inbox.lock().silence(client, Instant::now());
+        self.request_arrived.notify_all();
+    }
+
+    /// Adds a request of a client.
+    pub(crate) fn request(
+        &self,
+        client: u64,
+        received_at: Instant,
+        request: SteeringRequest,
+    ) -> Result<(), NotAccepted> {
+        let result = self.inbox.lock().push(client, received_at, request);
+        self.request_arrived.notify_all();
+        result
+    }
+
+    /// Adds a reply to a client.
+    pub(crate) fn reply(&self, client: u64, reply: Reply) {
+        if let Some(client) = self.clients.lock().get_mut(&client) {
+            client.outbox.push(reply);
+        }
+    }
+
+    /// Takes the oldest reply to a client.
+    pub(crate) fn take_reply(&self, client: u64) -> Option<Reply> {
+        self.clients.lock().get_mut(&client)?.outbox.pop()
+    }
+
+    /// What all clients receive.
+    pub(crate) fn published(&self) -> watch::Receiver<Published> {
+        self.published.subscribe()
+    }
+
+    fn publish_clients(&self) {
+        // The lock is held until the list is published, so that the newest list is the last.
+        let clients = self.clients.lock();
+        let list = clients.iter().map(|(&id, client)| ConnectedClient {
+            id,
+            role: client.role,
+        });
+        let list = list.collect();
+        self.published.send_modify(|published| {
+            published.clients = list;
+            published.n_urgent += 1;
+        });
+    }
+}
+
+/// The parts of a state whose changes clients must learn at once. Texts and scales of limits change
+/// with every motion, so they are left out.
+type UrgentPart<'a> = (
+    Option<u64>,
+    Option<u64>,
+    Option<&'a str>,
+    Vec<(LimitLink, LimitEffect)>,
+);
+
+fn urgent_part(state: &SteeringState) -> UrgentPart<'_> {
+    let limits = state.limits.iter();
+    (
+        state.holder,
+        state.offered_to,
+        state.stop.as_deref(),
+        limits.map(|limit| (limit.link, limit.effect)).collect(),
+    )
+}
+
+/// The arm that clients may steer.
+#[derive(Clone, Debug, Default)]
+struct SteeredArm(Option<Arc<SteeringServer>>);
+
+impl Hub {
+    /// Sets the arm that clients may steer. With `None`, and before the first call, `/steer` answers
+    /// 404, and connected clients are disconnected.
+    pub fn set_steering(&self, server: Option<Arc<SteeringServer>>) {
+        self.latest::<SteeredArm>().send_replace(SteeredArm(server));
+    }
+
+    /// The arm that clients may steer.
+    pub(crate) fn steering(&self) -> Option<Arc<SteeringServer>> {
+        self.latest::<SteeredArm>().borrow().0.clone()
+    }
+}
