@@ -270,6 +270,7 @@ function receiveStatus(status: Status): void {
   preview.show(status);
   for (const ages of [robotAge, overlayAges]) ages.hasEnded = banner.isFinished;
   namedViews.runIs(status);
+  steering.offered = status.steering === true;
   flow.isReading = CONTROLLABLE.includes(status.state);
 }
 
@@ -281,7 +282,6 @@ function receiveText(message: TextMessage): void {
       stages = message.default_stages;
       header.client = message.client;
       edits.client = message.client;
-      steering.offered = message.steering === true;
       showRole(message.role);
       break;
     case "scene":

@@ -45,8 +45,6 @@ export interface Hello {
   max_size_px: [number, number];
   default_stages: number[];
   clock_millis: number;
-  /** Whether the server has the WebSocket `/steer`; missing in runs without motion, and on older servers. */
-  steering?: boolean;
 }
 
 /** Reply to the page's hello. */
@@ -111,6 +109,8 @@ export interface Status extends ModelStatus {
   source?: ModelSource;
   /** Files that can be downloaded. */
   files?: FileLink[];
+  /** Whether the server has the WebSocket `/steer`; missing in runs without motion, and on older servers. */
+  steering?: boolean;
 }
 
 /** Which robot and run a server shows. */

@@ -50,15 +50,15 @@ export class LeasePanel {
 
   private listClients(): void {
     const { arm, state } = this.commander;
-    const others = (state?.clients ?? []).filter(({ client, may_steer }) => may_steer && client !== arm?.client);
-    const shown = others.map(({ client }) => client).join();
+    const others = (state?.clients ?? []).filter(({ id, role }) => role === "operator" && id !== arm?.client);
+    const shown = others.map(({ id }) => id).join();
     if (shown === this.shownClients) return;
     this.shownClients = shown;
     const chosen = this.to.value;
     this.to.replaceChildren(
-      ...others.map(({ client }) => make("option", { value: String(client), textContent: `operator ${client}` })),
+      ...others.map(({ id }) => make("option", { value: String(id), textContent: `operator ${id}` })),
     );
-    if (others.some(({ client }) => String(client) === chosen)) this.to.value = chosen;
+    if (others.some(({ id }) => String(id) === chosen)) this.to.value = chosen;
   }
 
   private announceHolder(): void {

@@ -76,9 +76,10 @@ export interface Applied {
   applied_micros: number;
 }
 
+/** A connection of `/steer`. */
 export interface SteerClient {
-  client: number;
-  may_steer: boolean;
+  id: number;
+  role: string;
 }
 
 export interface SteerState {
@@ -211,7 +212,7 @@ function appliedIn(value: unknown): Applied | null {
 }
 
 function clientIn(value: unknown): SteerClient | null {
-  return isFields(value) && isNumber(value.client) ? { client: value.client, may_steer: value.may_steer === true } : null;
+  return isFields(value) && isNumber(value.id) && isText(value.role) ? { id: value.id, role: value.role } : null;
 }
 
 function previewIn({ id, verdict, text, position, place }: Fields): PreviewAnswer | null {

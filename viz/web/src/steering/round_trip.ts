@@ -80,8 +80,8 @@ export class ModeChoice {
     } else if (this.isFirst) {
       this.isFirst = false;
       this.chosen = roundTripMillis <= thresholdMillis ? "servo" : "preview";
-    } else if (roundTripMillis > thresholdMillis) {
-      this.chosen = "preview";
+    } else if (!(roundTripMillis <= thresholdMillis)) {
+      this.chosen = "preview"; // NaN, too.
       this.shortSince = null;
     } else if (roundTripMillis > RETURN_SHARE * thresholdMillis) {
       this.shortSince = null;

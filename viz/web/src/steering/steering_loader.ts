@@ -39,6 +39,7 @@ export class SteeringLoader {
 
   /** Whether the server has an arm that can be steered. */
   set offered(isOffered: boolean) {
+    if (isOffered === this.isOffered) return;
     this.isOffered = isOffered;
     element("toggle-steer").hidden = !isOffered;
     if (this.steering) this.steering.offered = isOffered;
@@ -57,7 +58,7 @@ export class SteeringLoader {
       this.steering = new script.Steering({ view, newRobotLayer, action, toggle });
       this.steering.offered = this.isOffered;
     } catch (error) {
-      // The next connection tries again.
+      this.isOffered = false; // The next status tries again.
       showToast(`Steering cannot be loaded: ${reasonOf(error)}`);
     }
     this.isLoading = false;
