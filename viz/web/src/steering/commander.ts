@@ -63,6 +63,9 @@ export class Commander {
   private readonly choice = new ModeChoice();
   private chosen: Mode = "preview";
   private isConnected = false;
+  private hasSocket = false;
+  /** Whether the arm could move when the link was lost. */
+  private couldMove = false;
   private isHidden = false;
   private hiddenMillis = 0;
   private usedMillis = 0;
@@ -100,7 +103,13 @@ export class Commander {
   /** Whether the arm can move, so that everybody needs the stop button. */
   get canMove(): boolean {
     const { state } = this;
-    return state !== null && (state.is_moving || (state.holder !== null && state.stop === null));
+    if (!state) return this.couldMove;
+    return state.is_moving || (state.holder !== null && state.stop === null);
+  }
+
+  /** Whether a stop can be sent. A link that is silent may still carry it. */
+  get canSend(): boolean {
+    return this.hasSocket;
   }
 
   /** Whether messages arrive. */
@@ -135,12 +144,15 @@ export class Commander {
   // What arrives.
 
   connected(nowMillis: number): void {
+    this.hasSocket = true;
     this.roundTrips.restart();
     this.receivedMillis = nowMillis;
     this.pingedMillis = -Infinity;
   }
 
   disconnected(): void {
+    this.couldMove = this.canMove;
+    this.hasSocket = false;
     this.isConnected = false;
     this.state = null;
     this.roundTrips.restart();
@@ -320,6 +332,7 @@ export class Commander {
     } else {
       this.axes = this.axesNow();
       if (source !== "go" && source !== "pad go") this.goal.clear();
+      this.events.notice("");
     }
     // The arm must not wait for the next sample to brake.
     this.sample();

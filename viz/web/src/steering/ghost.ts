@@ -61,12 +61,14 @@ export interface GhostParts {
 export class Ghost {
   private readonly look: GhostLook;
   private readonly layer: RobotLayer;
+  /** What is shown, as text: the view is drawn again only if it changes. */
+  private shown = "";
 
   constructor(
     private readonly robot: RobotLayer,
     occlusion: Occlusion,
     { newRobotLayer }: GhostParts,
-    changed: () => void,
+    private readonly changed: () => void,
   ) {
     this.look = new GhostLook(occlusion);
     this.layer = newRobotLayer(changed, () => this.look);
@@ -79,18 +81,26 @@ export class Ghost {
 
   /** Shows the robot with these positions of its joints, in the order of `names`. */
   show(names: readonly string[], positions: readonly number[], look: GhostLookName): void {
-    if (!this.pose(names, positions)) return;
+    const { state } = this.robot;
+    const key = JSON.stringify([names, positions, look, state?.positions, state?.world_from_base]);
+    if (key === this.shown || !this.pose(names, positions)) return;
+    this.shown = key;
     this.look.show(look);
     this.layer.enabled = true;
+    this.changed();
   }
 
   hide(): void {
+    if (this.shown === "") return;
+    this.shown = "";
     this.layer.enabled = false;
+    this.changed();
   }
 
   /** Pose of a link in another one at these joint positions; null if the robot does not have them, or is unknown. */
   linkInLink(from: string, to: string, names: readonly string[], positions: readonly number[]): Pose | null {
     if (!this.pose(names, positions)) return null;
+    this.shown = this.shown && "another pose";
     const [worldFromBase, worldFromTip] = [this.layer.linkPose(from), this.layer.linkPose(to)];
     return worldFromBase && worldFromTip && poseOfMatrix(worldFromBase.clone().invert().multiply(worldFromTip));
   }

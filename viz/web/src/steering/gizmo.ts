@@ -45,6 +45,8 @@ export class Gizmo implements ViewTool {
   hasTakenPress = false;
   private readonly parts: Part[];
   private pose: { worldFromBase: Pose; baseFromHand: Pose; worldFromAxes: THREE.Quaternion } | null = null;
+  /** The last pose as text: the view is drawn again only if it changes. */
+  private placed = "";
   private grab: Grab | null = null;
 
   constructor(
@@ -68,6 +70,9 @@ export class Gizmo implements ViewTool {
 
   /** Places the gizmo; null hides it. While it is dragged, its axes stay. */
   place(pose: Gizmo["pose"]): void {
+    const key = pose ? JSON.stringify(pose) : "";
+    if (key === this.placed) return;
+    this.placed = key;
     const axes = this.grab ? this.pose?.worldFromAxes : undefined;
     this.pose = pose && { ...pose, worldFromAxes: axes ?? pose.worldFromAxes };
     this.root.visible = pose !== null;
@@ -123,6 +128,11 @@ export class Gizmo implements ViewTool {
     const { grab } = this;
     if (!grab || event.pointerId !== grab.pointerId) return;
     event.stopPropagation();
+    // The release of one of several buttons is a move.
+    if (event.pointerType === "mouse" && (event.buttons & 1) === 0) {
+      this.giveUp();
+      return;
+    }
     const worldFromHand = grab.drag.to(this.ray(grab.camera, event));
     this.events.drag(composed(grab.baseFromWorld, worldFromHand));
   }

@@ -3,6 +3,7 @@
 /** Calls `changed` when the button is pressed and when it is released. Leaving the button releases it, too. */
 export function holdButton(button: HTMLElement, changed: (isHeld: boolean) => void): void {
   let isHeld = false;
+  let pointerId: number | null = null;
   const set = (held: boolean): void => {
     if (held === isHeld) return;
     isHeld = held;
@@ -11,12 +12,15 @@ export function holdButton(button: HTMLElement, changed: (isHeld: boolean) => vo
   };
   button.addEventListener("pointerdown", (event) => {
     if (event.button !== 0) return;
+    pointerId = event.pointerId;
     // A finger that slides off its first element would otherwise still belong to it.
     if (button.hasPointerCapture(event.pointerId)) button.releasePointerCapture(event.pointerId);
     set(true);
   });
-  for (const kind of ["pointerup", "pointercancel", "pointerleave", "blur"] as const) {
-    button.addEventListener(kind, () => set(false));
+  for (const kind of ["pointerleave", "blur"] as const) button.addEventListener(kind, () => set(false));
+  // The button may be hidden or covered before the release.
+  for (const kind of ["pointerup", "pointercancel"] as const) {
+    window.addEventListener(kind, (event) => event.pointerId === pointerId && set(false), { capture: true });
   }
   button.addEventListener("keydown", (event) => {
     if (event.key !== "Enter") return;

@@ -29,6 +29,7 @@ export class LeasePanel {
     const { arm, state, isOpen, hasControl } = this.commander;
     const isKnown = isOpen && arm !== null && state !== null;
     setText(element("steer-lease"), isKnown ? leaseText(state, arm.client) : "No link to the arm");
+    element("toggle-steer").dataset.control = hasControl ? "own" : typeof state?.holder === "number" ? "other" : "nobody";
     this.take.hidden = hasControl;
     disable(this.take, this.reasonAgainstTaking());
     this.release.hidden = !hasControl;

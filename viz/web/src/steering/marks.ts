@@ -21,6 +21,7 @@ export class Marks implements ViewTool {
   readonly hasTakenPress = false;
   private readonly list = element("steer-marks");
   private marks: readonly Mark[] = [];
+  private shown = "[]";
 
   constructor(
     private readonly camera: THREE.PerspectiveCamera,
@@ -29,7 +30,9 @@ export class Marks implements ViewTool {
   ) {}
 
   show(marks: readonly Mark[]): void {
-    if (marks.length === 0 && this.marks.length === 0) return;
+    const key = JSON.stringify(marks);
+    if (key === this.shown) return;
+    this.shown = key;
     this.marks = marks;
     this.changed();
   }

@@ -6,6 +6,7 @@ import { element } from "../panels/element";
 import { setText } from "../panels/html";
 import { capitalized } from "../panels/sentence";
 import { disable } from "../panels/title";
+import { showToast } from "../panels/toast";
 import type { action, toggle } from "../keys";
 import type { OrbitView } from "../view/orbit_view";
 import { Commander } from "./commander";
@@ -199,8 +200,12 @@ export class Steering {
   }
 
   private notice(text: string): void {
-    setText(element("steer-note"), capitalized(text));
-    if (text !== "") announce(text);
+    const note = element("steer-note");
+    if (note.textContent === capitalized(text)) return;
+    note.textContent = capitalized(text);
+    if (text === "") return;
+    announce(text);
+    if (element("steer").hidden) showToast(capitalized(text));
   }
 
   // What is drawn.
@@ -258,10 +263,11 @@ export class Steering {
     const { state, goal } = this.commander;
     const { judgement, target } = goal;
     if (target) {
-      // Without a solution, the ghost of the last pose would be in the wrong place: the gizmo shows where the goal is.
-      const position = (target.kind === "joints" ? target.position : judgement?.position) ?? state?.position;
+      const position = target.kind === "joints" ? target.position : judgement?.position;
       const look = judgement ? lookOfVerdict(judgement.verdict) : "checking";
+      // Without a solution, any ghost would be in the wrong place: the gizmo shows where the goal is.
       if (position) this.ghost.show(this.jointNames, position, look);
+      else this.ghost.hide();
     } else if (state?.target && isApart(state.target, state.position)) {
       this.ghost.show(this.jointNames, state.target, lookOfLimits(state.limits));
     } else {

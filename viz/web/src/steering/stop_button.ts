@@ -33,10 +33,12 @@ export class StopButton {
   }
 
   show(): void {
-    const { state, hasControl, isOpen, canMove } = this.commander;
+    const { arm, state, hasControl, canSend, canMove } = this.commander;
     this.button.hidden = !canMove;
     // Without a link, the arm brakes by its own watchdog; a button that does nothing must not look as if it did.
-    disable(this.button, isOpen ? "" : "The link to the arm is cut: the arm brakes when its commands expire");
+    disable(this.button, canSend ? "" : "The link to the arm is cut: the arm brakes when its commands expire");
+    const isOwn = state?.holder === arm?.client;
+    setText(element("steer-who"), typeof state?.holder === "number" ? (isOwn ? "you" : `operator ${state.holder}`) : "");
     element("steer-stopped").hidden = !state?.stop;
     setText(element("steer-stop-text"), state?.stop ? `The arm is stopped: ${state.stop}` : "");
     disable(this.rearm, hasControl ? "" : "Only the operator who has control can permit motion");
@@ -45,7 +47,7 @@ export class StopButton {
   }
 
   private stop(): void {
-    if (this.commander.isOpen) this.commander.stop();
+    this.commander.stop();
   }
 
   private press(event: KeyboardEvent): void {
