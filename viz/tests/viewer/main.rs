@@ -34,6 +34,7 @@ mod shared;
 mod shared_page;
 mod shown_pictures;
 mod slow;
+mod steering_page;
 mod tls;
 mod unsupported_page;
 mod video_page;
