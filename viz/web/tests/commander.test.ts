@@ -204,6 +204,56 @@ test("over a slow link, inputs move a goal, and only go moves the arm", () => {
   assert.equal(bench.last().grip, null);
 });
 
+test("a trigger and the button go move the arm to the goal, sticks discard the goal", () => {
+  bench.run(1500);
+  const held = { isHeld: true, isGo: false, isStop: false, deflection: NO_DEFLECTION };
+  const preview = (): void => {
+    bench.commander.preview([0.15, 0.2]);
+    bench.run(120);
+    const asked = bench.sent.filter((request) => request.type === "preview").at(-1)!;
+    bench.commander.receive({ type: "preview", id: asked.id, verdict: "near", text: "", position: [0.15, 0.2], place: null }, bench.clock.millis);
+  };
+  preview();
+  bench.commander.setPad(held);
+  bench.commander.setPad({ ...held, isGo: true });
+  bench.run(40);
+  assert.equal(bench.commander.deadMan.source, "pad go");
+  assert.deepEqual(bench.last().intent, { kind: "joints", position: [0.15, 0.2] });
+  bench.commander.setPad({ ...held, isHeld: false });
+  assert.equal(bench.last().grip, null);
+  assert.ok(bench.commander.goal.target, "the arm is not there yet");
+  bench.commander.setPad(held);
+  bench.commander.setPad({ ...held, deflection: { ...NO_DEFLECTION, up: 1 } });
+  assert.equal(bench.commander.goal.target, null);
+  assert.equal(bench.last().intent?.kind, "tip_velocity");
+});
+
+test("a goal is forgotten once the arm is there and go is released", () => {
+  bench.run(1500);
+  bench.commander.preview([0.15, 0.2]);
+  bench.run(120);
+  const asked = bench.sent.filter((request) => request.type === "preview").at(-1)!;
+  bench.commander.receive({ type: "preview", id: asked.id, verdict: "reachable", text: "", position: [0.15, 0.2], place: null }, bench.clock.millis);
+  bench.commander.setGo(true);
+  bench.run(100, { position: [0.15, 0.2] });
+  assert.ok(bench.commander.goal.target, "the arm is held there");
+  bench.commander.setGo(false);
+  bench.run(40, { position: [0.15, 0.2] });
+  assert.equal(bench.commander.goal.target, null);
+});
+
+test("a goal that changes while the arm moves to it ends the motion", () => {
+  bench.run(1500);
+  bench.commander.preview([0.15, 0.2]);
+  bench.run(120);
+  const asked = bench.sent.filter((request) => request.type === "preview").at(-1)!;
+  bench.commander.receive({ type: "preview", id: asked.id, verdict: "reachable", text: "", position: [0.15, 0.2], place: null }, bench.clock.millis);
+  bench.commander.setGo(true);
+  assert.equal(bench.last().grip, 1);
+  bench.commander.preview([0.5, 0.2]);
+  assert.equal(bench.last().grip, null);
+});
+
 test("a link that becomes slow ends a grip in servo mode", () => {
   bench.run(1500);
   bench.commander.setJog("keys", FORWARD);

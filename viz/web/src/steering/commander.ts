@@ -315,9 +315,11 @@ export class Commander {
   /** Adopts what a gamepad reports; null if there is none. */
   setPad(input: PadInput | null): void {
     if (input?.isStop && this.canMove) this.stop();
-    this.setGo(input?.isGo === true, "pad go");
     const isJogging = input?.isHeld === true && !input.isGo;
+    // The trigger is pulled before the other button, so that it is let go first.
     this.setJog("pad", isJogging ? { kind: "tip", deflection: input.deflection } : null);
+    this.setGo(input?.isGo === true, "pad go");
+    if (this.deadMan.source === "pad" && input && isDeflected(input.deflection)) this.goal.clear();
   }
 
   private axesNow(): Axes | null {
@@ -331,7 +333,8 @@ export class Commander {
       this.axes = null;
     } else {
       this.axes = this.axesNow();
-      if (source !== "go" && source !== "pad go") this.goal.clear();
+      // A trigger of a gamepad may be the first half of "go".
+      if (source === "gizmo" || source === "keys" || source === "button") this.goal.clear();
       this.events.notice("");
     }
     // The arm must not wait for the next sample to brake.

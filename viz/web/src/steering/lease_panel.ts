@@ -4,6 +4,7 @@ import { announce } from "../panels/announcer";
 import { element } from "../panels/element";
 import { make, setText } from "../panels/html";
 import { disable } from "../panels/title";
+import { showToast } from "../panels/toast";
 import type { Commander } from "./commander";
 import type { SteerRequest } from "./messages";
 import { leaseText } from "./texts";
@@ -15,6 +16,7 @@ export class LeasePanel {
   private readonly to = element("steer-to", HTMLSelectElement);
   private shownClients = "";
   private holder: number | null = null;
+  private isOffered = false;
 
   constructor(
     private readonly commander: Commander,
@@ -38,6 +40,7 @@ export class LeasePanel {
     for (const shown of document.querySelectorAll<HTMLElement>(".steer-offer")) shown.hidden = !hasControl || !others;
     element("steer-controls").hidden = !hasControl;
     this.announceHolder();
+    this.announceOffer();
   }
 
   /** Why nobody can take control here now; empty if it is possible. */
@@ -60,6 +63,17 @@ export class LeasePanel {
       ...others.map(({ id }) => make("option", { value: String(id), textContent: `operator ${id}` })),
     );
     if (others.some(({ id }) => String(id) === chosen)) this.to.value = chosen;
+  }
+
+  private announceOffer(): void {
+    const { arm, state } = this.commander;
+    const isOffered = state !== null && state.holder !== null && state.offered_to === arm?.client;
+    if (isOffered && !this.isOffered) {
+      const text = `Operator ${state.holder} offers you control of the arm: press Take control under Steer`;
+      announce(text);
+      showToast(text);
+    }
+    this.isOffered = isOffered;
   }
 
   private announceHolder(): void {

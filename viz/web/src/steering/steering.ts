@@ -287,6 +287,8 @@ export class Steering {
     this.showMode();
     this.showGoal();
     this.showTime();
+    const contacts = commander.state?.contacts ?? 0;
+    setText(element("steer-contacts"), contacts > 0 ? `The robot has touched the scene ${contacts} times` : "");
     if (!commander.state) {
       this.gizmo.place(null);
       this.ghost.hide();

@@ -1,9 +1,10 @@
 // The stop button, for everybody and by a key that works wherever the focus is, and the permission to move again.
 
 import { type action, isTyping } from "../keys";
+import { announce } from "../panels/announcer";
 import { element } from "../panels/element";
 import { setText } from "../panels/html";
-import { disable } from "../panels/title";
+import { disable, setTitle } from "../panels/title";
 import type { Commander } from "./commander";
 
 /** The second press permits motion only within this time. */
@@ -39,11 +40,20 @@ export class StopButton {
     disable(this.button, canSend ? "" : "The link to the arm is cut: the arm brakes when its commands expire");
     const isOwn = state?.holder === arm?.client;
     setText(element("steer-who"), typeof state?.holder === "number" ? (isOwn ? "you" : `operator ${state.holder}`) : "");
-    element("steer-stopped").hidden = !state?.stop;
-    setText(element("steer-stop-text"), state?.stop ? `The arm is stopped: ${state.stop}` : "");
+    this.showStop(state?.stop ?? null);
     disable(this.rearm, hasControl ? "" : "Only the operator who has control can permit motion");
     if (performance.now() > this.sureUntil || !state?.stop) this.sureUntil = 0;
     setText(this.rearm, this.sureUntil === 0 ? REARM : REARM_AGAIN);
+  }
+
+  private showStop(stop: string | null): void {
+    const text = stop === null ? "" : `The arm is stopped: ${stop}`;
+    element("steer-stopped").hidden = stop === null;
+    element("steer-halt").hidden = stop === null;
+    if (element("steer-stop-text").textContent === text) return;
+    setText(element("steer-stop-text"), text);
+    setTitle(element("steer-halt"), text);
+    if (text !== "") announce(text);
   }
 
   private stop(): void {
