@@ -49,7 +49,7 @@ pub use steering::request::{
     SteeringRequest,
 };
 pub use steering::state::{AppliedCommand, AppliedLimit, LimitEffect, LimitLink, SteeringState};
-pub use steering::steering_server::SteeringServer;
+pub use steering::steering_server::{SteeringServer, publish_steering};
 pub use topics::edit_status::{ErasedBox, LastEdit, SavedEdits};
 pub use topics::model_chunks::PublishedChunks;
 pub use topics::observations::{ObservationMap, ObservedCell};
@@ -69,4 +69,11 @@ pub use topics::robot_description::{MeshFormat, RobotDescription, RobotMesh};
 #[cfg(fuzzing)]
 pub fn check_messages(messages: &str) {
     client::message_checks::check_messages(messages);
+}
+
+/// Handles the messages of a client that steers, one per line, and panics if a result is
+/// inconsistent.
+#[cfg(fuzzing)]
+pub fn check_steering_messages(messages: &str) {
+    steering::message_checks::check_messages(messages);
 }

@@ -63,6 +63,11 @@ impl PictureRequests {
         self.queue().join(role)
     }
 
+    /// A number that no client of any socket has or gets.
+    pub(crate) fn reserve_number(&self) -> u64 {
+        self.queue().reserve_number()
+    }
+
     /// Removes a client with its requests.
     pub(crate) fn leave(&self, client: u64) {
         self.queue().leave(client);

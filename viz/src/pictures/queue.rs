@@ -114,11 +114,17 @@ pub(crate) struct DrawnPicture {
 impl Queue {
     /// Adds a client. The returned handle is notified when its outbox has a result.
     pub(crate) fn join(&mut self, role: Role) -> (u64, Arc<Notify>) {
-        self.n_joined += 1;
+        let client = self.reserve_number();
         let waiting = ClientQueue::new(role);
         let wake = Arc::clone(&waiting.wake);
-        self.clients.insert(self.n_joined, waiting);
-        (self.n_joined, wake)
+        self.clients.insert(client, waiting);
+        (client, wake)
+    }
+
+    /// The number of a new client, which no other client gets.
+    pub(crate) fn reserve_number(&mut self) -> u64 {
+        self.n_joined += 1;
+        self.n_joined
     }
 
     /// Removes a client and its pending work.

@@ -8,7 +8,7 @@ use parking_lot::Mutex;
 use std::cmp::Reverse;
 use std::net::SocketAddr;
 use std::sync::Arc;
-use std::sync::atomic::{AtomicUsize, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 use std::time::{Duration, Instant};
 use tokio::sync::watch;
 use tokio::time::timeout_at;
@@ -19,6 +19,9 @@ const MAX_CONNECTIONS: usize = 256;
 /// Maximum number of WebSocket clients. Each client may use memory for pictures that are not sent
 /// yet (see `pictures/queue.rs`).
 const MAX_CLIENTS: usize = 32;
+/// Maximum number of clients of `/steer`. They have their own places, so that no number of pages can
+/// keep an operator from the arm.
+const MAX_STEERING_CLIENTS: usize = 16;
 /// Number of file descriptors that must be available per connection. Connections therefore use at
 /// most a quarter of the limit on open files.
 const DESCRIPTORS_PER_CONNECTION: usize = 4;
@@ -36,8 +39,10 @@ const IDLE_CLIENT_AFTER: Duration = Duration::from_secs(3);
 pub(crate) struct Limits {
     /// Maximum number of open connections.
     pub(crate) connections: usize,
-    /// Maximum number of WebSocket clients among them.
+    /// Maximum number of clients of `/ws` among them.
     pub(crate) clients: usize,
+    /// Maximum number of clients of `/steer` among them.
+    pub(crate) steering_clients: usize,
 }
 
 impl Limits {
@@ -49,6 +54,7 @@ impl Limits {
             connections,
             // Clients never take all connections, so the files of a page can always be loaded.
             clients: MAX_CLIENTS.min(connections / 2),
+            steering_clients: MAX_STEERING_CLIENTS.min(connections / 4),
         }
     }
 
@@ -85,6 +91,8 @@ pub(crate) struct Connection {
     peer: Option<SocketAddr>,
     /// Size that the kernel's send buffer should have, bytes; 0 if it should not change.
     send_buffer_bytes: AtomicUsize,
+    /// Whether another thread polls the stream from now on.
+    has_new_thread: AtomicBool,
     /// Becomes true when the task that serves the connection must drop it.
     is_closed: watch::Sender<bool>,
     activity: Mutex<Activity>,
@@ -101,6 +109,8 @@ struct Activity {
     /// on.
     client_since: Option<Instant>,
     is_operator: bool,
+    /// Whether it is a client of `/steer`, and not of `/ws`.
+    is_steering: bool,
     /// Time of the last message. Pongs do not count, because libraries send them automatically.
     last_message: Option<Instant>,
     /// Time of the ping that has not been answered yet.
@@ -163,14 +173,37 @@ impl Admission {
     /// important client. If all are in use, an operator replaces the viewer that connected last, so
     /// that viewers cannot lock operators out.
     pub(crate) fn admit_client(&self, connection: &Connection, is_operator: bool) -> bool {
+        self.admit_to(self.limits.clients, connection, is_operator, false)
+    }
+
+    /// Registers a client of `/steer` on its connection, with the same rules. In addition, a viewer
+    /// never replaces an operator, who may be holding the lease over a bad connection.
+    pub(crate) fn admit_steering_client(&self, connection: &Connection, is_operator: bool) -> bool {
+        self.admit_to(self.limits.steering_clients, connection, is_operator, true)
+    }
+
+    fn admit_to(
+        &self,
+        max_clients: usize,
+        connection: &Connection,
+        is_operator: bool,
+        is_steering: bool,
+    ) -> bool {
         // Locked until the client is registered, so that two clients cannot take the same place.
         let connections = self.connections.lock();
         let now = Instant::now();
         let clients: Vec<_> = open(&connections)
+            .filter(|other| other.activity.lock().is_steering == is_steering)
             .filter_map(|other| Some((other.importance(now)?, other)))
             .collect();
-        if clients.len() >= self.limits.clients {
-            let least = clients.iter().min_by_key(|(importance, _)| *importance);
+        if clients.len() >= max_clients {
+            let is_protected = |other: &Connection| {
+                is_steering && !is_operator && other.activity.lock().is_operator
+            };
+            let least = clients
+                .iter()
+                .filter(|(_, other)| !is_protected(other))
+                .min_by_key(|(importance, _)| *importance);
             let replaced = least.filter(|(importance, _)| match importance {
                 Importance::Operator => false,
                 Importance::Viewer(_) => is_operator,
@@ -184,6 +217,7 @@ impl Admission {
         let mut activity = connection.activity.lock();
         activity.client_since = Some(now);
         activity.is_operator = is_operator;
+        activity.is_steering = is_steering;
         true
     }
 
@@ -207,12 +241,14 @@ impl Connection {
         Self {
             peer,
             send_buffer_bytes: AtomicUsize::new(0),
+            has_new_thread: AtomicBool::new(false),
             is_closed: watch::Sender::new(false),
             activity: Mutex::new(Activity {
                 has_requested: false,
                 active_at: Instant::now(),
                 client_since: None,
                 is_operator: false,
+                is_steering: false,
                 last_message: None,
                 pinged: None,
                 has_answered: false,
@@ -263,6 +299,18 @@ impl Connection {
     pub(crate) fn take_send_buffer(&self) -> Option<usize> {
         let n_bytes = self.send_buffer_bytes.swap(0, Ordering::Relaxed);
         (n_bytes > 0).then_some(n_bytes)
+    }
+
+    /// Says that the thread that calls this polls the stream from now on.
+    pub(crate) fn change_thread(&self) {
+        // Like the size of the buffer, this is only stored here.
+        self.has_new_thread.store(true, Ordering::Relaxed);
+    }
+
+    /// Whether the thread has changed since the last call.
+    #[cfg(unix)]
+    pub(crate) fn take_thread_change(&self) -> bool {
+        self.has_new_thread.swap(false, Ordering::Relaxed)
     }
 
     /// Returns whether a ping is due. At most one ping is unanswered at a time, so that the time

@@ -67,12 +67,36 @@ impl GuardedStream {
     #[cfg(not(unix))]
     fn resize_send_buffer(&self) {}
 
+    /// Lets the runtime of this thread watch the socket, if the thread has changed. Otherwise, the
+    /// thread that accepted the connection would have to notice each message. A failure affects only
+    /// latency.
+    #[cfg(unix)]
+    fn change_runtime(&mut self) {
+        use std::os::fd::AsFd;
+        if !self.connection.take_thread_change() {
+            return;
+        }
+        // A runtime watches a descriptor as long as it is open, so the socket gets another one.
+        let moved = self.stream.as_fd().try_clone_to_owned();
+        match moved.and_then(|socket| TcpStream::from_std(socket.into())) {
+            Ok(stream) => {
+                self.stream = stream;
+                self.write_timer = None;
+            }
+            Err(error) => log::debug!("cannot move a connection to another thread: {error}"),
+        }
+    }
+
+    #[cfg(not(unix))]
+    fn change_runtime(&mut self) {}
+
     /// Runs a write, and closes the connection if the peer accepts no bytes for too long.
     fn write(
         &mut self,
         context: &mut Context<'_>,
         write: impl FnOnce(Pin<&mut TcpStream>, &mut Context<'_>) -> Poll<io::Result<usize>>,
     ) -> Poll<io::Result<usize>> {
+        self.change_runtime();
         self.resize_send_buffer();
         let written = write(Pin::new(&mut self.stream), context);
         if written.is_ready() {
@@ -99,6 +123,7 @@ impl AsyncRead for GuardedStream {
         context: &mut Context<'_>,
         buffer: &mut ReadBuf<'_>,
     ) -> Poll<io::Result<()>> {
+        self.change_runtime();
         Pin::new(&mut self.stream).poll_read(context, buffer)
     }
 }

@@ -20,9 +20,14 @@ use crate::server::downloads::FileServer;
 use crate::server::guarded_stream::GuardedStream;
 use crate::server::page::{FILES, has_version};
 use crate::server::server_context::ServerContext;
+use crate::steering::client_message;
+use crate::steering::socket::SteeringSocket;
+use crate::steering::steering_server::steered_arm;
+use crate::steering::steering_thread::{SteeringSpawner, SteeringThread};
 use crate::topics::robot_description::RobotDescription;
 use crate::topics::{self, Publisher};
 use crate::{Error, Hub, Status, client};
+use axum::extract::ws::rejection::WebSocketUpgradeRejection;
 use axum::extract::{Extension, Path, Request, State, WebSocketUpgrade};
 use axum::http::{HeaderMap, HeaderName, HeaderValue, StatusCode, header};
 use axum::middleware::{Next, from_fn, from_fn_with_state};
@@ -98,6 +103,7 @@ pub struct Server {
     scheme: &'static str,
     stop: watch::Sender<bool>,
     thread: Option<JoinHandle<()>>,
+    steering_thread: SteeringThread,
 }
 
 impl Server {
@@ -137,8 +143,10 @@ impl Server {
         let (listener, address) = listen(listen_address)?;
         let scheme = if tls.is_some() { "https" } else { "http" };
         let (stop, stopped) = watch::channel(false);
-        // The server needs only one thread, because clients mostly wait, and computations run on
-        // threads for blocking tasks.
+        let steering_thread = SteeringThread::start(stopped.clone())?;
+        let steering = steering_thread.spawner();
+        // Except for steering, the server needs only one thread, because clients mostly wait, and
+        // computations run on threads for blocking tasks.
         let runtime = tokio::runtime::Builder::new_current_thread()
             .enable_all()
             .build()
@@ -146,7 +154,13 @@ impl Server {
         let thread = std::thread::Builder::new()
             .name("viz-server".to_owned())
             .spawn(move || {
-                if let Err(error) = runtime.block_on(serve(listener, hub, access, tls, stopped)) {
+                let services = Services {
+                    access,
+                    tls,
+                    steering,
+                };
+                let served = serve(listener, hub, services, stopped);
+                if let Err(error) = runtime.block_on(served) {
                     log::error!("the server on {address} stopped: {error}");
                 }
                 // Does not wait for pictures that are still being encoded.
@@ -158,6 +172,7 @@ impl Server {
             scheme,
             stop,
             thread: Some(thread),
+            steering_thread,
         })
     }
 
@@ -183,6 +198,9 @@ impl Drop for Server {
         {
             log::error!("the server thread on {} panicked", self.address);
         }
+        if !self.steering_thread.join() {
+            log::error!("the steering thread on {} panicked", self.address);
+        }
     }
 }
 
@@ -197,11 +215,17 @@ fn listen(address: SocketAddr) -> Result<(TcpListener, SocketAddr), Error> {
     Ok((listener, bound))
 }
 
+/// What connections of a server need.
+struct Services {
+    access: Access,
+    tls: Option<TlsAcceptor>,
+    steering: SteeringSpawner,
+}
+
 async fn serve(
     listener: TcpListener,
     hub: Hub,
-    access: Access,
-    tls: Option<TlsAcceptor>,
+    services: Services,
     mut stopped: watch::Receiver<bool>,
 ) -> std::io::Result<()> {
     #[cfg(unix)]
@@ -230,11 +254,12 @@ async fn serve(
     let app = TowerToHyperService::new(router(AppState {
         server_context,
         admission: Arc::clone(&admission),
-        access: Arc::new(access),
+        access: Arc::new(services.access),
         files: FileServer::new(hub.clone()),
+        steering: services.steering,
     }));
     tokio::select! {
-        () = accept(&listener, &admission, tls.as_ref(), &app) => {}
+        () = accept(&listener, &admission, services.tls.as_ref(), &app) => {}
         _ = stopped.changed() => {}
     }
     // The server accepts no new connections while the clients receive the goodbye.
@@ -367,6 +392,7 @@ struct AppState {
     admission: Arc<Admission>,
     access: Arc<Access>,
     files: FileServer,
+    steering: SteeringSpawner,
 }
 
 fn router(app_state: AppState) -> Router {
@@ -375,6 +401,7 @@ fn router(app_state: AppState) -> Router {
         .route("/robot/{mesh}", get(robot_mesh))
         .route("/files/{name}", get(file))
         .route("/ws", get(connect))
+        .route("/steer", get(steer))
         .route_layer(from_fn_with_state(app_state.clone(), require_token));
     // The files of the page need no token. They contain no data, and the page needs them before it
     // can send the token. The page reads the token from the fragment of the address, which browsers
@@ -492,6 +519,48 @@ async fn connect(
         .max_message_size(MAX_MESSAGE_BYTES)
         .max_frame_size(MAX_MESSAGE_BYTES)
         .on_upgrade(move |socket| client::serve(socket, connection, role, app_state.server_context))
+}
+
+/// A client that steers the arm, or watches how others do.
+async fn steer(
+    upgrade: Result<WebSocketUpgrade, WebSocketUpgradeRejection>,
+    Extension(connection): Extension<Arc<Connection>>,
+    Extension(role): Extension<Role>,
+    State(app_state): State<AppState>,
+) -> Response {
+    let Some(server) = steered_arm(&app_state.server_context.hub) else {
+        return (
+            StatusCode::NOT_FOUND,
+            "no arm can be steered: this needs [arm.motion] in the rig file and a run that permits motion",
+        )
+            .into_response();
+    };
+    let upgrade = match upgrade {
+        Ok(upgrade) => upgrade,
+        Err(rejection) => return rejection.into_response(),
+    };
+    if !app_state
+        .admission
+        .admit_steering_client(&connection, role == Role::Operator)
+    {
+        return (
+            StatusCode::SERVICE_UNAVAILABLE,
+            "too many clients are connected to the arm, try again later",
+        )
+            .into_response();
+    }
+    upgrade
+        .max_message_size(client_message::MAX_MESSAGE_BYTES)
+        .max_frame_size(client_message::MAX_MESSAGE_BYTES)
+        .on_upgrade(move |socket| async move {
+            app_state.steering.serve(SteeringSocket {
+                socket,
+                connection,
+                role,
+                server,
+                context: app_state.server_context,
+            });
+        })
 }
 
 /// Adds headers that keep other web sites from embedding or reading the responses.

@@ -102,11 +102,18 @@ impl Inbox {
         Ok(())
     }
 
-    /// Removes what the client asked for, except for stops. If the loop knows the client, it learns
-    /// that the client is silent.
+    /// Removes what a silent client asked for, except for stops. If the loop knows the client, it
+    /// learns of the silence.
     pub(crate) fn silence(&mut self, client: u64, at: Instant) {
+        // The end of an earlier silence stays, too: the loop has not released that lease yet.
+        let stays = |request: &SteeringRequest| {
+            matches!(
+                request,
+                SteeringRequest::Stop | SteeringRequest::Disconnected
+            )
+        };
         self.waiting
-            .retain(|waiting| waiting.client != client || waiting.request == SteeringRequest::Stop);
+            .retain(|waiting| waiting.client != client || stays(&waiting.request));
         let Some(sender) = self.clients.get_mut(&client) else {
             return;
         };

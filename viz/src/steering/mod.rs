@@ -5,9 +5,16 @@
 //! be read, roles that may not steer, and floods.
 
 pub(crate) mod arm_description;
+pub(crate) mod client_message;
 mod inbox;
+#[cfg(any(test, fuzzing))]
+pub(crate) mod message_checks;
+mod message_rate;
 mod outbox;
 pub(crate) mod preview;
 pub(crate) mod request;
+mod server_message;
+pub(crate) mod socket;
 pub(crate) mod state;
 pub(crate) mod steering_server;
+pub(crate) mod steering_thread;

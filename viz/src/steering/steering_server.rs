@@ -17,7 +17,7 @@ use tokio::sync::{Notify, watch};
 
 /// Passes the requests of clients to the loop that steers an arm, and its answers to the clients.
 ///
-/// No function waits for a client. [`Hub::set_steering`] gives it to the server, which then accepts
+/// No function waits for a client. [`publish_steering`] gives it to the server, which then accepts
 /// clients under `/steer`.
 #[derive(Debug)]
 pub struct SteeringServer {
@@ -193,19 +193,32 @@ fn urgent_part(state: &SteeringState) -> UrgentPart<'_> {
     )
 }
 
+/// Waits until clients may no longer steer the arm of this server.
+pub(crate) async fn steering_ended(hub: &Hub, server: &Arc<SteeringServer>) {
+    let mut steered = hub.latest::<SteeredArm>().subscribe();
+    let is_other = |arm: &SteeredArm| {
+        let current = arm.0.as_ref();
+        current.is_none_or(|current| !Arc::ptr_eq(current, server))
+    };
+    // The hub keeps the sender, so there is no error while somebody waits.
+    let _ = steered.wait_for(is_other).await;
+}
+
 /// The arm that clients may steer.
 #[derive(Clone, Debug, Default)]
 struct SteeredArm(Option<Arc<SteeringServer>>);
 
-impl Hub {
-    /// Sets the arm that clients may steer. With `None`, and before the first call, `/steer` answers
-    /// 404, and connected clients are disconnected.
-    pub fn set_steering(&self, server: Option<Arc<SteeringServer>>) {
-        self.latest::<SteeredArm>().send_replace(SteeredArm(server));
+/// Sets the arm that clients of a hub may steer. With `None`, and before the first call, `/steer`
+/// answers 404, and connected clients are disconnected. The status says whether there is an arm.
+pub fn publish_steering(hub: &Hub, server: Option<Arc<SteeringServer>>) {
+    hub.latest::<SteeredArm>().send_replace(SteeredArm(server));
+    // The hub fills in the status. Before the first status, there is nothing to update.
+    if hub.status().is_some() {
+        hub.change_status(|_| {});
     }
+}
 
-    /// The arm that clients may steer.
-    pub(crate) fn steering(&self) -> Option<Arc<SteeringServer>> {
-        self.latest::<SteeredArm>().borrow().0.clone()
-    }
+/// The arm that clients of a hub may steer.
+pub(crate) fn steered_arm(hub: &Hub) -> Option<Arc<SteeringServer>> {
+    hub.latest::<SteeredArm>().borrow().0.clone()
 }

@@ -23,6 +23,9 @@ pub struct OperatorStatus {
     pub store: Option<KeyframeStore>,
     /// The connected clients. The hub fills them in.
     pub clients: Vec<ConnectedClient>,
+    /// Whether clients can connect to `/steer`. The hub fills it in.
+    #[serde(skip_serializing_if = "std::ops::Not::not")]
+    pub steering: bool,
     /// Number of the client that has paused training; `None` if it is not paused.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub paused_by: Option<u64>,

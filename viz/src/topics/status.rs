@@ -3,6 +3,7 @@
 use crate::Hub;
 use crate::client::server_message::ServerMessage;
 use crate::clock::ServerClock;
+use crate::steering::steering_server::steered_arm;
 use crate::topics::published_data::{RunResult, StateProgress, Status};
 use crate::topics::shared_topic::{SharedTopic, only_message};
 use crate::topics::{DefaultRate, Priority};
@@ -76,6 +77,7 @@ impl Hub {
             // The clients are also read within the lock. A client that joins afterwards then
             // changes this status.
             status.operator.clients = self.pictures().clients();
+            status.operator.steering = steered_arm(self).is_some();
             *latest = Some(Arc::new(status));
         });
     }

@@ -20,16 +20,16 @@ const HANDSHAKE_SECS: std::ops::Range<f64> = 2.0..8.0;
 const VIEWER_TIMEOUT: Duration = Duration::from_secs(1);
 
 /// A shared server and what its users know.
-struct Shared {
-    hub: Hub,
+pub(crate) struct Shared {
+    pub(crate) hub: Hub,
     server: Server,
-    operator: String,
-    viewer: String,
+    pub(crate) operator: String,
+    pub(crate) viewer: String,
     fingerprint: String,
 }
 
 impl Shared {
-    fn start() -> Self {
+    pub(crate) fn start() -> Self {
         let folder = tempfile::tempdir().expect("a folder");
         let certificate = Certificate::kept_in(folder.path()).expect("a certificate");
         let (fingerprint, tokens) = (
@@ -61,16 +61,16 @@ impl Shared {
         }
     }
 
-    fn address(&self) -> SocketAddr {
+    pub(crate) fn address(&self) -> SocketAddr {
         SocketAddr::from(([127, 0, 0, 1], self.server.address().port()))
     }
 
-    fn tls(&self) -> tls::TlsStream {
+    pub(crate) fn tls(&self) -> tls::TlsStream {
         tls::connect(self.address(), &self.fingerprint)
     }
 
     /// Status line and headers, and the body, of a GET request with additional headers.
-    fn get(&self, path: &str, headers: &str) -> (String, String) {
+    pub(crate) fn get(&self, path: &str, headers: &str) -> (String, String) {
         let mut stream = self.tls();
         let address = self.address();
         write!(
@@ -173,7 +173,13 @@ fn data_requires_a_token_and_the_page_does_not() {
     let shared = Shared::start();
     let bearer = |token: &str| format!("Authorization: Bearer {token}\r\n");
     let cookie = format!("Cookie: __Host-fieldrig-7007={}\r\n", shared.viewer);
-    for path in ["/status", "/robot/0.stl", "/files/splat.ply", "/ws"] {
+    for path in [
+        "/status",
+        "/robot/0.stl",
+        "/files/splat.ply",
+        "/ws",
+        "/steer",
+    ] {
         for (headers, named) in [
             (String::new(), "requires a token"),
             (bearer("0123"), "invalid token"),
@@ -219,7 +225,7 @@ fn foreign_origins_are_refused_despite_a_token() {
             "Authorization: Bearer {}\r\nOrigin: {origin}\r\n",
             shared.operator
         );
-        for path in ["/status", "/ws", "/"] {
+        for path in ["/status", "/ws", "/steer", "/"] {
             let (head, body) = shared.get(path, &headers);
             assert!(
                 head.starts_with("http/1.1 403") && body.lines().count() == 1,

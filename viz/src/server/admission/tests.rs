@@ -7,6 +7,7 @@ use std::time::{Duration, Instant};
 const LIMITS: Limits = Limits {
     connections: 4,
     clients: 2,
+    steering_clients: 1,
 };
 
 /// An admission, and as many connections as it allows.
@@ -37,15 +38,16 @@ fn importance(connection: &Connection) -> Importance {
 
 #[test]
 fn connections_leave_descriptors_for_files() {
-    for (n_descriptors, connections, clients) in [
-        (1024, 256, 32),
-        (1_000_000, 256, 32),
-        (128, 32, 16),
-        (16, 8, 4),
+    for (n_descriptors, connections, clients, steering_clients) in [
+        (1024, 256, 32, 16),
+        (1_000_000, 256, 32, 16),
+        (128, 32, 16, 8),
+        (16, 8, 4, 2),
     ] {
         let expected = Limits {
             connections,
             clients,
+            steering_clients,
         };
         assert_eq!(Limits::of_descriptors(n_descriptors), expected);
     }
@@ -129,6 +131,25 @@ fn viewers_make_room_for_operators() {
     );
     assert!(!admission.admit_client(&newcomer, false));
     assert!(!d.is_closed() && !e.is_closed());
+}
+
+#[test]
+fn clients_that_steer_have_their_own_places() {
+    let (admission, [page, other_page, operator, newcomer]) = full_admission();
+    for client in [&page, &other_page] {
+        assert!(admission.admit_client(client, true));
+        act_like_page(client);
+    }
+    assert!(admission.admit_steering_client(&operator, true));
+    // The operator has never answered a ping, so anybody could replace it on `/ws`.
+    assert!(
+        !admission.admit_steering_client(&newcomer, false),
+        "a viewer replaces no operator"
+    );
+    assert!(!operator.is_closed());
+    assert!(admission.admit_steering_client(&newcomer, true));
+    assert!(operator.is_closed());
+    assert!(!page.is_closed() && !other_page.is_closed());
 }
 
 #[test]

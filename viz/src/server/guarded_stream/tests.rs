@@ -12,6 +12,7 @@ use tokio::net::TcpStream;
 const LIMITS: Limits = Limits {
     connections: 4,
     clients: 2,
+    steering_clients: 1,
 };
 /// The timeout is shorter than the timeout of a server.
 const WRITE_TIMEOUT: Duration = Duration::from_millis(200);

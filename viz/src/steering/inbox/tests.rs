@@ -253,6 +253,18 @@ fn a_silent_client_releases_once_until_it_speaks_again() {
 }
 
 #[test]
+fn a_second_silence_does_not_hide_the_first() {
+    let mut inbox = inbox();
+    push(&mut inbox, A, SteeringRequest::TakeLease);
+    inbox.take();
+    inbox.silence(A, Instant::now());
+    // The loop is held up: it has not seen the silence when the client speaks and leaves.
+    push(&mut inbox, A, SteeringRequest::TakeLease);
+    inbox.leave(A, Instant::now());
+    assert_eq!(taken(&mut inbox), ["4: Disconnected"]);
+}
+
+#[test]
 fn clients_that_come_and_go_leave_nothing_behind() {
     let mut inbox = Inbox::default();
     for client in 0..10_000 {
