@@ -341,7 +341,7 @@ fn operators_steer_with_a_held_switch_and_preview_over_long_links() {
     assert!(!page.is_visible("toggle-steer"), "nothing can be steered");
 
     let arm = ScriptedArm::start(FOLLOWS_MILLIS);
-    hub.set_steering(Some(Arc::clone(&arm.server)));
+    publish_steering(&hub, Some(Arc::clone(&arm.server)));
     check_control(&mut page, &arm);
     page.browser.click("reset-view");
     let view = page.shown_view();
@@ -354,7 +354,7 @@ fn operators_steer_with_a_held_switch_and_preview_over_long_links() {
 
     // Another arm behind a long link: the page connects again, and has no control of it.
     let far = ScriptedArm::start(PREVIEWS_MILLIS);
-    hub.set_steering(Some(Arc::clone(&far.server)));
+    publish_steering(&hub, Some(Arc::clone(&far.server)));
     drop(arm);
     page.wait_for_text("steer-mode", "limit 0 ms");
     page.wait_for_text("steer-lease", "Nobody has control");
@@ -370,7 +370,7 @@ fn operators_steer_with_a_held_switch_and_preview_over_long_links() {
     page.save("steering-phone.png");
     check_targets(&mut page);
 
-    hub.set_steering(None);
+    publish_steering(&hub, None);
     page.wait_until_visible("toggle-steer", false);
     drop((page, far, thread, server));
     std::fs::remove_dir_all(&profile).expect("the browser has left its profile");
@@ -704,7 +704,7 @@ fn viewers_watch_and_stop() {
     let last: Arc<Mutex<Option<RenderRequest>>> = Arc::default();
     let (hub, thread) = hub_with_robot(&last);
     let arm = ScriptedArm::start(FOLLOWS_MILLIS);
-    hub.set_steering(Some(Arc::clone(&arm.server)));
+    publish_steering(&hub, Some(Arc::clone(&arm.server)));
     let config = ServerConfig {
         listen: ([127, 0, 0, 1], 0).into(),
     };

@@ -105,7 +105,7 @@ test("texts say who has control, and how the arm moves and why", () => {
   assert.equal(leaseText(STATE, CLIENT), "You have control");
   assert.equal(leaseText({ ...STATE, holder: null }, CLIENT), "Nobody has control of the arm");
   const other = { ...STATE, holder: 3, lease_left_secs: 4.2, offered_to: CLIENT };
-  assert.equal(leaseText(other, CLIENT), "Operator 3 has control, 4 s left. Control is offered to you");
+  assert.equal(leaseText(other, CLIENT), "Operator 3 has control for at least 4 s more. Control is offered to you");
   assert.match(modeText("servo", 32.4, 120, false), /^Servo.*32 ms, limit 120 ms/);
   assert.match(modeText("preview", null, 120, true), /^Preview, then go as chosen.*not measured/);
   const limit = { link: "clearance", speed_scale: 0.25, text: "3 cm to a surface", place: null };

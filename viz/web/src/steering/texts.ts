@@ -6,11 +6,11 @@ import type { Mode } from "./round_trip";
 /** Who has control, from the view of one client. */
 export function leaseText({ holder, lease_left_secs, offered_to }: SteerState, client: number): string {
   if (holder === null) return "Nobody has control of the arm";
-  const left = lease_left_secs === null ? "" : `, ${Math.max(0, lease_left_secs).toFixed(0)} s left`;
   if (holder === client) {
     return offered_to === null ? "You have control" : `You have control, offered to operator ${offered_to}`;
   }
-  // The time only counts down while the holder is silent.
+  // The time begins anew with each message of the holder.
+  const left = lease_left_secs === null ? "" : ` for at least ${Math.max(0, lease_left_secs).toFixed(0)} s more`;
   const who = `Operator ${holder} has control${left}`;
   return offered_to === client ? `${who}. Control is offered to you` : who;
 }
@@ -37,7 +37,7 @@ export function shownLimits(limits: readonly Limit[], isHeld: boolean): Limit[] 
 
 const VERDICT_TEXTS: Record<Verdict, string> = {
   reachable: "The goal can be reached",
-  near: "The goal is close to a surface: the arm slows down",
+  near: "The goal is close to a surface, where the arm slows down or stops",
   unreachable: "The goal is out of reach",
   "self-collision": "The robot would touch itself",
   "never seen": "No camera has seen the space at the goal",
