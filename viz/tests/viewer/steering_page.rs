@@ -223,8 +223,8 @@ impl Page {
         self.wait_until(&format!("{id} visible: {is_visible}"), &expression);
     }
 
-    /// The request of the full picture that the page shows.
-    fn shown_view(&mut self) -> RenderRequest {
+    /// The request of the full picture that the page shows, once it is one of this kind.
+    fn shown_view(&mut self, is_expected: impl Fn(&RenderRequest) -> bool) -> RenderRequest {
         let last = Arc::clone(&self.last);
         let mut shown = None;
         self.wait("the full picture", |browser| {
@@ -234,7 +234,8 @@ impl Page {
             shown = last
                 .lock()
                 .clone()
-                .filter(|request| is_shown && request.size_px == [width, height]);
+                .filter(|request| is_shown && request.size_px == [width, height])
+                .filter(&is_expected);
             shown.is_some()
         });
         shown.expect("the condition holds")
@@ -294,13 +295,18 @@ fn pinhole(request: &RenderRequest) -> ([f64; 2], [f64; 2]) {
     (focal_px, principal_px)
 }
 
+/// The view of the button "First view".
+fn first_view() -> kinematics::Transform {
+    Translation3::new(0.0, 0.0, 0.3) * looking_along_y()
+}
+
 /// A scene with a robot, and the thread that draws it.
 fn hub_with_robot(last: &Arc<Mutex<Option<RenderRequest>>>) -> (Hub, RequestThread) {
     let hub = Hub::new();
     hub.set_scene_hint(SceneHint {
         center_m: [0.0, 0.0, 0.2],
         radius_m: 0.8,
-        world_from_camera: Translation3::new(0.0, 0.0, 0.3) * looking_along_y(),
+        world_from_camera: first_view(),
     });
     hub.set_status(Status {
         state: "training".to_owned(),
@@ -337,14 +343,17 @@ fn operators_steer_with_a_held_switch_and_preview_over_long_links() {
         browser: Browser::open(&program, &profile, &server.url(), WINDOW_PX),
         last,
     };
-    page.shown_view();
+    page.shown_view(|_| true);
     assert!(!page.is_visible("toggle-steer"), "nothing can be steered");
 
     let arm = ScriptedArm::start(FOLLOWS_MILLIS);
     publish_steering(&hub, Some(Arc::clone(&arm.server)));
     check_control(&mut page, &arm);
     page.browser.click("reset-view");
-    let view = page.shown_view();
+    let view = page.shown_view(|request| {
+        let eye = first_view().translation.vector;
+        (request.world_from_camera.translation.vector - eye).norm() < 1e-3
+    });
     check_drag(&mut page, &arm, &view);
     check_lost_events(&mut page, &arm, &view);
     check_jogging(&mut page, &arm);
