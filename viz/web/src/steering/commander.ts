@@ -3,7 +3,8 @@
 
 import { DeadMan, type Source } from "./dead_man";
 import { Goal } from "./goal";
-import { median, ModeChoice, type Mode, RoundTrips } from "./round_trip";
+import { HandTimes } from "./hand_times";
+import { ModeChoice, type Mode, RoundTrips } from "./round_trip";
 import {
   type Axes,
   axesOf,
@@ -17,6 +18,7 @@ import {
   tipVelocity,
 } from "./jog";
 import type { PadInput } from "./gamepad";
+import { LeaseKeeper } from "./lease_keeper";
 import type { Arm, Intent, SteerMessage, SteerRequest, SteerState } from "./messages";
 import { type HandSpeed, integrated, numbersOf, type Pose, poseOf, slewed } from "./pose";
 import { capitalized } from "../panels/sentence";
@@ -28,13 +30,6 @@ const MAX_STEP_SECS = 0.1;
 const PING_MILLIS = 250;
 /** Without a message for this time, the link is regarded as cut. The server answers four pings a second. */
 const SILENT_MILLIS = 1000;
-const RENEW_MILLIS = 1000;
-/** Control is given back after this time without input, and after this time in a hidden tab. */
-const IDLE_MILLIS = 5 * 60_000;
-const HIDDEN_MILLIS = 30_000;
-/** Number of commands of which the time to the joints is shown as a median, and the age from which it is not shown. */
-const N_TIMES = 15;
-const OLD_TIME_MICROS = 2_000_000;
 
 /** What one of the jog inputs asks for. */
 export type Jog = { kind: "tip"; deflection: Deflection } | { kind: "joint"; ix: number; direction: number };
@@ -66,12 +61,10 @@ export class Commander {
   private hasSocket = false;
   /** Whether the arm could move when the link was lost. */
   private couldMove = false;
-  private isHidden = false;
-  private hiddenMillis = 0;
-  private usedMillis = 0;
+  private readonly keeper = new LeaseKeeper();
+  private readonly times: HandTimes;
   private receivedMillis = 0;
   private pingedMillis = -Infinity;
-  private renewedMillis = -Infinity;
   private tickedMillis = 0;
   private sequence = 0;
   private readonly jogs = new Map<Source, Jog>();
@@ -82,14 +75,14 @@ export class Commander {
   /** The hand of the gizmo: where it is, and where the pointer wants it. */
   private hand: { now: Pose; wanted: Pose } | null = null;
   private goIntent: Intent | null = null;
-  private times: number[] = [];
-  private timedSequence = -1;
 
   /** `device` differs from that of every other page, because each one counts its grips from the beginning. */
   constructor(
     private readonly device: number,
     private readonly events: CommanderEvents,
-  ) {}
+  ) {
+    this.times = new HandTimes(device);
+  }
 
   get hasControl(): boolean {
     return this.isConnected && this.arm !== null && this.state?.holder === this.arm.client;
@@ -123,10 +116,7 @@ export class Commander {
 
   /** Median time from the hand to the joints over the last commands of this page, milliseconds; null if there are none. */
   get handToJointMillis(): number | null {
-    const { state } = this;
-    const newest = state?.applied?.applied_micros ?? -Infinity;
-    const isOld = state === null || state.time_micros - newest > OLD_TIME_MICROS;
-    return isOld || this.times.length === 0 ? null : median(this.times);
+    return this.state && this.times.millis(this.state);
   }
 
   /** Where the gizmo is: at the hand, at the goal, or at the tip of the arm. In the base; null without an arm. */
@@ -188,16 +178,13 @@ export class Commander {
   private receiveState(state: SteerState, nowMillis: number): void {
     const hadControl = this.hasControl;
     this.state = state;
-    if (this.hasControl && !hadControl) {
-      this.usedMillis = nowMillis;
-      this.hiddenMillis = nowMillis;
-    }
+    if (this.hasControl && !hadControl) this.keeper.used(nowMillis);
     this.permit(state.stop ?? "control of the arm has ended");
     if (hadControl && !this.hasControl) {
       this.goal.clear();
       this.nudge = null;
     }
-    this.measure(state);
+    this.times.add(state);
     if (this.deadMan.source === null && this.goal.isReached(state.position) && this.goIntent) {
       this.goIntent = null;
       this.goal.clear();
@@ -205,22 +192,16 @@ export class Commander {
   }
 
   private permit(reason: string): void {
-    const may = this.maySteer && !this.isHidden;
+    const may = this.maySteer && !this.keeper.isHidden;
     // The server must see an open switch before the first grip.
     if (this.deadMan.permit(may, reason) && may) this.sample();
-  }
-
-  private measure({ applied }: SteerState): void {
-    if (!applied || applied.device !== this.device || applied.sequence <= this.timedSequence) return;
-    this.timedSequence = applied.sequence;
-    this.times = [...this.times, (applied.applied_micros - applied.captured_micros) / 1000].slice(-N_TIMES);
   }
 
   // What the operator does.
 
   /** The operator uses the page. */
   used(nowMillis: number): void {
-    this.usedMillis = nowMillis;
+    this.keeper.used(nowMillis);
   }
 
   stop(): void {
@@ -230,9 +211,8 @@ export class Commander {
 
   /** The page is shown or hidden. */
   setHidden(isHidden: boolean, nowMillis: number): void {
-    if (isHidden === this.isHidden) return;
-    this.isHidden = isHidden;
-    this.hiddenMillis = nowMillis;
+    if (isHidden === this.keeper.isHidden) return;
+    this.keeper.setHidden(isHidden, nowMillis);
     if (isHidden) this.deadMan.loseEvents("the page is hidden");
     this.nudge = null;
     this.permit("the page is hidden");
@@ -356,7 +336,7 @@ export class Commander {
     this.chooseMode(nowMillis);
     this.moveHand(secs);
     this.moveGoal(secs);
-    if (this.deadMan.grip !== null || this.nudge) this.usedMillis = nowMillis;
+    if (this.deadMan.grip !== null || this.nudge) this.keeper.used(nowMillis);
     if (nowMillis - this.pingedMillis >= PING_MILLIS) {
       this.pingedMillis = nowMillis;
       this.events.send({ type: "ping", id: this.roundTrips.ping(nowMillis) });
@@ -401,22 +381,10 @@ export class Commander {
   }
 
   private keepControl(nowMillis: number): void {
-    const isIdle = nowMillis - this.usedMillis > IDLE_MILLIS;
-    const isLongHidden = this.isHidden && nowMillis - this.hiddenMillis > HIDDEN_MILLIS;
-    if (isIdle || isLongHidden) {
-      if (nowMillis - this.renewedMillis < RENEW_MILLIS) return;
-      this.renewedMillis = nowMillis;
-      this.events.notice(`Control was given back, because the page ${isIdle ? "was not used" : "was hidden"}`);
-      this.events.send({ type: "lease", action: "release" });
-      return;
-    }
-    if (this.isHidden) {
-      if (nowMillis - this.renewedMillis < RENEW_MILLIS) return;
-      this.renewedMillis = nowMillis;
-      this.events.send({ type: "lease", action: "renew" });
-    } else {
-      this.sample();
-    }
+    const keeping = this.keeper.keep(nowMillis);
+    if (keeping === "sample") this.sample();
+    else if (keeping !== "nothing") this.events.send({ type: "lease", action: keeping });
+    if (keeping === "release") this.events.notice(`Control was given back, because ${this.keeper.reason(nowMillis)}`);
   }
 
   /** Sends the state of the dead-man switch and, while it is held, what the operator wants. */
