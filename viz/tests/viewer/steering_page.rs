@@ -20,6 +20,7 @@ use viz::{
     AppliedLimit, ArmDescription, Certificate, Hub, LimitEffect, LimitLink, Preview, PreviewGoal,
     PreviewVerdict, RefusedRequest, SceneHint, Server, ServerConfig, Sharing, Status, SteeredJoint,
     SteeringCommand, SteeringIntent, SteeringRequest, SteeringServer, SteeringState, Tokens,
+    publish_steering,
 };
 
 const WINDOW_PX: [u32; 2] = [1280, 760];

@@ -6,6 +6,7 @@ import { element } from "../panels/element";
 import { child } from "../panels/html";
 import type { Commander } from "./commander";
 import type { Mark, Marks } from "./marks";
+import type { Limit, Point } from "./messages";
 import type { Pose } from "./pose";
 import { limitText, shownLimits, verdictText } from "./texts";
 import { mayGo } from "./goal";
@@ -33,12 +34,13 @@ export class LimitsList {
     this.marks.show(worldFromBase ? this.marksOf(limits, worldFromBase) : []);
   }
 
-  private marksOf(limits: ReturnType<typeof shownLimits>, { position, rotation }: Pose): Mark[] {
+  private marksOf(limits: readonly Limit[], { position, rotation }: Pose): Mark[] {
     const { judgement, target } = this.commander.goal;
-    const ofGoal =
-      target && judgement?.place && judgement.verdict !== "reachable"
-        ? [{ place: judgement.place, effect: mayGo(judgement.verdict) ? "slowed" : "refused", text: verdictText(judgement.verdict, judgement.text) }]
-        : [];
+    const ofGoal: { place: Point | null; effect: string; text: string }[] = [];
+    if (target && judgement && judgement.verdict !== "reachable") {
+      const { verdict, text, place } = judgement;
+      ofGoal.push({ place, effect: mayGo(verdict) ? "slowed" : "refused", text: verdictText(verdict, text) });
+    }
     const ofArm = limits.map((limit) => ({ place: limit.place, effect: limit.effect, text: limitText(limit) }));
     return [...ofArm, ...ofGoal].flatMap(({ place, effect, text }) =>
       place ? [{ worldPoint: new THREE.Vector3(...place).applyQuaternion(rotation).add(position), effect, text }] : [],

@@ -318,7 +318,8 @@ export class Steering {
     element("steer-verdict").title = judgement ? `Look of the ghost: ${LOOKS[lookOfVerdict(judgement.verdict)].name}` : "";
     // While it is held, a disabled button would get no release.
     const isHeld = this.commander.deadMan.source === "go";
-    disable(element("steer-go", HTMLButtonElement), goal.intent || isHeld ? "" : "The goal cannot be reached, or is still being checked");
+    const reason = goal.intent || isHeld ? "" : "The goal cannot be reached, or is still being checked";
+    disable(element("steer-go", HTMLButtonElement), reason);
   }
 
   private showTime(): void {
