@@ -109,14 +109,22 @@ struct Activity {
     /// on.
     client_since: Option<Instant>,
     is_operator: bool,
-    /// Whether it is a client of `/steer`, and not of `/ws`.
-    is_steering: bool,
+    socket: Socket,
     /// Time of the last message. Pongs do not count, because libraries send them automatically.
     last_message: Option<Instant>,
     /// Time of the ping that has not been answered yet.
     pinged: Option<Instant>,
     /// Whether the client has ever answered a ping, which shows that it reads.
     has_answered: bool,
+}
+
+/// Which WebSocket a client uses.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Socket {
+    /// `/ws`.
+    Page,
+    /// `/steer`.
+    Steering,
 }
 
 /// Importance of a client. The least important client is replaced first. Within a variant, the
@@ -173,32 +181,30 @@ impl Admission {
     /// important client. If all are in use, an operator replaces the viewer that connected last, so
     /// that viewers cannot lock operators out.
     pub(crate) fn admit_client(&self, connection: &Connection, is_operator: bool) -> bool {
-        self.admit_to(self.limits.clients, connection, is_operator, false)
+        self.admit_to(Socket::Page, connection, is_operator)
     }
 
     /// Registers a client of `/steer` on its connection, with the same rules. In addition, a viewer
     /// never replaces an operator, who may be holding the lease over a bad connection.
     pub(crate) fn admit_steering_client(&self, connection: &Connection, is_operator: bool) -> bool {
-        self.admit_to(self.limits.steering_clients, connection, is_operator, true)
+        self.admit_to(Socket::Steering, connection, is_operator)
     }
 
-    fn admit_to(
-        &self,
-        max_clients: usize,
-        connection: &Connection,
-        is_operator: bool,
-        is_steering: bool,
-    ) -> bool {
+    fn admit_to(&self, socket: Socket, connection: &Connection, is_operator: bool) -> bool {
+        let max_clients = match socket {
+            Socket::Page => self.limits.clients,
+            Socket::Steering => self.limits.steering_clients,
+        };
         // Locked until the client is registered, so that two clients cannot take the same place.
         let connections = self.connections.lock();
         let now = Instant::now();
         let clients: Vec<_> = open(&connections)
-            .filter(|other| other.activity.lock().is_steering == is_steering)
+            .filter(|other| other.activity.lock().socket == socket)
             .filter_map(|other| Some((other.importance(now)?, other)))
             .collect();
         if clients.len() >= max_clients {
             let is_protected = |other: &Connection| {
-                is_steering && !is_operator && other.activity.lock().is_operator
+                socket == Socket::Steering && !is_operator && other.activity.lock().is_operator
             };
             let least = clients
                 .iter()
@@ -217,7 +223,7 @@ impl Admission {
         let mut activity = connection.activity.lock();
         activity.client_since = Some(now);
         activity.is_operator = is_operator;
-        activity.is_steering = is_steering;
+        activity.socket = socket;
         true
     }
 
@@ -248,7 +254,7 @@ impl Connection {
                 active_at: Instant::now(),
                 client_since: None,
                 is_operator: false,
-                is_steering: false,
+                socket: Socket::Page,
                 last_message: None,
                 pinged: None,
                 has_answered: false,

@@ -133,8 +133,11 @@ impl Reader<'_> {
     /// Reads until the client disconnects or violates the WebSocket protocol.
     async fn run(mut self) {
         let lease_secs = self.server.description().lease_secs;
-        // Unlike `clamp`, this gives a number even if the description has none.
-        let silence_secs = lease_secs.max(MIN_SILENCE_SECS).min(MAX_SILENCE_SECS);
+        let silence_secs = if lease_secs.is_nan() {
+            MIN_SILENCE_SECS
+        } else {
+            lease_secs.clamp(MIN_SILENCE_SECS, MAX_SILENCE_SECS)
+        };
         let silence = Duration::from_secs_f64(silence_secs);
         let mut heard_at = Instant::now();
         let mut is_silent = false;
