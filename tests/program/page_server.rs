@@ -62,6 +62,7 @@ fn send_file(mut stream: TcpStream, head: &str) {
         "/splat_worker.js" => ("splat_worker.js", "text/javascript"),
         "/mesh_loaders.js" => ("mesh_loaders.js", "text/javascript"),
         "/coverage.js" => ("coverage.js", "text/javascript"),
+        "/steering.js" => ("steering.js", "text/javascript"),
         "/app.css" => ("app.css", "text/css"),
         _ => ("", "text/plain"),
     };

@@ -32,6 +32,14 @@ const withoutRenderer = {
     onResolve({ filter: /^three$/ }, () => ({ path: join(here, "node_modules/three/build/three.core.js") }));
   },
 };
+/** The classes of three.js that the page has, for a script that draws with them: see src/steering/steering_loader.ts. */
+const threeOfThePage = {
+  name: "three of the page",
+  setup({ onResolve, onLoad }) {
+    onResolve({ filter: /^three$/ }, ({ path }) => ({ path, namespace: "page" }));
+    onLoad({ filter: /^/, namespace: "page" }, () => ({ contents: "module.exports = globalThis.fieldrigThree" }));
+  },
+};
 await build({
   ...options,
   entryPoints: {
@@ -50,6 +58,12 @@ await build({
   },
   format: "esm",
   plugins: [withoutRenderer],
+});
+await build({
+  ...options,
+  entryPoints: { steering: join(here, "src/steering/steering.ts") },
+  format: "esm",
+  plugins: [threeOfThePage],
 });
 await build({ entryPoints: [join(here, "src/app.css")], outfile: join(here, "dist/app.css"), bundle: true, minify: true });
 copyFileSync(join(here, "src/index.html"), join(here, "dist/index.html"));

@@ -64,6 +64,12 @@ pub(crate) const FILES: &[PageFile] = &[
         "coverage.js"
     ),
     page_file!(
+        "/steering.js",
+        "text/javascript; charset=utf-8",
+        "../../web/dist/",
+        "steering.js"
+    ),
+    page_file!(
         "/app.css",
         "text/css; charset=utf-8",
         "../../web/dist/",

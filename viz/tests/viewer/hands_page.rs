@@ -327,7 +327,12 @@ fn check_buttons_stay(page: &mut Page) {
     // Their order does not depend on which of them appears first.
     assert_eq!(
         page.strings("[...document.querySelectorAll('#late-tools button')].map(({ id }) => id)"),
-        ["toggle-edit", "toggle-follow", "toggle-history"]
+        [
+            "toggle-edit",
+            "toggle-steer",
+            "toggle-follow",
+            "toggle-history"
+        ]
     );
 }
 

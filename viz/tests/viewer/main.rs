@@ -37,6 +37,7 @@ mod slow;
 mod steering;
 mod steering_client;
 mod steering_hostile;
+mod steering_page;
 mod tls;
 mod unsupported_page;
 mod video_page;

@@ -40,7 +40,7 @@ const LABELS: Record<string, string> = {
 const NOT_TEXT = ["range", "checkbox", "radio", "button", "color", "file", "submit", "reset"];
 const VALUE_KEYS = ["arrowleft", "arrowright", "arrowup", "arrowdown", "home", "end", "pageup", "pagedown"];
 
-/** Parses chords separated by spaces, such as `0 Home` or `Ctrl+Shift+Z`. */
+/** Parses chords separated by spaces, such as `0 Home`, `Ctrl+Shift+Z` or `Space`. */
 export function parseChords(text: string): Chord[] {
   return text.split(" ").filter(Boolean).map(parseChord);
 }
@@ -48,7 +48,8 @@ export function parseChords(text: string): Chord[] {
 function parseChord(text: string): Chord {
   const names = text.toLowerCase().split("+");
   const isPlus = text.endsWith("+"); // The key "+" itself: "+" or "Ctrl++".
-  const key = isPlus ? "+" : names[names.length - 1]!;
+  const last = names[names.length - 1]!;
+  const key = isPlus ? "+" : last === "space" ? " " : last;
   return { key, hasControl: names.includes("ctrl"), hasShift: names.includes("shift") };
 }
 
@@ -81,9 +82,13 @@ export function keyOf({ key, code }: Pick<Press, "key" | "code">): string {
  */
 export function keepsKey({ tag, type, isEditable }: Focus, key: string): boolean {
   if (key === "escape") return false;
-  const isText = isEditable || tag === "textarea" || (tag === "input" && !NOT_TEXT.includes(type));
-  if (isText) return true;
+  if (isTextField({ tag, type, isEditable })) return true;
   if (key === " " || key === "enter") return ["input", "select", "button", "summary", "a"].includes(tag);
   const hasValue = tag === "select" || (tag === "input" && (type === "range" || type === "radio"));
   return hasValue && VALUE_KEYS.includes(key);
+}
+
+/** Whether keys enter text in the focused element. */
+export function isTextField({ tag, type, isEditable }: Focus): boolean {
+  return isEditable || tag === "textarea" || (tag === "input" && !NOT_TEXT.includes(type));
 }

@@ -2,7 +2,7 @@
 
 import { announce } from "./panels/announcer";
 import { element } from "./panels/element";
-import { type Chord, type Focus, chordLabel, isPressed as isChordPressed, keepsKey, keyOf, parseChords } from "./key_chord";
+import { type Chord, type Focus, chordLabel, isPressed as isChordPressed, isTextField, keepsKey, keyOf, parseChords } from "./key_chord";
 import { KEYS } from "./key_table";
 import { setTitle, titleOf } from "./panels/title";
 import { isMovementKey } from "./view/movement_keys";
@@ -61,14 +61,15 @@ export function action(id: string, act: () => void, when: () => boolean = () => 
   setTitle(button, titleWithKeys(binding));
 }
 
-/** Makes a button switch something on and off. */
-export function toggle(id: string, apply: (isOn: boolean) => void): void {
-  action(id, () => {
+/** Makes a button switch something on and off. Its keys work while `when` is true. */
+export function toggle(id: string, apply: (isOn: boolean) => void, when: () => boolean = () => true): void {
+  const switchOver = (): void => {
     const isOn = !isPressed(id);
     element(id).setAttribute("aria-pressed", String(isOn));
     apply(isOn);
     onToggle();
-  });
+  };
+  action(id, switchOver, when);
 }
 
 /** Whether the toggle with this id is on. */
@@ -107,6 +108,11 @@ export function keysLabel({ chords }: KeyBinding): string {
 /** Whether the focused control needs this key itself, as fields need the keys of text. */
 export function isKeptByFocus(event: KeyboardEvent): boolean {
   return keepsKey(focusOf(event.target), keyOf(event));
+}
+
+/** Whether the focused control takes all keys as text. */
+export function isTyping(event: KeyboardEvent): boolean {
+  return isTextField(focusOf(event.target));
 }
 
 /** Whether a modal dialog covers the page. Keys have no effect on elements that it covers. */

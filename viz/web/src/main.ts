@@ -48,6 +48,7 @@ import { showToast } from "./panels/toast";
 import { setUpToolbar } from "./panels/toolbar";
 import { Tooltip } from "./panels/tooltip";
 import { TrainingPanel } from "./panels/training_panel";
+import { SteeringLoader } from "./steering/steering_loader";
 import { basePathTopic } from "./topics/base_path";
 import { KeyframePointsTopic } from "./topics/keyframe_points";
 import { KeyframesTopic } from "./topics/keyframes";
@@ -199,6 +200,7 @@ const viewControls = new ViewControls(view, images);
 const timeSlider = new TimeSlider(keyframes, view, new TimePhoto(browser.photos));
 const settings = new ViewSettings(view, scheduler, sides[1]);
 new BoxPanel(view.crop);
+const steering = new SteeringLoader(view);
 setUpSavePicture(view, pictureInfo, () => model.status?.identity);
 setUpKeys(() => view.changed());
 setUpButtons({
@@ -219,6 +221,7 @@ setUpPanels([
   { button: "toggle-layers", panel: "layers" },
   { button: "toggle-settings", panel: "settings" },
   { button: "toggle-edit", panel: "edit", onToggle: (isOpen) => (edits.isOpen = isOpen) },
+  { button: "toggle-steer", panel: "steer" },
   { button: "toggle-views", panel: "views" },
   { button: "toggle-history", panel: "history", onToggle: (isOpen) => timeSlider.opened(isOpen) },
 ]);
@@ -267,6 +270,7 @@ function receiveStatus(status: Status): void {
   preview.show(status);
   for (const ages of [robotAge, overlayAges]) ages.hasEnded = banner.isFinished;
   namedViews.runIs(status);
+  steering.offered = status.steering === true;
   flow.isReading = CONTROLLABLE.includes(status.state);
 }
 

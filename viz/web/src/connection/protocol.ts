@@ -109,6 +109,8 @@ export interface Status extends ModelStatus {
   source?: ModelSource;
   /** Files that can be downloaded. */
   files?: FileLink[];
+  /** Whether the server has the WebSocket `/steer`; missing in runs without motion, and on older servers. */
+  steering?: boolean;
 }
 
 /** Which robot and run a server shows. */

@@ -15,7 +15,18 @@ export function nearOpacity(distanceM: number): number {
   return THREE.MathUtils.smoothstep(distanceM, HIDDEN_M, FULL_M);
 }
 
-export class LinkLook {
+/** Materials of the shapes of a link. */
+export interface Look {
+  /** The material of shapes of a color. */
+  material(color: readonly number[]): THREE.MeshLambertMaterial;
+  /** Draws a mesh as a part of the link. Returns what to draw besides at the same place. */
+  add(mesh: THREE.Mesh): THREE.Object3D;
+  outdated: boolean;
+  /** Fades the link if it is close to the eye. */
+  fadeNear(eye: THREE.Vector3): void;
+}
+
+export class LinkLook implements Look {
   private readonly materials = new Map<string, THREE.MeshLambertMaterial>();
   private readonly meshes: THREE.Mesh[] = [];
   /** Writes only depth, so that a faint link does not show its own inside. */
@@ -49,6 +60,10 @@ export class LinkLook {
   add(mesh: THREE.Mesh): THREE.Mesh {
     this.meshes.push(mesh);
     return new THREE.Mesh(mesh.geometry, this.depthOnly);
+  }
+
+  get outdated(): boolean {
+    return this.isOutdated;
   }
 
   /** Draws the link faintly while its pose is outdated. */

@@ -2,7 +2,7 @@
 
 import * as THREE from "three";
 import { worldFromCamera as matrixOf } from "../view/convention";
-import { LinkLook } from "./link_look";
+import { LinkLook, type Look } from "./link_look";
 import type { MeshPart } from "./mesh_loaders";
 import type { Occlusion } from "./occlusion";
 import type { PosedFrame } from "./overlays";
@@ -25,15 +25,22 @@ export class RobotLayer {
   private described = "";
   private joints: MovingJoint[] = [];
   private readonly links = new Map<string, THREE.Group>();
-  private readonly looks = new Map<string, LinkLook>();
+  private readonly looks = new Map<string, Look>();
   private base: THREE.Group | null = null;
   private isOutdated = false;
   private isEnabled = true;
   private hasState = false;
+  /** The last state; null before the first one. */
+  state: RobotState | null = null;
   /** Whether the present server has not described this robot. */
   isOld = false;
 
-  constructor(private readonly occlusion: Occlusion, private readonly changed: () => void) {
+  /** `newLook` makes the look of each link. */
+  constructor(
+    occlusion: Occlusion,
+    private readonly changed: () => void,
+    private readonly newLook: () => Look = () => new LinkLook(occlusion),
+  ) {
     this.root.visible = false;
     this.root.matrixAutoUpdate = false;
   }
@@ -60,7 +67,7 @@ export class RobotLayer {
     for (const { name, shapes } of robot.links) {
       const link = new THREE.Group();
       link.name = name;
-      const look = new LinkLook(this.occlusion);
+      const look = this.newLook();
       look.outdated = this.isOutdated;
       this.looks.set(name, look);
       for (const shape of shapes) this.addShape(link, look, shape);
@@ -104,8 +111,14 @@ export class RobotLayer {
     this.root.matrix.multiplyMatrices(matrixOf(state.world_from_base), this.base.matrixWorld.clone().invert());
     this.root.updateMatrixWorld(true);
     this.hasState = true;
+    this.state = state;
     this.enabled = this.isEnabled;
     this.changed();
+  }
+
+  /** The robot that is drawn; null before it is known. */
+  get description(): Robot | null {
+    return this.robot;
   }
 
   /** The link whose pose is sent, and the last link that the joints move; null before the robot is known. */
@@ -172,10 +185,11 @@ export class RobotLayer {
     this.looks.clear();
     this.joints = [];
     this.hasState = false;
+    this.state = null;
     this.root.visible = false;
   }
 
-  private addShape(link: THREE.Group, look: LinkLook, shape: RobotShape): void {
+  private addShape(link: THREE.Group, look: Look, shape: RobotShape): void {
     const pose = new THREE.Group();
     pose.matrixAutoUpdate = false;
     pose.matrix.copy(matrixOf(shape.link_from_shape));
@@ -192,7 +206,7 @@ export class RobotLayer {
 
   private async loadMesh(
     pose: THREE.Group,
-    look: LinkLook,
+    look: Look,
     { url, format }: RobotShape & { kind: "mesh" },
     material: THREE.MeshLambertMaterial,
   ): Promise<void> {
@@ -207,13 +221,13 @@ export class RobotLayer {
   }
 }
 
-function addMesh(parent: THREE.Object3D, look: LinkLook, geometry: THREE.BufferGeometry, material: THREE.Material): void {
+function addMesh(parent: THREE.Object3D, look: Look, geometry: THREE.BufferGeometry, material: THREE.Material): void {
   const mesh = new THREE.Mesh(geometry, material);
   parent.add(mesh, look.add(mesh));
 }
 
 /** Adds a mesh of a file, in its own colors if it has some. */
-function addPart(parent: THREE.Object3D, look: LinkLook, part: MeshPart, material: THREE.Material): void {
+function addPart(parent: THREE.Object3D, look: Look, part: MeshPart, material: THREE.Material): void {
   const geometry = new THREE.BufferGeometry();
   geometry.setAttribute("position", new THREE.BufferAttribute(part.positions, 3));
   if (part.normals) geometry.setAttribute("normal", new THREE.BufferAttribute(part.normals, 3));

@@ -28,6 +28,25 @@ const FLY_KEYS: Group = {
     ["Shift", "Faster"],
   ],
 };
+const STEER_KEYS: Group = {
+  title: "Keys: jogging, while control is yours and Keys is on",
+  rows: [
+    ["W A S D", "Hand forward, left, back, right, in the chosen axes, while held"],
+    ["Q E", "Hand down and up"],
+    ["← → ↑ ↓", "Turn left and right, nose up and down"],
+    ["Z C", "Roll left and right"],
+  ],
+};
+const STEER_PAD: Group = {
+  title: "Gamepad: while control is yours",
+  rows: [
+    ["Hold a trigger", "Dead-man switch: without it, nothing moves"],
+    ["Left stick, D-pad", "Hand left, right, forward, back; up and down"],
+    ["Right stick, shoulders", "Turn and nose up and down; roll"],
+    ["Trigger and lower button", "Go to the ghost, while held"],
+    ["Right button", "Stop the arm"],
+  ],
+};
 const CLOSE_KEYS: Group = {
   title: "Keys: everywhere",
   rows: [["Esc", "Close the topmost panel, or end flying and measuring"]],
@@ -69,7 +88,10 @@ function groups(): Group[] {
       title: device === "mouse" ? "Mouse" : "Touch screen",
       rows: GESTURES[device].map(({ how, what }): [string, string] => [how, what]),
     }));
-  return present.includes("keyboard") ? [...gestures, VIEW_KEYS, ...boundKeys(), FLY_KEYS, CLOSE_KEYS] : gestures;
+  const isSteered = !element("toggle-steer").hidden;
+  const steering = isSteered ? [STEER_KEYS, STEER_PAD] : [];
+  if (!present.includes("keyboard")) return isSteered ? [...gestures, STEER_PAD] : gestures;
+  return [...gestures, VIEW_KEYS, ...boundKeys(), FLY_KEYS, ...steering, CLOSE_KEYS];
 }
 
 /** The keys of all buttons that exist now, in the groups of the buttons. */

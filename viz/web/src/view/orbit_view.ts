@@ -34,6 +34,7 @@ import { cameraAlong, viewOfCamera } from "./view_request";
 import type { ViewMode, ViewState } from "./view_state";
 import { turnControls } from "./up_axis";
 import { listenToViewKeys } from "./view_keys";
+import type { ViewTool } from "./view_tool";
 
 const VERTICAL_FOV_DEGREES = 50;
 /**
@@ -72,6 +73,8 @@ export class OrbitView {
   /** The part of the scene to draw. */
   readonly crop: CropBox;
   readonly measure: MeasureTool;
+  /** Tools that other modules have added. */
+  private readonly tools: ViewTool[] = [];
   /** Larger windows are rendered at this width and upscaled. */
   maxPictureWidthPx = 1280;
   /** Where to draw the arrow to the robot; null while the robot is in the picture. */
@@ -133,6 +136,14 @@ export class OrbitView {
       onMove();
     }).observe(canvas.parentElement!);
     this.fit();
+  }
+
+  /** Adds a tool that uses the camera of the view. */
+  addTool<T extends ViewTool>(create: (camera: THREE.PerspectiveCamera) => T): T {
+    const tool = create(this.camera);
+    this.tools.push(tool);
+    this.world.add(tool.root);
+    return tool;
   }
 
   /** Restores what was lost with the WebGL context, and draws again. To be called after the renderer's own listener. */
@@ -415,9 +426,9 @@ export class OrbitView {
     this.attachment.startRide(camera);
   }
 
-  /** Whether clicks on the view belong to a tool: to the measurement, or to a handle of the box. */
+  /** Whether clicks on the view belong to a tool: to the measurement, to a handle of the box, or to another tool. */
   get isToolInUse(): boolean {
-    return this.measure.enabled || this.crop.hasTakenPress;
+    return this.measure.enabled || this.crop.hasTakenPress || this.tools.some((tool) => tool.hasTakenPress);
   }
 
   /** Whether the view moves with the robot. */
@@ -486,6 +497,7 @@ export class OrbitView {
     this.occlusion.local = needsSplatDepth ? this.splatDepth(view) : null;
     this.crop.update();
     this.measure.update();
+    for (const tool of this.tools) tool.update();
     this.robot.fadeNear(this.camera.position);
     this.arrow = arrowPlace(this.sceneViews.robotBox(), this.camera, [this.canvas.clientWidth, this.canvas.clientHeight]);
     if (this.frames.isVisible) {

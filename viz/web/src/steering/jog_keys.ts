@@ -1,0 +1,60 @@
+// Jogging with keys. While it is on, the keys of JOG_KEYS have no other meaning, and each held key is a dead-man switch.
+
+import { isKeptByFocus, isPageCovered, isPressed, type toggle } from "../keys";
+import { element } from "../panels/element";
+import type { Commander } from "./commander";
+import { deflectionOfKeys, JOG_KEYS } from "./jog";
+
+const BUTTON = "steer-keys";
+
+export class JogKeys {
+  private readonly held = new Set<string>();
+
+  constructor(
+    private readonly commander: Commander,
+    addToggle: typeof toggle,
+  ) {
+    const switched = (isOn: boolean): void => {
+      this.release();
+      // Both use the same keys.
+      if (isOn && isPressed("toggle-fly")) element("toggle-fly").click();
+    };
+    addToggle(BUTTON, switched, () => commander.hasControl);
+    window.addEventListener("keydown", (event) => this.press(event), { capture: true });
+    window.addEventListener("keyup", ({ code }) => this.up(code), { capture: true });
+    for (const kind of ["blur", "pagehide"] as const) window.addEventListener(kind, () => this.release());
+    document.addEventListener("visibilitychange", () => this.release());
+  }
+
+  /** Switches the keys off when control ends or when the view flies. */
+  show(): void {
+    const isOn = isPressed(BUTTON);
+    if (isOn && (!this.commander.hasControl || isPressed("toggle-fly"))) element(BUTTON).click();
+  }
+
+  private press(event: KeyboardEvent): void {
+    const { code, repeat } = event;
+    if (!isPressed(BUTTON) || !(code in JOG_KEYS) || isKeptByFocus(event) || isPageCovered()) return;
+    if (event.ctrlKey || event.metaKey || event.altKey) return;
+    event.preventDefault();
+    event.stopImmediatePropagation();
+    // A key that was held before the page got the focus repeats. It does not count before it is pressed anew.
+    if (repeat) return;
+    this.held.add(code);
+    this.apply();
+  }
+
+  private up(code: string): void {
+    if (this.held.delete(code)) this.apply();
+  }
+
+  private release(): void {
+    this.held.clear();
+    this.apply();
+  }
+
+  private apply(): void {
+    const jog = { kind: "tip", deflection: deflectionOfKeys(this.held) } as const;
+    this.commander.setJog("keys", this.held.size > 0 ? jog : null);
+  }
+}

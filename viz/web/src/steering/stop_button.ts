@@ -1,0 +1,93 @@
+// The stop button, for everybody and by a key that works wherever the focus is, and the permission to move again.
+
+import { type action, isTyping } from "../keys";
+import { announce } from "../panels/announcer";
+import { element } from "../panels/element";
+import { setText } from "../panels/html";
+import { disable, setTitle } from "../panels/title";
+import type { Commander } from "./commander";
+
+/** The second press permits motion only within this time. */
+const SURE_MILLIS = 5000;
+const REARM = "Permit motion";
+const REARM_AGAIN = "Sure? Press again";
+
+export class StopButton {
+  private readonly button = element("steer-stop", HTMLButtonElement);
+  private readonly rearm = element("steer-rearm", HTMLButtonElement);
+  private sureUntil = 0;
+  /** Whether the key is down that has stopped the arm: its release must not press a focused button. */
+  private isKeyDown = false;
+
+  constructor(
+    private readonly commander: Commander,
+    addAction: typeof action,
+    private readonly sendRearm: () => void,
+  ) {
+    // A press is faster than a click, which needs the release.
+    this.button.addEventListener("pointerdown", () => this.stop());
+    addAction("steer-stop", () => this.stop());
+    // Before all other listeners, also those of focused buttons and sliders and of dialogs.
+    window.addEventListener("keydown", (event) => this.press(event), { capture: true });
+    window.addEventListener("keyup", (event) => this.release(event), { capture: true });
+    this.rearm.addEventListener("click", () => this.pressRearm());
+  }
+
+  show(): void {
+    const { arm, state, hasControl, canSend, canMove } = this.commander;
+    this.button.hidden = !canMove;
+    // Without a link, the arm brakes by its own watchdog; a button that does nothing must not look as if it did.
+    disable(this.button, canSend ? "" : "The link to the arm is cut: the arm brakes when its commands expire");
+    const isOwn = state?.holder === arm?.client;
+    setText(element("steer-who"), typeof state?.holder === "number" ? (isOwn ? "you" : `operator ${state.holder}`) : "");
+    this.showStop(state?.stop ?? null);
+    disable(this.rearm, hasControl ? "" : "Only the operator who has control can permit motion");
+    if (performance.now() > this.sureUntil || !state?.stop) this.sureUntil = 0;
+    setText(this.rearm, this.sureUntil === 0 ? REARM : REARM_AGAIN);
+  }
+
+  private showStop(stop: string | null): void {
+    const text = stop === null ? "" : `The arm is stopped: ${stop}`;
+    element("steer-stopped").hidden = stop === null;
+    element("steer-halt").hidden = stop === null;
+    if (element("steer-stop-text").textContent === text) return;
+    setText(element("steer-stop-text"), text);
+    setTitle(element("steer-halt"), text);
+    if (text !== "") announce(text);
+  }
+
+  private stop(): void {
+    this.commander.stop();
+  }
+
+  private press(event: KeyboardEvent): void {
+    if (!this.isStopKey(event)) return;
+    event.preventDefault();
+    event.stopImmediatePropagation();
+    this.isKeyDown = true;
+    if (!event.repeat) this.stop();
+  }
+
+  private release(event: KeyboardEvent): void {
+    if (event.key !== " " || !this.isKeyDown) return;
+    this.isKeyDown = false;
+    event.preventDefault();
+    event.stopImmediatePropagation();
+  }
+
+  /** Space, while the arm can move. In fields, it is a letter. */
+  private isStopKey(event: KeyboardEvent): boolean {
+    return event.key === " " && this.commander.canMove && !isTyping(event);
+  }
+
+  private pressRearm(): void {
+    const now = performance.now();
+    if (now < this.sureUntil) {
+      this.sureUntil = 0;
+      this.sendRearm();
+    } else {
+      this.sureUntil = now + SURE_MILLIS;
+    }
+    this.show();
+  }
+}

@@ -1,0 +1,55 @@
+// What the panel says about control, the link, limits and goals. This file has no DOM.
+
+import type { Limit, SteerState, Verdict } from "./messages";
+import type { Mode } from "./round_trip";
+
+/** Who has control, from the view of one client. */
+export function leaseText({ holder, lease_left_secs, offered_to }: SteerState, client: number): string {
+  if (holder === null) return "Nobody has control of the arm";
+  if (holder === client) {
+    return offered_to === null ? "You have control" : `You have control, offered to operator ${offered_to}`;
+  }
+  // The time begins anew with each message of the holder.
+  const left = lease_left_secs === null ? "" : ` for at least ${Math.max(0, lease_left_secs).toFixed(0)} s more`;
+  const who = `Operator ${holder} has control${left}`;
+  return offered_to === client ? `${who}. Control is offered to you` : who;
+}
+
+/** How the arm is moved now, and why. */
+export function modeText(mode: Mode, roundTripMillis: number | null, thresholdMillis: number, isForced: boolean): string {
+  const limit = `limit ${Math.round(thresholdMillis)} ms`;
+  const measured = roundTripMillis === null ? `link not measured yet, ${limit}` : `${Math.round(roundTripMillis)} ms, ${limit}`;
+  if (mode === "servo") return `Servo: the arm follows while you hold (${measured})`;
+  return `Preview, then go${isForced ? " as chosen" : ""}: you move the ghost, then hold Go (${measured})`;
+}
+
+/** A limit in one sentence. */
+export function limitText({ effect, speed_scale, text }: Limit): string {
+  if (effect === "slowed") return `Slowed to ${Math.round(100 * speed_scale)} %: ${text}`;
+  return `${effect === "refused" ? "Refused" : "Braking"}: ${text}`;
+}
+
+/** The limits that say something: an open switch is the normal state of a clutch. */
+export function shownLimits(limits: readonly Limit[], isHeld: boolean): Limit[] {
+  const isNews = ({ link, effect }: Limit): boolean => isHeld || effect === "slowed" || (link !== "clutch" && link !== "lease");
+  return limits.filter(isNews);
+}
+
+const VERDICT_TEXTS: Record<Verdict, string> = {
+  reachable: "The goal can be reached",
+  near: "The goal is close to a surface, where the arm slows down or stops",
+  unreachable: "The goal is out of reach",
+  "self-collision": "The robot would touch itself",
+  "never seen": "No camera has seen the space at the goal",
+  limits: "The goal is beyond a limit",
+};
+
+/** A verdict in one sentence, with the reason of the server. */
+export function verdictText(verdict: Verdict, text: string): string {
+  return text === "" ? VERDICT_TEXTS[verdict] : `${VERDICT_TEXTS[verdict]}: ${text}`;
+}
+
+/** A joint position in the units of operators. */
+export function jointText(position: number, isPrismatic: boolean): string {
+  return isPrismatic ? `${(1000 * position).toFixed(1)} mm` : `${((180 / Math.PI) * position).toFixed(1)}°`;
+}
