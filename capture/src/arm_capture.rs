@@ -39,8 +39,8 @@ const MAX_ERROR: f64 = 0.1;
 const DISTANCE_TOLERANCE_M: f64 = 0.03;
 /// Duration of one wait for an image. It bounds the time until a fault of the arm is noticed.
 const POLL: Duration = Duration::from_millis(20);
-/// Number of joint states kept. At 1 kHz, they cover a minute, because a slow computer may take this
-/// long to render an image of a simulated camera. They take 20 MB.
+/// Number of joint states kept. At 1 kHz, they cover a minute, because a slow computer may take
+/// this long to render an image of a simulated camera. They take 20 MB.
 const MAX_STATES: usize = 60_000;
 
 /// A wait for an image, in the time of the arm. Simulated devices that wait for their caller stand

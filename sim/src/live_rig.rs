@@ -29,8 +29,8 @@ const MAX_TRUTH_IMAGES: usize = 8;
 /// short pauses of the computer. With a larger value, samples arrive later than those of a real
 /// device.
 const MAX_LATE: Duration = Duration::from_millis(50);
-/// Lag of the simulation beyond which a device without samples counts as silent. A slow computer may
-/// take many seconds to render an image.
+/// Lag of the simulation beyond which a device without samples counts as silent. A slow computer
+/// may take many seconds to render an image.
 const MAX_LAG: Duration = Duration::from_secs(120);
 
 /// Simulated devices that deliver in real time.

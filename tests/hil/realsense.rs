@@ -248,9 +248,9 @@ fn file_on_the_clock_starts_at_its_stamps() {
     assert_eq!(live.next_sample().unwrap(), None);
 }
 
-/// Plays a file that began a second ago. Returns its images, the stamp of its first image, and the
-/// times before and after it was opened. If the machine stalls until the file is over, another
-/// second is tried.
+/// Plays a file that began a second ago. Returns its images that are due after it was opened, when
+/// the file began, and the times before and after it was opened. If the machine stalls until the
+/// file is over, repeats it.
 fn play_late(
     config: &Config,
     read: impl Fn(RealsenseCamera) -> Vec<Image>,

@@ -108,8 +108,9 @@ mod tests {
         };
         let config = ControllerConfig::e_series(address, chain);
         // A busy machine may stall the driver, so the controller waits for its setpoints.
+        let answer_wait = Duration::from_secs(2);
         let simulator = Box::new(joint_simulator);
-        let controller = EmulatedController::start_waiting(config, TEST_TIMEOUT, simulator);
+        let controller = EmulatedController::start_waiting(config, answer_wait, simulator);
         (controller.expect("a free address"), address)
     }
 

@@ -18,7 +18,7 @@ use std::time::{Duration, Instant};
 /// Motions end at the target up to rounding.
 const MAX_ERROR_RAD: f64 = 1e-9;
 /// How long a robot waits for a setpoint of our driver, which a busy machine may stall.
-const ANSWER_WAIT: Duration = Duration::from_secs(10);
+const ANSWER_WAIT: Duration = Duration::from_secs(2);
 /// Maximum velocity of the joints.
 const MAX_RAD_S: f64 = 0.5;
 

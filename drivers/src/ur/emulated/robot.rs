@@ -30,6 +30,8 @@ pub(super) struct Robot {
     velocity_rad_s: [f64; N_JOINTS],
     /// Whether the joints brake after the end of a program.
     is_braking: bool,
+    /// Whether the program followed a setpoint in its last cycle.
+    is_servoing: bool,
 }
 
 /// Input registers of RTDE.
@@ -73,6 +75,7 @@ impl Robot {
             watchdog: None,
             velocity_rad_s: [0.0; N_JOINTS],
             is_braking: false,
+            is_servoing: false,
         }
     }
 
@@ -192,6 +195,7 @@ impl Robot {
         let Some(mut program) = self.program.take() else {
             return;
         };
+        self.is_servoing = false;
         match program.run_cycle(&mut |call| self.call(call)) {
             // A call may have caused a protective stop, which pauses the program.
             Ok(MachineState::Running) => self.program = Some(program),
@@ -203,9 +207,9 @@ impl Robot {
         }
     }
 
-    /// Whether the program follows setpoints: it has set a watchdog on their number.
+    /// Whether the program follows setpoints, and watches their number.
     pub(super) fn follows_setpoints(&self) -> bool {
-        self.watchdog.is_some() && self.values.runtime_state == PLAYING
+        self.is_servoing && self.watchdog.is_some() && self.values.runtime_state == PLAYING
     }
 
     /// Whether a setpoint has arrived since the last cycle.
@@ -333,6 +337,7 @@ impl Robot {
         }
         self.velocity_rad_s = velocity_rad_s;
         self.values.target_rad = target_rad;
+        self.is_servoing = true;
         Ok(())
     }
 }

@@ -53,8 +53,8 @@ impl EmulatedController {
     }
 
     /// Like [`start`](Self::start), but a program that follows setpoints waits up to `answer_wait`
-    /// for the setpoint after each state, and follows one setpoint per cycle. A real controller does
-    /// not wait. Tests wait, so that their motions do not depend on the load of the machine.
+    /// for the setpoint after each state, and follows one setpoint per cycle. A real controller
+    /// does not wait. Tests wait, so that their motions do not depend on the load of the machine.
     pub fn start_waiting(
         config: ControllerConfig,
         answer_wait: Duration,
