@@ -423,53 +423,61 @@ mod tests {
 
     const CYCLE: Duration = Duration::from_millis(2);
 
-    /// A motion that has just begun, from zero to one radian.
-    fn active_motion() -> ActiveMotion {
-        let limits = MotionLimits {
-            position: [-6.0, 6.0],
-            velocity: 0.5,
-            acceleration: 2.0,
-            jerk: 20.0,
-        };
-        let limits = [limits; N_JOINTS];
-        let mut generator =
-            TrajectoryGenerator::new(&limits, &[0.0; N_JOINTS], CYCLE).expect("valid limits");
-        let target = JointTarget {
-            position: vec![1.0; N_JOINTS],
-        };
-        generator.set_target(&target).expect("a valid target");
-        ActiveMotion {
-            session: 1,
-            generator,
-            sent_rad: [0.0; N_JOINTS],
-            n_at_rest: 0,
-        }
+    /// A motion that has just begun, and its last setpoint.
+    struct Moving {
+        mover: Mover,
+        sent_rad: [f64; N_JOINTS],
     }
 
-    /// The first joint of the next setpoint.
-    fn advance(active: &mut ActiveMotion, n_cycles: u64, pause: Duration) -> f64 {
-        let state = RobotState::default();
-        let cycle = Cycle {
-            state: &state,
-            n_cycles,
-            pause,
-        };
-        active.sent_rad = active.next_position(None, &cycle).expect("a setpoint");
-        active.sent_rad[0]
+    impl Moving {
+        /// From zero to one radian.
+        fn begin() -> Self {
+            let limits = MotionLimits {
+                position: [-6.0, 6.0],
+                velocity: 0.5,
+                acceleration: 2.0,
+                jerk: 20.0,
+            };
+            let mut mover = Mover::default();
+            let at_zero = vec![0.0; N_JOINTS];
+            let held = mover.hold_at(vec![limits; N_JOINTS], at_zero, CYCLE);
+            held.expect("valid limits");
+            let target = JointTarget {
+                position: vec![1.0; N_JOINTS],
+            };
+            mover.set_target(&target).expect("a valid target");
+            Self {
+                mover,
+                sent_rad: [0.0; N_JOINTS],
+            }
+        }
+
+        /// The first joint of the next setpoint.
+        fn advance(&mut self, n_cycles: u64, pause: Duration) -> f64 {
+            let state = RobotState::default();
+            let cycle = Cycle {
+                state: &state,
+                n_cycles,
+                pause,
+            };
+            let next = next_position(&mut self.mover, self.sent_rad, None, &cycle);
+            self.sent_rad = next.expect("a setpoint");
+            self.sent_rad[0]
+        }
     }
 
     #[test]
     fn a_setpoint_covers_the_cycles_since_the_last_one() {
-        let mut in_time = active_motion();
-        let each: Vec<f64> = (0..1000).map(|_| advance(&mut in_time, 1, CYCLE)).collect();
-        let mut delayed = active_motion();
+        let mut in_time = Moving::begin();
+        let each: Vec<f64> = (0..1000).map(|_| in_time.advance(1, CYCLE)).collect();
+        let mut delayed = Moving::begin();
         let mut n_steps = 0;
         // More than four cycles are not caught up: the setpoint would jump.
         for (n_cycles, n_expected) in [(1, 1), (2, 2), (3, 3), (4, 4), (5, 4), (24, 4)]
             .into_iter()
             .flat_map(|steps| repeat_n(steps, 30))
         {
-            let position = advance(&mut delayed, n_cycles, CYCLE);
+            let position = delayed.advance(n_cycles, CYCLE);
             n_steps += n_expected;
             assert_eq!(position, each[n_steps - 1], "after {n_steps} cycles");
         }
@@ -477,10 +485,10 @@ mod tests {
 
     #[test]
     fn a_motion_continues_from_rest_after_a_pause() {
-        let mut active = active_motion();
-        let moving: Vec<f64> = (0..300).map(|_| advance(&mut active, 1, CYCLE)).collect();
+        let mut delayed = Moving::begin();
+        let moving: Vec<f64> = (0..300).map(|_| delayed.advance(1, CYCLE)).collect();
         assert!(moving[299] - moving[298] > 0.9e-3, "it moves at 0.5 rad/s");
-        let resumed = advance(&mut active, 100, MAX_PAUSE + CYCLE);
+        let resumed = delayed.advance(100, MAX_PAUSE + CYCLE);
         // One cycle of the maximum jerk.
         let max_step = 20.0 * CYCLE.as_secs_f64().powi(3);
         let step = resumed - moving[299];
