@@ -337,9 +337,48 @@ mod tests {
             (Point3::new(1.0, 0.0, 0.0), 0.2),
         );
         let hits = |y: f64, reach: f64| {
-            occluders.is_occluded(&Point3::new(0.0, y, 0.0), &Vector3::x(), reach)
+            occluders.is_occluded(&[], &Point3::new(0.0, y, 0.0), &Vector3::x(), reach)
         };
         assert!(hits(0.09, 2.0) && !hits(0.11, 2.0) && !hits(0.0, 0.79) && hits(0.0, 0.81));
-        assert!(!occluders.is_occluded(&Point3::origin(), &-Vector3::x(), 2.0));
+        assert!(!occluders.is_occluded(&[], &Point3::origin(), &-Vector3::x(), 2.0));
+    }
+
+    #[test]
+    fn boxes_that_are_left_out_block_no_ray() {
+        const REACH_M: f64 = 0.3;
+        let mut occluders = Occluders::new(REACH_M);
+        let random = RandomStream::new(1, &[]);
+        let position = |ix: u64| {
+            let at = [0, 1, 2].map(|axis| random.between(3 * ix + axis, -0.5, 0.5));
+            Vector3::from(at)
+        };
+        for ix in 0..12 {
+            let turn = Vector3::new(0.3, 0.1, 0.2) * ix as f64;
+            occluders.add_box(Transform::new(position(ix), turn), [0.1, 0.05, 0.02]);
+        }
+        let all: Vec<&SolidBox> = occluders.boxes.iter().collect();
+        let to_lamp = KEY.to_lamp();
+        let side = to_lamp.cross(&Vector3::x()).normalize();
+        let mut n_blocked = [0; 2];
+        for ix in 100..2000 {
+            let from = Point3::from(position(ix));
+            let around = position(ix + 10_000).normalize();
+            let to_edge = (to_lamp + side * KEY_SIZE).normalize();
+            let is_hit = |solid: &&SolidBox| {
+                [
+                    solid.blocks(&from, &to_edge, 10.0),
+                    solid.blocks(&from, &around, REACH_M),
+                ]
+            };
+            for solid in all.iter().filter(|solid| is_hit(solid)[0]) {
+                assert!(solid.is_in_cone(&from, &to_lamp, KEY_SIZE));
+                n_blocked[0] += 1;
+            }
+            for solid in all.iter().filter(|solid| is_hit(solid)[1]) {
+                assert!(solid.is_within(&from, REACH_M));
+                n_blocked[1] += 1;
+            }
+        }
+        assert!(n_blocked.iter().all(|n| *n > 50), "{n_blocked:?}");
     }
 }
