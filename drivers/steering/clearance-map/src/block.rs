@@ -110,12 +110,18 @@ impl Block {
                 let kept = if evidence.is_measured {
                     0
                 } else {
-                    self.measured[z] >> (BLOCK_VOXELS * y + x)
+                    self.measured[z] >> (BLOCK_VOXELS * y + x) & row_bits(side)
                 };
-                for (ix, millis) in row.iter_mut().enumerate() {
-                    if *millis <= evidence.millis && kept >> ix & 1 == 0 {
-                        *millis = evidence.millis;
-                        older |= 1 << ix;
+                if kept == 0 && row.iter().all(|millis| *millis <= evidence.millis) {
+                    // The usual case.
+                    row.fill(evidence.millis);
+                    older = row_bits(side);
+                } else {
+                    for (ix, millis) in row.iter_mut().enumerate() {
+                        if *millis <= evidence.millis && kept >> ix & 1 == 0 {
+                            *millis = evidence.millis;
+                            older |= 1 << ix;
+                        }
                     }
                 }
                 let bits = older << (BLOCK_VOXELS * y + x);
@@ -125,6 +131,39 @@ impl Block {
             }
         }
         self.is_changed = true;
+    }
+
+    /// Sets voxels of the row at (y, z) free that have a given state.
+    ///
+    /// * `bits`: the voxels; the lowest bit is at x = 0.
+    pub(crate) fn set_row_free(
+        &mut self,
+        [y, z]: [usize; 2],
+        bits: u8,
+        before: State,
+        evidence: Evidence,
+    ) {
+        let row = |words: &[u64; BLOCK_VOXELS]| words[z].to_le_bytes()[y];
+        let (free, occupied) = (row(&self.free), row(&self.occupied));
+        let of_state = match before {
+            State::Unknown => !free & !occupied,
+            State::Free => free,
+            State::Occupied => occupied,
+        };
+        let mut left = bits & of_state;
+        while left != 0 {
+            let x = left.trailing_zeros() as usize;
+            let voxel = (z * BLOCK_VOXELS + y) * BLOCK_VOXELS + x;
+            self.set(voxel, State::Free, evidence);
+            left &= left - 1;
+        }
+    }
+
+    /// Whether any voxel of a cube is free.
+    pub(crate) fn has_free(&self, [x, y, z]: [usize; 3], side: usize) -> bool {
+        let row = row_bits(side) << x;
+        let layer = (y..y + side).fold(0, |layer, y| layer | row << (BLOCK_VOXELS * y));
+        self.free[z..z + side].iter().any(|word| word & layer != 0)
     }
 
     /// The bits of the row of voxels at (y, z) that are not free; the lowest bit is at x = 0.
@@ -138,20 +177,23 @@ impl Block {
         let range = |cell: usize| cell * CELL_VOXELS..(cell + 1) * CELL_VOXELS;
         for z in range(cell_z) {
             for y in range(cell_y) {
-                let first = (z * BLOCK_VOXELS + y) * BLOCK_VOXELS;
-                for x in range(cell_x) {
-                    let is_free = self.free[z] >> (BLOCK_VOXELS * y + x) & 1 != 0;
-                    let millis = if is_free {
-                        self.millis[first + x]
-                    } else {
-                        NEVER
-                    };
-                    oldest = oldest.min(millis);
+                let first = (z * BLOCK_VOXELS + y) * BLOCK_VOXELS + cell_x * CELL_VOXELS;
+                let row = &self.millis[first..first + CELL_VOXELS];
+                let free = self.free[z] >> (BLOCK_VOXELS * y + cell_x * CELL_VOXELS);
+                for (ix, millis) in row.iter().enumerate() {
+                    if free >> ix & 1 != 0 {
+                        oldest = oldest.min(*millis);
+                    }
                 }
             }
         }
         oldest
     }
+}
+
+/// The bits of the first voxels of a row.
+fn row_bits(n: usize) -> u64 {
+    (1 << n) - 1
 }
 
 fn place(voxel: usize) -> (usize, u64) {

@@ -23,6 +23,19 @@ pub(crate) struct RowSpan {
     pub(crate) z: usize,
 }
 
+impl RowSpan {
+    /// The blocks of the row, and the voxels of each: the lowest bit is the first one.
+    pub(crate) fn bytes(&self) -> impl Iterator<Item = (usize, u8)> + use<> {
+        let Range { start, end } = self.x;
+        (start / BLOCK_VOXELS..end.div_ceil(BLOCK_VOXELS)).map(move |byte| {
+            let first = byte * BLOCK_VOXELS;
+            let low = start.saturating_sub(first);
+            let high = (end - first).min(BLOCK_VOXELS);
+            (byte, (u8::MAX << low) & (u8::MAX >> (BLOCK_VOXELS - high)))
+        })
+    }
+}
+
 /// Capsules in voxels.
 ///
 /// * `margin_m`: growth of each radius.

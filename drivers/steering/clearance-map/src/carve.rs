@@ -16,6 +16,10 @@ use nalgebra::Vector3;
 /// percent of all pixels, and beside objects that are closer.
 const MIN_VALID_FRAC: f32 = 0.75;
 
+/// Cubes of this side that are not in the image as a whole are not judged. Single voxels at the
+/// edges of the image would take more time than all others.
+const MIN_PARTLY: usize = 2;
+
 /// An image that shows free space.
 #[derive(Debug)]
 pub(crate) struct Carving<'a> {
@@ -62,31 +66,33 @@ pub(crate) fn carve(blocks: &mut Blocks, carving: &Carving<'_>) -> bool {
 fn carve_cube(blocks: &mut Blocks, carving: &Carving<'_>, cube: Cube) -> bool {
     let projected = match carving.view.project(&cube.center(), cube.side) {
         Visible::No => return false,
-        Visible::Partly => {
-            return cube.side > 1
-                && cube.parts().fold(false, |is_visible, part| {
-                    carve_cube(blocks, carving, part) || is_visible
-                });
-        }
+        Visible::Partly => return cube.side > MIN_PARTLY && carve_parts(blocks, carving, cube),
         Visible::Whole(projected) => projected,
     };
     let readings = carving.pyramid.over(&projected);
-    if projected.near_m > readings.far_m {
-        // Hidden, or without readings.
+    let block = blocks.get(cube.block_ix);
+    let has_free = block.is_some_and(|block| block.has_free(cube.low, cube.side));
+    if !carving.may_show_free(&projected, &readings, has_free) {
         return true;
     }
-    if carving.is_in_front(&projected, &readings) && readings.min_valid_frac >= MIN_VALID_FRAC {
+    if carving.is_in_front(&projected, &readings) && readings.min_valid_frac() >= MIN_VALID_FRAC {
         if let Some(block) = blocks.get_or_make(cube.block_ix) {
             block.set_free(cube.low, cube.side, carving.evidence);
         }
     } else if cube.side > 1 {
-        for part in cube.parts() {
-            carve_cube(blocks, carving, part);
-        }
-    } else if readings.valid_frac >= MIN_VALID_FRAC {
+        carve_parts(blocks, carving, cube);
+    } else if readings.valid_frac() >= MIN_VALID_FRAC {
         carve_voxel(blocks, carving, &cube, &projected, &readings);
     }
     true
+}
+
+fn carve_parts(blocks: &mut Blocks, carving: &Carving<'_>, cube: Cube) -> bool {
+    let mut is_visible = false;
+    for part in cube.parts() {
+        is_visible |= carve_cube(blocks, carving, part);
+    }
+    is_visible
 }
 
 fn carve_voxel(
@@ -106,7 +112,7 @@ fn carve_voxel(
         State::Unknown => carving.is_before_robot(projected, readings),
         // What was free before needs no margin to stay free. Otherwise, voxels in the margin of a
         // surface would be seen only once, from close by. A surface inside would have occupied it.
-        State::Free => projected.center_m <= readings.near_scene_m.min(readings.near_robot_m),
+        State::Free => projected.center_m <= readings.near_scene_m().min(readings.near_robot_m()),
     };
     if is_free && let Some(block) = blocks.get_or_make(cube.block_ix) {
         block.set(voxel, State::Free, carving.evidence);
@@ -114,22 +120,34 @@ fn carve_voxel(
 }
 
 impl Carving<'_> {
+    /// Whether any voxel of a cube may become or stay free, because it is in front of the largest
+    /// reading. Cubes behind surfaces and in their margin end here.
+    fn may_show_free(&self, cube: &Projected, readings: &Footprint, has_free: bool) -> bool {
+        let is_margin_needed = !has_free && readings.near_robot_m() == f32::INFINITY;
+        let voxel_m = self.view.voxel_depth_m();
+        if is_margin_needed {
+            cube.near_m + voxel_m <= self.noise.free_up_to_m(readings.far_m())
+        } else {
+            cube.near_m + 0.5 * voxel_m <= readings.far_m()
+        }
+    }
+
     /// Whether the whole cube is in front of all surfaces.
     fn is_in_front(&self, cube: &Projected, readings: &Footprint) -> bool {
-        cube.far_m <= readings.near_robot_m && self.is_before_scene(cube, readings)
+        cube.far_m <= readings.near_robot_m() && self.is_before_scene(cube, readings)
     }
 
     /// Whether the whole cube is in front of the scene, and its center in front of the robot. What
     /// is between the camera and the robot is known to be free without a margin, because the
     /// surface is that of the robot.
     fn is_before_robot(&self, cube: &Projected, readings: &Footprint) -> bool {
-        cube.center_m <= readings.near_robot_m && self.is_before_scene(cube, readings)
+        cube.center_m <= readings.near_robot_m() && self.is_before_scene(cube, readings)
     }
 
     fn is_before_scene(&self, cube: &Projected, readings: &Footprint) -> bool {
         // Infinite minus infinite would be NaN: no reading of the scene is no limit.
-        readings.near_scene_m == f32::INFINITY
-            || cube.far_m <= self.noise.free_up_to_m(readings.near_scene_m)
+        readings.near_scene_m() == f32::INFINITY
+            || cube.far_m <= self.noise.free_up_to_m(readings.near_scene_m())
     }
 }
 

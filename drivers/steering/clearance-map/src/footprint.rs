@@ -4,50 +4,90 @@
 //! Miller 1993). Here, it shows that a whole cube of voxels is in front of all surfaces.
 
 use crate::grid::floor;
+use crate::samples::{Sample, sample_px};
 use crate::view::Projected;
 
-/// The finest level has about as many columns as this. More would take longer; fewer would blur
-/// the edges of objects over more voxels.
+/// Images with more columns than this have texels of four samples. More texels would take longer;
+/// fewer would blur the edges of objects over more voxels.
 const MAX_COLUMNS: usize = 160;
 
-/// Maximum number of texels per side that a query reads, minus one. A query of more texels uses a
-/// coarser level.
+/// Texels per side that a query reads, minus one. A query of more texels uses a coarser level.
 const MAX_SPAN: usize = 3;
+
+/// Up to this level, the fraction of valid pixels is judged per texel; above, by the worst of these
+/// texels. A texel of the level is about as large as a voxel at a distance of one meter.
+const VALIDITY_LEVEL: usize = 2;
 
 /// Readings of a rectangle.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(crate) struct Footprint {
-    /// Smallest reading that is not the robot, meters; infinite if there is none.
-    pub(crate) near_scene_m: f32,
-    /// Smallest reading that is the robot, meters; infinite if there is none.
-    pub(crate) near_robot_m: f32,
-    /// Largest reading, meters; 0 if there is none.
-    pub(crate) far_m: f32,
+    /// Minima of all values that are joined by a minimum, in one array, so that they are joined
+    /// together: most of the time of an image is spent here.
+    minima: [f32; 4],
     /// Fraction of pixels with a reading.
-    pub(crate) valid_frac: f32,
-    /// Smallest such fraction of a texel of the finest level.
-    pub(crate) min_valid_frac: f32,
+    valid_frac: f32,
 }
+
+const NEAR_SCENE: usize = 0;
+const NEAR_ROBOT: usize = 1;
+const MINUS_FAR: usize = 2;
+const MIN_VALID: usize = 3;
 
 impl Footprint {
     const EMPTY: Self = Self {
-        near_scene_m: f32::INFINITY,
-        near_robot_m: f32::INFINITY,
-        far_m: 0.0,
+        minima: [f32::INFINITY, f32::INFINITY, 0.0, 1.0],
         valid_frac: 0.0,
-        min_valid_frac: 1.0,
     };
 
+    /// Smallest reading that is not the robot, meters; infinite if there is none.
+    pub(crate) fn near_scene_m(&self) -> f32 {
+        self.minima[NEAR_SCENE]
+    }
+
+    /// Smallest reading that is the robot, meters; infinite if there is none.
+    pub(crate) fn near_robot_m(&self) -> f32 {
+        self.minima[NEAR_ROBOT]
+    }
+
+    /// Largest reading, meters; 0 if there is none.
+    pub(crate) fn far_m(&self) -> f32 {
+        -self.minima[MINUS_FAR]
+    }
+
+    /// Fraction of pixels with a reading.
+    pub(crate) fn valid_frac(&self) -> f32 {
+        self.valid_frac
+    }
+
+    /// Smallest fraction of pixels with a reading in any part of the size of a voxel.
+    pub(crate) fn min_valid_frac(&self) -> f32 {
+        self.minima[MIN_VALID]
+    }
+
+    /// Adds a sample to a texel whose fraction is still a count.
+    pub(crate) fn add(&mut self, sample: &Sample, is_robot: bool) {
+        let near = if is_robot { NEAR_ROBOT } else { NEAR_SCENE };
+        self.minima[near] = smaller(self.minima[near], sample.near_m);
+        self.minima[MINUS_FAR] = smaller(self.minima[MINUS_FAR], -sample.far_m);
+        self.valid_frac += sample.n_valid;
+    }
+
     /// Joins two rectangles, except for their fractions of pixels, which are summed.
-    fn joined(self, other: &Self) -> Self {
+    fn joined(&self, other: &Self) -> Self {
+        let mut minima = self.minima;
+        for (own, others) in minima.iter_mut().zip(&other.minima) {
+            *own = smaller(*own, *others);
+        }
         Self {
-            near_scene_m: self.near_scene_m.min(other.near_scene_m),
-            near_robot_m: self.near_robot_m.min(other.near_robot_m),
-            far_m: self.far_m.max(other.far_m),
+            minima,
             valid_frac: self.valid_frac + other.valid_frac,
-            min_valid_frac: self.min_valid_frac.min(other.min_valid_frac),
         }
     }
+}
+
+/// The smaller one of two numbers. Unlike [`f32::min`], it is one instruction, as no value is NaN.
+fn smaller(a: f32, b: f32) -> f32 {
+    if b < a { b } else { a }
 }
 
 /// A pyramid over one image.
@@ -67,7 +107,12 @@ struct Level {
 impl Pyramid {
     /// An empty finest level for an image, to which [`Self::add`] adds readings.
     pub(crate) fn start(&mut self, size_px: [usize; 2]) {
-        self.stride_px = size_px[0].div_ceil(MAX_COLUMNS);
+        let sample_px = sample_px(size_px[0]);
+        self.stride_px = if size_px[0] > MAX_COLUMNS {
+            2 * sample_px
+        } else {
+            sample_px
+        };
         let size = size_px.map(|size| size.div_ceil(self.stride_px));
         self.levels.truncate(1);
         if self.levels.is_empty() {
@@ -84,10 +129,10 @@ impl Pyramid {
         self.stride_px
     }
 
-    /// The texels of the finest level over a row of pixels.
-    pub(crate) fn texels_of_row(&mut self, row_px: usize) -> &mut [Footprint] {
+    /// A row of texels of the finest level.
+    pub(crate) fn texels_of_row(&mut self, row: usize) -> &mut [Footprint] {
         let finest = &mut self.levels[0];
-        let first = row_px / self.stride_px * finest.size[0];
+        let first = row * finest.size[0];
         &mut finest.texels[first..first + finest.size[0]]
     }
 
@@ -102,11 +147,16 @@ impl Pyramid {
                 let n_pixels = (pixels_in(column, 0) * pixels_in(row, 1)) as f32;
                 let texel = &mut finest.texels[row * columns + column];
                 texel.valid_frac /= n_pixels;
-                texel.min_valid_frac = texel.valid_frac;
+                texel.minima[MIN_VALID] = texel.valid_frac;
             }
         }
         while self.levels[self.levels.len() - 1].size != [1, 1] {
-            let coarser = self.levels[self.levels.len() - 1].coarser();
+            let mut coarser = self.levels[self.levels.len() - 1].coarser();
+            if self.levels.len() <= VALIDITY_LEVEL {
+                for texel in &mut coarser.texels {
+                    texel.minima[MIN_VALID] = texel.valid_frac;
+                }
+            }
             self.levels.push(coarser);
         }
     }

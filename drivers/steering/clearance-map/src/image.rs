@@ -15,25 +15,25 @@ pub enum DepthOrigin {
 }
 
 impl DepthOrigin {
-    /// How much closer than its reading a surface may be, meters. Beyond this error, readings are
-    /// outliers.
+    /// How much closer than the closest one of neighboring readings a surface may be, meters.
     ///
-    /// Measured: three standard deviations of a stereo camera whose disparities have an error of
-    /// 0.08 pixels, at a focal length of 640 pixels and a baseline of 50 mm (Intel, "Tuning depth
-    /// cameras for best performance": the error of depth is `z² * subpixel / (focal * baseline)`),
-    /// and 8 mm of calibration errors. Rendered: the depth errors of a model that was trained for
-    /// some seconds are a few centimeters at a distance of one meter.
+    /// Measured: 8 mm of errors of calibration and depth, and the standard deviation of a stereo
+    /// camera whose disparities have an error of 0.08 pixels, at a focal length of 640 pixels and a
+    /// baseline of 50 mm (Intel, "Tuning depth cameras for best performance": the error of depth is
+    /// `z² * subpixel / (focal * baseline)`). More is not needed, because the closest one of a dozen
+    /// readings is already closer than the surface. Rendered: the errors of a model that was trained
+    /// for some seconds are a few centimeters at a distance of one meter.
     pub(crate) fn noise(self) -> Noise {
         match self {
             Self::Measured => Noise {
                 constant_m: 0.008,
                 per_meter: 0.0,
-                per_square_meter: 0.0075,
+                per_square_meter: 0.0025,
             },
             Self::Rendered => Noise {
                 constant_m: 0.02,
                 per_meter: 0.03,
-                per_square_meter: 0.0075,
+                per_square_meter: 0.0025,
             },
         }
     }

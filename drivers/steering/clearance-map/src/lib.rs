@@ -52,6 +52,7 @@ mod image;
 mod map;
 mod query;
 mod rows;
+mod samples;
 mod snapshot;
 mod surfaces;
 #[cfg(test)]

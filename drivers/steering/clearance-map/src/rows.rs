@@ -1,7 +1,6 @@
 //! The rows of a version of the map, without the voxels inside of the robot.
 
 use crate::capsules::GridCapsule;
-use crate::config::BLOCK_VOXELS;
 use crate::grid::Grid;
 use crate::snapshot::Snapshot;
 
@@ -56,12 +55,7 @@ impl Rows {
             capsule.rows(self.grid.side(), |span| {
                 let row = self.grid.row(span.y, span.z);
                 let bundle = self.bundle_row(span.y / BUNDLE, span.z / BUNDLE);
-                let bytes = span.x.start / BLOCK_VOXELS..=(span.x.end - 1) / BLOCK_VOXELS;
-                for byte in bytes {
-                    let first = byte * BLOCK_VOXELS;
-                    let low = span.x.start.saturating_sub(first);
-                    let high = (span.x.end - first).min(BLOCK_VOXELS);
-                    let inside = (u8::MAX << low) & (u8::MAX >> (BLOCK_VOXELS - high));
+                for (byte, inside) in span.bytes() {
                     self.clear(row + byte, bundle + byte, inside);
                 }
             });

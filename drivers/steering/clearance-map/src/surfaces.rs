@@ -1,5 +1,4 @@
-//! First pass over an image: which readings are valid, which voxels they occupy, and what has
-//! appeared.
+//! First pass over an image: which voxels its readings occupy, and what has appeared.
 
 use crate::block::{Evidence, State};
 use crate::blocks::Blocks;
@@ -7,13 +6,9 @@ use crate::capsules::RobotMask;
 use crate::config::MapConfig;
 use crate::footprint::{Footprint, Pyramid};
 use crate::grid::VoxelIx;
+use crate::samples::{Sample, Samples, sample_px};
 use crate::view::View;
 use nalgebra::Vector3;
-
-/// Readings of neighboring pixels on the same surface differ by less than this fraction of the
-/// depth, or by a voxel: at a distance of 1 m and with a focal length of 600 pixels, the surface is
-/// then inclined by up to 87 degrees.
-const MAX_STEP_FRAC: f32 = 0.03;
 
 /// A surface in a voxel that was free before.
 #[derive(Clone, Copy, Debug)]
@@ -31,72 +26,33 @@ pub(crate) struct Scene<'a> {
     pub(crate) evidence: Evidence,
 }
 
-/// Readings with at least one neighbor of a similar depth, up to the maximum depth; 0 for all
-/// others. Pixels at the border of the image have too few neighbors.
-pub(crate) fn without_outliers(depth_m: &[f32], width: usize, config: &MapConfig) -> Vec<f32> {
-    #[expect(clippy::cast_possible_truncation, reason = "depth is in f32")]
-    let [voxel_m, min_m, max_m] =
-        [config.voxel_m, config.min_depth_m, config.max_depth_m].map(|m| m as f32);
-    let mut kept = vec![0.0; depth_m.len()];
-    let height = depth_m.len() / width;
-    if width < 3 || height < 3 {
-        return kept;
-    }
-    for row in 1..height - 1 {
-        let line = |row: usize| &depth_m[row * width..(row + 1) * width];
-        let (above, own, below) = (line(row - 1), line(row), line(row + 1));
-        let kept = &mut kept[row * width + 1..(row + 1) * width - 1];
-        for (ix, kept) in kept.iter_mut().enumerate() {
-            let z = own[ix + 1];
-            let max_step = voxel_m.max(MAX_STEP_FRAC * z);
-            // Comparisons with NaN are false. Readings of 0 differ from all valid ones by more.
-            let is_close = |other: f32| (other - z).abs() <= max_step;
-            let is_kept = is_close(above[ix])
-                | is_close(above[ix + 1])
-                | is_close(above[ix + 2])
-                | is_close(own[ix])
-                | is_close(own[ix + 2])
-                | is_close(below[ix])
-                | is_close(below[ix + 1])
-                | is_close(below[ix + 2]);
-            let is_valid = z >= min_m && z < f32::INFINITY;
-            *kept = if is_kept & is_valid {
-                z.min(max_m)
-            } else {
-                0.0
-            };
-        }
-    }
-    kept
-}
-
 /// Marks voxels with readings as occupied, forgets what is behind a surface that has appeared, and
 /// fills the pyramid.
 pub(crate) fn mark(
     blocks: &mut Blocks,
     scene: &Scene<'_>,
-    readings_m: &[f32],
+    samples: &Samples,
     pyramid: &mut Pyramid,
 ) {
-    let [width, _] = scene.view.size_px;
     pyramid.start(scene.view.size_px);
-    let stride_px = pyramid.stride_px();
+    let sample_px = sample_px(scene.view.size_px[0]);
+    let samples_per_texel = pyramid.stride_px() / sample_px;
     let mut appeared = Vec::new();
-    for (row, readings) in readings_m.chunks_exact(width).enumerate() {
-        let mut pixels = RowPixels {
-            first_ray: scene.view.ray(0, row),
-            last: None,
-            blocks,
-            scene,
-            appeared: &mut appeared,
-        };
-        let texels = pyramid.texels_of_row(row);
-        for (texel_ix, (texel, readings)) in texels
-            .iter_mut()
-            .zip(readings.chunks(stride_px))
-            .enumerate()
-        {
-            pixels.add(texel, readings, texel_ix * stride_px);
+    let mut marking = Marking {
+        last: None,
+        blocks: &mut *blocks,
+        scene,
+        appeared: &mut appeared,
+    };
+    for (row, samples) in samples.rows().enumerate() {
+        let texels = pyramid.texels_of_row(row / samples_per_texel);
+        // The ray through the center of a sample.
+        let center = |ix: usize| (ix as f32 + 0.5) * sample_px as f32;
+        let mut ray = scene.view.ray(center(0), center(row));
+        let per_sample = scene.view.per_column() * sample_px as f32;
+        for (column, sample) in samples.iter().enumerate() {
+            marking.add(&mut texels[column / samples_per_texel], sample, &ray);
+            ray += per_sample;
         }
     }
     pyramid.finish(scene.view.size_px);
@@ -105,50 +61,42 @@ pub(crate) fn mark(
     }
 }
 
-/// The pixels of one row.
-struct RowPixels<'a> {
-    first_ray: Vector3<f32>,
-    /// The voxel of the pixel before, and whether it is the robot. Neighbors often share a voxel.
-    last: Option<(VoxelIx, bool)>,
+/// Readings on their way into the map and the pyramid.
+struct Marking<'a> {
+    /// The voxel of the last reading, if it is not the robot. Neighbors often share a voxel.
+    last: Option<VoxelIx>,
     blocks: &'a mut Blocks,
     scene: &'a Scene<'a>,
     appeared: &'a mut Vec<Appeared>,
 }
 
-impl RowPixels<'_> {
-    /// Adds the readings of some pixels to their texel and to the map.
-    fn add(&mut self, texel: &mut Footprint, readings_m: &[f32], first_column: usize) {
-        let per_column = self.scene.view.per_column();
-        for (ix, z_m) in readings_m.iter().enumerate() {
-            if *z_m <= 0.0 {
-                continue;
-            }
-            texel.valid_frac += 1.0;
-            texel.far_m = texel.far_m.max(*z_m);
-            let ray = self.first_ray + per_column * (first_column + ix) as f32;
-            if self.is_robot(ray, *z_m) {
-                texel.near_robot_m = texel.near_robot_m.min(*z_m);
-            } else {
-                texel.near_scene_m = texel.near_scene_m.min(*z_m);
-            }
+impl Marking<'_> {
+    /// Adds a sample to its texel and to the map.
+    fn add(&mut self, texel: &mut Footprint, sample: &Sample, ray: &Vector3<f32>) {
+        if sample.n_valid == 0.0 {
+            return;
         }
+        let is_robot = self.is_robot(ray, sample.near_m);
+        texel.add(sample, is_robot);
     }
 
     /// Whether a reading is the robot. If not, it occupies its voxel.
-    fn is_robot(&mut self, ray: Vector3<f32>, z_m: f32) -> bool {
+    fn is_robot(&mut self, ray: &Vector3<f32>, z_m: f32) -> bool {
         let point = self.scene.view.center() + ray * z_m;
         let Some(at) = self.blocks.grid.voxel_of(&point) else {
             return false;
         };
-        if let Some((_, false)) = self.last.filter(|(last, _)| *last == at) {
+        if self.last == Some(at) {
             return false;
         }
-        let is_robot = self.scene.robot.contains(&point, at.block);
-        self.last = Some((at, is_robot));
-        if !is_robot && f64::from(z_m) < self.scene.config.max_depth_m {
-            self.occupy(at, Appeared { point, ray });
+        if self.scene.robot.contains(&point, at.block) {
+            return true;
         }
-        is_robot
+        self.last = Some(at);
+        if f64::from(z_m) < self.scene.config.max_depth_m {
+            self.occupy(at, Appeared { point, ray: *ray });
+        }
+        false
     }
 
     fn occupy(&mut self, at: VoxelIx, surface: Appeared) {

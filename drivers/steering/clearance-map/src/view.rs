@@ -75,18 +75,21 @@ impl View {
         self.center
     }
 
-    /// The ray through a pixel: voxels per meter of depth. The ray of the next pixel of the row is
-    /// this plus [`Self::per_column`].
-    pub(crate) fn ray(&self, column: usize, row: usize) -> Vector3<f32> {
-        let at = |pixel: usize, axis: usize| {
-            (pixel as f32 + 0.5 - self.principal_px[axis]) / self.focal_px[axis]
-        };
-        self.grid_from_camera * Vector3::new(at(column, 0), at(row, 1), 1.0)
+    /// The ray through a place in the image: voxels per meter of depth. The ray through the place one
+    /// pixel to the right is this plus [`Self::per_column`].
+    pub(crate) fn ray(&self, x_px: f32, y_px: f32) -> Vector3<f32> {
+        let slope = |px: f32, axis: usize| (px - self.principal_px[axis]) / self.focal_px[axis];
+        self.grid_from_camera * Vector3::new(slope(x_px, 0), slope(y_px, 1), 1.0)
     }
 
     /// How a ray changes from one column to the next.
     pub(crate) fn per_column(&self) -> Vector3<f32> {
         self.grid_from_camera.column(0) / self.focal_px[0]
+    }
+
+    /// Extent of a voxel along z of the camera, meters.
+    pub(crate) fn voxel_depth_m(&self) -> f32 {
+        2.0 * self.half_voxel_m.z
     }
 
     /// A cube of voxels in the image.

@@ -10,8 +10,9 @@ use crate::error::Error;
 use crate::footprint::Pyramid;
 use crate::grid::Grid;
 use crate::image::{DepthImage, DepthOrigin, Posture};
+use crate::samples::{Samples, without_outliers};
 use crate::snapshot::Snapshot;
-use crate::surfaces::{Scene, mark, without_outliers};
+use crate::surfaces::{Scene, mark};
 use crate::view::View;
 use kinematics::Transform;
 use nalgebra::Vector3;
@@ -73,13 +74,14 @@ impl VoxelMap {
         // Surfaces come first: what is behind a surface that appeared is forgotten, unless the same
         // image shows it, for example beside a wire.
         let readings_m = without_outliers(&image.depth_m, view.size_px[0], &self.config);
+        let samples = Samples::new(&readings_m, view.size_px[0]);
         let scene = Scene {
             config: &self.config,
             view: &view,
             robot: &self.robot,
             evidence,
         };
-        mark(&mut self.blocks, &scene, &readings_m, &mut self.pyramid);
+        mark(&mut self.blocks, &scene, &samples, &mut self.pyramid);
         let carving = Carving {
             view: &view,
             pyramid: &self.pyramid,
@@ -134,15 +136,17 @@ impl VoxelMap {
         let blocks = &mut self.blocks;
         for capsule in capsules {
             capsule.rows(grid.side(), |span| {
-                for x in span.x {
-                    let at = grid.voxel([x, span.y, span.z]);
-                    let state = blocks
-                        .get(at.block)
-                        .map_or(State::Unknown, |block| block.state(at.voxel));
-                    if state == before
-                        && let Some((block, voxel)) = blocks.of_voxel(at)
-                    {
-                        block.set(voxel, State::Free, evidence);
+                let [block_y, block_z] = [span.y, span.z].map(|voxel| voxel / BLOCK_VOXELS);
+                let row = [span.y, span.z].map(|voxel| voxel % BLOCK_VOXELS);
+                for (block_x, bits) in span.bytes() {
+                    let block_ix = grid.block_ix([block_x, block_y, block_z]);
+                    // A block that does not exist has only unknown voxels.
+                    let block = match before {
+                        State::Unknown => blocks.get_or_make(block_ix),
+                        State::Free | State::Occupied => blocks.existing(block_ix),
+                    };
+                    if let Some(block) = block {
+                        block.set_row_free(row, bits, before, evidence);
                     }
                 }
             });

@@ -47,7 +47,8 @@ fn robot_is_not_in_the_map() {
     }
     // The arm is at 0.3 now. Where it was before is free, up to the table.
     tested.set_robot(&[arm(0.3)], at(2.0));
-    for z in [0.2, 0.3, 0.4] {
+    // Above, the camera sees nothing within its range, so readings are missing.
+    for z in [0.15, 0.2, 0.3] {
         let distance_m = tested.distance([0.0, 0.12, z]).unwrap();
         assert!(distance_m > 0.05, "{z}: {distance_m}");
     }

@@ -70,7 +70,7 @@ pub(super) const PERFECT: Flaws = Flaws {
     outlier_frac: 0.0,
 };
 
-/// As of a stereo camera: the margin for errors is three standard deviations.
+/// As of a stereo camera. The margin has one of its standard deviations.
 pub(super) const STEREO: Flaws = Flaws {
     sigma_m: 0.0025,
     hole_frac: 0.04,
