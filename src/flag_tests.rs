@@ -14,7 +14,7 @@ use syn::{Attribute, Item, LitStr, Macro, Meta};
 /// Source files or folders, and the commands that print their messages. If a message contains a
 /// flag or setting, all these commands must accept it. The exception is a message that names a
 /// command that accepts the flag.
-const PRINTED_BY: [(&str, &[&str]); 37] = [
+const PRINTED_BY: [(&str, &[&str]); 38] = [
     ("bench/src", &["bench"]),
     (
         "calibration/procedures/src/hand_eye",
@@ -43,6 +43,7 @@ const PRINTED_BY: [(&str, &[&str]); 37] = [
     ("calibration/procedures/src/scene.rs", &["calibrate scene"]),
     ("calibration/src/hand_eye", &["calibrate hand-eye"]),
     ("capture/src/init", &["init"]),
+    ("capture/src/open/steered.rs", &["run"]),
     ("capture/src/record.rs", &["record"]),
     ("keyframe/src/error.rs", &["train", "eval", "bench"]),
     ("session/src/camera_path.rs", &["render"]),
