@@ -8,7 +8,7 @@ use drivers::Sample;
 use std::path::{Path, PathBuf};
 
 /// Pages whose blocks are only parts of the rig file of an arm with other motors, and the reason.
-const PARTS: [(&str, &str, &str); 2] = [
+const PARTS: [(&str, &str, &str); 3] = [
     (
         "arms.md",
         "[arm.motor.joint1]",
@@ -18,6 +18,11 @@ const PARTS: [(&str, &str, &str); 2] = [
         "moving-arms.md",
         "[arm.motion]",
         "is added to the rig file of a CAN arm",
+    ),
+    (
+        "steering.md",
+        "[arm.motion.steering]",
+        "is added to a rig file with [arm.motion]",
     ),
 ];
 

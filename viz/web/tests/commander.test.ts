@@ -197,6 +197,9 @@ test("over a slow link, inputs move a goal, and only go moves the arm", () => {
   const answer: SteerMessage = { type: "preview", id: asked.id, verdict: "reachable", text: "", position: [0.15, 0.2], place: null };
   bench.commander.receive(answer, bench.clock.millis);
   bench.commander.setGo(true);
+  const first = bench.last();
+  assert.equal(first.grip, 1);
+  assert.deepEqual(first.intent, { kind: "joints", position: [0.15, 0.2] }, "the server refuses a grip without intent");
   bench.run(40);
   assert.equal(bench.last().grip, 1);
   assert.deepEqual(bench.last().intent, { kind: "joints", position: [0.15, 0.2] });

@@ -269,8 +269,10 @@ export class Commander {
       this.deadMan.release(source);
       return;
     }
-    const { intent } = this.goal;
-    if (this.deadMan.press(source, intent !== null)) this.goIntent = intent;
+    const before = this.goIntent;
+    // The press sends the first sample of the grip, which must have the intent.
+    this.goIntent = this.goal.intent;
+    if (!this.deadMan.press(source, this.goIntent !== null)) this.goIntent = before;
   }
 
   /** Sets what a source of jogging asks for; null if it is released. */
