@@ -32,8 +32,8 @@ const THICKNESS: f64 = 0.15;
 /// A disc is known to lie on a surface, so it is mostly opaque. The opacity is below 1, because the
 /// gradient of the logit vanishes at 1.
 const SEED_OPACITY: f64 = 0.7;
-/// Maximum number of splats in a random cloud per image. The first image of a live scan does not
-/// tell how far the scene is away, so it gets only some of them.
+/// Maximum number of splats in a random cloud per image. The first images of a live scan do not tell
+/// how far the scene is away, so they get only some of them.
 const RANDOM_PER_IMAGE: usize = 10_000;
 /// Most positions of a random cloud are wrong. Low opacity lets the gradients reach splats behind
 /// them.
