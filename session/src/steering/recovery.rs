@@ -11,8 +11,7 @@ use steering::Operator;
 const MAX_REPORT_SECS: f64 = 1.0;
 
 /// Why motion is not permitted after a recovery that has succeeded.
-const STOPPED_SINCE: &str =
-    "the arm was stopped during its recovery: permit motion again when everybody agrees";
+const STOPPED_SINCE: &str = "the arm was stopped during its recovery: permit motion again";
 
 /// The recovery of one arm.
 #[derive(Debug)]
