@@ -11,7 +11,7 @@ use crate::check::{check, positive};
 use crate::error::Error;
 use crate::inverse::InverseKinematics;
 use crate::reason::{Effect, Limit, Link, Reason};
-use drivers::motion::MotionLimits;
+use drivers::motion::{ArmState, MotionLimits};
 use kinematics::{Chain, Transform, transform};
 use nalgebra::{UnitQuaternion, Vector3};
 use serde::{Deserialize, Serialize};
@@ -47,6 +47,8 @@ impl Default for LimitConfig {
     }
 }
 
+/// Rounding of the position in which an arm comes to rest at its target, radians or meters.
+const ARRIVAL: f64 = 1e-4;
 /// Maximum distance of a joint between two targets, before the step is shortened. A longer one
 /// means that the posture found is another branch of solutions. The way to it would not follow the
 /// pose.
@@ -179,6 +181,14 @@ impl Limits {
                 joint: chain.joint_names()[ix].clone(),
                 lag,
             })
+    }
+
+    /// Whether an arm at rest has not begun to move to its target, for example because its
+    /// controller takes a while to start a motion. A target that moved on would make the arm catch
+    /// up with the speed of its joints, faster than its parts may be and beside the checked path.
+    pub(crate) fn has_not_begun(target: &[f64], arm: &ArmState) -> bool {
+        let pairs = target.iter().zip(&arm.position);
+        arm.is_at_rest && pairs.map(|(a, b)| (a - b).abs()).any(|gap| gap > ARRIVAL)
     }
 
     /// A step from `q` toward a goal.

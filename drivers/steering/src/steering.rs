@@ -400,6 +400,14 @@ impl Steering {
             Some(_) if arm.braked_motion >= self.n_motions => {
                 Err(self.brake(Link::Arm, Reason::ArmBraked))
             }
+            Some(motion) if arm.is_at_rest => {
+                // The target of an arm at rest is at most one step away. If the arm is elsewhere, a
+                // person has moved it by hand, and it must not move back by itself.
+                match self.limits.lag(&self.chain, &motion.target, &arm.position) {
+                    Some(reason) => Err(self.brake(Link::Arm, reason)),
+                    None => Ok(motion),
+                }
+            }
             Some(motion) => Ok(motion),
             // The grip starts where the arm comes to rest, so it waits until then.
             None if !arm.is_at_rest => Err((Link::Arm, Reason::StillBraking)),
@@ -501,6 +509,9 @@ impl Steering {
         // The grip starts at the tip's pose at rest, also if the target cannot move yet.
         let tip = self.chain.forward(q).ok()?;
         let goal = self.goal(&tip, q, pace)?;
+        if Limits::has_not_begun(q, arm) {
+            return None;
+        }
         if let Some(reason) = self.limits.lag(&self.chain, q, &arm.position) {
             limits.push(Limit {
                 link: Link::Limits,

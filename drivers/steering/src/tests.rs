@@ -2,6 +2,7 @@
 
 mod clearance_tests;
 mod clutch_tests;
+mod late_start_tests;
 mod lease_tests;
 mod random_tests;
 mod replay_tests;

@@ -10,11 +10,16 @@ use steering::Operator;
 /// their state in each of their cycles.
 const MAX_REPORT_SECS: f64 = 1.0;
 
+/// Why motion is not permitted after a recovery that has succeeded.
+const STOPPED_SINCE: &str = "the arm was stopped during its recovery: permit motion again";
+
 /// The recovery of one arm.
 #[derive(Debug)]
 pub(super) struct Recovery {
     port: SteeringPort,
     state: State,
+    /// Whether somebody has stopped the arm since the recovery was asked for.
+    is_revoked: bool,
 }
 
 #[derive(Debug)]
@@ -32,6 +37,7 @@ impl Recovery {
         Self {
             port,
             state: State::Idle,
+            is_revoked: false,
         }
     }
 
@@ -50,7 +56,14 @@ impl Recovery {
             .spawn(move || port.recover().map_err(|error| error.to_string()))
             .map_err(|error| format!("the recovery of the arm cannot be started: {error}"))?;
         self.state = State::Running(operator, thread);
+        self.is_revoked = false;
         Ok(())
+    }
+
+    /// Notes that somebody has stopped the arm. Whoever asked for the recovery that is under way did
+    /// not know this, so the arm is enabled, but motion must be permitted again.
+    pub(super) fn revoke(&mut self) {
+        self.is_revoked = true;
     }
 
     /// The result of a recovery that has ended since the last call, and who asked for it.
@@ -77,6 +90,7 @@ impl Recovery {
                 }
             }
             State::Enabled(operator, until) => match &arm.stopped {
+                None if self.is_revoked => Some((operator, Err(STOPPED_SINCE.to_owned()))),
                 None => Some((operator, Ok(()))),
                 Some(reason) if now > until => Some((operator, Err(reason.clone()))),
                 Some(_) => {

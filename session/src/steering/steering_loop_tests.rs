@@ -379,6 +379,36 @@ fn an_arm_with_a_fault_is_recovered_only_when_the_holder_permits_motion() {
 }
 
 #[test]
+fn a_stop_during_a_recovery_is_not_undone_by_its_end() {
+    let mut run = Run::with_lease();
+    run.fault = Some("a motor is too hot");
+    run.move_arm(1);
+    run.cycle(vec![(ANA, SteeringRequest::Rearm)]);
+    let outcome = run.cycle(vec![(BEN, SteeringRequest::Stop)]);
+    assert!(outcome.replies.is_empty(), "{outcome:?}");
+    // The recovery runs on a thread of its own, so the test waits for it in real time.
+    let until = std::time::Instant::now() + Duration::from_secs(60);
+    let refused = loop {
+        assert!(std::time::Instant::now() < until, "the recovery has no end");
+        if run.n_recoveries.load(Ordering::Relaxed) > 0 {
+            run.fault = None;
+        }
+        let outcome = run.cycle(vec![(ANA, SteeringRequest::RenewLease)]);
+        let stop = outcome.state.as_ref().and_then(|state| state.stop.as_ref());
+        assert!(stop.is_some(), "nobody has permitted motion since the stop");
+        if !outcome.replies.is_empty() {
+            break refusal(&outcome);
+        }
+        std::thread::yield_now();
+    };
+    assert_eq!(refused.0, RefusedRequest::Rearm);
+    assert!(refused.1.contains("permit motion again"), "{}", refused.1);
+    let outcome = run.cycle(vec![(ANA, SteeringRequest::Rearm)]);
+    assert!(outcome.replies.is_empty(), "{outcome:?}");
+    assert!(outcome.state.is_some_and(|state| state.stop.is_none()));
+}
+
+#[test]
 fn goals_are_judged_without_moving_the_arm() {
     let mut run = Run::new();
     let rest = run.tip();
