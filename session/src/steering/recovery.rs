@@ -15,6 +15,8 @@ const MAX_REPORT_SECS: f64 = 1.0;
 pub(super) struct Recovery {
     port: SteeringPort,
     state: State,
+    /// Whether somebody has stopped the arm since the recovery was started.
+    was_stopped: bool,
 }
 
 #[derive(Debug)]
@@ -32,7 +34,14 @@ impl Recovery {
         Self {
             port,
             state: State::Idle,
+            was_stopped: false,
         }
+    }
+
+    /// Somebody stops the arm. A recovery that is under way goes on, but does not permit motion,
+    /// because the wish to stop is newer than the wish to move.
+    pub(super) fn note_stop(&mut self) {
+        self.was_stopped = true;
     }
 
     /// Starts a recovery, at the request of an operator.
@@ -50,6 +59,7 @@ impl Recovery {
             .spawn(move || port.recover().map_err(|error| error.to_string()))
             .map_err(|error| format!("the recovery of the arm cannot be started: {error}"))?;
         self.state = State::Running(operator, thread);
+        self.was_stopped = false;
         Ok(())
     }
 
@@ -77,6 +87,10 @@ impl Recovery {
                 }
             }
             State::Enabled(operator, until) => match &arm.stopped {
+                None if self.was_stopped => {
+                    let reason = "the arm was stopped while it was recovered: permit motion again";
+                    Some((operator, Err(reason.to_owned())))
+                }
                 None => Some((operator, Ok(()))),
                 Some(reason) if now > until => Some((operator, Err(reason.clone()))),
                 Some(_) => {

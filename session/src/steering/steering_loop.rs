@@ -204,7 +204,10 @@ impl SteeringLoop {
                 from: operator,
                 to: Operator(*to),
             },
-            SteeringRequest::Stop => Request::Stop { by: Some(operator) },
+            SteeringRequest::Stop => {
+                self.recovery.note_stop();
+                Request::Stop { by: Some(operator) }
+            }
             SteeringRequest::Rearm => return self.rearm(now, operator, arm),
             SteeringRequest::Command(command) => return self.command(now, operator, command),
             SteeringRequest::Preview(request) => {

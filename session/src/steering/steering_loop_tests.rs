@@ -379,6 +379,35 @@ fn an_arm_with_a_fault_is_recovered_only_when_the_holder_permits_motion() {
 }
 
 #[test]
+fn a_stop_during_a_recovery_is_not_undone_by_it() {
+    let mut run = Run::with_lease();
+    run.fault = Some("a motor is too hot");
+    run.move_arm(1);
+    run.cycle(vec![(ANA, SteeringRequest::Rearm)]);
+    run.cycle(vec![(BEN, SteeringRequest::Stop)]);
+    run.fault = None;
+    let until = std::time::Instant::now() + Duration::from_secs(60);
+    let refused = loop {
+        let outcome = run.cycle(vec![(ANA, SteeringRequest::RenewLease)]);
+        assert!(
+            outcome
+                .state
+                .as_ref()
+                .is_some_and(|state| state.stop.is_some())
+        );
+        if !outcome.replies.is_empty() {
+            break refusal(&outcome);
+        }
+        assert!(std::time::Instant::now() < until, "the recovery ends");
+        std::thread::yield_now();
+    };
+    assert_eq!(refused.0, RefusedRequest::Rearm);
+    assert!(refused.1.contains("permit motion again"), "{}", refused.1);
+    let outcome = run.cycle(vec![(ANA, SteeringRequest::Rearm)]);
+    assert!(outcome.state.is_some_and(|state| state.stop.is_none()));
+}
+
+#[test]
 fn goals_are_judged_without_moving_the_arm() {
     let mut run = Run::new();
     let rest = run.tip();
