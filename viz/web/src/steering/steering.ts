@@ -156,6 +156,7 @@ export class Steering {
     };
     window.addEventListener("blur", lose("another window has the focus"));
     window.addEventListener("pagehide", lose("the page is closed"));
+    window.addEventListener("contextmenu", (event) => event.defaultPrevented || lose("a menu is open")());
     canvas.addEventListener("webglcontextlost", () => {
       this.commander.interrupt("the view cannot be drawn");
       this.gizmo.giveUp();
@@ -196,13 +197,14 @@ export class Steering {
 
   private readPad(): void {
     const { commander } = this;
-    const pads = navigator.getGamepads();
+    // Browsers do not update gamepads for hidden pages, and have none on insecure ones.
+    const pads = document.hidden ? [] : (navigator.getGamepads?.() ?? []);
     const pad = firstPad(pads);
     // Gamepads report also to pages without the focus, while the operator may use another program.
     const hasAttention = commander.hasControl && document.hasFocus() && pad?.ix === this.padIx;
     this.padIx = pad?.ix ?? null;
     commander.setPad(pad?.input ?? null, hasAttention);
-    const unknown = pads.some((other) => other !== null) ? "The gamepad has an unknown layout" : "";
+    const unknown = pads.some((other) => other !== null) ? "The gamepad has an unknown layout and is not used" : "";
     setText(element("steer-pad"), pad ? "Gamepad: hold a trigger, move the sticks" : unknown);
   }
 
