@@ -12,6 +12,7 @@ type Command = SteerRequest & { type: "command" };
 
 const FORWARD = { kind: "tip", deflection: { ...NO_DEFLECTION, forward: 1 } } as const;
 const DEVICE = 42;
+const PAD = { isHeld: false, isGo: false, isStop: false, deflection: { ...NO_DEFLECTION, up: 1 } };
 
 /** A commander whose server answers after a fixed time, and everything that was sent and said. */
 class Bench {
@@ -139,7 +140,8 @@ for (const [name, end] of [
 ] as const) {
   test(`${name} ends the grip, says why, and does not grip again by itself`, () => {
     bench.run(1500);
-    bench.commander.setPad({ isHeld: true, isGo: false, isStop: false, deflection: { ...NO_DEFLECTION, up: 1 } });
+    bench.commander.setPad(PAD);
+    bench.commander.setPad({ ...PAD, isHeld: true });
     assert.equal(bench.commander.deadMan.grip, 1);
     end();
     assert.equal(bench.commander.deadMan.grip, null);
@@ -147,7 +149,7 @@ for (const [name, end] of [
     // The trigger is still pulled when everything is well again.
     bench.commander.receive(ARM, bench.clock.millis);
     bench.commander.setHidden(false, bench.clock.millis);
-    const held = { isHeld: true, isGo: false, isStop: false, deflection: { ...NO_DEFLECTION, up: 1 } };
+    const held = { ...PAD, isHeld: true };
     for (let n = 0; n < 80; n++) {
       bench.run(20);
       bench.commander.setPad(held);
@@ -158,6 +160,71 @@ for (const [name, end] of [
     assert.equal(bench.commander.deadMan.grip, 2);
   });
 }
+
+test("a trigger that is pulled already does not move the arm when control is taken", () => {
+  const held = { ...PAD, isHeld: true };
+  bench.run(1500, { holder: null });
+  bench.commander.setPad(held, false);
+  bench.run(100);
+  bench.commander.setPad(held);
+  assert.equal(bench.commander.deadMan.grip, null);
+  bench.commander.setPad(PAD);
+  bench.commander.setPad(held);
+  assert.equal(bench.commander.deadMan.grip, 1);
+});
+
+for (const [name, lose] of [
+  ["the page was hidden or without the focus", () => bench.commander.setPad({ ...PAD, isHeld: true }, false)],
+  ["the gamepad was away", () => bench.commander.setPad(null)],
+] as const) {
+  test(`a trigger that is still pulled after ${name} must be released first`, () => {
+    bench.run(1500);
+    bench.commander.setPad(PAD);
+    bench.commander.setPad({ ...PAD, isHeld: true });
+    lose();
+    assert.equal(bench.last().grip, null, "the release is sent at once");
+    bench.commander.setPad({ ...PAD, isHeld: true });
+    assert.equal(bench.commander.deadMan.grip, null);
+    bench.commander.setPad(PAD);
+    bench.commander.setPad({ ...PAD, isHeld: true });
+    assert.equal(bench.commander.deadMan.grip, 2);
+  });
+}
+
+test("the stop button of a gamepad stops the arm also without control, until the server confirms it", () => {
+  bench.run(1500, { holder: 3 });
+  const stops = (): number => bench.sent.filter(({ type }) => type === "stop").length;
+  bench.commander.setPad({ ...PAD, isStop: true }, false);
+  assert.equal(stops(), 1);
+  bench.state({ holder: 3, stop: "stopped by operator 2", is_moving: true });
+  bench.commander.setPad({ ...PAD, isStop: true }, false);
+  assert.equal(stops(), 1);
+});
+
+test("after an interruption, the release of one of two keys does not grip again", () => {
+  bench.run(1500);
+  bench.commander.setJog("keys", FORWARD);
+  bench.commander.interrupt("the goal was discarded");
+  assert.equal(bench.last().grip, null);
+  bench.commander.setJog("keys", { kind: "tip", deflection: { ...NO_DEFLECTION, right: 1 } });
+  assert.equal(bench.commander.deadMan.grip, null);
+  bench.commander.setJog("keys", null);
+  bench.commander.setJog("keys", FORWARD);
+  assert.equal(bench.commander.deadMan.grip, 2);
+});
+
+test("notices say what to do: hold again only if that has an effect, and the emergency stop without a link", () => {
+  bench.run(1500);
+  bench.commander.setJog("keys", FORWARD);
+  bench.commander.loseEvents("another window has the focus");
+  assert.equal(bench.notices.at(-1), "Released: another window has the focus. Let go and hold again");
+  bench.commander.setJog("keys", FORWARD);
+  bench.state({ stop: "stopped by operator 3" });
+  assert.equal(bench.notices.at(-1), "Released: stopped by operator 3");
+  bench.commander.disconnected();
+  bench.commander.stop();
+  assert.match(bench.notices.at(-1)!, /not sent.*emergency stop/);
+});
 
 test("a busy page and a silent server end the grip", () => {
   bench.run(1500);
@@ -217,6 +284,7 @@ test("a trigger and the button go move the arm to the goal, sticks discard the g
     bench.commander.receive({ type: "preview", id: asked.id, verdict: "near", text: "", position: [0.15, 0.2], place: null }, bench.clock.millis);
   };
   preview();
+  bench.commander.setPad(PAD);
   bench.commander.setPad(held);
   bench.commander.setPad({ ...held, isGo: true });
   bench.run(40);
@@ -277,6 +345,7 @@ test("what was pressed in preview mode does not move the arm when the link becom
   bench.roundTripMillis = 10;
   bench.run(4000);
   bench.commander.previewsAlways = true;
+  bench.commander.setPad(PAD);
   bench.commander.setPad(held);
   bench.commander.previewsAlways = false;
   bench.commander.setPad(held);

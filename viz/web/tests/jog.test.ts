@@ -1,7 +1,7 @@
 import assert from "node:assert/strict";
 import { test } from "node:test";
 import { Matrix4, Quaternion, Vector3 } from "three";
-import { padInput, withoutDeadZone } from "../src/steering/gamepad";
+import { firstPad, padInput, withoutDeadZone } from "../src/steering/gamepad";
 import { axesOf, deflectionOfKeys, type FrameName, jointVelocities, movedJoints, NO_DEFLECTION, tipVelocity } from "../src/steering/jog";
 import { ARM } from "./steering_examples";
 import { assertClose } from "./close";
@@ -87,4 +87,14 @@ test("sticks that are pushed away move forward, within a dead zone not at all", 
 test("a gamepad of unknown layout is not used", () => {
   assert.equal(padInput({ mapping: "", axes: [1, 1], buttons: RELEASED }), null);
   assert.equal(padInput({ mapping: "standard", axes: [], buttons: [] })?.isHeld, false);
+});
+
+test("of several gamepads, the first one moves, and each one stops", () => {
+  const buttons = (pressed: number): typeof RELEASED => RELEASED.map((button, ix) => (ix === pressed ? { pressed: true, value: 1 } : button));
+  const [trigger, stop] = [6, 1].map((ix) => ({ mapping: "standard", axes: [], buttons: buttons(ix) }));
+  const unknown = { mapping: "", axes: [], buttons: buttons(1) };
+  assert.equal(firstPad([null, unknown]), null);
+  const first = firstPad([null, unknown, trigger!, stop!])!;
+  assert.deepEqual([first.ix, first.input.isHeld, first.input.isStop], [2, true, true]);
+  assert.deepEqual(firstPad([stop!, trigger!])?.input.isHeld, false);
 });

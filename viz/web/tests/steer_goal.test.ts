@@ -33,6 +33,13 @@ test("a goal is asked for, and the arm may go only after the answer", () => {
   assert.ok(goal.isReached([1.001, 2]) && !goal.isReached([1.1, 2]) && !goal.isReached([1]));
 });
 
+test("the nearest posture to a goal that cannot be reached is not the goal", () => {
+  const goal = new Goal();
+  goal.set({ kind: "joints", position: [1, 2] });
+  goal.answer(answer(askedId(goal, 0), "unreachable", [0.9, 2]));
+  assert.equal(goal.isReached([0.9, 2]), false);
+});
+
 test("while a goal is dragged, questions are few, and old answers permit nothing", () => {
   const goal = new Goal();
   const set = (x: number): void => goal.set({ kind: "pose", baseFromTip: poseOf([x, 0, 0, 0, 0, 0, 1]) });

@@ -30,6 +30,8 @@ const MAX_STEP_SECS = 0.1;
 const PING_MILLIS = 250;
 /** Without a message for this time, the link is regarded as cut. The server answers four pings a second. */
 const SILENT_MILLIS = 1000;
+/** Why the switch is open after the operator's own stop. */
+const OWN_STOP = "you stopped the arm";
 
 /** What one of the jog inputs asks for. */
 export type Jog = { kind: "tip"; deflection: Deflection } | { kind: "joint"; ix: number; direction: number };
@@ -75,6 +77,8 @@ export class Commander {
   /** The hand of the gizmo: where it is, and where the pointer wants it. */
   private hand: { now: Pose; wanted: Pose } | null = null;
   private goIntent: Intent | null = null;
+  /** Whether the triggers of the gamepad were seen open since the page has paid attention to it. */
+  private isPadReady = false;
 
   /** `device` differs from that of every other page, because each one counts its grips from the beginning. */
   constructor(
@@ -205,8 +209,9 @@ export class Commander {
   }
 
   stop(): void {
-    this.deadMan.open("you stopped the arm");
+    this.deadMan.open(OWN_STOP);
     this.events.send({ type: "stop" });
+    if (!this.canSend) this.events.notice("The stop was not sent, because the link to the arm is cut: use the emergency stop");
   }
 
   /** The page is shown or hidden. */
@@ -216,6 +221,12 @@ export class Commander {
     if (isHidden) this.deadMan.loseEvents("the page is hidden");
     this.nudge = null;
     this.permit("the page is hidden");
+  }
+
+  /** Opens the switch. Whatever is pressed must be released and pressed again. */
+  interrupt(reason: string): void {
+    this.nudge = null;
+    this.deadMan.open(reason);
   }
 
   /** The window no longer receives the events of keys and pointers. */
@@ -294,13 +305,19 @@ export class Commander {
     if (isPreview && hasAxes && this.maySteer && !this.nudge) this.nudge = { source, axes };
   }
 
-  /** Adopts what a gamepad reports; null if there is none. */
-  setPad(input: PadInput | null): void {
-    if (input?.isStop && this.canMove) this.stop();
-    const isJogging = input?.isHeld === true && !input.isGo;
+  /**
+   * Adopts what a gamepad reports; null if there is none. Without attention, it can only stop the arm. A trigger that is pulled
+   * when the attention begins has no effect before it is released and pulled again.
+   */
+  setPad(input: PadInput | null, hasAttention = true): void {
+    if (input?.isStop && this.canMove && this.state?.stop === null) this.stop();
+    this.isPadReady = input !== null && hasAttention && (this.isPadReady || !input.isHeld);
+    const isHeld = this.isPadReady && input?.isHeld === true;
+    const isGo = isHeld && input.isGo;
+    const isJogging = isHeld && !isGo;
     // The trigger is pulled before the other button, so that it is let go first.
     this.setJog("pad", isJogging ? { kind: "tip", deflection: input.deflection } : null);
-    this.setGo(input?.isGo === true, "pad go");
+    this.setGo(isGo, "pad go");
     if (this.deadMan.source === "pad" && input && isDeflected(input.deflection)) this.goal.clear();
   }
 
@@ -311,7 +328,9 @@ export class Commander {
   private gripChanged(): void {
     const { source, reason } = this.deadMan;
     if (source === null) {
-      if (reason !== "") this.events.notice(`Released: ${reason}. Let go and hold again`);
+      // After a stop, or without control, holding again has no effect.
+      const advice = this.maySteer && reason !== OWN_STOP ? ". Let go and hold again" : "";
+      if (reason !== "") this.events.notice(`Released: ${reason}${advice}`);
       this.axes = null;
     } else {
       this.axes = this.axesNow();

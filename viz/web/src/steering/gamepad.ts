@@ -52,6 +52,14 @@ export function padInput({ mapping, axes, buttons }: PadState): PadInput | null 
   };
 }
 
+/** What the first gamepad reports whose layout is known, and its place in the list. The stop button of each gamepad counts. */
+export function firstPad(pads: readonly (PadState | null)[]): { ix: number; input: PadInput } | null {
+  const inputs = pads.map((pad) => pad && padInput(pad));
+  const ix = inputs.findIndex((input) => input !== null);
+  const input = inputs[ix];
+  return input ? { ix, input: { ...input, isStop: inputs.some((other) => other?.isStop === true) } } : null;
+}
+
 /** The deflection beyond the dead zone, from -1 to 1, without a step at its border. */
 export function withoutDeadZone(value: number): number {
   const beyond = Math.min(1, Math.abs(value)) - DEAD_ZONE;

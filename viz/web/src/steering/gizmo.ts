@@ -112,8 +112,12 @@ export class Gizmo implements ViewTool {
     this.hasTakenPress = true;
     event.stopPropagation();
     event.preventDefault();
-    if (!this.events.begin()) return;
+    // First, because it fails if the pointer is gone: then, the hand must not be held.
     this.canvas.setPointerCapture(event.pointerId);
+    if (!this.events.begin()) {
+      this.canvas.releasePointerCapture(event.pointerId);
+      return;
+    }
     const camera = this.camera.clone();
     camera.updateMatrixWorld(true);
     const { worldFromBase, baseFromHand, worldFromAxes } = this.pose;

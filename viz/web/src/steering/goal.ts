@@ -84,10 +84,10 @@ export class Goal {
     return { kind: "pose", base_from_tip: numbersOf(wanted.baseFromTip) };
   }
 
-  /** Whether the joints are at the goal. */
+  /** Whether the joints are at the goal. Those of an answer without permission are only close to it. */
   isReached(position: readonly number[]): boolean {
     const goal = this.judged?.position;
-    if (!goal || !this.isJudged || goal.length !== position.length) return false;
+    if (!goal || !this.isJudged || !mayGo(this.judged!.verdict) || goal.length !== position.length) return false;
     return goal.every((value, ix) => Math.abs(value - position[ix]!) < REACHED);
   }
 }

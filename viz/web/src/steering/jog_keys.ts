@@ -22,8 +22,7 @@ export class JogKeys {
     addToggle(BUTTON, switched, () => commander.hasControl);
     window.addEventListener("keydown", (event) => this.press(event), { capture: true });
     window.addEventListener("keyup", ({ code }) => this.up(code), { capture: true });
-    for (const kind of ["blur", "pagehide"] as const) window.addEventListener(kind, () => this.release());
-    document.addEventListener("visibilitychange", () => this.release());
+    this.listenToLosses();
   }
 
   /** Switches the keys off when control ends or when the view flies. */
@@ -32,8 +31,21 @@ export class JogKeys {
     if (isOn && (!this.commander.hasControl || isPressed("toggle-fly"))) element(BUTTON).click();
   }
 
+  /** Everything after which the page may not see the release of a key. */
+  private listenToLosses(): void {
+    for (const kind of ["blur", "pagehide"] as const) window.addEventListener(kind, () => this.release());
+    document.addEventListener("visibilitychange", () => this.release());
+    // Menus, and the lists of selects, take the keyboard.
+    window.addEventListener("contextmenu", (event) => event.defaultPrevented || this.release());
+    for (const kind of ["focusin", "pointerdown"] as const) {
+      window.addEventListener(kind, ({ target }) => target instanceof HTMLSelectElement && this.release(), { capture: true });
+    }
+  }
+
   private press(event: KeyboardEvent): void {
     const { code, repeat } = event;
+    // While Meta is down, macOS does not report the release of other keys.
+    if (event.metaKey) this.release();
     if (!isPressed(BUTTON) || !(code in JOG_KEYS) || isKeptByFocus(event) || isPageCovered()) return;
     if (event.ctrlKey || event.metaKey || event.altKey) return;
     event.preventDefault();
@@ -49,6 +61,7 @@ export class JogKeys {
   }
 
   private release(): void {
+    if (this.held.size === 0) return;
     this.held.clear();
     this.apply();
   }

@@ -18,6 +18,12 @@ const PAIRS: readonly [minus: string, plus: string, axis: keyof Deflection][] = 
   ["Turn right", "Turn left", "yaw"],
 ];
 
+/** Whether the buttons of one arm fit the other. Each connection describes its arm anew. */
+function haveSameButtons(a: readonly ArmJoint[], b: readonly ArmJoint[]): boolean {
+  const isSame = ({ name, is_prismatic }: ArmJoint, ix: number): boolean => name === b[ix]?.name && is_prismatic === b[ix].is_prismatic;
+  return a.length === b.length && a.every(isSame);
+}
+
 export class JogPad {
   private joints: readonly ArmJoint[] = [];
   private values: HTMLElement[] = [];
@@ -33,7 +39,7 @@ export class JogPad {
   /** Shows the positions of the joints. Other joints get other buttons. */
   show(): void {
     const { arm, state } = this.commander;
-    if (arm && arm.joints !== this.joints) this.build(arm.joints);
+    if (arm && !haveSameButtons(arm.joints, this.joints)) this.build(arm.joints);
     for (const [ix, { is_prismatic }] of this.joints.entries()) {
       const position = state?.position[ix];
       if (position !== undefined) setText(this.values[ix]!, jointText(position, is_prismatic));

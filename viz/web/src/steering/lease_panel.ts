@@ -47,7 +47,7 @@ export class LeasePanel {
   private reasonAgainstTaking(): string {
     const { arm, state, isOpen } = this.commander;
     if (!arm || !state || !isOpen) return "There is no link to the arm";
-    if (!arm.may_steer) return "Only operators can steer; you are connected as viewer";
+    if (!arm.may_steer) return "Only operators can steer. You are connected as viewer: ask for an operator's link";
     const isFree = state.holder === null || state.offered_to === arm.client;
     return isFree ? "" : `Operator ${state.holder} has control: ask for it`;
   }

@@ -10,7 +10,7 @@ import { showToast } from "../panels/toast";
 import type { action, toggle } from "../keys";
 import type { OrbitView } from "../view/orbit_view";
 import { Commander } from "./commander";
-import { type PadInput, padInput } from "./gamepad";
+import { firstPad } from "./gamepad";
 import { Ghost, type GhostParts } from "./ghost";
 import { isApart, lookOfLimits, lookOfVerdict, LOOKS } from "./ghost_looks";
 import { Gizmo } from "./gizmo";
@@ -53,6 +53,8 @@ export class Steering {
   private readonly limits: LimitsList;
   private shownMillis = -Infinity;
   private shownMode = "";
+  /** The gamepad that was read last. */
+  private padIx: number | null = null;
   /** The last joint positions of which the pose of the tip was computed. */
   private tip: { position: readonly number[]; pose: Pose | null } | null = null;
 
@@ -130,14 +132,14 @@ export class Steering {
     });
     const always = element("steer-always", HTMLInputElement);
     always.addEventListener("change", () => {
-      commander.loseEvents("another way of moving was chosen");
+      commander.interrupt("another way of moving was chosen");
       commander.previewsAlways = always.checked;
       if (!always.checked) commander.goal.clear();
       this.show();
     });
     holdButton(element("steer-go"), (isHeld) => commander.setGo(isHeld));
     element("steer-discard").addEventListener("click", () => {
-      commander.loseEvents("the goal was discarded");
+      commander.interrupt("the goal was discarded");
       commander.goal.clear();
       this.show();
     });
@@ -154,7 +156,11 @@ export class Steering {
     };
     window.addEventListener("blur", lose("another window has the focus"));
     window.addEventListener("pagehide", lose("the page is closed"));
-    canvas.addEventListener("webglcontextlost", lose("the view cannot be drawn"));
+    window.addEventListener("contextmenu", (event) => event.defaultPrevented || lose("a menu is open")());
+    canvas.addEventListener("webglcontextlost", () => {
+      this.commander.interrupt("the view cannot be drawn");
+      this.gizmo.giveUp();
+    });
     document.addEventListener("visibilitychange", () => {
       if (document.hidden) lose("the page is hidden")();
       this.commander.setHidden(document.hidden, performance.now());
@@ -183,20 +189,23 @@ export class Steering {
     const now = performance.now();
     this.socket.check();
     const { commander } = this;
-    if (commander.hasControl) commander.setPad(document.hidden ? null : this.readPad());
+    this.readPad();
     commander.tick(now);
     if (commander.deadMan.source === "gizmo") this.placeGizmo();
     if (now - this.shownMillis >= SHOW_MILLIS) this.show();
   }
 
-  /** What the first gamepad reports whose layout is known. */
-  private readPad(): PadInput | null {
-    const pads = navigator.getGamepads().filter((pad) => pad !== null);
-    const inputs = pads.map((pad) => padInput(pad));
-    const input = inputs.find((found) => found !== null) ?? null;
-    const unknown = pads[0] ? "The gamepad has an unknown layout" : "";
-    setText(element("steer-pad"), input ? "Gamepad: hold a trigger, move the sticks" : unknown);
-    return input;
+  private readPad(): void {
+    const { commander } = this;
+    // Browsers do not update gamepads for hidden pages, and have none on insecure ones.
+    const pads = document.hidden ? [] : (navigator.getGamepads?.() ?? []);
+    const pad = firstPad(pads);
+    // Gamepads report also to pages without the focus, while the operator may use another program.
+    const hasAttention = commander.hasControl && document.hasFocus() && pad?.ix === this.padIx;
+    this.padIx = pad?.ix ?? null;
+    commander.setPad(pad?.input ?? null, hasAttention);
+    const unknown = pads.some((other) => other !== null) ? "The gamepad has an unknown layout and is not used" : "";
+    setText(element("steer-pad"), pad ? "Gamepad: hold a trigger, move the sticks" : unknown);
   }
 
   private notice(text: string): void {

@@ -31,6 +31,8 @@ export class StopButton {
     window.addEventListener("keydown", (event) => this.press(event), { capture: true });
     window.addEventListener("keyup", (event) => this.release(event), { capture: true });
     this.rearm.addEventListener("click", () => this.pressRearm());
+    // Enter that is held clicks again and again, but counts as one press.
+    this.rearm.addEventListener("keydown", (event) => event.repeat && event.preventDefault());
   }
 
   show(): void {
@@ -69,7 +71,7 @@ export class StopButton {
   }
 
   private release(event: KeyboardEvent): void {
-    if (event.key !== " " || !this.isKeyDown) return;
+    if (!isSpace(event) || !this.isKeyDown) return;
     this.isKeyDown = false;
     event.preventDefault();
     event.stopImmediatePropagation();
@@ -77,7 +79,7 @@ export class StopButton {
 
   /** Space, while the arm can move. In fields, it is a letter. */
   private isStopKey(event: KeyboardEvent): boolean {
-    return event.key === " " && this.commander.canMove && !isTyping(event);
+    return isSpace(event) && this.commander.canMove && !isTyping(event);
   }
 
   private pressRearm(): void {
@@ -90,4 +92,9 @@ export class StopButton {
     }
     this.show();
   }
+}
+
+/** Whether the key is Space, whatever the input method makes of it. */
+function isSpace({ key, code }: KeyboardEvent): boolean {
+  return key === " " || code === "Space";
 }
