@@ -173,7 +173,7 @@ impl SupervisedArm {
             // is already at rest.
             if self.arm.motion() == Motion::Holding {
                 return Ok(MotionEnd {
-                    state,
+                    state: self.read_newest(on_state)?,
                     has_arrived: true,
                 });
             }
@@ -184,11 +184,20 @@ impl SupervisedArm {
                     on_state(&self.read()?);
                 }
                 return Ok(MotionEnd {
-                    state: self.read()?,
+                    state: self.read_newest(on_state)?,
                     has_arrived: false,
                 });
             }
         }
+    }
+
+    /// Waits for a joint state that arrives after this call. On a busy computer, earlier states may
+    /// wait to be read, in which the arm is still on its way.
+    fn read_newest(&mut self, mut on_state: impl FnMut(&JointState)) -> anyhow::Result<JointState> {
+        self.read_queued(&mut on_state)?;
+        let state = self.read()?;
+        on_state(&state);
+        Ok(state)
     }
 
     /// Reads the arm, which holds its position, until a stop is requested.

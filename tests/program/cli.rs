@@ -370,7 +370,7 @@ fn invalid_arguments_exit_with_2() {
         &["1000000", "the smallest distance field takes 2629632 bytes"],
     );
     assert!(!out.exists(), "a rejected command leaves no files behind");
-    for address in ["7105", "localhost:7105"] {
+    for address in ["7105", "computer:7105"] {
         assert_fails_with(
             &["run", "rig.toml", "--sim", "--listen", address],
             2,

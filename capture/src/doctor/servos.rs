@@ -5,6 +5,12 @@ use crate::config::{ArmDriver, Rig};
 use crate::open::servo_config;
 use drivers::servos::{ServoArmConfig, ServoBus};
 use std::path::Path;
+use std::time::Duration;
+
+/// How often a servo that does not answer is asked. An answer that comes late, because the computer
+/// or an adapter is busy, counts as missing.
+const N_ROUNDS: usize = 4;
+const PAUSE: Duration = Duration::from_millis(300);
 
 /// Largest latency of an FTDI adapter that permits the default rate. The adapter holds received
 /// bytes for this time, in each exchange.
@@ -30,10 +36,18 @@ fn ping_all(config: &ServoArmConfig) -> Vec<Finding> {
             return vec![Finding::fail("servos", error.to_string(), remedy)];
         }
     };
-    let missing: Vec<_> = config
-        .servos
+    let mut silent: Vec<_> = config.servos.iter().collect();
+    for round in 0..N_ROUNDS {
+        if round > 0 {
+            std::thread::sleep(PAUSE);
+        }
+        silent.retain(|servo| !matches!(bus.ping(servo.id), Ok(Some(_))));
+        if silent.is_empty() {
+            break;
+        }
+    }
+    let missing: Vec<_> = silent
         .iter()
-        .filter(|servo| !matches!(bus.ping(servo.id), Ok(Some(_))))
         .map(|servo| format!("{} (ID {})", servo.joint, servo.id))
         .collect();
     let title = config.protocol.title();
