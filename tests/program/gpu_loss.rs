@@ -158,8 +158,8 @@ fn out_of_gpu_memory_stops_growth() {
         )
     };
     let free = done(&train("free", &[]));
-    // This is enough memory to train and render the first 50 000 splats, but not 75 000.
-    let full = train("full", &[("FIELDRIG_TEST_GPU_BYTES", "48000000")]);
+    // This is enough memory to train and render the first 10 000 splats, but not 15 000.
+    let full = train("full", &[("FIELDRIG_TEST_GPU_BYTES", "12000000")]);
     let text = stderr(&full);
     assert_eq!(
         text.matches("the model stops growing at").count(),
