@@ -10,7 +10,7 @@ use trainer::ModelKind;
 /// With fewer images, large parts of a scene are seen once or never. A scan of a table needs about
 /// 60 keyframes.
 const MIN_KEYFRAMES: u64 = 30;
-/// Splats and NeRFs reach their level after some thousand steps. Before this many, the step count
+/// Splats and neural fields reach their level after some thousand steps. Before this many, the step count
 /// alone explains a poor result.
 const MIN_STEPS: u64 = 1000;
 /// A PSNR that rises faster than this has not reached its level, dB per doubling of the time.

@@ -202,7 +202,7 @@ pub(crate) fn build_contacts(
         // Each object is a body, so that its pieces are counted as one.
         let _ = writeln!(bodies, "<body name=\"{name}\" {pose}>");
         for (ix, points) in convex_pieces(object).iter().enumerate() {
-            let vertices: Vec<String> = points.iter().map(|point| list(point)).collect();
+            let vertices: Vec<String> = points.iter().map(list).collect();
             let vertices = vertices.join(" ");
             let _ = writeln!(assets, "<mesh name=\"{name}{ix}\" vertex=\"{vertices}\"/>");
             let _ = writeln!(bodies, "<geom type=\"mesh\" mesh=\"{name}{ix}\"/>");

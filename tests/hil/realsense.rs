@@ -263,7 +263,7 @@ fn play_late(
             clock_offset_nanos: starts_at.0 - BEGIN_NANOS,
             ..config.clone()
         })
-        .unwrap();
+        .expect("a readable file");
         let opened = [before, drivers::clock::now()];
         let images = read(camera);
         if !images.is_empty() {

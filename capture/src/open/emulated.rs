@@ -21,8 +21,11 @@ use std::time::Duration;
 /// the computer.
 const ANSWER_WAIT: Duration = Duration::from_millis(15);
 
+/// An arm that can be moved, and cameras that show it.
+type ArmAndCameras = (Box<dyn MovableArm>, Vec<Box<dyn Camera>>);
+
 /// Opens the cameras, and the arm for motion. The address of the arm becomes that of the controller.
-pub(super) fn open(rig: &mut Rig) -> anyhow::Result<(Box<dyn MovableArm>, Vec<Box<dyn Camera>>)> {
+pub(super) fn open(rig: &mut Rig) -> anyhow::Result<ArmAndCameras> {
     if rig.arm.driver != ArmDriver::Franka {
         bail!(
             "sim.emulate_arm: only a controller of the driver \"franka\" can be emulated for a simulated camera"

@@ -1,4 +1,8 @@
 //! Depths from rendered images of scenes whose shape is known.
+#![expect(
+    clippy::cast_possible_truncation,
+    reason = "cells and intensities are rounded down on purpose"
+)]
 
 use super::stereo::depth_from_images;
 use keyframe::{DepthMap, Keyframe, Split};

@@ -364,8 +364,7 @@ fn pose(name: &'static str, numbers: [f64; 7]) -> Result<[f64; 7], MessageError>
 }
 
 fn check_numbers(name: &'static str, numbers: &[f64]) -> Result<(), MessageError> {
-    // The comparison is written so that NaN fails.
-    let is_large = |number: &&f64| !(number.abs() <= MAX_NUMBER);
+    let is_large = |number: &&f64| number.is_nan() || number.abs() > MAX_NUMBER;
     match numbers.iter().find(is_large) {
         Some(&got) => Err(MessageError::LargeNumber { name, got }),
         None => Ok(()),

@@ -458,8 +458,8 @@ fn a_server_thread_that_is_held_up_delays_neither_commands_nor_states() {
     let desk = Desk::start();
     desk.hub.set_state("training");
     let mut client = desk.client();
-    let (release, released) = mpsc::channel::<()>();
-    let (holding, held) = mpsc::channel();
+    let (release, released) = mpsc::sync_channel::<()>(1);
+    let (holding, held) = mpsc::sync_channel(1);
     std::thread::scope(|scope| {
         let hub = desk.hub.clone();
         scope.spawn(move || {

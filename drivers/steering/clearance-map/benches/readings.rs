@@ -5,6 +5,7 @@ use criterion::{Criterion, criterion_group, criterion_main};
 use kinematics::urdf::Robot;
 use kinematics::{Chain, Stamp, Transform};
 use nalgebra::{Isometry3, Point3, Vector3};
+use numbers::f32_of;
 use std::hint::black_box;
 use steering::{Body, Clearance};
 
@@ -34,13 +35,13 @@ fn image(camera: &str, from: [f64; 3], secs: f64) -> DepthImage {
             1.0,
         );
         let in_world = pose.rotation * ray;
-        let is_block = (column / 80 + row / 80) % 3 == 0;
+        let is_block = (column / 80 + row / 80).is_multiple_of(3);
         let height_m = if is_block { 0.1 } else { 0.0 };
         let z_m = (height_m - from[2]) / in_world.z;
-        if (column * 7 + row * 13) % 50 == 0 || z_m < 0.0 {
+        if (column * 7 + row * 13).is_multiple_of(50) || z_m < 0.0 {
             0.0
         } else {
-            z_m as f32
+            f32_of(z_m)
         }
     };
     let pixels = (0..size_px[1]).flat_map(|row| (0..size_px[0]).map(move |column| (column, row)));

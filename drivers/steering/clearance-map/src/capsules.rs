@@ -47,7 +47,7 @@ pub(crate) fn in_grid(
 ) -> Vec<GridCapsule> {
     let to_grid = |capsule: &Capsule| {
         let in_world = capsule.transformed(world_from_base);
-        let [start, end] = in_world.ends.map(|end| grid.from_world(&end));
+        let [start, end] = in_world.ends.map(|end| grid.in_voxels(&end));
         GridCapsule {
             start: start.cast(),
             along: (end - start).cast(),

@@ -43,7 +43,7 @@ impl Grid {
     }
 
     /// A point of the world in voxels.
-    pub(crate) fn from_world(&self, in_world: &Vector3<f64>) -> Vector3<f64> {
+    pub(crate) fn in_voxels(&self, in_world: &Vector3<f64>) -> Vector3<f64> {
         let side = BLOCK_VOXELS as f64;
         let first = self.first_block.map(|block| block as f64 * side);
         in_world / self.voxel_m - Vector3::from(first)

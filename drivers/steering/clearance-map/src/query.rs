@@ -105,7 +105,7 @@ impl Query {
         let grid = self.snapshot.grid;
         let to_grid = |point: &[f64; 3]| {
             let in_world = world_from_base * Point3::from(*point);
-            grid.from_world(&in_world.coords).cast::<f32>()
+            grid.in_voxels(&in_world.coords).cast::<f32>()
         };
         points_in_base
             .iter()

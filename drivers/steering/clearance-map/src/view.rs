@@ -63,7 +63,7 @@ impl View {
             size_px: image.size_px.map(|size| size as usize),
             focal_px: cast(image.focal_px),
             principal_px: cast(image.principal_px),
-            center: grid.from_world(&pose.translation.vector).cast(),
+            center: grid.in_voxels(&pose.translation.vector).cast(),
             grid_from_camera: grid_from_camera.cast(),
             camera_from_grid: camera_from_grid.cast(),
             half_voxel_m: half_voxel_m.cast(),

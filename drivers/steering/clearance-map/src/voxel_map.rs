@@ -158,7 +158,7 @@ impl VoxelMap {
         let base = world_from_base.translation.vector;
         let grid = self.blocks.grid;
         let middle = Vector3::repeat(0.5 * grid.side() as f64);
-        let off_center = (grid.from_world(&base) - middle) / BLOCK_VOXELS as f64;
+        let off_center = (grid.in_voxels(&base) - middle) / BLOCK_VOXELS as f64;
         if off_center.amax() <= MAX_OFF_CENTER_BLOCKS {
             return;
         }

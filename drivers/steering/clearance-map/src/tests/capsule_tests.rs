@@ -74,7 +74,7 @@ fn mask_equals_a_test_of_all_capsules() {
         mask.set(&grid, all[..n].to_vec());
         let mut n_inside = 0;
         for _ in 0..20_000 {
-            let point = grid.from_world(&random_point(&mut random, 0.9)).cast();
+            let point = grid.in_voxels(&random_point(&mut random, 0.9)).cast();
             let at = grid.voxel_of(&point).unwrap();
             let deepest = all[..n]
                 .iter()

@@ -192,7 +192,7 @@ fn answers_equal_a_search_over_all_voxels() {
     let mut n_answers = 0;
     for _ in 0..25 {
         let point = random_point(&mut random, 0.6);
-        let in_grid = grid.from_world(&point);
+        let in_grid = grid.in_voxels(&point);
         let to_voxel = |low: &Vector3<f64>| {
             let outside = (in_grid - low - Vector3::repeat(0.5)).abs() - Vector3::repeat(0.5);
             outside.sup(&Vector3::zeros()).norm()

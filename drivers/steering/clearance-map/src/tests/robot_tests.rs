@@ -165,7 +165,7 @@ fn volume_of_a_resting_robot_does_not_age() {
     }
     let snapshot = tested.map.snapshot();
     let age_secs = |x: f64, z: f64| {
-        let in_grid = snapshot.grid.from_world(&Vector3::new(x, axis[1], z));
+        let in_grid = snapshot.grid.in_voxels(&Vector3::new(x, axis[1], z));
         let [x, y, z] = [in_grid.x, in_grid.y, in_grid.z].map(|voxel| voxel as usize / 4);
         snapshot
             .clock
