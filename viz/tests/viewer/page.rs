@@ -879,7 +879,7 @@ fn panels_are_next_to_toolbar(browser: &mut Browser) -> bool {
             const isApart = top > bounds('toolbar').bottom || bottom < bounds('toolbar').top;
             return isApart && top > bounds('view').top && bottom < bounds('view').bottom && height > 40;
         };
-        return panels.length === 7 && panels.every(isRight);
+        return panels.length === 8 && panels.every(isRight);
     })()";
     browser.evaluate(expression) == true
 }
