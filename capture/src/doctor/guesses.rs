@@ -7,7 +7,7 @@ const CHECK: &str = "guess";
 
 /// The guessed values of a rig file, as warnings: a run with them works, but its poses may be wrong.
 ///
-/// * `text`: the text of the rig file. A comment above a key that begins with [`GUESS`] marks its
+/// * `text`: the text of the rig file. A comment above a key that begins with `Guess:` marks its
 ///   value. Keys that were measured since have no such comment, because commands that write rig
 ///   files write no comments.
 #[must_use]

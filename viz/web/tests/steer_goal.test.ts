@@ -49,7 +49,7 @@ test("while a goal is dragged, questions are few, and old answers permit nothing
   assert.equal(goal.question(50), null);
   assert.ok(goal.answer(answer(first, "reachable", [1, 1])));
   assert.equal(goal.intent, null, "the answer is about another place");
-  assert.deepEqual(goal.judgement?.position, [1, 1], "but the ghost is shown there");
+  assert.deepEqual(goal.judgment?.position, [1, 1], "but the ghost is shown there");
   assert.equal(goal.question(60), null, "too early");
   const second = askedId(goal, 120);
   assert.equal(goal.answer(answer(first, "reachable", null)), false);

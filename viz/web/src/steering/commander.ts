@@ -390,8 +390,8 @@ export class Commander {
     const jog = nudge && this.jogs.get(nudge.source);
     if (!nudge || !jog || !state || !arm || !this.maySteer || this.mode !== "preview") return;
     if (jog.kind === "joint") {
-      const { target, judgement } = this.goal;
-      const from = target?.kind === "joints" ? target.position : ((target && judgement?.position) ?? state.position);
+      const { target, judgment } = this.goal;
+      const from = target?.kind === "joints" ? target.position : ((target && judgment?.position) ?? state.position);
       const velocity = jointVelocities(arm.joints, jog.ix, jog.direction, this.speed);
       this.setGoal({ kind: "joints", position: movedJoints(arm.joints, from, velocity, secs) });
     } else if (nudge.axes && isDeflected(jog.deflection)) {

@@ -13,7 +13,7 @@ const REACHED = 0.004;
 export type GoalTarget = { kind: "pose"; baseFromTip: Pose } | { kind: "joints"; position: number[] };
 
 /** What is known about a goal. */
-export interface Judgement {
+export interface Judgment {
   verdict: Verdict;
   text: string;
   position: number[] | null;
@@ -22,7 +22,7 @@ export interface Judgement {
 
 export class Goal {
   private wanted: GoalTarget | null = null;
-  private judged: Judgement | null = null;
+  private judged: Judgment | null = null;
   private nextId = 1;
   private asked: { id: number; isNewest: boolean; atMillis: number } | null = null;
   private askedMillis = -Infinity;
@@ -33,7 +33,7 @@ export class Goal {
   }
 
   /** The answer for the goal or, while it is dragged, for where it was shortly before; null before the first answer. */
-  get judgement(): Judgement | null {
+  get judgment(): Judgment | null {
     return this.judged;
   }
 

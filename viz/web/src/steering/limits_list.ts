@@ -35,10 +35,10 @@ export class LimitsList {
   }
 
   private marksOf(limits: readonly Limit[], { position, rotation }: Pose): Mark[] {
-    const { judgement, target } = this.commander.goal;
+    const { judgment, target } = this.commander.goal;
     const ofGoal: { place: Point | null; effect: string; text: string }[] = [];
-    if (target && judgement && judgement.verdict !== "reachable") {
-      const { verdict, text, place } = judgement;
+    if (target && judgment && judgment.verdict !== "reachable") {
+      const { verdict, text, place } = judgment;
       ofGoal.push({ place, effect: mayGo(verdict) ? "slowed" : "refused", text: verdictText(verdict, text) });
     }
     const ofArm = limits.map((limit) => ({ place: limit.place, effect: limit.effect, text: limitText(limit) }));

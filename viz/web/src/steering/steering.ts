@@ -270,10 +270,10 @@ export class Steering {
 
   private drawGhost(): void {
     const { state, goal } = this.commander;
-    const { judgement, target } = goal;
+    const { judgment, target } = goal;
     if (target) {
-      const position = target.kind === "joints" ? target.position : judgement?.position;
-      const look = judgement ? lookOfVerdict(judgement.verdict) : "checking";
+      const position = target.kind === "joints" ? target.position : judgment?.position;
+      const look = judgment ? lookOfVerdict(judgment.verdict) : "checking";
       // Without a solution, any ghost would be in the wrong place: the gizmo shows where the goal is.
       if (position) this.ghost.show(this.jointNames, position, look);
       else this.ghost.hide();
@@ -319,12 +319,12 @@ export class Steering {
 
   private showGoal(): void {
     const { goal, state } = this.commander;
-    const { target, judgement } = goal;
+    const { target, judgment } = goal;
     element("steer-goal").hidden = target === null;
     const isThere = state !== null && goal.isReached(state.position);
-    const verdict = judgement ? verdictText(judgement.verdict, judgement.text) : "Checking the goal";
+    const verdict = judgment ? verdictText(judgment.verdict, judgment.text) : "Checking the goal";
     setText(element("steer-verdict"), target ? (isThere ? "The arm is at the goal" : verdict) : "");
-    element("steer-verdict").title = judgement ? `Look of the ghost: ${LOOKS[lookOfVerdict(judgement.verdict)].name}` : "";
+    element("steer-verdict").title = judgment ? `Look of the ghost: ${LOOKS[lookOfVerdict(judgment.verdict)].name}` : "";
     // While it is held, a disabled button would get no release.
     const isHeld = this.commander.deadMan.source === "go";
     const reason = goal.intent || isHeld ? "" : "The goal cannot be reached, or is still being checked";
