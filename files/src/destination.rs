@@ -74,7 +74,7 @@ fn check_entries_of(folder: &Path) -> Result<(), Unwritable> {
         _ => return Ok(()),
     };
     Err(Unwritable {
-        // The current folder has no name that tells it apart.
+        // The current folder has no distinctive name.
         folder: std::path::absolute(folder).unwrap_or_else(|_| folder.to_owned()),
         reason,
     })

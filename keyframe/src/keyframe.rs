@@ -70,11 +70,9 @@ impl Keyframe {
     /// Whether most of the image has no depth. The result is true if the keyframe has no depth. It
     /// is also true if the depth comes from a range scanner, which covers only a band of the image.
     pub fn lacks_dense_depth(&self) -> bool {
-        self.depth.as_ref().is_none_or(|depth| {
-            // NaN compares false, so it counts as unknown.
-            let n_known = depth.depth_m.iter().filter(|z| **z > 0.0).count();
-            2 * n_known < depth.depth_m.len()
-        })
+        self.depth
+            .as_ref()
+            .is_none_or(|depth| depth.known_frac() < 0.5)
     }
 
     /// Host memory of the arrays, bytes.
@@ -188,6 +186,13 @@ pub struct DepthMap {
 }
 
 impl DepthMap {
+    /// Fraction of the pixels with a reading, 0 to 1.
+    pub fn known_frac(&self) -> f64 {
+        // NaN compares false, so it counts as unknown.
+        let n_known = self.depth_m.iter().filter(|z| **z > 0.0).count();
+        n_known as f64 / self.depth_m.len().max(1) as f64
+    }
+
     /// Point at depth `z_m` on the ray through the center of a pixel, in the depth camera's axes,
     /// meters.
     ///

@@ -59,7 +59,7 @@ impl ReadingOrder {
         self.joint_offsets.get(value_ix).copied().unwrap_or(0.0)
     }
 
-    /// A motion of the joints as it is reported.
+    /// A motion of the joints, as reported.
     fn reported(&self, position: &Joints, velocity: &Joints, acceleration: &Joints) -> Setpoint {
         let ordered = |joints: &Joints| self.joint_ixs.iter().map(|ix| joints[*ix]).collect();
         let mut reported: Vec<f64> = ordered(position);
@@ -245,7 +245,7 @@ impl Arm {
         self.handover = Some((handover, order));
     }
 
-    /// Tells the controller that the simulation has ended.
+    /// Reports the end of the simulation to the controller.
     pub(crate) fn end_control(&self) {
         if let Some((handover, _)) = &self.handover {
             handover.finish();

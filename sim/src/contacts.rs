@@ -1,4 +1,4 @@
-//! Counts how often the robot touches the scene, in a model of its own.
+//! Counts how often the robot touches the scene, in a separate model.
 //!
 //! The model of the images has no contacts: its meshes are not convex, and an arm that could be
 //! blocked would not follow its tour. In this model, the scene consists of convex pieces. The robot

@@ -379,7 +379,7 @@ impl Engine {
         self.contacts = contacts;
     }
 
-    /// Tells the controller of the arm that the simulation has ended.
+    /// Reports the end of the simulation to the controller of the arm.
     pub(crate) fn end_control(&mut self) {
         if let Some(arm) = self.robot.arm_mut() {
             arm.end_control();

@@ -1,7 +1,7 @@
 //! Passes an arm from its tour to the controller that an operator steers.
 //!
 //! The thread of the simulation moves the arm and renders, so it may lag behind real time. The
-//! controller runs in real time on a thread of its own, and stays ahead of the simulation: it
+//! controller runs in real time on a separate thread, and stays ahead of the simulation: it
 //! generates one setpoint per step, and the simulation follows them when it gets there.
 
 use drivers::motion::Setpoint;

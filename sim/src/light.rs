@@ -353,8 +353,11 @@ mod tests {
             Vector3::from(at)
         };
         for ix in 0..12 {
-            let turn = Vector3::new(0.3, 0.1, 0.2) * ix as f64;
-            occluders.add_box(Transform::new(position(ix), turn), [0.1, 0.05, 0.02]);
+            let rotation_rad = Vector3::new(0.3, 0.1, 0.2) * ix as f64;
+            occluders.add_box(
+                Transform::new(position(ix), rotation_rad),
+                [0.1, 0.05, 0.02],
+            );
         }
         let all: Vec<&SolidBox> = occluders.boxes.iter().collect();
         let to_lamp = KEY.to_lamp();

@@ -331,7 +331,7 @@ impl Rig {
         start: Stamp,
         limits: SteeredLimits<'_>,
     ) -> Result<(LiveRig, SteeredArm), Error> {
-        // Steering does not need the contacts, which only tell how well it works.
+        // Steering does not need the contacts, which only measure how well it works.
         let contacts = (self.build_contacts)()
             .map(ContactCounter::new)
             .inspect_err(|error| log::warn!("contacts with the scene are not counted: {error}"))

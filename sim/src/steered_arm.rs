@@ -2,7 +2,7 @@
 //!
 //! Until the operator begins, the arm moves on its tour. It then brakes, and follows the port of
 //! the operator. Where the operator leaves it, it stays. The controller runs in real time on a
-//! thread of its own, so that the arm brakes in time, however long an image takes to render.
+//! separate thread, so that the arm brakes in time, however long an image takes to render.
 
 use crate::Error;
 use crate::arm::STEP_NANOS;

@@ -23,7 +23,7 @@ pub(super) fn read(
 ) -> Result<Rig, ConfigError> {
     let (rig, context) = keys(file, text, overrides, folder)?;
     if let Some(problem) = context.into_problem() {
-        // Only the robot description tells which links there are, so a missing description comes
+        // Only the robot description lists the links, so a missing description comes
         // first.
         if let Some((_, urdf_path)) = &rig
             && problem.first().is_missing("arm.flange_link")

@@ -81,7 +81,7 @@ fn paced_motion(mut joint_simulator: JointSimulator, pace: &Pace) -> JointSimula
     })
 }
 
-/// Waits until the robot has moved for this many milliseconds of its own time, and stands still.
+/// Waits until the robot has moved for this many milliseconds of its clock, and stands still.
 /// Returns the reason if the arm has stopped.
 fn move_for(arm: &MovableFrankaArm, pace: &Pace, n_states: u64) -> Result<(), String> {
     pace.limit(n_states);

@@ -402,7 +402,7 @@ impl Steering {
             }
             Some(motion) if arm.is_at_rest => {
                 // The target of an arm at rest is at most one step away. If the arm is elsewhere, a
-                // person has moved it by hand, and it must not move back by itself.
+                // person has moved it by hand, and it must not move back without a new grip.
                 match self.limits.lag(&self.chain, &motion.target, &arm.position) {
                     Some(reason) => Err(self.brake(Link::Arm, reason)),
                     None => Ok(motion),

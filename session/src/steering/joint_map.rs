@@ -34,7 +34,7 @@ impl JointMap {
         })
     }
 
-    /// Positions of the chain for positions of the driver. A list of another length stays as it is,
+    /// Positions of the chain for positions of the driver. A list of another length is returned unchanged,
     /// so that the chain of decisions reports it.
     pub(super) fn in_chain(&self, of_driver: &[f64]) -> Vec<f64> {
         if of_driver.len() != self.driver_ixs.len() {

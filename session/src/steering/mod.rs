@@ -1,6 +1,6 @@
 //! Lets operators steer the arm of a run.
 //!
-//! A thread of its own takes the requests of the clients of `/steer` ([`SteeringServer`]), decides
+//! A separate thread takes the requests of the clients of `/steer` ([`SteeringServer`]), decides
 //! with the chain of the crate `steering` what the arm does, and sends it to the arm's own thread,
 //! which brakes as soon as targets expire. The thread needs neither the trainer nor the GPU, so
 //! both may be busy for any time. `steering_loop.rs` has one cycle, and the other files its parts.

@@ -1,4 +1,4 @@
-//! Enables an arm that has stopped by itself, without holding up the loop: a recovery may take a
+//! Enables an arm that a fault has stopped, without holding up the loop: a recovery may take a
 //! minute.
 
 use drivers::motion::{ArmState, SteeringPort};

@@ -256,11 +256,7 @@ mod tests {
         );
         scene.end_sweep();
         scene.set_posture(&arm_at(Stamp(2 * AT.0)));
-        assert_eq!(
-            scene.state.lock().swept_at,
-            Some(AT),
-            "it moves by itself no more"
-        );
+        assert_eq!(scene.state.lock().swept_at, Some(AT), "the tour has ended");
     }
 
     #[test]

@@ -264,7 +264,7 @@ impl SteeringLoop {
         Ok(())
     }
 
-    /// Permits motion after a stop. An arm that has stopped by itself is enabled first, which takes
+    /// Permits motion after a stop. An arm that a fault has stopped is enabled first, which takes
     /// a while.
     fn rearm(&mut self, now: Stamp, operator: Operator, arm: &ArmState) -> Result<(), String> {
         if arm.stopped.is_some() && self.holds_lease(operator) {

@@ -362,7 +362,7 @@ fn an_arm_with_a_fault_is_recovered_only_when_the_holder_permits_motion() {
             .replies
             .is_empty()
     );
-    // The recovery runs on a thread of its own, so the test waits for it in real time.
+    // The recovery runs on a separate thread, so the test waits for it in real time.
     while run.n_recoveries.load(Ordering::Relaxed) == 0 {
         std::thread::yield_now();
     }
@@ -386,7 +386,7 @@ fn a_stop_during_a_recovery_is_not_undone_by_its_end() {
     run.cycle(vec![(ANA, SteeringRequest::Rearm)]);
     let outcome = run.cycle(vec![(BEN, SteeringRequest::Stop)]);
     assert!(outcome.replies.is_empty(), "{outcome:?}");
-    // The recovery runs on a thread of its own, so the test waits for it in real time.
+    // The recovery runs on a separate thread, so the test waits for it in real time.
     let until = std::time::Instant::now() + Duration::from_secs(60);
     let refused = loop {
         assert!(std::time::Instant::now() < until, "the recovery has no end");

@@ -17,6 +17,7 @@ use kinematics::Transform;
 use nalgebra::{Matrix3, Vector3};
 use numbers::{f32_of, f32s_of};
 use rayon::prelude::*;
+use std::sync::OnceLock;
 
 /// Maximum width and height of the reduced images, pixels.
 const MAX_SIZE_PX: u32 = 96;
@@ -34,7 +35,7 @@ const MAX_BASELINE_RATIO: f64 = 3.0;
 const STEP_PX: f64 = 1.0;
 /// Maximum shift in the neighbor with the shortest baseline, as a fraction of the image's size.
 const MAX_SHIFT_FRAC: f64 = 0.33;
-/// Smallest shift that tells a distance, in steps.
+/// Smallest shift from which a depth is computed, in steps.
 const MIN_SHIFT_STEPS: usize = 2;
 /// Windows have `2 RADIUS + 1` pixels in both directions.
 const RADIUS: usize = 2;
@@ -52,28 +53,52 @@ const SUPPORT_FRAC: f32 = 0.08;
 /// Smallest number of the eight adjacent pixels that must support a depth.
 const MIN_SUPPORT: usize = 4;
 
-/// Depth of a keyframe from other keyframes, at a reduced resolution. `None` if no keyframe shows
-/// the scene from a suitable place, or if no depth is certain.
-///
-/// * `others`: keyframes with poses in the same world. The keyframe itself may be among them.
-pub(super) fn depth_from_images(keyframe: &Keyframe, others: &[&Keyframe]) -> Option<DepthMap> {
-    let neighbors = neighbors(keyframe, others);
-    let baseline_m = |other: &&Keyframe| baseline_m(keyframe, other);
-    let shortest_m = neighbors.iter().map(baseline_m).reduce(f64::min)?;
-    let longest_m = neighbors.iter().map(baseline_m).reduce(f64::max)?;
-    let image = GrayImage::of(keyframe);
-    let neighbors: Vec<Neighbor> = neighbors
-        .into_iter()
-        .map(|other| Neighbor::new(&image, keyframe, other))
-        .collect();
+/// Keyframes with poses in one world. Each image is reduced at its first use.
+pub(super) struct StereoImages<'a> {
+    keyframes: Vec<&'a Keyframe>,
+    images: Vec<OnceLock<GrayImage>>,
+}
 
+impl<'a> StereoImages<'a> {
+    pub(super) fn new(keyframes: Vec<&'a Keyframe>) -> Self {
+        let images = keyframes.iter().map(|_| OnceLock::new()).collect();
+        Self { keyframes, images }
+    }
+
+    /// Depth of a keyframe, at a reduced resolution. `None` if no other keyframe shows the scene
+    /// from a suitable place, or if no depth is certain. The keyframe itself may be among the
+    /// others.
+    pub(super) fn depth_of(&self, keyframe: &Keyframe) -> Option<DepthMap> {
+        let reference = Reference::new(keyframe);
+        let neighbors = neighbors(keyframe, &self.keyframes)
+            .into_iter()
+            .map(|ix| {
+                let other = self.keyframes[ix];
+                let image = self.images[ix].get_or_init(|| GrayImage::of(other));
+                Neighbor::new(&reference.image, keyframe, other, image)
+            })
+            .collect::<Vec<_>>();
+        sweep(&reference, &neighbors, keyframe.world_from_camera)
+    }
+}
+
+/// Compares an image with its neighbors at all inverse depths.
+fn sweep(
+    reference: &Reference,
+    neighbors: &[Neighbor<'_>],
+    world_from_camera: Transform,
+) -> Option<DepthMap> {
+    let image = &reference.image;
+    let baselines_m = || neighbors.iter().map(|neighbor| neighbor.baseline_m);
+    let shortest_m = baselines_m().reduce(f64::min)?;
+    let longest_m = baselines_m().reduce(f64::max)?;
     let focal_px = image.focal_px[0].max(image.focal_px[1]);
     let max_shift_px = MAX_SHIFT_FRAC * image.size().into_iter().max()? as f64;
     let step_per_m = STEP_PX / (focal_px * longest_m);
     let n_planes = (max_shift_px / (focal_px * shortest_m) / step_per_m) as usize + 1;
     let planes: Vec<Vec<f32>> = (0..n_planes)
         .into_par_iter()
-        .map(|plane| correlations(&image, &neighbors, plane as f64 * step_per_m))
+        .map(|plane| correlations(reference, neighbors, plane as f64 * step_per_m))
         .collect();
 
     let inverse_depths: Vec<f32> = (0..image.gray.len())
@@ -89,7 +114,7 @@ pub(super) fn depth_from_images(keyframe: &Keyframe, others: &[&Keyframe]) -> Op
             .iter()
             .map(|per_m| if *per_m > 0.0 { 1.0 / per_m } else { 0.0 })
             .collect(),
-        world_from_camera: keyframe.world_from_camera,
+        world_from_camera,
     })
 }
 
@@ -99,14 +124,16 @@ fn baseline_m(a: &Keyframe, b: &Keyframe) -> f64 {
     (a - b).norm()
 }
 
-/// Keyframes that show about the same part of the scene from other places.
-fn neighbors<'a>(keyframe: &Keyframe, others: &[&'a Keyframe]) -> Vec<&'a Keyframe> {
+/// Indices of the keyframes that show about the same part of the scene from other places.
+fn neighbors(keyframe: &Keyframe, others: &[&Keyframe]) -> Vec<usize> {
     let axis = |keyframe: &Keyframe| keyframe.world_from_camera * Vector3::z();
     let is_similar = |other: &Keyframe| axis(keyframe).angle(&axis(other)) < MAX_ANGLE_RAD;
-    let mut nearest: Vec<(f64, &Keyframe)> = others
+    let mut nearest: Vec<(f64, usize)> = others
         .iter()
-        .map(|other| (baseline_m(keyframe, other), *other))
-        .filter(|(baseline_m, other)| *baseline_m > 0.0 && is_similar(other))
+        .enumerate()
+        .filter(|(_, other)| is_similar(other))
+        .map(|(ix, other)| (baseline_m(keyframe, other), ix))
+        .filter(|(baseline_m, _)| *baseline_m > 0.0)
         .collect();
     // The sort is stable, so that equal distances keep the order of arrival.
     nearest.sort_by(|a, b| a.0.total_cmp(&b.0));
@@ -190,18 +217,45 @@ impl GrayImage {
     }
 }
 
-/// Another image, and how positions in it depend on the pixel and its inverse depth:
-/// `turn * (column, row, 1) + inverse_depth * shift`, in homogeneous coordinates.
-struct Neighbor {
+/// The image whose depth is computed, with the statistics of its windows.
+struct Reference {
     image: GrayImage,
-    turn: [[f32; 3]; 3],
-    shift: [f32; 3],
+    means: Vec<f32>,
+    variances: Vec<f32>,
 }
 
-impl Neighbor {
+impl Reference {
+    fn new(keyframe: &Keyframe) -> Self {
+        let image = GrayImage::of(keyframe);
+        let [means, variances] = statistics(&image.gray, image.size());
+        Self {
+            image,
+            means,
+            variances,
+        }
+    }
+}
+
+/// Another image, and how positions in it depend on the pixel of the reference and its inverse
+/// depth: `homography * (column, row, 1) + inverse_depth * epipole`, in homogeneous coordinates.
+/// These are the homography of the plane at infinity and the epipole (Hartley and Zisserman,
+/// "Multiple view geometry", section 13.1).
+struct Neighbor<'a> {
+    image: &'a GrayImage,
+    baseline_m: f64,
+    homography: [[f32; 3]; 3],
+    epipole: [f32; 3],
+}
+
+impl<'a> Neighbor<'a> {
     /// * `reference`: the reduced image of `keyframe`.
-    fn new(reference: &GrayImage, keyframe: &Keyframe, other: &Keyframe) -> Self {
-        let image = GrayImage::of(other);
+    /// * `image`: the reduced image of `other`.
+    fn new(
+        reference: &GrayImage,
+        keyframe: &Keyframe,
+        other: &Keyframe,
+        image: &'a GrayImage,
+    ) -> Self {
         let other_from_camera: Transform =
             other.world_from_camera.inverse() * keyframe.world_from_camera;
         let ray_from_px = reference
@@ -209,23 +263,24 @@ impl Neighbor {
             .try_inverse()
             .unwrap_or_else(Matrix3::identity);
         let rotation = other_from_camera.rotation.to_rotation_matrix();
-        let turn = image.px_from_ray() * rotation.matrix() * ray_from_px;
-        let shift = image.px_from_ray() * other_from_camera.translation.vector;
+        let homography = image.px_from_ray() * rotation.matrix() * ray_from_px;
+        let epipole = image.px_from_ray() * other_from_camera.translation.vector;
         Self {
             image,
-            turn: [0, 1, 2].map(|row| f32s_of([turn[(row, 0)], turn[(row, 1)], turn[(row, 2)]])),
-            shift: f32s_of([shift.x, shift.y, shift.z]),
+            baseline_m: baseline_m(keyframe, other),
+            homography: [0, 1, 2]
+                .map(|row| f32s_of([0, 1, 2].map(|column| homography[(row, column)]))),
+            epipole: f32s_of(epipole.into()),
         }
     }
 
-    /// The intensities that the pixels of an image of this size have here, if all are at an
-    /// inverse depth.
-    fn seen_at(&self, [width, height]: [usize; 2], per_m: f32) -> Vec<f32> {
+    /// The image, warped to a reference of this size whose pixels are all at an inverse depth.
+    fn warped(&self, [width, height]: [usize; 2], per_m: f32) -> Vec<f32> {
         let position = |ix: usize| {
             let (column, row) = ((ix % width) as f32, (ix / width) as f32);
             let [x, y, z] = [0, 1, 2].map(|axis| {
-                let [by_column, by_row, constant] = self.turn[axis];
-                by_column * column + by_row * row + constant + per_m * self.shift[axis]
+                let [by_column, by_row, constant] = self.homography[axis];
+                by_column * column + by_row * row + constant + per_m * self.epipole[axis]
             });
             if z > 0.0 {
                 self.image.at(x / z, y / z)
@@ -239,12 +294,12 @@ impl Neighbor {
 
 /// Correlation of each pixel's window at an inverse depth: the mean of the better half of the
 /// neighbors, because the other ones may not see the surface. NaN where no neighbor sees it.
-fn correlations(image: &GrayImage, neighbors: &[Neighbor], per_m: f64) -> Vec<f32> {
+fn correlations(reference: &Reference, neighbors: &[Neighbor<'_>], per_m: f64) -> Vec<f32> {
     let of_neighbors: Vec<Vec<f32>> = neighbors
         .iter()
         .map(|neighbor| {
-            let seen = neighbor.seen_at(image.size(), f32_of(per_m));
-            correlation(&image.gray, &seen, image.size())
+            let warped = neighbor.warped(reference.image.size(), f32_of(per_m));
+            correlation(reference, &warped)
         })
         .collect();
     let mean_of_better = |ix: usize| {
@@ -257,39 +312,46 @@ fn correlations(image: &GrayImage, neighbors: &[Neighbor], per_m: f64) -> Vec<f3
         known.truncate(known.len().div_ceil(2));
         known.iter().sum::<f32>() / known.len() as f32
     };
-    (0..image.gray.len()).map(mean_of_better).collect()
+    (0..reference.image.gray.len())
+        .map(mean_of_better)
+        .collect()
 }
 
 /// Normalized cross-correlation of the windows around each pixel, -1 to 1. NaN where a window has
 /// unknown pixels, ends at the border, or has no texture.
-fn correlation(a: &[f32], b: &[f32], size: [usize; 2]) -> Vec<f32> {
-    let sums = |of: fn(f32, f32) -> f32| {
-        let products: Vec<f32> = a.iter().zip(b).map(|(a, b)| of(*a, *b)).collect();
-        window_sums(&products, size)
-    };
-    // A pixel that is unknown in one of the images must be left out of all sums.
-    let [sum_a, sum_b] = [
-        sums(|a, b| if b.is_nan() { b } else { a }),
-        sums(|a, b| if a.is_nan() { a } else { b }),
-    ];
-    let [sum_aa, sum_bb, sum_ab] = [
-        sums(|a, b| if b.is_nan() { b } else { a * a }),
-        sums(|a, b| if a.is_nan() { a } else { b * b }),
-        sums(|a, b| a * b),
-    ];
-    (0..a.len())
+fn correlation(reference: &Reference, other: &[f32]) -> Vec<f32> {
+    let size = reference.image.size();
+    let [means, variances] = statistics(other, size);
+    let products = reference.image.gray.iter().zip(other);
+    let products: Vec<f32> = products.map(|(a, b)| a * b).collect();
+    let sums = window_sums(&products, size);
+    (0..other.len())
         .map(|ix| {
-            let (mean_a, mean_b) = (sum_a[ix] / N_WINDOW, sum_b[ix] / N_WINDOW);
-            let variance_a = sum_aa[ix] / N_WINDOW - mean_a * mean_a;
-            let variance_b = sum_bb[ix] / N_WINDOW - mean_b * mean_b;
+            let (variance_a, variance_b) = (reference.variances[ix], variances[ix]);
             // NaN fails both comparisons.
             if variance_a > MIN_VARIANCE && variance_b > 0.25 * MIN_VARIANCE {
-                (sum_ab[ix] / N_WINDOW - mean_a * mean_b) / (variance_a * variance_b).sqrt()
+                let covariance = sums[ix] / N_WINDOW - reference.means[ix] * means[ix];
+                covariance / (variance_a * variance_b).sqrt()
             } else {
                 f32::NAN
             }
         })
         .collect()
+}
+
+/// Mean and variance of the window around each pixel. NaN where a window has unknown pixels or ends
+/// at the border.
+fn statistics(values: &[f32], size: [usize; 2]) -> [Vec<f32>; 2] {
+    let squares: Vec<f32> = values.iter().map(|value| value * value).collect();
+    let [means, mean_squares] = [values, &squares].map(|values| {
+        let sums = window_sums(values, size);
+        sums.iter().map(|sum| sum / N_WINDOW).collect::<Vec<f32>>()
+    });
+    let variances = means.iter().zip(mean_squares);
+    let variances = variances
+        .map(|(mean, square)| square - mean * mean)
+        .collect();
+    [means, variances]
 }
 
 /// Sum over the window around each pixel. NaN at the border.

@@ -4,9 +4,9 @@
     reason = "cells and intensities are rounded down on purpose"
 )]
 
-use super::stereo::depth_from_images;
-use keyframe::{DepthMap, Keyframe, Split};
-use kinematics::{Stamp, Transform};
+use super::stereo::StereoImages;
+use keyframe::{DepthMap, Keyframe, scenes};
+use kinematics::Transform;
 use nalgebra::{Point3, Translation3, UnitQuaternion, Vector3};
 use numbers::random::Random;
 use std::sync::Arc;
@@ -69,11 +69,11 @@ fn plain(from: &Point3<f64>, ray: &Vector3<f64>) -> (f64, Texture) {
     (wall(from, ray).0, Texture::None)
 }
 
-/// A picture of the scene from a place, looking along z, turned around y.
-fn picture(scene: Scene, [x, y, z]: [f64; 3], turn_rad: f64) -> Keyframe {
+/// A picture of the scene from a place, looking along z, rotated about y.
+fn picture(scene: Scene, [x, y, z]: [f64; 3], rotation_rad: f64) -> Keyframe {
     let world_from_camera = Transform::from_parts(
         Translation3::new(x, y, z),
-        UnitQuaternion::from_axis_angle(&Vector3::y_axis(), turn_rad),
+        UnitQuaternion::from_axis_angle(&Vector3::y_axis(), rotation_rad),
     );
     let principal_px = SIZE_PX.map(|px| f64::from(px) / 2.0);
     let gray = |ix: u32| {
@@ -91,20 +91,13 @@ fn picture(scene: Scene, [x, y, z]: [f64; 3], turn_rad: f64) -> Keyframe {
         })
         .collect();
     Keyframe {
-        camera: "test".into(),
-        stamp: Stamp(0),
         size_px: SIZE_PX,
         focal_px: [FOCAL_PX; 2],
         principal_px,
         rgba_srgb,
         depth: None,
         world_from_camera,
-        twist: None,
-        readout_secs: 0.0,
-        joint_twists: [].into(),
-        base: None,
-        split: Split::Train,
-        truth: None,
+        ..scenes::keyframe(0, &[], world_from_camera)
     }
 }
 
@@ -120,6 +113,11 @@ fn pictures(scene: Scene) -> Vec<Keyframe> {
         .into_iter()
         .map(|place| picture(scene, place, -0.3 * place[0]))
         .collect()
+}
+
+/// Depth of an image, computed with others.
+fn depth_from_images(image: &Keyframe, others: &[&Keyframe]) -> Option<DepthMap> {
+    StereoImages::new(others.to_vec()).depth_of(image)
 }
 
 /// Relative errors of the known depths, and the fraction of pixels that are known.

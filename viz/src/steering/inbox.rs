@@ -102,7 +102,7 @@ impl Inbox {
         Ok(())
     }
 
-    /// Removes what a silent client asked for, except for stops. If the loop knows the client, it
+    /// Removes what a silent client asked for, except for stops. If the loop has seen the client, it
     /// learns of the silence.
     pub(crate) fn silence(&mut self, client: u64, at: Instant) {
         // The end of an earlier silence stays, too: the loop has not released that lease yet.

@@ -124,7 +124,7 @@ impl SteeringServer {
         self.publish_clients();
     }
 
-    /// Tells the loop that a client is silent.
+    /// Reports to the loop that a client is silent.
     pub(crate) fn silence(&self, client: u64) {
         self.inbox.lock().silence(client, Instant::now());
         self.request_arrived.notify_all();

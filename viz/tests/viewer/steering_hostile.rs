@@ -147,7 +147,7 @@ fn a_client_cannot_act_for_the_holder_of_the_lease() {
     holder.settle();
     arm_loop.run();
     assert_eq!(arm_loop.moved_by, [holder.number()]);
-    // The server knows the sender by its connection, whatever a message claims.
+    // The server identifies the sender by its connection, whatever a message claims.
     let mut forged = command(2, Some(1), now_micros);
     for field in ["client", "operator", "holder", "from"] {
         forged[field] = json!(holder.number());
@@ -391,12 +391,12 @@ fn a_client_learns_that_it_floods_and_may_then_continue() {
         let text = message["text"].as_str().unwrap_or_default();
         message["request"] == "message" && text.contains("messages in a second")
     };
-    let mut is_told = false;
-    while !is_told {
+    let mut is_reported = false;
+    while !is_reported {
         assert!(Instant::now() < deadline, "the flood is not noticed");
         flood(&mut client, &messages);
         // The reply to the ping may be missing in the flood, so several are sent.
-        is_told = answered(&mut client).iter().any(is_flood);
+        is_reported = answered(&mut client).iter().any(is_flood);
     }
     // The opening of a switch is obeyed in any case.
     desk.arm.take_requests();

@@ -370,7 +370,7 @@ fn operators_steer_with_a_held_switch_and_preview_over_long_links() {
     page.wait_for_text("steer-lease", "Nobody has control");
     assert!(
         far.script.lock().commands.is_empty(),
-        "nothing continues by itself"
+        "nothing continues without a new press"
     );
     page.browser.click("steer-take");
     page.wait_for_text("steer-lease", "You have control");

@@ -138,7 +138,7 @@ for (const [name, end] of [
   ["a lost link", () => bench.commander.disconnected()],
   ["the own stop", () => bench.commander.stop()],
 ] as const) {
-  test(`${name} ends the grip, says why, and does not grip again by itself`, () => {
+  test(`${name} ends the grip, says why, and grips again only after a new press`, () => {
     bench.run(1500);
     bench.commander.setPad(PAD);
     bench.commander.setPad({ ...PAD, isHeld: true });

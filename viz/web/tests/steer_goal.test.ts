@@ -75,7 +75,7 @@ test("a lost answer is asked for again, and goals that are refused have no inten
   assert.equal(goal.target, null);
 });
 
-test("each look of the ghost has a pattern of its own, and collisions precede nearness", () => {
+test("each look of the ghost has a distinct pattern, and collisions precede nearness", () => {
   const patterns = Object.values(LOOKS).map(({ pattern }) => pattern);
   assert.equal(new Set(patterns).size, patterns.length);
   const looks = (["reachable", "near", "self-collision", "never seen", "unreachable", "limits"] as const).map(lookOfVerdict);

@@ -39,7 +39,7 @@ fn target_stays_one_step_ahead_of_an_arm_that_has_not_begun() {
     assert!((moved_m - 49.0 * HAND_STEP_M).abs() < 1e-4, "{moved_m}");
 }
 
-/// Invariant: an arm that was moved by hand during a grip does not move back by itself.
+/// Invariant: an arm that was moved by hand during a grip moves back only after a new grip.
 #[test]
 fn arm_that_was_moved_by_hand_needs_a_new_grip() {
     let mut sim = Sim::ready(ageless());

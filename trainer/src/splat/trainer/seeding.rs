@@ -5,7 +5,7 @@ use crate::model_options::ModelOptions;
 use crate::splat::options::{RANDOM_SPLATS, SplatOptions};
 use crate::splat::seed::{self, Density, Seeder};
 use crate::splat::snapshot::ObservedScene;
-use crate::splat::stereo;
+use crate::splat::stereo::StereoImages;
 use keyframe::Keyframe;
 use model_files::InitialPoints;
 use model_files::splat::arrays::SplatArrays;
@@ -165,14 +165,15 @@ impl Seeding {
         arrived: &[Arc<Keyframe>],
         views: &ViewSet,
     ) -> (Vec<SplatArrays>, Vec<Arc<Keyframe>>) {
-        let all: Vec<&Keyframe> = views.keyframes().map(AsRef::as_ref).collect();
+        let images = StereoImages::new(views.keyframes().map(AsRef::as_ref).collect());
         let with_depth = |keyframe: &Arc<Keyframe>| {
-            let depth = stereo::depth_from_images(keyframe, &all)?;
-            let keyframe = Arc::new(Keyframe {
-                depth: Some(depth),
-                ..(**keyframe).clone()
-            });
-            (known_frac(&keyframe) >= MIN_KNOWN_FRAC).then_some(keyframe)
+            let depth = images.depth_of(keyframe)?;
+            (depth.known_frac() >= MIN_KNOWN_FRAC).then(|| {
+                Arc::new(Keyframe {
+                    depth: Some(depth),
+                    ..(**keyframe).clone()
+                })
+            })
         };
         let found: Vec<Option<Arc<Keyframe>>> = arrived.iter().map(with_depth).collect();
         let poor = std::iter::zip(arrived, &found).filter(|(_, found)| found.is_none());
@@ -191,10 +192,10 @@ impl Seeding {
         (discs, poor)
     }
 
-    /// Depths from images have fewer pixels than those of sensors. On a software adapter, more discs
-    /// would slow down the first minute: a scan of 640 x 480 pixels had 103,000 after 107 steps.
+    /// Fewer discs than with depth sensors, because depths from images have fewer pixels. On a
+    /// software adapter, more discs would slow down the first minute.
     fn density_in_images(&self) -> Density {
-        const DIVISOR: f64 = 5.0;
+        const DIVISOR: f64 = 2.0;
         Density {
             max_discs: self.density.max_discs / DIVISOR,
             ..self.density
@@ -227,14 +228,6 @@ impl Seeding {
         self.scene = scene;
         self.unseeded = unseeded;
     }
-}
-
-/// Fraction of the pixels of a keyframe's depth that are known.
-fn known_frac(keyframe: &Keyframe) -> f64 {
-    keyframe.depth.as_ref().map_or(0.0, |depth| {
-        let n_known = depth.depth_m.iter().filter(|z| **z > 0.0).count();
-        n_known as f64 / depth.depth_m.len().max(1) as f64
-    })
 }
 
 /// Scale of the scene, from the spread of the cameras and their typical depth. The learning rate of

@@ -1,4 +1,4 @@
-// The dead-man switch of the page. It is held by one source at a time. Everything that ends a grip ends it for good: the
+// The dead-man switch of the page. It is held by one source at a time. Everything that ends a grip ends it permanently: the
 // source must be released and pressed again. This file has no DOM.
 
 /** What can hold the switch. */

@@ -1,5 +1,5 @@
-// Which look the ghost has. Each look has a pattern of its own besides its color, because not everybody sees all colors. This
-// file has no DOM.
+// Which look the ghost has. Each look has a distinct pattern besides its color, because some people cannot distinguish the
+// colors. This file has no DOM.
 
 import type { Limit, Verdict } from "./messages";
 

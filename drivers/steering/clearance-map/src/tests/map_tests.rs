@@ -51,17 +51,18 @@ fn image(secs: f64, world_from_base: Transform, random: &mut Random) -> DepthIma
     image
 }
 
-/// Waits until the thread has done its work.
-fn wait_for(map: &ClearanceMap, is_done: impl Fn(crate::MapState) -> bool) {
+/// Waits until the thread has done its work. The limit only ends a test that would hang.
+fn wait_until(map: &ClearanceMap, is_done: impl Fn() -> bool) {
+    const LIMIT: Duration = Duration::from_secs(120);
     let started = Instant::now();
-    while !is_done(map.state()) {
-        assert!(
-            started.elapsed() < Duration::from_secs(120),
-            "{:?}",
-            map.state()
-        );
+    while !is_done() {
+        assert!(started.elapsed() < LIMIT, "{:?}", map.state());
         std::thread::sleep(Duration::from_millis(2));
     }
+}
+
+fn wait_for(map: &ClearanceMap, is_done: impl Fn(crate::MapState) -> bool) {
+    wait_until(map, || is_done(map.state()));
 }
 
 fn one(map: &ClearanceMap, point: [f64; 3], now: Stamp) -> Option<Seen> {
@@ -82,20 +83,14 @@ fn images_of_the_thread_reach_the_answers() {
     assert!(seen.age_secs >= 3.0);
     assert_eq!(map.state().newest, Some(at(0.0)));
     map.forget();
-    let started = Instant::now();
-    while one(&map, point, at(3.0)).is_some() {
-        assert!(started.elapsed() < Duration::from_secs(120));
-    }
+    wait_until(&map, || one(&map, point, at(3.0)).is_none());
     // The robot is free, wherever it is.
     map.set_posture(&posture(-0.1, at(3.0), Transform::identity()))
         .unwrap();
     assert!(one(&map, [-0.1, 0.0, 0.2], at(3.0)).is_some());
     map.sweep(posture(0.3, at(4.0), Transform::identity()), 0.05)
         .unwrap();
-    let started = Instant::now();
-    while one(&map, [0.3, 0.1, 0.2], at(4.0)).is_none() {
-        assert!(started.elapsed() < Duration::from_secs(120));
-    }
+    wait_until(&map, || one(&map, [0.3, 0.1, 0.2], at(4.0)).is_some());
 }
 
 #[test]
