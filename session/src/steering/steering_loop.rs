@@ -160,7 +160,11 @@ impl SteeringLoop {
             self.port.send(&self.joints.output_for_driver(output));
         }
         self.note_applied(now, &verdict);
-        self.answer_preview(now, arm, scene, &mut outcome);
+        // A goal out of reach takes longer than a cycle. While the arm follows an operator, the next
+        // decision must not wait for it.
+        if verdict.target().is_none() {
+            self.answer_preview(now, arm, scene, &mut outcome);
+        }
         outcome.state = self.state(now, arm, &verdict);
         outcome
     }
@@ -293,7 +297,7 @@ impl SteeringLoop {
         Ok(())
     }
 
-    /// Answers at most one preview, because a goal out of reach takes a part of the cycle.
+    /// Answers at most one preview, so that requests are still taken between several.
     fn answer_preview(
         &mut self,
         now: Stamp,

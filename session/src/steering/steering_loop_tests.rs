@@ -409,6 +409,26 @@ fn a_stop_during_a_recovery_is_not_undone_by_its_end() {
 }
 
 #[test]
+fn previews_wait_while_the_arm_follows_an_operator() {
+    let mut run = Run::with_lease();
+    let far = run.moved_by([0.0, 0.3, 0.0]);
+    run.hold(Some(1), &far, 50);
+    let goal = PreviewGoal::Joints {
+        position: START.to_vec(),
+    };
+    let request = SteeringRequest::Preview(PreviewRequest { id: 7, goal });
+    let held = run.command(Some(1), far.clone());
+    let outcome = run.cycle(vec![(BEN, request), held]);
+    assert!(outcome.replies.is_empty(), "{outcome:?}");
+    let released = run.command(None, far);
+    let outcome = run.cycle(vec![released]);
+    assert!(
+        matches!(&outcome.replies[..], [(BEN, Reply::Preview(7, _))]),
+        "{outcome:?}"
+    );
+}
+
+#[test]
 fn goals_are_judged_without_moving_the_arm() {
     let mut run = Run::new();
     let rest = run.tip();
