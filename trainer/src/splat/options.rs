@@ -42,9 +42,10 @@ pub struct SplatOptions {
     /// the full resolution. `None` selects a default for the adapter. The default is higher on a
     /// CPU, where the duration of a step is proportional to the number of pixels.
     pub coarse_steps: Option<[u64; 2]>,
-    /// Maximum number of pixels of an image during the first and the second of the coarse stages. An
-    /// image that is still larger at a quarter or at half of the resolution is made even coarser.
-    /// `None` selects a default: a limit on a CPU, and none on a GPU.
+    /// Maximum number of pixels of an image during the first and the second of the coarse stages. It
+    /// replaces the quarter and the half of the resolution: an image is reduced until its size is
+    /// within the limit, and a smaller image is not reduced. `u32::MAX` is no limit. `None` selects
+    /// a default: a limit on a CPU, and none on a GPU.
     #[serde(default = "without_limit")]
     pub max_coarse_px: Option<[u32; 2]>,
     /// Number of splats at random positions from which training starts if there is no depth. `None`

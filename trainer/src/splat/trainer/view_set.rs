@@ -28,9 +28,10 @@ const COARSE_STEPS: [u64; 2] = [150, 400];
 /// The default on a software adapter, whose steps at full resolution take much longer.
 const SOFTWARE_COARSE_STEPS: [u64; 2] = [500, 4000];
 /// Default of [`SplatOptions::max_coarse_px`] on a software adapter, where the duration of a step is
-/// proportional to the number of pixels. Images of 640 x 480 pixels stay below it: at a quarter, they
-/// have 19 200 pixels, and at half 76 800. Images of 1280 x 720 pixels are trained at an eighth and a
-/// quarter, which is four times as fast.
+/// proportional to the number of pixels. Images of 640 x 480 pixels are trained at a quarter and at
+/// half of their resolution, with 19 200 and 76 800 pixels, and images of 1280 x 720 pixels at an
+/// eighth and at a quarter. Images of 160 x 120 pixels are never reduced: with fewer pixels, the
+/// duration of a step depends on the number of splats.
 const SOFTWARE_COARSE_PX: [u32; 2] = [24_000, 96_000];
 
 /// Training views.
@@ -73,11 +74,14 @@ impl Resolution {
 
     /// Level of an image of this size at a step. Level `n` divides width and height by `2^n`.
     fn level(&self, step: u64, size_px: [u32; 2]) -> u32 {
-        let (coarse, max_px) = match step {
+        let (fixed, max_px) = match step {
             step if step < self.coarse_steps[0] => (2, self.max_coarse_px[0]),
             step if step < self.coarse_steps[1] => (1, self.max_coarse_px[1]),
             _ => return 0,
         };
+        if max_px == u32::MAX {
+            return fixed;
+        }
         let n_px = |level: u32| {
             size_px
                 .map(|side| u64::from(side >> level))
@@ -85,9 +89,9 @@ impl Resolution {
                 .product::<u64>()
         };
         // The last level of an image has one pixel or none.
-        (coarse..u32::BITS)
+        (0..u32::BITS)
             .find(|level| n_px(*level) <= u64::from(max_px))
-            .unwrap_or(coarse)
+            .unwrap_or(fixed)
     }
 }
 
@@ -352,10 +356,11 @@ mod tests {
     }
 
     #[test]
-    fn large_images_are_coarser_on_a_software_adapter() {
+    fn the_size_of_coarse_images_is_limited_on_a_software_adapter() {
         let options = SplatOptions::default();
         for (size_px, expected) in [
-            ([160, 120], [2, 1, 0]),
+            ([160, 120], [0, 0, 0]),
+            ([320, 240], [1, 0, 0]),
             ([640, 480], [2, 1, 0]),
             ([1280, 720], [3, 2, 0]),
             ([1920, 1080], [4, 3, 0]),
