@@ -118,6 +118,8 @@ const DEPTH_NOISE: u64 = 2;
 const DROP_STREAM: u64 = 3;
 /// Random number stream of one scan.
 const SCANS: u64 = 4;
+/// Number of samples that wait to be delivered while the robot steps ahead: those of some seconds.
+const MAX_WAITING_SLOTS: usize = 4096;
 
 #[expect(
     clippy::cast_possible_truncation,
@@ -458,8 +460,9 @@ impl Engine {
     /// Whether the robot may move before the next sample is delivered.
     fn may_step(&self) -> bool {
         if self.looks_ahead && !self.robot.is_commanded() {
-            // While images are rendered, the processor steps the robot.
-            self.n_pending < self.max_pending
+            // While images are rendered, the processor steps the robot. A rig without cameras has
+            // no images that would limit the steps.
+            self.n_pending < self.max_pending && self.slots.len() < MAX_WAITING_SLOTS
         } else {
             // Commands apply to the samples that follow them, so the robot must not be ahead of
             // its samples.

@@ -282,6 +282,20 @@ fn real_time_rig_ends_after_its_duration() {
     assert_eq!(join.counts().images, n_images);
 }
 
+#[test]
+fn a_rig_without_cameras_delivers_joints_in_lockstep() {
+    let mut rig = small("static-arm.toml", &[]);
+    // An arm with a longer link has no scene of its own, and may be brought up before its cameras.
+    rig.sim.scene = None;
+    rig.arm.urdf_text = rig.arm.urdf_text.replace("0.316", "0.336");
+    rig.cameras.clear();
+    let mut source = super::rig(rig, Devices::Sim).expect("the simulator").source;
+    for _ in 0..6000 {
+        let sample = source.next_sample().expect("the rig works");
+        assert!(matches!(sample, Some(Sample::Joints(_))), "{sample:?}");
+    }
+}
+
 /// Range scans as text that is exact to the last bit.
 fn range_bits(join: &Join) -> Vec<String> {
     join.range_scans().map(|scan| format!("{scan:?}")).collect()
