@@ -31,7 +31,7 @@ const ALLOWED: &str = "
     session       -> background calibration capture clearance-map drivers files gpu keyframe \
                      kinematics messages model-files numbers report steering trainer viz
     calibrate     -> calibration capture drivers files keyframe kinematics messages numbers report \
-                     session targets
+                     session targets viz
     bench         -> calibration capture files gpu keyframe kinematics messages model-files numbers \
                      report session trainer
     fieldrig      -> background bench calibrate calibration capture drivers files gpu keyframe \
