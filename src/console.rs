@@ -2,13 +2,13 @@
 
 use crate::exit::Exit;
 use crate::work_lines::WorkLines;
-use crate::{early_exit, log_file, print, version};
+use crate::{early_exit, print, version};
 use indicatif::ProgressBar;
 use messages::counted;
 use parking_lot::Mutex;
 use serde::Serialize;
 use session::next_commands::{self, SavedModel};
-use session::{FinishedModel, FinishedRun, Limits, Observer, ReadProgress, SessionEvent};
+use session::{FinishedModel, FinishedRun, Limits, Observer, ReadProgress, SessionEvent, run_log};
 use std::time::{Duration, Instant};
 use viz::Verdict;
 
@@ -87,7 +87,7 @@ impl Observer for Console {
         match (event, self.output) {
             (SessionEvent::Started(run), _) => {
                 early_exit::remember(run);
-                log_file::begin(&run.run_folder, &log_header());
+                run_log::begin(&run.run_folder, &log_header());
             }
             (SessionEvent::Working(work), _) => {
                 self.work = work.filter(|_| self.has_lines()).map(WorkLines::new);

@@ -16,10 +16,8 @@ mod flag_names;
 mod flag_tests;
 #[cfg(test)]
 mod guide_tests;
-mod log_file;
 mod number_args;
 mod open_gpu;
-mod output_thread;
 mod page_args;
 mod permission_args;
 mod print;
@@ -54,7 +52,7 @@ fn main() -> ExitCode {
     // The output is flushed, because the exit would end the writer threads with text in their
     // queues.
     print::flush();
-    log_file::flush();
+    session::run_log::flush();
     match result {
         Ok(exit) => exit.or_output_loss().into(),
         Err(error) if exit::is_broken_pipe(&error) => exit::Exit::Done.into(),

@@ -66,6 +66,7 @@ pub mod rendered_files;
 mod report;
 pub mod robot_meshes;
 pub mod run_folder;
+pub mod run_log;
 mod run_plan;
 mod run_state;
 pub mod runs;
