@@ -2,7 +2,7 @@
 
 use crate::exit::Exit;
 use crate::work_lines::WorkLines;
-use crate::{early_exit, print, version};
+use crate::{print, version};
 use indicatif::ProgressBar;
 use messages::counted;
 use parking_lot::Mutex;
@@ -86,7 +86,7 @@ impl Observer for Console {
     fn on_event(&mut self, event: &SessionEvent<'_>) {
         match (event, self.output) {
             (SessionEvent::Started(run), _) => {
-                early_exit::remember(run);
+                run.remember();
                 run_log::begin(&run.run_folder, &log_header());
             }
             (SessionEvent::Working(work), _) => {

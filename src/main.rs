@@ -9,7 +9,6 @@ mod commands;
 mod console;
 mod ctrl_c;
 mod data_args;
-mod early_exit;
 mod exit;
 mod flag_names;
 #[cfg(test)]
