@@ -61,6 +61,7 @@ mod stamp_clock;
 mod stations;
 mod stop;
 mod supervised_arm;
+mod tip_poses;
 
 pub use arm_capture::ArmCapture;
 pub use calibration_images::{
@@ -84,3 +85,4 @@ pub use stamp_clock::StampClock;
 pub use stations::{StationReport, Stations};
 pub use stop::Stop;
 pub use supervised_arm::{HOLDING, MotionEnd, SupervisedArm};
+pub use tip_poses::TipPoses;
