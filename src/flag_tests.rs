@@ -14,7 +14,7 @@ use syn::{Attribute, Item, LitStr, Macro, Meta};
 /// Source files or folders, and the commands that print their messages. If a message contains a
 /// flag or setting, all these commands must accept it. The exception is a message that names a
 /// command that accepts the flag.
-const PRINTED_BY: [(&str, &[&str]); 38] = [
+const PRINTED_BY: [(&str, &[&str]); 40] = [
     ("bench/src", &["bench"]),
     (
         "calibration/procedures/src/hand_eye",
@@ -57,6 +57,8 @@ const PRINTED_BY: [(&str, &[&str]); 38] = [
     ("session/src/eval_plan.rs", &["eval"]),
     ("session/src/likely_cause.rs", &["run", "train"]),
     ("session/src/method_options.rs", &["run", "train", "bench"]),
+    ("session/src/export_plan.rs", &["export"]),
+    ("session/src/render_plan.rs", &["render"]),
     ("session/src/rendered_files.rs", &["render"]),
     ("session/src/run_folder.rs", &["run", "train"]),
     ("session/src/run_plan", &["run"]),

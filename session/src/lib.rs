@@ -25,7 +25,7 @@
 
 mod advice;
 pub mod camera_list;
-pub mod camera_path;
+mod camera_path;
 pub mod checkpoints;
 mod chunk_publisher;
 pub mod corrected_rig;
@@ -63,7 +63,8 @@ mod recent_images;
 pub mod recoveries;
 pub mod recovery;
 mod render_budget;
-pub mod rendered_files;
+mod render_plan;
+mod rendered_files;
 mod report;
 pub mod robot_meshes;
 pub mod run_folder;
@@ -111,6 +112,7 @@ pub use previous_run::FinishedRun;
 pub use read_progress::{OnReadProgress, ReadProgress, ignore_progress};
 pub use recoveries::OpenGpu;
 pub use recovery::Recovery;
+pub use render_plan::{RenderPlan, RenderedCameras, RenderedPicture};
 pub use run_plan::{
     DiscardedRun, EndedRun, OpenedRun, PreparedRun, PreviousLiveRun, RunInProgress, RunInput,
     RunPlan, SavedRun,

@@ -39,6 +39,10 @@ settings! {
     BaseLink = "base_link",
     /// Camera of a rig file to calibrate, or place of a camera.
     Camera = "camera",
+    /// Camera path of rendered images.
+    CameraPath = "camera_path",
+    /// Width of the cells of a simplified mesh.
+    CellM = "cell_m",
     /// Rule for the number of splats.
     Count = "count",
     /// Box outside of which a rendered scene is invisible.
@@ -51,6 +55,8 @@ settings! {
     DriftPpm = "drift_ppm",
     /// Confirmation that an arm may move.
     EnableMotion = "is_confirmed",
+    /// Whether rendered images are panoramas.
+    Equirect = "is_equirectangular",
     /// Horizontal field of view of a camera.
     FieldOfView = "field_of_view_deg",
     /// Constant latency of a camera.
