@@ -108,7 +108,7 @@ const PRINTED_BY: [(&str, &[&str]); 40] = [
 ];
 
 /// Settings in messages of libraries, where the message names a command that accepts the setting.
-const NAMED_WITH_COMMAND: [(&str, Setting, &str); 16] = [
+const NAMED_WITH_COMMAND: [(&str, Setting, &str); 17] = [
     (
         "capture/src/config/required.rs",
         Setting::Target,
@@ -130,6 +130,7 @@ const NAMED_WITH_COMMAND: [(&str, Setting, &str); 16] = [
     ("session/src/next_commands.rs", Setting::Keyframes, "eval"),
     ("session/src/next_commands.rs", Setting::Out, "export"),
     ("session/src/next_commands.rs", Setting::To, "export"),
+    ("session/src/saved_view.rs", Setting::From, "run"),
     ("session/src/training.rs", Setting::DepthFrom, "train"),
     ("trainer/gpu/src/error.rs", Setting::MaxBytes, "train"),
     ("trainer/gpu/src/error.rs", Setting::MaxSplats, "train"),

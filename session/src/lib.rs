@@ -119,7 +119,7 @@ pub use run_plan::{
     DiscardedRun, EndedRun, OpenedRun, PreparedRun, PreviousLiveRun, RunInProgress, RunInput,
     RunPlan, SavedRun,
 };
-pub use saved_view::{publish_loading, publish_saved};
+pub use saved_view::{check_is_model, load_saved};
 pub use scene_calibration::{RelativePose, SCENE_PARAMS, SceneCalibration, calibrate_scene};
 pub use session::{
     EndViewers, EndingSession, Evaluators, FinishedModel, Limits, Persistence, Scoreboard, Session,

@@ -5,12 +5,10 @@ use crate::open_gpu::open_gpu;
 use crate::page_args::PageArgs;
 use crate::signals;
 use kinematics::Transform;
-use messages::BadInput;
 use nalgebra::{Translation3, UnitQuaternion, Vector3};
 use serde_json::json;
-use session::{ModelViewer, ServedModel, methods, publish_loading, publish_saved, run_folder};
-use std::path::{Path, PathBuf};
-use trainer::LoadedModel;
+use session::{ModelViewer, check_is_model, load_saved, run_folder};
+use std::path::PathBuf;
 use viz::Hub;
 
 /// Flags of `view`.
@@ -71,58 +69,13 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     let page = args.page.serve_or_free_port(&hub)?;
 
     let model_from_page = args.up.model_from_page();
-    let mut models: Vec<LoadedModel> = Vec::new();
-    for (ix, path) in paths.iter().enumerate() {
-        publish_loading(&hub, &paths, ix);
-        models.push(methods::load(gpu.clone(), path)?);
-    }
-    publish_saved(&hub, &gpu, &mut models, &paths, &model_from_page)?;
+    let models = load_saved(&hub, &gpu, paths, &model_from_page)?;
     let methods: Vec<&str> = models.iter().map(|model| model.kind.name()).collect();
     page.print(args.json, json!({ "methods": methods }))?;
-    let served = |(
-        LoadedModel {
-            kind,
-            method,
-            edits,
-        },
-        path,
-    )| ServedModel {
-        kind,
-        method,
-        edits: edits.into(),
-        path,
-    };
-    let models = models.into_iter().zip(paths).map(served).collect();
     ModelViewer::new(models, hub)
         .with_model_from_page(model_from_page)
         .serve(&stop);
     Ok(Exit::Done)
-}
-
-/// Rejects paths that are often mistaken for a model. The error names the command to use instead.
-fn check_is_model(model: &Path) -> Result<(), BadInput> {
-    let shown = model.display();
-    let is_url = |scheme: &str| model.to_str().is_some_and(|text| text.starts_with(scheme));
-    if ["http://", "https://", "ws://", "wss://"]
-        .into_iter()
-        .any(is_url)
-    {
-        return Err(BadInput(format!(
-            "{shown} is the address of a page: open it in a browser; view shows saved models and splat files"
-        )));
-    }
-    if model.is_file() && run_folder::is_recording(model) {
-        return Err(BadInput(format!(
-            "{shown} is a recording, not a model: train a model with `fieldrig train`, or watch one being trained with \
-             `fieldrig run RIG.toml --from {shown}`"
-        )));
-    }
-    if drivers::dataset::is_dataset_folder(model) && run_folder::models_at(model).is_err() {
-        return Err(BadInput(format!(
-            "{shown} is a dataset, not a model: train a model with `fieldrig train {shown}` and pass the folder of that run"
-        )));
-    }
-    Ok(())
 }
 
 #[cfg(test)]
