@@ -6,6 +6,7 @@ use messages::Setting;
 pub(crate) fn flag(setting: Setting) -> &'static str {
     match setting {
         Setting::BaseLink => "--base-link",
+        Setting::By => "--by",
         Setting::Camera => "--camera",
         Setting::CameraPath => "--camera-path",
         Setting::CellM => "--cell-m",
@@ -34,6 +35,7 @@ pub(crate) fn flag(setting: Setting) -> &'static str {
         Setting::Params => "--params",
         Setting::Peer => "--peer",
         Setting::Pose => "--pose",
+        Setting::Positions => "--to",
         Setting::RateHz => "--rate-hz",
         Setting::Rates => "--rates",
         Setting::Record => "--record",

@@ -14,7 +14,7 @@ use syn::{Attribute, Item, LitStr, Macro, Meta};
 /// Source files or folders, and the commands that print their messages. If a message contains a
 /// flag or setting, all these commands must accept it. The exception is a message that names a
 /// command that accepts the flag.
-const PRINTED_BY: [(&str, &[&str]); 40] = [
+const PRINTED_BY: [(&str, &[&str]); 41] = [
     ("bench/src", &["bench"]),
     (
         "calibration/procedures/src/hand_eye",
@@ -45,6 +45,7 @@ const PRINTED_BY: [(&str, &[&str]); 40] = [
     ("capture/src/init", &["init"]),
     ("capture/src/open/steered.rs", &["run"]),
     ("capture/src/record.rs", &["record"]),
+    ("capture/src/requested_motion.rs", &["move"]),
     ("keyframe/src/error.rs", &["train", "eval", "bench"]),
     ("session/src/camera_path.rs", &["render"]),
     ("session/src/checkpoints.rs", &["run", "train"]),

@@ -4,17 +4,13 @@ use crate::exit::Exit;
 use crate::{print, signals};
 use anyhow::bail;
 use capture::config::Rig;
-use capture::{HOLDING, Stop, SupervisedArm, open};
+use capture::{HOLDING, RequestedMotion, Stop, SupervisedArm, open};
 use drivers::clock;
 use drivers::motion::{JointTarget, OnLoss};
 use indicatif::ProgressBar;
 use kinematics::{JointState, Stamp};
-use messages::BadInput;
 use serde::Serialize;
 use std::path::PathBuf;
-
-/// A target may exceed the joint range by this much, rad or m.
-const TOLERANCE_RAD: f64 = 1e-4;
 
 /// Flags of `move`.
 #[derive(Debug, clap::Args)]
@@ -81,7 +77,11 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     signals::stop_when_output_closes(&stop)?;
     let rig = Rig::load(&args.rig_file, &[])?;
     let motion = open::motion_of(&rig)?;
-    check(args, &rig)?;
+    let requested = RequestedMotion {
+        to: args.to.clone(),
+        by: args.by.clone(),
+    };
+    requested.check(&rig)?;
     let mut arm = SupervisedArm::new(open::movable_arm(&rig)?, &rig);
     let bar = print::bar(None, "{spinner} {elapsed} {msg}", args.json);
     // An arm with an error accepts no target, so it is recovered first.
@@ -90,24 +90,8 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
         log::info!("the arm has recovered");
     }
     let initial = arm.read()?;
-    if args.to.is_some() || !args.by.is_empty() {
-        let requested = target(args, &rig.arm.joints, &initial);
-        // The target is checked before it is sent. The driver would clamp it, and the arm would
-        // move although the target is a mistake.
-        check_range(&rig, &requested, &initial)?;
-        let target = arm.command(&requested)?;
-        for (joint, (requested, accepted)) in rig
-            .arm
-            .joints
-            .iter()
-            .zip(requested.position.iter().zip(&target.position))
-        {
-            if (requested - accepted).abs() > TOLERANCE_RAD {
-                log::warn!(
-                    "joint {joint:?} moves to {accepted:.4}, the limit of its range, instead of {requested:.4}"
-                );
-            }
-        }
+    if !requested.is_empty() {
+        let target = requested.start(&mut arm, &rig, &initial)?;
         let began = clock::now();
         let last = follow(&mut arm, &target, &stop, &bar).inspect_err(|error| {
             if args.json {
@@ -128,76 +112,6 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     }
     bar.finish_and_clear();
     Ok(Exit::Done)
-}
-
-fn check(args: &Args, rig: &Rig) -> Result<(), BadInput> {
-    let joints = &rig.arm.joints;
-    if let Some(to) = args.to.as_ref().filter(|to| to.len() != joints.len()) {
-        let n = to.len();
-        let names = joints.join(", ");
-        return Err(BadInput(format!(
-            "--to has {n} positions, the arm has {} joints: {names}",
-            joints.len()
-        )));
-    }
-    // Two values for a joint are ambiguous: the user may mean their sum, or the last value.
-    if let Some(joint) = joints
-        .iter()
-        .find(|joint| args.by.iter().filter(|(by, _)| by == *joint).count() > 1)
-    {
-        return Err(BadInput(format!("--by: joint {joint:?} is given twice")));
-    }
-    if let Some((joint, _)) = args.by.iter().find(|(joint, _)| !joints.contains(joint)) {
-        let available = if joints.is_empty() {
-            "none".to_owned()
-        } else {
-            joints.join(", ")
-        };
-        return Err(BadInput(format!(
-            "--by: unknown joint {joint:?}; joints of the arm: {available}"
-        )));
-    }
-    Ok(())
-}
-
-/// Rejects a target outside the joint ranges of the URDF, so that a typing error does not move an
-/// arm to its limits. A joint that is already outside its range may stay there.
-fn check_range(rig: &Rig, requested: &JointTarget, now: &JointState) -> anyhow::Result<()> {
-    let chain = open::chain_of(rig)?;
-    for (ix, joint) in rig.arm.joints.iter().enumerate() {
-        let Some(joint_ix) = chain.joint_names().iter().position(|known| known == joint) else {
-            continue;
-        };
-        let lower = chain.limits()[joint_ix].lower;
-        let upper = chain.limits()[joint_ix].upper;
-        let requested = requested.position[ix];
-        let now = now.position[ix];
-        // Rounded positions of a joint at its limit may lie slightly outside.
-        if (requested - now).abs() > TOLERANCE_RAD
-            && !(lower - TOLERANCE_RAD..=upper + TOLERANCE_RAD).contains(&requested)
-        {
-            return Err(BadInput(format!(
-                "joint {joint:?}: target {requested:.4} is outside its range of {lower:.4} to {upper:.4}; the joint is at {now:.4}, and nothing was moved"
-            ))
-            .into());
-        }
-    }
-    Ok(())
-}
-
-fn target(args: &Args, joints: &[String], now: &JointState) -> JointTarget {
-    // Without `--to`, joints that `--by` does not name stay where they are.
-    let mut position = args.to.clone().unwrap_or_else(|| now.position.clone());
-    for (joint, delta) in &args.by {
-        let moved = joints
-            .iter()
-            .zip(&mut position)
-            .find(|(name, _)| *name == joint);
-        if let Some((_, position)) = moved {
-            *position += delta;
-        }
-    }
-    JointTarget { position }
 }
 
 fn report_arrival(

@@ -37,6 +37,8 @@ macro_rules! settings {
 settings! {
     /// Base link of a robot description.
     BaseLink = "base_link",
+    /// Distances by which joints move from their positions.
+    By = "by",
     /// Camera of a rig file to calibrate, or place of a camera.
     Camera = "camera",
     /// Camera path of rendered images.
@@ -93,6 +95,8 @@ settings! {
     Peer = "peers",
     /// Viewpoint of a rendered image.
     Pose = "pose",
+    /// Target positions of joints.
+    Positions = "to",
     /// Images per second of a dataset.
     RateHz = "rate_hz",
     /// Images per second of simulated cameras.
