@@ -19,6 +19,7 @@ pub(crate) fn flag(setting: Setting) -> &'static str {
         Setting::Equirect => "--equirect",
         Setting::FieldOfView => "--fov",
         Setting::FixedMillis => "--fixed-millis",
+        Setting::Force => "--force",
         Setting::From => "--from",
         Setting::Holdout => "--holdout",
         Setting::JitterMillis => "--jitter-millis",

@@ -63,6 +63,8 @@ settings! {
     FieldOfView = "field_of_view_deg",
     /// Constant latency of a camera.
     FixedMillis = "fixed_millis",
+    /// Whether an existing file is replaced.
+    Force = "can_replace",
     /// Recording that replaces the devices.
     From = "recording",
     /// Selection of test images.
