@@ -20,6 +20,7 @@ pub(crate) fn flag(setting: Setting) -> &'static str {
         Setting::FieldOfView => "--fov",
         Setting::FixedMillis => "--fixed-millis",
         Setting::Force => "--force",
+        Setting::Foxglove => "--foxglove",
         Setting::From => "--from",
         Setting::Holdout => "--holdout",
         Setting::JitterMillis => "--jitter-millis",

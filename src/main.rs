@@ -20,7 +20,6 @@ mod open_gpu;
 mod page_args;
 mod permission_args;
 mod print;
-mod served_page;
 mod signals;
 mod training_args;
 mod version;

@@ -2,7 +2,7 @@
 
 use crate::exit::Exit;
 use crate::open_gpu::open_gpu;
-use crate::page_args::PageArgs;
+use crate::page_args::{PageArgs, print_page};
 use crate::signals;
 use kinematics::Transform;
 use nalgebra::{Translation3, UnitQuaternion, Vector3};
@@ -71,7 +71,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     let model_from_page = args.up.model_from_page();
     let models = load_saved(&hub, &gpu, paths, &model_from_page)?;
     let methods: Vec<&str> = models.iter().map(|model| model.kind.name()).collect();
-    page.print(args.json, json!({ "methods": methods }))?;
+    print_page(&page, args.json, json!({ "methods": methods }))?;
     ModelViewer::new(models, hub)
         .with_model_from_page(model_from_page)
         .serve(&stop);

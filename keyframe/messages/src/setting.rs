@@ -65,6 +65,8 @@ settings! {
     FixedMillis = "fixed_millis",
     /// Whether an existing file is replaced.
     Force = "can_replace",
+    /// Address at which Foxglove gets the data of the page.
+    Foxglove = "foxglove",
     /// Recording that replaces the devices.
     From = "recording",
     /// Selection of test images.

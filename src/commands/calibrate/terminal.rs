@@ -2,7 +2,6 @@
 
 use crate::console::ReadBar;
 use crate::page_args::PageArgs;
-use crate::served_page::ServedPage;
 use crate::{print, signals};
 use anyhow::Context;
 use calibrate::{Activity, CameraView, GuidancePage, Host};
@@ -12,7 +11,7 @@ use capture::config::Camera;
 use drivers::Image;
 use indicatif::ProgressBar;
 use session::ReadProgress;
-use viz::Hub;
+use viz::{Hub, ServedPage};
 
 /// The terminal in which a calibration runs.
 pub(super) struct Terminal<'a> {
