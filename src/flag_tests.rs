@@ -58,6 +58,7 @@ const PRINTED_BY: [(&str, &[&str]); 41] = [
     ("session/src/eval_plan.rs", &["eval"]),
     ("session/src/likely_cause.rs", &["run", "train"]),
     ("session/src/method_options.rs", &["run", "train", "bench"]),
+    ("session/src/event_texts.rs", &["run", "train"]),
     ("session/src/export_plan.rs", &["export"]),
     ("session/src/render_plan.rs", &["render"]),
     ("session/src/rendered_files.rs", &["render"]),
@@ -73,7 +74,6 @@ const PRINTED_BY: [(&str, &[&str]); 41] = [
     ),
     ("src/commands/bench", &["bench"]),
     ("src/commands/calibrate", &["calibrate"]),
-    ("src/console.rs", &["run", "train"]),
     (
         "src/page_args.rs",
         &[
