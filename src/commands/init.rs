@@ -88,12 +88,7 @@ fn wanted_camera(text: &str) -> Result<WantedCamera, String> {
 
 /// The parent frame with this name.
 fn parent(place: &str) -> Result<Parent, String> {
-    match place {
-        "flange" => Ok(Parent::Flange),
-        "base" => Ok(Parent::Base),
-        "world" => Ok(Parent::World),
-        other => Err(format!("{other:?} is not flange, base or world")),
-    }
+    Parent::named(place).ok_or_else(|| format!("{place:?} is not flange, base or world"))
 }
 
 /// Writes a rig file for the devices that are found.

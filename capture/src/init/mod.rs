@@ -26,6 +26,6 @@ pub use findings::{
 };
 pub use links::ArmLinks;
 pub use new_rig_file::NewRigFile;
-pub use plan::RigPlan;
+pub use plan::{RigPlan, default_parent};
 pub use search::{SearchPlan, controller_at, search};
 pub use wishes::{RobotChoice, WantedCamera, Wishes};

@@ -5,7 +5,8 @@ use crate::print;
 use anyhow::Context;
 use capture::config::Parent;
 use capture::init::{
-    Findings, RobotChoice, WantedCamera, Wishes, controller_at, likely_robot, missing_controller,
+    Findings, RobotChoice, WantedCamera, Wishes, controller_at, default_parent, likely_robot,
+    missing_controller,
 };
 use capture::known_robots::KNOWN_ROBOTS;
 use drivers::NetworkAddress;
@@ -98,13 +99,12 @@ fn ask_places(wishes: &Wishes, findings: &Findings) -> anyhow::Result<Vec<Wanted
             .cameras
             .get(ix)
             .map_or("the camera".to_owned(), ToString::to_string);
-        let (places, default) = match (has_arm, wishes.has_moving_base) {
-            (true, _) if ix == 0 => ("flange, base or world", "flange"),
-            (true, false) => ("flange, base or world", "world"),
-            (true, true) => ("flange, base or world", "base"),
-            (false, true) => ("base or world", "base"),
-            (false, false) => ("base or world", "world"),
+        let places = if has_arm {
+            "flange, base or world"
+        } else {
+            "base or world"
         };
+        let default = default_parent(ix, has_arm, wishes.has_moving_base).name();
         let question = format!("Where is {name}: {places}");
         let place = answer(&question, default, |text| {
             let parent = parent(text).map_err(anyhow::Error::msg)?;
