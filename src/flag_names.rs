@@ -36,6 +36,7 @@ pub(crate) fn flag(setting: Setting) -> &'static str {
         Setting::Out => "--out",
         Setting::Params => "--params",
         Setting::Peer => "--peer",
+        Setting::Picture => "--picture",
         Setting::Pose => "--pose",
         Setting::Positions => "--to",
         Setting::RateHz => "--rate-hz",

@@ -14,7 +14,7 @@ use syn::{Attribute, Item, LitStr, Macro, Meta};
 /// Source files or folders, and the commands that print their messages. If a message contains a
 /// flag or setting, all these commands must accept it. The exception is a message that names a
 /// command that accepts the flag.
-const PRINTED_BY: [(&str, &[&str]); 41] = [
+const PRINTED_BY: [(&str, &[&str]); 42] = [
     ("bench/src", &["bench"]),
     (
         "calibration/procedures/src/hand_eye",
@@ -46,6 +46,7 @@ const PRINTED_BY: [(&str, &[&str]); 41] = [
     ("capture/src/open/steered.rs", &["run"]),
     ("capture/src/record.rs", &["record"]),
     ("capture/src/requested_motion.rs", &["move"]),
+    ("capture/src/rig_facts", &["doctor"]),
     ("keyframe/src/error.rs", &["train", "eval", "bench"]),
     ("session/src/camera_path.rs", &["render"]),
     ("session/src/checkpoints.rs", &["run", "train"]),
@@ -109,7 +110,7 @@ const PRINTED_BY: [(&str, &[&str]); 41] = [
 ];
 
 /// Settings in messages of libraries, where the message names a command that accepts the setting.
-const NAMED_WITH_COMMAND: [(&str, Setting, &str); 17] = [
+const NAMED_WITH_COMMAND: [(&str, Setting, &str); 18] = [
     (
         "capture/src/config/required.rs",
         Setting::Target,
@@ -121,6 +122,7 @@ const NAMED_WITH_COMMAND: [(&str, Setting, &str); 17] = [
         "calibrate",
     ),
     ("capture/src/dataset.rs", Setting::Scale, "train"),
+    ("capture/src/doctor/mod.rs", Setting::Sim, "run"),
     ("capture/src/emulation/mod.rs", Setting::Sim, "run"),
     ("capture/src/found_devices.rs", Setting::Sim, "run"),
     ("capture/src/init/rig_text.rs", Setting::Sim, "run"),

@@ -4,7 +4,7 @@
 use crate::exit::Exit;
 use crate::open_gpu::open_gpu;
 use crate::{print, signals};
-use capture::{ChangeKind, DeviceChange, DeviceInfo, DeviceWatch, found_devices};
+use capture::{DeviceInfo, DeviceWatch, found_devices};
 use std::time::Duration;
 
 /// Time between two looks at the kernel's lists of devices, which takes less than a millisecond. A
@@ -45,12 +45,9 @@ fn print_devices(devices: &[DeviceInfo], args: &Args) -> anyhow::Result<()> {
         if args.json {
             print::json(device)?;
         } else {
-            let label = if device.usable { "yes" } else { "no " };
-            print::line(format_args!(
-                "{label}  {:10} {:14} {}",
-                device.kind, device.address, device.name
-            ))?;
-            print::line(format_args!("     {}", device.note))?;
+            for line in device.lines() {
+                print::line(line)?;
+            }
         }
     }
     if !args.json {
@@ -73,22 +70,10 @@ fn print_changes(watch: &mut DeviceWatch, as_json: bool) -> anyhow::Result<()> {
             if as_json {
                 print::json(&change)?;
             } else {
-                print_change(&change)?;
+                print::line(change)?;
             }
         }
     }
-    Ok(())
-}
-
-fn print_change(DeviceChange { change, device }: &DeviceChange) -> anyhow::Result<()> {
-    let change = match change {
-        ChangeKind::Connected => "connected",
-        ChangeKind::Disconnected => "disconnected",
-    };
-    print::line(format_args!(
-        "{change:12}  {:10} {:14} {}; {}",
-        device.kind, device.address, device.name, device.note
-    ))?;
     Ok(())
 }
 

@@ -97,6 +97,8 @@ settings! {
     Params = "params",
     /// Curves of other trainers.
     Peer = "peers",
+    /// Picture of a rig.
+    Picture = "picture",
     /// Viewpoint of a rendered image.
     Pose = "pose",
     /// Target positions of joints.
