@@ -7,7 +7,6 @@ mod cli;
 mod cli_page_tests;
 mod commands;
 mod console;
-mod ctrl_c;
 mod data_args;
 mod exit;
 mod flag_names;

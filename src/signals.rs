@@ -11,10 +11,10 @@
 //!
 //! SIGXFSZ (a file reached the limit of its size) does not end a command: the write fails instead.
 
-use crate::ctrl_c::{CtrlC, Request};
 use crate::print;
 use anyhow::Context;
 use capture::Stop;
+use capture::ctrl_c::{CtrlC, Request};
 use files::partial;
 use rustix::event::{PollFd, PollFlags, poll};
 use rustix::io::Errno;

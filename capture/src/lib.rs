@@ -35,6 +35,7 @@ mod arm_capture;
 mod calibration_images;
 pub mod camera_info;
 pub mod config;
+pub mod ctrl_c;
 pub mod dataset;
 pub mod doctor;
 pub mod downscale;
