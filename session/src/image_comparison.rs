@@ -1,4 +1,4 @@
-//! Scores of an image against another one, both read from files.
+//! Compares an image with another one, both read from files.
 
 use crate::evaluate::load_lpips;
 use anyhow::{Context, bail};
@@ -23,7 +23,7 @@ pub struct ImageComparison {
 
 /// Scores of an image; `None` if unavailable. They serialize as JSON.
 #[derive(Debug, Default, Serialize)]
-pub struct ImageScores {
+pub struct ComparisonScores {
     psnr: Option<f64>,
     ssim: Option<f64>,
     lpips: Option<f64>,
@@ -35,7 +35,7 @@ impl ImageComparison {
     ///
     /// # Errors
     /// Fails if an image or the weights cannot be read, or if the images differ in size.
-    pub fn run(&self) -> anyhow::Result<ImageScores> {
+    pub fn run(&self) -> anyhow::Result<ComparisonScores> {
         let rendered = open(&self.rendered)?;
         let truth = open(&self.truth)?;
         let [size_px, truth_px] =
@@ -78,11 +78,14 @@ fn decode(path: &Path) -> anyhow::Result<DynamicImage> {
     Ok(reader.decode()?)
 }
 
-fn color_scores(pair: &PixelPair<'_>, lpips_weights: Option<&Path>) -> anyhow::Result<ImageScores> {
+fn color_scores(
+    pair: &PixelPair<'_>,
+    lpips_weights: Option<&Path>,
+) -> anyhow::Result<ComparisonScores> {
     let lpips = load_lpips(lpips_weights)?
         .map(|lpips| lpips.distance(pair))
         .transpose()?;
-    Ok(ImageScores {
+    Ok(ComparisonScores {
         psnr: Some(psnr(pair)?),
         ssim: Some(ssim(pair)?),
         lpips,
@@ -90,7 +93,7 @@ fn color_scores(pair: &PixelPair<'_>, lpips_weights: Option<&Path>) -> anyhow::R
     })
 }
 
-fn depth_scores(counts: [&Vec<u16>; 2], meters_per_count: f64) -> anyhow::Result<ImageScores> {
+fn depth_scores(counts: [&Vec<u16>; 2], meters_per_count: f64) -> anyhow::Result<ComparisonScores> {
     #[expect(
         clippy::cast_possible_truncation,
         reason = "16-bit counts keep more digits in f32 than sensors have"
@@ -98,13 +101,13 @@ fn depth_scores(counts: [&Vec<u16>; 2], meters_per_count: f64) -> anyhow::Result
     let meters_from_count = |count: &u16| (f64::from(*count) * meters_per_count) as f32;
     let [rendered_m, truth_m] =
         counts.map(|counts| counts.iter().map(meters_from_count).collect::<Vec<_>>());
-    Ok(ImageScores {
+    Ok(ComparisonScores {
         depth_rmse_m: depth_rmse_m(&rendered_m, &truth_m)?,
-        ..ImageScores::default()
+        ..ComparisonScores::default()
     })
 }
 
-impl ImageScores {
+impl ComparisonScores {
     /// The scores as one line of text.
     #[must_use]
     pub fn to_text(&self) -> String {
