@@ -41,6 +41,7 @@ pub mod evaluate;
 pub mod evaluation_schedule;
 mod event_texts;
 mod export_plan;
+mod gpu_check;
 mod gpu_loss;
 mod holdout;
 mod image_comparison;
@@ -101,6 +102,7 @@ pub use eval_plan::{EvalOutcome, EvalPlan, NamedScores};
 pub use evaluate::Evaluator;
 pub use event_texts::end_lines;
 pub use export_plan::{CheckedExport, ExportPlan, ModelExport, NERFSTUDIO};
+pub use gpu_check::{gpu_device, gpu_findings};
 pub use gpu_loss::lose_gpu_at_step;
 pub use image_comparison::{ComparisonScores, ImageComparison};
 pub use kept_folder::KeptFolder;
@@ -121,7 +123,7 @@ pub use run_plan::{
     DiscardedRun, EndedRun, OpenedRun, PreparedRun, PreviousLiveRun, RunInProgress, RunInput,
     RunPlan, SavedRun,
 };
-pub use saved_view::{check_is_model, load_saved};
+pub use saved_view::{check_is_model, load_saved, model_from_page};
 pub use scene_calibration::{RelativePose, SCENE_PARAMS, SceneCalibration, calibrate_scene};
 pub use session::{
     EndViewers, EndingSession, Evaluators, FinishedModel, Limits, Persistence, Scoreboard, Session,

@@ -7,7 +7,7 @@ use crate::{camera_list, methods, model_source, served_files, viewers};
 use gpu::Gpu;
 use kinematics::Transform;
 use messages::{BadInput, Setting};
-use nalgebra::Point3;
+use nalgebra::{Point3, Translation3, UnitQuaternion, Vector3};
 use serde_json::Value;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -124,6 +124,18 @@ fn publish_loading(hub: &Hub, paths: &[PathBuf], ix: usize) {
     };
     let progress = StateProgress::of_parts(text, ix, paths.len());
     hub.set_state_and_progress("loading the model", Some(progress.at_startup()));
+}
+
+/// Pose of the page's world, which is z up, in the world of a model.
+///
+/// * `up`: direction that points up in the world of the model.
+#[must_use]
+pub fn model_from_page(up: &Vector3<f64>) -> Transform {
+    let rotation = UnitQuaternion::rotation_between(&Vector3::z(), up);
+    // If the two directions are opposite, rotate by 180 degrees about a horizontal axis.
+    let rotation =
+        rotation.unwrap_or_else(|| UnitQuaternion::new(std::f64::consts::PI * Vector3::x()));
+    Transform::from_parts(Translation3::identity(), rotation)
 }
 
 /// Rejects paths that are often mistaken for a model. The error names the command to use instead.
@@ -296,5 +308,23 @@ mod tests {
             (Some(23.5), 700, 120)
         );
         assert_eq!(status.psnr_history, [(0.5, 20.0), (2.0, 22.0), (8.0, 23.5)]);
+    }
+
+    #[test]
+    fn up_axis_is_up_on_the_page() {
+        const TOLERANCE: f64 = 1e-12;
+        for up in [
+            [0.0, 0.0, 1.0],
+            [0.0, 0.0, -1.0],
+            [0.0, 1.0, 0.0],
+            [0.0, -1.0, 0.0],
+            [-1.0, 0.0, 0.0],
+        ] {
+            let in_page = model_from_page(&up.into()).inverse() * Point3::from(up);
+            assert!(
+                (in_page - Point3::new(0.0, 0.0, 1.0)).norm() < TOLERANCE,
+                "{up:?}: {in_page}"
+            );
+        }
     }
 }

@@ -5,6 +5,7 @@ use crate::exit::Exit;
 use crate::open_gpu::open_gpu;
 use crate::{print, signals};
 use capture::{DeviceInfo, DeviceWatch, found_devices};
+use session::gpu_device;
 use std::time::Duration;
 
 /// Time between two looks at the kernel's lists of devices, which takes less than a millisecond. A
@@ -41,7 +42,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
 }
 
 fn print_devices(devices: &[DeviceInfo], args: &Args) -> anyhow::Result<()> {
-    for device in std::iter::once(&gpu()).chain(devices) {
+    for device in std::iter::once(&gpu_device(open_gpu)).chain(devices) {
         if args.json {
             print::json(device)?;
         } else {
@@ -75,23 +76,4 @@ fn print_changes(watch: &mut DeviceWatch, as_json: bool) -> anyhow::Result<()> {
         }
     }
     Ok(())
-}
-
-fn gpu() -> DeviceInfo {
-    let (name, usable, note) = match open_gpu() {
-        Ok(gpu) if gpu.is_software() => (
-            gpu.describe(),
-            true,
-            "software adapter: works, but slowly".to_owned(),
-        ),
-        Ok(gpu) => (gpu.describe(), true, "trains and renders".to_owned()),
-        Err(error) => ("none".to_owned(), false, error.to_string()),
-    };
-    DeviceInfo {
-        kind: "gpu",
-        address: "default".into(),
-        name,
-        usable,
-        note,
-    }
 }

@@ -1,16 +1,17 @@
 //! `fieldrig doctor`: checks this computer and the devices of a rig, and prints a fix for each
 //! problem.
 
-mod gpu;
 mod page_address;
 
 use crate::exit::Exit;
 use crate::number_args::number_in_range;
+use crate::open_gpu::open_gpu;
 use crate::{print, signals};
 use anyhow::Context;
 use capture::Rig;
 use capture::doctor::{self, Finding, Verdict};
 use capture::rig_facts;
+use session::gpu_findings;
 use std::path::PathBuf;
 
 /// Default address of the page that `run` serves.
@@ -63,7 +64,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     if let (Some(rig), Some(file)) = (&rig, &args.picture) {
         rig_facts::write_picture(rig, file)?;
     }
-    findings.extend(gpu::gpu());
+    findings.extend(gpu_findings(open_gpu));
     findings.push(doctor::simulation());
     findings.push(page_address::page_address(DEFAULT_ADDRESS));
     findings.extend(doctor::check(rig.as_ref()));
