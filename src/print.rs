@@ -239,6 +239,11 @@ pub(crate) fn line(text: impl Display) -> Result<(), StdoutError> {
     })
 }
 
+/// Prints several lines of the result.
+pub(crate) fn lines(texts: impl IntoIterator<Item = impl Display>) -> Result<(), StdoutError> {
+    texts.into_iter().try_for_each(line)
+}
+
 /// Prints one line about a result in a file. If stdout fails or accepts no output, the line is
 /// lost, which is logged once.
 pub(crate) fn report(text: impl Display) {

@@ -46,9 +46,7 @@ fn print_devices(devices: &[DeviceInfo], args: &Args) -> anyhow::Result<()> {
         if args.json {
             print::json(device)?;
         } else {
-            for line in device.lines() {
-                print::line(line)?;
-            }
+            print::lines(device.lines())?;
         }
     }
     if !args.json {

@@ -97,9 +97,7 @@ fn print_findings(findings: &[Finding], as_json: bool) -> anyhow::Result<()> {
             print::json(finding)?;
             continue;
         }
-        for line in finding.lines() {
-            print::line(line)?;
-        }
+        print::lines(finding.lines())?;
     }
     Ok(())
 }

@@ -60,9 +60,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     if args.json {
         print::json(&outcome)?;
     } else {
-        for line in outcome.lines() {
-            print::line(line)?;
-        }
+        print::lines(outcome.lines())?;
     }
     // Scores of incomplete data are printed, but the exit code reports the loss.
     Ok(exit::from_losses(&outcome.data_losses))

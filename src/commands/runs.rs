@@ -127,9 +127,7 @@ fn list(args: &ListArgs) -> anyhow::Result<Exit> {
         })?;
         return Ok(Exit::Done);
     }
-    for line in runs::table(&runs) {
-        print::line(line)?;
-    }
+    print::lines(runs::table(&runs))?;
     print::line(format_args!(
         "{} in {}, {}",
         counted(runs.len() as u64, "run"),

@@ -2,8 +2,8 @@
 //! of a board.
 
 use super::flags::{ReportFlag, RigFlags};
+use super::target_argument;
 use super::terminal::Terminal;
-use super::{print_lines, target_argument};
 use crate::exit::Exit;
 use crate::number_args::number_in_range;
 use crate::print;
@@ -118,7 +118,7 @@ fn calibrate_and_print(
     if is_json {
         print::json(&document)?
     } else {
-        print_lines(&document.lines())?;
+        print::lines(document.lines())?;
         for warning in &document.warnings {
             log::warn!("{warning}");
         }

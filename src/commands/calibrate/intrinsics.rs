@@ -1,8 +1,8 @@
 //! `fieldrig calibrate intrinsics`: the lens of a camera from images of a target.
 
 use super::flags::{ReportFlag, RigFlags};
+use super::target_argument;
 use super::terminal::Terminal;
-use super::{print_lines, target_argument};
 use crate::exit::Exit;
 use crate::print;
 use calibrate::IntrinsicsTask;
@@ -71,7 +71,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     if args.json {
         print::json(&document)?
     } else {
-        print_lines(&document.lines())?
+        print::lines(document.lines())?
     }
     for warning in outcome.warnings() {
         log::warn!("{warning}");

@@ -10,7 +10,6 @@ mod terminal;
 mod time_offset;
 
 use crate::exit::Exit;
-use crate::print;
 use clap::{Parser, Subcommand};
 use targets::TargetSpec;
 
@@ -51,12 +50,4 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
 fn target_argument(text: &str) -> Result<TargetSpec, String> {
     text.parse()
         .map_err(|error: targets::SpecError| error.to_string())
-}
-
-/// Prints the lines of a result.
-fn print_lines(lines: &[String]) -> anyhow::Result<()> {
-    for line in lines {
-        print::line(line)?;
-    }
-    Ok(())
 }

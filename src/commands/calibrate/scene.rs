@@ -1,7 +1,6 @@
 //! `fieldrig calibrate scene`: calibrates the cameras of a rig from images of a static scene.
 
 use super::flags::ReportFlag;
-use super::print_lines;
 use super::terminal::Terminal;
 use crate::exit::{self, Exit};
 use crate::number_args::number_in_range;
@@ -55,7 +54,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     if args.json {
         print::json(&outcome.document())?;
     } else {
-        print_lines(&outcome.lines())?;
+        print::lines(outcome.lines())?;
         for warning in outcome.warnings() {
             log::warn!("{warning}");
         }

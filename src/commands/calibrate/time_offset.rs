@@ -1,7 +1,6 @@
 //! `fieldrig calibrate time-offset`: the offset between the clocks of two pose streams.
 
 use super::flags::ReportFlag;
-use super::print_lines;
 use crate::exit::Exit;
 use crate::number_args::number_in_range;
 use crate::print;
@@ -43,7 +42,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     if args.json {
         print::json(&document)?
     } else {
-        print_lines(&document.lines())?
+        print::lines(document.lines())?
     }
     // The result is printed even if the report cannot be written.
     written?;
