@@ -81,7 +81,7 @@ pub use nearest_name::nearest_name;
 pub use notes::Notes;
 pub use outputs::{check_output_file, check_output_folder};
 pub use record::{RecordPlan, Recorded, WrittenRecording};
-pub use requested_motion::RequestedMotion;
+pub use requested_motion::{Arrival, RequestedMotion, format_positions};
 pub use robot_motion::RobotMotion;
 pub use separate_devices::{DeviceEvent, DeviceGroup, SeparateDevices};
 pub use stamp_clock::StampClock;

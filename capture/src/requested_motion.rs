@@ -1,11 +1,13 @@
-//! A motion of an arm to joint positions that a user has requested.
+//! A motion of an arm to joint positions that a user has requested, and its result.
 
 use crate::config::Rig;
 use crate::open;
 use crate::supervised_arm::SupervisedArm;
+use drivers::clock;
 use drivers::motion::JointTarget;
-use kinematics::JointState;
+use kinematics::{JointState, Stamp};
 use messages::{BadInput, Setting};
+use serde::Serialize;
 
 /// A target may exceed the joint range by this much, rad or m.
 const TOLERANCE_RAD: f64 = 1e-4;
@@ -136,4 +138,65 @@ fn check_range(rig: &Rig, requested: &JointTarget, now: &JointState) -> anyhow::
         }
     }
     Ok(())
+}
+
+/// Where an arm has arrived. It serializes as JSON.
+#[derive(Debug, Serialize)]
+pub struct Arrival<'a> {
+    event: &'static str,
+    joints: &'a [String],
+    /// The target, and the position that the joints report, rad or m.
+    target: &'a [f64],
+    position: &'a [f64],
+    /// Largest absolute difference between the two.
+    error: f64,
+    seconds: f64,
+}
+
+impl<'a> Arrival<'a> {
+    /// The arrival at a target of a motion that began at `began`.
+    ///
+    /// * `last`: the joints at the end.
+    #[must_use]
+    pub fn new(
+        joints: &'a [String],
+        target: &'a JointTarget,
+        last: &'a JointState,
+        began: Stamp,
+    ) -> Self {
+        let errors = target
+            .position
+            .iter()
+            .zip(&last.position)
+            .map(|(target, actual)| (target - actual).abs());
+        Self {
+            event: "done",
+            joints,
+            target: &target.position,
+            position: &last.position,
+            error: errors.fold(0.0, f64::max),
+            seconds: clock::now().secs_since(began),
+        }
+    }
+
+    /// The arrival as one line.
+    #[must_use]
+    pub fn line(&self) -> String {
+        format!(
+            "arrived after {:.1} s at {}, maximum error {:.5}",
+            self.seconds,
+            format_positions(self.position),
+            self.error
+        )
+    }
+}
+
+/// Positions of joints as text, rad or m.
+#[must_use]
+pub fn format_positions(position: &[f64]) -> String {
+    position
+        .iter()
+        .map(|position| format!("{position:.4}"))
+        .collect::<Vec<_>>()
+        .join(", ")
 }

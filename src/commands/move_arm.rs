@@ -4,12 +4,11 @@ use crate::exit::Exit;
 use crate::{print, signals};
 use anyhow::bail;
 use capture::config::Rig;
-use capture::{HOLDING, RequestedMotion, Stop, SupervisedArm, open};
+use capture::{Arrival, HOLDING, RequestedMotion, Stop, SupervisedArm, format_positions, open};
 use drivers::clock;
 use drivers::motion::{JointTarget, OnLoss};
 use indicatif::ProgressBar;
-use kinematics::{JointState, Stamp};
-use serde::Serialize;
+use kinematics::JointState;
 use std::path::PathBuf;
 
 /// Flags of `move`.
@@ -55,19 +54,6 @@ fn delta(text: &str) -> Result<(String, f64), String> {
         .ok_or_else(|| "expected JOINT=DELTA, such as joint1=0.1".to_owned())
 }
 
-/// Report of an arrival.
-#[derive(Debug, Serialize)]
-struct ArrivedEvent<'a> {
-    event: &'static str,
-    joints: &'a [String],
-    /// The target, and the position that the joints report, rad or m.
-    target: &'a [f64],
-    position: &'a [f64],
-    /// Largest absolute difference between the two.
-    error: f64,
-    seconds: f64,
-}
-
 /// Moves the arm, then holds it if its motors would release it on exit.
 pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     // Signals are handled before the arm is enabled, so that Ctrl-C never leaves a moving arm.
@@ -101,7 +87,12 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
                 );
             }
         })?;
-        report_arrival(args, &rig.arm.joints, &target, &last, began)?;
+        let arrival = Arrival::new(&rig.arm.joints, &target, &last, began);
+        if args.json {
+            print::report_json(&arrival)?;
+        } else {
+            print::report(arrival.line());
+        }
     }
     // The arm is held, because the motors would otherwise release it when this program ends.
     if motion.on_loss != OnLoss::Hold && !args.exit_on_arrival {
@@ -112,37 +103,6 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     }
     bar.finish_and_clear();
     Ok(Exit::Done)
-}
-
-fn report_arrival(
-    args: &Args,
-    joints: &[String],
-    target: &JointTarget,
-    last: &JointState,
-    began: Stamp,
-) -> anyhow::Result<()> {
-    let errors = target
-        .position
-        .iter()
-        .zip(&last.position)
-        .map(|(target, actual)| (target - actual).abs());
-    let error = errors.fold(0.0, f64::max);
-    let seconds = clock::now().secs_since(began);
-    if args.json {
-        return print::report_json(&ArrivedEvent {
-            event: "done",
-            joints,
-            target: &target.position,
-            position: &last.position,
-            error,
-            seconds,
-        });
-    }
-    print::report(format_args!(
-        "arrived after {seconds:.1} s at {}, maximum error {error:.5}",
-        format_positions(&last.position)
-    ));
-    Ok(())
 }
 
 /// Waits until the arm arrives. Ctrl-C stops the arm and returns an error.
@@ -166,12 +126,4 @@ fn follow(
         );
     }
     Ok(end.state)
-}
-
-fn format_positions(position: &[f64]) -> String {
-    position
-        .iter()
-        .map(|position| format!("{position:.4}"))
-        .collect::<Vec<_>>()
-        .join(", ")
 }
