@@ -35,7 +35,7 @@ const ALLOWED: &str = "
     bench         -> calibration capture files gpu keyframe kinematics messages model-files numbers \
                      report session trainer
     fieldrig      -> background bench calibrate calibration capture drivers files gpu keyframe \
-                     kinematics messages model-files numbers report session sim targets trainer viz
+                     kinematics messages session sim targets trainer viz
 ";
 
 /// Crates that only `fieldrig` may use, because only it prints and parses command lines.
