@@ -14,7 +14,7 @@ use syn::{Attribute, Item, LitStr, Macro, Meta};
 /// Source files or folders, and the commands that print their messages. If a message contains a
 /// flag or setting, all these commands must accept it. The exception is a message that names a
 /// command that accepts the flag.
-const PRINTED_BY: [(&str, &[&str]); 42] = [
+const PRINTED_BY: [(&str, &[&str]); 43] = [
     ("bench/src", &["bench"]),
     (
         "calibration/procedures/src/hand_eye",
@@ -31,6 +31,10 @@ const PRINTED_BY: [(&str, &[&str]); 42] = [
     (
         "calibration/procedures/src/outputs.rs",
         &["calibrate intrinsics", "calibrate hand-eye"],
+    ),
+    (
+        "calibration/procedures/src/printed_target.rs",
+        &["calibrate target"],
     ),
     (
         "calibration/procedures/src/saved_images.rs",
