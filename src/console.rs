@@ -2,13 +2,14 @@
 
 use crate::exit::Exit;
 use crate::work_lines::WorkLines;
-use crate::{early_exit, log_file, print, version};
+use crate::{print, version};
 use indicatif::ProgressBar;
-use messages::counted;
 use parking_lot::Mutex;
 use serde::Serialize;
-use session::next_commands::{self, SavedModel};
-use session::{FinishedModel, FinishedRun, Limits, Observer, ReadProgress, SessionEvent};
+use session::next_commands;
+use session::{
+    FinishedModel, FinishedRun, Limits, Observer, ReadProgress, SessionEvent, end_lines, run_log,
+};
 use std::time::{Duration, Instant};
 use viz::Verdict;
 
@@ -86,8 +87,8 @@ impl Observer for Console {
     fn on_event(&mut self, event: &SessionEvent<'_>) {
         match (event, self.output) {
             (SessionEvent::Started(run), _) => {
-                early_exit::remember(run);
-                log_file::begin(&run.run_folder, &log_header());
+                run.remember();
+                run_log::begin(&run.run_folder, &log_header());
             }
             (SessionEvent::Working(work), _) => {
                 self.work = work.filter(|_| self.has_lines()).map(WorkLines::new);
@@ -101,12 +102,7 @@ impl Observer for Console {
                 } else {
                     whole_secs(session.seconds)
                 });
-                let psnr = session
-                    .psnr
-                    .map_or(String::new(), |psnr| format!(", {psnr:.2} dB"));
-                let primitives = counted(progress.primitives, session.primitive);
-                self.bar
-                    .set_message(format!("step {}, {primitives}{psnr}", progress.step));
+                self.bar.set_message(session.summary());
             }
             (SessionEvent::TrainingEnded, _) => self.bar.finish_and_clear(),
             (SessionEvent::Scoring { n_scored, n_all }, _) => {
@@ -125,39 +121,14 @@ impl Observer for Console {
             }
             (SessionEvent::Evaluated(evaluation), OutputMode::Json) => print_json(evaluation),
             (SessionEvent::Evaluated(evaluation), OutputMode::Lines) => {
-                print::report(format_args!(
-                    "{:7.2} s  step {:6}  {:>15}  {:7.2} ms/step  {}",
-                    evaluation.seconds,
-                    evaluation.step,
-                    counted(evaluation.primitives, evaluation.primitive),
-                    evaluation.step_millis.unwrap_or_default(),
-                    evaluation.scores.short()
-                ))
+                print::report(evaluation.line());
             }
             (SessionEvent::Finished(finished), OutputMode::Json) => {
                 finished.profile.iter().for_each(print_json);
                 print_json(finished.done);
             }
             (SessionEvent::Finished(finished), OutputMode::Lines) => {
-                for (name, millis) in finished.profile.iter().flat_map(|profile| profile.passes) {
-                    print::report(format_args!("{millis:9.3} ms  {name}"));
-                }
-                let done = finished.done;
-                let result = format!(
-                    "{:.1} s, {}, {}, {:.1} MB: {}",
-                    done.seconds,
-                    counted(done.steps, "step"),
-                    counted(done.primitives, finished.primitive),
-                    done.bytes as f64 / 1e6,
-                    done.scores
-                );
-                wrapped(&result).iter().for_each(print::report);
-                let with_page = if finished.has_page {
-                    ", with pictures and scores in report.html"
-                } else {
-                    ""
-                };
-                print::report(format_args!("saved in {}{with_page}", done.out.display()));
+                finished.lines().iter().for_each(print::report);
             }
             (
                 SessionEvent::Evaluated(_) | SessionEvent::Finished(_),
@@ -186,47 +157,20 @@ pub(crate) fn print_json(value: &impl Serialize) {
 /// Prints commands to run next on these models, and the likely cause of a poor result. The last line
 /// is the verdict on the models, with the first of these commands.
 pub(crate) fn print_end(models: &[FinishedModel], likely_cause: Option<&str>, verdict: &Verdict) {
-    let saved: Vec<SavedModel<'_>> = models.iter().map(FinishedModel::saved).collect();
-    let commands = next_commands::for_models(&saved);
-    next_commands::lines(&commands)
+    end_lines(models, likely_cause, verdict)
         .iter()
         .for_each(print::report);
-    if let Some(cause) = likely_cause {
-        print::report(format_args!("likely cause of the low PSNR: {cause}"));
-    }
-    if let Some(first) = commands.first() {
-        print::report(format_args!("{}. Next: {}", verdict.text, first.command));
-    }
 }
 
 /// Prints that the run to be continued has already reached its limits.
 pub(crate) fn print_finished_run(run: &FinishedRun, json: bool) -> anyhow::Result<Exit> {
-    let FinishedRun {
-        folder,
-        seconds,
-        limits,
-    } = run;
     if json {
         print::report_json(
-            &serde_json::json!({ "event": "finished", "seconds": seconds, "out": folder }),
+            &serde_json::json!({ "event": "finished", "seconds": run.seconds, "out": run.folder }),
         )?;
         return Ok(Exit::Done);
     }
-    let limits = [
-        limits.steps.map(|steps| format!("--steps {steps}")),
-        limits.seconds.map(|secs| format!("--seconds {secs}")),
-    ];
-    let limits: Vec<String> = limits.into_iter().flatten().collect();
-    let limits = if limits.is_empty() {
-        String::new()
-    } else {
-        format!("{}, ", limits.join(" "))
-    };
-    print::report(format_args!(
-        "nothing left to do: the run in {} is finished ({limits}{seconds:.1} s) and its model is saved there; \
-         to continue it, use a larger --steps or --seconds",
-        folder.display()
-    ));
+    print::report(run.describe());
     Ok(Exit::Done)
 }
 
@@ -281,30 +225,6 @@ impl ProgressLines {
         }
         is_due
     }
-}
-
-/// Maximum length of the lines of [`wrapped`].
-const MAX_LINE_CHARS: usize = 100;
-
-/// A list that is broken after commas, if possible into lines of at most [`MAX_LINE_CHARS`]
-/// characters. All lines except the first are indented.
-fn wrapped(list: &str) -> Vec<String> {
-    let mut lines: Vec<String> = Vec::new();
-    for word in list.split_inclusive(", ") {
-        match lines.last_mut() {
-            Some(line)
-                if line.chars().count() + word.trim_end().chars().count() <= MAX_LINE_CHARS =>
-            {
-                line.push_str(word)
-            }
-            Some(_) => lines.push(format!("  {word}")),
-            None => lines.push(word.to_owned()),
-        }
-    }
-    lines
-        .iter()
-        .map(|line| line.trim_end().to_owned())
-        .collect()
 }
 
 /// A progress bar for reading images. It is cleared when the value is dropped.
@@ -406,17 +326,5 @@ mod tests {
         }
         let mut hidden = ProgressLines::new(false, start);
         assert!(!hidden.is_due(10, 100, at(60_000)));
-    }
-
-    #[test]
-    fn long_lists_are_wrapped_after_commas() {
-        let words: Vec<String> = (0..30).map(|n| format!("score{n} 12.34 dB")).collect();
-        let list = words.join(", ");
-        let lines = wrapped(&list);
-        assert!(lines.len() > 1 && lines.iter().all(|line| line.len() <= MAX_LINE_CHARS));
-        assert!(lines[1..].iter().all(|line| line.starts_with("  score")));
-        let joined: Vec<&str> = lines.iter().map(|line| line.trim()).collect();
-        assert_eq!(joined.join(" "), list);
-        assert_eq!(wrapped("one"), ["one"]);
     }
 }

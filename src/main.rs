@@ -7,23 +7,18 @@ mod cli;
 mod cli_page_tests;
 mod commands;
 mod console;
-mod ctrl_c;
 mod data_args;
-mod early_exit;
 mod exit;
 mod flag_names;
 #[cfg(test)]
 mod flag_tests;
 #[cfg(test)]
 mod guide_tests;
-mod log_file;
 mod number_args;
 mod open_gpu;
-mod output_thread;
 mod page_args;
 mod permission_args;
 mod print;
-mod served_page;
 mod signals;
 mod training_args;
 mod version;
@@ -54,7 +49,7 @@ fn main() -> ExitCode {
     // The output is flushed, because the exit would end the writer threads with text in their
     // queues.
     print::flush();
-    log_file::flush();
+    session::run_log::flush();
     match result {
         Ok(exit) => exit.or_output_loss().into(),
         Err(error) if exit::is_broken_pipe(&error) => exit::Exit::Done.into(),

@@ -1,12 +1,16 @@
 //! Flags for the address of the page, and who may open it.
 
-use crate::served_page::{ServedPage, Shared};
+use crate::print;
 use anyhow::Context;
 use messages::BadInput;
+use qrcode::QrCode;
+use qrcode::render::unicode::Dense1x2;
+use serde_json::Value;
 use session::next_commands::quoted;
+use std::io::IsTerminal;
 use std::net::{Ipv4Addr, SocketAddr};
 use std::path::PathBuf;
-use viz::{Certificate, Hub, Server, ServerConfig, Sharing, Tokens};
+use viz::{CertificateSource, Hub, PageOptions, ServedPage};
 
 /// Where the page is served, and to whom.
 #[derive(Clone, Debug, clap::Args)]
@@ -56,92 +60,77 @@ impl PageArgs {
     /// Rejects an address that other machines can reach, unless the page is shared, and flags that
     /// this build lacks.
     pub(crate) fn check(&self) -> Result<(), BadInput> {
-        match self.listen {
-            Some(address) if !address.ip().is_loopback() && !self.share => {
-                // The user can copy the command with the missing flag.
-                let command: Vec<String> = std::env::args().skip(1).map(|word| quoted(&word)).collect();
-                Err(BadInput(format!(
-                    "other machines can reach {address}, so the page must be encrypted and require a token: run \
-                     `fieldrig {} --share`",
-                    command.join(" ")
-                )))
-            }
-            _ if self.foxglove.is_some() && !cfg!(feature = "foxglove") => Err(BadInput(
-                "--foxglove: this program was built without Foxglove support: build with `--features foxglove`"
-                    .to_owned(),
-            )),
-            _ => Ok(()),
+        if let Some(address) = self.listen
+            && !address.ip().is_loopback()
+            && !self.share
+        {
+            // The user can copy the command with the missing flag.
+            let command: Vec<String> = std::env::args().skip(1).map(|word| quoted(&word)).collect();
+            return Err(BadInput(format!(
+                "other machines can reach {address}, so the page must be encrypted and require a token: run \
+                 `fieldrig {} --share`",
+                command.join(" ")
+            )));
         }
+        let options = self.options()?;
+        options.check().map_err(|error| BadInput(error.to_string()))
     }
 
     /// Serves the page.
     pub(crate) fn serve(&self, hub: &Hub) -> anyhow::Result<ServedPage> {
-        self.serve_at(self.listen.unwrap_or_else(|| self.default_address()), hub)
+        Ok(self.options()?.serve(hub)?)
     }
 
     /// Serves the page; if the default address is in use, at a free port.
     pub(crate) fn serve_or_free_port(&self, hub: &Hub) -> anyhow::Result<ServedPage> {
-        // A user who gives an address expects the page there. The default address is only a
-        // proposal.
-        let served = self.serve(hub);
-        match served.as_ref().map_err(|error| error.downcast_ref()) {
-            Err(Some(viz::Error::AddressInUse { address })) if self.listen.is_none() => {
-                log::info!("{address} is in use by another program; using a free port");
-                self.serve_at(SocketAddr::new(address.ip(), 0), hub)
-            }
-            _ => served,
-        }
+        Ok(self.options()?.serve_or_free_port(hub)?)
     }
 
-    fn default_address(&self) -> SocketAddr {
-        let ServerConfig { mut listen } = ServerConfig::default();
-        // The default address can only be reached from this computer.
-        if self.share {
-            listen.set_ip(Ipv4Addr::UNSPECIFIED.into());
-        }
-        listen
-    }
-
-    fn serve_at(&self, listen: SocketAddr, hub: &Hub) -> anyhow::Result<ServedPage> {
-        let config = ServerConfig { listen };
-        let (server, shared) = if self.share {
-            let (server, shared) = self.share_at(config, hub)?;
-            (server, Some(shared))
-        } else {
-            (Server::start(config, hub.clone())?, None)
+    /// The flags as options.
+    fn options(&self) -> Result<PageOptions, BadInput> {
+        let shared_with = match &self.certificate {
+            _ if !self.share => None,
+            Some(file) => Some(CertificateSource::Files {
+                certificate: file.clone(),
+                key: self.certificate_key.as_ref().unwrap_or(file).clone(),
+            }),
+            None => Some(CertificateSource::KeptIn(data_folder()?)),
         };
-        Ok(ServedPage {
-            server,
-            shared,
-            #[cfg(feature = "foxglove")]
-            foxglove: self
-                .foxglove
-                .map(|address| viz::FoxgloveServer::start(address, hub.clone()))
-                .transpose()?,
+        Ok(PageOptions {
+            listen: self.listen,
+            shared_with,
+            foxglove: self.foxglove,
         })
     }
+}
 
-    fn share_at(&self, config: ServerConfig, hub: &Hub) -> anyhow::Result<(Server, Shared)> {
-        let certificate = match &self.certificate {
-            Some(file) => Certificate::read(file, self.certificate_key.as_ref().unwrap_or(file))?,
-            // The certificate is kept, so that browsers which have accepted it do not warn at the
-            // next run.
-            None => Certificate::kept_in(&data_folder()?)?,
-        };
-        let tokens = Tokens::random().context("cannot create a token")?;
-        let fingerprint = certificate.fingerprint();
-        let is_self_signed = self.certificate.is_none();
-        let server = Server::start_shared(
-            config,
-            Sharing {
-                certificate,
-                tokens: tokens.clone(),
-            },
-            hub.clone(),
-        )?;
-        let shared = Shared::new(server.address(), &tokens, fingerprint, is_self_signed);
-        Ok((server, shared))
+/// Prints the addresses of a page. If `is_json` is set, prints them as an event that also has these
+/// fields.
+pub(crate) fn print_page(page: &ServedPage, is_json: bool, fields: Value) -> anyhow::Result<()> {
+    if is_json {
+        let mut event = page.event();
+        if let (Value::Object(event), Value::Object(fields)) = (&mut event, fields) {
+            event.extend(fields);
+        }
+        return print::report_json(&event);
     }
+    page.lines().iter().for_each(print::report);
+    // The QR code is for phones, which cannot reach a page that only this computer can open.
+    if page.is_shared() && std::io::stdout().is_terminal() {
+        print::report_styled(qr_code(&page.url())?);
+    }
+    Ok(())
+}
+
+/// A QR code for terminals. It is dark on light, independent of the terminal's colors.
+fn qr_code(text: &str) -> anyhow::Result<String> {
+    let code = QrCode::new(text).context("cannot create a QR code")?;
+    let lines = code.render::<Dense1x2>().build();
+    Ok(lines
+        .lines()
+        .map(|line| format!("\x1b[30;107m{line}\x1b[0m"))
+        .collect::<Vec<_>>()
+        .join("\n"))
 }
 
 /// The user's folder for data of this program.

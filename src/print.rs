@@ -10,13 +10,13 @@
 //! Text may come from files and other programs. A terminal may interpret control characters in this
 //! text, so they are escaped.
 
-use crate::log_file;
-use crate::output_thread::{self, OutputChunk};
 use anyhow::Context;
+use background::output_thread::{self, OutputChunk};
 use console::Term;
 use indicatif::{MultiProgress, ProgressBar, ProgressDrawTarget, ProgressStyle, TermLike};
 use parking_lot::Mutex;
 use serde::Serialize;
+use session::run_log;
 use std::borrow::Cow;
 use std::fmt::Display;
 use std::io::Write;
@@ -239,6 +239,11 @@ pub(crate) fn line(text: impl Display) -> Result<(), StdoutError> {
     })
 }
 
+/// Prints several lines of the result.
+pub(crate) fn lines(texts: impl IntoIterator<Item = impl Display>) -> Result<(), StdoutError> {
+    texts.into_iter().try_for_each(line)
+}
+
 /// Prints one line about a result in a file. If stdout fails or accepts no output, the line is
 /// lost, which is logged once.
 pub(crate) fn report(text: impl Display) {
@@ -262,7 +267,7 @@ pub(crate) fn notice(text: impl Display) {
 /// right code.
 pub(crate) fn error(error: &anyhow::Error) {
     let line = format!("error: {}\n", printable(&format!("{error:#}")));
-    log_file::record(&line);
+    run_log::record(&line);
     send(&STDERR, line);
 }
 
@@ -351,7 +356,7 @@ struct LogTarget;
 impl Write for LogTarget {
     fn write(&mut self, bytes: &[u8]) -> std::io::Result<usize> {
         let text = printable(&String::from_utf8_lossy(bytes)).into_owned();
-        log_file::record(&text);
+        run_log::record(&text);
         send(&STDERR, text);
         Ok(bytes.len())
     }

@@ -11,13 +11,14 @@
 //!
 //! SIGXFSZ (a file reached the limit of its size) does not end a command: the write fails instead.
 
-use crate::ctrl_c::{CtrlC, Request};
-use crate::early_exit;
+use crate::print;
 use anyhow::Context;
 use capture::Stop;
+use capture::ctrl_c::{CtrlC, Request};
 use files::partial;
 use rustix::event::{PollFd, PollFlags, poll};
 use rustix::io::Errno;
+use session::StartedRun;
 use signal_hook::consts::{SIGHUP, SIGINT, SIGQUIT, SIGTERM, SIGXCPU, SIGXFSZ};
 use signal_hook::iterator::Signals;
 use signal_hook::{flag, low_level};
@@ -71,7 +72,8 @@ fn handle_signals(mut signals: Signals, signaled: &AtomicBool, interrupted: &Ato
                 Request::Nothing => continue,
                 Request::Exit => {
                     drivers::motion::apply_fail_safe();
-                    early_exit::print_left();
+                    StartedRun::lines_at_exit().iter().for_each(print::notice);
+                    print::flush_briefly();
                     low_level::exit(SIGNAL_EXIT_BASE + SIGINT);
                 }
             }

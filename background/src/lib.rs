@@ -6,6 +6,8 @@
 //! assert_eq!(task.join().expect("no panic"), 5050);
 //! ```
 
+pub mod output_thread;
+
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Mutex, PoisonError};

@@ -32,6 +32,19 @@ pub struct DeviceInfo {
 }
 
 impl DeviceInfo {
+    /// The device in columns, and how to use it on another line.
+    #[must_use]
+    pub fn lines(&self) -> [String; 2] {
+        let label = if self.usable { "yes" } else { "no " };
+        [
+            format!(
+                "{label}  {:10} {:14} {}",
+                self.kind, self.address, self.name
+            ),
+            format!("     {}", self.note),
+        ]
+    }
+
     /// Whether another list has this device, perhaps in another state.
     fn is_same_as(&self, other: &Self) -> bool {
         self.kind == other.kind && self.address == other.address

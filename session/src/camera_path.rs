@@ -10,24 +10,24 @@ use std::path::Path;
 
 /// One viewpoint.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct PathCamera {
+pub(crate) struct PathCamera {
     /// Pose of the camera: x right, y down, z forward.
-    pub world_from_camera: Transform,
+    pub(crate) world_from_camera: Transform,
     /// Vertical field of view in radians, if the path specifies it.
-    pub fov_y_rad: Option<f64>,
+    pub(crate) fov_y_rad: Option<f64>,
 }
 
 /// A camera path.
 #[derive(Clone, Debug, PartialEq)]
-pub struct CameraPath {
+pub(crate) struct CameraPath {
     /// The cameras, in the order of the path.
-    pub cameras: Vec<PathCamera>,
+    pub(crate) cameras: Vec<PathCamera>,
     /// Width and height of the pictures in pixels, if the path specifies them.
-    pub size_px: Option<[u32; 2]>,
+    pub(crate) size_px: Option<[u32; 2]>,
     /// Whether the path was made for panoramas.
-    pub is_panoramic: bool,
+    pub(crate) is_panoramic: bool,
     /// Notes about parts of the file that are not used: one sentence each.
-    pub notes: Vec<String>,
+    pub(crate) notes: Vec<String>,
 }
 
 const PERSPECTIVE: &str = "perspective";
@@ -129,7 +129,7 @@ fn whole_side(name: &str, side_px: Option<f64>) -> anyhow::Result<Option<u32>> {
 impl CameraPath {
     /// Reads a nerfstudio camera path and converts its cameras to the axes of
     /// [`kinematics::camera`].
-    pub fn load(path: &Path) -> anyhow::Result<Self> {
+    pub(crate) fn load(path: &Path) -> anyhow::Result<Self> {
         let text =
             files::read_text(path).with_context(|| format!("cannot read {}", path.display()))?;
         Self::parse(&text).with_context(|| format!("the nerfstudio camera path {}", path.display()))
@@ -137,7 +137,7 @@ impl CameraPath {
 
     /// A path with one viewpoint, from the 16 numbers of `world_from_camera`, row major, with the
     /// axes of [`kinematics::camera`].
-    pub fn of_pose(numbers: &[f64]) -> anyhow::Result<Self> {
+    pub(crate) fn of_pose(numbers: &[f64]) -> anyhow::Result<Self> {
         let world_from_camera =
             rigid(numbers).map_err(|error| BadInput(format!("{}: {error}", Setting::Pose)))?;
         let cameras = vec![PathCamera {
@@ -181,7 +181,7 @@ impl CameraPath {
 }
 
 /// Converts a row-major 4x4 matrix, whose numbers may be rounded, to a rigid transform.
-pub fn rigid(numbers: &[f64]) -> anyhow::Result<Transform> {
+pub(crate) fn rigid(numbers: &[f64]) -> anyhow::Result<Transform> {
     let rows: &[f64; 16] = numbers
         .try_into()
         .ok()

@@ -152,8 +152,8 @@ pub fn with_extrinsics(
         return Err(BadInput(format!(
             "{} {name}: its parent in the rig file is {}, but the calibrated pose is relative to the {}; change parent, or the setup of the calibration",
             Setting::Camera,
-            name_of(given),
-            name_of(parent)
+            given.name(),
+            parent.name()
         ))
         .into());
     }
@@ -189,14 +189,6 @@ pub fn expect_size(camera: &Camera, [width, height]: [u32; 2]) -> anyhow::Result
         camera.name
     ))
     .into())
-}
-
-fn name_of(parent: Parent) -> &'static str {
-    match parent {
-        Parent::Flange => "flange",
-        Parent::Base => "base",
-        Parent::World => "world",
-    }
 }
 
 /// Checks that a rig file can be written to this path.

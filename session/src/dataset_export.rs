@@ -8,7 +8,9 @@ use drivers::dataset::nerfstudio;
 use image::ExtendedColorType;
 use keyframe::{DepthMap, Keyframe, KeyframeList, Split};
 use kinematics::{Transform, transform};
+use messages::counted;
 use serde_json::{Map, Value, json};
+use std::fmt::{Display, Formatter};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
@@ -45,6 +47,28 @@ pub struct Written {
     /// Number of depth images that were left out, because their intrinsics differ from the
     /// intrinsics of the color image. The format cannot express this.
     pub n_depth_skipped: usize,
+}
+
+impl Display for Written {
+    fn fmt(&self, f: &mut Formatter<'_>) -> std::fmt::Result {
+        let Self {
+            n_images,
+            n_depth,
+            n_depth_skipped,
+        } = *self;
+        let skipped = match n_depth_skipped as u64 {
+            0 => String::new(),
+            n => format!(
+                ", {} skipped: their lens differs from the lens of the photo",
+                counted(n, "depth image")
+            ),
+        };
+        write!(
+            f,
+            "{}, {n_depth} of them with depth{skipped}",
+            counted(n_images as u64, "photo")
+        )
+    }
 }
 
 /// Writes a dataset to a folder that does not contain one yet. The folder is written under a

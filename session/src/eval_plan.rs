@@ -50,6 +50,20 @@ pub struct NamedScores {
     pub scores: ImageScores,
 }
 
+impl EvalOutcome {
+    /// The scores of each image, then their means.
+    #[must_use]
+    pub fn lines(&self) -> Vec<String> {
+        let per_image = self.per_image.iter().map(|image| {
+            let scores = Scores::mean(std::slice::from_ref(&image.scores));
+            format!("{:30} {scores}", image.name)
+        });
+        let mean = format!("mean of {}", self.per_image.len());
+        let mean = format!("{mean:30} {}", self.scores);
+        per_image.chain([mean]).collect()
+    }
+}
+
 impl EvalPlan {
     /// Renders and scores every test image.
     ///

@@ -25,7 +25,7 @@
 
 mod advice;
 pub mod camera_list;
-pub mod camera_path;
+mod camera_path;
 pub mod checkpoints;
 mod chunk_publisher;
 pub mod corrected_rig;
@@ -39,8 +39,12 @@ mod error;
 mod eval_plan;
 pub mod evaluate;
 pub mod evaluation_schedule;
+mod event_texts;
+mod export_plan;
+mod gpu_check;
 mod gpu_loss;
 mod holdout;
+mod image_comparison;
 mod kept_folder;
 mod latency;
 mod ledger;
@@ -62,10 +66,12 @@ mod recent_images;
 pub mod recoveries;
 pub mod recovery;
 mod render_budget;
-pub mod rendered_files;
+mod render_plan;
+mod rendered_files;
 mod report;
 pub mod robot_meshes;
 pub mod run_folder;
+pub mod run_log;
 mod run_plan;
 mod run_state;
 pub mod runs;
@@ -94,7 +100,11 @@ pub use decisions::{DecisionLog, RunDescription, Settings};
 pub use error::{class, is_gpu_error, is_gpu_unrecoverable};
 pub use eval_plan::{EvalOutcome, EvalPlan, NamedScores};
 pub use evaluate::Evaluator;
+pub use event_texts::end_lines;
+pub use export_plan::{CheckedExport, ExportPlan, ModelExport, NERFSTUDIO};
+pub use gpu_check::{gpu_device, gpu_findings};
 pub use gpu_loss::lose_gpu_at_step;
+pub use image_comparison::{ComparisonScores, ImageComparison};
 pub use kept_folder::KeptFolder;
 pub use latency::Latency;
 pub use ledger::{KeyframeTimes, Ledger, latencies};
@@ -108,11 +118,12 @@ pub use previous_run::FinishedRun;
 pub use read_progress::{OnReadProgress, ReadProgress, ignore_progress};
 pub use recoveries::OpenGpu;
 pub use recovery::Recovery;
+pub use render_plan::{RenderPlan, RenderedCameras, RenderedPicture};
 pub use run_plan::{
     DiscardedRun, EndedRun, OpenedRun, PreparedRun, PreviousLiveRun, RunInProgress, RunInput,
     RunPlan, SavedRun,
 };
-pub use saved_view::{publish_loading, publish_saved};
+pub use saved_view::{check_is_model, load_saved, model_from_page};
 pub use scene_calibration::{RelativePose, SCENE_PARAMS, SceneCalibration, calibrate_scene};
 pub use session::{
     EndViewers, EndingSession, Evaluators, FinishedModel, Limits, Persistence, Scoreboard, Session,

@@ -18,7 +18,7 @@ fn files(folder: &Path, ix: usize) -> [PathBuf; 2] {
 /// # Errors
 ///
 /// If the folder holds such a file.
-pub fn check_no_overwrite(folder: &Path, n: usize) -> Result<(), BadInput> {
+pub(crate) fn check_no_overwrite(folder: &Path, n: usize) -> Result<(), BadInput> {
     match (0..n)
         .flat_map(|ix| files(folder, ix))
         .find(|file| file.exists())
@@ -35,7 +35,7 @@ pub fn check_no_overwrite(folder: &Path, n: usize) -> Result<(), BadInput> {
 /// Writes an image and optionally its depth; returns their files.
 ///
 /// * `ix`: index of the image, which names the files.
-pub fn write(
+pub(crate) fn write(
     folder: &Path,
     ix: usize,
     picture: &Picture,

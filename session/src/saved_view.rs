@@ -1,21 +1,60 @@
 //! Shows saved models to viewers: their cameras, scores and initial view.
 
-use crate::run_folder::report;
+use crate::run_folder::{is_recording, models_at, report};
 use crate::scene_hint::SceneView;
+use crate::viewer::ServedModel;
 use crate::{camera_list, methods, model_source, served_files, viewers};
 use gpu::Gpu;
 use kinematics::Transform;
-use nalgebra::Point3;
+use messages::{BadInput, Setting};
+use nalgebra::{Point3, Translation3, UnitQuaternion, Vector3};
 use serde_json::Value;
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
 use trainer::{Bounds, LoadedModel, ModelKind, Progress};
 use viz::{Hub, Identity, KeyframePose, ModelStatus, OperatorStatus, StateProgress, Status};
+
+/// Reads saved models, and publishes them to viewers.
+///
+/// * `paths`: folders or files of the models.
+/// * `model_from_page`: pose of the page's world, which is z up, in the world of the models.
+///
+/// # Errors
+///
+/// If a model cannot be read.
+pub fn load_saved(
+    hub: &Hub,
+    gpu: &Arc<Gpu>,
+    paths: Vec<PathBuf>,
+    model_from_page: &Transform,
+) -> anyhow::Result<Vec<ServedModel>> {
+    let mut models = Vec::new();
+    for (ix, path) in paths.iter().enumerate() {
+        publish_loading(hub, &paths, ix);
+        models.push(methods::load(Arc::clone(gpu), path)?);
+    }
+    publish_saved(hub, gpu, &mut models, &paths, model_from_page)?;
+    let served = |(loaded, path)| {
+        let LoadedModel {
+            kind,
+            method,
+            edits,
+        } = loaded;
+        ServedModel {
+            kind,
+            method,
+            edits: edits.into(),
+            path,
+        }
+    };
+    Ok(models.into_iter().zip(paths).map(served).collect())
+}
 
 /// Publishes the cameras, the status and the initial view of saved models.
 ///
 /// * `paths`: folders or files of the models, in the same order.
 /// * `model_from_page`: pose of the page's world, which is z up, in the world of the models.
-pub fn publish_saved(
+fn publish_saved(
     hub: &Hub,
     gpu: &Gpu,
     models: &mut [LoadedModel],
@@ -77,7 +116,7 @@ fn identity(paths: &[PathBuf]) -> Identity {
 /// Publishes that a saved model is being read, before [`publish_saved`].
 ///
 /// * `ix`: index of the model in `paths`.
-pub fn publish_loading(hub: &Hub, paths: &[PathBuf], ix: usize) {
+fn publish_loading(hub: &Hub, paths: &[PathBuf], ix: usize) {
     let name = paths[ix].display();
     let text = match paths.len() {
         1 => name.to_string(),
@@ -85,6 +124,49 @@ pub fn publish_loading(hub: &Hub, paths: &[PathBuf], ix: usize) {
     };
     let progress = StateProgress::of_parts(text, ix, paths.len());
     hub.set_state_and_progress("loading the model", Some(progress.at_startup()));
+}
+
+/// Pose of the page's world, which is z up, in the world of a model.
+///
+/// * `up`: direction that points up in the world of the model.
+#[must_use]
+pub fn model_from_page(up: &Vector3<f64>) -> Transform {
+    let rotation = UnitQuaternion::rotation_between(&Vector3::z(), up);
+    // If the two directions are opposite, rotate by 180 degrees about a horizontal axis.
+    let rotation =
+        rotation.unwrap_or_else(|| UnitQuaternion::new(std::f64::consts::PI * Vector3::x()));
+    Transform::from_parts(Translation3::identity(), rotation)
+}
+
+/// Rejects paths that are often mistaken for a model. The error names the command to use instead.
+///
+/// # Errors
+///
+/// If the path is the address of a page, a recording or a dataset.
+pub fn check_is_model(model: &Path) -> Result<(), BadInput> {
+    let shown = model.display();
+    let is_url = |scheme: &str| model.to_str().is_some_and(|text| text.starts_with(scheme));
+    if ["http://", "https://", "ws://", "wss://"]
+        .into_iter()
+        .any(is_url)
+    {
+        return Err(BadInput(format!(
+            "{shown} is the address of a page: open it in a browser; view shows saved models and splat files"
+        )));
+    }
+    if model.is_file() && is_recording(model) {
+        return Err(BadInput(format!(
+            "{shown} is a recording, not a model: train a model with `fieldrig train`, or watch one being trained with \
+             `fieldrig run RIG.toml {} {shown}`",
+            Setting::From
+        )));
+    }
+    if drivers::dataset::is_dataset_folder(model) && models_at(model).is_err() {
+        return Err(BadInput(format!(
+            "{shown} is a dataset, not a model: train a model with `fieldrig train {shown}` and pass the folder of that run"
+        )));
+    }
+    Ok(())
 }
 
 /// The cameras of the first model whose folder lists them. An unreadable list only causes a
@@ -226,5 +308,23 @@ mod tests {
             (Some(23.5), 700, 120)
         );
         assert_eq!(status.psnr_history, [(0.5, 20.0), (2.0, 22.0), (8.0, 23.5)]);
+    }
+
+    #[test]
+    fn up_axis_is_up_on_the_page() {
+        const TOLERANCE: f64 = 1e-12;
+        for up in [
+            [0.0, 0.0, 1.0],
+            [0.0, 0.0, -1.0],
+            [0.0, 1.0, 0.0],
+            [0.0, -1.0, 0.0],
+            [-1.0, 0.0, 0.0],
+        ] {
+            let in_page = model_from_page(&up.into()).inverse() * Point3::from(up);
+            assert!(
+                (in_page - Point3::new(0.0, 0.0, 1.0)).norm() < TOLERANCE,
+                "{up:?}: {in_page}"
+            );
+        }
     }
 }

@@ -4,7 +4,8 @@
 use crate::exit::Exit;
 use crate::open_gpu::open_gpu;
 use crate::{print, signals};
-use capture::{ChangeKind, DeviceChange, DeviceInfo, DeviceWatch, found_devices};
+use capture::{DeviceInfo, DeviceWatch, found_devices};
+use session::gpu_device;
 use std::time::Duration;
 
 /// Time between two looks at the kernel's lists of devices, which takes less than a millisecond. A
@@ -41,16 +42,11 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
 }
 
 fn print_devices(devices: &[DeviceInfo], args: &Args) -> anyhow::Result<()> {
-    for device in std::iter::once(&gpu()).chain(devices) {
+    for device in std::iter::once(&gpu_device(open_gpu)).chain(devices) {
         if args.json {
             print::json(device)?;
         } else {
-            let label = if device.usable { "yes" } else { "no " };
-            print::line(format_args!(
-                "{label}  {:10} {:14} {}",
-                device.kind, device.address, device.name
-            ))?;
-            print::line(format_args!("     {}", device.note))?;
+            print::lines(device.lines())?;
         }
     }
     if !args.json {
@@ -73,40 +69,9 @@ fn print_changes(watch: &mut DeviceWatch, as_json: bool) -> anyhow::Result<()> {
             if as_json {
                 print::json(&change)?;
             } else {
-                print_change(&change)?;
+                print::line(change)?;
             }
         }
     }
     Ok(())
-}
-
-fn print_change(DeviceChange { change, device }: &DeviceChange) -> anyhow::Result<()> {
-    let change = match change {
-        ChangeKind::Connected => "connected",
-        ChangeKind::Disconnected => "disconnected",
-    };
-    print::line(format_args!(
-        "{change:12}  {:10} {:14} {}; {}",
-        device.kind, device.address, device.name, device.note
-    ))?;
-    Ok(())
-}
-
-fn gpu() -> DeviceInfo {
-    let (name, usable, note) = match open_gpu() {
-        Ok(gpu) if gpu.is_software() => (
-            gpu.describe(),
-            true,
-            "software adapter: works, but slowly".to_owned(),
-        ),
-        Ok(gpu) => (gpu.describe(), true, "trains and renders".to_owned()),
-        Err(error) => ("none".to_owned(), false, error.to_string()),
-    };
-    DeviceInfo {
-        kind: "gpu",
-        address: "default".into(),
-        name,
-        usable,
-        note,
-    }
 }

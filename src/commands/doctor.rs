@@ -1,18 +1,18 @@
 //! `fieldrig doctor`: checks this computer and the devices of a rig, and prints a fix for each
 //! problem.
 
-mod gpu;
 mod page_address;
 
 use crate::exit::Exit;
 use crate::number_args::number_in_range;
+use crate::open_gpu::open_gpu;
 use crate::{print, signals};
 use anyhow::Context;
 use capture::Rig;
 use capture::doctor::{self, Finding, Verdict};
-use capture::rig_facts::{self, RigFacts};
-use messages::BadInput;
-use std::path::{Path, PathBuf};
+use capture::rig_facts;
+use session::gpu_findings;
+use std::path::PathBuf;
 
 /// Default address of the page that `run` serves.
 const DEFAULT_ADDRESS: &str = "127.0.0.1:7007";
@@ -62,10 +62,10 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
         findings.extend(doctor::guesses(&text));
     }
     if let (Some(rig), Some(file)) = (&rig, &args.picture) {
-        write_picture(rig, file)?;
+        rig_facts::write_picture(rig, file)?;
     }
-    findings.extend(gpu::gpu());
-    findings.push(simulation());
+    findings.extend(gpu_findings(open_gpu));
+    findings.push(doctor::simulation());
     findings.push(page_address::page_address(DEFAULT_ADDRESS));
     findings.extend(doctor::check(rig.as_ref()));
     // The checks are printed before listening, because listening takes as long as the user asks
@@ -91,47 +91,13 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     Ok(if failed { Exit::Failed } else { Exit::Done })
 }
 
-/// Draws the rig.
-fn write_picture(rig: &Rig, file: &Path) -> anyhow::Result<()> {
-    if file.extension().is_none_or(|ending| ending != "svg") {
-        let reason = format!("--picture {}: must have the extension .svg", file.display());
-        return Err(BadInput(reason).into());
-    }
-    let picture = rig_facts::svg(&RigFacts::of(rig)?);
-    files::write(file, picture).with_context(|| format!("cannot write {}", file.display()))
-}
-
 fn print_findings(findings: &[Finding], as_json: bool) -> anyhow::Result<()> {
     for finding in findings {
         if as_json {
             print::json(finding)?;
             continue;
         }
-        let label = match finding.verdict {
-            Verdict::Ok => "ok  ",
-            Verdict::Warn => "warn",
-            Verdict::Fail => "fail",
-        };
-        print::line(format_args!(
-            "{label}  {:12} {}",
-            finding.check, finding.message
-        ))?;
-        if let Some(remedy) = &finding.remedy {
-            print::line(format_args!("      {:12} -> {remedy}", ""))?;
-        }
+        print::lines(finding.lines())?;
     }
     Ok(())
-}
-
-fn simulation() -> Finding {
-    if cfg!(feature = "sim") {
-        Finding::ok("simulation", "MuJoCo is built in")
-    } else {
-        let remedy = "make deps && cargo build --release --features sim";
-        Finding::warn(
-            "simulation",
-            "built without MuJoCo: `fieldrig run --sim` is not available",
-            remedy,
-        )
-    }
 }

@@ -6,7 +6,6 @@ use crate::exit::{self, Exit};
 use crate::open_gpu::open_gpu;
 use crate::print;
 use session::EvalPlan;
-use session::evaluate::Scores;
 use std::path::PathBuf;
 use std::time::Instant;
 
@@ -61,18 +60,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     if args.json {
         print::json(&outcome)?;
     } else {
-        for image in &outcome.per_image {
-            print::line(format_args!(
-                "{:30} {}",
-                image.name,
-                Scores::mean(std::slice::from_ref(&image.scores))
-            ))?;
-        }
-        print::line(format_args!(
-            "{:30} {}",
-            format!("mean of {}", outcome.per_image.len()),
-            outcome.scores
-        ))?;
+        print::lines(outcome.lines())?;
     }
     // Scores of incomplete data are printed, but the exit code reports the loss.
     Ok(exit::from_losses(&outcome.data_losses))

@@ -1,16 +1,13 @@
 //! `fieldrig init`: finds devices, and writes a first rig file.
 
 mod questions;
-mod urdf_path;
 
 use crate::exit::Exit;
 use crate::number_args::number_in_range;
 use crate::print;
-use anyhow::Context;
-use capture::Rig;
 use capture::config::Parent;
-use capture::init::{Findings, RigPlan, RobotChoice, SearchPlan, WantedCamera, Wishes, search};
-use capture::known_robots::{BUILTIN_PREFIX, KNOWN_ROBOTS, KnownRobot};
+use capture::init::{NewRigFile, RigPlan, RobotChoice, SearchPlan, WantedCamera, Wishes, search};
+use capture::known_robots::KNOWN_ROBOTS;
 use drivers::NetworkAddress;
 use messages::BadInput;
 use questions::Questions;
@@ -91,12 +88,7 @@ fn wanted_camera(text: &str) -> Result<WantedCamera, String> {
 
 /// The parent frame with this name.
 fn parent(place: &str) -> Result<Parent, String> {
-    match place {
-        "flange" => Ok(Parent::Flange),
-        "base" => Ok(Parent::Base),
-        "world" => Ok(Parent::World),
-        other => Err(format!("{other:?} is not flange, base or world")),
-    }
+    Parent::named(place).ok_or_else(|| format!("{place:?} is not flange, base or world"))
 }
 
 /// Writes a rig file for the devices that are found.
@@ -106,8 +98,11 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
         return Ok(Exit::Done);
     }
     // Whatever can be wrong in the arguments is checked before the search, which takes seconds.
-    check_new(&args.rig, args.force)?;
-    check_folder(&args.rig)?;
+    let file = NewRigFile {
+        path: args.rig.clone(),
+        can_replace: args.force,
+    };
+    file.check()?;
     check_addresses(args)?;
     let robot = robot(args)?;
     print::notice("searching for cameras, CAN motors, servos and controllers");
@@ -116,7 +111,8 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
         ur: args.ur.clone(),
         serial: args.serial.clone(),
     });
-    report_findings(&findings);
+    print::report("Found");
+    findings.lines().iter().for_each(print::report);
     let mut wishes = Wishes {
         robot,
         base_link: args.base_link.clone(),
@@ -127,7 +123,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     };
     Questions::new(args.yes).ask(&mut wishes, &mut findings, &args.rig)?;
     let plan = RigPlan::new(&wishes, &findings).map_err(|error| BadInput(format!("{error:#}")))?;
-    write(args, &wishes, &plan)?;
+    file.write(&wishes, &plan)?;
     report_plan(&args.rig, &plan);
     Ok(Exit::Done)
 }
@@ -137,22 +133,6 @@ fn list_robots() -> anyhow::Result<()> {
         print::line(format_args!("{:8} {}", robot.name, robot.title))?;
     }
     Ok(())
-}
-
-fn check_new(rig: &Path, force: bool) -> Result<(), BadInput> {
-    if !force && rig.symlink_metadata().is_ok() {
-        let rig = rig.display();
-        return Err(BadInput(format!(
-            "{rig} exists: choose another name, or replace it with --force"
-        )));
-    }
-    Ok(())
-}
-
-/// Checks that the folder of the rig file exists and accepts files.
-fn check_folder(rig: &Path) -> Result<(), BadInput> {
-    files::destination::check_file(rig)
-        .map_err(|problem| BadInput(format!("cannot write {}: {problem}", rig.display())))
 }
 
 /// Rejects addresses of controllers that are incomplete.
@@ -169,74 +149,10 @@ fn check_addresses(args: &Args) -> Result<(), BadInput> {
 /// The robot that the flags name.
 fn robot(args: &Args) -> anyhow::Result<RobotChoice> {
     match (&args.robot, &args.urdf) {
-        (Some(name), _) => known_robot(name),
-        (None, Some(urdf)) => urdf_path::urdf(urdf, &args.rig),
+        (Some(name), _) => Ok(RobotChoice::named(name)?),
+        (None, Some(urdf)) => RobotChoice::of_urdf(urdf, &args.rig),
         (None, None) => Ok(RobotChoice::Automatic),
     }
-}
-
-/// The known robot with this name, or no robot.
-fn known_robot(name: &str) -> anyhow::Result<RobotChoice> {
-    if name == "none" {
-        return Ok(RobotChoice::None);
-    }
-    let name = name.strip_prefix(BUILTIN_PREFIX).unwrap_or(name);
-    let robot = KnownRobot::named_by(&format!("{BUILTIN_PREFIX}{name}"));
-    let robot = robot.map_err(|unknown| BadInput(format!("--robot: {unknown}, none")))?;
-    Ok(robot.map_or(RobotChoice::None, RobotChoice::Known))
-}
-
-/// Writes the rig file, after it was read like any other rig file.
-fn write(args: &Args, wishes: &Wishes, plan: &RigPlan) -> anyhow::Result<()> {
-    let path = args.rig.display();
-    let text = plan.to_toml(&path.to_string());
-    let urdf = match &wishes.robot {
-        RobotChoice::Urdf { text, .. } => text,
-        _ => "",
-    };
-    Rig::parse(&path.to_string(), &text, urdf, &[])
-        .context("the rig file would be invalid, so it was not written")?;
-    // Another program may have written it during the search.
-    check_new(&args.rig, args.force)?;
-    files::write(&args.rig, text).with_context(|| format!("cannot write {path}"))
-}
-
-fn report_findings(findings: &Findings) {
-    let Findings {
-        cameras,
-        buses,
-        servos,
-        controllers,
-        notes,
-    } = findings;
-    print::report("Found");
-    let (found, silent): (Vec<_>, Vec<_>) = controllers
-        .iter()
-        .partition(|controller| controller.answers());
-    let rows = [
-        ("camera", texts(cameras)),
-        ("CAN", texts(buses)),
-        ("servos", texts(servos)),
-        ("controller", texts(&found)),
-    ];
-    if rows.iter().all(|(_, found)| found.is_empty()) {
-        print::report("  no cameras, motors, servos or controllers");
-    }
-    for (kind, found) in rows {
-        for device in found {
-            print::report(format_args!("  {kind:10} {device}"));
-        }
-    }
-    for controller in silent {
-        print::report(format_args!("  not found  {controller}"));
-    }
-    for note in notes {
-        print::report(format_args!("  not used   {note}"));
-    }
-}
-
-fn texts(devices: &[impl ToString]) -> Vec<String> {
-    devices.iter().map(ToString::to_string).collect()
 }
 
 fn report_plan(rig: &Path, plan: &RigPlan) {
@@ -278,19 +194,5 @@ mod tests {
         );
         let error = wanted_camera("wrist").expect_err("no place");
         assert!(error.contains("flange, base or world"), "{error}");
-    }
-
-    #[test]
-    fn robots_are_named_with_or_without_prefix() {
-        for name in ["ur5e", "builtin:ur5e", "UR5e"] {
-            let robot = known_robot(name).expect(name);
-            assert!(matches!(robot, RobotChoice::Known(robot) if robot.name == "ur5e"));
-        }
-        assert_eq!(known_robot("none").expect("no arm"), RobotChoice::None);
-        let error = known_robot("ur5").expect_err("unknown").to_string();
-        assert!(
-            error.contains("did you mean \"ur5e\"") && error.ends_with("so101, none"),
-            "{error}"
-        );
     }
 }

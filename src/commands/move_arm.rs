@@ -4,17 +4,12 @@ use crate::exit::Exit;
 use crate::{print, signals};
 use anyhow::bail;
 use capture::config::Rig;
-use capture::{HOLDING, Stop, SupervisedArm, open};
+use capture::{Arrival, HOLDING, RequestedMotion, Stop, SupervisedArm, format_positions, open};
 use drivers::clock;
 use drivers::motion::{JointTarget, OnLoss};
 use indicatif::ProgressBar;
-use kinematics::{JointState, Stamp};
-use messages::BadInput;
-use serde::Serialize;
+use kinematics::JointState;
 use std::path::PathBuf;
-
-/// A target may exceed the joint range by this much, rad or m.
-const TOLERANCE_RAD: f64 = 1e-4;
 
 /// Flags of `move`.
 #[derive(Debug, clap::Args)]
@@ -59,19 +54,6 @@ fn delta(text: &str) -> Result<(String, f64), String> {
         .ok_or_else(|| "expected JOINT=DELTA, such as joint1=0.1".to_owned())
 }
 
-/// Report of an arrival.
-#[derive(Debug, Serialize)]
-struct ArrivedEvent<'a> {
-    event: &'static str,
-    joints: &'a [String],
-    /// The target, and the position that the joints report, rad or m.
-    target: &'a [f64],
-    position: &'a [f64],
-    /// Largest absolute difference between the two.
-    error: f64,
-    seconds: f64,
-}
-
 /// Moves the arm, then holds it if its motors would release it on exit.
 pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     // Signals are handled before the arm is enabled, so that Ctrl-C never leaves a moving arm.
@@ -81,7 +63,11 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     signals::stop_when_output_closes(&stop)?;
     let rig = Rig::load(&args.rig_file, &[])?;
     let motion = open::motion_of(&rig)?;
-    check(args, &rig)?;
+    let requested = RequestedMotion {
+        to: args.to.clone(),
+        by: args.by.clone(),
+    };
+    requested.check(&rig)?;
     let mut arm = SupervisedArm::new(open::movable_arm(&rig)?, &rig);
     let bar = print::bar(None, "{spinner} {elapsed} {msg}", args.json);
     // An arm with an error accepts no target, so it is recovered first.
@@ -90,24 +76,8 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
         log::info!("the arm has recovered");
     }
     let initial = arm.read()?;
-    if args.to.is_some() || !args.by.is_empty() {
-        let requested = target(args, &rig.arm.joints, &initial);
-        // The target is checked before it is sent. The driver would clamp it, and the arm would
-        // move although the target is a mistake.
-        check_range(&rig, &requested, &initial)?;
-        let target = arm.command(&requested)?;
-        for (joint, (requested, accepted)) in rig
-            .arm
-            .joints
-            .iter()
-            .zip(requested.position.iter().zip(&target.position))
-        {
-            if (requested - accepted).abs() > TOLERANCE_RAD {
-                log::warn!(
-                    "joint {joint:?} moves to {accepted:.4}, the limit of its range, instead of {requested:.4}"
-                );
-            }
-        }
+    if !requested.is_empty() {
+        let target = requested.start(&mut arm, &rig, &initial)?;
         let began = clock::now();
         let last = follow(&mut arm, &target, &stop, &bar).inspect_err(|error| {
             if args.json {
@@ -117,7 +87,12 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
                 );
             }
         })?;
-        report_arrival(args, &rig.arm.joints, &target, &last, began)?;
+        let arrival = Arrival::new(&rig.arm.joints, &target, &last, began);
+        if args.json {
+            print::report_json(&arrival)?;
+        } else {
+            print::report(arrival.line());
+        }
     }
     // The arm is held, because the motors would otherwise release it when this program ends.
     if motion.on_loss != OnLoss::Hold && !args.exit_on_arrival {
@@ -128,107 +103,6 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     }
     bar.finish_and_clear();
     Ok(Exit::Done)
-}
-
-fn check(args: &Args, rig: &Rig) -> Result<(), BadInput> {
-    let joints = &rig.arm.joints;
-    if let Some(to) = args.to.as_ref().filter(|to| to.len() != joints.len()) {
-        let n = to.len();
-        let names = joints.join(", ");
-        return Err(BadInput(format!(
-            "--to has {n} positions, the arm has {} joints: {names}",
-            joints.len()
-        )));
-    }
-    // Two values for a joint are ambiguous: the user may mean their sum, or the last value.
-    if let Some(joint) = joints
-        .iter()
-        .find(|joint| args.by.iter().filter(|(by, _)| by == *joint).count() > 1)
-    {
-        return Err(BadInput(format!("--by: joint {joint:?} is given twice")));
-    }
-    if let Some((joint, _)) = args.by.iter().find(|(joint, _)| !joints.contains(joint)) {
-        let available = if joints.is_empty() {
-            "none".to_owned()
-        } else {
-            joints.join(", ")
-        };
-        return Err(BadInput(format!(
-            "--by: unknown joint {joint:?}; joints of the arm: {available}"
-        )));
-    }
-    Ok(())
-}
-
-/// Rejects a target outside the joint ranges of the URDF, so that a typing error does not move an
-/// arm to its limits. A joint that is already outside its range may stay there.
-fn check_range(rig: &Rig, requested: &JointTarget, now: &JointState) -> anyhow::Result<()> {
-    let chain = open::chain_of(rig)?;
-    for (ix, joint) in rig.arm.joints.iter().enumerate() {
-        let Some(joint_ix) = chain.joint_names().iter().position(|known| known == joint) else {
-            continue;
-        };
-        let lower = chain.limits()[joint_ix].lower;
-        let upper = chain.limits()[joint_ix].upper;
-        let requested = requested.position[ix];
-        let now = now.position[ix];
-        // Rounded positions of a joint at its limit may lie slightly outside.
-        if (requested - now).abs() > TOLERANCE_RAD
-            && !(lower - TOLERANCE_RAD..=upper + TOLERANCE_RAD).contains(&requested)
-        {
-            return Err(BadInput(format!(
-                "joint {joint:?}: target {requested:.4} is outside its range of {lower:.4} to {upper:.4}; the joint is at {now:.4}, and nothing was moved"
-            ))
-            .into());
-        }
-    }
-    Ok(())
-}
-
-fn target(args: &Args, joints: &[String], now: &JointState) -> JointTarget {
-    // Without `--to`, joints that `--by` does not name stay where they are.
-    let mut position = args.to.clone().unwrap_or_else(|| now.position.clone());
-    for (joint, delta) in &args.by {
-        let moved = joints
-            .iter()
-            .zip(&mut position)
-            .find(|(name, _)| *name == joint);
-        if let Some((_, position)) = moved {
-            *position += delta;
-        }
-    }
-    JointTarget { position }
-}
-
-fn report_arrival(
-    args: &Args,
-    joints: &[String],
-    target: &JointTarget,
-    last: &JointState,
-    began: Stamp,
-) -> anyhow::Result<()> {
-    let errors = target
-        .position
-        .iter()
-        .zip(&last.position)
-        .map(|(target, actual)| (target - actual).abs());
-    let error = errors.fold(0.0, f64::max);
-    let seconds = clock::now().secs_since(began);
-    if args.json {
-        return print::report_json(&ArrivedEvent {
-            event: "done",
-            joints,
-            target: &target.position,
-            position: &last.position,
-            error,
-            seconds,
-        });
-    }
-    print::report(format_args!(
-        "arrived after {seconds:.1} s at {}, maximum error {error:.5}",
-        format_positions(&last.position)
-    ));
-    Ok(())
 }
 
 /// Waits until the arm arrives. Ctrl-C stops the arm and returns an error.
@@ -252,12 +126,4 @@ fn follow(
         );
     }
     Ok(end.state)
-}
-
-fn format_positions(position: &[f64]) -> String {
-    position
-        .iter()
-        .map(|position| format!("{position:.4}"))
-        .collect::<Vec<_>>()
-        .join(", ")
 }

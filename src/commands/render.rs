@@ -4,21 +4,11 @@ use crate::console::ProgressLines;
 use crate::exit::Exit;
 use crate::open_gpu::open_gpu;
 use crate::{print, signals};
-use anyhow::Context;
-use messages::{BadInput, Setting, counted};
-use model_files::Aabb;
-use serde::Serialize;
-use session::camera_path::{CameraPath, PathCamera};
-use session::evaluate::{covered_frac, warn_if_hardly_covered};
-use session::run_folder::expect_model;
-use session::{methods, rendered_files};
+use messages::{BadInput, counted};
+use session::{RenderPlan, RenderedCameras};
 use std::path::PathBuf;
-use std::sync::Arc;
 use std::time::Instant;
-use trainer::{LoadedModel, Projection, RenderRequest};
 
-/// Image size if neither a flag nor the camera path gives one.
-const DEFAULT_SIZE_PX: [u32; 2] = [1280, 720];
 /// Maximum width and height of an image.
 const MAX_SIDE_PX: u32 = 16_384;
 
@@ -102,144 +92,57 @@ fn size(text: &str) -> Result<[u32; 2], String> {
         })
 }
 
-/// A rendered image.
-#[derive(Debug, Serialize)]
-struct RenderedPicture {
-    picture: PathBuf,
-    #[serde(skip_serializing_if = "Option::is_none")]
-    depth: Option<PathBuf>,
-    size_px: [u32; 2],
-    /// Wall time from the request to the pixels, milliseconds.
-    draw_millis: f64,
-}
-
 /// Renders every camera of the path.
 pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
-    let path = match (&args.camera_path, &args.pose) {
-        (Some(file), _) => CameraPath::load(file)?,
-        (None, Some(pose)) => CameraPath::of_pose(&pose.0)?,
-        (None, None) => {
-            return Err(BadInput("either --camera-path or --pose is needed".into()).into());
-        }
-    };
-    for note in &path.notes {
-        log::warn!("--camera-path: {note}");
-    }
-    if path.is_panoramic && !args.equirect {
-        return Err(BadInput(
-            "--camera-path: the path was made for panoramas; add --equirect".into(),
-        )
-        .into());
-    }
-    let size_px = args.size.or(path.size_px).unwrap_or(DEFAULT_SIZE_PX);
-    let requests = path
-        .cameras
-        .iter()
-        .map(|camera| args.request(camera, size_px))
-        .collect::<Result<Vec<_>, _>>()?;
-    // Everything that can be refused is checked before the GPU is opened and the model is loaded.
-    expect_model(&args.model)?;
-    capture::check_output_folder(Setting::Out, &args.out)?;
-    rendered_files::check_no_overwrite(&args.out, requests.len())?;
+    let plan = args.plan()?;
     signals::remove_partial_files_on_signals()?;
-    let loaded = methods::load(open_gpu()?, &args.model)?;
-    let is_empty = methods::note_if_empty(&args.model, &loaded).is_some();
-    let LoadedModel {
-        method: mut model,
-        edits,
-        ..
-    } = loaded;
-    // All requests share the edits, because a model may have many of them.
-    let edits = Arc::new(edits);
-    std::fs::create_dir_all(&args.out)
-        .with_context(|| format!("cannot create the folder {}", args.out.display()))?;
-    let bar = print::bar(
-        Some(requests.len() as u64),
-        "{bar:30} {pos} of {len}",
-        args.json,
-    );
-    let mut lines = ProgressLines::new(bar.is_hidden() && !args.json, Instant::now());
-    let mut covered_fracs = Vec::new();
-    for (ix, request) in requests.iter().enumerate() {
-        // Only the request is timed, because encoding and writing files are not part of drawing.
-        let since = Instant::now();
-        let picture = model.model_mut().render(&RenderRequest {
-            edits: Arc::clone(&edits),
-            ..request.clone()
-        })?;
-        let draw_millis = since.elapsed().as_secs_f64() * 1e3;
-        covered_fracs.push(covered_frac(&picture));
-        let (picture, depth) = rendered_files::write(&args.out, ix, &picture, args.depth)?;
-        let rendered = RenderedPicture {
-            picture,
-            depth,
-            size_px,
-            draw_millis,
-        };
-        bar.inc(1);
-        if lines.is_due(ix + 1, requests.len(), Instant::now()) {
-            print::notice(format_args!(
-                "rendered {} of {} images",
-                ix + 1,
-                requests.len()
-            ));
+    let mut shown = None;
+    let n_pictures = plan.run(open_gpu, &mut |n_done, n_all, rendered| {
+        let (bar, lines) = shown.get_or_insert_with(|| {
+            let bar = print::bar(Some(n_all as u64), "{bar:30} {pos} of {len}", args.json);
+            let lines = ProgressLines::new(bar.is_hidden() && !args.json, Instant::now());
+            (bar, lines)
+        });
+        bar.set_position(n_done as u64);
+        if lines.is_due(n_done, n_all, Instant::now()) {
+            print::notice(format_args!("rendered {n_done} of {n_all} images"));
         }
-        if args.json {
-            print::report_json(&rendered)?;
+        match rendered {
+            Some(rendered) if args.json => print::report_json(rendered),
+            _ => Ok(()),
         }
-    }
-    bar.finish_and_clear();
-    // An empty model has a separate note.
-    if !is_empty {
-        warn_if_hardly_covered(&covered_fracs);
+    })?;
+    if let Some((bar, _)) = shown {
+        bar.finish_and_clear();
     }
     if !args.json {
-        let n_pictures = counted(requests.len() as u64, "image");
+        let n_pictures = counted(n_pictures as u64, "image");
         print::report(format_args!("{n_pictures} in {}", args.out.display()));
     }
     Ok(Exit::Done)
 }
 
 impl Args {
-    fn request(&self, camera: &PathCamera, size_px: [u32; 2]) -> Result<RenderRequest, BadInput> {
-        const DEFAULT_FOV_DEGREES: f64 = 60.0;
-        let fov_y_rad = self
-            .fov
-            .map(f64::to_radians)
-            .or(camera.fov_y_rad)
-            .unwrap_or(DEFAULT_FOV_DEGREES.to_radians());
-        if !(fov_y_rad > 0.0 && fov_y_rad < std::f64::consts::PI) {
-            return Err(BadInput(format!(
-                "field of view {} degrees: must be above 0 and below 180",
-                fov_y_rad.to_degrees()
-            )));
-        }
-        let [width, height] = size_px.map(f64::from);
-        let focal_px = 0.5 * height / (0.5 * fov_y_rad).tan();
-        let pinhole = Projection::Pinhole {
-            focal_px: [focal_px; 2],
-            principal_px: [0.5 * width, 0.5 * height],
+    /// The flags as a plan.
+    fn plan(&self) -> Result<RenderPlan, BadInput> {
+        let cameras = match (&self.camera_path, &self.pose) {
+            (Some(file), _) => RenderedCameras::Path(file.clone()),
+            (None, Some(Numbers(pose))) => RenderedCameras::Pose(*pose),
+            (None, None) => {
+                return Err(BadInput("either --camera-path or --pose is needed".into()));
+            }
         };
-        Ok(RenderRequest {
-            world_from_camera: camera.world_from_camera,
-            size_px,
-            projection: if self.equirect {
-                Projection::Equirectangular
-            } else {
-                pinhole
-            },
-            shutter: None,
-            near_m: 0.01,
-            far_m: 1000.0,
-            crop: self.crop.map(|Numbers([x, y, z, to_x, to_y, to_z])| Aabb {
-                world_from_box: kinematics::Transform::identity(),
-                min_m: [x, y, z],
-                max_m: [to_x, to_y, to_z],
-            }),
-            edits: Arc::default(),
-            background_srgb: [0.0; 3],
-            appearance_of: None,
+        Ok(RenderPlan {
+            model: self.model.clone(),
+            cameras,
+            size_px: self.size,
+            fov_y_deg: self.fov,
+            is_equirectangular: self.equirect,
+            crop_m: self
+                .crop
+                .map(|Numbers([x, y, z, to_x, to_y, to_z])| [[x, y, z], [to_x, to_y, to_z]]),
             depth: self.depth,
+            out: self.out.clone(),
         })
     }
 }

@@ -5,9 +5,8 @@ use crate::console::{Console, OutputMode, print_end, print_finished_run};
 use crate::exit::{self, Exit};
 use crate::number_args::number_in_range;
 use crate::open_gpu::open_gpu;
-use crate::page_args::PageArgs;
+use crate::page_args::{PageArgs, print_page};
 use crate::permission_args::PermissionArgs;
-use crate::served_page::ServedPage;
 use crate::training_args::{TRAINING_ARGS, TrainingArgs};
 use crate::{print, signals};
 use capture::Stop;
@@ -16,6 +15,7 @@ use session::{
 };
 use std::io::IsTerminal;
 use std::path::PathBuf;
+use viz::ServedPage;
 
 /// Flags of `run`.
 #[derive(Debug, clap::Args)]
@@ -172,7 +172,7 @@ pub(super) fn start(args: &Args, previous: Option<PreviousLiveRun>) -> anyhow::R
     // once, and viewers can connect while kernels are compiled.
     let page = args.page.serve(prepared.hub())?;
     let opened = prepared.open_devices()?;
-    page.print(args.json, serde_json::json!({}))?;
+    print_page(&page, args.json, serde_json::json!({}))?;
     let run = opened.start()?;
     Ok(Running { run, page, stop })
 }

@@ -7,7 +7,7 @@ use anyhow::Context;
 use messages::{BadInput, counted};
 use serde::Serialize;
 use session::run_folder::RUNS;
-use session::runs::{self, KeptModel, KeptRun, OldRuns, RemovableRun};
+use session::runs::{self, KeptRun, OldRuns, RemovableRun, size};
 use std::io::{BufRead, ErrorKind, IsTerminal};
 use std::path::PathBuf;
 use std::time::{Duration, SystemTime};
@@ -127,9 +127,7 @@ fn list(args: &ListArgs) -> anyhow::Result<Exit> {
         })?;
         return Ok(Exit::Done);
     }
-    for line in table(&runs) {
-        print::line(line)?;
-    }
+    print::lines(runs::table(&runs))?;
     print::line(format_args!(
         "{} in {}, {}",
         counted(runs.len() as u64, "run"),
@@ -137,69 +135,6 @@ fn list(args: &ListArgs) -> anyhow::Result<Exit> {
         size(bytes)
     ))?;
     Ok(Exit::Done)
-}
-
-/// The runs in columns, with a header if there are any.
-fn table(runs: &[KeptRun]) -> Vec<String> {
-    if runs.is_empty() {
-        return Vec::new();
-    }
-    let header = [
-        "NAME",
-        "CHANGED (UTC)",
-        "RIG OR DATA",
-        "MODELS",
-        "SIZE",
-        "STATE",
-    ];
-    let mut rows = vec![header.map(str::to_owned)];
-    rows.extend(runs.iter().map(row));
-    let width = |column: usize| {
-        let cells = rows.iter().map(|row| row[column].chars().count());
-        cells.max().unwrap_or_default()
-    };
-    let widths: [usize; 6] = std::array::from_fn(width);
-    rows.iter()
-        .map(|row| {
-            let cells = row.iter().zip(widths);
-            let cells = cells.map(|(cell, width)| format!("{cell:width$}"));
-            let line = cells.collect::<Vec<_>>().join("  ");
-            line.trim_end().to_owned()
-        })
-        .collect()
-}
-
-fn row(run: &KeptRun) -> [String; 6] {
-    let models: Vec<String> = run.models.iter().map(model).collect();
-    [
-        run.name.clone(),
-        session::run_folder::utc_time(Duration::from_secs(run.changed_unix_secs)),
-        run.rig.clone().unwrap_or_else(|| "unknown".to_owned()),
-        if models.is_empty() {
-            "none".to_owned()
-        } else {
-            models.join(", ")
-        },
-        size(run.bytes),
-        run.state.words().to_owned(),
-    ]
-}
-
-fn model(model: &KeptModel) -> String {
-    match model.psnr {
-        Some(psnr) => format!("{} {psnr:.2} dB", model.method),
-        None => format!("{} not scored", model.method),
-    }
-}
-
-/// A size in units of 1000 bytes, as `ls` and disk vendors use them.
-fn size(bytes: u64) -> String {
-    let mega = bytes as f64 / 1e6;
-    if mega < 1000.0 {
-        format!("{mega:.1} MB")
-    } else {
-        format!("{:.2} GB", mega / 1e3)
-    }
 }
 
 fn remove(args: &RemoveArgs) -> anyhow::Result<Exit> {
@@ -280,7 +215,6 @@ fn is_yes(answer: &str) -> bool {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use session::runs::RunState;
 
     #[test]
     fn only_yes_confirms() {
@@ -294,41 +228,5 @@ mod tests {
         ] {
             assert_eq!(is_yes(answer), expected, "{answer:?}");
         }
-    }
-
-    #[test]
-    fn runs_are_shown_in_columns() {
-        let run = |name: &str, models: Vec<KeptModel>, bytes| KeptRun {
-            name: name.to_owned(),
-            folder: name.into(),
-            changed_unix_secs: 1_795_000_000,
-            rig: None,
-            models,
-            bytes,
-            state: RunState::Done,
-        };
-        let scored = KeptModel {
-            method: "splat".to_owned(),
-            psnr: Some(25.254),
-        };
-        let unscored = KeptModel {
-            method: "tsdf".to_owned(),
-            psnr: None,
-        };
-        let lines = table(&[
-            run("a", vec![scored, unscored], 467_000_000),
-            run("20261129-181500", vec![], 1_500_000_000),
-        ]);
-        assert_eq!(
-            lines[1],
-            "a                2026-11-18 11:06  unknown      splat 25.25 dB, tsdf not scored  467.0 MB  done"
-        );
-        assert!(
-            lines[2].ends_with("unknown      none                             1.50 GB   done"),
-            "{}",
-            lines[2]
-        );
-        assert!(lines[0].starts_with("NAME             CHANGED (UTC)     RIG OR DATA  MODELS"));
-        assert!(table(&[]).is_empty());
     }
 }

@@ -2,15 +2,12 @@
 
 use crate::exit::Exit;
 use crate::open_gpu::open_gpu;
-use crate::page_args::PageArgs;
+use crate::page_args::{PageArgs, print_page};
 use crate::signals;
-use kinematics::Transform;
-use messages::BadInput;
-use nalgebra::{Translation3, UnitQuaternion, Vector3};
+use nalgebra::Vector3;
 use serde_json::json;
-use session::{ModelViewer, ServedModel, methods, publish_loading, publish_saved, run_folder};
-use std::path::{Path, PathBuf};
-use trainer::LoadedModel;
+use session::{ModelViewer, check_is_model, load_saved, model_from_page, run_folder};
+use std::path::PathBuf;
 use viz::Hub;
 
 /// Flags of `view`.
@@ -47,17 +44,6 @@ fn up_axis(text: &str) -> Result<Up, String> {
     Ok(Up(sign * axis))
 }
 
-impl Up {
-    /// Rotation from the page, which is z up, to the model.
-    fn model_from_page(self) -> Transform {
-        let rotation = UnitQuaternion::rotation_between(&Vector3::z(), &self.0);
-        // If the two directions are opposite, rotate by 180 degrees about a horizontal axis.
-        let rotation =
-            rotation.unwrap_or_else(|| UnitQuaternion::new(std::f64::consts::PI * Vector3::x()));
-        Transform::from_parts(Translation3::identity(), rotation)
-    }
-}
-
 /// Serves the page until Ctrl-C.
 pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     args.page.check()?;
@@ -70,84 +56,23 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     // once.
     let page = args.page.serve_or_free_port(&hub)?;
 
-    let model_from_page = args.up.model_from_page();
-    let mut models: Vec<LoadedModel> = Vec::new();
-    for (ix, path) in paths.iter().enumerate() {
-        publish_loading(&hub, &paths, ix);
-        models.push(methods::load(gpu.clone(), path)?);
-    }
-    publish_saved(&hub, &gpu, &mut models, &paths, &model_from_page)?;
+    let model_from_page = model_from_page(&args.up.0);
+    let models = load_saved(&hub, &gpu, paths, &model_from_page)?;
     let methods: Vec<&str> = models.iter().map(|model| model.kind.name()).collect();
-    page.print(args.json, json!({ "methods": methods }))?;
-    let served = |(
-        LoadedModel {
-            kind,
-            method,
-            edits,
-        },
-        path,
-    )| ServedModel {
-        kind,
-        method,
-        edits: edits.into(),
-        path,
-    };
-    let models = models.into_iter().zip(paths).map(served).collect();
+    print_page(&page, args.json, json!({ "methods": methods }))?;
     ModelViewer::new(models, hub)
         .with_model_from_page(model_from_page)
         .serve(&stop);
     Ok(Exit::Done)
 }
 
-/// Rejects paths that are often mistaken for a model. The error names the command to use instead.
-fn check_is_model(model: &Path) -> Result<(), BadInput> {
-    let shown = model.display();
-    let is_url = |scheme: &str| model.to_str().is_some_and(|text| text.starts_with(scheme));
-    if ["http://", "https://", "ws://", "wss://"]
-        .into_iter()
-        .any(is_url)
-    {
-        return Err(BadInput(format!(
-            "{shown} is the address of a page: open it in a browser; view shows saved models and splat files"
-        )));
-    }
-    if model.is_file() && run_folder::is_recording(model) {
-        return Err(BadInput(format!(
-            "{shown} is a recording, not a model: train a model with `fieldrig train`, or watch one being trained with \
-             `fieldrig run RIG.toml --from {shown}`"
-        )));
-    }
-    if drivers::dataset::is_dataset_folder(model) && run_folder::models_at(model).is_err() {
-        return Err(BadInput(format!(
-            "{shown} is a dataset, not a model: train a model with `fieldrig train {shown}` and pass the folder of that run"
-        )));
-    }
-    Ok(())
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
-    use nalgebra::Point3;
 
     #[test]
-    fn up_axis_is_up_on_the_page() {
-        const TOLERANCE: f64 = 1e-12;
-        for (text, up) in [
-            ("z", [0.0, 0.0, 1.0]),
-            ("-z", [0.0, 0.0, -1.0]),
-            ("y", [0.0, 1.0, 0.0]),
-            ("-y", [0.0, -1.0, 0.0]),
-            ("-x", [-1.0, 0.0, 0.0]),
-        ] {
-            let Up(axis) = up_axis(text).expect("an axis");
-            assert_eq!(axis, Vector3::from(up), "{text}");
-            let in_page = Up(axis).model_from_page().inverse() * Point3::from(up);
-            assert!(
-                (in_page - Point3::new(0.0, 0.0, 1.0)).norm() < TOLERANCE,
-                "{text}: {in_page}"
-            );
-        }
+    fn axes_are_parsed() {
+        assert_eq!(up_axis("-y"), Ok(Up(-Vector3::y())));
         for invalid in ["", "up", "--z", "Z", "xy"] {
             assert!(up_axis(invalid).is_err(), "{invalid}");
         }

@@ -31,11 +31,11 @@ const ALLOWED: &str = "
     session       -> background calibration capture clearance-map drivers files gpu keyframe \
                      kinematics messages model-files numbers report steering trainer viz
     calibrate     -> calibration capture drivers files keyframe kinematics messages numbers report \
-                     session targets
+                     session targets viz
     bench         -> calibration capture files gpu keyframe kinematics messages model-files numbers \
                      report session trainer
     fieldrig      -> background bench calibrate calibration capture drivers files gpu keyframe \
-                     kinematics messages model-files numbers report session sim targets trainer viz
+                     kinematics messages session sim targets trainer viz
 ";
 
 /// Crates that only `fieldrig` may use, because only it prints and parses command lines.

@@ -48,6 +48,12 @@ pub enum Error {
         /// Error of the operating system.
         source: std::io::Error,
     },
+    /// There are no random numbers for the tokens of a shared page.
+    #[error("cannot create a token")]
+    Token {
+        /// Error of the operating system.
+        source: std::io::Error,
+    },
     /// The TLS library rejected a certificate.
     #[error("cannot set up TLS")]
     Tls {
@@ -63,6 +69,12 @@ pub enum Error {
         /// Requested address.
         address: SocketAddr,
     },
+    /// Foxglove is requested, but this build lacks it.
+    #[error(
+        "{}: this program was built without Foxglove support: build with `--features foxglove`",
+        Setting::Foxglove
+    )]
+    FoxgloveNotBuilt,
     /// The server for Foxglove could not start.
     #[error("cannot serve Foxglove on {address}: {reason}")]
     Foxglove {

@@ -47,6 +47,8 @@ pub struct SceneOutcome {
     pub calibration: SceneCalibration,
     /// The reason why no camera could be calibrated. `None` if at least one camera was calibrated.
     pub refused: Option<String>,
+    /// What was requested.
+    pub(crate) params: Vec<Refine>,
     /// The rig before the calibration, if there is one.
     before: Option<Rig>,
     write_rig: Option<PathBuf>,
@@ -103,6 +105,7 @@ impl SceneTask {
             refused: refusal(&data, &calibration),
             data,
             calibration,
+            params: self.params.clone(),
             before: rig,
             write_rig: self.write_rig.clone(),
             written,

@@ -3,7 +3,7 @@
 use targets::TargetSpec;
 
 /// A warning if the pose of a target is ambiguous.
-pub fn symmetry_warning(target: &TargetSpec) -> Option<String> {
+pub(crate) fn symmetry_warning(target: &TargetSpec) -> Option<String> {
     let turn = match target.symmetry().len() {
         0 | 1 => return None,
         2 => "half a turn",

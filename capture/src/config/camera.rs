@@ -218,6 +218,25 @@ pub enum Parent {
     World,
 }
 
+impl Parent {
+    /// Name of the frame in rig files.
+    #[must_use]
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Flange => "flange",
+            Self::Base => "base",
+            Self::World => "world",
+        }
+    }
+
+    /// The frame with this name.
+    #[must_use]
+    pub fn named(name: &str) -> Option<Self> {
+        let all = [Self::Flange, Self::Base, Self::World];
+        all.into_iter().find(|parent| parent.name() == name)
+    }
+}
+
 /// Calibration values that are missing in the rig file. RealSense cameras report their lenses when
 /// they are opened, and calibration finds the rest. Until then, the rig contains placeholders that
 /// must not be used. [`Rig::require`](super::Rig::require) rejects them.

@@ -5,7 +5,7 @@
 //! poses call [`Rig::require`]. Its errors name the missing key and the command that finds its
 //! value.
 
-use super::{ArmDriver, Camera, CameraDriver, Parent, Rig};
+use super::{ArmDriver, Camera, CameraDriver, Rig};
 use messages::{BadInput, Setting};
 use std::borrow::Cow;
 
@@ -86,11 +86,7 @@ impl Rig {
         }
         // The arm carries the camera or the target.
         let remedy = if self.arm.driver == ArmDriver::None || self.has_moving_base() {
-            let parent = match camera.parent {
-                Parent::Flange => "flange",
-                Parent::Base => "base",
-                Parent::World => "world",
-            };
+            let parent = camera.parent.name();
             format!(
                 "measure the pose of the optical frame (x right, y down, z forward) in the frame {parent}"
             )

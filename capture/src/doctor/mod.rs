@@ -30,6 +30,7 @@ pub use listen::{DeviceStatistics, Latency, ListenResult, listen};
 pub use meaning::meaning;
 
 use crate::config::Rig;
+use messages::Setting;
 use serde::Serialize;
 use std::path::Path;
 
@@ -97,6 +98,20 @@ impl Finding {
             remedy: Some(remedy.into()),
         }
     }
+
+    /// The finding in columns. The remedy has its own line.
+    #[must_use]
+    pub fn lines(&self) -> Vec<String> {
+        let label = match self.verdict {
+            Verdict::Ok => "ok  ",
+            Verdict::Warn => "warn",
+            Verdict::Fail => "fail",
+        };
+        let mut lines = vec![format!("{label}  {:12} {}", self.check, self.message)];
+        let remedy = self.remedy.as_ref();
+        lines.extend(remedy.map(|remedy| format!("      {:12} -> {remedy}", "")));
+        lines
+    }
 }
 
 impl std::fmt::Display for Finding {
@@ -106,6 +121,22 @@ impl std::fmt::Display for Finding {
             None => f.write_str(&self.message),
         }
     }
+}
+
+/// Whether this build can simulate rigs.
+#[must_use]
+pub fn simulation() -> Finding {
+    if cfg!(feature = "sim") {
+        return Finding::ok("simulation", "MuJoCo is built in");
+    }
+    Finding::warn(
+        "simulation",
+        format!(
+            "built without MuJoCo: `fieldrig run {}` is not available",
+            Setting::Sim
+        ),
+        "make deps && cargo build --release --features sim",
+    )
 }
 
 /// Checks clocks, memory, priorities and permissions of this computer. Also checks the devices of

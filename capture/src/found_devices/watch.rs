@@ -6,6 +6,7 @@
 use super::{DeviceInfo, children, devices_with};
 use serde::Serialize;
 use std::collections::BTreeSet;
+use std::fmt::{Display, Formatter};
 use std::path::Path;
 
 /// Folders in sysfs whose entries change when a device is connected or disconnected.
@@ -34,6 +35,21 @@ pub struct DeviceChange {
     /// The device.
     #[serde(flatten)]
     pub device: DeviceInfo,
+}
+
+impl Display for DeviceChange {
+    fn fmt(&self, f: &mut Formatter<'_>) -> std::fmt::Result {
+        let Self { change, device } = self;
+        let change = match change {
+            ChangeKind::Connected => "connected",
+            ChangeKind::Disconnected => "disconnected",
+        };
+        write!(
+            f,
+            "{change:12}  {:10} {:14} {}; {}",
+            device.kind, device.address, device.name, device.note
+        )
+    }
 }
 
 /// Compares the connected devices with those of the previous look.

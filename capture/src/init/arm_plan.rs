@@ -297,3 +297,18 @@ fn motors(
     );
     Some(ArmSource::Motors { buses, motors })
 }
+
+/// The maker of the controller that a known robot needs, if none was found.
+#[must_use]
+pub fn missing_controller(wishes: &Wishes, findings: &Findings) -> Option<ControllerKind> {
+    let RobotChoice::Known(robot) = &wishes.robot else {
+        return None;
+    };
+    let kinds = [ControllerKind::Franka, ControllerKind::Ur];
+    let kind = kinds.into_iter().find(|kind| kind.controls(robot))?;
+    let is_found = findings
+        .controllers
+        .iter()
+        .any(|controller| controller.kind == kind);
+    (!is_found).then_some(kind)
+}

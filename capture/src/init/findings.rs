@@ -200,3 +200,46 @@ impl fmt::Display for FoundController {
         }
     }
 }
+
+impl Findings {
+    /// The findings as text.
+    #[must_use]
+    pub fn lines(&self) -> Vec<String> {
+        let Self {
+            cameras,
+            buses,
+            servos,
+            controllers,
+            notes,
+        } = self;
+        let mut lines = Vec::new();
+        let (found, silent): (Vec<_>, Vec<_>) = controllers
+            .iter()
+            .partition(|controller| controller.answers());
+        let rows = [
+            ("camera", texts(cameras)),
+            ("CAN", texts(buses)),
+            ("servos", texts(servos)),
+            ("controller", texts(&found)),
+        ];
+        if rows.iter().all(|(_, found)| found.is_empty()) {
+            lines.push("  no cameras, motors, servos or controllers".to_owned());
+        }
+        for (kind, found) in rows {
+            for device in found {
+                lines.push(format!("  {kind:10} {device}"));
+            }
+        }
+        for controller in silent {
+            lines.push(format!("  not found  {controller}"));
+        }
+        for note in notes {
+            lines.push(format!("  not used   {note}"));
+        }
+        lines
+    }
+}
+
+fn texts(devices: &[impl ToString]) -> Vec<String> {
+    devices.iter().map(ToString::to_string).collect()
+}

@@ -110,19 +110,9 @@ fn wanted_cameras(
         }
         return Ok(wishes.cameras.clone());
     }
-    let first = match (has_arm, wishes.has_moving_base) {
-        (true, _) => Parent::Flange,
-        (false, true) => Parent::Base,
-        (false, false) => Parent::World,
-    };
-    let others = if wishes.has_moving_base {
-        Parent::Base
-    } else {
-        Parent::World
-    };
     let n = findings.cameras.len().max(1);
-    let parents: Vec<Parent> = std::iter::once(first)
-        .chain(std::iter::repeat_n(others, n - 1))
+    let parents: Vec<Parent> = (0..n)
+        .map(|ix| default_parent(ix, has_arm, wishes.has_moving_base))
         .collect();
     let places: Vec<&str> = parents.iter().map(|parent| place(*parent)).collect();
     assumptions.push(format!(
@@ -135,6 +125,18 @@ fn wanted_cameras(
         device: None,
     };
     Ok(parents.into_iter().map(camera).collect())
+}
+
+/// The place of camera `ix` if nobody has said where it is.
+#[must_use]
+pub fn default_parent(ix: usize, has_arm: bool, has_moving_base: bool) -> Parent {
+    if ix == 0 && has_arm {
+        Parent::Flange
+    } else if has_moving_base {
+        Parent::Base
+    } else {
+        Parent::World
+    }
 }
 
 /// Where a camera is, in words.

@@ -5,7 +5,7 @@ use super::GUESS;
 use super::arm_plan::{ArmPlan, ArmSource};
 use super::findings::{ControllerKind, FoundBus, FoundMotor, FoundServos};
 use super::plan::{CameraPlan, RigPlan, place};
-use crate::config::{CameraDriver, Parent};
+use crate::config::CameraDriver;
 use drivers::can::{AllowedValues, FAMILIES, MotorKey, SettingValue};
 use kinematics::Transform;
 use messages::Setting;
@@ -72,12 +72,7 @@ impl RigPlan {
         } else {
             format!("The camera is {place}. {others}")
         };
-        let parent = match camera.parent {
-            Parent::Flange => "flange",
-            Parent::Base => "base",
-            Parent::World => "world",
-        };
-        text.key("parent", quoted(parent), &about);
+        text.key("parent", quoted(camera.parent.name()), &about);
         let commands = if self.arm.is_some() {
             let target = Setting::Target;
             format!(

@@ -18,8 +18,11 @@ pub use robot::{ArmFacts, Bone};
 pub use sentences::{Sentence, sentences};
 
 use crate::config::{BaseDriver, Rig};
+use anyhow::Context;
 use kinematics::Transform;
+use messages::{BadInput, Setting};
 use robot::RobotAtRest;
+use std::path::Path;
 
 /// What a rig file means.
 #[derive(Clone, Debug)]
@@ -38,6 +41,24 @@ pub struct RigFacts {
     pub cameras: Vec<CameraFacts>,
     /// Range scanners in the order of the rig.
     pub scanners: Vec<ScannerFacts>,
+}
+
+/// Draws a rig into a file, which is replaced if it exists.
+///
+/// # Errors
+///
+/// If the file has another extension than `.svg`, or cannot be written.
+pub fn write_picture(rig: &Rig, file: &Path) -> anyhow::Result<()> {
+    if file.extension().is_none_or(|ending| ending != "svg") {
+        return Err(BadInput(format!(
+            "{} {}: must have the extension .svg",
+            Setting::Picture,
+            file.display()
+        ))
+        .into());
+    }
+    let picture = svg(&RigFacts::of(rig)?);
+    files::write(file, picture).with_context(|| format!("cannot write {}", file.display()))
 }
 
 impl RigFacts {

@@ -37,8 +37,14 @@ macro_rules! settings {
 settings! {
     /// Base link of a robot description.
     BaseLink = "base_link",
+    /// Distances by which joints move from their positions.
+    By = "by",
     /// Camera of a rig file to calibrate, or place of a camera.
     Camera = "camera",
+    /// Camera path of rendered images.
+    CameraPath = "camera_path",
+    /// Width of the cells of a simplified mesh.
+    CellM = "cell_m",
     /// Rule for the number of splats.
     Count = "count",
     /// Box outside of which a rendered scene is invisible.
@@ -51,10 +57,16 @@ settings! {
     DriftPpm = "drift_ppm",
     /// Confirmation that an arm may move.
     EnableMotion = "is_confirmed",
+    /// Whether rendered images are panoramas.
+    Equirect = "is_equirectangular",
     /// Horizontal field of view of a camera.
     FieldOfView = "field_of_view_deg",
     /// Constant latency of a camera.
     FixedMillis = "fixed_millis",
+    /// Whether an existing file is replaced.
+    Force = "can_replace",
+    /// Address at which Foxglove gets the data of the page.
+    Foxglove = "foxglove",
     /// Recording that replaces the devices.
     From = "recording",
     /// Selection of test images.
@@ -85,8 +97,12 @@ settings! {
     Params = "params",
     /// Curves of other trainers.
     Peer = "peers",
+    /// Picture of a rig.
+    Picture = "picture",
     /// Viewpoint of a rendered image.
     Pose = "pose",
+    /// Target positions of joints.
+    Positions = "to",
     /// Images per second of a dataset.
     RateHz = "rate_hz",
     /// Images per second of simulated cameras.

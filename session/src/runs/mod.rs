@@ -1,8 +1,10 @@
-//! The runs in a folder: lists and removes them.
+//! The runs in a folder: lists, shows and removes them.
 
 mod list;
 mod own_files;
 mod remove;
+mod table;
 
 pub use list::{KeptModel, KeptRun, RunState, list};
 pub use remove::{OldRuns, Refused, RemovableRun, by_age, by_name};
+pub use table::{size, table};

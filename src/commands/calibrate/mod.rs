@@ -1,20 +1,16 @@
 //! `fieldrig calibrate`: calibrates cameras, with a printed target or from images of any static
 //! scene.
 
-mod coverage;
 mod flags;
 mod hand_eye;
 mod intrinsics;
-mod page;
 mod scene;
 mod target;
 mod terminal;
 mod time_offset;
 
 use crate::exit::Exit;
-use crate::print;
 use clap::{Parser, Subcommand};
-use kinematics::{Transform, transform};
 use targets::TargetSpec;
 
 /// Flags of `calibrate`.
@@ -54,19 +50,4 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
 fn target_argument(text: &str) -> Result<TargetSpec, String> {
     text.parse()
         .map_err(|error: targets::SpecError| error.to_string())
-}
-
-/// The matrix of a transform, row by row.
-fn matrix_of(transform: &Transform) -> [[f64; 4]; 4] {
-    let rows = transform::to_rows(transform);
-    std::array::from_fn(|row| std::array::from_fn(|column| rows[4 * row + column]))
-}
-
-/// Prints a matrix row by row.
-fn print_matrix(matrix: &[[f64; 4]; 4]) -> anyhow::Result<()> {
-    for row in matrix {
-        let row: Vec<String> = row.iter().map(|value| format!("{value:10.6}")).collect();
-        print::line(format!("  {}", row.join(" ")))?;
-    }
-    Ok(())
 }

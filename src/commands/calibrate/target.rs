@@ -2,11 +2,9 @@
 
 use super::target_argument;
 use crate::print;
-use anyhow::Context;
-use calibrate::symmetry_warning;
-use messages::BadInput;
+use calibrate::PrintedTargetTask;
 use std::path::PathBuf;
-use targets::{Paper, TargetSpec};
+use targets::TargetSpec;
 
 /// This target fits on A4 and letter paper, and can be identified if parts of it are hidden.
 const DEFAULT_TARGET: &str = "charuco:5x7:34mm:26mm:5X5_100";
@@ -30,31 +28,10 @@ pub(crate) struct Args {
 
 /// Writes the PDF file.
 pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
-    // All errors below are about the arguments, so nothing is written before they are checked.
-    let bad = |error: targets::PrintError| BadInput(error.to_string());
-    let paper: Paper = args.paper.parse().map_err(bad)?;
-    let pdf = args.target.pdf(paper).map_err(bad)?;
-    if args
-        .out
-        .extension()
-        .is_none_or(|extension| !extension.eq_ignore_ascii_case("pdf"))
-    {
-        return Err(BadInput(format!("--out {}: must end with .pdf", args.out.display())).into());
-    }
-    // An old file may describe a printed target that is still in use, so it is never replaced.
-    if args.out.exists() {
-        return Err(BadInput(format!("{} exists", args.out.display())).into());
-    }
-    // This is only a warning, because the target can still be used to calibrate a lens.
-    if let Some(warning) = symmetry_warning(&args.target) {
-        log::warn!("{warning}");
-    }
-    files::write(&args.out, pdf).with_context(|| format!("cannot write {}", args.out.display()))?;
-    print::line(format!(
-        "{}: print it at 100 % (no scaling), measure the ruler, and fix it to something flat.\nCalibrate with \
-         --target {}",
-        args.out.display(),
-        args.target
-    ))?;
-    Ok(())
+    let task = PrintedTargetTask {
+        target: args.target.clone(),
+        out: args.out.clone(),
+        paper: args.paper.clone(),
+    };
+    Ok(print::line(task.run()?)?)
 }

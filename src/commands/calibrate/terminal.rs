@@ -1,17 +1,17 @@
 //! Signals, progress bars and the page of calibrations.
 
-use super::page::GuidancePage;
 use crate::console::ReadBar;
 use crate::page_args::PageArgs;
 use crate::{print, signals};
 use anyhow::Context;
-use calibrate::{Activity, CameraView, Host};
+use calibrate::{Activity, CameraView, GuidancePage, Host};
 use calibration::{BoardView, LensCoverage};
 use capture::Stop;
 use capture::config::Camera;
 use drivers::Image;
 use indicatif::ProgressBar;
 use session::ReadProgress;
+use viz::{Hub, ServedPage};
 
 /// The terminal in which a calibration runs.
 pub(super) struct Terminal<'a> {
@@ -71,8 +71,17 @@ impl Host for Terminal<'_> {
         let is_hidden = self.is_json || activity != Activity::ReadImages;
         // The bar is created first, so that the addresses of the page are printed above it.
         let bar = print::bar(None, "{spinner} {msg}", is_hidden);
-        let page = GuidancePage::start(page, camera)?;
-        Ok(Box::new(TerminalView { bar, page }))
+        let hub = Hub::new();
+        // The page is only an aid, so a port that is in use must not prevent the calibration.
+        let server = page.serve_or_free_port(&hub)?;
+        // The address is printed to stderr, because stdout contains only the result.
+        print::notice("the page shows camera images and what to do next:");
+        server.lines().iter().for_each(print::notice);
+        Ok(Box::new(TerminalView {
+            bar,
+            page: GuidancePage::new(hub, camera),
+            _server: server,
+        }))
     }
 }
 
@@ -80,6 +89,8 @@ impl Host for Terminal<'_> {
 struct TerminalView {
     bar: ProgressBar,
     page: GuidancePage,
+    /// The server stops when it is dropped.
+    _server: ServedPage,
 }
 
 impl CameraView for TerminalView {

@@ -1,11 +1,12 @@
 //! The questions of `fieldrig init` on a terminal. Each has a default and a flag.
 
-use super::{known_robot, parent, urdf_path};
+use super::parent;
 use crate::print;
 use anyhow::Context;
 use capture::config::Parent;
 use capture::init::{
-    ControllerKind, Findings, RobotChoice, WantedCamera, Wishes, controller_at, likely_robot,
+    Findings, RobotChoice, WantedCamera, Wishes, controller_at, default_parent, likely_robot,
+    missing_controller,
 };
 use capture::known_robots::KNOWN_ROBOTS;
 use drivers::NetworkAddress;
@@ -80,24 +81,10 @@ fn ask_robot(findings: &Findings, rig: &Path) -> anyhow::Result<RobotChoice> {
             return Ok(RobotChoice::Automatic);
         }
         if text.contains(['/', '.']) {
-            return urdf_path::urdf(Path::new(text), rig);
+            return RobotChoice::of_urdf(Path::new(text), rig);
         }
-        known_robot(text)
+        Ok(RobotChoice::named(text)?)
     })
-}
-
-/// The maker of the controller that a known robot needs, if none was found.
-fn missing_controller(wishes: &Wishes, findings: &Findings) -> Option<ControllerKind> {
-    let RobotChoice::Known(robot) = &wishes.robot else {
-        return None;
-    };
-    let kinds = [ControllerKind::Franka, ControllerKind::Ur];
-    let kind = kinds.into_iter().find(|kind| kind.controls(robot))?;
-    let is_found = findings
-        .controllers
-        .iter()
-        .any(|controller| controller.kind == kind);
-    (!is_found).then_some(kind)
 }
 
 fn ask_places(wishes: &Wishes, findings: &Findings) -> anyhow::Result<Vec<WantedCamera>> {
@@ -112,13 +99,12 @@ fn ask_places(wishes: &Wishes, findings: &Findings) -> anyhow::Result<Vec<Wanted
             .cameras
             .get(ix)
             .map_or("the camera".to_owned(), ToString::to_string);
-        let (places, default) = match (has_arm, wishes.has_moving_base) {
-            (true, _) if ix == 0 => ("flange, base or world", "flange"),
-            (true, false) => ("flange, base or world", "world"),
-            (true, true) => ("flange, base or world", "base"),
-            (false, true) => ("base or world", "base"),
-            (false, false) => ("base or world", "world"),
+        let places = if has_arm {
+            "flange, base or world"
+        } else {
+            "base or world"
         };
+        let default = default_parent(ix, has_arm, wishes.has_moving_base).name();
         let question = format!("Where is {name}: {places}");
         let place = answer(&question, default, |text| {
             let parent = parent(text).map_err(anyhow::Error::msg)?;

@@ -7,6 +7,7 @@ pub(crate) mod client_log;
 pub(crate) mod downloads;
 mod guarded_stream;
 mod page;
+pub(crate) mod served_page;
 pub(crate) mod server_context;
 mod tls;
 

@@ -1,9 +1,11 @@
 //! The pose of a camera on a robot, from images of a target or poses of a board.
 
+mod document;
 mod moved;
 mod samples_file;
 mod source;
 
+pub use document::HandEyeDocument;
 pub use moved::{MotionOptions, MovedArm};
 
 use crate::guide::Purpose;
@@ -340,17 +342,17 @@ impl HandEyeTask {
 
 impl HandEyeOutcome {
     /// Whether the camera is on the flange or fixed.
-    pub fn setup(&self) -> Setup {
+    fn setup(&self) -> Setup {
         self.source.setup()
     }
 
     /// Samples whose image cannot be read or does not show the target.
-    pub fn unused(&self) -> &[Unused] {
+    fn unused(&self) -> &[Unused] {
         &self.samples.unused
     }
 
     /// A warning if some images show a board of another size than the target.
-    pub fn size_warning(&self) -> Option<&str> {
+    fn size_warning(&self) -> Option<&str> {
         self.samples
             .other_size
             .as_ref()
@@ -433,7 +435,7 @@ fn with_symmetry(error: calibration::Error, symmetry: Option<&str>) -> anyhow::E
 }
 
 /// The value of `parent_from_camera` in a rig file.
-pub fn pose_toml(pose: &Transform) -> String {
+fn pose_toml(pose: &Transform) -> String {
     let xyz_m = nine_digits(pose.translation.vector.as_slice());
     let quat_xyzw = nine_digits(pose.rotation.coords.as_slice());
     format!("{{ xyz_m = [{xyz_m}], quat_xyzw = [{quat_xyzw}] }}")

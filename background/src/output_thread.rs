@@ -4,14 +4,19 @@
 use std::sync::mpsc::{Receiver, SyncSender};
 
 /// A part of the output.
-pub(crate) enum OutputChunk {
+pub enum OutputChunk {
+    /// Bytes to write.
     Bytes(Vec<u8>),
     /// A request that is acknowledged once all earlier chunks have been written.
     Flush(SyncSender<()>),
 }
 
 /// Starts a thread that calls `write` for each chunk, until all senders are dropped.
-pub(crate) fn start(
+///
+/// # Errors
+///
+/// Fails if the thread cannot be started.
+pub fn start(
     chunks: Receiver<OutputChunk>,
     mut write: impl FnMut(&[u8]) + Send + 'static,
 ) -> std::io::Result<()> {

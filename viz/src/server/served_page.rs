@@ -1,25 +1,51 @@
-//! A page that is being served: its addresses, and what is printed about them.
+//! The page as it is served: who may open it, and its addresses.
 
-use crate::print;
-use anyhow::Context;
-use qrcode::QrCode;
-use qrcode::render::unicode::Dense1x2;
+use crate::server::access::Tokens;
+use crate::server::certificate::Certificate;
+use crate::server::{Server, ServerConfig, Sharing};
+use crate::{Error, Hub};
 use serde_json::{Value, json};
-use std::io::IsTerminal;
 use std::net::{IpAddr, Ipv4Addr, Ipv6Addr, SocketAddr, UdpSocket};
-use viz::{Server, Tokens};
+use std::path::PathBuf;
+
+/// Where the page is served, and to whom.
+#[derive(Clone, Debug, Default)]
+pub struct PageOptions {
+    /// Address of the page. `None`: the default address.
+    pub listen: Option<SocketAddr>,
+    /// The certificate with which the page is served to other machines. `None`: only this computer
+    /// can open the page.
+    pub shared_with: Option<CertificateSource>,
+    /// Loopback address at which Foxglove gets the same data.
+    pub foxglove: Option<SocketAddr>,
+}
+
+/// Where the certificate of a shared page comes from.
+#[derive(Clone, Debug)]
+pub enum CertificateSource {
+    /// Files in PEM format.
+    Files {
+        /// The certificate with its chain.
+        certificate: PathBuf,
+        /// Its private key.
+        key: PathBuf,
+    },
+    /// A self-signed certificate in this folder. It is created if there is none, and kept, so that
+    /// browsers which have accepted it do not warn at the next run.
+    KeptIn(PathBuf),
+}
 
 /// A page that is being served.
-pub(crate) struct ServedPage {
-    pub(crate) server: Server,
+pub struct ServedPage {
+    server: Server,
     /// The data that clients on other machines need, if they may open the page.
-    pub(crate) shared: Option<Shared>,
+    shared: Option<Shared>,
     #[cfg(feature = "foxglove")]
-    pub(crate) foxglove: Option<viz::FoxgloveServer>,
+    foxglove: Option<crate::FoxgloveServer>,
 }
 
 /// The data that clients of a shared page need.
-pub(crate) struct Shared {
+struct Shared {
     operator_url: String,
     viewer_url: String,
     other_addresses: Vec<IpAddr>,
@@ -27,9 +53,103 @@ pub(crate) struct Shared {
     is_self_signed: bool,
 }
 
+impl PageOptions {
+    /// Rejects options that this build lacks.
+    ///
+    /// # Errors
+    ///
+    /// If Foxglove is requested from a build without it.
+    pub fn check(&self) -> Result<(), Error> {
+        if self.foxglove.is_some() && !cfg!(feature = "foxglove") {
+            return Err(Error::FoxgloveNotBuilt);
+        }
+        Ok(())
+    }
+
+    /// Serves the page.
+    ///
+    /// # Errors
+    ///
+    /// If the address or the certificate cannot be used.
+    pub fn serve(&self, hub: &Hub) -> Result<ServedPage, Error> {
+        self.check()?;
+        self.serve_at(self.listen.unwrap_or_else(|| self.default_address()), hub)
+    }
+
+    /// Serves the page; if the default address is in use, at a free port.
+    ///
+    /// # Errors
+    ///
+    /// If the address or the certificate cannot be used.
+    pub fn serve_or_free_port(&self, hub: &Hub) -> Result<ServedPage, Error> {
+        // A user who gives an address expects the page there. The default address is only a
+        // proposal.
+        match self.serve(hub) {
+            Err(Error::AddressInUse { address }) if self.listen.is_none() => {
+                log::info!("{address} is in use by another program; using a free port");
+                self.serve_at(SocketAddr::new(address.ip(), 0), hub)
+            }
+            served => served,
+        }
+    }
+
+    fn default_address(&self) -> SocketAddr {
+        let ServerConfig { mut listen } = ServerConfig::default();
+        // The default address can only be reached from this computer.
+        if self.shared_with.is_some() {
+            listen.set_ip(Ipv4Addr::UNSPECIFIED.into());
+        }
+        listen
+    }
+
+    fn serve_at(&self, listen: SocketAddr, hub: &Hub) -> Result<ServedPage, Error> {
+        let config = ServerConfig { listen };
+        let (server, shared) = match &self.shared_with {
+            Some(source) => {
+                let (server, shared) = share_at(config, source, hub)?;
+                (server, Some(shared))
+            }
+            None => (Server::start(config, hub.clone())?, None),
+        };
+        Ok(ServedPage {
+            server,
+            shared,
+            #[cfg(feature = "foxglove")]
+            foxglove: self
+                .foxglove
+                .map(|address| crate::FoxgloveServer::start(address, hub.clone()))
+                .transpose()?,
+        })
+    }
+}
+
+fn share_at(
+    config: ServerConfig,
+    source: &CertificateSource,
+    hub: &Hub,
+) -> Result<(Server, Shared), Error> {
+    let certificate = match source {
+        CertificateSource::Files { certificate, key } => Certificate::read(certificate, key)?,
+        CertificateSource::KeptIn(folder) => Certificate::kept_in(folder)?,
+    };
+    let tokens = Tokens::random().map_err(|source| Error::Token { source })?;
+    let fingerprint = certificate.fingerprint();
+    let is_self_signed = matches!(source, CertificateSource::KeptIn(_));
+    let server = Server::start_shared(
+        config,
+        Sharing {
+            certificate,
+            tokens: tokens.clone(),
+        },
+        hub.clone(),
+    )?;
+    let shared = Shared::new(server.address(), &tokens, fingerprint, is_self_signed);
+    Ok((server, shared))
+}
+
 impl Shared {
     /// The URLs of a page that is served at this address.
-    pub(crate) fn new(
+    fn new(
         address: SocketAddr,
         tokens: &Tokens,
         fingerprint: String,
@@ -52,12 +172,12 @@ impl Shared {
 
 impl ServedPage {
     /// The address at which the server listens.
-    pub(crate) fn address(&self) -> SocketAddr {
+    pub fn address(&self) -> SocketAddr {
         self.server.address()
     }
 
     /// The address to open in a browser, as operator.
-    pub(crate) fn url(&self) -> String {
+    pub fn url(&self) -> String {
         self.shared
             .as_ref()
             .map_or_else(|| self.server.url(), |shared| shared.operator_url.clone())
@@ -66,22 +186,18 @@ impl ServedPage {
     /// The address to open in Foxglove.
     fn foxglove_url(&self) -> Option<String> {
         #[cfg(feature = "foxglove")]
-        return self.foxglove.as_ref().map(viz::FoxgloveServer::url);
+        return self.foxglove.as_ref().map(crate::FoxgloveServer::url);
         #[cfg(not(feature = "foxglove"))]
         None
     }
 
-    /// Prints the addresses of the page. If `is_json` is set, prints them as an event that also has
-    /// these fields.
-    pub(crate) fn print(&self, is_json: bool, fields: Value) -> anyhow::Result<()> {
-        if is_json {
-            self.print_event(fields)
-        } else {
-            self.print_lines()
-        }
+    /// Whether other machines may open the page.
+    pub fn is_shared(&self) -> bool {
+        self.shared.is_some()
     }
 
-    fn print_event(&self, fields: Value) -> anyhow::Result<()> {
+    /// The addresses of the page, and other data that clients need, as JSON.
+    pub fn event(&self) -> Value {
         let mut event = json!({ "event": "serving", "url": self.url() });
         if let Some(shared) = &self.shared {
             event["viewer_url"] = json!(shared.viewer_url);
@@ -90,24 +206,12 @@ impl ServedPage {
         if let Some(url) = self.foxglove_url() {
             event["foxglove_url"] = json!(url);
         }
-        if let (Value::Object(event), Value::Object(fields)) = (&mut event, fields) {
-            event.extend(fields);
-        }
-        print::report_json(&event)
-    }
-
-    fn print_lines(&self) -> anyhow::Result<()> {
-        self.lines().iter().for_each(print::report);
-        // The QR code is for phones, which cannot reach a page that only this computer can open.
-        if self.shared.is_some() && std::io::stdout().is_terminal() {
-            print::report_styled(qr_code(&self.url())?);
-        }
-        Ok(())
+        event
     }
 
     /// The addresses of the page, and other data that clients need. The addresses contain the
     /// tokens, so they must not be logged.
-    pub(crate) fn lines(&self) -> Vec<String> {
+    pub fn lines(&self) -> Vec<String> {
         let mut lines = vec![format!("open {} in a browser", self.url())];
         lines.extend(
             self.foxglove_url()
@@ -179,15 +283,4 @@ fn default_route_address() -> Option<IpAddr> {
     // An address for documentation (RFC 5737), which no network uses.
     socket.connect((Ipv4Addr::new(192, 0, 2, 1), 9)).ok()?;
     socket.local_addr().ok().map(|address| address.ip())
-}
-
-/// A QR code for terminals. It is dark on light, independent of the terminal's colors.
-fn qr_code(text: &str) -> anyhow::Result<String> {
-    let code = QrCode::new(text).context("cannot create a QR code")?;
-    let lines = code.render::<Dense1x2>().build();
-    Ok(lines
-        .lines()
-        .map(|line| format!("\x1b[30;107m{line}\x1b[0m"))
-        .collect::<Vec<_>>()
-        .join("\n"))
 }

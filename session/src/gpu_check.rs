@@ -1,11 +1,13 @@
-//! Checks the GPU.
+//! Checks whether there is a GPU that can train and render.
 
-use crate::open_gpu::open_gpu;
-use ::gpu::Gpu;
+use crate::recoveries::OpenGpu;
+use capture::DeviceInfo;
 use capture::doctor::Finding;
+use gpu::Gpu;
 
-/// Opens the GPU and describes it.
-pub(super) fn gpu() -> Vec<Finding> {
+/// Opens the GPU and describes it, with a remedy for each problem.
+#[must_use]
+pub fn gpu_findings(open_gpu: OpenGpu) -> Vec<Finding> {
     let gpu = match open_gpu() {
         Ok(gpu) => gpu,
         Err(error) => {
@@ -52,6 +54,27 @@ pub(super) fn gpu() -> Vec<Finding> {
         ));
     }
     findings
+}
+
+/// Opens the GPU and describes it as a device.
+#[must_use]
+pub fn gpu_device(open_gpu: OpenGpu) -> DeviceInfo {
+    let (name, usable, note) = match open_gpu() {
+        Ok(gpu) if gpu.is_software() => (
+            gpu.describe(),
+            true,
+            "software adapter: works, but slowly".to_owned(),
+        ),
+        Ok(gpu) => (gpu.describe(), true, "trains and renders".to_owned()),
+        Err(error) => ("none".to_owned(), false, error.to_string()),
+    };
+    DeviceInfo {
+        kind: "gpu",
+        address: "default".into(),
+        name,
+        usable,
+        note,
+    }
 }
 
 fn numbered(names: &[String]) -> String {

@@ -4,7 +4,7 @@ use calibration::{CoverageGoal, ImagePart, LensCoverage, NextPhotograph, Side};
 use viz::{CoverageItem, ImagePartCoverage, PhotographCoverage};
 
 /// The coverage as clients draw it.
-pub(super) fn published(camera: &str, coverage: &LensCoverage) -> PhotographCoverage {
+pub(crate) fn published(camera: &str, coverage: &LensCoverage) -> PhotographCoverage {
     let cells = coverage.cells();
     let goals = coverage.goals();
     let next = match coverage.next() {

@@ -8,7 +8,7 @@ const MAX_SAME_PRESS: Duration = Duration::from_millis(500);
 
 /// What a SIGINT requests.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(crate) enum Request {
+pub enum Request {
     /// An orderly stop.
     Stop,
     /// Nothing: it belongs to the key press before.
@@ -19,7 +19,7 @@ pub(crate) enum Request {
 
 /// The key presses so far.
 #[derive(Debug, Default)]
-pub(crate) struct CtrlC {
+pub struct CtrlC {
     /// Time of the last signal that counted.
     last_at: Option<Instant>,
 }
@@ -28,7 +28,8 @@ impl CtrlC {
     /// What a signal at `now` requests.
     ///
     /// * `is_stopping`: whether the program is stopping because of an earlier Ctrl-C.
-    pub(crate) fn request(&mut self, is_stopping: bool, now: Instant) -> Request {
+    #[must_use]
+    pub fn request(&mut self, is_stopping: bool, now: Instant) -> Request {
         let is_same_press = self
             .last_at
             .is_some_and(|last| now.duration_since(last) < MAX_SAME_PRESS);

@@ -1,10 +1,7 @@
-//! The web page while images of a target are taken. It shows the camera image, the corners found so
-//! far, and the next instruction.
+//! The content of the web page while images of a target are taken. It shows the camera image, the
+//! corners found so far, and the next instruction.
 
-use super::coverage::published;
-use crate::page_args::PageArgs;
-use crate::print;
-use crate::served_page::ServedPage;
+use crate::published_coverage::published;
 use calibration::{BoardView, LensCoverage};
 use capture::config::Camera;
 use drivers::Image;
@@ -21,11 +18,9 @@ const DETECTED_FOR: Duration = Duration::from_millis(1200);
 const EARLIER_SRGB: [u8; 3] = [227, 179, 65];
 const NEWEST_SRGB: [u8; 3] = [76, 255, 140];
 
-/// A server of the page.
-pub(super) struct GuidancePage {
+/// The page that guides a user through a calibration.
+pub struct GuidancePage {
     hub: Hub,
-    /// The server stops when it is dropped.
-    _page: ServedPage,
     camera: Arc<str>,
     focal_px: [f64; 2],
     principal_px: [f64; 2],
@@ -42,18 +37,13 @@ pub(super) struct GuidancePage {
 }
 
 impl GuidancePage {
-    /// Serves the page for a camera.
-    pub(super) fn start(args: &PageArgs, camera: &Camera) -> anyhow::Result<Self> {
-        let hub = Hub::new();
-        // The page is only an aid, so a port that is in use must not prevent the calibration.
-        let page = args.serve_or_free_port(&hub)?;
-        // The address is printed to stderr, because stdout contains only the result.
-        print::notice("the page shows camera images and what to do next:");
-        page.lines().iter().for_each(print::notice);
+    /// The page for a camera.
+    ///
+    /// * `hub`: receives what the page shows.
+    pub fn new(hub: Hub, camera: &Camera) -> Self {
         let began = Instant::now();
-        Ok(Self {
+        Self {
             hub,
-            _page: page,
             camera: Arc::clone(&camera.name),
             focal_px: camera.intrinsics.focal_px,
             principal_px: camera.intrinsics.principal_px,
@@ -63,17 +53,17 @@ impl GuidancePage {
             corners_px: Vec::new(),
             coverage: None,
             text: String::new(),
-        })
+        }
     }
 
     /// Shows the next instruction.
-    pub(super) fn guide(&mut self, text: &str) {
+    pub fn guide(&mut self, text: &str) {
         text.clone_into(&mut self.text);
         self.show_guidance();
     }
 
     /// Shows what the photographs cover.
-    pub(super) fn set_coverage(&mut self, coverage: &LensCoverage) {
+    pub fn set_coverage(&mut self, coverage: &LensCoverage) {
         self.coverage = Some(published(&self.camera, coverage));
         self.show_guidance();
     }
@@ -90,7 +80,7 @@ impl GuidancePage {
     }
 
     /// Shows that no more images are taken. Clients keep this text when the server stops.
-    pub(super) fn finish(&self) {
+    pub fn finish(&self) {
         let text = format!(
             "{} images of the target were taken; the result is in the terminal",
             self.n_views
@@ -117,7 +107,7 @@ impl GuidancePage {
 
     /// Shows an image of the camera with the corners of earlier images, unless no client shows
     /// images.
-    pub(super) fn show_live(&mut self, image: &Image) {
+    pub fn show_live(&mut self, image: &Image) {
         // This is checked before decoding, because most images are not shown.
         let now = Instant::now();
         if image.camera != self.camera
@@ -135,12 +125,7 @@ impl GuidancePage {
     }
 
     /// Shows a gray image in which the target was searched, with its corners.
-    pub(super) fn show_searched(
-        &mut self,
-        size_px: [u32; 2],
-        gray: &[u8],
-        view: Option<&BoardView>,
-    ) {
+    pub fn show_searched(&mut self, size_px: [u32; 2], gray: &[u8], view: Option<&BoardView>) {
         let newest: Vec<[f64; 2]> = view
             .iter()
             .flat_map(|view| &view.points)

@@ -5,9 +5,9 @@
 //! that blocks does not block the program. If the file cannot be written, the run continues without
 //! it, with one warning.
 
-use crate::output_thread::{self, OutputChunk};
+use crate::run_folder::{LOG, OLDER_LOG};
+use background::output_thread::{self, OutputChunk};
 use parking_lot::Mutex;
-use session::run_folder::{LOG, OLDER_LOG};
 use std::fs::File;
 use std::io::Write;
 use std::os::unix::fs::MetadataExt;
@@ -37,7 +37,7 @@ enum Sink {
 static SINK: Mutex<Sink> = Mutex::new(Sink::Early(String::new()));
 
 /// Adds a record, or several, with their line breaks.
-pub(crate) fn record(text: &str) {
+pub fn record(text: &str) {
     match &mut *SINK.lock() {
         Sink::Early(early) => {
             if early.len() + text.len() <= MAX_EARLY_BYTES {
@@ -51,7 +51,7 @@ pub(crate) fn record(text: &str) {
 
 /// Starts the file in the folder of a run, with a header. A resumed run continues the file. Only
 /// the first call has an effect: several models share the folder of their run.
-pub(crate) fn begin(folder: &Path, header: &str) {
+pub fn begin(folder: &Path, header: &str) {
     let mut sink = SINK.lock();
     let Sink::Early(early) = &*sink else { return };
     let (thread, chunks) = sync_channel(MAX_WAITING);
@@ -74,7 +74,7 @@ pub(crate) fn begin(folder: &Path, header: &str) {
 }
 
 /// Waits until the records are written, for a limited time.
-pub(crate) fn flush() {
+pub fn flush() {
     let (done, is_done) = sync_channel(1);
     // The lock is released before waiting, because the thread may log a warning.
     let is_requested = match &*SINK.lock() {

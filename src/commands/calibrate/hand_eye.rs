@@ -1,17 +1,14 @@
 //! `fieldrig calibrate hand-eye`: the pose of a camera on a robot, from images of a target or poses
 //! of a board.
 
-mod printed;
-
 use super::flags::{ReportFlag, RigFlags};
 use super::target_argument;
 use super::terminal::Terminal;
-use crate::exit::{self, Exit};
+use crate::exit::Exit;
 use crate::number_args::number_in_range;
 use crate::print;
 use calibrate::{HandEyeSamples, HandEyeTask, Host, MotionOptions, RobotOptions};
 use messages::BadInput;
-use printed::{Printed, PrintedPose, PrintedSample};
 use std::path::PathBuf;
 use targets::TargetSpec;
 
@@ -111,38 +108,24 @@ fn calibrate_and_print(
     host: &dyn Host,
 ) -> anyhow::Result<Exit> {
     let outcome = task.calibrate(samples, host)?;
-    let mut printed = match &outcome.result {
-        Ok(calibrated) => Printed {
-            next_poses: calibrated
-                .next_poses
-                .iter()
-                .cloned()
-                .map(PrintedPose::of)
-                .collect(),
-            ..printed::printed(&calibrated.calibration)
-        },
-        // In JSON output, a refusal has the same form as a result, so that programs can evaluate
-        // it.
-        Err(error) if exit::of(error) == Exit::InsufficientData && is_json => {
-            Printed::refused(outcome.setup(), format!("{error:#}"))
-        }
-        Err(_) => return outcome.finish().map(|()| Exit::Done),
+    // In JSON output, a refusal has the same form as a result, so that programs can evaluate it.
+    let document = outcome
+        .document()
+        .filter(|document| is_json || document.refused.is_none());
+    let Some(document) = document else {
+        return outcome.finish().map(|()| Exit::Done);
     };
-    printed
-        .samples
-        .extend(outcome.unused().iter().map(PrintedSample::unused));
-    printed
-        .warnings
-        .extend(outcome.size_warning().map(str::to_owned));
-    let rig_pose = outcome.result.as_ref().ok().map(|found| found.rig_pose);
     if is_json {
-        print::json(&printed)?
+        print::json(&document)?
     } else {
-        printed::describe(&printed, rig_pose.as_ref())?
+        print::lines(document.lines())?;
+        for warning in &document.warnings {
+            log::warn!("{warning}");
+        }
     }
     match outcome.finish() {
         // The reason is already part of the JSON output.
-        Err(_) if printed.refused.is_some() => Ok(Exit::InsufficientData),
+        Err(_) if document.refused.is_some() => Ok(Exit::InsufficientData),
         finished => finished.map(|()| Exit::Done),
     }
 }
