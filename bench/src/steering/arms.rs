@@ -100,8 +100,8 @@ pub(super) fn start(kind: ArmKind) -> Result<BenchArm> {
         ArmKind::Ur => emulated_ur::start(),
         #[cfg(not(all(feature = "sim", target_os = "linux")))]
         _ => Err(messages::BadInput(format!(
-            "the arm {:?} needs an emulated controller: use Linux and a program built with `cargo build --release \
-             --features sim`, or choose the arm {:?}",
+            "the arm {:?} needs an emulated controller: use Linux and a program built with \
+             `cargo build --release --features sim`, or choose the arm {:?}",
             kind.name(),
             ArmKind::Simulated.name()
         ))

@@ -93,8 +93,8 @@ fn stop_secs_of(sample: &Sample, brake_limits: &[MotionLimits]) -> f64 {
 /// * `motion`: velocity and acceleration.
 pub(super) fn stop_secs(motion: [f64; 2], max_acceleration: f64, max_jerk: f64) -> f64 {
     let [velocity, acceleration] = motion;
-    // The velocity that is left if the acceleration is first reduced to zero. Its sign says in which
-    // direction the joint must brake.
+    // The velocity that is left if the acceleration is first reduced to zero. Its sign is the
+    // direction in which the joint must brake.
     let coasting = velocity + acceleration * acceleration.abs() / (2.0 * max_jerk);
     let direction = if coasting < 0.0 { -1.0 } else { 1.0 };
     let [velocity, acceleration] = [direction * velocity, direction * acceleration];

@@ -213,8 +213,8 @@ pub(super) fn table(rows: &[FaultRow]) -> Table {
     }
 }
 
-/// The chart of all faults: for each arm, the beginning of the brake and the rest, from the median to
-/// the worst.
+/// The chart of all faults: for each arm, the beginning of the brake and the rest, from the median
+/// to the worst.
 pub(super) fn chart(rows: &[FaultRow]) -> Chart {
     let arms: std::collections::BTreeSet<ArmKind> = rows.iter().map(|row| row.arm).collect();
     let faults: std::collections::BTreeSet<Fault> = rows.iter().map(|row| row.fault).collect();

@@ -131,15 +131,17 @@ fn findings(options: &SteeringOptions, results: &Results) -> Result<Findings> {
         tables.push(grips::table(grips));
     }
     let faults = format!(
-        "Each fault happens {} times while the tip follows a hand at 0.1 m/s. Times are from the fault, or from the release \
-         of the switch while the fault lasts. A brake begins with the first cycle from which the arm only becomes slower, \
-         and not before the arm reports the end of its motion. The prediction follows from the limits of braking. The position, \
-         velocity, acceleration and jerk of each joint are checked in each cycle.",
+        "Each fault happens {} times while the tip follows a hand at 0.1 m/s. Times are from the \
+         fault, or from the release of the switch while the fault lasts. A brake begins with the \
+         first cycle from which the arm only becomes slower, and not before the arm reports the end \
+         of its motion. The prediction follows from the limits of braking. The position, velocity, \
+         acceleration and jerk of each joint are checked in each cycle.",
         options.n_trials
     );
-    let path = "Faults take the way of a run in real time: a client of /steer on a real connection, the server, the thread of \
-                the decisions, and the thread of the arm. Loss is the delay with which TCP delivers a lost packet. Grips are \
-                measured on a simulated clock, without a server.";
+    let path = "Faults take the way of a run in real time: a client of /steer on a real connection, \
+                the server, the thread of the decisions, and the thread of the arm. Loss is the \
+                delay with which TCP delivers a lost packet. Grips are measured on a simulated \
+                clock, without a server.";
     Ok(Findings {
         name: "steering",
         title: "Steering".to_owned(),

@@ -59,7 +59,8 @@ impl SteeredRig {
 fn rig_of(arm: &BenchArm) -> Result<Rig> {
     let robot = arm.robot;
     let text = format!(
-        "[arm]\ndriver = \"sim\"\nurdf = {:?}\nbase_link = {:?}\nflange_link = {:?}\njoints = {:?}\n",
+        "[arm]\ndriver = \"sim\"\nurdf = {:?}\nbase_link = {:?}\nflange_link = {:?}\n\
+         joints = {:?}\n",
         robot.name, robot.base_link, robot.flange_link, robot.joints
     );
     Rig::parse("rig.toml", &text, robot.urdf, &[]).context("the rig of the bench")

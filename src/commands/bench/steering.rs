@@ -13,7 +13,13 @@ use std::path::PathBuf;
 pub(crate) struct Args {
     /// Arms, separated by commas: `simulated`, or the drivers `franka` and `ur` with emulated
     /// controllers [default: all that this program contains]
-    #[arg(long, value_name = "ARM,...", value_delimiter = ',', value_parser = arm_parser(), hide_possible_values = true)]
+    #[arg(
+        long,
+        value_name = "ARM,...",
+        value_delimiter = ',',
+        value_parser = arm_parser(),
+        hide_possible_values = true
+    )]
     arms: Vec<ArmKind>,
     /// Faults, separated by commas [default: all]
     #[arg(long, value_name = "FAULT,...", value_delimiter = ',', value_parser = fault_parser())]
