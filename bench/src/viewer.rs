@@ -370,6 +370,7 @@ fn split(message: &[u8]) -> Result<(Value, &[u8])> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use std::io::{Read, Write};
     use trainer::Picture;
     use viz::{Hub, NewestKeyframe, Server, ServerConfig, TrainedKeyframes};
 
