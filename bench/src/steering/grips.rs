@@ -227,15 +227,14 @@ fn anywhere(random: &mut Random) -> Transform {
 
 /// The table of all grips.
 pub(super) fn table(grips: &Grips) -> Table {
-    let head = ["grips", "moved the arm", "limits exceeded"];
+    let head = ["path", "grips", "moved the arm", "limits exceeded"];
+    let counts = [grips.n_grips, grips.n_moved, grips.n_exceeded];
+    let mut row = vec!["decisions and generator on a simulated clock".to_owned()];
+    row.extend(counts.map(|n| n.to_string()));
     Table {
         title: "Grips with the hand anywhere".to_owned(),
         head: head.map(str::to_owned).to_vec(),
-        rows: vec![
-            [grips.n_grips, grips.n_moved, grips.n_exceeded]
-                .map(|n| n.to_string())
-                .to_vec(),
-        ],
+        rows: vec![row],
     }
 }
 

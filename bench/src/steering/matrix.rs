@@ -15,6 +15,8 @@ use serde::Serialize;
 
 /// How often a trial is repeated in which the arm stopped before the event, per trial that counts.
 const MAX_REPEATS: u32 = 3;
+/// The way that every fault of the matrix takes.
+const PATH: &str = "client, server, decisions and arm in real time";
 /// Rounding to cycles by which an arm may be at rest later than predicted, milliseconds: the
 /// beginning and the end of a brake, and the delay of a setpoint on its way to a controller.
 const MAX_LATE_MILLIS: f64 = 5.0;
@@ -163,6 +165,7 @@ impl FaultRow {
         let mut cells = vec![
             self.arm.name().to_owned(),
             self.title.to_owned(),
+            PATH.to_owned(),
             self.n_trials.to_string(),
         ];
         cells.extend(self.begins.cells());
@@ -192,6 +195,7 @@ pub(super) fn table(rows: &[FaultRow]) -> Table {
     let head = [
         "arm",
         "fault",
+        "path",
         "trials",
         "brake begins p50, ms",
         "worst",

@@ -258,10 +258,9 @@ mod tests {
         let figure = Figure::new();
         assert!(figure.at(0.0).norm() < 1e-12);
         let round_secs = figure.lengths_m[N_POINTS] / HAND_M_S;
-        let n_steps = (round_secs / STEP_SECS) as u32;
         let mut width_m: f64 = 0.0;
-        for ix in 0..n_steps {
-            let secs = f64::from(ix) * STEP_SECS;
+        let mut secs = 0.0;
+        while secs < round_secs {
             let step_m = (figure.at(secs + STEP_SECS) - figure.at(secs)).norm();
             let speed_m_s = step_m / STEP_SECS;
             assert!(
@@ -269,6 +268,7 @@ mod tests {
                 "{speed_m_s}"
             );
             width_m = width_m.max(2.0 * figure.at(secs).y);
+            secs += STEP_SECS;
         }
         assert!((width_m - WIDTH_M).abs() < 1e-4, "{width_m}");
     }
