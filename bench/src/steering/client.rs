@@ -129,6 +129,8 @@ impl SteeringClient {
         }
         // Fails if the connection has ended already.
         let _ = self.link.stream().shutdown(Shutdown::Both);
+        // The receiving thread learns of it only later.
+        self.shared.received.lock().is_closed = true;
     }
 
     /// Whether the connection has ended.

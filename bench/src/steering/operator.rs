@@ -155,18 +155,22 @@ impl<'rig> Operator<'rig> {
     /// Connects if necessary, takes the lease, and permits motion after a stop.
     fn take_control(&mut self) -> Result<()> {
         let until = Instant::now() + MAX_WAIT;
-        if self.client.is_closed() {
-            self.client = self.rig.connect()?;
-        }
         loop {
+            if self.client.is_closed() {
+                self.client = self.rig.connect()?;
+            }
             let state = self.client.state();
             let holds_lease = state
                 .as_ref()
                 .is_some_and(|state| state.holder == Some(self.client.number()));
-            match state.and_then(|state| state.stop) {
+            let sent = match state.and_then(|state| state.stop) {
                 None if holds_lease => return Ok(()),
-                Some(_) if holds_lease => self.client.request("rearm")?,
-                _ => self.client.lease("take")?,
+                Some(_) if holds_lease => self.client.request("rearm"),
+                _ => self.client.lease("take"),
+            };
+            if let Err(error) = sent {
+                // The operator then connects again.
+                log::debug!("the connection of the operator ended: {error:#}");
             }
             if Instant::now() > until {
                 bail!(
