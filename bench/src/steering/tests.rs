@@ -27,10 +27,11 @@ fn one_trial_of_each_fault_brakes_the_arm_within_its_limits() {
             continue;
         }
         assert_eq!((row.n_exceeded, row.n_not_at_rest), (0, 0), "{row:?}");
-        // The fault comes first, then the brake, then the rest. How fast is a result, not a test.
+        // The fault comes first, then the brake, then the rest. How fast is a result, not a test. An
+        // arm may arrive at its last target before it brakes because of silence.
         let begins = row.begins.worst_millis.expect("it brakes");
         let rests = row.rests.worst_millis.expect("it comes to rest");
-        assert!(begins >= 0.0 && rests > begins, "{row:?}");
+        assert!(begins >= 0.0 && rests >= begins, "{row:?}");
     }
     let n_measured = rows.iter().filter(|row| row.n_trials > 0).count();
     assert!(n_measured > 0, "no fault was tried: {rows:?}");
