@@ -18,7 +18,7 @@ TEST_FEATURES = $(FEATURES),nokhwa,foxglove$(shell [ -e .deps/realsense/made-of 
 	scripts/install-packages.sh --check realsense 2>/dev/null && echo ,realsense)
 
 # The crates whose code depends on features, and one that makes them share dependencies with the others (tests/features).
-CONDITIONAL := --package test-features --package fieldrig --package capture --package drivers --package trainer --package viz
+CONDITIONAL := --package test-features --package fieldrig --package bench --package capture --package drivers --package trainer --package viz
 
 # Folder of everything that cargo builds.
 TARGET_FOLDER := $(or $(CARGO_TARGET_DIR),target)

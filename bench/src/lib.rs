@@ -5,7 +5,8 @@
 //! to a file, so that a bench restarted in the same folder does not repeat it. [`kernels`] and
 //! [`field`] measure training speed. [`stamps`] measures the errors of image stamps, and
 //! [`calibration`] measures the accuracy of calibration. [`live`] measures a live run with viewers,
-//! and [`memory`] measures the memory of a long run. The results are [`Findings`], which contain
+//! [`memory`] measures the memory of a long run, and
+//! [`steering`] measures how fast steered arms brake and how well they follow. The results are [`Findings`], which contain
 //! JSON with every number, charts, and a page.
 //!
 //! The caller opens the GPU, requests stops and receives reports ([`Host`], [`BenchObserver`]).
@@ -49,8 +50,10 @@ mod runs;
 pub mod stability;
 pub mod stamps;
 mod statistics;
+pub mod steering;
 mod variant;
 mod viewer;
+mod websocket;
 
 pub use disturb::Disturbance;
 pub use findings::{BenchResult, Findings};

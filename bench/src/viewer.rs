@@ -5,12 +5,12 @@
 //! process. To affect the measurement little, it decodes only the first picture with each new
 //! keyframe. It then reports that it has shown this picture.
 
+use crate::websocket::{self, BINARY, CLOSE, PING, PONG, TEXT};
 use anyhow::{Context, Result, anyhow, ensure};
 use kinematics::Transform;
 use nalgebra::{Point3, Vector3};
 use parking_lot::Mutex;
 use serde_json::{Value, json};
-use std::io::{BufRead, BufReader, Read, Write};
 use std::net::{Shutdown, SocketAddr, TcpStream};
 use std::sync::Arc;
 use std::thread::JoinHandle;
@@ -31,12 +31,6 @@ const MAX_BINARY_BYTES: u64 = 256 << 20;
 
 /// Protocol version of this client.
 const PROTOCOL_VERSION: u32 = 4;
-
-const TEXT: u8 = 1;
-const BINARY: u8 = 2;
-const CLOSE: u8 = 8;
-const PING: u8 = 9;
-const PONG: u8 = 10;
 
 /// What a viewer requests.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -101,15 +95,11 @@ impl Viewer {
         stream
             .set_read_timeout(Some(MAX_SILENCE))
             .context("cannot set a timeout")?;
-        // Browsers also disable the delay of small packets. With the delay, a request after a
-        // report would wait up to 40 ms for an acknowledgment.
-        stream
-            .set_nodelay(true)
-            .context("cannot set an option of a connection")?;
+        let (receiver, sender) = websocket::open(&stream, address, "/ws")?;
         let pictures = Arc::default();
-        let mut client = Client {
-            reader: BufReader::new(stream.try_clone().context("cannot share a connection")?),
-            stream: stream.try_clone().context("cannot share a connection")?,
+        let client = Client {
+            receiver,
+            sender,
             options,
             pictures: Arc::clone(&pictures),
             started: Instant::now(),
@@ -122,7 +112,6 @@ impl Viewer {
             server_started: None,
             n_keyframes: 0,
         };
-        client.handshake(address)?;
         let thread = std::thread::Builder::new()
             .name("viewer".into())
             .spawn(move || client.run());
@@ -165,8 +154,8 @@ impl Drop for Viewer {
 }
 
 struct Client {
-    reader: BufReader<TcpStream>,
-    stream: TcpStream,
+    receiver: websocket::Receiver,
+    sender: websocket::Sender,
     options: ViewerOptions,
     pictures: Arc<Mutex<Vec<ReceivedPicture>>>,
     started: Instant,
@@ -188,54 +177,27 @@ struct Client {
 }
 
 impl Client {
-    fn handshake(&mut self, address: SocketAddr) -> Result<()> {
-        write!(
-            self.stream,
-            "GET /ws HTTP/1.1\r\nHost: {address}\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n\
-             Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\nSec-WebSocket-Version: 13\r\n\r\n"
-        )?;
-        let mut line = String::new();
-        self.reader.read_line(&mut line)?;
-        ensure!(
-            line.starts_with("HTTP/1.1 101"),
-            "the server responded {:?}, expected a WebSocket",
-            line.trim_end()
-        );
-        // The headers end with an empty line.
-        while line.trim_end() != "" {
-            line.clear();
-            ensure!(
-                self.reader.read_line(&mut line)? > 0,
-                "the server closed the connection"
-            );
-        }
-        Ok(())
-    }
-
     fn run(mut self) -> Result<()> {
         let hello = json!({
             "type": "hello",
             "protocols": [PROTOCOL_VERSION, PROTOCOL_VERSION],
             "capabilities": ["subscribe", "compact_depth", "keyframe_changes", "parts", "shown"],
         });
-        self.send(TEXT, hello.to_string().as_bytes())?;
+        self.sender.send(TEXT, hello.to_string().as_bytes())?;
         self.request_picture()?;
         loop {
-            let (opcode, n_bytes) = self.next_frame()?;
+            let (opcode, n_bytes) = self.receiver.next_frame()?;
             match opcode {
                 TEXT => self.handle_text(n_bytes)?,
                 BINARY => self.handle_binary(n_bytes)?,
                 PING => {
                     // A ping has at most 125 bytes (RFC 6455, section 5.5). Without the answer, the
                     // server closes the connection.
-                    let mut contents = Vec::new();
-                    (&mut self.reader)
-                        .take(n_bytes.min(125))
-                        .read_to_end(&mut contents)?;
-                    self.send(PONG, &contents)?;
+                    let contents = self.receiver.contents(n_bytes.min(125))?;
+                    self.sender.send(PONG, &contents)?;
                 }
                 CLOSE => return Ok(()),
-                _ => self.skip(n_bytes)?,
+                _ => self.receiver.skip(n_bytes)?,
             }
         }
     }
@@ -245,7 +207,7 @@ impl Client {
             n_bytes <= MAX_TEXT_BYTES,
             "a text message of {n_bytes} bytes, expected at most {MAX_TEXT_BYTES}"
         );
-        let message: Value = serde_json::from_reader((&mut self.reader).take(n_bytes))?;
+        let message: Value = serde_json::from_slice(&self.receiver.contents(n_bytes)?)?;
         if let Some(clock) = message["clock_millis"]
             .as_f64()
             .and_then(|n| Duration::try_from_secs_f64(n * 1e-3).ok())
@@ -285,12 +247,7 @@ impl Client {
             n_bytes <= MAX_BINARY_BYTES,
             "a binary message of {n_bytes} bytes, expected at most {MAX_BINARY_BYTES}"
         );
-        let mut message = Vec::new();
-        let n_read = (&mut self.reader).take(n_bytes).read_to_end(&mut message)?;
-        ensure!(
-            n_read as u64 == n_bytes,
-            "the server closed the connection within a message"
-        );
+        let message = self.receiver.contents(n_bytes)?;
         let (header, payload) = split(&message)?;
         if header["type"] != "part" {
             return self.handle_picture(&header, payload);
@@ -354,7 +311,7 @@ impl Client {
         };
         let shown_millis = started.elapsed().as_secs_f64() * 1e3;
         let shown = json!({ "type": "shown", "id": header["id"], "shown_millis": shown_millis });
-        self.send(TEXT, shown.to_string().as_bytes())
+        self.sender.send(TEXT, shown.to_string().as_bytes())
     }
 
     /// Requests the next image on a circle around the scene.
@@ -384,74 +341,7 @@ impl Client {
         self.n_requested += 1;
         self.requested = Instant::now();
         self.first_stage = None;
-        self.send(TEXT, request.to_string().as_bytes())
-    }
-
-    /// Opcode and length of the next frame. The server sends each message as one frame.
-    fn next_frame(&mut self) -> Result<(u8, u64)> {
-        let mut head = [0; 2];
-        self.reader.read_exact(&mut head)?;
-        let is_final = head[0] & 0x80 != 0;
-        ensure!(
-            is_final,
-            "the server sent a fragmented message, expected one frame per message"
-        );
-        // According to RFC 6455, section 5.2, lengths from 126 on are in the next 2 or 8 bytes. The
-        // highest bit of this byte marks a mask, which only clients use.
-        let n_bytes = match head[1] {
-            126 => {
-                let mut bytes = [0; 2];
-                self.reader.read_exact(&mut bytes)?;
-                u64::from(u16::from_be_bytes(bytes))
-            }
-            127 => {
-                let mut bytes = [0; 8];
-                self.reader.read_exact(&mut bytes)?;
-                u64::from_be_bytes(bytes)
-            }
-            short @ 0..126 => u64::from(short),
-            masked => {
-                return Err(anyhow!(
-                    "the server sent a masked frame (length byte {masked})"
-                ));
-            }
-        };
-        Ok((head[0] & 0x0f, n_bytes))
-    }
-
-    fn skip(&mut self, n_bytes: u64) -> Result<()> {
-        let n_skipped = std::io::copy(&mut (&mut self.reader).take(n_bytes), &mut std::io::sink())?;
-        ensure!(
-            n_skipped == n_bytes,
-            "the server closed the connection within a message"
-        );
-        Ok(())
-    }
-
-    /// Sends a frame. The protocol requires a mask to protect proxies. The mask is zero, because
-    /// there is no proxy on loopback.
-    fn send(&mut self, opcode: u8, contents: &[u8]) -> Result<()> {
-        let mut frame = vec![0x80 | opcode];
-        match u8::try_from(contents.len()) {
-            Ok(n @ 0..126) => frame.push(0x80 | n),
-            _ => {
-                frame.push(0x80 | 126);
-                let too_long = |_| {
-                    anyhow!(
-                        "a message of {} bytes, expected at most 65535",
-                        contents.len()
-                    )
-                };
-                frame.extend(
-                    u16::try_from(contents.len())
-                        .map_err(too_long)?
-                        .to_be_bytes(),
-                );
-            }
-        }
-        frame.extend([0; 4]);
-        frame.extend(contents);
-        Ok(self.stream.write_all(&frame)?)
+        self.sender.send(TEXT, request.to_string().as_bytes())
     }
 }
 
@@ -480,6 +370,7 @@ fn split(message: &[u8]) -> Result<(Value, &[u8])> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use std::io::{Read, Write};
     use trainer::Picture;
     use viz::{Hub, NewestKeyframe, Server, ServerConfig, TrainedKeyframes};
 

@@ -131,6 +131,7 @@ pub use session::{
 };
 pub use session_setup::{NewObserver, Services};
 pub use started_run::StartedRun;
+pub use steering::{SteeringThread, Surroundings, steer_standalone};
 pub use stored_keyframes::StoredKeyframes;
 pub use train_plan::{TrainOutcome, TrainPlan, Trained};
 pub use training::{UnsavedTraining, check_before_data, limits, model_specs};

@@ -138,6 +138,31 @@ fn kernel_bench_reports_every_variant() {
     assert!(row["step_visible_millis"].as_f64() > Some(0.0), "{row}");
 }
 
+#[test]
+fn steering_bench_reports_each_fault_and_writes_a_chart() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let args = ["steering", "--arms", "simulated", "--trials", "1"];
+    let faults = ["--faults", "released,page-frozen", "--json"];
+    let short = ["--tracking-seconds", "0", "--poses", "20", "--grips", "2"];
+    let events = events(folder.path(), &[&args[..], &faults, &short].concat());
+    let [released, frozen, done] = &events[..] else {
+        panic!("two faults and the results: {events:?}");
+    };
+    for (event, fault) in [(released, "released"), (frozen, "page-frozen")] {
+        assert_eq!(event["event"], "fault", "{event}");
+        assert_eq!(event["row"]["fault"], fault, "{event}");
+        assert_eq!(event["row"]["n_exceeded"], 0, "{event}");
+    }
+    assert_eq!(done["findings"]["grips"]["n_exceeded"], 0, "{done}");
+    let rates = done["findings"]["inverse"].as_array().expect("a list");
+    assert!(rates.len() > 3, "{done}");
+    let out = folder.path().join("bench-steering");
+    assert!(out.join("steering-faults.svg").is_file());
+
+    let unknown = ["steering", "--faults", "weather"];
+    assert_fails_with(folder.path(), &unknown, 2, &["--faults", "weather"]);
+}
+
 /// Checks that `--scan` reproduces the counts of a scan (docs/benchmarks/README.md), with as many
 /// splats per pixel as in a scan.
 #[test]

@@ -42,7 +42,7 @@ pub use server::access::{Role, Token, Tokens};
 pub use server::certificate::Certificate;
 pub use server::downloads::{OpenFile, ServedFile, publish_files};
 pub use server::served_page::{CertificateSource, PageOptions, ServedPage};
-pub use server::{Server, ServerConfig, Sharing};
+pub use server::{Server, ServerConfig, ServerThread, Sharing};
 pub use steering::arm_description::{ArmDescription, SteeredJoint};
 pub use steering::preview::{Preview, PreviewVerdict};
 pub use steering::request::{

@@ -24,7 +24,8 @@ pub struct SteeredArm {
 
 impl SteeredArm {
     /// An arm that holds its position until it is steered.
-    fn real(port: SteeringPort) -> Self {
+    #[must_use]
+    pub fn holding(port: SteeringPort) -> Self {
         Self {
             port,
             #[cfg(feature = "sim")]
@@ -123,7 +124,7 @@ fn steer(
 ) -> anyhow::Result<SteeredArm> {
     let port = arm.steering_port(BRAKE_FACTOR)?;
     devices.arm = Some(arm);
-    Ok(SteeredArm::real(port))
+    Ok(SteeredArm::holding(port))
 }
 
 #[cfg(feature = "sim")]

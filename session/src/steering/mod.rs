@@ -14,14 +14,18 @@ mod recovery;
 mod requests;
 mod robot;
 mod scene_clearance;
+mod standalone;
 mod steering_loop;
 #[cfg(test)]
 mod steering_loop_tests;
+mod surroundings;
 mod time_base;
 mod undrawn;
 
 pub(crate) use clearance_feed::{ClearanceFeed, MIN_STEPS};
 pub(crate) use observer::SteeringObserver;
+pub use standalone::steer_standalone;
+pub use surroundings::Surroundings;
 
 use crate::viewers::Viewers;
 use anyhow::{Context, bail};
@@ -48,10 +52,10 @@ const MIN_PERIOD: Duration = Duration::from_millis(2);
 const MAX_FIRST_REPORT: Duration = Duration::from_secs(5);
 
 /// The steered arm of a run, before its input is read.
-pub(crate) struct PreparedSteering {
+pub(crate) struct PreparedSteering<S = SceneClearance> {
     arm: SteeredArm,
     robot: robot::ChainAndBody,
-    scene: Arc<SceneClearance>,
+    scene: Arc<S>,
     config: SteeringConfig,
     servo_round_trip_millis: f64,
     joint_names: Vec<String>,
@@ -91,7 +95,9 @@ impl PreparedSteering {
     pub(crate) fn clearance_feed(&self) -> ClearanceFeed {
         ClearanceFeed::new(Arc::clone(&self.scene))
     }
+}
 
+impl<S: Surroundings> PreparedSteering<S> {
     /// Lets clients of the hub steer the arm.
     ///
     /// # Errors
@@ -180,7 +186,7 @@ fn first_report(arm: &SteeredArm) -> anyhow::Result<ArmState> {
 
 /// The running thread. Dropping it lets the arm brake, disconnects the clients, and waits for the
 /// end of the thread.
-pub(crate) struct SteeringThread {
+pub struct SteeringThread {
     must_stop: Arc<AtomicBool>,
     thread: Option<JoinHandle<()>>,
 }
@@ -213,16 +219,16 @@ impl Drop for Admission {
 }
 
 /// What the thread owns.
-struct Running {
+struct Running<S> {
     steering_loop: SteeringLoop,
     arm: SteeredArm,
-    scene: Arc<SceneClearance>,
+    scene: Arc<S>,
     server: Arc<SteeringServer>,
     must_stop: Arc<AtomicBool>,
     _admission: Admission,
 }
 
-impl Running {
+impl<S: Surroundings> Running<S> {
     fn run(mut self) {
         let mut decided = Instant::now();
         while !self.must_stop.load(Ordering::Relaxed) {

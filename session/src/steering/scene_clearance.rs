@@ -28,7 +28,7 @@ const SWEEP_PERIOD_SECS: f64 = 0.2;
 const SIMULATED_MARGIN_M: f64 = 0.15;
 
 /// The space around an arm.
-pub(super) struct SceneClearance {
+pub(crate) struct SceneClearance {
     map: ClearanceMap,
     /// Index in the lists of the rig file of each joint of the chain.
     joint_ixs: Vec<usize>,

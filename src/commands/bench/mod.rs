@@ -12,6 +12,7 @@ mod run_flags;
 mod runs_args;
 mod stability;
 mod stamps;
+mod steering;
 
 use crate::exit::Exit;
 use clap::{Parser, Subcommand};
@@ -40,6 +41,9 @@ enum BenchCommand {
     Stability(stability::Args),
     /// Errors of image stamps with jitter and clock drift, as a histogram
     Stamps(stamps::Args),
+    /// Time from faults to the brake and to rest of steered arms, tracking of a hand, and rates of
+    /// inverse kinematics
+    Steering(steering::Args),
     /// Accuracy, reported uncertainty, speed and limits of calibration with and without a target
     Calibration(calibration::Args),
     /// Live runs with viewers: latency of pictures, time from shutter to model, and PSNR over time
@@ -58,6 +62,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
         BenchCommand::Ablation(args) => ablation::run(args),
         BenchCommand::Stability(args) => stability::run(args),
         BenchCommand::Stamps(args) => stamps::run(args),
+        BenchCommand::Steering(args) => steering::run(args),
         BenchCommand::Calibration(args) => calibration::run(args),
         BenchCommand::Live(args) => live::run(args),
         BenchCommand::Memory(args) => memory::run(args),

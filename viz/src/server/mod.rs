@@ -97,6 +97,15 @@ pub struct Sharing {
     pub tokens: Tokens,
 }
 
+/// A thread of a server.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum ServerThread {
+    /// The thread that accepts clients, and sends pages, pictures and data.
+    Pages,
+    /// The thread of the clients of `/steer`.
+    Steering,
+}
+
 /// A running server. Dropping it sends a goodbye to all clients and frees the port.
 #[derive(Debug)]
 pub struct Server {
@@ -104,6 +113,7 @@ pub struct Server {
     scheme: &'static str,
     stop: watch::Sender<bool>,
     thread: Option<JoinHandle<()>>,
+    runtime: tokio::runtime::Handle,
     steering_thread: SteeringThread,
 }
 
@@ -152,6 +162,7 @@ impl Server {
             .enable_all()
             .build()
             .map_err(|source| Error::Thread { source })?;
+        let handle = runtime.handle().clone();
         let thread = std::thread::Builder::new()
             .name("viz-server".to_owned())
             .spawn(move || {
@@ -173,6 +184,7 @@ impl Server {
             scheme,
             stop,
             thread: Some(thread),
+            runtime: handle,
             steering_thread,
         })
     }
@@ -185,6 +197,16 @@ impl Server {
     /// The URL to open in a browser on this computer. Clients of a shared server also need a token.
     pub fn url(&self) -> String {
         format!("{}://{}/", self.scheme, self.address)
+    }
+
+    /// Blocks a thread of the server for a time, as a slow operation would. Benches find out with
+    /// it what does not wait for this thread.
+    pub fn block(&self, thread: ServerThread, time: Duration) {
+        let runtime = match thread {
+            ServerThread::Pages => &self.runtime,
+            ServerThread::Steering => self.steering_thread.runtime(),
+        };
+        runtime.spawn(async move { std::thread::sleep(time) });
     }
 }
 

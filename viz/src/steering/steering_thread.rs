@@ -64,6 +64,11 @@ impl SteeringThread {
         self.spawner.clone()
     }
 
+    /// The runtime of the thread.
+    pub(crate) fn runtime(&self) -> &Handle {
+        &self.spawner.runtime
+    }
+
     /// Waits until the thread has ended. Returns false if it panicked.
     pub(crate) fn join(&mut self) -> bool {
         self.thread

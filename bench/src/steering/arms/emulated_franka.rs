@@ -1,0 +1,160 @@
+//! The driver of Franka arms with an emulated controller, which refuses each command beyond the
+//! limits of a Panda.
+
+use super::super::trace::Recorder;
+use super::{ArmKind, BRAKE_FACTOR, BenchArm, RunningArm, motion_limits, robot};
+use anyhow::{Context, Result};
+use drivers::Arm;
+use drivers::franka::emulated::{CommandedJoints, EmulatedRobot, Joints, Limits, RobotConfig};
+use drivers::franka::{ArmConfig, ContactConfig, FciVersion, MovableFrankaArm, N_JOINTS};
+use drivers::motion::{MotionConfig, MotionLimits, MovableArm, OnLoss, Setpoint};
+use kinematics::{Stamp, Transform};
+use parking_lot::Mutex;
+use std::net::Ipv4Addr;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::thread::JoinHandle;
+use std::time::Duration;
+
+/// Time between two commands.
+const PERIOD: Duration = Duration::from_millis(1);
+/// How long the emulated controller waits for the answer to a state. A real one does not wait, and
+/// its driver runs with real-time priority on a computer without other work. Emulated arms of runs
+/// wait equally long.
+const ANSWER_WAIT: Duration = Duration::from_millis(15);
+/// A posture with space around it, radians.
+const START_RAD: [f64; N_JOINTS] = [0.0, -0.5, 0.0, -2.2, 0.0, 1.8, 0.8];
+/// Maximum time of a read, so that the statistics can be read in between.
+const READ_TIMEOUT: Duration = Duration::from_millis(20);
+/// Watchdog of the rig file. The robot brakes earlier, after 20 ms without a command.
+const WATCHDOG: Duration = Duration::from_millis(100);
+
+/// The arm, whose states are read as in a run, and its controller.
+struct Franka {
+    arm: Arc<Mutex<MovableFrankaArm>>,
+    must_stop: Arc<AtomicBool>,
+    thread: Option<JoinHandle<()>>,
+    /// This field is dropped last, so that the controller answers until the arm is at rest.
+    _controller: EmulatedRobot,
+}
+
+impl RunningArm for Franka {
+    fn success_frac(&self) -> Option<f64> {
+        Some(self.arm.lock().motion_statistics().success_frac())
+    }
+}
+
+impl Drop for Franka {
+    fn drop(&mut self) {
+        self.must_stop.store(true, Ordering::Relaxed);
+        if let Some(thread) = self.thread.take() {
+            // The panic hook has already reported a panic of the thread.
+            let _ = thread.join();
+        }
+    }
+}
+
+pub(super) fn start() -> Result<BenchArm> {
+    let (robot, chain) = robot("panda")?;
+    let recorder = Recorder::default();
+    let config = RobotConfig {
+        address: (Ipv4Addr::LOCALHOST, 0).into(),
+        version: FciVersion::V5,
+        chain: chain.clone(),
+        flange_from_tool: Transform::identity(),
+        limits: Limits::panda(),
+    };
+    let controller = EmulatedRobot::start_waiting(
+        config,
+        ANSWER_WAIT,
+        Box::new(recorded_joints(recorder.clone())),
+    )?;
+    let config = ArmConfig {
+        address: controller.address().to_string(),
+        joint_names: chain.joint_names().to_vec(),
+        chain: chain.clone(),
+    };
+    let motion = MotionConfig {
+        limits: motion_limits(&chain),
+        on_loss: OnLoss::Hold,
+        timeout: WATCHDOG,
+        accept_no_watchdog: false,
+    };
+    let mut arm = MovableFrankaArm::open(&config, &motion, &ContactConfig::default())?;
+    let port = arm.steering_port(BRAKE_FACTOR)?;
+    let arm = Arc::new(Mutex::new(arm));
+    let must_stop = Arc::<AtomicBool>::default();
+    let thread = std::thread::Builder::new()
+        .name("arm reader".to_owned())
+        .spawn({
+            let (arm, must_stop) = (Arc::clone(&arm), Arc::clone(&must_stop));
+            move || read(&arm, &must_stop)
+        })
+        .context("cannot start a thread")?;
+    Ok(BenchArm {
+        kind: ArmKind::Franka,
+        robot,
+        chain,
+        start: START_RAD.to_vec(),
+        recorder,
+        checked_limits: checked_limits(port.brake_limits()),
+        port,
+        period: PERIOD,
+        running: Box::new(Franka {
+            arm,
+            must_stop,
+            thread: Some(thread),
+            _controller: controller,
+        }),
+    })
+}
+
+/// Reads the states, as a run does. Errors are reported by the port.
+fn read(arm: &Mutex<MovableFrankaArm>, must_stop: &AtomicBool) {
+    while !must_stop.load(Ordering::Relaxed) {
+        let result = arm.lock().read(READ_TIMEOUT);
+        if result.is_err() {
+            std::thread::sleep(READ_TIMEOUT);
+        }
+    }
+}
+
+/// Joints that follow their commands without error. Each command is recorded.
+fn recorded_joints(recorder: Recorder) -> impl FnMut(Stamp, &CommandedJoints) -> Joints + Send {
+    let mut is_first = true;
+    move |_, commanded| {
+        let position_rad = if std::mem::take(&mut is_first) {
+            START_RAD
+        } else {
+            commanded.position_rad
+        };
+        let setpoint = Setpoint {
+            position: position_rad.to_vec(),
+            velocity: commanded.velocity_rad_s.to_vec(),
+            acceleration: commanded.acceleration_rad_s2.to_vec(),
+        };
+        // The stamp of the controller is when a state was due. The command may have come later.
+        recorder.push(drivers::clock::now(), setpoint);
+        Joints {
+            position_rad,
+            velocity_rad_s: commanded.velocity_rad_s,
+            ..Joints::default()
+        }
+    }
+}
+
+/// The brake limits for velocities and ranges, and the limits of the robot for accelerations and
+/// jerks: if a command is late, the robot continues without it, and the driver makes up for the
+/// difference with more jerk than it planned.
+fn checked_limits(brake_limits: &[MotionLimits]) -> Vec<MotionLimits> {
+    let robot = Limits::panda();
+    brake_limits
+        .iter()
+        .enumerate()
+        .map(|(ix, limits)| MotionLimits {
+            acceleration: robot.acceleration_rad_s2[ix],
+            jerk: robot.jerk_rad_s3[ix],
+            ..*limits
+        })
+        .collect()
+}

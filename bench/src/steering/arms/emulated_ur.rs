@@ -1,0 +1,143 @@
+//! The driver of arms of Universal Robots with an emulated controller.
+
+use super::super::trace::Recorder;
+use super::{ArmKind, BRAKE_FACTOR, BenchArm, RunningArm, motion_limits, robot};
+use anyhow::{Context, Result};
+use drivers::Arm;
+use drivers::motion::{MotionConfig, MovableArm, OnLoss, Setpoint};
+use drivers::ur::emulated::{CommandedJoints, ControllerConfig, EmulatedController, Joints};
+use drivers::ur::{ArmConfig, MovableUrArm, N_JOINTS, RTDE_PORT};
+use kinematics::{Chain, Stamp};
+use std::net::{Ipv4Addr, SocketAddr};
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::thread::JoinHandle;
+use std::time::Duration;
+
+/// Time between two setpoints of an e-Series controller.
+const PERIOD: Duration = Duration::from_millis(2);
+/// How long the emulated controller waits for the setpoint after a state, so that a busy computer
+/// does not look like an exceeded limit.
+const ANSWER_WAIT: Duration = Duration::from_millis(500);
+/// A posture with space around it, radians.
+const START_RAD: [f64; N_JOINTS] = [0.3, -1.4, 1.6, -1.8, -1.5, 0.4];
+/// Maximum time of a read.
+const READ_TIMEOUT: Duration = Duration::from_millis(20);
+/// Time without setpoints after which the program of the controller brakes the arm.
+const WATCHDOG: Duration = Duration::from_secs(1);
+/// Link to which the first joint is attached.
+const FIRST_PARENT: &str = "base_link_inertia";
+
+/// The thread that reads the states as a run does, with the arm, and its controller.
+struct Ur {
+    must_stop: Arc<AtomicBool>,
+    thread: Option<JoinHandle<()>>,
+    /// This field is dropped last, so that the controller answers until the arm is at rest.
+    _controller: EmulatedController,
+}
+
+impl RunningArm for Ur {}
+
+impl Drop for Ur {
+    fn drop(&mut self) {
+        self.must_stop.store(true, Ordering::Relaxed);
+        if let Some(thread) = self.thread.take() {
+            // The panic hook has already reported a panic of the thread.
+            let _ = thread.join();
+        }
+    }
+}
+
+pub(super) fn start() -> Result<BenchArm> {
+    let (robot, chain) = robot("ur5e")?;
+    let from_first_joint = Chain::from_urdf(robot.urdf, FIRST_PARENT, robot.flange_link)?;
+    let recorder = Recorder::default();
+    let controller = EmulatedController::start_waiting(
+        ControllerConfig::e_series(own_address(), from_first_joint.clone()),
+        ANSWER_WAIT,
+        Box::new(recorded_joints(recorder.clone())),
+    )?;
+    let config = ArmConfig {
+        address: controller.address().to_string(),
+        joint_names: chain.joint_names().to_vec(),
+        chain: from_first_joint,
+    };
+    let motion = MotionConfig {
+        limits: motion_limits(&chain),
+        on_loss: OnLoss::Hold,
+        timeout: WATCHDOG,
+        accept_no_watchdog: false,
+    };
+    let mut arm = MovableUrArm::open(&config, &motion)?;
+    let port = arm.steering_port(BRAKE_FACTOR)?;
+    let must_stop = Arc::<AtomicBool>::default();
+    let thread = std::thread::Builder::new()
+        .name("arm reader".to_owned())
+        .spawn({
+            let must_stop = Arc::clone(&must_stop);
+            move || read(arm, &must_stop)
+        })
+        .context("cannot start a thread")?;
+    Ok(BenchArm {
+        kind: ArmKind::Ur,
+        robot,
+        chain,
+        start: START_RAD.to_vec(),
+        recorder,
+        checked_limits: port.brake_limits().to_vec(),
+        port,
+        period: PERIOD,
+        running: Box::new(Ur {
+            must_stop,
+            thread: Some(thread),
+            _controller: controller,
+        }),
+    })
+}
+
+/// An address of this computer for this process. The ports of a controller cannot be chosen by the
+/// system.
+fn own_address() -> SocketAddr {
+    let [_, _, high, low] = std::process::id().to_be_bytes();
+    (Ipv4Addr::new(127, 41, high, low.max(1)), RTDE_PORT).into()
+}
+
+/// Reads the states until the bench ends, and then brings the arm to rest. Errors are reported by
+/// the port.
+fn read(mut arm: MovableUrArm, must_stop: &AtomicBool) {
+    while !must_stop.load(Ordering::Relaxed) {
+        if arm.read(READ_TIMEOUT).is_err() {
+            std::thread::sleep(READ_TIMEOUT);
+        }
+    }
+}
+
+/// Joints that follow their setpoints without error. Each setpoint is recorded, with the
+/// acceleration as the difference of two velocities.
+fn recorded_joints(recorder: Recorder) -> impl FnMut(Stamp, &CommandedJoints) -> Joints + Send {
+    let mut last_velocity_rad_s = None::<[f64; N_JOINTS]>;
+    move |_, commanded| {
+        let last_velocity = last_velocity_rad_s.replace(commanded.velocity_rad_s);
+        // Before the first cycle, the controller has commanded nothing.
+        let Some(last_velocity) = last_velocity else {
+            return Joints {
+                position_rad: START_RAD,
+                ..Joints::default()
+            };
+        };
+        let change = |ix: usize| commanded.velocity_rad_s[ix] - last_velocity[ix];
+        let setpoint = Setpoint {
+            position: commanded.position_rad.to_vec(),
+            velocity: commanded.velocity_rad_s.to_vec(),
+            acceleration: (0..N_JOINTS)
+                .map(|ix| change(ix) / PERIOD.as_secs_f64())
+                .collect(),
+        };
+        recorder.push(drivers::clock::now(), setpoint);
+        Joints {
+            position_rad: commanded.position_rad,
+            velocity_rad_s: commanded.velocity_rad_s,
+            ..Joints::default()
+        }
+    }
+}

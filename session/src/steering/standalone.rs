@@ -1,0 +1,41 @@
+//! Steers an arm without a run.
+
+use super::surroundings::Surroundings;
+use super::{PreparedSteering, SteeringThread, config, robot};
+use capture::config::Rig;
+use capture::open::SteeredArm;
+use drivers::motion::SteeringPort;
+use std::path::Path;
+use std::sync::Arc;
+use viz::Hub;
+
+/// Lets clients of the hub steer an arm, with the thread and the decisions of a run, but without
+/// cameras and training. Benches measure with it.
+///
+/// * `rig`: the robot and the settings of steering. Its robot description must not name mesh files.
+/// * `port`: the port of an arm that holds its position, in the order of the joints of `rig`.
+/// * `scene`: the surroundings of the arm.
+///
+/// # Errors
+///
+/// If the robot description has no shapes, the arm reports nothing, its limits do not match the
+/// robot, or no thread can be started.
+pub fn steer_standalone<S: Surroundings>(
+    rig: &Rig,
+    port: SteeringPort,
+    scene: Arc<S>,
+    hub: &Hub,
+) -> anyhow::Result<SteeringThread> {
+    let settings = rig.arm.motion.as_ref().map(|motion| &motion.steering);
+    let settings = settings.cloned().unwrap_or_default();
+    let prepared = PreparedSteering {
+        arm: SteeredArm::holding(port),
+        robot: robot::chain_and_body(rig, Path::new(""))?,
+        scene,
+        config: config(&settings),
+        servo_round_trip_millis: settings.servo_round_trip_millis,
+        joint_names: rig.arm.joints.clone(),
+        joint_offsets: rig.arm.joint_offsets.clone(),
+    };
+    prepared.start(hub)
+}
