@@ -70,11 +70,22 @@ pub struct Command {
     /// When the device was read, on the clock of the chain. The caller converts the device's time.
     #[serde(with = "exact::stamp")]
     pub captured_at: Stamp,
+    /// When the command arrived at this program. The silence of the device counts from here, so that
+    /// a command that waited for a decision does not look fresh.
+    #[serde(with = "exact::stamp")]
+    pub received_at: Stamp,
     /// Number of the grip: how often the dead-man switch has been closed since the device started.
     /// `None` while it is open. A count instead of a flag shows a release whose message was lost.
     pub grip: Option<u64>,
     /// Where to move while the switch is closed.
     pub intent: Intent,
+}
+
+impl Command {
+    /// When the command arrived, but not after it is decided: clocks are rounded.
+    pub(crate) fn received_by(&self, now: Stamp) -> Stamp {
+        self.received_at.min(now)
+    }
 }
 
 /// Where the arm should move.

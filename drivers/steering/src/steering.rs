@@ -327,7 +327,7 @@ impl Steering {
     }
 
     fn take_command(&mut self, now: Stamp, command: &Command) -> Result<(), Reason> {
-        self.lease.renew(now, command.operator)?;
+        self.lease.hear(now, command)?;
         let was_held = self.clutch.held().is_some();
         let may_move = self.stop.is_none();
         let change = self.clutch.receive(now, command, may_move);

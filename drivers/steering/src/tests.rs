@@ -134,6 +134,7 @@ impl Sim {
             device: PAD,
             sequence: self.sequence,
             captured_at: self.now,
+            received_at: self.now,
             grip,
             intent,
         }

@@ -213,7 +213,7 @@ impl SteeringLoop {
                 Request::Stop { by: Some(operator) }
             }
             SteeringRequest::Rearm => return self.rearm(now, operator, arm),
-            SteeringRequest::Command(command) => return self.command(now, operator, command),
+            SteeringRequest::Command(command) => return self.command(now, received, command),
             SteeringRequest::Preview(request) => {
                 return self.queue_preview(received.client, request);
             }
@@ -252,11 +252,11 @@ impl SteeringLoop {
     fn command(
         &mut self,
         now: Stamp,
-        operator: Operator,
+        received: &ReceivedRequest,
         command: &SteeringCommand,
     ) -> Result<(), String> {
         let n_joints = self.chain.n_joints();
-        let converted = requests::command(operator.0, command, self.times, n_joints);
+        let converted = requests::command(received, command, self.times, n_joints);
         self.handle(now, &Request::Command(converted))?;
         if command.grip.is_some() {
             self.pending = Some(AppliedSource {

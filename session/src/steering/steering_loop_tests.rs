@@ -409,6 +409,40 @@ fn a_stop_during_a_recovery_is_not_undone_by_its_end() {
 }
 
 #[test]
+fn a_command_that_waited_in_the_inbox_does_not_look_fresh() {
+    let mut run = Run::with_lease();
+    let far = run.moved_by([0.0, 0.3, 0.0]);
+    run.hold(Some(1), &far, 100);
+    let (client, request) = run.command(Some(1), far);
+    let received = ReceivedRequest {
+        client,
+        received_at: run.times.instant(run.now),
+        request,
+    };
+    let received_at = run.now;
+    // The loop is late by less than the time after which the arm itself brakes.
+    run.move_arm(80);
+    run.scene.seen_at = run.now;
+    let arm = run.steering_loop.arm().expect("a report");
+    let outcome = run
+        .steering_loop
+        .cycle(run.now, &[received], &arm, &run.scene);
+    let followed = outcome.state.expect("a state");
+    assert!(followed.target.is_some(), "{:?}", followed.limits);
+    let mut braked = None;
+    while braked.is_none() {
+        run.move_arm(ARM_STEPS_PER_CYCLE);
+        let state = run.cycle(Vec::new()).state.expect("a state");
+        braked = state.target.is_none().then_some(state);
+    }
+    let braked = braked.expect("the loop has ended");
+    let text = &limit_of(&braked, LimitLink::Clutch).text;
+    assert!(text.contains("was silent"), "{text}");
+    let silent_secs = run.now.secs_since(received_at);
+    assert!(silent_secs < 0.15, "{silent_secs} s");
+}
+
+#[test]
 fn previews_wait_while_the_arm_follows_an_operator() {
     let mut run = Run::with_lease();
     let far = run.moved_by([0.0, 0.3, 0.0]);

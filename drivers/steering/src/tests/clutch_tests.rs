@@ -160,6 +160,48 @@ fn silent_device_brakes_the_arm_and_must_grip_again() {
     assert!(!is_braking(&sim.drive(Some(2), hand(0.0, 0.0, 0.0))));
 }
 
+/// Invariant: a command that waited for its decision does not look fresh.
+#[test]
+fn silence_counts_from_the_receipt_of_a_command_and_not_from_its_decision() {
+    let mut sim = Sim::ready(ageless());
+    for step in 0..20_u32 {
+        sim.drive(Some(1), hand(0.002 * f64::from(step), 0.0, 0.0));
+    }
+    let last = sim.command(Some(1), hand(0.04, 0.0, 0.0));
+    let received_at = last.received_at;
+    // The device is silent from here on. Its last command waits.
+    sim.now += Duration::from_millis(60);
+    sim.request(Request::Command(last)).unwrap();
+    let mut verdict = sim.cycle();
+    let target = verdict.target().expect("the device was heard 70 ms ago");
+    assert!(
+        target.expires_at <= received_at.plus_secs(0.12),
+        "the arm itself must notice the silence in time: {target:?}"
+    );
+    while !is_braking(&verdict) {
+        verdict = sim.cycle();
+    }
+    let silence = sim.now.secs_since(received_at);
+    assert!(silence > 0.12 && silence < 0.15, "{silence}");
+    assert!(
+        words(&verdict).contains("device 10 was silent"),
+        "{}",
+        words(&verdict)
+    );
+}
+
+/// Invariant: a grip whose commands have waited for longer than a device may be silent moves nothing.
+#[test]
+fn a_grip_that_waited_for_too_long_never_begins() {
+    let mut sim = Sim::ready(ageless());
+    let waiting = sim.command(Some(1), hand(0.0, 0.0, 0.0));
+    sim.now += Duration::from_millis(200);
+    sim.request(Request::Command(waiting)).unwrap();
+    let verdict = sim.cycle();
+    assert!(is_braking(&verdict), "{}", words(&verdict));
+    sim.send(Some(1), hand(0.0, 0.0, 0.0)).unwrap_err();
+}
+
 #[test]
 fn commands_that_are_not_used_do_not_count_as_signs_of_life() {
     let unusable: [fn(&mut crate::Command); 6] = [

@@ -103,6 +103,20 @@ fn control_expires_with_silence_and_old_grips_do_not_return() {
 }
 
 #[test]
+fn a_command_renews_control_from_its_receipt() {
+    let mut sim = Sim::ready(ageless());
+    sim.now += Duration::from_secs(1);
+    let waiting = sim.command(None, hand(0.0, 0.0, 0.0));
+    sim.now += Duration::from_secs(2);
+    sim.request(Request::Command(waiting)).unwrap();
+    let left_secs = sim.steering.lease_left_secs(sim.now);
+    assert!(
+        left_secs.is_some_and(|left_secs| (left_secs - 3.0).abs() < 1e-9),
+        "{left_secs:?}"
+    );
+}
+
+#[test]
 fn clock_that_goes_back_ends_control() {
     let mut sim = Sim::ready(ageless());
     sim.drive(Some(1), hand(0.0, 0.0, 0.0));
