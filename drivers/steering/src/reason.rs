@@ -90,6 +90,12 @@ pub enum Reason {
     /// A program stopped the arm.
     #[error("stopped by the program: check the arm, then permit motion again")]
     StoppedByProgram,
+    /// The model of the scene has failed.
+    #[error("nothing is known about the scene any more: {report}")]
+    SceneLost {
+        /// Why.
+        report: String,
+    },
     /// The arm reports a fault.
     #[error("the arm stopped: {report}; recover the arm, then permit motion again")]
     ArmStopped {

@@ -50,6 +50,13 @@ pub enum Request {
         /// Who stopped the arm; `None` for a program.
         by: Option<Operator>,
     },
+    /// Brake, and stay at rest until [`Request::Rearm`], because nothing is known about the scene any
+    /// more. [`Steering::cycle`](crate::Steering::cycle) makes this request for
+    /// [`Clearance::failure`](crate::Clearance::failure), so that the record contains it.
+    SceneLost {
+        /// Why, in words.
+        report: String,
+    },
     /// Permit motion after a stop. Only the holder of the lease may do this, and only because a
     /// person asked for it. The arm does not move before a new grip.
     Rearm(Operator),

@@ -222,6 +222,11 @@ impl Steering {
     /// * `arm`: the newest state of the arm.
     /// * `scene`: what is known about the scene.
     pub fn cycle(&mut self, now: Stamp, arm: &ArmState, scene: &dyn Clearance) -> Verdict {
+        if let Some(report) = scene.failure().filter(|_| self.stop.is_none()) {
+            // A permission cannot mend the model, so the next cycle stops the arm again.
+            let stopped = self.handle(now, &Request::SceneLost { report });
+            debug_assert!(stopped.is_ok(), "everybody may stop the arm");
+        }
         // The closure borrows the points while the decision changes the rest.
         let points = Arc::clone(&self.clearance);
         let mut seen = Vec::new();
@@ -315,6 +320,11 @@ impl Steering {
                 self.latch_stop(Link::Clutch, reason);
                 Ok(())
             }
+            Request::SceneLost { report } => {
+                let report = report.clone();
+                self.latch_stop(Link::Clearance, Reason::SceneLost { report });
+                Ok(())
+            }
             Request::Rearm(operator) => {
                 self.lease.renew(now, *operator)?;
                 // The arm's own fault is reported again in the next cycle, if it is still there.
@@ -367,9 +377,7 @@ impl Steering {
     /// The motion that all of lease, clutch and arm permit. If one of them does not, the motion has
     /// ended.
     fn permitted_motion(&mut self, now: Stamp, arm: &ArmState) -> Result<Motion, (Link, Reason)> {
-        if let Some(reason) = self.arm_problem(now, arm) {
-            return Err(self.brake(Link::Arm, reason));
-        }
+        // An arm that stops may report nothing after its reason, so the reason comes first.
         if let Some(report) = &arm.stopped {
             let report = report.clone();
             self.latch_stop(Link::Arm, Reason::ArmStopped { report });
@@ -377,9 +385,13 @@ impl Steering {
         if let Some(reason) = &self.stop {
             let link = match reason {
                 Reason::ArmStopped { .. } => Link::Arm,
+                Reason::SceneLost { .. } => Link::Clearance,
                 _ => Link::Clutch,
             };
             return Err((link, reason.clone()));
+        }
+        if let Some(reason) = self.arm_problem(now, arm) {
+            return Err(self.brake(Link::Arm, reason));
         }
         if self.lease.holder().is_none() {
             return Err(self
