@@ -59,7 +59,15 @@ pub enum Request {
     },
     /// Permit motion after a stop. Only the holder of the lease may do this, and only because a
     /// person asked for it. The arm does not move before a new grip.
-    Rearm(Operator),
+    Rearm {
+        /// Holder of the lease.
+        operator: Operator,
+        /// Number of the newest stop that the person has seen ([`Steering::stop_number`]). A
+        /// permission must not undo a stop that came after it was given.
+        ///
+        /// [`Steering::stop_number`]: crate::Steering::stop_number
+        stop: u64,
+    },
     /// Move the arm.
     Command(Command),
 }

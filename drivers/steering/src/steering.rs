@@ -96,6 +96,10 @@ pub struct Steering {
     clutch: Clutch,
     /// Why the arm must stay at rest until an operator permits motion.
     stop: Option<Reason>,
+    /// Number of the newest stop; 0 before the first.
+    stop_number: u64,
+    /// Whether the newest report of the arm says that it is stopped.
+    is_arm_stopped: bool,
     /// The motion of the grip that is held; `None` while the arm must be at rest.
     motion: Option<Motion>,
     /// Why the last motion ended.
@@ -164,6 +168,8 @@ impl Steering {
             clutch: Clutch::new(config.clutch, n_joints),
             config,
             stop: None,
+            stop_number: 0,
+            is_arm_stopped: false,
             motion: None,
             last_brake: None,
             n_motions: 0,
@@ -197,6 +203,24 @@ impl Steering {
     /// Why the arm stays at rest until an operator permits motion, if it does.
     pub fn stop(&self) -> Option<&Reason> {
         self.stop.as_ref()
+    }
+
+    /// Number of the newest stop, which a permission must name; 0 before the first. Each stop by
+    /// anybody, and each fault of the arm, has its own number.
+    pub fn stop_number(&self) -> u64 {
+        self.stop_number
+    }
+
+    /// Checks that a permission names the newest stop.
+    ///
+    /// # Errors
+    /// That it names another one.
+    pub fn check_stop(&self, named: u64) -> Result<(), Reason> {
+        let newest = self.stop_number;
+        if named == newest {
+            return Ok(());
+        }
+        Err(Reason::OtherStop { named, newest })
     }
 
     /// The pairs of parts that are checked for collisions.
@@ -326,8 +350,9 @@ impl Steering {
                 self.latch_stop(Link::Clearance, Reason::SceneLost { report });
                 Ok(())
             }
-            Request::Rearm(operator) => {
+            Request::Rearm { operator, stop } => {
                 self.lease.renew(now, *operator)?;
+                self.check_stop(*stop)?;
                 // The arm's own fault is reported again in the next cycle, if it is still there.
                 self.stop = None;
                 self.clutch.open();
@@ -379,10 +404,7 @@ impl Steering {
     /// ended.
     fn permitted_motion(&mut self, now: Stamp, arm: &ArmState) -> Result<Motion, (Link, Reason)> {
         // An arm that stops may report nothing after its reason, so the reason comes first.
-        if let Some(report) = &arm.stopped {
-            let report = report.clone();
-            self.latch_stop(Link::Arm, Reason::ArmStopped { report });
-        }
+        self.note_stopped_arm(arm);
         if let Some(reason) = &self.stop {
             let link = match reason {
                 Reason::ArmStopped { .. } => Link::Arm,
@@ -425,6 +447,18 @@ impl Steering {
             // The grip starts where the arm comes to rest, so it waits until then.
             None if !arm.is_at_rest => Err((Link::Arm, Reason::StillBraking)),
             None => Ok(self.start_motion(arm)),
+        }
+    }
+
+    /// Notes a stop of the arm: once if it lasts, and again if motion was permitted meanwhile.
+    fn note_stopped_arm(&mut self, arm: &ArmState) {
+        let was_stopped = std::mem::replace(&mut self.is_arm_stopped, arm.stopped.is_some());
+        let Some(report) = &arm.stopped else {
+            return;
+        };
+        if self.stop.is_none() || !was_stopped {
+            let report = report.clone();
+            self.latch_stop(Link::Arm, Reason::ArmStopped { report });
         }
     }
 
@@ -643,6 +677,7 @@ impl Steering {
 
     /// Ends the motion until an operator permits it again. The first reason stays.
     fn latch_stop(&mut self, link: Link, reason: Reason) {
+        self.stop_number += 1;
         self.brake(link, reason.clone());
         self.stop.get_or_insert(reason);
     }

@@ -56,7 +56,7 @@ pub(super) fn kind(request: &SteeringRequest) -> Option<RefusedRequest> {
         | SteeringRequest::ReleaseLease
         | SteeringRequest::OfferLease { .. } => Some(RefusedRequest::Lease),
         SteeringRequest::Stop => Some(RefusedRequest::Stop),
-        SteeringRequest::Rearm => Some(RefusedRequest::Rearm),
+        SteeringRequest::Rearm { .. } => Some(RefusedRequest::Rearm),
         SteeringRequest::Command(_) => Some(RefusedRequest::Command),
         SteeringRequest::Preview(_) => Some(RefusedRequest::Preview),
         SteeringRequest::Disconnected => None,

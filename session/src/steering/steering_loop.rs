@@ -3,7 +3,7 @@
 
 use super::joint_map::JointMap;
 use super::previews::{Now, Previews};
-use super::recovery::Recovery;
+use super::recovery::{Permission, Recovery};
 use super::requests;
 use super::time_base::TimeBase;
 use drivers::motion::{ArmState, Output, SteeringPort};
@@ -208,11 +208,14 @@ impl SteeringLoop {
                 from: operator,
                 to: Operator(*to),
             },
-            SteeringRequest::Stop => {
-                self.recovery.revoke();
-                Request::Stop { by: Some(operator) }
+            SteeringRequest::Stop => Request::Stop { by: Some(operator) },
+            SteeringRequest::Rearm { stop } => {
+                let permission = Permission {
+                    operator,
+                    stop: *stop,
+                };
+                return self.rearm(now, permission, arm);
             }
-            SteeringRequest::Rearm => return self.rearm(now, operator, arm),
             SteeringRequest::Command(command) => return self.command(now, received, command),
             SteeringRequest::Preview(request) => {
                 return self.queue_preview(received.client, request);
@@ -270,22 +273,30 @@ impl SteeringLoop {
 
     /// Permits motion after a stop. An arm that a fault has stopped is enabled first, which takes
     /// a while.
-    fn rearm(&mut self, now: Stamp, operator: Operator, arm: &ArmState) -> Result<(), String> {
-        if arm.stopped.is_some() && self.holds_lease(operator) {
-            return self.recovery.start(operator);
+    fn rearm(&mut self, now: Stamp, permission: Permission, arm: &ArmState) -> Result<(), String> {
+        if arm.stopped.is_some() && self.holds_lease(permission.operator) {
+            let named = self.steering.check_stop(permission.stop);
+            named.map_err(|reason| reason.to_string())?;
+            return self.recovery.start(permission);
         }
-        self.handle(now, &Request::Rearm(operator))
+        self.permit(now, permission)
+    }
+
+    fn permit(&mut self, now: Stamp, permission: Permission) -> Result<(), String> {
+        let Permission { operator, stop } = permission;
+        self.handle(now, &Request::Rearm { operator, stop })
     }
 
     fn finish_recovery(&mut self, now: Stamp, arm: &ArmState, outcome: &mut Outcome) {
-        let Some((operator, recovered)) = self.recovery.take_result(now, arm) else {
+        let Some((permission, recovered)) = self.recovery.take_result(now, arm) else {
             return;
         };
-        // The arm's stop was noted in each cycle, also during its recovery.
-        let permitted = recovered.and_then(|()| self.handle(now, &Request::Rearm(operator)));
+        // Stops were noted also during the recovery. Whoever asked for it did not know of them, so
+        // the arm is enabled, but motion must be permitted again.
+        let permitted = recovered.and_then(|()| self.permit(now, permission));
         if let Err(reason) = permitted {
             let refused = Reply::Refused(RefusedRequest::Rearm, reason);
-            outcome.replies.push((operator.0, refused));
+            outcome.replies.push((permission.operator.0, refused));
         }
     }
 
@@ -347,6 +358,7 @@ impl SteeringLoop {
             lease_left_secs: self.steering.lease_left_secs(now),
             offered_to: self.steering.offered_to(now).map(|operator| operator.0),
             stop: self.steering.stop().map(ToString::to_string),
+            stop_number: self.steering.stop().map(|_| self.steering.stop_number()),
             is_moving: !arm.is_at_rest,
             base_from_tip: pose_at(&arm.position)?,
             base_from_target: target.as_deref().and_then(pose_at),

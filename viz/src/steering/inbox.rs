@@ -184,7 +184,7 @@ impl Inbox {
                 let last = self.waiting.iter().rev().find(|waiting| {
                     matches!(
                         waiting.request,
-                        SteeringRequest::Stop | SteeringRequest::Rearm
+                        SteeringRequest::Stop | SteeringRequest::Rearm { .. }
                     )
                 });
                 last.is_some_and(|last| last.request == SteeringRequest::Stop)

@@ -180,6 +180,7 @@ type UrgentPart<'a> = (
     Option<u64>,
     Option<u64>,
     Option<&'a str>,
+    Option<u64>,
     Vec<(LimitLink, LimitEffect)>,
 );
 
@@ -189,6 +190,7 @@ fn urgent_part(state: &SteeringState) -> UrgentPart<'_> {
         state.holder,
         state.offered_to,
         state.stop.as_deref(),
+        state.stop_number,
         limits.map(|limit| (limit.link, limit.effect)).collect(),
     )
 }

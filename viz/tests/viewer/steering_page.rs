@@ -148,7 +148,8 @@ fn obey(server: &SteeringServer, script: &mut Script, client: u64, request: Stee
             script.stops.push(client);
             script.stop = Some(format!("stopped by operator {client}"));
         }
-        SteeringRequest::Rearm => {
+        SteeringRequest::Rearm { stop } => {
+            assert_eq!(stop, script.stops.len() as u64, "the newest stop");
             script.n_rearmed += 1;
             script.stop = None;
         }
@@ -181,6 +182,7 @@ fn state(script: &Script) -> SteeringState {
         lease_left_secs: script.holder.map(|_| 5.0),
         offered_to: None,
         stop: script.stop.clone(),
+        stop_number: script.stop.as_ref().map(|_| script.stops.len() as u64),
         is_moving: false,
         position: POSITION.to_vec(),
         target: None,

@@ -156,7 +156,7 @@ fn a_scene_that_is_not_observed_any_more_stops_the_arm_and_no_permission_helps()
             .all(|limit| limit.link == Link::Clearance)
     );
     sim.rest();
-    sim.request(Request::Rearm(ANA)).unwrap();
+    sim.rearm(ANA).unwrap();
     sim.cycle();
     assert!(matches!(
         sim.steering.stop(),

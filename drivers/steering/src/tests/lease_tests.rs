@@ -23,7 +23,10 @@ fn control_cannot_be_stolen() {
         Request::TakeLease(BEN),
         Request::RenewLease(BEN),
         Request::ReleaseLease(BEN),
-        Request::Rearm(BEN),
+        Request::Rearm {
+            operator: BEN,
+            stop: 0,
+        },
         Request::OfferLease { from: BEN, to: BEN },
     ] {
         let refusal = sim.request(request).unwrap_err();

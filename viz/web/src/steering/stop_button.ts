@@ -16,13 +16,15 @@ export class StopButton {
   private readonly button = element("steer-stop", HTMLButtonElement);
   private readonly rearm = element("steer-rearm", HTMLButtonElement);
   private sureUntil = 0;
+  /** Number of the newest stop that the operator sees. */
+  private shownStop: number | null = null;
   /** Whether the key is down that has stopped the arm: its release must not press a focused button. */
   private isKeyDown = false;
 
   constructor(
     private readonly commander: Commander,
     addAction: typeof action,
-    private readonly sendRearm: () => void,
+    private readonly sendRearm: (stop: number) => void,
   ) {
     // A press is faster than a click, which needs the release.
     this.button.addEventListener("pointerdown", () => this.stop());
@@ -43,6 +45,7 @@ export class StopButton {
     const isOwn = state?.holder === arm?.client;
     setText(element("steer-who"), typeof state?.holder === "number" ? (isOwn ? "you" : `operator ${state.holder}`) : "");
     this.showStop(state?.stop ?? null);
+    this.shownStop = state?.stop_number ?? null;
     disable(this.rearm, hasControl ? "" : "Only the operator who has control can permit motion");
     if (performance.now() > this.sureUntil || !state?.stop) this.sureUntil = 0;
     setText(this.rearm, this.sureUntil === 0 ? REARM : REARM_AGAIN);
@@ -86,7 +89,8 @@ export class StopButton {
     const now = performance.now();
     if (now < this.sureUntil) {
       this.sureUntil = 0;
-      this.sendRearm();
+      // A stop that has arrived since the page was drawn has another number, so it is not undone.
+      if (typeof this.shownStop === "number") this.sendRearm(this.shownStop);
     } else {
       this.sureUntil = now + SURE_MILLIS;
     }
