@@ -574,7 +574,8 @@ fn check_stop(page: &mut Page, arm: &ScriptedArm) {
     page.wait_for_text("steer-rearm", "Press again");
     assert_eq!(arm.script.lock().n_rearmed, 0, "one press is not enough");
     page.wait("the permission", |browser| {
-        // The page forgets the first press after some seconds.
+        // Quick presses do not count, and the page forgets the first press after some seconds.
+        std::thread::sleep(Duration::from_millis(500));
         browser.click("steer-rearm");
         arm.script.lock().n_rearmed > 0
     });

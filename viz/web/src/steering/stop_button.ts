@@ -6,16 +6,15 @@ import { element } from "../panels/element";
 import { setText } from "../panels/html";
 import { disable, setTitle } from "../panels/title";
 import type { Commander } from "./commander";
+import { TwoPresses } from "./two_presses";
 
-/** The second press permits motion only within this time. */
-const SURE_MILLIS = 5000;
 const REARM = "Permit motion";
 const REARM_AGAIN = "Sure? Press again";
 
 export class StopButton {
   private readonly button = element("steer-stop", HTMLButtonElement);
   private readonly rearm = element("steer-rearm", HTMLButtonElement);
-  private sureUntil = 0;
+  private readonly presses = new TwoPresses(() => performance.now());
   /** Number of the newest stop that the operator sees. */
   private shownStop: number | null = null;
   /** Whether the key is down that has stopped the arm: its release must not press a focused button. */
@@ -47,8 +46,7 @@ export class StopButton {
     this.showStop(state?.stop ?? null);
     this.shownStop = state?.stop_number ?? null;
     disable(this.rearm, hasControl ? "" : "Only the operator who has control can permit motion");
-    if (performance.now() > this.sureUntil || !state?.stop) this.sureUntil = 0;
-    setText(this.rearm, this.sureUntil === 0 ? REARM : REARM_AGAIN);
+    setText(this.rearm, this.presses.isAwaited(this.shownStop) ? REARM_AGAIN : REARM);
   }
 
   private showStop(stop: string | null): void {
@@ -86,14 +84,9 @@ export class StopButton {
   }
 
   private pressRearm(): void {
-    const now = performance.now();
-    if (now < this.sureUntil) {
-      this.sureUntil = 0;
-      // A stop that has arrived since the page was drawn has another number, so it is not undone.
-      if (typeof this.shownStop === "number") this.sendRearm(this.shownStop);
-    } else {
-      this.sureUntil = now + SURE_MILLIS;
-    }
+    const stop = this.shownStop;
+    // The server refuses a permission after a stop that the page has not shown yet, because it has another number.
+    if (stop !== null && this.presses.press(stop)) this.sendRearm(stop);
     this.show();
   }
 }
