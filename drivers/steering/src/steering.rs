@@ -96,6 +96,8 @@ pub struct Steering {
     clutch: Clutch,
     /// Why the arm must stay at rest until an operator permits motion.
     stop: Option<Reason>,
+    /// The newest reason, if another stop has followed.
+    newest_stop: Option<Reason>,
     /// Number of the newest stop; 0 before the first.
     stop_number: u64,
     /// Whether the newest report of the arm says that it is stopped.
@@ -168,6 +170,7 @@ impl Steering {
             clutch: Clutch::new(config.clutch, n_joints),
             config,
             stop: None,
+            newest_stop: None,
             stop_number: 0,
             is_arm_stopped: false,
             motion: None,
@@ -203,6 +206,12 @@ impl Steering {
     /// Why the arm stays at rest until an operator permits motion, if it does.
     pub fn stop(&self) -> Option<&Reason> {
         self.stop.as_ref()
+    }
+
+    /// Why the arm was stopped since, if somebody or something has stopped it again for another
+    /// reason than [`Steering::stop`].
+    pub fn newest_stop(&self) -> Option<&Reason> {
+        self.newest_stop.as_ref()
     }
 
     /// Number of the newest stop, which a permission must name; 0 before the first. Each stop by
@@ -355,6 +364,7 @@ impl Steering {
                 self.check_stop(*stop)?;
                 // The arm's own fault is reported again in the next cycle, if it is still there.
                 self.stop = None;
+                self.newest_stop = None;
                 self.clutch.open();
                 Ok(())
             }
@@ -679,7 +689,8 @@ impl Steering {
     fn latch_stop(&mut self, link: Link, reason: Reason) {
         self.stop_number += 1;
         self.brake(link, reason.clone());
-        self.stop.get_or_insert(reason);
+        let first = self.stop.get_or_insert_with(|| reason.clone());
+        self.newest_stop = (*first != reason).then_some(reason);
     }
 
     /// Ends the motion and uses the grip up. Returns its arguments.

@@ -49,7 +49,7 @@ impl Recovery {
     ///
     /// Why none was started, in one sentence.
     pub(super) fn start(&mut self, permission: Permission) -> Result<(), String> {
-        if !matches!(self.state, State::Idle) {
+        if self.is_running() {
             return Err("the arm is being recovered already: wait".to_owned());
         }
         let port = self.port.clone();
@@ -59,6 +59,11 @@ impl Recovery {
             .map_err(|error| format!("the recovery of the arm cannot be started: {error}"))?;
         self.state = State::Running(permission, thread);
         Ok(())
+    }
+
+    /// Whether a recovery is under way.
+    pub(super) fn is_running(&self) -> bool {
+        !matches!(self.state, State::Idle)
     }
 
     /// The result of a recovery that has ended since the last call, and the permission that asked for it.

@@ -348,6 +348,16 @@ impl SteeringLoop {
         }
     }
 
+    /// Why the arm is stopped: the first reason, because it is the cause, and the newest, because
+    /// operators must see that their own stop has arrived, for example during a recovery.
+    fn stop(&self) -> Option<String> {
+        let first = self.steering.stop()?;
+        Some(match self.steering.newest_stop() {
+            Some(newest) => format!("{first}; since then: {newest}"),
+            None => first.to_string(),
+        })
+    }
+
     /// The state for clients; `None` if the arm's report has no pose.
     fn state(&self, now: Stamp, arm: &ArmState, verdict: &Verdict) -> Option<SteeringState> {
         let pose_at = |q: &[f64]| Some(transform::to_xyz_xyzw(&self.chain.forward(q).ok()?));
@@ -357,8 +367,9 @@ impl SteeringLoop {
             holder: self.steering.holder().map(|(holder, _)| holder.0),
             lease_left_secs: self.steering.lease_left_secs(now),
             offered_to: self.steering.offered_to(now).map(|operator| operator.0),
-            stop: self.steering.stop().map(ToString::to_string),
+            stop: self.stop(),
             stop_number: self.steering.stop().map(|_| self.steering.stop_number()),
+            is_recovering: self.recovery.is_running(),
             is_moving: !arm.is_at_rest,
             base_from_tip: pose_at(&arm.position)?,
             base_from_target: target.as_deref().and_then(pose_at),

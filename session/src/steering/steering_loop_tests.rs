@@ -373,7 +373,9 @@ fn an_arm_with_a_fault_is_recovered_only_when_the_holder_permits_motion() {
     );
     assert_eq!(run.n_recoveries.load(Ordering::Relaxed), 0);
     let rearm = run.rearm(ANA);
-    assert!(run.cycle(vec![rearm]).replies.is_empty());
+    let outcome = run.cycle(vec![rearm]);
+    assert!(outcome.replies.is_empty(), "{outcome:?}");
+    assert!(outcome.state.is_some_and(|state| state.is_recovering));
     // The recovery runs on a separate thread, so the test waits for it in real time.
     while run.n_recoveries.load(Ordering::Relaxed) == 0 {
         std::thread::yield_now();
@@ -382,7 +384,8 @@ fn an_arm_with_a_fault_is_recovered_only_when_the_holder_permits_motion() {
     let until = std::time::Instant::now() + Duration::from_secs(60);
     loop {
         let state = run.cycle(vec![(ANA, SteeringRequest::RenewLease)]).state;
-        if state.is_some_and(|state| state.stop.is_none()) {
+        if let Some(state) = state.filter(|state| state.stop.is_none()) {
+            assert!(!state.is_recovering, "it has ended");
             break;
         }
         assert!(std::time::Instant::now() < until, "motion is not permitted");
@@ -442,6 +445,13 @@ fn a_stop_during_a_recovery_is_not_undone_by_its_end() {
     run.cycle(vec![rearm]);
     let outcome = run.cycle(vec![(BEN, SteeringRequest::Stop)]);
     assert!(outcome.replies.is_empty(), "{outcome:?}");
+    let state = outcome.state.expect("a state");
+    assert!(state.is_recovering);
+    let stop = state.stop.expect("the arm is stopped");
+    assert!(
+        stop.contains("too hot") && stop.contains("since then: stopped by operator 2"),
+        "{stop}"
+    );
     // The recovery runs on a separate thread, so the test waits for it in real time.
     let until = std::time::Instant::now() + Duration::from_secs(60);
     let refused = loop {

@@ -181,6 +181,7 @@ type UrgentPart<'a> = (
     Option<u64>,
     Option<&'a str>,
     Option<u64>,
+    bool,
     Vec<(LimitLink, LimitEffect)>,
 );
 
@@ -191,6 +192,7 @@ fn urgent_part(state: &SteeringState) -> UrgentPart<'_> {
         state.offered_to,
         state.stop.as_deref(),
         state.stop_number,
+        state.is_recovering,
         limits.map(|limit| (limit.link, limit.effect)).collect(),
     )
 }

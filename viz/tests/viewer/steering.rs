@@ -275,7 +275,7 @@ fn states_have_all_fields_on_the_servers_clock() {
     );
     let expected = json!({
         "type": "state", "time_micros": null, "holder": client.number(), "lease_left_secs": 4.5,
-        "offered_to": 8, "stop": null, "stop_number": null, "is_moving": true, "position": vec![0.0; N_JOINTS],
+        "offered_to": 8, "stop": null, "stop_number": null, "is_recovering": false, "is_moving": true, "position": vec![0.0; N_JOINTS],
         "target": [0.5, 0.25], "base_from_tip": [0.4, 0.0, 0.5, 0.0, 0.0, 0.0, 1.0],
         "base_from_target": [0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0],
         "limits": [{
@@ -319,6 +319,13 @@ fn states_are_thinned_but_the_newest_and_each_stop_arrive() {
             }
         }
     }
+    desk.arm.publish(SteeringState {
+        stop: Some("second".to_owned()),
+        stop_number: Some(3),
+        is_recovering: true,
+        ..state()
+    });
+    while client.next_of("state")["is_recovering"] != json!(true) {}
     // A client that connects later gets the newest state.
     assert_eq!(desk.client().next_of("state")["stop"], json!("second"));
 }

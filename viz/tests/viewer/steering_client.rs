@@ -44,6 +44,7 @@ pub(crate) fn state() -> SteeringState {
         offered_to: None,
         stop: None,
         stop_number: None,
+        is_recovering: false,
         is_moving: false,
         position: vec![0.0; N_JOINTS],
         target: None,

@@ -183,6 +183,7 @@ fn state(script: &Script) -> SteeringState {
         offered_to: None,
         stop: script.stop.clone(),
         stop_number: script.stop.as_ref().map(|_| script.stops.len() as u64),
+        is_recovering: false,
         is_moving: false,
         position: POSITION.to_vec(),
         target: None,

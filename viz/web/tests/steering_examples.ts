@@ -28,6 +28,7 @@ export const STATE: SteerState = {
   offered_to: null,
   stop: null,
   stop_number: null,
+  is_recovering: false,
   is_moving: false,
   position: [0.1, 0.2],
   target: null,

@@ -2,7 +2,7 @@
 
 use super::{ANA, Sim, ageless, hand, is_braking, new_steering, pose_intent, words};
 use crate::{
-    AnalyticScene, Capsule, Clearance, ClearanceConfig, Effect, Link, Reason, Request, Seen, Solid,
+    AnalyticScene, Capsule, Clearance, ClearanceConfig, Effect, Link, Reason, Seen, Solid,
     SteeringConfig, Verdict,
 };
 use kinematics::{Stamp, Transform};

@@ -93,6 +93,8 @@ export interface SteerState {
   stop: string | null;
   /** Number of the newest stop, which a permission names; null without a stop. */
   stop_number: number | null;
+  /** Whether the arm is being enabled after a fault. Motion is permitted afterward, unless somebody stops the arm. */
+  is_recovering: boolean;
   is_moving: boolean;
   position: number[];
   target: number[] | null;
@@ -188,6 +190,7 @@ function stateIn(fields: Fields): SteerState | null {
     offered_to: numberOr(fields.offered_to),
     stop: isText(fields.stop) ? fields.stop : null,
     stop_number: numberOr(fields.stop_number),
+    is_recovering: fields.is_recovering === true,
     is_moving: fields.is_moving === true,
     position,
     target: areNumbers(fields.target) && fields.target.length === position.length ? fields.target : null,

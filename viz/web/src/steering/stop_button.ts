@@ -6,6 +6,7 @@ import { element } from "../panels/element";
 import { setText } from "../panels/html";
 import { disable, setTitle } from "../panels/title";
 import type { Commander } from "./commander";
+import { stopText } from "./texts";
 import { TwoPresses } from "./two_presses";
 
 const REARM = "Permit motion";
@@ -43,16 +44,17 @@ export class StopButton {
     disable(this.button, canSend ? "" : "The link to the arm is cut: the arm brakes when its commands expire");
     const isOwn = state?.holder === arm?.client;
     setText(element("steer-who"), typeof state?.holder === "number" ? (isOwn ? "you" : `operator ${state.holder}`) : "");
-    this.showStop(state?.stop ?? null);
+    this.showStop(state ? stopText(state) : "");
+    setText(element("steer-halt"), state?.is_recovering ? "Arm is being recovered" : "Arm stopped");
     this.shownStop = state?.stop_number ?? null;
-    disable(this.rearm, hasControl ? "" : "Only the operator who has control can permit motion");
+    const reason = state?.is_recovering ? "The arm is being recovered: wait" : "";
+    disable(this.rearm, hasControl ? reason : "Only the operator who has control can permit motion");
     setText(this.rearm, this.presses.isAwaited(this.shownStop) ? REARM_AGAIN : REARM);
   }
 
-  private showStop(stop: string | null): void {
-    const text = stop === null ? "" : `The arm is stopped: ${stop}`;
-    element("steer-stopped").hidden = stop === null;
-    element("steer-halt").hidden = stop === null;
+  private showStop(text: string): void {
+    element("steer-stopped").hidden = text === "";
+    element("steer-halt").hidden = text === "";
     if (element("steer-stop-text").textContent === text) return;
     setText(element("steer-stop-text"), text);
     setTitle(element("steer-halt"), text);
