@@ -48,7 +48,8 @@ impl SteeredArm {
         &self.port
     }
 
-    /// Takes the arm over. A simulated arm ends its tour; a real arm holds its position anyway.
+    /// Takes the arm over, or stops it. A simulated arm brakes and ends its tour; a real arm holds its
+    /// position anyway.
     pub fn begin(&self) {
         #[cfg(feature = "sim")]
         if let Some(arm) = &self.simulated {

@@ -12,7 +12,8 @@ use kinematics::{Chain, Stamp, transform};
 use std::collections::VecDeque;
 use std::time::Instant;
 use steering::{
-    Body, Clearance, NearestPosture, Operator, Request, Robot, Steering, SteeringConfig, Verdict,
+    Body, Clearance, NearestPosture, Operator, Reason, Request, Robot, Steering, SteeringConfig,
+    Verdict,
 };
 use viz::{
     AppliedCommand, Preview, PreviewRequest, ReceivedRequest, RefusedRequest, SteeringCommand,
@@ -66,6 +67,9 @@ pub(super) struct Outcome {
     pub(super) replies: Vec<(u64, Reply)>,
     /// Whether an operator has the lease for the first time, and thus the arm.
     pub(super) begins: bool,
+    /// Whether somebody has stopped the arm, also if nobody has had the lease yet: the tour of a
+    /// simulated arm must end.
+    pub(super) ends_tour: bool,
     /// The state for clients; `None` if the arm's report has no pose.
     pub(super) state: Option<SteeringState>,
 }
@@ -155,6 +159,9 @@ impl SteeringLoop {
         }
         self.finish_recovery(now, arm, &mut outcome);
         let verdict = self.steering.cycle(now, arm, scene);
+        // Nobody sees any more through what the arm moves on its tour.
+        let is_scene_lost = matches!(self.steering.stop(), Some(Reason::SceneLost { .. }));
+        outcome.ends_tour |= is_scene_lost;
         if self.has_begun {
             let output = verdict.output.clone();
             self.port.send(&self.joints.output_for_driver(output));
@@ -208,7 +215,10 @@ impl SteeringLoop {
                 from: operator,
                 to: Operator(*to),
             },
-            SteeringRequest::Stop => Request::Stop { by: Some(operator) },
+            SteeringRequest::Stop => {
+                outcome.ends_tour = true;
+                Request::Stop { by: Some(operator) }
+            }
             SteeringRequest::Rearm { stop } => {
                 let permission = Permission {
                     operator,

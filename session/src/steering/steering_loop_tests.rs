@@ -393,6 +393,21 @@ fn an_arm_with_a_fault_is_recovered_only_when_the_holder_permits_motion() {
     }
 }
 
+/// The tour of a simulated arm ends, see `capture::open::SteeredArm::begin`.
+#[test]
+fn a_stop_before_the_first_lease_ends_the_tour() {
+    let mut run = Run::new();
+    assert!(!run.cycle(Vec::new()).ends_tour);
+    let outcome = run.cycle(vec![(BEN, SteeringRequest::Stop)]);
+    assert!(outcome.ends_tour && !outcome.begins, "{outcome:?}");
+    let state = outcome.state.expect("a state");
+    assert!(state.stop.is_some_and(|stop| stop.contains("operator 2")));
+    // The first operator takes the arm over afterward, and must permit motion.
+    let outcome = run.cycle(vec![(ANA, SteeringRequest::TakeLease)]);
+    assert!(outcome.begins);
+    assert!(outcome.state.is_some_and(|state| state.stop.is_some()));
+}
+
 #[test]
 fn a_permission_from_before_a_newer_stop_does_not_undo_it() {
     let mut run = Run::with_lease();
