@@ -49,8 +49,8 @@ impl SteeredArm {
         &self.port
     }
 
-    /// Takes the arm over, or stops it. A simulated arm brakes and ends its tour; a real arm holds its
-    /// position anyway.
+    /// Takes the arm over, or stops it. A simulated arm brakes and ends its tour; a real arm holds
+    /// its position anyway.
     pub fn begin(&self) {
         #[cfg(feature = "sim")]
         if let Some(arm) = &self.simulated {
@@ -223,8 +223,9 @@ fn check_joints(rig: &Rig) -> anyhow::Result<()> {
         return Ok(());
     }
     bail!(BadInput(format!(
-        "{}: arm.joints contains {}, which are not between {:?} and {:?}; an arm with such joints cannot be steered \
-         yet: remove them from arm.joints, set arm.flange_link to a link behind them, or remove the flag",
+        "{}: arm.joints contains {}, but only joints between {:?} and {:?} can be steered yet: \
+         remove the others from arm.joints, set arm.flange_link to a link behind them, or remove \
+         the flag",
         Setting::EnableMotion,
         others.join(", "),
         arm.base_link,

@@ -189,8 +189,8 @@ impl Steered {
 }
 
 impl Drop for Steered {
-    /// Reports a panic of the arm's thread. The newest report would otherwise look as if the arm only
-    /// was slow, and nobody would be asked to check it.
+    /// Reports a panic of the arm's thread. The newest report would otherwise look as if the arm
+    /// only was slow, and nobody would be asked to check it.
     fn drop(&mut self) {
         if !std::thread::panicking() {
             return;

@@ -92,7 +92,8 @@ pub enum Reason {
     StoppedByProgram,
     /// A permission was given after another stop than the newest.
     #[error(
-        "this permits motion after stop {named}, but the newest is stop {newest}: check the arm, then permit motion again"
+        "this permits motion after stop {named}, but the newest is stop {newest}: check the arm, \
+         then permit motion again"
     )]
     OtherStop {
         /// Number of the stop in the request.

@@ -50,8 +50,8 @@ pub enum Request {
         /// Who stopped the arm; `None` for a program.
         by: Option<Operator>,
     },
-    /// Brake, and stay at rest until [`Request::Rearm`], because nothing is known about the scene any
-    /// more. [`Steering::cycle`](crate::Steering::cycle) makes this request for
+    /// Brake, and stay at rest until [`Request::Rearm`], because nothing is known about the scene
+    /// any more. [`Steering::cycle`](crate::Steering::cycle) makes this request for
     /// [`Clearance::failure`](crate::Clearance::failure), so that the record contains it.
     SceneLost {
         /// Why, in words.
@@ -85,8 +85,8 @@ pub struct Command {
     /// When the device was read, on the clock of the chain. The caller converts the device's time.
     #[serde(with = "exact::stamp")]
     pub captured_at: Stamp,
-    /// When the command arrived at this program. The silence of the device counts from here, so that
-    /// a command that waited for a decision does not look fresh.
+    /// When the command arrived at this program. The silence of the device counts from here, so
+    /// that a command that waited for a decision does not look fresh.
     #[serde(with = "exact::stamp")]
     pub received_at: Stamp,
     /// Number of the grip: how often the dead-man switch has been closed since the device started.

@@ -40,8 +40,8 @@ const ALWAYS_CLOSE_FRAC: f64 = 0.95;
 /// Range of a joint without limits, radians or meters, from which postures are drawn.
 const UNLIMITED: f64 = std::f64::consts::PI;
 
-/// How much closer than at the start a pair may come that was too close there: positions are rounded,
-/// and joints at rest vibrate.
+/// How much closer than at the start a pair may come that was too close there: positions are
+/// rounded, and joints at rest vibrate.
 const START_TOLERANCE_M: f64 = 1e-3;
 
 /// The pairs of parts that must not touch.
@@ -118,7 +118,8 @@ impl SelfCollision {
         Ok(selected)
     }
 
-    /// One sentence for each pair of links that is closer than the stop distance in the free posture.
+    /// One sentence for each pair of links that is closer than the stop distance in the free
+    /// posture.
     pub fn notes(&self) -> &[String] {
         &self.notes
     }
@@ -143,8 +144,8 @@ impl SelfCollision {
         close
     }
 
-    /// Speed as a fraction of full speed, with its reason if it is less. Pairs that are too close in
-    /// the free posture do not count: the arm would be slow wherever it works.
+    /// Speed as a fraction of full speed, with its reason if it is less. Pairs that are too close
+    /// in the free posture do not count: the arm would be slow wherever it works.
     pub(crate) fn speed(&self, here: &[ClosePair], body: &Body) -> (f64, Option<Reason>) {
         let nearest = here
             .iter()
@@ -238,8 +239,8 @@ impl SelfCollision {
         let note = |([a, b], distance_m): (&[&str; 2], &f64)| {
             let millimeters = 1000.0 * distance_m;
             format!(
-                "{a} and {b}, or the capsules around them, are {millimeters:.0} mm apart at the start: \
-                 they cannot come closer"
+                "{a} and {b}, or the capsules around them, are {millimeters:.0} mm apart at the \
+                 start: they cannot come closer"
             )
         };
         self.notes = nearest.iter().map(note).collect();

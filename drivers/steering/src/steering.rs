@@ -65,8 +65,8 @@ pub struct Robot<'a> {
     pub body: Body,
     /// Limits of the joints, as the generator of the setpoints has them.
     pub joints: &'a [MotionLimits],
-    /// A posture in which no parts of the robot touch, if one is known, such as that at the start; see
-    /// [`SelfCollision::new`].
+    /// A posture in which no parts of the robot touch, if one is known, such as that at the start;
+    /// see [`SelfCollision::new`].
     pub free_posture: Option<&'a [f64]>,
 }
 

@@ -66,7 +66,8 @@ impl Recovery {
         !matches!(self.state, State::Idle)
     }
 
-    /// The result of a recovery that has ended since the last call, and the permission that asked for it.
+    /// The result of a recovery that has ended since the last call, and the permission that asked
+    /// for it.
     pub(super) fn take_result(
         &mut self,
         now: Stamp,

@@ -19,8 +19,8 @@ pub struct SteeringState {
     pub stop: Option<String>,
     /// Number of the newest stop while `stop` is set. A permission names it.
     pub stop_number: Option<u64>,
-    /// Whether the arm is being enabled after a fault. When this succeeds, motion is permitted, unless
-    /// somebody stops the arm meanwhile.
+    /// Whether the arm is being enabled after a fault. When this succeeds, motion is permitted,
+    /// unless somebody stops the arm meanwhile.
     pub is_recovering: bool,
     /// Whether the arm moves or brakes.
     pub is_moving: bool,

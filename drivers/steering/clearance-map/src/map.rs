@@ -17,7 +17,8 @@ use steering::{Body, Clearance, Seen};
 const MAX_WAITING: usize = 16;
 
 /// Why a map whose thread has ended knows nothing.
-const ENDED: &str = "the thread of the map of free space has ended, which is a bug: start the program again to move the arm";
+const ENDED: &str = "the thread of the map of free space has ended, which is a bug: \
+                     start the program again to move the arm";
 
 /// Free space around an arm. Share it in an [`Arc`].
 ///

@@ -223,7 +223,8 @@ fn silence_counts_from_the_receipt_of_a_command_and_not_from_its_decision() {
     );
 }
 
-/// Invariant: a grip whose commands have waited for longer than a device may be silent moves nothing.
+/// Invariant: a grip whose commands have waited for longer than a device may be silent moves
+/// nothing.
 #[test]
 fn a_grip_that_waited_for_too_long_never_begins() {
     let mut sim = Sim::ready(ageless());
