@@ -8,6 +8,7 @@ use crate::stamp_clock::StampClock;
 use anyhow::bail;
 use drivers::motion::{MovableArm, SteeringPort};
 use drivers::{LiveDevices, Source};
+use kinematics::Chain;
 use messages::{BadInput, Setting};
 
 /// Acceleration and jerk of braking, as a factor of those of motions. Drivers keep motions far
@@ -49,7 +50,8 @@ impl SteeredArm {
         &self.port
     }
 
-    /// Takes the arm over. A simulated arm ends its tour; a real arm holds its position anyway.
+    /// Takes the arm over, or stops it. A simulated arm brakes and ends its tour; a real arm holds
+    /// its position anyway.
     pub fn begin(&self) {
         #[cfg(feature = "sim")]
         if let Some(arm) = &self.simulated {
@@ -167,8 +169,8 @@ fn open_emulated(_rig: &mut Rig) -> anyhow::Result<(drivers::Devices, SteeredArm
 ///
 /// # Errors
 ///
-/// If the rig has no arm, its arm cannot be moved, its base moves, or a simulation waits for the
-/// trainer.
+/// If the rig has no arm, its arm cannot be moved, its base moves, it has joints beside those that
+/// move the flange, or a simulation waits for the trainer.
 pub fn check_steerable(rig: &Rig, devices: Devices) -> anyhow::Result<()> {
     let is_simulated = devices == Devices::Sim || rig.arm.driver == ArmDriver::Sim;
     if rig.arm.joints.is_empty() || (rig.arm.driver == ArmDriver::None && !is_simulated) {
@@ -183,6 +185,7 @@ pub fn check_steerable(rig: &Rig, devices: Devices) -> anyhow::Result<()> {
             Setting::EnableMotion
         )));
     }
+    check_joints(rig)?;
     if rig.sim.lockstep && is_simulated {
         bail!(BadInput(format!(
             "{}: a simulation that waits for the trainer has no real time in which an arm could be steered: remove {}, \
@@ -203,6 +206,32 @@ pub fn check_steerable(rig: &Rig, devices: Devices) -> anyhow::Result<()> {
     real::motion_of(rig)?;
     real::check_motion(rig)?;
     check_arm(rig)
+}
+
+/// Checks that the arm has exactly the joints that move its flange: targets contain no others.
+fn check_joints(rig: &Rig) -> anyhow::Result<()> {
+    let arm = &rig.arm;
+    let chain = Chain::from_urdf(&arm.urdf_text, &arm.base_link, &arm.flange_link)?;
+    chain.order_in(&arm.joints)?;
+    let is_other = |joint: &&String| !chain.joint_names().contains(*joint);
+    let others: Vec<&str> = arm
+        .joints
+        .iter()
+        .filter(is_other)
+        .map(String::as_str)
+        .collect();
+    if others.is_empty() {
+        return Ok(());
+    }
+    bail!(BadInput(format!(
+        "{}: arm.joints contains {}, but only joints between {:?} and {:?} can be steered yet: \
+         remove the others from arm.joints, set arm.flange_link to a link behind them, or remove \
+         the flag",
+        Setting::EnableMotion,
+        others.join(", "),
+        arm.base_link,
+        arm.flange_link
+    )))
 }
 
 #[cfg(test)]
@@ -264,6 +293,25 @@ mod tests {
                 }
             }
         }
+    }
+
+    #[test]
+    fn arms_with_joints_beside_their_chain_are_refused_before_devices_are_opened() {
+        let file = Path::new(env!("CARGO_MANIFEST_DIR")).join("../rigs/static-arm.toml");
+        let mut rig = Rig::load(&file, &[]).expect("a rig of this repository");
+        rig.arm.joints.push("gripper".to_owned());
+        let devices = Devices::Sim;
+        let refusal = check_steerable(&rig, devices).expect_err("a joint too many");
+        let refusal = format!("{refusal:#}");
+        assert!(
+            refusal.contains("arm.joints contains gripper") && refusal.contains("remove"),
+            "{refusal}"
+        );
+        // Opening makes the same check first.
+        let opened = steered(rig, devices)
+            .err()
+            .map(|error| format!("{error:#}"));
+        assert_eq!(opened, Some(refusal));
     }
 
     #[cfg(feature = "sim")]

@@ -457,6 +457,17 @@ impl MotionLoop {
     }
 }
 
+impl Drop for MotionLoop {
+    /// Reports a panic of the thread to the owner of the arm. `mover` reports it through a steering
+    /// port.
+    fn drop(&mut self) {
+        if std::thread::panicking() {
+            self.mailbox
+                .update(|mailbox_state| mailbox_state.control.end_after_panic());
+        }
+    }
+}
+
 /// The reason why a robot does not follow commands, according to its state; `None` if the robot is
 /// ready.
 fn cause(state: &RobotState) -> Option<String> {
@@ -471,5 +482,50 @@ fn cause(state: &RobotState) -> Option<String> {
         }
         RobotMode::Idle | RobotMode::Move | RobotMode::AutomaticErrorRecovery => None,
         mode => request::blocking_reason(mode).map(str::to_owned),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::FciVersion;
+    use super::super::tests::{REST_RAD, ideal_joints, robot};
+    use super::*;
+    use crate::motion::SteeringPort;
+
+    #[test]
+    fn a_panic_of_the_thread_stops_the_arm_with_a_reason() {
+        let robot = robot(FciVersion::V5, ideal_joints());
+        let connection = Connection::open(&robot.address().to_string()).unwrap();
+        let limits = MotionLimits {
+            position: [-6.0, 6.0],
+            velocity: 0.5,
+            acceleration: 2.0,
+            jerk: 20.0,
+        };
+        let limits = vec![limits; REST_RAD.len()];
+        let mailbox = Arc::<MotionMailbox>::default();
+        let port = SteeringPort::new(&limits, 2.0, || Ok(())).unwrap();
+        let mut motion_loop = MotionLoop::new(
+            "arm".to_owned(),
+            Arc::new(connection),
+            Arc::clone(&mailbox),
+            RobotLimits::panda(),
+            limits,
+        );
+        motion_loop.mover.steer_later(port.clone());
+        idle_cycle(&mailbox, &mut motion_loop.mover, clock::now(), &REST_RAD);
+        assert_eq!(port.state().and_then(|state| state.stopped), None);
+        let thread = std::thread::spawn(move || {
+            let _moved_here = motion_loop;
+            panic!("as a bug in the thread of an arm would do");
+        });
+        thread.join().unwrap_err();
+        let state = port.state().unwrap();
+        let reason = state.stopped.unwrap();
+        assert!(reason.contains("panicked"), "{reason}");
+        assert_eq!(state.position, REST_RAD, "where it was last");
+        let control = &mailbox.lock().control;
+        assert!(control.is_lost);
+        assert_eq!(control.motion, Motion::Stopped { reason });
     }
 }

@@ -4,6 +4,7 @@
 
 use super::mailbox::{Mailbox, MotionCommand};
 use super::mover::{Mover, STEERED};
+use super::steered::PANICKED;
 use super::steering_port::SteeringPort;
 use super::{JointTarget, Motion};
 use kinematics::Stamp;
@@ -141,6 +142,12 @@ impl Control {
         self.accepts_commands = false;
         self.wants_motion = false;
         self.motion = Motion::Stopped { reason };
+    }
+
+    /// Records that the thread of the arm is panicking: nothing moves the arm any more.
+    pub(crate) fn end_after_panic(&mut self) {
+        self.is_lost = true;
+        self.stop_because(PANICKED.to_owned());
     }
 
     /// Whether the arm never moves again.

@@ -6,7 +6,7 @@ use super::follower::{Follower, brake_limits};
 use super::generator::Setpoint;
 use super::steering_port::{SteeringPort, position_in};
 use super::target::{ArmState, Output};
-use crate::Error;
+use crate::{Error, clock};
 use kinematics::Stamp;
 use std::time::Duration;
 
@@ -21,6 +21,10 @@ pub struct Steered {
     /// Whether the arm takes no more targets, because it is shut down.
     is_closed: bool,
 }
+
+/// Why an arm stays stopped after its thread has panicked.
+pub(crate) const PANICKED: &str =
+    "the thread of the arm panicked, which is a bug: check the arm, then start the program again";
 
 impl Steered {
     /// An arm at rest at `position`, with one setpoint per `period`.
@@ -180,6 +184,25 @@ impl Steered {
             is_at_rest: self.follower.is_at_rest(),
             braked_motion: self.follower.braked_motion(),
             stopped,
+        });
+    }
+}
+
+impl Drop for Steered {
+    /// Reports a panic of the arm's thread. The newest report would otherwise look as if the arm
+    /// only was slow, and nobody would be asked to check it.
+    fn drop(&mut self) {
+        if !std::thread::panicking() {
+            return;
+        }
+        // The follower may be in any state, so nothing is asked of it.
+        let braked_motion = self.port.end_motions();
+        self.port.report(ArmState {
+            reported_at: clock::now(),
+            position: std::mem::take(&mut self.position),
+            is_at_rest: false,
+            braked_motion,
+            stopped: Some(PANICKED.to_owned()),
         });
     }
 }

@@ -427,3 +427,34 @@ fn arm_that_was_not_enabled_has_no_setpoints() {
     mover.set_target(&target).unwrap_err();
     assert!(mover.is_at_rest());
 }
+
+#[test]
+fn panic_of_the_thread_is_reported_and_nothing_is_followed_any_more() {
+    let mut sim = Sim::new();
+    sim.drive(1, [0.8, -1.0], 300);
+    let Sim {
+        port,
+        steered,
+        last,
+        now,
+        ..
+    } = sim;
+    let waiting = Target {
+        motion: 1,
+        serial: 1_000_000,
+        position: vec![0.8, -1.0],
+        expires_at: now + VALIDITY,
+    };
+    port.send(&Output::Follow(waiting));
+    let thread = std::thread::spawn(move || {
+        let _moved_here = steered;
+        panic!("as a bug in the thread of an arm would do");
+    });
+    thread.join().unwrap_err();
+    let state = port.state().unwrap();
+    let reason = state.stopped.unwrap();
+    assert!(reason.contains("panicked"), "{reason}");
+    assert_eq!(state.position, last.position);
+    assert_eq!(state.braked_motion, 1);
+    assert!(!port.has_target());
+}

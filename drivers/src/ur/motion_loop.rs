@@ -374,6 +374,17 @@ impl MotionLoop {
     }
 }
 
+impl Drop for MotionLoop {
+    /// Reports a panic of the thread to the owner of the arm. `mover` reports it through a steering
+    /// port.
+    fn drop(&mut self) {
+        if std::thread::panicking() {
+            self.mailbox
+                .update(|mailbox_state| mailbox_state.control.end_after_panic());
+        }
+    }
+}
+
 /// The next state of the loop, and the session and position of the setpoint to send.
 type Step = (MotionState, Option<(i32, [f64; N_JOINTS])>);
 
@@ -418,10 +429,16 @@ fn next_position(
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::motion::JointTarget;
+    use crate::motion::{JointTarget, SteeringPort};
     use std::iter::repeat_n;
 
     const CYCLE: Duration = Duration::from_millis(2);
+    const LIMITS: MotionLimits = MotionLimits {
+        position: [-6.0, 6.0],
+        velocity: 0.5,
+        acceleration: 2.0,
+        jerk: 20.0,
+    };
 
     /// A motion that has just begun, and its last setpoint.
     struct Moving {
@@ -432,15 +449,9 @@ mod tests {
     impl Moving {
         /// From zero to one radian.
         fn begin() -> Self {
-            let limits = MotionLimits {
-                position: [-6.0, 6.0],
-                velocity: 0.5,
-                acceleration: 2.0,
-                jerk: 20.0,
-            };
             let mut mover = Mover::default();
             let at_zero = vec![0.0; N_JOINTS];
-            let held = mover.hold_at(vec![limits; N_JOINTS], at_zero, CYCLE);
+            let held = mover.hold_at(vec![LIMITS; N_JOINTS], at_zero, CYCLE);
             held.expect("valid limits");
             let target = JointTarget {
                 position: vec![1.0; N_JOINTS],
@@ -464,6 +475,30 @@ mod tests {
             self.sent_rad = next.expect("a setpoint");
             self.sent_rad[0]
         }
+    }
+
+    #[test]
+    fn a_panic_of_the_thread_stops_the_arm_with_a_reason() {
+        let limits = vec![LIMITS; N_JOINTS];
+        let mailbox = Arc::<MotionMailbox>::default();
+        let port = SteeringPort::new(&limits, 2.0, || Ok(())).expect("valid limits");
+        let device = "arm".to_owned();
+        let mut motion_loop = MotionLoop::new(device, Arc::clone(&mailbox), limits, 500.0);
+        motion_loop.mover.steer_later(port.clone());
+        idle_cycle(&mailbox, &mut motion_loop.mover, clock::now(), &[0.1; 6]);
+        assert_eq!(port.state().and_then(|state| state.stopped), None);
+        let thread = std::thread::spawn(move || {
+            let _moved_here = motion_loop;
+            panic!("as a bug in the thread of an arm would do");
+        });
+        thread.join().expect_err("it panicked");
+        let state = port.state().expect("a report");
+        let reason = state.stopped.expect("the arm is not moved any more");
+        assert!(reason.contains("panicked"), "{reason}");
+        assert_eq!(state.position, [0.1; 6], "where it was last");
+        let control = &mailbox.lock().control;
+        assert!(control.is_lost);
+        assert_eq!(control.motion, Motion::Stopped { reason });
     }
 
     #[test]

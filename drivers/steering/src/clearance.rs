@@ -32,6 +32,12 @@ pub trait Clearance {
     ///
     /// * `points_in_base`: points in the frame of the arm's base, meters.
     fn readings(&self, points_in_base: &[[f64; 3]], now: Stamp) -> Vec<Option<Seen>>;
+
+    /// Why the model learns of no changes of the scene any more, in words, if that is so. The arm
+    /// is then stopped: what the model knows may have changed since.
+    fn failure(&self) -> Option<String> {
+        None
+    }
 }
 
 /// Distances from the scene.

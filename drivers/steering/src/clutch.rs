@@ -67,6 +67,7 @@ struct Known {
 pub(crate) struct Held {
     pub(crate) device: Device,
     grip: u64,
+    /// When the newest command arrived, however long it then waited for a decision.
     pub(crate) received_at: Stamp,
     captured_at: Stamp,
     pub(crate) intent: Intent,
@@ -165,7 +166,7 @@ impl Clutch {
         let ix = self.known_ix(now, command);
         self.check(now, command, self.known[ix].newest_sequence)?;
         self.known[ix].newest_sequence = Some(command.sequence);
-        self.known[ix].heard_at = now;
+        self.known[ix].heard_at = command.received_by(now);
         if !may_move {
             self.use_up(command.device, grip);
         }
@@ -186,7 +187,7 @@ impl Clutch {
                 self.held = Some(Held {
                     device,
                     grip,
-                    received_at: now,
+                    received_at: command.received_by(now),
                     captured_at: command.captured_at,
                     intent: command.intent.clone(),
                     anchor: None,
@@ -229,7 +230,7 @@ impl Clutch {
     fn release(&mut self, now: Stamp, command: &Command) -> Change {
         let ix = self.known_ix(now, command);
         let known = &mut self.known[ix];
-        known.heard_at = now;
+        known.heard_at = command.received_by(now);
         known.newest_sequence = known.newest_sequence.max(Some(command.sequence));
         if self
             .held
@@ -294,7 +295,7 @@ impl Clutch {
             held.anchor = None;
         }
         held.intent = command.intent.clone();
-        held.received_at = now;
+        held.received_at = command.received_by(now).max(held.received_at);
         held.captured_at = command.captured_at;
         Ok(Change::Updated)
     }
@@ -321,7 +322,7 @@ impl Clutch {
             device,
             newest_sequence: None,
             used_up: command.grip,
-            heard_at: now,
+            heard_at: command.received_by(now),
         });
         self.known.len() - 1
     }

@@ -1,7 +1,7 @@
 //! First link: one operator at a time may move the arm.
 
 use crate::reason::Reason;
-use crate::request::Operator;
+use crate::request::{Command, Operator};
 use kinematics::Stamp;
 use serde::{Deserialize, Serialize};
 
@@ -123,6 +123,17 @@ impl Lease {
         match &mut self.holder {
             Some(holder) if holder.operator == operator => {
                 holder.heard_at = now;
+                Ok(())
+            }
+            _ => Err(self.refusal(now)),
+        }
+    }
+
+    /// Like [`Lease::renew`] for a command: its sender was heard when the command arrived.
+    pub(crate) fn hear(&mut self, now: Stamp, command: &Command) -> Result<(), Reason> {
+        match &mut self.holder {
+            Some(holder) if holder.operator == command.operator => {
+                holder.heard_at = holder.heard_at.max(command.received_by(now));
                 Ok(())
             }
             _ => Err(self.refusal(now)),

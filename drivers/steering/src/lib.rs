@@ -58,7 +58,9 @@
 //!         let base_from_hand = [0.0, 0.0, -1e-4 * f64::from(cycle), 0.0, 0.0, 0.0, 1.0];
 //!         let intent = Intent::Hand { base_from_hand };
 //!         let sequence = u64::from(cycle);
-//!         let command = Command { operator, device, sequence, captured_at: now, grip, intent };
+//!         let (captured_at, received_at) = (now, now);
+//!         let command =
+//!             Command { operator, device, sequence, captured_at, received_at, grip, intent };
 //!         steering.handle(now, &Request::Command(command))?;
 //!     }
 //!     let arm = ArmState {

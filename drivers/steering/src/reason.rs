@@ -90,6 +90,23 @@ pub enum Reason {
     /// A program stopped the arm.
     #[error("stopped by the program: check the arm, then permit motion again")]
     StoppedByProgram,
+    /// A permission was given after another stop than the newest.
+    #[error(
+        "this permits motion after stop {named}, but the newest is stop {newest}: check the arm, \
+         then permit motion again"
+    )]
+    OtherStop {
+        /// Number of the stop in the request.
+        named: u64,
+        /// Number of the newest stop.
+        newest: u64,
+    },
+    /// The model of the scene has failed.
+    #[error("nothing is known about the scene any more: {report}")]
+    SceneLost {
+        /// Why.
+        report: String,
+    },
     /// The arm reports a fault.
     #[error("the arm stopped: {report}; recover the arm, then permit motion again")]
     ArmStopped {

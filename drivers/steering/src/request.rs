@@ -50,9 +50,24 @@ pub enum Request {
         /// Who stopped the arm; `None` for a program.
         by: Option<Operator>,
     },
+    /// Brake, and stay at rest until [`Request::Rearm`], because nothing is known about the scene
+    /// any more. [`Steering::cycle`](crate::Steering::cycle) makes this request for
+    /// [`Clearance::failure`](crate::Clearance::failure), so that the record contains it.
+    SceneLost {
+        /// Why, in words.
+        report: String,
+    },
     /// Permit motion after a stop. Only the holder of the lease may do this, and only because a
     /// person asked for it. The arm does not move before a new grip.
-    Rearm(Operator),
+    Rearm {
+        /// Holder of the lease.
+        operator: Operator,
+        /// Number of the newest stop that the person has seen ([`Steering::stop_number`]). A
+        /// permission must not undo a stop that came after it was given.
+        ///
+        /// [`Steering::stop_number`]: crate::Steering::stop_number
+        stop: u64,
+    },
     /// Move the arm.
     Command(Command),
 }
@@ -70,11 +85,22 @@ pub struct Command {
     /// When the device was read, on the clock of the chain. The caller converts the device's time.
     #[serde(with = "exact::stamp")]
     pub captured_at: Stamp,
+    /// When the command arrived at this program. The silence of the device counts from here, so
+    /// that a command that waited for a decision does not look fresh.
+    #[serde(with = "exact::stamp")]
+    pub received_at: Stamp,
     /// Number of the grip: how often the dead-man switch has been closed since the device started.
     /// `None` while it is open. A count instead of a flag shows a release whose message was lost.
     pub grip: Option<u64>,
     /// Where to move while the switch is closed.
     pub intent: Intent,
+}
+
+impl Command {
+    /// When the command arrived, but not after it is decided: clocks are rounded.
+    pub(crate) fn received_by(&self, now: Stamp) -> Stamp {
+        self.received_at.min(now)
+    }
 }
 
 /// Where the arm should move.

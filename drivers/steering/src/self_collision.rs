@@ -7,6 +7,7 @@ use crate::ramp::{check_ramp, speed_scale};
 use crate::reason::Reason;
 use numbers::random::Random;
 use serde::{Deserialize, Serialize};
+use std::collections::BTreeMap;
 
 /// Distances between parts of the robot.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
@@ -39,12 +40,24 @@ const ALWAYS_CLOSE_FRAC: f64 = 0.95;
 /// Range of a joint without limits, radians or meters, from which postures are drawn.
 const UNLIMITED: f64 = std::f64::consts::PI;
 
+/// How much closer than at the start a pair may come that was too close there: positions are
+/// rounded, and joints at rest vibrate.
+const START_TOLERANCE_M: f64 = 1e-3;
+
 /// The pairs of parts that must not touch.
 #[derive(Clone, Debug)]
 pub struct SelfCollision {
     config: SelfCollisionConfig,
-    pairs: Vec<[usize; 2]>,
+    pairs: Vec<Pair>,
     notes: Vec<String>,
+}
+
+/// Two parts that are checked.
+#[derive(Clone, Copy, Debug)]
+struct Pair {
+    part_ixs: [usize; 2],
+    /// Distance in the free posture, if it is below the stop distance.
+    start_m: Option<f64>,
 }
 
 /// A pair that is closer than [`SelfCollisionConfig::slow_m`].
@@ -60,8 +73,8 @@ impl SelfCollision {
     /// or because their capsules are larger than they are.
     ///
     /// * `ranges`: range of each joint.
-    /// * `free_posture`: a posture in which no parts touch, if one is known. Pairs whose capsules
-    ///   are too close there are not checked.
+    /// * `free_posture`: a posture in which no parts touch, if one is known, such as the posture at
+    ///   the start. Parts whose capsules are too close there may not come closer than that.
     ///
     /// # Errors
     /// If the configuration is invalid or the numbers of joints differ.
@@ -100,12 +113,13 @@ impl SelfCollision {
         };
         selected.drop_always_close(body, ranges);
         if let Some(free_posture) = free_posture {
-            selected.drop_close_at(body, free_posture);
+            selected.keep_distances_at(body, free_posture);
         }
         Ok(selected)
     }
 
-    /// One sentence for each pair of links that is not checked because of the free posture.
+    /// One sentence for each pair of links that is closer than the stop distance in the free
+    /// posture.
     pub fn notes(&self) -> &[String] {
         &self.notes
     }
@@ -118,8 +132,9 @@ impl SelfCollision {
     /// All close pairs, in a fixed order.
     pub(crate) fn close_pairs(&self, capsules: &[Capsule]) -> Vec<ClosePair> {
         let mut close = Vec::new();
-        for (pair_ix, [a, b]) in self.pairs.iter().enumerate() {
-            let gap = capsules[*a].gap(&capsules[*b]);
+        for (pair_ix, pair) in self.pairs.iter().enumerate() {
+            let [a, b] = pair.part_ixs;
+            let gap = capsules[a].gap(&capsules[b]);
             // Written so that NaN counts as close.
             let is_far = gap.distance_m >= self.config.slow_m;
             if !is_far {
@@ -129,10 +144,12 @@ impl SelfCollision {
         close
     }
 
-    /// Speed as a fraction of full speed, with its reason if it is less.
+    /// Speed as a fraction of full speed, with its reason if it is less. Pairs that are too close
+    /// in the free posture do not count: the arm would be slow wherever it works.
     pub(crate) fn speed(&self, here: &[ClosePair], body: &Body) -> (f64, Option<Reason>) {
         let nearest = here
             .iter()
+            .filter(|close| self.pairs[close.pair_ix].start_m.is_none())
             .min_by(|a, b| a.gap.distance_m.total_cmp(&b.gap.distance_m));
         let Some(nearest) = nearest else {
             return (1.0, None);
@@ -157,16 +174,24 @@ impl SelfCollision {
         let refused = there.iter().find(|pair| {
             let before = here.iter().find(|before| before.pair_ix == pair.pair_ix);
             let before_m = before.map_or(self.config.slow_m, |before| before.gap.distance_m);
-            let is_free = pair.gap.distance_m >= self.config.stop_m;
+            let is_free = pair.gap.distance_m >= self.stop_m(pair);
             let is_leaving = pair.gap.distance_m >= before_m;
             !is_free && !is_leaving
         });
         refused.map(|pair| self.reason(pair, body))
     }
 
+    /// Distance below which the parts of a pair do not approach each other any more.
+    fn stop_m(&self, close: &ClosePair) -> f64 {
+        let start_m = self.pairs[close.pair_ix].start_m;
+        start_m.map_or(self.config.stop_m, |start_m| start_m - START_TOLERANCE_M)
+    }
+
     fn reason(&self, pair: &ClosePair, body: &Body) -> Reason {
         Reason::SelfCollision {
-            parts: self.pairs[pair.pair_ix].map(|part_ix| body.part(part_ix).link.clone()),
+            parts: self.pairs[pair.pair_ix]
+                .part_ixs
+                .map(|part_ix| body.part(part_ix).link.clone()),
             distance_m: pair.gap.distance_m,
             place: pair.gap.place.into(),
         }
@@ -194,38 +219,45 @@ impl SelfCollision {
             .retain(|_| !counts.next().is_some_and(is_always_close));
     }
 
-    fn drop_close_at(&mut self, body: &Body, free_posture: &[f64]) {
-        let mut too_close: Vec<usize> = self
-            .close_pairs(&body.capsules(free_posture))
-            .iter()
-            .filter(|pair| pair.gap.distance_m < self.config.stop_m)
-            .map(|pair| pair.pair_ix)
-            .collect();
-        // From the end, so that the remaining indices stay valid.
-        too_close.reverse();
-        for pair_ix in too_close {
-            let links = self
-                .pairs
-                .remove(pair_ix)
-                .map(|ix| body.part(ix).link.as_str());
-            self.notes.push(format!(
-                "capsules around {} and {} overlap in the free posture and are not checked",
-                links[0], links[1]
-            ));
+    /// Keeps the distances of pairs that are too close in the free posture.
+    fn keep_distances_at(&mut self, body: &Body, free_posture: &[f64]) {
+        // A link may have several capsules, and gets one note.
+        let mut nearest: BTreeMap<[&str; 2], f64> = BTreeMap::new();
+        for close in self.close_pairs(&body.capsules(free_posture)) {
+            let distance_m = close.gap.distance_m;
+            // Written so that NaN counts as too close. No distance is then free.
+            let is_far = distance_m >= self.config.stop_m;
+            if is_far {
+                continue;
+            }
+            let pair = &mut self.pairs[close.pair_ix];
+            pair.start_m = Some(distance_m);
+            let links = pair.part_ixs.map(|ix| body.part(ix).link.as_str());
+            let least_m = nearest.entry(links).or_insert(distance_m);
+            *least_m = least_m.min(distance_m);
         }
-        self.notes.sort();
-        self.notes.dedup();
+        let note = |([a, b], distance_m): (&[&str; 2], &f64)| {
+            let millimeters = 1000.0 * distance_m;
+            format!(
+                "{a} and {b}, or the capsules around them, are {millimeters:.0} mm apart at the \
+                 start: they cannot come closer"
+            )
+        };
+        self.notes = nearest.iter().map(note).collect();
     }
 }
 
 /// All pairs of parts that move relative to each other, except neighbors.
-fn moving_pairs(body: &Body) -> Vec<[usize; 2]> {
+fn moving_pairs(body: &Body) -> Vec<Pair> {
     let mut pairs = Vec::new();
     for a in 0..body.n_parts() {
         for b in a + 1..body.n_parts() {
             let frames = [body.part(a).frame_ix, body.part(b).frame_ix];
             if frames[0] != frames[1] && !body.are_adjacent(frames[0], frames[1]) {
-                pairs.push([a, b]);
+                pairs.push(Pair {
+                    part_ixs: [a, b],
+                    start_m: None,
+                });
             }
         }
     }

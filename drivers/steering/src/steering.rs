@@ -65,7 +65,8 @@ pub struct Robot<'a> {
     pub body: Body,
     /// Limits of the joints, as the generator of the setpoints has them.
     pub joints: &'a [MotionLimits],
-    /// A posture in which no parts of the robot touch, if one is known; see [`SelfCollision::new`].
+    /// A posture in which no parts of the robot touch, if one is known, such as that at the start;
+    /// see [`SelfCollision::new`].
     pub free_posture: Option<&'a [f64]>,
 }
 
@@ -95,6 +96,12 @@ pub struct Steering {
     clutch: Clutch,
     /// Why the arm must stay at rest until an operator permits motion.
     stop: Option<Reason>,
+    /// The newest reason, if another stop has followed.
+    newest_stop: Option<Reason>,
+    /// Number of the newest stop; 0 before the first.
+    stop_number: u64,
+    /// Whether the newest report of the arm says that it is stopped.
+    is_arm_stopped: bool,
     /// The motion of the grip that is held; `None` while the arm must be at rest.
     motion: Option<Motion>,
     /// Why the last motion ended.
@@ -163,6 +170,9 @@ impl Steering {
             clutch: Clutch::new(config.clutch, n_joints),
             config,
             stop: None,
+            newest_stop: None,
+            stop_number: 0,
+            is_arm_stopped: false,
             motion: None,
             last_brake: None,
             n_motions: 0,
@@ -198,6 +208,30 @@ impl Steering {
         self.stop.as_ref()
     }
 
+    /// Why the arm was stopped since, if somebody or something has stopped it again for another
+    /// reason than [`Steering::stop`].
+    pub fn newest_stop(&self) -> Option<&Reason> {
+        self.newest_stop.as_ref()
+    }
+
+    /// Number of the newest stop, which a permission must name; 0 before the first. Each stop by
+    /// anybody, and each fault of the arm, has its own number.
+    pub fn stop_number(&self) -> u64 {
+        self.stop_number
+    }
+
+    /// Checks that a permission names the newest stop.
+    ///
+    /// # Errors
+    /// That it names another one.
+    pub fn check_stop(&self, named: u64) -> Result<(), Reason> {
+        let newest = self.stop_number;
+        if named == newest {
+            return Ok(());
+        }
+        Err(Reason::OtherStop { named, newest })
+    }
+
     /// The pairs of parts that are checked for collisions.
     pub fn self_collision(&self) -> &SelfCollision {
         &self.self_collision
@@ -222,6 +256,11 @@ impl Steering {
     /// * `arm`: the newest state of the arm.
     /// * `scene`: what is known about the scene.
     pub fn cycle(&mut self, now: Stamp, arm: &ArmState, scene: &dyn Clearance) -> Verdict {
+        if let Some(report) = scene.failure().filter(|_| self.stop.is_none()) {
+            // A permission cannot mend the model, so the next cycle stops the arm again.
+            let stopped = self.handle(now, &Request::SceneLost { report });
+            debug_assert!(stopped.is_ok(), "everybody may stop the arm");
+        }
         // The closure borrows the points while the decision changes the rest.
         let points = Arc::clone(&self.clearance);
         let mut seen = Vec::new();
@@ -315,10 +354,17 @@ impl Steering {
                 self.latch_stop(Link::Clutch, reason);
                 Ok(())
             }
-            Request::Rearm(operator) => {
+            Request::SceneLost { report } => {
+                let report = report.clone();
+                self.latch_stop(Link::Clearance, Reason::SceneLost { report });
+                Ok(())
+            }
+            Request::Rearm { operator, stop } => {
                 self.lease.renew(now, *operator)?;
+                self.check_stop(*stop)?;
                 // The arm's own fault is reported again in the next cycle, if it is still there.
                 self.stop = None;
+                self.newest_stop = None;
                 self.clutch.open();
                 Ok(())
             }
@@ -327,7 +373,7 @@ impl Steering {
     }
 
     fn take_command(&mut self, now: Stamp, command: &Command) -> Result<(), Reason> {
-        self.lease.renew(now, command.operator)?;
+        self.lease.hear(now, command)?;
         let was_held = self.clutch.held().is_some();
         let may_move = self.stop.is_none();
         let change = self.clutch.receive(now, command, may_move);
@@ -367,19 +413,18 @@ impl Steering {
     /// The motion that all of lease, clutch and arm permit. If one of them does not, the motion has
     /// ended.
     fn permitted_motion(&mut self, now: Stamp, arm: &ArmState) -> Result<Motion, (Link, Reason)> {
-        if let Some(reason) = self.arm_problem(now, arm) {
-            return Err(self.brake(Link::Arm, reason));
-        }
-        if let Some(report) = &arm.stopped {
-            let report = report.clone();
-            self.latch_stop(Link::Arm, Reason::ArmStopped { report });
-        }
+        // An arm that stops may report nothing after its reason, so the reason comes first.
+        self.note_stopped_arm(arm);
         if let Some(reason) = &self.stop {
             let link = match reason {
                 Reason::ArmStopped { .. } => Link::Arm,
+                Reason::SceneLost { .. } => Link::Clearance,
                 _ => Link::Clutch,
             };
             return Err((link, reason.clone()));
+        }
+        if let Some(reason) = self.arm_problem(now, arm) {
+            return Err(self.brake(Link::Arm, reason));
         }
         if self.lease.holder().is_none() {
             return Err(self
@@ -412,6 +457,18 @@ impl Steering {
             // The grip starts where the arm comes to rest, so it waits until then.
             None if !arm.is_at_rest => Err((Link::Arm, Reason::StillBraking)),
             None => Ok(self.start_motion(arm)),
+        }
+    }
+
+    /// Notes a stop of the arm: once if it lasts, and again if motion was permitted meanwhile.
+    fn note_stopped_arm(&mut self, arm: &ArmState) {
+        let was_stopped = std::mem::replace(&mut self.is_arm_stopped, arm.stopped.is_some());
+        let Some(report) = &arm.stopped else {
+            return;
+        };
+        if self.stop.is_none() || !was_stopped {
+            let report = report.clone();
+            self.latch_stop(Link::Arm, Reason::ArmStopped { report });
         }
     }
 
@@ -630,8 +687,10 @@ impl Steering {
 
     /// Ends the motion until an operator permits it again. The first reason stays.
     fn latch_stop(&mut self, link: Link, reason: Reason) {
+        self.stop_number += 1;
         self.brake(link, reason.clone());
-        self.stop.get_or_insert(reason);
+        let first = self.stop.get_or_insert_with(|| reason.clone());
+        self.newest_stop = (*first != reason).then_some(reason);
     }
 
     /// Ends the motion and uses the grip up. Returns its arguments.

@@ -127,6 +127,12 @@ impl Sim {
         self.steering.handle(self.now, &request)
     }
 
+    /// An operator permits motion after the newest stop.
+    fn rearm(&mut self, operator: Operator) -> Result<(), Reason> {
+        let stop = self.steering.stop_number();
+        self.request(Request::Rearm { operator, stop })
+    }
+
     fn command(&mut self, grip: Option<u64>, intent: Intent) -> Command {
         self.sequence += 1;
         Command {
@@ -134,6 +140,7 @@ impl Sim {
             device: PAD,
             sequence: self.sequence,
             captured_at: self.now,
+            received_at: self.now,
             grip,
             intent,
         }

@@ -3,6 +3,7 @@
 //! A driver has its own order of joints, and its positions lack the offsets of the rig file. All
 //! decisions use the order of the chain, and positions of the robot description.
 
+use anyhow::bail;
 use drivers::motion::{ArmState, MotionLimits, Output, Target};
 use kinematics::Chain;
 
@@ -20,13 +21,22 @@ impl JointMap {
     /// * `driver_offsets`: offsets in the same order; empty if there are none.
     ///
     /// # Errors
-    /// If a joint of the chain is missing.
+    /// If a joint of the chain is missing, or the driver has other joints, too.
     pub(super) fn new(
         chain: &Chain,
         driver_names: &[String],
         driver_offsets: &[f64],
-    ) -> Result<Self, kinematics::Error> {
+    ) -> anyhow::Result<Self> {
         let driver_ixs = chain.order_in(driver_names)?;
+        // The devices are opened only if this holds. Without it, targets would lack positions.
+        if driver_ixs.len() != driver_names.len() {
+            bail!(
+                "the arm has {} joints, the chain to {:?} has {}",
+                driver_names.len(),
+                chain.tip_link(),
+                driver_ixs.len()
+            );
+        }
         let offset = |ix: &usize| driver_offsets.get(*ix).copied().unwrap_or(0.0);
         Ok(Self {
             offsets: driver_ixs.iter().map(offset).collect(),
@@ -131,5 +141,8 @@ mod tests {
         assert_eq!(limits[0].position, [-0.75, 1.25]);
         assert_eq!([limits[0].velocity, limits[1].velocity], [10.0, 20.0]);
         assert!(JointMap::new(&chain, &names[..1], &[]).is_err());
+        let more = ["j2", "gripper", "j1"].map(str::to_owned);
+        let refusal = JointMap::new(&chain, &more, &[]).expect_err("a joint too many");
+        assert!(refusal.to_string().contains("3 joints"), "{refusal}");
     }
 }

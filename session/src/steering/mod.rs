@@ -252,6 +252,8 @@ impl<S: Surroundings> Running<S> {
         let outcome = self.steering_loop.cycle(now, &received, &arm, &*self.scene);
         if outcome.begins {
             self.scene.end_sweep();
+        }
+        if outcome.begins || outcome.ends_tour {
             self.arm.begin();
         }
         for (client, reply) in outcome.replies {

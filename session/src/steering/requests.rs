@@ -2,14 +2,14 @@
 
 use super::time_base::TimeBase;
 use steering::{Command, Device, Effect, Intent, Limit, Link, Operator};
-use viz::SteeringRequest;
 use viz::{AppliedLimit, LimitEffect, LimitLink, RefusedRequest, SteeringCommand, SteeringIntent};
+use viz::{ReceivedRequest, SteeringRequest};
 
-/// A command of a client.
+/// A command of a client, which has arrived with a request.
 ///
 /// * `n_joints`: joints of the chain.
 pub(super) fn command(
-    client: u64,
+    received: &ReceivedRequest,
     command: &SteeringCommand,
     times: TimeBase,
     n_joints: usize,
@@ -22,10 +22,11 @@ pub(super) fn command(
         intent,
     );
     Command {
-        operator: Operator(client),
+        operator: Operator(received.client),
         device: Device(command.device),
         sequence: command.sequence,
         captured_at: times.stamp(command.captured_at),
+        received_at: times.stamp(received.received_at),
         grip: command.grip,
         intent,
     }
@@ -55,7 +56,7 @@ pub(super) fn kind(request: &SteeringRequest) -> Option<RefusedRequest> {
         | SteeringRequest::ReleaseLease
         | SteeringRequest::OfferLease { .. } => Some(RefusedRequest::Lease),
         SteeringRequest::Stop => Some(RefusedRequest::Stop),
-        SteeringRequest::Rearm => Some(RefusedRequest::Rearm),
+        SteeringRequest::Rearm { .. } => Some(RefusedRequest::Rearm),
         SteeringRequest::Command(_) => Some(RefusedRequest::Command),
         SteeringRequest::Preview(_) => Some(RefusedRequest::Preview),
         SteeringRequest::Disconnected => None,

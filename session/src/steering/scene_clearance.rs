@@ -183,6 +183,10 @@ impl Clearance for SceneClearance {
     fn readings(&self, points_in_base: &[[f64; 3]], now: Stamp) -> Vec<Option<Seen>> {
         self.map.readings(points_in_base, now)
     }
+
+    fn failure(&self) -> Option<String> {
+        self.map.failure()
+    }
 }
 
 #[cfg(test)]

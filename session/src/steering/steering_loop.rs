@@ -3,7 +3,7 @@
 
 use super::joint_map::JointMap;
 use super::previews::{Now, Previews};
-use super::recovery::Recovery;
+use super::recovery::{Permission, Recovery};
 use super::requests;
 use super::time_base::TimeBase;
 use drivers::motion::{ArmState, Output, SteeringPort};
@@ -12,7 +12,8 @@ use kinematics::{Chain, Stamp, transform};
 use std::collections::VecDeque;
 use std::time::Instant;
 use steering::{
-    Body, Clearance, NearestPosture, Operator, Request, Robot, Steering, SteeringConfig, Verdict,
+    Body, Clearance, NearestPosture, Operator, Reason, Request, Robot, Steering, SteeringConfig,
+    Verdict,
 };
 use viz::{
     AppliedCommand, Preview, PreviewRequest, ReceivedRequest, RefusedRequest, SteeringCommand,
@@ -66,6 +67,9 @@ pub(super) struct Outcome {
     pub(super) replies: Vec<(u64, Reply)>,
     /// Whether an operator has the lease for the first time, and thus the arm.
     pub(super) begins: bool,
+    /// Whether somebody has stopped the arm, also if nobody has had the lease yet: the tour of a
+    /// simulated arm must end.
+    pub(super) ends_tour: bool,
     /// The state for clients; `None` if the arm's report has no pose.
     pub(super) state: Option<SteeringState>,
 }
@@ -155,6 +159,9 @@ impl SteeringLoop {
         }
         self.finish_recovery(now, arm, &mut outcome);
         let verdict = self.steering.cycle(now, arm, scene);
+        // Nobody sees any more through what the arm moves on its tour.
+        let is_scene_lost = matches!(self.steering.stop(), Some(Reason::SceneLost { .. }));
+        outcome.ends_tour |= is_scene_lost;
         if self.has_begun {
             let output = verdict.output.clone();
             self.port.send(&self.joints.output_for_driver(output));
@@ -209,11 +216,17 @@ impl SteeringLoop {
                 to: Operator(*to),
             },
             SteeringRequest::Stop => {
-                self.recovery.revoke();
+                outcome.ends_tour = true;
                 Request::Stop { by: Some(operator) }
             }
-            SteeringRequest::Rearm => return self.rearm(now, operator, arm),
-            SteeringRequest::Command(command) => return self.command(now, operator, command),
+            SteeringRequest::Rearm { stop } => {
+                let permission = Permission {
+                    operator,
+                    stop: *stop,
+                };
+                return self.rearm(now, permission, arm);
+            }
+            SteeringRequest::Command(command) => return self.command(now, received, command),
             SteeringRequest::Preview(request) => {
                 return self.queue_preview(received.client, request);
             }
@@ -252,11 +265,11 @@ impl SteeringLoop {
     fn command(
         &mut self,
         now: Stamp,
-        operator: Operator,
+        received: &ReceivedRequest,
         command: &SteeringCommand,
     ) -> Result<(), String> {
         let n_joints = self.chain.n_joints();
-        let converted = requests::command(operator.0, command, self.times, n_joints);
+        let converted = requests::command(received, command, self.times, n_joints);
         self.handle(now, &Request::Command(converted))?;
         if command.grip.is_some() {
             self.pending = Some(AppliedSource {
@@ -270,22 +283,30 @@ impl SteeringLoop {
 
     /// Permits motion after a stop. An arm that a fault has stopped is enabled first, which takes
     /// a while.
-    fn rearm(&mut self, now: Stamp, operator: Operator, arm: &ArmState) -> Result<(), String> {
-        if arm.stopped.is_some() && self.holds_lease(operator) {
-            return self.recovery.start(operator);
+    fn rearm(&mut self, now: Stamp, permission: Permission, arm: &ArmState) -> Result<(), String> {
+        if arm.stopped.is_some() && self.holds_lease(permission.operator) {
+            let named = self.steering.check_stop(permission.stop);
+            named.map_err(|reason| reason.to_string())?;
+            return self.recovery.start(permission);
         }
-        self.handle(now, &Request::Rearm(operator))
+        self.permit(now, permission)
+    }
+
+    fn permit(&mut self, now: Stamp, permission: Permission) -> Result<(), String> {
+        let Permission { operator, stop } = permission;
+        self.handle(now, &Request::Rearm { operator, stop })
     }
 
     fn finish_recovery(&mut self, now: Stamp, arm: &ArmState, outcome: &mut Outcome) {
-        let Some((operator, recovered)) = self.recovery.take_result(now, arm) else {
+        let Some((permission, recovered)) = self.recovery.take_result(now, arm) else {
             return;
         };
-        // The arm's stop was noted in each cycle, also during its recovery.
-        let permitted = recovered.and_then(|()| self.handle(now, &Request::Rearm(operator)));
+        // Stops were noted also during the recovery. Whoever asked for it did not know of them, so
+        // the arm is enabled, but motion must be permitted again.
+        let permitted = recovered.and_then(|()| self.permit(now, permission));
         if let Err(reason) = permitted {
             let refused = Reply::Refused(RefusedRequest::Rearm, reason);
-            outcome.replies.push((operator.0, refused));
+            outcome.replies.push((permission.operator.0, refused));
         }
     }
 
@@ -337,6 +358,16 @@ impl SteeringLoop {
         }
     }
 
+    /// Why the arm is stopped: the first reason, because it is the cause, and the newest, because
+    /// operators must see that their own stop has arrived, for example during a recovery.
+    fn stop(&self) -> Option<String> {
+        let first = self.steering.stop()?;
+        Some(match self.steering.newest_stop() {
+            Some(newest) => format!("{first}; since then: {newest}"),
+            None => first.to_string(),
+        })
+    }
+
     /// The state for clients; `None` if the arm's report has no pose.
     fn state(&self, now: Stamp, arm: &ArmState, verdict: &Verdict) -> Option<SteeringState> {
         let pose_at = |q: &[f64]| Some(transform::to_xyz_xyzw(&self.chain.forward(q).ok()?));
@@ -346,7 +377,9 @@ impl SteeringLoop {
             holder: self.steering.holder().map(|(holder, _)| holder.0),
             lease_left_secs: self.steering.lease_left_secs(now),
             offered_to: self.steering.offered_to(now).map(|operator| operator.0),
-            stop: self.steering.stop().map(ToString::to_string),
+            stop: self.stop(),
+            stop_number: self.steering.stop().map(|_| self.steering.stop_number()),
+            is_recovering: self.recovery.is_running(),
             is_moving: !arm.is_at_rest,
             base_from_tip: pose_at(&arm.position)?,
             base_from_target: target.as_deref().and_then(pose_at),

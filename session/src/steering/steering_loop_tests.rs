@@ -39,6 +39,8 @@ struct Run {
     times: TimeBase,
     now: Stamp,
     sequence: u64,
+    /// Number of the newest stop that clients have seen.
+    stop_number: u64,
     /// Why the arm's thread does not follow the port, if it does not.
     fault: Option<&'static str>,
     n_recoveries: Arc<AtomicU32>,
@@ -93,6 +95,7 @@ impl Run {
             times,
             now,
             sequence: 0,
+            stop_number: 0,
             fault: None,
             n_recoveries,
         };
@@ -129,8 +132,18 @@ impl Run {
         let outcome = self
             .steering_loop
             .cycle(self.now, &received, &arm, &self.scene);
+        let state = outcome.state.as_ref();
+        self.stop_number = state
+            .and_then(|state| state.stop_number)
+            .unwrap_or(self.stop_number);
         self.move_arm(ARM_STEPS_PER_CYCLE);
         outcome
+    }
+
+    /// A client permits motion after the newest stop that clients have seen.
+    fn rearm(&self, client: u64) -> (u64, SteeringRequest) {
+        let stop = self.stop_number;
+        (client, SteeringRequest::Rearm { stop })
     }
 
     fn command(&mut self, grip: Option<u64>, intent: SteeringIntent) -> (u64, SteeringRequest) {
@@ -332,9 +345,11 @@ fn everybody_may_stop_the_arm_and_only_the_holder_permits_motion() {
     run.hold(None, &far, 2);
     run.hold(Some(2), &far, 50);
     assert_eq!(run.tip(), rest, "it stays stopped");
-    let outcome = run.cycle(vec![(BEN, SteeringRequest::Rearm)]);
+    let rearm = run.rearm(BEN);
+    let outcome = run.cycle(vec![rearm]);
     assert_eq!(refusal(&outcome).0, RefusedRequest::Rearm);
-    let outcome = run.cycle(vec![(ANA, SteeringRequest::Rearm)]);
+    let rearm = run.rearm(ANA);
+    let outcome = run.cycle(vec![rearm]);
     assert!(outcome.replies.is_empty(), "{outcome:?}");
     run.hold(None, &far, 2);
     run.hold(Some(3), &far, 100);
@@ -357,11 +372,10 @@ fn an_arm_with_a_fault_is_recovered_only_when_the_holder_permits_motion() {
         LimitEffect::Braked
     );
     assert_eq!(run.n_recoveries.load(Ordering::Relaxed), 0);
-    assert!(
-        run.cycle(vec![(ANA, SteeringRequest::Rearm)])
-            .replies
-            .is_empty()
-    );
+    let rearm = run.rearm(ANA);
+    let outcome = run.cycle(vec![rearm]);
+    assert!(outcome.replies.is_empty(), "{outcome:?}");
+    assert!(outcome.state.is_some_and(|state| state.is_recovering));
     // The recovery runs on a separate thread, so the test waits for it in real time.
     while run.n_recoveries.load(Ordering::Relaxed) == 0 {
         std::thread::yield_now();
@@ -370,7 +384,8 @@ fn an_arm_with_a_fault_is_recovered_only_when_the_holder_permits_motion() {
     let until = std::time::Instant::now() + Duration::from_secs(60);
     loop {
         let state = run.cycle(vec![(ANA, SteeringRequest::RenewLease)]).state;
-        if state.is_some_and(|state| state.stop.is_none()) {
+        if let Some(state) = state.filter(|state| state.stop.is_none()) {
+            assert!(!state.is_recovering, "it has ended");
             break;
         }
         assert!(std::time::Instant::now() < until, "motion is not permitted");
@@ -378,14 +393,80 @@ fn an_arm_with_a_fault_is_recovered_only_when_the_holder_permits_motion() {
     }
 }
 
+/// The tour of a simulated arm ends, see `capture::open::SteeredArm::begin`.
+#[test]
+fn a_stop_before_the_first_lease_ends_the_tour() {
+    let mut run = Run::new();
+    assert!(!run.cycle(Vec::new()).ends_tour);
+    let outcome = run.cycle(vec![(BEN, SteeringRequest::Stop)]);
+    assert!(outcome.ends_tour && !outcome.begins, "{outcome:?}");
+    let state = outcome.state.expect("a state");
+    assert!(state.stop.is_some_and(|stop| stop.contains("operator 2")));
+    // The first operator takes the arm over afterward, and must permit motion.
+    let outcome = run.cycle(vec![(ANA, SteeringRequest::TakeLease)]);
+    assert!(outcome.begins);
+    assert!(outcome.state.is_some_and(|state| state.stop.is_some()));
+}
+
+#[test]
+fn a_permission_from_before_a_newer_stop_does_not_undo_it() {
+    let mut run = Run::with_lease();
+    let stopped = run.cycle(vec![(ANA, SteeringRequest::Stop)]);
+    let first = stopped.state.and_then(|state| state.stop_number);
+    assert_eq!(first, Some(1));
+    let permission = run.rearm(ANA);
+    // The permission is on its way while Ben stops the arm.
+    let outcome = run.cycle(vec![(BEN, SteeringRequest::Stop), permission]);
+    let (kind, text) = refusal(&outcome);
+    assert_eq!(kind, RefusedRequest::Rearm);
+    assert!(text.contains("stop 1") && text.contains("stop 2"), "{text}");
+    let state = outcome.state.expect("a state");
+    assert!(state.stop.is_some());
+    assert_eq!(state.stop_number, Some(2));
+    let permission = run.rearm(ANA);
+    let outcome = run.cycle(vec![permission.clone()]);
+    assert!(outcome.replies.is_empty(), "{outcome:?}");
+    let state = outcome.state.expect("a state");
+    assert_eq!((state.stop, state.stop_number), (None, None));
+    // The same message again, after a third stop.
+    let outcome = run.cycle(vec![(BEN, SteeringRequest::Stop), permission]);
+    assert_eq!(refusal(&outcome).0, RefusedRequest::Rearm);
+}
+
+#[test]
+fn a_permission_from_before_a_fault_of_the_arm_does_not_undo_it() {
+    let mut run = Run::with_lease();
+    run.cycle(vec![(BEN, SteeringRequest::Stop)]);
+    let permission = run.rearm(ANA);
+    run.fault = Some("a motor is too hot");
+    run.move_arm(1);
+    let state = run.cycle(Vec::new()).state.expect("a state");
+    assert_eq!(state.stop_number, Some(2));
+    // A fault that lasts is one stop.
+    let state = run.cycle(Vec::new()).state.expect("a state");
+    assert_eq!(state.stop_number, Some(2));
+    let outcome = run.cycle(vec![permission]);
+    assert_eq!(refusal(&outcome).0, RefusedRequest::Rearm);
+    assert_eq!(run.n_recoveries.load(Ordering::Relaxed), 0);
+}
+
 #[test]
 fn a_stop_during_a_recovery_is_not_undone_by_its_end() {
     let mut run = Run::with_lease();
     run.fault = Some("a motor is too hot");
     run.move_arm(1);
-    run.cycle(vec![(ANA, SteeringRequest::Rearm)]);
+    run.cycle(Vec::new());
+    let rearm = run.rearm(ANA);
+    run.cycle(vec![rearm]);
     let outcome = run.cycle(vec![(BEN, SteeringRequest::Stop)]);
     assert!(outcome.replies.is_empty(), "{outcome:?}");
+    let state = outcome.state.expect("a state");
+    assert!(state.is_recovering);
+    let stop = state.stop.expect("the arm is stopped");
+    assert!(
+        stop.contains("too hot") && stop.contains("since then: stopped by operator 2"),
+        "{stop}"
+    );
     // The recovery runs on a separate thread, so the test waits for it in real time.
     let until = std::time::Instant::now() + Duration::from_secs(60);
     let refused = loop {
@@ -403,9 +484,44 @@ fn a_stop_during_a_recovery_is_not_undone_by_its_end() {
     };
     assert_eq!(refused.0, RefusedRequest::Rearm);
     assert!(refused.1.contains("permit motion again"), "{}", refused.1);
-    let outcome = run.cycle(vec![(ANA, SteeringRequest::Rearm)]);
+    let rearm = run.rearm(ANA);
+    let outcome = run.cycle(vec![rearm]);
     assert!(outcome.replies.is_empty(), "{outcome:?}");
     assert!(outcome.state.is_some_and(|state| state.stop.is_none()));
+}
+
+#[test]
+fn a_command_that_waited_in_the_inbox_does_not_look_fresh() {
+    let mut run = Run::with_lease();
+    let far = run.moved_by([0.0, 0.3, 0.0]);
+    run.hold(Some(1), &far, 100);
+    let (client, request) = run.command(Some(1), far);
+    let received = ReceivedRequest {
+        client,
+        received_at: run.times.instant(run.now),
+        request,
+    };
+    let received_at = run.now;
+    // The loop is late by less than the time after which the arm itself brakes.
+    run.move_arm(80);
+    run.scene.seen_at = run.now;
+    let arm = run.steering_loop.arm().expect("a report");
+    let outcome = run
+        .steering_loop
+        .cycle(run.now, &[received], &arm, &run.scene);
+    let followed = outcome.state.expect("a state");
+    assert!(followed.target.is_some(), "{:?}", followed.limits);
+    let mut braked = None;
+    while braked.is_none() {
+        run.move_arm(ARM_STEPS_PER_CYCLE);
+        let state = run.cycle(Vec::new()).state.expect("a state");
+        braked = state.target.is_none().then_some(state);
+    }
+    let braked = braked.expect("the loop has ended");
+    let text = &limit_of(&braked, LimitLink::Clutch).text;
+    assert!(text.contains("was silent"), "{text}");
+    let silent_secs = run.now.secs_since(received_at);
+    assert!(silent_secs < 0.15, "{silent_secs} s");
 }
 
 #[test]

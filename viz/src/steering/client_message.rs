@@ -104,6 +104,8 @@ enum MessageError {
          {MAX_CLOCK_DIFFERENCE_SECS} s are accepted: estimate the server's clock with ping"
     )]
     Clock { difference_secs: f64 },
+    #[error("rearm needs stop: the stop_number of the state that the operator has seen")]
+    NoStop,
     #[error("a command with a grip needs an intent")]
     NoIntent,
     #[error("a preview needs either base_from_tip or position")]
@@ -118,6 +120,12 @@ enum LeaseMessage {
     Renew,
     Release,
     Offer { to: u64 },
+}
+
+/// Fields of `rearm`.
+#[derive(Debug, Deserialize)]
+struct RearmMessage {
+    stop: Option<u64>,
 }
 
 /// Fields of `command`.
@@ -212,7 +220,7 @@ fn read_kind(
     }
     let request = match kind {
         Some("lease") => lease(serde_json::from_str(text)?)?,
-        Some("rearm") => SteeringRequest::Rearm,
+        Some("rearm") => rearm(&serde_json::from_str(text)?)?,
         Some("command") => {
             let message = serde_json::from_str(text)?;
             SteeringRequest::Command(command(message, received_at, context)?)
@@ -235,6 +243,13 @@ fn lease(message: LeaseMessage) -> Result<SteeringRequest, MessageError> {
         LeaseMessage::Offer { to } => SteeringRequest::OfferLease {
             to: integer("to", to)?,
         },
+    })
+}
+
+fn rearm(message: &RearmMessage) -> Result<SteeringRequest, MessageError> {
+    let stop = message.stop.ok_or(MessageError::NoStop)?;
+    Ok(SteeringRequest::Rearm {
+        stop: integer("stop", stop)?,
     })
 }
 

@@ -52,6 +52,9 @@ pub(crate) enum NotAccepted {
     /// A command was repeated or overtaken.
     #[error("command {sequence} came after command {newest} of the same device")]
     OutOfOrder { sequence: u64, newest: u64 },
+    /// Control was offered to a viewer.
+    #[error("client {to} may only watch: offer control to an operator")]
+    OnlyWatches { to: u64 },
     /// Too many devices.
     #[error("a connection may have at most {MAX_DEVICES} devices: connect again")]
     Devices,
@@ -184,7 +187,7 @@ impl Inbox {
                 let last = self.waiting.iter().rev().find(|waiting| {
                     matches!(
                         waiting.request,
-                        SteeringRequest::Stop | SteeringRequest::Rearm
+                        SteeringRequest::Stop | SteeringRequest::Rearm { .. }
                     )
                 });
                 last.is_some_and(|last| last.request == SteeringRequest::Stop)

@@ -71,6 +71,7 @@ fn check_request(request: &SteeringRequest, now: Instant) {
             }
         }
         SteeringRequest::OfferLease { to } => assert!(*to <= MAX_INTEGER),
+        SteeringRequest::Rearm { stop } => assert!(*stop <= MAX_INTEGER),
         SteeringRequest::Disconnected => panic!("no message says this"),
         _ => {}
     }

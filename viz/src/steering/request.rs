@@ -35,7 +35,11 @@ pub enum SteeringRequest {
     /// Brake, and stay at rest.
     Stop,
     /// Permit motion after a stop.
-    Rearm,
+    Rearm {
+        /// Number of the newest stop that the client has seen, as in
+        /// [`SteeringState::stop_number`](crate::SteeringState::stop_number).
+        stop: u64,
+    },
     /// Move the arm.
     Command(SteeringCommand),
     /// Say whether a goal can be reached, without moving the arm.

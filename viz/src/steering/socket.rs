@@ -232,7 +232,7 @@ fn kind_of(request: &SteeringRequest) -> RefusedRequest {
         | SteeringRequest::OfferLease { .. }
         | SteeringRequest::Disconnected => RefusedRequest::Lease,
         SteeringRequest::Stop => RefusedRequest::Stop,
-        SteeringRequest::Rearm => RefusedRequest::Rearm,
+        SteeringRequest::Rearm { .. } => RefusedRequest::Rearm,
         SteeringRequest::Command(_) => RefusedRequest::Command,
         SteeringRequest::Preview(_) => RefusedRequest::Preview,
     }
@@ -245,7 +245,7 @@ fn logged_action(request: &SteeringRequest) -> Option<&'static str> {
         SteeringRequest::ReleaseLease => Some("gives control of the arm back"),
         SteeringRequest::OfferLease { .. } => Some("offers control of the arm"),
         SteeringRequest::Stop => Some("stops the arm"),
-        SteeringRequest::Rearm => Some("permits the arm to move"),
+        SteeringRequest::Rearm { .. } => Some("permits the arm to move"),
         SteeringRequest::RenewLease
         | SteeringRequest::Command(_)
         | SteeringRequest::Preview(_)

@@ -17,6 +17,11 @@ pub struct SteeringState {
     pub offered_to: Option<u64>,
     /// Why the arm stays at rest until an operator permits motion, if it does.
     pub stop: Option<String>,
+    /// Number of the newest stop while `stop` is set. A permission names it.
+    pub stop_number: Option<u64>,
+    /// Whether the arm is being enabled after a fault. When this succeeds, motion is permitted,
+    /// unless somebody stops the arm meanwhile.
+    pub is_recovering: bool,
     /// Whether the arm moves or brakes.
     pub is_moving: bool,
     /// Position of each joint, radians or meters.

@@ -137,9 +137,24 @@ impl SteeringServer {
         received_at: Instant,
         request: SteeringRequest,
     ) -> Result<(), NotAccepted> {
+        if let SteeringRequest::OfferLease { to } = request {
+            self.check_offer(to)?;
+        }
         let result = self.inbox.lock().push(client, received_at, request);
         self.request_arrived.notify_all();
         result
+    }
+
+    /// Refuses to offer control to a client that cannot take it. The loop does not know the roles.
+    fn check_offer(&self, to: u64) -> Result<(), NotAccepted> {
+        let clients = self.clients.lock();
+        let only_watches = clients
+            .get(&to)
+            .is_some_and(|client| client.role < Role::Operator);
+        if only_watches {
+            return Err(NotAccepted::OnlyWatches { to });
+        }
+        Ok(())
     }
 
     /// Adds a reply to a client.
@@ -180,6 +195,8 @@ type UrgentPart<'a> = (
     Option<u64>,
     Option<u64>,
     Option<&'a str>,
+    Option<u64>,
+    bool,
     Vec<(LimitLink, LimitEffect)>,
 );
 
@@ -189,6 +206,8 @@ fn urgent_part(state: &SteeringState) -> UrgentPart<'_> {
         state.holder,
         state.offered_to,
         state.stop.as_deref(),
+        state.stop_number,
+        state.is_recovering,
         limits.map(|limit| (limit.link, limit.effect)).collect(),
     )
 }
@@ -221,4 +240,41 @@ pub fn publish_steering(hub: &Hub, server: Option<Arc<SteeringServer>>) {
 /// The arm that clients of a hub may steer.
 pub(crate) fn steered_arm(hub: &Hub) -> Option<Arc<SteeringServer>> {
     hub.latest::<SteeredArm>().borrow().0.clone()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn control_is_not_offered_to_clients_that_may_only_watch() {
+        const HOLDER: u64 = 1;
+        const VIEWER: u64 = 2;
+        const OPERATOR: u64 = 3;
+        let server = SteeringServer::new(ArmDescription {
+            base_link: "base".to_owned(),
+            tip_link: "tip".to_owned(),
+            joints: Vec::new(),
+            expiry_secs: 0.12,
+            lease_secs: 5.0,
+            servo_round_trip_millis: 120.0,
+        });
+        for (client, role) in [
+            (HOLDER, Role::Operator),
+            (VIEWER, Role::Viewer),
+            (OPERATOR, Role::Operator),
+        ] {
+            server.join(client, role);
+        }
+        let offer = |to| {
+            let request = SteeringRequest::OfferLease { to };
+            server.request(HOLDER, Instant::now(), request)
+        };
+        let refusal = offer(VIEWER).expect_err("a viewer cannot take control");
+        assert_eq!(refusal, NotAccepted::OnlyWatches { to: VIEWER });
+        assert!(refusal.to_string().contains("client 2 may only watch"));
+        assert_eq!(offer(OPERATOR), Ok(()));
+        let received = server.take_requests();
+        assert_eq!(received.len(), 1, "the loop sees no offer to the viewer");
+    }
 }

@@ -140,7 +140,7 @@ fn requests_arrive_in_order_with_their_senders() {
     client.send(&json!({"type": "preview", "id": 9, "position": [0.5, 0.25]}));
     client.send(&json!({"type": "lease", "action": "offer", "to": 77}));
     client.send(&json!({"type": "stop"}));
-    client.send(&json!({"type": "rearm"}));
+    client.send(&json!({"type": "rearm", "stop": 1}));
     client.send(&json!({"type": "lease", "action": "release"}));
     client.settle();
     let received = desk.arm.take_requests();
@@ -161,7 +161,7 @@ fn requests_arrive_in_order_with_their_senders() {
         SteeringRequest::Preview(preview),
         SteeringRequest::OfferLease { to: 77 },
         SteeringRequest::Stop,
-        SteeringRequest::Rearm,
+        SteeringRequest::Rearm { stop: 1 },
         SteeringRequest::ReleaseLease,
     ] = &requests[..]
     else {
@@ -275,7 +275,7 @@ fn states_have_all_fields_on_the_servers_clock() {
     );
     let expected = json!({
         "type": "state", "time_micros": null, "holder": client.number(), "lease_left_secs": 4.5,
-        "offered_to": 8, "stop": null, "is_moving": true, "position": vec![0.0; N_JOINTS],
+        "offered_to": 8, "stop": null, "stop_number": null, "is_recovering": false, "is_moving": true, "position": vec![0.0; N_JOINTS],
         "target": [0.5, 0.25], "base_from_tip": [0.4, 0.0, 0.5, 0.0, 0.0, 0.0, 1.0],
         "base_from_target": [0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0],
         "limits": [{
@@ -305,13 +305,27 @@ fn states_are_thinned_but_the_newest_and_each_stop_arrive() {
         n_received += 1;
     }
     assert!(n_received < N_STATES, "{n_received} states were sent");
-    for stop in ["first", "second"] {
+    // The number alone shows a stop by somebody who gives the same reason.
+    for (number, stop) in [(1, "first"), (2, "second"), (3, "second")] {
         desk.arm.publish(SteeringState {
             stop: Some(stop.to_owned()),
+            stop_number: Some(number),
             ..state()
         });
-        while client.next_of("state")["stop"] != json!(stop) {}
+        loop {
+            let state = client.next_of("state");
+            if state["stop"] == json!(stop) && state["stop_number"] == json!(number) {
+                break;
+            }
+        }
     }
+    desk.arm.publish(SteeringState {
+        stop: Some("second".to_owned()),
+        stop_number: Some(3),
+        is_recovering: true,
+        ..state()
+    });
+    while client.next_of("state")["is_recovering"] != json!(true) {}
     // A client that connects later gets the newest state.
     assert_eq!(desk.client().next_of("state")["stop"], json!("second"));
 }
@@ -420,7 +434,7 @@ fn viewers_watch_and_stop_over_tls() {
     let now_micros = viewer.now_micros();
     let (take, rearm) = (
         json!({"type": "lease", "action": "take"}),
-        json!({"type": "rearm"}),
+        json!({"type": "rearm", "stop": 1}),
     );
     let preview = json!({"type": "preview", "id": 1, "position": [0, 0]});
     let closing = command(1, Some(1), now_micros);

@@ -43,6 +43,8 @@ pub(crate) fn state() -> SteeringState {
         lease_left_secs: None,
         offered_to: None,
         stop: None,
+        stop_number: None,
+        is_recovering: false,
         is_moving: false,
         position: vec![0.0; N_JOINTS],
         target: None,

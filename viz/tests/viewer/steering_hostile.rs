@@ -122,7 +122,7 @@ impl<'a> MiniLoop<'a> {
                     self.holder = None;
                 }
                 SteeringRequest::Stop => self.is_stopped = true,
-                SteeringRequest::Rearm if is_holder => self.is_stopped = false,
+                SteeringRequest::Rearm { .. } if is_holder => self.is_stopped = false,
                 SteeringRequest::Command(command) if is_holder && !self.is_stopped => {
                     self.moved_by.extend(command.grip.map(|_| client));
                 }
@@ -157,7 +157,7 @@ fn a_client_cannot_act_for_the_holder_of_the_lease() {
         command(3, Some(2), now_micros),
         json!({"type": "lease", "action": "take"}),
         json!({"type": "lease", "action": "release"}),
-        json!({"type": "rearm"}),
+        json!({"type": "rearm", "stop": 1}),
         json!({"type": "lease", "action": "offer"}),
     ] {
         if message["action"] == "offer" {

@@ -148,7 +148,8 @@ fn obey(server: &SteeringServer, script: &mut Script, client: u64, request: Stee
             script.stops.push(client);
             script.stop = Some(format!("stopped by operator {client}"));
         }
-        SteeringRequest::Rearm => {
+        SteeringRequest::Rearm { stop } => {
+            assert_eq!(stop, script.stops.len() as u64, "the newest stop");
             script.n_rearmed += 1;
             script.stop = None;
         }
@@ -181,6 +182,8 @@ fn state(script: &Script) -> SteeringState {
         lease_left_secs: script.holder.map(|_| 5.0),
         offered_to: None,
         stop: script.stop.clone(),
+        stop_number: script.stop.as_ref().map(|_| script.stops.len() as u64),
+        is_recovering: false,
         is_moving: false,
         position: POSITION.to_vec(),
         target: None,
@@ -572,7 +575,8 @@ fn check_stop(page: &mut Page, arm: &ScriptedArm) {
     page.wait_for_text("steer-rearm", "Press again");
     assert_eq!(arm.script.lock().n_rearmed, 0, "one press is not enough");
     page.wait("the permission", |browser| {
-        // The page forgets the first press after some seconds.
+        // Quick presses do not count, and the page forgets the first press after some seconds.
+        std::thread::sleep(Duration::from_millis(500));
         browser.click("steer-rearm");
         arm.script.lock().n_rearmed > 0
     });

@@ -201,6 +201,18 @@ test("the stop button of a gamepad stops the arm also without control, until the
   assert.equal(stops(), 1);
 });
 
+test("a recovery can be stopped, with one stop for each press of a gamepad's button", () => {
+  const recovering = { stop: "the arm stopped: too hot", stop_number: 1, is_recovering: true };
+  bench.run(1500, recovering);
+  assert.equal(bench.commander.canMove, true, "motion is permitted when the recovery ends");
+  const stops = (): number => bench.sent.filter(({ type }) => type === "stop").length;
+  for (const isStop of [true, true, true, false, true]) {
+    bench.commander.setPad({ ...PAD, isStop }, false);
+    bench.state(recovering);
+  }
+  assert.equal(stops(), 2);
+});
+
 test("after an interruption, the release of one of two keys does not grip again", () => {
   bench.run(1500);
   bench.commander.setJog("keys", FORWARD);

@@ -10,6 +10,8 @@ function parsed(message: object): unknown {
 test("complete messages are read", () => {
   assert.deepEqual(parsed(ARM), ARM);
   assert.deepEqual(parsed(STATE), STATE);
+  const stopped = { ...STATE, stop: "stopped by operator 3", stop_number: 12 };
+  assert.deepEqual(parsed(stopped), stopped);
   const refused = { type: "refused", request: "command", text: "grip 2 is used up" };
   assert.deepEqual(parsed(refused), refused);
   const preview = { type: "preview", id: 3, verdict: "never seen", text: "no data", position: null, place: [1, 2, 3] };

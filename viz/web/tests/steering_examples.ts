@@ -27,6 +27,8 @@ export const STATE: SteerState = {
   lease_left_secs: 5,
   offered_to: null,
   stop: null,
+  stop_number: null,
+  is_recovering: false,
   is_moving: false,
   position: [0.1, 0.2],
   target: null,

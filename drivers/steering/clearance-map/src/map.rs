@@ -16,6 +16,10 @@ use steering::{Body, Clearance, Seen};
 /// Maximum number of cameras whose newest image waits. Images of more cameras replace the oldest.
 const MAX_WAITING: usize = 16;
 
+/// Why a map whose thread has ended knows nothing.
+const ENDED: &str = "the thread of the map of free space has ended, which is a bug: \
+                     start the program again to move the arm";
+
 /// Free space around an arm. Share it in an [`Arc`].
 ///
 /// Its thread integrates the newest image of each camera. Answers never wait for it: they use the
@@ -183,6 +187,11 @@ impl ClearanceMap {
         self.shared.arrived.notify_one();
     }
 
+    /// Whether the thread has ended, which only a panic makes it do.
+    fn has_ended(&self) -> bool {
+        self.thread.as_ref().is_none_or(JoinHandle::is_finished)
+    }
+
     /// Counts since the start.
     pub fn state(&self) -> MapState {
         let n_replaced = self.shared.inbox.lock().n_replaced;
@@ -195,11 +204,19 @@ impl ClearanceMap {
 
 impl Clearance for ClearanceMap {
     fn readings(&self, points_in_base: &[[f64; 3]], now: Stamp) -> Vec<Option<Seen>> {
+        // The newest map would look as if only its ages grew, while the scene may change.
+        if self.has_ended() {
+            return Vec::new();
+        }
         // The lock of the published map is held only while a pointer is copied.
         let snapshot = Arc::clone(&self.shared.published.lock().snapshot);
         let mut query = self.query.lock();
         query.set_snapshot(snapshot);
         query.readings(points_in_base, now)
+    }
+
+    fn failure(&self) -> Option<String> {
+        self.has_ended().then(|| ENDED.to_owned())
     }
 }
 
@@ -262,3 +279,6 @@ impl Shared {
         }
     }
 }
+
+#[cfg(test)]
+mod ended_tests;

@@ -1,6 +1,6 @@
 //! The arm keeps its distance from what is near, old or unknown.
 
-use super::{Sim, ageless, hand, is_braking, pose_intent, words};
+use super::{ANA, Sim, ageless, hand, is_braking, new_steering, pose_intent, words};
 use crate::{
     AnalyticScene, Capsule, Clearance, ClearanceConfig, Effect, Link, Reason, Seen, Solid,
     SteeringConfig, Verdict,
@@ -122,6 +122,73 @@ fn what_was_never_seen_is_occupied() {
         "{}",
         words(&verdict)
     );
+}
+
+#[test]
+fn a_scene_that_is_not_observed_any_more_stops_the_arm_and_no_permission_helps() {
+    /// What was seen last is still there, but nothing new is seen.
+    struct Lost(AnalyticScene);
+    impl Clearance for Lost {
+        fn readings(&self, points: &[[f64; 3]], now: Stamp) -> Vec<Option<Seen>> {
+            self.0.readings(points, now)
+        }
+        fn failure(&self) -> Option<String> {
+            Some("the map has ended".to_owned())
+        }
+    }
+    let mut sim = Sim::ready(ageless());
+    for step in 0..30_u32 {
+        let verdict = sim.drive(Some(1), hand(0.002 * f64::from(step), 0.0, 0.0));
+        assert!(!is_braking(&verdict));
+    }
+    sim.scene = Box::new(Lost(scene(Vec::new())));
+    let verdict = sim.drive(Some(1), hand(0.06, 0.0, 0.0));
+    assert!(is_braking(&verdict));
+    assert!(
+        words(&verdict).contains("scene any more: the map has ended"),
+        "{}",
+        words(&verdict)
+    );
+    assert!(
+        verdict
+            .limits
+            .iter()
+            .all(|limit| limit.link == Link::Clearance)
+    );
+    sim.rest();
+    sim.rearm(ANA).unwrap();
+    sim.cycle();
+    assert!(matches!(
+        sim.steering.stop(),
+        Some(Reason::SceneLost { .. })
+    ));
+    sim.send(Some(2), hand(0.0, 0.0, 0.0)).unwrap_err();
+    // The record repeats the stop without the scene.
+    let (entries, _) = sim.steering.take_record();
+    let mut replayed = new_steering(ageless());
+    for entry in &entries {
+        replayed.replay(entry).unwrap();
+    }
+    assert_eq!(replayed.stop(), sim.steering.stop());
+}
+
+#[test]
+fn an_arm_that_reports_a_stop_and_then_nothing_is_stopped() {
+    let mut sim = Sim::ready(ageless());
+    sim.drive(Some(1), hand(0.0, 0.0, 0.0));
+    let mut arm = sim.arm();
+    arm.stopped = Some("its thread panicked".to_owned());
+    // The chain was held up, so that the last report is old already.
+    sim.now += Duration::from_millis(500);
+    let verdict = sim.steering.cycle(sim.now, &arm, sim.scene.as_ref());
+    assert!(
+        words(&verdict).contains("its thread panicked"),
+        "{verdict:?}"
+    );
+    assert!(matches!(
+        sim.steering.stop(),
+        Some(Reason::ArmStopped { .. })
+    ));
 }
 
 #[test]

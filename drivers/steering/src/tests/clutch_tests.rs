@@ -160,6 +160,82 @@ fn silent_device_brakes_the_arm_and_must_grip_again() {
     assert!(!is_braking(&sim.drive(Some(2), hand(0.0, 0.0, 0.0))));
 }
 
+/// Invariant: a permission undoes only stops that its operator has seen.
+#[test]
+fn a_permission_names_the_newest_stop() {
+    let mut sim = Sim::ready(ageless());
+    sim.request(Request::Stop { by: Some(BEN) }).unwrap();
+    let operator = ANA;
+    let stop = sim.steering.stop_number();
+    sim.request(Request::Stop { by: None }).unwrap();
+    let refusal = sim.request(Request::Rearm { operator, stop }).unwrap_err();
+    let newest = stop + 1;
+    assert_eq!(
+        refusal,
+        Reason::OtherStop {
+            named: stop,
+            newest
+        }
+    );
+    assert!(is_braking(&sim.cycle()) && sim.steering.stop().is_some());
+    // A fault that lasts counts once, and again after a permission.
+    sim.stopped = Some("a motor is silent".to_owned());
+    for _ in 0..3 {
+        sim.cycle();
+    }
+    assert_eq!(sim.steering.stop_number(), newest + 1);
+    sim.rearm(ANA).unwrap();
+    sim.cycle();
+    assert_eq!(sim.steering.stop_number(), newest + 2);
+    sim.stopped = None;
+    sim.rearm(ANA).unwrap();
+    sim.cycle();
+    assert_eq!(sim.steering.stop(), None);
+}
+
+/// Invariant: a command that waited for its decision does not look fresh.
+#[test]
+fn silence_counts_from_the_receipt_of_a_command_and_not_from_its_decision() {
+    let mut sim = Sim::ready(ageless());
+    for step in 0..20_u32 {
+        sim.drive(Some(1), hand(0.002 * f64::from(step), 0.0, 0.0));
+    }
+    let last = sim.command(Some(1), hand(0.04, 0.0, 0.0));
+    let received_at = last.received_at;
+    // The device is silent from here on. Its last command waits.
+    sim.now += Duration::from_millis(60);
+    sim.request(Request::Command(last)).unwrap();
+    let mut verdict = sim.cycle();
+    let target = verdict.target().expect("the device was heard 70 ms ago");
+    assert!(
+        target.expires_at <= received_at.plus_secs(0.12),
+        "the arm itself must notice the silence in time: {target:?}"
+    );
+    while !is_braking(&verdict) {
+        verdict = sim.cycle();
+    }
+    let silence = sim.now.secs_since(received_at);
+    assert!(silence > 0.12 && silence < 0.15, "{silence}");
+    assert!(
+        words(&verdict).contains("device 10 was silent"),
+        "{}",
+        words(&verdict)
+    );
+}
+
+/// Invariant: a grip whose commands have waited for longer than a device may be silent moves
+/// nothing.
+#[test]
+fn a_grip_that_waited_for_too_long_never_begins() {
+    let mut sim = Sim::ready(ageless());
+    let waiting = sim.command(Some(1), hand(0.0, 0.0, 0.0));
+    sim.now += Duration::from_millis(200);
+    sim.request(Request::Command(waiting)).unwrap();
+    let verdict = sim.cycle();
+    assert!(is_braking(&verdict), "{}", words(&verdict));
+    sim.send(Some(1), hand(0.0, 0.0, 0.0)).unwrap_err();
+}
+
 #[test]
 fn commands_that_are_not_used_do_not_count_as_signs_of_life() {
     let unusable: [fn(&mut crate::Command); 6] = [
@@ -218,8 +294,8 @@ fn stop_of_anybody_latches() {
             );
             assert!(is_braking(&sim.cycle()));
         }
-        sim.request(Request::Rearm(BEN)).unwrap_err();
-        sim.request(Request::Rearm(ANA)).unwrap();
+        sim.rearm(BEN).unwrap_err();
+        sim.rearm(ANA).unwrap();
         sim.send(Some(4), hand(0.0, 0.0, 0.0)).unwrap_err();
         assert!(
             is_braking(&sim.cycle()),
@@ -235,7 +311,7 @@ fn fault_of_the_arm_latches_too() {
     sim.drive(Some(1), hand(0.0, 0.0, 0.0));
     sim.stopped = Some("motor 3 is too hot".to_owned());
     assert!(words(&sim.cycle()).contains("the arm stopped: motor 3 is too hot"));
-    sim.request(Request::Rearm(ANA)).unwrap();
+    sim.rearm(ANA).unwrap();
     assert!(
         words(&sim.cycle()).contains("too hot"),
         "the fault is still there"
@@ -245,7 +321,7 @@ fn fault_of_the_arm_latches_too() {
         words(&sim.cycle()).contains("too hot"),
         "a person must permit motion"
     );
-    sim.request(Request::Rearm(ANA)).unwrap();
+    sim.rearm(ANA).unwrap();
     assert!(!is_braking(&sim.drive(Some(2), hand(0.0, 0.0, 0.0))));
 }
 

@@ -23,7 +23,10 @@ fn control_cannot_be_stolen() {
         Request::TakeLease(BEN),
         Request::RenewLease(BEN),
         Request::ReleaseLease(BEN),
-        Request::Rearm(BEN),
+        Request::Rearm {
+            operator: BEN,
+            stop: 0,
+        },
         Request::OfferLease { from: BEN, to: BEN },
     ] {
         let refusal = sim.request(request).unwrap_err();
@@ -100,6 +103,20 @@ fn control_expires_with_silence_and_old_grips_do_not_return() {
     sim.send(None, hand(0.0, 0.0, 0.0)).unwrap();
     let verdict = sim.drive(Some(2), hand(0.0, 0.0, 0.0));
     assert!(matches!(verdict.output, Output::Follow(_)));
+}
+
+#[test]
+fn a_command_renews_control_from_its_receipt() {
+    let mut sim = Sim::ready(ageless());
+    sim.now += Duration::from_secs(1);
+    let waiting = sim.command(None, hand(0.0, 0.0, 0.0));
+    sim.now += Duration::from_secs(2);
+    sim.request(Request::Command(waiting)).unwrap();
+    let left_secs = sim.steering.lease_left_secs(sim.now);
+    assert!(
+        left_secs.is_some_and(|left_secs| (left_secs - 3.0).abs() < 1e-9),
+        "{left_secs:?}"
+    );
 }
 
 #[test]

@@ -162,7 +162,7 @@ impl Permission {
                 self.is_stopped = true;
                 self.held = None;
             }
-            (Request::Rearm(_), Ok(())) => {
+            (Request::Rearm { .. }, Ok(())) => {
                 self.is_stopped = false;
                 self.held = None;
             }
@@ -224,7 +224,10 @@ fn random_request(sim: &mut Sim, random: &mut Random, grips: &mut [u64; 3]) -> R
             to: BEN,
         },
         4 => Request::Stop { by: Some(operator) },
-        5..=14 => Request::Rearm(operator),
+        5..=14 => Request::Rearm {
+            operator,
+            stop: sim.steering.stop_number(),
+        },
         15..=30 => Request::TakeLease(ANA),
         _ => {
             let ix = if random.below(10) == 0 {

@@ -34,7 +34,7 @@ fn session() -> (SteeringConfig, Vec<Entry>) {
         if step % 400 == 399 {
             sim.request(Request::Stop { by: None }).unwrap();
             sim.cycle();
-            sim.request(Request::Rearm(ANA)).unwrap();
+            sim.rearm(ANA).unwrap();
         }
         if super::is_braking(&sim.cycle()) {
             grip += 1;

@@ -2,6 +2,8 @@
 
 use super::{START, Sim, ageless, joint_limits, panda, words};
 use crate::{Body, Effect, Intent, Link, Reason, SelfCollision, SelfCollisionConfig};
+use kinematics::Chain;
+use kinematics::urdf::Robot as Urdf;
 
 fn selected() -> (Body, SelfCollision) {
     let (urdf, chain) = panda();
@@ -79,6 +81,56 @@ fn pairs_are_selected_and_usual_postures_are_free() {
             assert!(distance_m > 0.01, "{parts:?} {distance_m}");
         }
     }
+}
+
+/// Two balls of 10 cm on rails along x and y. At zero, 5 mm are between their surfaces.
+const CLOSE_BALLS: &str = r#"<robot name="balls">
+    <link name="base"><collision><geometry><sphere radius="0.1"/></geometry></collision></link>
+    <joint name="y" type="prismatic"><parent link="base"/><child link="rail"/><axis xyz="0 1 0"/>
+        <limit lower="-0.5" upper="0.5" velocity="1" effort="1"/></joint>
+    <link name="rail"/>
+    <joint name="x" type="prismatic"><parent link="rail"/><child link="ball"/>
+        <origin xyz="0.205 0 0"/><axis xyz="1 0 0"/>
+        <limit lower="-0.1" upper="0.5" velocity="1" effort="1"/></joint>
+    <link name="ball"><collision><geometry><sphere radius="0.1"/></geometry></collision></link>
+</robot>"#;
+
+/// Invariant: parts that are too close at the start do not come closer.
+#[test]
+fn parts_that_are_close_at_the_start_may_leave_but_not_approach_each_other() {
+    let urdf = Urdf::parse(CLOSE_BALLS).unwrap();
+    let chain = Chain::new(&urdf, "base", "ball").unwrap();
+    let body = Body::new(&urdf, &chain, &|_| None).unwrap();
+    let ranges = [[-0.5, 0.5], [-0.1, 0.5]];
+    let config = SelfCollisionConfig::default();
+    let started = SelfCollision::new(config, &body, &ranges, Some(&[0.0, 0.0])).unwrap();
+    assert_eq!(started.n_pairs(), 1);
+    let notes = started.notes().join("\n");
+    let has_note = notes.contains("base and ball") && notes.contains("are 5 mm apart");
+    assert!(has_note && started.notes().len() == 1, "{notes}");
+    let refusal = |from: [f64; 2], to: [f64; 2]| {
+        let [here, there] = [from, to].map(|q| started.close_pairs(&body.capsules(&q)));
+        started.refusal(&here, &there, &body)
+    };
+    let closer = refusal([0.0, 0.0], [0.0, -0.002]);
+    assert!(
+        matches!(closer, Some(Reason::SelfCollision { .. })),
+        "{closer:?}"
+    );
+    // In small steps, too.
+    let mut x = 0.0;
+    while refusal([0.0, x], [0.0, x - 1e-4]).is_none() {
+        x -= 1e-4;
+        assert!(x > -0.0015, "{x}");
+    }
+    assert_eq!(refusal([0.0, 0.0], [0.0, 0.01]), None, "it leaves");
+    assert_eq!(refusal([0.0, 0.0], [0.0, 0.0]), None, "it rests");
+    assert_eq!(refusal([0.0, 0.1], [0.0, 0.0]), None, "it returns");
+    let from_afar = refusal([0.0, 0.03], [0.0, -0.01]);
+    assert!(from_afar.is_some(), "closer than at the start");
+    // They do not slow the arm down where it was put.
+    let here = started.close_pairs(&body.capsules(&[0.0, 0.0]));
+    assert_eq!(started.speed(&here, &body), (1.0, None));
 }
 
 #[test]

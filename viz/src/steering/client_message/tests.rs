@@ -130,7 +130,14 @@ fn leases_previews_and_pings_are_read() {
         let message = json!({"type": "lease", "action": action, "to": 12});
         assert_eq!(lease(message), expected);
     }
-    assert_eq!(lease(json!({"type": "rearm"})), SteeringRequest::Rearm);
+    let rearm = lease(json!({"type": "rearm", "stop": 3}));
+    assert_eq!(rearm, SteeringRequest::Rearm { stop: 3 });
+    for stop in [Value::Null, json!(-1), json!("3"), json!(1_u64 << 53)] {
+        let message = json!({"type": "rearm", "stop": stop});
+        let refusal = desk.read(&message).expect_err("no number of a stop");
+        assert_eq!(refusal.request, RefusedRequest::Rearm);
+        assert!(refusal.text.contains("stop") || refusal.text.contains("valid"));
+    }
     let SteeringRequest::Preview(preview) =
         lease(json!({"type": "preview", "id": 8, "position": [0, 1]}))
     else {
@@ -328,7 +335,7 @@ fn viewers_can_only_stop_and_ping() {
     let refused = [
         json!({"type": "lease", "action": "take"}),
         json!({"type": "lease", "action": "release"}),
-        json!({"type": "rearm"}),
+        json!({"type": "rearm", "stop": 1}),
         json!({"type": "preview", "id": 1, "position": [0, 0]}),
         command_message(),
         changed("grip", Value::Null),

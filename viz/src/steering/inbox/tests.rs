@@ -101,14 +101,14 @@ fn commands_do_not_overtake_other_requests() {
     push(&mut inbox, A, command(1, 1, Some(1)));
     push(&mut inbox, A, command(1, 2, Some(1)));
     // The switch was closed before motion was permitted, so this grip may not move the arm.
-    push(&mut inbox, A, SteeringRequest::Rearm);
+    push(&mut inbox, A, SteeringRequest::Rearm { stop: 1 });
     push(&mut inbox, A, command(1, 3, Some(1)));
     push(&mut inbox, A, command(1, 4, Some(1)));
     push(&mut inbox, B, SteeringRequest::Stop);
     push(&mut inbox, A, command(1, 5, Some(1)));
     let expected = [
         "4: 1 2 Some(1)",
-        "4: Rearm",
+        "4: Rearm { stop: 1 }",
         "4: 1 4 Some(1)",
         "9: Stop",
         "4: 1 5 Some(1)",
@@ -126,7 +126,7 @@ fn leases_and_permissions_are_neither_lost_nor_reordered() {
         (A, SteeringRequest::ReleaseLease),
         (A, SteeringRequest::TakeLease),
         (B, SteeringRequest::Stop),
-        (B, SteeringRequest::Rearm),
+        (B, SteeringRequest::Rearm { stop: 1 }),
         (A, SteeringRequest::Stop),
     ];
     for (client, request) in requests.clone() {
@@ -191,7 +191,7 @@ fn a_flood_is_limited_and_does_not_hold_back_what_ends_motion() {
             0 => SteeringRequest::TakeLease,
             1 => command(ix % 3, ix, Some(ix)),
             2 => command(ix % 3, ix, None),
-            3 => SteeringRequest::Rearm,
+            3 => SteeringRequest::Rearm { stop: 1 },
             _ => SteeringRequest::ReleaseLease,
         };
         let is_urgent = matches!(ix % 5, 2 | 4);
@@ -229,7 +229,7 @@ fn a_client_that_leaves_releases_and_its_stop_stays() {
     inbox.take();
     push(&mut inbox, A, command(1, 1, Some(1)));
     push(&mut inbox, A, SteeringRequest::Stop);
-    push(&mut inbox, A, SteeringRequest::Rearm);
+    push(&mut inbox, A, SteeringRequest::Rearm { stop: 1 });
     inbox.leave(A, Instant::now());
     assert_eq!(taken(&mut inbox), ["4: Stop", "4: Disconnected"]);
     let gone = inbox.push(A, Instant::now(), SteeringRequest::TakeLease);

@@ -79,6 +79,8 @@ export class Commander {
   private goIntent: Intent | null = null;
   /** Whether the triggers of the gamepad were seen open since the page has paid attention to it. */
   private isPadReady = false;
+  /** Whether the gamepad's button for a stop is down. */
+  private isPadStop = false;
 
   /** `device` differs from that of every other page, because each one counts its grips from the beginning. */
   constructor(
@@ -101,7 +103,8 @@ export class Commander {
   get canMove(): boolean {
     const { state } = this;
     if (!state) return this.couldMove;
-    return state.is_moving || (state.holder !== null && state.stop === null);
+    // After a recovery, motion is permitted, if nobody stops the arm before.
+    return state.is_moving || state.is_recovering || (state.holder !== null && state.stop === null);
   }
 
   /** Whether a stop can be sent. A link that is silent may still carry it. */
@@ -310,7 +313,10 @@ export class Commander {
    * when the attention begins has no effect before it is released and pulled again.
    */
   setPad(input: PadInput | null, hasAttention = true): void {
-    if (input?.isStop && this.canMove && this.state?.stop === null) this.stop();
+    const isStop = input?.isStop === true;
+    // During a recovery, the arm is stopped already, so that each press is one more stop.
+    if (isStop && this.canMove && (this.state?.stop === null || !this.isPadStop)) this.stop();
+    this.isPadStop = isStop;
     this.isPadReady = input !== null && hasAttention && (this.isPadReady || !input.isHeld);
     const isHeld = this.isPadReady && input?.isHeld === true;
     const isGo = isHeld && input.isGo;

@@ -20,7 +20,7 @@ export type SteerRequest =
   | { type: "lease"; action: "take" | "renew" | "release" }
   | { type: "lease"; action: "offer"; to: number }
   | { type: "stop" }
-  | { type: "rearm" }
+  | { type: "rearm"; stop: number }
   | {
       type: "command";
       device: number;
@@ -91,6 +91,10 @@ export interface SteerState {
   offered_to: number | null;
   /** Why the arm stays at rest until an operator permits motion. */
   stop: string | null;
+  /** Number of the newest stop, which a permission names; null without a stop. */
+  stop_number: number | null;
+  /** Whether the arm is being enabled after a fault. Motion is permitted afterward, unless somebody stops the arm. */
+  is_recovering: boolean;
   is_moving: boolean;
   position: number[];
   target: number[] | null;
@@ -185,6 +189,8 @@ function stateIn(fields: Fields): SteerState | null {
     lease_left_secs: numberOr(fields.lease_left_secs),
     offered_to: numberOr(fields.offered_to),
     stop: isText(fields.stop) ? fields.stop : null,
+    stop_number: numberOr(fields.stop_number),
+    is_recovering: fields.is_recovering === true,
     is_moving: fields.is_moving === true,
     position,
     target: areNumbers(fields.target) && fields.target.length === position.length ? fields.target : null,

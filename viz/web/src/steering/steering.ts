@@ -87,7 +87,7 @@ export class Steering {
     const marks = view.addTool((ofView) => new Marks(ofView, canvas, changed));
     view.addTool(() => ({ root: this.ghost.root, hasTakenPress: false, update: () => undefined }));
     const send = (request: SteerRequest): void => this.send(request);
-    this.stopButton = new StopButton(this.commander, page.action, () => send({ type: "rearm" }));
+    this.stopButton = new StopButton(this.commander, page.action, (stop) => send({ type: "rearm", stop }));
     this.lease = new LeasePanel(this.commander, send);
     this.jogPad = new JogPad(this.commander);
     this.jogKeys = new JogKeys(this.commander, page.toggle);

@@ -6,23 +6,25 @@ import { element } from "../panels/element";
 import { setText } from "../panels/html";
 import { disable, setTitle } from "../panels/title";
 import type { Commander } from "./commander";
+import { stopText } from "./texts";
+import { TwoPresses } from "./two_presses";
 
-/** The second press permits motion only within this time. */
-const SURE_MILLIS = 5000;
 const REARM = "Permit motion";
 const REARM_AGAIN = "Sure? Press again";
 
 export class StopButton {
   private readonly button = element("steer-stop", HTMLButtonElement);
   private readonly rearm = element("steer-rearm", HTMLButtonElement);
-  private sureUntil = 0;
+  private readonly presses = new TwoPresses(() => performance.now());
+  /** Number of the newest stop that the operator sees. */
+  private shownStop: number | null = null;
   /** Whether the key is down that has stopped the arm: its release must not press a focused button. */
   private isKeyDown = false;
 
   constructor(
     private readonly commander: Commander,
     addAction: typeof action,
-    private readonly sendRearm: () => void,
+    private readonly sendRearm: (stop: number) => void,
   ) {
     // A press is faster than a click, which needs the release.
     this.button.addEventListener("pointerdown", () => this.stop());
@@ -42,16 +44,17 @@ export class StopButton {
     disable(this.button, canSend ? "" : "The link to the arm is cut: the arm brakes when its commands expire");
     const isOwn = state?.holder === arm?.client;
     setText(element("steer-who"), typeof state?.holder === "number" ? (isOwn ? "you" : `operator ${state.holder}`) : "");
-    this.showStop(state?.stop ?? null);
-    disable(this.rearm, hasControl ? "" : "Only the operator who has control can permit motion");
-    if (performance.now() > this.sureUntil || !state?.stop) this.sureUntil = 0;
-    setText(this.rearm, this.sureUntil === 0 ? REARM : REARM_AGAIN);
+    this.showStop(state ? stopText(state) : "");
+    setText(element("steer-halt"), state?.is_recovering ? "Arm is being recovered" : "Arm stopped");
+    this.shownStop = state?.stop_number ?? null;
+    const reason = state?.is_recovering ? "The arm is being recovered: wait" : "";
+    disable(this.rearm, hasControl ? reason : "Only the operator who has control can permit motion");
+    setText(this.rearm, this.presses.isAwaited(this.shownStop) ? REARM_AGAIN : REARM);
   }
 
-  private showStop(stop: string | null): void {
-    const text = stop === null ? "" : `The arm is stopped: ${stop}`;
-    element("steer-stopped").hidden = stop === null;
-    element("steer-halt").hidden = stop === null;
+  private showStop(text: string): void {
+    element("steer-stopped").hidden = text === "";
+    element("steer-halt").hidden = text === "";
     if (element("steer-stop-text").textContent === text) return;
     setText(element("steer-stop-text"), text);
     setTitle(element("steer-halt"), text);
@@ -83,13 +86,9 @@ export class StopButton {
   }
 
   private pressRearm(): void {
-    const now = performance.now();
-    if (now < this.sureUntil) {
-      this.sureUntil = 0;
-      this.sendRearm();
-    } else {
-      this.sureUntil = now + SURE_MILLIS;
-    }
+    const stop = this.shownStop;
+    // The server refuses a permission after a stop that the page has not shown yet, because it has another number.
+    if (stop !== null && this.presses.press(stop)) this.sendRearm(stop);
     this.show();
   }
 }

@@ -15,6 +15,13 @@ export function leaseText({ holder, lease_left_secs, offered_to }: SteerState, c
   return offered_to === client ? `${who}. Control is offered to you` : who;
 }
 
+/** Why the arm is stopped, and that it is being recovered; empty if neither is so. */
+export function stopText({ stop, is_recovering }: SteerState): string {
+  const reason = stop === null ? "" : `The arm is stopped: ${stop}`;
+  if (!is_recovering) return reason;
+  return `The arm is being recovered. Motion is permitted afterward, unless somebody stops it. ${reason}`.trimEnd();
+}
+
 /** How the arm is moved now, and why. */
 export function modeText(mode: Mode, roundTripMillis: number | null, thresholdMillis: number, isForced: boolean): string {
   const limit = `limit ${Math.round(thresholdMillis)} ms`;
