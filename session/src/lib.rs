@@ -41,6 +41,7 @@ pub mod evaluate;
 pub mod evaluation_schedule;
 mod gpu_loss;
 mod holdout;
+mod incident_view;
 mod kept_folder;
 mod latency;
 mod ledger;
@@ -120,6 +121,7 @@ pub use session::{
 };
 pub use session_setup::{NewObserver, Services};
 pub use started_run::StartedRun;
+pub use steering::steering_log;
 pub use stored_keyframes::StoredKeyframes;
 pub use train_plan::{TrainOutcome, TrainPlan, Trained};
 pub use training::{UnsavedTraining, check_before_data, limits, model_specs};

@@ -14,6 +14,7 @@ mod recovery;
 mod requests;
 mod robot;
 mod scene_clearance;
+pub mod steering_log;
 mod steering_loop;
 #[cfg(test)]
 mod steering_loop_tests;
@@ -35,6 +36,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 use steering::{LimitConfig, SteeringConfig};
+use steering_log::About;
 use steering_loop::{Reply, SteeringLoop};
 use time_base::TimeBase;
 use viz::{ArmDescription, Hub, SteeredJoint, SteeringServer};
@@ -56,6 +58,7 @@ pub(crate) struct PreparedSteering {
     servo_round_trip_millis: f64,
     joint_names: Vec<String>,
     joint_offsets: Vec<f64>,
+    about: About,
 }
 
 impl PreparedSteering {
@@ -78,6 +81,10 @@ impl PreparedSteering {
             servo_round_trip_millis: settings.servo_round_trip_millis,
             joint_names: rig.arm.joints.clone(),
             joint_offsets: rig.arm.joint_offsets.clone(),
+            about: About {
+                urdf: rig.arm.urdf_text.clone(),
+                world_from_base: rig.base.world_from_base,
+            },
         })
     }
 
@@ -92,19 +99,22 @@ impl PreparedSteering {
         ClearanceFeed::new(Arc::clone(&self.scene))
     }
 
-    /// Lets clients of the hub steer the arm.
+    /// Lets clients of the hub steer the arm, and logs all decisions in the folder of the run.
     ///
     /// # Errors
     ///
     /// If the arm reports nothing, its limits do not match the robot, or no thread can be started.
-    pub(crate) fn start(self, hub: &Hub) -> anyhow::Result<SteeringThread> {
+    pub(crate) fn start(self, hub: &Hub, folder: &Path) -> anyhow::Result<SteeringThread> {
         let first = first_report(&self.arm)?;
         let robot = self
             .robot
             .steered(&self.joint_names, &self.joint_offsets, &self.arm)?;
         let server = SteeringServer::new(self.description(&robot));
-        let steering_loop = SteeringLoop::new(self.config, robot, TimeBase::now(), &first)
+        let mut steering_loop = SteeringLoop::new(self.config, robot, TimeBase::now(), &first)
             .context("the arm cannot be steered")?;
+        steering_loop
+            .log_into(folder, self.about)
+            .context("cannot start a thread")?;
         let must_stop = Arc::new(AtomicBool::new(false));
         let running = Running {
             steering_loop,
