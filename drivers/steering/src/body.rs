@@ -13,6 +13,9 @@ use serde::{Deserialize, Serialize};
 /// be.
 const OTHER_JOINT_FRACS: [f64; 3] = [0.0, 0.5, 1.0];
 
+/// Maximum number of capsules of a record. Each pair of them is compared.
+const MAX_SHAPES: usize = 4096;
+
 /// Capsules around all links that are rigidly joined to the base of a chain or move with its
 /// joints.
 #[derive(Clone, Debug)]
@@ -152,6 +155,9 @@ impl Body {
         chain: &Chain,
         shapes: &[Shape],
     ) -> Result<Self, Error> {
+        if shapes.len() > MAX_SHAPES {
+            return Err(Error::Shapes);
+        }
         let mut body = Self::without_parts(chain);
         body.visit(robot, chain, &|_| None);
         let n_frames = body.frames.len();

@@ -92,7 +92,6 @@ mod reason;
 mod record;
 mod request;
 mod self_collision;
-mod setup;
 mod steering;
 #[cfg(test)]
 mod tests;
@@ -111,7 +110,7 @@ pub use reason::{Effect, Limit, Link, Reason};
 pub use record::{Difference, Entry};
 pub use request::{Command, Device, Intent, Operator, Request};
 pub use self_collision::{SelfCollision, SelfCollisionConfig};
-pub use setup::Setup;
+pub use steering::setup::Setup;
 pub use steering::state::State;
 pub use steering::{Robot, Steering, SteeringConfig};
 pub use verdict::Verdict;

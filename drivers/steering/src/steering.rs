@@ -20,6 +20,7 @@ use serde::{Deserialize, Serialize};
 use std::sync::Arc;
 
 mod posture_check;
+pub(crate) mod setup;
 pub(crate) mod state;
 
 /// Configuration of all links.

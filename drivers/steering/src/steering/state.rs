@@ -1,13 +1,12 @@
 //! The state of a chain of decisions, so that a record can begin at any time.
 
 use super::{Motion, Steering};
-use crate::body::Body;
 use crate::clutch::ClutchState;
 use crate::error::Error;
 use crate::lease::Holder;
 use crate::reason::{Link, Reason};
-use drivers::motion::{MotionLimits, exact};
-use kinematics::{Chain, Stamp};
+use drivers::motion::exact;
+use kinematics::Stamp;
 use serde::{Deserialize, Serialize};
 
 /// All that a chain of decisions remembers between two calls.
@@ -83,28 +82,6 @@ impl Steering {
         self.latest = state.times.latest.map(|Nanos(at)| at);
         self.last_cycle = state.times.last_cycle.map(|Nanos(at)| at);
         Ok(())
-    }
-}
-
-impl Steering {
-    /// Joints that move.
-    pub(crate) fn chain(&self) -> &Chain {
-        &self.chain
-    }
-
-    /// Shape of the robot.
-    pub(crate) fn body(&self) -> &Body {
-        &self.body
-    }
-
-    /// Limits of the joints.
-    pub(crate) fn motion_limits(&self) -> &[MotionLimits] {
-        self.limits.joints()
-    }
-
-    /// The posture for which the pairs of parts were selected.
-    pub(crate) fn free_posture(&self) -> Option<&[f64]> {
-        self.free_posture.as_deref()
     }
 }
 

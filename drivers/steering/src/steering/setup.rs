@@ -1,10 +1,10 @@
 //! What a chain of decisions consists of: the beginning of a record that can be replayed alone.
 
+use super::state::State;
+use super::{Robot, Steering, SteeringConfig};
 use crate::body::{Body, Shape};
 use crate::error::Error;
 use crate::inverse::NearestPosture;
-use crate::steering::state::State;
-use crate::steering::{Robot, Steering, SteeringConfig};
 use drivers::motion::{MotionLimits, exact};
 use kinematics::Chain;
 use kinematics::urdf::Robot as Urdf;
@@ -19,7 +19,7 @@ pub struct Setup {
     pub config: SteeringConfig,
     /// Robot description.
     pub urdf: String,
-    /// Links at both ends of the chain.
+    /// Link to which the chain is fixed.
     pub base_link: String,
     /// Link that operators move.
     pub tip_link: String,
@@ -68,13 +68,13 @@ impl Steering {
     /// * `urdf`: the description from which the chain of joints and the shapes were made.
     pub fn setup(&self, urdf: String) -> Setup {
         Setup {
-            config: self.config().clone(),
+            config: self.config.clone(),
             urdf,
-            base_link: self.chain().base_link().to_owned(),
-            tip_link: self.chain().tip_link().to_owned(),
-            shapes: self.body().shapes(),
-            joints: self.motion_limits().iter().map(Joint::from).collect(),
-            free_posture: self.free_posture().map(<[f64]>::to_vec),
+            base_link: self.chain.base_link().to_owned(),
+            tip_link: self.chain.tip_link().to_owned(),
+            shapes: self.body.shapes(),
+            joints: self.limits.joints().iter().map(Joint::from).collect(),
+            free_posture: self.free_posture.clone(),
             state: self.state(),
         }
     }
