@@ -46,7 +46,7 @@ pub(crate) enum Command {
     Train(train::Args),
     /// Show a saved model or a splat file in the browser
     View(view::Args),
-    /// List the folders of runs, or remove them
+    /// List the folders of runs, or remove them; replay steered runs
     Runs(runs::Args),
     /// Render images of a saved model
     Render(render::Args),

@@ -45,6 +45,7 @@ mod gpu_check;
 mod gpu_loss;
 mod holdout;
 mod image_comparison;
+mod incident_view;
 mod kept_folder;
 mod latency;
 mod ledger;
@@ -131,7 +132,7 @@ pub use session::{
 };
 pub use session_setup::{NewObserver, Services};
 pub use started_run::StartedRun;
-pub use steering::{SteeringThread, Surroundings, steer_standalone};
+pub use steering::{SteeringThread, Surroundings, steer_standalone, steering_log};
 pub use stored_keyframes::StoredKeyframes;
 pub use train_plan::{TrainOutcome, TrainPlan, Trained};
 pub use training::{UnsavedTraining, check_before_data, limits, model_specs};

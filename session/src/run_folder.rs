@@ -1,5 +1,6 @@
 //! The folder of a run and its files.
 
+use crate::steering::steering_log;
 use anyhow::{Context, bail, ensure};
 use capture::check_output_folder;
 use capture::config::Rig;
@@ -323,7 +324,10 @@ fn missing_folders(folder: &Path) -> Vec<PathBuf> {
 
 /// Whether a folder contains results that must not be removed.
 fn must_keep(folder: &Path) -> bool {
-    holds_recording(folder) || holds_model(folder) || folder.join(CHECKPOINT).exists()
+    holds_recording(folder)
+        || holds_model(folder)
+        || folder.join(CHECKPOINT).exists()
+        || folder.join(steering_log::FILE).exists()
 }
 
 /// Whether a folder contains a recording.

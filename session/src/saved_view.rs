@@ -3,7 +3,7 @@
 use crate::run_folder::{is_recording, models_at, report};
 use crate::scene_hint::SceneView;
 use crate::viewer::ServedModel;
-use crate::{camera_list, methods, model_source, served_files, viewers};
+use crate::{camera_list, incident_view, methods, model_source, served_files, viewers};
 use gpu::Gpu;
 use kinematics::Transform;
 use messages::{BadInput, Setting};
@@ -92,10 +92,9 @@ fn publish_saved(
     }
     hub.set_keyframes(cameras);
     hub.set_status(status);
-    viz::publish_files(
-        hub,
-        served_files::of_models(kinds.iter().copied().zip(paths)),
-    );
+    let mut files = served_files::of_models(kinds.iter().copied().zip(paths));
+    files.extend(incident_view::publish(hub, paths, model_from_page));
+    viz::publish_files(hub, files);
     Ok(())
 }
 

@@ -1,4 +1,6 @@
-//! `fieldrig runs`: lists and removes the folders of runs.
+//! `fieldrig runs`: lists and removes the folders of runs, and replays steered runs.
+
+mod replay;
 
 use crate::exit::Exit;
 use crate::number_args::number_in_range;
@@ -41,6 +43,14 @@ enum Action {
                            --keep, such folders are kept and named."
     )]
     Remove(RemoveArgs),
+    /// Repeat the decisions of a steered run, and compare its targets bit for bit
+    #[command(
+        after_long_help = "The steering log of the run contains all requests of operators, what was known about the arm and \
+                           the scene, and all decisions. The replay repeats the decisions and compares them in every bit. It \
+                           prints whether they are the same, or the first one that differs, with its time; the exit code is \
+                           then 1. A log whose program was killed is replayed up to its last complete line."
+    )]
+    Replay(replay::ReplayArgs),
 }
 
 /// The folder of the runs.
@@ -86,6 +96,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
         None => list(&args.list),
         Some(Action::List(args)) => list(args),
         Some(Action::Remove(args)) => remove(args),
+        Some(Action::Replay(args)) => replay::run(args),
     }
 }
 

@@ -36,21 +36,25 @@ impl Drop for Run {
 
 impl Run {
     fn start(folder: &Path, flags: &[&str]) -> Self {
-        let mut child = Command::new(env!("CARGO_BIN_EXE_fieldrig"))
-            .args([
-                "run",
-                "rig.toml",
-                "--sim",
-                "--listen",
-                "127.0.0.1:0",
-                "--json",
-            ])
-            .args(["--when-done", "exit", "--out", "out"])
-            .args(flags)
-            .current_dir(folder)
-            .stdout(Stdio::piped())
-            .spawn()
-            .expect("it is built");
+        Self::launch(
+            Command::new(env!("CARGO_BIN_EXE_fieldrig"))
+                .args([
+                    "run",
+                    "rig.toml",
+                    "--sim",
+                    "--listen",
+                    "127.0.0.1:0",
+                    "--json",
+                ])
+                .args(["--when-done", "exit", "--out", "out"])
+                .args(flags)
+                .current_dir(folder),
+        )
+    }
+
+    /// Starts a program that serves the page.
+    fn launch(command: &mut Command) -> Self {
+        let mut child = command.stdout(Stdio::piped()).spawn().expect("it is built");
         let mut stdout = BufReader::new(child.stdout.take().expect("piped"));
         let mut line = String::new();
         stdout.read_line(&mut line).expect("text");
@@ -87,6 +91,12 @@ impl Run {
         let mut reply = String::new();
         stream.read_to_string(&mut reply).expect("text");
         reply
+    }
+
+    /// Kills the program. Nothing of it runs any more.
+    fn kill(mut self) {
+        self.child.kill().expect("it runs");
+        self.child.wait().expect("our own child");
     }
 
     fn interrupt(mut self) {
@@ -301,6 +311,117 @@ fn an_operator_takes_the_simulated_arm_over_and_moves_its_tip_back_by_ten_centim
         );
     }
     run.interrupt();
+    let replayed = replay(folder.path());
+    assert_eq!(replayed["identical"], true, "{replayed}");
+    assert!(replayed["targets"].as_u64() > Some(100), "{replayed}");
+    assert_eq!(
+        (&replayed["missing"], &replayed["damage"]),
+        (&json!(0), &Value::Null)
+    );
+    check_incidents(folder.path());
+}
+
+/// Repeats the decisions of the run.
+fn replay(folder: &Path) -> Value {
+    try_replay(folder).expect("a complete line")
+}
+
+/// Repeats the decisions of the run; `None` if its log has no complete line yet.
+fn try_replay(folder: &Path) -> Option<Value> {
+    let output = Command::new(env!("CARGO_BIN_EXE_fieldrig"))
+        .args(["runs", "replay", "out", "--json"])
+        .current_dir(folder)
+        .output()
+        .expect("it is built");
+    let stderr = String::from_utf8_lossy(&output.stderr);
+    if stderr.contains("no steering log") || stderr.contains("it is empty") {
+        return None;
+    }
+    assert!(output.status.success(), "{output:?}");
+    Some(serde_json::from_slice(&output.stdout).expect("JSON"))
+}
+
+/// `fieldrig view` offers the incidents of the run, and shows its robot.
+fn check_incidents(folder: &Path) {
+    let view = Run::launch(
+        Command::new(env!("CARGO_BIN_EXE_fieldrig"))
+            .args(["view", "out", "--listen", "127.0.0.1:0", "--json"])
+            .current_dir(folder),
+    );
+    // The address is printed when the models are loaded, and the files are published before.
+    let mut stream = TcpStream::connect(&view.address).expect("the server listens");
+    stream.set_read_timeout(Some(TIMEOUT)).expect("a timeout");
+    let request = format!(
+        "GET /files/steering-incidents.json HTTP/1.1\r\nHost: {}\r\nConnection: close\r\n\r\n",
+        view.address
+    );
+    stream.write_all(request.as_bytes()).expect("sent");
+    let mut reply = String::new();
+    stream.read_to_string(&mut reply).expect("text");
+    let body = &reply[reply.find("\r\n\r\n").expect("a head")..];
+    let list = &body[body.find('{').expect("JSON")..=body.rfind('}').expect("JSON")];
+    let list: Value = serde_json::from_str(list).expect("JSON");
+    assert_eq!(
+        list["joint_names"].as_array().map(Vec::len),
+        Some(7),
+        "{list}"
+    );
+    let incidents = list["incidents"].as_array().expect("a list");
+    let taken = &incidents[0];
+    assert_eq!(taken["kind"], "lease", "{taken}");
+    let text = taken["text"].as_str().expect("a text");
+    assert!(text.ends_with("took control"), "{text}");
+    let robot = view.connect("/ws").map(|mut viewer| {
+        for message in [
+            json!({"type": "hello", "protocols": [3, 4], "capabilities": ["subscribe", "robot"]}),
+            json!({"type": "subscribe", "topic": "robot_state", "rate_hz": 20}),
+        ] {
+            let message = Message::text(message.to_string());
+            viewer.send(message).expect("the server reads");
+        }
+        loop {
+            if let Message::Text(text) = viewer.read().expect("the server sends") {
+                let message: Value = serde_json::from_str(&text).expect("JSON");
+                if message["type"] == "robot" {
+                    break message;
+                }
+            }
+        }
+    });
+    let robot = robot.expect("the page is served");
+    assert_eq!(robot["joint_names"], list["joint_names"], "{robot}");
+}
+
+#[test]
+fn a_killed_run_leaves_a_log_up_to_its_stop() {
+    let folder = tempfile::tempdir().expect("a folder");
+    small_rig::write(folder.path(), Pace::RealTime);
+    let run = Run::start(folder.path(), &["--enable-motion"]);
+    let mut operator = Operator::connect(&run);
+    let client = operator.client;
+    operator.send(json!({"type": "lease", "action": "take"}));
+    operator.read_until(|message| message["holder"] == client);
+    operator.send(json!({"type": "view", "world_from_camera": [1, 0, 2, 0, 0, 0, 1]}));
+    operator.send(json!({"type": "stop"}));
+    operator.read_until(|message| message["stop"].is_string());
+    // Several further decisions, so that the thread of the log has had time. It does not wait for
+    // anything.
+    let began = Instant::now();
+    loop {
+        operator.next_state();
+        let replayed = try_replay(folder.path()).unwrap_or_default();
+        if replayed["decisions"].as_u64() > Some(2) {
+            assert_eq!(replayed["identical"], true, "{replayed}");
+            break;
+        }
+        assert!(began.elapsed() < TIMEOUT, "the stop is not in the log");
+    }
+    run.kill();
+    let replayed = replay(folder.path());
+    assert_eq!(
+        (&replayed["identical"], &replayed["damage"]),
+        (&json!(true), &Value::Null)
+    );
 }
 
 #[test]

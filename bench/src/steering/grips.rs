@@ -165,6 +165,7 @@ impl SteeredChain {
             device: DEVICE,
             sequence: self.sequence,
             captured_at: self.now,
+            received_at: self.now,
             grip,
             intent: Intent::Hand {
                 base_from_hand: transform::to_xyz_xyzw(hand),

@@ -74,6 +74,37 @@ pub mod array {
     }
 }
 
+/// One number.
+pub mod number {
+    use super::{Deserialize, Deserializer, Serialize, Serializer, Written};
+
+    /// For `#[serde(with = ..)]`.
+    pub fn serialize<S: Serializer>(value: &f64, to: S) -> Result<S::Ok, S::Error> {
+        Written::from(*value).serialize(to)
+    }
+
+    /// For `#[serde(with = ..)]`.
+    pub fn deserialize<'de, D: Deserializer<'de>>(from: D) -> Result<f64, D::Error> {
+        Written::deserialize(from)?.read()
+    }
+}
+
+/// A pose as x, y, z in meters, and a quaternion x, y, z, w, which is not normalized again.
+pub mod pose {
+    use super::{Deserializer, Serializer, array};
+    use kinematics::{Transform, transform};
+
+    /// For `#[serde(with = ..)]`.
+    pub fn serialize<S: Serializer>(pose: &Transform, to: S) -> Result<S::Ok, S::Error> {
+        array::serialize(&transform::to_xyz_xyzw(pose), to)
+    }
+
+    /// For `#[serde(with = ..)]`.
+    pub fn deserialize<'de, D: Deserializer<'de>>(from: D) -> Result<Transform, D::Error> {
+        array::deserialize(from).map(transform::from_xyz_xyzw)
+    }
+}
+
 /// A stamp as nanoseconds.
 pub mod stamp {
     use super::{Deserialize, Deserializer, Serializer};

@@ -6,11 +6,15 @@ use crate::fit::enclosing_capsules;
 use kinematics::urdf::{Joint, JointKind, Robot};
 use kinematics::{Chain, Transform};
 use nalgebra::{Translation3, Unit, UnitQuaternion, Vector3};
+use serde::{Deserialize, Serialize};
 
 /// Positions, as fractions of the range, at which parts are enclosed that move with joints outside
 /// the chain, such as fingers. Their joints are not measured, so these parts are wherever they can
 /// be.
 const OTHER_JOINT_FRACS: [f64; 3] = [0.0, 0.5, 1.0];
+
+/// Maximum number of capsules of a record. Each pair of them is compared.
+const MAX_SHAPES: usize = 4096;
 
 /// Capsules around all links that are rigidly joined to the base of a chain or move with its
 /// joints.
@@ -50,6 +54,16 @@ pub(crate) struct Part {
     capsule_in_frame: Capsule,
 }
 
+/// A capsule of a record.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub(crate) struct Shape {
+    link: String,
+    frame_ix: usize,
+    /// Ends of the capsule in the frame, meters.
+    ends_m: [[f64; 3]; 2],
+    radius_m: f64,
+}
+
 /// Where to go on in the tree of links.
 struct Branch<'a> {
     link: &'a str,
@@ -75,7 +89,19 @@ impl Body {
         chain: &Chain,
         vertices_of: &dyn Fn(&str) -> Option<Vec<[f64; 3]>>,
     ) -> Result<Self, Error> {
-        let mut body = Self {
+        let mut body = Self::without_parts(chain);
+        body.visit(robot, chain, vertices_of);
+        body.drop_contained();
+        if body.parts.is_empty() {
+            return Err(Error::NoShapes {
+                robot: robot.name().to_owned(),
+            });
+        }
+        Ok(body)
+    }
+
+    fn without_parts(chain: &Chain) -> Self {
+        Self {
             frames: vec![Frame {
                 parent: None,
                 parent_from_joint: Transform::identity(),
@@ -84,7 +110,16 @@ impl Body {
             parts: Vec::new(),
             notes: Vec::new(),
             n_joints: chain.n_joints(),
-        };
+        }
+    }
+
+    /// Adds the frames and parts of all links.
+    fn visit(
+        &mut self,
+        robot: &Robot,
+        chain: &Chain,
+        vertices_of: &dyn Fn(&str) -> Option<Vec<[f64; 3]>>,
+    ) {
         let mut branches = vec![Branch {
             link: chain.base_link(),
             frame_ix: 0,
@@ -94,16 +129,54 @@ impl Body {
         }];
         // Every joint is crossed once per variant, so the walk ends.
         while let Some(branch) = branches.pop() {
-            body.add_shapes(robot, &branch, vertices_of);
-            body.add_children(robot, chain, &branch, &mut branches);
-            body.add_parent(robot, &branch, &mut branches);
+            self.add_shapes(robot, &branch, vertices_of);
+            self.add_children(robot, chain, &branch, &mut branches);
+            self.add_parent(robot, &branch, &mut branches);
         }
-        body.drop_contained();
-        if body.parts.is_empty() {
-            return Err(Error::NoShapes {
-                robot: robot.name().to_owned(),
-            });
+    }
+
+    /// The capsules that move with each frame, for records: mesh files may have changed since.
+    pub(crate) fn shapes(&self) -> Vec<Shape> {
+        let shape = |part: &Part| Shape {
+            link: part.link.clone(),
+            frame_ix: part.frame_ix,
+            ends_m: part.capsule_in_frame.ends.map(Into::into),
+            radius_m: part.capsule_in_frame.radius_m,
+        };
+        self.parts.iter().map(shape).collect()
+    }
+
+    /// The body of a record.
+    ///
+    /// # Errors
+    /// If there are no shapes, or one of them belongs to no frame of the robot or has no size.
+    pub(crate) fn from_shapes(
+        robot: &Robot,
+        chain: &Chain,
+        shapes: &[Shape],
+    ) -> Result<Self, Error> {
+        if shapes.len() > MAX_SHAPES {
+            return Err(Error::Shapes);
         }
+        let mut body = Self::without_parts(chain);
+        body.visit(robot, chain, &|_| None);
+        let n_frames = body.frames.len();
+        let part = |shape: &Shape| {
+            let mut numbers = shape.ends_m.iter().flatten().chain([&shape.radius_m]);
+            let is_valid = shape.frame_ix < n_frames && numbers.all(|x| x.is_finite());
+            is_valid.then(|| Part {
+                link: shape.link.clone(),
+                frame_ix: shape.frame_ix,
+                capsule_in_frame: Capsule {
+                    ends: shape.ends_m.map(Into::into),
+                    radius_m: shape.radius_m,
+                },
+            })
+        };
+        let parts: Option<Vec<Part>> = shapes.iter().map(part).collect();
+        body.parts = parts
+            .filter(|parts| !parts.is_empty())
+            .ok_or(Error::Shapes)?;
         Ok(body)
     }
 

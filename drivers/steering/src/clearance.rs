@@ -13,6 +13,9 @@ use crate::reason::Reason;
 use kinematics::Stamp;
 use serde::{Deserialize, Serialize};
 
+/// Rounding of a product, so that a multiple of a step stays the same.
+const ROUNDING: f64 = 1e-6;
+
 /// What is known about the surroundings of a point.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Seen {
@@ -140,6 +143,19 @@ pub struct Restriction {
     pub seen: Option<Seen>,
 }
 
+/// A distance in steps of 0.1 mm. It is far more exact than any map, and the records of long motions
+/// stay small.
+fn rounded_down_m(distance_m: f64) -> f64 {
+    const STEPS_PER_M: f64 = 1e4;
+    (distance_m * STEPS_PER_M + ROUNDING).floor() / STEPS_PER_M
+}
+
+/// An age in steps of 0.1 s, for the same reason.
+fn rounded_up_secs(age_secs: f64) -> f64 {
+    const STEPS_PER_SEC: f64 = 10.0;
+    (age_secs * STEPS_PER_SEC - ROUNDING).ceil() / STEPS_PER_SEC
+}
+
 /// Points of the robot whose distances are asked for.
 #[derive(Clone, Debug)]
 pub struct ClearancePoints {
@@ -207,8 +223,8 @@ impl ClearancePoints {
             let seen = seen.filter(|seen| seen.age_secs >= 0.0 && !seen.distance_m.is_nan());
             let seen = seen.map(|seen| Seen {
                 // JSON has no infinity. Beyond these bounds, nothing changes.
-                distance_m: (seen.distance_m - point.radius_m).clamp(-1e3, 1e3),
-                age_secs: seen.age_secs.min(1e9),
+                distance_m: rounded_down_m((seen.distance_m - point.radius_m).clamp(-1e3, 1e3)),
+                age_secs: rounded_up_secs(seen.age_secs.min(1e9)),
             });
             if seen.is_none_or(|seen| self.scale_of(seen) < 1.0) {
                 restrictions.push(Restriction { point_ix, seen });

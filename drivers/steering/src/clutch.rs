@@ -6,6 +6,7 @@
 
 use crate::reason::Reason;
 use crate::request::{Command, Device, Intent};
+use drivers::motion::exact;
 use kinematics::{Stamp, Transform};
 use serde::{Deserialize, Serialize};
 
@@ -53,32 +54,44 @@ const MAX_DEVICES: usize = 8;
 /// of a browser are rounded to as much as a tenth of a millisecond, some to a millisecond.
 const MIN_SAMPLE_SECS: f64 = 1e-3;
 
-#[derive(Clone, Copy, Debug)]
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 struct Known {
     device: Device,
     newest_sequence: Option<u64>,
     /// The greatest grip that may not move the arm any more.
     used_up: Option<u64>,
+    #[serde(with = "exact::stamp")]
     heard_at: Stamp,
 }
 
 /// A device with a closed switch.
-#[derive(Clone, Debug)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub(crate) struct Held {
     pub(crate) device: Device,
     grip: u64,
     /// When the newest command arrived, however long it then waited for a decision.
+    #[serde(with = "exact::stamp")]
     pub(crate) received_at: Stamp,
+    #[serde(with = "exact::stamp")]
     captured_at: Stamp,
     pub(crate) intent: Intent,
     /// Hand and tip at the start of the grip; `None` until the arm is at rest.
     anchor: Option<Anchor>,
 }
 
-#[derive(Clone, Copy, Debug)]
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 struct Anchor {
+    #[serde(with = "exact::pose")]
     base_from_hand: Transform,
+    #[serde(with = "exact::pose")]
     base_from_tip: Transform,
+}
+
+/// What a clutch knows, for records.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+pub(crate) struct ClutchState {
+    known: Vec<Known>,
+    held: Option<Held>,
 }
 
 /// Devices of the holder of the lease, and the one that moves the arm.
@@ -88,6 +101,13 @@ pub(crate) struct Clutch {
     n_joints: usize,
     known: Vec<Known>,
     held: Option<Held>,
+}
+
+impl ClutchState {
+    /// Number of joint values of the intent that is followed, if it has any.
+    pub(crate) fn n_joints(&self) -> Option<usize> {
+        self.held.as_ref()?.intent.n_joints()
+    }
 }
 
 /// How a command changed the clutch.
@@ -112,6 +132,20 @@ impl Clutch {
             known: Vec::new(),
             held: None,
         }
+    }
+
+    /// What the clutch knows.
+    pub(crate) fn state(&self) -> ClutchState {
+        ClutchState {
+            known: self.known.clone(),
+            held: self.held.clone(),
+        }
+    }
+
+    /// Continues from a state.
+    pub(crate) fn set_state(&mut self, state: ClutchState) {
+        self.known = state.known;
+        self.held = state.held;
     }
 
     /// The device that moves the arm.

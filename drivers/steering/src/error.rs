@@ -12,6 +12,17 @@ pub enum Error {
         /// Name of the robot.
         robot: String,
     },
+    /// The shapes of a record do not fit its robot.
+    #[error("the record has no shapes of the robot, or shapes that do not fit it: it is damaged")]
+    Shapes,
+    /// The state of a record does not fit its robot.
+    #[error("the state in the record has {got} joints, the robot has {expected}: it is damaged")]
+    State {
+        /// Number found.
+        got: usize,
+        /// Number expected.
+        expected: usize,
+    },
     /// A value is out of its range.
     #[error("steering: {what} is {value}, must be {expected}")]
     Value {

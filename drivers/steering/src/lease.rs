@@ -2,6 +2,7 @@
 
 use crate::reason::Reason;
 use crate::request::{Command, Operator};
+use drivers::motion::exact;
 use kinematics::Stamp;
 use serde::{Deserialize, Serialize};
 
@@ -26,20 +27,30 @@ impl Default for LeaseConfig {
 }
 
 /// The holder of the lease.
-#[derive(Clone, Copy, Debug, PartialEq)]
-struct Holder {
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+pub(crate) struct Holder {
     operator: Operator,
+    #[serde(with = "exact::stamp")]
     since: Stamp,
+    #[serde(with = "exact::stamp")]
     heard_at: Stamp,
-    /// An offer, and its end.
-    offered_to: Option<(Operator, Stamp)>,
+    offer: Option<Offer>,
+}
+
+/// An offer, and its end.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+struct Offer {
+    to: Operator,
+    #[serde(with = "exact::stamp")]
+    until: Stamp,
 }
 
 /// The right to move the arm.
 #[derive(Clone, Debug)]
 pub(crate) struct Lease {
     config: LeaseConfig,
-    holder: Option<Holder>,
+    /// The state, for records.
+    pub(crate) holder: Option<Holder>,
 }
 
 impl Lease {
@@ -64,7 +75,7 @@ impl Lease {
 
     /// The operator who may take the lease over now.
     pub(crate) fn offered_to(&self, now: Stamp) -> Option<Operator> {
-        let (to, until) = self.holder?.offered_to?;
+        let Offer { to, until } = self.holder?.offer?;
         (now <= until).then_some(to)
     }
 
@@ -100,8 +111,8 @@ impl Lease {
                 return self.renew(now, operator).map(|()| None);
             }
             let is_offered = holder
-                .offered_to
-                .is_some_and(|(to, until)| to == operator && now <= until);
+                .offer
+                .is_some_and(|offer| offer.to == operator && now <= offer.until);
             if !is_offered {
                 return Err(self.refusal(now));
             }
@@ -113,7 +124,7 @@ impl Lease {
             operator,
             since: now,
             heard_at: now,
-            offered_to: None,
+            offer: None,
         });
         Ok(lost)
     }
@@ -152,7 +163,7 @@ impl Lease {
         self.renew(now, from)?;
         let until = now.plus_secs(self.config.offer_secs);
         if let Some(holder) = &mut self.holder {
-            holder.offered_to = Some((to, until));
+            holder.offer = Some(Offer { to, until });
         }
         Ok(())
     }

@@ -112,6 +112,8 @@ pub use reason::{Effect, Limit, Link, Reason};
 pub use record::{Difference, Entry};
 pub use request::{Command, Device, Intent, Operator, Request};
 pub use self_collision::{SelfCollision, SelfCollisionConfig};
+pub use steering::setup::Setup;
+pub use steering::state::State;
 pub use steering::{Robot, Steering, SteeringConfig};
 pub use verdict::Verdict;
 

@@ -146,6 +146,11 @@ impl Limits {
         })
     }
 
+    /// Limits of the joints.
+    pub(crate) fn joints(&self) -> &[MotionLimits] {
+        &self.joints
+    }
+
     /// Ranges of the joints, without margins.
     pub(crate) fn ranges(&self) -> Vec<[f64; 2]> {
         self.joints.iter().map(|joint| joint.position).collect()

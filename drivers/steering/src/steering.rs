@@ -14,12 +14,14 @@ use crate::record::{Difference, Entry, Record, are_identical};
 use crate::request::{Command, Intent, Operator, Request};
 use crate::self_collision::{ClosePair, SelfCollision, SelfCollisionConfig};
 use crate::verdict::Verdict;
-use drivers::motion::{ArmState, MotionLimits, Output, Target};
+use drivers::motion::{ArmState, MotionLimits, Output, Target, exact};
 use kinematics::{Chain, Stamp, Transform};
 use serde::{Deserialize, Serialize};
 use std::sync::Arc;
 
 mod posture_check;
+pub(crate) mod setup;
+pub(crate) mod state;
 
 /// Configuration of all links.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -110,6 +112,8 @@ pub struct Steering {
     n_targets: u64,
     latest: Option<Stamp>,
     last_cycle: Option<Stamp>,
+    /// For records: the posture for which the pairs of parts were selected.
+    free_posture: Option<Vec<f64>>,
     record: Record,
 }
 
@@ -124,11 +128,13 @@ impl std::fmt::Debug for Steering {
 }
 
 /// A motion from a grip until the arm brakes.
-#[derive(Clone, Debug)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 struct Motion {
     /// The last target.
+    #[serde(with = "exact::list")]
     target: Vec<f64>,
-    /// Distance from the scene at which this target was accepted.
+    /// Distance from the scene at which this target was accepted; infinite without a surface.
+    #[serde(with = "exact::number")]
     accepted_m: f64,
 }
 
@@ -179,6 +185,7 @@ impl Steering {
             n_targets: 0,
             latest: None,
             last_cycle: None,
+            free_posture: robot.free_posture.map(<[f64]>::to_vec),
             record: Record::new(MAX_ENTRIES),
         })
     }
@@ -313,6 +320,18 @@ impl Steering {
                 seen,
                 verdict,
             } => {
+                let n_points = self.clearance.n_points();
+                let mut points = seen
+                    .iter()
+                    .flatten()
+                    .map(|restriction| restriction.point_ix);
+                if let Some(point_ix) = points.find(|ix| *ix >= n_points) {
+                    return Err(Difference {
+                        at: *at,
+                        replayed: format!("with {n_points} points of the robot"),
+                        recorded: format!("a distance of point {point_ix}"),
+                    });
+                }
                 let mut seen = seen.iter();
                 let replayed =
                     self.decide_cycle(*at, arm, &mut |_| seen.next().cloned().unwrap_or_default());

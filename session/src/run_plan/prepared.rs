@@ -172,7 +172,9 @@ impl OpenedRun<'_> {
         let stop = services.stop.clone();
         let clearance = steering.as_ref().map(PreparedSteering::clearance_feed);
         let feed = Feed::start(input, observer(&hub, steering.as_ref()), stop.clone())?;
-        let steering = steering.map(|steering| steering.start(&hub)).transpose()?;
+        let steering = steering
+            .map(|steering| steering.start(&hub, Some(run_folder_of(&folders))))
+            .transpose()?;
         let setup = SessionSetup {
             services,
             gpu: &gpu,
@@ -257,16 +259,22 @@ fn publish_robot(hub: &Hub, rig: &Rig, plan: &RunPlan) -> anyhow::Result<Option<
 /// folder of the run.
 fn identity(plan: &RunPlan, folders: &[PathBuf], robot: Option<String>) -> Identity {
     let name = |name: Option<&OsStr>| name.map(|name| name.to_string_lossy().into_owned());
-    let first = folders.first().map(PathBuf::as_path);
-    let run = match folders.len() {
-        2.. => first.and_then(Path::parent),
-        _ => first,
-    };
     Identity {
         rig: name(plan.rig_file.file_stem()),
         robot,
-        run: name(run.and_then(Path::file_name)),
+        run: name(run_folder_of(folders).file_name()),
     }
+}
+
+/// The folder of the run.
+///
+/// * `folders`: the folders of its models.
+fn run_folder_of(folders: &[PathBuf]) -> &Path {
+    let run = match folders {
+        [first, _, ..] => first.parent(),
+        _ => folders.first().map(PathBuf::as_path),
+    };
+    run.unwrap_or(Path::new(""))
 }
 
 /// The input, with the keyframes of the previous run restored. Also returns keyframes that exceed

@@ -3,6 +3,7 @@
 use crate::decisions;
 use crate::run_folder::{CHECKPOINT, KEYFRAMES, LOCK, LOG, MODEL, OLDER_LOG, REPORT, holds_model};
 use crate::run_plan::CORRECTED_RIG;
+use crate::steering::steering_log;
 use crate::{camera_list, report};
 use drivers::recording::{RIG_FILE, URDF_FILE};
 use std::ffi::OsStr;
@@ -10,7 +11,7 @@ use std::path::{Path, PathBuf};
 use trainer::ModelKind;
 
 /// Names of files that runs write, besides those of models and decision logs.
-const FILES: [&str; 11] = [
+const FILES: [&str; 13] = [
     LOCK,
     LOG,
     OLDER_LOG,
@@ -22,6 +23,8 @@ const FILES: [&str; 11] = [
     "keyframes.txt",
     RIG_FILE,
     URDF_FILE,
+    steering_log::FILE,
+    steering_log::OLDER_FILE,
 ];
 
 /// Whether a run has written into a folder. A folder with a rig file alone is not a run.

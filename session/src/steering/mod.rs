@@ -15,6 +15,7 @@ mod requests;
 mod robot;
 mod scene_clearance;
 mod standalone;
+pub mod steering_log;
 mod steering_loop;
 #[cfg(test)]
 mod steering_loop_tests;
@@ -39,6 +40,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 use steering::{LimitConfig, SteeringConfig};
+use steering_log::About;
 use steering_loop::{Reply, SteeringLoop};
 use time_base::TimeBase;
 use viz::{ArmDescription, Hub, SteeredJoint, SteeringServer};
@@ -60,6 +62,7 @@ pub(crate) struct PreparedSteering<S = SceneClearance> {
     servo_round_trip_millis: f64,
     joint_names: Vec<String>,
     joint_offsets: Vec<f64>,
+    about: About,
 }
 
 impl PreparedSteering {
@@ -71,18 +74,8 @@ impl PreparedSteering {
     pub(crate) fn new(arm: SteeredArm, rig: &Rig, rig_file: &Path) -> anyhow::Result<Self> {
         let folder = Rig::urdf_folder(rig_file).unwrap_or_default();
         let robot = robot::chain_and_body(rig, &folder)?;
-        let scene = SceneClearance::new(rig, &robot)?;
-        let settings = rig.arm.motion.as_ref().map(|motion| &motion.steering);
-        let settings = settings.cloned().unwrap_or_default();
-        Ok(Self {
-            arm,
-            robot,
-            scene: Arc::new(scene),
-            config: config(&settings),
-            servo_round_trip_millis: settings.servo_round_trip_millis,
-            joint_names: rig.arm.joints.clone(),
-            joint_offsets: rig.arm.joint_offsets.clone(),
-        })
+        let scene = Arc::new(SceneClearance::new(rig, &robot)?);
+        Ok(Self::of(arm, rig, robot, scene))
     }
 
     /// An observer of the run's input, from which the free space around the arm is known. It also
@@ -98,19 +91,48 @@ impl PreparedSteering {
 }
 
 impl<S: Surroundings> PreparedSteering<S> {
+    fn of(arm: SteeredArm, rig: &Rig, robot: robot::ChainAndBody, scene: Arc<S>) -> Self {
+        let settings = rig.arm.motion.as_ref().map(|motion| &motion.steering);
+        let settings = settings.cloned().unwrap_or_default();
+        Self {
+            arm,
+            robot,
+            scene,
+            config: config(&settings),
+            servo_round_trip_millis: settings.servo_round_trip_millis,
+            joint_names: rig.arm.joints.clone(),
+            joint_offsets: rig.arm.joint_offsets.clone(),
+            about: About {
+                urdf: rig.arm.urdf_text.clone(),
+                world_from_base: rig.base.world_from_base,
+            },
+        }
+    }
+
     /// Lets clients of the hub steer the arm.
+    ///
+    /// * `log_folder`: where all decisions are logged, if they are.
     ///
     /// # Errors
     ///
     /// If the arm reports nothing, its limits do not match the robot, or no thread can be started.
-    pub(crate) fn start(self, hub: &Hub) -> anyhow::Result<SteeringThread> {
+    pub(crate) fn start(
+        self,
+        hub: &Hub,
+        log_folder: Option<&Path>,
+    ) -> anyhow::Result<SteeringThread> {
         let first = first_report(&self.arm)?;
         let robot = self
             .robot
             .steered(&self.joint_names, &self.joint_offsets, &self.arm)?;
         let server = SteeringServer::new(self.description(&robot));
-        let steering_loop = SteeringLoop::new(self.config, robot, TimeBase::now(), &first)
+        let mut steering_loop = SteeringLoop::new(self.config, robot, TimeBase::now(), &first)
             .context("the arm cannot be steered")?;
+        if let Some(folder) = log_folder {
+            steering_loop
+                .log_into(folder, self.about)
+                .context("cannot start a thread")?;
+        }
         let must_stop = Arc::new(AtomicBool::new(false));
         let running = Running {
             steering_loop,

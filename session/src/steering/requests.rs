@@ -48,7 +48,7 @@ fn intent(intent: &SteeringIntent) -> Intent {
     }
 }
 
-/// The kind of a request, for its refusal. `None` for the end of a client.
+/// The kind of a request, for its refusal. `None` if it is not refused.
 pub(super) fn kind(request: &SteeringRequest) -> Option<RefusedRequest> {
     match request {
         SteeringRequest::TakeLease
@@ -59,7 +59,7 @@ pub(super) fn kind(request: &SteeringRequest) -> Option<RefusedRequest> {
         SteeringRequest::Rearm { .. } => Some(RefusedRequest::Rearm),
         SteeringRequest::Command(_) => Some(RefusedRequest::Command),
         SteeringRequest::Preview(_) => Some(RefusedRequest::Preview),
-        SteeringRequest::Disconnected => None,
+        SteeringRequest::View { .. } | SteeringRequest::Disconnected => None,
     }
 }
 

@@ -1,7 +1,7 @@
 //! Steers an arm without a run.
 
 use super::surroundings::Surroundings;
-use super::{PreparedSteering, SteeringThread, config, robot};
+use super::{PreparedSteering, SteeringThread, robot};
 use capture::config::Rig;
 use capture::open::SteeredArm;
 use drivers::motion::SteeringPort;
@@ -26,16 +26,7 @@ pub fn steer_standalone<S: Surroundings>(
     scene: Arc<S>,
     hub: &Hub,
 ) -> anyhow::Result<SteeringThread> {
-    let settings = rig.arm.motion.as_ref().map(|motion| &motion.steering);
-    let settings = settings.cloned().unwrap_or_default();
-    let prepared = PreparedSteering {
-        arm: SteeredArm::holding(port),
-        robot: robot::chain_and_body(rig, Path::new(""))?,
-        scene,
-        config: config(&settings),
-        servo_round_trip_millis: settings.servo_round_trip_millis,
-        joint_names: rig.arm.joints.clone(),
-        joint_offsets: rig.arm.joint_offsets.clone(),
-    };
-    prepared.start(hub)
+    let robot = robot::chain_and_body(rig, Path::new(""))?;
+    let prepared = PreparedSteering::of(SteeredArm::holding(port), rig, robot, scene);
+    prepared.start(hub, None)
 }

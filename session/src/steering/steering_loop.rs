@@ -5,11 +5,13 @@ use super::joint_map::JointMap;
 use super::previews::{Now, Previews};
 use super::recovery::{Permission, Recovery};
 use super::requests;
+use super::steering_log::{About, LoopLog};
 use super::time_base::TimeBase;
 use drivers::motion::{ArmState, Output, SteeringPort};
 use kinematics::inverse::InverseSolver;
 use kinematics::{Chain, Stamp, transform};
 use std::collections::VecDeque;
+use std::path::Path;
 use std::time::Instant;
 use steering::{
     Body, Clearance, NearestPosture, Operator, Reason, Request, Robot, Steering, SteeringConfig,
@@ -50,6 +52,7 @@ pub(super) struct SteeringLoop {
     /// The newest command that moves the arm, until a cycle has applied it.
     pending: Option<AppliedSource>,
     applied: Option<AppliedCommand>,
+    log: Option<LoopLog>,
 }
 
 /// Where a setpoint comes from.
@@ -134,7 +137,18 @@ impl SteeringLoop {
             has_begun: false,
             pending: None,
             applied: None,
+            log: None,
         })
+    }
+
+    /// Logs all decisions from now on.
+    ///
+    /// # Errors
+    ///
+    /// If no thread can be started.
+    pub(super) fn log_into(&mut self, folder: &Path, about: About) -> std::io::Result<()> {
+        self.log = Some(LoopLog::new(folder, about, &self.steering)?);
+        Ok(())
     }
 
     /// The newest state of the arm, in the order of the chain; `None` before the arm has reported one.
@@ -165,6 +179,9 @@ impl SteeringLoop {
         if self.has_begun {
             let output = verdict.output.clone();
             self.port.send(&self.joints.output_for_driver(output));
+        }
+        if let Some(log) = &mut self.log {
+            log.take(now, &mut self.steering);
         }
         self.note_applied(now, &verdict);
         // A goal out of reach takes longer than a cycle. While the arm follows an operator, the next
@@ -230,6 +247,10 @@ impl SteeringLoop {
             SteeringRequest::Preview(request) => {
                 return self.queue_preview(received.client, request);
             }
+            SteeringRequest::View { world_from_camera } => {
+                self.see(now, operator, *world_from_camera);
+                return Ok(());
+            }
             // Whoever has gone cannot open a dead-man switch any more.
             SteeringRequest::Disconnected if self.holds_lease(operator) => {
                 Request::ReleaseLease(operator)
@@ -237,6 +258,14 @@ impl SteeringLoop {
             SteeringRequest::Disconnected => return Ok(()),
         };
         self.handle(now, &request)
+    }
+
+    /// Logs what the holder of the lease sees.
+    fn see(&mut self, now: Stamp, operator: Operator, world_from_camera: [f64; 7]) {
+        let is_holder = self.holds_lease(operator);
+        if let Some(log) = self.log.as_mut().filter(|_| is_holder) {
+            log.see(now, operator.0, world_from_camera);
+        }
     }
 
     fn handle(&mut self, now: Stamp, request: &Request) -> Result<(), String> {

@@ -2,6 +2,7 @@
 
 use super::config;
 use super::joint_map::JointMap;
+use super::steering_log::{self, About};
 use super::steering_loop::{Outcome, Reply, SteeredRobot, SteeringLoop};
 use super::time_base::TimeBase;
 use capture::config::ArmSteering;
@@ -587,4 +588,39 @@ fn goals_are_judged_without_moving_the_arm() {
     assert_eq!(unseen.verdict, PreviewVerdict::NeverSeen, "{}", unseen.text);
     assert!(unseen.place.is_some());
     assert_eq!(run.tip(), rest);
+}
+
+#[test]
+fn log_of_the_loop_has_its_decisions_and_what_the_holder_of_the_lease_sees() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let mut run = Run::new();
+    let about = About {
+        urdf: PANDA.to_owned(),
+        world_from_base: Transform::identity(),
+    };
+    run.steering_loop
+        .log_into(folder.path(), about)
+        .expect("a thread");
+    run.cycle(vec![(ANA, SteeringRequest::TakeLease)]);
+    let [of_ana, of_ben] = [1.0, 2.0].map(|x| [x, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0]);
+    for (client, world_from_camera) in [(ANA, of_ana), (BEN, of_ben)] {
+        let outcome = run.cycle(vec![(client, SteeringRequest::View { world_from_camera })]);
+        assert!(outcome.replies.is_empty(), "{outcome:?}");
+    }
+    let down = run.moved_by([0.0, 0.0, -0.05]);
+    run.hold(None, &down, 2);
+    run.hold(Some(1), &down, 40);
+    run.cycle(vec![(BEN, SteeringRequest::Stop)]);
+    run.wait_for_rest();
+    drop(run);
+    let files = steering_log::files_of(folder.path()).expect("a log");
+    let replayed = steering_log::replay(&files).expect("a log");
+    assert!(replayed.is_identical(), "{}", replayed.sentence());
+    assert_eq!(replayed.targets, 40);
+    let found = steering_log::incidents(&files).expect("a log").incidents;
+    let stop = found.back().expect("a stop");
+    assert_eq!(
+        (&*stop.text, stop.view),
+        ("operator 2 stopped the arm", Some(of_ana))
+    );
 }

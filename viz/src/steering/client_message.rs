@@ -80,7 +80,7 @@ enum MessageError {
     #[error("the message is not valid: {0}")]
     Json(#[from] serde_json::Error),
     #[error(
-        "unknown type {0:?}, expected \"lease\", \"stop\", \"rearm\", \"command\", \"preview\" or \"ping\""
+        "unknown type {0:?}, expected \"lease\", \"stop\", \"rearm\", \"command\", \"preview\", \"view\" or \"ping\""
     )]
     UnknownType(String),
     #[error("the message has no type: it must be a JSON object with the field \"type\"")]
@@ -168,6 +168,12 @@ struct PreviewMessage {
     position: Option<Vec<f64>>,
 }
 
+/// Fields of `view`.
+#[derive(Debug, Deserialize)]
+struct ViewMessage {
+    world_from_camera: [f64; 7],
+}
+
 /// Fields of `ping`.
 #[derive(Debug, Deserialize)]
 struct PingMessage {
@@ -214,7 +220,7 @@ fn read_kind(
         }
         _ => {}
     }
-    let is_known = refused_kind(kind) != RefusedRequest::Message;
+    let is_known = refused_kind(kind) != RefusedRequest::Message || kind == Some("view");
     if is_known && context.role < Role::Operator {
         return Err(MessageError::NotOperator);
     }
@@ -228,6 +234,12 @@ fn read_kind(
         Some("preview") => {
             let message = serde_json::from_str(text)?;
             SteeringRequest::Preview(preview(message, context.n_joints)?)
+        }
+        Some("view") => {
+            let ViewMessage { world_from_camera } = serde_json::from_str(text)?;
+            SteeringRequest::View {
+                world_from_camera: pose("world_from_camera", world_from_camera)?,
+            }
         }
         Some(other) => return Err(MessageError::UnknownType(other.to_owned())),
         None => return Err(MessageError::NoType),

@@ -10,7 +10,7 @@
 //! - A stop is dropped if one waits already and nobody has asked to permit motion since.
 //! - Renewing or giving up the lease is dropped if the client's last waiting request of another kind
 //!   than commands and previews is the same.
-//! - A preview replaces the client's waiting preview.
+//! - A preview replaces the client's waiting preview, and a view its waiting view.
 //!
 //! A client may have [`MAX_WAITING`] requests; further ones are refused. Stops, open switches and
 //! giving up the lease are always accepted. Their number is also limited, because each of them
@@ -207,6 +207,9 @@ impl Inbox {
             SteeringRequest::Preview(_) => self.waiting.iter().position(|waiting| {
                 waiting.client == client && matches!(waiting.request, SteeringRequest::Preview(_))
             }),
+            SteeringRequest::View { .. } => self.waiting.iter().position(|waiting| {
+                waiting.client == client && matches!(waiting.request, SteeringRequest::View { .. })
+            }),
             SteeringRequest::Command(command) => self.replaced_command_ix(client, command),
             _ => None,
         }
@@ -250,7 +253,7 @@ fn is_urgent(request: &SteeringRequest) -> bool {
 fn is_replaceable(request: &SteeringRequest) -> bool {
     matches!(
         request,
-        SteeringRequest::Command(_) | SteeringRequest::Preview(_)
+        SteeringRequest::Command(_) | SteeringRequest::Preview(_) | SteeringRequest::View { .. }
     )
 }
 
@@ -258,7 +261,10 @@ fn is_replaceable(request: &SteeringRequest) -> bool {
 fn can_hold(request: &SteeringRequest) -> bool {
     !matches!(
         request,
-        SteeringRequest::Stop | SteeringRequest::Preview(_) | SteeringRequest::Disconnected
+        SteeringRequest::Stop
+            | SteeringRequest::Preview(_)
+            | SteeringRequest::View { .. }
+            | SteeringRequest::Disconnected
     )
 }
 

@@ -70,6 +70,7 @@ fn check_request(request: &SteeringRequest, now: Instant) {
                 PreviewGoal::Joints { position } => check_joints(position),
             }
         }
+        SteeringRequest::View { world_from_camera } => check_pose(world_from_camera),
         SteeringRequest::OfferLease { to } => assert!(*to <= MAX_INTEGER),
         SteeringRequest::Rearm { stop } => assert!(*stop <= MAX_INTEGER),
         SteeringRequest::Disconnected => panic!("no message says this"),

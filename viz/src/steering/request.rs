@@ -44,6 +44,11 @@ pub enum SteeringRequest {
     Command(SteeringCommand),
     /// Say whether a goal can be reached, without moving the arm.
     Preview(PreviewRequest),
+    /// What the operator sees, for the log of the run.
+    View {
+        /// Pose of the eye in the world. The camera is x right, y down, z forward.
+        world_from_camera: [f64; 7],
+    },
     /// The client has left, or has sent nothing for as long as a lease lasts. Whatever it held is
     /// released. A client that was only silent may send further requests.
     Disconnected,

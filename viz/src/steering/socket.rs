@@ -235,6 +235,7 @@ fn kind_of(request: &SteeringRequest) -> RefusedRequest {
         SteeringRequest::Rearm { .. } => RefusedRequest::Rearm,
         SteeringRequest::Command(_) => RefusedRequest::Command,
         SteeringRequest::Preview(_) => RefusedRequest::Preview,
+        SteeringRequest::View { .. } => RefusedRequest::Message,
     }
 }
 
@@ -249,6 +250,7 @@ fn logged_action(request: &SteeringRequest) -> Option<&'static str> {
         SteeringRequest::RenewLease
         | SteeringRequest::Command(_)
         | SteeringRequest::Preview(_)
+        | SteeringRequest::View { .. }
         | SteeringRequest::Disconnected => None,
     }
 }

@@ -330,6 +330,7 @@ fn check_buttons_stay(page: &mut Page) {
         [
             "toggle-edit",
             "toggle-steer",
+            "toggle-incidents",
             "toggle-follow",
             "toggle-history"
         ]

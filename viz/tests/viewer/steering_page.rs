@@ -143,7 +143,7 @@ fn obey(server: &SteeringServer, script: &mut Script, client: u64, request: Stee
         SteeringRequest::ReleaseLease | SteeringRequest::Disconnected => {
             script.holder = script.holder.filter(|holder| *holder != client);
         }
-        SteeringRequest::OfferLease { .. } => {}
+        SteeringRequest::OfferLease { .. } | SteeringRequest::View { .. } => {}
         SteeringRequest::Stop => {
             script.stops.push(client);
             script.stop = Some(format!("stopped by operator {client}"));

@@ -222,6 +222,7 @@ setUpPanels([
   { button: "toggle-settings", panel: "settings" },
   { button: "toggle-edit", panel: "edit", onToggle: (isOpen) => (edits.isOpen = isOpen) },
   { button: "toggle-steer", panel: "steer" },
+  { button: "toggle-incidents", panel: "incidents" },
   { button: "toggle-views", panel: "views" },
   { button: "toggle-history", panel: "history", onToggle: (isOpen) => timeSlider.opened(isOpen) },
 ]);
@@ -271,6 +272,7 @@ function receiveStatus(status: Status): void {
   for (const ages of [robotAge, overlayAges]) ages.hasEnded = banner.isFinished;
   namedViews.runIs(status);
   steering.offered = status.steering === true;
+  steering.showIncidents(status.files ?? []);
   flow.isReading = CONTROLLABLE.includes(status.state);
 }
 

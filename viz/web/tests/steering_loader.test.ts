@@ -2,8 +2,9 @@ import assert from "node:assert/strict";
 import { readdirSync, readFileSync } from "node:fs";
 import { test } from "node:test";
 
-/** The folder of the script, relative to viz/web, where npm runs the tests. */
+/** The folders of the script, relative to viz/web, where npm runs the tests. */
 const FOLDER = "src/steering";
+const FOLDERS = [FOLDER, "src/incidents"];
 const LOADER = "steering_loader.ts";
 
 /** Names of three.js that a file uses as values. */
@@ -16,8 +17,9 @@ function used(source: string): string[] {
 }
 
 test("the page shares every class of three.js that the script for steering uses, and no other", () => {
-  const files = readdirSync(FOLDER).filter((name) => name !== LOADER);
-  const wanted = new Set(files.flatMap((name) => used(readFileSync(`${FOLDER}/${name}`, "utf8"))));
+  const files = FOLDERS.flatMap((folder) => readdirSync(folder).map((name) => `${folder}/${name}`));
+  const own = files.filter((name) => !name.endsWith(LOADER));
+  const wanted = new Set(own.flatMap((name) => used(readFileSync(name, "utf8"))));
   const shared = [...readFileSync(`${FOLDER}/${LOADER}`, "utf8").matchAll(/^ {2}(\w+): THREE\.\w+,$/gm)].map(([, name]) => name!);
   assert.ok(wanted.size > 5);
   assert.deepEqual([...wanted].sort(), shared.sort());

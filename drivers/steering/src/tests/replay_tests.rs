@@ -1,7 +1,7 @@
 //! The same inputs give the same decisions, bit for bit.
 
 use super::{ANA, Sim, ageless, hand, new_steering, pose_intent};
-use crate::{AnalyticScene, Entry, Request, Solid, SteeringConfig};
+use crate::{AnalyticScene, Entry, Request, Setup, Solid, SteeringConfig};
 use kinematics::{Stamp, Transform};
 use numbers::random::Random;
 
@@ -96,4 +96,74 @@ fn record_is_bounded_and_counts_what_it_drops() {
     }
     let (entries, n_dropped) = sim.steering.take_record();
     assert_eq!((entries.len(), n_dropped), (6000, 102));
+}
+
+#[test]
+fn record_that_begins_in_the_middle_of_a_grip_replays_from_its_setup() {
+    let mut sim = Sim::ready(ageless());
+    for step in 0..150_u32 {
+        let _ = sim.send(Some(1), hand(0.0, 0.0, -5e-4 * f64::from(step)));
+        sim.cycle();
+    }
+    sim.steering.take_record();
+    let text = serde_json::to_string(&sim.steering.setup(super::PANDA.to_owned())).unwrap();
+    for step in 150..400_u32 {
+        let _ = sim.send(Some(1), hand(0.0, 2e-4 * f64::from(step), -0.075));
+        if step == 300 {
+            sim.request(Request::Stop { by: Some(ANA) }).unwrap();
+        }
+        sim.cycle();
+    }
+    let (entries, _) = sim.steering.take_record();
+    let setup: Setup = serde_json::from_str(&text).unwrap();
+    assert_eq!(serde_json::to_string(&setup).unwrap(), text);
+    let mut steering = setup.build().unwrap();
+    let mut n_follows = 0;
+    for entry in &entries {
+        steering.replay(entry).unwrap();
+        if let Entry::Cycle { verdict, .. } = entry {
+            n_follows += u32::from(verdict.target().is_some());
+        }
+    }
+    assert!(n_follows > 100, "{n_follows}");
+    assert_eq!(steering.state(), sim.steering.state());
+    // From another state, the same entries give other decisions.
+    let mut fresh = new_steering(ageless());
+    assert!(entries.iter().any(|entry| fresh.replay(entry).is_err()));
+}
+
+#[test]
+fn damaged_setup_and_record_are_refused() {
+    let (config, entries) = session();
+    let steering = new_steering(config.clone());
+    let text = serde_json::to_string(&steering.setup(super::PANDA.to_owned())).unwrap();
+    for (from, to) in [
+        (r#""frame_ix":1"#, r#""frame_ix":99"#),
+        (r#""max_speed_m_s":0.25"#, r#""max_speed_m_s":-1.0"#),
+        (
+            r#""motion":null"#,
+            r#""motion":{"target":[0.0],"accepted_m":1.0}"#,
+        ),
+        (
+            r#""tip_link":"panda_link8""#,
+            r#""tip_link":"panda_link80""#,
+        ),
+    ] {
+        assert!(text.contains(from), "{from}");
+        let setup: Setup = serde_json::from_str(&text.replace(from, to)).unwrap();
+        let error = setup.build().map(|_| ()).unwrap_err();
+        assert!(!error.to_string().is_empty());
+    }
+    let mut steering = new_steering(config);
+    let mut entry = entries
+        .iter()
+        .find(|entry| matches!(entry, Entry::Cycle { seen, .. } if seen.concat().len() > 1))
+        .cloned()
+        .expect("near an obstacle");
+    if let Entry::Cycle { seen, .. } = &mut entry {
+        for restriction in seen.iter_mut().flatten() {
+            restriction.point_ix = usize::MAX;
+        }
+    }
+    assert!(steering.replay(&entry).is_err());
 }

@@ -138,6 +138,13 @@ fn leases_previews_and_pings_are_read() {
         assert_eq!(refusal.request, RefusedRequest::Rearm);
         assert!(refusal.text.contains("stop") || refusal.text.contains("valid"));
     }
+    let eye = [1.0, 2.0, 3.0, 0.0, 0.0, 0.0, 1.0];
+    assert_eq!(
+        lease(json!({"type": "view", "world_from_camera": eye})),
+        SteeringRequest::View {
+            world_from_camera: eye
+        }
+    );
     let SteeringRequest::Preview(preview) =
         lease(json!({"type": "preview", "id": 8, "position": [0, 1]}))
     else {
@@ -337,6 +344,7 @@ fn viewers_can_only_stop_and_ping() {
         json!({"type": "lease", "action": "release"}),
         json!({"type": "rearm", "stop": 1}),
         json!({"type": "preview", "id": 1, "position": [0, 0]}),
+        json!({"type": "view", "world_from_camera": [0, 0, 0, 0, 0, 0, 1]}),
         command_message(),
         changed("grip", Value::Null),
     ];

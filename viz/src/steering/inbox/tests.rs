@@ -96,6 +96,26 @@ fn each_opening_and_closing_stays_in_order() {
 }
 
 #[test]
+fn only_the_newest_view_of_a_client_waits() {
+    let mut inbox = inbox();
+    let view = |x| SteeringRequest::View {
+        world_from_camera: [x, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0],
+    };
+    push(&mut inbox, A, command(1, 1, Some(1)));
+    push(&mut inbox, A, view(1.0));
+    push(&mut inbox, B, view(2.0));
+    push(&mut inbox, A, command(1, 2, Some(1)));
+    push(&mut inbox, A, view(3.0));
+    let requests: Vec<_> = inbox
+        .take()
+        .into_iter()
+        .map(|waiting| (waiting.client, waiting.request))
+        .collect();
+    let expected = [(A, command(1, 2, Some(1))), (A, view(3.0)), (B, view(2.0))];
+    assert_eq!(requests, expected);
+}
+
+#[test]
 fn commands_do_not_overtake_other_requests() {
     let mut inbox = inbox();
     push(&mut inbox, A, command(1, 1, Some(1)));

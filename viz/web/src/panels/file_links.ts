@@ -22,7 +22,8 @@ export function fileLinks(files: readonly FileLink[], folder: string | null): HT
       link.title = "Open the report in another tab";
     } else {
       link.download = "";
-      link.title = "Download the saved model, without the space that saved edits have erased";
+      const isModel = !file.path.endsWith(".json");
+      link.title = isModel ? "Download the saved model, without the space that saved edits have erased" : `Download: ${file.label}`;
     }
     return link;
   });

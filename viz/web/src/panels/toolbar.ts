@@ -5,7 +5,7 @@ import { closesWithEscape } from "../keys";
 import { element } from "./element";
 
 /** Buttons that depend on the model or the robot, in their order, which is that in which they usually appear. */
-const LATE_BUTTONS = ["toggle-edit", "toggle-steer", "toggle-follow", "toggle-history"];
+const LATE_BUTTONS = ["toggle-edit", "toggle-steer", "toggle-incidents", "toggle-follow", "toggle-history"];
 const STEPS: Record<string, number> = { ArrowLeft: -1, ArrowRight: 1 };
 
 export function setUpToolbar(): void {

@@ -19,7 +19,6 @@ const SIGNS: Record<string, string> = { slowed: "▲", refused: "✕", braked: "
 export class Marks implements ViewTool {
   readonly root = new THREE.Group();
   readonly hasTakenPress = false;
-  private readonly list = element("steer-marks");
   private marks: readonly Mark[] = [];
   private shown = "[]";
 
@@ -27,6 +26,7 @@ export class Marks implements ViewTool {
     private readonly camera: THREE.PerspectiveCamera,
     private readonly canvas: HTMLCanvasElement,
     private readonly changed: () => void,
+    private readonly list = element("steer-marks"),
   ) {}
 
   show(marks: readonly Mark[]): void {

@@ -31,6 +31,7 @@ export type SteerRequest =
       intent?: Intent;
     }
   | ({ type: "preview"; id: number } & PreviewTarget)
+  | { type: "view"; world_from_camera: PoseNumbers }
   | { type: "ping"; id: number };
 
 export interface ArmJoint {

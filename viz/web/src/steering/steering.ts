@@ -8,6 +8,7 @@ import { capitalized } from "../panels/sentence";
 import { disable } from "../panels/title";
 import { showToast } from "../panels/toast";
 import type { action, toggle } from "../keys";
+import { worldFromCamera } from "../view/convention";
 import type { OrbitView } from "../view/orbit_view";
 import { Commander } from "./commander";
 import { firstPad } from "./gamepad";
@@ -22,14 +23,19 @@ import { LeasePanel } from "./lease_panel";
 import { LimitsList } from "./limits_list";
 import { Marks } from "./marks";
 import type { SteerMessage, SteerRequest } from "./messages";
-import { type Pose, poseOf, poseOfMatrix } from "./pose";
+import { numbersOf, type Pose, poseOf, poseOfMatrix } from "./pose";
 import { PoseList } from "./pose_list";
 import { SteerSocket } from "./steer_socket";
 import { StopButton } from "./stop_button";
 import { modeText, verdictText } from "./texts";
 
+// One script for both, because they draw the same ghost.
+export { Incidents } from "../incidents/incidents";
+
 /** Period of the samples: 50 Hz, so that two can be lost before the arm brakes. */
 const TICK_MILLIS = 20;
+/** Minimum time between two views for the log of the run. */
+const VIEW_MILLIS = 200;
 /** Period at which the panel is updated. */
 const SHOW_MILLIS = 100;
 
@@ -53,6 +59,8 @@ export class Steering {
   private readonly limits: LimitsList;
   private shownMillis = -Infinity;
   private shownMode = "";
+  /** The last view that was sent, as text, and when. */
+  private sentView = { text: "", millis: -Infinity };
   /** The gamepad that was read last. */
   private padIx: number | null = null;
   /** The last joint positions of which the pose of the tip was computed. */
@@ -191,8 +199,20 @@ export class Steering {
     const { commander } = this;
     this.readPad();
     commander.tick(now);
+    this.sendView(now);
     if (commander.deadMan.source === "gizmo") this.placeGizmo();
     if (now - this.shownMillis >= SHOW_MILLIS) this.show();
+  }
+
+  /** Sends what the operator sees, if it has changed. It becomes a part of the log of the run. */
+  private sendView(now: number): void {
+    if (!this.commander.hasControl) this.sentView.text = "";
+    else if (now - this.sentView.millis >= VIEW_MILLIS) {
+      const world_from_camera = numbersOf(poseOfMatrix(worldFromCamera(this.view.view().world_from_camera)));
+      const text = JSON.stringify(world_from_camera);
+      if (text !== this.sentView.text) this.send({ type: "view", world_from_camera });
+      this.sentView = { text, millis: now };
+    }
   }
 
   private readPad(): void {

@@ -1,5 +1,6 @@
-// Loads the script for steering once a server has an arm that can be steered. The script uses the classes of three.js of the
-// page, because a second copy would be large, and its objects would have the same numbers as those of the page.
+// Loads the script for steering once a server has an arm that can be steered, or the incidents of a steered run. The script
+// uses the classes of three.js of the page, because a second copy would be large, and its objects would have the same numbers
+// as those of the page.
 
 import * as THREE from "three";
 import { action, toggle } from "../keys";
@@ -7,8 +8,10 @@ import { RobotLayer } from "../layers/robot_layer";
 import { element } from "../panels/element";
 import { reasonOf } from "../panels/sentence";
 import { showToast } from "../panels/toast";
+import type { FileLink } from "../connection/protocol";
+import type { Incidents } from "../incidents/incidents";
 import type { OrbitView } from "../view/orbit_view";
-import type { Steering } from "./steering";
+import type { PageParts, Steering } from "./steering";
 
 /** The part of three.js that the script uses. tests/steering_loader.test.ts compares it with the imports. */
 const SHARED = {
@@ -30,8 +33,13 @@ const SHARED = {
   Vector3: THREE.Vector3,
 };
 
+/** Name of the file with the incidents. */
+const INCIDENTS = "/steering-incidents.json";
+
 export class SteeringLoader {
   private steering: Steering | null = null;
+  private incidents: Incidents | null = null;
+  private incidentsPath: string | null = null;
   private isLoading = false;
   private isOffered = false;
 
@@ -46,6 +54,15 @@ export class SteeringLoader {
     else if (isOffered) void this.load();
   }
 
+  /** Shows the incidents of a steered run, if they are among the files of the server. */
+  showIncidents(files: readonly FileLink[]): void {
+    const file = files.find(({ path }) => path.endsWith(INCIDENTS));
+    element("toggle-incidents").hidden = !file;
+    this.incidentsPath = file?.path ?? null;
+    if (this.incidents && file) void this.incidents.load(file.path);
+    else if (file) void this.load();
+  }
+
   private async load(): Promise<void> {
     if (this.isLoading) return;
     this.isLoading = true;
@@ -53,10 +70,13 @@ export class SteeringLoader {
       Object.assign(globalThis, { fieldrigThree: SHARED });
       const script = await import("./steering");
       const { view } = this;
-      const newRobotLayer: ConstructorParameters<typeof Steering>[0]["newRobotLayer"] = (changed, newLook) =>
-        new RobotLayer(view.occlusion, changed, newLook);
-      this.steering = new script.Steering({ view, newRobotLayer, action, toggle });
-      this.steering.offered = this.isOffered;
+      const newRobotLayer: PageParts["newRobotLayer"] = (changed, newLook) => new RobotLayer(view.occlusion, changed, newLook);
+      if (this.isOffered) this.steering ??= new script.Steering({ view, newRobotLayer, action, toggle });
+      if (this.steering) this.steering.offered = this.isOffered;
+      if (this.incidentsPath !== null) {
+        this.incidents ??= new script.Incidents({ view, newRobotLayer });
+        void this.incidents.load(this.incidentsPath);
+      }
     } catch (error) {
       this.isOffered = false; // The next status tries again.
       showToast(`Steering cannot be loaded: ${reasonOf(error)}`);

@@ -1,0 +1,111 @@
+//! What a chain of decisions consists of: the beginning of a record that can be replayed alone.
+
+use super::state::State;
+use super::{Robot, Steering, SteeringConfig};
+use crate::body::{Body, Shape};
+use crate::error::Error;
+use crate::inverse::NearestPosture;
+use drivers::motion::{MotionLimits, exact};
+use kinematics::Chain;
+use kinematics::urdf::Robot as Urdf;
+use serde::{Deserialize, Serialize};
+
+/// Configuration, robot and state of a chain of decisions whose inverse kinematics is
+/// [`NearestPosture`].
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Setup {
+    /// Configuration of all links.
+    pub config: SteeringConfig,
+    /// Robot description.
+    pub urdf: String,
+    /// Link to which the chain is fixed.
+    pub base_link: String,
+    /// Link that operators move.
+    pub tip_link: String,
+    shapes: Vec<Shape>,
+    joints: Vec<Joint>,
+    free_posture: Option<Vec<f64>>,
+    state: State,
+}
+
+/// Limits of a joint.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+struct Joint {
+    #[serde(with = "exact::array")]
+    position: [f64; 2],
+    velocity: f64,
+    acceleration: f64,
+    jerk: f64,
+}
+
+impl From<&MotionLimits> for Joint {
+    fn from(limits: &MotionLimits) -> Self {
+        Self {
+            position: limits.position,
+            velocity: limits.velocity,
+            acceleration: limits.acceleration,
+            jerk: limits.jerk,
+        }
+    }
+}
+
+impl From<&Joint> for MotionLimits {
+    fn from(joint: &Joint) -> Self {
+        Self {
+            position: joint.position,
+            velocity: joint.velocity,
+            acceleration: joint.acceleration,
+            jerk: joint.jerk,
+        }
+    }
+}
+
+impl Steering {
+    /// What the chain consists of now.
+    ///
+    /// * `urdf`: the description from which the chain of joints and the shapes were made.
+    pub fn setup(&self, urdf: String) -> Setup {
+        Setup {
+            config: self.config.clone(),
+            urdf,
+            base_link: self.chain.base_link().to_owned(),
+            tip_link: self.chain.tip_link().to_owned(),
+            shapes: self.body.shapes(),
+            joints: self.limits.joints().iter().map(Joint::from).collect(),
+            free_posture: self.free_posture.clone(),
+            state: self.state(),
+        }
+    }
+}
+
+impl Setup {
+    /// The same chain in another state.
+    #[must_use]
+    pub fn with_state(self, state: State) -> Self {
+        Self { state, ..self }
+    }
+
+    /// The chain of decisions in the recorded state.
+    ///
+    /// # Errors
+    /// If a part of the setup is invalid, which means that it is damaged.
+    pub fn build(&self) -> Result<Steering, Error> {
+        let urdf = Urdf::parse(&self.urdf)?;
+        let chain = Chain::new(&urdf, &self.base_link, &self.tip_link)?;
+        let joints: Vec<MotionLimits> = self.joints.iter().map(MotionLimits::from).collect();
+        let mut steering = Steering::new(
+            self.config.clone(),
+            Robot {
+                inverse: Box::new(NearestPosture::new(chain.clone())),
+                body: Body::from_shapes(&urdf, &chain, &self.shapes)?,
+                chain,
+                joints: &joints,
+                free_posture: self.free_posture.as_deref(),
+            },
+        )?;
+        steering.set_state(self.state.clone())?;
+        Ok(steering)
+    }
+}

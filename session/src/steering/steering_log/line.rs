@@ -1,0 +1,65 @@
+//! The lines of a steering log.
+
+use drivers::motion::exact;
+use kinematics::Stamp;
+use serde::{Deserialize, Serialize};
+use steering::{Entry, Setup};
+
+/// Version of the format. Logs of other versions are refused, because their replay would differ.
+pub(super) const VERSION: u64 = 1;
+
+/// One line.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub(super) enum Line {
+    /// The first line, and the first one after missing entries: the chain of decisions with its
+    /// state.
+    Start(Box<Start>),
+    /// A request or a cycle.
+    Entry(Box<Entry>),
+    /// What the holder of the lease sees from now on.
+    View(View),
+    /// Entries are missing here, because the disk was too slow.
+    Missing(u64),
+    /// The log is complete.
+    End(Moment),
+}
+
+/// What all further lines depend on.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(super) struct Start {
+    /// [`VERSION`].
+    pub(super) version: u64,
+    /// Version and processor of the program.
+    pub(super) program: String,
+    /// Now on the clock of the entries.
+    #[serde(with = "exact::stamp")]
+    pub(super) at: Stamp,
+    /// The same moment on the wall clock, milliseconds since 1970.
+    pub(super) unix_millis: u64,
+    /// Pose of the base of the arm: x, y, z in meters, and a quaternion x, y, z, w.
+    pub(super) world_from_base: [f64; 7],
+    /// Configuration, robot, limits and state.
+    pub(super) setup: Setup,
+}
+
+/// A time on the clock of the entries.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub(super) struct Moment {
+    /// The time.
+    #[serde(with = "exact::stamp")]
+    pub(super) at: Stamp,
+}
+
+/// The pose of an operator's eye.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+pub(super) struct View {
+    /// When it arrived.
+    #[serde(with = "exact::stamp")]
+    pub(super) at: Stamp,
+    /// Number of the operator.
+    pub(super) operator: u64,
+    /// x, y, z in meters, and a quaternion x, y, z, w; the camera is x right, y down, z forward.
+    pub(super) world_from_camera: [f64; 7],
+}
