@@ -55,15 +55,17 @@ fn publish_robot(hub: &Hub, model: &Path) -> anyhow::Result<()> {
 /// a client asks for it.
 fn write(logs: &[PathBuf], page_from_model: &Transform) -> anyhow::Result<File> {
     let mut incidents = steering_log::incidents(logs)?;
-    let in_page = |pose: [f64; 7]| {
-        transform::to_xyz_xyzw(&(page_from_model * transform::from_xyz_xyzw(pose)))
-    };
-    incidents.world_from_base = in_page(incidents.world_from_base);
+    incidents.world_from_base = in_page(page_from_model, incidents.world_from_base);
     for incident in &mut incidents.incidents {
-        incident.view = incident.view.map(in_page);
+        incident.view = incident.view.map(|view| in_page(page_from_model, view));
     }
     let mut file = tempfile::tempfile().context("cannot create a temporary file")?;
     file.write_all(&serde_json::to_vec(&incidents)?)?;
     file.rewind()?;
     Ok(file)
+}
+
+/// A pose in the world of the page.
+fn in_page(page_from_model: &Transform, pose: [f64; 7]) -> [f64; 7] {
+    transform::to_xyz_xyzw(&(page_from_model * transform::from_xyz_xyzw(pose)))
 }

@@ -119,7 +119,7 @@ pub use previous_run::FinishedRun;
 pub use read_progress::{OnReadProgress, ReadProgress, ignore_progress};
 pub use recoveries::OpenGpu;
 pub use recovery::Recovery;
-pub use render_plan::{RenderPlan, RenderedCameras, RenderedPicture};
+pub use render_plan::{OnPicture, RenderPlan, RenderedCameras, RenderedPicture};
 pub use run_plan::{
     DiscardedRun, EndedRun, OpenedRun, PreparedRun, PreviousLiveRun, RunInProgress, RunInput,
     RunPlan, SavedRun,

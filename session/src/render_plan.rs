@@ -59,6 +59,10 @@ pub struct RenderedPicture {
     draw_millis: f64,
 }
 
+/// Receives the number of rendered images, the number of all images, and the newest image.
+pub type OnPicture<'a> =
+    dyn FnMut(usize, usize, Option<&RenderedPicture>) -> anyhow::Result<()> + 'a;
+
 impl RenderPlan {
     /// Renders every camera, and returns the number of images.
     ///
@@ -68,11 +72,7 @@ impl RenderPlan {
     /// # Errors
     /// Fails if the plan contradicts itself, if a file cannot be read or written, if a file exists,
     /// or with the error of `on_picture`.
-    pub fn run(
-        &self,
-        open_gpu: OpenGpu,
-        on_picture: &mut dyn FnMut(usize, usize, Option<&RenderedPicture>) -> anyhow::Result<()>,
-    ) -> anyhow::Result<usize> {
+    pub fn run(&self, open_gpu: OpenGpu, on_picture: &mut OnPicture<'_>) -> anyhow::Result<usize> {
         // Everything that can be refused is checked before the GPU is opened and the model is
         // loaded.
         let requests = self.requests()?;

@@ -11,7 +11,7 @@ use parking_lot::Mutex;
 use std::io::{Read, Write};
 use std::net::{Ipv4Addr, Shutdown, SocketAddr, TcpListener, TcpStream};
 use std::sync::Arc;
-use std::sync::mpsc::{Receiver, Sender, channel};
+use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
 use std::time::{Duration, Instant};
 
 /// Delay of a packet that was lost once: three more packets at 90 Hz.
@@ -60,7 +60,7 @@ impl Link {
         for (ix, from, to) in directions {
             let clone =
                 |stream: &TcpStream| stream.try_clone().context("cannot share a connection");
-            let (packets, waiting) = channel();
+            let (packets, waiting) = sync_channel(MAX_PACKETS);
             let direction = Direction {
                 from: clone(from)?,
                 packets,
@@ -111,13 +111,17 @@ fn spawn(name: &str, run: impl FnOnce() + Send + 'static) -> Result<()> {
     Ok(())
 }
 
+/// Number of packets on the way in one direction. Above it, the sender waits, as it does when the
+/// buffers of a real connection are full.
+const MAX_PACKETS: usize = 256;
+
 /// A packet, and when it arrives.
 type Packet = (Instant, Vec<u8>);
 
 /// One direction of a link.
 struct Direction {
     from: TcpStream,
-    packets: Sender<Packet>,
+    packets: SyncSender<Packet>,
     fault: Arc<Mutex<LinkFault>>,
     random: Random,
     /// When the newest packet arrives. No packet overtakes another.

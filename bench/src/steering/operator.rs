@@ -60,7 +60,7 @@ impl<'rig> Operator<'rig> {
     pub(super) fn prepare(&mut self) -> Result<()> {
         self.take_control()?;
         self.wait_for_rest()?;
-        if self.from_home_m()?.norm() > NEAR_HOME_M {
+        if self.offset_from_home_m()?.norm() > NEAR_HOME_M {
             self.return_home()?;
             self.wait_for_rest()?;
         }
@@ -69,7 +69,7 @@ impl<'rig> Operator<'rig> {
     }
 
     /// From the first position of the tip to the current one, meters.
-    pub(super) fn from_home_m(&self) -> Result<Vector3<f64>> {
+    pub(super) fn offset_from_home_m(&self) -> Result<Vector3<f64>> {
         Ok(self.tip_m()? - self.home_m)
     }
 

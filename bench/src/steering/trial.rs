@@ -80,7 +80,7 @@ pub(super) fn run(
     random: &mut Random,
 ) -> Result<Option<Outcome>> {
     operator.prepare()?;
-    let hand_m_s = HAND_M_S * direction(operator.from_home_m()?, random);
+    let hand_m_s = HAND_M_S * direction(operator.offset_from_home_m()?, random);
     let moving_secs = random.uniform(MOVING_SECS[0], MOVING_SECS[1]);
     operator.rig.arm.recorder.take();
     let mut trial = Trial {
@@ -102,10 +102,10 @@ pub(super) fn run(
 }
 
 /// An axis of the base, toward the first position of the tip if it is away from there.
-fn direction(from_home_m: Vector3<f64>, random: &mut Random) -> Vector3<f64> {
+fn direction(offset_from_home_m: Vector3<f64>, random: &mut Random) -> Vector3<f64> {
     let axis = random.below(3);
-    let is_positive = if from_home_m[axis].abs() > MOVE_BACK_M {
-        from_home_m[axis] < 0.0
+    let is_positive = if offset_from_home_m[axis].abs() > MOVE_BACK_M {
+        offset_from_home_m[axis] < 0.0
     } else {
         random.unit() < 0.5
     };
