@@ -92,6 +92,36 @@ fn a_webcam_lens_is_calibrated_from_guided_photographs() {
 }
 
 #[test]
+fn the_lens_of_any_simulated_camera_is_calibrated() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let folder = folder.path();
+    // The rig file has no target, and its camera is on an arm that a base carries.
+    let init = "init rig.toml --robot panda --moving-base --camera flange --yes";
+    let output = fieldrig(folder, &init.split(' ').collect::<Vec<_>>());
+    assert!(output.status.success(), "{}", stderr(&output));
+    let lens = [
+        "calibrate",
+        "intrinsics",
+        "rig.toml",
+        "--sim",
+        "--target",
+        TARGET,
+        "--json",
+    ];
+    let output = fieldrig(folder, &lens);
+    let log = stderr(&output);
+    assert!(output.status.success(), "{log}");
+    assert!(log.contains("the images cover everything"), "{log}");
+    let file = std::fs::read_to_string(folder.join("rig.toml")).expect("a rig file");
+    let rig: toml::Table = file.parse().expect("TOML");
+    let true_px = rig["camera"]["wrist"]["intrinsics"]["focal_px"][0]
+        .as_float()
+        .expect("a number");
+    let focal_px = number(&json_of(&output)["focal_px"][0]);
+    assert!((focal_px - true_px).abs() < MAX_ERROR_PX, "{focal_px}");
+}
+
+#[test]
 fn photographs_are_not_mixed_with_others() {
     let folder = tempfile::tempdir().expect("a folder");
     let folder = folder.path();

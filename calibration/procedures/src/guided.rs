@@ -264,7 +264,7 @@ impl RigOptions {
         }
         session::expect(input)?;
         let saved = save.map(SavedImages::create).transpose()?;
-        let devices = self.open_for_lens(input)?;
+        let devices = self.open_for_lens(input, target)?;
         // The calibration that a simulated camera reports is not the calibration of the real
         // camera.
         if let Some(output) = output.filter(|_| !self.sim) {
@@ -299,7 +299,7 @@ impl RigOptions {
         Ok(Some(scan))
     }
 
-    fn open_for_lens(&self, rig_file: &Path) -> anyhow::Result<LensDevices> {
+    fn open_for_lens(&self, rig_file: &Path, target: &TargetSpec) -> anyhow::Result<LensDevices> {
         // In lockstep, the result does not depend on the speed of this computer.
         let overrides = if self.sim {
             vec![
@@ -316,7 +316,7 @@ impl RigOptions {
         } else {
             Devices::Real
         };
-        lens_devices::open(rig, &camera, devices)
+        lens_devices::open(rig, &camera, target, devices)
     }
 }
 

@@ -4,8 +4,9 @@
 //! camera is opened, also if an arm carries it. A simulated camera is the exception, because one
 //! simulation moves the camera, its arm and the target.
 
-use capture::config::{ArmDriver, BaseDriver, Camera, Parent, Rig};
+use capture::config::{ArmDriver, BaseDriver, Camera, Parent, Rig, SimTarget};
 use capture::open::{self, Devices, Opened};
+use targets::TargetSpec;
 
 /// Open devices, and the whole rig with the calibration that the camera reports.
 pub(crate) struct LensDevices {
@@ -16,12 +17,19 @@ pub(crate) struct LensDevices {
 
 /// Opens a camera of a rig. If the camera is simulated, opens the whole rig.
 ///
+/// * `target`: shown to a simulated camera if the rig file names no simulated target.
+///
 /// # Errors
 /// Fails if a device cannot be opened.
-pub(crate) fn open(rig: Rig, camera: &str, devices: Devices) -> anyhow::Result<LensDevices> {
+pub(crate) fn open(
+    rig: Rig,
+    camera: &str,
+    target: &TargetSpec,
+    devices: Devices,
+) -> anyhow::Result<LensDevices> {
     let part = camera_alone(&rig, camera);
     if devices == Devices::Sim || open::is_any_simulated(&part) {
-        return open_simulated(rig, camera, devices);
+        return open_simulated(with_target(rig, camera, target), camera, devices);
     }
     let opened = open::rig(part, devices)?;
     let mut rig = rig;
@@ -44,15 +52,32 @@ pub(crate) fn open(rig: Rig, camera: &str, devices: Devices) -> anyhow::Result<L
 }
 
 /// Opens all devices of a rig. The arm is used if it carries the camera, because a simulated arm
-/// never rests: its speed decides which images are sharp.
+/// never rests: its speed decides which images are sharp. The pose of the base does not matter.
 fn open_simulated(rig: Rig, camera: &str, devices: Devices) -> anyhow::Result<LensDevices> {
     let is_carried = is_carried(&rig, camera);
     let mut opened = open::rig(rig, devices)?;
     let rig = opened.rig.clone();
+    opened.rig.base.driver = BaseDriver::Fixed;
     if !is_carried {
         without_arm(&mut opened.rig);
     }
     Ok(LensDevices { opened, rig })
+}
+
+/// The rig with a target in its simulated scene. If the rig file has none, a hand moves one in front
+/// of the camera, so that the calibration can be tried with any rig file.
+fn with_target(mut rig: Rig, camera: &str, target: &TargetSpec) -> Rig {
+    if rig.sim.targets.is_empty() {
+        log::info!("a simulated hand moves the target in front of camera {camera:?}");
+        let target = SimTarget {
+            spec: target.to_string(),
+            world_from_board: None,
+            flange_from_board: None,
+            moved_before: Some(camera.to_owned()),
+        };
+        rig.sim.targets.insert("in_hand".to_owned(), target);
+    }
+    rig
 }
 
 /// The rig with only this camera.
@@ -110,6 +135,7 @@ mod tests {
 
     #[test]
     fn a_real_camera_on_an_arm_is_opened_without_the_arm() {
+        let target = "charuco:7x5:17mm:13mm:5X5_100".parse().expect("a target");
         for arm in ["franka", "sim"] {
             let rig = rig_with_webcam(arm);
             let part = camera_alone(&rig, "wrist");
@@ -118,7 +144,7 @@ mod tests {
             assert_eq!(part.cameras[0].parent, Parent::Base);
             assert!(!open::is_any_simulated(&part), "{arm}");
             // The camera is missed, and not the arm.
-            let Err(error) = open(rig, "wrist", Devices::Real) else {
+            let Err(error) = open(rig, "wrist", &target, Devices::Real) else {
                 panic!("there is no such camera");
             };
             let error = format!("{error:#}");

@@ -47,6 +47,7 @@ impl ArmLinks {
             Some(base) => base.to_owned(),
             None => robot.root()?.to_owned(),
         };
+        robot.check_link(&base)?;
         let flange = match tip {
             Some(tip) => tip.to_owned(),
             None => flange(&robot, &base)?,
@@ -270,12 +271,13 @@ mod tests {
             &["root", "plate"],
             &[joint("glue", "fixed", "root", "plate", "")],
         );
-        let problem = |tip| {
-            let links = ArmLinks::choose(&urdf, None, tip);
+        let problem = |base, tip| {
+            let links = ArmLinks::choose(&urdf, base, tip);
             links.expect_err("no joint moves").to_string()
         };
-        assert!(problem(None).contains("no joint moves below the link \"root\""));
-        assert!(problem(Some("plate")).contains("between \"root\" and \"plate\""));
-        assert!(problem(Some("hand")).contains("hand"));
+        assert!(problem(None, None).contains("no joint moves below the link \"root\""));
+        assert!(problem(None, Some("plate")).contains("between \"root\" and \"plate\""));
+        assert!(problem(None, Some("hand")).contains("link \"hand\" is not in the URDF"));
+        assert!(problem(Some("bace"), None).contains("link \"bace\" is not in the URDF"));
     }
 }

@@ -168,7 +168,11 @@ impl Robot {
         Ok(joints_upwards)
     }
 
-    fn check_link(&self, link: &str) -> Result<(), Error> {
+    /// Checks that a link exists.
+    ///
+    /// # Errors
+    /// [`Error::UnknownLink`] if it does not.
+    pub fn check_link(&self, link: &str) -> Result<(), Error> {
         if self.joint_above.contains_key(link) {
             return Ok(());
         }

@@ -19,7 +19,9 @@ pub(super) fn no_model_reason(n_keyframes: usize, counts: &Counts, rig: &Rig) ->
         }
         (0, 1..) => format!("the run ended before the trainer received a keyframe ({counts})"),
         (0, 0) if counts.images == 0 => {
-            format!("no image was received; the rig file has the cameras {expected}")
+            format!(
+                "no image arrived before the run ended; the rig file has the cameras {expected}"
+            )
         }
         (0, 0) if n_unknown == counts.images => {
             format!(
@@ -64,7 +66,11 @@ mod tests {
                 counts(1, 1, &[]),
                 "ended before the trainer received a keyframe",
             ),
-            (0, counts(0, 0, &[]), "no image was received"),
+            (
+                0,
+                counts(0, 0, &[]),
+                "no image arrived before the run ended",
+            ),
             (
                 0,
                 counts(7, 0, &[(Rejection::UnknownCamera, 7)]),
