@@ -66,6 +66,8 @@ pub(super) struct ClientState {
     pub(super) offered_to: Option<u64>,
     /// Why the arm must stay at rest.
     pub(super) stop: Option<String>,
+    /// Number of the newest stop.
+    pub(super) stop_number: u64,
     /// Position of the tip, meters.
     pub(super) tip_m: [f64; 3],
 }
@@ -148,9 +150,14 @@ impl SteeringClient {
         self.send(&json!({ "type": "lease", "action": "offer", "to": to }))
     }
 
-    /// Stops the arm, or permits motion again.
-    pub(super) fn request(&self, kind: &str) -> Result<()> {
-        self.send(&json!({ "type": kind }))
+    /// Stops the arm.
+    pub(super) fn stop(&self) -> Result<()> {
+        self.send(&json!({ "type": "stop" }))
+    }
+
+    /// Permits motion again after a stop, see [`ClientState::stop_number`].
+    pub(super) fn rearm(&self, stop_number: u64) -> Result<()> {
+        self.send(&json!({ "type": "rearm", "stop": stop_number }))
     }
 
     /// A command with the next number and the current time.
@@ -283,6 +290,7 @@ fn client_state(state: &Value) -> Option<ClientState> {
         holder: state["holder"].as_u64(),
         offered_to: state["offered_to"].as_u64(),
         stop: state["stop"].as_str().map(str::to_owned),
+        stop_number: state["stop_number"].as_u64()?,
         tip_m: [tip_m[0]?, tip_m[1]?, tip_m[2]?],
     })
 }

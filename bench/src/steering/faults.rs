@@ -311,7 +311,7 @@ impl Fault {
             Self::ClockBehind => client.clock_error = ClockError(-CLOCK_STEP_MICROS),
             Self::Stale => client.clock_error = ClockError(-STALE_MICROS),
             Self::OperatorReplaced => other.lease("take")?,
-            Self::StoppedByOther => other.request("stop")?,
+            Self::StoppedByOther => other.stop()?,
             Self::Loss5 => client.set_link(loss(0.05)),
             Self::Loss15 => client.set_link(loss(0.15)),
             Self::PageFrozen

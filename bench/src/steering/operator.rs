@@ -163,9 +163,9 @@ impl<'rig> Operator<'rig> {
             let holds_lease = state
                 .as_ref()
                 .is_some_and(|state| state.holder == Some(self.client.number()));
-            let sent = match state.and_then(|state| state.stop) {
-                None if holds_lease => return Ok(()),
-                Some(_) if holds_lease => self.client.request("rearm"),
+            let sent = match state {
+                Some(state) if holds_lease && state.stop.is_none() => return Ok(()),
+                Some(state) if holds_lease => self.client.rearm(state.stop_number),
                 _ => self.client.lease("take"),
             };
             if let Err(error) = sent {

@@ -7,7 +7,7 @@ use drivers::Arm;
 use drivers::motion::{MotionConfig, MovableArm, OnLoss, Setpoint};
 use drivers::ur::emulated::{CommandedJoints, ControllerConfig, EmulatedController, Joints};
 use drivers::ur::{ArmConfig, MovableUrArm, N_JOINTS, RTDE_PORT};
-use kinematics::{Chain, Stamp};
+use kinematics::Stamp;
 use std::net::{Ipv4Addr, SocketAddr};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -25,8 +25,6 @@ const START_RAD: [f64; N_JOINTS] = [0.3, -1.4, 1.6, -1.8, -1.5, 0.4];
 const READ_TIMEOUT: Duration = Duration::from_millis(20);
 /// Time without setpoints after which the program of the controller brakes the arm.
 const WATCHDOG: Duration = Duration::from_secs(1);
-/// Link to which the first joint is attached.
-const FIRST_PARENT: &str = "base_link_inertia";
 
 /// The thread that reads the states as a run does, with the arm, and its controller.
 struct Ur {
@@ -50,17 +48,16 @@ impl Drop for Ur {
 
 pub(super) fn start() -> Result<BenchArm> {
     let (robot, chain) = robot("ur5e")?;
-    let from_first_joint = Chain::from_urdf(robot.urdf, FIRST_PARENT, robot.flange_link)?;
     let recorder = Recorder::default();
     let controller = EmulatedController::start_waiting(
-        ControllerConfig::e_series(own_address(), from_first_joint.clone()),
+        ControllerConfig::e_series(own_address(), chain.clone()),
         ANSWER_WAIT,
         Box::new(recorded_joints(recorder.clone())),
     )?;
     let config = ArmConfig {
         address: controller.address().to_string(),
         joint_names: chain.joint_names().to_vec(),
-        chain: from_first_joint,
+        chain: chain.clone(),
     };
     let motion = MotionConfig {
         limits: motion_limits(&chain),

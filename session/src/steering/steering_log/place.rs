@@ -1,6 +1,6 @@
 //! Where the files of a steering log are.
 
-use messages::BadInput;
+use messages::{BadInput, Setting};
 use std::path::{Path, PathBuf};
 use trainer::ModelKind;
 
@@ -31,7 +31,8 @@ pub fn files_of(run: &Path) -> Result<Vec<PathBuf>, BadInput> {
         }
     }
     Err(BadInput(format!(
-        "{} has no steering log ({FILE}): runs with --enable-motion write one when an operator takes control",
-        run.display()
+        "{} has no steering log ({FILE}): runs with {} write one when an operator takes control",
+        run.display(),
+        Setting::EnableMotion
     )))
 }

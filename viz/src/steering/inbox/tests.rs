@@ -101,17 +101,18 @@ fn only_the_newest_view_of_a_client_waits() {
     let view = |x| SteeringRequest::View {
         world_from_camera: [x, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0],
     };
+    let newest = command(1, 2, Some(1));
     push(&mut inbox, A, command(1, 1, Some(1)));
     push(&mut inbox, A, view(1.0));
     push(&mut inbox, B, view(2.0));
-    push(&mut inbox, A, command(1, 2, Some(1)));
+    push(&mut inbox, A, newest.clone());
     push(&mut inbox, A, view(3.0));
     let requests: Vec<_> = inbox
         .take()
         .into_iter()
         .map(|waiting| (waiting.client, waiting.request))
         .collect();
-    let expected = [(A, command(1, 2, Some(1))), (A, view(3.0)), (B, view(2.0))];
+    let expected = [(A, newest), (A, view(3.0)), (B, view(2.0))];
     assert_eq!(requests, expected);
 }
 
