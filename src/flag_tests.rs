@@ -114,7 +114,7 @@ const PRINTED_BY: [(&str, &[&str]); 43] = [
 ];
 
 /// Settings in messages of libraries, where the message names a command that accepts the setting.
-const NAMED_WITH_COMMAND: [(&str, Setting, &str); 18] = [
+const NAMED_WITH_COMMAND: [(&str, Setting, &str); 19] = [
     (
         "capture/src/config/required.rs",
         Setting::Target,
@@ -138,6 +138,11 @@ const NAMED_WITH_COMMAND: [(&str, Setting, &str); 18] = [
     ("session/src/next_commands.rs", Setting::Out, "export"),
     ("session/src/next_commands.rs", Setting::To, "export"),
     ("session/src/saved_view.rs", Setting::From, "run"),
+    (
+        "session/src/steering/steering_log/place.rs",
+        Setting::EnableMotion,
+        "run",
+    ),
     ("session/src/training.rs", Setting::DepthFrom, "train"),
     ("trainer/gpu/src/error.rs", Setting::MaxBytes, "train"),
     ("trainer/gpu/src/error.rs", Setting::MaxSplats, "train"),

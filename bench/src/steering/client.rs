@@ -64,10 +64,8 @@ pub(super) struct ClientState {
     pub(super) holder: Option<u64>,
     /// Whom the holder has offered the lease.
     pub(super) offered_to: Option<u64>,
-    /// Why the arm must stay at rest.
-    pub(super) stop: Option<String>,
-    /// Number of the newest stop.
-    pub(super) stop_number: u64,
+    /// Number of the newest stop, while the arm is stopped.
+    pub(super) stop_number: Option<u64>,
     /// Position of the tip, meters.
     pub(super) tip_m: [f64; 3],
 }
@@ -289,8 +287,7 @@ fn client_state(state: &Value) -> Option<ClientState> {
     Some(ClientState {
         holder: state["holder"].as_u64(),
         offered_to: state["offered_to"].as_u64(),
-        stop: state["stop"].as_str().map(str::to_owned),
-        stop_number: state["stop_number"].as_u64()?,
+        stop_number: state["stop_number"].as_u64(),
         tip_m: [tip_m[0]?, tip_m[1]?, tip_m[2]?],
     })
 }

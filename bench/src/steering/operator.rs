@@ -164,8 +164,10 @@ impl<'rig> Operator<'rig> {
                 .as_ref()
                 .is_some_and(|state| state.holder == Some(self.client.number()));
             let sent = match state {
-                Some(state) if holds_lease && state.stop.is_none() => return Ok(()),
-                Some(state) if holds_lease => self.client.rearm(state.stop_number),
+                Some(state) if holds_lease => match state.stop_number {
+                    None => return Ok(()),
+                    Some(number) => self.client.rearm(number),
+                },
                 _ => self.client.lease("take"),
             };
             if let Err(error) = sent {

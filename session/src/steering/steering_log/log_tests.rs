@@ -400,7 +400,7 @@ fn incidents_have_words_times_and_postures() {
         .filter(|sample| sample.seconds < stop.seconds)
         .count();
     assert!(
-        n_before >= 15 && around.len() > n_before + 2,
+        n_before >= 15 && around.len() > n_before,
         "{n_before} of {}",
         around.len()
     );
