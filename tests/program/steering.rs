@@ -263,14 +263,6 @@ fn an_operator_takes_the_simulated_arm_over_and_moves_its_tip_back_by_ten_centim
     small_rig::write(folder.path(), Pace::RealTime);
     let run = Run::start(folder.path(), &["--enable-motion"]);
     let mut operator = Operator::connect(&run);
-    let mut viewer = run.connect("/ws").expect("the page is served");
-    for message in [
-        json!({"type": "hello", "protocols": [3, 4], "capabilities": ["subscribe", "robot"]}),
-        json!({"type": "subscribe", "topic": "robot_state", "rate_hz": 20}),
-    ] {
-        let message = Message::text(message.to_string());
-        viewer.send(message).expect("the server reads");
-    }
 
     // The arm is on its tour. The space that it has passed is free, so the operator goes back.
     let mut way = vec![operator.next_state()];
@@ -297,7 +289,16 @@ fn an_operator_takes_the_simulated_arm_over_and_moves_its_tip_back_by_ten_centim
     assert!(tip_distance_m(&start, &left) > 0.9 * DISTANCE_M, "{left}");
     assert_eq!(left["contacts"], 0, "{left}");
 
-    // Viewers see the arm where the operator left it, and it stays there.
+    // Viewers see the arm where the operator left it, and it stays there. The server would end the
+    // connection of a viewer that did not read before.
+    let mut viewer = run.connect("/ws").expect("the page is served");
+    for message in [
+        json!({"type": "hello", "protocols": [3, 4], "capabilities": ["subscribe", "robot"]}),
+        json!({"type": "subscribe", "topic": "robot_state", "rate_hz": 20}),
+    ] {
+        let message = Message::text(message.to_string());
+        viewer.send(message).expect("the server reads");
+    }
     let left = numbers(&left["position"]);
     let began = Instant::now();
     while distance(&watched_positions(&mut viewer), &left) > ARRIVED_RAD {

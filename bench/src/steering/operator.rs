@@ -208,6 +208,12 @@ impl<'rig> Operator<'rig> {
                     self.client.refusals()
                 );
             }
+            if !self.client.refusals().is_empty() || self.client.is_closed() {
+                // On a busy computer, the arm has braked, and the grip or the control has ended.
+                self.client.forget();
+                self.take_control()?;
+                self.begin_grip()?;
+            }
             self.wait_for_sample();
             let sample = self.closed_sample(&intent);
             self.client.send(&sample)?;
