@@ -13,6 +13,9 @@ use anyhow::{Context, Result};
 use capture::known_robots::KnownRobot;
 use drivers::motion::{MotionLimits, SteeringPort, brake_limits};
 use kinematics::Chain;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::thread::JoinHandle;
 use std::time::Duration;
 
 /// Acceleration and jerk of braking, as a factor of the limits of motions: that of runs.
@@ -83,6 +86,42 @@ pub(super) trait RunningArm: Send {
     /// The fraction of the robot's cycles that got a command in time, if the arm counts it.
     fn success_frac(&self) -> Option<f64> {
         None
+    }
+}
+
+/// A thread of an arm. Dropping it ends the thread.
+struct ArmThread {
+    must_stop: Arc<AtomicBool>,
+    thread: Option<JoinHandle<()>>,
+}
+
+impl ArmThread {
+    /// * `run`: called in the thread. It returns soon after its argument has become true.
+    fn spawn(run: impl FnOnce(&AtomicBool) + Send + 'static) -> Result<Self> {
+        let must_stop = Arc::<AtomicBool>::default();
+        let thread = std::thread::Builder::new()
+            .name("bench arm".to_owned())
+            .spawn({
+                let must_stop = Arc::clone(&must_stop);
+                move || run(&must_stop)
+            })
+            .context("cannot start a thread")?;
+        Ok(Self {
+            must_stop,
+            thread: Some(thread),
+        })
+    }
+}
+
+impl RunningArm for ArmThread {}
+
+impl Drop for ArmThread {
+    fn drop(&mut self) {
+        self.must_stop.store(true, Ordering::Relaxed);
+        if let Some(thread) = self.thread.take() {
+            // The panic hook has already reported a panic of the thread.
+            let _ = thread.join();
+        }
     }
 }
 

@@ -50,7 +50,7 @@ pub struct FaultRow {
     pub n_exceeded: u32,
     /// The first such excess.
     pub excess: Option<Excess>,
-    /// Trials in which the arm stopped because of a fault of its own.
+    /// Trials in which the arm stopped because the arm itself reported a fault.
     pub n_stopped: u32,
     /// The first reason of such a stop.
     pub stopped: Option<String>,

@@ -109,7 +109,7 @@ pub(super) fn largest_excess(
             let position = after.position[ix];
             let [lower, upper] = joint.position;
             for (bound, beyond) in [(lower, lower - position), (upper, position - upper)] {
-                // A range has no scale of its own, so the excess counts against a radian.
+                // The excess of a range is relative to one radian, because ranges have no natural scale.
                 note(LimitKind::Position, ix, position, bound, 1.0 + beyond);
             }
             let rate = |after: &[f64], before: &[f64]| (after[ix] - before[ix]) / period_secs;
@@ -156,8 +156,7 @@ pub(super) mod tests {
         vec![joint; 2]
     }
 
-    /// An arm that moves at its full velocity, and brakes after some cycles, as far as it is
-    /// recorded.
+    /// The record of an arm that moves at its full velocity and brakes after some cycles.
     pub(in super::super) fn braked_motion(
         n_moving: i64,
         brake_limits: &[MotionLimits],

@@ -44,7 +44,7 @@ pub(super) struct Outcome {
     pub(super) braking: Option<Braking>,
     /// The largest excess over a limit in any cycle of the trial.
     pub(super) excess: Option<Excess>,
-    /// Why the arm stopped because of a fault of its own, if it did.
+    /// Why the arm stopped because the arm itself reported a fault, if it did.
     pub(super) stopped: Option<String>,
     /// How often the fault alone made the arm brake before the operator released the switch.
     pub(super) n_own_brakes: u32,

@@ -36,8 +36,8 @@ pub trait Clearance {
     /// * `points_in_base`: points in the frame of the arm's base, meters.
     fn readings(&self, points_in_base: &[[f64; 3]], now: Stamp) -> Vec<Option<Seen>>;
 
-    /// Why the model learns of no changes of the scene any more, in words, if that is so. The arm
-    /// is then stopped: what the model knows may have changed since.
+    /// Why the model is no longer updated, in words; `None` while it is. The arm is stopped after a
+    /// failure, because the scene may change.
     fn failure(&self) -> Option<String> {
         None
     }

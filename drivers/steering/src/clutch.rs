@@ -87,7 +87,7 @@ struct Anchor {
     base_from_tip: Transform,
 }
 
-/// What a clutch knows, for records.
+/// The state of a clutch, for records.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub(crate) struct ClutchState {
     known: Vec<Known>,
@@ -134,7 +134,7 @@ impl Clutch {
         }
     }
 
-    /// What the clutch knows.
+    /// The devices and the grip, for records.
     pub(crate) fn state(&self) -> ClutchState {
         ClutchState {
             known: self.known.clone(),

@@ -264,7 +264,7 @@ impl Steering {
     /// * `scene`: what is known about the scene.
     pub fn cycle(&mut self, now: Stamp, arm: &ArmState, scene: &dyn Clearance) -> Verdict {
         if let Some(report) = scene.failure().filter(|_| self.stop.is_none()) {
-            // A permission cannot mend the model, so the next cycle stops the arm again.
+            // The failure lasts: if motion is permitted, the next cycle stops the arm again.
             let stopped = self.handle(now, &Request::SceneLost { report });
             debug_assert!(stopped.is_ok(), "everybody may stop the arm");
         }

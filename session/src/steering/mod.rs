@@ -20,6 +20,8 @@ mod steering_loop;
 #[cfg(test)]
 mod steering_loop_tests;
 mod surroundings;
+#[cfg(test)]
+mod test_arm;
 mod time_base;
 mod undrawn;
 

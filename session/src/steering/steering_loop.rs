@@ -330,8 +330,8 @@ impl SteeringLoop {
         let Some((permission, recovered)) = self.recovery.take_result(now, arm) else {
             return;
         };
-        // Stops were noted also during the recovery. Whoever asked for it did not know of them, so
-        // the arm is enabled, but motion must be permitted again.
+        // The operator could not know of stops during the recovery. After such a stop, the arm is
+        // enabled, but motion must be permitted again.
         let permitted = recovered.and_then(|()| self.permit(now, permission));
         if let Err(reason) = permitted {
             let refused = Reply::Refused(RefusedRequest::Rearm, reason);

@@ -4,24 +4,22 @@ use super::config;
 use super::joint_map::JointMap;
 use super::steering_log::{self, About};
 use super::steering_loop::{Outcome, Reply, SteeredRobot, SteeringLoop};
+use super::test_arm::{PANDA, START, panda};
 use super::time_base::TimeBase;
 use capture::config::ArmSteering;
 use drivers::Error;
-use drivers::motion::{ArmState, MotionLimits, Steered, SteeringPort};
-use kinematics::urdf::Robot as Urdf;
+use drivers::motion::{ArmState, Steered, SteeringPort};
 use kinematics::{Chain, Stamp, Transform, transform};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU32, Ordering};
 use std::time::Duration;
-use steering::{AnalyticScene, Body};
+use steering::AnalyticScene;
 use viz::{
     AppliedLimit, LimitEffect, LimitLink, PreviewGoal, PreviewRequest, PreviewVerdict,
     ReceivedRequest, RefusedRequest, SteeringCommand, SteeringIntent, SteeringRequest,
     SteeringState,
 };
 
-const PANDA: &str = include_str!("../../../rigs/robots/panda.urdf");
-const START: [f64; 7] = [0.0, -0.5, 0.0, -2.2, 0.0, 1.8, 0.8];
 /// Period of the arm's thread, and of the loop in periods of the arm's thread.
 const ARM_PERIOD: Duration = Duration::from_millis(1);
 const ARM_STEPS_PER_CYCLE: usize = 5;
@@ -49,13 +47,7 @@ struct Run {
 
 impl Run {
     fn new() -> Self {
-        let urdf = Urdf::parse(PANDA).expect("a robot");
-        let chain = Chain::new(&urdf, "panda_link0", "panda_link8").expect("a chain");
-        let limits: Vec<MotionLimits> = chain
-            .limits()
-            .iter()
-            .map(|joint| MotionLimits::new(joint, 1.0, 0.5, 0.1))
-            .collect();
+        let (chain, body, limits) = panda();
         let n_recoveries = Arc::<AtomicU32>::default();
         let recover = {
             let n_recoveries = Arc::clone(&n_recoveries);
@@ -69,7 +61,7 @@ impl Run {
         let times = TimeBase::now();
         let now = times.stamp(std::time::Instant::now());
         let robot = SteeredRobot {
-            body: Body::new(&urdf, &chain, &|_| None).expect("it has shapes"),
+            body,
             joints: JointMap::new(&chain, chain.joint_names(), &[]).expect("the same joints"),
             chain: chain.clone(),
             port: port.clone(),

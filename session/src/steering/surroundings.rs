@@ -1,4 +1,4 @@
-//! What the loop needs to know about the surroundings of an arm.
+//! The surroundings of an arm, as the loop uses them.
 
 use super::scene_clearance::SceneClearance;
 use drivers::motion::ArmState;

@@ -1,4 +1,4 @@
-//! The page as it is served: who may open it, and its addresses.
+//! Serves the page of a program, and describes its addresses.
 
 use crate::server::access::Tokens;
 use crate::server::certificate::Certificate;
@@ -8,13 +8,12 @@ use serde_json::{Value, json};
 use std::net::{IpAddr, Ipv4Addr, Ipv6Addr, SocketAddr, UdpSocket};
 use std::path::PathBuf;
 
-/// Where the page is served, and to whom.
+/// Address of the page, and the clients that may open it.
 #[derive(Clone, Debug, Default)]
 pub struct PageOptions {
     /// Address of the page. `None`: the default address.
     pub listen: Option<SocketAddr>,
-    /// The certificate with which the page is served to other machines. `None`: only this computer
-    /// can open the page.
+    /// The certificate for clients on other machines. `None`: only this computer can open the page.
     pub shared_with: Option<CertificateSource>,
     /// Loopback address at which Foxglove gets the same data.
     pub foxglove: Option<SocketAddr>,

@@ -145,7 +145,7 @@ impl SteeringServer {
         result
     }
 
-    /// Refuses to offer control to a client that cannot take it. The loop does not know the roles.
+    /// Refuses to offer control to a client that cannot take it. The loop has no access to the roles.
     fn check_offer(&self, to: u64) -> Result<(), NotAccepted> {
         let clients = self.clients.lock();
         let only_watches = clients

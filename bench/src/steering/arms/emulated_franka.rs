@@ -2,8 +2,8 @@
 //! limits of a Panda.
 
 use super::super::trace::Recorder;
-use super::{ArmKind, BRAKE_FACTOR, BenchArm, RunningArm, motion_limits, robot};
-use anyhow::{Context, Result};
+use super::{ArmKind, ArmThread, BRAKE_FACTOR, BenchArm, RunningArm, motion_limits, robot};
+use anyhow::Result;
 use drivers::Arm;
 use drivers::franka::emulated::{CommandedJoints, EmulatedRobot, Joints, Limits, RobotConfig};
 use drivers::franka::{ArmConfig, ContactConfig, FciVersion, MovableFrankaArm, N_JOINTS};
@@ -13,7 +13,6 @@ use parking_lot::Mutex;
 use std::net::Ipv4Addr;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
-use std::thread::JoinHandle;
 use std::time::Duration;
 
 /// Time between two commands.
@@ -32,8 +31,7 @@ const WATCHDOG: Duration = Duration::from_millis(100);
 /// The arm, whose states are read as in a run, and its controller.
 struct Franka {
     arm: Arc<Mutex<MovableFrankaArm>>,
-    must_stop: Arc<AtomicBool>,
-    thread: Option<JoinHandle<()>>,
+    _thread: ArmThread,
     /// This field is dropped last, so that the controller answers until the arm is at rest.
     _controller: EmulatedRobot,
 }
@@ -41,16 +39,6 @@ struct Franka {
 impl RunningArm for Franka {
     fn success_frac(&self) -> Option<f64> {
         Some(self.arm.lock().motion_statistics().success_frac())
-    }
-}
-
-impl Drop for Franka {
-    fn drop(&mut self) {
-        self.must_stop.store(true, Ordering::Relaxed);
-        if let Some(thread) = self.thread.take() {
-            // The panic hook has already reported a panic of the thread.
-            let _ = thread.join();
-        }
     }
 }
 
@@ -83,14 +71,10 @@ pub(super) fn start() -> Result<BenchArm> {
     let mut arm = MovableFrankaArm::open(&config, &motion, &ContactConfig::default())?;
     let port = arm.steering_port(BRAKE_FACTOR)?;
     let arm = Arc::new(Mutex::new(arm));
-    let must_stop = Arc::<AtomicBool>::default();
-    let thread = std::thread::Builder::new()
-        .name("arm reader".to_owned())
-        .spawn({
-            let (arm, must_stop) = (Arc::clone(&arm), Arc::clone(&must_stop));
-            move || read(&arm, &must_stop)
-        })
-        .context("cannot start a thread")?;
+    let thread = ArmThread::spawn({
+        let arm = Arc::clone(&arm);
+        move |must_stop| read(&arm, must_stop)
+    })?;
     Ok(BenchArm {
         kind: ArmKind::Franka,
         robot,
@@ -102,8 +86,7 @@ pub(super) fn start() -> Result<BenchArm> {
         period: PERIOD,
         running: Box::new(Franka {
             arm,
-            must_stop,
-            thread: Some(thread),
+            _thread: thread,
             _controller: controller,
         }),
     })

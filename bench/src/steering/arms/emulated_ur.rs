@@ -1,17 +1,15 @@
 //! The driver of arms of Universal Robots with an emulated controller.
 
 use super::super::trace::Recorder;
-use super::{ArmKind, BRAKE_FACTOR, BenchArm, RunningArm, motion_limits, robot};
-use anyhow::{Context, Result};
+use super::{ArmKind, ArmThread, BRAKE_FACTOR, BenchArm, RunningArm, motion_limits, robot};
+use anyhow::Result;
 use drivers::Arm;
 use drivers::motion::{MotionConfig, MovableArm, OnLoss, Setpoint};
 use drivers::ur::emulated::{CommandedJoints, ControllerConfig, EmulatedController, Joints};
 use drivers::ur::{ArmConfig, MovableUrArm, N_JOINTS, RTDE_PORT};
 use kinematics::Stamp;
 use std::net::{Ipv4Addr, SocketAddr};
-use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
-use std::thread::JoinHandle;
 use std::time::Duration;
 
 /// Time between two setpoints of an e-Series controller.
@@ -28,23 +26,12 @@ const WATCHDOG: Duration = Duration::from_secs(1);
 
 /// The thread that reads the states as a run does, with the arm, and its controller.
 struct Ur {
-    must_stop: Arc<AtomicBool>,
-    thread: Option<JoinHandle<()>>,
+    _thread: ArmThread,
     /// This field is dropped last, so that the controller answers until the arm is at rest.
     _controller: EmulatedController,
 }
 
 impl RunningArm for Ur {}
-
-impl Drop for Ur {
-    fn drop(&mut self) {
-        self.must_stop.store(true, Ordering::Relaxed);
-        if let Some(thread) = self.thread.take() {
-            // The panic hook has already reported a panic of the thread.
-            let _ = thread.join();
-        }
-    }
-}
 
 pub(super) fn start() -> Result<BenchArm> {
     let (robot, chain) = robot("ur5e")?;
@@ -67,14 +54,7 @@ pub(super) fn start() -> Result<BenchArm> {
     };
     let mut arm = MovableUrArm::open(&config, &motion)?;
     let port = arm.steering_port(BRAKE_FACTOR)?;
-    let must_stop = Arc::<AtomicBool>::default();
-    let thread = std::thread::Builder::new()
-        .name("arm reader".to_owned())
-        .spawn({
-            let must_stop = Arc::clone(&must_stop);
-            move || read(arm, &must_stop)
-        })
-        .context("cannot start a thread")?;
+    let thread = ArmThread::spawn(|must_stop| read(arm, must_stop))?;
     Ok(BenchArm {
         kind: ArmKind::Ur,
         robot,
@@ -85,8 +65,7 @@ pub(super) fn start() -> Result<BenchArm> {
         port,
         period: PERIOD,
         running: Box::new(Ur {
-            must_stop,
-            thread: Some(thread),
+            _thread: thread,
             _controller: controller,
         }),
     })

@@ -1,38 +1,18 @@
 //! A simulated arm without a scene: the controller of simulated arms after their tour, with a
-//! setpoint per millisecond on a thread of its own.
+//! setpoint per millisecond on a separate thread.
 
 use super::super::trace::Recorder;
-use super::{ArmKind, BRAKE_FACTOR, BenchArm, RunningArm, brake_limits, motion_limits, robot};
-use anyhow::{Context, Result};
+use super::{ArmKind, ArmThread, BRAKE_FACTOR, BenchArm, brake_limits, motion_limits, robot};
+use anyhow::Result;
 use drivers::clock;
 use drivers::motion::{Setpoint, Steered, SteeringPort};
-use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
-use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
 /// Time between two setpoints.
 const PERIOD: Duration = Duration::from_millis(1);
 /// A posture of a Panda with space around it, radians.
 const START_RAD: [f64; 7] = [0.0, -0.5, 0.0, -2.2, 0.0, 1.8, 0.8];
-
-/// The thread of the arm.
-struct ArmThread {
-    must_stop: Arc<AtomicBool>,
-    thread: Option<JoinHandle<()>>,
-}
-
-impl RunningArm for ArmThread {}
-
-impl Drop for ArmThread {
-    fn drop(&mut self) {
-        self.must_stop.store(true, Ordering::Relaxed);
-        if let Some(thread) = self.thread.take() {
-            // The panic hook has already reported a panic of the thread.
-            let _ = thread.join();
-        }
-    }
-}
 
 pub(super) fn start() -> Result<BenchArm> {
     let (robot, chain) = robot("panda")?;
@@ -41,15 +21,10 @@ pub(super) fn start() -> Result<BenchArm> {
     let port = SteeringPort::new(&limits, BRAKE_FACTOR, || Ok(()))?;
     let steered = Steered::new(port.clone(), &START_RAD, PERIOD)?;
     let recorder = Recorder::default();
-    let must_stop = Arc::<AtomicBool>::default();
-    let thread = std::thread::Builder::new()
-        .name("sim-arm".to_owned())
-        .spawn({
-            let recorder = recorder.clone();
-            let must_stop = Arc::clone(&must_stop);
-            move || follow(steered, &recorder, &must_stop)
-        })
-        .context("cannot start a thread")?;
+    let thread = ArmThread::spawn({
+        let recorder = recorder.clone();
+        move |must_stop| follow(steered, &recorder, must_stop)
+    })?;
     Ok(BenchArm {
         kind: ArmKind::Simulated,
         robot,
@@ -59,10 +34,7 @@ pub(super) fn start() -> Result<BenchArm> {
         checked_limits: brake_limits(&limits, BRAKE_FACTOR),
         port,
         period: PERIOD,
-        running: Box::new(ArmThread {
-            must_stop,
-            thread: Some(thread),
-        }),
+        running: Box::new(thread),
     })
 }
 

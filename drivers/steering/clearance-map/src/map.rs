@@ -16,7 +16,7 @@ use steering::{Body, Clearance, Seen};
 /// Maximum number of cameras whose newest image waits. Images of more cameras replace the oldest.
 const MAX_WAITING: usize = 16;
 
-/// Why a map whose thread has ended knows nothing.
+/// The failure of a map whose thread has ended.
 const ENDED: &str = "the thread of the map of free space has ended, which is a bug: \
                      start the program again to move the arm";
 

@@ -3,7 +3,7 @@
 
 mod capsule_tests;
 mod distance_tests;
-mod map_tests;
+pub(crate) mod map_tests;
 mod robot_tests;
 mod scene;
 mod time_tests;

@@ -6,18 +6,16 @@ use super::place::{FILE, OLDER_FILE, files_of};
 use super::reader::LogReader;
 use super::writer::{LogWriter, MAX_WAITING};
 use super::{IncidentKind, Incidents, Replayed, incidents, replay};
-use drivers::motion::{ArmState, Follower, MotionLimits, brake_limits};
-use kinematics::urdf::Robot as Urdf;
-use kinematics::{Chain, Stamp, Transform};
+use crate::steering::test_arm::{PANDA, START, panda};
+use drivers::motion::{ArmState, Follower, brake_limits};
+use kinematics::{Stamp, Transform};
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 use steering::{
-    AnalyticScene, Body, Command, Device, Intent, NearestPosture, Operator, Request, Robot,
-    Steering, SteeringConfig,
+    AnalyticScene, Command, Device, Intent, NearestPosture, Operator, Request, Robot, Steering,
+    SteeringConfig,
 };
 
-const PANDA: &str = include_str!("../../../../rigs/robots/panda.urdf");
-const START: [f64; 7] = [0.0, -0.5, 0.0, -2.2, 0.0, 1.8, 0.8];
 const CYCLE: Duration = Duration::from_millis(5);
 const ANA: Operator = Operator(1);
 const BEN: Operator = Operator(2);
@@ -33,16 +31,10 @@ struct Session {
 
 impl Session {
     fn new(folder: &Path) -> Self {
-        let urdf = Urdf::parse(PANDA).expect("a robot");
-        let chain = Chain::new(&urdf, "panda_link0", "panda_link8").expect("a chain");
-        let limits: Vec<MotionLimits> = chain
-            .limits()
-            .iter()
-            .map(|joint| MotionLimits::new(joint, 1.0, 0.5, 0.1))
-            .collect();
+        let (chain, body, limits) = panda();
         let robot = Robot {
             inverse: Box::new(NearestPosture::new(chain.clone())),
-            body: Body::new(&urdf, &chain, &|_| None).expect("it has shapes"),
+            body,
             chain,
             joints: &limits,
             free_posture: Some(&START),

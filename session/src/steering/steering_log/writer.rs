@@ -1,4 +1,4 @@
-//! Writes a steering log on a thread of its own, so that decisions never wait for the disk.
+//! Writes a steering log on a separate thread, so that decisions never wait for the disk.
 //!
 //! The file consists of gzip members (RFC 1952, section 2.2), each with a checksum, so that common
 //! tools can read it. Compressed data is passed on to the operating system as soon as no line

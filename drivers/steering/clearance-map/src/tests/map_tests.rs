@@ -24,11 +24,11 @@ fn slide() -> (Body, Chain) {
     (Body::new(&robot, &chain, &|_| None).unwrap(), chain)
 }
 
-fn started() -> ClearanceMap {
+pub(crate) fn started() -> ClearanceMap {
     ClearanceMap::start(&config(), slide().0).unwrap()
 }
 
-fn posture(x: f64, stamp: Stamp, world_from_base: Transform) -> Posture {
+pub(crate) fn posture(x: f64, stamp: Stamp, world_from_base: Transform) -> Posture {
     Posture {
         stamp,
         position: vec![x],
@@ -52,7 +52,7 @@ fn image(secs: f64, world_from_base: Transform, random: &mut Random) -> DepthIma
 }
 
 /// Waits until the thread has done its work. The limit only ends a test that would hang.
-fn wait_until(map: &ClearanceMap, is_done: impl Fn() -> bool) {
+pub(crate) fn wait_until(map: &ClearanceMap, is_done: impl Fn() -> bool) {
     const LIMIT: Duration = Duration::from_secs(120);
     let started = Instant::now();
     while !is_done() {
