@@ -33,7 +33,7 @@ impl TipPoses {
     /// limits only cause a warning.
     ///
     /// # Errors
-    /// Fails if a file cannot be read, or if links or joint names are not those of the robot.
+    /// Fails if a file cannot be read, or if the robot has no such links or joints.
     pub fn compute(&self) -> anyhow::Result<Vec<[f64; 16]>> {
         let urdf = read_urdf(&self.urdf)?;
         let robot = Robot::parse(&urdf).with_context(|| self.urdf.display().to_string())?;

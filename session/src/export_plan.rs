@@ -12,7 +12,7 @@ use trainer::method_entry::{Export, ExportRequest, ExportWriter, Exported};
 /// The output format for recordings: a folder.
 pub const NERFSTUDIO: &str = "nerfstudio";
 
-/// What to export.
+/// Options of an export.
 #[derive(Clone, Debug)]
 pub struct ExportPlan {
     /// A model folder, a splat file, or a recording.
@@ -43,7 +43,7 @@ pub struct ModelExport<'a> {
     plan: &'a ExportPlan,
 }
 
-/// What the input contains.
+/// Content of the input.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum Contents {
     Model(ModelKind),
@@ -123,7 +123,7 @@ impl ExportPlan {
 }
 
 impl ModelExport<'_> {
-    /// Writes the model, and describes what was written.
+    /// Writes the model, and returns a description of the files.
     ///
     /// # Errors
     /// Fails if the model cannot be read, or the file cannot be written.

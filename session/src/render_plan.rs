@@ -17,7 +17,7 @@ use trainer::{LoadedModel, Projection, RenderRequest};
 /// Image size if neither the plan nor the camera path gives one.
 const DEFAULT_SIZE_PX: [u32; 2] = [1280, 720];
 
-/// What to render, and where to write it.
+/// Model and cameras to render, and the output folder.
 #[derive(Clone, Debug)]
 pub struct RenderPlan {
     /// Folder of a saved model, or a splat file.

@@ -118,7 +118,7 @@ const DEPTH_NOISE: u64 = 2;
 const DROP_STREAM: u64 = 3;
 /// Random number stream of one scan.
 const SCANS: u64 = 4;
-/// Number of samples that wait to be delivered while the robot steps ahead: those of some seconds.
+/// Number of samples that wait to be delivered while the robot steps ahead: some seconds.
 const MAX_WAITING_SLOTS: usize = 4096;
 
 #[expect(

@@ -93,7 +93,7 @@ impl Run {
         reply
     }
 
-    /// Kills the program. Nothing of it runs any more.
+    /// Kills the program with all its threads.
     fn kill(mut self) {
         self.child.kill().expect("it runs");
         self.child.wait().expect("our own child");

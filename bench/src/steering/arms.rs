@@ -18,7 +18,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::thread::JoinHandle;
 use std::time::Duration;
 
-/// Acceleration and jerk of braking, as a factor of the limits of motions: that of runs.
+/// Acceleration and jerk of braking, as a factor of the limits of motions, as in runs.
 const BRAKE_FACTOR: f64 = 2.0;
 /// Maximum speed of a joint, rad/s, and times to full speed and full acceleration: the defaults of
 /// rig files.
@@ -155,7 +155,7 @@ fn robot(name: &str) -> Result<(&'static KnownRobot, Chain)> {
     Ok((robot, chain))
 }
 
-/// Limits of motions, as in a rig file without limits of its own.
+/// Default limits of motions.
 pub(super) fn motion_limits(chain: &Chain) -> Vec<MotionLimits> {
     let joints = chain.limits().iter();
     joints

@@ -16,7 +16,7 @@ const MAX_ANSWER: Duration = Duration::from_secs(60);
 /// Number of pings from which the server's clock is estimated. The fastest one counts.
 const N_PINGS: u64 = 10;
 
-/// What the server has sent.
+/// Messages from the server.
 #[derive(Debug, Default)]
 struct Received {
     /// The description of the arm.
@@ -32,7 +32,7 @@ struct Received {
     is_closed: bool,
 }
 
-/// What the receiving thread shares with the client.
+/// Data that the receiving thread shares with the client.
 #[derive(Debug, Default)]
 struct Shared {
     received: Mutex<Received>,
@@ -116,7 +116,7 @@ impl SteeringClient {
         self.number
     }
 
-    /// Sets what is wrong with the connection.
+    /// Sets the fault of the connection.
     pub(super) fn set_link(&self, fault: LinkFault) {
         self.link.set(fault);
     }

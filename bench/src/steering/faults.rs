@@ -31,7 +31,7 @@ const SILENCE: f64 = 150.0;
 /// A fault.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub enum Fault {
-    /// The operator lets go of the dead-man switch.
+    /// The operator releases the dead-man switch.
     Released,
     /// The page is hidden: it opens the switch, and only keeps the lease.
     PageHidden,
@@ -39,7 +39,7 @@ pub enum Fault {
     PageClosed,
     /// The connection ends without a farewell.
     PageCrashed,
-    /// Nothing that either side sends arrives any more.
+    /// No message arrives in either direction.
     LinkCut,
     /// The client stays connected, and sends nothing.
     PageFrozen,
@@ -51,7 +51,7 @@ pub enum Fault {
     ServerHeld,
     /// The thread of the decisions is held: the map of free space answers late.
     DecisionsHeld,
-    /// The map of free space does not answer, as while whoever feeds it is held.
+    /// The map of free space does not answer, as if its input was blocked.
     ClearanceMissing,
     /// The clock of the device steps forward.
     ClockAhead,
@@ -81,7 +81,7 @@ pub enum Fault {
     Loss15,
 }
 
-/// What makes the arm brake.
+/// Reason for which the arm brakes.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Event {
     /// The beginning of the fault.
@@ -148,7 +148,7 @@ impl Fault {
         self.entry().name
     }
 
-    /// What happens, for tables.
+    /// Description for tables.
     #[must_use]
     pub fn title(self) -> &'static str {
         self.entry().title
@@ -160,7 +160,7 @@ impl Fault {
         self.entry().goal_millis
     }
 
-    /// What makes the arm brake.
+    /// Reason for which the arm brakes.
     pub(super) fn event(self) -> Event {
         self.entry().event
     }
@@ -331,7 +331,7 @@ impl Fault {
         operator.rig.scene.answer();
         operator.client.clock_error = ClockError::default();
         if matches!(self, Self::LinkCut | Self::Loss5 | Self::Loss15) {
-            // What waits on the link must not arrive during the next trial.
+            // Waiting messages must not arrive during the next trial.
             operator.client.disconnect(false);
             operator.client.set_link(LinkFault::default());
         }
@@ -342,7 +342,7 @@ impl Fault {
     }
 }
 
-/// What the client sends while a fault lasts.
+/// Messages of the client while a fault lasts.
 pub(super) struct FaultyDevice {
     fault: Fault,
     /// The newest message that was sent in time.
@@ -362,7 +362,7 @@ impl FaultyDevice {
         }
     }
 
-    /// Sends what the device of the fault sends instead of a sample of the hand. The connection may
+    /// Sends the message of the fault instead of a sample of the hand. The connection may
     /// have ended.
     pub(super) fn send(&mut self, operator: &mut Operator<'_>, hand_m: Vector3<f64>) -> Result<()> {
         match self.fault {

@@ -122,7 +122,7 @@ impl SteeredChain {
         })
     }
 
-    /// Grips with the hand anywhere, moves it, and lets go. Returns all setpoints until rest.
+    /// Grips with the hand anywhere, moves it, and releases the switch. Returns all setpoints until rest.
     fn grip(&mut self, grip: u64, random: &mut Random) -> Result<Vec<Sample>> {
         let mut samples = vec![self.sample()];
         let mut hand = anywhere(random);

@@ -23,10 +23,10 @@ const POLL: Duration = Duration::from_millis(1);
 /// Size of a buffer. Messages of clients have at most 4096 bytes.
 const BUFFER_BYTES: usize = 16 << 10;
 
-/// What is wrong with a link.
+/// Faults of a link.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub(super) struct LinkFault {
-    /// Whether nothing arrives any more. Neither side learns of it, as with a cable that is pulled.
+    /// Whether messages are lost in both directions without notice, as with an unplugged cable.
     pub(super) is_cut: bool,
     /// Fraction of the packets that are lost, 0 to 1.
     pub(super) loss_frac: f64,
@@ -80,7 +80,7 @@ impl Link {
         &self.stream
     }
 
-    /// Sets what is wrong with the link.
+    /// Sets the fault of the link.
     pub(super) fn set(&self, fault: LinkFault) {
         *self.fault.lock() = fault;
     }
@@ -88,7 +88,7 @@ impl Link {
 
 impl Drop for Link {
     fn drop(&mut self) {
-        // What still waits is not delivered any more. Errors mean that a side has ended.
+        // Waiting packets are dropped. Errors mean that a side has ended.
         self.set(LinkFault::default());
         let _ = self.stream.shutdown(Shutdown::Both);
     }

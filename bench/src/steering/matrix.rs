@@ -28,7 +28,7 @@ pub struct FaultRow {
     pub arm: ArmKind,
     /// The fault.
     pub fault: Fault,
-    /// What happens.
+    /// Description of the fault.
     pub title: &'static str,
     /// Trials that count.
     pub n_trials: u32,
@@ -132,7 +132,7 @@ impl FaultRow {
         }
     }
 
-    /// What the arm did worse than it should, in words; empty if nothing.
+    /// Missed goals, in words; empty if there are none.
     #[must_use]
     pub fn problems(&self) -> Vec<String> {
         let mut problems = Vec::new();

@@ -101,7 +101,7 @@ pub fn run(
             let row = matrix::measure(&rig, *fault, options.n_trials)?;
             on_row(&row)?;
             results.faults.push(row);
-            // An interrupted bench keeps what it has measured.
+            // An interrupted bench keeps its results.
             findings(options, &results)?.write(&options.out)?;
         }
     }

@@ -22,9 +22,9 @@ pub(super) enum Answers {
     /// At once.
     #[default]
     Prompt,
-    /// Not at all until this time, as when whoever feeds the map is busy.
+    /// Not at all until this time, as if the input of the map was blocked.
     MissingUntil(Instant),
-    /// Only at this time: whoever asks is blocked until then.
+    /// Only at this time: callers are blocked until then.
     BlockedUntil(Instant),
 }
 
@@ -34,7 +34,7 @@ impl BenchScene {
         *self.answers.lock() = Answers::MissingUntil(Instant::now() + time);
     }
 
-    /// Blocks whoever asks for a time.
+    /// Blocks callers for a time.
     pub(super) fn block_answers(&self, time: Duration) {
         *self.answers.lock() = Answers::BlockedUntil(Instant::now() + time);
     }

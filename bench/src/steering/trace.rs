@@ -51,7 +51,7 @@ impl Recorder {
     }
 }
 
-/// What a joint must keep to in each cycle.
+/// Limits of a joint in each cycle.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "snake_case")]
 pub enum LimitKind {

@@ -119,7 +119,7 @@ pub(super) fn measure(rig: &SteeredRig, planned_seconds: f64) -> Result<Tracking
     })
 }
 
-/// What is kept of the motion of the arm. A sample per millisecond would need too much memory.
+/// Recorded motion of the arm. A sample per millisecond would need too much memory.
 #[derive(Default)]
 struct Record {
     tips: Vec<TipAt>,

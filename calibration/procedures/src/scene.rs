@@ -47,7 +47,7 @@ pub struct SceneOutcome {
     pub calibration: SceneCalibration,
     /// The reason why no camera could be calibrated. `None` if at least one camera was calibrated.
     pub refused: Option<String>,
-    /// What was requested.
+    /// The requested calibration.
     pub(crate) params: Vec<Refine>,
     /// The rig before the calibration, if there is one.
     before: Option<Rig>,

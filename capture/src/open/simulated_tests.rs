@@ -285,7 +285,7 @@ fn real_time_rig_ends_after_its_duration() {
 #[test]
 fn a_rig_without_cameras_delivers_joints_in_lockstep() {
     let mut rig = small("static-arm.toml", &[]);
-    // An arm with a longer link has no scene of its own, and may be brought up before its cameras.
+    // For an arm with a longer link, there is no bundled scene. Such an arm may have no camera.
     rig.sim.scene = None;
     rig.arm.urdf_text = rig.arm.urdf_text.replace("0.316", "0.336");
     rig.cameras.clear();

@@ -144,7 +144,7 @@ impl Control {
         self.motion = Motion::Stopped { reason };
     }
 
-    /// Records that the thread of the arm is panicking: nothing moves the arm any more.
+    /// Records that the thread of the arm is panicking, so that the arm cannot be moved.
     pub(crate) fn end_after_panic(&mut self) {
         self.is_lost = true;
         self.stop_because(PANICKED.to_owned());

@@ -181,7 +181,7 @@ impl SelfCollision {
         refused.map(|pair| self.reason(pair, body))
     }
 
-    /// Distance below which the parts of a pair do not approach each other any more.
+    /// Distance below which the parts of a pair may not approach each other.
     fn stop_m(&self, close: &ClosePair) -> f64 {
         let start_m = self.pairs[close.pair_ix].start_m;
         start_m.map_or(self.config.stop_m, |start_m| start_m - START_TOLERANCE_M)

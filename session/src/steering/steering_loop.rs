@@ -173,7 +173,7 @@ impl SteeringLoop {
         }
         self.finish_recovery(now, arm, &mut outcome);
         let verdict = self.steering.cycle(now, arm, scene);
-        // Nobody sees any more through what the arm moves on its tour.
+        // Without a map of the scene, a simulated arm must not continue its tour.
         let is_scene_lost = matches!(self.steering.stop(), Some(Reason::SceneLost { .. }));
         outcome.ends_tour |= is_scene_lost;
         if self.has_begun {
@@ -260,7 +260,7 @@ impl SteeringLoop {
         self.handle(now, &request)
     }
 
-    /// Logs what the holder of the lease sees.
+    /// Logs the view of the holder of the lease.
     fn see(&mut self, now: Stamp, operator: Operator, world_from_camera: [f64; 7]) {
         let is_holder = self.holds_lease(operator);
         if let Some(log) = self.log.as_mut().filter(|_| is_holder) {

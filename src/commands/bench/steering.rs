@@ -53,7 +53,7 @@ fn arm_parser() -> impl TypedValueParser<Value = ArmKind> {
     })
 }
 
-/// The names of faults, with what happens.
+/// The names of faults, with descriptions.
 fn fault_parser() -> impl TypedValueParser<Value = Fault> {
     let values = Fault::ALL.map(|fault| PossibleValue::new(fault.name()).help(fault.title()));
     PossibleValuesParser::new(values).map(|name| {

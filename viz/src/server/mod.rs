@@ -199,8 +199,8 @@ impl Server {
         format!("{}://{}/", self.scheme, self.address)
     }
 
-    /// Blocks a thread of the server for a time, as a slow operation would. Benches find out with
-    /// it what does not wait for this thread.
+    /// Blocks a thread of the server for a time, as a slow operation would. Benches measure with
+    /// it whether other threads wait.
     pub fn block(&self, thread: ServerThread, time: Duration) {
         let runtime = match thread {
             ServerThread::Pages => &self.runtime,

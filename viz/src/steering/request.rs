@@ -44,7 +44,7 @@ pub enum SteeringRequest {
     Command(SteeringCommand),
     /// Say whether a goal can be reached, without moving the arm.
     Preview(PreviewRequest),
-    /// What the operator sees, for the log of the run.
+    /// View of the operator, for the log of the run.
     View {
         /// Pose of the eye in the world. The camera is x right, y down, z forward.
         world_from_camera: [f64; 7],

@@ -147,7 +147,7 @@ fn a_client_cannot_act_for_the_holder_of_the_lease() {
     holder.settle();
     arm_loop.run();
     assert_eq!(arm_loop.moved_by, [holder.number()]);
-    // The server identifies the sender by its connection, whatever a message claims.
+    // The server identifies the sender by its connection, not by the content of a message.
     let mut forged = command(2, Some(1), now_micros);
     for field in ["client", "operator", "holder", "from"] {
         forged[field] = json!(holder.number());

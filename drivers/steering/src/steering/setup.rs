@@ -1,4 +1,4 @@
-//! What a chain of decisions consists of: the beginning of a record that can be replayed alone.
+//! Configuration of a chain of decisions, with which a record can be replayed alone.
 
 use super::state::State;
 use super::{Robot, Steering, SteeringConfig};
@@ -63,7 +63,7 @@ impl From<&Joint> for MotionLimits {
 }
 
 impl Steering {
-    /// What the chain consists of now.
+    /// The configuration of the chain.
     ///
     /// * `urdf`: the description from which the chain of joints and the shapes were made.
     pub fn setup(&self, urdf: String) -> Setup {

@@ -126,7 +126,7 @@ fn what_was_never_seen_is_occupied() {
 
 #[test]
 fn a_scene_that_is_not_observed_any_more_stops_the_arm_and_no_permission_helps() {
-    /// What was seen last is still there, but nothing new is seen.
+    /// The newest readings remain, but there are no new ones.
     struct Lost(AnalyticScene);
     impl Clearance for Lost {
         fn readings(&self, points: &[[f64; 3]], now: Stamp) -> Vec<Option<Seen>> {

@@ -1,4 +1,4 @@
-//! What happened in a steering log: changes of control, stops, brakes, refusals, and where the arm
+//! Incidents in a steering log: changes of control, stops, brakes, refusals, and where the arm
 //! was.
 
 use super::line::{Line, Start};
@@ -20,7 +20,7 @@ const SAMPLE_SECS: f64 = 0.05;
 /// Time before and after an incident that is in the track.
 const TRACKED_BEFORE_SECS: f64 = 2.0;
 const TRACKED_AFTER_SECS: f64 = 3.0;
-/// Number of samples that are kept, the newest ones: those of 17 minutes.
+/// Number of samples that are kept, the newest ones: 17 minutes.
 const MAX_SAMPLES: usize = 20_000;
 
 /// The incidents of a log, for viewers.
@@ -51,19 +51,19 @@ pub struct Incidents {
 pub struct Incident {
     /// Time since the beginning of the log.
     pub seconds: f64,
-    /// What kind of incident it is.
+    /// Kind of incident.
     pub kind: IncidentKind,
-    /// What happened, in words.
+    /// Description in words.
     pub text: String,
     /// Where it happened, in the frame of the arm's base, meters.
     pub place: Option<[f64; 3]>,
-    /// Who had control.
+    /// The operator in control.
     pub operator: Option<u64>,
     /// Positions of the joints, radians or meters.
     pub position: Vec<f64>,
     /// The last target of the joints; `None` if the arm followed none.
     pub target: Option<Vec<f64>>,
-    /// What the operator saw, `world_from_camera`: x, y, z in meters, and a quaternion x, y, z, w.
+    /// View of the operator, `world_from_camera`: x, y, z in meters, and a quaternion x, y, z, w.
     pub view: Option<[f64; 7]>,
 }
 
@@ -109,7 +109,7 @@ pub struct Sample {
     pub target: Option<Vec<f64>>,
 }
 
-/// What is known up to a line.
+/// State of the log up to a line.
 #[derive(Default)]
 struct History {
     found: Incidents,
@@ -130,7 +130,7 @@ struct History {
     episodes: Vec<(Episode, Stamp)>,
 }
 
-/// What makes two limits or refusals equal: their numbers may differ.
+/// Limits or refusals with equal episodes belong to one incident. Their numbers may differ.
 #[derive(Clone, Copy, PartialEq)]
 struct Episode {
     kind: IncidentKind,

@@ -17,7 +17,7 @@ pub(super) enum Line {
     Start(Box<Start>),
     /// A request or a cycle.
     Entry(Box<Entry>),
-    /// What the holder of the lease sees from now on.
+    /// New view of the holder of the lease.
     View(View),
     /// Entries are missing here, because the disk was too slow.
     Missing(u64),
@@ -25,7 +25,7 @@ pub(super) enum Line {
     End(Moment),
 }
 
-/// What all further lines depend on.
+/// Setup for all further lines.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(super) struct Start {

@@ -18,7 +18,7 @@ const MOVING_PERIOD_SECS: f64 = 0.05;
 /// The same while the arm is at rest.
 const REST_PERIOD_SECS: f64 = 1.0;
 
-/// What a log contains besides decisions.
+/// Content of a log besides decisions.
 #[derive(Clone, Debug)]
 pub(in crate::steering) struct About {
     /// The robot description.
@@ -68,7 +68,7 @@ impl LoopLog {
         })
     }
 
-    /// Logs what the chain has decided since the last call. Call it after each cycle.
+    /// Logs the decisions of the chain since the last call. Call it after each cycle.
     pub(in crate::steering) fn take(&mut self, now: Stamp, steering: &mut Steering) {
         let (entries, n_dropped) = steering.take_record();
         self.latest = now;
@@ -89,7 +89,7 @@ impl LoopLog {
         self.before = state;
     }
 
-    /// Logs what an operator sees.
+    /// Logs the view of an operator.
     pub(in crate::steering) fn see(&mut self, at: Stamp, operator: u64, eye: [f64; 7]) {
         if self.has_begun {
             let view = View {

@@ -1,9 +1,9 @@
-//! The steering log of a run: requests of operators, what the chain of decisions knew, and what it
-//! decided, with stamps. Its replay repeats all decisions.
+//! The steering log of a run: requests of operators, inputs of the chain of decisions, and its
+//! decisions, with stamps. Its replay repeats all decisions.
 //!
 //! The log is a gzip file of JSON lines (`docs/reference/files.md`). `loop_log.rs` and `writer.rs`
-//! write it, `reader.rs` reads it, `replay.rs` repeats it, and `incidents.rs` extracts what viewers
-//! look at later.
+//! write it, `reader.rs` reads it, `replay.rs` repeats it, and `incidents.rs` extracts the
+//! incidents for viewers.
 
 mod incidents;
 mod line;

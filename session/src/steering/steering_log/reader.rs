@@ -85,7 +85,7 @@ impl LogReader {
                 self.end("a part of it is too large".to_owned());
             }
             Ok(_) => self.parse(&text),
-            // The rest was not written any more. All complete lines are used.
+            // The rest is missing. All complete lines are used.
             Err(error) if error.kind() == ErrorKind::UnexpectedEof => {
                 let n_complete = text.iter().rposition(|byte| *byte == b'\n');
                 self.parse(&text[..n_complete.map_or(0, |ix| ix + 1)]);

@@ -16,7 +16,7 @@ use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 use std::sync::mpsc::{Receiver, SyncSender, TryRecvError, sync_channel};
 use std::thread::JoinHandle;
 
-/// Maximum number of lists of lines that wait for the disk: those of ten seconds.
+/// Maximum number of lists of lines that wait for the disk: ten seconds.
 pub(super) const MAX_WAITING: usize = 2048;
 /// Size at which a file ends: half an hour of motion near surfaces, or several hours otherwise.
 /// There are at most two files.

@@ -1,4 +1,4 @@
-// Two deliberate presses of a button, for what must not happen by a double click. This file has no DOM.
+// Two deliberate presses of a button, for actions that a double click must not trigger. This file has no DOM.
 
 /** A second press that comes earlier is a double click, or a finger that trembles. */
 const MIN_MILLIS = 400;
