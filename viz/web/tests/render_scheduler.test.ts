@@ -106,6 +106,22 @@ test("a view at rest is refreshed after a change, with pauses", (context) => {
   assert.equal(requests.length, 3);
 });
 
+test("a view at rest is refreshed continuously where its user wants it", (context) => {
+  const { scheduler, requests, clock, answer } = setUp(context);
+  scheduler.isContinuous = true;
+  scheduler.tick();
+  answer(100);
+  for (const n of [2, 3, 4]) {
+    scheduler.modelChanged();
+    clock.millis += 1;
+    scheduler.tick();
+    assert.equal(requests.length, n, "as soon as the previous picture has arrived");
+    scheduler.tick();
+    assert.equal(requests.length, n, "one at a time");
+    answer(100);
+  }
+});
+
 test("a request without an answer is repeated after a timeout, or when it has failed", (context) => {
   const { scheduler, requests, clock } = setUp(context);
   const move = (): void => {

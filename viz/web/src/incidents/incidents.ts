@@ -38,7 +38,7 @@ export class Incidents {
   private readonly marks: Marks;
   private readonly panel = element("incidents");
   private readonly list = make("ol", { className: "incident-list" });
-  private readonly chosenText = child("p");
+  private readonly chosenText = element("incident-text");
   private readonly look = make("button", { textContent: "Look as the operator", hidden: true });
   private readonly slider = make("input", { type: "range", min: "0", hidden: true, ariaLabel: "Time around the incident" });
   private samples: readonly Sample[] = [];
@@ -56,8 +56,6 @@ export class Incidents {
     element("steer-marks").after(labels); // Those of an arm that is steered are others.
     this.marks = view.addTool((ofView) => new Marks(ofView, canvas, changed, labels));
     view.addTool(() => ({ root: this.ghost.root, hasTakenPress: false, update: () => undefined }));
-    this.chosenText.id = "incident-text";
-    this.chosenText.setAttribute("role", "status");
     this.look.title = "Look from where the operator looked at this time";
     this.look.addEventListener("click", () => this.lookAsOperator());
     this.slider.title = "Move the robot through the seconds around the incident";

@@ -13,12 +13,22 @@ const MAX_HOLD_PX = 10;
 const GAP_PX = 6;
 const MARGIN_PX = 8;
 
+/** A touch of a control that has not ended. */
+interface Held {
+  control: HTMLElement;
+  pointer: number;
+  x: number;
+  y: number;
+  pressedMillis: number;
+  isAnswered: boolean;
+}
+
 export class Tooltip {
   private readonly tooltip = element("tooltip");
   private owner: HTMLElement | null = null;
   private ownerTitle = "";
   private timer = 0;
-  private held: { pointer: number; x: number; y: number; pressedMillis: number; isAnswered: boolean } | null = null;
+  private held: Held | null = null;
   /** Whether the end of the touch must not cause a click, because the touch only requested the tooltip. */
   private ignoresClick = false;
 
@@ -58,15 +68,17 @@ export class Tooltip {
   private press(event: PointerEvent): void {
     if (!this.tooltip.contains(event.target as Node)) this.hide();
     this.ignoresClick = false;
-    const titled = event.pointerType === "touch" ? titledAt(event.target) : null;
-    if (!titled) return;
+    const control = event.pointerType === "touch" ? titledAt(event.target) : null;
+    if (!control) return;
     const { pointerId: pointer, clientX: x, clientY: y, timeStamp: pressedMillis } = event;
-    const held = { pointer, x, y, pressedMillis, isAnswered: false };
+    const held = { control, pointer, x, y, pressedMillis, isAnswered: false };
     this.held = held;
-    this.timer = window.setTimeout(() => {
-      this.show(titled, true);
-      held.isAnswered = this.owner !== null;
-    }, HOLD_MILLIS);
+    this.timer = window.setTimeout(() => this.answer(held), HOLD_MILLIS);
+  }
+
+  private answer(held: Held): void {
+    this.show(held.control, true);
+    held.isAnswered = this.owner !== null;
   }
 
   private move({ pointerId, clientX, clientY }: PointerEvent): void {
@@ -87,8 +99,12 @@ export class Tooltip {
     this.stopTimer();
   }
 
-  /** A touch that shows a tooltip opens no menu of the browser. */
+  /**
+   * A touch that shows a tooltip opens no menu of the browser, which would end the touch. The browser may ask first
+   * where its own time for a long touch is shorter or the page is busy.
+   */
   private openMenu(event: Event): void {
+    if (this.held && !this.held.isAnswered) this.answer(this.held);
     if (this.ignoresClick || this.held?.isAnswered) event.preventDefault();
   }
 
