@@ -14,6 +14,7 @@ use drivers::motion::ArmState;
 use keyframe::{Keyframe, RobotState};
 use kinematics::{JointHistory, JointState, Stamp, Transform};
 use parking_lot::Mutex;
+use std::collections::BTreeSet;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 use steering::{Clearance, Seen};
@@ -22,8 +23,14 @@ use steering::{Clearance, Seen};
 const MAX_GAP: Duration = Duration::from_millis(100);
 /// Number of postures kept: those of five seconds at 1 kHz. Keyframes take less time to arrive.
 const MAX_POSTURES: usize = 5000;
-/// Time between two postures that are swept. The arm of a tour moves by less than the margin.
+/// Time between two reported postures that are swept. The arm of a tour moves by less than the
+/// margin.
 const SWEEP_PERIOD_SECS: f64 = 0.2;
+/// Minimum time from a reading that is swept to all other swept postures. Readings are swept only
+/// where reports are missing.
+const GAP_SECS: f64 = 0.15;
+/// Number of swept postures whose times are kept: several minutes.
+const MAX_SWEPT: usize = 1000;
 /// Margin of swept space in simulations, meters. Their tours keep this distance from the scene.
 const SIMULATED_MARGIN_M: f64 = 0.15;
 
@@ -41,9 +48,16 @@ pub(crate) struct SceneClearance {
 struct State {
     /// Postures in the order of the chain.
     postures: JointHistory,
-    /// Whether no operator has had the arm.
-    is_sweeping: bool,
-    swept_at: Option<Stamp>,
+    sweep: Sweep,
+}
+
+/// The times of the postures that have shown free space.
+#[derive(Debug, Default)]
+struct Sweep {
+    swept: BTreeSet<Stamp>,
+    newest_report: Option<Stamp>,
+    /// Time of the newest report when an operator took the arm over.
+    ended_at: Option<Stamp>,
 }
 
 impl SceneClearance {
@@ -68,8 +82,7 @@ impl SceneClearance {
             swept_margin_m,
             state: Mutex::new(State {
                 postures: JointHistory::new(MAX_GAP, MAX_POSTURES),
-                is_sweeping: true,
-                swept_at: None,
+                sweep: Sweep::default(),
             }),
             undrawn: UndrawnKeyframes::default(),
         })
@@ -78,10 +91,10 @@ impl SceneClearance {
     /// Sets where the arm is now, in the order of the chain.
     pub(super) fn set_posture(&self, arm: &ArmState) {
         let posture = self.posture(arm.reported_at, arm.position.clone());
-        let is_swept = self.state.lock().is_swept(arm.reported_at);
+        let is_due = self.state.lock().sweep.takes_report(arm.reported_at);
         let result = self.map.set_posture(&posture).and_then(|()| {
             // The arm reports its state also while the input waits for a busy trainer.
-            if is_swept {
+            if is_due {
                 self.map.sweep(posture, self.swept_margin_m)
             } else {
                 Ok(())
@@ -95,7 +108,7 @@ impl SceneClearance {
 
     /// From now on, an operator moves the arm, so that its own way proves nothing any more.
     pub(super) fn end_sweep(&self) {
-        self.state.lock().is_sweeping = false;
+        self.state.lock().sweep.end();
     }
 
     /// Takes a reading of the joints.
@@ -109,13 +122,22 @@ impl SceneClearance {
         else {
             return;
         };
+        let mut state = self.state.lock();
+        let is_due = state.sweep.takes_reading(robot.stamp);
         // Readings that are not later than the last one are counted by the history.
-        let _ = self.state.lock().postures.push(JointState {
+        let _ = state.postures.push(JointState {
             stamp: robot.stamp,
-            position,
+            position: position.clone(),
             velocity: Vec::new(),
             effort: Vec::new(),
         });
+        drop(state);
+        if is_due {
+            let posture = self.posture(robot.stamp, position);
+            if let Err(error) = self.map.sweep(posture, self.swept_margin_m) {
+                log::debug!("steering: {error}");
+            }
+        }
     }
 
     /// Takes a keyframe. If most of its pixels have no depth, it waits for that of the model.
@@ -165,17 +187,40 @@ impl SceneClearance {
     }
 }
 
-impl State {
-    /// Whether a posture at a time shows free space. It is noted as such.
-    fn is_swept(&mut self, at: Stamp) -> bool {
-        let is_due = self
-            .swept_at
-            .is_none_or(|last| at.secs_since(last) >= SWEEP_PERIOD_SECS);
-        let is_swept = self.is_sweeping && is_due;
-        if is_swept {
-            self.swept_at = Some(at);
+impl Sweep {
+    /// Whether the posture of a report is swept. It then counts as swept.
+    fn takes_report(&mut self, at: Stamp) -> bool {
+        self.newest_report = Some(at);
+        let last = self.swept.last();
+        let is_due = last.is_none_or(|last| at.secs_since(*last) >= SWEEP_PERIOD_SECS);
+        self.take(at, is_due && self.ended_at.is_none())
+    }
+
+    /// Whether the posture of a reading is swept. It then counts as swept. Readings may arrive late,
+    /// also after the end, but none of them is missing after the program was stalled.
+    fn takes_reading(&mut self, at: Stamp) -> bool {
+        let is_in_time = self.ended_at.is_none_or(|end| at <= end);
+        let is_far = |other: Option<&Stamp>| {
+            other.is_none_or(|other| at.secs_since(*other).abs() >= GAP_SECS)
+        };
+        let is_in_gap =
+            is_far(self.swept.range(..=at).next_back()) && is_far(self.swept.range(at..).next());
+        self.take(at, is_in_time && is_in_gap)
+    }
+
+    fn take(&mut self, at: Stamp, is_due: bool) -> bool {
+        if is_due {
+            self.swept.insert(at);
+            if self.swept.len() > MAX_SWEPT {
+                self.swept.pop_first();
+            }
         }
-        is_swept
+        is_due
+    }
+
+    fn end(&mut self) {
+        // Without a report, nothing is known about the way of the arm.
+        self.ended_at = Some(self.newest_report.unwrap_or(Stamp(i64::MIN)));
     }
 }
 
@@ -260,7 +305,36 @@ mod tests {
         );
         scene.end_sweep();
         scene.set_posture(&arm_at(Stamp(2 * AT.0)));
-        assert_eq!(scene.state.lock().swept_at, Some(AT), "the tour has ended");
+        let swept = scene.state.lock().sweep.swept.clone();
+        assert_eq!(swept, BTreeSet::from([AT]), "the tour has ended");
+    }
+
+    #[test]
+    fn readings_fill_the_gaps_between_reports_also_after_the_end() {
+        let at = |secs| AT.plus_secs(secs);
+        let mut sweep = Sweep::default();
+        // The program is stalled for 0.8 s, and an operator then takes the arm over.
+        let reports = [0.0, 0.1, 0.2, 1.0].map(|secs| sweep.takes_report(at(secs)));
+        assert_eq!(reports, [true, false, true, true]);
+        sweep.end();
+        let readings = [0.1, 0.3, 0.4, 0.5, 0.6, 0.8, 0.9, 1.1, 1.4];
+        let swept = readings.map(|secs| sweep.takes_reading(at(secs)));
+        let expected = [false, false, true, false, true, true, false, false, false];
+        assert_eq!(swept, expected);
+        assert!(!sweep.takes_report(at(1.5)), "the tour has ended");
+    }
+
+    #[test]
+    fn a_posture_that_only_the_input_reports_shows_free_space() {
+        let (scene, robot) = simulated();
+        let tip = robot
+            .chain
+            .forward(&START)
+            .expect("seven joints")
+            .translation;
+        let beside_tip = [tip.x, tip.y + 0.1, tip.z];
+        scene.observe_robot(&reading_at(AT));
+        wait_until_known(&scene, beside_tip);
     }
 
     #[test]
