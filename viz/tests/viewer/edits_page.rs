@@ -3,8 +3,8 @@
 //!
 //! Skipped, with a message, if Chromium or the bundle (`make web`) is missing.
 
-use crate::analytic_scene::{draw, looking_along_y};
 use crate::request_thread::RequestThread;
+use analytic_scene::{draw, looking_along_y};
 use nalgebra::{Point3, Translation3};
 use parking_lot::Mutex;
 use serde_json::json;

@@ -3,10 +3,10 @@
 //!
 //! Skipped, with a message, if Chromium or the bundle (`make web`) is missing.
 
-use crate::analytic_scene::{draw, looking_along_y};
 use crate::downloads::served;
 use crate::proxy::{Link, Proxy};
 use crate::request_thread::RequestThread;
+use analytic_scene::{draw, looking_along_y};
 use flate2::Compression;
 use flate2::write::ZlibEncoder;
 use nalgebra::{Translation3, Vector3};

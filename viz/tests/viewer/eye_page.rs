@@ -4,8 +4,8 @@
 //!
 //! Skipped, with a message, if Chromium or the bundle (`make web`) is missing.
 
-use crate::analytic_scene::ray_in_world;
 use crate::request_thread::RequestThread;
+use analytic_scene::draw_boxes;
 use kinematics::Transform;
 use nalgebra::{Point3, UnitQuaternion, Vector3};
 use serde_json::json;
@@ -39,62 +39,14 @@ pub(crate) fn clearance(point: Vector3<f64>) -> f64 {
     inside(ROOM).min(-inside(PILLAR))
 }
 
-/// Distances along a ray at which it enters and leaves a box.
-fn crossings(
-    eye: Point3<f64>,
-    direction: Vector3<f64>,
-    [min, max]: [[f64; 3]; 2],
-) -> Option<[f64; 2]> {
-    let mut range = [f64::NEG_INFINITY, f64::INFINITY];
-    for axis in 0..3 {
-        let at = [min, max].map(|corner| (corner[axis] - eye[axis]) / direction[axis]);
-        range = [
-            range[0].max(at[0].min(at[1])),
-            range[1].min(at[0].max(at[1])),
-        ];
-    }
-    (range[0] < range[1]).then_some(range)
-}
-
-/// The room, with or without its pillar, and the depth of its surfaces, which are visible from both
-/// sides.
-#[expect(clippy::cast_possible_truncation, reason = "depths are meters")]
+/// The room, with or without its pillar.
 fn draw(request: &RenderRequest, has_pillar: bool) -> Picture {
-    let [width, height] = request.size_px;
     let outside = [
         ROOM[0].map(|min| min - WALL_M),
         ROOM[1].map(|max| max + WALL_M),
     ];
-    let (mut rgba_srgb, mut depth_m) = (Vec::new(), Vec::new());
-    for (x, y) in (0..height).flat_map(|y| (0..width).map(move |x| (x, y))) {
-        let (eye, direction) = ray_in_world(request, f64::from(x) + 0.5, f64::from(y) + 0.5);
-        let boxes = [ROOM, outside]
-            .into_iter()
-            .chain(has_pillar.then_some(PILLAR));
-        let hits = boxes.filter_map(|corners| crossings(eye, direction, corners));
-        let depth = hits
-            .flatten()
-            .filter(|depth| *depth > request.near_m)
-            .fold(f64::INFINITY, f64::min);
-        let hit = eye + direction * depth;
-        let is_dark = hit
-            .iter()
-            .map(|along| (along * 4.0).floor())
-            .sum::<f64>()
-            .rem_euclid(2.0)
-            < 0.5;
-        rgba_srgb.extend(if is_dark {
-            [90, 85, 80, 255]
-        } else {
-            [190, 185, 175, 255]
-        });
-        depth_m.push(if depth.is_finite() { depth as f32 } else { 0.0 });
-    }
-    Picture {
-        size_px: request.size_px,
-        rgba_srgb,
-        depth_m,
-    }
+    let boxes = [ROOM, outside, PILLAR];
+    draw_boxes(request, &boxes[..if has_pillar { 3 } else { 2 }])
 }
 
 /// Draws the room on a thread, and records the requests for the main view.

@@ -3,8 +3,8 @@
 //!
 //! Skipped, with a message, if Chromium or the bundle (`make web`) is missing.
 
-use crate::analytic_scene::looking_along_y;
 use crate::request_thread::RequestThread;
+use analytic_scene::looking_along_y;
 use keyframe::RangePoints;
 use kinematics::{Stamp, Transform};
 use nalgebra::{Translation3, Vector3};

@@ -2,7 +2,6 @@
 //! fill all processors.
 
 mod admission;
-mod analytic_scene;
 mod black_page;
 mod client;
 mod coverage_page;

@@ -1,6 +1,5 @@
 //! Tests versions, capabilities, views, subscriptions and priorities over a real connection.
 
-use crate::analytic_scene;
 use crate::client;
 use crate::client::TIMEOUT;
 use crate::client::{Client, Received};

@@ -4,9 +4,9 @@
 
 mod moved_picture;
 
-use crate::analytic_scene::{draw, looking_along_y};
 use crate::proxy::{Link, Proxy};
 use crate::request_thread::RequestThread;
+use analytic_scene::{draw, looking_along_y};
 use kinematics::{Stamp, Transform};
 use nalgebra::{Point3, Translation3, UnitQuaternion, Vector3};
 use std::collections::BTreeMap;

@@ -3,7 +3,6 @@
 //! WebGL calls draw nothing, because drawing on the CPU would dominate the tasks. Skipped, with
 //! a message, if Chromium or the bundle (`make web`) is missing.
 
-use crate::analytic_scene;
 use crate::robot;
 use kinematics::{Stamp, Transform};
 use std::collections::BTreeMap;

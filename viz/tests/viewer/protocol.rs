@@ -1,13 +1,12 @@
 //! Tests the real server over loopback with an independent client that follows
 //! `docs/reference/protocol.md`.
 
-use crate::analytic_scene;
-use crate::analytic_scene::draw;
 use crate::client;
 use crate::client::TIMEOUT;
 use crate::client::{Client, Received};
 use crate::keyframe_images::header_of_photograph;
 use crate::robot;
+use analytic_scene::draw;
 use keyframe::RangePoints;
 use kinematics::{Stamp, Transform};
 use model_files::Aabb;

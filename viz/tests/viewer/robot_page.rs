@@ -3,9 +3,9 @@
 //!
 //! Skipped, with a message, if Chromium or the bundle (`make web`) is missing.
 
-use crate::analytic_scene::{draw, looking_along_y, ray_in_world};
 use crate::request_thread::RequestThread;
 use crate::robot;
+use analytic_scene::{draw, looking_along_y, ray_in_world};
 use kinematics::Chain;
 use nalgebra::{Point3, Translation3, Vector3};
 use std::path::PathBuf;

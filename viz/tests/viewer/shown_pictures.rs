@@ -1,6 +1,5 @@
 //! Tests the times of keyframes in pictures, and reports of shown pictures, over a real connection.
 
-use crate::analytic_scene;
 use crate::client::Client;
 use crate::client::TIMEOUT;
 use serde_json::{Value, json};

@@ -2,8 +2,8 @@
 //!
 //! Skipped, with a message, if Chromium or the bundle (`make web`) is missing.
 
-use crate::analytic_scene::{draw, looking_along_y};
 use crate::request_thread::RequestThread;
+use analytic_scene::{draw, looking_along_y};
 use nalgebra::Vector3;
 use serde_json::json;
 use std::path::PathBuf;

@@ -3,10 +3,10 @@
 //!
 //! Skipped, with a message, if Chromium or the bundle (`make web`) is missing.
 
-use crate::analytic_scene::{draw, looking_along_y};
 use crate::eye_page::{self, clearance};
 use crate::request_thread::RequestThread;
 use crate::robot;
+use analytic_scene::{draw, looking_along_y};
 use kinematics::{Stamp, Transform};
 use nalgebra::{Point3, UnitQuaternion, Vector3};
 use serde_json::json;

@@ -4,7 +4,7 @@
 use super::{
     BACKGROUND, RenderThread, drag, pixel, pixel_of, reset_view, shot_without_bottom, uncovered,
 };
-use crate::analytic_scene::{draw, ray_in_world};
+use analytic_scene::{draw, ray_in_world};
 use std::path::PathBuf;
 use std::sync::atomic::Ordering;
 use std::time::Duration;

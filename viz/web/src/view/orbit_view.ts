@@ -34,6 +34,7 @@ import { cameraAlong, viewOfCamera } from "./view_request";
 import type { ViewMode, ViewState } from "./view_state";
 import { turnControls } from "./up_axis";
 import { listenToViewKeys } from "./view_keys";
+import { viewRenderer } from "./view_renderer";
 import type { ViewTool } from "./view_tool";
 
 const VERTICAL_FOV_DEGREES = 50;
@@ -94,7 +95,7 @@ export class OrbitView {
     private readonly onMove: () => void,
     private readonly clock: () => ServerClock,
   ) {
-    this.renderer = new THREE.WebGLRenderer({ canvas, antialias: true });
+    this.renderer = viewRenderer(canvas);
     // Colors arrive as sRGB and are output unchanged.
     this.renderer.outputColorSpace = THREE.LinearSRGBColorSpace;
     THREE.ColorManagement.enabled = false;

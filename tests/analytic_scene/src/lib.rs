@@ -1,4 +1,6 @@
-//! Ray casts a checkered floor and three balls exactly, as the reference for wire and page.
+//! Exact pictures of two small scenes by ray casting, as the reference for wire and page: three balls
+//! on a checkered floor, and checkered boxes. A crate for the tests, so that it can be optimized
+//! while they are not.
 
 use nalgebra::{Isometry3, Matrix3, Point3, Rotation3, Translation3, UnitQuaternion, Vector3};
 use trainer::{Picture, Projection, RenderRequest};
@@ -33,7 +35,7 @@ const BALLS: [Ball; 3] = [
 const FLOOR_HALF_M: f64 = 1.0;
 
 /// A camera at (0, -2, 0.5) that looks along the world's y axis.
-pub(crate) fn looking_along_y() -> Isometry3<f64> {
+pub fn looking_along_y() -> Isometry3<f64> {
     let rotation =
         Rotation3::from_matrix_unchecked(Matrix3::new(1., 0., 0., 0., 0., 1., 0., -1., 0.));
     Isometry3::from_parts(
@@ -48,7 +50,7 @@ pub(crate) fn looking_along_y() -> Isometry3<f64> {
     clippy::cast_sign_loss,
     reason = "colors are between 0 and 1, depths are meters"
 )]
-pub(crate) fn draw(request: &RenderRequest) -> Picture {
+pub fn draw(request: &RenderRequest) -> Picture {
     let [width, height] = request.size_px;
     let eye = Point3::from(request.world_from_camera.translation.vector);
     let (mut rgba_srgb, mut depth_m) = (Vec::new(), Vec::new());
@@ -70,7 +72,7 @@ pub(crate) fn draw(request: &RenderRequest) -> Picture {
 }
 
 /// Eye and direction of a pixel in world; hits of the direction are depths.
-pub(crate) fn ray_in_world(request: &RenderRequest, u: f64, v: f64) -> (Point3<f64>, Vector3<f64>) {
+pub fn ray_in_world(request: &RenderRequest, u: f64, v: f64) -> (Point3<f64>, Vector3<f64>) {
     let eye = Point3::from(request.world_from_camera.translation.vector);
     (
         eye,
@@ -132,4 +134,55 @@ fn nearest_hit(
         .chain(floor)
         .filter(|(depth, _)| (request.near_m..=request.far_m).contains(depth))
         .min_by(|a, b| a.0.total_cmp(&b.0))
+}
+
+/// Draws boxes, each given by two corners in meters, which are visible from both sides.
+#[expect(clippy::cast_possible_truncation, reason = "depths are meters")]
+pub fn draw_boxes(request: &RenderRequest, boxes: &[[[f64; 3]; 2]]) -> Picture {
+    let [width, height] = request.size_px;
+    let (mut rgba_srgb, mut depth_m) = (Vec::new(), Vec::new());
+    for (x, y) in (0..height).flat_map(|y| (0..width).map(move |x| (x, y))) {
+        let (eye, direction) = ray_in_world(request, f64::from(x) + 0.5, f64::from(y) + 0.5);
+        let depth = boxes
+            .iter()
+            .filter_map(|corners| crossings(eye, direction, *corners))
+            .flatten()
+            .filter(|depth| *depth > request.near_m)
+            .fold(f64::INFINITY, f64::min);
+        let hit = eye + direction * depth;
+        let is_dark = hit
+            .iter()
+            .map(|along| (along * 4.0).floor())
+            .sum::<f64>()
+            .rem_euclid(2.0)
+            < 0.5;
+        rgba_srgb.extend(if is_dark {
+            [90, 85, 80, 255]
+        } else {
+            [190, 185, 175, 255]
+        });
+        depth_m.push(if depth.is_finite() { depth as f32 } else { 0.0 });
+    }
+    Picture {
+        size_px: request.size_px,
+        rgba_srgb,
+        depth_m,
+    }
+}
+
+/// Distances along a ray at which it enters and leaves a box.
+fn crossings(
+    eye: Point3<f64>,
+    direction: Vector3<f64>,
+    [min, max]: [[f64; 3]; 2],
+) -> Option<[f64; 2]> {
+    let mut range = [f64::NEG_INFINITY, f64::INFINITY];
+    for axis in 0..3 {
+        let at = [min, max].map(|corner| (corner[axis] - eye[axis]) / direction[axis]);
+        range = [
+            range[0].max(at[0].min(at[1])),
+            range[1].min(at[0].max(at[1])),
+        ];
+    }
+    (range[0] < range[1]).then_some(range)
 }
