@@ -318,11 +318,12 @@ impl Optics {
         };
         let mut sum = [0.0; 3];
         for y in 0..=side {
+            let weight_y = weight(y, share_y);
             let line = &picture.rgb[3 * ((row + y) * width + column)..][..3 * (side + 1)];
-            for x in 0..=side {
-                let weight = weight(x, share_x) * weight(y, share_y);
-                for channel in 0..3 {
-                    sum[channel] += weight * f32::from(line[3 * x + channel]);
+            for (x, color) in line.chunks_exact(3).enumerate() {
+                let weight = weight(x, share_x) * weight_y;
+                for (sum, channel) in sum.iter_mut().zip(color) {
+                    *sum += weight * f32::from(*channel);
                 }
             }
         }

@@ -27,6 +27,7 @@ const ALLOWED: &str = "
     report        -> calibration files kinematics messages numbers
     trainer       -> background calibration files gpu keyframe kinematics messages model-files \
                      numbers
+    analytic-scene -> trainer
     viz           -> files keyframe kinematics messages model-files numbers trainer
     session       -> background calibration capture clearance-map drivers files gpu keyframe \
                      kinematics messages model-files numbers report steering trainer viz

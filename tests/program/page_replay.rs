@@ -224,8 +224,21 @@ fn check_times(pictures: &[(Value, Vec<u8>)]) {
     assert!(newest_keyframes.len() >= 3, "{newest_keyframes:?}");
 }
 
-/// Tasks of the main thread are short while a session is replayed.
+/// Tasks of the main thread are short while a session is replayed. Other programs can lengthen
+/// tasks, because processors share caches and clocks, so the shortest of three measurements counts.
 fn check_tasks(program: &Path, session: &Session, speed: f64) {
+    let mut p99_millis = f64::INFINITY;
+    for _ in 0..3 {
+        p99_millis = p99_millis.min(p99_of_tasks(program, session, speed));
+        if p99_millis < MAX_P99_MILLIS {
+            return;
+        }
+    }
+    panic!("the 99th percentile is {p99_millis:.1} ms");
+}
+
+/// The 99th percentile of the CPU time of tasks while a session is replayed, milliseconds.
+fn p99_of_tasks(program: &Path, session: &Session, speed: f64) -> f64 {
     let mut replay = Replay::start(program, session, speed, 0);
     // The recorded pictures need not answer the requests of this page.
     wait_for(&mut replay.browser, "a picture", |browser| {
@@ -249,12 +262,8 @@ fn check_tasks(program: &Path, session: &Session, speed: f64) {
         percentile(|task| task.millis, 990)
     );
     assert!(tasks.len() > 500, "only {} tasks", tasks.len());
-    assert!(
-        percentile(cpu, 990) < MAX_P99_MILLIS,
-        "the 99th percentile is {:.1} ms",
-        percentile(cpu, 990)
-    );
     replay.end();
+    percentile(cpu, 990)
 }
 
 /// If images arrive faster than they can be decoded, at most one picture and one camera image is
