@@ -105,6 +105,43 @@ impl Rig {
     }
 }
 
+impl Camera {
+    /// The keys that name the devices of the camera, as far as its driver needs them and they are
+    /// missing. A rig file may omit them as long as all devices are simulated.
+    #[must_use]
+    pub fn missing_devices(&self) -> Vec<MissingKey> {
+        let (needs_device, depth) = match self.driver {
+            CameraDriver::V4l2 => (true, self.depth.as_ref()),
+            CameraDriver::Nokhwa => (true, None),
+            // Without a serial number, the only connected RealSense camera is opened.
+            CameraDriver::Realsense | CameraDriver::Sim => (false, None),
+        };
+        let name = &self.name;
+        let color = (needs_device && self.device.is_empty()).then(|| "device".to_owned());
+        let depth = depth
+            .filter(|depth| depth.device.is_empty())
+            .map(|_| "depth.device".to_owned());
+        color
+            .into_iter()
+            .chain(depth)
+            .map(|key| MissingKey {
+                key: format!("camera.{name}.{key}"),
+                remedy: "set it to the device that `fieldrig devices` prints for the camera".into(),
+                is_reported: false,
+            })
+            .collect()
+    }
+
+    /// Checks that the rig file names the devices that the driver of the camera opens.
+    ///
+    /// # Errors
+    ///
+    /// If a key is missing. The error names all missing keys, and how to list the devices.
+    pub fn require_devices(&self) -> Result<(), BadInput> {
+        refuse(&self.missing_devices())
+    }
+}
+
 fn missing_intrinsics(camera: &Camera) -> Option<MissingKey> {
     let remedy = if camera.reports_lenses() {
         Cow::Borrowed("it is stored in the camera, which this command does not open")
@@ -197,6 +234,32 @@ mod tests {
         assert!(without_pose.require(Need::Intrinsics("wrist")).is_ok());
         assert!(without_pose.require(Need::PosedImages).is_err());
         assert!(!without_pose.has_same_calibration(&at_flange));
+    }
+
+    #[test]
+    fn cameras_need_a_device_only_if_their_driver_cannot_choose_one() {
+        let depth = "[camera.wrist.depth]\nmeters_per_count = 0.001\n";
+        let keys = |driver: &str, more: &str| -> Vec<String> {
+            let text = format!("{ARM}{CAMERA}{more}").replace("v4l2", driver);
+            let missing = rig(&text).cameras[0].missing_devices();
+            missing.into_iter().map(|missing| missing.key).collect()
+        };
+        let [color, depth_too] = ["camera.wrist.device", "camera.wrist.depth.device"];
+        assert_eq!(keys("v4l2", ""), [color]);
+        assert_eq!(keys("v4l2", depth), [color, depth_too]);
+        assert_eq!(keys("nokhwa", depth), [color]);
+        assert_eq!(
+            keys("v4l2", &format!("device = \"cam\"\n{depth}")),
+            [depth_too]
+        );
+        assert_eq!(keys("realsense", depth), [""; 0]);
+        assert_eq!(keys("sim", depth), [""; 0]);
+        let refused = rig(&format!("{ARM}{CAMERA}")).cameras[0].require_devices();
+        let refused = refused.expect_err("no device").to_string();
+        assert_eq!(
+            refused,
+            "camera.wrist.device is missing: set it to the device that `fieldrig devices` prints for the camera"
+        );
     }
 
     #[test]
