@@ -171,7 +171,10 @@ fn urdf_is_named_relative_to_the_rig_file() {
 fn unknown_robots_and_places_are_refused() {
     let folder = tempfile::tempdir().expect("a folder");
     for (args, words) in [
-        (["--robot", "ur5"], "did you mean \"ur5e\""),
+        (
+            ["--robot", "ur5"],
+            "a UR5 has a shoulder that is 73 mm lower",
+        ),
         (["--camera", "wrist"], "flange, base or world"),
         (["--urdf", "absent.urdf"], "absent.urdf"),
         (["--ur", "192.168.1"], "four numbers from 0 to 255"),

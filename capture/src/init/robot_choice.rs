@@ -95,7 +95,7 @@ mod tests {
         );
         let error = RobotChoice::named("ur5").expect_err("unknown").to_string();
         assert!(
-            error.contains("did you mean \"ur5e\"") && error.ends_with("so101, none"),
+            error.contains("a UR5 has a shoulder") && error.ends_with("so101, none"),
             "{error}"
         );
     }
