@@ -128,7 +128,7 @@ const OTHER_MODELS: &[OtherModel] = &[
     },
     OtherModel {
         name: "ur10",
-        difference: "a UR10 has a shoulder that is 53 mm lower, and wrist links that are up to 24 mm shorter",
+        difference: "a UR10 has a shoulder that is more than 50 mm lower, and wrist links that are up to 24 mm shorter",
     },
 ];
 

@@ -209,8 +209,8 @@ impl Rig {
         }
     }
 
-    /// Writes the effective rig file and the robot description into a folder. Returns the path of
-    /// the rig file.
+    /// Writes the effective rig file into a folder, and the robot description if the rig has one.
+    /// Returns the path of the rig file.
     ///
     /// # Errors
     ///
@@ -218,10 +218,10 @@ impl Rig {
     pub fn write_resolved(&self, folder: &Path) -> std::io::Result<PathBuf> {
         let path = folder.join(drivers::recording::RIG_FILE);
         // The robot description is written first, so that a complete rig file can always be read.
-        files::write(
-            &folder.join(drivers::recording::URDF_FILE),
-            &self.arm.urdf_text,
-        )?;
+        if self.arm.has_description() {
+            let urdf = folder.join(drivers::recording::URDF_FILE);
+            files::write(&urdf, &self.arm.urdf_text)?;
+        }
         files::write(&path, self.to_toml())?;
         Ok(path)
     }
