@@ -52,14 +52,12 @@ pub struct NextCommand {
 
 /// The commands for models that were trained together.
 pub fn for_models(models: &[SavedModel<'_>]) -> Vec<NextCommand> {
-    let program = std::env::args_os()
-        .next()
-        .map_or("fieldrig".into(), |word| {
-            word.to_string_lossy().into_owned()
-        });
     let mut commands = Vec::new();
     let mut add = |purpose: &str, words: &[&str]| {
-        commands.push(next_command(&program, purpose, words));
+        commands.push(NextCommand {
+            purpose: purpose.to_owned(),
+            command: command_line(words.iter().copied().map(str::to_owned)),
+        });
     };
     if let Some(folder) = common_folder(models) {
         add("view the model", &["view", &argument(folder)]);
@@ -92,16 +90,18 @@ pub fn for_models(models: &[SavedModel<'_>]) -> Vec<NextCommand> {
     commands
 }
 
-/// A command with its words quoted for a shell.
-fn next_command(program: &str, purpose: &str, words: &[&str]) -> NextCommand {
+/// A command line of this program, as it was called, with the words quoted for a shell.
+pub(crate) fn command_line(words: impl IntoIterator<Item = String>) -> String {
+    let program = std::env::args_os()
+        .next()
+        .map_or("fieldrig".into(), |word| {
+            word.to_string_lossy().into_owned()
+        });
     let words: Vec<String> = std::iter::once(program)
-        .chain(words.iter().copied())
-        .map(quoted)
+        .chain(words)
+        .map(|word| quoted(&word))
         .collect();
-    NextCommand {
-        purpose: purpose.to_owned(),
-        command: words.join(" "),
-    }
+    words.join(" ")
 }
 
 /// The command line of this process.
@@ -163,7 +163,7 @@ fn numbered_file(name: &str, n: u32, extension: &str) -> PathBuf {
 
 /// A path as a positional argument. A path that starts with a hyphen would be parsed as a flag, so
 /// `./` is prepended.
-fn argument(path: &Path) -> String {
+pub(crate) fn argument(path: &Path) -> String {
     let text = path.to_string_lossy();
     if text.starts_with('-') {
         format!("./{text}")
