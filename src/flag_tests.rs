@@ -115,14 +115,24 @@ const PRINTED_BY: [(&str, &[&str]); 44] = [
 ];
 
 /// Settings in messages of libraries, where the message names a command that accepts the setting.
-const NAMED_WITH_COMMAND: [(&str, Setting, &str); 20] = [
+const NAMED_WITH_COMMAND: [(&str, Setting, &str); 23] = [
     (
-        "capture/src/config/required.rs",
+        "capture/src/calibration_commands.rs",
+        Setting::Camera,
+        "calibrate",
+    ),
+    (
+        "capture/src/calibration_commands.rs",
+        Setting::Out,
+        "calibrate",
+    ),
+    (
+        "capture/src/calibration_commands.rs",
         Setting::Target,
         "calibrate",
     ),
     (
-        "capture/src/config/required.rs",
+        "capture/src/calibration_commands.rs",
         Setting::WriteRig,
         "calibrate",
     ),
@@ -131,9 +141,18 @@ const NAMED_WITH_COMMAND: [(&str, Setting, &str); 20] = [
     ("capture/src/emulation/mod.rs", Setting::Sim, "run"),
     ("capture/src/found_devices.rs", Setting::Sim, "run"),
     ("capture/src/init/rig_text.rs", Setting::Sim, "run"),
-    ("capture/src/init/rig_text.rs", Setting::Target, "calibrate"),
+    (
+        "capture/src/init/rig_text.rs",
+        Setting::WriteRig,
+        "calibrate",
+    ),
     ("capture/src/open/mod.rs", Setting::Rig, "train"),
     ("capture/src/open/mod.rs", Setting::Sim, "run"),
+    (
+        "capture/src/supervised_arm.rs",
+        Setting::EnableMotion,
+        "move",
+    ),
     ("capture/src/supervised_arm.rs", Setting::Recover, "move"),
     ("session/src/next_commands.rs", Setting::Keyframes, "eval"),
     ("session/src/next_commands.rs", Setting::Out, "export"),

@@ -32,6 +32,7 @@
 //! ```
 
 mod arm_capture;
+mod calibration_commands;
 mod calibration_images;
 pub mod camera_info;
 pub mod config;
@@ -66,6 +67,7 @@ mod supervised_arm;
 mod tip_poses;
 
 pub use arm_capture::ArmCapture;
+pub use calibration_commands::CalibrationCommand;
 pub use calibration_images::{
     ArmDuringImage, CalibrationImage, CalibrationImages, calibration_images,
     chosen_calibration_images,

@@ -20,6 +20,7 @@ mod motion;
 mod pose;
 mod required;
 mod rig_file;
+mod rig_path;
 mod scanner;
 mod schema;
 #[cfg(test)]
@@ -43,6 +44,7 @@ pub use error::{ConfigError, SourceLocation};
 pub use join::JoinConfig;
 pub use motion::{ArmMotion, ArmSteering};
 pub use required::{MissingKey, Need};
+pub use rig_path::RigPath;
 pub use scanner::{Scanner, ScannerDriver, ScannerSim};
 pub use servos::{ArmSerial, ArmServo};
 pub use sim::{Sim, SimTarget};
@@ -68,6 +70,8 @@ pub struct Rig {
     pub train: Train,
     /// Settings of the simulation.
     pub sim: Sim,
+    /// Path of the rig file.
+    pub path: RigPath,
 }
 
 /// A value from the command line that overrides a key of the rig file.
@@ -121,6 +125,7 @@ impl Rig {
             read_file("the robot description", &path)
         };
         let mut rig = rig_file::read(&file, &text, overrides, Some(&folder), read_urdf)?;
+        rig.path = RigPath::of(path);
         rig.arm.urdf_folder = urdf_folder;
         if let Some(motion) = rig
             .arm

@@ -6,7 +6,8 @@
 //! value.
 
 use super::{ArmDriver, Camera, CameraDriver, Rig};
-use messages::{BadInput, Setting};
+use crate::calibration_commands::{CalibrationCommand, where_the_target_is_from};
+use messages::BadInput;
 use std::borrow::Cow;
 
 /// What a command needs to know about the cameras of a rig.
@@ -45,7 +46,7 @@ impl Rig {
                 .cameras
                 .iter()
                 .flat_map(|camera| {
-                    missing_intrinsics(camera)
+                    self.missing_intrinsics(camera)
                         .into_iter()
                         .chain(self.missing_extrinsics(camera))
                 })
@@ -54,7 +55,7 @@ impl Rig {
                 .cameras
                 .iter()
                 .filter(|camera| &*camera.name == name)
-                .filter_map(missing_intrinsics)
+                .filter_map(|camera| self.missing_intrinsics(camera))
                 .collect(),
         }
     }
@@ -91,17 +92,35 @@ impl Rig {
                 "measure the pose of the optical frame (x right, y down, z forward) in the frame {parent}"
             )
         } else {
-            format!(
-                "`fieldrig calibrate hand-eye RIG.toml {} SPEC {} CALIBRATED.toml` finds it",
-                Setting::Target,
-                Setting::WriteRig
-            )
+            self.found_by(CalibrationCommand::HandEye, camera)
         };
         Some(MissingKey {
             key: format!("camera.{}.parent_from_camera", camera.name),
             remedy: remedy.into(),
             is_reported: camera.driver == CameraDriver::Sim,
         })
+    }
+
+    fn missing_intrinsics(&self, camera: &Camera) -> Option<MissingKey> {
+        let remedy = if camera.reports_lenses() {
+            Cow::Borrowed("it is stored in the camera, which this command does not open")
+        } else {
+            self.found_by(CalibrationCommand::Intrinsics, camera).into()
+        };
+        camera.unknown.intrinsics.then(|| MissingKey {
+            key: format!("camera.{}.intrinsics", camera.name),
+            remedy,
+            is_reported: camera.reports_lenses() || camera.driver == CameraDriver::Sim,
+        })
+    }
+
+    /// The command that finds a missing calibration.
+    fn found_by(&self, command: CalibrationCommand, camera: &Camera) -> String {
+        format!(
+            "`{}` finds it, {}",
+            command.line(&self.path.argument(), &camera.name),
+            where_the_target_is_from()
+        )
     }
 }
 
@@ -140,24 +159,6 @@ impl Camera {
     pub fn require_devices(&self) -> Result<(), BadInput> {
         refuse(&self.missing_devices())
     }
-}
-
-fn missing_intrinsics(camera: &Camera) -> Option<MissingKey> {
-    let remedy = if camera.reports_lenses() {
-        Cow::Borrowed("it is stored in the camera, which this command does not open")
-    } else {
-        format!(
-            "`fieldrig calibrate intrinsics RIG.toml {} SPEC {} CALIBRATED.toml` finds it",
-            Setting::Target,
-            Setting::WriteRig
-        )
-        .into()
-    };
-    camera.unknown.intrinsics.then(|| MissingKey {
-        key: format!("camera.{}.intrinsics", camera.name),
-        remedy,
-        is_reported: camera.reports_lenses() || camera.driver == CameraDriver::Sim,
-    })
 }
 
 /// An error that lists missing keys, unless there are none.
@@ -213,12 +214,32 @@ mod tests {
         let rig = rig(&format!("{ARM}{CAMERA}"));
         let refused = refused(&rig);
         for words in [
-            "camera.wrist.intrinsics is missing: `fieldrig calibrate intrinsics RIG.toml",
-            "camera.wrist.parent_from_camera is missing: `fieldrig calibrate hand-eye RIG.toml",
+            "camera.wrist.intrinsics is missing: `fieldrig calibrate intrinsics RIG.toml camera wrist target charuco:",
+            "camera.wrist.parent_from_camera is missing: `fieldrig calibrate hand-eye RIG.toml camera wrist target charuco:",
+            "`fieldrig calibrate target out target.pdf`",
         ] {
             assert!(refused.contains(words), "{refused}");
         }
         assert!(rig.require(Need::Intrinsics("wrist")).is_err());
+    }
+
+    #[test]
+    fn commands_name_the_rig_file_that_was_read() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let path = folder.path().join("my rig.toml");
+        std::fs::write(&path, format!("{ARM}{CAMERA}")).expect("written");
+        std::fs::write(folder.path().join("one.urdf"), URDF).expect("written");
+        let refused = refused(&Rig::load(&path, &[]).expect("a valid rig"));
+        let rig = format!("'{}'", path.display());
+        for command in ["intrinsics", "hand-eye"] {
+            let begin = format!("`fieldrig calibrate {command} {rig} camera wrist ");
+            let end = format!(" write_rig {rig}`");
+            assert!(
+                refused.contains(&begin) && refused.contains(&end),
+                "{refused}"
+            );
+        }
+        assert!(!refused.contains("SPEC"), "{refused}");
     }
 
     #[test]

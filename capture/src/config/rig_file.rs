@@ -3,7 +3,7 @@
 use super::key::entry;
 use super::section::{ParseContext, Section};
 use super::{
-    Arm, ArmDriver, Base, BaseDriver, ConfigError, Override, Rig, arm, base, camera,
+    Arm, ArmDriver, Base, BaseDriver, ConfigError, Override, Rig, RigPath, arm, base, camera,
     camera_info_file, scanner, servo_calibration_file, sim,
 };
 use std::path::Path;
@@ -115,6 +115,7 @@ fn rig(mut root: Section<'_>) -> Option<(Rig, String)> {
         join: join?,
         train: train?,
         sim: sim?,
+        path: RigPath::default(),
     };
     Some((rig, urdf_path))
 }

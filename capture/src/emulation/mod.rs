@@ -306,7 +306,8 @@ fn check(rig: &Rig) -> Result<(), BadInput> {
     if !is_any_emulated {
         return Err(BadInput(format!(
             "no device of this rig can be emulated: its cameras would stay real; to simulate all devices, use \
-             `fieldrig run {}`",
+             `fieldrig run {} {}`",
+            rig.path.argument(),
             Setting::Sim
         )));
     }
