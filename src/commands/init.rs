@@ -7,6 +7,7 @@ use crate::number_args::number_in_range;
 use crate::print;
 use capture::CalibrationCommand;
 use capture::config::Parent;
+use capture::doctor::Finding;
 use capture::init::{NewRigFile, RigPlan, RobotChoice, SearchPlan, WantedCamera, Wishes, search};
 use capture::known_robots::KNOWN_ROBOTS;
 use drivers::NetworkAddress;
@@ -125,7 +126,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     Questions::new(args.yes).ask(&mut wishes, &mut findings, &args.rig)?;
     let plan = RigPlan::new(&wishes, &findings).map_err(|error| BadInput(format!("{error:#}")))?;
     file.write(&wishes, &plan)?;
-    report_plan(&args.rig, &plan);
+    report_plan(&args.rig, &plan, &wishes.robot.mesh_warnings(&args.rig));
     Ok(Exit::Done)
 }
 
@@ -156,10 +157,16 @@ fn robot(args: &Args) -> anyhow::Result<RobotChoice> {
     }
 }
 
-fn report_plan(rig: &Path, plan: &RigPlan) {
+fn report_plan(rig: &Path, plan: &RigPlan, warnings: &[Finding]) {
     print::report("Assumed");
     for assumption in &plan.assumptions {
         print::report(format_args!("  {assumption}"));
+    }
+    if !warnings.is_empty() {
+        print::report("Warnings");
+        for warning in warnings {
+            print::report(format_args!("  {warning}"));
+        }
     }
     print::report(format_args!("Wrote {}. Next", rig.display()));
     let rig = quoted_for_shell(&rig.to_string_lossy());
