@@ -228,6 +228,13 @@ fn other_robot(rig: &Rig, file: &Path) -> Option<PathBuf> {
     (existing != rig.arm.urdf_text).then_some(urdf)
 }
 
+/// The text of a rig file to write: all keys, and the comments of the file from which the rig was
+/// read. The comments of a rig that was read from elsewhere are those of the file to replace.
+fn text_of(rig: &Rig, file: &Path) -> String {
+    let source = files::read_text(rig.path.get().unwrap_or(file));
+    rig.to_toml_with_comments(&source.unwrap_or_default())
+}
+
 /// Writes a rig file atomically, and the robot's URDF next to it if the rig has one. An existing file is kept with the
 /// extension `.old`, or with `.old2`, `.old3` and so on if `.old` exists. Does not overwrite the
 /// URDF of another robot. If two programs write the same file at the same time, the second program
@@ -241,12 +248,12 @@ pub fn write(rig: &Rig, file: &Path) -> anyhow::Result<()> {
     let written = files::replace(file, |unfinished| {
         write_urdf(rig, file)?;
         backup = back_up(file)?;
-        unfinished.write_all(rig.to_toml().as_bytes())
+        unfinished.write_all(text_of(rig, file).as_bytes())
     });
     written.with_context(|| format!("cannot write {}", file.display()))?;
     if let Some(backup) = backup {
         log::info!(
-            "{} has all keys and no comments now; the previous file, with its comments, is {}",
+            "{} has all keys now, also those with default values; the previous file is {}",
             file.display(),
             backup.display()
         );
@@ -537,7 +544,7 @@ mod tests {
             for ix in 0..N_FILES {
                 rig.cameras[0].intrinsics.focal_px[0] = 600.0 + f64::from(N_FILES * writer + ix);
                 match write(&rig, &file) {
-                    Ok(()) => texts.push(rig.to_toml()),
+                    Ok(()) => texts.push(text_of(&rig, &file)),
                     Err(error) => {
                         let message = format!("{error:#}");
                         assert!(
@@ -582,6 +589,45 @@ mod tests {
             std::fs::read_dir(folder.path()).unwrap().count() == found.len() + 1,
             "these and the URDF"
         );
+    }
+
+    #[test]
+    fn comments_of_the_rig_file_are_kept_except_for_guesses_that_were_measured() {
+        let folder = tempfile::tempdir().unwrap();
+        let at = |name: &str| folder.path().join(name);
+        let text = "# My robot.\n\n[arm]\ndriver = \"none\"\n[camera.room]\ndriver = \"sim\" # a webcam\n\
+                    size_px = [64, 48]\nrate_hz = 1\nparent = \"world\"\n# Guess: in the corner.\n\
+                    parent_from_camera = { xyz_m = [1, 0, 0] }\n# Guess: a usual lens.\n\
+                    intrinsics = { focal_px = [60, 60], principal_px = [32, 24] }\n";
+        std::fs::write(at("rig.toml"), text).unwrap();
+        let rig = Rig::load(&at("rig.toml"), &[]).unwrap();
+        let measured = Intrinsics {
+            focal_px: [61.0, 61.5],
+            ..rig.cameras[0].intrinsics.clone()
+        };
+        let rig = with_intrinsics(&rig, "room", &measured, None).unwrap();
+        // The comments are those of the rig file that was read, whichever file is written.
+        for name in ["calibrated.toml", "rig.toml", "rig.toml"] {
+            write(&rig, &at(name)).unwrap();
+            let written = std::fs::read_to_string(at(name)).unwrap();
+            for comment in [
+                "# My robot.\n\n",
+                "driver = \"sim\" # a webcam\n",
+                "# Guess: in the corner.\n",
+            ] {
+                assert!(written.contains(comment), "{name}: {written}");
+            }
+            assert!(!written.contains("a usual lens"), "{name}: {written}");
+            assert_eq!(Rig::load(&at(name), &[]).unwrap(), rig, "{name}");
+            let guesses = capture::doctor::guesses(&written);
+            assert!(
+                guesses.len() == 1
+                    && guesses[0]
+                        .message
+                        .starts_with("camera.room.parent_from_camera is a guess"),
+                "{guesses:?}"
+            );
+        }
     }
 
     #[test]

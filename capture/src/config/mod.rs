@@ -10,6 +10,7 @@ mod base;
 mod camera;
 mod camera_info_file;
 mod can;
+mod comments;
 mod error;
 mod join;
 mod key;
@@ -186,6 +187,14 @@ impl Rig {
     #[must_use]
     pub fn to_toml(&self) -> String {
         rig_file::write(self)
+    }
+
+    /// The effective rig file with the comments of `source`, the text of an earlier rig file of the
+    /// same robot. A comment that marks a value as a guess is left out if the value has changed.
+    #[must_use]
+    pub fn to_toml_with_comments(&self, source: &str) -> String {
+        let text = self.to_toml();
+        comments::carried(source, &text).unwrap_or(text)
     }
 
     /// Whether the calibration is the same. The calibration consists of extrinsics, intrinsics,

@@ -1,4 +1,4 @@
-//! The path of a rig file, for the commands in messages.
+//! The path of a rig file, for its comments and for commands in messages.
 
 use messages::quoted_for_shell;
 use std::path::{Path, PathBuf};
@@ -14,6 +14,12 @@ pub struct RigPath(Option<PathBuf>);
 impl RigPath {
     pub(super) fn of(path: &Path) -> Self {
         Self(Some(path.to_owned()))
+    }
+
+    /// The path. `None` if the rig was not read from a file.
+    #[must_use]
+    pub fn get(&self) -> Option<&Path> {
+        self.0.as_deref()
     }
 
     /// The path as an argument of a command, quoted for a shell. `RIG.toml` if the rig was not read
