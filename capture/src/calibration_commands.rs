@@ -31,8 +31,7 @@ impl CalibrationCommand {
 }
 
 /// How to get the target in the command lines, as the end of a sentence.
-#[must_use]
-pub fn where_the_target_is_from() -> String {
+pub(crate) fn where_the_target_is_from() -> String {
     format!(
         "with the target that `fieldrig calibrate target {} target.pdf` draws",
         Setting::Out

@@ -12,6 +12,7 @@ use crate::error::is_rejection;
 use crate::models_verdict::{likely_cause_of, verdict_of};
 use crate::previous_run::{FinishedRun, PreviousRun, limit_flags, out_folder};
 use crate::read_progress::OnReadProgress;
+use crate::resume_command::ResumeCommand;
 use crate::run_folder::{self, CreatedFolders};
 use crate::session::{FinishedModel, Limits};
 use crate::session_setup::Services;
