@@ -67,14 +67,11 @@ fn unstable_node(camera: &Camera) -> Finding {
     )
 }
 
-/// Reports V4L2 cameras of a rig that are not connected, or whose rig file names no device.
+/// Reports cameras of a rig whose rig file names no device, and V4L2 cameras that are not connected.
 #[cfg(target_os = "linux")]
 pub(super) fn missing(rig: &Rig) -> Vec<Finding> {
-    let cameras = rig
-        .cameras
+    rig.cameras
         .iter()
-        .filter(|camera| camera.driver == CameraDriver::V4l2);
-    cameras
         .flat_map(|camera| {
             let unnamed = camera.missing_devices().into_iter().map(unnamed_device);
             unnamed.chain(absent_devices(camera))
@@ -88,17 +85,18 @@ fn unnamed_device(missing: MissingKey) -> Finding {
     Finding::fail("cameras", message, missing.remedy)
 }
 
-/// The devices that the rig file names for a camera, and that are not connected.
+/// The devices that the rig file names for a V4L2 camera, and that are not connected.
 #[cfg(target_os = "linux")]
 fn absent_devices(camera: &Camera) -> impl Iterator<Item = Finding> {
     let name = &camera.name;
+    let is_v4l2 = camera.driver == CameraDriver::V4l2;
     let depth = camera.depth.as_ref();
     let devices = [
         ("device", Some(&camera.device)),
         ("depth.device", depth.map(|depth| &depth.device)),
     ];
     devices.into_iter().filter_map(move |(key, device)| {
-        let device = device.filter(|device| !device.is_empty())?;
+        let device = device.filter(|device| !device.is_empty() && is_v4l2)?;
         let problem = v4l2::check_connected(device).err()?;
         Some(Finding::fail(
             "cameras",
