@@ -14,7 +14,7 @@ use syn::{Attribute, Item, LitStr, Macro, Meta};
 /// Source files or folders, and the commands that print their messages. If a message contains a
 /// flag or setting, all these commands must accept it. The exception is a message that names a
 /// command that accepts the flag.
-const PRINTED_BY: [(&str, &[&str]); 43] = [
+const PRINTED_BY: [(&str, &[&str]); 44] = [
     ("bench/src", &["bench"]),
     (
         "calibration/procedures/src/hand_eye",
@@ -67,6 +67,7 @@ const PRINTED_BY: [(&str, &[&str]); 43] = [
     ("session/src/export_plan.rs", &["export"]),
     ("session/src/render_plan.rs", &["render"]),
     ("session/src/rendered_files.rs", &["render"]),
+    ("session/src/resume_command.rs", &["run", "train"]),
     ("session/src/run_folder.rs", &["run", "train"]),
     ("session/src/run_plan", &["run"]),
     ("session/src/scene_calibration.rs", &["calibrate scene"]),
@@ -114,14 +115,24 @@ const PRINTED_BY: [(&str, &[&str]); 43] = [
 ];
 
 /// Settings in messages of libraries, where the message names a command that accepts the setting.
-const NAMED_WITH_COMMAND: [(&str, Setting, &str); 19] = [
+const NAMED_WITH_COMMAND: [(&str, Setting, &str); 23] = [
     (
-        "capture/src/config/required.rs",
+        "capture/src/calibration_commands.rs",
+        Setting::Camera,
+        "calibrate",
+    ),
+    (
+        "capture/src/calibration_commands.rs",
+        Setting::Out,
+        "calibrate",
+    ),
+    (
+        "capture/src/calibration_commands.rs",
         Setting::Target,
         "calibrate",
     ),
     (
-        "capture/src/config/required.rs",
+        "capture/src/calibration_commands.rs",
         Setting::WriteRig,
         "calibrate",
     ),
@@ -130,13 +141,23 @@ const NAMED_WITH_COMMAND: [(&str, Setting, &str); 19] = [
     ("capture/src/emulation/mod.rs", Setting::Sim, "run"),
     ("capture/src/found_devices.rs", Setting::Sim, "run"),
     ("capture/src/init/rig_text.rs", Setting::Sim, "run"),
-    ("capture/src/init/rig_text.rs", Setting::Target, "calibrate"),
+    (
+        "capture/src/init/rig_text.rs",
+        Setting::WriteRig,
+        "calibrate",
+    ),
     ("capture/src/open/mod.rs", Setting::Rig, "train"),
     ("capture/src/open/mod.rs", Setting::Sim, "run"),
+    (
+        "capture/src/supervised_arm.rs",
+        Setting::EnableMotion,
+        "move",
+    ),
     ("capture/src/supervised_arm.rs", Setting::Recover, "move"),
     ("session/src/next_commands.rs", Setting::Keyframes, "eval"),
     ("session/src/next_commands.rs", Setting::Out, "export"),
     ("session/src/next_commands.rs", Setting::To, "export"),
+    ("session/src/resume_command.rs", Setting::Rig, "train"),
     ("session/src/saved_view.rs", Setting::From, "run"),
     (
         "session/src/steering/steering_log/place.rs",

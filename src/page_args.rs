@@ -2,11 +2,10 @@
 
 use crate::print;
 use anyhow::Context;
-use messages::BadInput;
+use messages::{BadInput, quoted_for_shell};
 use qrcode::QrCode;
 use qrcode::render::unicode::Dense1x2;
 use serde_json::Value;
-use session::next_commands::quoted;
 use std::io::IsTerminal;
 use std::net::{Ipv4Addr, SocketAddr};
 use std::path::PathBuf;
@@ -65,7 +64,10 @@ impl PageArgs {
             && !self.share
         {
             // The user can copy the command with the missing flag.
-            let command: Vec<String> = std::env::args().skip(1).map(|word| quoted(&word)).collect();
+            let command: Vec<String> = std::env::args()
+                .skip(1)
+                .map(|word| quoted_for_shell(&word))
+                .collect();
             return Err(BadInput(format!(
                 "other machines can reach {address}, so the page must be encrypted and require a token: run \
                  `fieldrig {} --share`",

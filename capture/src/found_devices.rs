@@ -76,7 +76,7 @@ fn simulation() -> DeviceInfo {
     let usable = cfg!(feature = "sim");
     let note = if usable {
         format!(
-            "`fieldrig run {}` simulates all devices of a rig",
+            "`fieldrig run RIG.toml {}` simulates all devices of a rig",
             Setting::Sim
         )
     } else {

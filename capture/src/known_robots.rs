@@ -108,11 +108,35 @@ pub const KNOWN_ROBOTS: &[KnownRobot] = &[
     },
 ];
 
+/// A robot that is not known, and whose name is easily taken for that of a known robot.
+struct OtherModel {
+    name: &'static str,
+    /// How it differs from the known robot with the most similar name.
+    difference: &'static str,
+}
+
+/// Earlier models of known robots. Source of the lengths: Universal Robots, "DH Parameters for
+/// calculations of kinematics and dynamics" (d1 and d4 to d6 of each model).
+const OTHER_MODELS: &[OtherModel] = &[
+    OtherModel {
+        name: "ur3",
+        difference: "a UR3 has wrist links that are up to 19 mm shorter",
+    },
+    OtherModel {
+        name: "ur5",
+        difference: "a UR5 has a shoulder that is 73 mm lower, and wrist links that are up to 24 mm shorter",
+    },
+    OtherModel {
+        name: "ur10",
+        difference: "a UR10 has a shoulder that is more than 50 mm lower, and wrist links that are up to 24 mm shorter",
+    },
+];
+
 /// A reference `builtin:NAME` with a name that no known robot has.
 #[derive(Debug, thiserror::Error)]
 #[error(
     "no known robot is named {name:?}{}; known robots: {}",
-    nearest_robot(.name).map(|nearest| format!(", did you mean {nearest:?}?")).unwrap_or_default(),
+    suggestion(.name),
     known_names().join(", ")
 )]
 pub struct UnknownRobot {
@@ -158,13 +182,25 @@ fn known_names() -> Vec<&'static str> {
     KNOWN_ROBOTS.iter().map(|robot| robot.name).collect()
 }
 
-fn nearest_robot(name: &str) -> Option<&'static str> {
-    nearest_name(&name.to_ascii_lowercase(), known_names())
+/// The known robot with the most similar name, as a question. Empty if none is similar. A similar
+/// name may be that of another machine, so the suggestion says what the robot is, and what to do if
+/// the user has another one.
+fn suggestion(name: &str) -> String {
+    let name = name.to_ascii_lowercase();
+    let Some(nearest) = nearest_name(&name, known_names()).and_then(KnownRobot::find) else {
+        return String::new();
+    };
+    let other = OTHER_MODELS.iter().find(|other| other.name == name);
+    let difference = other.map_or("another model has other lengths", |other| other.difference);
+    format!(
+        ", did you mean {:?} ({}; {difference}: it needs its own URDF file)?",
+        nearest.name, nearest.title
+    )
 }
 
 #[cfg(test)]
 mod tests {
-    use super::{KNOWN_ROBOTS, KnownRobot};
+    use super::{KNOWN_ROBOTS, KnownRobot, OTHER_MODELS, suggestion};
     use kinematics::Chain;
     use std::collections::BTreeSet;
 
@@ -215,8 +251,18 @@ mod tests {
             .to_string();
         assert_eq!(
             error,
-            "no known robot is named \"ur5\", did you mean \"ur5e\"?; \
+            "no known robot is named \"ur5\", did you mean \"ur5e\" (Universal Robots UR5e; a UR5 has a shoulder \
+             that is 73 mm lower, and wrist links that are up to 24 mm shorter: it needs its own URDF file)?; \
              known robots: panda, fr3, ur3e, ur5e, ur10e, so101"
+        );
+        let error = KnownRobot::named_by("builtin:pandas")
+            .expect_err("unknown")
+            .to_string();
+        assert!(
+            error.contains(
+                "\"panda\" (Franka Emika Panda; another model has other lengths: it needs"
+            ),
+            "{error}"
         );
         let error = KnownRobot::named_by("builtin:xyz")
             .expect_err("unknown")
@@ -225,5 +271,18 @@ mod tests {
             error.contains("is named \"xyz\"; known robots: panda"),
             "{error}"
         );
+    }
+    #[test]
+    fn other_models_are_compared_with_the_robot_that_is_suggested() {
+        for other in OTHER_MODELS {
+            assert_eq!(KnownRobot::find(other.name), None);
+            let suggested = suggestion(other.name);
+            let robot = other.name.to_ascii_uppercase();
+            assert!(
+                suggested.contains(&format!("{:?}", format!("{}e", other.name)))
+                    && suggested.contains(&format!("a {robot} has")),
+                "{suggested}"
+            );
+        }
     }
 }

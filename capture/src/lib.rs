@@ -32,6 +32,7 @@
 //! ```
 
 mod arm_capture;
+mod calibration_commands;
 mod calibration_images;
 pub mod camera_info;
 pub mod config;
@@ -66,6 +67,7 @@ mod supervised_arm;
 mod tip_poses;
 
 pub use arm_capture::ArmCapture;
+pub use calibration_commands::CalibrationCommand;
 pub use calibration_images::{
     ArmDuringImage, CalibrationImage, CalibrationImages, calibration_images,
     chosen_calibration_images,
@@ -76,7 +78,7 @@ pub use found_devices::{ChangeKind, DeviceChange, DeviceInfo, DeviceWatch, found
 pub use input_counts::InputCounts;
 pub use join::{Change, Counts, Join, JoinEvent, PosedImage, Rejection, SampleUse, StoreUse};
 pub use live_pixels::live_pixels;
-pub use mesh_files::mesh_file_candidates;
+pub use mesh_files::{MeshKind, found_mesh_file, missing_mesh_file};
 pub use nearest_name::nearest_name;
 pub use notes::Notes;
 pub use outputs::{check_output_file, check_output_folder};

@@ -1,12 +1,58 @@
-//! Finds the mesh files that a robot description names.
+//! Finds the mesh files that a robot description names, and says which programs can read them.
 
 use std::path::{Path, PathBuf};
+
+/// Which parts of fieldrig can read a mesh file.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum MeshKind {
+    /// Triangles (`.stl`, `.obj`): the page, the simulator and steering.
+    Triangles,
+    /// COLLADA (`.dae`): only the page.
+    Collada,
+    /// None.
+    Unsupported,
+}
+
+impl MeshKind {
+    /// The kind of a file with this name.
+    #[must_use]
+    pub fn of(file: &str) -> Self {
+        let extension = file.rsplit_once('.').map(|(_, extension)| extension);
+        match extension.map(str::to_ascii_lowercase).as_deref() {
+            Some("stl" | "obj") => Self::Triangles,
+            Some("dae") => Self::Collada,
+            _ => Self::Unsupported,
+        }
+    }
+}
+
+/// The path of a mesh file; `None` if it does not exist.
+#[must_use]
+pub fn found_mesh_file(file: &str, urdf_folder: &Path) -> Option<PathBuf> {
+    mesh_file_candidates(file, urdf_folder)
+        .into_iter()
+        .find(|path| path.is_file())
+}
+
+/// Why a mesh file was not found. Most files are missing because only the URDF was copied.
+#[must_use]
+pub fn missing_mesh_file(file: &str, urdf_folder: &Path) -> String {
+    let folder = urdf_folder.display();
+    let package = file
+        .strip_prefix("package://")
+        .and_then(|path| path.split_once('/'));
+    match package {
+        Some((package, rest)) => format!(
+            "no file {rest:?} in a folder {package:?} beside or above {folder}; copy the whole package of the URDF"
+        ),
+        None => format!("no such file; relative names start at {folder}"),
+    }
+}
 
 /// Paths where a mesh file may be, the most likely one first. The folder of a package is a parent
 /// folder of the URDF, or beside such a parent. Usually, it has the name of the package. A parent
 /// folder with another name may be the package, too: a checkout or a download is often renamed.
-#[must_use]
-pub fn mesh_file_candidates(file: &str, urdf_folder: &Path) -> Vec<PathBuf> {
+fn mesh_file_candidates(file: &str, urdf_folder: &Path) -> Vec<PathBuf> {
     let package_path = file
         .strip_prefix("package://")
         .or_else(|| file.strip_prefix("model://"));

@@ -1,6 +1,6 @@
 //! Supervision of an arm that moves: its faults, requests to stop, and joint offsets.
 
-use crate::config::Rig;
+use crate::config::{Rig, RigPath};
 use crate::stop::Stop;
 use anyhow::{Context, bail};
 use drivers::motion::{JointTarget, Motion};
@@ -22,6 +22,7 @@ pub const HOLDING: &str = "holding the arm; support it before you press Ctrl-C, 
 pub struct SupervisedArm {
     arm: Box<dyn MovableArm>,
     offsets: Vec<f64>,
+    rig_path: RigPath,
 }
 
 /// How a motion ended.
@@ -38,7 +39,11 @@ impl SupervisedArm {
     pub fn new(arm: Box<dyn MovableArm>, rig: &Rig) -> Self {
         let mut offsets = rig.arm.joint_offsets.clone();
         offsets.resize(rig.arm.joints.len(), 0.0);
-        Self { arm, offsets }
+        Self {
+            arm,
+            offsets,
+            rig_path: rig.path.clone(),
+        }
     }
 
     /// Enables a stopped arm again. Call this only at the request of a person who has checked the
@@ -77,8 +82,10 @@ impl SupervisedArm {
         // because of a fault may no longer report anything.
         if let Motion::Stopped { reason } = self.arm.motion() {
             bail!(
-                "the arm stopped: {reason}. Inspect it, then recover it with `fieldrig move {}`",
-                Setting::Recover
+                "the arm stopped: {reason}. Inspect it, then recover it with `fieldrig move {} {} {}`",
+                self.rig_path.argument(),
+                Setting::Recover,
+                Setting::EnableMotion
             );
         }
         match state {

@@ -40,6 +40,11 @@ impl CheckpointOptions {
         ))
     }
 
+    /// Whether checkpoints are written, so that the run can be continued.
+    pub fn are_written(self) -> bool {
+        self.period != Some(Duration::ZERO)
+    }
+
     /// These options, with the period of the earlier run if the flag was not given.
     pub fn or_previous(self, flags: &BTreeMap<String, String>) -> Self {
         Self {

@@ -217,28 +217,47 @@ pub fn check_target_file(rig: &Rig, file: &Path) -> anyhow::Result<()> {
     }
 }
 
-/// Path of the URDF next to a rig file, if it describes another robot.
+/// Path of the URDF next to a rig file, if it describes another robot. A rig without a robot
+/// description does not use this file.
 fn other_robot(rig: &Rig, file: &Path) -> Option<PathBuf> {
+    if !rig.arm.has_description() {
+        return None;
+    }
     let urdf = file.with_file_name(drivers::recording::URDF_FILE);
     let existing = files::read_text(&urdf).ok()?;
     (existing != rig.arm.urdf_text).then_some(urdf)
 }
 
-/// Writes a rig file atomically, and the robot's URDF next to it. An existing file is kept with the
+/// The text of a rig file to write: all keys, and the comments of the file from which the rig was
+/// read. The comments of a rig that was read from elsewhere are those of the file to replace.
+fn text_of(rig: &Rig, file: &Path) -> String {
+    let source = files::read_text(rig.path.get().unwrap_or(file));
+    rig.to_toml_with_comments(&source.unwrap_or_default())
+}
+
+/// Writes a rig file atomically, and the robot's URDF next to it if the rig has one. An existing file is kept with the
 /// extension `.old`, or with `.old2`, `.old3` and so on if `.old` exists. Does not overwrite the
 /// URDF of another robot. If two programs write the same file at the same time, the second program
 /// gets an error.
 pub fn write(rig: &Rig, file: &Path) -> anyhow::Result<()> {
     check_target_file(rig, file)?;
     let linked = std::fs::read_link(file);
+    let mut backup = None;
     // The previous file is copied while no other program can write it, so that the copy has the
     // latest contents.
     let written = files::replace(file, |unfinished| {
         write_urdf(rig, file)?;
-        back_up(file)?;
-        unfinished.write_all(rig.to_toml().as_bytes())
+        backup = back_up(file)?;
+        unfinished.write_all(text_of(rig, file).as_bytes())
     });
     written.with_context(|| format!("cannot write {}", file.display()))?;
+    if let Some(backup) = backup {
+        log::info!(
+            "{} has all keys now, also those with default values; the previous file is {}",
+            file.display(),
+            backup.display()
+        );
+    }
     if let Ok(target) = linked {
         log::warn!(
             "{} was a symbolic link: it is a file now, and {} is unchanged",
@@ -249,8 +268,11 @@ pub fn write(rig: &Rig, file: &Path) -> anyhow::Result<()> {
     Ok(())
 }
 
-/// Writes the robot's URDF next to a rig file, unless it is there.
+/// Writes the robot's URDF next to a rig file, unless it is there, or the rig has none.
 fn write_urdf(rig: &Rig, file: &Path) -> std::io::Result<()> {
+    if !rig.arm.has_description() {
+        return Ok(());
+    }
     let urdf = file.with_file_name(drivers::recording::URDF_FILE);
     // The URDF is created but never replaced, because the folder may belong to another robot.
     let error = match files::create(&urdf, |out| out.write_all(rig.arm.urdf_text.as_bytes())) {
@@ -271,10 +293,10 @@ fn write_urdf(rig: &Rig, file: &Path) -> std::io::Result<()> {
     ))
 }
 
-/// Copies a file, if it exists, to an unused name.
-fn back_up(file: &Path) -> std::io::Result<()> {
+/// Copies a file, if it exists, to an unused name, and returns this name.
+fn back_up(file: &Path) -> std::io::Result<Option<PathBuf>> {
     if !file.exists() {
-        return Ok(());
+        return Ok(None);
     }
     let backup = unused_backup(file);
     let copy = |backup: &mut File| std::io::copy(&mut files::open(file)?, backup).map(drop);
@@ -283,7 +305,8 @@ fn back_up(file: &Path) -> std::io::Result<()> {
             error.kind(),
             format!("cannot keep it as {}: {error}", backup.display()),
         )
-    })
+    })?;
+    Ok(Some(backup))
 }
 
 /// Path of a backup that does not exist yet.
@@ -489,6 +512,25 @@ mod tests {
         );
     }
 
+    #[test]
+    fn rig_without_an_arm_neither_writes_nor_uses_a_robot_description() {
+        const TEXT: &str = "[arm]\ndriver = \"none\"\n[camera.room]\ndriver = \"sim\"\nsize_px = [64, 48]\n\
+                            rate_hz = 1\nparent = \"world\"\n";
+        let rig = Rig::parse("rig.toml", TEXT, "", &[]).unwrap();
+        let folder = tempfile::tempdir().unwrap();
+        let file = folder.path().join("rig.toml");
+        let urdf = folder.path().join(drivers::recording::URDF_FILE);
+        write(&rig, &file).unwrap();
+        assert!(!urdf.exists());
+        // A rig with an arm can be written into the same folder afterwards, and beside its robot
+        // description, rigs without an arm.
+        write(&bundled_rig(), &file).unwrap();
+        let robot = std::fs::read_to_string(&urdf).unwrap();
+        write(&rig, &file).unwrap();
+        assert_eq!(std::fs::read_to_string(&urdf).unwrap(), robot);
+        assert_eq!(Rig::load(&file, &[]).unwrap(), rig);
+    }
+
     /// This happens when several programs write their results into one rig file.
     #[test]
     fn no_result_of_simultaneous_writers_disappears() {
@@ -502,7 +544,7 @@ mod tests {
             for ix in 0..N_FILES {
                 rig.cameras[0].intrinsics.focal_px[0] = 600.0 + f64::from(N_FILES * writer + ix);
                 match write(&rig, &file) {
-                    Ok(()) => texts.push(rig.to_toml()),
+                    Ok(()) => texts.push(text_of(&rig, &file)),
                     Err(error) => {
                         let message = format!("{error:#}");
                         assert!(
@@ -547,6 +589,45 @@ mod tests {
             std::fs::read_dir(folder.path()).unwrap().count() == found.len() + 1,
             "these and the URDF"
         );
+    }
+
+    #[test]
+    fn comments_of_the_rig_file_are_kept_except_for_guesses_that_were_measured() {
+        let folder = tempfile::tempdir().unwrap();
+        let at = |name: &str| folder.path().join(name);
+        let text = "# My robot.\n\n[arm]\ndriver = \"none\"\n[camera.room]\ndriver = \"sim\" # a webcam\n\
+                    size_px = [64, 48]\nrate_hz = 1\nparent = \"world\"\n# Guess: in the corner.\n\
+                    parent_from_camera = { xyz_m = [1, 0, 0] }\n# Guess: a usual lens.\n\
+                    intrinsics = { focal_px = [60, 60], principal_px = [32, 24] }\n";
+        std::fs::write(at("rig.toml"), text).unwrap();
+        let rig = Rig::load(&at("rig.toml"), &[]).unwrap();
+        let measured = Intrinsics {
+            focal_px: [61.0, 61.5],
+            ..rig.cameras[0].intrinsics.clone()
+        };
+        let rig = with_intrinsics(&rig, "room", &measured, None).unwrap();
+        // The comments are those of the rig file that was read, whichever file is written.
+        for name in ["calibrated.toml", "rig.toml", "rig.toml"] {
+            write(&rig, &at(name)).unwrap();
+            let written = std::fs::read_to_string(at(name)).unwrap();
+            for comment in [
+                "# My robot.\n\n",
+                "driver = \"sim\" # a webcam\n",
+                "# Guess: in the corner.\n",
+            ] {
+                assert!(written.contains(comment), "{name}: {written}");
+            }
+            assert!(!written.contains("a usual lens"), "{name}: {written}");
+            assert_eq!(Rig::load(&at(name), &[]).unwrap(), rig, "{name}");
+            let guesses = capture::doctor::guesses(&written);
+            assert!(
+                guesses.len() == 1
+                    && guesses[0]
+                        .message
+                        .starts_with("camera.room.parent_from_camera is a guess"),
+                "{guesses:?}"
+            );
+        }
     }
 
     #[test]

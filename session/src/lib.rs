@@ -70,6 +70,7 @@ mod render_budget;
 mod render_plan;
 mod rendered_files;
 mod report;
+mod resume_command;
 pub mod robot_meshes;
 pub mod run_folder;
 pub mod run_log;
@@ -120,6 +121,7 @@ pub use read_progress::{OnReadProgress, ReadProgress, ignore_progress};
 pub use recoveries::OpenGpu;
 pub use recovery::Recovery;
 pub use render_plan::{OnPicture, RenderPlan, RenderedCameras, RenderedPicture};
+pub use resume_command::ResumeCommand;
 pub use run_plan::{
     DiscardedRun, EndedRun, OpenedRun, PreparedRun, PreviousLiveRun, RunInProgress, RunInput,
     RunPlan, SavedRun,

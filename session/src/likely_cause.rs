@@ -43,6 +43,8 @@ struct Figures {
     n_keyframes: Option<u64>,
     images: ImageFlow,
     is_software: bool,
+    /// The command that continues the run; `None` if it has no checkpoint.
+    resume_command: Option<String>,
     /// Whether errors of the calibration were estimated.
     is_calibrated: bool,
 }
@@ -85,6 +87,7 @@ impl Figures {
             n_keyframes: count("keyframes").or_else(|| count("n_train")),
             images: images(report),
             is_software: adapter.contains("(Cpu, "),
+            resume_command: report["resume_command"].as_str().map(str::to_owned),
             is_calibrated: !report["alignment"].is_null()
                 || report["cameras"]
                     .as_object()
@@ -154,13 +157,20 @@ fn few_steps(figures: &Figures) -> Option<String> {
         ""
     };
     Some(format!(
-        "too few steps: {} in {:.0} s{without_gpu}{rise}. Train for longer, for example with {} and {} {:.0}",
+        "too few steps: {} in {:.0} s{without_gpu}{rise}. {}",
         counted(figures.steps, "step"),
         figures.seconds,
-        Setting::Resume,
-        Setting::Seconds,
-        longer_secs(figures.seconds)
+        longer_training(figures)
     ))
+}
+
+/// How to train for longer.
+fn longer_training(figures: &Figures) -> String {
+    let time = format!("{} {:.0}", Setting::Seconds, longer_secs(figures.seconds));
+    match &figures.resume_command {
+        Some(command) => format!("Train for longer: `{command} {time}` continues the run"),
+        None => format!("Train for longer, for example with {time}"),
+    }
 }
 
 /// Twice the time or more, in whole minutes.
@@ -281,7 +291,16 @@ mod tests {
         });
         assert_eq!(
             text,
-            "too few steps: 270 steps in 60 s without a GPU. Train for longer, for example with resume and seconds 120"
+            "too few steps: 270 steps in 60 s without a GPU. Train for longer, for example with seconds 120"
+        );
+        let text = cause(|report| {
+            report["done"]["steps"] = 270.into();
+            report["resume_command"] = "fieldrig run 'my rig.toml' resume out".into();
+        });
+        assert_eq!(
+            text,
+            "too few steps: 270 steps in 60 s. Train for longer: `fieldrig run 'my rig.toml' resume out seconds 120` \
+             continues the run"
         );
         let text = cause(|report| report["evaluations"][1]["psnr"] = 18.0.into());
         assert!(

@@ -1,7 +1,7 @@
 //! Suggested commands to run after training. They work as printed in the folder where training was
 //! started.
 
-use messages::Setting;
+use messages::{Setting, quoted_for_shell};
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use trainer::ModelKind;
@@ -52,14 +52,12 @@ pub struct NextCommand {
 
 /// The commands for models that were trained together.
 pub fn for_models(models: &[SavedModel<'_>]) -> Vec<NextCommand> {
-    let program = std::env::args_os()
-        .next()
-        .map_or("fieldrig".into(), |word| {
-            word.to_string_lossy().into_owned()
-        });
     let mut commands = Vec::new();
     let mut add = |purpose: &str, words: &[&str]| {
-        commands.push(next_command(&program, purpose, words));
+        commands.push(NextCommand {
+            purpose: purpose.to_owned(),
+            command: command_line(words.iter().copied().map(str::to_owned)),
+        });
     };
     if let Some(folder) = common_folder(models) {
         add("view the model", &["view", &argument(folder)]);
@@ -92,22 +90,24 @@ pub fn for_models(models: &[SavedModel<'_>]) -> Vec<NextCommand> {
     commands
 }
 
-/// A command with its words quoted for a shell.
-fn next_command(program: &str, purpose: &str, words: &[&str]) -> NextCommand {
+/// A command line of this program, as it was called, with the words quoted for a shell.
+pub(crate) fn command_line(words: impl IntoIterator<Item = String>) -> String {
+    let program = std::env::args_os()
+        .next()
+        .map_or("fieldrig".into(), |word| {
+            word.to_string_lossy().into_owned()
+        });
     let words: Vec<String> = std::iter::once(program)
-        .chain(words.iter().copied())
-        .map(quoted)
+        .chain(words)
+        .map(|word| quoted_for_shell(&word))
         .collect();
-    NextCommand {
-        purpose: purpose.to_owned(),
-        command: words.join(" "),
-    }
+    words.join(" ")
 }
 
 /// The command line of this process.
 pub fn this_command() -> String {
     std::env::args_os()
-        .map(|word| quoted(&word.to_string_lossy()))
+        .map(|word| quoted_for_shell(&word.to_string_lossy()))
         .collect::<Vec<_>>()
         .join(" ")
 }
@@ -163,7 +163,7 @@ fn numbered_file(name: &str, n: u32, extension: &str) -> PathBuf {
 
 /// A path as a positional argument. A path that starts with a hyphen would be parsed as a flag, so
 /// `./` is prepended.
-fn argument(path: &Path) -> String {
+pub(crate) fn argument(path: &Path) -> String {
     let text = path.to_string_lossy();
     if text.starts_with('-') {
         format!("./{text}")
@@ -172,40 +172,9 @@ fn argument(path: &Path) -> String {
     }
 }
 
-/// A word, quoted for a shell.
-pub fn quoted(word: &str) -> String {
-    let is_plain = |letter: char| letter.is_ascii_alphanumeric() || "_-./:=@%+,".contains(letter);
-    if !word.is_empty() && word.chars().all(is_plain) {
-        return word.to_owned();
-    }
-    format!("'{}'", word.replace('\'', r"'\''"))
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
-
-    #[test]
-    fn quoted_words_round_trip_through_the_shell() {
-        for word in [
-            "plain/path-1.spz",
-            "two words",
-            "it's",
-            "$HOME `x` \"y\" \\ *",
-            "",
-            "naïve",
-            "a\nb",
-        ] {
-            let output = std::process::Command::new("sh")
-                .args(["-c", &format!("printf %s {}", quoted(word))])
-                .output();
-            assert_eq!(
-                String::from_utf8_lossy(&output.expect("sh starts").stdout),
-                word
-            );
-        }
-        assert_eq!(quoted("runs/20261123-170000"), "runs/20261123-170000");
-    }
 
     #[test]
     fn commands_depend_on_the_kind_of_model() {
@@ -222,7 +191,7 @@ mod tests {
             n_tests: 3,
         };
         let commands = |models: &[SavedModel<'_>]| -> Vec<String> {
-            let program = quoted(&std::env::args().next().expect("a program"));
+            let program = quoted_for_shell(&std::env::args().next().expect("a program"));
             let strip = |next: NextCommand| {
                 next.command
                     .trim_start_matches(&format!("{program} "))

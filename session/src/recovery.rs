@@ -2,6 +2,7 @@
 
 use crate::decisions::Settings;
 use crate::error::is_gpu_error;
+use crate::resume_command::ResumeCommand;
 use crate::run_folder::CHECKPOINT;
 use keyframe::Keyframe;
 use std::path::{Path, PathBuf};
@@ -20,8 +21,8 @@ pub struct Recovery {
     pub known: Vec<Arc<Keyframe>>,
     /// Settings for the decision log.
     pub settings: Settings,
-    /// The command that continues from the newest checkpoint.
-    pub resume_command: String,
+    /// The command that continues the run.
+    pub resume_command: ResumeCommand,
 }
 
 impl Recovery {
@@ -36,14 +37,15 @@ impl Recovery {
         match (has_checkpoint, &self.resumed) {
             (true, _) => {
                 format!(
-                    "the newest checkpoint is {}: `{resume_command}` continues from it",
-                    in_folder(folder)
+                    "the newest checkpoint is {}: `{}` continues from it",
+                    in_folder(folder),
+                    resume_command.line(folder)
                 )
             }
             (false, Some(resumed)) => {
                 format!(
-                    "no newer checkpoint was written: resume again from the one in {}",
-                    resumed.display()
+                    "no newer checkpoint was written: `{}` continues again from the older one",
+                    resume_command.line(resumed)
                 )
             }
             (false, None) => "no checkpoint was written yet: start the run again".to_owned(),

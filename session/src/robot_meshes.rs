@@ -2,7 +2,7 @@
 
 use anyhow::Context;
 use capture::config::{ArmDriver, Rig};
-use capture::mesh_file_candidates;
+use capture::{found_mesh_file, missing_mesh_file};
 use files::Budget;
 use kinematics::shape::Geometry;
 use kinematics::urdf::Robot;
@@ -80,15 +80,14 @@ fn describe(failures: &[String], n_files: usize) -> Option<String> {
 fn read(file: &str, urdf_folder: &Path, left: Budget) -> Result<RobotMesh, String> {
     let format = MeshFormat::of_file(file)
         .ok_or("its type is not supported, convert it to .stl, .dae or .obj")?;
-    let candidates = mesh_file_candidates(file, urdf_folder);
-    let Some(path) = candidates.iter().find(|path| path.is_file()) else {
-        return Err(not_found(file, urdf_folder));
+    let Some(path) = found_mesh_file(file, urdf_folder) else {
+        return Err(missing_mesh_file(file, urdf_folder));
     };
     let shown = path.display();
     // The budget of one file, but not more than the rest of the budget of all files.
     let max_bytes = Budget::MESH.max_bytes.min(left.max_bytes);
     let bytes = files::read(
-        path,
+        &path,
         Budget {
             max_bytes,
             ..Budget::MESH
@@ -105,23 +104,10 @@ fn read(file: &str, urdf_folder: &Path, left: Budget) -> Result<RobotMesh, Strin
     })
 }
 
-/// Why a mesh file was not found. Most files are missing because only the URDF was copied.
-fn not_found(file: &str, urdf_folder: &Path) -> String {
-    let folder = urdf_folder.display();
-    let package = file
-        .strip_prefix("package://")
-        .and_then(|path| path.split_once('/'));
-    match package {
-        Some((package, rest)) => format!(
-            "no file {rest:?} in a folder {package:?} beside or above {folder}; copy the whole package of the URDF"
-        ),
-        None => format!("no such file; relative names start at {folder}"),
-    }
-}
-
 #[cfg(test)]
 mod tests {
     use super::{describe, meshes, read};
+    use capture::MeshKind;
     use files::Budget;
     use kinematics::urdf::Robot;
     use std::path::Path;
@@ -197,5 +183,19 @@ mod tests {
             "the robot is drawn without 3 of 5 mesh files: a; and 2 others"
         );
         assert!(describe(&[], 5).is_none());
+    }
+    #[test]
+    fn the_page_draws_the_kinds_that_doctor_says() {
+        for (file, kind) in [
+            ("a.STL", MeshKind::Triangles),
+            ("a.obj", MeshKind::Triangles),
+            ("a.dae", MeshKind::Collada),
+            ("a.glb", MeshKind::Unsupported),
+            ("stl", MeshKind::Unsupported),
+        ] {
+            assert_eq!(MeshKind::of(file), kind, "{file}");
+            let is_drawn = MeshFormat::of_file(file).is_some();
+            assert_eq!(is_drawn, kind != MeshKind::Unsupported, "{file}");
+        }
     }
 }

@@ -1,9 +1,11 @@
 //! The folder of a run and its files.
 
+use crate::resume_command::ResumeCommand;
 use crate::steering::steering_log;
 use anyhow::{Context, bail, ensure};
 use capture::check_output_folder;
 use capture::config::Rig;
+use drivers::recording::RIG_FILE;
 use keyframe::Keyframe;
 use messages::{BadInput, Setting, listed};
 use model_files::Edits;
@@ -61,7 +63,9 @@ pub fn check_no_model(folder: &Path) -> anyhow::Result<()> {
 
 /// Returns an error if a folder contains any interrupted run, because a new run would replace its
 /// checkpoint.
-pub fn check_no_unfinished_run(out: &Path) -> anyhow::Result<()> {
+///
+/// * `resume_command`: continues a run with the input of the new run.
+fn check_no_unfinished_run(out: &Path, resume_command: &ResumeCommand) -> anyhow::Result<()> {
     let folders = std::iter::once(out.to_owned())
         .chain(ModelKind::ALL.iter().map(|kind| out.join(kind.name())));
     match folders
@@ -69,11 +73,11 @@ pub fn check_no_unfinished_run(out: &Path) -> anyhow::Result<()> {
         .find(|folder| folder.join(CHECKPOINT).exists())
     {
         Some(folder) => Err(BadInput(format!(
-            "{} {}: {} contains an interrupted run: continue it with {}, or give another folder",
+            "{} {}: {} contains an interrupted run: `{}` continues it; or give another folder",
             Setting::Out,
             out.display(),
             folder.display(),
-            Setting::Resume
+            resume_command.line(&folder)
         ))
         .into()),
         None => Ok(()),
@@ -85,10 +89,12 @@ pub fn check_no_unfinished_run(out: &Path) -> anyhow::Result<()> {
 ///
 /// * `resume`: folder of the run that is continued.
 /// * `data`: folder of the data.
+/// * `resume_command`: continues a run with the same input.
 pub(crate) fn check_out(
     out: Option<&Path>,
     resume: Option<&Path>,
     data: Option<&Path>,
+    resume_command: &ResumeCommand,
 ) -> anyhow::Result<()> {
     // A run that is continued may be finished, and then writes nothing.
     if out.is_some() || resume.is_none() {
@@ -102,7 +108,7 @@ pub(crate) fn check_out(
     if resume == Some(out) {
         Ok(())
     } else {
-        check_no_unfinished_run(out)
+        check_no_unfinished_run(out, resume_command)
     }
 }
 
@@ -156,8 +162,8 @@ pub fn expect_model(model: &Path) -> anyhow::Result<()> {
         let has_checkpoint = model.join(CHECKPOINT).exists();
         let hint = if has_checkpoint {
             format!(
-                " but has a checkpoint: train {} continues from it",
-                Setting::Resume
+                " but has a checkpoint: `{}` continues from it",
+                resume_command_of(model).line(model)
             )
         } else {
             String::new()
@@ -183,6 +189,17 @@ pub fn expect_model(model: &Path) -> anyhow::Result<()> {
         return Err(BadInput(message).into());
     }
     Ok(())
+}
+
+/// The command that continues the run in a folder, as far as the folder shows it.
+fn resume_command_of(folder: &Path) -> ResumeCommand {
+    // Only live runs store keyframes. They also store their rig file, and whether it is simulated.
+    if folder.join(KEYFRAMES).exists() {
+        ResumeCommand::of_devices(&folder.join(RIG_FILE))
+    } else {
+        // The folder does not contain the path of the data.
+        ResumeCommand::of_data(Path::new("DATA"))
+    }
 }
 
 /// The content of the report in a model's folder; `Null` if there is none.
@@ -669,17 +686,20 @@ mod tests {
     #[test]
     fn unfinished_run_is_not_overwritten() {
         let out = tempfile::tempdir().expect("a folder");
-        check_no_unfinished_run(&out.path().join("new")).expect("nothing is there");
+        let command = ResumeCommand::of_data(Path::new("my data"));
+        let check = |folder: &Path| check_no_unfinished_run(folder, &command);
+        check(&out.path().join("new")).expect("nothing is there");
         let run = out.path().join(ModelKind::default().name());
         std::fs::create_dir(&run).expect("disk space");
-        check_no_unfinished_run(out.path()).expect("no checkpoint");
+        check(out.path()).expect("no checkpoint");
         std::fs::write(run.join(CHECKPOINT), b"x").expect("disk space");
-        assert!(check_no_unfinished_run(out.path()).is_err_and(|error| {
-            error
-                .to_string()
-                .contains("splat contains an interrupted run")
-        }));
-        assert!(check_no_unfinished_run(&run).is_err());
+        let message = check(out.path()).expect_err("a checkpoint").to_string();
+        assert!(
+            message.contains("splat contains an interrupted run")
+                && message.contains(&format!("`{}`", command.line(&run))),
+            "{message}"
+        );
+        assert!(check(&run).is_err());
     }
 
     #[test]
@@ -726,7 +746,13 @@ mod tests {
             std::fs::write(at(name), b"x").expect("file");
             assert!(message(name).contains("give its folder"), "{name}");
             if name == CHECKPOINT {
-                assert!(message("").contains("train resume"));
+                let resume = |command: ResumeCommand| format!("`{}`", command.line(&at("")));
+                let of_data = resume(ResumeCommand::of_data(Path::new("DATA")));
+                assert!(message("").contains(&of_data), "{}", message(""));
+                std::fs::create_dir(at(KEYFRAMES)).expect("folder");
+                let of_devices = resume(ResumeCommand::of_devices(&at(RIG_FILE)));
+                assert!(message("").contains(&of_devices), "{}", message(""));
+                std::fs::remove_dir(at(KEYFRAMES)).expect("folder");
             }
         }
         std::fs::write(at("splats.ply"), b"x").expect("file");

@@ -9,6 +9,7 @@ use crate::observer::{Observer, SessionEvent};
 use crate::previous_run::PreviousRun;
 use crate::recoveries::OpenGpu;
 use crate::recovery::Recovery;
+use crate::resume_command::ResumeCommand;
 use crate::session::{Evaluators, Limits, Session, SessionOptions};
 use crate::started_run::StartedRun;
 use crate::training_clock::Clock;
@@ -74,13 +75,13 @@ impl SessionSetup<'_> {
     /// yet.
     ///
     /// * `data`: for the report and the next commands.
-    /// * `resume_command`: continues from the newest checkpoint.
+    /// * `resume_command`: continues the run.
     pub(crate) fn session(
         &self,
         resumed: Resumed,
         folder: &Path,
         data: DataSource,
-        resume_command: String,
+        resume_command: ResumeCommand,
     ) -> anyhow::Result<Session> {
         let Resumed {
             model_spec,
@@ -146,7 +147,7 @@ impl SessionSetup<'_> {
     }
 
     /// The folders of the session that writes into `folder`.
-    fn started(&self, folder: &Path, resume_command: &str) -> StartedRun {
+    fn started(&self, folder: &Path, resume_command: &ResumeCommand) -> StartedRun {
         let run_folder = match self.n_models {
             // Each of several models has a subfolder.
             2.. => folder.parent().unwrap_or(folder),
@@ -155,7 +156,7 @@ impl SessionSetup<'_> {
         StartedRun {
             run_folder: run_folder.to_owned(),
             model_folder: folder.to_owned(),
-            resume_command: resume_command.to_owned(),
+            resume_command: resume_command.line(folder),
         }
     }
 

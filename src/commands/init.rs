@@ -5,11 +5,13 @@ mod questions;
 use crate::exit::Exit;
 use crate::number_args::number_in_range;
 use crate::print;
+use capture::CalibrationCommand;
 use capture::config::Parent;
+use capture::doctor::Finding;
 use capture::init::{NewRigFile, RigPlan, RobotChoice, SearchPlan, WantedCamera, Wishes, search};
 use capture::known_robots::KNOWN_ROBOTS;
 use drivers::NetworkAddress;
-use messages::BadInput;
+use messages::{BadInput, quoted_for_shell};
 use questions::Questions;
 use std::path::{Path, PathBuf};
 
@@ -124,7 +126,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     Questions::new(args.yes).ask(&mut wishes, &mut findings, &args.rig)?;
     let plan = RigPlan::new(&wishes, &findings).map_err(|error| BadInput(format!("{error:#}")))?;
     file.write(&wishes, &plan)?;
-    report_plan(&args.rig, &plan);
+    report_plan(&args.rig, &plan, &wishes.robot.mesh_warnings(&args.rig));
     Ok(Exit::Done)
 }
 
@@ -155,19 +157,24 @@ fn robot(args: &Args) -> anyhow::Result<RobotChoice> {
     }
 }
 
-fn report_plan(rig: &Path, plan: &RigPlan) {
+fn report_plan(rig: &Path, plan: &RigPlan, warnings: &[Finding]) {
     print::report("Assumed");
     for assumption in &plan.assumptions {
         print::report(format_args!("  {assumption}"));
     }
-    let rig = rig.display();
-    print::report(format_args!("Wrote {rig}. Next"));
+    if !warnings.is_empty() {
+        print::report("Warnings");
+        for warning in warnings {
+            print::report(format_args!("  {warning}"));
+        }
+    }
+    print::report(format_args!("Wrote {}. Next", rig.display()));
+    let rig = quoted_for_shell(&rig.to_string_lossy());
     print::report(format_args!("  fieldrig doctor {rig}"));
     print::report(format_args!("  fieldrig run {rig} --sim"));
     for camera in plan.cameras_without_lens() {
-        print::report(format_args!(
-            "  fieldrig calibrate intrinsics {rig} --camera {camera} --target charuco:5x7:34mm:26mm:5X5_100 --write-rig {rig}"
-        ));
+        let command = CalibrationCommand::Intrinsics.line(&rig, camera);
+        print::report(format_args!("  {command}"));
     }
 }
 

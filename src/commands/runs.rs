@@ -20,7 +20,7 @@ use std::time::{Duration, SystemTime};
     args_conflicts_with_subcommands = true,
     after_long_help = "Without a subcommand, the runs are listed. States: `running`: a process writes into the folder. \
                        `done`: all models were saved and scored. `not scored`: the run ended before its scores. \
-                       `unfinished`: there is a checkpoint, from which `run --resume` or `train --resume` continues, but no model. `no model`: there is neither.\n\n\
+                       `unfinished`: there is no model, but a checkpoint, from which `fieldrig run RIG.toml --resume RUN` or `fieldrig train DATA --resume RUN` continues. `no model`: there is neither.\n\n\
                        The name of the rig or data is in the report, which is written with the scores, and is `unknown` before. \
                        The models of a run come with their PSNR on the test images."
 )]

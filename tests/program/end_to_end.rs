@@ -335,6 +335,16 @@ fn tsdf_runs_live_replays_and_resumes() {
         done["checkpoint_sha256"]
     );
     let mesh = std::fs::read(folder.join("live/mesh.glb")).expect("a mesh");
+    // A run on a recording continues with the recording, and not with the devices.
+    for (run, command) in [
+        ("live", " run rig.toml --resume live"),
+        ("replay", " train scan.mcap --rig rig.toml --resume replay"),
+    ] {
+        let report = std::fs::read(folder.join(run).join("report.json")).expect("a report");
+        let report: Value = serde_json::from_slice(&report).expect("JSON");
+        let resume = report["resume_command"].as_str().expect("a command");
+        assert!(resume.ends_with(command), "{resume}");
+    }
 
     // More steps than keyframes: training ends with the recording.
     let more = [

@@ -135,7 +135,10 @@ fn a_known_robot_needs_no_file() {
     }
     let (code, _, errors) = fk(Path::new("builtin:ur5"), &flags, &joints.to_string());
     assert_eq!(code, 1, "{errors}");
-    assert!(errors.contains("did you mean \"ur5e\"?"), "{errors}");
+    assert!(
+        errors.contains("did you mean \"ur5e\" (Universal Robots UR5e; a UR5 has"),
+        "{errors}"
+    );
 }
 
 #[test]

@@ -110,7 +110,8 @@ fn permanent_gpu_loss_error_names_checkpoint_and_command() {
         "{text}"
     );
     assert!(
-        text.contains("lost/training.ckpt: `fieldrig train data --resume lost` continues from it"),
+        text.contains("lost/training.ckpt: `")
+            && text.contains(" train data --resume lost` continues from it"),
         "{text}"
     );
     let step = Checkpoint::read(&folder.join("lost/training.ckpt"))
@@ -232,7 +233,7 @@ fn live_run_survives_gpu_loss_or_keeps_its_recording() {
     let text = stderr(&unrecovered);
     assert_eq!(unrecovered.status.code(), Some(1), "{text}");
     assert!(
-        (text.contains("`fieldrig run ") && text.contains("--resume gone`"))
+        (text.contains(" run ") && text.contains(" --resume gone` continues from it"))
             || text.contains("no checkpoint was written yet"),
         "{text}"
     );

@@ -159,11 +159,18 @@ fn urdf_is_named_relative_to_the_rig_file() {
     let folder = tempfile::tempdir().expect("a folder");
     std::fs::create_dir(folder.path().join("robots")).expect("a folder");
     let urdf = include_str!("../../kinematics/tests/data/ur5e-dh.urdf");
+    let mesh = "<visual><geometry><mesh filename=\"package://arm/base.dae\"/></geometry></visual>";
+    let with_mesh = format!("<link name=\"base_link\">{mesh}</link>");
+    let urdf = urdf.replace("<link name=\"base_link\"/>", &with_mesh);
     std::fs::write(folder.path().join("robots/arm.urdf"), urdf).expect("written");
     let (printed, rig) = init(folder.path(), &["--urdf", "robots/arm.urdf", "--yes"]);
     assert_eq!(rig["arm"]["urdf"].as_str(), Some("robots/arm.urdf"));
     assert_eq!(rig["arm"]["flange_link"].as_str(), Some("tool0"));
     assert!(printed.contains("wrist_3_joint"), "{printed}");
+    assert!(
+        printed.contains("1 of 1 mesh file of the robot description is missing, the first is \"package://arm/base.dae\""),
+        "{printed}"
+    );
     assert_doctor_accepts(folder.path());
 }
 
@@ -171,7 +178,10 @@ fn urdf_is_named_relative_to_the_rig_file() {
 fn unknown_robots_and_places_are_refused() {
     let folder = tempfile::tempdir().expect("a folder");
     for (args, words) in [
-        (["--robot", "ur5"], "did you mean \"ur5e\""),
+        (
+            ["--robot", "ur5"],
+            "a UR5 has a shoulder that is 73 mm lower",
+        ),
         (["--camera", "wrist"], "flange, base or world"),
         (["--urdf", "absent.urdf"], "absent.urdf"),
         (["--ur", "192.168.1"], "four numbers from 0 to 255"),

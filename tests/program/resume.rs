@@ -65,6 +65,13 @@ fn resumed_training_equals_uninterrupted_training() {
         .concat(),
     );
     assert_ne!(half["checkpoint_sha256"], whole["checkpoint_sha256"]);
+    let report = std::fs::read(folder.join("half/report.json")).unwrap();
+    let report: Value = serde_json::from_slice(&report).unwrap();
+    let resume = report["resume_command"].as_str().unwrap();
+    assert!(
+        resume.contains("fieldrig train ") && resume.ends_with(" --resume half"),
+        "{resume}"
+    );
     let both = done(
         folder,
         &["--resume", "half", "--steps", N_STEPS, "--out", "both"],

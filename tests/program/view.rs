@@ -508,7 +508,11 @@ fn non_model_paths_give_one_error() {
         assert_fails_with(folder, &["view", model], code, words)
     };
     refused("absent", 1, &["absent does not exist"]);
-    refused("cut", 1, &["cut contains no model", "train --resume"]);
+    refused(
+        "cut",
+        1,
+        &["cut contains no model", "train DATA --resume cut`"],
+    );
     refused(
         "scan.mcap",
         2,

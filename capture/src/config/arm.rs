@@ -17,6 +17,9 @@ use toml::{Table, Value};
 /// Maximum joint offset, rad or m. A larger offset is probably in degrees, or has the wrong sign.
 const MAX_JOINT_OFFSET: f64 = 1.0;
 
+/// Robot description of a rig without an arm, if the rig file names none.
+pub(super) const EMPTY_URDF: &str = r#"<robot name="none"><link name="base"/></robot>"#;
+
 keys! {
     /// The arm of the rig.
     #[derive(Clone, Debug, PartialEq)]
@@ -63,6 +66,15 @@ keys! {
         /// Offsets that must be added to the simulated readings to get the true joint positions, in
         /// the order of `joints`, rad. Each is from -1 to 1. An empty list means right readings.
         pub true_joint_offsets: Vec<f64> = Vec::new();
+    }
+}
+
+impl Arm {
+    /// Whether the rig has a robot description. The rig file of a robot without an arm need not name
+    /// one.
+    #[must_use]
+    pub fn has_description(&self) -> bool {
+        self.driver != ArmDriver::None || self.urdf_text != EMPTY_URDF
     }
 }
 
@@ -178,7 +190,9 @@ fn known_robot(keys: &Section<'_>, urdf: &str) -> Option<&'static KnownRobot> {
 
 pub(super) fn write(arm: &Arm) -> Table {
     let mut table = arm.write_keys();
-    table.extend(entry("urdf", &drivers::recording::URDF_FILE.to_owned()));
+    if arm.has_description() {
+        table.extend(entry("urdf", &drivers::recording::URDF_FILE.to_owned()));
+    }
     table.extend(can::write(&arm.buses, &arm.motors));
     table.extend(servos::write(&arm.servos));
     table

@@ -52,7 +52,8 @@ fn an_unknown_robot_is_one_problem() {
     assert_eq!(
         error.to_string(),
         "rig.toml line 4: arm.urdf is \"builtin:ur5\", allowed: a path, or a known robot; \
-         no known robot is named \"ur5\", did you mean \"ur5e\"?; \
+         no known robot is named \"ur5\", did you mean \"ur5e\" (Universal Robots UR5e; a UR5 has a shoulder that is \
+         73 mm lower, and wrist links that are up to 24 mm shorter: it needs its own URDF file)?; \
          known robots: panda, fr3, ur3e, ur5e, ur10e, so101"
     );
 }

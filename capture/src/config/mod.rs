@@ -10,6 +10,7 @@ mod base;
 mod camera;
 mod camera_info_file;
 mod can;
+mod comments;
 mod error;
 mod join;
 mod key;
@@ -20,6 +21,7 @@ mod motion;
 mod pose;
 mod required;
 mod rig_file;
+mod rig_path;
 mod scanner;
 mod schema;
 #[cfg(test)]
@@ -43,6 +45,7 @@ pub use error::{ConfigError, SourceLocation};
 pub use join::JoinConfig;
 pub use motion::{ArmMotion, ArmSteering};
 pub use required::{MissingKey, Need};
+pub use rig_path::RigPath;
 pub use scanner::{Scanner, ScannerDriver, ScannerSim};
 pub use servos::{ArmSerial, ArmServo};
 pub use sim::{Sim, SimTarget};
@@ -68,6 +71,8 @@ pub struct Rig {
     pub train: Train,
     /// Settings of the simulation.
     pub sim: Sim,
+    /// Path of the rig file.
+    pub path: RigPath,
 }
 
 /// A value from the command line that overrides a key of the rig file.
@@ -121,6 +126,7 @@ impl Rig {
             read_file("the robot description", &path)
         };
         let mut rig = rig_file::read(&file, &text, overrides, Some(&folder), read_urdf)?;
+        rig.path = RigPath::of(path);
         rig.arm.urdf_folder = urdf_folder;
         if let Some(motion) = rig
             .arm
@@ -183,6 +189,14 @@ impl Rig {
         rig_file::write(self)
     }
 
+    /// The effective rig file with the comments of `source`, the text of an earlier rig file of the
+    /// same robot. A comment that marks a value as a guess is left out if the value has changed.
+    #[must_use]
+    pub fn to_toml_with_comments(&self, source: &str) -> String {
+        let text = self.to_toml();
+        comments::carried(source, &text).unwrap_or(text)
+    }
+
     /// Whether the calibration is the same. The calibration consists of extrinsics, intrinsics,
     /// time offsets and depth of the cameras, and of the joint offsets.
     #[must_use]
@@ -209,8 +223,8 @@ impl Rig {
         }
     }
 
-    /// Writes the effective rig file and the robot description into a folder. Returns the path of
-    /// the rig file.
+    /// Writes the effective rig file into a folder, and the robot description if the rig has one.
+    /// Returns the path of the rig file.
     ///
     /// # Errors
     ///
@@ -218,10 +232,10 @@ impl Rig {
     pub fn write_resolved(&self, folder: &Path) -> std::io::Result<PathBuf> {
         let path = folder.join(drivers::recording::RIG_FILE);
         // The robot description is written first, so that a complete rig file can always be read.
-        files::write(
-            &folder.join(drivers::recording::URDF_FILE),
-            &self.arm.urdf_text,
-        )?;
+        if self.arm.has_description() {
+            let urdf = folder.join(drivers::recording::URDF_FILE);
+            files::write(&urdf, &self.arm.urdf_text)?;
+        }
         files::write(&path, self.to_toml())?;
         Ok(path)
     }

@@ -6,7 +6,8 @@
 //! value.
 
 use super::{ArmDriver, Camera, CameraDriver, Rig};
-use messages::{BadInput, Setting};
+use crate::calibration_commands::{CalibrationCommand, where_the_target_is_from};
+use messages::BadInput;
 use std::borrow::Cow;
 
 /// What a command needs to know about the cameras of a rig.
@@ -45,7 +46,7 @@ impl Rig {
                 .cameras
                 .iter()
                 .flat_map(|camera| {
-                    missing_intrinsics(camera)
+                    self.missing_intrinsics(camera)
                         .into_iter()
                         .chain(self.missing_extrinsics(camera))
                 })
@@ -54,7 +55,7 @@ impl Rig {
                 .cameras
                 .iter()
                 .filter(|camera| &*camera.name == name)
-                .filter_map(missing_intrinsics)
+                .filter_map(|camera| self.missing_intrinsics(camera))
                 .collect(),
         }
     }
@@ -91,11 +92,7 @@ impl Rig {
                 "measure the pose of the optical frame (x right, y down, z forward) in the frame {parent}"
             )
         } else {
-            format!(
-                "`fieldrig calibrate hand-eye RIG.toml {} SPEC {} CALIBRATED.toml` finds it",
-                Setting::Target,
-                Setting::WriteRig
-            )
+            self.found_by(CalibrationCommand::HandEye, camera)
         };
         Some(MissingKey {
             key: format!("camera.{}.parent_from_camera", camera.name),
@@ -103,24 +100,65 @@ impl Rig {
             is_reported: camera.driver == CameraDriver::Sim,
         })
     }
+
+    fn missing_intrinsics(&self, camera: &Camera) -> Option<MissingKey> {
+        let remedy = if camera.reports_lenses() {
+            Cow::Borrowed("it is stored in the camera, which this command does not open")
+        } else {
+            self.found_by(CalibrationCommand::Intrinsics, camera).into()
+        };
+        camera.unknown.intrinsics.then(|| MissingKey {
+            key: format!("camera.{}.intrinsics", camera.name),
+            remedy,
+            is_reported: camera.reports_lenses() || camera.driver == CameraDriver::Sim,
+        })
+    }
+
+    /// The command that finds a missing calibration.
+    fn found_by(&self, command: CalibrationCommand, camera: &Camera) -> String {
+        format!(
+            "`{}` finds it, {}",
+            command.line(&self.path.argument(), &camera.name),
+            where_the_target_is_from()
+        )
+    }
 }
 
-fn missing_intrinsics(camera: &Camera) -> Option<MissingKey> {
-    let remedy = if camera.reports_lenses() {
-        Cow::Borrowed("it is stored in the camera, which this command does not open")
-    } else {
-        format!(
-            "`fieldrig calibrate intrinsics RIG.toml {} SPEC {} CALIBRATED.toml` finds it",
-            Setting::Target,
-            Setting::WriteRig
-        )
-        .into()
-    };
-    camera.unknown.intrinsics.then(|| MissingKey {
-        key: format!("camera.{}.intrinsics", camera.name),
-        remedy,
-        is_reported: camera.reports_lenses() || camera.driver == CameraDriver::Sim,
-    })
+impl Camera {
+    /// The keys that name the devices of the camera, as far as its driver needs them and they are
+    /// missing. A rig file may omit them as long as all devices are simulated.
+    #[must_use]
+    pub fn missing_devices(&self) -> Vec<MissingKey> {
+        let (needs_device, depth) = match self.driver {
+            CameraDriver::V4l2 => (true, self.depth.as_ref()),
+            CameraDriver::Nokhwa => (true, None),
+            // Without a serial number, the only connected RealSense camera is opened.
+            CameraDriver::Realsense | CameraDriver::Sim => (false, None),
+        };
+        let name = &self.name;
+        let color = (needs_device && self.device.is_empty()).then(|| "device".to_owned());
+        let depth = depth
+            .filter(|depth| depth.device.is_empty())
+            .map(|_| "depth.device".to_owned());
+        color
+            .into_iter()
+            .chain(depth)
+            .map(|key| MissingKey {
+                key: format!("camera.{name}.{key}"),
+                remedy: "set it to the device that `fieldrig devices` prints for the camera".into(),
+                is_reported: false,
+            })
+            .collect()
+    }
+
+    /// Checks that the rig file names the devices that the driver of the camera opens.
+    ///
+    /// # Errors
+    ///
+    /// If a key is missing. The error names all missing keys, and how to list the devices.
+    pub fn require_devices(&self) -> Result<(), BadInput> {
+        refuse(&self.missing_devices())
+    }
 }
 
 /// An error that lists missing keys, unless there are none.
@@ -176,12 +214,32 @@ mod tests {
         let rig = rig(&format!("{ARM}{CAMERA}"));
         let refused = refused(&rig);
         for words in [
-            "camera.wrist.intrinsics is missing: `fieldrig calibrate intrinsics RIG.toml",
-            "camera.wrist.parent_from_camera is missing: `fieldrig calibrate hand-eye RIG.toml",
+            "camera.wrist.intrinsics is missing: `fieldrig calibrate intrinsics RIG.toml camera wrist target charuco:",
+            "camera.wrist.parent_from_camera is missing: `fieldrig calibrate hand-eye RIG.toml camera wrist target charuco:",
+            "`fieldrig calibrate target out target.pdf`",
         ] {
             assert!(refused.contains(words), "{refused}");
         }
         assert!(rig.require(Need::Intrinsics("wrist")).is_err());
+    }
+
+    #[test]
+    fn commands_name_the_rig_file_that_was_read() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let path = folder.path().join("my rig.toml");
+        std::fs::write(&path, format!("{ARM}{CAMERA}")).expect("written");
+        std::fs::write(folder.path().join("one.urdf"), URDF).expect("written");
+        let refused = refused(&Rig::load(&path, &[]).expect("a valid rig"));
+        let rig = format!("'{}'", path.display());
+        for command in ["intrinsics", "hand-eye"] {
+            let begin = format!("`fieldrig calibrate {command} {rig} camera wrist ");
+            let end = format!(" write_rig {rig}`");
+            assert!(
+                refused.contains(&begin) && refused.contains(&end),
+                "{refused}"
+            );
+        }
+        assert!(!refused.contains("SPEC"), "{refused}");
     }
 
     #[test]
@@ -197,6 +255,32 @@ mod tests {
         assert!(without_pose.require(Need::Intrinsics("wrist")).is_ok());
         assert!(without_pose.require(Need::PosedImages).is_err());
         assert!(!without_pose.has_same_calibration(&at_flange));
+    }
+
+    #[test]
+    fn cameras_need_a_device_only_if_their_driver_cannot_choose_one() {
+        let depth = "[camera.wrist.depth]\nmeters_per_count = 0.001\n";
+        let keys = |driver: &str, more: &str| -> Vec<String> {
+            let text = format!("{ARM}{CAMERA}{more}").replace("v4l2", driver);
+            let missing = rig(&text).cameras[0].missing_devices();
+            missing.into_iter().map(|missing| missing.key).collect()
+        };
+        let [color, depth_too] = ["camera.wrist.device", "camera.wrist.depth.device"];
+        assert_eq!(keys("v4l2", ""), [color]);
+        assert_eq!(keys("v4l2", depth), [color, depth_too]);
+        assert_eq!(keys("nokhwa", depth), [color]);
+        assert_eq!(
+            keys("v4l2", &format!("device = \"cam\"\n{depth}")),
+            [depth_too]
+        );
+        assert_eq!(keys("realsense", depth), [""; 0]);
+        assert_eq!(keys("sim", depth), [""; 0]);
+        let refused = rig(&format!("{ARM}{CAMERA}")).cameras[0].require_devices();
+        let refused = refused.expect_err("no device").to_string();
+        assert_eq!(
+            refused,
+            "camera.wrist.device is missing: set it to the device that `fieldrig devices` prints for the camera"
+        );
     }
 
     #[test]

@@ -3,14 +3,11 @@
 use super::key::entry;
 use super::section::{ParseContext, Section};
 use super::{
-    Arm, ArmDriver, Base, BaseDriver, ConfigError, Override, Rig, arm, base, camera,
+    Arm, ArmDriver, Base, BaseDriver, ConfigError, Override, Rig, RigPath, arm, base, camera,
     camera_info_file, scanner, servo_calibration_file, sim,
 };
 use std::path::Path;
 use toml::{Table, Value};
-
-/// Robot description of a rig without an arm, if the rig file names none.
-const EMPTY_URDF: &str = r#"<robot name="none"><link name="base"/></robot>"#;
 
 /// Reads a rig. `read_urdf` returns the robot description for the path in the file. Lens parameters
 /// may be in other files only if the folder of the rig file is given.
@@ -37,7 +34,7 @@ pub(super) fn read(
     if !urdf_path.is_empty() {
         rig.arm.urdf_text = read_urdf(&urdf_path)?;
     } else if rig.arm.urdf_text.is_empty() {
-        rig.arm.urdf_text = EMPTY_URDF.to_owned();
+        rig.arm.urdf_text = arm::EMPTY_URDF.to_owned();
     }
     arm::resolve_joints(file, &mut rig.arm)?;
     Ok(rig)
@@ -118,6 +115,7 @@ fn rig(mut root: Section<'_>) -> Option<(Rig, String)> {
         join: join?,
         train: train?,
         sim: sim?,
+        path: RigPath::default(),
     };
     Some((rig, urdf_path))
 }

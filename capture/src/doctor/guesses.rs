@@ -8,8 +8,8 @@ const CHECK: &str = "guess";
 /// The guessed values of a rig file, as warnings: a run with them works, but its poses may be wrong.
 ///
 /// * `text`: the text of the rig file. A comment above a key that begins with `Guess:` marks its
-///   value. Keys that were measured since have no such comment, because commands that write rig
-///   files write no comments.
+///   value, also above the header of the table that is the value. Keys that were measured since have
+///   no such comment, because commands that write rig files drop it.
 #[must_use]
 pub fn guesses(text: &str) -> Vec<Finding> {
     let mut findings = Vec::new();
@@ -25,11 +25,11 @@ pub fn guesses(text: &str) -> Vec<Finding> {
             continue;
         }
         let about = std::mem::take(&mut about).join(" ");
-        if let Some(name) = line
-            .strip_prefix('[')
-            .and_then(|rest| rest.strip_suffix(']'))
-        {
+        // A comment may follow the header of a table.
+        let header = line.strip_prefix('[').and_then(|rest| rest.split_once(']'));
+        if let Some((name, _)) = header {
             name.clone_into(&mut table);
+            findings.extend(about.strip_prefix(GUESS).map(|about| finding(name, about)));
         } else if let (Some((key, _)), Some(about)) =
             (line.split_once('='), about.strip_prefix(GUESS))
         {
@@ -68,7 +68,7 @@ mod tests {
 [arm]
 # The arm is simulated.
 driver = \"sim\"
-[camera.wrist]
+[camera.wrist] # on the arm
 # Images per second.
 rate_hz = 30
 # exposure_micros = 8000
@@ -78,6 +78,10 @@ intrinsics = { focal_px = [1, 1] }
 size_px = [640, 480]
 # Guess: counts per turn.
 counts = 3
+
+# Guess: at the origin. A drawing has it.
+[camera.wrist.parent_from_camera]
+xyz_m = [0, 0, 0]
 
 # Guess: a comment without a key.
 
@@ -92,6 +96,8 @@ seed = 1
                  intrinsics` measures it; then delete the comment that begins with \"Guess:\"",
                 "camera.wrist.counts is a guess: counts per turn; measure it; then delete the comment that begins with \
                  \"Guess:\"",
+                "camera.wrist.parent_from_camera is a guess: at the origin; A drawing has it; then delete the comment that \
+                 begins with \"Guess:\"",
             ]
         );
         assert_eq!(guesses(""), []);

@@ -13,6 +13,7 @@ mod guesses;
 mod listen;
 mod meaning;
 mod memory;
+mod meshes;
 mod motion;
 mod realsense;
 mod realtime;
@@ -28,6 +29,7 @@ mod video_devices;
 pub use guesses::guesses;
 pub use listen::{DeviceStatistics, Latency, ListenResult, listen};
 pub use meaning::meaning;
+pub use meshes::{meshes, meshes_of};
 
 use crate::config::Rig;
 use messages::Setting;
@@ -173,6 +175,7 @@ pub fn check(rig: Option<&Rig>) -> Vec<Finding> {
     findings.extend(rig.into_iter().flat_map(servos::servos));
     findings.extend(rig.and_then(flange::simulator));
     findings.extend(rig.and_then(motion::motion));
+    findings.extend(rig.into_iter().flat_map(meshes));
     findings.extend(rig.into_iter().flat_map(calibration::missing));
     findings.extend(rig.into_iter().flat_map(calibration::calibration));
     findings.extend(rig.into_iter().flat_map(|rig| {

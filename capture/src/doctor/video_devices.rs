@@ -2,7 +2,7 @@
 
 use super::Finding;
 #[cfg(target_os = "linux")]
-use crate::config::{Camera, CameraDriver, Rig};
+use crate::config::{Camera, CameraDriver, MissingKey, Rig};
 #[cfg(target_os = "linux")]
 use drivers::v4l2;
 use std::path::{Path, PathBuf};
@@ -67,28 +67,43 @@ fn unstable_node(camera: &Camera) -> Finding {
     )
 }
 
-/// Reports V4L2 cameras of a rig that are not connected.
+/// Reports cameras of a rig whose rig file names no device, and V4L2 cameras that are not connected.
 #[cfg(target_os = "linux")]
 pub(super) fn missing(rig: &Rig) -> Vec<Finding> {
-    let cameras = rig
-        .cameras
+    rig.cameras
         .iter()
-        .filter(|camera| camera.driver == CameraDriver::V4l2);
-    let devices = cameras.flat_map(|camera| {
-        let depth = camera.depth.as_ref().map(|depth| &depth.device);
-        std::iter::once(&camera.device)
-            .chain(depth)
-            .map(move |device| (&camera.name, device))
-    });
-    let missing = devices.filter_map(|(name, device)| {
+        .flat_map(|camera| {
+            let unnamed = camera.missing_devices().into_iter().map(unnamed_device);
+            unnamed.chain(absent_devices(camera))
+        })
+        .collect()
+}
+
+#[cfg(target_os = "linux")]
+fn unnamed_device(missing: MissingKey) -> Finding {
+    let message = format!("{} is missing", missing.key);
+    Finding::fail("cameras", message, missing.remedy)
+}
+
+/// The devices that the rig file names for a V4L2 camera, and that are not connected.
+#[cfg(target_os = "linux")]
+fn absent_devices(camera: &Camera) -> impl Iterator<Item = Finding> {
+    let name = &camera.name;
+    let is_v4l2 = camera.driver == CameraDriver::V4l2;
+    let depth = camera.depth.as_ref();
+    let devices = [
+        ("device", Some(&camera.device)),
+        ("depth.device", depth.map(|depth| &depth.device)),
+    ];
+    devices.into_iter().filter_map(move |(key, device)| {
+        let device = device.filter(|device| !device.is_empty() && is_v4l2)?;
         let problem = v4l2::check_connected(device).err()?;
         Some(Finding::fail(
             "cameras",
             format!("camera {name:?}: {problem}"),
-            format!("connect it, or set camera.{name}.device to one that fieldrig devices lists"),
+            format!("connect it, or set camera.{name}.{key} to one that `fieldrig devices` lists"),
         ))
-    });
-    missing.collect()
+    })
 }
 
 #[cfg(all(test, target_os = "linux"))]
@@ -110,6 +125,26 @@ mod tests {
             findings
                 .iter()
                 .any(|finding| finding.message.contains("\"no such serial\"")),
+            "{findings:?}"
+        );
+    }
+    #[test]
+    fn camera_without_a_device_is_reported_by_its_key() {
+        let rig = bundled_rig("static-arm.toml", &[("camera.wrist.driver", "v4l2")]);
+        let findings = missing(&rig);
+        assert!(
+            findings[0].message == "camera.wrist.device is missing"
+                && findings[0]
+                    .remedy
+                    .as_ref()
+                    .is_some_and(|remedy| remedy.contains("`fieldrig devices`")),
+            "{findings:?}"
+        );
+        // An empty name is not the name of a camera.
+        assert!(
+            findings
+                .iter()
+                .all(|finding| !finding.message.contains("\"\"")),
             "{findings:?}"
         );
     }

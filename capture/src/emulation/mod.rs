@@ -306,7 +306,8 @@ fn check(rig: &Rig) -> Result<(), BadInput> {
     if !is_any_emulated {
         return Err(BadInput(format!(
             "no device of this rig can be emulated: its cameras would stay real; to simulate all devices, use \
-             `fieldrig run {}`",
+             `fieldrig run {} {}`",
+            rig.path.argument(),
             Setting::Sim
         )));
     }
@@ -357,13 +358,8 @@ fn check_controller_address(text: &str, default_port: u16) -> anyhow::Result<()>
 
 /// Writes the rig file to run against the emulated devices, and the robot description next to it.
 fn write_rig(folder: &Path, rig: &Rig) -> anyhow::Result<PathBuf> {
-    let path = folder.join(drivers::recording::RIG_FILE);
-    let urdf = folder.join(drivers::recording::URDF_FILE);
-    // The rig file names the robot description, so both are in one folder.
-    for (path, text) in [(&path, &rig.to_toml()), (&urdf, &rig.arm.urdf_text)] {
-        files::write(path, text).with_context(|| format!("cannot write {}", path.display()))?;
-    }
-    Ok(path)
+    rig.write_resolved(folder)
+        .with_context(|| format!("cannot write into {}", folder.display()))
 }
 
 /// Devices that reply until they are dropped.

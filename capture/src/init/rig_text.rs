@@ -5,10 +5,11 @@ use super::GUESS;
 use super::arm_plan::{ArmPlan, ArmSource};
 use super::findings::{ControllerKind, FoundBus, FoundMotor, FoundServos};
 use super::plan::{CameraPlan, RigPlan, place};
+use crate::calibration_commands::{CalibrationCommand, where_the_target_is_from};
 use crate::config::CameraDriver;
 use drivers::can::{AllowedValues, FAMILIES, MotorKey, SettingValue};
 use kinematics::Transform;
-use messages::Setting;
+use messages::{Setting, quoted_for_shell};
 use std::fmt::Display;
 
 /// Maximum length of a line of a comment, in characters.
@@ -22,6 +23,7 @@ impl RigPlan {
     /// * `rig`: path of the file, for the commands in its comments.
     #[must_use]
     pub fn to_toml(&self, rig: &str) -> String {
+        let rig = &quoted_for_shell(rig);
         let mut text = RigText::default();
         self.write_head(&mut text, rig);
         match &self.arm {
@@ -73,13 +75,15 @@ impl RigPlan {
             format!("The camera is {place}. {others}")
         };
         text.key("parent", quoted(camera.parent.name()), &about);
+        let scene = scene_command(rig);
         let commands = if self.arm.is_some() {
-            let target = Setting::Target;
             format!(
-                "`fieldrig calibrate hand-eye {rig} {target} SPEC` or `fieldrig calibrate scene {rig}` measures it."
+                "`{}` measures it, {}; or `{scene}`, without a target.",
+                CalibrationCommand::HandEye.line(rig, &camera.name),
+                where_the_target_is_from()
             )
         } else {
-            format!("`fieldrig calibrate scene {rig}` measures it if the base moves.")
+            format!("`{scene}` measures it if the base moves.")
         };
         let about = format!(
             "{GUESS}pose of the camera (x right, y down, z forward) in that frame. {commands}"
@@ -92,7 +96,10 @@ impl RigPlan {
         self.write_lens(text, camera, rig);
         text.unknown(
             "stamp_to_mid_exposure_millis = { value = 0.0 }",
-            &format!("Time from the stamp of an image to mid-exposure. `fieldrig calibrate scene {rig}` measures it."),
+            &format!(
+                "Time from the stamp of an image to mid-exposure. `{}` measures it.",
+                scene_command(rig)
+            ),
         );
         let has_depth = camera
             .found
@@ -126,12 +133,19 @@ impl RigPlan {
             number(y)
         );
         let about = format!(
-            "{GUESS}a lens without distortion and with a horizontal field of view of {} degrees. `fieldrig calibrate intrinsics {rig} {} SPEC` measures it.",
+            "{GUESS}a lens without distortion and with a horizontal field of view of {} degrees. `{}` measures it, {}.",
             self.field_of_view_deg,
-            Setting::Target
+            CalibrationCommand::Intrinsics.line(rig, &camera.name),
+            where_the_target_is_from()
         );
         text.key("intrinsics", lens, &about);
     }
+}
+
+/// The command that calibrates the cameras of a rig file without a target, and writes the result into
+/// the rig file.
+fn scene_command(rig: &str) -> String {
+    format!("fieldrig calibrate scene {rig} {} {rig}", Setting::WriteRig)
 }
 
 /// Driver and device of a camera.

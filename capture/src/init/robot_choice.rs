@@ -1,6 +1,7 @@
 //! The robot of a new rig file, by name or from a robot description.
 
 use super::wishes::RobotChoice;
+use crate::doctor::{Finding, meshes_of};
 use crate::known_robots::{BUILTIN_PREFIX, KnownRobot};
 use anyhow::Context;
 use messages::{BadInput, Setting};
@@ -43,6 +44,21 @@ impl RobotChoice {
             path: path.display().to_string(),
             text,
         })
+    }
+}
+
+impl RobotChoice {
+    /// Warnings about the mesh files that the robot description names.
+    ///
+    /// * `rig`: path of the rig file.
+    #[must_use]
+    pub fn mesh_warnings(&self, rig: &Path) -> Vec<Finding> {
+        let Self::Urdf { path, text } = self else {
+            return Vec::new();
+        };
+        let urdf = rig.with_file_name(path);
+        let urdf = std::path::absolute(&urdf).unwrap_or(urdf);
+        meshes_of(text, urdf.parent().unwrap_or(Path::new("")))
     }
 }
 
@@ -95,7 +111,7 @@ mod tests {
         );
         let error = RobotChoice::named("ur5").expect_err("unknown").to_string();
         assert!(
-            error.contains("did you mean \"ur5e\"") && error.ends_with("so101, none"),
+            error.contains("a UR5 has a shoulder") && error.ends_with("so101, none"),
             "{error}"
         );
     }

@@ -144,6 +144,23 @@ fn guessed_keys(plan: &RigPlan) -> Vec<String> {
 }
 
 #[test]
+fn commands_that_measure_guesses_are_complete() {
+    let (_, plan) = rig(&wishes(RobotChoice::Automatic), &Findings::default());
+    let remedies: Vec<String> = guesses(&plan.to_toml("my rig.toml"))
+        .iter()
+        .map(Finding::to_string)
+        .collect();
+    let remedies = remedies.join("\n");
+    for command in [
+        "`fieldrig calibrate intrinsics 'my rig.toml' camera wrist target charuco:",
+        "`fieldrig calibrate hand-eye 'my rig.toml' camera wrist target charuco:",
+        "`fieldrig calibrate scene 'my rig.toml' write_rig 'my rig.toml'`",
+    ] {
+        assert!(remedies.contains(command), "{remedies}");
+    }
+}
+
+#[test]
 fn doctor_names_every_guess_and_nothing_that_is_known() {
     let (_, plan) = rig(&wishes(RobotChoice::Automatic), &Findings::default());
     assert_eq!(

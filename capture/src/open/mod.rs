@@ -53,10 +53,14 @@ use tags::TagBaseSource;
 pub use assumed_lens::approximate_intrinsics;
 pub(crate) use assumed_lens::assume_calibration;
 
-/// Hint in error messages about devices that cannot be opened.
-fn sim_hint() -> String {
+/// End of the hint that devices can be simulated.
+const SIM_HINT_END: &str = " replaces every device by its simulated twin";
+
+/// Hint in error messages about devices of a rig that cannot be opened.
+fn sim_hint(rig: &Rig) -> String {
     format!(
-        "`fieldrig run {}` replaces every device by its simulated twin",
+        "`fieldrig run {} {}`{SIM_HINT_END}",
+        rig.path.argument(),
         Setting::Sim
     )
 }
@@ -66,8 +70,10 @@ fn sim_hint() -> String {
 #[must_use]
 pub fn without_sim_hint(error: &anyhow::Error) -> String {
     let text = format!("{error:#}");
-    let hint = format!("; {}", sim_hint());
-    text.strip_suffix(&hint).unwrap_or(&text).to_owned()
+    let before_hint = text
+        .strip_suffix(SIM_HINT_END)
+        .and_then(|rest| rest.rsplit_once("; `"));
+    before_hint.map_or(text.clone(), |(before, _)| before.to_owned())
 }
 
 /// The port of a Franka controller.
@@ -174,7 +180,10 @@ fn open_rig(
     // The settings are checked before any device is opened, so that an error of the rig file does
     // not start cameras.
     if let Some(device) = unsupported_device(&rig) {
-        bail!("{device} cannot be opened by this version; {}", sim_hint());
+        bail!(
+            "{device} cannot be opened by this version; {}",
+            sim_hint(&rig)
+        );
     }
     check_arm(&rig)?;
     let (source, stamp_clock, steered_arm) = if is_steered {
@@ -202,15 +211,15 @@ fn open_rig(
 /// Opens the real and the simulated devices of a rig for reading.
 fn open_devices(rig: &mut Rig) -> anyhow::Result<(Box<dyn Source>, StampClock)> {
     let opened = real::open(rig, &mut real::end_on_failure);
-    let (real, _) = opened.map_err(with_sim_hint)?;
+    let (real, _) = opened.map_err(|error| with_sim_hint(error, rig))?;
     if is_any_simulated(rig) {
         return simulate(rig, real);
     }
     Ok((Box::new(LiveDevices::new(real)?), StampClock::Computer))
 }
 
-fn with_sim_hint(error: anyhow::Error) -> anyhow::Error {
-    anyhow!("{error:#}; {}", sim_hint())
+fn with_sim_hint(error: anyhow::Error, rig: &Rig) -> anyhow::Error {
+    anyhow!("{error:#}; {}", sim_hint(rig))
 }
 
 /// Replaces every device by its simulated twin. Calibration that only a real camera could report is
@@ -464,7 +473,7 @@ mod tests {
                 .expect("no such driver")
         );
         assert!(
-            message.contains("rgbd") && message.contains("run sim`"),
+            message.contains("rgbd") && message.contains("static-arm.toml sim`"),
             "{message}"
         );
     }
@@ -491,7 +500,7 @@ mod tests {
         let message = error_of(&on_base);
         assert!(
             message.contains("no V4L2 camera named \"no such serial\"")
-                && message.contains("run sim`"),
+                && message.contains("static-arm.toml sim`"),
             "{message}"
         );
         let without_scale = [&on_base[..3], &on_base[5..]].concat();
@@ -543,7 +552,7 @@ mod tests {
             "--features realsense"
         };
         assert!(
-            message.contains(expected) && message.contains("run sim`"),
+            message.contains(expected) && message.contains("static-arm.toml sim`"),
             "{message}"
         );
     }

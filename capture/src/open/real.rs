@@ -83,6 +83,7 @@ pub(super) fn open(
 /// Opens a camera. The depth images of a V4L2 camera come from a second device. A simulated camera
 /// has no device.
 fn cameras_of(camera: &mut Camera) -> anyhow::Result<Vec<Box<dyn drivers::Camera>>> {
+    camera.require_devices()?;
     match camera.driver {
         CameraDriver::V4l2 => v4l2_cameras(camera),
         CameraDriver::Nokhwa => Ok(vec![nokhwa_camera(camera)?]),
@@ -414,10 +415,10 @@ fn v4l2_color(camera: &Camera) -> Config {
 /// exposure.
 #[cfg(target_os = "linux")]
 fn v4l2_depth(camera: &Camera, depth: &Depth) -> anyhow::Result<Config> {
-    let Some(meters_per_count) = depth.meters_per_count.filter(|_| !depth.device.is_empty()) else {
+    let Some(meters_per_count) = depth.meters_per_count else {
         let name = &camera.name;
         bail!(
-            "camera {name:?}: depth by V4L2 needs camera.{name}.depth.device and camera.{name}.depth.meters_per_count"
+            "camera.{name}.depth.meters_per_count is missing: set it to the meters per count of the depth images, 0.001 for a RealSense D4xx"
         );
     };
     Ok(Config {

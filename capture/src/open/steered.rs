@@ -102,7 +102,7 @@ pub(super) fn open_devices(
             let (source, arm) = open_simulated(rig)?;
             return Ok((source, StampClock::Computer, arm));
         }
-        _ => open_real(rig).map_err(super::with_sim_hint)?,
+        _ => open_real(rig).map_err(|error| super::with_sim_hint(error, rig))?,
     };
     let source = Box::new(LiveDevices::new(devices)?);
     Ok((source, StampClock::Computer, arm))

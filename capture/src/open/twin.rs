@@ -2,7 +2,7 @@
 //! rig file.
 
 use crate::config::{ArmDriver, BaseDriver, Parent, Rig};
-use crate::mesh_files::mesh_file_candidates;
+use crate::mesh_files::found_mesh_file;
 use anyhow::{Context, bail};
 use files::Budget;
 use kinematics::shape::Geometry;
@@ -165,8 +165,7 @@ fn meshes(robot: &Robot, urdf_folder: &Path) -> BTreeMap<String, Arc<[u8]>> {
         if meshes.contains_key(file) {
             continue;
         }
-        let candidates = mesh_file_candidates(file, urdf_folder);
-        let Some(path) = candidates.iter().find(|path| path.is_file()) else {
+        let Some(path) = found_mesh_file(file, urdf_folder) else {
             continue;
         };
         let max_bytes = Budget::MESH.max_bytes.min(budget.max_bytes);
@@ -174,7 +173,7 @@ fn meshes(robot: &Robot, urdf_folder: &Path) -> BTreeMap<String, Arc<[u8]>> {
             max_bytes,
             ..Budget::MESH
         };
-        if let Ok(bytes) = files::read(path, limit) {
+        if let Ok(bytes) = files::read(&path, limit) {
             budget = budget.after(bytes.len() as u64);
             meshes.insert(file.clone(), bytes.into());
         }

@@ -18,6 +18,10 @@ const POLL_INTERVAL: Duration = Duration::from_millis(1);
 const ONE_CLIENT_HINT: &str = "FCI accepts one client at a time: stop the other one; if the arm is only read, that one may \
                           send the joint states instead (arm.driver = \"udp\", docs/reference/udp.md)";
 
+/// What to check if something else than a controller answers. A test compares the port.
+const CHECK_ADDRESS: &str =
+    "check that the address is that of a Franka controller, and its port that of FCI, 1337";
+
 /// An open connection. Dropping it closes the connection.
 #[derive(Debug)]
 pub(super) struct Connection {
@@ -115,10 +119,9 @@ fn connect(address: &str, version: u16) -> Result<ConnectResponse, String> {
         return Err(format!("it does not answer. {ONE_CLIENT_HINT}"));
     };
     let [status, low, high, ..] = *message_payload(HeaderLayout::Robot, &message) else {
-        return Err(
-            "its answer to the first message is too short; check that the address is that of a Franka controller"
-                .to_owned(),
-        );
+        return Err(no_controller(
+            "its answer to the first message is too short",
+        ));
     };
     // A controller that accepts us but has another version would send states that we cannot decode.
     match (status, u16::from_le_bytes([low, high])) {
@@ -130,11 +133,21 @@ fn connect(address: &str, version: u16) -> Result<ConnectResponse, String> {
     }
 }
 
-/// The reason if the controller closes the connection during the negotiation.
+/// The reason if the negotiation fails.
 fn disconnected(error: FrankaError) -> String {
+    let text = error_text(&error);
+    let text = text.trim_end_matches('.');
+    match error {
+        // The header of the answer is impossible, for example because it is text.
+        FrankaError::Protocol(_) => no_controller(text),
+        _ => format!("it closed the connection ({text}). {ONE_CLIENT_HINT}"),
+    }
+}
+
+/// The reason if the answer is not that of a controller.
+fn no_controller(problem: &str) -> String {
     format!(
-        "it closed the connection ({}). {ONE_CLIENT_HINT}",
-        error_text(&error).trim_end_matches('.')
+        "what answers there is no control interface (FCI) of a Franka controller: {problem}; {CHECK_ADDRESS}"
     )
 }
 

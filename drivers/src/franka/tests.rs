@@ -8,6 +8,7 @@ use super::emulated::{
 use super::test_pace::Pace;
 use super::{ArmConfig, FciVersion, FrankaArm, N_JOINTS};
 use crate::{Arm, Error};
+use franka::wire::ROBOT_COMMAND_PORT;
 use franka::{
     ControllerMode, FrankaError, JointPositions, MoveStatus, RealtimeConfig, Robot, RobotMode,
 };
@@ -264,6 +265,25 @@ fn unresponsive_or_unsupported_controller_is_error() {
         no_answer.contains("does not answer") && no_answer.contains("udp"),
         "{no_answer}"
     );
+    let listener = std::net::TcpListener::bind(FREE_PORT).unwrap();
+    let address = listener.local_addr().unwrap();
+    let thread = std::thread::spawn(move || {
+        let (mut stream, _) = listener.accept().unwrap();
+        stream.read_exact(&mut [0; 16]).unwrap();
+        stream
+            .write_all(b"HTTP/1.1 400 Bad Request\r\n\r\n")
+            .unwrap();
+        stream
+    });
+    let web_server = FrankaArm::open(&config(address)).unwrap_err().to_string();
+    assert!(
+        web_server.contains("no control interface (FCI) of a Franka controller")
+            && web_server.contains(&address.to_string())
+            && web_server.contains(&format!("that of FCI, {ROBOT_COMMAND_PORT}"))
+            && !web_server.contains("one client"),
+        "{web_server}"
+    );
+    thread.join().unwrap();
     for (answer, expected) in [
         (vec![1, 7, 0], "version 7"),
         (vec![9, 10, 0], "status 9"),

@@ -18,6 +18,8 @@ const MAX_ANSWER: Duration = Duration::from_secs(2);
 pub(super) const POLL: Duration = Duration::from_millis(100);
 /// Bytes to receive at once: more than the states of 100 ms.
 const RECEIVE_BYTES: usize = 32 * 1024;
+/// What to check if something else than a controller answers. A test compares the port.
+const CHECK_ADDRESS: &str = "check that the address is that of a controller of Universal Robots, and its port that of RTDE, 30004";
 /// Major version of PolyScope on CB3 controllers. Those of e-Series and later are higher.
 const CB3_MAJOR: u32 = 3;
 
@@ -144,7 +146,7 @@ impl Connection {
 
     /// The next data package that has already been received.
     pub(super) fn next_received(&mut self) -> Result<Option<Reading>, String> {
-        while let Some(package) = self.packages.splitter.next()? {
+        while let Some(package) = self.packages.next_received()? {
             match package.package_type {
                 PackageType::Data => return Ok(Some(self.reading(&package))),
                 _ => log_text(&package),
@@ -177,6 +179,8 @@ fn log_text(package: &Package) {
 struct PackageStream {
     stream: TcpStream,
     splitter: PackageSplitter,
+    /// Whether the peer has sent a package, so that it is the RTDE interface of a controller.
+    is_rtde: bool,
 }
 
 impl PackageStream {
@@ -191,6 +195,7 @@ impl PackageStream {
         let mut packages = Self {
             stream,
             splitter: PackageSplitter::default(),
+            is_rtde: false,
         };
         packages.agree_on_protocol()?;
         let version = packages.controller_version()?;
@@ -285,7 +290,7 @@ impl PackageStream {
         self.send(package_type, payload)?;
         let deadline = clock::now() + MAX_ANSWER;
         loop {
-            while let Some(package) = self.splitter.next()? {
+            while let Some(package) = self.next_received()? {
                 if package.package_type == package_type {
                     return Ok(package.payload);
                 }
@@ -294,10 +299,25 @@ impl PackageStream {
             let remaining = deadline.duration_since(clock::now());
             if remaining.is_zero() {
                 return Err(format!(
-                    "it does not answer the request {package_type:?} within {MAX_ANSWER:?}; check that the address is that of a controller of Universal Robots, and that RTDE is enabled at the pendant (Settings, Security, Services)"
+                    "it does not answer the request {package_type:?} within {MAX_ANSWER:?}; {CHECK_ADDRESS}, and that RTDE is enabled at the pendant (Settings, Security, Services)"
                 ));
             }
             self.receive(remaining)?;
+        }
+    }
+
+    /// The next package that has already been received.
+    fn next_received(&mut self) -> Result<Option<Package>, String> {
+        match self.splitter.next() {
+            Ok(package) => {
+                self.is_rtde |= package.is_some();
+                Ok(package)
+            }
+            // The controller or the network has damaged the stream.
+            Err(problem) if self.is_rtde => Err(problem.to_string()),
+            Err(problem) => Err(format!(
+                "what answers there is no RTDE interface of a controller of Universal Robots: {problem}; {CHECK_ADDRESS}"
+            )),
         }
     }
 
@@ -317,7 +337,10 @@ impl PackageStream {
             .map_err(failed)?;
         let mut bytes = [0; RECEIVE_BYTES];
         match self.stream.read(&mut bytes) {
-            Ok(0) => Err("it closed the connection".to_owned()),
+            Ok(0) if self.is_rtde => Err("it closed the connection".to_owned()),
+            Ok(0) => Err(format!(
+                "it closed the connection without an answer; {CHECK_ADDRESS}"
+            )),
             Ok(n) => {
                 self.splitter.push(&bytes[..n]);
                 Ok(())

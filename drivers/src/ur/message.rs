@@ -4,6 +4,8 @@
 pub(super) const PROTOCOL_VERSION: u16 = 2;
 /// Size of the header: two bytes for the size of the package, and one for its type.
 const HEADER_BYTES: usize = 3;
+/// Number of bytes of a foreign protocol that a message shows: the first words of its greeting.
+const MAX_SHOWN_BYTES: usize = 24;
 
 /// Type of a package. The values are ASCII letters.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -60,6 +62,22 @@ pub(super) fn encode(package_type: PackageType, payload: &[u8]) -> Vec<u8> {
     bytes
 }
 
+/// The peer sent bytes that are no package of RTDE.
+#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
+#[error("it sent \"{}\", which is no package of RTDE", .start.escape_ascii())]
+pub(super) struct NotRtde {
+    /// The first bytes, which often name the protocol of the peer.
+    start: Vec<u8>,
+}
+
+impl NotRtde {
+    fn new(bytes: &[u8]) -> Self {
+        Self {
+            start: bytes[..bytes.len().min(MAX_SHOWN_BYTES)].to_vec(),
+        }
+    }
+}
+
 /// Splits the bytes of a TCP stream into packages.
 #[derive(Debug, Default)]
 pub(super) struct PackageSplitter {
@@ -77,20 +95,14 @@ impl PackageSplitter {
     /// # Errors
     /// If the bytes are not RTDE. The stream has no markers, so the next package cannot be found,
     /// and the connection must be closed.
-    pub(super) fn next(&mut self) -> Result<Option<Package>, String> {
+    pub(super) fn next(&mut self) -> Result<Option<Package>, NotRtde> {
         let [high, low, value, ..] = *self.buffer else {
             return Ok(None);
         };
         let size = usize::from(u16::from_be_bytes([high, low]));
-        if size < HEADER_BYTES {
-            return Err(format!(
-                "it sent a package of {size} bytes, but the header alone has {HEADER_BYTES}: it does not speak RTDE"
-            ));
-        }
-        let Some(package_type) = PackageType::of_value(value) else {
-            return Err(format!(
-                "it sent a package of the unknown type {value}: it does not speak RTDE"
-            ));
+        let Some(package_type) = PackageType::of_value(value).filter(|_| size >= HEADER_BYTES)
+        else {
+            return Err(NotRtde::new(&self.buffer));
         };
         if self.buffer.len() < size {
             return Ok(None);
@@ -159,14 +171,20 @@ mod tests {
 
     #[test]
     fn bytes_that_are_not_rtde_are_an_error() {
-        for (bytes, expected) in [
-            (&[0, 2, b'U'][..], "2 bytes"),
-            (b"HTTP/1.1 400 Bad Request", "type 84"),
+        for (bytes, shown) in [
+            (&[0, 2, b'U'][..], r#"it sent "\x00\x02U", "#),
+            (
+                b"HTTP/1.1 400 Bad Request\r\nServer: nginx",
+                r#"it sent "HTTP/1.1 400 Bad Request", "#,
+            ),
+            (b"SSH-2.0-OpenSSH_9.2\r\n", r#""SSH-2.0-OpenSSH_9.2\r\n""#),
+            // The primary interface of a controller begins with the size in four bytes.
+            (&[0, 0, 0, 79, 16], r#""\x00\x00\x00O\x10""#),
         ] {
             let mut splitter = PackageSplitter::default();
             splitter.push(bytes);
-            let error = splitter.next().unwrap_err();
-            assert!(error.contains(expected), "{error}");
+            let error = splitter.next().unwrap_err().to_string();
+            assert!(error.contains(shown), "{error}");
         }
     }
 

@@ -307,9 +307,9 @@ fn unsupported_controllers_are_reported_with_a_remedy() {
     for (answer, expected) in [
         (
             &b"HTTP/1.1 400 Bad Request\r\n\r\n"[..],
-            "does not speak RTDE",
+            "what answers there is no RTDE interface of a controller of Universal Robots: it sent \"HTTP/1.1 400 Bad Request\"",
         ),
-        (&[], "closed the connection"),
+        (&[], "closed the connection without an answer"),
     ] {
         let listener = TcpListener::bind(address).unwrap();
         let thread = std::thread::spawn(move || {
@@ -320,6 +320,11 @@ fn unsupported_controllers_are_reported_with_a_remedy() {
         });
         let message = UrArm::open(&config(address)).unwrap_err().to_string();
         assert!(message.contains(expected), "{message}");
+        assert!(
+            message.contains(&address.to_string())
+                && message.contains(&format!("that of RTDE, {RTDE_PORT}")),
+            "{message}"
+        );
         thread.join().unwrap();
     }
     let listener = TcpListener::bind(address).unwrap();
@@ -490,6 +495,9 @@ fn only_a_controller_tells_its_version() {
         client.read_exact(&mut [0]).unwrap();
     });
     let error = controller_version(&address).unwrap_err().to_string();
-    assert!(error.contains(&address), "{error}");
+    assert!(
+        error.contains(&address) && error.contains("it sent \"SSH-2.0-OpenSSH_9.2"),
+        "{error}"
+    );
     greeting.join().unwrap();
 }

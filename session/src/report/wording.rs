@@ -70,6 +70,7 @@ pub(super) fn label(key: &str) -> String {
         "range_scans" => "range scans used",
         "range_points" => "points of the range scans",
         "max_position_error_m" => "largest error of a camera position (simulation)",
+        "resume_command" => "continue the run",
         "seed" => "random seed",
         other => return other.replace('_', " "),
     };

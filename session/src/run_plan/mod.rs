@@ -24,8 +24,9 @@ use crate::data::DataOptions;
 use crate::live_loop::Pace;
 use crate::method_options;
 use crate::methods::methods_of;
-use crate::next_commands::{self, DataSource};
+use crate::next_commands::DataSource;
 use crate::previous_run::{FinishedRun, PreviousRun, limit_flags, out_folder};
+use crate::resume_command::ResumeCommand;
 use crate::run_folder;
 use crate::session::Limits;
 use crate::session_setup::Services;
@@ -126,7 +127,12 @@ impl RunPlan {
         previous: Option<PreviousLiveRun>,
         services: Services<'_>,
     ) -> anyhow::Result<PreparedRun<'_>> {
-        run_folder::check_out(self.out.as_deref(), self.resume.as_deref(), None)?;
+        run_folder::check_out(
+            self.out.as_deref(),
+            self.resume.as_deref(),
+            None,
+            &self.resume_command(),
+        )?;
         if let Some(file) = &self.record {
             self.check_record(file)?;
         }
@@ -304,11 +310,18 @@ impl RunPlan {
         }
     }
 
-    /// The command that resumes the run in a folder.
-    fn resume_command(&self, folder: &Path) -> String {
-        let [rig, folder] =
-            [&*self.rig_file, folder].map(|path| next_commands::quoted(&path.to_string_lossy()));
-        format!("fieldrig run {rig} {} {folder}", Setting::Resume)
+    /// The command that continues this run.
+    fn resume_command(&self) -> ResumeCommand {
+        match &self.input {
+            // In real time, the run did not use all images of the recording, so `train` would not
+            // find the same keyframes.
+            RunInput::Recording {
+                path,
+                is_real_time: false,
+                ..
+            } => ResumeCommand::of_recording(path, &self.rig_file),
+            _ => ResumeCommand::of_devices(&self.rig_file),
+        }
     }
 
     /// Name of the rig file without its extension.

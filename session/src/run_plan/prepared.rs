@@ -339,7 +339,7 @@ fn session(
         resumed,
         folder,
         plan.data_source(folder),
-        plan.resume_command(folder),
+        plan.resume_command(),
     )?;
     // The model of the checkpoint was already trained on its keyframes, so only other keyframes are
     // pushed.

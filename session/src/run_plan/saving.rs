@@ -7,6 +7,7 @@ use crate::latency::Latency;
 use crate::live_loop::{EndedLoop, LiveLoop};
 use crate::models_verdict::{likely_cause_of, verdict_of};
 use crate::next_commands::DataSource;
+use crate::resume_command::ResumeCommand;
 use crate::run_folder::{self, CreatedFolders};
 use crate::session::{self, EndViewers, EndingSession, FinishedModel, Session};
 use crate::verdict::ImageLoss;
@@ -18,7 +19,7 @@ use keyframe::{Keyframe, Split};
 use messages::InsufficientData;
 use serde::Serialize;
 use std::collections::BTreeMap;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::sync::{Arc, OnceLock};
 use std::time::Duration;
 use viz::{CheckpointState, Grade, Hub, RequestedCheckpoint, RunResult, Status, Verdict};
@@ -211,6 +212,10 @@ pub(super) fn save(
     let mut details = DetailsOfRun {
         rig: plan.rig_name(),
         seed: rig.train.seed,
+        resume_command: plan
+            .checkpoints
+            .are_written()
+            .then(|| plan.resume_command()),
         input_result: &input_result,
         data_losses: &data_losses,
         latencies,
@@ -219,7 +224,7 @@ pub(super) fn save(
     let mut endings = Vec::new();
     for (session, out) in sessions.into_iter().zip(folders) {
         endings.push(EndingSession {
-            details: details.of(&session),
+            details: details.of(&session, &out),
             session: if is_recorded {
                 session
             } else {
@@ -309,6 +314,9 @@ struct RunDetails {
     range_scans: usize,
     range_points: usize,
     data_losses: Vec<String>,
+    /// The command line that continues the run, if it has checkpoints.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    resume_command: Option<String>,
     /// Estimated base pose at each station after the first.
     stations: Vec<StationReport>,
     /// Durations from mid-exposure to the model and to viewers, by name; only for the first model.
@@ -323,6 +331,8 @@ struct RunDetails {
 struct DetailsOfRun<'a> {
     rig: String,
     seed: u64,
+    /// `None` if the run has no checkpoints.
+    resume_command: Option<ResumeCommand>,
     input_result: &'a InputResult,
     data_losses: &'a [String],
     latencies: Vec<(String, Latency)>,
@@ -330,8 +340,8 @@ struct DetailsOfRun<'a> {
 }
 
 impl DetailsOfRun<'_> {
-    /// The entries for one model. Only the first one gets the latencies.
-    fn of(&mut self, session: &Session) -> RunDetails {
+    /// The entries for one model, which is saved in `folder`. Only the first one gets the latencies.
+    fn of(&mut self, session: &Session, folder: &Path) -> RunDetails {
         let InputResult { join, stations, .. } = self.input_result;
         let Counts {
             evicted,
@@ -355,6 +365,10 @@ impl DetailsOfRun<'_> {
                 .map(|scan| scan.points_in_world_m.len())
                 .sum(),
             data_losses: self.data_losses.to_vec(),
+            resume_command: self
+                .resume_command
+                .as_ref()
+                .map(|command| command.line(folder)),
             stations: stations
                 .as_ref()
                 .map_or(Vec::new(), |stations| stations.reports().to_vec()),

@@ -3,7 +3,7 @@
 //! Sources of the formats: 3D Systems, "Stereolithography Interface Specification" (1989), and
 //! Wavefront, "Advanced Visualizer Manual", appendix B1 (OBJ).
 
-use capture::mesh_file_candidates;
+use capture::{found_mesh_file, missing_mesh_file};
 use files::Budget;
 use std::path::Path;
 
@@ -20,12 +20,9 @@ const NORMAL_BYTES: usize = 3 * NUMBER_BYTES;
 ///
 /// Why it cannot be read, in one sentence.
 pub(super) fn read(file: &str, urdf_folder: &Path) -> Result<Vec<[f64; 3]>, String> {
-    let candidates = mesh_file_candidates(file, urdf_folder);
-    let path = candidates
-        .iter()
-        .find(|path| path.is_file())
-        .ok_or_else(|| format!("no such file near {}", urdf_folder.display()))?;
-    let bytes = files::read(path, Budget::MESH).map_err(|error| error.to_string())?;
+    let path =
+        found_mesh_file(file, urdf_folder).ok_or_else(|| missing_mesh_file(file, urdf_folder))?;
+    let bytes = files::read(&path, Budget::MESH).map_err(|error| error.to_string())?;
     let extension = file.rsplit('.').next().unwrap_or_default();
     let vertices = match extension.to_ascii_lowercase().as_str() {
         "stl" => stl(&bytes)?,

@@ -8,6 +8,9 @@ use capture::config::Rig;
 use capture::open::SteeredArm;
 use kinematics::Chain;
 use kinematics::urdf::{JointKind, Robot};
+use messages::counted;
+use std::cell::RefCell;
+use std::collections::BTreeMap;
 use std::path::Path;
 use steering::Body;
 
@@ -28,12 +31,18 @@ pub(super) fn chain_and_body(rig: &Rig, urdf_folder: &Path) -> anyhow::Result<Ch
     let arm = &rig.arm;
     let robot = Robot::parse(&arm.urdf_text).context("the arm's URDF")?;
     let chain = Chain::new(&robot, &arm.base_link, &arm.flange_link).context("the arm's URDF")?;
+    let unreadable = RefCell::new(BTreeMap::new());
     let vertices_of = |file: &str| {
         mesh_vertices::read(file, urdf_folder)
-            .map_err(|why| log::warn!("steering: the mesh {file:?}: {why}"))
+            .map_err(|why| unreadable.borrow_mut().insert(file.to_owned(), why))
             .ok()
     };
-    let body = Body::new(&robot, &chain, &vertices_of).context(
+    let body = Body::new(&robot, &chain, &vertices_of);
+    // One line for all of them, because they usually have the same cause.
+    if let Some(warning) = describe(&unreadable.into_inner()) {
+        log::warn!("steering: {warning}");
+    }
+    let body = body.context(
         "the arm cannot be steered, because its size is unknown: add <collision> shapes to its URDF",
     )?;
     for note in body.notes() {
@@ -48,6 +57,13 @@ pub(super) fn chain_and_body(rig: &Rig, urdf_folder: &Path) -> anyhow::Result<Ch
         chain,
         body,
     })
+}
+
+/// How many mesh files cannot be read, and why the first one cannot; `None` if all can be read.
+fn describe(unreadable: &BTreeMap<String, String>) -> Option<String> {
+    let (file, why) = unreadable.first_key_value()?;
+    let files = counted(unreadable.len() as u64, "mesh file");
+    Some(format!("cannot read {files}, the first is {file:?}: {why}"))
 }
 
 impl ChainAndBody {
@@ -68,5 +84,22 @@ impl ChainAndBody {
             body: self.body.clone(),
             port: arm.port().clone(),
         })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn one_warning_describes_all_unreadable_meshes() {
+        let all = [("a.dae", "convert it"), ("b.stl", "no such file")];
+        let all = all.map(|(file, why)| (file.to_owned(), why.to_owned()));
+        let warning = describe(&BTreeMap::from(all)).expect("a warning");
+        assert_eq!(
+            warning,
+            "cannot read 2 mesh files, the first is \"a.dae\": convert it"
+        );
+        assert_eq!(describe(&BTreeMap::new()), None);
     }
 }

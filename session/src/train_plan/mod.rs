@@ -12,12 +12,13 @@ use crate::error::is_rejection;
 use crate::models_verdict::{likely_cause_of, verdict_of};
 use crate::previous_run::{FinishedRun, PreviousRun, limit_flags, out_folder};
 use crate::read_progress::OnReadProgress;
+use crate::resume_command::ResumeCommand;
 use crate::run_folder::{self, CreatedFolders};
 use crate::session::{FinishedModel, Limits};
 use crate::session_setup::Services;
 use crate::training_options::TrainingOptions;
 use crate::verdict::ImageLoss;
-use crate::{corrected_rig, next_commands, training};
+use crate::{corrected_rig, training};
 use capture::config::Rig;
 use messages::Setting;
 use replay::Replay;
@@ -138,6 +139,7 @@ impl TrainPlan {
             self.out.as_deref(),
             self.resume.as_deref(),
             Some(&self.data),
+            &self.resume_command(),
         )?;
         // Then the checkpoint of the resumed run is read, because its flags complete the given
         // ones.
@@ -233,11 +235,9 @@ impl TrainPlan {
         }
     }
 
-    /// The command that resumes training in a folder.
-    fn resume_command(&self, folder: &Path) -> String {
-        let [data, folder] =
-            [&*self.data, folder].map(|path| next_commands::quoted(&path.to_string_lossy()));
-        format!("fieldrig train {data} {} {folder}", Setting::Resume)
+    /// The command that continues this run.
+    fn resume_command(&self) -> ResumeCommand {
+        ResumeCommand::of_data(&self.data)
     }
 
     /// The folder of the results, if it is not a new one in `runs`.

@@ -75,6 +75,9 @@ struct TrainDetails<'a> {
     n_validation: usize,
     n_test: usize,
     data_losses: &'a [String],
+    /// The command line that continues the run, if it has checkpoints.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    resume_command: Option<String>,
     /// Estimated base pose at each station after the first.
     stations: &'a [StationReport],
     /// Amount of depth that was rendered from a model.
@@ -347,7 +350,7 @@ impl TrainRun<'_> {
         for (model, folder) in models.into_iter().zip(folders) {
             let list = folder.join("keyframes.txt");
             run_folder::write_keyframe_list(&list, &input.data.keyframes)?;
-            let resume_command = self.plan.resume_command(folder);
+            let resume_command = self.plan.resume_command();
             sessions.push(setup.session(model, folder, source.clone(), resume_command)?);
         }
         Ok(sessions)
@@ -385,6 +388,11 @@ impl TrainRun<'_> {
                     n_validation: data.of_split(Split::Validation).len(),
                     n_test: data.of_split(Split::Test).len(),
                     data_losses: &data.data_losses,
+                    resume_command: self
+                        .plan
+                        .checkpoints
+                        .are_written()
+                        .then(|| self.plan.resume_command().line(&out)),
                     stations: &data.stations,
                     rendered_depth: data.rendered_depth.as_ref(),
                 },

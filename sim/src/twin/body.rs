@@ -264,15 +264,12 @@ impl<'a> Writer<'a> {
                 self.estimated_masses.join(", ")
             );
         }
-        if !self.unreadable.is_empty() {
-            let reasons: Vec<_> = self
-                .unreadable
-                .iter()
-                .map(|(file, why)| format!("{file:?}: {why}"))
-                .collect();
+        // One line for all of them, because they usually have the same cause.
+        if let Some((file, why)) = self.unreadable.first_key_value() {
+            let n = self.unreadable.len();
+            let files = if n == 1 { "mesh file" } else { "mesh files" };
             log::info!(
-                "meshes that the simulator cannot draw are replaced by simpler shapes: {}",
-                reasons.join("; ")
+                "the simulator draws simpler shapes instead of {n} {files}, the first is {file:?}: {why}"
             );
         }
         if !self.barred.is_empty() {

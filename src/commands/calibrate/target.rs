@@ -3,11 +3,9 @@
 use super::target_argument;
 use crate::print;
 use calibrate::PrintedTargetTask;
+use messages::EXAMPLE_TARGET;
 use std::path::PathBuf;
 use targets::TargetSpec;
-
-/// This target fits on A4 and letter paper, and can be identified if parts of it are hidden.
-const DEFAULT_TARGET: &str = "charuco:5x7:34mm:26mm:5X5_100";
 
 const TARGET_HELP: &str = "Target to draw: chessboard:9x6:25mm (inner corners, square), charuco:5x7:34mm:26mm:5X5_100 \
      (squares, square, marker, dictionary), aprilgrid:6x6:20mm:0.3 (tags, tag, gap relative to the tag), \
@@ -16,7 +14,7 @@ const TARGET_HELP: &str = "Target to draw: chessboard:9x6:25mm (inner corners, s
 /// Flags of `calibrate target`.
 #[derive(Debug, clap::Args)]
 pub(crate) struct Args {
-    #[arg(long, value_name = "SPEC", default_value = DEFAULT_TARGET, value_parser = target_argument, help = TARGET_HELP)]
+    #[arg(long, value_name = "SPEC", default_value = EXAMPLE_TARGET, value_parser = target_argument, help = TARGET_HELP)]
     target: TargetSpec,
     /// PDF file to write; must not exist
     #[arg(long, value_name = "FILE.pdf")]

@@ -10,12 +10,13 @@ use capture::init::{
 };
 use capture::known_robots::KNOWN_ROBOTS;
 use drivers::NetworkAddress;
-use std::io::IsTerminal;
+use messages::BadInput;
+use std::io::{BufRead, IsTerminal};
 use std::path::Path;
 
 /// Maximum number of cameras whose places are asked for. The others get their defaults.
 const MAX_CAMERAS: usize = 3;
-/// Number of invalid answers after which the default is used.
+/// Number of invalid answers after which the command ends. A default never replaces an answer.
 const MAX_ATTEMPTS: usize = 3;
 
 /// Asks for what flags leave open.
@@ -121,7 +122,20 @@ fn ask_places(wishes: &Wishes, findings: &Findings) -> anyhow::Result<Vec<Wanted
 
 /// Asks one question on stderr. An empty answer, or the end of the input, is the default. After an
 /// invalid answer, the question is repeated.
+///
+/// # Errors
+/// If the input cannot be read, or if all answers are invalid.
 fn answer<T>(
+    question: &str,
+    default: &str,
+    read: impl Fn(&str) -> anyhow::Result<T>,
+) -> anyhow::Result<T> {
+    answer_from(&mut std::io::stdin().lock(), question, default, read)
+}
+
+/// Reads the answers of [`answer`] from `input`.
+fn answer_from<T>(
+    input: &mut impl BufRead,
     question: &str,
     default: &str,
     read: impl Fn(&str) -> anyhow::Result<T>,
@@ -135,7 +149,7 @@ fn answer<T>(
         // The question must be visible before the program waits.
         print::flush();
         let mut line = String::new();
-        std::io::stdin()
+        input
             .read_line(&mut line)
             .context("cannot read the answer")?;
         let text = match line.trim() {
@@ -147,5 +161,32 @@ fn answer<T>(
             Err(error) => print::notice(format_args!("{error:#}")),
         }
     }
-    read(default)
+    Err(BadInput(format!(
+        "{question}: {MAX_ATTEMPTS} invalid answers; nothing was written"
+    ))
+    .into())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_default_replaces_no_answer() {
+        let robot = |answers: &str| {
+            let read = |text: &str| Ok(RobotChoice::named(text)?);
+            answer_from(&mut answers.as_bytes(), "Robot", "ur5e", read)
+        };
+        let is_named = |choice: RobotChoice, name: &str| matches!(choice, RobotChoice::Known(robot) if robot.name == name);
+        for (answers, name) in [("", "ur5e"), ("\n", "ur5e"), ("ur5\npanda\n", "panda")] {
+            assert!(
+                is_named(robot(answers).expect(answers), name),
+                "{answers:?}"
+            );
+        }
+        let error = robot("ur5\nur5\nur5\n")
+            .expect_err("no known robot")
+            .to_string();
+        assert!(error.contains("nothing was written"), "{error}");
+    }
 }

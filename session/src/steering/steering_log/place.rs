@@ -31,7 +31,7 @@ pub fn files_of(run: &Path) -> Result<Vec<PathBuf>, BadInput> {
         }
     }
     Err(BadInput(format!(
-        "{} has no steering log ({FILE}): `fieldrig run {}` writes one when an operator takes control",
+        "{} has no steering log ({FILE}): `fieldrig run RIG.toml {}` writes one when an operator takes control",
         run.display(),
         Setting::EnableMotion
     )))
