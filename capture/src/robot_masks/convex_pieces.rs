@@ -88,7 +88,7 @@ fn around_sphere(radius_m: f64, center_z_m: f64) -> Piece {
 }
 
 /// Unit vectors that are distributed over the sphere: both poles, and rings between them.
-fn directions() -> Vec<Vector3<f64>> {
+pub(super) fn directions() -> Vec<Vector3<f64>> {
     let rings = (1..=N_RINGS).map(|ring| f64::from(ring) * STEP_RAD - FRAC_PI_2);
     let on_rings = rings.flat_map(|elevation_rad| {
         let (z, radius) = elevation_rad.sin_cos();

@@ -64,6 +64,7 @@ pub(crate) struct RobotMasks {
 
 /// A camera in whose images the robot is masked.
 struct MaskedCamera {
+    extent: Extent,
     parent: Parent,
     parent_from_camera: Transform,
     camera_from_depth: Transform,
@@ -112,7 +113,7 @@ impl RobotMasks {
     ///
     /// If the robot description does not match the rig.
     pub(crate) fn new(rig: &Rig) -> anyhow::Result<Option<Self>> {
-        let cameras: BTreeMap<_, _> = rig
+        let mut cameras: BTreeMap<_, _> = rig
             .cameras
             .iter()
             .filter(|camera| is_masked(camera, rig))
@@ -123,8 +124,10 @@ impl RobotMasks {
         }
         let arm = &rig.arm;
         let robot = Robot::parse(&arm.urdf_text).context("the arm's URDF")?;
-        // A base that does not move is a part of the static scene.
-        let extent = if rig.has_moving_base() {
+        let needs_all = cameras
+            .values()
+            .any(|camera: &MaskedCamera| camera.extent == Extent::WholeRobot);
+        let extent = if needs_all {
             Extent::WholeRobot
         } else {
             Extent::MovingLinks
@@ -137,6 +140,10 @@ impl RobotMasks {
             arm.urdf_folder.path(),
         )
         .context("the arm's URDF")?;
+        cameras.retain(|_, camera| shape.has_links(camera.extent));
+        if cameras.is_empty() {
+            return Ok(None);
+        }
         let base_from_flange =
             Chain::new(&robot, &arm.base_link, &arm.flange_link).context("the arm's URDF")?;
         let max_gap = Duration::from_secs_f64(rig.join.max_gap_millis * 1e-3);
@@ -160,7 +167,8 @@ impl RobotMasks {
 
     /// Whether images of a camera need the state of the robot.
     pub(crate) fn masks(&self, camera: &str) -> bool {
-        self.cameras.contains_key(camera) && !self.shape.is_empty()
+        let camera = self.cameras.get(camera);
+        camera.is_some_and(|camera| self.shape.has_pieces(camera.extent))
     }
 
     /// The parts of the robot that are not masked because their shapes are unknown, in one
@@ -177,7 +185,8 @@ impl RobotMasks {
             .iter()
             .next()
             .map(|(link, reason)| format!("{link:?}: {reason}"));
-        match (self.shape.is_empty(), first) {
+        let is_known = self.cameras().any(|camera| self.masks(camera));
+        match (!is_known, first) {
             (true, None) => Some(format!(
                 "{subject}, but no moving link of the URDF has a shape, so the moving robot will be trained into the model; \
                  add <visual> or <collision> shapes, or keep the robot out of view"
@@ -311,7 +320,7 @@ impl RobotMasks {
             (positions, view_from_camera * camera_from_base)
         });
         self.shape
-            .pieces_in_camera(&instants, &mut |piece| silhouette.add(piece));
+            .pieces_in_camera(camera.extent, &instants, &mut |piece| silhouette.add(piece));
         silhouette
     }
 
@@ -362,7 +371,15 @@ impl MaskedCamera {
         } else {
             0.0
         };
+        // A base that does not move is a part of the static scene, and a camera on a moving base is
+        // mounted so that the base does not hide its view.
+        let extent = if camera.parent == Parent::World && rig.has_moving_base() {
+            Extent::WholeRobot
+        } else {
+            Extent::MovingLinks
+        };
         Self {
+            extent,
             parent: camera.parent,
             parent_from_camera: camera.parent_from_camera,
             camera_from_depth: depth

@@ -14,17 +14,20 @@ use std::path::Path;
 const MAX_STEP_RAD: f64 = 0.35;
 const MAX_POSES: u32 = 16;
 
-/// The links of a robot that move, with their shapes.
+/// The links of a robot with their shapes.
 pub(super) struct RobotShape {
     root_from_base: JointedPose,
     links: Vec<Link>,
-    /// Names of moving links whose shapes cannot be read, with the reason.
+    /// Names of links whose shapes are not known, with the reason.
     unknown: BTreeMap<String, String>,
 }
 
 /// A link with its shape.
 struct Link {
     root_from_link: JointedPose,
+    /// Whether it moves relative to the base.
+    moves: bool,
+    /// Empty if its shape is unknown, or if it has none.
     pieces: Vec<Piece>,
 }
 
@@ -53,9 +56,15 @@ pub(super) enum Extent {
     WholeRobot,
 }
 
+impl Extent {
+    fn contains(self, moves: bool) -> bool {
+        moves || self == Self::WholeRobot
+    }
+}
+
 impl RobotShape {
-    /// Reads the shapes of the links. A link has its visual shapes. If a visual shape cannot be
-    /// read, or there is none, it has its collision shapes.
+    /// Reads the shapes of the links in an extent. A link has its visual shapes. If a visual shape
+    /// cannot be read, or there is none, it has its collision shapes.
     ///
     /// * `joints`: names of the measured joints.
     /// * `mesh_folder`: where the names of mesh files start; `None` if it is unknown.
@@ -82,37 +91,51 @@ impl RobotShape {
             links: Vec::new(),
             unknown: BTreeMap::new(),
         };
+        let has_shapes =
+            |link: &str| !robot.visuals(link).is_empty() || !robot.collisions(link).is_empty();
         for name in robot.links() {
             let root_from_link = match JointedPose::new(robot, [root, name.as_str()], joints) {
                 Ok(pose) => pose,
                 Err(error) => {
-                    shape.unknown.insert(name.clone(), error.to_string());
+                    if has_shapes(name) {
+                        shape.unknown.insert(name.clone(), error.to_string());
+                    }
                     continue;
                 }
             };
-            if extent == Extent::MovingLinks && !root_from_link.moves_on(&shape.root_from_base) {
+            let moves = root_from_link.moves_on(&shape.root_from_base);
+            if !extent.contains(moves) {
                 continue;
             }
-            let (pieces, unread) = meshes.pieces_of(robot, name);
-            if let Some(reason) = unread {
+            let (mut pieces, mut problem) = meshes.pieces_of(robot, name);
+            if let Some(reason) = root_from_link.problem().filter(|_| !pieces.is_empty()) {
+                pieces.clear();
+                problem = Some(reason);
+            }
+            if let Some(reason) = problem {
                 shape.unknown.insert(name.clone(), reason);
             }
-            if !pieces.is_empty() {
-                shape.links.push(Link {
-                    root_from_link,
-                    pieces,
-                });
-            }
+            shape.links.push(Link {
+                root_from_link,
+                moves,
+                pieces,
+            });
         }
         Ok(shape)
     }
 
-    /// Whether no link has a known shape.
-    pub(super) fn is_empty(&self) -> bool {
-        self.links.is_empty()
+    /// Whether there are links in an extent.
+    pub(super) fn has_links(&self, extent: Extent) -> bool {
+        self.links.iter().any(|link| extent.contains(link.moves))
     }
 
-    /// Names of moving links whose shapes are unknown, with the reason.
+    /// Whether the shape of any link in an extent is known.
+    pub(super) fn has_pieces(&self, extent: Extent) -> bool {
+        let mut links = self.links.iter();
+        links.any(|link| extent.contains(link.moves) && !link.pieces.is_empty())
+    }
+
+    /// Names of links whose shapes are not known, with the reason.
     pub(super) fn unknown(&self) -> &BTreeMap<String, String> {
         &self.unknown
     }
@@ -123,6 +146,7 @@ impl RobotShape {
     /// * `instants`: the positions of the measured joints and `camera_from_base`.
     pub(super) fn pieces_in_camera(
         &self,
+        extent: Extent,
         instants: &[(Vec<f64>, Transform)],
         draw: &mut dyn FnMut(&[Point3<f64>]),
     ) {
@@ -130,7 +154,7 @@ impl RobotShape {
             .iter()
             .map(|(q, camera_from_base)| camera_from_base * self.root_from_base.at(q, 0).inverse())
             .collect();
-        for link in &self.links {
+        for link in self.links.iter().filter(|link| extent.contains(link.moves)) {
             let poses = |pose_ix: u32| {
                 let both = instants.iter().zip(&camera_from_root);
                 both.map(move |((q, _), camera_from_root)| {
@@ -187,6 +211,17 @@ impl JointedPose {
             pose.chain.joint_names().iter().cloned().collect()
         };
         joints(self) != joints(other)
+    }
+
+    /// Why the place of the link is unknown. One joint that is not measured, such as that of a
+    /// gripper, moves a link on a known path. Several joints could move it anywhere.
+    fn problem(&self) -> Option<String> {
+        let joints = self.chain.joint_names().iter().zip(&self.sources);
+        let free: Vec<String> = joints
+            .filter(|(_, source)| matches!(source, Source::Anywhere(limits) if is_bounded(limits)))
+            .map(|(name, _)| format!("{name:?}"))
+            .collect();
+        (free.len() > 1).then(|| format!("its joints {} are not measured", free.join(", ")))
     }
 
     /// The pose with joints that are not measured at a fraction of their range.

@@ -1,6 +1,6 @@
 //! Pixels that convex pieces cover in an image, on a coarse grid.
 
-use super::convex_pieces::Piece;
+use super::convex_pieces::{Piece, directions};
 use nalgebra::Point3;
 use std::f64::consts::TAU;
 
@@ -63,10 +63,14 @@ impl Silhouette {
         }
     }
 
-    /// Adds a convex piece, given by points in the frame of the camera.
+    /// Adds a convex piece, given by points in the frame of the camera. A piece that contains the
+    /// camera is not visible: it is the simplified shape of the housing or mount of the camera.
     pub(super) fn add(&mut self, points_in_camera: &[Point3<f64>]) {
         // The projection of the convex hull of points in front of the camera is the convex hull of
         // their projections.
+        if contains_camera(points_in_camera) {
+            return;
+        }
         let visible = in_front(points_in_camera);
         let corners: Vec<Pixel> = visible
             .iter()
@@ -181,6 +185,16 @@ fn ends_in_band(start: Pixel, end: Pixel, [top, bottom]: [f64; 2]) -> Option<[f6
     }
     let at = |y: f64| low[0] + (high[0] - low[0]) * ((y - low[1]) / height).clamp(0.0, 1.0);
     Some([at(top), at(bottom)])
+}
+
+/// Whether no direction separates the camera from a convex piece.
+fn contains_camera(points: &[Point3<f64>]) -> bool {
+    let is_around = points.iter().any(|point| point.z < NEAR_M);
+    is_around
+        && directions().iter().all(|direction| {
+            let is_beyond = |point: &Point3<f64>| point.coords.dot(direction) > 0.0;
+            !points.iter().all(is_beyond)
+        })
 }
 
 /// The part of a convex piece in front of the near plane.
@@ -310,6 +324,29 @@ mod tests {
         assert!(
             (364..368).contains(&top) && bottom == 479,
             "{top} to {bottom}"
+        );
+    }
+
+    #[test]
+    fn a_housing_around_the_camera_is_not_visible() {
+        let corner = |ix: u32, side: f64| if ix == 0 { -side } else { side };
+        let housing = |shift_z: f64| -> Vec<[f64; 3]> {
+            (0..8)
+                .map(|ix| {
+                    let z = corner(ix / 4, 0.05) + shift_z;
+                    [corner(ix % 2, 0.1), corner(ix / 2 % 2, 0.1), z]
+                })
+                .collect()
+        };
+        assert!(covered(&housing(0.0), EXACT).is_empty());
+        assert!(
+            covered(&housing(-0.1), EXACT).is_empty(),
+            "behind the camera"
+        );
+        assert_eq!(
+            covered(&housing(0.2), EXACT).len(),
+            640 * 480,
+            "in front of it"
         );
     }
 

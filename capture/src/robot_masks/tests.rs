@@ -229,7 +229,8 @@ fn joints_that_are_not_measured_may_be_anywhere() {
         let shape = RobotShape::new(&robot, "base", joints, extent, None).expect("a robot");
         let camera_from_base = Transform::translation(0.0, 0.0, 1.0);
         let mut xs = Vec::new();
-        shape.pieces_in_camera(&[(vec![0.05], camera_from_base)], &mut |piece| {
+        let instants = [(vec![0.05], camera_from_base)];
+        shape.pieces_in_camera(extent, &instants, &mut |piece| {
             xs.extend(piece.iter().map(|point| point.x));
         });
         [
@@ -241,6 +242,47 @@ fn joints_that_are_not_measured_may_be_anywhere() {
     let measured = widths(&["slide".to_owned()]);
     assert!(close(measured, [0.04, 0.06]), "{measured:?}");
     assert!(close(widths(&[]), [-0.11, 0.11]));
+}
+
+#[test]
+fn links_behind_several_joints_that_are_not_measured_are_unknown() {
+    let mut rig = rig(&[]);
+    let joint = |name: &str, parent: &str, child: &str| {
+        format!(
+            r#"<link name="{child}"><visual><geometry><sphere radius="0.1"/></geometry></visual></link>
+            <joint name="{name}" type="revolute"><parent link="{parent}"/><child link="{child}"/>
+            <axis xyz="0 0 1"/><limit lower="-1" upper="1" effort="1" velocity="1"/></joint>"#
+        )
+    };
+    let other_arm = [
+        joint("one", "panda_link0", "upper"),
+        joint("two", "upper", "lower"),
+    ]
+    .concat();
+    rig.arm.urdf_text = rig
+        .arm
+        .urdf_text
+        .replacen("</robot>", &format!("{other_arm}</robot>"), 1);
+    let masks = RobotMasks::new(&rig)
+        .expect("a good rig")
+        .expect("a fixed camera");
+    let warning = masks.warning().expect("an arm without readings");
+    assert!(
+        warning.contains("1 link ") && warning.contains("\"one\", \"two\" are not measured"),
+        "{warning}"
+    );
+}
+
+#[test]
+fn cameras_on_a_base_without_moving_links_are_not_masked() {
+    let rig = Rig::load(&bundled("mobile-base.toml"), &[]).expect("a bundled rig file");
+    assert!(RobotMasks::new(&rig).expect("a good rig").is_none());
+    let in_room = [Override::new("camera.front.parent", "world")];
+    let rig = Rig::load(&bundled("mobile-base.toml"), &in_room).expect("a good rig");
+    let masks = RobotMasks::new(&rig)
+        .expect("a good rig")
+        .expect("the base moves");
+    assert!(masks.masks("front") && !masks.masks("rear"));
 }
 
 /// Minimum share of the robot's pixels that must be masked.
@@ -296,7 +338,7 @@ fn masks_cover_the_robot_that_the_simulator_draws() {
         let compare = |uncertainty| {
             let mut silhouette = Silhouette::new(view, uncertainty);
             let instant = (q.to_vec(), world_from_camera.inverse());
-            shape.pieces_in_camera(&[instant], &mut |piece| silhouette.add(piece));
+            shape.pieces_in_camera(extent, &[instant], &mut |piece| silhouette.add(piece));
             let both = pixels(view.size_px).zip(&exact);
             let mut n = [0.0_f64; 3];
             for ([x, y], is_robot) in both {
