@@ -57,9 +57,9 @@ pub use intrinsics::{
 };
 pub use params::ParamSet;
 pub use registration::{
-    Alignment, CameraMovement, Estimate, ExtrinsicsCovariance, MOVEMENT_WINDOW, MovementDetector,
-    PoseEstimate, PoseSigmas, ScalarEstimate, StationCorrection, Unobservable, align, candidates,
-    register_station,
+    Alignment, CameraMovement, Estimate, ExtrinsicsCovariance, HalvesAgreement, MOVEMENT_WINDOW,
+    MovementDetector, PoseEstimate, PoseSigmas, ScalarEstimate, StationCorrection, Unobservable,
+    align, candidates, compare_halves, register_station,
 };
 pub use tag_check::{ContradictionCause, TagCheck, TagContradiction, TagObservation};
 pub use trial::{CameraRefinement, Candidate, MIN_VALIDATION_IMAGES, Trial, TrialReport};

@@ -156,6 +156,10 @@ pub struct Trial {
     /// Mean gain over the validation keyframes of each camera, dB. Empty if it was not evaluated.
     #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
     pub gain_by_camera_db: BTreeMap<String, f64>,
+    /// Standard error of these gains, dB. Cameras with fewer than [`MIN_VALIDATION_IMAGES`] are
+    /// missing.
+    #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
+    pub standard_error_by_camera_db: BTreeMap<String, f64>,
 }
 
 impl Trial {
@@ -195,10 +199,11 @@ impl Trial {
             n_images,
             kept,
             gain_by_camera_db: BTreeMap::new(),
+            standard_error_by_camera_db: BTreeMap::new(),
         }
     }
 
-    /// Adds the mean gain of each camera from the gains of single images, dB.
+    /// Adds the mean gain of each camera and its standard error from the gains of single images, dB.
     #[must_use]
     pub fn with_cameras<'a>(self, gains_db: impl Iterator<Item = (&'a str, f64)>) -> Self {
         let mut by_camera: BTreeMap<String, Vec<f64>> = BTreeMap::new();
@@ -208,13 +213,26 @@ impl Trial {
                 .or_default()
                 .push(gain_db);
         }
-        let means = by_camera
-            .into_iter()
-            .map(|(camera, gains_db)| (camera, MeanGain::of(&gains_db).mean));
-        Self {
-            gain_by_camera_db: means.collect(),
-            ..self
+        let mut trial = self;
+        for (camera, gains_db) in by_camera {
+            let gain = MeanGain::of(&gains_db);
+            if gains_db.len() >= MIN_VALIDATION_IMAGES {
+                trial
+                    .standard_error_by_camera_db
+                    .insert(camera.clone(), gain.standard_error);
+            }
+            trial.gain_by_camera_db.insert(camera, gain.mean);
         }
+        trial
+    }
+
+    /// Whether the images of one camera gain significantly on their own. In a rig with several
+    /// cameras, the mean over all images may hide that one camera gains nothing. `None` if the
+    /// camera has too few validation images.
+    pub fn is_significant_for(&self, camera: &str) -> Option<bool> {
+        let gain_db = self.gain_by_camera_db.get(camera)?;
+        let standard_error_db = self.standard_error_by_camera_db.get(camera)?;
+        Some(*gain_db > MIN_STANDARD_ERRORS * standard_error_db)
     }
 
     /// Rejects the change if there are fewer than [`MIN_VALIDATION_IMAGES`].
@@ -291,4 +309,43 @@ pub struct TrialReport {
     pub n_images: usize,
     /// Whether that part was kept.
     pub kept: bool,
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const POSES: Candidate = Candidate::Cameras(ParamSet::EXTRINSICS);
+
+    /// The trial of two cameras with these gains of their images.
+    fn trial(moving_db: &[f64], fixed_db: &[f64]) -> Trial {
+        let all: Vec<f64> = moving_db.iter().chain(fixed_db).copied().collect();
+        let moving = moving_db.iter().map(|gain_db| ("moving", *gain_db));
+        let fixed = fixed_db.iter().map(|gain_db| ("fixed", *gain_db));
+        Trial::of_gains(POSES, &all).with_cameras(moving.chain(fixed))
+    }
+
+    #[test]
+    fn a_camera_must_gain_on_its_own() {
+        let gains_db = [0.9, 1.1, 1.0, 0.8, 1.2];
+        let noise_db = [0.4, -0.5, 0.3, -0.3, 0.2];
+        let both = trial(&gains_db, &noise_db);
+        assert!(both.kept, "the mean over all images is significant: {both}");
+        assert_eq!(both.is_significant_for("moving"), Some(true));
+        assert_eq!(both.is_significant_for("fixed"), Some(false));
+        assert_eq!(both.is_significant_for("absent"), None);
+        let failed = trial(&gains_db, &[f64::NAN; 5]);
+        assert_eq!(failed.is_significant_for("fixed"), Some(false));
+        let few = trial(&gains_db, &noise_db[..3]);
+        assert_eq!(few.is_significant_for("fixed"), None, "too few images");
+    }
+
+    #[test]
+    fn a_gain_within_twice_its_standard_error_is_rejected() {
+        // The mean is 0.12 dB, the standard error 0.13 dB.
+        let noisy = trial(&[0.5, -0.2, 0.4, -0.3, 0.2, 0.1], &[]);
+        assert!(!noisy.kept && noisy.gain_db > MIN_GAIN_DB, "{noisy}");
+        let steady = trial(&[0.14, 0.10, 0.12, 0.13, 0.11, 0.12], &[]);
+        assert!(steady.kept, "{steady}");
+    }
 }

@@ -3,7 +3,10 @@
 use crate::Data;
 use crate::corrected_rig;
 use crate::training_options::{Refine, TrainingOptions};
-use calibration::{Alignment, CameraRefinement, ExtrinsicsCovariance, ParamSet, PoseSigmas};
+use calibration::{
+    Alignment, CameraRefinement, Candidate, Estimate, ExtrinsicsCovariance, HalvesAgreement,
+    ParamSet, PoseSigmas,
+};
 use capture::config::{Parent, Rig};
 use keyframe::{Keyframe, Split};
 use kinematics::Transform;
@@ -19,12 +22,13 @@ pub struct SceneCalibration {
     /// The rig with the accepted corrections; `None` without a rig. Cameras in `refused` keep their
     /// extrinsics.
     pub rig: Option<Rig>,
-    /// Cameras whose extrinsics the motion does not determine, with the reason.
+    /// Cameras that keep their extrinsics, because the motion does not determine them, or because
+    /// the correction is not reliable, with the reason.
     pub refused: BTreeMap<String, String>,
 }
 
 impl SceneCalibration {
-    /// Whether there is no camera whose extrinsics are determined.
+    /// Whether all cameras keep their extrinsics for such a reason.
     pub fn is_refused(&self, data: &Data) -> bool {
         data.keyframes
             .iter()
@@ -144,6 +148,14 @@ pub fn calibrate_scene(
         let in_rig = rig.and_then(|rig| rig.cameras.iter().find(|other| *other.name == *camera));
         reasons.insert(camera, refusal(&directions, in_rig));
     }
+    for (camera, reason) in unreliable(&alignment, &keyframes, &choice) {
+        if choice.always().contains(ParamSet::EXTRINSICS) {
+            // Parameters that the user names have no acceptance test.
+            log::warn!("the pose of camera {camera:?} may be wrong: {reason}");
+        } else {
+            reasons.entry(camera).or_insert(reason);
+        }
+    }
     let refused = reasons;
     let rig = rig
         .map(|given| corrected(given, &alignment, &refused))
@@ -152,6 +164,85 @@ pub fn calibrate_scene(
         alignment,
         rig,
         refused,
+    })
+}
+
+/// Cameras with a significant correction of their extrinsics that does not hold for their own
+/// images, or for both halves of the images, with the reason.
+fn unreliable(
+    alignment: &Alignment,
+    keyframes: &[Arc<Keyframe>],
+    choice: &CameraRefinement,
+) -> BTreeMap<String, String> {
+    let corrected = significantly_moved(alignment);
+    if corrected.is_empty() {
+        return BTreeMap::new();
+    }
+    let trial = alignment
+        .trials
+        .iter()
+        .rfind(|trial| has_extrinsics(trial.candidate));
+    let set = accepted_params(alignment, choice);
+    // Other parameters have the same errors in both halves.
+    let halves = calibration::compare_halves(keyframes, set);
+    let mut reasons = BTreeMap::new();
+    for camera in corrected {
+        let own_gain = trial.and_then(|trial| trial.is_significant_for(camera));
+        let reason = match (own_gain, halves.get(camera)) {
+            (Some(false), _) => Some(
+                "its own validation images do not gain more than twice the standard error"
+                    .to_owned(),
+            ),
+            (_, Some(agreement)) => disagreement(agreement),
+            (_, None) => {
+                log::warn!(
+                    "camera {camera:?}: too few images to check that two halves of them give the same pose; record at \
+                     least twice as many"
+                );
+                None
+            }
+        };
+        reasons.extend(reason.map(|reason| (camera.to_owned(), reason)));
+    }
+    reasons
+}
+
+/// Names of the cameras whose extrinsics were corrected by more than three standard deviations.
+fn significantly_moved(alignment: &Alignment) -> Vec<&str> {
+    const MIN_SIGMAS: f64 = 3.0;
+    let moved = alignment.estimates.iter().filter_map(|estimate| {
+        let Estimate::HandEye(pose) = estimate else {
+            return None;
+        };
+        let is_moved = pose.rotation_rad > MIN_SIGMAS * pose.rotation_sigma_rad
+            || pose.translation_m > MIN_SIGMAS * pose.translation_sigma_m;
+        is_moved.then_some(pose.camera.as_str())
+    });
+    moved.collect()
+}
+
+fn has_extrinsics(candidate: Candidate) -> bool {
+    matches!(candidate, Candidate::Cameras(set) if set.contains(ParamSet::EXTRINSICS))
+}
+
+/// The parameters of the accepted model.
+fn accepted_params(alignment: &Alignment, choice: &CameraRefinement) -> ParamSet {
+    let kept = alignment.trials.iter().filter(|trial| trial.kept);
+    kept.fold(choice.always(), |set, trial| match trial.candidate {
+        Candidate::Cameras(params) => set | params,
+        Candidate::Halved { .. } | Candidate::ShDegree { .. } => set,
+    })
+}
+
+/// The reason why two halves of the images contradict each other. `None` if they agree.
+fn disagreement(halves: &HalvesAgreement) -> Option<String> {
+    (!halves.agrees()).then(|| {
+        format!(
+            "two halves of the images give poses that differ by {:.1} degrees and {:.0} mm, as much as the correction \
+             itself; keep everything that moves out of view or mask it, and record more images",
+            halves.difference_rad.to_degrees(),
+            1e3 * halves.difference_m,
+        )
     })
 }
 
@@ -222,4 +313,47 @@ fn corrected(
         }
     }
     Ok(rig)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use calibration::Trial;
+
+    fn trial(set: ParamSet, gains_db: &[f64]) -> Trial {
+        let by_camera = gains_db.iter().map(|gain_db| ("fixed", *gain_db));
+        Trial::of_gains(Candidate::Cameras(set), gains_db).with_cameras(by_camera)
+    }
+
+    #[test]
+    fn accepted_parameters_are_those_of_kept_trials_and_of_the_request() {
+        let alignment = Alignment {
+            trials: vec![
+                trial(ParamSet::EXTRINSICS, &[1.0, 1.1, 0.9, 1.0]),
+                trial(ParamSet::LENS, &[0.1, -0.1, 0.2, -0.2]),
+            ],
+            ..Alignment::default()
+        };
+        let choice = CameraRefinement::AlwaysAndTry(ParamSet::TIME_OFFSET, Vec::new());
+        assert_eq!(
+            accepted_params(&alignment, &choice),
+            ParamSet::EXTRINSICS | ParamSet::TIME_OFFSET
+        );
+        assert!(
+            unreliable(&alignment, &[], &choice).is_empty(),
+            "no camera was moved"
+        );
+    }
+
+    #[test]
+    fn halves_that_differ_as_much_as_the_correction_are_a_reason() {
+        let halves = |ratio| HalvesAgreement {
+            ratio,
+            difference_rad: 0.02,
+            difference_m: 0.026,
+        };
+        assert_eq!(disagreement(&halves(100.0)), None);
+        let reason = disagreement(&halves(1.5)).expect("a reason");
+        assert!(reason.contains("1.1 degrees and 26 mm"), "{reason}");
+    }
 }

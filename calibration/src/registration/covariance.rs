@@ -88,6 +88,13 @@ impl ExtrinsicsCovariance {
         Some(PoseSigmas::of(&self.block(ix, ix)))
     }
 
+    /// Covariance of the extrinsics of a camera: translations (meters), then rotations (radians),
+    /// along and about its own axes. `None` if they were not estimated.
+    pub(super) fn matrix_of(&self, camera: &str) -> Option<Matrix6<f64>> {
+        let ix = self.ix(camera)?;
+        Some(self.block(ix, ix))
+    }
+
     /// Standard deviations of the pose of a camera in the frame of another camera with the same
     /// parent, along and about its own axes. `None` if one of the two poses was not estimated.
     pub fn between(

@@ -16,6 +16,7 @@ mod corrections;
 mod covariance;
 mod features;
 mod fit;
+mod halves;
 mod layout;
 mod movement;
 mod pairs;
@@ -32,6 +33,7 @@ mod validation;
 mod view;
 
 pub use covariance::{ExtrinsicsCovariance, PoseSigmas};
+pub use halves::{HalvesAgreement, compare_halves};
 pub use movement::{CameraMovement, MOVEMENT_WINDOW, MovementDetector};
 pub use report::{Alignment, Estimate, PoseEstimate, ScalarEstimate, Unobservable};
 pub use station::{StationCorrection, register_station};

@@ -31,7 +31,10 @@ keys! {
         pub address: String = String::new();
         /// The URDF text.
         pub urdf_text: String => String::new();
-        /// Folder of the URDF.
+        /// Folder at which the names of mesh files in the URDF start, relative to the rig file.
+        /// Without this key, the folder of the URDF.
+        pub mesh_folder: Option<String>;
+        /// The absolute folder of mesh files.
         pub urdf_folder: UrdfFolder => UrdfFolder::default();
         /// Moving joints in the order of the joint states.
         pub joints: Vec<String> = Vec::new();

@@ -45,6 +45,12 @@ keys! {
         /// Covariance of focal lengths, principal point and distortion coefficients, row by row. An
         /// empty list means that it is unknown.
         pub intrinsics_covariance: Vec<f64> = Vec::new();
+        /// Whether the robot is masked in the images. Without this key, it is masked if the camera
+        /// is not on the flange.
+        pub mask_robot: Option<bool>;
+        /// How far the mask extends beyond the robot, meters. Set it to the error of
+        /// `parent_from_camera`, if that is larger.
+        pub mask_margin_m: f64 = 0.01, in 0.0..=0.5;
         /// Depth images, if the camera delivers them.
         pub depth: Option<Depth> => None;
         /// Calibration that the rig file omits.

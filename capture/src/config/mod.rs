@@ -127,6 +127,15 @@ impl Rig {
         };
         let mut rig = rig_file::read(&file, &text, overrides, Some(&folder), read_urdf)?;
         rig.path = RigPath::of(path);
+        if let Some(meshes) = &rig.arm.mesh_folder {
+            let meshes = folder.join(meshes);
+            urdf_folder = UrdfFolder::at(&std::path::absolute(&meshes).unwrap_or(meshes));
+        }
+        // The effective rig file and its robot description are in another folder, or in a recording.
+        if rig.arm.mesh_folder.is_some() || rig.arm.urdf_text.contains("<mesh") {
+            let meshes = urdf_folder.path();
+            rig.arm.mesh_folder = meshes.map(|meshes| meshes.to_string_lossy().into_owned());
+        }
         rig.arm.urdf_folder = urdf_folder;
         if let Some(motion) = rig
             .arm
@@ -155,15 +164,17 @@ impl Rig {
         Ok(rig)
     }
 
-    /// The folder of the robot description that a rig file names. `None` if the rig file names no
-    /// robot description or cannot be read. Mesh files are named relative to this folder.
+    /// The folder to which the names of mesh files are relative: the folder that a rig file names, or
+    /// that of its robot description. `None` if the rig file names neither or cannot be read.
     #[must_use]
     pub fn urdf_folder(path: &Path) -> Option<PathBuf> {
         let table: toml::Table = toml::from_str(&files::read_text(path).ok()?).ok()?;
-        let urdf = path
-            .parent()
-            .unwrap_or(Path::new(""))
-            .join(table.get("arm")?.get("urdf")?.as_str()?);
+        let arm = table.get("arm")?;
+        let folder = path.parent().unwrap_or(Path::new(""));
+        if let Some(meshes) = arm.get("mesh_folder").and_then(toml::Value::as_str) {
+            return std::path::absolute(folder.join(meshes)).ok();
+        }
+        let urdf = folder.join(arm.get("urdf")?.as_str()?);
         std::path::absolute(urdf).ok()?.parent().map(Path::to_owned)
     }
 
@@ -179,7 +190,11 @@ impl Rig {
         urdf_text: &str,
         overrides: &[Override],
     ) -> Result<Self, ConfigError> {
-        rig_file::read(file, text, overrides, None, |_| Ok(urdf_text.to_owned()))
+        let mut rig = rig_file::read(file, text, overrides, None, |_| Ok(urdf_text.to_owned()))?;
+        if let Some(meshes) = &rig.arm.mesh_folder {
+            rig.arm.urdf_folder = UrdfFolder::at(Path::new(meshes));
+        }
+        Ok(rig)
     }
 
     /// The effective rig file with every key. The same rig can be read from it if the robot

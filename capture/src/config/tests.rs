@@ -158,6 +158,7 @@ pub(super) const KEYS: &[(&str, &str, &str)] = &[
     ("arm.driver", "'ur'", "'ur5e'"),
     ("arm.address", "'172.16.0.2'", "7"),
     ("arm.urdf", "'other.urdf'", "7"),
+    ("arm.mesh_folder", "'/opt/meshes'", "7"),
     ("arm.joints", "['j2', 'j1']", "['j1', 'j9']"),
     ("arm.joint_offsets", "[0.01, -0.02]", "[0.01]"),
     ("arm.sim.true_joint_offsets", "[0.01, -0.02]", "[0.01]"),
@@ -213,6 +214,8 @@ pub(super) const KEYS: &[(&str, &str, &str)] = &[
     ("camera.wrist.rate_hz", "15", "0"),
     ("camera.wrist.exposure_micros", "4000", "40_000"),
     ("camera.wrist.readout_micros", "15000", "-1"),
+    ("camera.wrist.mask_robot", "true", "1"),
+    ("camera.wrist.mask_margin_m", "0.03", "-0.01"),
     (
         "camera.wrist.stamp_to_mid_exposure_millis.value",
         "-12.4",

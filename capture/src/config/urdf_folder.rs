@@ -14,6 +14,11 @@ impl UrdfFolder {
         Self(absolute.and_then(|path| path.parent().map(Path::to_owned)))
     }
 
+    /// This folder, which must be absolute.
+    pub(super) fn at(folder: &Path) -> Self {
+        Self(folder.is_absolute().then(|| folder.to_owned()))
+    }
+
     /// The folder; `None` if the rig was not read from a file.
     #[must_use]
     pub fn path(&self) -> Option<&Path> {

@@ -1,7 +1,7 @@
 //! Measures rates, latencies and losses of a rig's devices, with the drivers of `run`. Nothing is
 //! moved.
 
-use super::{Finding, datagrams, flange, remedies};
+use super::{Finding, datagrams, flange, remedies, robot_masks};
 use crate::config::{ArmDriver, BaseDriver, Need, Rig};
 use crate::open::{self, DeviceFailure, Listening};
 use crate::{Join, JoinEvent, Rejection, Stop};
@@ -214,6 +214,8 @@ pub fn listen(rig: &Rig, secs: f64, stop: &Stop) -> anyhow::Result<ListenResult>
     findings.extend(devices.iter().filter_map(problem));
     findings.extend(devices.iter().filter_map(wrong_unit));
     findings.extend(join.as_ref().and_then(join_finding));
+    let counts = join.as_ref().map(Join::counts);
+    findings.extend(counts.into_iter().flat_map(robot_masks::cover));
     Ok(ListenResult { devices, findings })
 }
 

@@ -18,6 +18,7 @@ mod motion;
 mod realsense;
 mod realtime;
 mod remedies;
+mod robot_masks;
 #[cfg(target_os = "linux")]
 mod servos;
 #[cfg(target_os = "linux")]
@@ -176,6 +177,7 @@ pub fn check(rig: Option<&Rig>) -> Vec<Finding> {
     findings.extend(rig.and_then(flange::simulator));
     findings.extend(rig.and_then(motion::motion));
     findings.extend(rig.into_iter().flat_map(meshes));
+    findings.extend(rig.and_then(robot_masks::known_shape));
     findings.extend(rig.into_iter().flat_map(calibration::missing));
     findings.extend(rig.into_iter().flat_map(calibration::calibration));
     findings.extend(rig.into_iter().flat_map(|rig| {

@@ -317,6 +317,15 @@ impl Motion {
         }
     }
 
+    /// `world_from_base` and the twist of the base in base axes at a stamp; `NotYet` if no pose at
+    /// or after the stamp has arrived.
+    pub(super) fn base_at(&self, stamp: Stamp) -> Result<(Transform, Twist), HistoryError> {
+        match &self.base {
+            BaseMotion::Fixed(pose) => Ok((*pose, Twist::zero())),
+            BaseMotion::ReportedPoses(reported) => reported.poses.with_twist_at(stamp),
+        }
+    }
+
     /// The pose and velocity of a camera at a stamp; `NotYet` if no reading at or after the stamp
     /// has arrived.
     pub(crate) fn at(

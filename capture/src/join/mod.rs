@@ -23,6 +23,8 @@ pub use rejection::{Counts, Rejection, SampleUse};
 pub use store::StoreUse;
 
 use crate::config::{self, BaseDriver, CameraDriver, Need, Parent, Rig};
+use crate::notes::Notes;
+use crate::robot_masks::{RobotAt, RobotMasks};
 use accept::Acceptance;
 use anyhow::Context;
 use assemble::Undistorter;
@@ -35,12 +37,17 @@ use std::sync::Arc;
 use store::KeyframeStore;
 use waiting::{Partner, Waiting};
 
+/// Number of keyframes after which a note names the mean share of the image that the robot covers.
+const MIN_IMAGES_OF_COVER: u64 = 8;
+
 /// Converts samples to keyframes.
 ///
 /// [`Join::push`] takes samples one by one. [`Join::finish`] ends the stream. The store of
 /// keyframes is bounded. Beyond its limits, the most redundant keyframe is evicted.
 pub struct Join {
     motion: Motion,
+    robot_masks: Option<RobotMasks>,
+    notes: Notes,
     cameras: Vec<CameraState>,
     store: KeyframeStore,
     ranges: RangeScans,
@@ -111,6 +118,9 @@ struct ReadyImage {
     camera_pose: CameraPose,
     depth: Option<(Image, CameraPose)>,
     truth: Option<TruthImage>,
+    /// The robot to mask, and the time from the image to the depth image, seconds.
+    robot: Option<RobotAt>,
+    depth_delay_secs: f64,
 }
 
 impl Join {
@@ -127,8 +137,14 @@ impl Join {
             translation_m: join.min_translation_m,
             rotation_rad: join.min_rotation_rad,
         };
+        let robot_masks = RobotMasks::new(rig)?;
+        if let Some(warning) = robot_masks.as_ref().and_then(RobotMasks::warning) {
+            log::warn!("{warning}");
+        }
         Ok(Self {
             motion: Motion::new(rig)?,
+            robot_masks,
+            notes: Notes::default(),
             cameras: rig
                 .cameras
                 .iter()
@@ -146,6 +162,15 @@ impl Join {
             newest_resumed: None,
             stamp_offset_nanos: None,
         })
+    }
+
+    /// Adds notes about masked robots to the notes of a run.
+    #[must_use]
+    pub fn with_notes(mut self, notes: Notes) -> Self {
+        let warning = self.robot_masks.as_ref().and_then(RobotMasks::warning);
+        warning.into_iter().for_each(|warning| notes.add(warning));
+        self.notes = notes;
+        self
     }
 
     /// Accepts exactly the keyframes of a list, with its splits, without acceptance tests or store
@@ -246,6 +271,9 @@ impl Join {
         // Images that still wait belong to the motion before the jump, so they are decided first.
         let events = self.finish();
         self.motion.restart();
+        if let Some(robot_masks) = &mut self.robot_masks {
+            robot_masks.restart();
+        }
         events
     }
 
@@ -303,8 +331,13 @@ impl Join {
             log::warn!("{joint_limit_warning}");
             self.warned_joint_limits = true;
         }
+        let all_joints = self.robot_masks.is_some().then(|| state.clone());
         match self.motion.push_joints(state) {
-            Ok(()) => {}
+            Ok(()) => {
+                if let (Some(robot_masks), Some(state)) = (&mut self.robot_masks, all_joints) {
+                    robot_masks.push_joints(&state);
+                }
+            }
             Err(JointsRejection::Invalid) => self.counts.joints_rejected += 1,
             Err(JointsRejection::TooFast(jump)) => {
                 if self.counts.joints_too_fast == 0 {
@@ -395,10 +428,18 @@ impl Join {
         // An image whose depth image or ground truth was lost must not wait forever, because newer
         // images of its camera queue behind it.
         let overdue = at_end || self.newest.secs_since(stamp) > self.max_wait_secs;
-        let camera_pose = match self.motion.at(&camera.config, stamp) {
+        let masks = self.robot_masks.as_ref();
+        let masks = masks.filter(|masks| masks.masks(&camera.config.name));
+        let robot_at = |masks: &RobotMasks| masks.at(stamp, self.motion.base_at(stamp)?);
+        let camera_pose = self.motion.at(&camera.config, stamp);
+        // Without the state of the robot, the image would train the robot into the model.
+        let posed = camera_pose.and_then(|pose| Ok((pose, masks.map(robot_at).transpose()?)));
+        let (camera_pose, robot) = match posed {
             Err(HistoryError::NotYet { .. }) if !overdue => return None,
-            camera_pose => camera_pose,
+            Err(error) => (Err(error), None),
+            Ok((camera_pose, robot)) => (Ok(camera_pose), robot),
         };
+        let mut depth_delay_secs = 0.0;
         let period_secs = 1.0 / camera.config.rate_hz;
         let mut depth = None;
         if camera.config.depth.is_some() && camera_pose.is_ok() {
@@ -409,6 +450,7 @@ impl Join {
                 return None;
             }
             if let Some(depth_stamp) = depth_stamp {
+                depth_delay_secs = depth_stamp.secs_since(stamp);
                 // The depth image has its own pose, because the camera moves between the two
                 // exposures.
                 match self.motion.at(&camera.config, depth_stamp) {
@@ -449,12 +491,14 @@ impl Join {
                 camera_pose,
                 depth,
                 truth,
+                robot,
+                depth_delay_secs,
             })),
             Err(_) => Some(Err((image.camera, stamp))),
         }
     }
 
-    fn decide(&mut self, camera_ix: usize, ready: ReadyImage, events: &mut Vec<JoinEvent>) {
+    fn decide(&mut self, camera_ix: usize, mut ready: ReadyImage, events: &mut Vec<JoinEvent>) {
         let listed = self
             .list
             .as_ref()
@@ -469,6 +513,8 @@ impl Join {
             Some(Some(split)) => split,
             None => Split::of(camera.n_accepted),
         };
+        let robot = ready.robot.take();
+        let depth_delay_secs = ready.depth_delay_secs;
         let keyframe = match camera.keyframe(ready, split, listed.is_none(), self.default_depth_m) {
             Ok(keyframe) => keyframe,
             Err(why) => return self.reject(&name, stamp, why, events),
@@ -497,17 +543,35 @@ impl Join {
                     _ => 0,
                 });
         let stamp = Stamp(keyframe.stamp.0.saturating_add(stamp_offset_nanos));
-        let keyframe = Arc::new(Keyframe {
+        let mut keyframe = Keyframe {
             depth: keyframe.depth.or(depth_from_ranges),
             stamp,
             ..keyframe
-        });
+        };
         self.counts.without_depth +=
             u64::from(camera.config.depth.is_some() && keyframe.depth.is_none());
+        if let Some(robot) = robot {
+            self.mask_robot(&mut keyframe, &robot, depth_delay_secs);
+        }
+        let keyframe = Arc::new(keyframe);
         events.push(JoinEvent::Accepted(Arc::clone(&keyframe)));
         for (camera, stamp) in self.store.push(keyframe) {
             self.counts.evicted += 1;
             events.push(JoinEvent::Evicted { camera, stamp });
+        }
+    }
+
+    /// Masks the robot in a keyframe, and adds a note as soon as its mean share is known.
+    fn mask_robot(&mut self, keyframe: &mut Keyframe, robot: &RobotAt, depth_delay_secs: f64) {
+        let masks = self.robot_masks.as_ref();
+        let cover = masks.and_then(|masks| masks.apply(keyframe, robot, depth_delay_secs));
+        let Some(cover) = cover else { return };
+        let n_images = self.counts.add_robot_cover(&keyframe.camera, cover);
+        if n_images == MIN_IMAGES_OF_COVER {
+            if let Some(note) = self.counts.robot_note(&keyframe.camera) {
+                log::info!("{note}");
+                self.notes.add(note);
+            }
         }
     }
 

@@ -1,5 +1,6 @@
 //! Reasons why images did not become keyframes, and their counts.
 
+use crate::robot_masks::RobotCover;
 use messages::counted;
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
@@ -100,7 +101,13 @@ pub struct Counts {
     pub rejected: BTreeMap<Rejection, u64>,
     /// Cameras that sent images but are not in the rig file.
     pub unknown_cameras: BTreeSet<Arc<str>>,
+    /// For each camera in whose images the robot is masked, the number of keyframes and the pixels
+    /// that the robot covers in them.
+    pub robot_cover: BTreeMap<Arc<str>, (u64, RobotCover)>,
 }
+
+/// Share of the image from which on the robot leaves too little of the scene, percent.
+const LARGE_COVER_PERCENT: u64 = 80;
 
 /// Purpose of the samples, which determines whether dropped images are a loss.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -136,6 +143,29 @@ impl Counts {
             ));
         }
         data_losses
+    }
+
+    /// What the masks of the robot cover in the images of a camera, in one sentence. `None` if it
+    /// is not masked.
+    pub(crate) fn robot_note(&self, camera: &str) -> Option<String> {
+        let (_, cover) = self.robot_cover.get(camera)?;
+        let percent = cover.percent();
+        let advice = if percent >= LARGE_COVER_PERCENT {
+            "; little of the scene is visible, so move the camera, or check its parent_from_camera"
+        } else {
+            ""
+        };
+        Some(format!(
+            "camera {camera:?}: the robot covers {percent} % of the image on average and is masked{advice}"
+        ))
+    }
+
+    /// Adds the cover of a keyframe. Returns the number of keyframes of this camera.
+    pub(super) fn add_robot_cover(&mut self, camera: &Arc<str>, cover: RobotCover) -> u64 {
+        let (n_images, sum) = self.robot_cover.entry(Arc::clone(camera)).or_default();
+        *n_images += 1;
+        sum.add(cover);
+        *n_images
     }
 
     pub(super) fn reject(&mut self, why: Rejection) {
@@ -174,6 +204,13 @@ impl std::fmt::Display for Counts {
             if n > 0 {
                 write!(f, "; {n} {what}")?;
             }
+        }
+        for note in self
+            .robot_cover
+            .keys()
+            .filter_map(|name| self.robot_note(name))
+        {
+            write!(f, "; {note}")?;
         }
         Ok(())
     }

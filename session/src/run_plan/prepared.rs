@@ -163,7 +163,8 @@ impl OpenedRun<'_> {
         let held = previous
             .as_ref()
             .map_or(&[][..], |previous| &previous.keyframes);
-        let (input, evicted) = input(&plan, &rig, (source, stamp_clock), held)?;
+        let (mut input, evicted) = input(&plan, &rig, (source, stamp_clock), held)?;
+        input.join = input.join.with_notes(device_notes.clone());
         let robot = publish_robot(&hub, &rig, &plan)?;
         let steering = steered_arm
             .map(|arm| PreparedSteering::new(arm, &rig, &plan.rig_file))

@@ -7,7 +7,6 @@
 
 mod clearance_feed;
 mod joint_map;
-mod mesh_vertices;
 mod observer;
 mod previews;
 mod recovery;

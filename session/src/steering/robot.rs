@@ -1,10 +1,10 @@
 //! The chain and the shape of the robot that operators steer.
 
 use super::joint_map::JointMap;
-use super::mesh_vertices;
 use super::steering_loop::SteeredRobot;
 use anyhow::Context;
 use capture::config::Rig;
+use capture::mesh_triangles;
 use capture::open::SteeredArm;
 use kinematics::Chain;
 use kinematics::urdf::{JointKind, Robot};
@@ -33,7 +33,8 @@ pub(super) fn chain_and_body(rig: &Rig, urdf_folder: &Path) -> anyhow::Result<Ch
     let chain = Chain::new(&robot, &arm.base_link, &arm.flange_link).context("the arm's URDF")?;
     let unreadable = RefCell::new(BTreeMap::new());
     let vertices_of = |file: &str| {
-        mesh_vertices::read(file, urdf_folder)
+        mesh_triangles(file, urdf_folder)
+            .map(|triangles| triangles.into_flattened())
             .map_err(|why| unreadable.borrow_mut().insert(file.to_owned(), why))
             .ok()
     };

@@ -533,7 +533,7 @@ impl FeatureScene {
         matches: &[PairMatches],
     ) -> Trial {
         let folds = self.folds();
-        let gains_db: Vec<f64> = (0..N_FOLDS)
+        let gains: Vec<(usize, f64)> = (0..N_FOLDS)
             .into_par_iter()
             .flat_map_iter(|fold| {
                 let is_held_out: Vec<bool> =
@@ -541,17 +541,23 @@ impl FeatureScene {
                 self.held_out_gains_db([baseline, variant], matches, &is_held_out)
             })
             .collect();
-        log::debug!("features: {set}: gains {gains_db:.2?} dB");
-        Trial::of_gains(Candidate::Cameras(set), &gains_db).with_enough_images()
+        log::debug!("features: {set}: gains {gains:.2?} dB");
+        let gains_db: Vec<f64> = gains.iter().map(|(_, gain_db)| *gain_db).collect();
+        let by_camera = gains
+            .iter()
+            .map(|(image, gain_db)| (&*self.cameras[self.images[*image].camera], *gain_db));
+        Trial::of_gains(Candidate::Cameras(set), &gains_db)
+            .with_enough_images()
+            .with_cameras(by_camera)
     }
 
-    /// Gain of each held-out image, dB, if two models are estimated without them.
+    /// Index and gain of each held-out image, dB, if two models are estimated without them.
     fn held_out_gains_db(
         &self,
         [baseline, variant]: [&CalibrationModel; 2],
         matches: &[PairMatches],
         is_held_out: &[bool],
-    ) -> Vec<f64> {
+    ) -> Vec<(usize, f64)> {
         // A pair with one held-out image must not be used, because the estimate would then depend
         // on the corners of that image.
         let (tested, used): (Vec<PairMatches>, Vec<PairMatches>) = matches
@@ -566,7 +572,10 @@ impl FeatureScene {
         };
         (0..self.images.len())
             .filter(|image| is_held_out[*image])
-            .filter_map(|image| mean_gain_db(&tested, image, [&baseline, &variant]))
+            .filter_map(|image| {
+                let gain_db = mean_gain_db(&tested, image, [&baseline, &variant])?;
+                Some((image, gain_db))
+            })
             .collect()
     }
 

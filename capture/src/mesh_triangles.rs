@@ -1,9 +1,9 @@
-//! Reads the vertices of mesh files, which bound the parts of a robot.
+//! Reads the triangles of mesh files, which bound the parts of a robot.
 //!
 //! Sources of the formats: 3D Systems, "Stereolithography Interface Specification" (1989), and
 //! Wavefront, "Advanced Visualizer Manual", appendix B1 (OBJ).
 
-use capture::{found_mesh_file, missing_mesh_file};
+use crate::mesh_files::{found_mesh_file, missing_mesh_file};
 use files::Budget;
 use std::path::Path;
 
@@ -14,32 +14,36 @@ const STL_TRIANGLE_BYTES: usize = 50;
 const NUMBER_BYTES: usize = 4;
 const NORMAL_BYTES: usize = 3 * NUMBER_BYTES;
 
-/// Vertices of a mesh file of a URDF in the frame of the mesh, meters.
+/// A triangle, given by its corners.
+pub type Triangle = [[f64; 3]; 3];
+
+/// Triangles of a mesh file of a URDF in the frame of the mesh, meters. Faces with more corners are
+/// divided into triangles. A vertex of an OBJ file without faces is a triangle without area.
 ///
 /// # Errors
 ///
-/// Why it cannot be read, in one sentence.
-pub(super) fn read(file: &str, urdf_folder: &Path) -> Result<Vec<[f64; 3]>, String> {
+/// Why the file cannot be read, in one sentence.
+pub fn mesh_triangles(file: &str, urdf_folder: &Path) -> Result<Vec<Triangle>, String> {
     let path =
         found_mesh_file(file, urdf_folder).ok_or_else(|| missing_mesh_file(file, urdf_folder))?;
     let bytes = files::read(&path, Budget::MESH).map_err(|error| error.to_string())?;
     let extension = file.rsplit('.').next().unwrap_or_default();
-    let vertices = match extension.to_ascii_lowercase().as_str() {
+    let triangles = match extension.to_ascii_lowercase().as_str() {
         "stl" => stl(&bytes)?,
-        "obj" => text(&String::from_utf8_lossy(&bytes), "v ")?,
+        "obj" => obj(&String::from_utf8_lossy(&bytes))?,
         other => {
             return Err(format!(
                 "the bounds of .{other} files cannot be read, convert it to .stl or .obj"
             ));
         }
     };
-    if vertices.is_empty() {
+    if triangles.is_empty() {
         return Err("it has no vertices".to_owned());
     }
-    Ok(vertices)
+    Ok(triangles)
 }
 
-fn stl(bytes: &[u8]) -> Result<Vec<[f64; 3]>, String> {
+fn stl(bytes: &[u8]) -> Result<Vec<Triangle>, String> {
     let n_triangles = bytes
         .get(STL_HEADER_BYTES - NUMBER_BYTES..STL_HEADER_BYTES)
         .and_then(|count| count.try_into().ok())
@@ -50,16 +54,17 @@ fn stl(bytes: &[u8]) -> Result<Vec<[f64; 3]>, String> {
         && n_triangles.checked_mul(STL_TRIANGLE_BYTES) == Some(bytes.len() - STL_HEADER_BYTES)
     {
         let triangles = bytes[STL_HEADER_BYTES..].chunks_exact(STL_TRIANGLE_BYTES);
-        return Ok(triangles.flat_map(binary_corners).collect());
+        return Ok(triangles.map(binary_corners).collect());
     }
     if bytes.trim_ascii_start().starts_with(b"solid") {
-        return text(&String::from_utf8_lossy(bytes), "vertex ");
+        let corners = points(&String::from_utf8_lossy(bytes), "vertex ")?;
+        return Ok(corners.as_chunks::<3>().0.to_vec());
     }
     Err("it is neither a binary nor a text STL file".to_owned())
 }
 
 /// The corners of a triangle of a binary STL file, after its normal.
-fn binary_corners(triangle: &[u8]) -> [[f64; 3]; 3] {
+fn binary_corners(triangle: &[u8]) -> Triangle {
     let number = |ix: usize| {
         let start = NORMAL_BYTES + NUMBER_BYTES * ix;
         let bytes: [u8; NUMBER_BYTES] = std::array::from_fn(|at| triangle[start + at]);
@@ -68,8 +73,48 @@ fn binary_corners(triangle: &[u8]) -> [[f64; 3]; 3] {
     std::array::from_fn(|corner| std::array::from_fn(|axis| number(3 * corner + axis)))
 }
 
+/// The triangles of an OBJ file.
+fn obj(text: &str) -> Result<Vec<Triangle>, String> {
+    let vertices = points(text, "v ")?;
+    let mut triangles = Vec::new();
+    for (ix, line) in text.lines().enumerate() {
+        let Some(corners) = line.trim_start().strip_prefix("f ") else {
+            continue;
+        };
+        let corners: Option<Vec<[f64; 3]>> = corners
+            .split_whitespace()
+            .map(|corner| face_corner(corner, &vertices))
+            .collect();
+        let Some(corners) = corners else {
+            return Err(format!(
+                "line {} names a vertex that does not exist",
+                ix + 1
+            ));
+        };
+        // Faces are flat and convex, so they can be divided into triangles at their first corner.
+        let pairs = corners.windows(2).skip(1);
+        triangles.extend(pairs.map(|pair| [corners[0], pair[0], pair[1]]));
+    }
+    if triangles.is_empty() {
+        triangles.extend(vertices.iter().map(|vertex| [*vertex; 3]));
+    }
+    Ok(triangles)
+}
+
+/// The vertex of a corner such as `7/1/3` (vertex 7) or `-1` (the last vertex).
+fn face_corner(corner: &str, vertices: &[[f64; 3]]) -> Option<[f64; 3]> {
+    let number: i64 = corner.split('/').next()?.parse().ok()?;
+    let n_vertices = i64::try_from(vertices.len()).ok()?;
+    let ix = if number < 0 {
+        n_vertices + number
+    } else {
+        number - 1
+    };
+    vertices.get(usize::try_from(ix).ok()?).copied()
+}
+
 /// The points on the lines of a text file that start with a keyword.
-fn text(text: &str, keyword: &str) -> Result<Vec<[f64; 3]>, String> {
+fn points(text: &str, keyword: &str) -> Result<Vec<[f64; 3]>, String> {
     let lines = text.lines().enumerate();
     let points = lines.filter_map(|(ix, line)| {
         let numbers = line.trim_start().strip_prefix(keyword)?;
@@ -91,14 +136,14 @@ fn point(numbers: &str) -> Option<[f64; 3]> {
 mod tests {
     use super::*;
 
-    fn vertices(name: &str, contents: &[u8]) -> Result<Vec<[f64; 3]>, String> {
+    fn triangles(name: &str, contents: &[u8]) -> Result<Vec<Triangle>, String> {
         let folder = tempfile::tempdir().expect("a folder");
         std::fs::write(folder.path().join(name), contents).expect("written");
-        read(name, folder.path())
+        mesh_triangles(name, folder.path())
     }
 
     #[test]
-    fn vertices_of_all_formats_are_read() {
+    fn triangles_of_all_formats_are_read() {
         let mut binary = b"solid, but binary".to_vec();
         binary.resize(STL_HEADER_BYTES - NUMBER_BYTES, 0);
         binary.extend(1_u32.to_le_bytes());
@@ -107,13 +152,19 @@ mod tests {
         ];
         binary.extend(numbers.iter().flat_map(|number| number.to_le_bytes()));
         binary.extend([0, 0]);
-        let expected = vec![[1.0, 2.0, 3.0], [4.0, 5.0, 6.0], [7.0, 8.0, 9.5]];
-        assert_eq!(vertices("a.stl", &binary), Ok(expected.clone()));
+        let expected = vec![[[1.0, 2.0, 3.0], [4.0, 5.0, 6.0], [7.0, 8.0, 9.5]]];
+        assert_eq!(triangles("a.stl", &binary), Ok(expected.clone()));
         let stl = "solid\n facet normal 0 0 1\n outer loop\n vertex 1 2 3\n vertex 4 5 6\n\
                    vertex 7 8 9.5\n endloop\n endfacet\nendsolid\n";
-        assert_eq!(vertices("a.STL", stl.as_bytes()), Ok(expected.clone()));
+        assert_eq!(triangles("a.STL", stl.as_bytes()), Ok(expected.clone()));
         let obj = "# a mesh\nvn 0 0 1\nv 1 2 3\nv 4 5 6\nv 7 8 9.5\nf 1 2 3\n";
-        assert_eq!(vertices("a.obj", obj.as_bytes()), Ok(expected));
+        assert_eq!(triangles("a.obj", obj.as_bytes()), Ok(expected));
+        let square = "v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\nf 1/1/1 2//1 3 -1\n";
+        let halves = triangles("a.obj", square.as_bytes()).expect("a square");
+        assert_eq!(halves[1], [[0.0; 3], [1.0, 1.0, 0.0], [0.0, 1.0, 0.0]]);
+        assert_eq!(halves.len(), 2);
+        let cloud = triangles("a.obj", b"v 1 2 3\nv 4 5 6\n").expect("vertices");
+        assert_eq!(cloud, [[[1.0, 2.0, 3.0]; 3], [[4.0, 5.0, 6.0]; 3]]);
     }
 
     #[test]
@@ -122,13 +173,14 @@ mod tests {
             ("a.stl", "short", "neither a binary nor a text"),
             ("a.stl", "solid\n vertex 1 2\n", "line 2 has no point"),
             ("a.obj", "v 1 2 inf\n", "line 1 has no point"),
+            ("a.obj", "v 1 2 3\nf 1 2 1\n", "line 2 names a vertex"),
             ("a.obj", "# nothing\n", "no vertices"),
             ("a.dae", "<COLLADA/>", "convert it to .stl"),
         ] {
-            let error = vertices(name, contents.as_bytes()).expect_err(name);
+            let error = triangles(name, contents.as_bytes()).expect_err(name);
             assert!(error.contains(words), "{name}: {error}");
         }
-        let missing = read("missing.stl", Path::new("/nowhere")).expect_err("missing");
+        let missing = mesh_triangles("missing.stl", Path::new("/nowhere")).expect_err("missing");
         assert!(missing.contains("no such file"), "{missing}");
     }
 }
