@@ -62,6 +62,7 @@ test("an arrow at the border points to a robot outside of the picture", () => {
   assertClose([above.x, above.y, above.angleRad], [400, 96, -Math.PI / 2], 1e-6);
   const behind = place(boxAt(0, -5, 0))!;
   assertClose([behind.x, behind.y, behind.angleRad], [400, 316, Math.PI / 2], 1e-6);
+  assert.equal(place(boxAt(0, -0.3, 0)), null, "the eye is on the robot");
 });
 
 test("the model hides the robot only if it hides all of it", () => {

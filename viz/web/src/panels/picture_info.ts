@@ -32,9 +32,10 @@ export class PictureInfo {
     view.picture.accepts = (header) => this.label.accepts(header);
   }
 
-  /** Whether the view shows the full picture of the wanted view and model. */
+  /** Whether the view shows the full picture of the wanted view and model. A coarser stage can also be current. */
   get isComplete(): boolean {
-    return this.info.dataset.state === "current";
+    const isFull = this.isLocal || (this.label.header?.scale ?? 0) >= 1 - 1e-9;
+    return isFull && this.info.dataset.state === "current";
   }
 
   /** The drawn model; empty if there is none. */

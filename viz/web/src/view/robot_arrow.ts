@@ -14,9 +14,14 @@ export interface ArrowPlace {
   angleRad: number;
 }
 
-/** Where the arrow is in a view of this size; null if a part of the box is visible. */
+/** Eyes at most this far from the robot's box, in shares of its diagonal, look from the robot, such as from its camera. */
+const SEAT_FRAC = 0.1;
+
+/** Where the arrow is in a view of this size; null if a part of the box is visible, or the eye is on the robot. */
 export function arrowPlace(box: Box3, camera: PerspectiveCamera, [width, height]: [number, number]): ArrowPlace | null {
   if (box.isEmpty() || isInView(box, camera)) return null;
+  const diagonal = box.getSize(new Vector3()).length();
+  if (box.distanceToPoint(camera.position) <= SEAT_FRAC * diagonal) return null;
   const center = box.getCenter(new Vector3()).applyMatrix4(camera.matrixWorldInverse);
   // Pixels are square, so this is the direction on the screen. It is also the way to turn if the robot is behind.
   const isStraightBehind = Math.hypot(center.x, center.y) < 1e-6;
