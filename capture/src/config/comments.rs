@@ -170,7 +170,7 @@ impl Items {
     fn of(text: &str) -> Option<Self> {
         let table = DeTable::parse(text).ok()?;
         let (mut keys, mut strings) = (Vec::new(), Vec::new());
-        collect(table.get_ref(), &Vec::new(), &mut keys, &mut strings);
+        collect(table.get_ref(), &[], &mut keys, &mut strings);
         keys.sort_by_key(|place| place.key.start);
         // Only strings of several lines contain the beginning of a line.
         strings.retain(|string| text[string.clone()].contains('\n'));
@@ -207,12 +207,12 @@ impl Items {
 
 fn collect(
     table: &DeTable<'_>,
-    parents: &KeyPath,
+    parents: &[String],
     keys: &mut Vec<KeyPlace>,
     strings: &mut Vec<Range<usize>>,
 ) {
     for (key, value) in table {
-        let mut path = parents.clone();
+        let mut path = parents.to_vec();
         path.push(key.get_ref().to_string());
         match value.get_ref() {
             DeValue::Table(inner) => collect(inner, &path, keys, strings),
