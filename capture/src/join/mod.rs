@@ -567,11 +567,11 @@ impl Join {
         let cover = masks.and_then(|masks| masks.apply(keyframe, robot, depth_delay_secs));
         let Some(cover) = cover else { return };
         let n_images = self.counts.add_robot_cover(&keyframe.camera, cover);
-        if n_images == MIN_IMAGES_OF_COVER {
-            if let Some(note) = self.counts.robot_note(&keyframe.camera) {
-                log::info!("{note}");
-                self.notes.add(note);
-            }
+        if n_images == MIN_IMAGES_OF_COVER
+            && let Some(note) = self.counts.robot_note(&keyframe.camera)
+        {
+            log::info!("{note}");
+            self.notes.add(note);
         }
     }
 

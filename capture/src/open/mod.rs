@@ -515,6 +515,7 @@ mod tests {
             let driver = [
                 ("arm.driver", "none"),
                 ("camera.wrist.driver", "nokhwa"),
+                ("camera.wrist.device", "no such camera"),
                 ("camera.wrist.parent", "base"),
             ];
             let overrides = driver
