@@ -50,8 +50,8 @@ fn commands_name_the_calibration_that_they_need_and_how_to_find_it() {
         (
             &["run", "rig.toml"][..],
             &[
-                "camera.wrist.intrinsics is missing: `fieldrig calibrate intrinsics RIG.toml --target SPEC",
-                "camera.wrist.parent_from_camera is missing: `fieldrig calibrate hand-eye RIG.toml --target SPEC",
+                "camera.wrist.intrinsics is missing: `fieldrig calibrate intrinsics rig.toml --camera wrist --target charuco:",
+                "camera.wrist.parent_from_camera is missing: `fieldrig calibrate hand-eye rig.toml --camera wrist --target charuco:",
             ][..],
         ),
         (
