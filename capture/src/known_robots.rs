@@ -108,7 +108,7 @@ pub const KNOWN_ROBOTS: &[KnownRobot] = &[
     },
 ];
 
-/// A robot that is not known, and whose name is easily taken for that of a known robot.
+/// An unknown robot whose name is easily confused with the name of a known robot.
 struct OtherModel {
     name: &'static str,
     /// How it differs from the known robot with the most similar name.

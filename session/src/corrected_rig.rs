@@ -229,7 +229,7 @@ fn other_robot(rig: &Rig, file: &Path) -> Option<PathBuf> {
 }
 
 /// The text of a rig file to write: all keys, and the comments of the file from which the rig was
-/// read. The comments of a rig that was read from elsewhere are those of the file to replace.
+/// read. A rig that was read from elsewhere gets the comments of the file to replace.
 fn text_of(rig: &Rig, file: &Path) -> String {
     let source = files::read_text(rig.path.get().unwrap_or(file));
     rig.to_toml_with_comments(&source.unwrap_or_default())
@@ -606,7 +606,7 @@ mod tests {
             ..rig.cameras[0].intrinsics.clone()
         };
         let rig = with_intrinsics(&rig, "room", &measured, None).unwrap();
-        // The comments are those of the rig file that was read, whichever file is written.
+        // The comments come from the rig file that was read, whichever file is written.
         for name in ["calibrated.toml", "rig.toml", "rig.toml"] {
             write(&rig, &at(name)).unwrap();
             let written = std::fs::read_to_string(at(name)).unwrap();

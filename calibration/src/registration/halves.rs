@@ -32,7 +32,7 @@ const MIN_RATIO: f64 = 4.284;
 /// The corrections of a camera pose that two halves of the keyframes give.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct HalvesAgreement {
-    /// Squared length of the mean correction, divided by that of half the difference.
+    /// Squared length of the mean correction, divided by the squared length of half the difference.
     pub ratio: f64,
     /// Angle (radians) and distance (meters) between the corrections of the two halves.
     pub difference_rad: f64,

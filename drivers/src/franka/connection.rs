@@ -20,7 +20,7 @@ const ONE_CLIENT_HINT: &str = "FCI accepts one client at a time: stop the other 
 
 /// What to check if something else than a controller answers. A test compares the port.
 const CHECK_ADDRESS: &str =
-    "check that the address is that of a Franka controller, and its port that of FCI, 1337";
+    "check that the address belongs to a Franka controller, and that the port is 1337 (FCI)";
 
 /// An open connection. Dropping it closes the connection.
 #[derive(Debug)]
@@ -144,7 +144,7 @@ fn disconnected(error: FrankaError) -> String {
     }
 }
 
-/// The reason if the answer is not that of a controller.
+/// The reason if no controller has answered.
 fn no_controller(problem: &str) -> String {
     format!(
         "what answers there is no control interface (FCI) of a Franka controller: {problem}; {CHECK_ADDRESS}"

@@ -279,7 +279,7 @@ fn unresponsive_or_unsupported_controller_is_error() {
     assert!(
         web_server.contains("no control interface (FCI) of a Franka controller")
             && web_server.contains(&address.to_string())
-            && web_server.contains(&format!("that of FCI, {ROBOT_COMMAND_PORT}"))
+            && web_server.contains(&format!("{ROBOT_COMMAND_PORT} (FCI)"))
             && !web_server.contains("one client"),
         "{web_server}"
     );

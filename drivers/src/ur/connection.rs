@@ -19,7 +19,7 @@ pub(super) const POLL: Duration = Duration::from_millis(100);
 /// Bytes to receive at once: more than the states of 100 ms.
 const RECEIVE_BYTES: usize = 32 * 1024;
 /// What to check if something else than a controller answers. A test compares the port.
-const CHECK_ADDRESS: &str = "check that the address is that of a controller of Universal Robots, and its port that of RTDE, 30004";
+const CHECK_ADDRESS: &str = "check that the address belongs to a controller of Universal Robots, and that the port is 30004 (RTDE)";
 /// Major version of PolyScope on CB3 controllers. Those of e-Series and later are higher.
 const CB3_MAJOR: u32 = 3;
 

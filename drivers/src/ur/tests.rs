@@ -322,7 +322,7 @@ fn unsupported_controllers_are_reported_with_a_remedy() {
         assert!(message.contains(expected), "{message}");
         assert!(
             message.contains(&address.to_string())
-                && message.contains(&format!("that of RTDE, {RTDE_PORT}")),
+                && message.contains(&format!("{RTDE_PORT} (RTDE)")),
             "{message}"
         );
         thread.join().unwrap();
