@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 /// Which parts of fieldrig can read a mesh file.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum MeshKind {
-    /// Triangles (`.stl`, `.obj`): the page, the simulator and steering.
+    /// Triangles (`.stl`, `.obj`): the page, the simulator, steering and masks of the robot.
     Triangles,
     /// COLLADA (`.dae`): only the page.
     Collada,

@@ -33,7 +33,7 @@ pub fn mesh_triangles(file: &str, urdf_folder: &Path) -> Result<Vec<Triangle>, S
         "obj" => obj(&String::from_utf8_lossy(&bytes))?,
         other => {
             return Err(format!(
-                "the bounds of .{other} files cannot be read, convert it to .stl or .obj"
+                ".{other} files cannot be read, convert it to .stl or .obj"
             ));
         }
     };

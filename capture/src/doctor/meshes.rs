@@ -38,10 +38,24 @@ pub fn meshes_of(urdf: &str, folder: &Path) -> Vec<Finding> {
         let files = found.iter().copied();
         files.filter(|file| MeshKind::of(file) == kind).collect()
     };
+    let simpler = "the robot is drawn without them, or with simpler shapes";
+    let convert = |_: &str| "convert them to .stl or .obj".to_owned();
     let findings = [
-        named.missing(&missing, folder),
-        named.collada(&of_kind(MeshKind::Collada)),
-        named.unsupported(&of_kind(MeshKind::Unsupported)),
+        named.warning(&missing, "missing", simpler, |first| {
+            missing_mesh_file(first, folder)
+        }),
+        named.warning(
+            &of_kind(MeshKind::Collada),
+            "in COLLADA format (.dae)",
+            "the page draws them, but a simulation draws simpler shapes",
+            convert,
+        ),
+        named.warning(
+            &of_kind(MeshKind::Unsupported),
+            "of a kind that cannot be read",
+            simpler,
+            convert,
+        ),
     ];
     findings.into_iter().flatten().collect()
 }
@@ -75,46 +89,25 @@ impl<'a> NamedMeshes<'a> {
         meshes
     }
 
-    fn missing(&self, files: &[&str], folder: &Path) -> Option<Finding> {
+    /// A warning about some of the files; `None` if there are none.
+    ///
+    /// * `state`: why they cannot be used, after "are".
+    /// * `loss`: what the run lacks without them.
+    /// * `remedy`: what to do about the first file.
+    fn warning(
+        &self,
+        files: &[&str],
+        state: &str,
+        loss: &str,
+        remedy: impl FnOnce(&str) -> String,
+    ) -> Option<Finding> {
         let first = files.first()?;
         let message = format!(
-            "{} missing, the first is {first:?}: the robot is drawn without them, or with simpler shapes{}",
+            "{} {state}, the first is {first:?}: {loss}{}",
             self.part(files),
             self.without_distance(files)
         );
-        Some(Finding::warn(
-            CHECK,
-            message,
-            missing_mesh_file(first, folder),
-        ))
-    }
-
-    fn collada(&self, files: &[&str]) -> Option<Finding> {
-        let first = files.first()?;
-        let message = format!(
-            "{} in COLLADA format (.dae), the first is {first:?}: the page draws them, but a simulation draws simpler shapes{}",
-            self.part(files),
-            self.without_distance(files)
-        );
-        Some(Finding::warn(
-            CHECK,
-            message,
-            "convert them to .stl or .obj",
-        ))
-    }
-
-    fn unsupported(&self, files: &[&str]) -> Option<Finding> {
-        let first = files.first()?;
-        let message = format!(
-            "{} of a kind that cannot be read, the first is {first:?}: the robot is drawn without them, or with simpler shapes{}",
-            self.part(files),
-            self.without_distance(files)
-        );
-        Some(Finding::warn(
-            CHECK,
-            message,
-            "convert them to .stl or .obj",
-        ))
+        Some(Finding::warn(CHECK, message, remedy(first)))
     }
 
     /// How many of the files are meant, as the beginning of a sentence.

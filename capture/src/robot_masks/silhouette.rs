@@ -101,12 +101,12 @@ impl Silhouette {
         } = self.view;
         let tan = [point.x / point.z, point.y / point.z];
         // Points outside the image move faster, but the edge of the robot is inside.
-        let slope = 1.0 + (tan[0].powi(2) + tan[1].powi(2)).min(self.max_tan_squared);
+        let secant_squared = 1.0 + (tan[0].powi(2) + tan[1].powi(2)).min(self.max_tan_squared);
         // To first order, rotating the camera by an angle moves the image of a point by at most
-        // this angle times `slope` focal lengths. Moving the point by a distance moves its image by
-        // at most this distance over z times the root of `slope`. Both errors are independent.
-        let by_rotation = self.uncertainty.rotation_rad * slope;
-        let by_position = self.uncertainty.position_m / point.z * slope.sqrt();
+        // this angle times `secant_squared` focal lengths. Moving the point by a distance moves its
+        // image by at most this distance over z times the secant. Both errors are independent.
+        let by_rotation = self.uncertainty.rotation_rad * secant_squared;
+        let by_position = self.uncertainty.position_m / point.z * secant_squared.sqrt();
         let margin = by_rotation.hypot(by_position) / (0.5 * TAU / f64::from(N_CORNERS)).cos();
         (0..N_CORNERS).map(move |ix| {
             let (sin, cos) = (TAU * f64::from(ix) / f64::from(N_CORNERS)).sin_cos();

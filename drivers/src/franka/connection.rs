@@ -147,7 +147,7 @@ fn disconnected(error: FrankaError) -> String {
 /// The reason if no controller has answered.
 fn no_controller(problem: &str) -> String {
     format!(
-        "what answers there is no control interface (FCI) of a Franka controller: {problem}; {CHECK_ADDRESS}"
+        "another server answers, and not the control interface (FCI) of a Franka controller: {problem}; {CHECK_ADDRESS}"
     )
 }
 

@@ -277,7 +277,7 @@ fn unresponsive_or_unsupported_controller_is_error() {
     });
     let web_server = FrankaArm::open(&config(address)).unwrap_err().to_string();
     assert!(
-        web_server.contains("no control interface (FCI) of a Franka controller")
+        web_server.contains("not the control interface (FCI) of a Franka controller")
             && web_server.contains(&address.to_string())
             && web_server.contains(&format!("{ROBOT_COMMAND_PORT} (FCI)"))
             && !web_server.contains("one client"),

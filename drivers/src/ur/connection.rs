@@ -316,7 +316,7 @@ impl PackageStream {
             // The controller or the network has damaged the stream.
             Err(problem) if self.is_rtde => Err(problem.to_string()),
             Err(problem) => Err(format!(
-                "what answers there is no RTDE interface of a controller of Universal Robots: {problem}; {CHECK_ADDRESS}"
+                "another server answers, and not the RTDE interface of a controller of Universal Robots: {problem}; {CHECK_ADDRESS}"
             )),
         }
     }

@@ -307,7 +307,7 @@ fn unsupported_controllers_are_reported_with_a_remedy() {
     for (answer, expected) in [
         (
             &b"HTTP/1.1 400 Bad Request\r\n\r\n"[..],
-            "what answers there is no RTDE interface of a controller of Universal Robots: it sent \"HTTP/1.1 400 Bad Request\"",
+            "another server answers, and not the RTDE interface of a controller of Universal Robots: it sent \"HTTP/1.1 400 Bad Request\"",
         ),
         (&[], "closed the connection without an answer"),
     ] {

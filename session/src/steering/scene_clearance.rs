@@ -123,20 +123,22 @@ impl SceneClearance {
             return;
         };
         let mut state = self.state.lock();
-        let is_due = state.sweep.takes_reading(robot.stamp);
+        let swept = state
+            .sweep
+            .takes_reading(robot.stamp)
+            .then(|| self.posture(robot.stamp, position.clone()));
         // Readings that are not later than the last one are counted by the history.
         let _ = state.postures.push(JointState {
             stamp: robot.stamp,
-            position: position.clone(),
+            position,
             velocity: Vec::new(),
             effort: Vec::new(),
         });
         drop(state);
-        if is_due {
-            let posture = self.posture(robot.stamp, position);
-            if let Err(error) = self.map.sweep(posture, self.swept_margin_m) {
-                log::debug!("steering: {error}");
-            }
+        if let Some(posture) = swept
+            && let Err(error) = self.map.sweep(posture, self.swept_margin_m)
+        {
+            log::debug!("steering: {error}");
         }
     }
 
@@ -247,12 +249,15 @@ mod tests {
     /// Maximum time until the map has integrated something, on a busy machine.
     const TIMEOUT: Duration = Duration::from_secs(60);
 
-    fn simulated() -> (SceneClearance, ChainAndBody) {
+    /// The clearance of a simulated arm, and a point 10 cm beside its tip at [`START`].
+    fn simulated() -> (SceneClearance, [f64; 3]) {
         let file = Path::new(env!("CARGO_MANIFEST_DIR")).join("../rigs/static-arm.toml");
         let rig = Rig::load(&file, &[]).expect("a rig of this repository");
         let robot = chain_and_body(&rig, Path::new("")).expect("its shapes are in the URDF");
         let scene = SceneClearance::new(&rig, &robot).expect("a map of its reach");
-        (scene, robot)
+        let base_from_tip = robot.chain.forward(&START).expect("seven joints");
+        let tip = base_from_tip.translation;
+        (scene, [tip.x, tip.y + 0.1, tip.z])
     }
 
     fn reading_at(stamp: Stamp) -> RobotState {
@@ -289,18 +294,12 @@ mod tests {
 
     #[test]
     fn the_way_of_the_arm_is_free_until_an_operator_has_it() {
-        let (scene, robot) = simulated();
-        let tip = robot
-            .chain
-            .forward(&START)
-            .expect("seven joints")
-            .translation;
-        let beside_tip = [tip.x, tip.y + 0.1, tip.z];
+        let (scene, beside_tip) = simulated();
         assert!(!is_known(&scene, beside_tip));
         scene.set_posture(&arm_at(AT));
         wait_until_known(&scene, beside_tip);
         assert!(
-            !is_known(&scene, [tip.x, tip.y + 0.5, tip.z]),
+            !is_known(&scene, [beside_tip[0], beside_tip[1] + 0.4, beside_tip[2]]),
             "it was not there"
         );
         scene.end_sweep();
@@ -326,13 +325,7 @@ mod tests {
 
     #[test]
     fn a_posture_that_only_the_input_reports_shows_free_space() {
-        let (scene, robot) = simulated();
-        let tip = robot
-            .chain
-            .forward(&START)
-            .expect("seven joints")
-            .translation;
-        let beside_tip = [tip.x, tip.y + 0.1, tip.z];
+        let (scene, beside_tip) = simulated();
         scene.observe_robot(&reading_at(AT));
         wait_until_known(&scene, beside_tip);
     }

@@ -220,17 +220,12 @@ impl Page {
         motion
     }
 
-    /// Presses (`touchStart`) or releases (`touchEnd`) a finger at the center of an element.
-    fn touch(&mut self, kind: &str, id: &str) {
-        touch(&mut self.browser, kind, id);
-    }
-
     fn check_accessibility(&mut self, when: &str) {
         assert_eq!(self.strings(PROBLEMS), [""; 0], "{when}");
     }
 }
 
-/// Sends a part of a touch of an element.
+/// Presses (`touchStart`) or releases (`touchEnd`) a finger at the center of an element.
 fn touch(browser: &mut Browser, kind: &str, id: &str) {
     let center = browser.evaluate(&format!(
         "(() => {{ const b = document.getElementById('{id}').getBoundingClientRect(); \
@@ -771,7 +766,7 @@ fn check_touch_help(page: &mut Page, [width, height]: [u32; 2]) {
 /// A finger that holds a button reads what it does, and does not press it.
 fn check_hold(page: &mut Page) {
     let is_open = "document.getElementById('toggle-layers').getAttribute('aria-expanded')";
-    page.touch("touchStart", "toggle-layers");
+    touch(&mut page.browser, "touchStart", "toggle-layers");
     page.wait_until(
         "a tooltip",
         "document.getElementById('tooltip')?.hidden === false",
@@ -781,7 +776,7 @@ fn check_hold(page: &mut Page) {
             .text("tooltip")
             .contains("Choose what is drawn")
     );
-    page.touch("touchEnd", "toggle-layers");
+    touch(&mut page.browser, "touchEnd", "toggle-layers");
     page.browser.next_frame();
     assert_eq!(page.browser.evaluate(is_open), Value::from("false"));
     page.wait("the layers", |browser| {
