@@ -385,21 +385,21 @@ fn local_splats_hide_what_lies_behind_them() {
             browser.evaluate("document.querySelectorAll('#live canvas').length") == 1
         });
         // On a busy computer, images are late, and the frustum is drawn faintly for a while.
-        let n_bright = |browser: &mut Browser, name: &str| {
+        let wait_for_pixels = |browser: &mut Browser, name: &str, n_min: usize| {
             let mut n = 0;
             wait_for(browser, name, |browser| {
                 n = n_accent_pixels(browser, name);
-                n > 60
+                n > n_min
             });
             n
         };
         browser.click("toggle-occlude");
-        let n_all = n_bright(&mut browser, &format!("{name}-without-occlusion"));
+        let n_all = wait_for_pixels(&mut browser, &format!("{name}-without-occlusion"), 60);
         browser.click("toggle-occlude");
         let n_shown = if y > 0.0 {
             n_accent_pixels(&mut browser, name)
         } else {
-            n_bright(&mut browser, name)
+            wait_for_pixels(&mut browser, name, n_all * 9 / 10)
         };
         camera.stop();
         eprintln!("{name}: {n_shown} of {n_all} pixels");
