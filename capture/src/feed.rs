@@ -78,6 +78,7 @@ struct Shared {
     first_image: OnceLock<Instant>,
     rejected: Mutex<BTreeMap<String, u64>>,
     source_failed: AtomicBool,
+    source_ended: AtomicBool,
     counts: Mutex<InputCounts>,
 }
 
@@ -194,6 +195,12 @@ impl Feed {
         self.ended
     }
 
+    /// Whether the source has ended or failed. Its last keyframes may still wait in the queue.
+    #[must_use]
+    pub fn source_ended(&self) -> bool {
+        self.shared.source_ended.load(Ordering::Relaxed)
+    }
+
     /// Whether the source failed.
     #[must_use]
     pub fn source_failed(&self) -> bool {
@@ -273,6 +280,7 @@ impl Pump {
                 break;
             }
         }
+        self.shared.source_ended.store(true, Ordering::Relaxed);
         // The input has ended. Images that are still waiting get a decision now, and a station is
         // registered with the keyframes received so far.
         let events = self.input.join.finish();

@@ -12,6 +12,17 @@ const MIN_IMAGES: u64 = 8;
 /// Waiting for the first image for longer than this is a problem. Cameras take up to some seconds
 /// to start.
 const MAX_WAIT_SECS: f64 = 10.0;
+/// If at least this share of the recent images is lost, or is rejected for the same reason, this is
+/// a problem.
+const PROBLEM_SHARE: f64 = 1.0 / 2.0;
+/// Smaller losses are common on slow computers and are no problem. From this share on, they are
+/// mentioned.
+const MENTIONED_SHARE: f64 = 1.0 / 4.0;
+/// What is shown stays until its share has fallen below this part of the share with which it began.
+/// Otherwise, it would come and go while the share varies around that limit.
+const KEPT_PART: f64 = 2.0 / 3.0;
+/// A shown share is replaced if the share differs by more than this.
+const MIN_SHARE_CHANGE: f64 = 0.15;
 /// Maximum difference between a share and the simple fraction, such as 7 of 8, by which it is
 /// described.
 const MAX_SHARE_ERROR: f64 = 0.01;
@@ -85,37 +96,75 @@ pub(crate) struct Situation {
     pub(crate) paused_by: Option<u64>,
 }
 
-/// The advice for a situation. Problems come first, the most costly one before the others.
-#[must_use]
-pub(crate) fn advise(situation: &Situation) -> Advice {
-    let state = state_text(situation);
-    let warning = |text: String| Advice {
-        text,
-        is_warning: true,
-    };
-    let info = |text: String| Advice {
-        text,
-        is_warning: false,
-    };
-    let is_scanning = match situation.state {
-        RunState::Waiting if situation.run_secs > MAX_WAIT_SECS => {
-            return warning(format!(
-                "{state}. None has come so far: check the cameras with fieldrig doctor"
-            ));
+/// What recent images have in common.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Finding {
+    /// So many did not arrive that this is a problem.
+    Lost,
+    /// They were rejected for the same reasons, as in this entry of [`REMEDIES`].
+    Rejected(usize),
+    /// Some did not arrive.
+    Dropped,
+}
+
+/// Advises the operator. It remembers what is shown, so that the advice does not come and go while
+/// the images vary.
+#[derive(Debug, Default)]
+pub(crate) struct Advisor {
+    /// What is shown, and the share of the images in its text.
+    shown: Option<(Finding, f64)>,
+}
+
+impl Advisor {
+    /// The advice for a situation. Problems come first, the most costly one before the others.
+    pub(crate) fn advise(&mut self, situation: &Situation) -> Advice {
+        let state = state_text(situation);
+        let is_scanning = match situation.state {
+            // While training is paused, keyframes are still accepted, so losses matter.
+            RunState::Collecting | RunState::Training | RunState::Paused => {
+                !situation.has_input_ended
+            }
+            RunState::Waiting | RunState::Finished => false,
+        };
+        self.shown = finding(&situation.recent, self.shown).filter(|_| is_scanning);
+        let is_late = situation.state == RunState::Waiting && situation.run_secs > MAX_WAIT_SECS;
+        let problem = self
+            .shown
+            .and_then(|(finding, share)| remedy(finding, share));
+        let (more, is_warning) = match problem {
+            _ if is_late => {
+                let text = "None has come so far: check the cameras with fieldrig doctor";
+                (Some(text.to_owned()), true)
+            }
+            Some(problem) => (Some(problem), true),
+            None if is_scanning => (self.hint(situation), false),
+            None => (None, false),
+        };
+        Advice {
+            text: more.map_or_else(|| state.clone(), |more| format!("{state}. {more}")),
+            is_warning,
         }
-        // While training is paused, keyframes are still accepted, so losses matter.
-        RunState::Collecting | RunState::Training | RunState::Paused => !situation.has_input_ended,
-        RunState::Waiting | RunState::Finished => false,
-    };
-    if !is_scanning {
-        return info(state);
     }
-    match problem(&situation.recent) {
-        Some(problem) => warning(format!("{state}. {problem}")),
-        None => match hint(situation) {
-            Some(hint) => info(format!("{state}. {hint}")),
-            None => info(state),
-        },
+
+    /// What the operator may want to know although nothing is wrong.
+    fn hint(&self, situation: &Situation) -> Option<String> {
+        let Situation { recent, store, .. } = situation;
+        let n_not_moved = recent.rejected.get(Rejection::NotMoved.name());
+        let is_still = n_not_moved.is_some_and(|n| 2 * n >= recent.received);
+        if recent.received >= MIN_IMAGES && recent.accepted == 0 && is_still {
+            let text = "The cameras see nothing new: move them to places that they have not seen";
+            return Some(text.to_owned());
+        }
+        if let Some((Finding::Dropped, share)) = self.shown {
+            let share = share_text(share);
+            return Some(format!("{share} dropped, and the next ones replace them"));
+        }
+        store.is_full().then(|| {
+            format!(
+                "The store is full with {} keyframes: new ones replace similar ones",
+                store.keyframes
+            )
+        })
     }
 }
 
@@ -148,58 +197,64 @@ fn state_text(situation: &Situation) -> String {
     }
 }
 
-/// Why most of the recent images are of no use, and what to do.
-pub(crate) fn problem(recent: &ImageFlow) -> Option<String> {
-    let n_sent = recent.received + recent.dropped;
-    // Smaller losses are common on slow computers and are no problem: see `hint`.
-    if n_sent >= MIN_IMAGES && 2 * recent.dropped >= n_sent {
-        let share = share_text(recent.dropped, n_sent);
-        return Some(format!("{share} lost: lower rate_hz of the cameras"));
-    }
-    let n_rejected = |reasons: &[Rejection]| -> u64 {
-        let counts = reasons.iter().map(|why| recent.rejected.get(why.name()));
-        counts.flatten().sum()
-    };
-    let is_common = |reasons: &[Rejection]| 2 * n_rejected(reasons) >= recent.received;
-    let found = REMEDIES.iter().find(|(reasons, _)| is_common(reasons));
-    found
-        .filter(|_| recent.received >= MIN_IMAGES)
-        .map(|(_, remedy)| (*remedy).to_owned())
+/// Why most of the images are of no use, and what to do.
+pub(crate) fn problem(images: &ImageFlow) -> Option<String> {
+    let (finding, share) = finding(images, None)?;
+    remedy(finding, share)
 }
 
-/// What the operator may want to know although nothing is wrong.
-fn hint(situation: &Situation) -> Option<String> {
-    let Situation { recent, store, .. } = situation;
-    let n_not_moved = recent.rejected.get(Rejection::NotMoved.name());
-    let is_still = n_not_moved.is_some_and(|n| 2 * n >= recent.received);
-    if recent.received >= MIN_IMAGES && recent.accepted == 0 && is_still {
-        return Some(
-            "The cameras see nothing new: move them to places that they have not seen".to_owned(),
-        );
-    }
-    let n_sent = recent.received + recent.dropped;
-    if n_sent >= MIN_IMAGES && 4 * recent.dropped >= n_sent {
-        let share = share_text(recent.dropped, n_sent);
-        return Some(format!("{share} dropped, and the next ones replace them"));
-    }
-    store.is_full().then(|| {
-        format!(
-            "The store is full with {} keyframes: new ones replace similar ones",
-            store.keyframes
-        )
-    })
-}
-
-/// A share of images in small numbers, such as `7 of 8 images`.
+/// What many of the recent images have in common, the most costly problem first, and the share of
+/// the images that is shown.
+///
+/// * `shown`: the previous result. It is kept while the images are similar.
 #[expect(
     clippy::cast_precision_loss,
     reason = "counts of images are far below 2^53"
 )]
-fn share_text(n: u64, n_all: u64) -> String {
-    if n >= n_all {
+fn finding(recent: &ImageFlow, shown: Option<(Finding, f64)>) -> Option<(Finding, f64)> {
+    let n_sent = recent.received + recent.dropped;
+    let n_rejected = |reasons: &[Rejection]| -> u64 {
+        let counts = reasons.iter().map(|why| recent.rejected.get(why.name()));
+        counts.flatten().sum()
+    };
+    let rejected = (REMEDIES.iter().enumerate())
+        .map(|(ix, (reasons, _))| (Finding::Rejected(ix), n_rejected(reasons), recent.received));
+    let candidates = std::iter::once((Finding::Lost, recent.dropped, n_sent))
+        .chain(rejected)
+        .chain([(Finding::Dropped, recent.dropped, n_sent)]);
+    let mut enough = candidates.filter(|(.., n_all)| *n_all >= MIN_IMAGES);
+    enough.find_map(|(finding, n, n_all)| {
+        let share = n as f64 / n_all as f64;
+        let shown_share = shown
+            .filter(|shown| shown.0 == finding)
+            .map(|shown| shown.1);
+        let begin = match finding {
+            Finding::Lost | Finding::Rejected(_) => PROBLEM_SHARE,
+            Finding::Dropped => MENTIONED_SHARE,
+        };
+        let min_share = shown_share.map_or(begin, |_| KEPT_PART * begin);
+        let is_similar = |shown: &f64| (shown - share).abs() <= MIN_SHARE_CHANGE;
+        (share >= min_share).then(|| (finding, shown_share.filter(is_similar).unwrap_or(share)))
+    })
+}
+
+/// Why images are of no use, and what to do. `None` if nothing has to be done.
+fn remedy(finding: Finding, share: f64) -> Option<String> {
+    match finding {
+        Finding::Lost => {
+            let share = share_text(share);
+            Some(format!("{share} lost: lower rate_hz of the cameras"))
+        }
+        Finding::Rejected(ix) => Some(REMEDIES[ix].1.to_owned()),
+        Finding::Dropped => None,
+    }
+}
+
+/// A share of images in small numbers, such as `7 of 8 images`.
+fn share_text(share: f64) -> String {
+    if share >= 1.0 {
         return "All images are".to_owned();
     }
-    let share = n as f64 / n_all as f64;
     if share > NEARLY_ALL {
         return "More than 9 of 10 images are".to_owned();
     }
@@ -232,6 +287,10 @@ mod tests {
             accepted: received - rejected.values().sum::<u64>(),
             rejected,
         }
+    }
+
+    fn advise(situation: &Situation) -> Advice {
+        Advisor::default().advise(situation)
     }
 
     fn situation(state: RunState, recent: ImageFlow) -> Situation {
@@ -306,6 +365,29 @@ mod tests {
     }
 
     #[test]
+    fn advice_stays_while_the_images_vary_around_its_limit() {
+        let mut advisor = Advisor::default();
+        let mut text_of = |n_lost: u64| {
+            let recent = flow(100 - n_lost, n_lost, &[]);
+            advisor.advise(&situation(RunState::Training, recent)).text
+        };
+        let lost = |share: &str| {
+            format!("Scanning. {share} images are lost: lower rate_hz of the cameras")
+        };
+        assert_eq!(text_of(52), lost("1 of 2"));
+        for n_lost in [48, 60, 40, 64, 50] {
+            assert_eq!(text_of(n_lost), lost("1 of 2"), "with {n_lost} of 100");
+        }
+        assert_eq!(text_of(75), lost("3 of 4"), "a change that matters");
+        let dropped = "Scanning. 1 of 3 images are dropped, and the next ones replace them";
+        for n_lost in [33, 45, 20] {
+            assert_eq!(text_of(n_lost), dropped, "with {n_lost} of 100");
+        }
+        assert_eq!(text_of(15), "Scanning");
+        assert_eq!(text_of(20), "Scanning", "it must begin anew");
+    }
+
+    #[test]
     fn every_state_has_a_sentence() {
         let lossy = flow(1, 9, &[]);
         let cases = [
@@ -367,17 +449,17 @@ mod tests {
 
     #[test]
     fn shares_are_small_fractions() {
-        for (n, n_all, text) in [
-            (1, 2, "1 of 2 images are"),
-            (667, 1000, "2 of 3 images are"),
-            (745, 1000, "3 of 4 images are"),
-            (48, 100, "1 of 2 images are"),
-            (94, 100, "9 of 10 images are"),
-            (95, 100, "9 of 10 images are"),
-            (999, 1000, "More than 9 of 10 images are"),
-            (5, 5, "All images are"),
+        for (share, text) in [
+            (0.5, "1 of 2 images are"),
+            (0.667, "2 of 3 images are"),
+            (0.745, "3 of 4 images are"),
+            (0.48, "1 of 2 images are"),
+            (0.94, "9 of 10 images are"),
+            (0.95, "9 of 10 images are"),
+            (0.999, "More than 9 of 10 images are"),
+            (1.0, "All images are"),
         ] {
-            assert_eq!(share_text(n, n_all), text);
+            assert_eq!(share_text(share), text);
         }
     }
 }

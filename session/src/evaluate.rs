@@ -6,6 +6,7 @@
 use anyhow::Context;
 use calibration::CalibratedCamera;
 use keyframe::{DepthMap, Keyframe};
+use kinematics::Transform;
 use messages::counted;
 use serde::Serialize;
 use std::borrow::Cow;
@@ -263,17 +264,33 @@ impl Evaluator {
         method: &mut AlignedModel,
         keyframe: &'a Keyframe,
     ) -> anyhow::Result<Drawn<'a>> {
-        let mut depth = None;
-        let mut at_truth = None;
-        if self.is_full {
-            depth = draw_depth(method, keyframe)?;
-            at_truth = draw_at_truth(method, keyframe)?;
+        if !self.is_full {
+            return Ok(Drawn {
+                keyframe,
+                picture: Arc::new(draw(method, keyframe, false)?),
+                depth: None,
+                at_truth: None,
+            });
         }
+        let lens = method.calibrated_camera(keyframe)?;
+        let depth = comparable_depth(method, keyframe);
+        // Depth that is aligned with the image is in the same picture.
+        let is_aligned = depth
+            .as_ref()
+            .is_some_and(|depth| is_aligned(depth, &lens, keyframe));
+        let picture = Arc::new(draw(method, keyframe, is_aligned)?);
+        let depth = match depth {
+            Some(depth) if is_aligned => Some((Arc::clone(&picture), depth)),
+            Some(depth) => {
+                render_depth(method, keyframe, &depth)?.map(|drawn| (Arc::new(drawn), depth))
+            }
+            None => None,
+        };
         Ok(Drawn {
             keyframe,
-            picture: draw(method, keyframe, false)?,
+            picture,
             depth,
-            at_truth,
+            at_truth: draw_at_truth(method, keyframe)?,
         })
     }
 }
@@ -288,9 +305,9 @@ fn name_of(keyframe: &Keyframe) -> String {
 /// The renders from which the scores of a test keyframe are computed.
 struct Drawn<'a> {
     keyframe: &'a Keyframe,
-    picture: Picture,
+    picture: Arc<Picture>,
     /// Rendered depth, and the measured depth at its size.
-    depth: Option<(Picture, Cow<'a, DepthMap>)>,
+    depth: Option<(Arc<Picture>, Cow<'a, DepthMap>)>,
     /// A render at the true pose.
     at_truth: Option<Picture>,
 }
@@ -564,21 +581,28 @@ fn request(keyframe: &Keyframe, lens: &CalibratedCamera) -> RenderRequest {
     }
 }
 
-/// Renders depth at the size at which the method can be compared with the measured depth.
-fn draw_depth<'a>(
-    method: &mut AlignedModel,
+/// The measured depth at the size at which the method can be compared with it.
+fn comparable_depth<'a>(
+    method: &AlignedModel,
     keyframe: &'a Keyframe,
-) -> anyhow::Result<Option<(Picture, Cow<'a, DepthMap>)>> {
-    let Some(full) = &keyframe.depth else {
-        return Ok(None);
-    };
+) -> Option<Cow<'a, DepthMap>> {
+    let full = keyframe.depth.as_ref()?;
     let stride = method.model().depth_stride();
-    let depth = if stride > 1 {
+    Some(if stride > 1 {
         Cow::Owned(full.subsampled(stride))
     } else {
         Cow::Borrowed(full)
-    };
-    Ok(render_depth(method, keyframe, &depth)?.map(|drawn| (drawn, depth)))
+    })
+}
+
+/// Whether each pixel of a depth image looks in the same direction from the same place as that of
+/// the color image, as [`render_depth`] and [`draw`] render them.
+fn is_aligned(depth: &DepthMap, lens: &CalibratedCamera, keyframe: &Keyframe) -> bool {
+    lens.color_from_depth == Some(Transform::identity())
+        && lens.shutter.is_none()
+        && depth.size_px == keyframe.size_px
+        && depth.focal_px == lens.focal_px
+        && depth.principal_px == lens.principal_px
 }
 
 /// Renders at the true pose, for the comparison with the noise-free image, which has no rolling

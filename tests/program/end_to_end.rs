@@ -454,7 +454,8 @@ fn nerf_runs_live_replays_and_resumes() {
             .cloned()
             .expect("events")
     };
-    let begin = ["--method", "nerf", "--plan-steps", "12"];
+    // Scoring small images is faster.
+    let begin = ["--method", "nerf", "--plan-steps", "12", "--scale", "0.5"];
     train_and_get_done(&[&begin[..], &["--steps", "6", "--out", "half"]].concat());
     let whole = train_and_get_done(&[&begin[..], &["--steps", "12", "--out", "whole"]].concat());
     let resumed = train_and_get_done(&["--resume", "half", "--steps", "12", "--out", "resumed"]);
@@ -606,7 +607,8 @@ fn interrupted(folder: &Path, args: &[&str], meanwhile: impl FnOnce(&Value)) -> 
     printed
 }
 
-/// Pauses training and continues it. Meanwhile, no model takes a step.
+/// Pauses training, during which no model takes a step, and continues it until the recording has
+/// ended.
 fn pause_and_continue(url: &str) {
     use std::time::{Duration, Instant};
     let address = url.trim_start_matches("http://").trim_end_matches('/');
@@ -641,6 +643,17 @@ fn pause_and_continue(url: &str) {
     }
     pause(&mut socket, false);
     while steps_in(&mut socket, "training")[1] == paused_at[1] {}
+    loop {
+        let tungstenite::Message::Text(text) = socket.read().expect("a status") else {
+            continue;
+        };
+        let status: Value = serde_json::from_str(&text).expect("JSON");
+        if status["input_ended"] == true {
+            let advice = status["advice"]["text"].as_str().expect("a sentence");
+            assert!(!advice.starts_with("Scanning"), "{advice}");
+            break;
+        }
+    }
 }
 
 /// Requests a picture of each model, and of a model that does not exist.

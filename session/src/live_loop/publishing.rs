@@ -1,7 +1,7 @@
 //! Publishes keyframes, models and the status of a run to viewers.
 
 use super::LiveLoop;
-use crate::advice::{ImageFlow, Situation, advise};
+use crate::advice::{Advisor, ImageFlow, Situation};
 use crate::chunk_publisher::ChunkPublisher;
 use crate::ledger::Ledger;
 use crate::observations::{ModelState, ObservationPublisher, PosedKeyframe};
@@ -34,6 +34,7 @@ pub(super) struct Publishing {
     identity: Identity,
     started: Instant,
     recent_images: RecentImages,
+    advisor: Advisor,
     /// When the status was published; `None` before the first time.
     status_at: Option<Instant>,
     /// Corrected cameras of the published keyframes.
@@ -59,6 +60,7 @@ impl Publishing {
             identity,
             started: Instant::now(),
             recent_images: RecentImages::default(),
+            advisor: Advisor::default(),
             status_at: None,
             cameras: Vec::new(),
             next_refreshed: 0,
@@ -239,7 +241,7 @@ impl LiveLoop {
         let paused_by = (self.requests.paused_by).filter(|_| state == RunState::Paused);
         let situation = Situation {
             state,
-            has_input_ended: self.feed.ended(),
+            has_input_ended: self.feed.source_ended(),
             run_secs: self.publishing.started.elapsed().as_secs_f64(),
             recent: self.publishing.recent_images.push(Instant::now(), total),
             store,
@@ -248,7 +250,8 @@ impl LiveLoop {
         };
         OperatorStatus {
             identity: Some(self.publishing.identity.clone()),
-            advice: Some(advise(&situation)),
+            advice: Some(self.publishing.advisor.advise(&situation)),
+            input_ended: situation.has_input_ended,
             images: Some(ImageCounts {
                 received: counts.images,
                 dropped: counts.dropped,

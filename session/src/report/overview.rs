@@ -6,8 +6,12 @@ use nalgebra::{Matrix3, Rotation3, Translation3, UnitQuaternion, Vector3};
 use report::inline_picture::data_uri;
 use trainer::{AlignedModel, Projection, RenderRequest};
 
-/// Size of the picture, pixels. It is rendered once, and costs as much as a test image.
-const SIZE_PX: [u32; 2] = [720, 450];
+/// Maximum size of the picture, pixels.
+const MAX_SIZE_PX: [u32; 2] = [720, 450];
+/// Maximum number of pixels, relative to the largest image. Small images give models without fine
+/// detail. Without a GPU, a picture of the maximum size would then take longer than the test
+/// images.
+const MAX_IMAGES: f64 = 4.0;
 const QUALITY: u8 = 82;
 /// Focal length in heights of the picture: a vertical field of view of 50 degrees.
 const FOCAL_HEIGHTS: f64 = 1.072;
@@ -23,15 +27,22 @@ const CUT_RADII: f64 = 1.15;
 const FAR_RADII: f64 = 50.0;
 
 /// An oblique picture of the model as a data URI; `None` without keyframes.
-pub(super) fn draw(method: &mut AlignedModel, seen: &SeenPlaces) -> anyhow::Result<Option<String>> {
+///
+/// * `image_px`: number of pixels of the largest image.
+pub(super) fn draw(
+    method: &mut AlignedModel,
+    seen: &SeenPlaces,
+    image_px: u64,
+) -> anyhow::Result<Option<String>> {
     let Some(world_from_camera) = oblique_view(seen) else {
         return Ok(None);
     };
-    let [width, height] = SIZE_PX.map(f64::from);
+    let size_px = size_for(image_px);
+    let [width, height] = size_px.map(f64::from);
     let background_srgb = method.model().background_srgb();
     let picture = method.model_mut().render(&RenderRequest {
         world_from_camera,
-        size_px: SIZE_PX,
+        size_px,
         projection: Projection::Pinhole {
             focal_px: [FOCAL_HEIGHTS * height; 2],
             principal_px: [0.5 * width, 0.5 * height],
@@ -52,12 +63,25 @@ pub(super) fn draw(method: &mut AlignedModel, seen: &SeenPlaces) -> anyhow::Resu
         .iter()
         .flat_map(|[red, green, blue, _]| [*red, *green, *blue])
         .collect();
-    data_uri(&rgb, SIZE_PX, QUALITY).map(Some)
+    data_uri(&rgb, size_px, QUALITY).map(Some)
 }
 
-/// Width and height of the picture, pixels.
-pub(super) fn size_px() -> [u32; 2] {
-    SIZE_PX
+/// Width and height at which pages show the picture, CSS pixels.
+pub(super) fn shown_size() -> [u32; 2] {
+    MAX_SIZE_PX
+}
+
+/// Size of the picture, pixels, for images of this many pixels.
+#[expect(
+    clippy::cast_possible_truncation,
+    clippy::cast_sign_loss,
+    clippy::cast_precision_loss,
+    reason = "pixels of a picture"
+)]
+fn size_for(image_px: u64) -> [u32; 2] {
+    let max_px: f64 = MAX_SIZE_PX.map(f64::from).iter().product();
+    let scale = (MAX_IMAGES * image_px as f64 / max_px).sqrt().min(1.0);
+    MAX_SIZE_PX.map(|side| ((f64::from(side) * scale) as u32).max(1))
 }
 
 /// An upright view of the center from the side of the cameras; `None` without any place.
@@ -90,6 +114,12 @@ mod tests {
     use super::super::seen_places::SeenCamera;
     use super::*;
     use nalgebra::Point3;
+
+    #[test]
+    fn pictures_are_no_finer_than_the_images() {
+        assert_eq!(size_for(640 * 480), MAX_SIZE_PX);
+        assert_eq!(size_for(160 * 120), [350, 219]);
+    }
 
     #[test]
     fn view_is_oblique_upright_and_from_the_side_of_the_cameras() {

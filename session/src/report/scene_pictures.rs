@@ -26,15 +26,18 @@ impl ScenePictures {
         let Some(seen) = SeenPlaces::of(method, keyframes)? else {
             return Ok(Self::default());
         };
+        let n_pixels = |[width, height]: [u32; 2]| u64::from(width) * u64::from(height);
+        let sizes = keyframes.iter().map(|keyframe| n_pixels(keyframe.size_px));
+        let image_px = sizes.max().unwrap_or_default();
         Ok(Self {
-            overview: overview::draw(method, &seen)?,
+            overview: overview::draw(method, &seen, image_px)?,
             coverage: coverage::map(&seen),
             n_keyframes: keyframes.len(),
         })
     }
 
     pub(super) fn html(&self) -> String {
-        let [width, height] = overview::size_px();
+        let [width, height] = overview::shown_size();
         let overview = self.overview.as_ref().map(|source| {
             format!(
                 "<figure class=\"card\"><img width=\"{width}\" height=\"{height}\" alt=\"The model seen obliquely from above\" \

@@ -15,6 +15,9 @@ pub struct OperatorStatus {
     /// enough.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub advice: Option<Advice>,
+    /// Whether the devices send nothing more, so that old images and robot poses are expected.
+    #[serde(skip_serializing_if = "std::ops::Not::not")]
+    pub input_ended: bool,
     /// What happened to the images of the cameras so far.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub images: Option<ImageCounts>,

@@ -127,7 +127,7 @@ pub(crate) struct Page {
     _alone: MutexGuard<'static, ()>,
     pub(crate) browser: Browser,
     pub(crate) renderer: Renderer,
-    hub: Hub,
+    pub(crate) hub: Hub,
     profile: PathBuf,
     _server: Server,
 }

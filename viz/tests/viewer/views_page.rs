@@ -640,3 +640,43 @@ fn a_wall_that_stops_the_eye_can_be_cut_away() {
     });
     page.close();
 }
+
+/// In the overview, the room hides the robot, so its front is cut away until the user shows the
+/// whole room.
+#[test]
+fn the_overview_cuts_away_what_hides_the_robot() {
+    let Some(mut page) = eye_page::Page::open("hidden-robot", true, 2.0) else {
+        return;
+    };
+    page.hub.set_robot(robot::description());
+    let state = robot::state(0.0);
+    let base = state.world_from_base.translation.vector;
+    page.hub.set_robot_state(state);
+    let depth_m = |request: &RenderRequest, point: Vector3<f64>| {
+        (point - eye(request).coords).dot(&forward(request))
+    };
+    let is_cut = |request: &RenderRequest| {
+        let ceiling = Vector3::new(base.x, base.y, eye_page::ROOM[1][2]);
+        request.near_m > depth_m(request, ceiling) && request.near_m < depth_m(request, base)
+    };
+    for _ in 0..2 {
+        page.browser.click("look-overview");
+        wait_for(&mut page.browser, "a view below the ceiling", |_| {
+            is_cut(&page.renderer.last())
+        });
+        page.rest();
+        let view = page.renderer.last();
+        assert!(eye(&view).z > eye_page::ROOM[1][2], "from above the room");
+        assert!(is_shown(&mut page.browser, "cut-chip"));
+        assert!(!is_shown(&mut page.browser, "blocked"));
+
+        page.browser.click("end-cut");
+        wait_for(&mut page.browser, "a message", |browser| {
+            is_shown(browser, "blocked")
+                && browser.text("blocked-text") == "The model hides the robot"
+        });
+        page.rest();
+        assert!(page.renderer.last().near_m < 0.02, "the user has ended it");
+    }
+    page.close();
+}

@@ -269,11 +269,13 @@ function receiveStatus(status: Status): void {
   showGuidance(status.guidance, banner, liveImages);
   photographCoverage.show(status.guidance?.coverage);
   preview.show(status);
-  for (const ages of [robotAge, overlayAges]) ages.hasEnded = banner.isFinished;
+  const hasInputEnded = status.input_ended ?? false;
+  for (const ages of [robotAge, overlayAges]) ages.hasEnded = banner.isFinished || hasInputEnded;
+  coverage.hasInputEnded = hasInputEnded;
   namedViews.runIs(status);
   steering.offered = status.steering === true;
   steering.showIncidents(status.files ?? []);
-  flow.isReading = CONTROLLABLE.includes(status.state);
+  flow.isReading = CONTROLLABLE.includes(status.state) && !hasInputEnded;
 }
 
 function receiveText(message: TextMessage): void {

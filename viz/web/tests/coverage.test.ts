@@ -57,7 +57,7 @@ test("the largest badly seen place is found, and not a single cell", () => {
   // The middle of cells 28 to 33 and 12 to 17.
   assertClose(place.pointM, [-1 + 31 * CELL_M, -0.75 + 15 * CELL_M, 0.5 * CELL_M], CELL_M);
   assertClose([place.sigmaM!], [1e-5 * Math.exp(0.055 * 179)], 1e-9);
-  assert.match(reasonText(place, true), /known to 189 mm/);
+  assert.match(reasonText(place, true), /uncertain by 189 mm/);
 });
 
 test("a place that is not determined counts more than one that is only uncertain", () => {
@@ -70,7 +70,7 @@ test("a place that is not determined counts more than one that is only uncertain
   );
   assert.ok(place);
   assert.equal(place.sigmaM, null);
-  assert.match(reasonText(place, false), /not determined/);
+  assert.match(reasonText(place, false), /too few directions/);
 });
 
 test("old places count in live runs only", () => {
@@ -125,9 +125,9 @@ test("directions are relative to the camera", () => {
   assert.equal(directionText(ahead), "straight ahead, 2.0 m away");
   const right = directionTo([3, 2, 1.6], ALONG_Y);
   assertClose([right.rightRad!], [Math.PI / 2], 1e-9);
-  assert.equal(directionText(right), "turn right 90 degrees, 0.6 m up, 2.1 m away");
-  assert.match(directionText(directionTo([-1, 4, 0.5], ALONG_Y)), /^turn left 45 degrees, 0.5 m down/);
-  assert.match(directionText(directionTo([2, 3, 0], DOWN)), /^turn right 45 degrees, 1.0 m down/);
+  assert.equal(directionText(right), "turn right 90 degrees, 0.6 m higher, 2.1 m away");
+  assert.match(directionText(directionTo([-1, 4, 0.5], ALONG_Y)), /^turn left 45 degrees, 0.5 m lower/);
+  assert.match(directionText(directionTo([2, 3, 0], DOWN)), /^turn right 45 degrees, 1.0 m lower/);
   // Straight below, there is nothing to turn to.
-  assert.equal(directionText(directionTo([1, 2, 0], ALONG_Y)), "1.0 m down, 1.0 m away");
+  assert.equal(directionText(directionTo([1, 2, 0], ALONG_Y)), "1.0 m lower, 1.0 m away");
 });

@@ -32,7 +32,9 @@ test("each fault is named", () => {
   assert.deepEqual(faults({}, { correction: { meters: 0.008, radians: 0.001 } }), [
     "pose corrected by 8.0 mm and 0.06 degrees",
   ]);
-  assert.match(faults({ worst: { name: "upper left", meanError: 0.3 } })[0]!, /^large error in the upper left: did something move/);
+  const upperLeft = { name: "upper left", meanError: 0.3 };
+  assert.match(faults({ worst: upperLeft })[0]!, /^large error in the upper left: did something move/);
+  assert.deepEqual(faults({ worst: upperLeft, detailRatio: 0.4 }), ["large error in the upper left", "blurred"]);
   assert.deepEqual(faults({ exposureEv: -0.42 }), ["exposure differs by 0.4 EV: the photograph is darker"]);
   assert.deepEqual(faults({}, { ageSecs: 240 }), ["old: 4 min"]);
   assert.match(faults({ shiftPx: [4.2, -1] })[0]!, /^shifted by 4.2 px to the right and 1.0 px up/);

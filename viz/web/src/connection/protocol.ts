@@ -102,6 +102,7 @@ export interface Status extends ModelStatus {
   store?: KeyframeStore;
   clients?: { id: number; role: Role }[];
   paused_by?: number;
+  input_ended?: boolean;
   checkpoint?: { state: "requested" | "written" | "failed"; text: string };
   /** The notes that only inform. */
   infos?: string[];

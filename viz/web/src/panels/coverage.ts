@@ -213,20 +213,23 @@ export function placeText([x, y, z]: readonly [number, number, number]): string 
   return `x ${x.toFixed(1)}, y ${y.toFixed(1)}, height ${z.toFixed(1)} m`;
 }
 
-/** The direction, to 5 degrees, as text, such as "turn right 40 degrees, 0.6 m up, 1.3 m away". */
+/**
+ * The direction, to 5 degrees, as text, such as "turn right 40 degrees, 0.6 m higher, 1.3 m away". The last two say where
+ * the place is: many cameras cannot move up and down.
+ */
 export function directionText({ rightRad, upM, distanceM }: Direction): string {
   const parts: string[] = [];
   const degrees = rightRad === null ? 0 : 5 * Math.round((rightRad * 36) / Math.PI);
   if (rightRad !== null) {
     parts.push(Math.abs(degrees) < 5 ? "straight ahead" : `turn ${degrees > 0 ? "right" : "left"} ${Math.abs(degrees)} degrees`);
   }
-  if (Math.abs(upM) >= 0.05) parts.push(`${Math.abs(upM).toFixed(1)} m ${upM > 0 ? "up" : "down"}`);
+  if (Math.abs(upM) >= 0.05) parts.push(`${Math.abs(upM).toFixed(1)} m ${upM > 0 ? "higher" : "lower"}`);
   return [...parts, `${distanceM.toFixed(1)} m away`].join(", ");
 }
 
 /** Why the place should be looked at. */
 export function reasonText({ sigmaM, ageSecs }: WorstPlace, isLive: boolean): string {
-  if (sigmaM === null) return "its position is not determined: it was seen from too few directions";
+  if (sigmaM === null) return "seen from too few directions to know where it is";
   if (sigmaM < GOOD_SIGMA_M && isLive) return `not seen for ${Math.round(ageSecs / 60)} min`;
-  return `its position is known to ${sigmaM < 0.01 ? (1000 * sigmaM).toFixed(1) : (1000 * sigmaM).toFixed(0)} mm`;
+  return `the position of the surface is uncertain by ${sigmaM < 0.01 ? (1000 * sigmaM).toFixed(1) : (1000 * sigmaM).toFixed(0)} mm`;
 }

@@ -36,6 +36,8 @@ export class CoverageHint {
   /** The camera whose direction to the place is shown. */
   private camera: string | null = null;
   private isEnabled = false;
+  /** Whether the devices send nothing more, so that no camera can be turned toward the place. */
+  hasInputEnded = false;
 
   constructor(private readonly sources: CoverageSources) {
     const { view } = sources;
@@ -103,11 +105,15 @@ export class CoverageHint {
 
   private hint(): string {
     const { search } = this;
-    if (!this.map || !search) return "Look here next: waiting for the map of observations";
-    if (!this.place) return "Look here next: everything within reach was seen well";
+    // Saved models have no newest keyframe.
+    const isLive = !this.hasInputEnded && this.map?.header.newest_millis !== null;
+    const title = isLive ? "Look here next" : "Seen worst";
+    if (!this.map || !search) return `${title}: waiting for the map of observations`;
+    if (!this.place) return `${title}: everything within reach was seen well`;
     const { pointM } = this.place;
-    const reason = search.reasonText(this.place, this.map.header.newest_millis !== null);
-    const place = `Look here next: place ${this.nPlaces} at ${search.placeText(pointM)} (${reason})`;
+    const reason = search.reasonText(this.place, isLive);
+    const place = `${title}: place ${this.nPlaces} at ${search.placeText(pointM)} (${reason})`;
+    if (!isLive) return place;
     const camera = search.cameraToTurn(this.sources.live(), pointM, this.camera);
     this.camera = camera?.camera ?? null;
     if (!camera) return place;

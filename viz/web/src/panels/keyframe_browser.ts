@@ -271,7 +271,7 @@ export class KeyframeBrowser {
     const place = ix < 0 ? "Keyframe that was removed" : `Keyframe ${ix + 1} of ${ordered.length}`;
     const { nMeasured } = this.survey;
     const isMeasuring = this.order === "error" && nMeasured < ordered.length;
-    this.panel.showTitle(this.shown ? place : "Keyframes", isMeasuring ? `${nMeasured} measured` : "");
+    this.panel.showTitle(this.shown ? place : "Keyframes", isMeasuring ? `${nMeasured} of ${ordered.length} measured so far` : "");
   }
 
   private listChanged(): void {

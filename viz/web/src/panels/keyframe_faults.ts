@@ -46,9 +46,12 @@ export function keyframeFaults(errors: KeyframeErrors | null, facts: KeyframeFac
 function pixelFaults(errors: KeyframeErrors, { turnRadS }: KeyframeFacts): string[] {
   const { worst, shiftPx, detailRatio, exposureEv, emptyFrac } = errors;
   const faults: string[] = [];
+  const isBlurred = detailRatio !== null && detailRatio < BLURRED_RATIO;
   if (shiftPx) faults.push(`shifted by ${shiftText(shiftPx)}: the pose or the time offset may be wrong`);
-  if (worst) faults.push(`large error in the ${worst.name}: did something move there?`);
-  if (detailRatio !== null && detailRatio < BLURRED_RATIO) {
+  // Blur and a missing detail are largest where the scene has the most detail. Nothing has moved there.
+  const isExplained = isBlurred || (detailRatio !== null && detailRatio > SMOOTH_RATIO);
+  if (worst) faults.push(`large error in the ${worst.name}${isExplained ? "" : ": did something move there?"}`);
+  if (isBlurred) {
     const isFast = turnRadS !== null && turnRadS > FAST_TURN_RAD_S;
     faults.push(`blurred${isFast ? `: the camera turned by ${degrees(turnRadS).toFixed(0)} degrees per second` : ""}`);
   }

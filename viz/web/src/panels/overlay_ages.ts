@@ -9,7 +9,7 @@ import { ageText } from "./quantities";
 const PERIOD_MILLIS = 100;
 
 export class OverlayAges {
-  /** Whether the run has ended, so that old data are expected. */
+  /** Whether the input has ended, so that old data are expected. */
   hasEnded = false;
 
   constructor(

@@ -10,7 +10,7 @@ import type { Age, ServerClock } from "../connection/server_clock";
 const LIVE_MILLIS = 500;
 
 export class RobotAge {
-  /** Whether the run has ended, so that an outdated pose is expected. */
+  /** Whether the input has ended, so that an outdated pose is expected. */
   hasEnded = false;
   /** Age of the drawn pose; null before the first pose. */
   private age: Age | null = null;

@@ -85,6 +85,8 @@ export class OrbitView {
   private hasAskedForOverview = false;
   /** Distance of the robot from the eye of the overview if the model hides it, meters; otherwise null. */
   private hiddenRobotM: number | null = null;
+  /** Whether the overview cuts away what hides the robot, until the user shows the whole model again. */
+  private mayCutForRobot = true;
   private isStale = true;
   private isModelShown = true;
   /** Whether another direction than the server's points up. */
@@ -183,6 +185,7 @@ export class OrbitView {
     this.attachment.end();
     this.hasUserMoved = false;
     this.hasAskedForOverview = true;
+    this.mayCutForRobot = true;
     this.sceneViews.restartOverview();
     this.keepOverview();
   }
@@ -337,6 +340,7 @@ export class OrbitView {
     const { posedDepth } = this.picture;
     if (posedDepth) this.see("picture", new PictureDepthMap(posedDepth));
     this.hiddenRobotM = this.mode === "overview" ? this.robotBehindModel() : null;
+    if (this.hiddenRobotM !== null && this.mayCutForRobot) this.isCut = true;
   }
 
   /** Distance of the robot if the model hides it; otherwise null. */
@@ -401,8 +405,11 @@ export class OrbitView {
     const { block } = this;
     const isAtWall = block !== null && canBeCut(block.what) && performance.now() - block.at < CUT_WALL_MILLIS;
     const distanceM = this.targetDistanceM;
-    if (!isCut) this.cut.end();
-    else if (block?.what.by === "model before robot") this.cut.beginAt(this.hiddenRobotM ?? distanceM, distanceM);
+    const robotM = isAtWall ? this.hiddenRobotM : this.robotBehindModel();
+    if (!isCut) {
+      this.cut.end();
+      this.mayCutForRobot = false;
+    } else if (robotM !== null) this.cut.beginAt(robotM, distanceM);
     else this.cut.begin(distanceM, this.sceneViews.radiusM, isAtWall);
     this.hiddenRobotM = null;
     this.motion.forgetPlaces();
