@@ -27,9 +27,9 @@ import tempfile
 import threading
 import time
 
-# Programs that use a single processor and are sensitive to timing. They run on the last processor beside all other programs, with
-# a higher priority if this user may set it.
-BESIDE = ("fieldrig hil",)
+# Programs that mostly wait for clocks and devices, and are sensitive to timing. They run one after another on the last processor
+# beside all other programs, with a higher priority if this user may set it.
+BESIDE = ("bench unit", "drivers franka_peers", "drivers unit", "fieldrig hil")
 # Tests that need other settings than the rest of their program. Each entry has the program, a part
 # of the names of the tests, and the environment. With this vector width, Mesa's software Vulkan has
 # subgroups of 16 lanes, so that the kernels for GPUs are tested, too.
@@ -250,7 +250,7 @@ class Runner:
 
 
 def run(programs):
-    """Runs all programs: those of BESIDE on one processor, those that only compute with a low priority, and the others."""
+    """Runs all programs: those of BESIDE on one processor, those of COMPUTING with a low priority, and the others."""
     runner = Runner()
     threading.Thread(target=runner.print_progress, args=(programs,), daemon=True).start()
     processors = sorted(os.sched_getaffinity(0))

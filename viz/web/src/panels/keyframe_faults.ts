@@ -48,9 +48,8 @@ function pixelFaults(errors: KeyframeErrors, { turnRadS }: KeyframeFacts): strin
   const faults: string[] = [];
   const isBlurred = detailRatio !== null && detailRatio < BLURRED_RATIO;
   if (shiftPx) faults.push(`shifted by ${shiftText(shiftPx)}: the pose or the time offset may be wrong`);
-  // Blur and a missing detail are largest where the scene has the most detail. Nothing has moved there.
-  const isExplained = isBlurred || (detailRatio !== null && detailRatio > SMOOTH_RATIO);
-  if (worst) faults.push(`large error in the ${worst.name}${isExplained ? "" : ": did something move there?"}`);
+  // Blur changes the picture most where the scene has the most detail. Nothing has moved there.
+  if (worst) faults.push(`large error in the ${worst.name}${isBlurred ? "" : ": did something move there?"}`);
   if (isBlurred) {
     const isFast = turnRadS !== null && turnRadS > FAST_TURN_RAD_S;
     faults.push(`blurred${isFast ? `: the camera turned by ${degrees(turnRadS).toFixed(0)} degrees per second` : ""}`);
