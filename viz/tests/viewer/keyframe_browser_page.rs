@@ -515,7 +515,7 @@ fn check_coverage(browser: &mut Browser, hub: &Hub, requests: &Mutex<Vec<RenderR
         newest_at: Some(Instant::now()),
     });
     wait_for(browser, "the place", |browser| {
-        browser.text("coverage-text").contains("not determined")
+        browser.text("coverage-text").contains("too few directions")
     });
     assert!(browser.text("coverage-text").contains("place 1 at x 0."));
     let camera = Translation3::new(0.05, 1.05, 0.0) * looking_along_y();
@@ -531,7 +531,7 @@ fn check_coverage(browser: &mut Browser, hub: &Hub, requests: &Mutex<Vec<RenderR
     });
     wait_for(browser, "the direction", |browser| {
         let text = browser.text("coverage-text");
-        text.contains("from wrist: turn right 45 degrees") && text.contains("m down")
+        text.contains("from wrist: turn right 45 degrees") && text.contains("m lower")
     });
     browser.click("coverage-look");
     let [_, _, width_px, _] = canvas_bounds(browser);
