@@ -27,16 +27,14 @@ impl MeshKind {
 }
 
 /// The path of a mesh file; `None` if it does not exist.
-#[must_use]
-pub fn found_mesh_file(file: &str, urdf_folder: &Path) -> Option<PathBuf> {
+pub(crate) fn found_mesh_file(file: &str, urdf_folder: &Path) -> Option<PathBuf> {
     mesh_file_candidates(file, urdf_folder)
         .into_iter()
         .find(|path| path.is_file())
 }
 
 /// Why a mesh file was not found. Most files are missing because only the URDF was copied.
-#[must_use]
-pub fn missing_mesh_file(file: &str, urdf_folder: &Path) -> String {
+pub(crate) fn missing_mesh_file(file: &str, urdf_folder: &Path) -> String {
     let folder = urdf_folder.display();
     let package = file
         .strip_prefix("package://")

@@ -3,9 +3,8 @@
 //! Sources of the formats: 3D Systems, "Stereolithography Interface Specification" (1989), and
 //! Wavefront, "Advanced Visualizer Manual", appendix B1 (OBJ).
 
-use crate::mesh_files::{found_mesh_file, missing_mesh_file};
+use crate::config::UrdfFolder;
 use files::Budget;
-use std::path::Path;
 
 /// Sizes of the header of a binary STL file and of each of its triangles, bytes.
 const STL_HEADER_BYTES: usize = 84;
@@ -23,10 +22,8 @@ pub type Triangle = [[f64; 3]; 3];
 /// # Errors
 ///
 /// Why the file cannot be read, in one sentence.
-pub fn mesh_triangles(file: &str, urdf_folder: &Path) -> Result<Vec<Triangle>, String> {
-    let path =
-        found_mesh_file(file, urdf_folder).ok_or_else(|| missing_mesh_file(file, urdf_folder))?;
-    let bytes = files::read(&path, Budget::MESH).map_err(|error| error.to_string())?;
+pub fn mesh_triangles(file: &str, urdf_folder: &UrdfFolder) -> Result<Vec<Triangle>, String> {
+    let bytes = urdf_folder.read_mesh(file, Budget::MESH)?;
     let extension = file.rsplit('.').next().unwrap_or_default();
     let triangles = match extension.to_ascii_lowercase().as_str() {
         "stl" => stl(&bytes)?,
@@ -139,7 +136,7 @@ mod tests {
     fn triangles(name: &str, contents: &[u8]) -> Result<Vec<Triangle>, String> {
         let folder = tempfile::tempdir().expect("a folder");
         std::fs::write(folder.path().join(name), contents).expect("written");
-        mesh_triangles(name, folder.path())
+        mesh_triangles(name, &UrdfFolder::at(folder.path()))
     }
 
     #[test]
@@ -180,7 +177,8 @@ mod tests {
             let error = triangles(name, contents.as_bytes()).expect_err(name);
             assert!(error.contains(words), "{name}: {error}");
         }
-        let missing = mesh_triangles("missing.stl", Path::new("/nowhere")).expect_err("missing");
+        let nowhere = UrdfFolder::at(std::path::Path::new("/nowhere"));
+        let missing = mesh_triangles("missing.stl", &nowhere).expect_err("missing");
         assert!(missing.contains("no such file"), "{missing}");
     }
 }

@@ -17,6 +17,8 @@
 //! The first two errors are independent, so their squares are added.
 
 mod convex_pieces;
+#[cfg(test)]
+mod recorded_tests;
 mod robot_shape;
 mod silhouette;
 #[cfg(test)]
@@ -137,7 +139,7 @@ impl RobotMasks {
             &arm.base_link,
             &arm.joints,
             extent,
-            arm.urdf_folder.path(),
+            &arm.urdf_folder,
         )
         .context("the arm's URDF")?;
         cameras.retain(|_, camera| shape.has_links(camera.extent));

@@ -1,13 +1,13 @@
 //! The shape of a robot, in convex pieces that move with its measured joints.
 
 use super::convex_pieces::{Piece, cover};
+use crate::config::UrdfFolder;
 use crate::mesh_triangles::{Triangle, mesh_triangles};
 use kinematics::shape::{Geometry, Shape};
 use kinematics::urdf::{JointKind, JointLimits, Robot};
 use kinematics::{Chain, Transform};
 use nalgebra::Point3;
 use std::collections::{BTreeMap, BTreeSet};
-use std::path::Path;
 
 /// Largest rotation of a joint between two poses at which a link is drawn if the joint is not
 /// measured, radians. The next constant is the largest number of poses.
@@ -67,7 +67,7 @@ impl RobotShape {
     /// cannot be read, or there is none, it has its collision shapes.
     ///
     /// * `joints`: names of the measured joints.
-    /// * `mesh_folder`: where the names of mesh files start; `None` if it is unknown.
+    /// * `mesh_folder`: where the mesh files are.
     ///
     /// # Errors
     ///
@@ -77,7 +77,7 @@ impl RobotShape {
         base_link: &str,
         joints: &[String],
         extent: Extent,
-        mesh_folder: Option<&Path>,
+        mesh_folder: &UrdfFolder,
     ) -> Result<Self, kinematics::Error> {
         // Links beside the base or above it, such as a platform, are drawn as well.
         let root = robot.root().unwrap_or(base_link);
@@ -270,7 +270,7 @@ fn n_poses_of(limits: &JointLimits, is_prismatic: bool) -> u32 {
 
 /// The mesh files that were read.
 struct Meshes<'a> {
-    folder: Option<&'a Path>,
+    folder: &'a UrdfFolder,
     read: BTreeMap<String, Result<Vec<Triangle>, String>>,
 }
 
@@ -310,10 +310,10 @@ impl Meshes<'_> {
             return Ok(&[]);
         };
         let folder = self.folder;
-        let read = self.read.entry(file.clone()).or_insert_with(|| {
-            let folder = folder.ok_or("the folder of the mesh files is unknown")?;
-            mesh_triangles(file, folder)
-        });
+        let read = self
+            .read
+            .entry(file.clone())
+            .or_insert_with(|| mesh_triangles(file, folder));
         read.as_deref()
             .map_err(|why| format!("mesh {file:?}: {why}"))
     }

@@ -1,7 +1,7 @@
 //! Masks compared with the simulator's exact segmentation, and masks in the keyframes of a join.
 
 use super::*;
-use crate::config::Override;
+use crate::config::{Override, UrdfFolder};
 use crate::join::{Join, JoinEvent};
 use drivers::{Image, PixelFormat, Sample};
 use nalgebra::{Point3, UnitQuaternion, Vector3};
@@ -27,7 +27,7 @@ fn bundled(name: &str) -> PathBuf {
 }
 
 /// A static arm, seen by a camera in the room with depth.
-fn rig(changes: &[Override]) -> Rig {
+pub(super) fn rig(changes: &[Override]) -> Rig {
     let pose = world_from_camera([1.3, 0.4, 0.8]);
     let list = |key, numbers: &[f64]| Override::new(key, Value::from(numbers.to_vec()));
     let size = SIZE_PX.map(i64::from).to_vec();
@@ -52,7 +52,7 @@ fn rig(changes: &[Override]) -> Rig {
 }
 
 /// Joint states at 100 Hz in which the first joint rotates, and an image with depth every 0.1 s.
-fn samples(speed_rad_s: f64) -> Vec<Sample> {
+pub(super) fn samples(speed_rad_s: f64) -> Vec<Sample> {
     let n_pixels = (SIZE_PX[0] * SIZE_PX[1]) as usize;
     let mut samples = Vec::new();
     for tick in 0..60_i64 {
@@ -94,7 +94,7 @@ fn samples(speed_rad_s: f64) -> Vec<Sample> {
     samples
 }
 
-fn keyframes(join: &mut Join, samples: Vec<Sample>) -> Vec<Arc<Keyframe>> {
+pub(super) fn keyframes(join: &mut Join, samples: Vec<Sample>) -> Vec<Arc<Keyframe>> {
     let mut events: Vec<JoinEvent> = samples
         .into_iter()
         .flat_map(|sample| join.push(sample))
@@ -121,7 +121,7 @@ fn pixel_ix(point_in_world: Point3<f64>, camera: &Transform) -> usize {
 }
 
 /// Number of masked pixels of color.
-fn n_masked(keyframe: &Keyframe) -> usize {
+pub(super) fn n_masked(keyframe: &Keyframe) -> usize {
     let (rgba, _) = keyframe.rgba_srgb.as_chunks::<4>();
     rgba.iter().filter(|pixel| pixel[3] == 0).count()
 }
@@ -227,7 +227,8 @@ fn joints_that_are_not_measured_may_be_anywhere() {
     let robot = Robot::parse(urdf).expect("a robot");
     let widths = |joints: &[String]| {
         let extent = Extent::MovingLinks;
-        let shape = RobotShape::new(&robot, "base", joints, extent, None).expect("a robot");
+        let shape = RobotShape::new(&robot, "base", joints, extent, &UrdfFolder::default())
+            .expect("a robot");
         let camera_from_base = Transform::translation(0.0, 0.0, 1.0);
         let mut xs = Vec::new();
         let instants = [(vec![0.05], camera_from_base)];
@@ -310,7 +311,14 @@ fn masks_cover_the_robot_that_the_simulator_draws() {
     let joints: Vec<String> = (1..8).map(|ix| format!("panda_joint{ix}")).collect();
     // The simulator's segmentation contains the base.
     let extent = Extent::WholeRobot;
-    let shape = RobotShape::new(&robot, "panda_link0", &joints, extent, None).expect("an arm");
+    let shape = RobotShape::new(
+        &robot,
+        "panda_link0",
+        &joints,
+        extent,
+        &UrdfFolder::default(),
+    )
+    .expect("an arm");
     let mut simulator =
         sim::RobotMasks::open(sim::Scene::StaticArm, view.size_px).expect("a valid scene");
     let postures = [
