@@ -161,10 +161,11 @@ impl Evaluator {
         method: &mut AlignedModel,
         keyframe: &Keyframe,
     ) -> anyhow::Result<ImageScores> {
+        let remasked = method.remasked(keyframe);
         // Scoring on the GPU needs no read-back of the picture. Other scores need the pixels.
         if !self.is_full
             && self.lpips.is_none()
-            && let Some(psnr) = psnr_on_gpu(method, keyframe)?
+            && let Some(psnr) = psnr_on_gpu(method, &remasked)?
         {
             return Ok(ImageScores {
                 camera: keyframe.camera.to_string(),
@@ -263,15 +264,16 @@ impl Evaluator {
         method: &mut AlignedModel,
         keyframe: &'a Keyframe,
     ) -> anyhow::Result<Drawn<'a>> {
+        let keyframe = method.remasked(keyframe);
         let mut depth = None;
         let mut at_truth = None;
         if self.is_full {
-            depth = draw_depth(method, keyframe)?;
-            at_truth = draw_at_truth(method, keyframe)?;
+            depth = draw_depth(method, &keyframe)?;
+            at_truth = draw_at_truth(method, &keyframe)?;
         }
         Ok(Drawn {
+            picture: draw(method, &keyframe, false)?,
             keyframe,
-            picture: draw(method, keyframe, false)?,
             depth,
             at_truth,
         })
@@ -287,10 +289,11 @@ fn name_of(keyframe: &Keyframe) -> String {
 
 /// The renders from which the scores of a test keyframe are computed.
 struct Drawn<'a> {
-    keyframe: &'a Keyframe,
+    /// The keyframe, with the mask of the robot as the corrected camera sees it.
+    keyframe: Cow<'a, Keyframe>,
     picture: Picture,
     /// Rendered depth, and the measured depth at its size.
-    depth: Option<(Picture, Cow<'a, DepthMap>)>,
+    depth: Option<(Picture, DepthMap)>,
     /// A render at the true pose.
     at_truth: Option<Picture>,
 }
@@ -565,18 +568,18 @@ fn request(keyframe: &Keyframe, lens: &CalibratedCamera) -> RenderRequest {
 }
 
 /// Renders depth at the size at which the method can be compared with the measured depth.
-fn draw_depth<'a>(
+fn draw_depth(
     method: &mut AlignedModel,
-    keyframe: &'a Keyframe,
-) -> anyhow::Result<Option<(Picture, Cow<'a, DepthMap>)>> {
+    keyframe: &Keyframe,
+) -> anyhow::Result<Option<(Picture, DepthMap)>> {
     let Some(full) = &keyframe.depth else {
         return Ok(None);
     };
     let stride = method.model().depth_stride();
     let depth = if stride > 1 {
-        Cow::Owned(full.subsampled(stride))
+        full.subsampled(stride)
     } else {
-        Cow::Borrowed(full)
+        full.clone()
     };
     Ok(render_depth(method, keyframe, &depth)?.map(|drawn| (drawn, depth)))
 }

@@ -4,6 +4,9 @@ use super::*;
 use crate::config::{Override, UrdfFolder};
 use crate::join::{Join, JoinEvent};
 use drivers::{Image, PixelFormat, Sample};
+use keyframe::masked_robot::ConvexPiece;
+#[cfg(feature = "sim")]
+use keyframe::masked_robot::{Pinhole, Silhouette};
 use nalgebra::{Point3, UnitQuaternion, Vector3};
 use std::path::{Path, PathBuf};
 use toml::Value;
@@ -179,6 +182,42 @@ fn the_mask_grows_with_the_speed_and_the_margin() {
 }
 
 #[test]
+fn corrected_masks_are_those_of_a_rig_with_the_right_pose() {
+    let right = rig(&[]);
+    // 3 degrees and 30 mm, which is beyond the margin.
+    let right_from_wrong = Transform::from_parts(
+        Vector3::new(0.03, 0.0, 0.0).into(),
+        UnitQuaternion::from_euler_angles(0.0, 0.052, 0.0),
+    );
+    let mut wrong = right.clone();
+    wrong.cameras[0].parent_from_camera = right.cameras[0].parent_from_camera * right_from_wrong;
+    let first = |rig: &Rig| {
+        let mut join = Join::new(rig).expect("a good rig");
+        keyframes(&mut join, samples(0.5)).remove(0)
+    };
+    let [expected, uncorrected] = [first(&right), first(&wrong)];
+    let correction = calibration::CameraCorrection {
+        rotation_rad: right_from_wrong.rotation.scaled_axis().into(),
+        translation_m: right_from_wrong.translation.vector.into(),
+        ..calibration::CameraCorrection::default()
+    };
+    let corrected = correction.corrected(&uncorrected);
+    let n_different = |keyframe: &Keyframe| {
+        let color = expected.rgba_srgb.iter().zip(&*keyframe.rgba_srgb);
+        let [of_expected, of_keyframe] = [&expected, keyframe].map(|keyframe| {
+            let depth = keyframe.depth.as_ref().expect("depth");
+            depth.depth_m.clone()
+        });
+        let depth = of_expected.iter().zip(&*of_keyframe);
+        color.filter(|(one, other)| one != other).count()
+            + depth.filter(|(one, other)| one != other).count()
+    };
+    assert!(n_different(&uncorrected) > 2000);
+    // Rounding may change a cell at the edge.
+    assert!(n_different(&corrected) < 20, "{}", n_different(&corrected));
+}
+
+#[test]
 fn images_wait_for_the_state_of_a_robot_that_is_masked() {
     let images = || {
         samples(0.0)
@@ -217,6 +256,23 @@ fn unknown_shapes_are_named() {
     assert!(masks.masks("wrist"), "the other links are masked");
 }
 
+/// The points of the pieces of a robot at all of their poses, in the frame of a camera.
+fn pieces_in_camera(
+    shape: &RobotShape,
+    extent: Extent,
+    instants: &[(Vec<f64>, Transform)],
+) -> Vec<ConvexPiece> {
+    let mut swept = Vec::new();
+    for sweep in shape.sweeps_in_camera(extent, instants) {
+        for piece in &shape.pieces()[sweep.link_ix] {
+            let poses = sweep.camera_from_link.iter();
+            let points = poses.flat_map(|pose| piece.iter().map(move |point| pose * point));
+            swept.push(points.collect());
+        }
+    }
+    swept
+}
+
 #[test]
 fn joints_that_are_not_measured_may_be_anywhere() {
     // A finger of 2 cm that moves by 20 cm.
@@ -230,11 +286,9 @@ fn joints_that_are_not_measured_may_be_anywhere() {
         let shape = RobotShape::new(&robot, "base", joints, extent, &UrdfFolder::default())
             .expect("a robot");
         let camera_from_base = Transform::translation(0.0, 0.0, 1.0);
-        let mut xs = Vec::new();
         let instants = [(vec![0.05], camera_from_base)];
-        shape.pieces_in_camera(extent, &instants, &mut |piece| {
-            xs.extend(piece.iter().map(|point| point.x));
-        });
+        let pieces = pieces_in_camera(&shape, extent, &instants);
+        let xs: Vec<f64> = pieces.iter().flatten().map(|point| point.x).collect();
         [
             xs.iter().copied().fold(f64::INFINITY, f64::min),
             xs.iter().copied().fold(f64::NEG_INFINITY, f64::max),
@@ -347,8 +401,12 @@ fn masks_cover_the_robot_that_the_simulator_draws() {
         let compare = |uncertainty| {
             let mut silhouette = Silhouette::new(view, uncertainty);
             let instant = (q.to_vec(), world_from_camera.inverse());
-            shape.pieces_in_camera(extent, &[instant], &mut |piece| silhouette.add(piece));
-            let both = pixels(view.size_px).zip(&exact);
+            for piece in pieces_in_camera(&shape, extent, &[instant]) {
+                silhouette.add(&piece);
+            }
+            let [width, height] = view.size_px;
+            let pixels = (0..height).flat_map(|y| (0..width).map(move |x| [x, y]));
+            let both = pixels.zip(&exact);
             let mut n = [0.0_f64; 3];
             for ([x, y], is_robot) in both {
                 let is_masked = silhouette.covers(x, y);

@@ -368,6 +368,7 @@ mod tests {
             base: None,
             split: Split::Train,
             truth: None,
+            robot: None,
         };
         scene.observe_keyframe(&keyframe);
         wait_until_known(&scene, [0.2, 0.5, 0.5]);

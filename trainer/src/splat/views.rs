@@ -178,14 +178,16 @@ impl TrainView {
     /// Replaces the camera by the camera of the same keyframe with other corrections. Uploaded
     /// images are kept unless the correction changes them.
     pub(crate) fn replace_camera(&mut self, gpu: &Gpu, keyframe: Arc<Keyframe>) {
-        let has_same_depth = has_same_depth(&self.keyframe, &keyframe);
+        let has_same_images =
+            has_same_color(&self.keyframe, &keyframe) && has_same_depth(&self.keyframe, &keyframe);
         // The lens is a slot of camera parameters. They start again at zero after a correction.
         self.lens = None;
         self.keyframe = keyframe;
-        // The color pixels never change, but uploaded depth is reprojected into the color camera,
-        // so it depends on the extrinsics and intrinsics.
-        if !has_same_depth {
+        // Color changes only with the mask of a robot. Uploaded depth is reprojected into the color
+        // camera, so it depends on the extrinsics and intrinsics.
+        if !has_same_images {
             self.median_depth_m = median_depth_m(&self.keyframe);
+            self.mean_srgb = mean_srgb(&self.keyframe);
             self.levels = [const { None }; N_LEVELS];
         }
         // Poses are part of the small view uniform, so large images need no second upload.
@@ -325,6 +327,12 @@ impl LevelImages {
 fn clamped(level: u32, [width, height]: [u32; 2]) -> usize {
     // Halving the shorter side `ilog2(side / tile)` times leaves at least one tile.
     level.min((width.min(height) / TILE_PX).max(1).ilog2()) as usize
+}
+
+/// Whether two versions of a keyframe have the same color pixels.
+fn has_same_color(a: &Keyframe, b: &Keyframe) -> bool {
+    // Corrected keyframes usually share the array, so the comparison of all pixels is rare.
+    Arc::ptr_eq(&a.rgba_srgb, &b.rgba_srgb) || a.rgba_srgb == b.rgba_srgb
 }
 
 /// Whether two versions of a keyframe have the same depth as seen from its color camera.
