@@ -5,10 +5,8 @@ use std::path::{Path, PathBuf};
 /// Which parts of fieldrig can read a mesh file.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum MeshKind {
-    /// Triangles (`.stl`, `.obj`): the page, the simulator, steering and masks of the robot.
+    /// Triangles (`.stl`, `.obj`, `.dae`): the page, the simulator, steering and masks of the robot.
     Triangles,
-    /// COLLADA (`.dae`): only the page.
-    Collada,
     /// None.
     Unsupported,
 }
@@ -19,8 +17,7 @@ impl MeshKind {
     pub fn of(file: &str) -> Self {
         let extension = file.rsplit_once('.').map(|(_, extension)| extension);
         match extension.map(str::to_ascii_lowercase).as_deref() {
-            Some("stl" | "obj") => Self::Triangles,
-            Some("dae") => Self::Collada,
+            Some("stl" | "obj" | "dae") => Self::Triangles,
             _ => Self::Unsupported,
         }
     }

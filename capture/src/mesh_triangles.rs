@@ -5,6 +5,7 @@
 
 use crate::config::UrdfFolder;
 use files::Budget;
+use kinematics::collada;
 
 /// Sizes of the header of a binary STL file and of each of its triangles, bytes.
 const STL_HEADER_BYTES: usize = 84;
@@ -13,8 +14,7 @@ const STL_TRIANGLE_BYTES: usize = 50;
 const NUMBER_BYTES: usize = 4;
 const NORMAL_BYTES: usize = 3 * NUMBER_BYTES;
 
-/// A triangle, given by its corners.
-pub type Triangle = [[f64; 3]; 3];
+pub use kinematics::collada::Triangle;
 
 /// Triangles of a mesh file of a URDF in the frame of the mesh, meters. Faces with more corners are
 /// divided into triangles. A vertex of an OBJ file without faces is a triangle without area.
@@ -28,9 +28,11 @@ pub fn mesh_triangles(file: &str, urdf_folder: &UrdfFolder) -> Result<Vec<Triang
     let triangles = match extension.to_ascii_lowercase().as_str() {
         "stl" => stl(&bytes)?,
         "obj" => obj(&String::from_utf8_lossy(&bytes))?,
+        "dae" => collada::triangles(&String::from_utf8_lossy(&bytes))
+            .map_err(|error| error.to_string())?,
         other => {
             return Err(format!(
-                ".{other} files cannot be read, convert it to .stl or .obj"
+                ".{other} files cannot be read, convert it to .stl, .dae or .obj"
             ));
         }
     };
@@ -172,7 +174,9 @@ mod tests {
             ("a.obj", "v 1 2 inf\n", "line 1 has no point"),
             ("a.obj", "v 1 2 3\nf 1 2 1\n", "line 2 names a vertex"),
             ("a.obj", "# nothing\n", "no vertices"),
-            ("a.dae", "<COLLADA/>", "convert it to .stl"),
+            ("a.dae", "<COLLADA/>", "no vertices"),
+            ("a.dae", "<robot/>", "expected a <COLLADA>"),
+            ("a.glb", "glTF", "convert it to .stl"),
         ] {
             let error = triangles(name, contents.as_bytes()).expect_err(name);
             assert!(error.contains(words), "{name}: {error}");

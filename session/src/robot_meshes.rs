@@ -178,7 +178,7 @@ mod tests {
         for (file, kind) in [
             ("a.STL", MeshKind::Triangles),
             ("a.obj", MeshKind::Triangles),
-            ("a.dae", MeshKind::Collada),
+            ("a.dae", MeshKind::Triangles),
             ("a.glb", MeshKind::Unsupported),
             ("stl", MeshKind::Unsupported),
         ] {

@@ -269,13 +269,13 @@ pub fn recorded_rig(path: &Path, overrides: &[Override]) -> anyhow::Result<Rig> 
 pub fn recording(path: &Path, rig: Option<Rig>, overrides: &[Override]) -> anyhow::Result<Opened> {
     let recording = Recording::open(path)?;
     let mut rig = match rig {
-        Some(rig) => rig,
+        Some(mut rig) => {
+            let meshes = RecordedMeshes::of(&recording);
+            rig.arm.urdf_folder = rig.arm.urdf_folder.with_recorded(meshes);
+            rig
+        }
         None => stored_rig(path, &recording, overrides)?,
     };
-    rig.arm.urdf_folder = rig
-        .arm
-        .urdf_folder
-        .with_recorded(RecordedMeshes::of(&recording));
     if let Some(recorded) = recording.joint_names() {
         // A rig from the user may have another joint order, or may even belong to another robot.
         // Joint readings keep the order of the recording, so the offsets must have the same order.

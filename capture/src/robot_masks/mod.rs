@@ -194,7 +194,7 @@ impl RobotMasks {
             )),
             (_, Some(first)) => Some(format!(
                 "{subject}, but the shape of {} is unknown ({first}), so these parts of the moving robot will be trained \
-                 into the model; add <collision> shapes, or meshes as .stl or .obj",
+                 into the model; add <collision> shapes, or meshes as .stl, .dae or .obj",
                 counted(unknown.len() as u64, "link"),
             )),
             (false, None) => None,

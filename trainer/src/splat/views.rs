@@ -459,6 +459,9 @@ fn not_uploaded() -> Error {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use calibration::scenes::{Miscalibration, capture};
+    use gpu::testing::test_gpu;
+    use kinematics::Transform;
 
     #[test]
     fn no_side_of_a_level_is_smaller_than_a_tile() {
@@ -476,5 +479,40 @@ mod tests {
                 );
             }
         }
+    }
+
+    #[test]
+    fn images_are_uploaded_again_only_if_a_mask_has_changed() {
+        let gpu = test_gpu();
+        let keyframe = capture(&Miscalibration::none()).remove(0);
+        let mut view = TrainView::new(keyframe.clone());
+        let images = LevelImages::new(&keyframe, 0);
+        view.upload(&gpu, 0, &images, None).unwrap();
+        let moved = Keyframe {
+            world_from_camera: Transform::translation(0.1, 0.0, 0.0) * keyframe.world_from_camera,
+            depth: None,
+            ..(*keyframe).clone()
+        };
+        let without_depth = Keyframe {
+            depth: None,
+            ..(*keyframe).clone()
+        };
+        view.replace_camera(&gpu, without_depth.into());
+        view.upload(&gpu, 0, &images, None).unwrap();
+        view.replace_camera(&gpu, Arc::new(moved.clone()));
+        assert!(view.has_level(0), "only the pose has changed");
+        let mut rgba = moved.rgba_srgb.to_vec();
+        let n_masked = rgba.len() / 2;
+        rgba[..n_masked]
+            .chunks_mut(4)
+            .for_each(|pixel| pixel[3] = 0);
+        let before = view.mean_srgb();
+        let masked = Keyframe {
+            rgba_srgb: rgba.into(),
+            ..moved
+        };
+        view.replace_camera(&gpu, masked.into());
+        assert!(!view.has_level(0), "the mask has changed");
+        assert_ne!(view.mean_srgb(), before);
     }
 }
