@@ -19,11 +19,17 @@ pub use kinematics::collada::Triangle;
 /// Triangles of a mesh file of a URDF in the frame of the mesh, meters. Faces with more corners are
 /// divided into triangles. A vertex of an OBJ file without faces is a triangle without area.
 ///
+/// * `budget`: limits the size of the file.
+///
 /// # Errors
 ///
 /// Why the file cannot be read, in one sentence.
-pub fn mesh_triangles(file: &str, urdf_folder: &UrdfFolder) -> Result<Vec<Triangle>, String> {
-    let bytes = urdf_folder.read_mesh(file, Budget::MESH)?;
+pub fn mesh_triangles(
+    file: &str,
+    urdf_folder: &UrdfFolder,
+    budget: Budget,
+) -> Result<Vec<Triangle>, String> {
+    let bytes = urdf_folder.read_mesh(file, budget)?;
     let extension = file.rsplit('.').next().unwrap_or_default();
     let triangles = match extension.to_ascii_lowercase().as_str() {
         "stl" => stl(&bytes)?,
@@ -138,7 +144,7 @@ mod tests {
     fn triangles(name: &str, contents: &[u8]) -> Result<Vec<Triangle>, String> {
         let folder = tempfile::tempdir().expect("a folder");
         std::fs::write(folder.path().join(name), contents).expect("written");
-        mesh_triangles(name, &UrdfFolder::at(folder.path()))
+        mesh_triangles(name, &UrdfFolder::at(folder.path()), Budget::MESH)
     }
 
     #[test]
@@ -182,7 +188,7 @@ mod tests {
             assert!(error.contains(words), "{name}: {error}");
         }
         let nowhere = UrdfFolder::at(std::path::Path::new("/nowhere"));
-        let missing = mesh_triangles("missing.stl", &nowhere).expect_err("missing");
+        let missing = mesh_triangles("missing.stl", &nowhere, Budget::MESH).expect_err("missing");
         assert!(missing.contains("no such file"), "{missing}");
     }
 }

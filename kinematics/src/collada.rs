@@ -2,7 +2,7 @@
 //! their visual shapes.
 //!
 //! Source of the format: Khronos, "COLLADA: Digital Asset Schema Release 1.4.1" (2008), chapter 5.
-//! Materials, normals, lines, curves and skins are not read. Like RViz and the page, this reader
+//! Materials, normals, lines, curves and skins are not read. Like `RViz` and the page, this reader
 //! uses the coordinates as they are, whatever `<up_axis>` says: robot descriptions are written for
 //! programs that do so.
 
@@ -493,7 +493,7 @@ mod tests {
             triangles(&whole.replacen(from, to, 1)).map_err(|error| error.to_string())
         };
         for (from, to, words) in [
-            ("</COLLADA>", "", "expected"),
+            ("</COLLADA>", "", "never closed"),
             ("<COLLADA ", "<!DOCTYPE x><COLLADA ", "DTD"),
             ("url=\"#g\"", "url=\"#h\"", "refers to \"#h\""),
             (

@@ -3,6 +3,7 @@
 use super::convex_pieces::cover;
 use crate::config::UrdfFolder;
 use crate::mesh_triangles::{Triangle, mesh_triangles};
+use files::Budget;
 use keyframe::masked_robot::{ConvexPiece, Sweep};
 use kinematics::shape::{Geometry, Shape};
 use kinematics::urdf::{JointKind, JointLimits, Robot};
@@ -86,6 +87,7 @@ impl RobotShape {
         let mut meshes = Meshes {
             folder: mesh_folder,
             read: BTreeMap::new(),
+            left: Budget::MESHES,
         };
         let mut links = Vec::new();
         let mut all_pieces = Vec::new();
@@ -284,6 +286,8 @@ fn n_poses_of(limits: &JointLimits, is_prismatic: bool) -> u32 {
 struct Meshes<'a> {
     folder: &'a UrdfFolder,
     read: BTreeMap<String, Result<Vec<Triangle>, String>>,
+    /// What all further files may have together. A small recording could contain any amount.
+    left: Budget,
 }
 
 impl Meshes<'_> {
@@ -321,11 +325,16 @@ impl Meshes<'_> {
         let Geometry::Mesh { file, .. } = geometry else {
             return Ok(&[]);
         };
-        let folder = self.folder;
-        let read = self
-            .read
-            .entry(file.clone())
-            .or_insert_with(|| mesh_triangles(file, folder));
+        let Self { folder, read, left } = self;
+        let read = read.entry(file.clone()).or_insert_with(|| {
+            let budget = Budget {
+                max_bytes: Budget::MESH.max_bytes.min(left.max_bytes),
+                ..Budget::MESH
+            };
+            let triangles = mesh_triangles(file, folder, budget)?;
+            *left = left.after(size_of_val(&*triangles) as u64);
+            Ok(triangles)
+        });
         read.as_deref()
             .map_err(|why| format!("mesh {file:?}: {why}"))
     }

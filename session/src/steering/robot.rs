@@ -6,6 +6,7 @@ use anyhow::Context;
 use capture::config::Rig;
 use capture::mesh_triangles;
 use capture::open::SteeredArm;
+use files::Budget;
 use kinematics::Chain;
 use kinematics::urdf::{JointKind, Robot};
 use messages::counted;
@@ -32,7 +33,7 @@ pub(super) fn chain_and_body(rig: &Rig) -> anyhow::Result<ChainAndBody> {
     let chain = Chain::new(&robot, &arm.base_link, &arm.flange_link).context("the arm's URDF")?;
     let unreadable = RefCell::new(BTreeMap::new());
     let vertices_of = |file: &str| {
-        mesh_triangles(file, &arm.urdf_folder)
+        mesh_triangles(file, &arm.urdf_folder, Budget::MESH)
             .map(|triangles| triangles.into_flattened())
             .map_err(|why| unreadable.borrow_mut().insert(file.to_owned(), why))
             .ok()

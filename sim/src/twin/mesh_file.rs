@@ -247,7 +247,7 @@ mod tests {
             ("a.obj", &b"v 0 0\n"[..], "three finite numbers"),
             ("a.obj", &b"v 0 0 0\nf 1 2 3\n"[..], "not a point"),
             ("a.dae", &b"<COLLADA/>"[..], "no triangles"),
-            ("a.dae", &b"solid"[..], "unknown token"),
+            ("a.dae", &b"<robot/>"[..], "expected a <COLLADA>"),
             ("a.glb", &b"glTF"[..], ".glb"),
         ] {
             let error = read(file, bytes, [1.0; 3]).expect_err("damaged");
