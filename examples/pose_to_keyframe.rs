@@ -70,6 +70,7 @@ fn main() -> anyhow::Result<()> {
         base: None,
         split: Split::Train,
         truth: None,
+        robot: None,
     };
     keyframe.check()?;
 

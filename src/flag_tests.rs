@@ -115,7 +115,7 @@ const PRINTED_BY: [(&str, &[&str]); 44] = [
 ];
 
 /// Settings in messages of libraries, where the message names a command that accepts the setting.
-const NAMED_WITH_COMMAND: [(&str, Setting, &str); 23] = [
+const NAMED_WITH_COMMAND: [(&str, Setting, &str); 26] = [
     (
         "capture/src/calibration_commands.rs",
         Setting::Camera,
@@ -157,6 +157,9 @@ const NAMED_WITH_COMMAND: [(&str, Setting, &str); 23] = [
     ("session/src/next_commands.rs", Setting::Keyframes, "eval"),
     ("session/src/next_commands.rs", Setting::Out, "export"),
     ("session/src/next_commands.rs", Setting::To, "export"),
+    ("session/src/resume_command.rs", Setting::From, "run"),
+    ("session/src/resume_command.rs", Setting::RealTime, "run"),
+    ("session/src/resume_command.rs", Setting::Repeat, "run"),
     ("session/src/resume_command.rs", Setting::Rig, "train"),
     ("session/src/saved_view.rs", Setting::From, "run"),
     (

@@ -356,6 +356,7 @@ pub(crate) mod tests {
                 base: None,
                 split: Split::of(usize::try_from(ix).expect("not negative")),
                 truth: None,
+                robot: None,
             })
         };
         (0..n).map(keyframe).collect()

@@ -1,6 +1,7 @@
 //! Runs alignment in parallel with training. Alignment starts with the first training step, on its
 //! own thread. Its result is applied at a fixed step.
 
+use crate::redrawn::RedrawnKeyframes;
 use crate::registration::{Alignment, CameraMovement, MovementDetector, align};
 use crate::{CalibratedCamera, CameraCorrection, CameraRefinement, Error};
 use background::{Task, run_in_background_pool};
@@ -34,14 +35,19 @@ pub struct AlignmentTask {
     /// The latest result. `None` until the first alignment has ended, and if alignment was not
     /// possible.
     result: Option<Alignment>,
+    /// Keyframes with the corrections of the latest result, until the caller has taken them.
+    redrawn: RedrawnKeyframes,
 }
+
+/// Result of an alignment, and the keyframes in which a robot is masked with its corrections.
+type AlignedKeyframes = (Alignment, RedrawnKeyframes);
 
 #[derive(Debug)]
 enum TaskState {
     /// Alignment can start.
     Requested,
     /// Alignment runs on its own thread.
-    Running(Task<Option<Alignment>>),
+    Running(Task<Option<AlignedKeyframes>>),
     /// Alignment has finished or was not requested.
     Done,
 }
@@ -57,6 +63,7 @@ impl AlignmentTask {
                 TaskState::Done
             },
             result: None,
+            redrawn: RedrawnKeyframes::default(),
         }
     }
 
@@ -65,6 +72,7 @@ impl AlignmentTask {
         Self {
             state: TaskState::Done,
             result,
+            redrawn: RedrawnKeyframes::default(),
         }
     }
 
@@ -99,12 +107,15 @@ impl AlignmentTask {
         // Alignment does not estimate movements of cameras, but it must apply known movements.
         // Otherwise, images before and after a movement would contradict each other.
         let choice = choice.clone();
-        let with_movements = |keyframe: &Arc<Keyframe>| match &self.result {
-            Some(result) => result.with_movements(keyframe),
-            None => keyframe.clone(),
+        let known = Alignment {
+            movements: self
+                .result
+                .as_ref()
+                .map_or(Vec::new(), |result| result.movements.clone()),
+            ..Alignment::default()
         };
-        let keyframes: Vec<_> = keyframes.iter().map(with_movements).collect();
-        let work = move || run_in_background_pool(|| align(&keyframes, &choice));
+        let originals = keyframes.to_vec();
+        let work = move || run_in_background_pool(|| aligned(&originals, &choice, &known));
         self.state = TaskState::Running(Task::start("alignment", work));
     }
 
@@ -115,10 +126,10 @@ impl AlignmentTask {
             return Ok(false);
         };
         let result = thread.join().map_err(|_| Error::AlignmentPanicked)?;
-        for line in result.iter().flat_map(Alignment::lines) {
+        for line in result.iter().flat_map(|(result, _)| result.lines()) {
             log::info!("{line}");
         }
-        let Some(mut result) = result else {
+        let Some((mut result, redrawn)) = result else {
             return Ok(false);
         };
         if self
@@ -141,13 +152,21 @@ impl AlignmentTask {
                 .any(|keyframe| latest.differs(&result, keyframe)),
         };
         if is_changed || self.result.is_none() {
+            self.redrawn = redrawn.if_valid_for(&result);
             self.result = Some(result);
         }
         Ok(is_changed)
     }
 
+    /// Forgets the keyframes that were corrected in the background, which hold pixels. They are
+    /// corrected again when they are requested.
+    pub fn forget_redrawn(&mut self) {
+        self.redrawn = RedrawnKeyframes::default();
+    }
+
     /// Adds a movement of a camera to the result. See [`Alignment::add_movement`].
     pub fn add_movement(&mut self, movement: CameraMovement, first: Stamp) {
+        self.forget_redrawn();
         self.result
             .get_or_insert_default()
             .add_movement(movement, first);
@@ -155,9 +174,19 @@ impl AlignmentTask {
 
     /// The keyframe with the corrections of alignment, if there are any.
     pub fn corrected(&self, keyframe: &Arc<Keyframe>) -> Arc<Keyframe> {
+        let redrawn = self.redrawn.of(keyframe);
+        redrawn.unwrap_or_else(|| {
+            self.result
+                .as_ref()
+                .map_or_else(|| keyframe.clone(), |result| result.corrected(keyframe))
+        })
+    }
+
+    /// Like [`Self::corrected`], but with the mask of a robot where it was, which takes less time.
+    pub fn moved(&self, keyframe: &Arc<Keyframe>) -> Arc<Keyframe> {
         self.result
             .as_ref()
-            .map_or_else(|| keyframe.clone(), |result| result.corrected(keyframe))
+            .map_or_else(|| keyframe.clone(), |result| result.moved(keyframe))
     }
 
     /// The camera of a keyframe with the corrections of alignment, followed by the corrections that
@@ -172,6 +201,27 @@ impl AlignmentTask {
             .unwrap_or(&Alignment::default())
             .camera(keyframe, learned)
     }
+}
+
+/// Aligns uncorrected keyframes. `None` if alignment is not possible.
+///
+/// * `known`: the known movements of cameras.
+fn aligned(
+    originals: &[Arc<Keyframe>],
+    choice: &CameraRefinement,
+    known: &Alignment,
+) -> Option<AlignedKeyframes> {
+    let moved: Vec<_> = originals
+        .iter()
+        .map(|keyframe| known.with_movements(keyframe))
+        .collect();
+    let alignment = align(&moved, choice)?;
+    let with_movements = Alignment {
+        movements: known.movements.clone(),
+        ..alignment.clone()
+    };
+    let redrawn = RedrawnKeyframes::new(&with_movements, originals);
+    Some((alignment, redrawn))
 }
 
 /// Accuracy of extrinsics that were estimated from color: 0.1 degrees and 3 mm.

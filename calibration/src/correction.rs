@@ -1,10 +1,12 @@
 //! Calibration corrections of one camera, and their application to keyframes.
 
-use keyframe::{DepthMap, Keyframe, Shutter};
+use keyframe::masked_robot::Pinhole;
+use keyframe::{DepthMap, Keyframe, MaskViews, Shutter};
 use kinematics::{Stamp, Transform, Twist, transform};
 use nalgebra::{Translation3, UnitQuaternion, Vector3};
 use numbers::f32_of;
 use std::collections::BTreeMap;
+use std::sync::Arc;
 
 /// Estimated calibration correction of one camera.
 #[derive(Clone, Debug, PartialEq, serde::Serialize, serde::Deserialize)]
@@ -214,22 +216,78 @@ impl CameraCorrection {
         rigid_transform * keyframe.world_from_camera.inverse() * depth.world_from_camera
     }
 
-    /// The keyframe with corrected pose, intrinsics, depth and readout time.
+    /// The keyframe with corrected pose, intrinsics, depth and readout time. The mask of a robot is
+    /// drawn again for the corrected camera.
     pub fn corrected(&self, keyframe: &Keyframe) -> Keyframe {
+        self.moved(&self.remasked(keyframe))
+    }
+
+    /// The keyframe with the mask of the robot as the corrected camera sees it. Its calibration stays
+    /// the same. Only extrinsics, lens and pose of the depth frame move the mask: the other
+    /// corrections do not move the camera relative to the robot, or by less than the margin of the
+    /// mask.
+    pub fn remasked(&self, keyframe: &Keyframe) -> Keyframe {
+        let mut remasked = keyframe.clone();
+        let Some(robot) = keyframe.robot.as_ref().filter(|_| self.moves_robot()) else {
+            return remasked;
+        };
+        let [corrected_from_camera, depth_correction] = [
+            (self.rotation_rad, self.translation_m),
+            (self.depth_rotation_rad, self.depth_translation_m),
+        ]
+        .map(|(rotation_rad, translation_m)| {
+            rigid_transform(rotation_rad.into(), translation_m.into())
+        });
+        let robot = robot.seen_by_corrected(&corrected_from_camera, &depth_correction);
+        let mut views = MaskViews::of(keyframe);
+        self.correct_view(&mut views.color);
+        if let (Some(view), Some(depth)) = (&mut views.depth, &keyframe.depth)
+            && shares_lens(keyframe, depth)
+        {
+            self.correct_view(view);
+        }
+        remasked.mask_robot(robot, &views);
+        remasked
+    }
+
+    /// Whether the correction moves the robot in the image.
+    fn moves_robot(&self) -> bool {
+        let poses = [
+            self.rotation_rad,
+            self.translation_m,
+            self.depth_rotation_rad,
+            self.depth_translation_m,
+        ];
+        let lens = [self.log_focal, self.principal_offset_focals];
+        poses.as_flattened().iter().any(|number| *number != 0.0)
+            || lens.as_flattened().iter().any(|number| *number != 0.0)
+    }
+
+    fn correct_view(&self, view: &mut Pinhole) {
+        let focal_px = view.focal_px;
+        view.focal_px = std::array::from_fn(|axis| focal_px[axis] * self.log_focal[axis].exp());
+        for (axis, principal_px) in view.principal_px.iter_mut().enumerate() {
+            *principal_px += self.principal_offset_focals[axis] * focal_px[axis];
+        }
+    }
+
+    /// The keyframe with corrected pose, intrinsics, depth and readout time, and with the mask of the
+    /// robot where it was.
+    pub fn moved(&self, keyframe: &Keyframe) -> Keyframe {
         let CalibratedCamera {
             world_from_camera,
             focal_px,
             principal_px,
             ..
         } = self.apply(keyframe);
+        // Without a correction, the readings are shared instead of copied.
+        let factor = f32_of(self.log_depth_scale.exp());
         let depth = keyframe.depth.as_ref().map(|depth| {
             let has_same_lens = shares_lens(keyframe, depth);
             let focal = |axis: usize| depth.focal_px[axis] * self.log_focal[axis].exp();
             let principal = |axis: usize| {
                 depth.principal_px[axis] + self.principal_offset_focals[axis] * depth.focal_px[axis]
             };
-            // Without a correction, the readings are shared instead of copied.
-            let factor = f32_of(self.log_depth_scale.exp());
             DepthMap {
                 size_px: depth.size_px,
                 focal_px: if has_same_lens {
@@ -264,6 +322,10 @@ impl CameraCorrection {
                 .iter()
                 .map(|twist| twist.of_attached(&raw_from_corrected))
                 .collect(),
+            robot: match &keyframe.robot {
+                Some(robot) if factor != 1.0 => Some(Arc::new(robot.with_depth_scaled(factor))),
+                robot => robot.clone(),
+            },
             ..keyframe.clone()
         }
     }

@@ -20,6 +20,7 @@
 //! #     camera: "wrist".into(), stamp: Stamp(0), size_px: [1, 1], focal_px: [1.0; 2], principal_px: [0.5; 2],
 //! #     rgba_srgb: [0; 4].into(), depth: None, world_from_camera: Transform::identity(), twist: None,
 //! #     readout_secs: 0.0, joint_twists: [].into(), base: None, split: Split::Train, truth: None,
+//! #     robot: None,
 //! # };
 //! // The camera is 5 mm further along its x axis than in its extrinsics.
 //! let correction = CameraCorrection { translation_m: [-0.005, 0.0, 0.0], ..CameraCorrection::default() };
@@ -35,6 +36,7 @@ pub mod hand_eye;
 mod intrinsics;
 pub mod least_squares;
 mod params;
+mod redrawn;
 mod registration;
 #[cfg(any(test, feature = "scenes"))]
 pub mod scenes;

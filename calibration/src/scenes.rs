@@ -306,6 +306,7 @@ impl Shot<'_> {
             base: None,
             split: Split::of(self.ix),
             truth: None,
+            robot: None,
         }
     }
 }

@@ -380,6 +380,7 @@ fn keyframe(lens: &LensMaps, image: &DatasetImage, scale_frac: f64) -> anyhow::R
         base: None,
         split: Split::Train,
         truth: None,
+        robot: None,
     };
     Ok(Converted {
         keyframe,

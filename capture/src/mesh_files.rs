@@ -5,10 +5,8 @@ use std::path::{Path, PathBuf};
 /// Which parts of fieldrig can read a mesh file.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum MeshKind {
-    /// Triangles (`.stl`, `.obj`): the page, the simulator, steering and masks of the robot.
+    /// Triangles (`.stl`, `.obj`, `.dae`): the page, the simulator, steering and masks of the robot.
     Triangles,
-    /// COLLADA (`.dae`): only the page.
-    Collada,
     /// None.
     Unsupported,
 }
@@ -19,24 +17,21 @@ impl MeshKind {
     pub fn of(file: &str) -> Self {
         let extension = file.rsplit_once('.').map(|(_, extension)| extension);
         match extension.map(str::to_ascii_lowercase).as_deref() {
-            Some("stl" | "obj") => Self::Triangles,
-            Some("dae") => Self::Collada,
+            Some("stl" | "obj" | "dae") => Self::Triangles,
             _ => Self::Unsupported,
         }
     }
 }
 
 /// The path of a mesh file; `None` if it does not exist.
-#[must_use]
-pub fn found_mesh_file(file: &str, urdf_folder: &Path) -> Option<PathBuf> {
+pub(crate) fn found_mesh_file(file: &str, urdf_folder: &Path) -> Option<PathBuf> {
     mesh_file_candidates(file, urdf_folder)
         .into_iter()
         .find(|path| path.is_file())
 }
 
 /// Why a mesh file was not found. Most files are missing because only the URDF was copied.
-#[must_use]
-pub fn missing_mesh_file(file: &str, urdf_folder: &Path) -> String {
+pub(crate) fn missing_mesh_file(file: &str, urdf_folder: &Path) -> String {
     let folder = urdf_folder.display();
     let package = file
         .strip_prefix("package://")

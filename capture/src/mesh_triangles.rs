@@ -3,9 +3,9 @@
 //! Sources of the formats: 3D Systems, "Stereolithography Interface Specification" (1989), and
 //! Wavefront, "Advanced Visualizer Manual", appendix B1 (OBJ).
 
-use crate::mesh_files::{found_mesh_file, missing_mesh_file};
+use crate::config::UrdfFolder;
 use files::Budget;
-use std::path::Path;
+use kinematics::collada;
 
 /// Sizes of the header of a binary STL file and of each of its triangles, bytes.
 const STL_HEADER_BYTES: usize = 84;
@@ -14,26 +14,31 @@ const STL_TRIANGLE_BYTES: usize = 50;
 const NUMBER_BYTES: usize = 4;
 const NORMAL_BYTES: usize = 3 * NUMBER_BYTES;
 
-/// A triangle, given by its corners.
-pub type Triangle = [[f64; 3]; 3];
+pub use kinematics::collada::Triangle;
 
 /// Triangles of a mesh file of a URDF in the frame of the mesh, meters. Faces with more corners are
 /// divided into triangles. A vertex of an OBJ file without faces is a triangle without area.
 ///
+/// * `budget`: limits the size of the file.
+///
 /// # Errors
 ///
 /// Why the file cannot be read, in one sentence.
-pub fn mesh_triangles(file: &str, urdf_folder: &Path) -> Result<Vec<Triangle>, String> {
-    let path =
-        found_mesh_file(file, urdf_folder).ok_or_else(|| missing_mesh_file(file, urdf_folder))?;
-    let bytes = files::read(&path, Budget::MESH).map_err(|error| error.to_string())?;
+pub fn mesh_triangles(
+    file: &str,
+    urdf_folder: &UrdfFolder,
+    budget: Budget,
+) -> Result<Vec<Triangle>, String> {
+    let bytes = urdf_folder.read_mesh(file, budget)?;
     let extension = file.rsplit('.').next().unwrap_or_default();
     let triangles = match extension.to_ascii_lowercase().as_str() {
         "stl" => stl(&bytes)?,
         "obj" => obj(&String::from_utf8_lossy(&bytes))?,
+        "dae" => collada::triangles(&String::from_utf8_lossy(&bytes))
+            .map_err(|error| error.to_string())?,
         other => {
             return Err(format!(
-                ".{other} files cannot be read, convert it to .stl or .obj"
+                ".{other} files cannot be read, convert it to .stl, .dae or .obj"
             ));
         }
     };
@@ -139,7 +144,7 @@ mod tests {
     fn triangles(name: &str, contents: &[u8]) -> Result<Vec<Triangle>, String> {
         let folder = tempfile::tempdir().expect("a folder");
         std::fs::write(folder.path().join(name), contents).expect("written");
-        mesh_triangles(name, folder.path())
+        mesh_triangles(name, &UrdfFolder::at(folder.path()), Budget::MESH)
     }
 
     #[test]
@@ -175,12 +180,15 @@ mod tests {
             ("a.obj", "v 1 2 inf\n", "line 1 has no point"),
             ("a.obj", "v 1 2 3\nf 1 2 1\n", "line 2 names a vertex"),
             ("a.obj", "# nothing\n", "no vertices"),
-            ("a.dae", "<COLLADA/>", "convert it to .stl"),
+            ("a.dae", "<COLLADA/>", "no vertices"),
+            ("a.dae", "<robot/>", "expected a <COLLADA>"),
+            ("a.glb", "glTF", "convert it to .stl"),
         ] {
             let error = triangles(name, contents.as_bytes()).expect_err(name);
             assert!(error.contains(words), "{name}: {error}");
         }
-        let missing = mesh_triangles("missing.stl", Path::new("/nowhere")).expect_err("missing");
+        let nowhere = UrdfFolder::at(std::path::Path::new("/nowhere"));
+        let missing = mesh_triangles("missing.stl", &nowhere, Budget::MESH).expect_err("missing");
         assert!(missing.contains("no such file"), "{missing}");
     }
 }

@@ -104,10 +104,11 @@ impl RecordPlan {
         } else {
             Devices::Real
         };
+        let meshes = open::meshes_to_record(&rig);
         let Opened {
             rig, mut source, ..
         } = open::rig(rig, devices)?;
-        let mut recorder = open::recorder(&self.out, &rig)?;
+        let mut recorder = open::recorder(&self.out, &rig, &meshes)?;
         let mut recorded = Recorded {
             event: "done",
             out: self.out.clone(),

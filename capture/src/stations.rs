@@ -743,6 +743,7 @@ mod tests {
             }),
             split: Split::of(ix),
             truth: None,
+            robot: None,
         })
     }
 

@@ -120,6 +120,7 @@ mod tests {
             readout_secs: 0.01,
             split: Split::Train,
             truth: None,
+            robot: None,
         }
     }
 

@@ -1,6 +1,7 @@
 //! Posed images for training, as plain arrays without driver types.
 
 use crate::Error;
+use crate::masked_robot::MaskedRobot;
 use kinematics::{Stamp, Transform, Twist, transform};
 use nalgebra::Vector3;
 use std::sync::Arc;
@@ -64,6 +65,9 @@ pub struct Keyframe {
     pub split: Split,
     /// Ground truth from a simulator.
     pub truth: Option<Truth>,
+    /// The robot that is masked in this image. `None` if the robot is not masked in the images of
+    /// this camera.
+    pub robot: Option<Arc<MaskedRobot>>,
 }
 
 impl Keyframe {
@@ -82,7 +86,8 @@ impl Keyframe {
             .as_ref()
             .map_or(0, |depth| size_of_val(&*depth.depth_m));
         let truth = self.truth.as_ref().map_or(0, |truth| truth.rgba_srgb.len());
-        (self.rgba_srgb.len() + depth + truth) as u64
+        let robot = self.robot.as_ref().map_or(0, |robot| robot.bytes());
+        (self.rgba_srgb.len() + depth + truth) as u64 + robot
     }
 
     /// Checks that the lengths of the arrays match their sizes in pixels.

@@ -25,6 +25,7 @@
 //!     base: None,
 //!     split: Split::Train,
 //!     truth: None,
+//!     robot: None,
 //! };
 //! gray.check()?;
 //! assert!(gray.is_finite() && gray.lacks_dense_depth());
@@ -36,7 +37,9 @@ mod fingerprint;
 mod holdout;
 mod keyframe;
 mod list;
+pub mod masked_robot;
 mod range_points;
+mod robot_masking;
 #[cfg(any(test, feature = "scenes"))]
 pub mod scenes;
 mod shutter;
@@ -48,5 +51,6 @@ pub use holdout::Holdout;
 pub use keyframe::{BaseState, DepthMap, Keyframe, Split, Truth};
 pub use list::{KeyframeList, list_text, split_from_name, split_name};
 pub use range_points::RangePoints;
+pub use robot_masking::MaskViews;
 pub use shutter::Shutter;
 pub use viewer_data::{LiveImage, LivePixels, RangeScan, RobotState};

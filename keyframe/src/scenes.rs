@@ -126,6 +126,7 @@ pub fn keyframe(ix: i64, shapes: &[TestShape], world_from_camera: Transform) -> 
         base: None,
         split: Split::Train,
         truth: None,
+        robot: None,
     }
 }
 

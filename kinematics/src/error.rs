@@ -55,6 +55,12 @@ pub enum Error {
         /// Height in pixels.
         height: u32,
     },
+    /// A COLLADA file cannot be read.
+    #[error("{why}")]
+    Collada {
+        /// The reason, in one sentence.
+        why: String,
+    },
     /// The text is not XML, or describes no robot.
     #[error("urdf: cannot be read: {why}")]
     UrdfSyntax {

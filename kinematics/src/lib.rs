@@ -30,6 +30,7 @@
 
 pub mod camera;
 pub mod chain;
+pub mod collada;
 pub mod device_clock;
 mod error;
 pub mod history;
@@ -44,6 +45,7 @@ pub mod stamp;
 pub mod transform;
 pub mod undistort;
 pub mod urdf;
+mod xml_limits;
 
 pub use camera::{Intrinsics, Lens};
 pub use chain::Chain;

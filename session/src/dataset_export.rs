@@ -380,6 +380,7 @@ mod tests {
             base: None,
             split: Split::of(ix),
             truth: None,
+            robot: None,
         }
     }
 

@@ -570,6 +570,7 @@ mod tests {
             readout_secs: 0.0,
             split,
             truth: None,
+            robot: None,
         })
     }
 

@@ -162,10 +162,11 @@ impl Evaluator {
         method: &mut AlignedModel,
         keyframe: &Keyframe,
     ) -> anyhow::Result<ImageScores> {
+        let remasked = method.remasked(keyframe);
         // Scoring on the GPU needs no read-back of the picture. Other scores need the pixels.
         if !self.is_full
             && self.lpips.is_none()
-            && let Some(psnr) = psnr_on_gpu(method, keyframe)?
+            && let Some(psnr) = psnr_on_gpu(method, &remasked)?
         {
             return Ok(ImageScores {
                 camera: keyframe.camera.to_string(),
@@ -264,33 +265,34 @@ impl Evaluator {
         method: &mut AlignedModel,
         keyframe: &'a Keyframe,
     ) -> anyhow::Result<Drawn<'a>> {
+        let keyframe = method.remasked(keyframe);
         if !self.is_full {
             return Ok(Drawn {
+                picture: Arc::new(draw(method, &keyframe, false)?),
                 keyframe,
-                picture: Arc::new(draw(method, keyframe, false)?),
                 depth: None,
                 at_truth: None,
             });
         }
-        let lens = method.calibrated_camera(keyframe)?;
-        let depth = comparable_depth(method, keyframe);
+        let lens = method.calibrated_camera(&keyframe)?;
+        let depth = comparable_depth(method, &keyframe);
         // Depth that is aligned with the image is in the same picture.
         let is_aligned = depth
             .as_ref()
-            .is_some_and(|depth| is_aligned(depth, &lens, keyframe));
-        let picture = Arc::new(draw(method, keyframe, is_aligned)?);
+            .is_some_and(|depth| is_aligned(depth, &lens, &keyframe));
+        let picture = Arc::new(draw(method, &keyframe, is_aligned)?);
         let depth = match depth {
             Some(depth) if is_aligned => Some((Arc::clone(&picture), depth)),
             Some(depth) => {
-                render_depth(method, keyframe, &depth)?.map(|drawn| (Arc::new(drawn), depth))
+                render_depth(method, &keyframe, &depth)?.map(|drawn| (Arc::new(drawn), depth))
             }
             None => None,
         };
         Ok(Drawn {
-            keyframe,
             picture,
             depth,
-            at_truth: draw_at_truth(method, keyframe)?,
+            at_truth: draw_at_truth(method, &keyframe)?,
+            keyframe,
         })
     }
 }
@@ -304,10 +306,11 @@ fn name_of(keyframe: &Keyframe) -> String {
 
 /// The renders from which the scores of a test keyframe are computed.
 struct Drawn<'a> {
-    keyframe: &'a Keyframe,
+    /// The keyframe, with the mask of the robot as the corrected camera sees it.
+    keyframe: Cow<'a, Keyframe>,
     picture: Arc<Picture>,
     /// Rendered depth, and the measured depth at its size.
-    depth: Option<(Arc<Picture>, Cow<'a, DepthMap>)>,
+    depth: Option<(Arc<Picture>, DepthMap)>,
     /// A render at the true pose.
     at_truth: Option<Picture>,
 }
@@ -582,16 +585,13 @@ fn request(keyframe: &Keyframe, lens: &CalibratedCamera) -> RenderRequest {
 }
 
 /// The measured depth at the size at which the method can be compared with it.
-fn comparable_depth<'a>(
-    method: &AlignedModel,
-    keyframe: &'a Keyframe,
-) -> Option<Cow<'a, DepthMap>> {
+fn comparable_depth(method: &AlignedModel, keyframe: &Keyframe) -> Option<DepthMap> {
     let full = keyframe.depth.as_ref()?;
     let stride = method.model().depth_stride();
     Some(if stride > 1 {
-        Cow::Owned(full.subsampled(stride))
+        full.subsampled(stride)
     } else {
-        Cow::Borrowed(full)
+        full.clone()
     })
 }
 

@@ -45,7 +45,7 @@ pub(crate) fn publish(
 fn publish_robot(hub: &Hub, model: &Path) -> anyhow::Result<()> {
     let file = model.join(RIG_FILE);
     let rig = Rig::load(&file, &[])?;
-    if let Some(robot) = robot_meshes::description(&rig, &file)? {
+    if let Some(robot) = robot_meshes::description(&rig)? {
         hub.set_robot(robot);
     }
     Ok(())

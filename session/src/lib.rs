@@ -86,6 +86,7 @@ mod session_setup;
 mod started_run;
 mod steering;
 mod stored_keyframes;
+mod stored_robot;
 mod time_slices;
 mod train_plan;
 mod training;

@@ -1,13 +1,11 @@
 //! The robot of a rig as viewers draw it, with the mesh files that its URDF names.
 
 use anyhow::Context;
-use capture::config::{ArmDriver, Rig};
-use capture::{found_mesh_file, missing_mesh_file};
+use capture::config::{ArmDriver, Rig, UrdfFolder};
 use files::Budget;
 use kinematics::shape::Geometry;
 use kinematics::urdf::Robot;
 use std::collections::BTreeSet;
-use std::path::Path;
 use viz::{MeshFormat, RobotDescription, RobotMesh};
 
 /// The robot of a rig; `None` if the rig has neither an arm nor a moving base. A shape that cannot
@@ -16,13 +14,12 @@ use viz::{MeshFormat, RobotDescription, RobotMesh};
 /// # Errors
 ///
 /// If the URDF is invalid, which [`Rig::load`] rules out.
-pub fn description(rig: &Rig, rig_file: &Path) -> anyhow::Result<Option<RobotDescription>> {
+pub fn description(rig: &Rig) -> anyhow::Result<Option<RobotDescription>> {
     if rig.arm.driver == ArmDriver::None && !rig.has_moving_base() {
         return Ok(None);
     }
     let robot = Robot::parse(&rig.arm.urdf_text).context("the arm's URDF")?;
-    let folder = Rig::urdf_folder(rig_file).unwrap_or_default();
-    let meshes = meshes(&robot, &folder);
+    let meshes = meshes(&robot, &rig.arm.urdf_folder);
     Ok(Some(RobotDescription {
         robot,
         base_link: rig.arm.base_link.clone(),
@@ -32,7 +29,7 @@ pub fn description(rig: &Rig, rig_file: &Path) -> anyhow::Result<Option<RobotDes
 }
 
 /// Reads the mesh files of all visual shapes.
-fn meshes(robot: &Robot, urdf_folder: &Path) -> Vec<RobotMesh> {
+fn meshes(robot: &Robot, urdf_folder: &UrdfFolder) -> Vec<RobotMesh> {
     let shapes = robot.links().iter().flat_map(|link| robot.visuals(link));
     let mut files: Vec<&str> = shapes
         .filter_map(|shape| match &shape.geometry {
@@ -77,30 +74,18 @@ fn describe(failures: &[String], n_files: usize) -> Option<String> {
 }
 
 /// Reads a mesh file. The error is the reason, in one sentence.
-fn read(file: &str, urdf_folder: &Path, left: Budget) -> Result<RobotMesh, String> {
+fn read(file: &str, urdf_folder: &UrdfFolder, left: Budget) -> Result<RobotMesh, String> {
     let format = MeshFormat::of_file(file)
         .ok_or("its type is not supported, convert it to .stl, .dae or .obj")?;
-    let Some(path) = found_mesh_file(file, urdf_folder) else {
-        return Err(missing_mesh_file(file, urdf_folder));
-    };
-    let shown = path.display();
     // The budget of one file, but not more than the rest of the budget of all files.
-    let max_bytes = Budget::MESH.max_bytes.min(left.max_bytes);
-    let bytes = files::read(
-        &path,
-        Budget {
-            max_bytes,
-            ..Budget::MESH
-        },
-    )
-    .map_err(|error| match error.kind() {
-        std::io::ErrorKind::FileTooLarge => format!("{shown}: {error}; reduce its triangles"),
-        _ => format!("cannot read {shown}: {error}"),
-    })?;
+    let budget = Budget {
+        max_bytes: Budget::MESH.max_bytes.min(left.max_bytes),
+        ..Budget::MESH
+    };
     Ok(RobotMesh {
         file: file.to_owned(),
         format,
-        bytes: bytes.into(),
+        bytes: urdf_folder.read_mesh(file, budget)?.into(),
     })
 }
 
@@ -108,6 +93,7 @@ fn read(file: &str, urdf_folder: &Path, left: Budget) -> Result<RobotMesh, Strin
 mod tests {
     use super::{describe, meshes, read};
     use capture::MeshKind;
+    use capture::config::UrdfFolder;
     use files::Budget;
     use kinematics::urdf::Robot;
     use std::path::Path;
@@ -144,7 +130,8 @@ mod tests {
             "missing.stl",
             "package://arm_description/meshes/a.txt",
         ];
-        let found = meshes(&robot(&files), &root.join("arm_description/urdf"));
+        let folder = UrdfFolder::at(&root.join("arm_description/urdf"));
+        let found = meshes(&robot(&files), &folder);
         let found: Vec<_> = found
             .iter()
             .map(|mesh| (&*mesh.file, mesh.format, mesh.bytes[0]))
@@ -163,14 +150,16 @@ mod tests {
         let root = folder.path();
         write(&root.join("checkout/arm/meshes/a.stl"), "a");
         let file = "package://arm_description/arm/meshes/a.stl";
-        let found = meshes(&robot(&[file]), &root.join("checkout/arm/urdf"));
+        let folder = UrdfFolder::at(&root.join("checkout/arm/urdf"));
+        let found = meshes(&robot(&[file]), &folder);
         assert_eq!(found[0].file, file);
     }
 
     #[test]
     fn one_warning_describes_all_missing_meshes() {
         let folder = tempfile::tempdir().expect("a folder");
-        let why = |file| read(file, folder.path(), Budget::MESHES).expect_err("missing");
+        let folder = UrdfFolder::at(folder.path());
+        let why = |file| read(file, &folder, Budget::MESHES).expect_err("missing");
         let missing = why("package://arm/meshes/a.stl");
         assert!(
             missing.starts_with("no file \"meshes/a.stl\" in a folder \"arm\" beside or above"),
@@ -189,7 +178,7 @@ mod tests {
         for (file, kind) in [
             ("a.STL", MeshKind::Triangles),
             ("a.obj", MeshKind::Triangles),
-            ("a.dae", MeshKind::Collada),
+            ("a.dae", MeshKind::Triangles),
             ("a.glb", MeshKind::Unsupported),
             ("stl", MeshKind::Unsupported),
         ] {

@@ -9,9 +9,11 @@ use drivers::recording::RIG_FILE;
 use keyframe::Keyframe;
 use messages::{BadInput, Setting, listed};
 use model_files::Edits;
+use model_files::checkpoint::Checkpoint;
 use serde::Serialize;
 use serde_json::Value;
 use sha2::{Digest, Sha256};
+use std::collections::BTreeMap;
 use std::ffi::OsStr;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -193,9 +195,11 @@ pub fn expect_model(model: &Path) -> anyhow::Result<()> {
 
 /// The command that continues the run in a folder, as far as the folder shows it.
 fn resume_command_of(folder: &Path) -> ResumeCommand {
-    // Only live runs store keyframes. They also store their rig file, and whether it is simulated.
+    // Only live runs store keyframes. They also store their rig file and their input.
     if folder.join(KEYFRAMES).exists() {
-        ResumeCommand::of_devices(&folder.join(RIG_FILE))
+        let checkpoint = Checkpoint::read(&folder.join(CHECKPOINT));
+        let flags = checkpoint.map_or_else(|_| BTreeMap::new(), |checkpoint| checkpoint.flags);
+        ResumeCommand::of_live_run(&flags, &folder.join(RIG_FILE))
     } else {
         // The folder does not contain the path of the data.
         ResumeCommand::of_data(Path::new("DATA"))

@@ -322,6 +322,7 @@ mod tests {
             base: None,
             split: Split::Train,
             truth: None,
+            robot: None,
         })
     }
 

@@ -5,9 +5,11 @@
 //! its color and depth as PNG. Ground truth from a simulator is left out.
 
 use crate::run_folder::KEYFRAMES;
+use crate::stored_robot::{self, RobotDescription};
 use anyhow::{Context, ensure};
 use image::codecs::png::{CompressionType, FilterType, PngEncoder};
 use image::{ExtendedColorType, ImageEncoder};
+use keyframe::masked_robot::ConvexPiece;
 use keyframe::{BaseState, DepthMap, Keyframe, split_from_name, split_name};
 use kinematics::transform::{from_xyz_xyzw, to_xyz_xyzw};
 use kinematics::{Stamp, Twist};
@@ -46,6 +48,9 @@ struct Description {
     split: String,
     depth: Option<DepthDescription>,
     base: Option<BaseDescription>,
+    /// The robot that is masked. Keyframes of older versions lack it.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    robot: Option<RobotDescription>,
 }
 
 #[derive(Debug, Serialize, Deserialize)]
@@ -108,9 +113,10 @@ impl StoredKeyframes {
         let names = self.names()?;
         let mut keyframes = Vec::new();
         let mut errors = Vec::new();
+        let mut links = None;
         for name in &names {
             let path = self.folder.join(name);
-            let read = || keyframe_of(&Checkpoint::read(&path)?);
+            let mut read = || keyframe_of(&Checkpoint::read(&path)?, &mut links);
             match read().with_context(|| format!("cannot read the keyframe {}", path.display())) {
                 Ok(keyframe) => keyframes.push(Arc::new(keyframe)),
                 Err(error) => errors.push(error),
@@ -151,7 +157,7 @@ impl StoredKeyframes {
         if !path.is_file() {
             return Ok(None);
         }
-        let read = || keyframe_of(&Checkpoint::read(&path)?);
+        let read = || keyframe_of(&Checkpoint::read(&path)?, &mut None);
         let keyframe =
             read().with_context(|| format!("cannot read the keyframe {}", path.display()))?;
         Ok(Some(keyframe))
@@ -191,6 +197,8 @@ fn file_name(camera: &str, stamp: Stamp) -> String {
 }
 
 fn to_checkpoint(keyframe: &Keyframe) -> anyhow::Result<Checkpoint> {
+    let robot = keyframe.robot.as_deref().map(stored_robot::to_stored);
+    let (robot, arrays_of_robot) = robot.unzip();
     let description = Description {
         camera: keyframe.camera.to_string(),
         stamp_nanos: keyframe.stamp.0,
@@ -213,6 +221,7 @@ fn to_checkpoint(keyframe: &Keyframe) -> anyhow::Result<Checkpoint> {
             world_from_base: to_xyz_xyzw(&base.world_from_base),
             map_from_odom: to_xyz_xyzw(&base.map_from_odom),
         }),
+        robot,
     };
     let mut arrays = vec![Array {
         name: COLOR.to_owned(),
@@ -229,6 +238,7 @@ fn to_checkpoint(keyframe: &Keyframe) -> anyhow::Result<Checkpoint> {
             bytes: png(depth.size_px, &bytes)?,
         });
     }
+    arrays.extend(arrays_of_robot.into_iter().flatten());
     Ok(Checkpoint {
         method: METHOD.to_owned(),
         seconds: 0.0,
@@ -242,7 +252,13 @@ fn to_checkpoint(keyframe: &Keyframe) -> anyhow::Result<Checkpoint> {
     })
 }
 
-fn keyframe_of(checkpoint: &Checkpoint) -> anyhow::Result<Keyframe> {
+/// Decodes a keyframe.
+///
+/// * `links`: see [`stored_robot::of_stored`].
+fn keyframe_of(
+    checkpoint: &Checkpoint,
+    links: &mut Option<Arc<[Vec<ConvexPiece>]>>,
+) -> anyhow::Result<Keyframe> {
     ensure!(
         checkpoint.method == METHOD,
         "it contains a {}, expected a {METHOD}",
@@ -253,6 +269,11 @@ fn keyframe_of(checkpoint: &Checkpoint) -> anyhow::Result<Keyframe> {
         .depth
         .as_ref()
         .map(|depth| depth_of(checkpoint, depth));
+    let robot = metadata
+        .robot
+        .as_ref()
+        .map(|robot| stored_robot::of_stored(robot, &checkpoint.arrays, links))
+        .transpose()?;
     Ok(Keyframe {
         camera: metadata.camera.into(),
         stamp: Stamp(metadata.stamp_nanos),
@@ -274,6 +295,7 @@ fn keyframe_of(checkpoint: &Checkpoint) -> anyhow::Result<Keyframe> {
         split: split_from_name(&metadata.split)
             .with_context(|| format!("unknown split {:?}", metadata.split))?,
         truth: None,
+        robot: robot.map(Arc::new),
     })
 }
 
@@ -371,6 +393,7 @@ mod tests {
             }),
             split: Split::Validation,
             truth: None,
+            robot: None,
         })
     }
 

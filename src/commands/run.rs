@@ -20,8 +20,10 @@ use viz::ServedPage;
 /// Flags of `run`.
 #[derive(Debug, clap::Args)]
 pub(crate) struct Args {
-    /// Rig file: cameras, arm and training settings (TOML)
-    rig_file: PathBuf,
+    /// Rig file: cameras, arm and training settings (TOML) [default: with --from, the rig in the
+    /// recording]
+    #[arg(required_unless_present = "from")]
+    rig_file: Option<PathBuf>,
     /// Simulate all devices of the rig file
     #[arg(long, conflicts_with = "from")]
     sim: bool,
@@ -50,8 +52,9 @@ pub(crate) struct Args {
     #[arg(long, conflicts_with = "from")]
     enable_motion: bool,
     /// Continue a run that crashed or was stopped, from the checkpoint and keyframes in its folder
-    /// and with its flags. New keyframes are added; --record and --listen are not restored
-    #[arg(long, value_name = "FOLDER", conflicts_with = "from", conflicts_with_all = TRAINING_ARGS)]
+    /// and with its flags. New keyframes are added; --record and --listen are not restored. A run
+    /// with --real-time also needs --from and --real-time; its recording is played from the start
+    #[arg(long, value_name = "FOLDER", conflicts_with_all = TRAINING_ARGS)]
     resume: Option<PathBuf>,
     /// Stop S seconds after the first image. Time before --resume counts [default: run until
     /// Ctrl-C]
@@ -114,10 +117,10 @@ pub(super) struct Running {
 /// effective rig file.
 pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     // The start of a run can take many seconds.
-    log::info!(
-        "reading {}",
-        args.resume.as_ref().unwrap_or(&args.rig_file).display()
-    );
+    let read_first = [&args.resume, &args.rig_file, &args.from];
+    if let Some(path) = read_first.into_iter().flatten().next() {
+        log::info!("reading {}", path.display());
+    }
     // The previous run is read before anything else, because its flags decide what this run does.
     let plan = args.plan();
     let previous = plan.previous()?;

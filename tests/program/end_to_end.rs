@@ -294,6 +294,31 @@ fn live_bench_repeats_a_recording() {
         error_m < MAX_POSITION_ERROR_M,
         "a camera pose is off by {error_m} m"
     );
+
+    // The run continues with the recording, and not with the devices.
+    let command = report["resume_command"].as_str().expect("a command");
+    let resume = [
+        "run",
+        "rig.toml",
+        "--from",
+        "scan.mcap",
+        "--real-time",
+        "--repeat",
+        "--resume",
+        "again",
+    ];
+    assert!(command.ends_with(&resume.join(" ")), "{command}");
+    let outputs = ["--seconds", "11", "--listen", "127.0.0.1:0", "--json"];
+    events(
+        folder,
+        &[&resume[..], &outputs[..], &["--out", "resumed"]].concat(),
+    );
+    let resumed = std::fs::read_to_string(folder.join("resumed/report.json")).expect("a report");
+    let resumed: Value = serde_json::from_str(&resumed).expect("JSON");
+    assert!(
+        number(&resumed, "keyframes") >= number(&report, "keyframes"),
+        "{resumed}"
+    );
 }
 
 /// Number of keyframes to fuse.
@@ -346,10 +371,9 @@ fn tsdf_runs_live_replays_and_resumes() {
         assert!(resume.ends_with(command), "{resume}");
     }
 
-    // More steps than keyframes: training ends with the recording.
+    // More steps than keyframes: training ends with the recording. The rig is that of the recording.
     let more = [
         "run",
-        "rig.toml",
         "--from",
         "scan.mcap",
         "--method",

@@ -20,7 +20,9 @@ use calibration::{
 use keyframe::{Keyframe, Split};
 use kinematics::Stamp;
 use model_files::checkpoint::Checkpoint;
+use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
+use std::borrow::Cow;
 use std::collections::BTreeMap;
 use std::path::Path;
 use std::sync::Arc;
@@ -335,6 +337,15 @@ impl AlignedModel {
             .calibrated_camera(keyframe, learned.get(&*keyframe.camera)))
     }
 
+    /// A keyframe with the mask of the robot as its corrected camera sees it, for comparisons with
+    /// the model. Its calibration stays the same.
+    pub fn remasked<'a>(&self, keyframe: &'a Keyframe) -> Cow<'a, Keyframe> {
+        match self.alignment() {
+            Some(alignment) => alignment.remasked(keyframe),
+            None => Cow::Borrowed(keyframe),
+        }
+    }
+
     /// Result of keyframe alignment. `None` until alignment has finished. Also `None` if alignment
     /// was not requested or not possible.
     pub fn alignment(&self) -> Option<&Alignment> {
@@ -472,6 +483,7 @@ impl AlignedModel {
                 _ => {}
             }
         }
+        self.alignment_task.forget_redrawn();
         // After a single alignment, nothing reads the original keyframes. They are dropped because
         // they hold all pixels.
         if self.state.timing == AlignTiming::Once {
@@ -485,12 +497,13 @@ impl AlignedModel {
         let Some(alignment) = self.alignment_task.result() else {
             return Ok(());
         };
+        // Masks of the robot that were not drawn in the background take a few milliseconds each.
         let keyframes: Vec<_> = self
             .original_keyframes
-            .iter()
+            .par_iter()
             .map(|original| CorrectedKeyframe {
-                before: previous.corrected(original),
-                after: alignment.corrected(original),
+                before: previous.moved(original),
+                after: self.alignment_task.corrected(original),
             })
             .collect();
         // A model that cannot move with its keyframes starts again from step 0. Its earlier steps
@@ -509,12 +522,12 @@ impl AlignedModel {
     /// keyframes are tested.
     fn detect_movements(&mut self, n_references: usize) {
         let corrected = |keyframe: &Arc<Keyframe>| self.alignment_task.corrected(keyframe);
-        let (references, later) = self.original_keyframes.split_at(n_references);
-        let mut task = MovementTask::new(references.iter().map(corrected).collect());
+        let corrected: Vec<_> = self.original_keyframes.par_iter().map(corrected).collect();
+        let (references, later) = corrected.split_at(n_references);
+        let mut task = MovementTask::new(references.to_vec());
         later
             .iter()
-            .map(corrected)
-            .for_each(|keyframe| task.push(keyframe));
+            .for_each(|keyframe| task.push(keyframe.clone()));
         self.movement_task = Some(task);
         self.state.n_references = Some(n_references);
     }

@@ -60,6 +60,7 @@ impl KeyframeSignature {
             base: None,
             split: Split::Train,
             truth: None,
+            robot: None,
         }
     }
 

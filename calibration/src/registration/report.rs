@@ -15,6 +15,7 @@ use keyframe::Keyframe;
 use kinematics::{Stamp, Transform};
 use nalgebra::{DVector, Vector3};
 use serde::{Deserialize, Serialize};
+use std::borrow::Cow;
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 
@@ -432,9 +433,9 @@ impl Alignment {
             Some(correction) => correction.color_from_depth(keyframe, depth),
             None => keyframe.world_from_camera.inverse() * depth.world_from_camera,
         });
-        // The depth map is left out, because only the pose is needed and scaling all pixels would
-        // take time.
-        let aligned = self.corrected(&Arc::new(Keyframe {
+        // The depth map and the mask of a robot are left out, because only the pose is needed and
+        // changing all pixels would take time.
+        let aligned = self.moved(&Arc::new(Keyframe {
             depth: None,
             ..keyframe.clone()
         }));
@@ -455,6 +456,32 @@ impl Alignment {
             Some(correction) => Arc::new(correction.corrected(&keyframe)),
             None => keyframe,
         }
+    }
+
+    /// The keyframe with these corrections, and with the mask of the robot where it was.
+    pub fn moved(&self, keyframe: &Arc<Keyframe>) -> Arc<Keyframe> {
+        let movements = self.movement_correction(&keyframe.camera, keyframe.stamp);
+        let corrections = movements
+            .iter()
+            .chain(self.corrections.get(&*keyframe.camera));
+        corrections.fold(Arc::clone(keyframe), |keyframe, correction| {
+            Arc::new(correction.moved(&keyframe))
+        })
+    }
+
+    /// The keyframe with the mask of the robot as the corrected camera sees it. Its calibration stays
+    /// the same.
+    pub fn remasked<'a>(&self, keyframe: &'a Keyframe) -> Cow<'a, Keyframe> {
+        if keyframe.robot.is_none() {
+            return Cow::Borrowed(keyframe);
+        }
+        let movements = self.movement_correction(&keyframe.camera, keyframe.stamp);
+        let corrections = movements
+            .iter()
+            .chain(self.corrections.get(&*keyframe.camera));
+        corrections.fold(Cow::Borrowed(keyframe), |keyframe, correction| {
+            Cow::Owned(correction.remasked(&keyframe))
+        })
     }
 
     /// The keyframe with the corrections of its camera's movements only.

@@ -164,20 +164,6 @@ impl Rig {
         Ok(rig)
     }
 
-    /// The folder to which the names of mesh files are relative: the folder that a rig file names, or
-    /// that of its robot description. `None` if the rig file names neither or cannot be read.
-    #[must_use]
-    pub fn urdf_folder(path: &Path) -> Option<PathBuf> {
-        let table: toml::Table = toml::from_str(&files::read_text(path).ok()?).ok()?;
-        let arm = table.get("arm")?;
-        let folder = path.parent().unwrap_or(Path::new(""));
-        if let Some(meshes) = arm.get("mesh_folder").and_then(toml::Value::as_str) {
-            return std::path::absolute(folder.join(meshes)).ok();
-        }
-        let urdf = folder.join(arm.get("urdf")?.as_str()?);
-        std::path::absolute(urdf).ok()?.parent().map(Path::to_owned)
-    }
-
     /// Checks the text of a rig file and the robot description `urdf_text`. Messages use the name
     /// `file`.
     ///

@@ -39,17 +39,11 @@ pub fn meshes_of(urdf: &str, folder: &Path) -> Vec<Finding> {
         files.filter(|file| MeshKind::of(file) == kind).collect()
     };
     let simpler = "the robot is drawn without them, or with simpler shapes";
-    let convert = |_: &str| "convert them to .stl or .obj".to_owned();
+    let convert = |_: &str| "convert them to .stl, .dae or .obj".to_owned();
     let findings = [
         named.warning(&missing, "missing", simpler, |first| {
             missing_mesh_file(first, folder)
         }),
-        named.warning(
-            &of_kind(MeshKind::Collada),
-            "in COLLADA format (.dae)",
-            "the page draws them, but a simulation draws simpler shapes",
-            convert,
-        ),
         named.warning(
             &of_kind(MeshKind::Unsupported),
             "of a kind that cannot be read",
@@ -176,7 +170,11 @@ mod tests {
     #[test]
     fn readable_meshes_cause_no_warning() {
         assert_eq!(
-            warnings(&["a.stl", "b.OBJ"], &["a.stl"], &["a.stl", "b.OBJ"]),
+            warnings(
+                &["a.stl", "b.OBJ"],
+                &["a.stl", "c.dae"],
+                &["a.stl", "b.OBJ", "c.dae"]
+            ),
             [""; 0]
         );
         assert_eq!(warnings(&[], &[], &[]), [""; 0]);
@@ -214,16 +212,9 @@ mod tests {
             &["c.stl"],
             &["a.dae", "b.glb", "c.stl"],
         );
-        assert_eq!(found.len(), 2, "{found:?}");
+        assert_eq!(found.len(), 1, "{found:?}");
         assert!(
-            found[0].starts_with(
-                "1 of 3 mesh files of the robot description is in COLLADA format (.dae)"
-            ) && found[0]
-                .contains("the page draws them, but a simulation draws simpler shapes; convert"),
-            "{found:?}"
-        );
-        assert!(
-            found[1].contains("of a kind that cannot be read, the first is \"b.glb\""),
+            found[0].contains("of a kind that cannot be read, the first is \"b.glb\""),
             "{found:?}"
         );
     }

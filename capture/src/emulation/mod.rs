@@ -193,7 +193,7 @@ impl EmulationPlan {
             }
             _ => {}
         }
-        let mut recorder = open::recorder(&path, &rig)?;
+        let mut recorder = open::recorder(&path, &rig, &open::meshes_to_record(&rig))?;
         let is_complete = self.for_each_sample(source.as_mut(), stop, |sample, secs| {
             on_progress(Stage::Simulating, secs);
             Ok(recorder.write(&sample)?)

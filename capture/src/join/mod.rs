@@ -689,6 +689,7 @@ impl CameraState {
             base: ready.camera_pose.base,
             split,
             truth,
+            robot: None,
         })
     }
 

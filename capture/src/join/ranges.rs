@@ -235,6 +235,7 @@ mod tests {
             base: None,
             split: Split::Train,
             truth: None,
+            robot: None,
         }
     }
 

@@ -217,6 +217,7 @@ mod tests {
             base: None,
             split: Split::of(ix),
             truth: None,
+            robot: None,
         })
     }
 

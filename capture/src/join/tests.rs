@@ -337,7 +337,8 @@ fn replay_reproduces_keyframes_bit_for_bit() {
     ]);
     let folder = tempfile::tempdir().expect("a folder");
     let path = folder.path().join("run.mcap");
-    let mut recorder = open::recorder(&path, &rig).expect("a new file");
+    let mut recorder =
+        open::recorder(&path, &rig, &open::meshes_to_record(&rig)).expect("a new file");
     let live = run_join(
         &mut join(&rig),
         samples(6)

@@ -7,6 +7,7 @@ mod documented_rigs_tests;
 #[cfg(all(feature = "sim", target_os = "linux"))]
 mod emulated;
 mod listening;
+mod meshes_to_record;
 mod movable;
 mod real;
 mod realsense;
@@ -29,6 +30,7 @@ mod ur;
 #[cfg(target_os = "linux")]
 pub use arm_config::controller_chain;
 pub(crate) use listening::{DeviceFailure, Listening, for_listening};
+pub use meshes_to_record::meshes_to_record;
 pub use movable::{Movable, movable};
 pub use real::{check_motion, motion_of, movable_arm, udp_arm_address};
 #[cfg(target_os = "linux")]
@@ -39,10 +41,13 @@ pub use ur::arm_config as ur_config;
 
 use crate::config::{ArmDriver, BaseDriver, CameraDriver, Override, Parent, Rig, ScannerDriver};
 use crate::notes::Notes;
+use crate::recorded_meshes::RecordedMeshes;
 use crate::stamp_clock::StampClock;
 use anyhow::{Context, anyhow, bail};
 use assumed_lens::assume_calibration_of_simulated;
-use drivers::recording::{RIG_FILE, Recorder, Recording, RecordingMetadata, URDF_FILE};
+use drivers::recording::{
+    RIG_FILE, Recorder, Recording, RecordingMetadata, URDF_FILE, mesh_attachment,
+};
 use drivers::{LiveDevices, Playback, Repeating, Sample, Source};
 use kinematics::Chain;
 use messages::Setting;
@@ -245,8 +250,18 @@ fn use_simulated_devices(rig: &mut Rig) {
     }
 }
 
+/// The rig that is stored in a recording, with its mesh files.
+///
+/// # Errors
+///
+/// If the file is not a recording, or contains no valid rig.
+pub fn recorded_rig(path: &Path, overrides: &[Override]) -> anyhow::Result<Rig> {
+    stored_rig(path, &Recording::open(path)?, overrides)
+}
+
 /// Opens a recording with the stored rig or with the given rig. The joints have the order that is
-/// stored in the recording.
+/// stored in the recording. Mesh files that are missing on this computer are read from the
+/// recording.
 ///
 /// # Errors
 ///
@@ -254,7 +269,11 @@ fn use_simulated_devices(rig: &mut Rig) {
 pub fn recording(path: &Path, rig: Option<Rig>, overrides: &[Override]) -> anyhow::Result<Opened> {
     let recording = Recording::open(path)?;
     let mut rig = match rig {
-        Some(rig) => rig,
+        Some(mut rig) => {
+            let meshes = RecordedMeshes::of(&recording);
+            rig.arm.urdf_folder = rig.arm.urdf_folder.with_recorded(meshes);
+            rig
+        }
         None => stored_rig(path, &recording, overrides)?,
     };
     if let Some(recorded) = recording.joint_names() {
@@ -300,12 +319,14 @@ fn in_recorded_order(offsets: &[f64], joints: &[String], recorded: &[String]) ->
         .collect()
 }
 
-/// Creates a recording of a rig, with the rig file and the URDF attached.
+/// Creates a recording of a rig, with the rig file, the URDF and its mesh files attached.
+///
+/// * `meshes`: the result of [`meshes_to_record`].
 ///
 /// # Errors
 ///
 /// If the file cannot be written.
-pub fn recorder(path: &Path, rig: &Rig) -> anyhow::Result<Recorder> {
+pub fn recorder(path: &Path, rig: &Rig, meshes: &RecordedMeshes) -> anyhow::Result<Recorder> {
     let cameras: Vec<_> = rig
         .cameras
         .iter()
@@ -315,11 +336,17 @@ pub fn recorder(path: &Path, rig: &Rig) -> anyhow::Result<Recorder> {
     // All settings of the rig are stored, including the calibration that cameras report. The
     // recording can then be used without the original files and devices.
     let resolved = rig.to_toml();
+    let mesh_files: Vec<(String, &[u8])> = meshes
+        .compressed()
+        .map(|(file, compressed)| (mesh_attachment(file), compressed))
+        .collect();
+    let mut files = vec![
+        (RIG_FILE, resolved.as_bytes()),
+        (URDF_FILE, rig.arm.urdf_text.as_bytes()),
+    ];
+    files.extend(mesh_files.iter().map(|(name, data)| (name.as_str(), *data)));
     let description = RecordingMetadata {
-        files: &[
-            (RIG_FILE, resolved.as_bytes()),
-            (URDF_FILE, rig.arm.urdf_text.as_bytes()),
-        ],
+        files: &files,
         cameras: &cameras,
         joint_names: &rig.arm.joints,
     };
@@ -337,12 +364,15 @@ pub fn chain_of(rig: &Rig) -> anyhow::Result<Chain> {
 }
 
 fn stored_rig(path: &Path, recording: &Recording, overrides: &[Override]) -> anyhow::Result<Rig> {
-    Ok(Rig::parse(
+    let mut rig = Rig::parse(
         RIG_FILE,
         stored_text(path, recording, RIG_FILE)?,
         stored_text(path, recording, URDF_FILE)?,
         overrides,
-    )?)
+    )?;
+    let meshes = RecordedMeshes::of(recording).before_files();
+    rig.arm.urdf_folder = rig.arm.urdf_folder.with_recorded(meshes);
+    Ok(rig)
 }
 
 /// The text of a file that is stored in a recording.
@@ -669,7 +699,7 @@ mod tests {
         let folder = tempfile::tempdir().expect("a folder");
         let path = folder.path().join("run.mcap");
         let rig = load("two-cameras.toml", &[Override::new("sim.seed", 77)]);
-        let mut recorder = recorder(&path, &rig).expect("a new file");
+        let mut recorder = recorder(&path, &rig, &meshes_to_record(&rig)).expect("a new file");
         let joints = kinematics::JointState {
             stamp: kinematics::Stamp(5),
             position: vec![0.0; 7],

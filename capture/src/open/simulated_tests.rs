@@ -5,6 +5,7 @@ use super::{Devices, Opened};
 use crate::config::{Override, Rig};
 use crate::join::{Join, JoinEvent};
 use crate::notes::Notes;
+use crate::recorded_meshes::RecordedMeshes;
 use crate::stations::Stations;
 use drivers::tags::{Family, TagDetector};
 use drivers::wire::datagram::{
@@ -132,7 +133,8 @@ fn live_and_replayed_keyframes_are_identical() {
     let path = folder.path().join("run.mcap");
     let rig = small("static-arm.toml", &[Override::new("sim.n_images", 24)]);
     let live = super::rig(rig.clone(), Devices::Sim).expect("the simulator");
-    let mut recorder = super::recorder(&path, &live.rig).expect("a new file");
+    let mut recorder =
+        super::recorder(&path, &live.rig, &RecordedMeshes::default()).expect("a new file");
     let (first, join) = keyframes(live, |sample| recorder.write(sample).expect("disk space"));
     recorder.finish().expect("disk space");
     assert!(first.len() >= 8, "{}", join.counts());
@@ -323,7 +325,8 @@ fn moving_base_keyframes_and_scans_replay_identically() {
         let path = folder.path().join("run.mcap");
         let rig = mobile(name, &[Override::new("sim.duration_secs", secs)]);
         let live = super::rig(rig.clone(), Devices::Sim).expect("the simulator");
-        let mut recorder = super::recorder(&path, &live.rig).expect("a new file");
+        let mut recorder =
+            super::recorder(&path, &live.rig, &RecordedMeshes::default()).expect("a new file");
         let mut samples = Vec::new();
         let (first, join) = keyframes(live, |sample| {
             recorder.write(sample).expect("disk space");
@@ -441,7 +444,8 @@ fn network_samples_are_registered_recorded_and_replayed() {
     let opened = super::rig(rig, Devices::Real).expect("a simulated arm, and two sockets");
     let folder = tempfile::tempdir().expect("a folder");
     let path = folder.path().join("run.mcap");
-    let mut recorder = super::recorder(&path, &opened.rig).expect("a new file");
+    let mut recorder =
+        super::recorder(&path, &opened.rig, &RecordedMeshes::default()).expect("a new file");
     let mut join = Join::new(&opened.rig).expect("a good rig");
     let mut source = opened.source;
     let stop = AtomicBool::new(false);
@@ -552,7 +556,8 @@ fn drifting_base_is_corrected_live_and_in_replay() {
         ],
     );
     let live = super::rig(rig, Devices::Sim).expect("the simulator");
-    let mut recorder = super::recorder(&path, &live.rig).expect("a new file");
+    let mut recorder =
+        super::recorder(&path, &live.rig, &RecordedMeshes::default()).expect("a new file");
     let mut stations = Stations::new(&live.rig).expect("its base moves");
     let (reported, join) = keyframes(live, |sample| recorder.write(sample).expect("disk space"));
     recorder.finish().expect("disk space");

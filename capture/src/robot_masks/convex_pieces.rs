@@ -2,20 +2,16 @@
 //! points.
 
 use crate::mesh_triangles::Triangle;
+use keyframe::masked_robot::{ConvexPiece, DIRECTION_STEP_RAD, directions};
 use kinematics::Transform;
 use kinematics::shape::{Geometry, Shape};
 use nalgebra::{Point3, Vector3};
 use std::collections::BTreeMap;
-use std::f64::consts::{FRAC_PI_2, TAU};
-
-/// The points of a convex piece, meters.
-pub(super) type Piece = Vec<Point3<f64>>;
 
 /// Angle between neighboring points around and along a round surface, radians.
-const STEP_RAD: f64 = TAU / 12.0;
-/// Number of points around an axis, and of rings of points between the poles of a sphere.
+const STEP_RAD: f64 = DIRECTION_STEP_RAD;
+/// Number of points around an axis.
 const N_AROUND: u32 = 12;
-const N_RINGS: u32 = 5;
 /// Side of the blocks into which a mesh is divided, meters. The hull of a block covers the concave
 /// places in it, so that masks of smaller blocks are tighter. They also take more time.
 const BLOCK_M: f64 = 0.08;
@@ -23,7 +19,7 @@ const BLOCK_M: f64 = 0.08;
 /// Convex pieces that cover a shape, in the frame of its link.
 ///
 /// * `triangles`: the triangles of the shape if it is a mesh, without the scale in the URDF.
-pub(super) fn cover(shape: &Shape, triangles: &[Triangle]) -> Vec<Piece> {
+pub(super) fn cover(shape: &Shape, triangles: &[Triangle]) -> Vec<ConvexPiece> {
     let pieces = match &shape.geometry {
         Geometry::Box { size_m } => vec![box_corners(*size_m)],
         Geometry::Cylinder { radius_m, length_m } => vec![prism(*radius_m, *length_m)],
@@ -40,14 +36,14 @@ pub(super) fn cover(shape: &Shape, triangles: &[Triangle]) -> Vec<Piece> {
         .collect()
 }
 
-fn in_link(piece: Piece, link_from_shape: &Transform) -> Piece {
+fn in_link(piece: ConvexPiece, link_from_shape: &Transform) -> ConvexPiece {
     piece
         .into_iter()
         .map(|point| link_from_shape * point)
         .collect()
 }
 
-fn box_corners(size_m: [f64; 3]) -> Piece {
+fn box_corners(size_m: [f64; 3]) -> ConvexPiece {
     (0..8)
         .map(|corner| {
             Point3::from(Vector3::from_fn(|axis, _| {
@@ -63,7 +59,7 @@ fn box_corners(size_m: [f64; 3]) -> Piece {
 }
 
 /// A prism around a cylinder along z.
-fn prism(radius_m: f64, length_m: f64) -> Piece {
+fn prism(radius_m: f64, length_m: f64) -> ConvexPiece {
     // The sides of the prism touch the cylinder, so its edges are outside.
     let edge_m = radius_m / (0.5 * STEP_RAD).cos();
     let around = (0..N_AROUND).map(|ix| (f64::from(ix) * STEP_RAD).sin_cos());
@@ -75,7 +71,7 @@ fn prism(radius_m: f64, length_m: f64) -> Piece {
 }
 
 /// A polyhedron around a sphere with its center at a height, meters.
-fn around_sphere(radius_m: f64, center_z_m: f64) -> Piece {
+fn around_sphere(radius_m: f64, center_z_m: f64) -> ConvexPiece {
     // A hull of points at a distance R reaches at least R cos(a) in every direction, where `a` is
     // the largest angle from any direction to the nearest point. With rings and points every
     // `STEP_RAD`, this angle is at most half the diagonal of a square with this side.
@@ -87,27 +83,11 @@ fn around_sphere(radius_m: f64, center_z_m: f64) -> Piece {
         .collect()
 }
 
-/// Unit vectors that are distributed over the sphere: both poles, and rings between them.
-pub(super) fn directions() -> Vec<Vector3<f64>> {
-    let rings = (1..=N_RINGS).map(|ring| f64::from(ring) * STEP_RAD - FRAC_PI_2);
-    let on_rings = rings.flat_map(|elevation_rad| {
-        let (z, radius) = elevation_rad.sin_cos();
-        (0..N_AROUND).map(move |ix| {
-            let (sin, cos) = (f64::from(ix) * STEP_RAD).sin_cos();
-            Vector3::new(radius * cos, radius * sin, z)
-        })
-    });
-    [-Vector3::z(), Vector3::z()]
-        .into_iter()
-        .chain(on_rings)
-        .collect()
-}
-
 /// The corners of the triangles in each block of a grid. A triangle belongs to the block of its
 /// center, and is inside the hull of its corners. The hulls therefore cover the whole surface.
-fn blocks(triangles: &[Triangle], scale: [f64; 3]) -> Vec<Piece> {
+fn blocks(triangles: &[Triangle], scale: [f64; 3]) -> Vec<ConvexPiece> {
     let scale = Vector3::from(scale);
-    let mut by_block: BTreeMap<[i64; 3], Piece> = BTreeMap::new();
+    let mut by_block: BTreeMap<[i64; 3], ConvexPiece> = BTreeMap::new();
     for triangle in triangles {
         let corners =
             triangle.map(|corner| Point3::from(Vector3::from(corner).component_mul(&scale)));
@@ -130,7 +110,7 @@ fn blocks(triangles: &[Triangle], scale: [f64; 3]) -> Vec<Piece> {
 
 /// The points that are farthest in some direction. Between the directions, the hull of a round
 /// surface shrinks by less than 7 % of its radius, which is a few millimeters for a block.
-fn thinned(piece: &[Point3<f64>]) -> Piece {
+fn thinned(piece: &[Point3<f64>]) -> ConvexPiece {
     let directions = directions();
     if piece.len() <= directions.len() {
         return piece.to_vec();

@@ -17,21 +17,22 @@
 //! The first two errors are independent, so their squares are added.
 
 mod convex_pieces;
+#[cfg(test)]
+mod recorded_tests;
 mod robot_shape;
-mod silhouette;
 #[cfg(test)]
 mod tests;
 
 use crate::config::{ArmDriver, Camera, CameraDriver, Parent, Rig};
 use anyhow::Context;
-use keyframe::Keyframe;
+use keyframe::masked_robot::{HiddenPixels, MaskedRobot, Sweep, Uncertainty};
+use keyframe::{Keyframe, MaskViews};
 use kinematics::urdf::Robot;
 use kinematics::{
     Chain, HistoryError, JointHistory, JointState, Stamp, Transform, Twist, transform,
 };
 use messages::counted;
 use robot_shape::{Extent, RobotShape};
-use silhouette::{Pinhole, Silhouette, Uncertainty};
 use std::collections::BTreeMap;
 use std::sync::Arc;
 use std::time::Duration;
@@ -137,7 +138,7 @@ impl RobotMasks {
             &arm.base_link,
             &arm.joints,
             extent,
-            arm.urdf_folder.path(),
+            &arm.urdf_folder,
         )
         .context("the arm's URDF")?;
         cameras.retain(|_, camera| shape.has_links(camera.extent));
@@ -193,7 +194,7 @@ impl RobotMasks {
             )),
             (_, Some(first)) => Some(format!(
                 "{subject}, but the shape of {} is unknown ({first}), so these parts of the moving robot will be trained \
-                 into the model; add <collision> shapes, or meshes as .stl or .obj",
+                 into the model; add <collision> shapes, or meshes as .stl, .dae or .obj",
                 counted(unknown.len() as u64, "link"),
             )),
             (false, None) => None,
@@ -262,66 +263,42 @@ impl RobotMasks {
         depth_delay_secs: f64,
     ) -> Option<RobotCover> {
         let camera = self.cameras.get(&keyframe.camera)?;
-        let view = Pinhole {
-            size_px: keyframe.size_px,
-            focal_px: keyframe.focal_px,
-            principal_px: keyframe.principal_px,
+        let during = |half_interval_secs: f64| self.sweeps(camera, robot, half_interval_secs);
+        let during_depth = if keyframe.depth.is_some() {
+            during(camera.half_interval_secs + depth_delay_secs.abs())
+        } else {
+            Vec::new()
         };
-        let silhouette = self.silhouette(
-            camera,
-            view,
-            &Transform::identity(),
-            robot,
-            camera.half_interval_secs,
-        );
-        let n_masked = mask_alpha(&mut keyframe.rgba_srgb, view.size_px, &silhouette);
-        if let Some(truth) = &mut keyframe.truth {
-            mask_alpha(&mut truth.rgba_srgb, view.size_px, &silhouette);
-        }
-        if let Some(depth) = &mut keyframe.depth {
-            let view = Pinhole {
-                size_px: depth.size_px,
-                focal_px: depth.focal_px,
-                principal_px: depth.principal_px,
-            };
-            let silhouette = self.silhouette(
-                camera,
-                view,
-                &camera.camera_from_depth.inverse(),
-                robot,
-                camera.half_interval_secs + depth_delay_secs.abs(),
-            );
-            let readings = Arc::make_mut(&mut depth.depth_m);
-            for (reading, [x, y]) in readings.iter_mut().zip(pixels(depth.size_px)) {
-                if silhouette.covers(x, y) {
-                    *reading = 0.0;
-                }
-            }
-        }
-        let [width, height] = view.size_px.map(u64::from);
+        let masked = MaskedRobot {
+            links: Arc::clone(self.shape.pieces()),
+            uncertainty: camera.uncertainty,
+            during_color: during(camera.half_interval_secs),
+            during_depth,
+            camera_from_depth: camera.camera_from_depth,
+            hidden: HiddenPixels::default(),
+        };
+        let views = MaskViews::of(keyframe);
+        let n_masked = keyframe.mask_robot(masked, &views);
+        let [width, height] = keyframe.size_px.map(u64::from);
         Some(RobotCover {
             n_masked,
             n_pixels: width * height,
         })
     }
 
-    fn silhouette(
+    /// Where the links may be in the frame of a camera.
+    fn sweeps(
         &self,
         camera: &MaskedCamera,
-        view: Pinhole,
-        view_from_camera: &Transform,
         robot: &RobotAt,
         half_interval_secs: f64,
-    ) -> Silhouette {
-        let mut silhouette = Silhouette::new(view, camera.uncertainty);
+    ) -> Vec<Sweep> {
         let instants = [-half_interval_secs, half_interval_secs].map(|delay_secs| {
             let (positions, world_from_base) = robot.after(delay_secs);
             let camera_from_base = self.camera_from_base(camera, &positions, &world_from_base);
-            (positions, view_from_camera * camera_from_base)
+            (positions, camera_from_base)
         });
-        self.shape
-            .pieces_in_camera(camera.extent, &instants, &mut |piece| silhouette.add(piece));
-        silhouette
+        self.shape.sweeps_in_camera(camera.extent, &instants)
     }
 
     fn camera_from_base(
@@ -416,22 +393,4 @@ fn half_interval_secs(camera: &Camera) -> f64 {
         None => UNKNOWN_STAMP_ERROR_SECS,
     };
     0.5 * (exposure_secs + readout_secs) + stamp_error_secs
-}
-
-/// Sets the alpha of covered pixels to 0. Returns the number of covered pixels.
-fn mask_alpha(rgba: &mut Arc<[u8]>, size_px: [u32; 2], silhouette: &Silhouette) -> u64 {
-    let mut n_masked = 0;
-    let (rgba, _) = Arc::make_mut(rgba).as_chunks_mut::<4>();
-    for (pixel, [x, y]) in rgba.iter_mut().zip(pixels(size_px)) {
-        if silhouette.covers(x, y) {
-            pixel[3] = 0;
-            n_masked += 1;
-        }
-    }
-    n_masked
-}
-
-/// The positions of all pixels, row by row.
-fn pixels([width, height]: [u32; 2]) -> impl Iterator<Item = [u32; 2]> {
-    (0..height).flat_map(move |y| (0..width).map(move |x| [x, y]))
 }

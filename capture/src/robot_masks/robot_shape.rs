@@ -1,13 +1,15 @@
 //! The shape of a robot, in convex pieces that move with its measured joints.
 
-use super::convex_pieces::{Piece, cover};
+use super::convex_pieces::cover;
+use crate::config::UrdfFolder;
 use crate::mesh_triangles::{Triangle, mesh_triangles};
+use files::Budget;
+use keyframe::masked_robot::{ConvexPiece, Sweep};
 use kinematics::shape::{Geometry, Shape};
 use kinematics::urdf::{JointKind, JointLimits, Robot};
 use kinematics::{Chain, Transform};
-use nalgebra::Point3;
 use std::collections::{BTreeMap, BTreeSet};
-use std::path::Path;
+use std::sync::Arc;
 
 /// Largest rotation of a joint between two poses at which a link is drawn if the joint is not
 /// measured, radians. The next constant is the largest number of poses.
@@ -18,17 +20,17 @@ const MAX_POSES: u32 = 16;
 pub(super) struct RobotShape {
     root_from_base: JointedPose,
     links: Vec<Link>,
+    /// The pieces of each link. A link has none if its shape is unknown, or if it has none.
+    pieces: Arc<[Vec<ConvexPiece>]>,
     /// Names of links whose shapes are not known, with the reason.
     unknown: BTreeMap<String, String>,
 }
 
-/// A link with its shape.
+/// A link.
 struct Link {
     root_from_link: JointedPose,
     /// Whether it moves relative to the base.
     moves: bool,
-    /// Empty if its shape is unknown, or if it has none.
-    pieces: Vec<Piece>,
 }
 
 /// The pose of a link as a function of the measured joints.
@@ -67,7 +69,7 @@ impl RobotShape {
     /// cannot be read, or there is none, it has its collision shapes.
     ///
     /// * `joints`: names of the measured joints.
-    /// * `mesh_folder`: where the names of mesh files start; `None` if it is unknown.
+    /// * `mesh_folder`: where the mesh files are.
     ///
     /// # Errors
     ///
@@ -77,7 +79,7 @@ impl RobotShape {
         base_link: &str,
         joints: &[String],
         extent: Extent,
-        mesh_folder: Option<&Path>,
+        mesh_folder: &UrdfFolder,
     ) -> Result<Self, kinematics::Error> {
         // Links beside the base or above it, such as a platform, are drawn as well.
         let root = robot.root().unwrap_or(base_link);
@@ -85,12 +87,11 @@ impl RobotShape {
         let mut meshes = Meshes {
             folder: mesh_folder,
             read: BTreeMap::new(),
+            left: Budget::MESHES,
         };
-        let mut shape = Self {
-            root_from_base,
-            links: Vec::new(),
-            unknown: BTreeMap::new(),
-        };
+        let mut links = Vec::new();
+        let mut all_pieces = Vec::new();
+        let mut unknown = BTreeMap::new();
         let has_shapes =
             |link: &str| !robot.visuals(link).is_empty() || !robot.collisions(link).is_empty();
         for name in robot.links() {
@@ -98,12 +99,12 @@ impl RobotShape {
                 Ok(pose) => pose,
                 Err(error) => {
                     if has_shapes(name) {
-                        shape.unknown.insert(name.clone(), error.to_string());
+                        unknown.insert(name.clone(), error.to_string());
                     }
                     continue;
                 }
             };
-            let moves = root_from_link.moves_on(&shape.root_from_base);
+            let moves = root_from_link.moves_on(&root_from_base);
             if !extent.contains(moves) {
                 continue;
             }
@@ -113,15 +114,25 @@ impl RobotShape {
                 problem = Some(reason);
             }
             if let Some(reason) = problem {
-                shape.unknown.insert(name.clone(), reason);
+                unknown.insert(name.clone(), reason);
             }
-            shape.links.push(Link {
+            links.push(Link {
                 root_from_link,
                 moves,
-                pieces,
             });
+            all_pieces.push(pieces);
         }
-        Ok(shape)
+        Ok(Self {
+            root_from_base,
+            links,
+            pieces: all_pieces.into(),
+            unknown,
+        })
+    }
+
+    /// The convex pieces of each link, in the frame of the link, meters.
+    pub(super) fn pieces(&self) -> &Arc<[Vec<ConvexPiece>]> {
+        &self.pieces
     }
 
     /// Whether there are links in an extent.
@@ -131,8 +142,8 @@ impl RobotShape {
 
     /// Whether the shape of any link in an extent is known.
     pub(super) fn has_pieces(&self, extent: Extent) -> bool {
-        let mut links = self.links.iter();
-        links.any(|link| extent.contains(link.moves) && !link.pieces.is_empty())
+        let mut links = self.links.iter().zip(&*self.pieces);
+        links.any(|(link, pieces)| extent.contains(link.moves) && !pieces.is_empty())
     }
 
     /// Names of links whose shapes are not known, with the reason.
@@ -140,43 +151,46 @@ impl RobotShape {
         &self.unknown
     }
 
-    /// The convex pieces of the robot in the frame of a camera. Each piece contains the part of the
-    /// robot at all given instants, and between them if it moves along a line.
+    /// Where the links may be in the frame of a camera. Each sweep contains the link at all given
+    /// instants, and between them if it moves along a line.
     ///
     /// * `instants`: the positions of the measured joints and `camera_from_base`.
-    pub(super) fn pieces_in_camera(
+    pub(super) fn sweeps_in_camera(
         &self,
         extent: Extent,
         instants: &[(Vec<f64>, Transform)],
-        draw: &mut dyn FnMut(&[Point3<f64>]),
-    ) {
+    ) -> Vec<Sweep> {
         let camera_from_root: Vec<Transform> = instants
             .iter()
             .map(|(q, camera_from_base)| camera_from_base * self.root_from_base.at(q, 0).inverse())
             .collect();
-        for link in self.links.iter().filter(|link| extent.contains(link.moves)) {
+        let mut sweeps = Vec::new();
+        let drawn = self.links.iter().enumerate();
+        for (link_ix, link) in drawn.filter(|(_, link)| extent.contains(link.moves)) {
+            if self.pieces[link_ix].is_empty() {
+                continue;
+            }
             let poses = |pose_ix: u32| {
                 let both = instants.iter().zip(&camera_from_root);
                 both.map(move |((q, _), camera_from_root)| {
                     camera_from_root * link.root_from_link.at(q, pose_ix)
                 })
             };
-            // A piece contains two neighboring poses, so that there is no gap between them.
+            // A sweep contains two neighboring poses, so that there is no gap between them.
             let n_steps = link.root_from_link.n_poses.saturating_sub(1).max(1);
             for step in 0..n_steps {
                 let next = (step + 1).min(link.root_from_link.n_poses - 1);
-                let mut swept: Vec<Transform> = poses(step).collect();
+                let mut camera_from_link: Vec<Transform> = poses(step).collect();
                 if next != step {
-                    swept.extend(poses(next));
+                    camera_from_link.extend(poses(next));
                 }
-                for piece in &link.pieces {
-                    let points = swept.iter().flat_map(|camera_from_link| {
-                        piece.iter().map(move |point| camera_from_link * point)
-                    });
-                    draw(&points.collect::<Piece>());
-                }
+                sweeps.push(Sweep {
+                    link_ix,
+                    camera_from_link,
+                });
             }
         }
+        sweeps
     }
 }
 
@@ -270,13 +284,15 @@ fn n_poses_of(limits: &JointLimits, is_prismatic: bool) -> u32 {
 
 /// The mesh files that were read.
 struct Meshes<'a> {
-    folder: Option<&'a Path>,
+    folder: &'a UrdfFolder,
     read: BTreeMap<String, Result<Vec<Triangle>, String>>,
+    /// What all further files may have together. A small recording could contain any amount.
+    left: Budget,
 }
 
 impl Meshes<'_> {
     /// The pieces of a link, and the reason why a part of its shape is unknown.
-    fn pieces_of(&mut self, robot: &Robot, link: &str) -> (Vec<Piece>, Option<String>) {
+    fn pieces_of(&mut self, robot: &Robot, link: &str) -> (Vec<ConvexPiece>, Option<String>) {
         let [visuals, collisions] = [robot.visuals(link), robot.collisions(link)];
         let (pieces, problem) = self.cover_all(visuals);
         let is_complete = problem.is_none() && !visuals.is_empty();
@@ -292,7 +308,7 @@ impl Meshes<'_> {
         (all, problem.or(problem_of_collisions))
     }
 
-    fn cover_all(&mut self, shapes: &[Shape]) -> (Vec<Piece>, Option<String>) {
+    fn cover_all(&mut self, shapes: &[Shape]) -> (Vec<ConvexPiece>, Option<String>) {
         let mut pieces = Vec::new();
         let mut problem = None;
         for shape in shapes {
@@ -309,10 +325,15 @@ impl Meshes<'_> {
         let Geometry::Mesh { file, .. } = geometry else {
             return Ok(&[]);
         };
-        let folder = self.folder;
-        let read = self.read.entry(file.clone()).or_insert_with(|| {
-            let folder = folder.ok_or("the folder of the mesh files is unknown")?;
-            mesh_triangles(file, folder)
+        let Self { folder, read, left } = self;
+        let read = read.entry(file.clone()).or_insert_with(|| {
+            let budget = Budget {
+                max_bytes: Budget::MESH.max_bytes.min(left.max_bytes),
+                ..Budget::MESH
+            };
+            let triangles = mesh_triangles(file, folder, budget)?;
+            *left = left.after(size_of_val(&*triangles) as u64);
+            Ok(triangles)
         });
         read.as_deref()
             .map_err(|why| format!("mesh {file:?}: {why}"))

@@ -1,9 +1,12 @@
 //! Masks compared with the simulator's exact segmentation, and masks in the keyframes of a join.
 
 use super::*;
-use crate::config::Override;
+use crate::config::{Override, UrdfFolder};
 use crate::join::{Join, JoinEvent};
 use drivers::{Image, PixelFormat, Sample};
+use keyframe::masked_robot::ConvexPiece;
+#[cfg(feature = "sim")]
+use keyframe::masked_robot::{Pinhole, Silhouette};
 use nalgebra::{Point3, UnitQuaternion, Vector3};
 use std::path::{Path, PathBuf};
 use toml::Value;
@@ -27,7 +30,7 @@ fn bundled(name: &str) -> PathBuf {
 }
 
 /// A static arm, seen by a camera in the room with depth.
-fn rig(changes: &[Override]) -> Rig {
+pub(super) fn rig(changes: &[Override]) -> Rig {
     let pose = world_from_camera([1.3, 0.4, 0.8]);
     let list = |key, numbers: &[f64]| Override::new(key, Value::from(numbers.to_vec()));
     let size = SIZE_PX.map(i64::from).to_vec();
@@ -52,7 +55,7 @@ fn rig(changes: &[Override]) -> Rig {
 }
 
 /// Joint states at 100 Hz in which the first joint rotates, and an image with depth every 0.1 s.
-fn samples(speed_rad_s: f64) -> Vec<Sample> {
+pub(super) fn samples(speed_rad_s: f64) -> Vec<Sample> {
     let n_pixels = (SIZE_PX[0] * SIZE_PX[1]) as usize;
     let mut samples = Vec::new();
     for tick in 0..60_i64 {
@@ -94,7 +97,7 @@ fn samples(speed_rad_s: f64) -> Vec<Sample> {
     samples
 }
 
-fn keyframes(join: &mut Join, samples: Vec<Sample>) -> Vec<Arc<Keyframe>> {
+pub(super) fn keyframes(join: &mut Join, samples: Vec<Sample>) -> Vec<Arc<Keyframe>> {
     let mut events: Vec<JoinEvent> = samples
         .into_iter()
         .flat_map(|sample| join.push(sample))
@@ -121,7 +124,7 @@ fn pixel_ix(point_in_world: Point3<f64>, camera: &Transform) -> usize {
 }
 
 /// Number of masked pixels of color.
-fn n_masked(keyframe: &Keyframe) -> usize {
+pub(super) fn n_masked(keyframe: &Keyframe) -> usize {
     let (rgba, _) = keyframe.rgba_srgb.as_chunks::<4>();
     rgba.iter().filter(|pixel| pixel[3] == 0).count()
 }
@@ -179,6 +182,42 @@ fn the_mask_grows_with_the_speed_and_the_margin() {
 }
 
 #[test]
+fn corrected_masks_are_those_of_a_rig_with_the_right_pose() {
+    let right = rig(&[]);
+    // 3 degrees and 30 mm, which is beyond the margin.
+    let right_from_wrong = Transform::from_parts(
+        Vector3::new(0.03, 0.0, 0.0).into(),
+        UnitQuaternion::from_euler_angles(0.0, 0.052, 0.0),
+    );
+    let mut wrong = right.clone();
+    wrong.cameras[0].parent_from_camera = right.cameras[0].parent_from_camera * right_from_wrong;
+    let first = |rig: &Rig| {
+        let mut join = Join::new(rig).expect("a good rig");
+        keyframes(&mut join, samples(0.5)).remove(0)
+    };
+    let [expected, uncorrected] = [first(&right), first(&wrong)];
+    let correction = calibration::CameraCorrection {
+        rotation_rad: right_from_wrong.rotation.scaled_axis().into(),
+        translation_m: right_from_wrong.translation.vector.into(),
+        ..calibration::CameraCorrection::default()
+    };
+    let corrected = correction.corrected(&uncorrected);
+    let n_different = |keyframe: &Keyframe| {
+        let color = expected.rgba_srgb.iter().zip(&*keyframe.rgba_srgb);
+        let [of_expected, of_keyframe] = [&expected, keyframe].map(|keyframe| {
+            let depth = keyframe.depth.as_ref().expect("depth");
+            depth.depth_m.clone()
+        });
+        let depth = of_expected.iter().zip(&*of_keyframe);
+        color.filter(|(one, other)| one != other).count()
+            + depth.filter(|(one, other)| one != other).count()
+    };
+    assert!(n_different(&uncorrected) > 2000);
+    // Rounding may change a cell at the edge.
+    assert!(n_different(&corrected) < 20, "{}", n_different(&corrected));
+}
+
+#[test]
 fn images_wait_for_the_state_of_a_robot_that_is_masked() {
     let images = || {
         samples(0.0)
@@ -217,6 +256,23 @@ fn unknown_shapes_are_named() {
     assert!(masks.masks("wrist"), "the other links are masked");
 }
 
+/// The points of the pieces of a robot at all of their poses, in the frame of a camera.
+fn pieces_in_camera(
+    shape: &RobotShape,
+    extent: Extent,
+    instants: &[(Vec<f64>, Transform)],
+) -> Vec<ConvexPiece> {
+    let mut swept = Vec::new();
+    for sweep in shape.sweeps_in_camera(extent, instants) {
+        for piece in &shape.pieces()[sweep.link_ix] {
+            let poses = sweep.camera_from_link.iter();
+            let points = poses.flat_map(|pose| piece.iter().map(move |point| pose * point));
+            swept.push(points.collect());
+        }
+    }
+    swept
+}
+
 #[test]
 fn joints_that_are_not_measured_may_be_anywhere() {
     // A finger of 2 cm that moves by 20 cm.
@@ -227,13 +283,12 @@ fn joints_that_are_not_measured_may_be_anywhere() {
     let robot = Robot::parse(urdf).expect("a robot");
     let widths = |joints: &[String]| {
         let extent = Extent::MovingLinks;
-        let shape = RobotShape::new(&robot, "base", joints, extent, None).expect("a robot");
+        let shape = RobotShape::new(&robot, "base", joints, extent, &UrdfFolder::default())
+            .expect("a robot");
         let camera_from_base = Transform::translation(0.0, 0.0, 1.0);
-        let mut xs = Vec::new();
         let instants = [(vec![0.05], camera_from_base)];
-        shape.pieces_in_camera(extent, &instants, &mut |piece| {
-            xs.extend(piece.iter().map(|point| point.x));
-        });
+        let pieces = pieces_in_camera(&shape, extent, &instants);
+        let xs: Vec<f64> = pieces.iter().flatten().map(|point| point.x).collect();
         [
             xs.iter().copied().fold(f64::INFINITY, f64::min),
             xs.iter().copied().fold(f64::NEG_INFINITY, f64::max),
@@ -310,7 +365,14 @@ fn masks_cover_the_robot_that_the_simulator_draws() {
     let joints: Vec<String> = (1..8).map(|ix| format!("panda_joint{ix}")).collect();
     // The simulator's segmentation contains the base.
     let extent = Extent::WholeRobot;
-    let shape = RobotShape::new(&robot, "panda_link0", &joints, extent, None).expect("an arm");
+    let shape = RobotShape::new(
+        &robot,
+        "panda_link0",
+        &joints,
+        extent,
+        &UrdfFolder::default(),
+    )
+    .expect("an arm");
     let mut simulator =
         sim::RobotMasks::open(sim::Scene::StaticArm, view.size_px).expect("a valid scene");
     let postures = [
@@ -339,8 +401,12 @@ fn masks_cover_the_robot_that_the_simulator_draws() {
         let compare = |uncertainty| {
             let mut silhouette = Silhouette::new(view, uncertainty);
             let instant = (q.to_vec(), world_from_camera.inverse());
-            shape.pieces_in_camera(extent, &[instant], &mut |piece| silhouette.add(piece));
-            let both = pixels(view.size_px).zip(&exact);
+            for piece in pieces_in_camera(&shape, extent, &[instant]) {
+                silhouette.add(&piece);
+            }
+            let [width, height] = view.size_px;
+            let pixels = (0..height).flat_map(|y| (0..width).map(move |x| [x, y]));
+            let both = pixels.zip(&exact);
             let mut n = [0.0_f64; 3];
             for ([x, y], is_robot) in both {
                 let is_masked = silhouette.covers(x, y);

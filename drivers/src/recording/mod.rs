@@ -3,12 +3,14 @@
 //! `docs/reference/recording.md` lists the topics and describes which samples remain readable after
 //! a crash or with a full disk.
 
+mod meshes;
 mod reader;
 mod record;
 mod records;
 mod topic;
 mod writer;
 
+pub use meshes::{MAX_MESH_BYTES, compress_mesh, decompress_mesh, mesh_attachment};
 pub use reader::Recording;
 pub use writer::{Recorder, RecordingMetadata};
 

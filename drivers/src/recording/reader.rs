@@ -3,6 +3,7 @@
 //! The file is read sequentially without its index, so a truncated recording yields every sample
 //! before the cut.
 
+use super::meshes::{MAX_MESH_BYTES, mesh_file_of};
 use super::record::Record;
 use super::records::{self, RawRecord, ReadError, Records};
 use super::topic::Topic;
@@ -19,6 +20,8 @@ use std::sync::Arc;
 
 /// Maximum number of unused topics, attachments and metadata that are reported.
 const MAX_UNUSED: usize = 50;
+/// Maximum length of the names of all mesh files. A robot has at most some hundred mesh files.
+const MAX_MESH_NAME_BYTES: u64 = 1 << 20;
 /// Maximum number of unused parts in the error about a recording without samples.
 const MAX_UNUSED_IN_ERROR: usize = 5;
 
@@ -32,6 +35,8 @@ pub struct Recording {
     /// Channels of topics of other programs.
     unused_channels: BTreeSet<u16>,
     attachments: BTreeMap<String, Vec<u8>>,
+    /// Size of the attached mesh files and of their names, bytes.
+    mesh_bytes: u64,
     joint_names: Option<Vec<String>>,
     notes: Notes,
     /// Topics, attachments and metadata of other programs, as messages name them.
@@ -105,6 +110,7 @@ impl Recording {
             channels: BTreeMap::new(),
             unused_channels: BTreeSet::new(),
             attachments: BTreeMap::new(),
+            mesh_bytes: 0,
             joint_names: None,
             notes: Notes::default(),
             unused: BTreeSet::new(),
@@ -152,8 +158,16 @@ impl Recording {
         }
     }
 
+    /// The mesh files of the robot, by their names in the robot description: each name with the
+    /// compressed contents, which [`super::decompress_mesh`] reads. In alphabetical order.
+    pub fn mesh_files(&self) -> impl Iterator<Item = (&str, &[u8])> {
+        self.attachments
+            .iter()
+            .filter_map(|(name, data)| Some((mesh_file_of(name)?, data.as_slice())))
+    }
+
     /// Returns the attachment with this name: [`super::RIG_FILE`] or [`super::URDF_FILE`]. Other
-    /// attachments are not kept.
+    /// attachments are not kept, except those of [`Self::mesh_files`].
     pub fn attachment(&self, name: &str) -> Option<&[u8]> {
         self.attachments.get(name).map(Vec::as_slice)
     }
@@ -191,7 +205,7 @@ impl Recording {
     }
 
     fn attach(&mut self, name: &str, data: &[u8]) {
-        if ![RIG_FILE, URDF_FILE].contains(&name) {
+        if ![RIG_FILE, URDF_FILE].contains(&name) && !self.takes_mesh(name, data) {
             return self.report_unused(format!("attachment {name:?}"));
         }
         match self.attachments.get(name) {
@@ -205,6 +219,25 @@ impl Recording {
                 )
             }),
         }
+    }
+
+    /// Whether an attachment is a mesh file, and fits into the limit of all mesh files. Counts it.
+    fn takes_mesh(&mut self, name: &str, data: &[u8]) -> bool {
+        if mesh_file_of(name).is_none() {
+            return false;
+        }
+        if self.attachments.contains_key(name) {
+            return true;
+        }
+        // Names count, too, so that files without contents cannot fill the memory.
+        let n_bytes = self
+            .mesh_bytes
+            .saturating_add((name.len() + data.len()) as u64);
+        let has_room = n_bytes <= MAX_MESH_BYTES + MAX_MESH_NAME_BYTES;
+        if has_room {
+            self.mesh_bytes = n_bytes;
+        }
+        has_room
     }
 
     /// Logs that a part of the file has no effect.

@@ -25,7 +25,8 @@ const FLUSH_NANOS: i64 = 1_000_000_000;
 /// Description of the rig, written before the first sample.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct RecordingMetadata<'a> {
-    /// Files to attach, by name. They are the complete rig file and the robot description.
+    /// Files to attach, by name. They are the complete rig file, the robot description, and its
+    /// mesh files.
     pub files: &'a [(&'a str, &'a [u8])],
     /// Cameras and their lens parameters.
     pub cameras: &'a [(&'a str, &'a Intrinsics)],
@@ -486,6 +487,7 @@ fn media_type_of(name: &str) -> &'static str {
         Some("toml") => "application/toml",
         Some("urdf" | "xml") => "application/xml",
         Some("json") => "application/json",
+        Some("gz") => "application/gzip",
         _ => "application/octet-stream",
     }
 }

@@ -107,12 +107,16 @@ settings! {
     RateHz = "rate_hz",
     /// Images per second of simulated cameras.
     Rates = "rates_hz",
+    /// Playback of a recording at the speed of its devices.
+    RealTime = "real_time",
     /// File to which the data of the devices are recorded.
     Record = "record",
     /// Recovery of an arm that has stopped.
     Recover = "recover",
     /// Calibration parameters that training refines.
     Refine = "refine",
+    /// Playback of a recording again and again.
+    Repeat = "repeat",
     /// File of a calibration report.
     Report = "report",
     /// Folder of the run that training continues.

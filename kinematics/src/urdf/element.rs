@@ -1,6 +1,7 @@
 //! Elements and attributes of a robot description, and notes about unused elements and attributes.
 
 use crate::Error;
+use crate::xml_limits::{self, MAX_NAMESPACES, MAX_NODES};
 use roxmltree::{Document, Node, ParsingOptions};
 use std::borrow::Cow;
 use std::collections::{BTreeMap, BTreeSet};
@@ -8,12 +9,6 @@ use std::collections::{BTreeMap, BTreeSet};
 /// Maximum size of a robot description. It is far above the size of any real description, because
 /// meshes are in other files. It prevents a wrong file from filling the memory.
 pub const MAX_BYTES: usize = 16 << 20;
-/// The parser's memory grows with the number of nodes.
-const MAX_NODES: u32 = 1 << 20;
-/// The parser's time grows with the square of the number of attributes of an element, and with the
-/// cube of the number of nested namespaces.
-const MAX_ATTRIBUTES: usize = 2000;
-const MAX_NAMESPACES: usize = 100;
 /// Maximum number of notes. Notes are printed, and a longer list would hide the first notes. The
 /// problems in the first notes often cause the others.
 const MAX_NOTES: usize = 100;
@@ -89,17 +84,7 @@ fn is_plain_name(text: &str) -> bool {
 
 /// Parses XML whose size and structure are limited.
 pub(super) fn parse(xml: &str) -> Result<Document<'_>, Error> {
-    // All limits are checked before the parser runs, because its time depends on them.
-    limited("bytes", xml.len(), MAX_BYTES)?;
-    limited("namespaces", xml.matches("xmlns").count(), MAX_NAMESPACES)?;
-    // Attributes are counted in the text before parsing, because parsing takes most of the time.
-    // The count may be too high, because values and comments also contain `=`.
-    let n_attributes = |element: &str| element.bytes().filter(|byte| *byte == b'=').count();
-    limited(
-        "attributes in one element",
-        xml.split('<').map(n_attributes).max().unwrap_or(0),
-        MAX_ATTRIBUTES,
-    )?;
+    xml_limits::check(xml, MAX_BYTES).map_err(|why| Error::UrdfSyntax { why })?;
     let options = ParsingOptions {
         nodes_limit: MAX_NODES,
         ..ParsingOptions::default()
@@ -122,16 +107,6 @@ pub(super) fn parse(xml: &str) -> Result<Document<'_>, Error> {
             why: format!("it describes a <{other}>, expected a <robot>"),
         }),
     }
-}
-
-/// An error if a text has more than `max` of something.
-fn limited(what: &str, n: usize, max: usize) -> Result<(), Error> {
-    if n <= max {
-        return Ok(());
-    }
-    Err(Error::UrdfSyntax {
-        why: format!("its {n} {what} exceed the maximum of {max}"),
-    })
 }
 
 /// The reason why an element cannot be used.

@@ -199,6 +199,7 @@ mod tests {
             base: None,
             split: Split::Train,
             truth: None,
+            robot: None,
         })
     }
 

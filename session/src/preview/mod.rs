@@ -101,7 +101,6 @@ impl Preview {
 /// What the clients of a preview see.
 struct Shown {
     hub: Hub,
-    rig_file: PathBuf,
     identity: Identity,
     notes: Vec<String>,
     devices: DeviceTable,
@@ -148,7 +147,6 @@ impl Shown {
         extent::publish(hub, &rig, &cameras);
         let mut shown = Self {
             hub: hub.clone(),
-            rig_file: rig_file.clone(),
             identity,
             notes,
             devices: DeviceTable::new(&rig, groups),
@@ -169,7 +167,7 @@ impl Shown {
         if rig.arm.joints.is_empty() && !rig.has_moving_base() {
             return Ok(());
         }
-        if let Some(robot) = robot_meshes::description(rig, &self.rig_file)? {
+        if let Some(robot) = robot_meshes::description(rig)? {
             self.identity.robot = Some(robot.robot.name().to_owned());
             self.hub.set_robot(robot);
         }

@@ -26,11 +26,12 @@ use crate::method_options;
 use crate::methods::methods_of;
 use crate::next_commands::DataSource;
 use crate::previous_run::{FinishedRun, PreviousRun, limit_flags, out_folder};
-use crate::resume_command::ResumeCommand;
+use crate::resume_command::{FROM, REAL_TIME, REPEAT, ResumeCommand};
 use crate::run_folder;
 use crate::session::Limits;
 use crate::session_setup::Services;
 use crate::training_options::{AvailableData, REALIGN, RefineSettings, TrainingOptions};
+use capture::RecordedMeshes;
 use capture::check_output_file;
 use capture::config::{ArmDriver, Need, Override, Rig};
 use capture::open::{self, Devices, Opened, SteeredArm};
@@ -56,8 +57,8 @@ const DEFAULT_STEPS_PER_KEYFRAME: u64 = 10;
 /// Options of a live run.
 #[derive(Clone, Debug)]
 pub struct RunPlan {
-    /// The rig file.
-    pub rig_file: PathBuf,
+    /// The rig file. `None` uses the rig that is stored in the recording.
+    pub rig_file: Option<PathBuf>,
     /// The devices, or a recording of them.
     pub input: RunInput,
     /// File to which everything is recorded that the devices send.
@@ -133,6 +134,7 @@ impl RunPlan {
             None,
             &self.resume_command(),
         )?;
+        self.check_resumable()?;
         if let Some(file) = &self.record {
             self.check_record(file)?;
         }
@@ -145,7 +147,7 @@ impl RunPlan {
         };
         let mut overrides = plan.overrides();
         overrides.extend(previous.iter().flat_map(PreviousLiveRun::overrides));
-        let rig = Rig::load(&plan.rig_file, &overrides)?;
+        let rig = plan.read_rig(&overrides)?;
         plan.require_calibration(&rig)?;
         if plan.is_steered {
             open::check_steerable(&rig, plan.devices()?)?;
@@ -174,6 +176,38 @@ impl RunPlan {
             models,
         };
         Ok(PreparedRun::new(rig, parts))
+    }
+
+    /// Reads the rig file, or the rig of the recording.
+    fn read_rig(&self, overrides: &[Override]) -> anyhow::Result<Rig> {
+        match (&self.rig_file, self.recording()) {
+            (Some(file), _) => Ok(Rig::load(file, overrides)?),
+            (None, Some(recording)) => open::recorded_rig(recording, overrides),
+            (None, None) => {
+                Err(BadInput("a run on devices needs the path of a rig file".to_owned()).into())
+            }
+        }
+    }
+
+    /// Rejects a recording as the input of a continued run if `train` continues such runs with the
+    /// same keyframes.
+    fn check_resumable(&self) -> Result<(), BadInput> {
+        match (&self.input, &self.resume) {
+            (
+                RunInput::Recording {
+                    is_real_time: false,
+                    ..
+                },
+                Some(folder),
+            ) => Err(BadInput(format!(
+                "{}: a run that waits for the trainer continues with `{}`; {} {} continues a run in real time",
+                Setting::Resume,
+                self.resume_command().line(folder),
+                Setting::From,
+                Setting::RealTime
+            ))),
+            _ => Ok(()),
+        }
     }
 
     /// Checks that a recording can be written. It may be in the folder of the results, which the run
@@ -260,6 +294,15 @@ impl RunPlan {
             } => (is_simulated, is_lockstep),
             RunInput::Recording { .. } => (false, false),
         };
+        let (from, is_real_time, is_repeated) = match &self.input {
+            RunInput::Devices { .. } => (None, false, false),
+            RunInput::Recording {
+                path,
+                is_real_time,
+                is_repeated,
+            } => (Some(path), *is_real_time, *is_repeated),
+        };
+        let from = from.map(|path| std::path::absolute(path).unwrap_or(path.clone()));
         let record = self.record.as_ref().map(|file| file.display().to_string());
         let given = [
             (
@@ -269,6 +312,9 @@ impl RunPlan {
             (SIM, is_simulated.then(|| true.to_string())),
             (LOCKSTEP, is_lockstep.then(|| true.to_string())),
             (RECORD, record),
+            (FROM, from.map(|path| path.display().to_string())),
+            (REAL_TIME, is_real_time.then(|| true.to_string())),
+            (REPEAT, is_repeated.then(|| true.to_string())),
             (
                 REALIGN,
                 self.training.realign().map(|is_on| is_on.to_string()),
@@ -287,6 +333,12 @@ impl RunPlan {
             log::warn!(
                 "the first part was recorded to {file}; this part is not recorded unless {} names another file",
                 Setting::Record
+            );
+        }
+        if let (Some(file), RunInput::Devices { .. }) = (previous.flag(FROM), &self.input) {
+            log::warn!(
+                "the first part was played from {file}; this part uses the devices of the rig file, because {} is not given",
+                Setting::From
             );
         }
         let input = match &self.input {
@@ -312,24 +364,32 @@ impl RunPlan {
 
     /// The command that continues this run.
     fn resume_command(&self) -> ResumeCommand {
+        let rig_file = self.rig_file.as_deref();
         match &self.input {
             // In real time, the run did not use all images of the recording, so `train` would not
-            // find the same keyframes.
+            // find the same keyframes. The run therefore plays the recording again.
             RunInput::Recording {
                 path,
-                is_real_time: false,
-                ..
-            } => ResumeCommand::of_recording(path, &self.rig_file),
-            _ => ResumeCommand::of_devices(&self.rig_file),
+                is_real_time: true,
+                is_repeated,
+            } => ResumeCommand::of_playback(path, rig_file, *is_repeated),
+            RunInput::Recording { path, .. } => ResumeCommand::of_recording(path, rig_file),
+            RunInput::Devices { .. } => {
+                ResumeCommand::of_devices(rig_file.unwrap_or(Path::new("RIG")))
+            }
         }
     }
 
-    /// Name of the rig file without its extension.
+    /// Name of the rig file without its extension. Without a rig file, that of the recording.
     fn rig_name(&self) -> String {
-        let name = self.rig_file.file_stem();
-        name.unwrap_or(self.rig_file.as_os_str())
-            .to_string_lossy()
-            .into_owned()
+        let file = self.rig_file.as_deref().or_else(|| self.recording());
+        let name = file.map(|file| file.file_stem().unwrap_or(file.as_os_str()));
+        name.unwrap_or_default().to_string_lossy().into_owned()
+    }
+
+    /// Mesh files of the robot to record; `None` if the run is not recorded.
+    fn meshes(&self, rig: &Rig) -> Option<RecordedMeshes> {
+        self.record.as_ref().map(|_| open::meshes_to_record(rig))
     }
 
     /// The folder of the results, if it is not a new one in `runs`.

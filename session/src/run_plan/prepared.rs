@@ -15,7 +15,10 @@ use crate::training_clock::Clock;
 use crate::viewers::{Viewers, gpu_notes};
 use capture::config::Rig;
 use capture::open::{self, Opened, SteeredArm};
-use capture::{Feed, Input, InputObserver, Join, Notes, RobotMotion, StampClock, Stations, doctor};
+use capture::{
+    Feed, Input, InputObserver, Join, Notes, RecordedMeshes, RobotMotion, StampClock, Stations,
+    doctor,
+};
 use drivers::Source;
 use gpu::Gpu;
 use keyframe::Keyframe;
@@ -46,6 +49,8 @@ pub struct OpenedRun<'a> {
     opened: Opened,
     /// The arm, if operators may steer it.
     steered_arm: Option<SteeredArm>,
+    /// Mesh files of the robot; `None` if the run is not recorded.
+    meshes: Option<RecordedMeshes>,
     device_notes: Notes,
     parts: Parts<'a>,
     hub: Hub,
@@ -107,9 +112,15 @@ impl<'a> PreparedRun<'a> {
                 .recording()
                 .map_or("devices", |_| "recording")
         );
-        let (opened, steered_arm) = self.parts.plan.open(self.rig)?;
+        let plan = &self.parts.plan;
+        // Devices do not wait, so meshes are compressed before they are opened. A recording waits,
+        // and may contain the meshes.
+        let of_devices = plan.recording().is_none().then(|| plan.meshes(&self.rig));
+        let (opened, steered_arm) = plan.open(self.rig)?;
+        let meshes = of_devices.unwrap_or_else(|| plan.meshes(&opened.rig));
         Ok(OpenedRun {
             steered_arm,
+            meshes,
             opened: opened.with_tag_check(&device_notes)?,
             device_notes,
             parts: self.parts,
@@ -136,6 +147,7 @@ impl OpenedRun<'_> {
         let Self {
             opened,
             steered_arm,
+            meshes,
             device_notes,
             parts,
             hub,
@@ -163,11 +175,12 @@ impl OpenedRun<'_> {
         let held = previous
             .as_ref()
             .map_or(&[][..], |previous| &previous.keyframes);
-        let (mut input, evicted) = input(&plan, &rig, (source, stamp_clock), held)?;
+        let devices = (source, stamp_clock);
+        let (mut input, evicted) = input(&plan, &rig, meshes.as_ref(), devices, held)?;
         input.join = input.join.with_notes(device_notes.clone());
-        let robot = publish_robot(&hub, &rig, &plan)?;
+        let robot = publish_robot(&hub, &rig)?;
         let steering = steered_arm
-            .map(|arm| PreparedSteering::new(arm, &rig, &plan.rig_file))
+            .map(|arm| PreparedSteering::new(arm, &rig))
             .transpose()?;
         let identity = identity(&plan, &folders, robot);
         let stop = services.stop.clone();
@@ -247,8 +260,8 @@ fn observer(hub: &Hub, steering: Option<&PreparedSteering>) -> Box<dyn InputObse
 }
 
 /// Publishes the robot, and returns its name; `None` if there is no robot.
-fn publish_robot(hub: &Hub, rig: &Rig, plan: &RunPlan) -> anyhow::Result<Option<String>> {
-    let Some(robot) = robot_meshes::description(rig, &plan.rig_file)? else {
+fn publish_robot(hub: &Hub, rig: &Rig) -> anyhow::Result<Option<String>> {
+    let Some(robot) = robot_meshes::description(rig)? else {
         return Ok(None);
     };
     let name = robot.robot.name().to_owned();
@@ -261,7 +274,7 @@ fn publish_robot(hub: &Hub, rig: &Rig, plan: &RunPlan) -> anyhow::Result<Option<
 fn identity(plan: &RunPlan, folders: &[PathBuf], robot: Option<String>) -> Identity {
     let name = |name: Option<&OsStr>| name.map(|name| name.to_string_lossy().into_owned());
     Identity {
-        rig: name(plan.rig_file.file_stem()),
+        rig: Some(plan.rig_name()),
         robot,
         run: name(run_folder_of(folders).file_name()),
     }
@@ -283,14 +296,14 @@ fn run_folder_of(folders: &[PathBuf]) -> &Path {
 fn input(
     plan: &RunPlan,
     rig: &Rig,
+    meshes: Option<&RecordedMeshes>,
     (source, stamp_clock): (Box<dyn Source>, StampClock),
     previous: &[Arc<Keyframe>],
 ) -> anyhow::Result<(Input, Vec<Evicted>)> {
     let (join, evicted) = Join::new(rig)?.resume_from(previous);
-    let recorder = plan
-        .record
-        .as_deref()
-        .map(|file| open::recorder(file, rig))
+    let recorder = meshes
+        .zip(plan.record.as_deref())
+        .map(|(meshes, file)| open::recorder(file, rig, meshes))
         .transpose()?;
     let camera_intrinsics = rig.cameras.iter().map(|camera| {
         let intrinsics = &camera.intrinsics;

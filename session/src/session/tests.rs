@@ -94,6 +94,7 @@ fn test_keyframe(ix: u8) -> Arc<Keyframe> {
         base: None,
         split: Split::Test,
         truth: None,
+        robot: None,
     })
 }
 

@@ -72,9 +72,8 @@ impl PreparedSteering {
     /// # Errors
     ///
     /// If the robot description has no shapes, because nothing would then protect the robot.
-    pub(crate) fn new(arm: SteeredArm, rig: &Rig, rig_file: &Path) -> anyhow::Result<Self> {
-        let folder = Rig::urdf_folder(rig_file).unwrap_or_default();
-        let robot = robot::chain_and_body(rig, &folder)?;
+    pub(crate) fn new(arm: SteeredArm, rig: &Rig) -> anyhow::Result<Self> {
+        let robot = robot::chain_and_body(rig)?;
         let scene = Arc::new(SceneClearance::new(rig, &robot)?);
         Ok(Self::of(arm, rig, robot, scene))
     }

@@ -6,12 +6,12 @@ use anyhow::Context;
 use capture::config::Rig;
 use capture::mesh_triangles;
 use capture::open::SteeredArm;
+use files::Budget;
 use kinematics::Chain;
 use kinematics::urdf::{JointKind, Robot};
 use messages::counted;
 use std::cell::RefCell;
 use std::collections::BTreeMap;
-use std::path::Path;
 use steering::Body;
 
 /// The chain from the base to the flange, and the shape of the whole robot.
@@ -27,13 +27,13 @@ pub(super) struct ChainAndBody {
 /// # Errors
 ///
 /// If the robot description is invalid, or has no shapes.
-pub(super) fn chain_and_body(rig: &Rig, urdf_folder: &Path) -> anyhow::Result<ChainAndBody> {
+pub(super) fn chain_and_body(rig: &Rig) -> anyhow::Result<ChainAndBody> {
     let arm = &rig.arm;
     let robot = Robot::parse(&arm.urdf_text).context("the arm's URDF")?;
     let chain = Chain::new(&robot, &arm.base_link, &arm.flange_link).context("the arm's URDF")?;
     let unreadable = RefCell::new(BTreeMap::new());
     let vertices_of = |file: &str| {
-        mesh_triangles(file, urdf_folder)
+        mesh_triangles(file, &arm.urdf_folder, Budget::MESH)
             .map(|triangles| triangles.into_flattened())
             .map_err(|why| unreadable.borrow_mut().insert(file.to_owned(), why))
             .ok()

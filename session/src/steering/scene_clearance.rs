@@ -253,7 +253,7 @@ mod tests {
     fn simulated() -> (SceneClearance, [f64; 3]) {
         let file = Path::new(env!("CARGO_MANIFEST_DIR")).join("../rigs/static-arm.toml");
         let rig = Rig::load(&file, &[]).expect("a rig of this repository");
-        let robot = chain_and_body(&rig, Path::new("")).expect("its shapes are in the URDF");
+        let robot = chain_and_body(&rig).expect("its shapes are in the URDF");
         let scene = SceneClearance::new(&rig, &robot).expect("a map of its reach");
         let base_from_tip = robot.chain.forward(&START).expect("seven joints");
         let tip = base_from_tip.translation;
@@ -368,6 +368,7 @@ mod tests {
             base: None,
             split: Split::Train,
             truth: None,
+            robot: None,
         };
         scene.observe_keyframe(&keyframe);
         wait_until_known(&scene, [0.2, 0.5, 0.5]);

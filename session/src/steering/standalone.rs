@@ -5,7 +5,6 @@ use super::{PreparedSteering, SteeringThread, robot};
 use capture::config::Rig;
 use capture::open::SteeredArm;
 use drivers::motion::SteeringPort;
-use std::path::Path;
 use std::sync::Arc;
 use viz::Hub;
 
@@ -26,7 +25,7 @@ pub fn steer_standalone<S: Surroundings>(
     scene: Arc<S>,
     hub: &Hub,
 ) -> anyhow::Result<SteeringThread> {
-    let robot = robot::chain_and_body(rig, Path::new(""))?;
+    let robot = robot::chain_and_body(rig)?;
     let prepared = PreparedSteering::of(SteeredArm::holding(port), rig, robot, scene);
     prepared.start(hub, None)
 }

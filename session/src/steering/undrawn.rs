@@ -102,6 +102,7 @@ mod tests {
             base: None,
             split: Split::Train,
             truth: None,
+            robot: None,
         }
     }
 

@@ -1,4 +1,4 @@
-//! Reads triangles from STL and OBJ files, which are the mesh files of a robot description.
+//! Reads triangles from STL, OBJ and COLLADA files, which are the mesh files of a robot description.
 //!
 //! Sources of the formats: 3D Systems, "Stereolithography Interface Specification" (1989), and
 //! Wavefront, "Advanced Visualizer Manual", appendix B1 (OBJ).
@@ -27,9 +27,10 @@ pub(crate) fn read(file: &str, bytes: &[u8], scale: [f64; 3]) -> Result<Mesh, St
     let triangles = match extension.to_ascii_lowercase().as_str() {
         "stl" => stl(bytes)?,
         "obj" => obj(&String::from_utf8_lossy(bytes))?,
+        "dae" => collada(&String::from_utf8_lossy(bytes))?,
         other => {
             return Err(format!(
-                "the simulator cannot read .{other} files, convert it to .stl or .obj"
+                "the simulator cannot read .{other} files, convert it to .stl, .dae or .obj"
             ));
         }
     };
@@ -151,6 +152,14 @@ fn obj(text: &str) -> Result<Vec<Triangle>, String> {
     Ok(triangles)
 }
 
+fn collada(text: &str) -> Result<Vec<Triangle>, String> {
+    let triangles = kinematics::collada::triangles(text).map_err(|error| error.to_string())?;
+    let points = triangles
+        .into_iter()
+        .map(|corners| corners.map(Point3::from));
+    Ok(points.collect())
+}
+
 /// The point of a corner such as `3`, `3/1` or `-1//2`. Indices start at 1. Negative indices count
 /// from the last point.
 fn obj_corner(corner: &str, points: &[Point3<f64>]) -> Result<Point3<f64>, String> {
@@ -237,7 +246,9 @@ mod tests {
             ("a.stl", &b"hello"[..], "neither"),
             ("a.obj", &b"v 0 0\n"[..], "three finite numbers"),
             ("a.obj", &b"v 0 0 0\nf 1 2 3\n"[..], "not a point"),
-            ("a.dae", &b"<COLLADA/>"[..], ".dae"),
+            ("a.dae", &b"<COLLADA/>"[..], "no triangles"),
+            ("a.dae", &b"<robot/>"[..], "expected a <COLLADA>"),
+            ("a.glb", &b"glTF"[..], ".glb"),
         ] {
             let error = read(file, bytes, [1.0; 3]).expect_err("damaged");
             assert!(error.contains(reason), "{file}: {error}");

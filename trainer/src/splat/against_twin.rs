@@ -652,6 +652,7 @@ fn moving_keyframe() -> Keyframe {
         base: None,
         split: Split::Train,
         truth: None,
+        robot: None,
     }
 }
 

@@ -717,6 +717,7 @@ mod tests {
             base: None,
             split: keyframe::Split::Train,
             truth: None,
+            robot: None,
         }
     }
 

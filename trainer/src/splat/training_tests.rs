@@ -112,6 +112,7 @@ pub(super) fn n_keyframes(gpu: &Arc<Gpu>, n: usize, with_depth: bool) -> Vec<Arc
                 base: None,
                 split: Split::of(ix),
                 truth: None,
+                robot: None,
             })
         })
         .collect()

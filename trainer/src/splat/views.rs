@@ -178,14 +178,16 @@ impl TrainView {
     /// Replaces the camera by the camera of the same keyframe with other corrections. Uploaded
     /// images are kept unless the correction changes them.
     pub(crate) fn replace_camera(&mut self, gpu: &Gpu, keyframe: Arc<Keyframe>) {
-        let has_same_depth = has_same_depth(&self.keyframe, &keyframe);
+        let has_same_images =
+            has_same_color(&self.keyframe, &keyframe) && has_same_depth(&self.keyframe, &keyframe);
         // The lens is a slot of camera parameters. They start again at zero after a correction.
         self.lens = None;
         self.keyframe = keyframe;
-        // The color pixels never change, but uploaded depth is reprojected into the color camera,
-        // so it depends on the extrinsics and intrinsics.
-        if !has_same_depth {
+        // Color changes only with the mask of a robot. Uploaded depth is reprojected into the color
+        // camera, so it depends on the extrinsics and intrinsics.
+        if !has_same_images {
             self.median_depth_m = median_depth_m(&self.keyframe);
+            self.mean_srgb = mean_srgb(&self.keyframe);
             self.levels = [const { None }; N_LEVELS];
         }
         // Poses are part of the small view uniform, so large images need no second upload.
@@ -327,6 +329,12 @@ fn clamped(level: u32, [width, height]: [u32; 2]) -> usize {
     level.min((width.min(height) / TILE_PX).max(1).ilog2()) as usize
 }
 
+/// Whether two versions of a keyframe have the same color pixels.
+fn has_same_color(a: &Keyframe, b: &Keyframe) -> bool {
+    // Corrected keyframes usually share the array, so the comparison of all pixels is rare.
+    Arc::ptr_eq(&a.rgba_srgb, &b.rgba_srgb) || a.rgba_srgb == b.rgba_srgb
+}
+
 /// Whether two versions of a keyframe have the same depth as seen from its color camera.
 fn has_same_depth(a: &Keyframe, b: &Keyframe) -> bool {
     // A correction of the color camera's pose often moves the depth camera along with it. In that
@@ -451,6 +459,9 @@ fn not_uploaded() -> Error {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use calibration::scenes::{Miscalibration, capture};
+    use gpu::testing::test_gpu;
+    use kinematics::Transform;
 
     #[test]
     fn no_side_of_a_level_is_smaller_than_a_tile() {
@@ -468,5 +479,40 @@ mod tests {
                 );
             }
         }
+    }
+
+    #[test]
+    fn images_are_uploaded_again_only_if_a_mask_has_changed() {
+        let gpu = test_gpu();
+        let keyframe = capture(&Miscalibration::none()).remove(0);
+        let mut view = TrainView::new(keyframe.clone());
+        let images = LevelImages::new(&keyframe, 0);
+        view.upload(&gpu, 0, &images, None).unwrap();
+        let moved = Keyframe {
+            world_from_camera: Transform::translation(0.1, 0.0, 0.0) * keyframe.world_from_camera,
+            depth: None,
+            ..(*keyframe).clone()
+        };
+        let without_depth = Keyframe {
+            depth: None,
+            ..(*keyframe).clone()
+        };
+        view.replace_camera(&gpu, without_depth.into());
+        view.upload(&gpu, 0, &images, None).unwrap();
+        view.replace_camera(&gpu, Arc::new(moved.clone()));
+        assert!(view.has_level(0), "only the pose has changed");
+        let mut rgba = moved.rgba_srgb.to_vec();
+        let n_masked = rgba.len() / 2;
+        rgba[..n_masked]
+            .chunks_mut(4)
+            .for_each(|pixel| pixel[3] = 0);
+        let before = view.mean_srgb();
+        let masked = Keyframe {
+            rgba_srgb: rgba.into(),
+            ..moved
+        };
+        view.replace_camera(&gpu, masked.into());
+        assert!(!view.has_level(0), "the mask has changed");
+        assert_ne!(view.mean_srgb(), before);
     }
 }

@@ -288,6 +288,7 @@ mod tests {
             base: None,
             split: Split::Test,
             truth: None,
+            robot: None,
         }
     }
 

@@ -364,6 +364,7 @@ mod tests {
             base: None,
             split: Split::Train,
             truth: None,
+            robot: None,
         }
     }
 

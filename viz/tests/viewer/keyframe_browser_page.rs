@@ -121,6 +121,7 @@ fn keyframe(case: &Case) -> Arc<Keyframe> {
         base: None,
         split: Split::Train,
         truth: None,
+        robot: None,
     })
 }
 

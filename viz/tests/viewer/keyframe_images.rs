@@ -43,6 +43,7 @@ fn photographed(stamp_nanos: i64) -> Keyframe {
         base: None,
         split: Split::Validation,
         truth: None,
+        robot: None,
     }
 }
 

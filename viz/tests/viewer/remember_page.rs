@@ -112,6 +112,7 @@ fn keyframes() -> Vec<Arc<Keyframe>> {
             base: None,
             split: Split::Train,
             truth: None,
+            robot: None,
         })
     };
     KEYFRAME_SECS.into_iter().enumerate().map(at).collect()

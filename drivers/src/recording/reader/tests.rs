@@ -1,8 +1,8 @@
 //! Recordings as other programs write or change them. The files are built byte by byte, because the
 //! library that writes recordings does not write invalid files.
 
-use super::{Notes, Recording};
-use crate::recording::{RIG_FILE, URDF_FILE};
+use super::{MAX_MESH_NAME_BYTES, Notes, Recording};
+use crate::recording::{MAX_MESH_BYTES, RIG_FILE, URDF_FILE};
 use crate::wire::protobuf::Message;
 use crate::wire::{descriptor, foxglove, joint_state, point_cloud};
 use crate::{
@@ -352,6 +352,7 @@ impl Contents {
 struct Read {
     samples: Vec<Sample>,
     attachments: [Option<Vec<u8>>; 2],
+    mesh_files: Vec<(String, Vec<u8>)>,
     joint_names: Option<Vec<String>>,
 }
 
@@ -363,6 +364,7 @@ fn read(contents: &Contents) -> (Read, Vec<String>, Option<String>) {
     let mut read = Read {
         samples: Vec::new(),
         attachments: [None, None],
+        mesh_files: Vec::new(),
         joint_names: None,
     };
     let mut recording = match Recording::open(&path) {
@@ -378,6 +380,10 @@ fn read(contents: &Contents) -> (Read, Vec<String>, Option<String>) {
     };
     read.attachments =
         [RIG_FILE, URDF_FILE].map(|name| recording.attachment(name).map(<[u8]>::to_vec));
+    read.mesh_files = recording
+        .mesh_files()
+        .map(|(file, data)| (file.to_owned(), data.to_vec()))
+        .collect();
     read.joint_names = recording.joint_names().map(<[String]>::to_vec);
     let notes = recording
         .notes
@@ -452,6 +458,9 @@ const CASES: &[(&str, &str, Change)] = &[
     }),
     ("attachments `rig.toml` and `robot.urdf`", "", |file| {
         file.attachments[1].1 = "<robot name=\"b\"/>"
+    }),
+    ("attachments `meshes/FILE.gz`", "", |file| {
+        file.attachments.push(("meshes/package://a/b.stl.gz", "m"))
     }),
     (
         "another attachment of that name with other contents",
@@ -1004,6 +1013,32 @@ fn files_without_samples_name_their_contents() {
         refused.contains("recorded by this program; it contains topic \"/scan\", topic \"/tf\" (see docs/guide/data"),
         "{refused}"
     );
+}
+
+#[test]
+fn mesh_files_are_kept_up_to_a_limit() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let path = folder.path().join("it.mcap");
+    let mut file = contents();
+    file.attachments.push(("meshes/a.stl.gz", "first"));
+    file.attachments.push(("meshes/a.stl.gz", "second"));
+    std::fs::write(&path, file.bytes()).expect("a file");
+    let mut recording = Recording::open(&path).expect("a recording");
+    let names = |recording: &Recording| -> Vec<String> {
+        let files = recording.mesh_files();
+        files.map(|(file, _)| file.to_owned()).collect()
+    };
+    assert_eq!(
+        recording.mesh_files().next(),
+        Some(("a.stl", &b"first"[..]))
+    );
+    assert_eq!(recording.notes.0.len(), 1, "the second one is named");
+    recording.mesh_bytes = MAX_MESH_BYTES + MAX_MESH_NAME_BYTES - 20;
+    recording.attach("meshes/b.stl.gz", b"12345");
+    assert_eq!(names(&recording), ["a.stl", "b.stl"]);
+    recording.attach("meshes/c.stl.gz", b"1");
+    assert_eq!(names(&recording), ["a.stl", "b.stl"]);
+    assert!(recording.unused.contains("attachment \"meshes/c.stl.gz\""));
 }
 
 #[test]

@@ -288,7 +288,7 @@ impl NerfModel {
         let corrections = self.learned_corrections()?;
         let correction_of = |image: &RayImage| corrections.get(image.keyframe.camera.as_ref());
         let with_predicted_pose = |image: &RayImage| match correction_of(image) {
-            Some(correction) => RayImage::new(correction.corrected(&image.keyframe).into()),
+            Some(correction) => RayImage::new(correction.moved(&image.keyframe).into()),
             None => image.clone(),
         };
         let images: Vec<RayImage> = self

@@ -170,10 +170,8 @@ impl Motion {
     fn of(keyframe: &CorrectedKeyframe, learned: Option<&CameraCorrection>) -> Self {
         let CorrectedKeyframe { before, after } = keyframe;
         // The splats were fitted to the learned cameras, not to the cameras of the keyframes.
-        let before = learned.map_or_else(
-            || before.clone(),
-            |learned| Arc::new(learned.corrected(before)),
-        );
+        let before =
+            learned.map_or_else(|| before.clone(), |learned| Arc::new(learned.moved(before)));
         let rotation =
             after.world_from_camera.rotation * before.world_from_camera.rotation.inverse();
         Self {

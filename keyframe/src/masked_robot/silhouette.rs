@@ -1,6 +1,7 @@
 //! Pixels that convex pieces cover in an image, on a coarse grid.
 
-use super::convex_pieces::{Piece, directions};
+use super::ConvexPiece;
+use super::directions::directions;
 use nalgebra::Point3;
 use std::f64::consts::TAU;
 
@@ -13,24 +14,28 @@ const NEAR_M: f64 = 0.02;
 const N_CORNERS: u32 = 8;
 
 /// A pinhole camera.
-#[derive(Clone, Copy, Debug)]
-pub(super) struct Pinhole {
-    pub(super) size_px: [u32; 2],
-    pub(super) focal_px: [f64; 2],
-    pub(super) principal_px: [f64; 2],
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Pinhole {
+    /// Width and height, pixels.
+    pub size_px: [u32; 2],
+    /// Focal length, pixels.
+    pub focal_px: [f64; 2],
+    /// Principal point, pixels.
+    pub principal_px: [f64; 2],
 }
 
 /// How far the robot may be from where it is drawn.
-#[derive(Clone, Copy, Debug)]
-pub(super) struct Uncertainty {
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Uncertainty {
     /// Error of the rotation of the camera, radians.
-    pub(super) rotation_rad: f64,
+    pub rotation_rad: f64,
     /// Error of the position of the robot's surface in the frame of the camera, meters.
-    pub(super) position_m: f64,
+    pub position_m: f64,
 }
 
 /// The cells of an image that show the robot.
-pub(super) struct Silhouette {
+#[derive(Debug)]
+pub struct Silhouette {
     view: Pinhole,
     uncertainty: Uncertainty,
     /// Largest square of the tangent of the angle between the optical axis and a pixel.
@@ -45,7 +50,8 @@ type Pixel = [f64; 2];
 
 impl Silhouette {
     /// An image that shows no robot.
-    pub(super) fn new(view: Pinhole, uncertainty: Uncertainty) -> Self {
+    #[must_use]
+    pub fn new(view: Pinhole, uncertainty: Uncertainty) -> Self {
         let cell_px = view.size_px[0].div_ceil(N_COLUMNS).max(1);
         let n_cells = view.size_px.map(|side| side.div_ceil(cell_px) as usize);
         let largest_tan = [0, 1].map(|axis| {
@@ -65,7 +71,7 @@ impl Silhouette {
 
     /// Adds a convex piece, given by points in the frame of the camera. A piece that contains the
     /// camera is not visible: it is the simplified shape of the housing or mount of the camera.
-    pub(super) fn add(&mut self, points_in_camera: &[Point3<f64>]) {
+    pub fn add(&mut self, points_in_camera: &[Point3<f64>]) {
         // The projection of the convex hull of points in front of the camera is the convex hull of
         // their projections.
         if contains_camera(points_in_camera) {
@@ -87,7 +93,8 @@ impl Silhouette {
     }
 
     /// Whether a pixel shows the robot.
-    pub(super) fn covers(&self, x: u32, y: u32) -> bool {
+    #[must_use]
+    pub fn covers(&self, x: u32, y: u32) -> bool {
         let [column, row] = [x, y].map(|at| (at / self.cell_px) as usize);
         self.is_covered[row * self.n_cells[0] + column]
     }
@@ -198,8 +205,8 @@ fn contains_camera(points: &[Point3<f64>]) -> bool {
 }
 
 /// The part of a convex piece in front of the near plane.
-fn in_front(points: &[Point3<f64>]) -> Piece {
-    let (front, behind): (Piece, Piece) =
+fn in_front(points: &[Point3<f64>]) -> ConvexPiece {
+    let (front, behind): (ConvexPiece, ConvexPiece) =
         points.iter().copied().partition(|point| point.z >= NEAR_M);
     let mut visible = front.clone();
     // All edges of the hull that cross the plane are among these lines. The other lines cross it
@@ -259,7 +266,7 @@ mod tests {
 
     fn covered(points: &[[f64; 3]], uncertainty: Uncertainty) -> Vec<[u32; 2]> {
         let mut silhouette = Silhouette::new(VIEW, uncertainty);
-        let points: Piece = points.iter().map(|point| Point3::from(*point)).collect();
+        let points: ConvexPiece = points.iter().map(|point| Point3::from(*point)).collect();
         silhouette.add(&points);
         let pixels = (0..480_u32).flat_map(|y| (0..640_u32).map(move |x| [x, y]));
         pixels.filter(|[x, y]| silhouette.covers(*x, *y)).collect()
