@@ -126,13 +126,17 @@ mod tests {
         let recording = Path::new("my scan.mcap");
         let rig_file = Some(Path::new("rig.toml"));
         for (rig_file, is_repeated, expected) in [
-            (rig_file, false, "run|rig.toml|from|my scan.mcap|real_time"),
+            (
+                rig_file,
+                false,
+                "run|rig.toml|recording|my scan.mcap|real_time",
+            ),
             (
                 rig_file,
                 true,
-                "run|rig.toml|from|my scan.mcap|real_time|repeat",
+                "run|rig.toml|recording|my scan.mcap|real_time|repeat",
             ),
-            (None, false, "run|from|my scan.mcap|real_time"),
+            (None, false, "run|recording|my scan.mcap|real_time"),
         ] {
             let command = ResumeCommand::of_playback(recording, rig_file, is_repeated);
             let line = command.line(Path::new("out"));
@@ -146,10 +150,13 @@ mod tests {
         for (given, expected) in [
             (&[][..], "run|out/rig.toml"),
             (&[FROM], "train|a.mcap|rig|out/rig.toml"),
-            (&[FROM, REAL_TIME], "run|out/rig.toml|from|a.mcap|real_time"),
+            (
+                &[FROM, REAL_TIME],
+                "run|out/rig.toml|recording|a.mcap|real_time",
+            ),
             (
                 &[FROM, REAL_TIME, REPEAT],
-                "run|out/rig.toml|from|a.mcap|real_time|repeat",
+                "run|out/rig.toml|recording|a.mcap|real_time|repeat",
             ),
         ] {
             let value = |name: &str| if name == FROM { "a.mcap" } else { "true" };

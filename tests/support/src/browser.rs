@@ -17,6 +17,16 @@ const TIMEOUT: Duration = Duration::from_secs(300);
 /// most of the time.
 pub const NO_DRAWING: &str = include_str!("no_drawing.js");
 
+/// Flags for WebGL on the CPU with Mesa's llvmpipe, which takes about half the computing time of
+/// the browser's own renderer. Chromium offers it only through EGL.
+const MESA: [&str; 3] = [
+    "--use-gl=angle",
+    "--use-angle=gl-egl",
+    "--ignore-gpu-blocklist",
+];
+/// Flags for WebGL on the CPU with the browser's own renderer, which needs no library.
+const SWIFTSHADER: [&str; 2] = ["--use-angle=swiftshader", "--enable-unsafe-swiftshader"];
+
 /// The hint at the first visit would cover a part of the view. This script makes the page believe
 /// that the browser has already shown the hint. Pages without an origin have no storage.
 const LATER_VISIT: &str = "try { localStorage.setItem('gestures-seen', '1'); } catch {}\n";
@@ -79,9 +89,26 @@ impl Browser {
         program: &Path,
         profile: &Path,
         url: &str,
-        [width, height]: [u32; 2],
+        size_px: [u32; 2],
         script: &str,
     ) -> Self {
+        let mut browser = Self::start(program, profile, size_px, &MESA);
+        let has_webgl = "document.createElement('canvas').getContext('webgl2') !== null";
+        if browser.evaluate(has_webgl) != true {
+            drop(browser);
+            browser = Self::start(program, profile, size_px, &SWIFTSHADER);
+        }
+        browser.call("Page.enable", json!({}));
+        browser.call(
+            "Page.addScriptToEvaluateOnNewDocument",
+            json!({"source": format!("{LATER_VISIT}{script}")}),
+        );
+        browser.call("Page.navigate", json!({"url": url}));
+        browser
+    }
+
+    /// Starts the browser with an empty page of this size in CSS pixels.
+    fn start(program: &Path, profile: &Path, [width, height]: [u32; 2], webgl: &[&str]) -> Self {
         let mut process = Command::new(program)
             .args([
                 "--headless",
@@ -95,12 +122,10 @@ impl Browser {
                 "--disable-component-update",
                 "--disable-sync",
             ])
-            .args([
-                "--use-angle=swiftshader",
-                "--enable-unsafe-swiftshader",
-                "--hide-scrollbars",
-            ])
-            .args(["--remote-debugging-port=0", "--force-device-scale-factor=1"])
+            .args(webgl)
+            .env("LIBGL_ALWAYS_SOFTWARE", "1")
+            .args(["--hide-scrollbars", "--remote-debugging-port=0"])
+            .arg("--force-device-scale-factor=1")
             .arg(format!("--window-size={width},{height}"))
             .arg(format!("--user-data-dir={}", profile.display()))
             .arg("about:blank")
@@ -143,12 +168,6 @@ impl Browser {
             .expect("a session")
             .to_owned();
         browser.resize([width, height]);
-        browser.call("Page.enable", json!({}));
-        browser.call(
-            "Page.addScriptToEvaluateOnNewDocument",
-            json!({"source": format!("{LATER_VISIT}{script}")}),
-        );
-        browser.call("Page.navigate", json!({"url": url}));
         browser
     }
 

@@ -6,7 +6,7 @@
 use kinematics::Stamp;
 use std::path::PathBuf;
 use std::time::Instant;
-use test_support::browser::{Browser, browser_for_page, wait_for};
+use test_support::browser::{Browser, NO_DRAWING, browser_for_page, wait_for};
 use viz::{
     CoverageItem, Guidance, Hub, ImagePartCoverage, LiveImage, LivePixels, PhotographCoverage,
     Server, ServerConfig, Status,
@@ -101,7 +101,7 @@ fn coverage_is_drawn_over_the_live_image_and_listed() {
     let server = Server::start(ServerConfig { listen }, hub.clone()).expect("a free port");
     let profile = PathBuf::from(env!("CARGO_TARGET_TMPDIR"))
         .join(format!("chromium-coverage-{}", std::process::id()));
-    let mut browser = Browser::open(&program, &profile, &server.url(), WINDOW_PX);
+    let mut browser = Browser::open_with(&program, &profile, &server.url(), WINDOW_PX, NO_DRAWING);
 
     // The list needs no image.
     wait_for(&mut browser, "the list", |browser| {

@@ -11,7 +11,7 @@ use serde_json::{Value, json};
 use std::path::PathBuf;
 use std::sync::{Arc, Mutex};
 use std::time::Duration;
-use test_support::browser::{Browser, browser_for_page, wait_for};
+use test_support::browser::{Browser, NO_DRAWING, browser_for_page, wait_for};
 use trainer::{Projection, RenderRequest};
 use viz::{Hub, ModelStatus, SceneHint, Server, ServerConfig, Status};
 
@@ -106,7 +106,8 @@ impl Page {
         });
         let profile = PathBuf::from(env!("CARGO_TARGET_TMPDIR"))
             .join(format!("chromium-hands-{name}-{}", std::process::id()));
-        let browser = Browser::open_with(&program, &profile, &server.url(), size_px, script);
+        let script = format!("{NO_DRAWING}{script}");
+        let browser = Browser::open_with(&program, &profile, &server.url(), size_px, &script);
         let mut page = Self {
             browser,
             hub,
