@@ -10,11 +10,11 @@ use crate::robot_meshes;
 use crate::run_folder::CreatedFolders;
 use crate::session::{Evaluators, Session};
 use crate::session_setup::{Services, SessionSetup};
-use crate::steering::PreparedSteering;
+use crate::steering::{PreparedRobot, SteeredRobot};
 use crate::training_clock::Clock;
 use crate::viewers::{Viewers, gpu_notes};
 use capture::config::Rig;
-use capture::open::{self, Opened, SteeredArm};
+use capture::open::{self, Opened};
 use capture::{Feed, Input, InputObserver, Join, Notes, RobotMotion, StampClock, Stations, doctor};
 use drivers::Source;
 use gpu::Gpu;
@@ -44,8 +44,8 @@ pub struct PreparedRun<'a> {
 /// A run whose devices are open.
 pub struct OpenedRun<'a> {
     opened: Opened,
-    /// The arm, if operators may steer it.
-    steered_arm: Option<SteeredArm>,
+    /// The arm or the base, if operators may steer it.
+    steered: Option<SteeredRobot>,
     device_notes: Notes,
     parts: Parts<'a>,
     hub: Hub,
@@ -107,9 +107,9 @@ impl<'a> PreparedRun<'a> {
                 .recording()
                 .map_or("devices", |_| "recording")
         );
-        let (opened, steered_arm) = self.parts.plan.open(self.rig)?;
+        let (opened, steered) = self.parts.plan.open(self.rig)?;
         Ok(OpenedRun {
-            steered_arm,
+            steered,
             opened: opened.with_tag_check(&device_notes)?,
             device_notes,
             parts: self.parts,
@@ -135,7 +135,7 @@ impl OpenedRun<'_> {
     fn start_in(self, created: &mut CreatedFolders) -> anyhow::Result<RunInProgress> {
         let Self {
             opened,
-            steered_arm,
+            steered,
             device_notes,
             parts,
             hub,
@@ -166,12 +166,12 @@ impl OpenedRun<'_> {
         let (mut input, evicted) = input(&plan, &rig, (source, stamp_clock), held)?;
         input.join = input.join.with_notes(device_notes.clone());
         let robot = publish_robot(&hub, &rig, &plan)?;
-        let steering = steered_arm
-            .map(|arm| PreparedSteering::new(arm, &rig, &plan.rig_file))
+        let steering = steered
+            .map(|robot| PreparedRobot::new(robot, &rig, &plan.rig_file))
             .transpose()?;
         let identity = identity(&plan, &folders, robot);
         let stop = services.stop.clone();
-        let clearance = steering.as_ref().map(PreparedSteering::clearance_feed);
+        let clearance = steering.as_ref().and_then(PreparedRobot::clearance_feed);
         let feed = Feed::start(input, observer(&hub, steering.as_ref()), stop.clone())?;
         let steering = steering
             .map(|steering| steering.start(&hub, Some(run_folder_of(&folders))))
@@ -238,10 +238,10 @@ impl OpenedRun<'_> {
 }
 
 /// What receives the data of the devices besides the trainer.
-fn observer(hub: &Hub, steering: Option<&PreparedSteering>) -> Box<dyn InputObserver> {
+fn observer(hub: &Hub, steering: Option<&PreparedRobot>) -> Box<dyn InputObserver> {
     let viewers = Viewers(hub.clone());
     match steering {
-        Some(steering) => Box::new(steering.observer(viewers)),
+        Some(steering) => steering.observer(viewers),
         None => Box::new(viewers),
     }
 }
