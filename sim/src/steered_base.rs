@@ -45,6 +45,15 @@ impl SteeredBase {
         self.way.0.state.lock().is_wanted = true;
     }
 
+    /// True pose of the base at a time, on the clock of the thread that drives it.
+    #[must_use]
+    pub fn world_from_base(&self, at: Stamp) -> Transform {
+        let Shared { start, tour, .. } = &*self.way.0;
+        let nanos = at.nanos_since(*start);
+        let steered = self.way.world_from_base(nanos);
+        steered.unwrap_or_else(|| tour.world_from_base(nanos as f64 * 1e-9))
+    }
+
     /// How often a part of the robot has touched a part of the scene; `None` if it is not counted.
     #[must_use]
     pub fn n_contacts(&self) -> Option<u64> {
@@ -371,6 +380,10 @@ mod tests {
         let report = driven.report(stamp(6_800_000_000));
         assert!(report.is_on_tour && !report.is_stop_confirmed, "{report:?}");
         assert_eq!(way.world_from_base(7_000_000_000), None);
+        let base = SteeredBase::new(way.clone(), None);
+        let tour = BaseMotion::Lap(1.0);
+        let at_start = base.world_from_base(stamp(6_900_000_000));
+        assert_eq!(at_start, tour.world_from_base(6.9));
         let result = driven.drive(stamp(6_820_000_000), &BaseVelocity::ZERO);
         result.expect("a simulated base is always reached");
         let report = driven.report(stamp(7_000_000_000));

@@ -10,6 +10,7 @@ mod listening;
 mod movable;
 mod real;
 mod realsense;
+mod robot_tap;
 mod servos;
 #[cfg(feature = "sim")]
 mod simulated;

@@ -1,6 +1,7 @@
 //! Opens the devices of a rig with a base that operators drive.
 
 use super::real;
+use super::robot_tap::RobotTap;
 use super::{Devices, Opened, check_arm, is_any_simulated};
 use crate::config::{
     ArmDriver, BaseDriver, BaseMotion, Camera, CameraDriver, Rig, Scanner, ScannerDriver,
@@ -10,23 +11,25 @@ use anyhow::bail;
 use drivers::Source;
 use drivers::base_motion::{BaseDrive, BasePort};
 use drivers::udp::UdpDrivenBase;
-use drivers::{LiveDevices, clock};
+use drivers::{BasePose, LiveDevices, clock};
+use kinematics::JointState;
 use messages::{BadInput, Setting};
 
 /// A base that operators drive. Dropping it lets the base brake.
 #[derive(Debug)]
 pub struct SteeredBase {
     drive: BaseDrive,
+    tap: RobotTap,
     #[cfg(feature = "sim")]
     simulated: Option<sim::SteeredBase>,
 }
 
 impl SteeredBase {
     /// A base that stands still until it is driven.
-    #[must_use]
-    pub fn standing(drive: BaseDrive) -> Self {
+    fn standing(drive: BaseDrive, tap: RobotTap) -> Self {
         Self {
             drive,
+            tap,
             #[cfg(feature = "sim")]
             simulated: None,
         }
@@ -36,6 +39,29 @@ impl SteeredBase {
     #[must_use]
     pub fn port(&self) -> &BasePort {
         self.drive.port()
+    }
+
+    /// The newest pose that the base or its localization has reported, without the corrections of
+    /// stations; `None` if it comes from the images of the run. It does not wait for the input of the
+    /// run.
+    #[must_use]
+    pub fn reported_pose(&self) -> Option<BasePose> {
+        #[cfg(feature = "sim")]
+        if let Some(base) = &self.simulated {
+            let stamp = clock::now();
+            return Some(BasePose {
+                stamp,
+                world_from_base: base.world_from_base(stamp),
+            });
+        }
+        self.tap.pose()
+    }
+
+    /// The newest joint state of the arm on the base, without `arm.joint_offsets`; `None` without an
+    /// arm. It does not wait for the input of the run.
+    #[must_use]
+    pub fn reported_joints(&self) -> Option<JointState> {
+        self.tap.joints()
     }
 
     /// Takes the base over, or stops it. A simulated base brakes and ends its tour; a real base stands
@@ -87,15 +113,18 @@ fn open_devices(
         let (source, base) = open_simulated(rig, &motion)?;
         return Ok((source, StampClock::Computer, base));
     }
-    let (devices, _) = real::open(rig, &mut real::end_on_failure)
+    let (mut devices, _) = real::open(rig, &mut real::end_on_failure)
         .map_err(|error| super::with_sim_hint(error, rig))?;
+    let tap = RobotTap::default();
+    devices.base = devices.base.map(|base| tap.of_base(base));
+    devices.arm = devices.arm.map(|arm| tap.of_arm(arm));
     // The base is reached last, so that it is driven only if everything else works.
-    let base = open_real(&motion)?;
+    let base = open_real(&motion, tap)?;
     let source = Box::new(LiveDevices::new(devices)?);
     Ok((source, StampClock::Computer, base))
 }
 
-fn open_real(motion: &BaseMotion) -> anyhow::Result<SteeredBase> {
+fn open_real(motion: &BaseMotion, tap: RobotTap) -> anyhow::Result<SteeredBase> {
     let Some(address) = motion.address else {
         bail!("base.motion.address is missing: this is a bug");
     };
@@ -109,7 +138,7 @@ fn open_real(motion: &BaseMotion) -> anyhow::Result<SteeredBase> {
         );
     }
     let drive = BaseDrive::start(Box::new(base), motion.limits())?;
-    Ok(SteeredBase::standing(drive))
+    Ok(SteeredBase::standing(drive, tap))
 }
 
 #[cfg(feature = "sim")]
@@ -120,6 +149,7 @@ fn open_simulated(
     let (source, base, driven) = super::simulated::with_steered_base(rig)?;
     let base = SteeredBase {
         drive: BaseDrive::start(driven, motion.limits())?,
+        tap: RobotTap::default(),
         simulated: Some(base),
     };
     Ok((source, base))

@@ -506,25 +506,20 @@ impl BaseSteering {
         let (Some(area), Some(pose)) = (self.area, pose) else {
             return wanted;
         };
-        let (scale, reason) = area.speed(&pose, &wanted, measured, &self.config.limits);
-        if let Some(reason) = reason {
+        let (velocity, slowed) = area.permitted(&pose, wanted, measured, &self.config.limits);
+        if let Some((scale, reason)) = slowed {
             let effect = if scale > 0.0 {
                 Effect::Slowed(scale)
             } else {
                 Effect::Refused
             };
-            let link = Link::Limits;
             limits.push(Limit {
-                link,
+                link: Link::Limits,
                 effect,
                 reason,
             });
         }
-        BaseVelocity {
-            forward_m_s: wanted.forward_m_s * scale,
-            left_m_s: wanted.left_m_s * scale,
-            yaw_rad_s: wanted.yaw_rad_s,
-        }
+        velocity
     }
 }
 

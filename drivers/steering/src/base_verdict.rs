@@ -35,6 +35,9 @@ pub struct SeenPose {
     pub at: Stamp,
     /// The pose.
     pub pose: FloorPose,
+    /// Height of the base link in the world, meters. No decision depends on it: it shows where the
+    /// robot was.
+    pub z_m: f64,
 }
 
 /// Where the joints of the arm on the base were at a time.

@@ -142,6 +142,7 @@ impl Sim {
         self.poses.push_back(SeenPose {
             at: self.now,
             pose: *pose,
+            z_m: 0.5,
         });
         if self.poses.len() > POSE_DELAY {
             self.poses.pop_front();
@@ -420,6 +421,7 @@ fn random_events_break_no_limit_and_replay_bit_for_bit() {
     let setup: BaseSetup =
         serde_json::from_str(&serde_json::to_string(&sim.steering.setup()).unwrap()).unwrap();
     sim.steering.take_record();
+    let mut entries = Vec::new();
     let mut grip = 1;
     let mut n_moving = 0;
     for _ in 0..2500 {
@@ -456,10 +458,11 @@ fn random_events_break_no_limit_and_replay_bit_for_bit() {
             (after.forward_m_s - before.forward_m_s).hypot(after.left_m_s - before.left_m_s);
         // The longest step of the follower is 0.1 s.
         assert!(change <= LIMITS.brake_m_s2 * 0.1 + ROUNDING, "{change}");
+        let (new, n_dropped) = sim.steering.take_record();
+        assert_eq!(n_dropped, 0);
+        entries.extend(new);
     }
     assert!(n_moving > 500, "{n_moving}");
-    let (entries, n_dropped) = sim.steering.take_record();
-    assert_eq!(n_dropped, 0);
     let mut replayed = setup.build().unwrap();
     for entry in &entries {
         let line = serde_json::to_string(entry).unwrap();
@@ -469,7 +472,6 @@ fn random_events_break_no_limit_and_replay_bit_for_bit() {
     assert_eq!(replayed.state(), sim.steering.state());
     // A target that differs in its last bit is found.
     let mut fresh = setup.build().unwrap();
-    let mut entries = entries;
     let changed = entries.iter_mut().find_map(|entry| match entry {
         BaseEntry::Cycle { verdict, .. } => match &mut verdict.output {
             BaseOutput::Drive(target) if target.velocity.forward_m_s != 0.0 => {

@@ -7,8 +7,7 @@ use crate::steering::requests;
 use crate::steering::steering_log::LoopLog;
 use crate::steering::time_base::TimeBase;
 use drivers::base_motion::{BaseOutput, BasePort, BaseState, BaseVelocity};
-use kinematics::Stamp;
-use kinematics::{Transform, transform};
+use kinematics::{Stamp, Transform, transform};
 use std::time::Instant;
 use steering::{
     BaseSituation, BaseSteering, BaseSteeringConfig, BaseVerdict, Error, Operator, Request,

@@ -97,7 +97,11 @@ impl Test {
             yaw_rad: 0.0,
         };
         let seen = SeenRobot {
-            pose: Some(SeenPose { at: now, pose }),
+            pose: Some(SeenPose {
+                at: now,
+                pose,
+                z_m: 0.25,
+            }),
             posture: None,
         };
         self.base_loop.cycle(now, &received, &seen)
@@ -203,6 +207,13 @@ fn an_operator_drives_the_base_and_the_log_replays_and_shows_the_stop() {
         .iter()
         .map(|incident| incident.text.as_str())
         .collect();
+    let stop = found
+        .incidents
+        .iter()
+        .find(|it| it.text.contains("stopped"));
+    let at_stop = stop.and_then(|stop| stop.world_from_base);
+    assert_eq!(at_stop, Some([0.0, 0.5, 0.25, 0.0, 0.0, 0.0, 1.0]));
+    assert!(found.track.iter().any(|it| it.world_from_base == at_stop));
     for expected in ["operator 1 took control", "operator 2 stopped the base"] {
         assert!(texts.contains(&expected), "{texts:?}");
     }

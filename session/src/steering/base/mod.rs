@@ -8,6 +8,7 @@
 mod base_loop;
 #[cfg(test)]
 mod base_loop_tests;
+mod pose_tracker;
 mod robot_watch;
 
 use super::steering_log::LoopLog;
@@ -34,6 +35,7 @@ pub(crate) struct PreparedBase {
     base_link: String,
     tip_link: String,
     watch: Arc<RobotWatch>,
+    joint_offsets: Vec<f64>,
 }
 
 impl PreparedBase {
@@ -46,6 +48,7 @@ impl PreparedBase {
             base_link: rig.arm.base_link.clone(),
             tip_link: rig.arm.flange_link.clone(),
             watch: Arc::new(RobotWatch::new(times)),
+            joint_offsets: rig.arm.joint_offsets.clone(),
         }
     }
 
@@ -80,6 +83,7 @@ impl PreparedBase {
             base_loop,
             base: self.base,
             watch: self.watch,
+            joint_offsets: self.joint_offsets,
             server: Arc::clone(&server),
             must_stop: Arc::clone(&must_stop),
             _admission: Admission::open(hub, server),
@@ -135,6 +139,7 @@ struct Running {
     base_loop: BaseLoop,
     base: SteeredBase,
     watch: Arc<RobotWatch>,
+    joint_offsets: Vec<f64>,
     server: Arc<SteeringServer>,
     must_stop: Arc<AtomicBool>,
     _admission: Admission,
@@ -156,6 +161,12 @@ impl Running {
     fn decide(&mut self) {
         let received = self.server.take_requests();
         let now = drivers::clock::now();
+        if let Some(pose) = self.base.reported_pose() {
+            self.watch.report_pose(pose.stamp, pose.world_from_base);
+        }
+        if let Some(joints) = self.base.reported_joints() {
+            self.watch.report_joints(&joints, &self.joint_offsets);
+        }
         let outcome = self.base_loop.cycle(now, &received, &self.watch.seen());
         if outcome.ends_tour {
             self.base.begin();

@@ -8,7 +8,7 @@ use serde::Serialize;
 use std::collections::VecDeque;
 use std::mem::{Discriminant, discriminant};
 use std::path::{Path, PathBuf};
-use steering::{BaseEntry, Effect, Entry, Limit, Link, Operator, Reason, Request};
+use steering::{BaseEntry, Effect, Entry, Limit, Link, Operator, Reason, Request, SeenPose};
 
 /// Number of incidents that are kept, the newest ones.
 const MAX_INCIDENTS: usize = 2000;
@@ -65,6 +65,9 @@ pub struct Incident {
     pub target: Option<Vec<f64>>,
     /// View of the operator, `world_from_camera`: x, y, z in meters, and a quaternion x, y, z, w.
     pub view: Option<[f64; 7]>,
+    /// Pose of the base, if it is steered: x, y, z in meters, and a quaternion x, y, z, w.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub world_from_base: Option<[f64; 7]>,
 }
 
 /// The kind of an incident.
@@ -107,6 +110,9 @@ pub struct Sample {
     pub position: Vec<f64>,
     /// The target, rounded like the positions; `None` if the arm followed none.
     pub target: Option<Vec<f64>>,
+    /// Pose of the base, if it is steered, rounded like the positions.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub world_from_base: Option<[f64; 7]>,
 }
 
 /// State of the log up to a line.
@@ -121,6 +127,8 @@ struct History {
     decided: Option<Decided>,
     /// Whether the log is that of a base.
     is_base: bool,
+    /// Its pose.
+    world_from_base: Option<[f64; 7]>,
     holder: Option<Operator>,
     view: Option<[f64; 7]>,
     /// The track of the last seconds, in case that an incident follows.
@@ -175,11 +183,14 @@ impl History {
         self.advance(start.at);
     }
 
-    /// Places of a base are in the world, and a base has no joints.
+    /// Places of a base are in the world.
     fn start_base(&mut self, start: &BaseStart) {
         self.begin(start.at, start.unix_millis, &start.program);
         self.found.world_from_base = [0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0];
         self.is_base = true;
+        if let Some(stowed) = &start.setup.config.stowed {
+            self.found.joint_names.clone_from(&stowed.joints);
+        }
         self.advance(start.at);
     }
 
@@ -229,9 +240,20 @@ impl History {
                 self.advance(*at);
                 self.answer(request, refusal.as_ref());
             }
-            BaseEntry::Cycle { at, verdict, .. } => {
+            BaseEntry::Cycle {
+                at,
+                situation,
+                verdict,
+            } => {
                 self.advance(*at);
+                if let Some(seen) = &situation.pose {
+                    self.world_from_base = Some(pose_numbers(seen));
+                }
+                if let Some(arm) = &situation.arm {
+                    self.position.clone_from(&arm.position);
+                }
                 self.cycle(&verdict.limits, verdict.target().is_some());
+                self.sample();
             }
         }
     }
@@ -366,6 +388,7 @@ impl History {
             seconds,
             position: rounded(&self.position),
             target: self.target.as_deref().map(rounded),
+            world_from_base: self.world_from_base,
         };
         if seconds <= self.tracked_until_secs {
             self.track(sample);
@@ -420,6 +443,7 @@ impl History {
             position: self.position.clone(),
             target: self.target.clone(),
             view: self.view,
+            world_from_base: self.world_from_base,
         });
         self.tracked_until_secs = self.found.seconds + TRACKED_AFTER_SECS;
         for sample in std::mem::take(&mut self.recent) {
@@ -433,9 +457,16 @@ impl History {
 }
 
 fn rounded(positions: &[f64]) -> Vec<f64> {
+    positions.iter().map(|q| rounded_number(*q)).collect()
+}
+
+fn rounded_number(number: f64) -> f64 {
     const STEPS: f64 = 1e4;
-    positions
-        .iter()
-        .map(|q| (q * STEPS).round() / STEPS)
-        .collect()
+    (number * STEPS).round() / STEPS
+}
+
+/// A pose on the floor as x, y, z and a quaternion x, y, z, w.
+fn pose_numbers(seen: &SeenPose) -> [f64; 7] {
+    let (sin, cos) = (0.5 * seen.pose.yaw_rad).sin_cos();
+    [seen.pose.x_m, seen.pose.y_m, seen.z_m, 0.0, 0.0, sin, cos].map(rounded_number)
 }
