@@ -108,7 +108,7 @@ mod tests {
     use crate::config::tests::{RIG, URDF};
 
     fn read(table: &str) -> Result<BaseMotion, String> {
-        let text = format!("{RIG}\n[base.motion]\n{table}\n");
+        let text = RIG.replace("[base.motion]", &format!("[base.motion]\n{table}"));
         let rig = Rig::parse("rig.toml", &text, URDF, &[]).map_err(|error| error.to_string())?;
         Ok(rig.base.motion.expect("its table"))
     }

@@ -63,6 +63,7 @@ counts_per_turn = 65536
 id = 1
 [arm.motion]
 on_loss = "release"
+[base.motion]
 [base.tag.7]
 size_m = 0.1
 [camera.wrist.sim.truth]
