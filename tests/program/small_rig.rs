@@ -41,6 +41,9 @@ pub(crate) fn write_base(folder: &Path) {
     let mut rig = shipped(&rigs, "mobile-base-small.toml");
     copy_urdf(&rigs, folder, &rig);
     rig.remove("range");
+    // Corrections of the map would look like motions of the base.
+    let base = rig["base"].as_table_mut().expect("a base");
+    base.insert("realign".into(), false.into());
     let cameras = rig["camera"].as_table_mut().expect("cameras");
     cameras.remove("rear");
     shrink(cameras["front"].as_table_mut().expect("a camera"));
