@@ -1,4 +1,5 @@
-//! Test of `scripts/senders/base_controller.py`: it obeys the driver of bases, and stops without it.
+//! Tests of the programs in `scripts/senders` that control a base: they obey the driver of bases, and
+//! stop without it. The packages of ROS 2 are replaced by small fakes in the folder `base_controller`.
 #![cfg(unix)]
 #![expect(clippy::unwrap_used, reason = "a failing test may panic")]
 
@@ -35,17 +36,27 @@ impl Drop for Controller {
 }
 
 impl Controller {
-    /// Starts the program; `None` if there is no Python.
-    fn start() -> Option<Self> {
+    /// Starts a program; `None` if there is no Python.
+    ///
+    /// * `name`: of the program.
+    /// * `to_poses`: its flag for the address to which it sends poses, if it has one.
+    fn start(name: &str, to_poses: Option<&str>) -> Option<Self> {
         let poses = UdpSocket::bind("127.0.0.1:0").unwrap();
         poses.set_read_timeout(Some(TIMEOUT)).unwrap();
-        let program =
-            Path::new(env!("CARGO_MANIFEST_DIR")).join("../scripts/senders/base_controller.py");
+        let folder = Path::new(env!("CARGO_MANIFEST_DIR"));
+        let program = folder.join("../scripts/senders").join(name);
+        let to = poses.local_addr().unwrap().to_string();
         let child = Command::new("python3")
             .env("PYTHONDONTWRITEBYTECODE", "1")
+            .env("PYTHONPATH", folder.join("tests/base_controller"))
             .arg(program)
-            .args(["--listen", "127.0.0.1:0", "--to"])
-            .arg(poses.local_addr().unwrap().to_string())
+            .args(["--listen", "127.0.0.1:0"])
+            .args(
+                to_poses
+                    .map(|flag| [flag, to.as_str()])
+                    .into_iter()
+                    .flatten(),
+            )
             .stdin(Stdio::null())
             .stdout(Stdio::piped())
             .spawn();
@@ -85,7 +96,7 @@ fn drive_until(
 
 #[test]
 fn the_example_in_python_obeys_reports_its_velocity_and_stops() {
-    let Some(controller) = Controller::start() else {
+    let Some(controller) = Controller::start("base_controller.py", Some("--to")) else {
         return;
     };
     let mut driver = UdpDrivenBase::open(controller.address, 1).unwrap();
@@ -113,7 +124,7 @@ fn the_example_in_python_obeys_reports_its_velocity_and_stops() {
 
 #[test]
 fn the_example_in_python_stops_when_commands_end() {
-    let Some(controller) = Controller::start() else {
+    let Some(controller) = Controller::start("base_controller.py", Some("--to")) else {
         return;
     };
     let mut driver = UdpDrivenBase::open(controller.address, 1).unwrap();
@@ -136,4 +147,20 @@ fn the_example_in_python_stops_when_commands_end() {
         last = Some(pose.world_from_base);
         assert!(began.elapsed() < TIMEOUT, "it does not stop: {pose:?}");
     }
+}
+
+#[test]
+fn the_program_for_ros_2_publishes_velocities_and_reports_the_odometry() {
+    let Some(controller) = Controller::start("ros2_drive.py", None) else {
+        return;
+    };
+    let mut driver = UdpDrivenBase::open(controller.address, 1).unwrap();
+    drive_until(&mut driver, &BaseVelocity::ZERO, |report| {
+        report.is_stop_confirmed
+    });
+    let moving = drive_until(&mut driver, &FORWARD, |report| report.velocity == FORWARD);
+    assert!(moving.fault.is_none(), "{moving:?}");
+    drive_until(&mut driver, &BaseVelocity::ZERO, |report| {
+        report.is_stop_confirmed && report.velocity == BaseVelocity::ZERO
+    });
 }

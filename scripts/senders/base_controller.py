@@ -147,7 +147,7 @@ class SimulatedBase:
         return {"xyz_m": [self.x_m, self.y_m, 0.0], "quat_xyzw": [0.0, 0.0, math.sin(half), math.cos(half)]}
 
 
-def _address(text):
+def address(text):
     host, _, port = text.rpartition(":")
     if not host or not port.isdecimal():
         raise argparse.ArgumentTypeError(f"{text!r} is not an IP address and a port, such as 127.0.0.1:7020")
@@ -156,9 +156,9 @@ def _address(text):
 
 def main():
     parser = argparse.ArgumentParser(description="Controls a simulated base that fieldrig drives.")
-    parser.add_argument("--listen", type=_address, default=LISTEN, metavar="IP:PORT",
+    parser.add_argument("--listen", type=address, default=LISTEN, metavar="IP:PORT",
                         help="base.motion.address in the rig file (default: 127.0.0.1:7020)")
-    parser.add_argument("--to", type=_address, default=POSES, metavar="IP:PORT",
+    parser.add_argument("--to", type=address, default=POSES, metavar="IP:PORT",
                         help="base.address in the rig file (default: 127.0.0.1:7009)")
     args = parser.parse_args()
     controller, base, poses = BaseController(args.listen), SimulatedBase(), DatagramSender(args.to)
